@@ -1,4 +1,4 @@
-//! Digests as texts.
+//! Digests in hexadecimal digits.
 
 use gleaner_base::hex;
 use gleaner_journal::FileDigest;
@@ -18,7 +18,7 @@ pub fn lambda_digest(files: &[FileDigest]) -> String {
 mod tests {
     use super::*;
 
-    /// Worked out with `printf 'aa  lambda.toml\nbb  main.py\n' | sha256sum`.
+    /// Computed with `printf 'aa lambda.toml\nbb main.py\n' | sha256sum`.
     #[test]
     fn a_digest_is_that_of_the_lines_of_sha256sum() {
         let file = |path: &str, sha256: &str| FileDigest {

@@ -1,4 +1,4 @@
-//! Why something cannot be recorded, in the words that a user sees.
+//! Errors of recording, with messages and help for users.
 
 use std::collections::TryReserveError;
 use std::error::Error;
@@ -10,23 +10,23 @@ use gleaner_base::{Exit, Explain};
 use gleaner_drives::ReplayError;
 use gleaner_transport::TransportError;
 
-/// Why something cannot be recorded, or kept, or found again.
+/// An error of recording, storing or recovering clips.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// A folder or a file cannot be made.
+    /// A folder or a file cannot be created.
     #[error("cannot create `{}`", path.display())]
     Create {
-        /// What was to be made.
+        /// The folder or file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// The folder's lock cannot be taken, for a reason other than that somebody has it.
+    /// The folder's lock cannot be taken, for a reason other than that another process holds it.
     #[error("cannot lock `{}`", path.display())]
     Lock {
         /// The lock.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
     /// Another process records into the folder.
@@ -40,7 +40,7 @@ pub enum RecordError {
     Read {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
     /// A file cannot be written.
@@ -48,25 +48,25 @@ pub enum RecordError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// What was written may not be on the disk.
-    #[error("cannot make sure that `{}` is on the disk", path.display())]
+    /// Written data may not be on the disk.
+    #[error("cannot sync `{}` to disk", path.display())]
     Sync {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// A whole file cannot be given its name.
+    /// A complete file cannot be renamed.
     #[error("cannot rename `{}` to `{}`", from.display(), to.display())]
     Rename {
-        /// Its name until then.
+        /// Its temporary name.
         from: PathBuf,
-        /// The name that it should have.
+        /// Its final name.
         to: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
     /// A file that is not needed any more cannot be removed.
@@ -74,48 +74,48 @@ pub enum RecordError {
     Remove {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// A clip is whole, but the list of clips does not name it; it will when the folder is opened
-    /// the next time.
+    /// A clip is complete, but not in the list of clips; it will be listed when the folder is
+    /// opened the next time.
     #[error("cannot list a clip in `{}`", path.display())]
     List {
         /// The list.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// The MCAP writer refuses something.
+    /// The MCAP writer returned an error.
     #[error("cannot write clip `{}`", path.display())]
     Format {
         /// The clip.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: Box<mcap::McapError>,
     },
-    /// An unfinished clip of a recorder that died cannot be saved. It is left as it is.
+    /// An unfinished clip of a recorder that died cannot be recovered. It is left unchanged.
     #[error("cannot recover the unfinished clip `{}`", path.display())]
     Recover {
         /// The unfinished clip.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: Box<RecordError>,
     },
-    /// A clip that was found cannot be read.
+    /// An existing clip cannot be read.
     #[error("cannot read clip `{}`", path.display())]
     Unreadable {
         /// The clip.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: Box<ReplayError>,
     },
-    /// A topic of a clip that was found cannot be read.
+    /// A topic of an existing clip cannot be read.
     #[error("cannot read a topic of clip `{}`", path.display())]
     Topic {
         /// The clip.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: Box<TransportError>,
     },
     /// A file of the preroll cannot be written, read or removed.
@@ -123,80 +123,84 @@ pub enum RecordError {
     Preroll {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// There is no memory for the preroll.
-    #[error("there is no memory for a preroll of {} MiB", bytes.div_ceil(1 << 20))]
+    /// The memory for the preroll cannot be allocated.
+    #[error("cannot allocate {} MiB for the preroll", bytes.div_ceil(1 << 20))]
     PrerollMemory {
-        /// What was asked for.
+        /// The requested size in bytes.
         bytes: u64,
-        /// What the system said.
+        /// The error of the system.
         source: TryReserveError,
     },
-    /// A topic says more of itself than a clip has room for.
+    /// The name, type or definitions of a topic are longer than a clip allows.
     #[error("the {what} of topic `{topic}` has {bytes} bytes; a clip has room for {most}")]
     LongTopic {
-        /// Its name, or the begin of it.
+        /// Its name, or the beginning of it.
         topic: String,
-        /// What is long.
+        /// The part that is too long.
         what: &'static str,
-        /// How long it is.
+        /// Its length in bytes.
         bytes: usize,
-        /// How long it may be.
+        /// The longest that is allowed, in bytes.
         most: usize,
     },
-    /// Something is larger than a clip can hold.
-    #[error("{what} of {bytes} bytes is larger than clip `{}` can hold: {most} bytes", path.display())]
+    /// A message or record is larger than a clip can hold.
+    #[error(
+        "{what} of {bytes} bytes is larger than clip `{}` can hold: {most} bytes",
+        path.display()
+    )]
     TooLarge {
         /// The clip.
         path: PathBuf,
-        /// What it is.
+        /// The kind of data.
         what: &'static str,
-        /// How large it is.
+        /// Its size in bytes.
         bytes: usize,
-        /// How large it may be.
+        /// The largest that is allowed, in bytes.
         most: usize,
     },
-    /// The thread that writes clips cannot be started, or is not there any more.
-    #[error("cannot write clips beside the recording")]
+    /// The thread that writes clips cannot be started, or has ended.
+    #[error("the thread that writes clips failed")]
     Thread {
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
-    /// More topics than a recorder holds.
+    /// More topics than a recorder supports.
     #[error("a recorder holds at most {most} topics")]
     TooManyTopics {
-        /// How many it holds.
+        /// The limit.
         most: usize,
     },
-    /// Topics whose names and types are longer than a recorder holds.
+    /// The names and types of the topics are longer in total than a recorder supports.
     #[error("the names and types of the recorded topics take more than {} KiB", most >> 10)]
     LongNames {
-        /// How many bytes it holds.
+        /// The limit in bytes.
         most: usize,
     },
-    /// More lambdas than a recorder holds; one that was started again counts again.
+    /// More lambdas than a recorder supports; a restarted lambda counts again.
     #[error("a recorder holds at most {most} lambdas, counted with each start")]
     TooManyLambdas {
-        /// How many it holds.
+        /// The limit.
         most: usize,
     },
 }
 
 impl RecordError {
-    /// Whether there is no room on the disk.
+    /// Returns whether the disk is full.
     pub(crate) fn is_full_disk(&self) -> bool {
-        matches!(self.system(), Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded))
+        matches!(self.os_error(), Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded))
     }
 
-    /// What the system said, wherever in the chain of causes it stands.
-    fn system(&self) -> Option<io::ErrorKind> {
+    /// The error of the system, anywhere in the chain of causes.
+    fn os_error(&self) -> Option<io::ErrorKind> {
         self.io().find(|error| error.raw_os_error().is_some()).map(io::Error::kind)
     }
 
-    /// Whether something that is no file or folder of ours has the name of one.
-    fn is_in_the_way(&self) -> bool {
+    /// Returns whether a name is taken by something other than a regular file or folder of this
+    /// program.
+    fn is_unsafe_path(&self) -> bool {
         self.io().any(|error| UnsafePath::of(error).is_some())
     }
 
@@ -210,13 +214,13 @@ impl RecordError {
 
 impl Explain for RecordError {
     fn help(&self) -> Option<String> {
-        let help = match (self, self.system()) {
+        let help = match (self, self.os_error()) {
             (Self::Busy { .. }, _) => "wait until it ends, or choose another folder: --out DIR",
             (Self::TooManyTopics { .. } | Self::LongNames { .. }, _) => {
                 "record fewer topics: [record] topics in lambda.toml, or --topics of a replay"
             }
             (Self::PrerollMemory { .. }, _) => {
-                "keep less: preroll_size in lambda.toml, or --preroll-memory BYTES"
+                "use a smaller preroll: preroll_size in lambda.toml, or --preroll-memory BYTES"
             }
             (Self::LongTopic { .. }, _) => "remove the topic from [record]",
             (_, Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)) => {
@@ -225,7 +229,7 @@ impl Explain for RecordError {
             (_, Some(io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem)) => {
                 "choose a folder that you may write to: --out DIR"
             }
-            _ if self.is_in_the_way() => UnsafePath::HELP,
+            _ if self.is_unsafe_path() => UnsafePath::HELP,
             _ => return None,
         };
         Some(help.to_owned())
@@ -253,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_is_explained_however_deep_it_lies() {
+    fn a_full_disk_is_explained_at_any_depth_of_the_chain() {
         let write = RecordError::Write { path: "clips/a.mcap.part".into(), source: full() };
         assert_eq!(write.to_string(), "cannot write `clips/a.mcap.part`");
         let format =

@@ -1,20 +1,19 @@
-//! Keeps the moments around triggers: the preroll, the windows that triggers open, and the clips
-//! that are cut there.
+//! Records the moments around triggers: the preroll, the windows that triggers open, and the clips
+//! that are cut from them.
 //!
-//! - `preroll`: what came lately, in memory or on disk, within a bound.
+//! - `preroll`: the recent samples and wakes, in memory or on disk, within a bound.
 //! - `window`: from triggers to windows, from windows to clips; pure bookkeeping.
-//! - `recorder`: the two together, sample by sample and wake by wake.
-//! - `file`: clips as MCAP files that are whole or not there, the list of them, and what a death
-//!   leaves.
+//! - `recorder`: both together, sample by sample and wake by wake.
+//! - `file`: atomic clip files in MCAP, the clip index, and crash recovery.
 //! - `thumbnail`: a small picture of a moment.
-//! - `program`: the process that does it live, for all lambdas of a vehicle; with the feature of
-//!   that name.
+//! - `program`: the process that records live, for all lambdas of a vehicle; with the feature
+//! `program`.
 //!
-//! A recorder of a replay is synchronous and without threads: what is recorded depends on the
-//! stamps of samples and wakes only. One that is fed live is the same, but for a thread that writes
-//! the files. What never happens here: running a lambda, deciding what is worth keeping.
+//! A recorder of a replay is synchronous and without threads: the recording depends on the stamps
+//! of samples and wakes only. A live recorder is the same, except that a thread writes the files.
+//! Never here: running a lambda, or deciding what is worth keeping.
 
-// The tests within the crate share support with those outside of it.
+// The unit tests share support code with the integration tests.
 #[cfg(test)]
 extern crate self as gleaner_recorder;
 
@@ -42,6 +41,6 @@ pub use recorder::{
 };
 pub use thumbnail::{is_image, thumbnail};
 
-/// Most lambdas of one recorder, counted with each start, and of one clip: of each a header is
+/// Most lambdas of one recorder, counted with each start, and of one clip: for each a header is
 /// kept.
 const LAMBDAS_MAX: usize = 1024;

@@ -1,19 +1,19 @@
-//! A small JPEG of an image message, for lists of clips.
+//! Creates a small JPEG from an image message, for lists of clips.
 
 use gleaner_image::{self as image, Encoding, View, ops};
 use gleaner_messages::{CompressedView, Endian, ImageView};
 use jpeg_encoder::{ColorType, Encoder};
 
-/// Most pixels in a row of a thumbnail.
+/// Greatest width of a thumbnail, in pixels.
 const WIDTH: u32 = 320;
-/// Most rows: a phone held upright makes 320x569, and what is still taller is made narrower.
+/// Greatest height: a phone held upright makes 320x569, and a taller image is made narrower.
 const HEIGHT: u32 = 640;
 const QUALITY: u8 = 80;
 /// Most bytes that a compressed image may have as rgb8; 21 megapixels.
 const DECODED_BYTES: usize = 64 << 20;
 
-/// Whether messages of this type are images, of which there are thumbnails; the name with or
-/// without `msg/`.
+/// Returns whether messages of this type are images, of which there are thumbnails; the name with
+/// or without `msg/`.
 pub fn is_image(type_name: &str) -> bool {
     ["Image", "CompressedImage"].iter().any(|image| {
         type_name
@@ -24,9 +24,9 @@ pub fn is_image(type_name: &str) -> bool {
 
 /// A JPEG of the image message `cdr`, 320x640 pixels at most and never larger than the image.
 ///
-/// `None` if the type is no image, or if the message or its image is broken, of a kind that we do
-/// not read, or larger than 64 MiB once it is decoded. Images without colour, among them those of
-/// raw sensors, become grey.
+/// `None` if the type is not an image, or if the message or its image is broken, in an unsupported
+/// format, or larger than 64 MiB once decoded. Images without colour, including those of raw
+/// sensors, become grey.
 pub fn thumbnail(type_name: &str, cdr: &[u8], endian: Endian) -> Option<Vec<u8>> {
     match type_name {
         "sensor_msgs/msg/Image" | "sensor_msgs/Image" => raw(&ImageView::read(cdr, endian).ok()?),
@@ -38,8 +38,8 @@ pub fn thumbnail(type_name: &str, cdr: &[u8], endian: Endian) -> Option<Vec<u8>>
 }
 
 fn raw(message: &ImageView<'_>) -> Option<Vec<u8>> {
-    // The colours of a raw sensor lie side by side. Their mean over an area is its grey level, near
-    // enough to know the place by.
+    // The colours of a raw sensor lie side by side. Their mean over an area is its grey level, good
+    // enough to recognise the scene.
     let encoding = match Encoding::from_ros(message.encoding).ok()? {
         Encoding::Bayer8(_) => Encoding::Mono8,
         Encoding::Bayer16(_) => Encoding::Mono16,
@@ -70,8 +70,8 @@ fn small(view: &View<'_>) -> Option<Vec<u8>> {
     Some(jpeg)
 }
 
-/// The largest size in the box of a thumbnail that has the ratio of `width` x `height`, and is not
-/// larger.
+/// The largest size within a thumbnail's bounds that has the ratio of `width` x `height`, and is
+/// not larger.
 fn fit(width: u32, height: u32) -> (u32, u32) {
     let scaled = |side: u32, to: u32, from: u32| {
         let exact =
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_image_has_no_thumbnail() {
+    fn other_messages_have_no_thumbnail() {
         let good = image(20, 10, "mono8", 20, &[90; 200]);
         assert!(thumbnail("sensor_msgs/msg/Imu", &good, Endian::Little).is_none());
         assert!(thumbnail(COMPRESSED, &good, Endian::Little).is_none());

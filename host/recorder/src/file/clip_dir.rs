@@ -1,4 +1,4 @@
-//! The names of files in a folder of clips.
+//! The clip folder: file names, the list, and the lock.
 
 use std::collections::HashSet;
 use std::fs::File;
@@ -10,28 +10,28 @@ use gleaner_lambda::Clip;
 use super::list::ClipList;
 use crate::error::RecordError;
 
-/// The folder of the clips, within that of the list.
+/// The folder of the clips, within the output folder.
 pub(super) const CLIPS: &str = "clips";
-/// A whole clip.
+/// Suffix of a complete clip.
 pub(super) const CLIP: &str = ".mcap";
-/// An unfinished clip.
+/// Suffix of an unfinished clip.
 pub(super) const PART: &str = ".mcap.part";
-/// What is being saved out of an unfinished clip.
+/// Suffix of a recovered copy of an unfinished clip, in progress.
 pub(super) const AGAIN: &str = ".mcap.part2";
-/// A thumbnail.
+/// Suffix of a thumbnail.
 pub(super) const JPG: &str = ".jpg";
-/// An unfinished thumbnail.
+/// Suffix of an unfinished thumbnail.
 pub(super) const JPG_PART: &str = ".jpg.part";
 
-/// Most bytes of a name without its ending; file systems take 255 with it.
-const STEM_MAX: usize = 160;
+/// Most bytes of a name without its suffix; file systems allow 255 with it.
+const BASE_MAX: usize = 160;
 
-/// The folder, as an unfinished clip shares it. Its lock is held as long as one of them lives.
+/// The folder, shared with unfinished clips. Its lock is held as long as one of them lives.
 pub(super) struct ClipDir {
     folder: PathBuf,
     list: ClipList,
-    /// File names that the list holds or will: none is given twice, even after its clip was fetched
-    /// and deleted.
+    /// File names that are or were listed, or will be: no name is used twice, even after its clip
+    /// was fetched and deleted.
     taken: Mutex<HashSet<String>>,
     _lock: File,
 }
@@ -58,14 +58,14 @@ impl ClipDir {
         self.path(name, suffix).symlink_metadata().is_ok()
     }
 
-    /// Adds a whole clip to the list.
+    /// Adds a complete clip to the list.
     pub(super) fn add(&self, name: &str, clip: &Clip) -> Result<(), RecordError> {
         self.list.append(clip)?;
         self.take(name);
         Ok(())
     }
 
-    /// From now on the name is given to no clip.
+    /// Reserves a name.
     pub(super) fn take(&self, name: &str) {
         self.taken().insert(format!("{name}{CLIP}"));
     }
@@ -74,21 +74,21 @@ impl ClipDir {
         self.taken().contains(file)
     }
 
-    /// Starts again with the names of these files.
+    /// Replaces the reserved names by these files.
     pub(super) fn take_only(&self, files: HashSet<String>) {
         *self.taken() = files;
     }
 
-    /// A name that no file has: `base`, or the first of `base-2`, `base-3` and so on.
+    /// A free name: `base`, or the first of `base-2`, `base-3` and so on.
     pub(super) fn free_name(&self, base: &str) -> String {
-        let base = plain(base);
+        let base = sanitized(base);
         names(&base)
             .find(|name| {
                 let is_file = |suffix: &&str| self.exists(name, suffix);
                 ![CLIP, PART, AGAIN, JPG, JPG_PART].iter().any(is_file)
                     && !self.is_taken(&format!("{name}{CLIP}"))
             })
-            .expect("numbers do not end before the files do")
+            .expect("there are more numbers than files")
     }
 
     fn taken(&self) -> MutexGuard<'_, HashSet<String>> {
@@ -101,11 +101,11 @@ pub(crate) fn names(base: &str) -> impl Iterator<Item = String> + '_ {
     (1_u64..).map(move |n| if n == 1 { base.to_owned() } else { format!("{base}-{n}") })
 }
 
-/// `base` as the begin of a file name on any system.
-fn plain(base: &str) -> String {
+/// Makes `base` valid as the beginning of a file name on any system.
+fn sanitized(base: &str) -> String {
     let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
     let name: String =
-        base.chars().map(|c| if allowed(c) { c } else { '-' }).take(STEM_MAX).collect();
+        base.chars().map(|c| if allowed(c) { c } else { '-' }).take(BASE_MAX).collect();
     match name.trim_start_matches('.') {
         "" => "clip".to_owned(),
         name => name.to_owned(),
@@ -118,12 +118,12 @@ mod tests {
 
     #[test]
     fn a_name_stays_within_the_folder() {
-        assert_eq!(plain("hello-20180802T083451.136Z"), "hello-20180802T083451.136Z");
-        assert_eq!(plain("../../etc/passwd"), "-..-etc-passwd");
-        assert_eq!(plain(""), "clip");
-        assert_eq!(plain(".."), "clip");
-        assert_eq!(plain("é\0\n"), "---");
-        assert_eq!(plain(&"x".repeat(1000)).len(), STEM_MAX);
+        assert_eq!(sanitized("hello-20180802T083451.136Z"), "hello-20180802T083451.136Z");
+        assert_eq!(sanitized("../../etc/passwd"), "-..-etc-passwd");
+        assert_eq!(sanitized(""), "clip");
+        assert_eq!(sanitized(".."), "clip");
+        assert_eq!(sanitized("é\0\n"), "---");
+        assert_eq!(sanitized(&"x".repeat(1000)).len(), BASE_MAX);
     }
 
     #[test]

@@ -1,5 +1,5 @@
-//! Statements of a clip about itself: its line in the list, and the metadata records in the file.
-//! `stated` compares them with its content, by making the records once more.
+//! The statements of a clip about itself: its line in the list, and the metadata records in the
+//! file. `stated` checks them against the content, by building the records again.
 
 use std::collections::{BTreeMap, HashSet};
 use std::fmt::Display;
@@ -12,9 +12,9 @@ use gleaner_lambda::{Clip, ClipLambda, ClipTopic, Moment};
 use super::written::{Written, WrittenTopic, crc32};
 use super::{ClipHeader, ClipTrailer};
 
-/// The program that writes clips, as their header names it.
+/// The program that writes clips, in their header.
 pub(super) const LIBRARY: &str = concat!("gleaner ", env!("CARGO_PKG_VERSION"));
-/// The record in front of the messages.
+/// The record before the messages.
 pub(super) const BEGIN: &str = "gleaner.begin";
 /// The record with the line of the list.
 pub(super) const CLIP_RECORD: &str = "gleaner.clip";
@@ -26,12 +26,12 @@ pub(super) const LAMBDA_RECORD: &str = "gleaner.lambda";
 pub(super) const DECISION_RECORD: &str = "gleaner.decision";
 /// The attachment with the thumbnail.
 pub(super) const THUMBNAIL: &str = "thumbnail.jpg";
-/// Key of [`CLIP_RECORD`]: the line of the list, without what only the finished file knows.
+/// Key of [`CLIP_RECORD`]: the line of the list, without fields that only the finished file has.
 pub(super) const LINE: &str = "line";
-/// Key of [`CLIP_RECORD`]: the unfinished file that a recovered clip was saved from.
+/// Key of [`CLIP_RECORD`]: the unfinished file that a clip was recovered from.
 const RECOVERED_FROM: &str = "recovered_from";
 
-/// In `incomplete`: the clip before has the messages before.
+/// In `incomplete`: the previous clip has the earlier messages.
 pub(crate) const CONTINUES: &str = "continues the clip before";
 
 const UNKNOWN: &str = "unknown";
@@ -39,7 +39,7 @@ const UNKNOWN: &str = "unknown";
 /// A metadata record.
 pub(super) type MetadataRecord = (String, BTreeMap<String, String>);
 
-/// The line of a clip, but for its length.
+/// The line of a clip, except for its length.
 pub(super) fn clip(
     trailer: &ClipTrailer,
     written: &Written,
@@ -63,8 +63,8 @@ pub(super) fn clip(
     }
 }
 
-/// The topics that the recorder names, then those that it forgot: their messages are in the file
-/// all the same.
+/// The topics that the recorder names, then those that it forgot but whose messages are in the
+/// file.
 fn topics(trailer: &ClipTrailer, written: &Written) -> Vec<ClipTopic> {
     let mut topics = Vec::new();
     for counts in &trailer.topics {
@@ -97,7 +97,7 @@ fn topics(trailer: &ClipTrailer, written: &Written) -> Vec<ClipTopic> {
     topics
 }
 
-/// The record in front of the messages, of a clip that `library` writes.
+/// The record before the messages, of a clip that `library` writes.
 pub(super) fn begin(clip_header: &ClipHeader, library: &str) -> MetadataRecord {
     let metadata = pairs([
         ("clock", clip_header.clock.clone()),
@@ -109,7 +109,7 @@ pub(super) fn begin(clip_header: &ClipHeader, library: &str) -> MetadataRecord {
     (BEGIN.to_owned(), metadata)
 }
 
-/// Reads a record of [`begin`]; the key that is malformed if it is.
+/// Parses a record of [`begin`]; the error is the malformed key.
 pub(super) fn read_begin(metadata: &BTreeMap<String, String>) -> Result<ClipHeader, &'static str> {
     Ok(ClipHeader {
         clock: value(metadata, "clock")?.clone(),
@@ -119,17 +119,17 @@ pub(super) fn read_begin(metadata: &BTreeMap<String, String>) -> Result<ClipHead
     })
 }
 
-/// The line of a whole clip, by its record [`CLIP_RECORD`].
+/// The line of a complete clip, from its record [`CLIP_RECORD`].
 pub(super) fn read_line(metadata: &BTreeMap<String, String>) -> Option<Clip> {
     serde_json::from_str(metadata.get(LINE)?).ok()
 }
 
-/// The unfinished file that a clip was saved from, by its record [`CLIP_RECORD`].
+/// The unfinished file that a clip was recovered from, from its record [`CLIP_RECORD`].
 pub(super) fn read_recovered_from(metadata: &BTreeMap<String, String>) -> Option<&str> {
     metadata.get(RECOVERED_FROM).map(String::as_str)
 }
 
-/// The records behind the messages.
+/// The records after the messages.
 pub(super) fn records<'a>(
     trailer: &'a ClipTrailer,
     clip: &'a Clip,
@@ -225,7 +225,7 @@ pub(super) fn decision(moment: &Moment) -> MetadataRecord {
         ("label", moment.label.clone()),
         ("lambda", moment.lambda.clone()),
     ]);
-    // A trigger need not have a score: none is not an unknown one.
+    // A trigger without a score has no unknown score.
     if let Some(score) = moment.score {
         metadata.insert("score".to_owned(), score.to_string());
     }
@@ -239,7 +239,7 @@ pub(super) fn decision(moment: &Moment) -> MetadataRecord {
     (DECISION_RECORD.to_owned(), metadata)
 }
 
-/// Reads a record of [`decision`]; the key that is malformed if it is.
+/// Parses a record of [`decision`]; the error is the malformed key.
 pub(super) fn read_decision(metadata: &BTreeMap<String, String>) -> Result<Moment, &'static str> {
     let score =
         metadata.get("score").map(|score| score.parse::<f64>()).transpose().map_err(|_| "score")?;
@@ -271,7 +271,7 @@ fn known(value: Option<impl Display>) -> String {
 }
 
 pub(super) fn json(value: &impl serde::Serialize) -> String {
-    serde_json::to_string(value).expect("what a clip says is plain data")
+    serde_json::to_string(value).expect("a clip is plain data")
 }
 
 fn pairs<const N: usize>(pairs: [(&str, String); N]) -> BTreeMap<String, String> {

@@ -1,4 +1,4 @@
-//! Steps of the file system that are on the disk when they return.
+//! File system operations that are on the disk when they return.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
@@ -9,7 +9,7 @@ use gleaner_base::safe_file;
 use super::recover::Pause;
 use crate::error::RecordError;
 
-/// Bytes that are copied at a time.
+/// Bytes to copy between two pauses.
 const PIECE: u64 = 8 << 20;
 
 /// Makes the names in `folder` durable: a rename is on the disk only when its folder is.
@@ -24,7 +24,7 @@ pub(super) fn sync_file(path: &Path) -> Result<(), RecordError> {
         .map_err(|source| RecordError::Sync { path: path.to_owned(), source })
 }
 
-/// Gives the file `from`, whose content is durable, the name `to`.
+/// Renames the file `from`, whose content is durable, to `to`.
 pub(super) fn rename(from: &Path, to: &Path, folder: &Path) -> Result<(), RecordError> {
     step("rename", to).and_then(|()| fs::rename(from, to)).map_err(|source| {
         RecordError::Rename { from: from.to_owned(), to: to.to_owned(), source }
@@ -32,7 +32,7 @@ pub(super) fn rename(from: &Path, to: &Path, folder: &Path) -> Result<(), Record
     sync_folder(folder)
 }
 
-/// Writes `to` by way of `part`, so that it is whole or not there.
+/// Writes `to` atomically, by way of `part`.
 pub(super) fn write(
     part: &Path,
     to: &Path,
@@ -42,7 +42,7 @@ pub(super) fn write(
     write_with(part, to, folder, |file| file.write_all(content))
 }
 
-/// As [`write`], with what `fill` writes.
+/// As [`write`], with the content that `fill` writes.
 pub(super) fn write_with(
     part: &Path,
     to: &Path,
@@ -56,9 +56,8 @@ pub(super) fn write_with(
     rename(part, to, folder)
 }
 
-/// Copies the content of `from` into the file `to`, which must not exist yet, and makes it durable
-/// there. What was read is what is on the disk then, even if an earlier attempt to make it durable
-/// where it was had failed.
+/// Copies the content of `from` into the new file `to`, and syncs it. So the content that was read
+/// is on the disk, even if an earlier sync of `from` had failed.
 pub(super) fn copy(from: &Path, to: &Path, pause: &mut Pause) -> Result<(), RecordError> {
     let cannot_write = |source| RecordError::Write { path: to.to_owned(), source };
     let source = safe_file::read(from)
@@ -71,7 +70,7 @@ pub(super) fn copy(from: &Path, to: &Path, pause: &mut Pause) -> Result<(), Reco
     sync_file(to)
 }
 
-/// Removes a file, and says whether it was there.
+/// Removes a file. Returns whether it existed.
 pub(super) fn remove(path: &Path) -> Result<bool, RecordError> {
     match step("remove", path).and_then(|()| fs::remove_file(path)) {
         Ok(()) => Ok(true),
@@ -80,7 +79,7 @@ pub(super) fn remove(path: &Path) -> Result<bool, RecordError> {
     }
 }
 
-/// Comes before each step: a test sees their order, and may let the process die at any of them.
+/// Called before each step: a test records their order, and can fail any of them.
 #[cfg(not(test))]
 pub(super) fn step(_: &str, _: &Path) -> io::Result<()> {
     Ok(())
@@ -96,10 +95,11 @@ pub(super) mod steps {
     use super::*;
 
     thread_local! {
-        static STEPS: RefCell<(Vec<String>, usize)> = const { RefCell::new((Vec::new(), usize::MAX)) };
+        static STEPS: RefCell<(Vec<String>, usize)> =
+            const { RefCell::new((Vec::new(), usize::MAX)) };
     }
 
-    /// Counts from here on; whatever comes after `last` steps fails, as if the process had died.
+    /// Restarts the count; every step after `last` steps fails, as if the process had died.
     pub fn restart(last: usize) {
         STEPS.set((Vec::new(), last));
     }

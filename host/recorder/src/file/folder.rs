@@ -1,4 +1,4 @@
-//! The folder that a recorder writes into.
+//! The output folder of a recorder.
 
 use std::collections::HashSet;
 use std::fs::{File, TryLockError};
@@ -19,33 +19,33 @@ use super::unfinished::UnfinishedClip;
 use super::{ClipHeader, replaced};
 use crate::error::RecordError;
 
-/// The clips that are listed in a [`RecordingFolder`], which stays held. Who starts anew replaces them once
-/// nothing is in the way, and then a recorder has the folder already.
+/// The clips that are listed in a [`RecordingFolder`], which stays locked. A replay replaces them
+/// once nothing else can fail, when its recorder already has the folder.
 pub struct EarlierClips {
     dir: Arc<ClipDir>,
 }
 
-/// A folder of clips with their list, held by one process at a time.
+/// A folder of clips with their list, locked by one process at a time.
 pub struct RecordingFolder {
     pub(super) dir: Arc<ClipDir>,
     retention: Option<Retention>,
     losses: Arc<LossList>,
-    left: Recovery,
+    unfinished: Recovery,
 }
 
 impl RecordingFolder {
-    /// Opens the folder `out`, which is made if there is none, and takes it for this process.
-    /// Whatever an earlier process left unfinished is completed first: the clips that came back by
-    /// that are returned, and listed already. What cannot be completed, for example because the
-    /// disk is full, is logged, and left as it is for a later process.
+    /// Opens and locks the folder `out`, which is created if it does not exist. Unfinished clips of
+    /// an earlier process are completed first: the recovered clips are returned, and listed
+    /// already. A clip that cannot be completed, for example because the disk is full, is logged,
+    /// and left unchanged for a later process.
     ///
     /// # Errors
     ///
     /// [`RecordError::Busy`] if another process records into it; other [`RecordError`]s if the
-    /// folder cannot be made, locked or read.
+    /// folder cannot be created, locked or read.
     pub fn open(out: &Path) -> Result<(Self, Vec<Clip>), RecordError> {
         let mut folder = Self::hold(out)?;
-        let mut recovery = folder.take_left();
+        let mut recovery = folder.take_unfinished();
         let mut found = Vec::new();
         while let Some(came) = recovery.next(&mut || true) {
             match came {
@@ -53,7 +53,7 @@ impl RecordingFolder {
                 Err(error) => {
                     warn!(
                         error = &error as &dyn std::error::Error,
-                        "a clip cannot be recovered, left for a later start"
+                        "cannot recover a clip; left for a later start"
                     )
                 }
             }
@@ -61,7 +61,7 @@ impl RecordingFolder {
         Ok((folder, found))
     }
 
-    /// As [`RecordingFolder::open`], but what an earlier process left is not completed yet: the thread of
+    /// As [`RecordingFolder::open`], but unfinished clips are not completed yet: the thread of
     /// [`crate::Recorder::live`] does that while it records.
     ///
     /// # Errors
@@ -76,13 +76,13 @@ impl RecordingFolder {
         replaced::complete(&clips, &list)?;
         let taken: HashSet<String> = list.read()?.into_iter().map(|listed| listed.file).collect();
         let dir = Arc::new(ClipDir::new(clips, list, taken, lock));
-        let left = Recovery::of(&dir)?;
-        Ok(Self { dir, retention: None, losses: Arc::new(LossList::of(out)), left })
+        let unfinished = Recovery::of(&dir)?;
+        Ok(Self { dir, retention: None, losses: Arc::new(LossList::of(out)), unfinished })
     }
 
-    /// What an earlier process left, for whoever completes it.
-    pub(crate) fn take_left(&mut self) -> Recovery {
-        std::mem::take(&mut self.left)
+    /// Takes the unfinished clips of an earlier process, to complete them.
+    pub(crate) fn take_unfinished(&mut self) -> Recovery {
+        std::mem::take(&mut self.unfinished)
     }
 
     /// As [`EarlierClips::replace`].
@@ -94,15 +94,15 @@ impl RecordingFolder {
         self.earlier().replace(keep)
     }
 
-    /// The clips that are listed in it.
+    /// The listed clips.
     pub fn earlier(&self) -> EarlierClips {
         EarlierClips { dir: Arc::clone(&self.dir) }
     }
 
-    /// From now on there are at most so many clips, or so many bytes of them: of more, the oldest
-    /// that nobody fetched are deleted, the present ones included. Each is named in `losses.jsonl`
-    /// before; those that go at once are returned, and with them those that should and cannot be
-    /// deleted.
+    /// Limits the number of clips, or their bytes, from now on. Over the limit, the oldest clips
+    /// that were not fetched are deleted, including existing ones. Each is first noted in
+    /// `losses.jsonl`; those that are deleted now are returned, with those that should be deleted
+    /// and cannot.
     ///
     /// # Errors
     ///
@@ -122,17 +122,17 @@ impl RecordingFolder {
         Arc::clone(&self.losses)
     }
 
-    /// A clip was finished: makes room, if there is a bound. What went for it, and what should have
-    /// and could not.
+    /// Makes room for a finished clip, if there is a limit. Returns the deleted clips, and those
+    /// that could not be deleted.
     pub(crate) fn added(&mut self, clip: &Clip) -> Vec<Loss> {
         self.retention.as_mut().map_or(Vec::new(), |retention| retention.add(&self.dir, clip))
     }
 
-    /// Begins a clip named `base`, or `base-2`, `base-3` and so on if there is one.
+    /// Begins a clip named `base`, or `base-2`, `base-3` and so on if the name is taken.
     ///
     /// # Errors
     ///
-    /// [`RecordError`] if its file cannot be made or written.
+    /// [`RecordError`] if its file cannot be created or written.
     pub(crate) fn begin(
         &mut self,
         base: &str,
@@ -144,23 +144,23 @@ impl RecordingFolder {
 }
 
 impl EarlierClips {
-    /// Starts anew with the clips in `keep`: deletes the others that are listed, with their
-    /// thumbnails, and says how many clips these were. Lines of the list that name no clip of ours
+    /// Replaces the list by the clips in `keep`: deletes the other listed clips with their
+    /// thumbnails, and returns their number. Lines of the list that name no clip of this program
     /// stay.
     ///
     /// Only plain files in the folder of clips are deleted, whatever the list names.
     ///
     /// # Errors
     ///
-    /// [`RecordError`] if the list cannot be written, and nothing is deleted then.
+    /// [`RecordError`] if the list cannot be written; then nothing is deleted.
     pub fn replace(&self, keep: &[Clip]) -> Result<u64, RecordError> {
         let dir = &self.dir;
         let kept: HashSet<PathBuf> = keep.iter().map(|clip| clip.file.clone()).collect();
         let is_kept =
             |listed: &ListedClip| kept.contains(Path::new(CLIPS).join(&listed.file).as_path());
         let (listed, doomed): (Vec<_>, Vec<_>) = dir.list().read()?.into_iter().partition(is_kept);
-        // The list never names a clip that is gone, and what it does not name any more is noted
-        // before: else the next start would find whole clips that no list names, and list them as
+        // The list never names a deleted clip, and clips are noted before they leave the list.
+        // Otherwise the next start would find complete clips that are not listed, and list them as
         // results of another replay.
         replaced::note(dir.folder(), &doomed)?;
         dir.list().replace(keep)?;

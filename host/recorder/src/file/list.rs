@@ -1,4 +1,4 @@
-//! `clips.jsonl`: a line for each whole clip.
+//! `clips.jsonl`: a line for each complete clip.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
@@ -13,9 +13,9 @@ use super::clip_dir::{CLIP, CLIPS, JPG};
 use super::durable;
 use crate::error::RecordError;
 
-/// Longer lines are not ours. One of ours has some KB; at most 13 MB: 1,024 topics, whose names and
-/// types of 256 KiB may stand in it and in six texts of `incomplete`, six bytes for each if they are
-/// control characters, and 100 moments of some 3 KB.
+/// Longer lines were not written by this program. Our lines have some KB; at most 13 MB: 1,024
+/// topics, whose names and types of 256 KiB may be in it and in six texts of `incomplete`, six
+/// bytes for each if they are control characters, and 100 moments of some 3 KB.
 const LINE_MAX: u64 = 16 << 20;
 
 /// The list of clips.
@@ -24,7 +24,7 @@ pub(super) struct ClipList {
     folder: PathBuf,
 }
 
-/// What a line says of the files of a clip; whatever else it says is left alone.
+/// The file names in a line; other fields are ignored.
 #[derive(Deserialize)]
 struct ListLine {
     file: PathBuf,
@@ -43,7 +43,7 @@ impl ClipList {
         Self { path: folder.join("clips.jsonl"), folder: folder.to_owned() }
     }
 
-    /// What the list names. A line that was torn when its writer died is cut off.
+    /// The listed clips. A last line that was torn when its writer died is truncated.
     pub(super) fn read(&self) -> Result<Vec<ListedClip>, RecordError> {
         let failed = |source| RecordError::List { path: self.path.clone(), source };
         let file = match safe_file::edit(&self.path) {
@@ -53,7 +53,11 @@ impl ClipList {
         };
         let (listed, whole, len) = read_lines(&file, |_| Ok(())).map_err(failed)?;
         if whole < len {
-            warn!(path = %self.path.display(), bytes = len - whole, "last line of the list was torn, cut off");
+            warn!(
+                path = %self.path.display(),
+                bytes = len - whole,
+                "truncated a torn last line of the list"
+            );
             file.set_len(whole).and_then(|()| file.sync_all()).map_err(failed)?;
         }
         Ok(listed)
@@ -67,15 +71,15 @@ impl ClipList {
         let before = file.metadata().map_err(failed)?.len();
         durable::step("append", &self.path).map_err(failed)?;
         if let Err(error) = file.write_all(&line(clip)).and_then(|()| file.sync_all()) {
-            // A torn line would swallow the next one. If this fails as well, the next start cuts it
-            // off.
+            // A torn line would corrupt the next one. If this fails as well, the next start
+            // truncates it.
             let _ = file.set_len(before);
             return Err(failed(error));
         }
         if is_new { durable::sync_folder(&self.folder) } else { Ok(()) }
     }
 
-    /// Starts anew with these clips, behind the lines that are not ours.
+    /// Replaces the list by these clips, after the lines of other programs.
     pub(super) fn replace(&self, clips: &[Clip]) -> Result<(), RecordError> {
         durable::write_with(
             &self.folder.join("clips.jsonl.part"),
@@ -103,9 +107,9 @@ fn line(clip: &Clip) -> Vec<u8> {
     line
 }
 
-/// The clips in `file`, how many of its bytes are whole lines, and how many there are. The lines
-/// that are not ours are given to `foreign`, each in one piece or, if it is longer than any of
-/// ours, in several.
+/// Returns the clips in `file`, its bytes in whole lines, and all its bytes. Lines of other
+/// programs are passed to `foreign`, each in one piece or, if longer than any of our lines, in
+/// several.
 pub(super) fn read_lines(
     file: &File,
     mut foreign: impl FnMut(&[u8]) -> io::Result<()>,
@@ -139,7 +143,7 @@ pub(super) fn read_lines(
         too_long = false;
     }
     if malformed > 0 {
-        warn!(malformed, "lines of clips.jsonl name no clip of ours, left alone");
+        warn!(malformed, "lines of clips.jsonl that name no clip of this program are kept");
     }
     Ok((listed, whole, at))
 }
@@ -149,8 +153,8 @@ fn names(line: ListLine) -> Option<ListedClip> {
     Some(ListedClip { file: plain_name(&line.file, CLIP)?, thumbnail })
 }
 
-/// The file name of `path` if it is `clips/NAME` with that ending and nothing else: what a list
-/// says is deleted, and nobody but us may say so of other files.
+/// The file name of `path` if it is `clips/NAME` with that suffix and nothing else: listed files
+/// get deleted, so the list must not name others.
 pub(super) fn plain_name(path: &Path, suffix: &str) -> Option<String> {
     let mut components = path.components();
     let (folder, name) = (components.next()?, components.next()?);
@@ -174,7 +178,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_plain_names_in_the_folder_of_clips_are_ours() {
+    fn only_plain_names_in_the_folder_of_clips_are_accepted() {
         assert_eq!(plain_name(Path::new("clips/a.mcap"), CLIP).as_deref(), Some("a.mcap"));
         let hostile = [
             "a.mcap",

@@ -1,5 +1,4 @@
-//! `losses.jsonl`: a line for each thing that was wanted and is not there. Whoever notes one does
-//! it here, so that lines stay whole.
+//! `losses.jsonl`: a line for each loss. All losses are written here, so that lines stay complete.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -24,7 +23,7 @@ impl LossList {
         LossList { path: folder.join("losses.jsonl"), turn: Mutex::default() }
     }
 
-    /// Adds a line, which is on the disk then. After an error the list is as it was.
+    /// Appends a line and syncs it. After an error the list is unchanged.
     ///
     /// # Errors
     ///
@@ -37,7 +36,7 @@ impl LossList {
         let mut file = safe_file::append(&self.path).map_err(failed)?;
         let before = file.metadata().map_err(failed)?.len();
         file.write_all(&line).and_then(|()| file.sync_data()).map_err(|error| {
-            // A torn line would swallow the next one.
+            // A torn line would corrupt the next one.
             let _ = file.set_len(before);
             failed(error)
         })

@@ -1,36 +1,36 @@
-//! Whose file it is, by its first bytes.
+//! Detects the writer of a file by its first bytes.
 
 use std::io::{self, BufReader, Read};
 use std::path::Path;
 
 use gleaner_base::safe_file;
 
-/// Who wrote a file.
+/// The writer of a file.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Origin {
-    /// A recorder, its header is whole.
-    Ours,
-    /// Nothing was written yet, or none of it reached the disk: empty, zeros, or cut off within our
-    /// header.
+    /// A recorder; its header is complete.
+    Recorder,
+    /// Unknown: nothing was written yet, or none of it reached the disk. The file is empty, zeros,
+    /// or truncated within our header.
     Nothing,
-    /// Somebody else.
+    /// Another program.
     Foreign,
 }
 
-/// Who wrote the file `path`.
+/// Returns the writer of the file `path`.
 pub(super) fn origin(path: &Path) -> io::Result<Origin> {
     let header = header();
     let mut file = BufReader::new(safe_file::read(path)?);
     let mut begin = Vec::new();
     file.by_ref().take(header.len() as u64).read_to_end(&mut begin)?;
-    let is_ours = begin
+    let is_recorder = begin
         .iter()
         .zip(&header)
         .all(|(found, wanted)| wanted.is_none_or(|wanted| wanted == *found));
-    if is_ours {
-        return Ok(if begin.len() == header.len() { Origin::Ours } else { Origin::Nothing });
+    if is_recorder {
+        return Ok(if begin.len() == header.len() { Origin::Recorder } else { Origin::Nothing });
     }
-    // After a power cut, a file may have its length and not its content.
+    // After a power failure, a file may have its length but not its content.
     let mut is_zero = begin.iter().all(|byte| *byte == 0);
     let mut piece = [0; 4096];
     while is_zero {
@@ -42,7 +42,7 @@ pub(super) fn origin(path: &Path) -> io::Result<Origin> {
     Ok(Origin::Foreign)
 }
 
-/// How our files begin, up to the version; `None` for bytes that depend on it.
+/// The first bytes of our files, up to the version; `None` for bytes that depend on it.
 ///
 /// Source: the MCAP specification, version 0: magic, header record, its length, profile and
 /// library.

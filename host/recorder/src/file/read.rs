@@ -1,9 +1,9 @@
-//! Reading a clip back, whole or cut off.
+//! Reads clips, complete or truncated.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gleaner_drives::{Damage, Limits, Place, Replay, ReplayError, read_extras};
+use gleaner_drives::{Damage, DamageLocation, DriveLimits, Replay, ReplayError, read_extras};
 use gleaner_lambda::Clip;
 use gleaner_transport::{Delivery, SampleMeta, TopicSpec, Transport};
 
@@ -13,18 +13,19 @@ use super::written::Written;
 use super::{ClipHeader, TopicSchema};
 use crate::error::RecordError;
 
-/// The largest chunk: one message of any size that a lambda may ask for.
-const LIMITS: Limits = Limits { chunk_bytes: 1 << 30, open_bytes: 1 << 30, unpacked_bytes: 0 };
-/// Most that the metadata and attachments of a clip may take: the journals of 16 lambdas.
+/// The largest chunk: one message of any size that a lambda may request.
+const LIMITS: DriveLimits =
+    DriveLimits { chunk_bytes: 1 << 30, open_bytes: 1 << 30, unpacked_bytes: 0 };
+/// Most bytes of the metadata and attachments of a clip: the journals of 16 lambdas.
 const EXTRAS_BYTES: u64 = 1 << 30;
 
-/// Where a file ends early, and why.
+/// The end of an incomplete file, and the reason.
 pub(super) struct EarlyEnd {
     pub(super) at: u64,
     pub(super) why: Damage,
 }
 
-/// A clip that is read.
+/// A clip that is being read.
 struct ClipReader {
     replay: Replay,
     last: Arc<LastMessage>,
@@ -32,7 +33,7 @@ struct ClipReader {
 }
 
 impl ClipReader {
-    fn open(path: &Path, limits: Limits) -> Result<ClipReader, RecordError> {
+    fn open(path: &Path, limits: DriveLimits) -> Result<ClipReader, RecordError> {
         let mut replay = Replay::open_with(&[path.to_owned()], limits).map_err(unreadable(path))?;
         let last = Arc::new(LastMessage::default());
         let mut topics = Vec::new();
@@ -60,7 +61,7 @@ impl ClipReader {
         Ok(ClipReader { replay, last, topics })
     }
 
-    /// Gives the next message, with the index of its topic, to `act`; `None` at the end.
+    /// Passes the next message, with the index of its topic, to `act`; `None` at the end.
     fn next<T>(
         &mut self,
         act: impl FnOnce(usize, &SampleMeta, &[u8]) -> T,
@@ -72,8 +73,8 @@ impl ClipReader {
     }
 }
 
-/// Gives each message of the clip `path` to `act`, in the order of their stamps, up to the end or
-/// to the damage that it returns.
+/// Passes each message of the clip `path` to `act`, in the order of their stamps, up to the end or
+/// to the damage, which is returned.
 pub(super) fn each_message(
     path: &Path,
     mut act: impl FnMut(&TopicSchema, &SampleMeta, &[u8]) -> Result<(), RecordError>,
@@ -84,7 +85,7 @@ pub(super) fn each_message(
         match reader.next(|topic, meta, cdr| act(&topics[topic], meta, cdr)) {
             Ok(Some(done)) => done?,
             Ok(None) => return Ok(None),
-            Err(ReplayError::Damaged { at: Place::Byte(at), what, .. }) => {
+            Err(ReplayError::Damaged { at: DamageLocation::Byte(at), what, .. }) => {
                 return Ok(Some(EarlyEnd { at, why: what }));
             }
             Err(error) => return Err(unreadable(path)(error)),
@@ -92,10 +93,10 @@ pub(super) fn each_message(
     }
 }
 
-/// The messages of the clip `path`, counted. It may come from anywhere: its chunks are bounded as
-/// those of a drive.
+/// Counts the messages of the clip `path`. The file is untrusted: its chunks are bounded as those
+/// of a drive.
 pub(super) fn written(path: &Path) -> Result<Written, RecordError> {
-    let mut reader = ClipReader::open(path, Limits::default())?;
+    let mut reader = ClipReader::open(path, DriveLimits::default())?;
     let mut written = Written::default();
     for topic in &reader.topics {
         written.add_topic(topic);
@@ -112,7 +113,7 @@ fn unreadable(path: &Path) -> impl Fn(ReplayError) -> RecordError + '_ {
     |source| RecordError::Unreadable { path: path.to_owned(), source: Box::new(source) }
 }
 
-/// The message that was delivered last.
+/// A sink that keeps the last message.
 #[derive(Default)]
 struct LastMessage(Mutex<Vec<u8>>);
 
@@ -125,8 +126,9 @@ impl gleaner_transport::Sink for LastMessage {
     }
 }
 
-/// The line of the clip `path` if it is whole, found out by reading all of it.
-pub(super) fn whole(path: &Path, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
+/// The list entry of the clip `path` if the file is complete, which is checked by reading all of
+/// it.
+pub(super) fn complete_clip(path: &Path, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
     if each_message(path, |_, _, _| pause())?.is_some() {
         return Ok(None);
     }
@@ -138,7 +140,7 @@ pub(super) fn whole(path: &Path, pause: &mut Pause) -> Result<Option<Clip>, Reco
         .and_then(|(_, metadata)| read_line(metadata)))
 }
 
-/// What the clip `path` says of its begin; `None` if that cannot be read.
+/// The header of the clip `path`; `None` if it cannot be read.
 pub(super) fn clip_header(path: &Path) -> Option<ClipHeader> {
     let extras = read_extras(path, EXTRAS_BYTES).ok()?;
     extras
@@ -148,7 +150,7 @@ pub(super) fn clip_header(path: &Path) -> Option<ClipHeader> {
         .and_then(|(_, metadata)| read_begin(metadata).ok())
 }
 
-/// The file that the clip `path` was saved from, if it was.
+/// The file that the clip `path` was recovered from, if it was.
 pub(super) fn recovered_from(path: &Path) -> Option<String> {
     let extras = read_extras(path, EXTRAS_BYTES).ok()?;
     let (_, metadata) = extras.metadata.iter().find(|(name, _)| name == CLIP_RECORD)?;

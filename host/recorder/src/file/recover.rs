@@ -1,8 +1,8 @@
-//! What a recorder that died left behind becomes whole clips.
+//! Recovers the unfinished clips of a recorder that died.
 //!
-//! Every step may be the last one of this process, too. So each leaves the folder in a state that
-//! the next attempt reads as it was meant: the unfinished file goes last, and a clip that was saved
-//! says from which file.
+//! This process may die at any step, too. So each step leaves the folder in a state that the next
+//! attempt reads correctly: the unfinished file is deleted last, and a recovered clip names the
+//! file that it came from.
 
 use std::collections::VecDeque;
 use std::fs;
@@ -18,45 +18,45 @@ use tracing::{info, warn};
 use super::clip_dir::{AGAIN, CLIP, CLIPS, ClipDir, JPG, JPG_PART, PART, names};
 use super::origin::{Origin, origin};
 use super::read::{self, EarlyEnd};
-use super::unfinished::{CHUNK_SPAN_NS, Saved, UnfinishedClip};
+use super::unfinished::{CHUNK_SPAN_NS, RecoveredFrom, UnfinishedClip};
 use super::{ClipTrailer, durable};
 use crate::error::RecordError;
 
-/// What an earlier process left in a folder. It is found before this one writes there, and
-/// completed one by one.
+/// The unfinished clips of an earlier process in a folder. They are collected before this process
+/// writes there, and completed one by one.
 #[derive(Default)]
 pub(crate) struct Recovery {
     dir: Option<Arc<ClipDir>>,
-    left: VecDeque<(&'static str, String)>,
+    unfinished: VecDeque<(&'static str, String)>,
 }
 
-/// Is called again and again while something takes long. It may do other things meanwhile; an error
-/// of it ends what takes long.
+/// Called repeatedly during a long operation. It may do other work meanwhile; its error aborts the
+/// operation.
 pub(super) type Pause<'a> = dyn FnMut() -> Result<(), RecordError> + 'a;
 
 impl Recovery {
-    /// What is left in the folder of `dir`.
+    /// Collects the unfinished clips in the folder of `dir`.
     pub(super) fn of(dir: &Arc<ClipDir>) -> Result<Recovery, RecordError> {
-        let mut left = VecDeque::new();
+        let mut unfinished = VecDeque::new();
         for suffix in [AGAIN, PART, CLIP] {
-            left.extend(files(dir.folder(), suffix)?.into_iter().map(|name| (suffix, name)));
+            unfinished.extend(files(dir.folder(), suffix)?.into_iter().map(|name| (suffix, name)));
         }
-        Ok(Recovery { dir: Some(Arc::clone(dir)), left })
+        Ok(Recovery { dir: Some(Arc::clone(dir)), unfinished })
     }
 
-    /// The next clip that came back, which is listed, or why one did not: that is left as it is,
-    /// for a later process. `go_on` is asked again and again; once it says no, what is under way is
-    /// left as well, and nothing more comes.
+    /// Returns the next recovered clip, which is listed, or the error of one that could not be
+    /// recovered and is left unchanged for a later process. `go_on` is called repeatedly; once it
+    /// returns false, the clip in progress is left as well, and no more are recovered.
     pub(crate) fn next(
         &mut self,
         go_on: &mut dyn FnMut() -> bool,
     ) -> Option<Result<Clip, RecordError>> {
         let dir = self.dir.as_ref()?;
         while go_on() {
-            let (suffix, name) = self.left.pop_front()?;
+            let (suffix, name) = self.unfinished.pop_front()?;
             let mut pause = || match go_on() {
                 true => Ok(()),
-                // Nobody is told of it.
+                // This error is never reported.
                 false => Err(RecordError::Read {
                     path: dir.path(&name, suffix),
                     source: io::ErrorKind::Interrupted.into(),
@@ -78,8 +78,7 @@ impl Recovery {
     }
 }
 
-/// The files in `folder` that end so, without the ending, sorted. What has another name, or is no
-/// file, is not ours.
+/// The regular files in `folder` with this suffix, without the suffix, sorted.
 fn files(folder: &Path, suffix: &str) -> Result<Vec<String>, RecordError> {
     let cannot_read = |source| RecordError::Read { path: folder.to_owned(), source };
     let mut names = Vec::new();
@@ -96,58 +95,63 @@ fn files(folder: &Path, suffix: &str) -> Result<Vec<String>, RecordError> {
     Ok(names)
 }
 
-/// Removes the copy that a recovery had begun; what it was copied from is still there.
+/// Removes the copy that an earlier recovery began; its source still exists.
 fn discard_copy(dir: &ClipDir, name: &str) -> Result<(), RecordError> {
     let path = dir.path(name, AGAIN);
     match origin(&path).map_err(|source| RecordError::Read { path: path.clone(), source })? {
         Origin::Foreign => {
-            warn!(path = %path.display(), "file is not of this program, left alone");
+            warn!(path = %path.display(), "file was not written by this program; left unchanged");
             Ok(())
         }
-        Origin::Ours | Origin::Nothing => durable::remove(&path).map(drop),
+        Origin::Recorder | Origin::Nothing => durable::remove(&path).map(drop),
     }
 }
 
-/// Makes a clip of the unfinished clip `name`, if there is anything in it, and lists it.
+/// Recovers the unfinished clip `name`, if it has any content, and lists it.
 fn recover(dir: &Arc<ClipDir>, name: &str, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
     let part = dir.path(name, PART);
     let recovered = attempt(dir, name, &part, pause);
     recovered.map_err(|source| RecordError::Recover { path: part, source: Box::new(source) })
 }
 
-/// Lists the clip `name`, which has its name and no line, if it is one of ours and whole.
+/// Lists the clip `name`, which has its final name but no line, if it is complete and written by a
+/// recorder.
 fn list(dir: &ClipDir, name: &str, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
     let path = dir.path(name, CLIP);
     match origin(&path) {
-        Ok(Origin::Ours) => {}
+        Ok(Origin::Recorder) => {}
         Ok(_) => return Ok(None),
         Err(error) => {
-            warn!(path = %path.display(), %error, "cannot read a file, left alone");
+            warn!(path = %path.display(), %error, "cannot read a file; left unchanged");
             return Ok(None);
         }
     }
-    match read::whole(&path, pause) {
-        // A clip that somebody copied here, under a name of theirs, is theirs.
+    match read::complete_clip(&path, pause) {
+        // A clip that was copied here under another name is not a result of this folder.
         Ok(Some(clip)) if !is_own_name(name, &clip) => Ok(None),
         Ok(Some(clip)) => {
-            // Whoever gave it its name may have died, or its disk lost its power, before the name
-            // was on the disk.
+            // The process that renamed it may have died, or the power failed, before the name was
+            // on the disk.
             durable::sync_file(&path)?;
             durable::sync_folder(dir.folder())?;
             add(dir, name, clip).map(Some)
         }
         Ok(None) => {
-            warn!(path = %path.display(), "clip is damaged and not listed, left alone");
+            warn!(path = %path.display(), "clip is damaged and not listed; left unchanged");
             Ok(None)
         }
         Err(error) => {
-            warn!(path = %path.display(), error = &error as &dyn std::error::Error, "cannot read a clip, left alone");
+            warn!(
+                path = %path.display(),
+                error = &error as &dyn std::error::Error,
+                "cannot read a clip; left unchanged"
+            );
             Ok(None)
         }
     }
 }
 
-/// Whether a clip that is called `name` was called so by its recorder, or by a recovery that found
+/// Returns whether the clip `name` got that name from its recorder, or from a recovery that found
 /// its name taken.
 fn is_own_name(name: &str, clip: &Clip) -> bool {
     let own =
@@ -164,38 +168,38 @@ fn attempt(
 ) -> Result<Option<Clip>, RecordError> {
     match origin(part).map_err(|source| RecordError::Read { path: part.to_owned(), source })? {
         Origin::Foreign => {
-            warn!(path = %part.display(), "file is not of this program, left alone");
+            warn!(path = %part.display(), "file was not written by this program; left unchanged");
             return Ok(None);
         }
         Origin::Nothing => return discard(dir, name).map(|()| None),
-        Origin::Ours => {}
+        Origin::Recorder => {}
     }
-    // What an earlier attempt wrote, and did not complete.
+    // The incomplete copy of an earlier attempt.
     durable::remove(&dir.path(name, AGAIN))?;
-    if was_saved(dir, name, part)? {
-        // It is listed, or will be, by its own name, which may not be on the disk yet.
+    if was_recovered(dir, name, part)? {
+        // It is listed, or will be, under its own name, which may not be on the disk yet.
         durable::sync_folder(dir.folder())?;
         durable::remove(&dir.path(name, JPG_PART))?;
         durable::remove(part)?;
         return Ok(None);
     }
-    match read::whole(part, pause)? {
-        // It died just before the rename.
+    match read::complete_clip(part, pause)? {
+        // The recorder died just before the rename.
         Some(clip) => adopt(dir, name, part, clip, pause).map(Some),
         None => save(dir, name, part, pause),
     }
 }
 
-/// Whether an earlier attempt got as far as a whole clip: one that says so, or a copy of the
-/// unfinished file.
-fn was_saved(dir: &ClipDir, name: &str, part: &Path) -> Result<bool, RecordError> {
+/// Returns whether an earlier attempt completed the clip: there is one that names this file as its
+/// source, or a copy of the unfinished file.
+fn was_recovered(dir: &ClipDir, name: &str, part: &Path) -> Result<bool, RecordError> {
     let from = format!("{name}{PART}");
     for path in names(name)
         .map(|name| dir.path(&name, CLIP))
         .take_while(|path| path.symlink_metadata().is_ok())
     {
         if !path.symlink_metadata().is_ok_and(|found| found.is_file()) {
-            // Not ours. A pipe would be waited for.
+            // Not a clip, and reading a pipe would block.
             continue;
         }
         let is_copy = || {
@@ -208,7 +212,7 @@ fn was_saved(dir: &ClipDir, name: &str, part: &Path) -> Result<bool, RecordError
     Ok(false)
 }
 
-/// Whether two files have the same content.
+/// Returns whether two files have the same content.
 fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
     let (one, other) = (safe_file::read(one)?, safe_file::read(other)?);
     if one.metadata()?.len() != other.metadata()?.len() {
@@ -229,22 +233,21 @@ fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
     }
 }
 
-/// The name for the clip of the unfinished file `name`: its own, as it was free when the file was
-/// begun, unless somebody has put another file there since. No clip that is begun meanwhile gets
-/// it.
+/// The name for the clip of the unfinished file `name`: its own, which was free when the file was
+/// begun, unless another file has taken it since. The name is reserved.
 fn name_for(dir: &ClipDir, name: &str) -> String {
     let is_free =
         |name: &String| !dir.exists(name, CLIP) && !dir.is_taken(&format!("{name}{CLIP}"));
-    let free = names(name).find(is_free).expect("numbers do not end before the files do");
+    let free = names(name).find(is_free).expect("there are more numbers than files");
     dir.take(&free);
     free
 }
 
-/// Makes a clip of an unfinished file that is whole.
+/// Turns an unfinished file that is complete into a clip.
 ///
-/// Its recorder may have died because the file could not be synced. The system then believes that
-/// its pages are on the disk, and to sync it again would prove nothing: only bytes that are written
-/// anew are known to arrive.
+/// Its recorder may have died because the file could not be synced. The system then takes its pages
+/// for written, and another sync would prove nothing: only bytes that are written again are known
+/// to arrive.
 fn adopt(
     dir: &ClipDir,
     name: &str,
@@ -255,7 +258,7 @@ fn adopt(
     let free = name_for(dir, name);
     let again = dir.path(name, AGAIN);
     if let Err(error) = durable::copy(part, &again, pause) {
-        // On a full disk, its room is wanted.
+        // On a full disk, its room is needed.
         durable::remove(&again)?;
         return Err(error);
     }
@@ -270,7 +273,7 @@ fn adopt(
     Ok(clip)
 }
 
-/// Lists a whole clip whose line is that of its own record.
+/// Lists a complete clip, by the line in its own record.
 fn add(dir: &ClipDir, name: &str, mut clip: Clip) -> Result<Clip, RecordError> {
     let path = dir.path(name, CLIP);
     let metadata =
@@ -278,15 +281,15 @@ fn add(dir: &ClipDir, name: &str, mut clip: Clip) -> Result<Clip, RecordError> {
     clip.file = format!("{CLIPS}/{name}{CLIP}").into();
     clip.thumbnail = dir.exists(name, JPG).then(|| format!("{CLIPS}/{name}{JPG}").into());
     clip.bytes = metadata.len();
-    // It is a result of the process that died, and not of the one that finds it.
+    // It is a result of the process that died, not of this one.
     let note = "the recorder died before it listed this clip; nothing of it is lost".to_owned();
     clip.recovered.get_or_insert(Recovered { lost_bytes: 0, note });
     dir.add(name, &clip)?;
-    info!(path = %path.display(), "clip was whole but not listed, now it is");
+    info!(path = %path.display(), "listed a complete clip that was missing from the list");
     Ok(clip)
 }
 
-/// Removes an unfinished clip without a message. Nothing that was acknowledged is lost by that.
+/// Removes an unfinished clip without a message. No acknowledged data is lost.
 fn discard(dir: &ClipDir, name: &str) -> Result<(), RecordError> {
     durable::remove(&dir.path(name, JPG_PART))?;
     if !dir.exists(name, CLIP) {
@@ -294,11 +297,11 @@ fn discard(dir: &ClipDir, name: &str) -> Result<(), RecordError> {
     }
     let part = dir.path(name, PART);
     let bytes = fs::metadata(&part).map_or(0, |metadata| metadata.len());
-    warn!(path = %part.display(), bytes, "unfinished clip has no message, removed");
+    warn!(path = %part.display(), bytes, "removed an unfinished clip without messages");
     durable::remove(&part).map(drop)
 }
 
-/// Copies the messages of `part` into a clip of their own.
+/// Copies the messages of `part` into a new clip.
 fn save(
     dir: &Arc<ClipDir>,
     name: &str,
@@ -312,7 +315,7 @@ fn save(
         durable::remove(part)?;
         return saved;
     }
-    // A copy that did not come to its end; on a full disk, its room is wanted.
+    // An incomplete copy; on a full disk, its room is needed.
     durable::remove(&again)?;
     if saved.is_ok() {
         discard(dir, name)?;
@@ -357,23 +360,30 @@ fn copy(
         ..ClipTrailer::default()
     };
     let lost_bytes = end.map_or(0, |end| len.saturating_sub(end.at));
-    warn!(path = %part.display(), messages = clip.messages(), lost_bytes, "unfinished clip of a dead recorder saved");
-    let saved = Saved { recovered: Recovered { lost_bytes, note }, from: format!("{name}{PART}") };
-    clip.close(suffix, &free, Some(saved)).map(Some)
+    warn!(
+        path = %part.display(),
+        messages = clip.messages(),
+        lost_bytes,
+        "recovered an unfinished clip of a dead recorder"
+    );
+    let recovery =
+        RecoveredFrom { recovered: Recovered { lost_bytes, note }, from: format!("{name}{PART}") };
+    clip.close(suffix, &free, Some(recovery)).map(Some)
 }
 
-/// Returns what happened and what is missing, for a person.
+/// Describes for a user what happened and what is missing.
 fn note(end: Option<&EarlyEnd>, kept_ns: i64, has_thumbnail: bool) -> String {
     let kept = kept_ns.max(0) as f64 / 1e9;
     let most = CHUNK_SPAN_NS / 1_000_000_000;
     let also = if has_thumbnail { "so is the journal" } else { "so are journal and thumbnail" };
     match end.map(|end| &end.why) {
         None | Some(Damage::Truncated(_) | Damage::NoFooter) => format!(
-            "the recorder died; messages after {kept:.3} s of the window are lost, at most {most} s of them unless the \
-             power failed; {also}"
+            "the recorder died; messages after {kept:.3} s of the window are lost, \
+             at most {most} s of them unless the power failed; {also}"
         ),
         Some(why) => format!(
-            "the recorder died and its file is damaged ({why}); messages after {kept:.3} s of the window are lost; {also}"
+            "the recorder died and its file is damaged ({why}); messages after \
+             {kept:.3} s of the window are lost; {also}"
         ),
     }
 }

@@ -1,5 +1,5 @@
-//! `clips/.replaced`: the clips that a replay is about to delete, noted before the list loses them.
-//! It is gone once they are.
+//! `clips/.replaced`: lists the clips that a replay will delete, before they leave the list of
+//! clips. The file is removed once they are deleted.
 
 use std::collections::HashSet;
 use std::fs;
@@ -15,10 +15,10 @@ use super::list::{ClipList, ListedClip, read_lines};
 use crate::error::RecordError;
 
 const NOTE: &str = ".replaced";
-/// The note while it is written.
+/// Its temporary name.
 const NOTE_PART: &str = ".replaced.part";
 
-/// Notes in the folder of clips that these go.
+/// Notes that these clips will be deleted.
 pub(super) fn note(folder: &Path, doomed: &[ListedClip]) -> Result<(), RecordError> {
     if doomed.is_empty() {
         return Ok(());
@@ -27,15 +27,15 @@ pub(super) fn note(folder: &Path, doomed: &[ListedClip]) -> Result<(), RecordErr
     durable::write(&folder.join(NOTE_PART), &folder.join(NOTE), folder, &lines)
 }
 
-/// A line as the list has it, as far as it names files.
+/// A line in the format of the list, with file names only.
 fn line(ListedClip { file, thumbnail }: &ListedClip) -> Vec<u8> {
     let path = |name: &String| format!("{CLIPS}/{name}");
     let line = serde_json::json!({ "file": path(file), "thumbnail": thumbnail.as_ref().map(path) });
     format!("{line}\n").into_bytes()
 }
 
-/// Deletes the noted clips, and returns how many these were. Clips that the list names stay: the
-/// process died before it wrote the list.
+/// Deletes the noted clips, and returns their number. Listed clips stay: the process died before it
+/// wrote the list.
 pub(super) fn complete(folder: &Path, list: &ClipList) -> Result<u64, RecordError> {
     // A process that died while it wrote the note had changed nothing else.
     let _ = fs::remove_file(folder.join(NOTE_PART));
@@ -51,22 +51,26 @@ pub(super) fn complete(folder: &Path, list: &ClipList) -> Result<u64, RecordErro
     let (mut deleted, mut left) = (0, Vec::new());
     for doomed in doomed.into_iter().filter(|doomed| !listed.contains(&doomed.file)) {
         let ListedClip { file, thumbnail } = &doomed;
-        // The thumbnail first: one without its clip would belong to nothing.
+        // The thumbnail first, so that none is left without its clip.
         let thumbnail = thumbnail
             .as_ref()
             .map_or(Ok(false), |thumbnail| durable::remove(&folder.join(thumbnail)));
         match thumbnail.and_then(|_| durable::remove(&folder.join(file))) {
             Ok(was_there) => deleted += u64::from(was_there),
-            // A folder of this name, for example: it stays, and is no clip of the list any more.
+            // For example a folder of this name: it stays, but is not listed any more.
             Err(error) => {
-                warn!(%file, error = &error as &dyn std::error::Error, "cannot delete a clip, which is tried again at the next start");
+                warn!(
+                    %file,
+                    error = &error as &dyn std::error::Error,
+                    "cannot delete a clip; retried at the next start"
+                );
                 left.push(doomed);
             }
         }
     }
     durable::sync_folder(folder)?;
-    // A clip of the same name may come next: the note must not outlive it. One that is still there
-    // would be taken for a clip that no process had listed.
+    // A clip of the same name may come next, so the note must not outlive it. A clip that is still
+    // there would be taken for one that was never listed.
     if left.is_empty() {
         durable::remove(&path)?;
         durable::sync_folder(folder)?;

@@ -1,4 +1,4 @@
-//! How much room clips may take. Beyond it the oldest go, and what goes is named.
+//! Retention: deletes the oldest clips over the limit, and notes each loss.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use super::list::ListedClip;
 use super::losses::LossList;
 use crate::error::RecordError;
 
-/// The clips that are there, oldest first, and how many there may be.
+/// The existing clips, oldest first, and their limits.
 pub(super) struct Retention {
     clips_max: u64,
     bytes_max: u64,
@@ -29,12 +29,12 @@ struct StoredClip {
     file: String,
     thumbnail: Option<String>,
     bytes: u64,
-    /// It could not be deleted, and that was told.
+    /// True if it could not be deleted, which was reported.
     is_stuck: bool,
 }
 
 impl Retention {
-    /// Over the clips that are listed. One that is not there was fetched.
+    /// Applies limits to the listed clips. A listed clip that does not exist was fetched.
     pub(super) fn new(
         dir: &ClipDir,
         losses: Arc<LossList>,
@@ -64,8 +64,8 @@ impl Retention {
         self.clips.push_back(kept);
     }
 
-    /// Adds a clip that is whole now; deletes the oldest until the others have room. The newest
-    /// stays in any case.
+    /// Adds a complete clip; deletes the oldest until the others are within the limits. The newest
+    /// always stays.
     pub(super) fn add(&mut self, dir: &ClipDir, clip: &Clip) -> Vec<Loss> {
         let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
         let (file, thumbnail) = (name(&clip.file), clip.thumbnail.as_deref().and_then(name));
@@ -75,35 +75,35 @@ impl Retention {
         self.make_room(dir)
     }
 
-    /// Deletes the oldest until the others have room. What cannot be deleted is passed over, and
-    /// tried again the next time.
+    /// Deletes the oldest until the others are within the limits. A clip that cannot be deleted is
+    /// skipped, and retried the next time.
     pub(super) fn make_room(&mut self, dir: &ClipDir) -> Vec<Loss> {
-        // Those that somebody has fetched take no room any more.
+        // Fetched clips do not count any more.
         self.clips.retain(|kept| dir.folder().join(&kept.file).symlink_metadata().is_ok());
         self.bytes = self.clips.iter().map(|kept| kept.bytes).sum();
-        let mut losses_now = Vec::new();
+        let mut reported = Vec::new();
         let mut skipped = 0;
         while self.clips.len() > skipped + 1
             && (self.clips.len() as u64 > self.clips_max || self.bytes > self.bytes_max)
         {
             let reason = match self.clips.len() as u64 > self.clips_max {
-                true => format!("there may be {} clips", self.clips_max),
-                false => format!("clips may take {} MiB", self.bytes_max >> 20),
+                true => format!("limit of {} clips", self.clips_max),
+                false => format!("limit of {} MiB", self.bytes_max >> 20),
             };
             let kept = &mut self.clips[skipped];
             match kept.delete(dir, &self.losses, reason) {
                 Ok(deleted) => {
-                    losses_now.push(deleted);
+                    reported.push(deleted);
                     self.bytes -= kept.bytes;
                     self.clips.remove(skipped);
                 }
                 Err(error) => {
                     skipped += 1;
-                    losses_now.extend(kept.stuck(&self.losses, error));
+                    reported.extend(kept.stuck(&self.losses, error));
                 }
             }
         }
-        losses_now
+        reported
     }
 }
 
@@ -112,14 +112,14 @@ impl StoredClip {
         PathBuf::from(CLIPS).join(&self.file)
     }
 
-    /// Deletes it, because of `reason`. What is lost is told before it is.
+    /// Deletes it, because of `reason`. The loss is noted before the deletion.
     fn delete(
         &self,
         dir: &ClipDir,
         losses: &LossList,
         reason: String,
     ) -> Result<Loss, RecordError> {
-        warn!(clip = %self.file, %reason, "oldest clip is deleted, nobody has fetched it");
+        warn!(clip = %self.file, %reason, "deleting the oldest clip, which was not fetched");
         let deleted = Loss::Deleted { at_ns: now(), file: self.path(), bytes: self.bytes, reason };
         losses.note(&deleted)?;
         if let Some(thumbnail) = &self.thumbnail {
@@ -129,18 +129,18 @@ impl StoredClip {
         Ok(deleted)
     }
 
-    /// It could not be deleted: that is told once.
+    /// Reports once that it could not be deleted.
     fn stuck(&mut self, losses: &LossList, error: RecordError) -> Option<Loss> {
         if std::mem::replace(&mut self.is_stuck, true) {
             return None;
         }
         let failure = Failure::from(error);
-        error!(clip = %self.file, %failure, "a clip cannot be deleted to make room, and stays");
+        error!(clip = %self.file, %failure, "cannot delete a clip to make room");
         let reason =
             std::iter::once(failure.message).chain(failure.causes).collect::<Vec<_>>().join(": ");
         let loss = Loss::NotDeleted { at_ns: now(), file: self.path(), bytes: self.bytes, reason };
         if let Err(error) = losses.note(&loss) {
-            error!(error = &error as &dyn std::error::Error, "cannot note a loss");
+            error!(error = &error as &dyn std::error::Error, "cannot write losses.jsonl");
         }
         Some(loss)
     }

@@ -1,15 +1,15 @@
-//! The file under an MCAP writer.
+//! The file of an MCAP writer.
 
 use std::fs::File;
 use std::io::{self, Seek, SeekFrom, Write};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Records around chunks are written in many small pieces; they are collected up to this size.
+/// Records around chunks are written in many small pieces, which are collected up to this size.
 const BUFFER: usize = 64 << 10;
 
-/// A file that only grows, and that nothing more is written to once a write has failed: behind a
-/// torn record nothing could be read.
+/// An append-only file that rejects writes after a failed one: data after a torn record would be
+/// unreadable.
 pub(super) struct FileSink {
     file: File,
     buffer: Vec<u8>,
@@ -23,13 +23,13 @@ impl FileSink {
         Self { file, buffer: Vec::with_capacity(BUFFER), position: Arc::default(), failed: false }
     }
 
-    /// The file, once everything was written.
+    /// Flushes and returns the file.
     pub(super) fn into_file(mut self) -> io::Result<File> {
         self.flush()?;
         Ok(self.file)
     }
 
-    /// Bytes written so far, to be read while an MCAP writer has the sink.
+    /// Number of bytes written so far, readable while an MCAP writer owns the sink.
     pub(super) fn position(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.position)
     }
@@ -79,7 +79,7 @@ impl Write for FileSink {
 }
 
 impl Seek for FileSink {
-    /// The writer asks where it is, and never goes elsewhere.
+    /// The writer only queries its position.
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         match to {
             SeekFrom::Current(0) => Ok(self.position.load(Ordering::Relaxed)),

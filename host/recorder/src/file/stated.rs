@@ -1,9 +1,9 @@
-//! Compares the statements of a finished clip about itself with its content. The file may come from
-//! anywhere.
+//! Checks the statements of a finished clip about itself against its content. The file is
+//! untrusted.
 //!
-//! The records are made once more, out of what they follow from: the line of the clip, the header
-//! of a journal in it, its messages. A statement that follows from nothing else in the file has to
-//! be the same wherever it stands. `docs/clips.md` lists them.
+//! The records are built again from their sources: the line of the clip, the header of a journal in
+//! it, its messages. A statement without a source in the file has to be the same at each place.
+//! `docs/clips.md` lists them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -30,8 +30,7 @@ type Values = BTreeMap<String, String>;
 /// The records of a clip.
 const RECORDS: [&str; 5] = [BEGIN, CLIP_RECORD, TOPIC_RECORD, LAMBDA_RECORD, DECISION_RECORD];
 
-/// Of two long texts, so many bytes are shown of what they have in common before the first
-/// difference.
+/// Of two long texts, bytes to show of the common part before the first difference.
 const IN_COMMON: usize = 24;
 
 /// A statement of a clip that the rest of the clip contradicts.
@@ -47,7 +46,7 @@ pub struct FalseStatement {
 
 impl FalseStatement {
     fn new(what: impl Into<String>, stated: &str, found: &str) -> Self {
-        // Of two texts that begin alike, the begin shows nothing.
+        // For two texts that begin alike, the beginning is not informative.
         let alike = stated.bytes().zip(found.bytes()).take_while(|(a, b)| a == b).count();
         let from = (0..=alike.saturating_sub(IN_COMMON))
             .rev()
@@ -75,21 +74,22 @@ pub struct ClipStatements {
 }
 
 impl ClipStatements {
-    /// Reads the records of a clip that holds the journal with this header, and compares them with
-    /// each other, with the header and with the attachments.
+    /// Reads the records of a clip that contains the journal with this header, and compares them
+    /// with each other, with the header and with the attachments.
     ///
     /// # Errors
     ///
-    /// The first [`FalseStatement`] statement: a record or an attachment that is missing, doubled or of
-    /// another kind, a value that is not as recorders write it, or that contradicts the rest.
+    /// The first [`FalseStatement`]: a record or an attachment that is missing, duplicated or of
+    /// another kind, a value in another form than recorders write, or one that contradicts the
+    /// rest.
     pub fn read(extras: &Extras, header: &JournalHeader) -> Result<Self, FalseStatement> {
         if let Some((name, _)) =
             extras.metadata.iter().find(|(name, _)| !RECORDS.contains(&name.as_str()))
         {
             return Err(FalseStatement::new(
                 format!("record `{}`", excerpt(name)),
-                "is there",
-                "no recorder writes it",
+                "present",
+                "not written by recorders",
             ));
         }
         let records = |of: &'static str| {
@@ -109,7 +109,7 @@ impl ClipStatements {
         Ok(Self { clip, moments, topics })
     }
 
-    /// The clip as its line describes it.
+    /// The clip as described by its line.
     pub fn clip(&self) -> &Clip {
         &self.clip
     }
@@ -196,19 +196,19 @@ fn in_clip(key: &str) -> String {
     format!("`{key}` of record {CLIP_RECORD}")
 }
 
-/// The program that wrote a clip, by the header of a journal that the same program wrote.
+/// The program that wrote a clip, from the header of a journal by the same program.
 fn library(header: &JournalHeader) -> String {
     format!("gleaner {}", header.gleaner)
 }
 
-/// Refuses the values of a record that are not those `expected`.
+/// Rejects a record whose values differ from `expected`.
 fn same(record: &str, stated: &Values, expected: &Values) -> Result<(), FalseStatement> {
     let value = |of: &Values, key: &str| of.get(key).cloned();
     let keys = stated.keys().chain(expected.keys().filter(|key| !stated.contains_key(*key)));
     for key in keys {
         let (stated, expected) = (value(stated, key), value(expected, key));
         if stated != expected {
-            let text = |value: Option<String>| value.unwrap_or_else(|| "not there".to_owned());
+            let text = |value: Option<String>| value.unwrap_or_else(|| "missing".to_owned());
             return Err(FalseStatement::new(
                 format!("`{}` of {record}", excerpt(key)),
                 &text(stated),
@@ -220,15 +220,15 @@ fn same(record: &str, stated: &Values, expected: &Values) -> Result<(), FalseSta
 }
 
 fn malformed(record: &str, key: &str, values: &Values) -> FalseStatement {
-    let stated = values.get(key).map_or("not there", String::as_str);
+    let stated = values.get(key).map_or("missing", String::as_str);
     FalseStatement::new(
         format!("`{key}` of record {record}"),
         stated,
-        "a value as recorders write it",
+        "a value in the format of recorders",
     )
 }
 
-/// The clip, by its line.
+/// Parses the clip from its line.
 fn clip(
     values: &Values,
     attachments: &[Attachment],
@@ -268,11 +268,11 @@ fn clip(
     Ok(clip)
 }
 
-/// Refuses attachments other than one journal of each lambda, and one thumbnail.
+/// Rejects attachments other than one journal of each lambda, and one thumbnail.
 fn attachments(attachments: &[Attachment], clip: &Clip) -> Result<(), FalseStatement> {
     let mut known = BTreeSet::from([THUMBNAIL.to_owned()]);
     for lambda in &clip.lambdas {
-        // A lambda that was started again has another journal.
+        // A restarted lambda has another journal.
         let mut journals = names(&lambda.name).map(|name| format!("journal/{name}.journal"));
         known.extend(journals.find(|journal| !known.contains(journal)));
     }
@@ -280,7 +280,7 @@ fn attachments(attachments: &[Attachment], clip: &Clip) -> Result<(), FalseState
     for attachment in attachments {
         let what = || format!("attachment `{}`", excerpt(&attachment.name));
         if !known.contains(&attachment.name) {
-            return Err(FalseStatement::new(what(), "is there", "no recorder writes it"));
+            return Err(FalseStatement::new(what(), "present", "not written by recorders"));
         }
         if !found.insert(attachment.name.as_str()) {
             return Err(FalseStatement::count(what(), 2, 1));
@@ -321,7 +321,7 @@ fn lambdas(records: &[&Values], clip: &Clip, header: &JournalHeader) -> Result<(
         };
         let (_, mut expected) = clip_records::lambda(&is, header);
         if header.is_none() {
-            // The journal of this one leads nowhere else.
+            // The journal of this lambda has no other source.
             for (key, value) in &mut expected {
                 let stated = values.get(key).filter(|_| {
                     !["name", "version", "kind", "digest", "windows"].contains(&key.as_str())
@@ -390,8 +390,7 @@ fn decisions(moments: &[Moment], clip: &Clip) -> Result<(), FalseStatement> {
     })
 }
 
-/// Compares the record in front of the messages: later windows may have added lambdas and windows
-/// since.
+/// Compares the record before the messages: later windows may have added lambdas and windows since.
 fn begin(
     values: &Values,
     clip: &Clip,

@@ -1,4 +1,4 @@
-//! A clip while it is written.
+//! Writes a clip.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::OpenOptions;
@@ -20,21 +20,20 @@ use super::{ClipHeader, ClipTrailer, TopicSchema};
 use crate::error::RecordError;
 
 /// On the example drive (JPEG, IMU, speed) zstd at level 1 leaves 0.74 of the bytes at 590 MB/s,
-/// lz4 0.77 at 650 MB/s, and none at all 1.06 at 1760 MB/s; without the camera 0.23, 0.28 and 1.25.
-/// Every reader of MCAP knows zstd.
+/// lz4 0.77 at 650 MB/s, and no compression 1.06 at 1760 MB/s; without the camera 0.23, 0.28 and
+/// 1.25. Every MCAP reader supports zstd.
 const COMPRESSION: Option<Compression> = Some(Compression::Zstd);
-/// A chunk is closed when it has as many bytes, before compression.
+/// A chunk is closed when it has this many bytes, before compression.
 const CHUNK_BYTES: u64 = 1 << 20;
-/// A chunk is closed before it spans more time: what a death of the recorder costs.
+/// A chunk is closed before it spans more time: the most that a crash of the recorder costs.
 pub(super) const CHUNK_SPAN_NS: i64 = 1_000_000_000;
-/// Most channels of a clip. Writers beyond share the channel of their topic that names no writer.
+/// Most channels of a clip. Further writers share one channel of their topic, without a writer.
 pub(super) const CHANNELS_MAX: usize = 16 << 10;
 
-/// Most bytes of a message. The fields of the file have room for more, but whoever reads a clip
-/// holds a chunk of it in memory, and our reader no more than 1 GiB: a message with what else may
-/// be in its chunk.
+/// Most bytes of a message. The fields of the file allow more, but every reader of a clip holds a
+/// chunk of it in memory, and our reader no more than 1 GiB: a message and the rest of its chunk.
 pub const MESSAGE_MAX: usize = 960 << 20;
-/// Most bytes of a metadata record; ours have some KB, and with it the config of a lambda.
+/// Most bytes of a metadata record; usual ones have some KB, with the config of a lambda.
 pub(super) const METADATA_MAX: usize = 64 << 20;
 
 /// A clip that is being written. Unless it is finished, its file stays unfinished, for
@@ -43,7 +42,7 @@ pub(crate) struct UnfinishedClip {
     dir: Arc<ClipDir>,
     name: String,
     path: PathBuf,
-    /// `None` once it is finished or given up.
+    /// `None` once it is finished or dropped.
     writer: Option<Writer<FileSink>>,
     clock: String,
     channels: Channels,
@@ -55,7 +54,7 @@ pub(crate) struct UnfinishedClip {
     written: Written,
 }
 
-/// The chunk that is open.
+/// The open chunk.
 #[derive(Copy, Clone)]
 struct Chunk {
     first_ns: i64,
@@ -75,24 +74,24 @@ struct TopicChannels {
     by_writer: HashMap<Option<Guid>, u16>,
 }
 
-/// Where messages of a topic go.
+/// The channel of a message.
 struct ClipChannel {
     /// Index in [`Written::topics`].
     index: usize,
     id: u16,
-    /// What it took to describe it, if it is new, about.
+    /// Approximate bytes of its description, if it is new.
     new_bytes: u64,
 }
 
-/// How a clip came back after its recorder died.
-pub(super) struct Saved {
+/// The recovery of a clip after its recorder died.
+pub(super) struct RecoveredFrom {
     pub(super) recovered: Recovered,
     /// File name of the unfinished clip.
     pub(super) from: String,
 }
 
 impl UnfinishedClip {
-    /// Begins the clip `name`, in a file with this ending, which must not exist yet.
+    /// Begins the clip `name`, in a new file with this suffix.
     pub(super) fn create(
         dir: Arc<ClipDir>,
         name: String,
@@ -140,8 +139,8 @@ impl UnfinishedClip {
     ///
     /// # Errors
     ///
-    /// [`RecordError::TooLarge`] above [`MESSAGE_MAX`]: nothing was written then. [`RecordError`]
-    /// if it cannot be written. The clip must not be used further then: what it has is recovered
+    /// [`RecordError::TooLarge`] above [`MESSAGE_MAX`]; then nothing was written. [`RecordError`]
+    /// if it cannot be written. Then the clip must not be used further: its content is recovered
     /// when the folder is opened again.
     pub fn message(
         &mut self,
@@ -179,7 +178,7 @@ impl UnfinishedClip {
         if chunk.bytes >= CHUNK_BYTES { self.flush() } else { Ok(()) }
     }
 
-    /// Gives `topic` a channel if it has none: it was recorded, and no message of it came.
+    /// Gives `topic` a channel if it has none: it was recorded, but had no message.
     ///
     /// # Errors
     ///
@@ -189,12 +188,12 @@ impl UnfinishedClip {
             return Ok(());
         }
         let channel = self.channel(topic, None)?;
-        // Many topics with large definitions are not to be in one chunk.
+        // Many topics with large definitions must not share one chunk.
         if channel.new_bytes > CHUNK_BYTES / 16 { self.flush() } else { Ok(()) }
     }
 
-    /// Closes the open chunk: what was added until now survives the death of this process. Called
-    /// by itself at least for every second of messages.
+    /// Closes the open chunk: its content survives a crash of this process. Called internally at
+    /// least for every second of messages.
     ///
     /// # Errors
     ///
@@ -205,12 +204,11 @@ impl UnfinishedClip {
         Ok(())
     }
 
-    /// Completes the clip, gives it its name, and lists it. When this returns, all of it is on the
-    /// disk.
+    /// Completes, renames and lists the clip. When this returns, all of it is on the disk.
     ///
     /// # Errors
     ///
-    /// [`RecordError`]; what was written is then recovered when the folder is opened again.
+    /// [`RecordError`]; the written content is then recovered when the folder is opened again.
     pub fn finish(self, trailer: ClipTrailer) -> Result<Clip, RecordError> {
         let name = self.name.clone();
         self.close(trailer, &name, None)
@@ -221,10 +219,10 @@ impl UnfinishedClip {
         mut self,
         trailer: ClipTrailer,
         name: &str,
-        saved: Option<Saved>,
+        recovery: Option<RecoveredFrom>,
     ) -> Result<Clip, RecordError> {
         let dir = Arc::clone(&self.dir);
-        // Before the footer: the clip of a whole unfinished file then has its thumbnail.
+        // Before the footer, so that a complete unfinished file has its thumbnail.
         if let Some(jpeg) = &trailer.thumbnail {
             durable::write(&dir.path(name, JPG_PART), &dir.path(name, JPG), dir.folder(), jpeg)?;
         }
@@ -235,8 +233,8 @@ impl UnfinishedClip {
             format!("{CLIPS}/{name}{CLIP}").into(),
             thumbnail,
         );
-        clip.recovered = saved.as_ref().map(|saved| saved.recovered.clone());
-        let from = saved.as_ref().map(|saved| saved.from.as_str());
+        clip.recovered = recovery.as_ref().map(|recovery| recovery.recovered.clone());
+        let from = recovery.as_ref().map(|recovery| recovery.from.as_str());
         let written = std::mem::take(&mut self.written);
         for (name, metadata) in clip_records::records(&trailer, &clip, &written, &self.clock, from)
         {
@@ -270,7 +268,7 @@ impl UnfinishedClip {
         Ok(clip)
     }
 
-    /// How many messages were written.
+    /// Number of messages written.
     pub(super) fn messages(&self) -> u64 {
         self.written.messages()
     }
@@ -309,7 +307,7 @@ impl UnfinishedClip {
         self.with_writer(|writer| writer.attach(&attachment))
     }
 
-    /// Whether a clip has room for `bytes` of something.
+    /// Checks that a clip has room for `bytes` of this kind of data.
     fn check(&self, what: &'static str, bytes: usize, most: usize) -> Result<(), RecordError> {
         if bytes <= most {
             Ok(())
@@ -318,7 +316,7 @@ impl UnfinishedClip {
         }
     }
 
-    /// The channel for messages of the topic by this writer, or by none that is named.
+    /// The channel for messages of the topic by this writer, or by an unnamed one.
     fn channel(
         &mut self,
         topic: &TopicSchema,
@@ -355,7 +353,7 @@ impl UnfinishedClip {
         let new_bytes =
             definitions.len() + topic.offered_qos.as_deref().map_or(0, str::len) + topic.name.len();
         let id = self.with_writer(|writer| {
-            // Without definitions the type still has a name.
+            // Without definitions the schema still has the type's name.
             let schema = writer.add_schema(&topic.type_name, "ros2msg", definitions.as_bytes())?;
             writer.add_channel(schema, &topic.name, "cdr", &metadata)
         })?;
@@ -380,7 +378,7 @@ impl UnfinishedClip {
 
 impl Drop for UnfinishedClip {
     fn drop(&mut self) {
-        // Left alone, the writer would add a footer, and the file would pass for a whole one.
+        // Otherwise the writer would add a footer, and the file would look complete.
         if let Some(writer) = self.writer.take() {
             drop(writer.into_inner());
         }
@@ -400,11 +398,11 @@ fn options() -> WriteOptions {
         .library(clip_records::LIBRARY)
         .compression(COMPRESSION)
         .compression_level(1)
-        // No threads: this one has the time.
+        // No threads: this thread has the time.
         .compression_threads(0)
-        // We close them, by time as well.
+        // Chunks are closed here, by time as well.
         .chunk_size(None)
-        // A chunk is put together in memory and written whole, so a torn one is always the last.
+        // A chunk is built in memory and written at once, so only the last one can be torn.
         .disable_seeking(true)
 }
 

@@ -1,5 +1,5 @@
-//! Counts and checksums of the messages in a clip, by topic: taken while it is written, and again
-//! when it is read.
+//! Counts and checksums of the messages in a clip, by topic: computed while it is written, and
+//! again when it is read.
 
 use std::collections::HashMap;
 
@@ -39,7 +39,7 @@ pub(super) struct Written {
 impl Written {
     /// Adds a topic, which is not there yet; returns its index.
     pub(super) fn add_topic(&mut self, topic: &TopicSchema) -> usize {
-        // Readers trim them.
+        // Readers trim definitions.
         let definitions =
             topic.definitions.as_deref().map(str::trim).filter(|text| !text.is_empty());
         self.topics.push(WrittenTopic {
@@ -57,9 +57,9 @@ impl Written {
     pub(super) fn count(&mut self, topic: usize, meta: &SampleMeta, cdr: &[u8]) {
         let topic = &mut self.topics[topic];
         topic.messages += 1;
-        // Readers sort messages by their stamps, so their order must not count. A plain sum would
-        // stay the same in one of 10,000 exchanges of bytes between two messages, as a CRC is
-        // linear; a sum of squares changes.
+        // Readers sort messages by their stamps, so the checksum must not depend on the order. A
+        // plain sum would miss one in 10,000 swaps of bytes between two messages, as a CRC is
+        // linear; a sum of squares does not.
         let crc = u64::from(checksum(meta, cdr));
         topic.checksum = topic.checksum.wrapping_add(crc * crc);
         let (first, last) = self.span.unwrap_or((meta.at_ns, meta.at_ns));
@@ -80,12 +80,12 @@ impl Written {
     }
 }
 
-/// A stamp as a file has it: MCAP has no time before the epoch.
+/// The stamp in the file: MCAP has no time before the epoch.
 pub(super) fn stamp(ns: i64) -> u64 {
     u64::try_from(ns).unwrap_or(0)
 }
 
-/// The four bytes in front of a payload.
+/// The four bytes before a payload.
 pub(super) fn encapsulation(meta: &SampleMeta) -> [u8; 4] {
     let endian = u8::from(matches!(meta.endian, Endian::Little));
     [0, endian, meta.options[0], meta.options[1]]
@@ -96,7 +96,7 @@ pub(super) fn crc32(bytes: &[u8]) -> String {
     format!("{:08x}", crc32fast::hash(bytes))
 }
 
-/// CRC-32 of a message as a file has it: stamps, number, encapsulation and payload.
+/// CRC-32 of a message in the file: stamps, number, encapsulation and payload.
 fn checksum(meta: &SampleMeta, cdr: &[u8]) -> u32 {
     let mut crc = crc32fast::Hasher::new();
     crc.update(&stamp(meta.at_ns).to_le_bytes());
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn definitions_count_without_the_white_space_around_them() {
+    fn definitions_are_compared_without_surrounding_white_space() {
         let mut written = Written::default();
         for (name, text) in [("/a", "float64 x"), ("/b", "\nfloat64 x\n"), ("/c", " \n")] {
             let (name, definitions) = (name.to_owned(), Some(text.into()));
@@ -153,15 +153,14 @@ mod tests {
         written.topics()[topic].checksum()
     }
 
-    /// Worked out in Python: `zlib.crc32(struct.pack("<QQI4B", 1, 2, 3, 0, 1, 4, 5) + b"abc") **
-    /// 2`.
+    /// Computed in Python: `zlib.crc32(struct.pack("<QQI4B", 1, 2, 3, 0, 1, 4, 5) + b"abc") ** 2`.
     #[test]
-    fn a_checksum_is_that_of_the_page() {
+    fn a_checksum_is_as_documented() {
         assert_eq!(checksum_of(&[(1, b"abc")]), "2030abf0358c4d19");
     }
 
     #[test]
-    fn the_order_of_messages_does_not_count_and_an_exchange_of_their_bytes_does() {
+    fn a_checksum_ignores_the_order_of_messages_but_not_swapped_bytes() {
         let both = checksum_of(&[(1, b"abc"), (7, b"xyz")]);
         assert_eq!(checksum_of(&[(7, b"xyz"), (1, b"abc")]), both);
         assert_ne!(checksum_of(&[(1, b"xyz"), (7, b"abc")]), both);

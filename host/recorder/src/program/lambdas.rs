@@ -176,7 +176,11 @@ impl ConnectedLambda {
         }
         if !self.is_warned {
             self.is_warned = true;
-            warn!(lambda = %self.name, is_now, "wakes of a lambda are not recorded: too many, or of another time");
+            warn!(
+                lambda = %self.name,
+                is_now,
+                "wakes of a lambda are not recorded: too many, or of another time"
+            );
         }
         Some(match is_now {
             true => RecordingCounts {

@@ -114,7 +114,7 @@ impl RecorderLoop {
             TopicEntry { name: name.to_owned(), type_name: None, sink: Arc::new(sink) }
         });
         // The watch takes them as they come.
-        let what = RequestKind::TopicEntry { topic, largest };
+        let what = RequestKind::Recorded { topic, largest };
         let _ = self.requests.send(TopicRequest {
             what,
             name: name.to_owned(),

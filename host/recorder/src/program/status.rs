@@ -30,7 +30,10 @@ impl RecorderLoop {
         }
         self.reported.clips = counts.recording.clips;
         for clip in self.recorder.take_recovered() {
-            warn!(clip = %clip.file.display(), "recovered a clip of an earlier recorder, which did not end well");
+            warn!(
+                clip = %clip.file.display(),
+                "recovered a clip of an earlier recorder, which did not end well"
+            );
             self.reports.send(RecorderReport::Recovered(Box::new(clip)));
         }
         let at_ns = self.clock.now();

@@ -44,7 +44,7 @@ const DEFINITIONS_TIMEOUT: Duration = Duration::from_secs(6);
 #[derive(Copy, Clone, Debug)]
 pub(super) enum RequestKind {
     /// To be recorded, once it is there and its type known.
-    TopicEntry {
+    Recorded {
         topic: TopicId,
         /// How large its samples are. Of several wants of a topic, the largest counts.
         largest: LargestSample,
@@ -117,7 +117,7 @@ fn add(
     subscribed: &[SubscribedTopic],
     request: TopicRequest,
 ) {
-    let RequestKind::TopicEntry { topic, largest } = request.what else {
+    let RequestKind::Recorded { topic, largest } = request.what else {
         return requested.push((request, 0));
     };
     let is_other = |known: &str| {
@@ -125,7 +125,12 @@ fn add(
             request.type_name.as_deref().filter(|requested| *requested != known)
         {
             let topic = visible(&request.name);
-            warn!(%topic, %requested, recorded = %visible(known), "a topic is wanted as two types, and recorded as one");
+            warn!(
+                %topic,
+                %requested,
+                recorded = %visible(known),
+                "a topic is wanted as two types, and recorded as one"
+            );
         }
     };
     if let Some(of) = subscribed.iter().find(|of| of.topic == topic) {
@@ -133,13 +138,18 @@ fn add(
         let (max_bytes, requested) = (of.max_bytes, largest.bytes(&of.type_name));
         if requested > max_bytes {
             let topic = visible(&request.name);
-            warn!(%topic, requested, max_bytes, "a topic is heard already, with room for smaller samples: more of them may be lost");
+            warn!(
+                %topic,
+                requested,
+                max_bytes,
+                "a topic is heard already, with room for smaller samples: more of them may be lost"
+            );
         }
         return;
     }
     for (known, _) in requested.iter_mut() {
         match &mut known.what {
-            RequestKind::TopicEntry { topic: of, largest: known_largest } if *of == topic => {
+            RequestKind::Recorded { topic: of, largest: known_largest } if *of == topic => {
                 *known_largest = known_largest.and(largest);
                 match &known.type_name {
                     Some(known) => is_other(known),
@@ -191,7 +201,7 @@ impl TopicWatch {
                         _ if *wait > 0 => return true,
                         // Whoever writes it is asked what it is. Until then it is not recorded, so
                         // it is not waited for longer.
-                        (RequestKind::TopicEntry { .. }, Some(found))
+                        (RequestKind::Recorded { .. }, Some(found))
                             if found.definitions_text.is_none()
                                 && waiting_since
                                     .entry(request.name.clone())
@@ -202,13 +212,13 @@ impl TopicWatch {
                         {
                             return true;
                         }
-                        (RequestKind::TopicEntry { topic, largest }, Some(found)) => {
+                        (RequestKind::Recorded { topic, largest }, Some(found)) => {
                             match self.record(request, topic, largest, found) {
                                 Some(of) => subscribed.push(of),
                                 None => *wait = RETRY_AFTER,
                             }
                         }
-                        (RequestKind::TopicEntry { .. }, None) => return true,
+                        (RequestKind::Recorded { .. }, None) => return true,
                         (RequestKind::Commands, _) => match self.subscribe_commands(request) {
                             Ok(subscription) => commands = Some(subscription),
                             Err(again) => *wait = again,
@@ -253,7 +263,11 @@ impl TopicWatch {
     ) -> Option<SubscribedTopic> {
         if found.definitions_text.is_none() {
             let (topic, type_name) = (visible(&request.name), visible(&found.type_name));
-            warn!(%topic, %type_name, "no definitions of this type: its messages are recorded without");
+            warn!(
+                %topic,
+                %type_name,
+                "no definitions of this type: its messages are recorded without"
+            );
         }
         let of = TopicSchema {
             name: request.name.clone(),
@@ -276,7 +290,11 @@ impl TopicWatch {
                 Some(SubscribedTopic { topic, subscription, type_name: spec.type_name, max_bytes })
             }
             Err(why) => {
-                error!(topic = %visible(&request.name), error = &why as &dyn std::error::Error, "cannot record a topic");
+                error!(
+                    topic = %visible(&request.name),
+                    error = &why as &dyn std::error::Error,
+                    "cannot record a topic"
+                );
                 None
             }
         }
@@ -295,7 +313,11 @@ impl TopicWatch {
         self.source.subscribe(&spec, Arc::clone(&request.sink)).map_err(|why| match why {
             TransportError::NoSuchTopic { .. } => 1,
             why => {
-                error!(topic = %visible(&request.name), error = &why as &dyn std::error::Error, "cannot hear commands");
+                error!(
+                    topic = %visible(&request.name),
+                    error = &why as &dyn std::error::Error,
+                    "cannot hear commands"
+                );
                 RETRY_AFTER
             }
         })
@@ -317,17 +339,27 @@ fn choose<'a>(
     let found = named.clone().find(is_wanted);
     let chosen = found.map(|found| &found.type_name);
     if let Some(other) = named.find(|topic| Some(&topic.type_name) != chosen)
-        && matches!(request.what, RequestKind::TopicEntry { .. })
+        && matches!(request.what, RequestKind::Recorded { .. })
         && odd.insert(request.name.clone())
     {
         let (topic, other) = (visible(&request.name), visible(&other.type_name));
         match (chosen, &request.type_name) {
             (Some(chosen), _) => {
-                warn!(%topic, recorded = %visible(chosen), %other, "a topic is written as several types, one is recorded");
+                warn!(
+                    %topic,
+                    recorded = %visible(chosen),
+                    %other,
+                    "a topic is written as several types, one is recorded"
+                );
             }
             (None, requested) => {
                 let requested = requested.as_deref().unwrap_or_default();
-                warn!(%topic, %requested, %other, "a topic is written as another type than the input says, not recorded so far");
+                warn!(
+                    %topic,
+                    %requested,
+                    %other,
+                    "a topic is written as another type than the input says, not recorded so far"
+                );
             }
         }
     }

@@ -37,8 +37,8 @@ type Put = (fn(&Path, &Path), &'static str);
 const IN_THE_WAY: [Put; 4] = [
     (|precious, path| symlink(precious, path).unwrap(), "it is a link"),
     (|precious, path| symlink(precious.with_extension("nothing"), path).unwrap(), "it is a link"),
-    (|precious, path| fs::hard_link(precious, path).unwrap(), "the file has other names"),
-    (|_, path| pipe(path), "it is no file"),
+    (|precious, path| fs::hard_link(precious, path).unwrap(), "the file has other hard links"),
+    (|_, path| pipe(path), "it is not a regular file"),
 ];
 
 /// Asserts that it is refused in words: which file, why, and what to do.
@@ -120,7 +120,7 @@ fn a_folder_of_clips_or_of_the_preroll_that_is_a_link_is_refused() {
     assert_refused(RecordingFolder::open(&scratch.0).err().unwrap(), &clips, "it is a link");
     fs::remove_file(&clips).unwrap();
     fs::write(&clips, "").unwrap();
-    assert_refused(RecordingFolder::open(&scratch.0).err().unwrap(), &clips, "it is no folder");
+    assert_refused(RecordingFolder::open(&scratch.0).err().unwrap(), &clips, "it is not a folder");
     fs::remove_file(&clips).unwrap();
     let preroll = scratch.0.join("preroll");
     fs::write(elsewhere.0.join("0.chunk"), PRECIOUS).unwrap();

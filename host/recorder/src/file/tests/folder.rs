@@ -24,7 +24,7 @@ fn a_name_is_given_once() {
         files.map(|file| file.to_str().unwrap().to_owned()),
         ["clips/a.mcap", "clips/a-2.mcap", "clips/-a.mcap"]
     );
-    // Not even after it was fetched and deleted.
+    // Not even after the clip was fetched and deleted.
     fs::remove_file(scratch.path("clips/a.mcap")).unwrap();
     fs::remove_file(scratch.path("clips/a.jpg")).unwrap();
     assert_eq!(record(&mut folder, "a").file.to_str(), Some("clips/a-3.mcap"));
@@ -36,14 +36,14 @@ fn a_folder_is_held_by_one_recorder_until_its_last_clip_is_closed() {
     let (mut folder, _) = scratch.open();
     let clip = folder.begin("a", &clip_header()).unwrap();
     drop(folder);
-    let error = RecordingFolder::open(&scratch.0).err().expect("it is held");
+    let error = RecordingFolder::open(&scratch.0).err().expect("the folder is locked");
     assert!(matches!(&error, RecordError::Busy { folder } if *folder == scratch.0), "{error:?}");
     clip.finish(trailer()).unwrap();
     assert!(scratch.open().1.is_empty());
 }
 
 #[test]
-fn a_torn_last_line_is_cut_off_and_its_clip_listed_again() {
+fn a_torn_last_line_is_truncated_and_its_clip_listed_again() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let clips = [record(&mut folder, "a"), record(&mut folder, "b")];
@@ -65,7 +65,7 @@ fn a_torn_last_line_is_cut_off_and_its_clip_listed_again() {
 }
 
 #[test]
-fn a_whole_clip_that_is_damaged_or_of_somebody_else_is_not_listed() {
+fn a_clip_that_is_damaged_or_of_another_program_is_not_listed() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     record(&mut folder, "a");
@@ -81,7 +81,7 @@ fn a_whole_clip_that_is_damaged_or_of_somebody_else_is_not_listed() {
 }
 
 #[test]
-fn files_of_others_are_left_alone() {
+fn files_of_other_programs_are_left_unchanged() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     record(&mut folder, "a");
@@ -110,7 +110,7 @@ fn files_of_others_are_left_alone() {
 }
 
 #[test]
-fn replacing_keeps_what_is_to_be_kept() {
+fn replacing_keeps_the_given_clips() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let [_, keep, _] = ["a", "b", "c"].map(|base| record(&mut folder, base));
@@ -125,7 +125,7 @@ fn replacing_keeps_what_is_to_be_kept() {
 }
 
 #[test]
-fn a_replacement_that_dies_at_any_step_is_completed_or_never_begun() {
+fn a_replacement_that_dies_at_any_step_is_completed_or_not_begun() {
     let mut died = 0;
     for last in 0.. {
         let scratch = TestDir::new();
@@ -153,7 +153,7 @@ fn a_replacement_that_dies_at_any_step_is_completed_or_never_begun() {
                 "died after {last} steps"
             ),
         }
-        // What is noted does not outlive the next clip of the same name.
+        // The note does not outlive the next clip of the same name.
         let next = record(&mut folder, "a");
         drop(folder);
         assert!(scratch.open().1.is_empty());
@@ -169,7 +169,7 @@ fn a_replacement_that_dies_at_any_step_is_completed_or_never_begun() {
 }
 
 #[test]
-fn a_note_of_others_deletes_no_more_than_a_list_does() {
+fn a_hostile_note_deletes_no_more_than_a_list_does() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let clip = record(&mut folder, "a");
@@ -188,14 +188,14 @@ fn a_note_of_others_deletes_no_more_than_a_list_does() {
 }
 
 #[test]
-fn lines_that_are_not_ours_stay_whatever_is_replaced() {
+fn lines_of_other_programs_survive_a_replacement() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let [a, _] = ["a", "b"].map(|base| record(&mut folder, base));
     let list = scratch.path("clips.jsonl");
-    let ours = fs::read_to_string(&list).unwrap();
-    let (first, second) = ours.trim_end().split_once('\n').unwrap();
-    // One line is longer than any of ours.
+    let own = fs::read_to_string(&list).unwrap();
+    let (first, second) = own.trim_end().split_once('\n').unwrap();
+    // One line is longer than any that this program writes.
     let foreign = [
         "# notes",
         r#"{"file":"../x.mcap","thumbnail":null}"#,
@@ -221,7 +221,7 @@ fn lines_that_are_not_ours_stay_whatever_is_replaced() {
 }
 
 #[test]
-fn the_longest_line_of_ours_is_read_again() {
+fn the_longest_possible_line_can_be_read_again() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     // No character takes more room in JSON than a control character.
@@ -240,7 +240,7 @@ fn the_longest_line_of_ours_is_read_again() {
     let long = ClipTrailer {
         topics: (0..256).map(counts).collect(),
         incomplete: (0..4 * 256)
-            .map(|n| format!("there is less of {}: for a reason of many words", name(n)))
+            .map(|n| format!("there is less of {}: for a long reason", name(n)))
             .collect(),
         moments: (0..200)
             .map(|n| Moment { label: "\u{1}".repeat(128), attributes: attributes(), ..moment(n) })
@@ -296,7 +296,7 @@ fn a_hostile_list_deletes_nothing_outside() {
 }
 
 #[test]
-fn a_clip_that_cannot_be_deleted_is_told_once_and_the_next_one_goes_for_it() {
+fn a_clip_that_cannot_be_deleted_is_reported_once_and_the_next_one_is_deleted() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
@@ -305,14 +305,14 @@ fn a_clip_that_cannot_be_deleted_is_told_once_and_the_next_one_goes_for_it() {
         folder.added(&clip)
     };
     assert!(added("a").is_empty() && added("b").is_empty());
-    // What no file is cannot be removed as one.
+    // A folder cannot be removed like a file.
     let (stuck, aside) = (scratch.path("clips/a.mcap"), scratch.path("aside"));
     fs::rename(&stuck, &aside).unwrap();
     fs::create_dir(&stuck).unwrap();
-    let told = added("c");
-    let [Loss::NotDeleted { file, reason, .. }, Loss::Deleted { file: gone, .. }] = &told[..]
+    let reported = added("c");
+    let [Loss::NotDeleted { file, reason, .. }, Loss::Deleted { file: gone, .. }] = &reported[..]
     else {
-        panic!("{told:?}")
+        panic!("{reported:?}")
     };
     assert_eq!((file.to_str(), gone.to_str()), (Some("clips/a.mcap"), Some("clips/b.mcap")));
     assert!(reason.contains("cannot remove") && reason.contains("a.mcap"), "{reason}");
@@ -320,18 +320,24 @@ fn a_clip_that_cannot_be_deleted_is_told_once_and_the_next_one_goes_for_it() {
         scratch.files().contains(&"c.mcap".to_owned())
             && !scratch.files().contains(&"b.mcap".to_owned())
     );
-    // Both stay known: the bound holds as far as it can.
-    let told = added("d");
+    // Both stay on the list, and the limit holds as far as possible.
+    let reported = added("d");
     assert!(
-        matches!(&told[..], [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/c.mcap")),
-        "{told:?}"
+        matches!(
+            &reported[..],
+            [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/c.mcap")
+        ),
+        "{reported:?}"
     );
     fs::remove_dir(&stuck).unwrap();
     fs::rename(&aside, &stuck).unwrap();
-    let told = added("e");
+    let reported = added("e");
     assert!(
-        matches!(&told[..], [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/a.mcap")),
-        "{told:?}"
+        matches!(
+            &reported[..],
+            [Loss::Deleted { file, .. }] if file.to_str() == Some("clips/a.mcap")
+        ),
+        "{reported:?}"
     );
     let noted = fs::read_to_string(scratch.path("losses.jsonl")).unwrap();
     let noted: Vec<Loss> = noted.lines().map(|line| serde_json::from_str(line).unwrap()).collect();

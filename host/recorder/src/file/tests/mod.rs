@@ -1,4 +1,4 @@
-//! Clips are written, read back by two readers, torn at every byte, and recovered.
+//! Tests of clips: written, read back by two readers, torn at every byte, and recovered.
 
 mod folder;
 mod recover;
@@ -39,7 +39,7 @@ impl TestDir {
         RecordingFolder::open(&self.0).unwrap()
     }
 
-    /// The clips that the list names.
+    /// The listed clips.
     fn listed(&self) -> Vec<Clip> {
         let text = fs::read_to_string(self.path("clips.jsonl")).unwrap_or_default();
         text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
@@ -112,7 +112,7 @@ fn meta(at_ns: i64, seq: u64) -> SampleMeta {
     }
 }
 
-/// The payload of message `n`: no two are equal.
+/// The payload of message `n`; no two are equal.
 fn payload(n: u64) -> Vec<u8> {
     [&n.to_le_bytes()[..], &[n as u8; 13]].concat()
 }
@@ -142,7 +142,7 @@ fn trailer() -> ClipTrailer {
     }
 }
 
-/// The clip as the next start lists it, if its recorder died before.
+/// The clip as the next start lists it, if its recorder died before listing it.
 fn unlisted(clip: &Clip) -> Clip {
     let note = "the recorder died before it listed this clip; nothing of it is lost".to_owned();
     Clip { recovered: Some(Recovered { lost_bytes: 0, note }), ..clip.clone() }
@@ -159,14 +159,14 @@ fn stamp(n: u64) -> i64 {
     10 * SECOND + n as i64 * SECOND / 4
 }
 
-/// What a replay of `path` delivers, in its order; it must be a whole file.
+/// The messages of a replay of `path`, in order; the file must be complete.
 fn replayed(path: &Path) -> Vec<(TopicSchema, SampleMeta, Vec<u8>)> {
     let mut all = Vec::new();
     let end = super::read::each_message(path, |topic, meta, cdr| {
         all.push((topic.clone(), *meta, cdr.to_vec()));
         Ok(())
     });
-    assert!(end.unwrap().is_none(), "{} is not whole", path.display());
+    assert!(end.unwrap().is_none(), "{} is incomplete", path.display());
     all
 }
 

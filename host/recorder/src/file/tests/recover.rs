@@ -7,8 +7,7 @@ use super::super::durable::steps;
 use super::*;
 use crate::error::RecordError;
 
-/// The bytes of an unfinished clip of `messages` messages, some of them in a chunk that was not
-/// closed.
+/// The bytes of an unfinished clip of `messages` messages, some of them in an open chunk.
 fn part(messages: u64) -> Vec<u8> {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
@@ -26,7 +25,7 @@ fn died(part: &[u8]) -> TestDir {
     scratch
 }
 
-/// How many messages the closed chunks of an unfinished clip of `messages` messages hold: five to a
+/// Number of messages in the closed chunks of an unfinished clip of `messages` messages: five per
 /// second.
 fn closed(messages: u64) -> u64 {
     messages.saturating_sub(1) / 5 * 5
@@ -52,7 +51,7 @@ fn an_abandoned_clip_has_every_closed_chunk_after_any_number_of_messages() {
 }
 
 #[test]
-fn a_recovered_clip_says_what_it_was_and_what_is_missing() {
+fn a_recovered_clip_describes_itself_and_what_is_missing() {
     let torn = [part(13), vec![9; 3]].concat();
     let scratch = died(&torn);
     let (_, found) = scratch.open();
@@ -70,8 +69,8 @@ fn a_recovered_clip_says_what_it_was_and_what_is_missing() {
     assert_eq!(recovered.lost_bytes, 3);
     assert_eq!(
         recovered.note,
-        "the recorder died; messages after 2.250 s of the window are lost, at most 1 s of them unless the power failed; \
-         so are journal and thumbnail"
+        "the recorder died; messages after 2.250 s of the window are lost, \
+         at most 1 s of them unless the power failed; so are journal and thumbnail"
     );
     assert_eq!(clip.incomplete, std::slice::from_ref(&recovered.note));
     let messages = replayed(&scratch.path("clips/a.mcap"));
@@ -79,7 +78,7 @@ fn a_recovered_clip_says_what_it_was_and_what_is_missing() {
 }
 
 #[test]
-fn a_file_torn_at_any_byte_becomes_a_whole_clip_or_nothing() {
+fn a_file_torn_at_any_byte_becomes_a_valid_clip_or_nothing() {
     let whole = part(14);
     let mut most = 0;
     for len in 0..=whole.len() {
@@ -118,10 +117,10 @@ fn a_byte_flipped_anywhere_never_gives_a_broken_clip() {
     }
 }
 
-/// A whole clip, torn at every byte on its way through the disk: with its footer it is taken as it
-/// is.
+/// A finished file, torn at every byte as after a power failure: with its footer it is adopted
+/// unchanged.
 #[test]
-fn a_finished_file_that_was_not_renamed_is_recovered_with_all_it_has() {
+fn a_finished_file_that_was_not_renamed_is_recovered_completely() {
     let source = TestDir::new();
     let (mut folder, _) = source.open();
     let mut clip = folder.begin("a", &clip_header()).unwrap();
@@ -147,8 +146,8 @@ fn a_finished_file_that_was_not_renamed_is_recovered_with_all_it_has() {
     }
 }
 
-/// A folder in which a recorder died that had finished a clip and not renamed it, the clip as it is
-/// listed then, and its bytes.
+/// A folder in which a recorder died after it had finished a clip and before the rename; the clip
+/// as it is then listed, and its bytes.
 fn died_before_the_name() -> (TestDir, Clip, Vec<u8>) {
     let source = TestDir::new();
     let (mut folder, _) = source.open();
@@ -162,9 +161,9 @@ fn died_before_the_name() -> (TestDir, Clip, Vec<u8>) {
     (scratch, unlisted(&finished), whole)
 }
 
-/// Of the whole file, it is not known whether its bytes are on the disk; of a copy it is.
+/// It is unknown whether the bytes of the original are on the disk; those of a copy are.
 #[test]
-fn a_finished_file_is_written_anew_before_it_gets_its_name() {
+fn a_finished_file_is_copied_before_it_is_renamed() {
     let (scratch, _, _) = died_before_the_name();
     let nothing = ["remove a.mcap.part2"];
     let expected = [
@@ -186,7 +185,7 @@ fn a_finished_file_is_written_anew_before_it_gets_its_name() {
 }
 
 #[test]
-fn a_finished_file_is_recovered_once_though_its_recovery_dies_at_every_step() {
+fn a_finished_file_is_recovered_once_even_if_its_recovery_dies_at_every_step() {
     let mut deaths = 0;
     for last in 0.. {
         let (scratch, finished, whole) = died_before_the_name();
@@ -194,7 +193,7 @@ fn a_finished_file_is_recovered_once_though_its_recovery_dies_at_every_step() {
         let mut is_done = false;
         for _ in 0..2 {
             steps::restart(last);
-            let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_left();
+            let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_unfinished();
             is_done = std::iter::from_fn(|| recovery.next(&mut || true)).all(|came| came.is_ok());
         }
         steps::restart(usize::MAX);
@@ -212,7 +211,7 @@ fn a_finished_file_is_recovered_once_though_its_recovery_dies_at_every_step() {
 }
 
 #[test]
-fn a_whole_clip_that_is_not_listed_is_on_the_disk_before_it_is() {
+fn a_complete_clip_is_synced_before_it_is_listed() {
     let (scratch, finished, whole) = died_before_the_name();
     fs::remove_file(scratch.path("clips/a.mcap.part")).unwrap();
     fs::write(scratch.path("clips/a.mcap"), whole).unwrap();
@@ -223,7 +222,7 @@ fn a_whole_clip_that_is_not_listed_is_on_the_disk_before_it_is() {
 
 /// The folder as it is after each step of a recovery that dies there.
 #[test]
-fn a_recovery_that_dies_at_any_step_is_done_again_without_doubles() {
+fn a_recovery_that_dies_at_any_step_is_repeated_without_duplicates() {
     let part = part(14);
     let done = died(&part);
     let (_, found) = done.open();
@@ -252,7 +251,7 @@ fn a_recovery_that_dies_at_any_step_is_done_again_without_doubles() {
 }
 
 #[test]
-fn a_file_that_somebody_put_in_the_place_of_the_clip_stays() {
+fn a_file_that_has_taken_the_name_of_the_clip_stays() {
     let scratch = died(&part(14));
     fs::write(scratch.path("clips/a.mcap"), b"not a clip").unwrap();
     let (_, found) = scratch.open();
@@ -263,7 +262,7 @@ fn a_file_that_somebody_put_in_the_place_of_the_clip_stays() {
 }
 
 #[test]
-fn an_unfinished_clip_without_content_is_removed_and_one_of_somebody_else_is_not() {
+fn an_empty_unfinished_clip_is_removed_and_a_file_of_another_program_is_not() {
     for nothing in [&[][..], &[0; 10_000], b"\x89MCAP0\r\n"] {
         let scratch = died(nothing);
         assert!(scratch.open().1.is_empty());
@@ -295,16 +294,19 @@ fn several_unfinished_clips_are_recovered_in_the_order_of_their_names() {
 }
 
 #[test]
-fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_keeps_nobody_from_recording() {
+fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_does_not_stop_recording() {
     let scratch = died(&part(14));
     fs::write(scratch.path("clips/b.mcap.part"), part(8)).unwrap();
-    // What no file is cannot be removed as one.
+    // A folder cannot be removed like a file.
     fs::create_dir(scratch.path(&format!("clips/a{AGAIN}"))).unwrap();
     for _ in 0..2 {
-        let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_left();
+        let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_unfinished();
         let why = recovery.next(&mut || true).unwrap().unwrap_err();
         assert!(
-            matches!(&why, RecordError::Recover { path, .. } if path.ends_with("clips/a.mcap.part")),
+            matches!(
+                &why,
+                RecordError::Recover { path, .. } if path.ends_with("clips/a.mcap.part")
+            ),
             "{why:?}"
         );
     }
@@ -327,14 +329,14 @@ fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_keeps_nobody_fr
 }
 
 #[test]
-fn a_recovery_that_is_ended_at_any_moment_leaves_what_it_was_to_recover() {
+fn a_recovery_that_is_aborted_at_any_time_leaves_the_unfinished_clip() {
     let part = part(14);
     let (_, _, whole) = died_before_the_name();
     for left in [part, whole] {
         let mut ended = 0;
         for moments in 0.. {
             let scratch = died(&left);
-            let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_left();
+            let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_unfinished();
             let mut asked = 0;
             let came = recovery.next(&mut || {
                 asked += 1;
@@ -358,9 +360,9 @@ fn a_recovery_that_is_ended_at_any_moment_leaves_what_it_was_to_recover() {
 fn clips_are_begun_and_finished_while_another_is_recovered() {
     let scratch = died(&part(14));
     let mut folder = RecordingFolder::hold(&scratch.0).unwrap();
-    // Somebody's file has the name of what is recovered.
+    // Another file has the name of the recovered clip.
     fs::write(scratch.path("clips/a.mcap"), b"not a clip").unwrap();
-    let mut recovery = folder.take_left();
+    let mut recovery = folder.take_unfinished();
     let mut clips = 0;
     let came = recovery.next(&mut || {
         let mut clip = folder.begin("a", &clip_header()).unwrap();

@@ -91,7 +91,7 @@ fn a_clip_reads_back_byte_for_byte() {
 }
 
 #[test]
-fn a_clip_says_what_it_is() {
+fn a_clip_describes_itself() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let mut writing = folder.begin("hello-1", &clip_header()).unwrap();
@@ -164,7 +164,7 @@ fn the_line_of_a_clip_keeps_a_hundred_moments_and_the_file_all() {
 }
 
 #[test]
-fn a_clip_says_of_a_lambda_what_its_journal_says() {
+fn a_clip_describes_a_lambda_by_its_journal() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let mut header = crate::support::member("hello", (1, 1, 1), &[]).header;
@@ -190,7 +190,7 @@ fn a_clip_says_of_a_lambda_what_its_journal_says() {
 }
 
 #[test]
-fn a_topic_without_a_message_has_a_channel_all_the_same() {
+fn a_topic_without_a_message_still_has_a_channel() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let mut clip = folder.begin("a", &clip_header()).unwrap();
@@ -225,11 +225,11 @@ fn a_topic_without_a_message_has_a_channel_all_the_same() {
 }
 
 #[test]
-fn what_a_clip_cannot_hold_is_refused_and_harms_nothing() {
+fn a_message_or_record_that_is_too_large_is_refused() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let mut clip = folder.begin("a", &clip_header()).unwrap();
-    // Zeros that nobody touches take no memory.
+    // Zeroed pages that are never touched take no memory.
     let huge = vec![0; MESSAGE_MAX + 1];
     let error = clip.message(&imu(), &meta(stamp(0), 1), &huge).unwrap_err();
     assert!(matches!(&error, RecordError::TooLarge { what: "a message", .. }), "{error:?}");
@@ -265,7 +265,7 @@ fn a_chunk_spans_a_second_at_most() {
 }
 
 #[test]
-fn stamps_before_the_epoch_become_its_begin() {
+fn stamps_before_the_epoch_become_the_epoch() {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
     let mut clip = folder.begin("a", &clip_header()).unwrap();
@@ -294,10 +294,10 @@ fn more_writers_than_channels_share_one_and_no_message_is_lost() {
     assert_eq!(replayed(&scratch.path("clips/a.mcap")).len() as u64, writers);
 }
 
-/// `/dev/full` takes no byte.
+/// `/dev/full` rejects every write.
 #[cfg(target_os = "linux")]
 #[test]
-fn a_full_disk_is_named_and_nothing_follows_it() {
+fn a_full_disk_is_reported_and_nothing_is_written_after_it() {
     let scratch = TestDir::new();
     let (folder, _) = scratch.open();
     let path = scratch.path("clips/a.mcap.part");

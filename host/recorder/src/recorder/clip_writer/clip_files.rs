@@ -65,8 +65,8 @@ impl ClipFiles {
     }
 
     /// What an earlier process left in the folder.
-    pub(super) fn take_left(&mut self) -> Recovery {
-        self.folder.take_left()
+    pub(super) fn take_unfinished(&mut self) -> Recovery {
+        self.folder.take_unfinished()
     }
 
     fn open_file(&mut self, clip: u64) -> &mut OpenFile {
@@ -135,7 +135,11 @@ impl ClipFiles {
                 None => {}
                 Some(Ok(journal)) => trailer.journals.push((name, journal)),
                 Some(Err(error)) => {
-                    tracing::error!(lambda = %name, %error, "the journal of a clip cannot be written");
+                    tracing::error!(
+                        lambda = %name,
+                        %error,
+                        "the journal of a clip cannot be written"
+                    );
                     trailer
                         .incomplete
                         .push(format!("the journal of {name} could not be written: {error}"));

@@ -292,7 +292,7 @@ struct WriterLoop {
 impl WriterLoop {
     /// What the thread does until it is told nothing more. Jobs do not wait for what is recovered.
     fn run(mut self, jobs: &Receiver<(usize, WriterJob)>, until: &OnceLock<Instant>) {
-        let mut recovery = self.files.take_left();
+        let mut recovery = self.files.take_unfinished();
         while let Some(came) = recovery.next(&mut || {
             let is_heard =
                 std::iter::from_fn(|| jobs.try_recv().ok()).all(|(cost, job)| self.job(cost, job));
