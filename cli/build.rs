@@ -1,15 +1,14 @@
-//! Puts what a new lambda needs into `gleaner`: the SDKs, the WIT, and the example that it begins
-//! with.
+//! Embeds the files of a new lambda in `gleaner`: the SDKs, the WIT and the example.
 
 use std::env;
 use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Files of the repository, and folders of which all files with one of the extensions are packed.
+/// Packed files, and folders of which all files with one of the [`EXTENSIONS`] are packed.
 const PACKED: &[&str] = &[
-    // With it, a new lambda is built of the very versions that Gleaner was tested with; cargo takes
-    // out what it does not need.
+    // Pins the versions that Gleaner was tested with; cargo removes the packages that a lambda does
+    // not need.
     "Cargo.lock",
     "LICENSE",
     "examples/hello/python/lambda.toml",
@@ -33,7 +32,7 @@ fn main() {
     }
     list.push(']');
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
-    fs::write(out.join("packed.rs"), list).expect("cargo's folder for it can be written to");
+    fs::write(out.join("packed.rs"), list).expect("OUT_DIR is writable");
 }
 
 fn add(root: &Path, path: &Path, list: &mut String) {
@@ -41,9 +40,9 @@ fn add(root: &Path, path: &Path, list: &mut String) {
     if full.is_dir() {
         let entries = fs::read_dir(&full).expect("a folder of the repository");
         let mut inside: Vec<_> =
-            entries.map(|entry| entry.expect("the same").file_name()).collect();
+            entries.map(|entry| entry.expect("a readable entry").file_name()).collect();
         inside.sort();
-        // Hidden is what tools leave.
+        // Hidden files and caches come from tools.
         let inside = inside
             .iter()
             .filter(|name| *name != "__pycache__" && !name.as_encoded_bytes().starts_with(b"."));

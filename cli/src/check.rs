@@ -1,18 +1,17 @@
-//! `gleaner check DIR`: a built lambda is loaded as on a vehicle and its `init` run, without any
-//! sample.
+//! `gleaner check DIR`: loads a built lambda as on a vehicle and runs its `init`, without samples.
 
 use std::ffi::OsString;
 
 use gleaner_base::{Exit, Failure};
 
 use crate::args::CheckArgs;
-use crate::replay::show_result;
+use crate::replay::print_result;
 use crate::runtime;
 
-/// Checks, and says what was found.
+/// Runs the check and prints its report.
 pub(crate) fn run(args: &CheckArgs) -> Result<Exit, Failure> {
     let mut line: Vec<OsString> = vec!["check".into()];
-    line.extend(args.asked.settings());
-    line.extend(["--".into(), args.asked.lambda.clone().into()]);
-    show_result(runtime::run(&args.asked.lambda, line)?, args.json)
+    line.extend(args.target.settings());
+    line.extend(["--".into(), args.target.lambda.clone().into()]);
+    print_result(runtime::run(&args.target.lambda, line)?, args.json)
 }

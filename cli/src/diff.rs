@@ -1,24 +1,24 @@
-//! `gleaner diff OUT1 OUT2`: shows what differs between two runs. What is compared, and how, is
-//! decided in `gleaner-report`.
+//! `gleaner diff OUT1 OUT2`: prints the differences between two runs, which `gleaner-report` finds.
 
 use gleaner_base::{Exit, Failure};
 use gleaner_report::Diff;
 
 use crate::args::DiffArgs;
+use crate::render::{self, Paint, json_line};
 use crate::report;
-use crate::say::say;
-use crate::show::{self, Paint, json_line};
+use crate::stdout::print;
 
-/// Compares, and shows what differs: ends with 0 if the decisions are the same, with 4 if not.
+/// Compares two runs and prints the differences. Exits with 0 if the decisions are identical, else
+/// with 4.
 pub(crate) fn run(args: &DiffArgs) -> Result<Exit, Failure> {
     let diff = Diff::between(&args.a, &args.b)?;
-    let exit = if diff.same { Exit::Ok } else { Exit::Differs };
-    say(&if args.json { json_line(&diff) } else { show::diff(&diff, Paint::of_stdout()) })?;
-    // Only then: a page that cannot be written must not cost what was found.
+    let exit = if diff.identical { Exit::Ok } else { Exit::Differs };
+    print(&if args.json { json_line(&diff) } else { render::diff(&diff, Paint::of_stdout()) })?;
+    // Last, since the differences are printed even if the page cannot be written.
     if let Some(path) = &args.report {
         let path = report::write_both(&args.a, &args.b, diff, path)?;
         if !args.json {
-            say(&format!("  report: {}\n", path.display()))?;
+            print(&format!("  report: {}\n", path.display()))?;
         }
     }
     Ok(exit)

@@ -1,5 +1,4 @@
-//! What is made from the definition of the command line alone: completions for shells, and man
-//! pages.
+//! Generates shell completions and man pages from the definition of the command line.
 
 use std::path::Path;
 
@@ -8,13 +7,13 @@ use clap_complete::Shell;
 use gleaner_base::{Exit, Failure};
 
 use crate::args::Cli;
-use crate::say::say;
+use crate::stdout::print;
 
-/// Prints what a shell needs to complete our commands.
+/// Prints the completion script of a shell.
 pub(crate) fn completions(shell: Shell) -> Result<Exit, Failure> {
     let mut script = Vec::new();
     clap_complete::generate(shell, &mut Cli::command(), "gleaner", &mut script);
-    say(&String::from_utf8_lossy(&script))?;
+    print(&String::from_utf8_lossy(&script))?;
     Ok(Exit::Ok)
 }
 
@@ -28,9 +27,9 @@ pub(crate) fn man(folder: &Path) -> Result<Exit, Failure> {
             format!("cannot write man pages into `{}`", folder.display()),
             &error,
         );
-        failure.with_help("name a folder that you may write to, such as ~/.local/share/man/man1")
+        failure.with_help("name a writable folder, such as ~/.local/share/man/man1")
     })?;
-    say(&format!(
+    print(&format!(
         "wrote the man pages into {}; read them with: man -l {}\n",
         folder.display(),
         folder.join("gleaner.1").display()
@@ -59,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn shells_are_told_of_our_flags() {
+    fn completions_have_commands_and_flags() {
         for shell in [Shell::Bash, Shell::Zsh, Shell::Fish] {
             let mut script = Vec::new();
             clap_complete::generate(shell, &mut Cli::command(), "gleaner", &mut script);

@@ -1,55 +1,57 @@
-//! The command `gleaner`: `new` makes a lambda's folder, `build` its build folder, `runtime` starts
-//! `gleaner-runtime` for `check`, `replay` and `verify`, `run` keeps it and the recorder going
-//! live, `show` is what people see of results, `report` writes the page about them, `diff` shows
-//! what differs between two runs, `dev` does all of it again whenever a source is saved, and
-//! `generated` is what is made from the command line's definition.
+//! The command `gleaner`.
 //!
-//! It is thin. No lambda runs in this process, and it links neither a WebAssembly engine nor
-//! Python: it starts its sibling programs and speaks to them through `gleaner-protocol`. What is
-//! known of results is in `gleaner-report`.
+//! `new` creates a lambda's folder, `build` its build folder. `runtime` starts `gleaner-runtime`
+//! for `check`, `replay` and `verify`, `run` supervises it and the recorder live, and `delegate`
+//! passes commands on to another program. `render` formats results as text, `report` writes the
+//! report page, `diff` compares two runs, and `dev` repeats all of this whenever a source is saved.
+//! `generated` prints shell completions and man pages.
+//!
+//! No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts
+//! the other programs and exchanges `gleaner-protocol` messages with them. `gleaner-report` reads
+//! results.
 
 pub mod args;
 mod build;
 mod check;
+mod delegate;
 pub mod dev;
 mod diff;
 mod doctor;
 mod generated;
-mod listen;
 mod new;
+mod pipe_reader;
+mod render;
 mod replay;
 mod report;
 mod run;
 mod runtime;
-mod say;
-mod show;
-mod sibling;
+mod stdout;
 
 use gleaner_base::{Exit, Failure};
 
-use args::{Cli, Command};
+use args::{Cli, CliCommand};
 
-/// Does what was typed.
+/// Runs the command.
 ///
 /// # Errors
 ///
-/// What the user is to see, with the exit code.
+/// A [`Failure`] with the message for the user and the exit code.
 pub fn run(cli: Cli) -> Result<Exit, Failure> {
     match cli.command {
-        Command::Inspect(args) => sibling::inspect(&args),
-        Command::New(args) => new::run(&args),
-        Command::Build(args) => build::run(&args.lambda, args.sandboxed),
-        Command::Check(args) => check::run(&args),
-        Command::Replay(args) => replay::run(&args),
-        Command::Report(args) => report::run(&args),
-        Command::Diff(args) => diff::run(&args),
-        Command::Dev(args) => dev::run(args),
-        Command::Verify(args) => replay::verify(&args),
-        Command::Run(args) => run::run(&args),
-        Command::Topics(args) => sibling::topics(&args),
-        Command::Play { arguments } => sibling::play(&arguments),
-        Command::Doctor(args) => doctor::run(&args),
-        Command::Completions { shell } => generated::completions(shell),
-        Command::Man { folder } => generated::man(&folder),
+        CliCommand::Inspect(args) => delegate::inspect(&args),
+        CliCommand::New(args) => new::run(&args),
+        CliCommand::Build(args) => build::run(&args.lambda, args.sandboxed),
+        CliCommand::Check(args) => check::run(&args),
+        CliCommand::Replay(args) => replay::run(&args),
+        CliCommand::Report(args) => report::run(&args),
+        CliCommand::Diff(args) => diff::run(&args),
+        CliCommand::Dev(args) => dev::run(args),
+        CliCommand::Verify(args) => replay::verify(&args),
+        CliCommand::Run(args) => run::run(&args),
+        CliCommand::Topics(args) => delegate::topics(&args),
+        CliCommand::Play { arguments } => delegate::play(&arguments),
+        CliCommand::Doctor(args) => doctor::run(&args),
+        CliCommand::Completions { shell } => generated::completions(shell),
+        CliCommand::Man { folder } => generated::man(&folder),
     }
 }

@@ -1,4 +1,4 @@
-//! `gleaner`: what people type. See `gleaner --help`.
+//! The program `gleaner`. See `gleaner --help`.
 
 use std::process::ExitCode;
 

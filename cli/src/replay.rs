@@ -1,5 +1,4 @@
-//! `gleaner replay DIR DRIVE...` and `gleaner verify CLIP`: what the runtime is asked for, and what
-//! people see of its result.
+//! `gleaner replay DIR DRIVE...` and `gleaner verify CLIP`: run the runtime and print its result.
 
 use std::ffi::OsString;
 use std::fs;
@@ -7,43 +6,43 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_protocol::Summary;
+use gleaner_protocol::ReplaySummary;
 use gleaner_report::{Decisions, clips};
 
 use crate::args::{ReplayArgs, VerifyArgs};
+use crate::render::{self, Digest, Paint};
 use crate::report;
-use crate::runtime::{self, Heard};
-use crate::say::say;
-use crate::show::{self, Digest, Paint};
+use crate::runtime::{self, RuntimeResult};
+use crate::stdout::print;
 
-/// Replays, and ends as the runtime ends.
+/// Replays; returns the exit code of the runtime.
 pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
     results(args).map(|(exit, _)| exit)
 }
 
-/// Replays. How the runtime ended, and whether there are results of this replay: a lambda that
-/// could not start leaves those of before.
+/// Replays. Returns the exit code of the runtime, and whether there are new results: a lambda that
+/// cannot start leaves the earlier ones.
 pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
-    let (mut heard, exit) = runtime::run(&args.asked.lambda, arguments(args))?;
-    let has_results = heard.is_some();
-    if let Some(Heard::Summary(summary)) = &mut heard {
-        // Not where the report says, which may come from the lambda's process.
-        summary.out = args.out.clone().unwrap_or_else(|| args.asked.lambda.join("out"));
+    let (mut result, exit) = runtime::run(&args.target.lambda, arguments(args))?;
+    let has_results = result.is_some();
+    if let Some(RuntimeResult::Summary(summary)) = &mut result {
+        // Not the path in the report, which may come from the lambda's process.
+        summary.out = args.out.clone().unwrap_or_else(|| args.target.lambda.join("out"));
     }
-    let report = match &heard {
-        Some(Heard::Summary(summary)) => report_of(&summary.out, args.no_report),
+    let report = match &result {
+        Some(RuntimeResult::Summary(summary)) => report_of(&summary.out, args.no_report),
         _ => Ok(None),
     };
-    show_result((heard, exit), args.json)?;
+    print_result((result, exit), args.json)?;
     match report {
         Ok(Some(path)) if !args.json => {
-            say(&format!(
+            print(&format!(
                 "  {}\n",
                 Paint::of_stdout().dim(&format!("report: {}", path.display()))
             ))?;
         }
         Ok(_) => {}
-        // The results are whole without it.
+        // The results are complete without the report page.
         Err(failure) => {
             eprintln!("{failure}");
             return Ok((if exit == Exit::Ok { Exit::Internal } else { exit }, has_results));
@@ -52,9 +51,9 @@ pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
     Ok((exit, has_results))
 }
 
-/// Writes the report of `out`, unless it was declined. That of an earlier replay goes in any case:
-/// it is about other results.
-fn report_of(out: &Path, is_declined: bool) -> Result<Option<PathBuf>, Failure> {
+/// Writes the report page into `out`, unless `no_report`. The page of an earlier replay is removed
+/// in any case, since it is about other results.
+fn report_of(out: &Path, no_report: bool) -> Result<Option<PathBuf>, Failure> {
     let path = out.join(report::NAME);
     if let Err(error) = fs::remove_file(&path)
         && error.kind() != io::ErrorKind::NotFound
@@ -64,47 +63,47 @@ fn report_of(out: &Path, is_declined: bool) -> Result<Option<PathBuf>, Failure> 
             format!("cannot write the report `{}`", path.display()),
             &error,
         );
-        return Err(failure.with_help("remove what is there: it is not about this replay"));
+        return Err(failure.with_help("remove the file: it is from an earlier replay"));
     }
-    if is_declined { Ok(None) } else { report::write(out).map(Some) }
+    if no_report { Ok(None) } else { report::write(out).map(Some) }
 }
 
-/// Makes the decisions in a clip again.
+/// Repeats the decisions of a clip.
 pub(crate) fn verify(args: &VerifyArgs) -> Result<Exit, Failure> {
     let mut line = vec!["verify".into(), "--lambda".into(), args.lambda.clone().into()];
     line.extend(args.vehicle.iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]));
     line.extend(["--".into(), args.clip.clone().into()]);
-    show_result(runtime::run(&args.lambda, line)?, args.json)
+    print_result(runtime::run(&args.lambda, line)?, args.json)
 }
 
-/// Shows what the runtime reported last, and ends as it ended.
-pub(crate) fn show_result(
-    (heard, exit): (Option<Heard>, Exit),
+/// Prints the result of the runtime, and returns its exit code.
+pub(crate) fn print_result(
+    (result, exit): (Option<RuntimeResult>, Exit),
     json: bool,
 ) -> Result<Exit, Failure> {
-    let text = match heard {
+    let text = match result {
         None => return Ok(exit),
-        Some(Heard::Summary(summary)) if json => show::json_line(&summary),
-        Some(Heard::Verified(verified)) if json => show::json_line(&verified),
-        Some(Heard::Checked(checked)) if json => show::json_line(&checked),
-        Some(Heard::Checked(checked)) => show::checked(&checked, Paint::of_stdout()),
-        Some(Heard::Summary(summary)) => summary_text(&summary)?,
-        Some(Heard::Verified(verified)) => show::verified(&verified, Paint::of_stdout()),
+        Some(RuntimeResult::Summary(summary)) if json => render::json_line(&summary),
+        Some(RuntimeResult::Verified(verified)) if json => render::json_line(&verified),
+        Some(RuntimeResult::Checked(checked)) if json => render::json_line(&checked),
+        Some(RuntimeResult::Checked(checked)) => render::check_report(&checked, Paint::of_stdout()),
+        Some(RuntimeResult::Summary(summary)) => summary_text(&summary)?,
+        Some(RuntimeResult::Verified(verified)) => render::verified(&verified, Paint::of_stdout()),
     };
-    say(&text)?;
+    print(&text)?;
     Ok(exit)
 }
 
-fn summary_text(summary: &Summary) -> Result<String, Failure> {
+fn summary_text(summary: &ReplaySummary) -> Result<String, Failure> {
     let digest = Digest::of(Decisions::open(&summary.out)?, summary.start_ns)?;
     let clips = if summary.recording.clips > 0 { clips(&summary.out)? } else { Vec::new() };
-    Ok(show::summary(summary, &digest, &clips, Paint::of_stdout()))
+    Ok(render::summary(summary, &digest, &clips, Paint::of_stdout()))
 }
 
-/// The runtime's arguments: ours, less what only concerns showing.
+/// The arguments of the runtime: those of the command, except the ones about output.
 fn arguments(args: &ReplayArgs) -> Vec<OsString> {
     let mut line: Vec<OsString> = vec!["replay".into()];
-    line.extend(args.asked.settings());
+    line.extend(args.target.settings());
     for (flag, file) in
         [("--out", &args.out), ("--journal", &args.journal), ("--verify", &args.verify)]
     {
@@ -124,7 +123,7 @@ fn arguments(args: &ReplayArgs) -> Vec<OsString> {
         }
     }
     line.push("--".into());
-    line.push(args.asked.lambda.clone().into());
+    line.push(args.target.lambda.clone().into());
     line.extend(args.drives.iter().map(|drive| drive.clone().into()));
     line
 }
@@ -132,12 +131,12 @@ fn arguments(args: &ReplayArgs) -> Vec<OsString> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::args::AskedArgs;
+    use crate::args::LambdaArgs;
 
     #[test]
-    fn the_runtime_gets_our_arguments_with_the_files_last() {
+    fn the_runtime_gets_the_arguments_with_the_files_last() {
         let args = ReplayArgs {
-            asked: AskedArgs {
+            target: LambdaArgs {
                 lambda: "-dir".into(),
                 set: vec!["x=-1".to_owned()],
                 remap: vec!["/a:=/b".to_owned()],
@@ -156,7 +155,9 @@ mod tests {
             json: true,
         };
         let line =
-            "replay --set x=-1 --remap /a:=/b --vehicle v.toml --out out --journal j --from 12.5 --to @7 --topics * --topics /a --all --no-record -- -dir a.mcap b".split(' ');
+            "replay --set x=-1 --remap /a:=/b --vehicle v.toml --out out --journal j --from 12.5 \
+             --to @7 --topics * --topics /a --all --no-record -- -dir a.mcap b"
+                .split(' ');
         assert_eq!(arguments(&args), line.collect::<Vec<_>>());
     }
 }

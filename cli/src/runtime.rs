@@ -1,4 +1,4 @@
-//! Starting `gleaner-runtime`, showing how far it is and what it says, and hearing its result.
+//! Runs `gleaner-runtime`: shows its progress and messages, and reads its result.
 
 use std::ffi::OsString;
 use std::io::{self, BufRead, BufReader, Read, Write};
@@ -9,42 +9,50 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use gleaner_base::{Exit, Explain, Failure, each_piece, visible};
 use gleaner_lambda::BuildDir;
-use gleaner_lambda::manifest::{Kind, Manifest};
+use gleaner_lambda::manifest::{LambdaKind, Manifest};
 use gleaner_parts::Parts;
-use gleaner_protocol::{Checked, Report, Summary, Verified};
+use gleaner_protocol::{CheckReport, ReplaySummary, Report, Verified};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::listen::Listener;
-use crate::sibling::starter;
+use crate::delegate::starter;
+use crate::pipe_reader::PipeReader;
 
-/// Longest report, as of one trigger with all its attributes or a clip with all that it lists, with
-/// much room.
+/// Maximum size of a report, far above that of a trigger with all its attributes or of a clip with
+/// all its lists.
 const REPORT_BYTES: u64 = 16 << 20;
 
-/// Why the runtime did not do what it was asked for, where it could not say so itself.
+/// Failures of the runtime that it cannot report itself.
 #[derive(Debug, thiserror::Error)]
 enum RuntimeError {
     #[error("cannot start `{}`", program.display())]
     Start { program: PathBuf, source: io::Error },
     #[error("cannot read the reports of gleaner-runtime")]
     Read { source: io::Error },
-    #[error("gleaner-runtime reports what this gleaner does not understand: {line}")]
+    #[error("cannot parse a report of gleaner-runtime: {line}")]
     Report { line: String, source: serde_json::Error },
     #[error("gleaner-runtime ended without a result ({status})")]
     NoResult { status: ExitStatus },
-    #[error("gleaner-runtime did not end well after its result ({status})")]
+    #[error("gleaner-runtime failed after its result ({status})")]
     Code { status: ExitStatus },
 }
 
 impl Explain for RuntimeError {
     fn help(&self) -> Option<String> {
         match self {
-            RuntimeError::Report { .. } => Some("install gleaner and gleaner-runtime of one version".to_owned()),
-            RuntimeError::NoResult { status } | RuntimeError::Code { status } if signal_of(*status) == Some(9) => {
-                Some("the system kills the largest process when memory runs out; see `dmesg`".to_owned())
+            RuntimeError::Report { .. } => {
+                Some("install the same version of gleaner and gleaner-runtime".to_owned())
+            }
+            RuntimeError::NoResult { status } | RuntimeError::Code { status }
+                if signal_of(*status) == Some(9) =>
+            {
+                Some(
+                    "the system kills the largest process when memory runs out; see `dmesg`"
+                        .to_owned(),
+                )
             }
             RuntimeError::NoResult { .. } | RuntimeError::Code { .. } => Some(
-                "no code of a lambda ends this process: run again with GLEANER_LOG=debug, and report what it prints"
+                "code of a lambda cannot end this process: run again with GLEANER_LOG=debug, and \
+                 report the output"
                     .to_owned(),
             ),
             RuntimeError::Start { .. } | RuntimeError::Read { .. } => None,
@@ -52,54 +60,53 @@ impl Explain for RuntimeError {
     }
 }
 
-/// What the runtime reports last.
+/// The last report of the runtime.
 #[derive(Debug)]
-pub(crate) enum Heard {
-    Summary(Box<Summary>),
+pub(crate) enum RuntimeResult {
+    Summary(Box<ReplaySummary>),
     Verified(Verified),
-    Checked(Box<Checked>),
+    Checked(Box<CheckReport>),
 }
 
-/// Runs the runtime on `lambda` with these arguments to its end. Returns its result and how it
-/// ended; no result if it has printed why there is none.
+/// Runs the runtime on `lambda` with these arguments. Returns its result and exit code; no result
+/// if it has printed an error instead.
 pub(crate) fn run(
     lambda: &Path,
     arguments: Vec<OsString>,
-) -> Result<(Option<Heard>, Exit), Failure> {
+) -> Result<(Option<RuntimeResult>, Exit), Failure> {
     let parts = Parts::find()?;
     let runtime = parts.program("gleaner-runtime")?;
     let shim = if has_worker(lambda) { None } else { Some(parts.program("gleaner-shim")?) };
     let bar = progress_bar();
     let mut child = start(shim, runtime, arguments)?;
-    // Both streams are heard on threads of their own: a lambda may leave processes behind that hold
-    // them open for ever.
+    // Both pipes are read by threads, since a lambda may leave processes running that hold them
+    // open forever.
     let explained = Arc::new(AtomicBool::new(false));
-    let says = child.stderr.take().map(|says| {
+    let errors = child.stderr.take().map(|stderr| {
         let (bar, explained) = (bar.clone(), explained.clone());
-        // While a bar is drawn, what the runtime says has to be put above it. Nobody is left to
-        // tell if standard error is gone.
+        // Messages are printed above the bar. An error of standard error itself cannot be reported.
         let show = move |piece: &[u8]| drop(bar.suspend(|| io::stderr().write_all(piece)));
-        Listener::start(move || pass_on(says, &explained, show))
+        PipeReader::start(move || pass_on(stderr, &explained, show))
     });
     let reports = child.stdout.take().map(|reports| {
         let bar = bar.clone();
-        Listener::start(move || follow(reports, &bar))
+        PipeReader::start(move || follow(reports, &bar))
     });
-    let heard = reports.and_then(|reports| reports.until_the_end_of(&mut child));
+    let reported = reports.and_then(|reports| reports.wait(&mut child));
     bar.finish_and_clear();
-    let result = heard.unwrap_or(Ok(None));
+    let result = reported.unwrap_or(Ok(None));
     if result.is_err() {
-        // Nobody listens to it any more. It may have ended meanwhile, which is as good.
+        // Its reports are no longer read. Killing fails if it has ended meanwhile.
         let _ = child.kill();
     }
     let status = child.wait().map_err(|source| RuntimeError::Read { source })?;
-    // The last it says is why it failed.
-    says.and_then(Listener::rest);
+    // Its last message is the cause of a failure.
+    errors.and_then(PipeReader::drain);
     let result = result?;
     match (result, status.code().and_then(Exit::from_code)) {
         (Some(result), Some(exit)) => Ok((Some(result), exit)),
         (Some(_), None) => Err(RuntimeError::Code { status }.into()),
-        // An exit code alone is not trusted: a lambda can end the process with any.
+        // An exit code alone is not trusted: a lambda can end the process with any code.
         (None, Some(exit)) if exit != Exit::Ok && explained.load(Ordering::Relaxed) => {
             Ok((None, exit))
         }
@@ -107,15 +114,14 @@ pub(crate) fn run(
     }
 }
 
-/// Whether nothing of the lambda runs in the process of `gleaner-runtime`, which starts a worker
-/// for it, below a shim: so it is for Python. Of a lambda that cannot be read, the runtime reports
-/// why.
+/// Returns whether the runtime starts a worker for the lambda, below a shim, as it does for Python.
+/// False if the manifest cannot be read, which the runtime reports.
 fn has_worker(lambda: &Path) -> bool {
     Manifest::load(BuildDir::of(lambda).path())
-        .is_ok_and(|manifest| manifest.lambda.kind == Kind::Python)
+        .is_ok_and(|manifest| manifest.lambda.kind == LambdaKind::Python)
 }
 
-/// Starts the runtime, below `shim` if the lambda runs in its process.
+/// Starts the runtime, below `shim` if the lambda runs in the runtime's process.
 fn start(
     shim: Option<PathBuf>,
     runtime: PathBuf,
@@ -135,15 +141,15 @@ fn start(
         .map_err(|source| RuntimeError::Start { program, source })
 }
 
-/// Reads the next report into `line`; `false` if there is none. What is longer than a report can be
-/// comes in pieces, which are none: a lambda's process writes here, too.
+/// Reads the next report into `line`; returns false at the end. A line beyond [`REPORT_BYTES`],
+/// which a lambda's process could write, comes in pieces that cannot be parsed.
 pub(crate) fn next_report(reports: &mut impl BufRead, line: &mut Vec<u8>) -> io::Result<bool> {
     line.clear();
     Ok(reports.take(REPORT_BYTES).read_until(b'\n', line)? > 0)
 }
 
-/// Reads reports up to the result, which is the last; `None` if they end before.
-fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, RuntimeError> {
+/// Reads reports up to the result, which is the last; `None` if there is no result.
+fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<RuntimeResult>, RuntimeError> {
     let mut reports = BufReader::new(reports);
     let mut line = Vec::new();
     while next_report(&mut reports, &mut line).map_err(|source| RuntimeError::Read { source })? {
@@ -154,10 +160,10 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, Runtim
                 }
                 bar.set_position(done);
             }
-            Ok(Report::Summary(summary)) => return Ok(Some(Heard::Summary(summary))),
-            Ok(Report::Checked(checked)) => return Ok(Some(Heard::Checked(checked))),
-            Ok(Report::Verified(verified)) => return Ok(Some(Heard::Verified(verified))),
-            // Of a replay that makes several passes; and what is only reported live.
+            Ok(Report::Summary(summary)) => return Ok(Some(RuntimeResult::Summary(summary))),
+            Ok(Report::Checked(checked)) => return Ok(Some(RuntimeResult::Checked(checked))),
+            Ok(Report::Verified(verified)) => return Ok(Some(RuntimeResult::Verified(verified))),
+            // Reports of several passes, and live reports.
             Ok(_) => {}
             Err(source) => {
                 let start = line.trim_ascii_end();
@@ -170,25 +176,25 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<Heard>, Runtim
     Ok(None)
 }
 
-/// Gives lines to `show`, and notes in `explained` that one of them says why the runtime failed.
-pub(crate) fn pass_on(says: impl Read, explained: &AtomicBool, mut show: impl FnMut(&[u8])) {
-    each_piece(says, |piece| {
+/// Passes lines to `show`, and sets `explained` if one of them is an error message.
+pub(crate) fn pass_on(stderr: impl Read, explained: &AtomicBool, mut show: impl FnMut(&[u8])) {
+    each_piece(stderr, |piece| {
         if piece.is_failure() {
             explained.store(true, Ordering::Relaxed);
         }
-        show(fit_to_print(piece.bytes).as_bytes());
+        show(escaped(piece.bytes).as_bytes());
     });
 }
 
-/// With what a terminal would act on written out.
-fn fit_to_print(piece: &[u8]) -> String {
+/// Escapes control characters, except tabs and the line end.
+fn escaped(piece: &[u8]) -> String {
     let text = String::from_utf8_lossy(piece);
     let (words, end) = text.strip_suffix('\n').map_or((&*text, ""), |words| (words, "\n"));
     words.split('\t').map(visible).collect::<Vec<_>>().join("\t") + end
 }
 
 fn progress_bar() -> ProgressBar {
-    // Hidden by itself where standard error is no terminal.
+    // indicatif hides the bar if standard error is not a terminal.
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
     let style = "{bar:30} {percent:>3} %  {human_pos} of {human_len} messages, {eta} left";
     bar.with_style(
@@ -211,7 +217,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_the_runtime_says_is_passed_on_line_by_line_and_to_the_end() {
+    fn messages_of_the_runtime_are_passed_on_line_by_line_to_the_end() {
         let long = "x".repeat(10_000);
         let mut shown = Vec::new();
         let text = format!("one\n{long}\nno line end");
@@ -221,7 +227,7 @@ mod tests {
         assert!(shown.iter().all(|piece| piece.len() <= 8192));
     }
 
-    /// Reports that begin with `text` and go on for ever; counts what was read of them.
+    /// A stream that begins with `text` and never ends; counts the bytes read.
     struct Endless<'a> {
         text: &'a [u8],
         read: u64,
@@ -229,7 +235,7 @@ mod tests {
 
     impl Read for Endless<'_> {
         fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
-            assert!(self.read < 4 * REPORT_BYTES, "what has no end is held");
+            assert!(self.read < 4 * REPORT_BYTES, "an endless line is held in memory");
             let n = match self.text.read(into)? {
                 0 => io::repeat(b'x').read(into)?,
                 n => n,
@@ -240,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn a_report_without_an_end_is_refused_and_not_held() {
+    fn an_endless_report_is_refused_and_not_held_in_memory() {
         let bar = ProgressBar::hidden();
         let progress = "{\"report\":\"progress\",\"done\":1,\"total\":2,\"at_ns\":0}\n";
         for text in ["", "\"", progress] {
@@ -252,20 +258,20 @@ mod tests {
     }
 
     #[test]
-    fn nothing_that_is_passed_on_acts_on_a_terminal() {
-        for (said, shown) in [
+    fn control_characters_of_messages_are_escaped() {
+        for (text, shown) in [
             ("plain\ttext, ä\n", "plain\ttext, ä\n"),
             ("\u{1b}]0;owned\u{7}\n", "\\u{1b}]0;owned\\u{7}\n"),
             ("back\rover", "back\\rover"),
             ("\u{202e}turned", "\\u{202e}turned"),
         ] {
-            assert_eq!(fit_to_print(said.as_bytes()), shown);
+            assert_eq!(escaped(text.as_bytes()), shown);
         }
-        assert_eq!(fit_to_print(b"\xffbroken\n"), "\u{fffd}broken\n");
+        assert_eq!(escaped(b"\xffbroken\n"), "\u{fffd}broken\n");
     }
 
     #[test]
-    fn only_a_line_that_begins_as_a_failure_explains_an_exit_code() {
+    fn only_a_line_that_begins_with_error_explains_an_exit_code() {
         let inside = format!("{}error: x", "y".repeat(8192));
         for (text, expected) in [
             ("error: x", true),

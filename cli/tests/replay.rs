@@ -1,4 +1,4 @@
-//! `gleaner replay` as it is started by people, with a runtime that is a script.
+//! Tests of the program `gleaner replay` with a script as runtime.
 #![cfg(unix)]
 
 use std::fs;
@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::process::{self, Command, Output, Stdio};
 use std::sync::{Mutex, PoisonError};
 
-use gleaner_protocol::Summary;
+use gleaner_protocol::ReplaySummary;
 
 const SUMMARY: &str = concat!(
     r#"{"lambda":"x","version":"0.1.0","kind":"wasm","drive":["a.mcap"],"out":"OUT","wakes":2,"triggers":1,"faults":0,"#,
@@ -19,11 +19,11 @@ const DECISION: &str = concat!(
     r#""triggers":[{"kind":"event","label":"seen","score":0.5,"attributes":{}}],"fault":null,"fuel":1,"run_ns":2}"#
 );
 
-/// Linux refuses to start a file that is open for writing anywhere, be it in the child that another
-/// test is about to start. Who writes a program, and who starts one, takes turns.
-static TURN: Mutex<()> = Mutex::new(());
+/// Linux refuses to start a file that is open for writing anywhere, such as in a child that another
+/// test is about to start. The lock serialises writing and starting programs.
+static EXEC_LOCK: Mutex<()> = Mutex::new(());
 
-/// A folder with `gleaner-runtime`, removed when the test ends.
+/// A folder with a script `gleaner-runtime`, removed when the test ends.
 struct Installation(PathBuf);
 
 impl Installation {
@@ -38,7 +38,7 @@ impl Installation {
         fs::write(folder.join("summary.json"), SUMMARY).unwrap();
         fs::write(folder.join("log.jsonl"), "").unwrap();
         fs::write(folder.join("decisions.jsonl"), format!("{DECISION}\n")).unwrap();
-        let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+        let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
         fs::write(&program, format!("#!/bin/sh\ncd '{}'\n{runtime}\n", folder.display())).unwrap();
         fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
         Installation(folder)
@@ -46,7 +46,7 @@ impl Installation {
 
     fn command(&self, arguments: &[&str]) -> Command {
         let mut gleaner = Command::new(env!("CARGO_BIN_EXE_gleaner"));
-        // What a runtime reports says what happened, and not where.
+        // The folder is given here, since `gleaner` does not use the path in the summary.
         gleaner
             .args(["replay", "dir", "a.mcap", "--out"])
             .arg(&self.0)
@@ -67,9 +67,9 @@ impl Drop for Installation {
 }
 
 fn output(command: &mut Command) -> Output {
-    let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     let child = command.stdin(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-    drop(turn);
+    drop(lock);
     child.wait_with_output().unwrap()
 }
 
@@ -96,15 +96,15 @@ fn json_is_the_summary_alone() {
     let expected = SUMMARY.replace("OUT", installation.0.to_str().unwrap());
     let line = text(&output.stdout);
     assert!(line.ends_with("}\n") && line.lines().count() == 1, "{line}");
-    // Counts that an older runtime does not have are 0.
+    // Counts that an older runtime lacks are 0.
     assert_eq!(
-        serde_json::from_str::<Summary>(line).unwrap(),
-        serde_json::from_str::<Summary>(&expected).unwrap()
+        serde_json::from_str::<ReplaySummary>(line).unwrap(),
+        serde_json::from_str::<ReplaySummary>(&expected).unwrap()
     );
 }
 
 #[test]
-fn a_replay_leaves_a_report_and_says_where() {
+fn a_replay_writes_a_report_and_prints_its_path() {
     let installation = Installation::new("page", "cat report");
     let page = installation.0.join("report.html");
     let output = installation.replay(&[]);
@@ -117,7 +117,7 @@ fn a_replay_leaves_a_report_and_says_where() {
     fs::remove_file(&page).unwrap();
     installation.replay(&["--json"]);
     assert!(page.exists());
-    // One that is not of this replay does not stay.
+    // A report of an earlier replay is removed.
     let output = installation.replay(&["--no-report"]);
     assert!(!page.exists() && !text(&output.stdout).contains("  report: "));
 }
@@ -127,17 +127,17 @@ fn a_report_that_cannot_be_written_is_an_error_beside_the_results() {
     let installation = Installation::new("no-page", "cat report; exit 6");
     fs::create_dir(installation.0.join("report.html")).unwrap();
     let output = installation.replay(&[]);
-    assert_eq!(output.status.code(), Some(6), "the replay's own");
-    let said = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(6), "the exit code of the runtime");
+    let stderr = text(&output.stderr);
     assert!(
-        said.starts_with("error: cannot write the report") && said.contains("  help:  "),
-        "{said}"
+        stderr.starts_with("error: cannot write the report") && stderr.contains("  help:  "),
+        "{stderr}"
     );
     assert!(text(&output.stdout).contains("seen") && !text(&output.stdout).contains("  report: "));
 }
 
 #[test]
-fn the_runtimes_exit_code_and_what_it_says_are_passed_on() {
+fn exit_code_and_messages_of_the_runtime_are_passed_on() {
     let output = Installation::new("fails", "echo 'error: no such drive' >&2; exit 2").replay(&[]);
     assert_eq!(output.status.code(), Some(2));
     assert_eq!(text(&output.stderr), "error: no such drive\n");
@@ -147,22 +147,22 @@ fn the_runtimes_exit_code_and_what_it_says_are_passed_on() {
 }
 
 #[test]
-fn a_runtime_that_is_killed_has_a_cause_of_its_own() {
+fn a_killed_runtime_is_reported_with_help() {
     let output = Installation::new("killed", "kill -9 $$").replay(&[]);
     assert_eq!(output.status.code(), Some(1));
-    let said = text(&output.stderr);
-    assert!(said.starts_with(
+    let stderr = text(&output.stderr);
+    assert!(stderr.starts_with(
         "error: gleaner-runtime ended without a result (signal: 9 (SIGKILL))\n  help:  the "
     ));
-    assert!(said.contains("dmesg"), "{said}");
+    assert!(stderr.contains("dmesg"), "{stderr}");
 }
 
-/// What a lambda may leave running: it holds the stream of reports, notes if it lived to its end,
-/// and ends early once the test has removed the folder.
+/// A process that a lambda leaves running: it holds the pipe of reports open, creates `waited` at
+/// its end, and ends early when the test has removed the folder.
 const ORPHAN: &str = "(n=0; while [ -e report ] && [ $n -lt 300 ]; do sleep 0.1; n=$((n+1)); done; touch waited) 2>/dev/null &";
 
 #[test]
-fn what_a_lambda_leaves_running_does_not_hold_up_the_summary() {
+fn a_process_left_running_does_not_delay_the_summary() {
     let installation = Installation::new("orphan", &format!("{ORPHAN} cat report"));
     let output = installation.replay(&[]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
@@ -171,7 +171,7 @@ fn what_a_lambda_leaves_running_does_not_hold_up_the_summary() {
 }
 
 #[test]
-fn what_a_lambda_leaves_running_does_not_hold_up_a_failure() {
+fn a_process_left_running_does_not_delay_a_failure() {
     let installation =
         Installation::new("orphan-fails", &format!("{ORPHAN} echo error: no >&2; exit 5"));
     assert_eq!(installation.replay(&[]).status.code(), Some(5));
@@ -180,28 +180,30 @@ fn what_a_lambda_leaves_running_does_not_hold_up_a_failure() {
 
 #[test]
 fn a_runtime_of_another_version_is_stopped() {
-    // It would go on for ever.
+    // The script never ends.
     let output = Installation::new("version", r#"while echo '{"report":"weather"}'; do :; done"#)
         .replay(&[]);
     assert_eq!(output.status.code(), Some(1));
-    assert!(text(&output.stderr).contains("install gleaner and gleaner-runtime of one version"));
+    assert!(
+        text(&output.stderr).contains("install the same version of gleaner and gleaner-runtime")
+    );
 }
 
 #[test]
-fn an_exit_code_that_nothing_explains_is_not_trusted() {
-    // As `os._exit` of a lambda ends the process, whatever the lambda wrote before.
-    for (code, said) in
+fn an_exit_code_without_an_error_message_is_not_trusted() {
+    // A lambda can end the process with `os._exit` after any output.
+    for (code, stderr) in
         [(0, ""), (3, ""), (6, ""), (3, "warning: an error: is near\n"), (101, "error: x\n")]
     {
-        let test = format!("unexplained-{code}-{}", said.len());
+        let test = format!("unexplained-{code}-{}", stderr.len());
         let output =
-            Installation::new(&test, &format!("printf '{said}' >&2; exit {code}")).replay(&[]);
+            Installation::new(&test, &format!("printf '{stderr}' >&2; exit {code}")).replay(&[]);
         assert_eq!(output.status.code(), Some(1));
         let ended = format!(
-            "error: gleaner-runtime ended without a result (exit status: {code})\n  help:  no code of a lambda "
+            "error: gleaner-runtime ended without a result (exit status: {code})\n  help:  code of a lambda "
         );
         assert!(
-            text(&output.stderr).starts_with(&format!("{said}{ended}")),
+            text(&output.stderr).starts_with(&format!("{stderr}{ended}")),
             "{}",
             text(&output.stderr)
         );
@@ -219,12 +221,12 @@ fn a_crash_names_its_signal() {
     );
 }
 
-/// Runs `gleaner` with arguments that name the folder of `installation` as OUT.
+/// Runs `gleaner` with these arguments; `OUT` stands for the folder of `installation`.
 fn with_out(installation: &Installation, arguments: &[&str]) -> Output {
     let out = installation.0.to_str().unwrap();
     let arguments =
         arguments.iter().map(|argument| if *argument == "OUT" { out } else { *argument });
-    // Seconds after which it counts as one that waits for ever; it takes some milliseconds.
+    // A generous limit for a command that takes some milliseconds.
     let mut gleaner = Command::new("timeout");
     output(
         gleaner
@@ -236,7 +238,7 @@ fn with_out(installation: &Installation, arguments: &[&str]) -> Output {
 }
 
 #[test]
-fn results_without_an_end_are_refused_with_their_name_and_bound() {
+fn oversized_results_are_refused_with_their_name_and_bound() {
     let commands: [&[&str]; 3] = [
         &["report", "OUT"],
         &["diff", "OUT", "OUT"],
@@ -255,24 +257,24 @@ fn results_without_an_end_are_refused_with_their_name_and_bound() {
         );
         let refused = format!("cause: it has 1099511627776 bytes; at most {bound} are read");
         let shown = installation.replay(&[]);
-        let said = text(&shown.stderr);
-        // What is not in the report that was asked for is missing.
-        assert_eq!(shown.status.code(), Some(1), "{said}");
-        assert!(said.contains(name) && said.contains(&refused), "{name}: {said}");
+        let stderr = text(&shown.stderr);
+        // The replay fails, since its report is incomplete.
+        assert_eq!(shown.status.code(), Some(1), "{stderr}");
+        assert!(stderr.contains(name) && stderr.contains(&refused), "{name}: {stderr}");
         for arguments in refusing {
             let output = with_out(&installation, arguments);
-            let said = text(&output.stderr);
-            assert_eq!(output.status.code(), Some(2), "{arguments:?}: {said}");
+            let stderr = text(&output.stderr);
+            assert_eq!(output.status.code(), Some(2), "{arguments:?}: {stderr}");
             assert!(
-                said.contains(name) && said.contains(&refused) && said.contains("help:"),
-                "{arguments:?}: {said}"
+                stderr.contains(name) && stderr.contains(&refused) && stderr.contains("help:"),
+                "{arguments:?}: {stderr}"
             );
         }
     }
 }
 
 #[test]
-fn results_of_others_are_not_shown_as_those_of_a_run() {
+fn linked_results_are_not_shown() {
     let other = "the log of another lambda";
     for name in ["log.jsonl", "decisions.jsonl", "summary.json"] {
         let installation = Installation::new(
@@ -282,11 +284,13 @@ fn results_of_others_are_not_shown_as_those_of_a_run() {
         let page = installation.0.join("report.html");
         installation.replay(&[]);
         let output = with_out(&installation, &["report", "OUT"]);
-        let said = text(&output.stderr);
-        assert_eq!(output.status.code(), Some(2), "{said}");
+        let stderr = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{stderr}");
         assert!(
-            said.contains(name) && said.contains("cause: it is a link") && !said.contains(other),
-            "{said}"
+            stderr.contains(name)
+                && stderr.contains("cause: it is a link")
+                && !stderr.contains(other),
+            "{stderr}"
         );
         assert!(!page.exists(), "{name}");
     }
@@ -294,7 +298,7 @@ fn results_of_others_are_not_shown_as_those_of_a_run() {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn an_output_that_takes_nothing_is_a_failure() {
+fn a_failing_standard_output_is_an_error() {
     let installation = Installation::new("full", "cat report");
     for arguments in [&[][..], &["--json"]] {
         let full = fs::File::options().write(true).open("/dev/full").unwrap();

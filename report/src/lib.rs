@@ -1,26 +1,28 @@
-//! The results of a run, for people: read from the folder that a replay or a live run wrote to,
-//! compared with those of another, and made a page of.
+//! Reads the results of a replay or a live run, compares two runs, and makes the report page.
 //!
-//! - [`Page`] is `report.html`: what a lambda did, when, why, what it missed and what it cost, in
-//!   one file that needs nothing else.
-//! - [`Diff`] is what differs between two runs, decision by decision.
-//! - [`Decisions`], [`JsonLines`] and [`clips`] read a file line by line; [`words`] has the form of
+//! - [`ReportPage`] is `report.html`: decisions, their causes, losses and cost, in one
+//!   self-contained file.
+//! - [`Diff`] holds the differences between two runs, decision by decision.
+//! - [`Decisions`], [`JsonLines`] and [`clips`] read a file line by line; [`mod@format`] formats
 //!   times, sizes and scores.
 //!
-//! Only the folders that a caller names are read, and nothing is written or printed: a caller
-//! stores the page and shows the differences. The files may have been written by others. Lines are
-//! read one by one, each list has a bound and says what is beyond it, links and pipes are refused.
+//! This crate reads only the folders that the caller names, and writes and prints nothing: the
+//! caller stores the page and shows the differences. The files are untrusted. Lines are read one by
+//! one, each list is bounded and counts its omitted items, links and pipes are refused.
 //!
-//! Instants are in ns as the drive has them, `_ns` in their name; `t`, `from` and `to` are in s
-//! after the start of the drive.
+//! Names ending in `_ns` are instants in ns as in the drive; `t`, `from` and `to` are in s after
+//! the start of the drive.
 
 mod diff;
+pub mod format;
 mod page;
 mod results;
 mod run_summary;
-pub mod words;
 
-pub use diff::{Change, Cost, Diff, DiffError, Difference, Is, Of, Side, Tally};
-pub use page::Page;
+pub use diff::{
+    ChangeCounts, ChangeKind, ComparedRun, Cost, Diff, DiffError, Difference, DifferenceKind,
+    ValueChange,
+};
+pub use page::ReportPage;
 pub use results::{Decisions, JsonLines, ResultsError, clips};
 pub use run_summary::{FileError, OutputError};

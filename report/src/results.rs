@@ -1,8 +1,7 @@
-//! The JSON lines in a folder of results: `decisions.jsonl`, `clips.jsonl` and what else has a line
-//! for each thing.
+//! Reads the JSON lines files of a run: `decisions.jsonl`, `clips.jsonl`, `log.jsonl`.
 //!
-//! Nothing is written here, and no file is held in memory as a whole: `decisions.jsonl` may have a
-//! line per wake.
+//! Files are read line by line, since `decisions.jsonl` may have a line per wake. Nothing is
+//! written.
 
 use std::io::{self, BufRead, BufReader, Read};
 use std::marker::PhantomData;
@@ -13,7 +12,7 @@ use gleaner_lambda::results::{LINE_MAX, LINES_MAX};
 use gleaner_lambda::{Clip, Decision};
 use serde::de::DeserializeOwned;
 
-/// Why results cannot be read.
+/// Errors of [`JsonLines`].
 #[derive(Debug, thiserror::Error)]
 pub enum ResultsError {
     /// A file cannot be read.
@@ -21,20 +20,20 @@ pub enum ResultsError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: io::Error,
     },
-    /// A line is no decision, or no clip.
-    #[error("`{}`, line {line}, is not what a replay writes", path.display())]
+    /// A line is not a decision, clip or log line.
+    #[error("`{}`, line {line}, is not a line that gleaner writes", path.display())]
     Line {
         /// The file.
         path: PathBuf,
         /// The line, from 1.
         line: usize,
-        /// Why not.
+        /// The cause.
         source: serde_json::Error,
     },
-    /// A line is longer than any that Gleaner writes.
+    /// A line is longer than Gleaner writes any.
     #[error("`{}`, line {line}, is longer than {LINE_MAX}", path.display())]
     Long {
         /// The file.
@@ -47,7 +46,7 @@ pub enum ResultsError {
 impl Explain for ResultsError {
     fn help(&self) -> Option<String> {
         Some(
-            "replay again; nothing else may write into the folder of the results meanwhile"
+            "replay again, and let no other program write into the result folder meanwhile"
                 .to_owned(),
         )
     }
@@ -57,24 +56,24 @@ impl Explain for ResultsError {
     }
 }
 
-/// A file of JSON lines, read one by one. After a line that cannot be used the next one follows;
-/// after one that is too long none, since a sparse file is one line without an end; and after a
-/// file that cannot be read, none.
+/// Iterates over the values of a JSON lines file. It continues after a line that cannot be parsed.
+/// It ends after a line that is too long, since a sparse file is one endless line, and after a read
+/// error.
 #[derive(Debug)]
 pub struct JsonLines<T> {
     path: PathBuf,
-    /// `None` once it could not be read.
+    /// `None` after a read error or a line that is too long.
     reader: Option<BufReader<PlainFile>>,
     text: Vec<u8>,
     line: usize,
-    of: PhantomData<T>,
+    value: PhantomData<T>,
 }
 
 /// The decisions of a replay, in the order of its wakes.
 pub type Decisions = JsonLines<Decision>;
 
 impl Decisions {
-    /// The decisions in `out/decisions.jsonl`.
+    /// Opens `out/decisions.jsonl`.
     ///
     /// # Errors
     ///
@@ -84,7 +83,7 @@ impl Decisions {
     }
 }
 
-/// The clips in `out/clips.jsonl`, in the order in which they were finished.
+/// Reads the clips of `out/clips.jsonl`, in the order of their completion.
 ///
 /// # Errors
 ///
@@ -94,7 +93,7 @@ pub fn clips(out: &Path) -> Result<Vec<Clip>, ResultsError> {
 }
 
 impl<T> JsonLines<T> {
-    /// The lines of the file `path`, each a JSON value.
+    /// Opens the file `path`, whose lines are JSON values.
     ///
     /// # Errors
     ///
@@ -106,7 +105,7 @@ impl<T> JsonLines<T> {
                 reader: Some(BufReader::new(file)),
                 text: Vec::new(),
                 line: 0,
-                of: PhantomData,
+                value: PhantomData,
             }),
             Err(source) => Err(ResultsError::Read { path, source }),
         }
@@ -133,8 +132,8 @@ impl<T> JsonLines<T> {
 }
 
 impl<T: DeserializeOwned> JsonLines<T> {
-    /// The same, each with the bytes of its line.
-    pub(crate) fn weighed(mut self) -> impl Iterator<Item = Result<(T, usize), ResultsError>> {
+    /// Returns the values with the sizes of their lines, in bytes.
+    pub(crate) fn with_sizes(mut self) -> impl Iterator<Item = Result<(T, usize), ResultsError>> {
         std::iter::from_fn(move || Some(self.next()?.map(|value| (value, self.text.len()))))
     }
 }
@@ -159,7 +158,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_that_cannot_be_used_is_named_and_the_next_one_follows_unless_it_is_too_long() {
+    fn reading_continues_after_a_bad_line_but_not_after_one_that_is_too_long() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("decisions.jsonl");
         let long = "1".repeat(LINE_MAX.bytes() as usize + 1);
@@ -173,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_without_an_end_is_refused_or_ends_with_its_first_line_without_one() {
+    fn a_sparse_file_is_refused_or_ends_with_its_first_line() {
         let folder = tempfile::tempdir().unwrap();
         let sparse = |bytes| {
             let file = std::fs::File::create(folder.path().join("decisions.jsonl")).unwrap();
@@ -192,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pipe_or_a_link_in_the_place_of_results_is_refused() {
+    fn a_pipe_or_a_link_in_place_of_results_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let [decisions, clips_list] =
             ["decisions.jsonl", "clips.jsonl"].map(|name| folder.path().join(name));
@@ -201,7 +200,7 @@ mod tests {
         std::os::unix::fs::symlink("other", &clips_list).unwrap();
         let errors = [Decisions::open(folder.path()).err(), clips(folder.path()).err()];
         for (error, said) in errors.into_iter().zip([
-            "decisions.jsonl`\n  cause: it is no file",
+            "decisions.jsonl`\n  cause: it is not a regular file",
             "clips.jsonl`\n  cause: it is a link",
         ]) {
             let text = gleaner_base::Failure::from(error.unwrap()).to_string();

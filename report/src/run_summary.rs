@@ -1,5 +1,4 @@
-//! What the files of an output tell as a whole: `summary.json` of a replay or of a live run, and
-//! `signals.json`.
+//! Reads `summary.json` of a replay or of a live run, and `signals.json`.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -7,53 +6,54 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{ByteSize, Exit, Explain, NotPlain, PlainFile};
-use gleaner_lambda::manifest::{ConfigValue, Kind};
+use gleaner_lambda::manifest::{ConfigValue, LambdaKind};
 use gleaner_lambda::results::{SIGNALS_MAX, SUMMARY_MAX};
 use gleaner_lambda::signals::{Curve, Signals};
 use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
-use gleaner_protocol::{Live, Recording, Summary};
+use gleaner_protocol::{LiveStatus, RecordingCounts, ReplaySummary};
 use serde::de::DeserializeOwned;
 
+use crate::format::cut;
 use crate::results::ResultsError;
-use crate::words::cut;
 
-/// Most topics of a summary, and drives of it: a lambda has fewer, but the file may be by others.
-/// Most characters of their names, and of what else a summary says in a word.
+/// Maximum number of topics in a summary. A lambda has fewer, but the file is untrusted.
 const TOPICS_MAX: usize = 256;
+/// Maximum number of drives in a summary.
 const DRIVES_MAX: usize = 50;
+/// Maximum number of characters of a name.
 const NAME_CHARS: usize = 300;
-/// Most values of a config.
+/// Maximum number of config values.
 const CONFIG_MAX: usize = 200;
-/// Most characters of why something is not whole.
+/// Maximum number of characters of a reason or an error.
 const WHY_CHARS: usize = 2_000;
 
-/// Why a folder is no output.
+/// Errors of reading a result folder.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
     /// It has no `summary.json`.
-    #[error("`{}` holds no results", out.display())]
+    #[error("`{}` does not hold results", out.display())]
     None {
         /// The folder.
         out: PathBuf,
-        /// Folders in it that hold results.
+        /// Subfolders that hold results.
         inside: Vec<PathBuf>,
-        /// Why not.
+        /// The cause.
         source: FileError,
     },
-    /// Its `summary.json` or `signals.json` is none of ours.
-    #[error("`{}` is not what gleaner writes", path.display())]
-    Summary {
+    /// Its `summary.json` or `signals.json` is not a file of Gleaner.
+    #[error("`{}` was not written by gleaner", path.display())]
+    Invalid {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: FileError,
     },
-    /// A file of lines that no run of ours has left so.
+    /// A JSON lines file that no run of Gleaner has written.
     #[error(transparent)]
     Lines(#[from] ResultsError),
 }
 
-/// Why a file of an output cannot be used.
+/// Errors of reading `summary.json` or `signals.json`.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
     /// It cannot be opened or read.
@@ -61,22 +61,22 @@ pub enum FileError {
     Read {
         /// Its name in the folder.
         name: &'static str,
-        /// Why not.
+        /// The cause.
         source: io::Error,
     },
-    /// It is no JSON, or other JSON than ours.
-    #[error("`{name}` cannot be understood")]
+    /// It is not JSON, or lacks keys.
+    #[error("cannot parse `{name}`")]
     Json {
         /// Its name in the folder.
         name: &'static str,
-        /// Why not.
+        /// The cause.
         source: serde_json::Error,
     },
 }
 
 impl FileError {
-    /// Whether it is a link or a pipe, or too long: no run leaves such a file.
-    fn is_no_result(&self) -> bool {
+    /// Returns whether the file is a link or a pipe, or too long. No run writes such a file.
+    fn is_suspicious(&self) -> bool {
         matches!(self, Self::Read { source, .. } if NotPlain::of(source).is_some())
     }
 
@@ -89,15 +89,17 @@ impl Explain for OutputError {
     fn help(&self) -> Option<String> {
         Some(match self {
             Self::None { inside, .. } if !inside.is_empty() => {
-                let names: Vec<_> = inside.iter().map(|folder| format!("`{}`", folder.display())).collect();
-                format!("name a folder inside of it: {}", names.join(", "))
+                let names: Vec<_> =
+                    inside.iter().map(|folder| format!("`{}`", folder.display())).collect();
+                format!("name one of its subfolders: {}", names.join(", "))
             }
             Self::None { .. } => {
-                "name the folder that `gleaner replay` or `gleaner run` wrote to; it has a summary.json once they have ended"
+                "name the result folder of `gleaner replay` or `gleaner run`; it has a \
+                 summary.json when they have ended"
                     .to_owned()
             }
             Self::Lines(error) => return error.help(),
-            Self::Summary { .. } => "replay again, with the gleaner that is to read it".to_owned(),
+            Self::Invalid { .. } => "replay again with this version of gleaner".to_owned(),
         })
     }
 
@@ -106,36 +108,36 @@ impl Explain for OutputError {
     }
 }
 
-/// What a run did as a whole.
+/// `summary.json` of a run.
 #[derive(Debug)]
 pub(crate) enum RunSummary {
-    /// It was a replay.
-    Replay(Box<Summary>),
-    /// It was live.
-    Live(Box<Live>),
+    /// Of a replay.
+    Replay(Box<ReplaySummary>),
+    /// Of a live run.
+    Live(Box<LiveStatus>),
 }
 
-/// A topic's samples, by what became of them.
+/// Numbers of samples of an input, received and lost.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
-pub(crate) struct Losses {
+pub(crate) struct TopicCounts {
     pub(crate) input: String,
     pub(crate) topic: String,
     pub(crate) type_name: String,
     pub(crate) received: u64,
-    /// Before they reached us; `None` if nobody knows.
+    /// Lost upstream; `None` if unknown.
     pub(crate) lost: Option<u64>,
     pub(crate) no_slot: u64,
     pub(crate) too_big: u64,
     /// Live only.
     pub(crate) malformed: Option<u64>,
-    /// Pushed out by newer ones: how a ring works, and no loss.
+    /// Evicted from the ring by newer samples. That is no loss.
     pub(crate) overwritten: u64,
 }
 
 impl RunSummary {
     /// Reads `out/summary.json`.
     fn of(out: &Path) -> Result<Self, OutputError> {
-        let text = match bounded(out, "summary.json", SUMMARY_MAX) {
+        let text = match read_bounded(out, "summary.json", SUMMARY_MAX) {
             Ok(text) => text,
             Err(source) if source.is_absent() => {
                 return Err(OutputError::None {
@@ -145,33 +147,33 @@ impl RunSummary {
                 });
             }
             Err(source) => {
-                return Err(OutputError::Summary { path: out.join("summary.json"), source });
+                return Err(OutputError::Invalid { path: out.join("summary.json"), source });
             }
         };
-        // The two are told apart by a key that only one of them has, so that what is wrong with a
-        // summary is said of the right one.
+        // A key that only live summaries have decides, so that parse errors are about the right
+        // type.
         let is_live = serde_json::from_slice::<serde_json::Value>(&text)
             .is_ok_and(|value| value.get("up_s").is_some());
-        let told = if is_live {
+        let summary = if is_live {
             parsed("summary.json", &text).map(Self::Live)
         } else {
             parsed("summary.json", &text).map(Self::Replay)
         };
-        told.map_err(|source| OutputError::Summary { path: out.join("summary.json"), source })
+        summary.map_err(|source| OutputError::Invalid { path: out.join("summary.json"), source })
     }
 
-    /// As `of`, within what a page has room for. What is left out is said in `notes`.
+    /// As `of`, cut to what fits on a page. Adds to `notes` what is omitted.
     pub(crate) fn bounded(out: &Path, notes: &mut Vec<String>) -> Result<Self, OutputError> {
-        let mut told = Self::of(out)?;
-        let mut left_out = |what: &str, found: usize, most: usize| {
-            if found > most {
-                notes.push(format!("`summary.json`: {} of {found} {what} left out", found - most));
+        let mut run = Self::of(out)?;
+        let mut note_omitted = |what: &str, found: usize, max: usize| {
+            if found > max {
+                notes.push(format!("`summary.json`: {} of {found} {what} omitted", found - max));
             }
         };
-        match &mut told {
+        match &mut run {
             Self::Replay(summary) => {
-                left_out("drives", summary.drive.len(), DRIVES_MAX);
-                left_out("topics", summary.topics.len(), TOPICS_MAX);
+                note_omitted("drives", summary.drive.len(), DRIVES_MAX);
+                note_omitted("topics", summary.topics.len(), TOPICS_MAX);
                 summary.drive.truncate(DRIVES_MAX);
                 summary
                     .drive
@@ -186,7 +188,7 @@ impl RunSummary {
                 shorten(names.chain([&mut summary.lambda, &mut summary.version]));
             }
             Self::Live(live) => {
-                left_out("topics", live.topics.len(), TOPICS_MAX);
+                note_omitted("topics", live.topics.len(), TOPICS_MAX);
                 live.topics.truncate(TOPICS_MAX);
                 let topics = live.topics.iter_mut();
                 let names = topics.flat_map(|topic| {
@@ -197,11 +199,11 @@ impl RunSummary {
                 shorten(names.chain([&mut live.lambda, &mut live.version]));
             }
         }
-        Ok(told)
+        Ok(run)
     }
 
     /// Name, version and kind of the lambda.
-    pub(crate) fn lambda(&self) -> (&str, &str, Kind) {
+    pub(crate) fn lambda(&self) -> (&str, &str, LambdaKind) {
         match self {
             Self::Replay(summary) => (&summary.lambda, &summary.version, summary.kind),
             Self::Live(live) => (&live.lambda, &live.version, live.kind),
@@ -217,69 +219,69 @@ impl RunSummary {
         [("wakes", wakes), ("triggers", triggers), ("faults", faults)]
     }
 
-    /// What did not happen or was thrown away, beside samples of topics.
+    /// Counts of losses and omissions, except samples of topics.
     pub(crate) fn missed(&self) -> Vec<(&'static str, u64)> {
-        let shared = |skipped, ticks, log, refused, passed| {
+        let shared = |skipped, ticks, log, refused, backed_off| {
             vec![
-                ("event samples that woke nobody", skipped),
+                ("event samples skipped", skipped),
                 ("ticks missed", ticks),
                 ("log lines over the rate limit", log),
                 ("triggers refused, over `events_per_minute`", refused),
-                ("wakes passed over after repeated faults", passed),
+                ("wakes backed off after repeated faults", backed_off),
             ]
         };
         match self {
-            Self::Replay(told) => {
+            Self::Replay(summary) => {
                 let mut counts = shared(
-                    told.skipped,
-                    told.missed_ticks,
-                    told.log_dropped,
-                    told.triggers_refused,
-                    told.backed_off,
+                    summary.skipped,
+                    summary.missed_ticks,
+                    summary.log_dropped,
+                    summary.triggers_refused,
+                    summary.backed_off,
                 );
-                counts.push(("messages out of order in the drive", told.out_of_order));
-                counts.extend(by_cause(&told.recording));
+                counts.push(("messages out of order in the drive", summary.out_of_order));
+                counts.extend(by_cause(&summary.recording));
                 counts
             }
-            Self::Live(told) => {
+            Self::Live(live) => {
                 let mut counts = shared(
-                    told.skipped,
-                    told.missed_ticks,
-                    told.log_dropped,
-                    told.triggers_refused,
-                    told.backed_off,
+                    live.skipped,
+                    live.missed_ticks,
+                    live.log_dropped,
+                    live.triggers_refused,
+                    live.backed_off,
                 );
-                counts.push(("decisions and log lines not written", told.unwritten));
-                counts.push(("messages not sent, of `--rtt` and `--decisions`", told.unsent));
-                counts.push(("datagrams dropped by full sockets", told.network.socket_drops));
-                counts.push(("hostile datagrams dropped", told.network.filtered));
-                counts.extend(told.recorder.iter().flat_map(|recorder| {
+                counts.push(("decisions and log lines not written", live.unwritten));
+                counts.push(("messages not sent, of `--rtt` and `--decisions`", live.unsent));
+                counts.push(("datagrams dropped, socket buffer full", live.network.socket_drops));
+                counts.push(("hostile datagrams dropped", live.network.filtered));
+                counts.extend(live.recorder_link.iter().flat_map(|recorder| {
                     [
-                        ("wakes not told to the recorder", recorder.wakes_dropped),
-                        ("triggers not told to the recorder", recorder.triggers_lost),
+                        ("wakes not sent to the recorder", recorder.wakes_dropped),
+                        ("triggers not sent to the recorder", recorder.triggers_lost),
                     ]
                 }));
-                counts.extend(told.recording.iter().flat_map(|status| recorded(status)));
+                counts.extend(live.recording.iter().flat_map(|status| recorded(status)));
                 counts
             }
         }
     }
 
-    /// What became of the samples of each input.
-    pub(crate) fn topics(&self) -> Vec<Losses> {
+    /// Sample counts of each input.
+    pub(crate) fn topics(&self) -> Vec<TopicCounts> {
         match self {
-            Self::Replay(summary) => summary.topics.iter().map(Losses::from).collect(),
-            Self::Live(live) => live.topics.iter().map(Losses::from).collect(),
+            Self::Replay(summary) => summary.topics.iter().map(TopicCounts::from).collect(),
+            Self::Live(live) => live.topics.iter().map(TopicCounts::from).collect(),
         }
     }
 }
 
-/// What a recorder did not record.
-fn by_cause(recording: &Recording) -> impl Iterator<Item = (&'static str, u64)> {
+/// Counts of what a recorder did not record, by cause.
+fn by_cause(recording: &RecordingCounts) -> impl Iterator<Item = (&'static str, u64)> {
     recording.by_cause().into_iter().map(|counted| (counted.label, counted.count))
 }
 
-/// The same live, where there is more on the way to it.
+/// The same for a live run, with the losses of the network.
 fn recorded(status: &RecorderStatus) -> Vec<(&'static str, u64)> {
     let sum = |count: fn(&RecordedTopic) -> u64| {
         status.topics.iter().map(count).fold(0, u64::saturating_add)
@@ -287,19 +289,13 @@ fn recorded(status: &RecorderStatus) -> Vec<(&'static str, u64)> {
     let (network, commands) = (status.network.as_ref(), status.commands.as_ref());
     let mut counts: Vec<_> = by_cause(&status.recording).collect();
     counts.extend([
-        (
-            "samples to be recorded, lost before they reached the recorder",
-            sum(|topic| topic.lost.unwrap_or(0)),
-        ),
-        (
-            "samples to be recorded, without room as the recorder was busy",
-            sum(|topic| topic.no_slot),
-        ),
-        ("samples to be recorded, larger than the recorder can take", sum(|topic| topic.too_big)),
-        ("samples to be recorded, malformed", sum(|topic| topic.malformed)),
+        ("samples to record, lost upstream", sum(|topic| topic.lost.unwrap_or(0))),
+        ("samples to record, no free slot: recorder busy", sum(|topic| topic.no_slot)),
+        ("samples to record, larger than the recorder accepts", sum(|topic| topic.too_big)),
+        ("samples to record, malformed", sum(|topic| topic.malformed)),
         ("commands refused", commands.map_or(0, |commands| commands.refused)),
         (
-            "datagrams dropped by full sockets of the recorder",
+            "datagrams dropped, socket buffer of the recorder full",
             network.map_or(0, |network| network.socket_drops),
         ),
         (
@@ -314,7 +310,7 @@ fn shorten<'a>(texts: impl Iterator<Item = &'a mut String>) {
     texts.for_each(|text| *text = cut(text, NAME_CHARS));
 }
 
-impl From<&gleaner_protocol::TopicReport> for Losses {
+impl From<&gleaner_protocol::TopicReport> for TopicCounts {
     fn from(topic: &gleaner_protocol::TopicReport) -> Self {
         Self {
             input: topic.name.clone(),
@@ -330,7 +326,7 @@ impl From<&gleaner_protocol::TopicReport> for Losses {
     }
 }
 
-impl From<&gleaner_protocol::LiveTopic> for Losses {
+impl From<&gleaner_protocol::LiveTopic> for TopicCounts {
     fn from(topic: &gleaner_protocol::LiveTopic) -> Self {
         Self {
             input: topic.name.clone(),
@@ -346,48 +342,49 @@ impl From<&gleaner_protocol::LiveTopic> for Losses {
     }
 }
 
-/// What the lambda read; `None` if the run left no `signals.json`, as a live one does not.
+/// Reads `signals.json`, the fields that the lambda read; `None` if the file is missing, as after a
+/// live run.
 ///
-/// What is more than it may be is cut, and curves whose numbers do not belong together are left
-/// out; `notes` says so.
+/// Lists beyond their bounds are cut, and inconsistent curves are omitted. Both is added to
+/// `notes`.
 ///
 /// # Errors
 ///
-/// If the file is a link, or something else that no run leaves.
+/// [`OutputError::Invalid`] if the file is a link or a pipe, or too long.
 pub(crate) fn signals(out: &Path, notes: &mut Vec<String>) -> Result<Option<Signals>, OutputError> {
-    let read = bounded(out, "signals.json", SIGNALS_MAX)
+    let read = read_bounded(out, "signals.json", SIGNALS_MAX)
         .and_then(|text| parsed::<Signals>("signals.json", &text));
     let mut signals = match read {
         Ok(signals) => signals,
         Err(error) if error.is_absent() => return Ok(None),
-        Err(source) if source.is_no_result() => {
-            return Err(OutputError::Summary { path: out.join("signals.json"), source });
+        Err(source) if source.is_suspicious() => {
+            return Err(OutputError::Invalid { path: out.join("signals.json"), source });
         }
         Err(error) => {
-            // It may quote what was found there.
+            // The error may quote a text of the file.
             notes.push(cut(&in_words(&error), WHY_CHARS));
             return Ok(None);
         }
     };
     let found = signals.curves.len();
     signals.curves.truncate(Signals::CURVES_MAX);
-    signals.curves.retain(is_whole);
+    signals.curves.retain(is_consistent);
     let dropped = found - signals.curves.len();
     if dropped > 0 {
-        notes.push(format!("`signals.json`: {dropped} of {found} curves are not as gleaner writes them, and left out"));
+        notes.push(format!("`signals.json`: {dropped} of {found} inconsistent curves omitted"));
     }
     signals.pictures.truncate(Signals::PICTURES_MAX);
     Ok(Some(signals))
 }
 
-/// What a page shows of a config; it is compared whole.
+/// Cuts a config to what fits on a page. [`Diff`](crate::Diff) compares it whole.
 pub(crate) fn shown_config(
     config: &BTreeMap<String, ConfigValue>,
     notes: &mut Vec<String>,
 ) -> BTreeMap<String, ConfigValue> {
     if config.len() > CONFIG_MAX {
         notes.push(format!(
-            "`signals.json`: {} of {} config values left out",
+            "`signals.json`: {} of {} config values omitted",
             config.len() - CONFIG_MAX,
             config.len()
         ));
@@ -399,7 +396,7 @@ pub(crate) fn shown_config(
     config.iter().take(CONFIG_MAX).map(|(key, of)| (cut(key, NAME_CHARS), value(of))).collect()
 }
 
-fn is_whole(curve: &Curve) -> bool {
+fn is_consistent(curve: &Curve) -> bool {
     let points = curve.at_ns.len();
     points <= Signals::POINTS_MAX && curve.min.len() == points && curve.max.len() == points
 }
@@ -419,13 +416,13 @@ fn parsed<T: DeserializeOwned>(name: &'static str, text: &[u8]) -> Result<T, Fil
     serde_json::from_slice(text).map_err(|source| FileError::Json { name, source })
 }
 
-/// The file `name` of `out`.
-fn bounded(out: &Path, name: &'static str, most: ByteSize) -> Result<Vec<u8>, FileError> {
-    let read = PlainFile::result(&out.join(name), most).and_then(PlainFile::read_whole);
+/// Reads the file `name` of `out`.
+fn read_bounded(out: &Path, name: &'static str, max: ByteSize) -> Result<Vec<u8>, FileError> {
+    let read = PlainFile::result(&out.join(name), max).and_then(PlainFile::read_whole);
     read.map_err(|source| FileError::Read { name, source })
 }
 
-/// Folders in `out` that hold results: a vehicle has one for each lambda.
+/// Subfolders of `out` that hold results: a vehicle has one for each lambda.
 fn outputs_in(out: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(out).into_iter().flatten().flatten();
     let mut folders: Vec<_> = entries

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::GENERATED;
-use gleaner_report::words::trigger_lines;
+use gleaner_report::format::trigger_lines;
 
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Recipe, Replayed, difference};

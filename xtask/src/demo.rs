@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use gleaner_base::{Exit, Failure, visible};
 use gleaner_lambda::Decision;
-use gleaner_report::words::{clip_contents, clip_span, grouped, seconds};
+use gleaner_report::format::{clip_contents, clip_span, grouped, seconds};
 
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Example, Replayed, difference};
@@ -79,9 +79,9 @@ fn clip_lines(twin: &Replayed) -> Vec<String> {
         let thumbnail =
             clip.thumbnail.as_ref().map_or("no camera in it".to_owned(), |path| twin.path(path));
         let short = clip
-            .short
+            .incomplete
             .iter()
-            .map(|why| format!("\n    short: {}", visible(why)))
+            .map(|why| format!("\n    incomplete: {}", visible(why)))
             .collect::<String>();
         format!(
             "  {}\n    {from:.2} to {to:.2} s: {}\n    thumbnail: {thumbnail}{short}",

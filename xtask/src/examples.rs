@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::{Clip, Decision, twins_differ};
-use gleaner_protocol::{Summary, Verified};
+use gleaner_protocol::{ReplaySummary, Verified};
 use gleaner_report::{Decisions, ResultsError, clips};
 
 use crate::checkout::Checkout;
@@ -38,7 +38,7 @@ pub(crate) const EXAMPLES: [Example; 3] = [
 
 /// What one twin did.
 pub(crate) struct Replayed {
-    pub(crate) summary: Summary,
+    pub(crate) summary: ReplaySummary,
     /// Those with a trigger or a fault.
     pub(crate) decisions: Vec<Decision>,
     /// Made around its triggers.
@@ -145,7 +145,7 @@ fn replay(
     fs::create_dir_all(checkout.path(&out))
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot make `out/demo`", &error))?;
     replay.arg("--journal").arg(out.join(JOURNAL));
-    let summary: Summary = report(&mut replay)?;
+    let summary: ReplaySummary = report(&mut replay)?;
     let folder = checkout.path(&out);
     let clips = if summary.recording.clips > 0 { clips(&folder)? } else { Vec::new() };
     Ok(Replayed { decisions: decisions(&folder)?, clips, summary, lambda, out })

@@ -1,4 +1,4 @@
-//! The command line, checked as far as it can be without looking at a file.
+//! Defines the command line, and checks arguments as far as possible without opening files.
 
 use std::ffi::OsString;
 use std::net::IpAddr;
@@ -6,99 +6,98 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
-use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::manifest::LambdaKind;
 use gleaner_protocol::DriveTime;
 
-/// Small functions next to the sensors, that keep the data worth keeping.
+/// Run small functions (lambdas) next to the sensors of a vehicle, and keep the data worth keeping
 #[derive(Parser, Debug)]
 #[command(name = "gleaner", version, propagate_version = true)]
 pub struct Cli {
-    /// What to do.
+    /// The command
     #[command(subcommand)]
-    pub command: Command,
+    pub command: CliCommand,
 }
 
-/// What `gleaner` can do.
+/// Commands of `gleaner`.
 #[derive(Subcommand, Debug)]
-pub enum Command {
-    /// Show what is in a recorded drive: topics, rates, gaps, sizes, and the inputs to paste into a
-    /// manifest
+pub enum CliCommand {
+    /// Show topics, rates, gaps and sizes of a recorded drive, and [[input]] tables for a manifest
     Inspect(InspectArgs),
-    /// Make the folder of a new lambda, with its SDK, a test, and something to begin with
+    /// Create a folder with a new lambda: an example with a test and the SDK
     New(NewArgs),
-    /// Make the build folder DIR/build of a lambda
+    /// Build a lambda into DIR/build
     Build(BuildArgs),
-    /// Load a built lambda as on a vehicle, run its init, and say what it will need
+    /// Load a built lambda as on a vehicle, run its init, and show its needs
     ///
-    /// Finds inputs and fields that are not there, and shows how much memory and disk it takes.
+    /// Reports missing inputs and fields, and shows how much memory and disk the lambda needs.
     Check(CheckArgs),
     /// Run a built lambda over recorded drives
     ///
-    /// Writes OUT/decisions.jsonl, OUT/log.jsonl, OUT/summary.json, the clips that the manifest
-    /// asks for, and OUT/report.html, and shows a summary.
+    /// Writes OUT/decisions.jsonl, OUT/log.jsonl, OUT/summary.json, OUT/report.html and the clips
+    /// of the manifest's table `record`, and shows a summary.
     Replay(ReplayArgs),
-    /// Write OUT/report.html, the page about a replay or a live run, from the files in OUT
+    /// Write OUT/report.html, the report of a replay or a live run, from the files in OUT
     Report(ReportArgs),
-    /// Show what differs between the results of two runs
+    /// Compare the results of two runs
     ///
-    /// Ends with 0 if the decisions are the same, and with 4 if they are not.
+    /// Exits with 0 if the decisions are identical, and with 4 if they differ.
     Diff(DiffArgs),
-    /// Build and replay a lambda whenever one of its sources is saved, and show what that changed
-    /// in its decisions
+    /// Rebuild and replay a lambda whenever a source is saved, and show the changes in its
+    /// decisions
     Dev(DevArgs),
-    /// Make the decisions in a clip again, and compare them with its journal
+    /// Repeat the decisions of a clip, and compare them with its journal
     ///
-    /// Ends with 0 if all are the same, and with 4 at the first that is not.
+    /// Exits with 0 if all are identical, and with 4 at the first difference.
     Verify(VerifyArgs),
-    /// Run a built lambda on the live topics of this vehicle, until ctrl-C
+    /// Run a built lambda on the live topics of this vehicle, until Ctrl-C
     ///
-    /// Records the clips that the manifest asks for, and writes OUT/decisions.jsonl, OUT/log.jsonl
-    /// and OUT/summary.json.
+    /// Records the clips of the manifest's table `record`, and writes OUT/decisions.jsonl,
+    /// OUT/log.jsonl and OUT/summary.json.
     Run(RunArgs),
-    /// Show the live topics that are there
+    /// List the live topics
     Topics(TopicsArgs),
     /// Play recorded drives as live topics; see `gleaner play --help`
     #[command(disable_help_flag = true)]
     Play {
-        /// Handed to gleaner-player as they are
+        /// Arguments of gleaner-player
         #[arg(value_name = "ARGUMENTS", trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<OsString>,
     },
-    /// Look for what would keep lambdas from running well on this machine
+    /// Check whether lambdas can run well on this machine
     Doctor(DoctorArgs),
-    /// Print what a shell needs to complete these commands
+    /// Print a completion script for a shell
     Completions {
         /// The shell
         shell: Shell,
     },
     /// Write a man page for each command into a folder
     Man {
-        /// The folder, as in ~/.local/share/man/man1
+        /// The folder, such as ~/.local/share/man/man1
         #[arg(value_name = "DIR")]
         folder: PathBuf,
     },
 }
 
-/// Which lambda, with which settings.
+/// A lambda and its settings.
 #[derive(Args, Debug, Clone)]
-pub struct AskedArgs {
+pub struct LambdaArgs {
     /// The lambda's folder, built by `gleaner build DIR`
     #[arg(value_name = "DIR")]
     pub lambda: PathBuf,
-    /// Another value for a key of the config table, as in brake_mps2=-1.4
+    /// Override a key of the config table, as in brake_mps2=-1.4
     #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
     pub set: Vec<String>,
-    /// Another name for a topic of the manifest, as in /imu/data:=/car/imu
+    /// Rename a topic of the manifest, as in /imu/data:=/car/imu
     #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
     pub remap: Vec<String>,
-    /// The configuration of the vehicle, whose limits hold where they are smaller than those of the
+    /// Configuration file of the vehicle. Its limits apply where they are smaller than those of the
     /// manifest; see docs/limits.md
     #[arg(long, value_name = "FILE")]
     pub vehicle: Option<PathBuf>,
 }
 
-impl AskedArgs {
-    /// The settings, as our programs take them.
+impl LambdaArgs {
+    /// The settings as arguments of the other programs.
     pub(crate) fn settings(&self) -> Vec<OsString> {
         let settings = [("--set", &self.set), ("--remap", &self.remap)];
         let vehicle =
@@ -113,19 +112,19 @@ impl AskedArgs {
     }
 }
 
-/// Which network to join.
+/// The network to join.
 #[derive(Args, Debug, Clone, Default)]
 pub struct NetworkArgs {
-    /// The domain of DDS [default: ROS_DOMAIN_ID, else 0]
+    /// DDS domain [default: ROS_DOMAIN_ID, else 0]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=232))]
     pub domain: Option<u16>,
-    /// The address of an interface to use; may be repeated [default: all]
+    /// Address of a network interface to use; may be repeated [default: all]
     #[arg(long, value_name = "ADDRESS")]
     pub interface: Vec<IpAddr>,
 }
 
 impl NetworkArgs {
-    /// The same, as our programs take it.
+    /// The same as arguments of the other programs.
     pub(crate) fn to_args(&self) -> impl Iterator<Item = OsString> {
         let domain = self.domain.map(|domain| format!("--domain={domain}"));
         let interfaces = self.interface.iter().map(|address| format!("--interface={address}"));
@@ -138,46 +137,46 @@ impl NetworkArgs {
 pub struct RunArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
-    pub asked: AskedArgs,
-    /// Where the results go [default: DIR/live]
+    pub target: LambdaArgs,
+    /// Result folder [default: DIR/live]
     #[arg(long)]
     pub out: Option<PathBuf>,
     /// Write every decision, not only those with a trigger or a fault
     #[arg(long)]
     pub all: bool,
-    /// Leave out the clips that the table `record` of the manifest asks for
+    /// Do not record the clips of the manifest's table `record`
     #[arg(long)]
     pub no_record: bool,
-    /// Show how the lambda and its topics are doing, every second
+    /// Show statistics of the lambda and its topics every second
     #[arg(long)]
     pub stats: bool,
-    /// Stop after so many seconds
+    /// Stop after this many seconds
     #[arg(long = "for", value_name = "SECONDS", value_parser = clap::value_parser!(u32).range(1..))]
     pub last: Option<u32>,
-    /// Answer each wake on this topic with the stamps of input and decision, as
+    /// Publish the stamps of input and decision of each wake on this topic, as
     /// sensor_msgs/msg/TimeReference
     #[arg(long, value_name = "TOPIC")]
     pub rtt: Option<String>,
     /// Publish decisions with a trigger or a fault on this topic, as std_msgs/msg/String with JSON
     #[arg(long, value_name = "TOPIC")]
     pub decisions: Option<String>,
-    /// Take commands to record from this topic, as std_msgs/msg/String with JSON; see docs/clips.md
+    /// Accept recording commands on this topic, as std_msgs/msg/String with JSON; see docs/clips.md
     #[arg(long, value_name = "TOPIC")]
     pub commands: Option<String>,
-    /// Bytes of the disk that stay free: below, no clip is begun [default: 1 GiB]
+    /// Start no clip if the disk has fewer free bytes [default: 1 GiB]
     #[arg(long, value_name = "BYTES")]
     pub disk_floor: Option<u64>,
-    /// Most clips that are kept; of more, the oldest that nobody fetched are deleted, and counted
+    /// Maximum number of clips to keep; the oldest ones are deleted and counted
     #[arg(long, value_name = "N")]
     pub clips_max: Option<u64>,
-    /// Most bytes of clips that are kept, likewise
+    /// Maximum total size of clips to keep; the oldest ones are deleted and counted
     #[arg(long, value_name = "BYTES")]
     pub bytes_max: Option<u64>,
-    /// Give the lambda's process a control group of its own in this folder of cgroup v2, delegated
-    /// to this user
+    /// Create a control group for the lambda's process in this cgroup v2 folder, which must be
+    /// delegated to this user
     #[arg(long, value_name = "DIR")]
     pub cgroup: Option<PathBuf>,
-    /// Print what is reported as JSON, an object a line
+    /// Print reports as JSON, one object per line
     #[arg(long, conflicts_with = "stats")]
     pub json: bool,
     #[command(flatten)]
@@ -188,13 +187,13 @@ pub struct RunArgs {
 /// Arguments of `gleaner inspect`.
 #[derive(Args, Debug)]
 pub struct InspectArgs {
-    /// MCAP files, .db3 files and directories of rosbag2; several are one drive
+    /// MCAP files, rosbag2 .db3 files and directories; several are merged into one drive
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
-    /// Read all of a drive that is larger than 256 MiB, not only three parts of it
+    /// Read a drive of more than 256 MiB completely, not only three parts of it
     #[arg(long)]
     pub all: bool,
-    /// Print what is found as one JSON object
+    /// Print the result as one JSON object
     #[arg(long)]
     pub json: bool,
 }
@@ -202,7 +201,7 @@ pub struct InspectArgs {
 /// Arguments of `gleaner topics`.
 #[derive(Args, Debug)]
 pub struct TopicsArgs {
-    /// How long to listen, in seconds [default: 2]
+    /// Time to wait for topics, in seconds [default: 2]
     #[arg(long, value_name = "SECONDS")]
     pub wait: Option<f64>,
     /// Print the topics as one JSON object
@@ -216,7 +215,7 @@ pub struct TopicsArgs {
 /// Arguments of `gleaner doctor`.
 #[derive(Args, Debug)]
 pub struct DoctorArgs {
-    /// Print the findings as JSON, an object a line
+    /// Print the findings as JSON, one object per line
     #[arg(long)]
     pub json: bool,
 }
@@ -224,18 +223,18 @@ pub struct DoctorArgs {
 /// Arguments of `gleaner new`.
 #[derive(Args, Debug)]
 pub struct NewArgs {
-    /// The folder to make; its name becomes the lambda's
+    /// The folder to create; its name becomes the name of the lambda
     #[arg(value_name = "DIR")]
     pub path: PathBuf,
-    /// What it is written in
+    /// The language of the lambda
     #[arg(long, value_enum, default_value = "rust")]
     pub kind: Language,
-    /// Replace the SDK in the folder of a lambda by that of this gleaner, and nothing else
+    /// Only replace the SDK in an existing lambda's folder by that of this gleaner
     #[arg(long, conflicts_with = "kind")]
     pub update: bool,
 }
 
-/// What a lambda is written in.
+/// Language of a lambda.
 #[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum Language {
@@ -243,7 +242,7 @@ pub enum Language {
     Python,
 }
 
-impl From<Language> for Kind {
+impl From<Language> for LambdaKind {
     fn from(language: Language) -> Self {
         match language {
             Language::Rust => Self::Wasm,
@@ -255,8 +254,8 @@ impl From<Language> for Kind {
 /// Arguments of `gleaner build`.
 #[derive(Args, Debug)]
 pub struct BuildArgs {
-    /// Compile a Rust lambda where its build scripts and macros reach no network and no files but
-    /// its own; see docs/security.md
+    /// Compile a Rust lambda in a sandbox: its build scripts and macros reach no network and only
+    /// its own files; see docs/security.md
     #[arg(long)]
     pub sandboxed: bool,
     /// The lambda's folder, with its lambda.toml
@@ -269,7 +268,7 @@ pub struct BuildArgs {
 pub struct CheckArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
-    pub asked: AskedArgs,
+    pub target: LambdaArgs,
     /// Print the result as one JSON object
     #[arg(long)]
     pub json: bool,
@@ -280,39 +279,43 @@ pub struct CheckArgs {
 pub struct ReplayArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
-    pub asked: AskedArgs,
-    /// MCAP files, .db3 files and directories of rosbag2, packed with zstd or not; several are
+    pub target: LambdaArgs,
+    /// MCAP files, rosbag2 .db3 files and directories, plain or compressed with zstd; several are
     /// merged by time
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
-    /// Replay from this time on: seconds after the drive's start, as in 12.5 or 2min, or since
-    /// 1970, as in @1700000000.5
+    /// Start at this time: seconds after the start of the drive, as in 12.5 or 2min, or since 1970,
+    /// as in @1700000000.5
     #[arg(long, value_name = "TIME", value_parser = drive_time)]
     pub from: Option<String>,
-    /// Replay until before this time, given likewise
+    /// Stop before this time, in the same form
     #[arg(long, value_name = "TIME", value_parser = drive_time)]
     pub to: Option<String>,
-    /// Where the results go [default: DIR/out]
+    /// Result folder [default: DIR/out]
     #[arg(long)]
     pub out: Option<PathBuf>,
     /// Write every decision, not only those with a trigger or a fault
     #[arg(long)]
     pub all: bool,
-    /// Leave out the clips that the table `record` of the manifest asks for
+    /// Do not record the clips of the manifest's table `record`
     #[arg(long)]
     pub no_record: bool,
-    /// Have clips hold these topics of the drive instead of those of the table `record`, as in '*'
-    /// or '/camera/*'
+    /// Record these topics of the drive instead of those of the table `record`, as in '*' or
+    /// '/camera/*'
     #[arg(long, value_name = "PATTERN", conflicts_with_all = ["no_record", "verify"])]
     pub topics: Vec<String>,
-    /// Write a journal: of every wake, what the lambda saw and decided
+    /// Write a journal with the inputs and decisions of every wake
     #[arg(long, value_name = "FILE")]
     pub journal: Option<PathBuf>,
-    /// Make every decision of a journal again and compare, instead of writing results; exit code 4
-    /// at the first difference
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["from", "to", "out", "all", "no_record", "journal"])]
+    /// Repeat every decision of a journal and compare, instead of writing results; exit with 4 at
+    /// the first difference
+    #[arg(
+        long,
+        value_name = "FILE",
+        conflicts_with_all = ["from", "to", "out", "all", "no_record", "journal"]
+    )]
     pub verify: Option<PathBuf>,
-    /// Leave out OUT/report.html
+    /// Do not write OUT/report.html
     #[arg(long)]
     pub no_report: bool,
     /// Print the summary as one JSON object
@@ -323,23 +326,23 @@ pub struct ReplayArgs {
 /// Arguments of `gleaner report`.
 #[derive(Args, Debug)]
 pub struct ReportArgs {
-    /// The folder that `gleaner replay` or `gleaner run` wrote to
+    /// Result folder of `gleaner replay` or `gleaner run`
     pub out: PathBuf,
 }
 
 /// Arguments of `gleaner diff`.
 #[derive(Args, Debug)]
 pub struct DiffArgs {
-    /// The folder of the first run
+    /// Result folder of the first run
     #[arg(value_name = "OUT1")]
     pub a: PathBuf,
-    /// The folder of the second run
+    /// Result folder of the second run
     #[arg(value_name = "OUT2")]
     pub b: PathBuf,
     /// Print the differences as one JSON object
     #[arg(long)]
     pub json: bool,
-    /// Write a page with both runs, their differences marked
+    /// Write a report page of both runs with their differences
     #[arg(long, value_name = "FILE")]
     pub report: Option<PathBuf>,
 }
@@ -349,21 +352,20 @@ pub struct DiffArgs {
 pub struct DevArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
-    pub asked: AskedArgs,
-    /// MCAP files, .db3 files and directories of rosbag2; several are merged by time
+    pub target: LambdaArgs,
+    /// MCAP files, rosbag2 .db3 files and directories; several are merged by time
     #[arg(value_name = "DRIVE", required = true)]
     pub drives: Vec<PathBuf>,
-    /// Replay from this time on, as in `gleaner replay`
+    /// Start at this time, as in `gleaner replay`
     #[arg(long, value_name = "TIME", value_parser = drive_time)]
     pub from: Option<String>,
-    /// Replay until before this time
+    /// Stop before this time
     #[arg(long, value_name = "TIME", value_parser = drive_time)]
     pub to: Option<String>,
-    /// Where the results go [default: DIR/out]
+    /// Result folder [default: DIR/out]
     #[arg(long)]
     pub out: Option<PathBuf>,
-    /// Leave out the clips that the table `record` of the manifest asks for: a replay is faster
-    /// without
+    /// Do not record the clips of the manifest's table `record`, which makes a replay faster
     #[arg(long)]
     pub no_record: bool,
 }
@@ -371,12 +373,12 @@ pub struct DevArgs {
 /// Arguments of `gleaner verify`.
 #[derive(Args, Debug)]
 pub struct VerifyArgs {
-    /// A clip that gleaner made
+    /// A clip that Gleaner recorded
     pub clip: PathBuf,
     /// The lambda's folder, built by `gleaner build DIR`
     #[arg(long, value_name = "DIR")]
     pub lambda: PathBuf,
-    /// The configuration of the vehicle [default: the limits that the journal names]
+    /// Configuration file of the vehicle [default: the limits in the journal]
     #[arg(long, value_name = "FILE")]
     pub vehicle: Option<PathBuf>,
     /// Print the result as one JSON object
@@ -384,7 +386,7 @@ pub struct VerifyArgs {
     pub json: bool,
 }
 
-// All are passed on as they are: the runtime takes them apart. Here they are only refused early.
+// Early checks only: the texts are passed on unchanged, and the runtime parses them.
 
 fn assignment(text: &str) -> Result<String, String> {
     match text.split_once('=') {

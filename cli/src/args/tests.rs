@@ -3,13 +3,13 @@ use super::*;
 fn replay(arguments: &[&str]) -> Result<ReplayArgs, String> {
     let line = ["gleaner", "replay"].iter().chain(arguments);
     match Cli::try_parse_from(line).map_err(|error| error.to_string())?.command {
-        Command::Replay(args) => Ok(args),
+        CliCommand::Replay(args) => Ok(args),
         other => Err(format!("{other:?}")),
     }
 }
 
 #[test]
-fn the_definition_of_the_command_line_is_sound() {
+fn the_definition_of_the_command_line_is_valid() {
     use clap::CommandFactory;
     Cli::command().debug_assert();
 }
@@ -19,13 +19,13 @@ fn a_value_may_begin_with_a_minus_and_hold_an_equals_sign() {
     let args =
         replay(&["dir", "a.mcap", "--set", "brake_mps2=-1.4", "--set", "word=a=b", "b.mcap"])
             .unwrap();
-    assert_eq!(args.asked.set, ["brake_mps2=-1.4", "word=a=b"]);
+    assert_eq!(args.target.set, ["brake_mps2=-1.4", "word=a=b"]);
     assert_eq!(args.drives, [PathBuf::from("a.mcap"), PathBuf::from("b.mcap")]);
 }
 
 #[test]
 fn bad_arguments_are_refused_with_an_example() {
-    for (arguments, said) in [
+    for (arguments, message) in [
         (["dir", "a.mcap", "--set", "brake_mps2"], "write KEY=VALUE"),
         (["dir", "a.mcap", "--set", "=3"], "write KEY=VALUE"),
         (["dir", "a.mcap", "--remap", "/imu=/car"], "write FROM:=TO"),
@@ -34,7 +34,7 @@ fn bad_arguments_are_refused_with_an_example() {
         (["dir", "a.mcap", "--from", "12:30"], "as in 12.5 or 2min"),
     ] {
         let error = replay(&arguments).unwrap_err();
-        assert!(error.contains(said), "{error}");
+        assert!(error.contains(message), "{error}");
     }
     assert!(replay(&["dir"]).unwrap_err().contains("<DRIVE>"));
 }

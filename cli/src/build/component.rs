@@ -1,4 +1,4 @@
-//! Rust: cargo compiles the package in the lambda's folder, and says which file came out.
+//! Compiles a Rust lambda with cargo, and finds the component among cargo's messages.
 
 use std::env;
 use std::ffi::OsString;
@@ -14,11 +14,11 @@ use serde_json::Value;
 use super::error::{BuildError, TARGET};
 use super::sandbox::Sandbox;
 
-/// Cargo's own variable for what is left out of a component.
+/// Cargo's variable for stripping a component.
 const STRIP: &str = "CARGO_PROFILE_RELEASE_STRIP";
 
-/// Instructions on 128 bits at a time, which every host runs: kernels of the SDK take several times
-/// as long without. Not `relaxed-simd`, whose results depend on the CPU.
+/// Enables 128-bit SIMD, which every host supports: kernels of the SDK are several times slower
+/// without it. `relaxed-simd` stays off, since its results depend on the CPU.
 const SIMD: &str = "-Ctarget-feature=+simd128";
 
 /// A component in cargo's target folder.
@@ -27,7 +27,7 @@ pub(super) struct Compiled {
     pub(super) opened: io::Result<PlainFile>,
 }
 
-/// Compiles the package in `dir`, in a sandbox if that is asked for.
+/// Compiles the package in `dir`, if `sandboxed` in a sandbox.
 pub(super) fn compile(dir: &Path, sandboxed: bool) -> Result<Compiled, BuildError> {
     let package = dir.join("Cargo.toml");
     if !package.is_file() {
@@ -61,7 +61,7 @@ pub(super) fn compile(dir: &Path, sandboxed: bool) -> Result<Compiled, BuildErro
         .map_err(no_cargo)?;
     let mut component = None;
     if let Some(messages) = child.stdout.take() {
-        // A line that cannot be read ends the list; cargo's exit status says the rest.
+        // A read error ends the list; cargo's exit status decides.
         for line in BufReader::new(messages).lines().map_while(Result::ok) {
             component = component_in(&line, &package).or(component);
         }
@@ -69,7 +69,7 @@ pub(super) fn compile(dir: &Path, sandboxed: bool) -> Result<Compiled, BuildErro
     let status = child.wait().map_err(no_cargo)?;
     if !status.success() {
         return Err(match &sandbox {
-            // Cargo itself ends with 1 or 101.
+            // Cargo itself exits with 1 or 101.
             Some(_) if status.code() == Some(i32::from(Exit::Denied.code())) => {
                 BuildError::NoSandbox
             }
@@ -80,7 +80,7 @@ pub(super) fn compile(dir: &Path, sandboxed: bool) -> Result<Compiled, BuildErro
     }
     let path = component.ok_or(BuildError::NoComponent { package })?;
     let opened = match &sandbox {
-        // What was built says where it is, and could name anything.
+        // The path comes from untrusted code, which could name any file.
         Some(sandbox) => PlainFile::inside(sandbox.target(), &path, COMPONENT_MAX),
         None => PlainFile::named(&path, COMPONENT_MAX),
     };
@@ -93,11 +93,11 @@ fn cargo() -> Command {
     cargo
 }
 
-/// Adds [`SIMD`] to the flags that the compiler gets. Cargo takes those of one place only, and of a
-/// variable first; so they are added where the user has some.
+/// Adds [`SIMD`] to the compiler flags. Cargo reads flags from one place only, variables first, so
+/// they are added to the variable that the user has set, if any.
 fn with_simd(cargo: &mut Command, variable: impl Fn(&str) -> Option<OsString>) -> &mut Command {
     for (name, between) in [("CARGO_ENCODED_RUSTFLAGS", "\x1f"), ("RUSTFLAGS", " ")] {
-        // Set to nothing it still counts, and hides those of files.
+        // An empty variable still takes precedence over configuration files.
         if let Some(mut flags) = variable(name) {
             if !flags.is_empty() {
                 flags.push(between);
@@ -106,11 +106,11 @@ fn with_simd(cargo: &mut Command, variable: impl Fn(&str) -> Option<OsString>) -
             return cargo.env(name, flags);
         }
     }
-    // Joined with those of the user's files of configuration for this target.
+    // Cargo adds these to the flags of the user's configuration files for this target.
     cargo.arg("--config").arg(format!("target.{TARGET}.rustflags=['{SIMD}']"))
 }
 
-/// The component that this message of cargo announces, if it does and `package` made it.
+/// Path of the component in this message of cargo, if it is about the component of `package`.
 fn component_in(message: &str, package: &Path) -> Option<PathBuf> {
     let message: Value = serde_json::from_str(message).ok()?;
     let of_package =
@@ -130,8 +130,8 @@ fn component_in(message: &str, package: &Path) -> Option<PathBuf> {
         .find(|file| file.extension().is_some_and(|e| e == "wasm"))
 }
 
-/// Whether the compiler lacks the target's libraries. Cargo's own message about it is long, and its
-/// way out depends on how Rust was installed; so this is asked only after a failure.
+/// Returns whether the compiler lacks the target's libraries. Called only after a failure, since
+/// cargo's own message about it is long, and its advice depends on how Rust was installed.
 fn target_is_missing() -> bool {
     let output = Command::new(program("RUSTC", "rustc"))
         .args(["--print", "target-libdir", "--target", TARGET])
@@ -161,15 +161,15 @@ mod tests {
     }
 
     #[test]
-    fn flags_of_the_user_stay_and_vectors_come_to_them() {
+    fn simd_is_added_to_the_flags_of_the_user() {
         let build = |set: &'static str, flags: &'static str| {
             let mut cargo = Command::new("cargo");
             with_simd(&mut cargo, |name| (name == set).then(|| flags.into()));
-            let told = cargo
+            let variables = cargo
                 .get_envs()
                 .filter_map(|(name, value)| Some((name.to_owned(), value?.to_owned())));
             let arguments = cargo.get_args().map(ToOwned::to_owned).collect::<Vec<_>>();
-            (told.collect::<Vec<_>>(), arguments)
+            (variables.collect::<Vec<_>>(), arguments)
         };
         let config = "target.wasm32-wasip2.rustflags=['-Ctarget-feature=+simd128']";
         assert_eq!(build("", ""), (vec![], vec!["--config".into(), config.into()]));
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn other_messages_announce_no_component() {
+    fn other_messages_name_no_component() {
         let package = Path::new("/l/Cargo.toml");
         for message in [
             MESSAGE.replace("/l/", "/dependency/"),

@@ -4,18 +4,21 @@ use std::process::ExitStatus;
 
 use gleaner_base::{Exit, Explain, NotPlain};
 use gleaner_lambda::layout::{BUILD_MAX, FILES_MAX};
-use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{LayoutError, ManifestError};
 use gleaner_parts::PartsError;
 
-/// Why a lambda cannot be built.
+/// Errors of building a lambda.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum BuildError {
-    #[error("`entry` is `{entry}`, and the entry of a {} lambda ends with `.{extension}`", kind.as_str())]
-    EntryName { entry: String, kind: Kind, extension: &'static str },
-    #[error("`{}`, which {named_by} names, is not there", path.display())]
+    #[error(
+        "`entry` is `{entry}`, and the entry of a {} lambda ends with `.{extension}`",
+        kind.as_str()
+    )]
+    EntryName { entry: String, kind: LambdaKind, extension: &'static str },
+    #[error("`{}` ({named_by} in lambda.toml) does not exist", path.display())]
     Missing { path: PathBuf, named_by: &'static str },
-    #[error("there is no `{}`", path.display())]
+    #[error("`{}` does not exist", path.display())]
     NoPackage { path: PathBuf },
     #[error("cannot start `{}`", program.display())]
     NoCargo { program: PathBuf, source: io::Error },
@@ -25,74 +28,89 @@ pub(super) enum BuildError {
     Compile { status: ExitStatus },
     #[error("cargo ended with {status} in its sandbox; its messages are above")]
     CompileSandboxed { status: ExitStatus },
-    #[error("cargo is not sandboxed; gleaner-shim says above what is missing")]
+    #[error("cargo cannot be sandboxed; the message of gleaner-shim above names the cause")]
     NoSandbox,
     #[error(
-        "what the lambda depends on cannot be fetched: cargo ended with {status}; its messages are above"
+        "cannot fetch the dependencies of the lambda: cargo ended with {status}; its messages are \
+         above"
     )]
     Fetch { status: ExitStatus },
-    #[error("the lambda belongs to the workspace `{}`, and all of that could be read", workspace.display())]
+    #[error(
+        "the lambda belongs to the workspace `{}`, which the build could read completely",
+        workspace.display()
+    )]
     Workspace { workspace: PathBuf },
-    #[error("HOME is no absolute path, and cargo's own folder is not known")]
+    #[error("cannot find cargo's folder: HOME is not an absolute path")]
     NoHome,
-    #[error("the toolchain of `{}` is none of rustup's", rustc.display())]
+    #[error("the toolchain of `{}` was not installed by rustup", rustc.display())]
     Toolchain { rustc: PathBuf },
     #[error(transparent)]
     Parts(PartsError),
-    #[error("the package `{}` makes no component", package.display())]
+    #[error("the package `{}` does not build a component", package.display())]
     NoComponent { package: PathBuf },
     #[error("cannot {action} `{}`", path.display())]
     File { action: &'static str, path: PathBuf, source: io::Error },
-    #[error("it would have more than {FILES_MAX} files, or more than {BUILD_MAX}")]
+    #[error("the build has more than {FILES_MAX} files, or more than {BUILD_MAX}")]
     TooMuch,
     #[error(transparent)]
     Manifest(ManifestError),
-    #[error("`{}` is newer than the build that was just made of it", source_file.display())]
+    #[error("`{}` is newer than the build just made from it", source_file.display())]
     Changed { source_file: PathBuf },
-    #[error("the lambda's files cannot be listed")]
+    #[error("cannot list the files of the lambda")]
     Sources(#[source] LayoutError),
-    #[error("the new build cannot be checked")]
+    #[error("cannot check the new build")]
     Layout(#[source] LayoutError),
 }
 
-/// What a component is compiled for.
+/// Compilation target of a component.
 pub(super) const TARGET: &str = "wasm32-wasip2";
 
 impl Explain for BuildError {
     fn help(&self) -> Option<String> {
         Some(match self {
-            BuildError::EntryName { kind: Kind::Wasm, .. } => {
+            BuildError::EntryName { kind: LambdaKind::Wasm, .. } => {
                 "write entry = \"NAME.wasm\", or kind = \"python\"".to_owned()
             }
-            BuildError::EntryName { .. } => "write entry = \"main.py\", or kind = \"wasm\"".to_owned(),
-            BuildError::Missing { named_by, .. } => format!("add the file, or correct {named_by} in lambda.toml"),
+            BuildError::EntryName { .. } => {
+                "write entry = \"main.py\", or kind = \"wasm\"".to_owned()
+            }
+            BuildError::Missing { named_by, .. } => {
+                format!("create the file, or correct {named_by} in lambda.toml")
+            }
             BuildError::NoPackage { .. } => {
-                "kind = \"wasm\" is a Rust package: `cargo init --lib` makes one; for Python write kind = \"python\""
+                "kind = \"wasm\" needs a Rust package: create one with `cargo init --lib`; \
+                 for Python write kind = \"python\""
                     .to_owned()
             }
-            BuildError::NoCargo { .. } => "install Rust with rustup, or set CARGO to the cargo to use".to_owned(),
+            BuildError::NoCargo { .. } => {
+                "install Rust with rustup, or set CARGO to the cargo to use".to_owned()
+            }
             BuildError::NoTarget => format!("run `rustup target add {TARGET}`"),
             BuildError::NoComponent { .. } => {
                 "write crate-type = [\"cdylib\", \"rlib\"] below [lib] in its Cargo.toml".to_owned()
             }
             BuildError::Changed { .. } => {
-                "it changed meanwhile: build again; if its date lies in the future, `touch` it first".to_owned()
+                "it was changed during the build: build again; if its date is in the future, \
+                 `touch` it first"
+                    .to_owned()
             }
             BuildError::TooMuch => {
-                "keep in the lambda's folder what belongs to it: data that a lambda does not need goes elsewhere"
-                    .to_owned()
+                "move data that the lambda does not need out of its folder".to_owned()
             }
             BuildError::File { source, .. } => return NotPlain::of(source).map(NotPlain::help),
             BuildError::CompileSandboxed { .. } => {
-                "where a build script or a macro was refused something, it was by the layer `files` (all but the toolchain, crates and its \
-                 own workspace to read, all but its target folder to write) or `sockets` (any): leave that out, or build without --sandboxed \
-                 if you trust its author"
+                "if a build script or a macro was denied an access: the layer `files` lets it read \
+                 the toolchain, crates and its workspace, and write its target folder; the layer \
+                 `sockets` lets it open none. Remove that access, or build without --sandboxed if \
+                 you trust the author"
                     .to_owned()
             }
-            BuildError::Workspace { .. } => "move the lambda into a folder of its own".to_owned(),
-            BuildError::NoHome => "set HOME".to_owned(),
+            BuildError::Workspace { .. } => {
+                "move the lambda into its own folder outside of the workspace".to_owned()
+            }
+            BuildError::NoHome => "set HOME to an absolute path".to_owned(),
             BuildError::Toolchain { .. } => {
-                "remove the rust-toolchain.toml that names it, or name the toolchain: RUSTUP_TOOLCHAIN".to_owned()
+                "remove the rust-toolchain.toml that names it, or set RUSTUP_TOOLCHAIN".to_owned()
             }
             BuildError::Parts(error) => return error.help(),
             BuildError::NoSandbox | BuildError::Fetch { .. } => return None,

@@ -1,4 +1,4 @@
-//! The build folder while it is made, and the moment in which it takes the old one's place.
+//! Fills the new build folder, and replaces the old one atomically.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -12,31 +12,32 @@ use gleaner_lambda::{BuildDir, Manifest};
 
 use super::error::BuildError;
 
-/// A build in the making, in a hidden folder beside the old one; hidden, because then no file in it
-/// counts as a source if we are killed. Dropped before [`finish`](Self::finish), it leaves nothing.
-pub(super) struct Partial {
+/// An unfinished build, in a folder beside the old one. The folder is hidden, so that its files do
+/// not count as sources if this process is killed. Dropping it before [`finish`](Self::finish)
+/// removes it.
+pub(super) struct PartialBuild {
     dir: PathBuf,
     path: PathBuf,
     built: Built,
 }
 
-/// What a build holds.
+/// Number and size of the files in a build.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Built {
     pub(super) files: u64,
     pub(super) bytes: u64,
 }
 
-impl Partial {
-    /// An empty build of the lambda in `dir`. What a build that was killed has left goes.
-    pub(super) fn begin(dir: &Path) -> Result<Partial, BuildError> {
+impl PartialBuild {
+    /// Creates an empty build of the lambda in `dir`, and removes the remains of a killed one.
+    pub(super) fn begin(dir: &Path) -> Result<PartialBuild, BuildError> {
         let path = dir.join(".build.partial");
         remove(&path)?;
         fs::create_dir(&path).map_err(failed("create", &path))?;
-        Ok(Partial { dir: dir.to_owned(), path, built: Built::default() })
+        Ok(PartialBuild { dir: dir.to_owned(), path, built: Built::default() })
     }
 
-    /// Copies the file that was `opened`, of the name `from`, to `to`, relative to the build.
+    /// Copies the `opened` file `from` to the path `to` in the build.
     pub(super) fn add(
         &mut self,
         from: &Path,
@@ -44,7 +45,7 @@ impl Partial {
         to: &Path,
     ) -> Result<(), BuildError> {
         let file = opened.map_err(failed("copy", from))?;
-        // Before the disk is full of it.
+        // Checked before the copy fills the disk.
         self.count(file.length())?;
         let to = self.path.join(to);
         if let Some(folder) = to.parent() {
@@ -63,8 +64,8 @@ impl Partial {
         if is_within { Ok(()) } else { Err(BuildError::TooMuch) }
     }
 
-    /// Adds the manifest, by whose time the age of a build is told, and puts the build into its
-    /// place. `started` is when its first source was read.
+    /// Adds the manifest and replaces the old build. `started`, the time when the first source was
+    /// read, becomes the time of the manifest, which is the age of a build.
     pub(super) fn finish(mut self, started: SystemTime) -> Result<Built, BuildError> {
         let text = Manifest::read(&self.dir).map_err(BuildError::Manifest)?;
         self.count(text.len() as u64)?;
@@ -90,7 +91,7 @@ impl Partial {
         };
         if let Err(error) = fs::rename(&self.path, build.path()) {
             if had_one {
-                // As it was; if even that fails, the first error tells more.
+                // Restores the old build. If that fails too, the first error matters more.
                 let _ = fs::rename(&old, build.path());
             }
             return Err(failed("write", build.path())(error));
@@ -99,10 +100,9 @@ impl Partial {
     }
 }
 
-impl Drop for Partial {
+impl Drop for PartialBuild {
     fn drop(&mut self) {
-        // Gone already after `finish`; after a failure, that failure is what the user has to hear
-        // of.
+        // The folder is gone after `finish`. After a failure, that failure is reported.
         let _ = fs::remove_dir_all(&self.path);
     }
 }

@@ -1,9 +1,9 @@
-//! `gleaner build DIR`: a lambda's sources become its build folder, which every other command uses.
+//! `gleaner build DIR`: builds a lambda's folder `build`, which every other command uses.
 //!
-//! `component` compiles Rust, in a `sandbox` if that is asked for, `folder` puts everything
-//! together beside the old build and swaps the two, so that a build that fails leaves the old one
-//! as it was. Which files make up a lambda is said by `gleaner_lambda::Sources`. Nothing here runs
-//! a lambda or looks into a component.
+//! `component` compiles Rust, in a `sandbox` on request. `folder` collects the files beside the old
+//! build and then replaces it, so that a failed build leaves the old one unchanged. The files of a
+//! lambda are listed by `gleaner_lambda::Sources`. Nothing here runs a lambda or parses a
+//! component.
 
 mod component;
 mod error;
@@ -16,19 +16,19 @@ use std::time::SystemTime;
 
 use gleaner_base::{ByteSize, Exit, Failure, PlainFile};
 use gleaner_lambda::layout::FILE_MAX;
-use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{BuildDir, LayoutError, Manifest, SOURCE_MAX, Sources};
-use gleaner_report::words::size;
+use gleaner_report::format::size;
 
 use error::BuildError;
-use folder::{Built, Partial};
+use folder::{Built, PartialBuild};
 
-use crate::say::say;
+use crate::stdout::print;
 
-/// Builds the lambda in `dir` and says so. If it is `sandboxed`, code of its author runs in a jail
-/// meanwhile.
+/// Builds the lambda in `dir` and prints a summary. If `sandboxed`, build scripts and macros run in
+/// a jail.
 pub(crate) fn run(dir: &Path, sandboxed: bool) -> Result<Exit, Failure> {
-    // A change that comes while we build makes the build older than its source, as it should.
+    // A source that is changed during the build is then newer than the build.
     let started = SystemTime::now();
     let manifest = Manifest::load(dir)?;
     let built = build(dir, &manifest, started, sandboxed).map_err(|error| {
@@ -39,7 +39,7 @@ pub(crate) fn run(dir: &Path, sandboxed: bool) -> Result<Exit, Failure> {
     })?;
     let (path, files) = (BuildDir::of(dir), built.files);
     let files = if files == 1 { "1 file".to_owned() } else { format!("{files} files") };
-    say(&format!(
+    print(&format!(
         "built {} ({files}, {})\n{}",
         path.path().display(),
         size(built.bytes),
@@ -55,23 +55,23 @@ fn build(
     sandboxed: bool,
 ) -> Result<Built, BuildError> {
     check_entry(manifest)?;
-    // Two builds of one lambda take turns. Where a folder cannot be locked, they are on their own.
-    let turn = File::open(dir).and_then(|folder| folder.lock().map(|()| folder));
+    // The lock serialises builds of one lambda, where folders can be locked.
+    let lock = File::open(dir).and_then(|folder| folder.lock().map(|()| folder));
 
-    let mut partial = Partial::begin(dir)?;
+    let mut partial = PartialBuild::begin(dir)?;
     let sources = Sources::of(dir, manifest).map_err(BuildError::Sources)?;
     check_named(dir, manifest)?;
-    if manifest.lambda.kind == Kind::Wasm {
+    if manifest.lambda.kind == LambdaKind::Wasm {
         let component = component::compile(dir, sandboxed)?;
         partial.add(&component.path, component.opened, manifest.lambda.entry.as_path())?;
     }
     for source in &sources.copied {
-        let opened = PlainFile::inside(dir, source, longest(manifest, source));
+        let opened = PlainFile::inside(dir, source, max_size(manifest, source));
         partial.add(&dir.join(source), opened, source)?;
     }
     let built = partial.finish(started)?;
 
-    drop(turn);
+    drop(lock);
     match BuildDir::check_fresh(dir) {
         Ok(_) => Ok(built),
         Err(LayoutError::Older { source_file, .. }) => Err(BuildError::Changed { source_file }),
@@ -79,13 +79,13 @@ fn build(
     }
 }
 
-/// The bound of a file that a build copies.
-fn longest(manifest: &Manifest, source: &Path) -> ByteSize {
+/// Maximum size of a file that a build copies.
+fn max_size(manifest: &Manifest, source: &Path) -> ByteSize {
     let is_model = manifest.models.iter().any(|model| model.file.as_path() == source);
     if is_model { FILE_MAX } else { SOURCE_MAX }
 }
 
-/// What a clip of this lambda will not be able to prove, if there is anything.
+/// A note if clips of this lambda cannot be verified alone.
 fn note(manifest: &Manifest) -> String {
     let Some(record) = &manifest.record else { return String::new() };
     let unrecorded = manifest
@@ -98,18 +98,20 @@ fn note(manifest: &Manifest) -> String {
         true => String::new(),
         false => {
             format!(
-                "note: [record] leaves out {topics}, which the lambda reads: its clips cannot be verified alone\n"
+                "note: [record] lacks {topics}, which the lambda reads: its clips cannot be \
+                 verified alone\n"
             )
         }
     }
 }
 
-/// The entry has its kind's extension, so that it cannot be the manifest or a message definition.
+/// Checks that the entry has the extension of its kind, so that it cannot be the manifest or a
+/// message definition.
 fn check_entry(manifest: &Manifest) -> Result<(), BuildError> {
     let entry = &manifest.lambda.entry;
     let extension = match manifest.lambda.kind {
-        Kind::Wasm => "wasm",
-        Kind::Python => "py",
+        LambdaKind::Wasm => "wasm",
+        LambdaKind::Python => "py",
     };
     if entry.as_path().extension().is_some_and(|found| found == extension) {
         return Ok(());
@@ -117,13 +119,13 @@ fn check_entry(manifest: &Manifest) -> Result<(), BuildError> {
     Err(BuildError::EntryName { entry: entry.to_string(), kind: manifest.lambda.kind, extension })
 }
 
-/// What the manifest names is there, except for the entry that a compiler makes.
+/// Checks that the files in the manifest exist, except for the entry that the compiler makes.
 fn check_named(dir: &Path, manifest: &Manifest) -> Result<(), BuildError> {
-    let entry = (manifest.lambda.kind == Kind::Python)
+    let entry = (manifest.lambda.kind == LambdaKind::Python)
         .then(|| (manifest.lambda.entry.as_path(), "`entry`"));
     let models =
         manifest.models.iter().map(|model| (model.file.as_path(), "`file` of a [[model]]"));
-    // What is there and no file is refused by name when it is copied.
+    // What exists but is not a file is refused when it is copied.
     match entry.into_iter().chain(models).find(|(file, _)| !dir.join(file).exists()) {
         Some((file, named_by)) => Err(BuildError::Missing { path: dir.join(file), named_by }),
         None => Ok(()),

@@ -1,51 +1,52 @@
-//! `--sandboxed`: building a Rust lambda runs code of its author, build scripts and macros. Here
-//! that code can read the toolchain, fetched crates and the workspace of the lambda, and write into
-//! a folder of its own, and has no sockets.
+//! Builds a Rust lambda in a sandbox (`--sandboxed`), since build scripts and macros are code of
+//! its author.
 //!
-//! What it needs from a network is fetched before, which runs none of that code. Cargo is started
-//! in the root folder: a configuration or toolchain file beside the lambda, which could name
-//! programs to run, is not read. The jail itself is `gleaner-shim --compiler`.
+//! That code can read the toolchain, fetched crates and the workspace of the lambda, can write into
+//! one folder, and has no sockets. Dependencies are fetched before, which runs none of that code.
+//! Cargo starts in the root folder, so that it does not read a configuration or toolchain file
+//! beside the lambda, which could name programs to run. The jail itself is `gleaner-shim
+//! --compiler`.
 
 use std::env;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use gleaner_base::{NotPlain, hex, own_file};
+use gleaner_base::{NotPlain, hex, safe_file};
 use gleaner_parts::Parts;
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::error::{BuildError, TARGET};
 
-/// Where cargo is started.
+/// Working directory of cargo.
 const ROOT: &str = "/";
 
-/// The target folder of cargo before it is in its jail: nothing can be written there, whatever
-/// links the lambda's own has.
+/// Target folder of cargo outside of the jail. It cannot be written, unlike the lambda's own target
+/// folder, which may contain links.
 const NOWHERE: &str = "/dev/null/target";
 
-/// What is needed of cargo's own folder: crates, and where they come from. Its credentials are not.
-const OF_CARGO: [&str; 4] = ["registry", "git", "config.toml", "config"];
+/// Readable parts of cargo's home: crates and the configuration of registries, but no credentials.
+const CARGO_HOME_PARTS: [&str; 4] = ["registry", "git", "config.toml", "config"];
 
-/// How a package is compiled.
+/// Settings for compiling a package in the sandbox.
 pub(super) struct Sandbox {
     shim: PathBuf,
     sysroot: PathBuf,
     cargo_home: PathBuf,
     workspace: PathBuf,
-    /// The only folder that is written.
+    /// The only writable folder.
     target: PathBuf,
 }
 
-/// What cargo says of a package.
+/// Output of `cargo metadata`.
 #[derive(Deserialize)]
-struct Metadata {
+struct CargoMetadata {
     workspace_root: PathBuf,
 }
 
 impl Sandbox {
-    /// Fetches what `package`, a `Cargo.toml`, depends on.
+    /// Checks the workspace of `package`, a `Cargo.toml`, and fetches its dependencies.
     pub(super) fn prepare(package: &Path) -> Result<Self, BuildError> {
         let shim = Parts::find()
             .and_then(|parts| parts.program("gleaner-shim"))
@@ -53,12 +54,12 @@ impl Sandbox {
         let home = env::var_os("HOME").map(PathBuf::from).filter(|home| home.is_absolute());
         let home = home.ok_or(BuildError::NoHome)?;
         let sysroot = sysroot(&home)?;
-        let Metadata { workspace_root } = metadata(&sysroot, package)?;
+        let CargoMetadata { workspace_root } = metadata(&sysroot, package)?;
         if !package.starts_with(&workspace_root) || home.starts_with(&workspace_root) {
             return Err(BuildError::Workspace { workspace: workspace_root });
         }
         let lock = workspace_root.join("Cargo.lock");
-        // Cargo would write to where a link leads, and wait for a pipe.
+        // Cargo would follow a link and block on a pipe.
         match lock.symlink_metadata() {
             Ok(found) if found.is_symlink() => {
                 return Err(file("write", &lock)(io::Error::other(NotPlain::Link)));
@@ -69,13 +70,13 @@ impl Sandbox {
             _ => {}
         }
         fetch(&sysroot, package)?;
-        // One for each lambda, which else could change what was compiled for another.
+        // One target folder per lambda, so that a lambda cannot change what another one uses.
         let name = hex(&Sha256::digest(package.as_os_str().as_encoded_bytes())[..8]);
         let all = workspace_root.join("target");
         let sandboxed = all.join("sandboxed");
         let target = sandboxed.join(name);
         for folder in [&all, &sandboxed, &target, &target.join("tmp")] {
-            own_file::folder(folder).map_err(file("create", folder))?;
+            safe_file::folder(folder).map_err(file("create", folder))?;
         }
         let target = target.canonicalize().map_err(file("create", &target))?;
         let cargo_home =
@@ -83,24 +84,24 @@ impl Sandbox {
         Ok(Self { shim, sysroot, cargo_home, workspace: workspace_root, target })
     }
 
-    /// Where everything is that the build writes.
+    /// The folder that the build writes to.
     pub(super) fn target(&self) -> &Path {
         &self.target
     }
 
-    /// Cargo, in its jail, for `cargo build`.
+    /// The command `cargo build` in the jail.
     pub(super) fn cargo(&self) -> Command {
         let mut command = Command::new(&self.shim);
         command.arg("--compiler").arg("--write").arg(&self.target);
-        let of_cargo = OF_CARGO.map(|name| self.cargo_home.join(name));
-        for path in of_cargo.iter().chain([&self.sysroot, &self.workspace]) {
+        let home_parts = CARGO_HOME_PARTS.map(|name| self.cargo_home.join(name));
+        for path in home_parts.iter().chain([&self.sysroot, &self.workspace]) {
             command.arg("--read").arg(path);
         }
         command.arg("--").arg(program_of(&self.sysroot, "cargo")).arg("build").arg("--offline");
         command.arg("--target-dir").arg(&self.target);
-        // Not by way of a wrapper, which is a program of the user's, and may want a socket. That of
-        // the workspace is left alone: cargo has it in the names of symbols, be it set to nothing,
-        // so that another component would come out.
+        // No compiler wrapper: it is a program of the user, and may need a socket. A workspace
+        // wrapper is left alone: cargo hashes even an empty one into symbol names, which would
+        // change the component.
         command.env("RUSTC", program_of(&self.sysroot, "rustc")).env("RUSTC_WRAPPER", "");
         command
             .env("CARGO_HOME", &self.cargo_home)
@@ -110,24 +111,24 @@ impl Sandbox {
     }
 }
 
-/// The folder of the compiler that the user has chosen. A toolchain file may name any folder: only
-/// what rustup installed is started.
+/// The sysroot of the compiler that the user has chosen. Only a toolchain that rustup installed is
+/// started, since a toolchain file may name any folder.
 fn sysroot(home: &Path) -> Result<PathBuf, BuildError> {
     let chosen = env::var_os("CARGO").map(PathBuf::from).filter(|cargo| cargo.is_absolute());
     let rustc = match chosen {
         Some(cargo) => cargo.with_file_name("rustc"),
-        None => match answer(Command::new("rustup").args(["which", "rustc"])) {
-            Ok(rustc) => of_rustup(rustc.into(), home)?,
-            // There is no rustup: then no file chooses a compiler.
+        None => match first_line(Command::new("rustup").args(["which", "rustc"])) {
+            Ok(rustc) => check_rustup(rustc.into(), home)?,
+            // Without rustup, no file chooses a compiler.
             Err(_) => "rustc".into(),
         },
     };
-    answer(Command::new(&rustc).args(["--print", "sysroot"]).current_dir(ROOT))
+    first_line(Command::new(&rustc).args(["--print", "sysroot"]).current_dir(ROOT))
         .map(PathBuf::from)
         .map_err(|source| BuildError::NoCargo { program: rustc, source })
 }
 
-fn of_rustup(rustc: PathBuf, home: &Path) -> Result<PathBuf, BuildError> {
+fn check_rustup(rustc: PathBuf, home: &Path) -> Result<PathBuf, BuildError> {
     let rustup = env::var_os("RUSTUP_HOME").map_or_else(|| home.join(".rustup"), PathBuf::from);
     let is_installed = rustc.starts_with(rustup.join("toolchains"));
     if is_installed { Ok(rustc) } else { Err(BuildError::Toolchain { rustc }) }
@@ -138,7 +139,7 @@ fn program_of(sysroot: &Path, name: &str) -> PathBuf {
     if program.is_file() { program } else { name.into() }
 }
 
-fn metadata(sysroot: &Path, package: &Path) -> Result<Metadata, BuildError> {
+fn metadata(sysroot: &Path, package: &Path) -> Result<CargoMetadata, BuildError> {
     let cargo = program_of(sysroot, "cargo");
     let mut command = Command::new(&cargo);
     command
@@ -159,7 +160,7 @@ fn metadata(sysroot: &Path, package: &Path) -> Result<Metadata, BuildError> {
 
 fn fetch(sysroot: &Path, package: &Path) -> Result<(), BuildError> {
     let (cargo, rustc) = (program_of(sysroot, "cargo"), program_of(sysroot, "rustc"));
-    let host = answer(Command::new(&rustc).args(["--print", "host-tuple"]).current_dir(ROOT))
+    let host = first_line(Command::new(&rustc).args(["--print", "host-tuple"]).current_dir(ROOT))
         .map_err(|source| BuildError::NoCargo { program: rustc, source })?;
     let mut command = Command::new(&cargo);
     command
@@ -173,8 +174,8 @@ fn fetch(sysroot: &Path, package: &Path) -> Result<(), BuildError> {
     if status.success() { Ok(()) } else { Err(BuildError::Fetch { status }) }
 }
 
-/// The line that `command` prints.
-fn answer(command: &mut Command) -> io::Result<String> {
+/// Runs `command` and returns the line that it prints.
+fn first_line(command: &mut Command) -> io::Result<String> {
     let output = command.stdin(Stdio::null()).stderr(Stdio::null()).output()?;
     let line = String::from_utf8_lossy(&output.stdout).trim().to_owned();
     if output.status.success() && !line.is_empty() {

@@ -9,14 +9,14 @@ use super::*;
 const PYTHON: &str = "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'\n";
 
 /// A lambda's folder, removed when the test ends.
-struct Lambda(PathBuf);
+struct LambdaFolder(PathBuf);
 
-impl Lambda {
-    fn new(manifest: &str) -> Lambda {
+impl LambdaFolder {
+    fn new(manifest: &str) -> LambdaFolder {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let name =
             format!("gleaner-cli-{}-{}", process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
-        let lambda = Lambda(std::env::temp_dir().join(name));
+        let lambda = LambdaFolder(std::env::temp_dir().join(name));
         lambda.write("lambda.toml", manifest);
         lambda
     }
@@ -36,7 +36,7 @@ impl Lambda {
         fs::read_to_string(self.0.join(relative)).ok()
     }
 
-    /// Everything in the folder `relative`, in order.
+    /// All files in the folder `relative`, sorted.
     fn files(&self, relative: &str) -> Vec<String> {
         fn walk(root: &Path, folder: &Path, found: &mut Vec<String>) {
             for entry in fs::read_dir(folder).unwrap().map(Result::unwrap) {
@@ -55,7 +55,7 @@ impl Lambda {
     }
 }
 
-impl Drop for Lambda {
+impl Drop for LambdaFolder {
     fn drop(&mut self) {
         let _ = fs::remove_dir_all(&self.0);
     }
@@ -63,7 +63,7 @@ impl Drop for Lambda {
 
 #[test]
 fn a_python_build_holds_the_manifest_the_sources_and_the_messages() {
-    let lambda = Lambda::new(PYTHON);
+    let lambda = LambdaFolder::new(PYTHON);
     for file in [
         "main.py",
         "part/of.py",
@@ -87,7 +87,7 @@ fn a_python_build_holds_the_manifest_the_sources_and_the_messages() {
 
 #[test]
 fn a_second_build_replaces_the_first_and_leaves_nothing_else() {
-    let lambda = Lambda::new(PYTHON);
+    let lambda = LambdaFolder::new(PYTHON);
     lambda.write("main.py", "1");
     lambda.write("gone.py", "");
     lambda.build().unwrap();
@@ -101,7 +101,7 @@ fn a_second_build_replaces_the_first_and_leaves_nothing_else() {
 
 #[test]
 fn a_build_that_fails_leaves_the_old_one_as_it_was() {
-    let lambda = Lambda::new(PYTHON);
+    let lambda = LambdaFolder::new(PYTHON);
     lambda.write("main.py", "1");
     lambda.build().unwrap();
     fs::remove_file(lambda.0.join("main.py")).unwrap();
@@ -114,8 +114,8 @@ fn a_build_that_fails_leaves_the_old_one_as_it_was() {
 }
 
 #[test]
-fn what_a_killed_build_left_is_in_nobodys_way() {
-    let lambda = Lambda::new(PYTHON);
+fn remains_of_a_killed_build_are_removed() {
+    let lambda = LambdaFolder::new(PYTHON);
     lambda.write("main.py", "1");
     lambda.write(".build.partial/half.py", "");
     lambda.write(".build.old/main.py", "");
@@ -124,8 +124,8 @@ fn what_a_killed_build_left_is_in_nobodys_way() {
 }
 
 #[test]
-fn a_build_is_as_fresh_as_what_it_is_made_of_and_no_more() {
-    let lambda = Lambda::new(PYTHON);
+fn a_build_is_fresh_until_one_of_its_sources_changes() {
+    let lambda = LambdaFolder::new(PYTHON);
     lambda.write("main.py", "1");
     lambda.build().unwrap();
     let later = |relative: &str| {
@@ -140,43 +140,43 @@ fn a_build_is_as_fresh_as_what_it_is_made_of_and_no_more() {
 
 #[test]
 fn a_source_from_the_future_is_named() {
-    let lambda = Lambda::new(PYTHON);
+    let lambda = LambdaFolder::new(PYTHON);
     lambda.write("main.py", "1");
     let file = File::options().write(true).open(lambda.0.join("main.py")).unwrap();
     file.set_modified(SystemTime::now() + Duration::from_secs(3600)).unwrap();
     let error = lambda.build().unwrap_err();
-    assert_eq!(error.to_string(), "`main.py` is newer than the build that was just made of it");
+    assert_eq!(error.to_string(), "`main.py` is newer than the build just made from it");
 }
 
 #[test]
 fn an_entry_has_the_extension_of_its_kind() {
-    for (kind, entry, said) in [
+    for (kind, entry, message) in [
         ("python", "lambda.toml", "the entry of a python lambda ends with `.py`"),
         ("wasm", "main.py", "the entry of a wasm lambda ends with `.wasm`"),
     ] {
-        let lambda = Lambda::new(&PYTHON.replace("python", kind).replace("main.py", entry));
+        let lambda = LambdaFolder::new(&PYTHON.replace("python", kind).replace("main.py", entry));
         let error = lambda.build().unwrap_err();
-        assert!(error.to_string().contains(said), "{error}");
+        assert!(error.to_string().contains(message), "{error}");
     }
 }
 
 #[test]
-fn a_wasm_lambda_without_a_package_is_told_how_to_make_one() {
+fn a_wasm_lambda_without_a_package_is_refused_with_help() {
     use gleaner_base::Explain;
-    let lambda = Lambda::new(&PYTHON.replace("python", "wasm").replace("main.py", "x.wasm"));
+    let lambda = LambdaFolder::new(&PYTHON.replace("python", "wasm").replace("main.py", "x.wasm"));
     let error = lambda.build().unwrap_err();
     assert_eq!(
         error.to_string(),
-        format!("there is no `{}`", lambda.0.join("Cargo.toml").display())
+        format!("`{}` does not exist", lambda.0.join("Cargo.toml").display())
     );
     assert!(error.help().unwrap().contains("cargo init --lib"));
 }
 
 #[test]
-fn messages_may_be_absent_but_a_model_that_is_named_may_not() {
+fn messages_are_optional_but_a_model_in_the_manifest_must_exist() {
     let model =
         format!("[[model]]\nname = 'm'\nfile = 'models/m.onnx'\nsha256 = '{}'\n", "0".repeat(64));
-    let lambda = Lambda::new(&format!("{PYTHON}{model}"));
+    let lambda = LambdaFolder::new(&format!("{PYTHON}{model}"));
     lambda.write("main.py", "1");
     let error = lambda.build().unwrap_err();
     assert!(error.to_string().contains("models/m.onnx"), "{error}");
@@ -186,12 +186,12 @@ fn messages_may_be_absent_but_a_model_that_is_named_may_not() {
 }
 
 #[test]
-fn a_lambda_whose_clips_will_lack_an_input_is_told_so() {
+fn a_note_says_which_inputs_clips_will_lack() {
     let manifest = |recorded: &str| {
         let inputs = "[[input]]\nname = 'imu'\ntopic = '/imu/data'\ntype = 'sensor_msgs/msg/Imu'\n";
         let text = format!("{PYTHON}{inputs}[record]\ntopics = ['{recorded}']\n");
         Manifest::parse(&text, "lambda.toml").unwrap()
     };
     assert_eq!(note(&manifest("/imu/data")), "");
-    assert!(note(&manifest("/camera")).starts_with("note: [record] leaves out `/imu/data`"));
+    assert!(note(&manifest("/camera")).starts_with("note: [record] lacks `/imu/data`"));
 }

@@ -1,8 +1,7 @@
 //! `gleaner dev DIR DRIVE...`: builds and replays a lambda whenever one of its sources is saved,
-//! and shows what that changed.
+//! and shows the changes.
 //!
-//! Nothing here is a way of its own to build, to replay or to compare: it does what the three
-//! commands do, one after the other.
+//! It runs the code of `gleaner build`, `replay` and `diff`, one after the other.
 
 mod watch;
 
@@ -10,36 +9,35 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
-use gleaner_base::{ByteSize, Exit, Failure, PlainFile, own_file, visible};
+use gleaner_base::{ByteSize, Exit, Failure, PlainFile, safe_file, visible};
 use gleaner_report::Diff;
 
 use crate::args::{DevArgs, ReplayArgs};
-use crate::say::say;
-use crate::show::{self, Paint};
+use crate::render::{self, Paint};
+use crate::stdout::print;
 use crate::{build, replay};
 
-use watch::Seen;
+use watch::SourceSnapshot;
 
-/// Where what a replay is compared with is kept, below its results: `gleaner diff` finds it there,
+/// Folder below the results with the results of the previous replay. `gleaner diff` can read it,
 /// too.
 const BEFORE: &str = ".before";
 
-/// Files of a replay from which it is compared with the next.
+/// Result files that are compared with the next replay.
 const COMPARED: [&str; 4] = ["summary.json", "decisions.jsonl", "signals.json", "clips.jsonl"];
 
-/// Longest file that is kept: it is there twice.
+/// Maximum size of a file that is kept, since it takes disk space twice.
 const KEPT_MAX: ByteSize = ByteSize::gib(1);
 
-/// Goes on until somebody ends it.
+/// Runs until the user ends it.
 pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
-    let dir = args.asked.lambda.clone();
+    let dir = args.target.lambda.clone();
     let out = args.out.clone().unwrap_or_else(|| dir.join("out"));
     let before = out.join(BEFORE);
     let replay = replay_args(args);
-    // Of the one before this started, if its results still lie there, too: somebody comes back from
-    // lunch.
+    // The first comparison is with the results of an earlier session, if there are any.
     let mut has_before = keep(&out, &before);
-    let mut seen = Seen::of(&dir);
+    let mut sources = SourceSnapshot::of(&dir);
     loop {
         match once(&dir, &replay) {
             Ok(true) => {
@@ -51,20 +49,20 @@ pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
             Ok(false) => {}
             Err(failure) => eprintln!("{failure}"),
         }
-        say(&format!("\nwaiting for changes in {} (ctrl-C ends)\n", dir.display()))?;
-        let (now, changed) = seen.wait_for_change(&dir);
-        seen = now;
+        print(&format!("\nwaiting for changes in {} (Ctrl-C ends)\n", dir.display()))?;
+        let (now, changed) = sources.wait_for_change(&dir);
+        sources = now;
         let changed = changed
             .iter()
             .map(|path| visible(&path.to_string_lossy()))
             .collect::<Vec<_>>()
             .join(", ");
-        say(&format!("\n── changed: {changed}\n"))?;
+        print(&format!("\n── changed: {changed}\n"))?;
     }
 }
 
-/// Builds and replays; whether there are results, be they of a lambda with faults or of a damaged
-/// drive.
+/// Builds and replays. Returns whether there are results, which is also the case for a lambda with
+/// faults and for a damaged drive.
 fn once(dir: &Path, args: &ReplayArgs) -> Result<bool, Failure> {
     build::run(dir, false)?;
     replay::results(args).map(|(_, has_results)| has_results)
@@ -74,22 +72,22 @@ fn compare(before: &Path, out: &Path) -> Result<(), Failure> {
     let mut changes = Diff::between(before, out)?;
     changes.a.out = "before".to_owned();
     changes.b.out = "now".to_owned();
-    say(&format!("\n{}", show::diff(&changes, Paint::of_stdout())))
+    print(&format!("\n{}", render::diff(&changes, Paint::of_stdout())))
 }
 
-/// Copies what a later replay is compared with; false if there is nothing whole.
+/// Copies the results for the next comparison; returns false if they are incomplete.
 fn keep(out: &Path, before: &Path) -> bool {
     let copied = || -> io::Result<()> {
         if !out.join(COMPARED[0]).is_file() {
             return Err(io::ErrorKind::NotFound.into());
         }
-        own_file::folder(before)?;
+        safe_file::folder(before)?;
         for name in COMPARED {
             match PlainFile::result(&out.join(name), KEPT_MAX) {
                 Err(error) if error.kind() == io::ErrorKind::NotFound && name != COMPARED[0] => {
                     let _ = fs::remove_file(before.join(name));
                 }
-                file => file?.copy_to(&mut own_file::anew(&before.join(name))?)?,
+                file => file?.copy_to(&mut safe_file::create(&before.join(name))?)?,
             }
         }
         Ok(())
@@ -98,19 +96,16 @@ fn keep(out: &Path, before: &Path) -> bool {
         Ok(()) => true,
         Err(error) if error.kind() == io::ErrorKind::NotFound => false,
         Err(error) => {
-            eprintln!(
-                "warning: these results are not compared with the next: cannot copy them from `{}`: {error}",
-                out.display()
-            );
+            eprintln!("warning: cannot copy `{}` for the next comparison: {error}", out.display());
             false
         }
     }
 }
 
 fn replay_args(args: DevArgs) -> ReplayArgs {
-    let DevArgs { asked, drives, from, to, out, no_record } = args;
+    let DevArgs { target, drives, from, to, out, no_record } = args;
     ReplayArgs {
-        asked,
+        target,
         drives,
         from,
         to,
@@ -130,7 +125,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_kept_of_results_is_written_to_files_of_ours_only() {
+    fn copies_do_not_follow_links() {
         let folder = tempfile::tempdir().unwrap();
         let (out, precious) = (folder.path().join("out"), folder.path().join("precious"));
         let before = out.join(BEFORE);
@@ -141,7 +136,7 @@ mod tests {
         assert!(keep(&out, &before));
         assert_eq!(fs::read_to_string(before.join("summary.json")).unwrap(), "{}");
         assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
-        // What is read is no link, either, and a folder that is one is not written to.
+        // Links are not read either, and a linked folder is not written to.
         fs::remove_file(out.join("summary.json")).unwrap();
         std::os::unix::fs::symlink(&precious, out.join("summary.json")).unwrap();
         assert!(!keep(&out, &before));

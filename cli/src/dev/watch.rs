@@ -1,8 +1,8 @@
-//! Waiting until somebody saves a source of a lambda.
+//! Waits until a source of a lambda is saved.
 //!
-//! The sources are looked at, some times a second, by length and date: that is a handful of calls
-//! for what one person writes, and unlike notices of a kernel it works on shared and mounted
-//! folders, and with editors that replace files instead of writing them.
+//! It polls the lengths and dates of the sources several times a second. That takes few calls, and
+//! unlike kernel notifications it works on shared and mounted folders, and with editors that
+//! replace files.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,16 +12,15 @@ use std::time::{Duration, SystemTime};
 
 use gleaner_lambda::{Manifest, Sources};
 
-/// Between two looks: sooner than one notices.
-const EVERY: Duration = Duration::from_millis(200);
+/// Poll interval, shorter than a user notices.
+const POLL_INTERVAL: Duration = Duration::from_millis(200);
 
-/// The sources of a lambda as they were at some time.
+/// Lengths and dates of the sources of a lambda at one time.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Seen(BTreeMap<PathBuf, Option<(u64, SystemTime)>>);
+pub(super) struct SourceSnapshot(BTreeMap<PathBuf, Option<(u64, SystemTime)>>);
 
-impl Seen {
-    /// As they are now in `dir`. Of a manifest that cannot be read, only the manifest is a source:
-    /// nothing else tells.
+impl SourceSnapshot {
+    /// The current state of `dir`. If the manifest cannot be read, it is the only known source.
     pub(super) fn of(dir: &Path) -> Self {
         let sources =
             Manifest::load(dir).ok().and_then(|manifest| Sources::of(dir, &manifest).ok());
@@ -33,16 +32,16 @@ impl Seen {
         Self(sources.map(|path| (path.to_owned(), state(path))).collect())
     }
 
-    /// Waits until the sources in `dir` differ from these, and nobody is writing them any more.
-    /// Gives them as they are then, and which differ.
+    /// Waits until the sources in `dir` differ from these and are no longer being written. Returns
+    /// their new state, and the paths that differ.
     pub(super) fn wait_for_change(&self, dir: &Path) -> (Self, Vec<PathBuf>) {
         loop {
-            thread::sleep(EVERY);
+            thread::sleep(POLL_INTERVAL);
             let now = Self::of(dir);
             if now == *self {
                 continue;
             }
-            thread::sleep(EVERY);
+            thread::sleep(POLL_INTERVAL);
             if Self::of(dir) == now {
                 let changed = self.changed(&now);
                 return (now, changed);
@@ -65,7 +64,7 @@ mod tests {
                             type = \"sensor_msgs/msg/Imu\"\n";
 
     #[test]
-    fn what_is_saved_is_seen_and_what_is_no_source_is_not() {
+    fn saved_sources_are_changes_and_other_files_are_not() {
         let folder = tempfile::tempdir().unwrap();
         let dir = folder.path();
         let write = |name: &str, text: &str| {
@@ -74,20 +73,20 @@ mod tests {
         };
         write("lambda.toml", MANIFEST);
         write("main.py", "a");
-        let before = Seen::of(dir);
+        let before = SourceSnapshot::of(dir);
         for other in ["out/decisions.jsonl", "build/main.py", "notes.txt", "tests/test_x.py"] {
             write(other, "x");
         }
-        assert_eq!(before, Seen::of(dir));
+        assert_eq!(before, SourceSnapshot::of(dir));
         write("main.py", "ab");
         write("more/part.py", "c");
         let (after, changed) = before.wait_for_change(dir);
         assert_eq!(changed, [PathBuf::from("main.py"), PathBuf::from("more/part.py")]);
-        // Broken, and mended: both are changes.
+        // Breaking and mending the manifest are both changes.
         write("lambda.toml", "[lambda");
         let (broken, changed) = after.wait_for_change(dir);
         assert!(changed.contains(&PathBuf::from("lambda.toml")), "{changed:?}");
         write("lambda.toml", MANIFEST);
-        assert_ne!(broken, Seen::of(dir));
+        assert_ne!(broken, SourceSnapshot::of(dir));
     }
 }

@@ -1,12 +1,11 @@
-//! Which layers of isolation a lambda's process has here: `gleaner-shim` sets each up, and tries
-//! it.
+//! Checks the isolation layers of a lambda's process: `gleaner-shim` sets each one up and tests it.
 
 use std::process::Command;
 
 use gleaner_parts::Parts;
 use gleaner_protocol::{Holds, Layer};
 
-use super::{Finding, State};
+use super::{Finding, Severity};
 
 /// A finding for each layer.
 pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
@@ -23,23 +22,25 @@ fn layers(parts: &Parts) -> Result<Vec<Layer>, String> {
     let output = Command::new(&shim).arg("--layers").output().map_err(|error| error.to_string())?;
     if !output.status.success() {
         return Err(format!(
-            "gleaner-shim cannot tell: {}",
+            "gleaner-shim failed: {}",
             String::from_utf8_lossy(&output.stderr).trim()
         ));
     }
     serde_json::from_slice(&output.stdout)
-        .map_err(|error| format!("cannot understand gleaner-shim: {error}"))
+        .map_err(|error| format!("cannot parse the output of gleaner-shim: {error}"))
 }
 
 fn finding(layer: &Layer) -> Finding {
-    let found = format!("{}: {}", layer.name, layer.note);
+    let detail = format!("{}: {}", layer.name, layer.note);
     match layer.holds {
-        Holds::Yes => Finding::fine("isolation", found),
+        Holds::Yes => Finding::ok("isolation", detail),
         Holds::Partly | Holds::No => Finding {
-            about: "isolation",
-            state: State::Warning,
-            found,
-            help: Some("Python lambdas are held by fewer layers; see docs/security.md".to_owned()),
+            subject: "isolation",
+            state: Severity::Warning,
+            detail,
+            help: Some(
+                "Python lambdas are isolated by fewer layers; see docs/security.md".to_owned(),
+            ),
         },
     }
 }

@@ -1,7 +1,6 @@
-//! `gleaner doctor`: what would keep lambdas from running well on this machine, and what to do
-//! about it.
+//! `gleaner doctor`: checks whether lambdas can run well on this machine, and suggests fixes.
 //!
-//! It only looks: nothing is changed, started or sent.
+//! It changes, starts and sends nothing.
 
 mod isolation;
 mod network;
@@ -11,66 +10,66 @@ use gleaner_parts::Parts;
 use serde::Serialize;
 
 use crate::args::DoctorArgs;
-use crate::say::say;
-use crate::show::json_line;
+use crate::render::json_line;
+use crate::stdout::print;
 
-/// What was found of one thing.
+/// Result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 struct Finding {
-    /// What was looked at.
-    about: &'static str,
-    /// How bad it is.
-    state: State,
-    /// What was found.
-    found: String,
-    /// What to do about it.
+    /// The checked thing.
+    subject: &'static str,
+    /// Severity of the result.
+    state: Severity,
+    /// The result, as text.
+    detail: String,
+    /// A fix.
     #[serde(skip_serializing_if = "Option::is_none")]
     help: Option<String>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-enum State {
-    Fine,
-    /// Some things will not work, or not well.
+enum Severity {
+    Ok,
+    /// Some features will not work, or not well.
     Warning,
-    /// Nothing will work.
-    Broken,
+    /// No lambda can run.
+    Error,
 }
 
 impl Finding {
-    fn fine(about: &'static str, found: impl Into<String>) -> Self {
-        Self { about, state: State::Fine, found: found.into(), help: None }
+    fn ok(subject: &'static str, detail: impl Into<String>) -> Self {
+        Self { subject, state: Severity::Ok, detail: detail.into(), help: None }
     }
 
-    fn warning(about: &'static str, found: impl Into<String>, help: impl Into<String>) -> Self {
-        Self { about, state: State::Warning, found: found.into(), help: Some(help.into()) }
+    fn warning(subject: &'static str, detail: impl Into<String>, help: impl Into<String>) -> Self {
+        Self { subject, state: Severity::Warning, detail: detail.into(), help: Some(help.into()) }
     }
 }
 
-/// Looks, and shows what was found. The exit is [`Exit::Internal`] if something is broken.
+/// Runs all checks and prints their results. Returns [`Exit::Internal`] if one is an error.
 pub(crate) fn run(args: &DoctorArgs) -> Result<Exit, Failure> {
     let parts = Parts::find()?;
     let mut findings =
         vec![program(&parts, "gleaner-runtime"), program(&parts, "gleaner-recorder")];
     findings.push(program(&parts, "gleaner-shim"));
-    findings.push(optional(&parts, "gleaner-player", "`gleaner play` needs it"));
+    findings.push(optional(&parts, "gleaner-player", "needed by `gleaner play`"));
     findings.push(python(&parts));
     findings.extend(isolation::findings(&parts));
     findings.extend(network::findings());
     let text = findings.iter().map(if args.json { json_line::<Finding> } else { text });
-    say(&text.collect::<String>())?;
-    let broken = findings.iter().any(|finding| finding.state == State::Broken);
-    Ok(if broken { Exit::Internal } else { Exit::Ok })
+    print(&text.collect::<String>())?;
+    let has_error = findings.iter().any(|finding| finding.state == Severity::Error);
+    Ok(if has_error { Exit::Internal } else { Exit::Ok })
 }
 
 fn program(parts: &Parts, name: &'static str) -> Finding {
     match parts.program(name) {
-        Ok(path) => Finding::fine(name, path.display().to_string()),
+        Ok(path) => Finding::ok(name, path.display().to_string()),
         Err(error) => {
             let failure = Failure::from(error);
-            let (found, help) = (failure.message, failure.help);
-            Finding { about: name, state: State::Broken, found, help }
+            let (detail, help) = (failure.message, failure.help);
+            Finding { subject: name, state: Severity::Error, detail, help }
         }
     }
 }
@@ -78,8 +77,8 @@ fn program(parts: &Parts, name: &'static str) -> Finding {
 fn optional(parts: &Parts, name: &'static str, why: &str) -> Finding {
     let finding = program(parts, name);
     match finding.state {
-        State::Broken => {
-            Finding { state: State::Warning, found: format!("not there; {why}"), ..finding }
+        Severity::Error => {
+            Finding { state: Severity::Warning, detail: format!("not found; {why}"), ..finding }
         }
         _ => finding,
     }
@@ -87,13 +86,13 @@ fn optional(parts: &Parts, name: &'static str, why: &str) -> Finding {
 
 fn python(parts: &Parts) -> Finding {
     match parts.python(None) {
-        Ok(python) => Finding::fine("Python", python.display().to_string()),
+        Ok(python) => Finding::ok("Python", python.display().to_string()),
         Err(error) => {
             let failure = Failure::from(error);
             let help = failure.help.unwrap_or_else(|| "install Python 3.9 or newer".to_owned());
             Finding::warning(
                 "Python",
-                format!("{}; lambdas of kind python need it", failure.message),
+                format!("{}; needed by lambdas of kind python", failure.message),
                 help,
             )
         }
@@ -102,11 +101,11 @@ fn python(parts: &Parts) -> Finding {
 
 fn text(finding: &Finding) -> String {
     let state = match finding.state {
-        State::Fine => "fine   ",
-        State::Warning => "warning",
-        State::Broken => "broken ",
+        Severity::Ok => "ok     ",
+        Severity::Warning => "warning",
+        Severity::Error => "error  ",
     };
-    let mut text = format!("{state}  {}: {}\n", finding.about, finding.found);
+    let mut text = format!("{state}  {}: {}\n", finding.subject, finding.detail);
     if let Some(help) = &finding.help {
         text += &format!("         help: {help}\n");
     }

@@ -1,4 +1,4 @@
-//! The network of this machine, as far as DDS depends on it.
+//! Checks the network settings that DDS depends on.
 
 use std::fs;
 use std::net::Ipv4Addr;
@@ -11,12 +11,12 @@ use super::Finding;
 const UP: InterfaceFlags = InterfaceFlags::IFF_UP;
 const MULTICAST: InterfaceFlags = InterfaceFlags::IFF_MULTICAST;
 
-/// Largest socket buffer that a runtime asks for.
+/// Largest socket buffer that a runtime requests.
 const BUFFER_BYTES: u64 = 64 << 20;
-/// What a socket filter of ours takes, and some more: see `docs/dds-limits.md`.
+/// Memory for the socket filter, with some reserve: see `docs/dds-limits.md`.
 const FILTER_BYTES: u64 = 128 << 10;
-/// Participants on one host that find each other without multicast: RustDDS announces itself to the
-/// first twelve by address.
+/// Number of participants on one host that find each other without multicast: RustDDS announces
+/// itself by unicast to the first twelve.
 const WITHOUT_MULTICAST: usize = 12;
 
 /// An interface of this machine.
@@ -41,68 +41,69 @@ pub(super) fn findings() -> Vec<Finding> {
     ]
 }
 
-fn socket_buffer(most: Option<u64>) -> Finding {
-    const ABOUT: &str = "socket buffer";
+fn socket_buffer(max: Option<u64>) -> Finding {
+    const SUBJECT: &str = "socket buffer";
     let help = format!(
         "for images: `sysctl -w net.core.rmem_max={BUFFER_BYTES}`, and the same in /etc/sysctl.d"
     );
-    match most {
-        None => Finding::warning(ABOUT, "the system does not tell its limit", help),
-        Some(most) if most >= BUFFER_BYTES => {
-            Finding::fine(ABOUT, format!("up to {} MiB", most >> 20))
+    match max {
+        None => Finding::warning(SUBJECT, "unknown limit", help),
+        Some(max) if max >= BUFFER_BYTES => {
+            Finding::ok(SUBJECT, format!("up to {} MiB", max >> 20))
         }
-        Some(most) => {
-            let kib = most >> 10;
+        Some(max) => {
+            let kib = max >> 10;
             Finding::warning(
-                ABOUT,
-                format!("{kib} KiB at most: bursts of large messages will be lost"),
+                SUBJECT,
+                format!("up to {kib} KiB: bursts of large messages will be lost"),
                 help,
             )
         }
     }
 }
 
-fn socket_filter(most: Option<u64>) -> Finding {
-    const ABOUT: &str = "socket filter";
+fn socket_filter(max: Option<u64>) -> Finding {
+    const SUBJECT: &str = "socket filter";
     let help =
         format!("`sysctl -w net.core.optmem_max={FILTER_BYTES}`, and the same in /etc/sysctl.d");
-    match most {
-        Some(most) if most >= FILTER_BYTES => {
-            Finding::fine(ABOUT, format!("up to {} KiB", most >> 10))
+    match max {
+        Some(max) if max >= FILTER_BYTES => {
+            Finding::ok(SUBJECT, format!("up to {} KiB", max >> 10))
         }
         _ => {
-            let found = "no room for the one that keeps hostile fragments from taking all memory";
-            Finding::warning(ABOUT, found, help)
+            let found = "too little memory for the filter against fragment floods";
+            Finding::warning(SUBJECT, found, help)
         }
     }
 }
 
 fn discovery(interfaces: &[Interface], routes: &str, localhost_only: bool) -> Finding {
-    const ABOUT: &str = "discovery";
+    const SUBJECT: &str = "discovery";
     let usable = |interface: &&Interface| {
         interface.flags.contains(UP | MULTICAST)
             && (!localhost_only || interface.name == "lo")
             && has_multicast_route(routes, &interface.name)
     };
-    let by: Vec<&str> =
+    let names: Vec<&str> =
         interfaces.iter().filter(usable).map(|interface| interface.name.as_str()).collect();
-    if !by.is_empty() {
-        return Finding::fine(ABOUT, format!("multicast by {}", by.join(", ")));
+    if !names.is_empty() {
+        return Finding::ok(SUBJECT, format!("multicast on {}", names.join(", ")));
     }
     let found = format!(
-        "no interface carries multicast: participants of this machine find each other only up to {WITHOUT_MULTICAST}, and other machines not at all"
+        "no interface supports multicast: only {WITHOUT_MULTICAST} participants of this machine \
+         find each other, and none finds other machines"
     );
     let help = format!(
-        "more than {WITHOUT_MULTICAST} lambdas need it: `ip link set lo multicast on; ip route add 224.0.0.0/4 dev lo`"
+        "more than {WITHOUT_MULTICAST} lambdas need it: \
+         `ip link set lo multicast on; ip route add 224.0.0.0/4 dev lo`"
     );
-    Finding::warning(ABOUT, found, help)
+    Finding::warning(SUBJECT, found, help)
 }
 
-/// Whether multicast leaves by this interface: it has a route of its own for it, or the default
-/// one.
+/// Returns whether multicast is routed to this interface, by its own or by the default route.
 fn has_multicast_route(routes: &str, interface: &str) -> bool {
-    // Interface, destination, gateway, flags, references, use, metric, mask; addresses as the CPU
-    // holds them.
+    // Columns: interface, destination, gateway, flags, references, use, metric, mask. Addresses are
+    // in native byte order.
     routes.lines().skip(1).any(|line| {
         let mut words = line.split_whitespace();
         let (Some(name), Some(destination)) = (words.next(), words.next()) else { return false };
@@ -114,28 +115,28 @@ fn has_multicast_route(routes: &str, interface: &str) -> bool {
         let (Some(destination), Some(mask)) = (address(Some(destination)), address(mask)) else {
             return false;
         };
-        // The group that every participant joins.
+        // The multicast group that every participant joins.
         let group = Ipv4Addr::new(239, 255, 0, 1);
         name == interface && u32::from(group) & u32::from(mask) == u32::from(destination)
     })
 }
 
 fn domain(id: Option<&str>) -> Finding {
-    const ABOUT: &str = "ROS_DOMAIN_ID";
+    const SUBJECT: &str = "ROS_DOMAIN_ID";
     match id.map(str::trim) {
-        None | Some("") => Finding::fine(ABOUT, "not set: domain 0"),
+        None | Some("") => Finding::ok(SUBJECT, "not set: domain 0"),
         Some(id) => match id.parse::<u16>() {
-            Ok(domain) if domain <= 232 => Finding::fine(ABOUT, format!("domain {domain}")),
+            Ok(domain) if domain <= 232 => Finding::ok(SUBJECT, format!("domain {domain}")),
             _ => Finding::warning(
-                ABOUT,
-                format!("`{}` is no domain", gleaner_base::visible(id)),
-                "use 0 to 232",
+                SUBJECT,
+                format!("`{}` is not a domain", gleaner_base::visible(id)),
+                "set it to 0 to 232",
             ),
         },
     }
 }
 
-/// Those of the network that this process is in, each once.
+/// The interfaces in the network namespace of this process, each once.
 fn interfaces() -> Vec<Interface> {
     let mut interfaces: Vec<Interface> = Vec::new();
     for address in getifaddrs().into_iter().flatten() {
@@ -148,7 +149,7 @@ fn interfaces() -> Vec<Interface> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::State;
+    use super::super::Severity;
     use super::*;
 
     const HEAD: &str =
@@ -163,49 +164,49 @@ mod tests {
     fn more_than_twelve_runtimes_need_multicast_and_a_route_for_it() {
         let lo = [interface("lo", UP | MULTICAST)];
         let route = format!("{HEAD}lo\t000000E0\t00000000\t0001\t0\t0\t0\t000000F0\t0\t0\t0\n");
-        assert_eq!(discovery(&lo, &route, true).state, State::Fine);
-        assert_eq!(discovery(&lo, HEAD, true).state, State::Warning);
-        assert_eq!(discovery(&[interface("lo", UP)], &route, true).state, State::Warning);
+        assert_eq!(discovery(&lo, &route, true).state, Severity::Ok);
+        assert_eq!(discovery(&lo, HEAD, true).state, Severity::Warning);
+        assert_eq!(discovery(&[interface("lo", UP)], &route, true).state, Severity::Warning);
         assert!(discovery(&lo, HEAD, true).help.unwrap().contains("more than 12 lambdas"));
     }
 
     #[cfg(target_endian = "little")]
     #[test]
-    fn the_default_route_carries_multicast_unless_only_this_machine_is_meant() {
+    fn the_default_route_carries_multicast_unless_discovery_is_local() {
         let interfaces = [interface("eth0", UP | MULTICAST), interface("lo", UP)];
         let route = format!("{HEAD}eth0\t00000000\t0100000A\t0003\t0\t0\t0\t00000000\t0\t0\t0\n");
-        assert_eq!(discovery(&interfaces, &route, false).found, "multicast by eth0");
-        assert_eq!(discovery(&interfaces, &route, true).state, State::Warning);
+        assert_eq!(discovery(&interfaces, &route, false).detail, "multicast on eth0");
+        assert_eq!(discovery(&interfaces, &route, true).state, Severity::Warning);
         let down = [interface("eth0", MULTICAST)];
-        assert_eq!(discovery(&down, &route, false).state, State::Warning);
+        assert_eq!(discovery(&down, &route, false).state, Severity::Warning);
     }
 
     #[test]
-    fn a_small_socket_buffer_is_named_with_the_way_out() {
-        assert_eq!(socket_buffer(Some(64 << 20)).state, State::Fine);
+    fn a_small_socket_buffer_is_reported_with_help() {
+        assert_eq!(socket_buffer(Some(64 << 20)).state, Severity::Ok);
         let small = socket_buffer(Some(212_992));
-        assert_eq!(small.found, "208 KiB at most: bursts of large messages will be lost");
+        assert_eq!(small.detail, "208 KiB at most: bursts of large messages will be lost");
         assert!(small.help.unwrap().contains("net.core.rmem_max=67108864"));
     }
 
     #[test]
-    fn the_domain_is_that_which_all_programs_of_ours_read() {
+    fn the_domain_is_parsed_as_in_all_programs() {
         let page = include_str!("../../../tests/domains.txt");
         for line in page.lines().filter(|line| line.starts_with('|')) {
-            let (content, wanted) = line[1..].split_once('|').unwrap();
+            let (content, expected) = line[1..].split_once('|').unwrap();
             let found = domain(Some(content));
-            assert_eq!(found.state == State::Fine, wanted.trim() != "none", "{line}");
+            assert_eq!(found.state == Severity::Ok, expected.trim() != "none", "{line}");
             assert!(
-                found.state != State::Fine || found.found.ends_with(&format!("domain{wanted}")),
+                found.state != Severity::Ok || found.detail.ends_with(&format!("domain{expected}")),
                 "{line}"
             );
         }
     }
 
     #[test]
-    fn a_domain_that_is_none_is_said() {
-        assert_eq!(domain(Some("42")).found, "domain 42");
-        assert_eq!(domain(Some("233")).state, State::Warning);
-        assert_eq!(domain(Some("x\ny")).found, "`x\\ny` is no domain");
+    fn an_invalid_domain_is_reported() {
+        assert_eq!(domain(Some("42")).detail, "domain 42");
+        assert_eq!(domain(Some("233")).state, Severity::Warning);
+        assert_eq!(domain(Some("x\ny")).detail, "`x\\ny` is not a domain");
     }
 }

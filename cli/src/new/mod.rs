@@ -1,8 +1,8 @@
-//! `gleaner new`: a folder with a lambda in it that builds, passes its test, and finds something in
-//! the sample drive.
+//! `gleaner new`: creates a folder with a lambda that builds, passes its test, and triggers on the
+//! sample drive.
 //!
-//! It begins as the example `hello`. With it comes the SDK, in `.gleaner`, so that the folder
-//! builds wherever it is taken. Nothing that is there already is changed.
+//! The new lambda is a copy of the example `hello`. Its SDK is copied to `.gleaner`, so that the
+//! folder builds anywhere. Existing files are not changed.
 
 use std::fs;
 use std::io;
@@ -11,22 +11,22 @@ use std::str::FromStr;
 
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_lambda::Manifest;
-use gleaner_lambda::manifest::{Kind, LambdaName, NameError};
+use gleaner_lambda::manifest::{LambdaKind, LambdaName, NameError};
 
 use crate::args::NewArgs;
-use crate::say::say;
+use crate::stdout::print;
 
-/// Files of the repository, by their path in it.
+/// Embedded files by their path in the repository.
 const PACKED: &[(&str, &[u8])] = include!(concat!(env!("OUT_DIR"), "/packed.rs"));
 
-/// Where the SDK is.
+/// Folder of the SDK.
 const SDK: &str = ".gleaner";
-/// What takes the place of a `Cargo.toml` of the repository in it.
+/// Replacements for the `Cargo.toml` files of the repository in the SDK.
 const PACKAGES: [(&str, &str); 2] = [
     ("guest-sdk-rust/Cargo.toml", include_str!("files/sdk.toml")),
     ("rules/Cargo.toml", include_str!("files/rules.toml")),
 ];
-/// Names that mean something to cargo or to Rust: keywords, and crates that are there already.
+/// Names that a package cannot have: keywords, and names of existing crates.
 const NO_CRATES: &[&str] = &[
     "abstract",
     "alloc",
@@ -89,18 +89,18 @@ const NO_CRATES: &[&str] = &[
 ];
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// Why there is no new lambda.
+/// Errors of `gleaner new`.
 #[derive(Debug, thiserror::Error)]
 enum NewError {
-    #[error("`{}` ends with no name", path.display())]
+    #[error("`{}` does not end with a name", path.display())]
     NoName { path: PathBuf },
     #[error(transparent)]
     Name(#[from] NameError),
-    #[error("there is something in `{}` already", path.display())]
+    #[error("`{}` exists and is not empty", path.display())]
     NotEmpty { path: PathBuf },
-    #[error("there is no `{}`", path.display())]
+    #[error("`{}` does not exist", path.display())]
     NoSdk { path: PathBuf },
-    #[error("a crate cannot have the name `{name}`")]
+    #[error("a crate cannot be named `{name}`")]
     CrateName { name: LambdaName },
     #[error("cannot {action} `{}`", path.display())]
     File { action: &'static str, path: PathBuf, source: io::Error },
@@ -109,21 +109,18 @@ enum NewError {
 impl Explain for NewError {
     fn help(&self) -> Option<String> {
         match self {
-            Self::NoName { .. } => Some(
-                "give the folder to make, whose name is the lambda's: gleaner new brake-dark"
-                    .to_owned(),
-            ),
+            Self::NoName { .. } => {
+                Some("name the folder to create, such as: gleaner new brake-dark".to_owned())
+            }
             Self::Name(error) => error.help(),
             Self::NotEmpty { .. } => Some(
-                "choose another name; to replace only the SDK in it: gleaner new --update DIR"
+                "choose another name; to update only the SDK in it: gleaner new --update DIR"
                     .to_owned(),
             ),
             Self::NoSdk { .. } => {
-                Some("give the folder of a lambda that `gleaner new` made".to_owned())
+                Some("name the folder of a lambda that `gleaner new` created".to_owned())
             }
-            Self::CrateName { .. } => {
-                Some("it means something to Rust; choose another one".to_owned())
-            }
+            Self::CrateName { .. } => Some("Rust reserves it; choose another name".to_owned()),
             Self::File { .. } => None,
         }
     }
@@ -136,21 +133,22 @@ impl Explain for NewError {
     }
 }
 
-/// Makes a lambda's folder, or replaces the SDK in one, and says what comes next.
+/// Creates a lambda's folder, or replaces its SDK, and prints the next steps.
 pub(crate) fn run(args: &NewArgs) -> Result<Exit, Failure> {
     let (dir, shown) = (&args.path, args.path.display());
     if args.update {
         update(dir)?;
-        say(&format!(
-            "{shown}/{SDK} is that of gleaner {VERSION} now; next: gleaner build {shown}\n"
+        print(&format!(
+            "updated {shown}/{SDK} to gleaner {VERSION}; next: gleaner build {shown}\n"
         ))?;
         return Ok(Exit::Ok);
     }
     let name = name_of(dir)?;
     make(dir, &name, args.kind.into())?;
     let test = test_command(args.kind.into());
-    say(&format!(
-        "made {shown}: what it reads and may use is in lambda.toml, what it decides in {}\nnext:\n  cd {shown}\n  {test}\n  gleaner dev . DRIVE.mcap\n",
+    print(&format!(
+        "created {shown}: inputs and limits are in lambda.toml, the code is in {}\nnext:\n  \
+         cd {shown}\n  {test}\n  gleaner dev . DRIVE.mcap\n",
         source(args.kind.into()),
     ))?;
     Ok(Exit::Ok)
@@ -162,9 +160,9 @@ fn name_of(dir: &Path) -> Result<LambdaName, NewError> {
     Ok(LambdaName::from_str(name)?)
 }
 
-/// All of it or nothing: it is made in a folder beside, which then takes its name.
-fn make(dir: &Path, name: &LambdaName, kind: Kind) -> Result<(), NewError> {
-    if kind == Kind::Wasm && NO_CRATES.contains(&name.as_str()) {
+/// Creates the folder atomically: fills a temporary folder beside it and renames that.
+fn make(dir: &Path, name: &LambdaName, kind: LambdaKind) -> Result<(), NewError> {
+    if kind == LambdaKind::Wasm && NO_CRATES.contains(&name.as_str()) {
         return Err(NewError::CrateName { name: name.clone() });
     }
     if dir.symlink_metadata().is_ok() && !is_empty(dir) {
@@ -173,33 +171,33 @@ fn make(dir: &Path, name: &LambdaName, kind: Kind) -> Result<(), NewError> {
     if let Some(parent) = dir.parent() {
         fs::create_dir_all(parent).map_err(failed("make", parent))?;
     }
-    // One of our own: what has that name already is somebody else's.
+    // The process id makes the name unique.
     let partial = dir.with_file_name(format!(".{name}.partial-{}", std::process::id()));
     fs::create_dir(&partial).map_err(failed("make", &partial))?;
     let made = fill(&partial, name, kind)
         .and_then(|()| fs::rename(&partial, dir).map_err(failed("make", dir)));
     if made.is_err() {
-        // What went wrong tells more than what cannot be cleaned up after it.
+        // The first error matters more than a failed clean-up.
         let _ = fs::remove_dir_all(&partial);
     }
     made
 }
 
-fn fill(dir: &Path, name: &LambdaName, kind: Kind) -> Result<(), NewError> {
+fn fill(dir: &Path, name: &LambdaName, kind: LambdaKind) -> Result<(), NewError> {
     let example = match kind {
-        Kind::Wasm => "examples/hello/rust",
-        Kind::Python => "examples/hello/python",
+        LambdaKind::Wasm => "examples/hello/rust",
+        LambdaKind::Python => "examples/hello/python",
     };
     for (path, bytes) in below(example) {
         let named = String::from_utf8_lossy(bytes).replace("\"hello\"", &format!("\"{name}\""));
         write(dir, path, named.replace("hello.wasm", &format!("{name}.wasm")).as_bytes())?;
     }
-    if kind == Kind::Wasm {
+    if kind == LambdaKind::Wasm {
         copy("Cargo.lock", dir)?;
     }
     let own: &[(&str, &str)] = match kind {
-        Kind::Wasm => &[("Cargo.toml", include_str!("files/package.toml"))],
-        Kind::Python => &[
+        LambdaKind::Wasm => &[("Cargo.toml", include_str!("files/package.toml"))],
+        LambdaKind::Python => &[
             ("pyproject.toml", include_str!("files/pyproject.toml")),
             ("tests/test_main.py", include_str!("files/test_main.py")),
         ],
@@ -233,10 +231,10 @@ fn update(dir: &Path) -> Result<(), Failure> {
     Ok(remove(&old)?)
 }
 
-fn unpack_sdk(to: &Path, kind: Kind) -> Result<(), NewError> {
+fn unpack_sdk(to: &Path, kind: LambdaKind) -> Result<(), NewError> {
     let (parts, packages): (&[&str], &[(&str, &str)]) = match kind {
-        Kind::Wasm => (&["guest-sdk-rust", "rules", "wit"], &PACKAGES),
-        Kind::Python => (&["guest-sdk-python", "wit"], &[]),
+        LambdaKind::Wasm => (&["guest-sdk-rust", "rules", "wit"], &PACKAGES),
+        LambdaKind::Python => (&["guest-sdk-python", "wit"], &[]),
     };
     for part in parts {
         for (path, bytes) in below(part) {
@@ -249,7 +247,7 @@ fn unpack_sdk(to: &Path, kind: Kind) -> Result<(), NewError> {
     copy("LICENSE", to)
 }
 
-/// A packed file, into a folder.
+/// Writes the embedded `file` into the folder `to`.
 fn copy(file: &str, to: &Path) -> Result<(), NewError> {
     PACKED
         .iter()
@@ -257,24 +255,24 @@ fn copy(file: &str, to: &Path) -> Result<(), NewError> {
         .try_for_each(|(path, bytes)| write(to, Path::new(path), bytes))
 }
 
-/// What is packed of a folder, by the path in it.
+/// The embedded files below `folder`, by their path in it.
 fn below(folder: &str) -> impl Iterator<Item = (&'static Path, &'static [u8])> {
     PACKED.iter().filter_map(move |(path, bytes)| {
         Some((Path::new(*path).strip_prefix(folder).ok()?, *bytes))
     })
 }
 
-fn test_command(kind: Kind) -> &'static str {
+fn test_command(kind: LambdaKind) -> &'static str {
     match kind {
-        Kind::Wasm => "cargo test",
-        Kind::Python => "pip install ./.gleaner/guest-sdk-python pytest && python -m pytest",
+        LambdaKind::Wasm => "cargo test",
+        LambdaKind::Python => "pip install ./.gleaner/guest-sdk-python pytest && python -m pytest",
     }
 }
 
-fn source(kind: Kind) -> &'static str {
+fn source(kind: LambdaKind) -> &'static str {
     match kind {
-        Kind::Wasm => "src/lib.rs",
-        Kind::Python => "main.py",
+        LambdaKind::Wasm => "src/lib.rs",
+        LambdaKind::Python => "main.py",
     }
 }
 

@@ -3,9 +3,9 @@ use toml::{Table, Value};
 
 use super::*;
 
-struct Scratch(PathBuf);
+struct TempFolder(PathBuf);
 
-impl Scratch {
+impl TempFolder {
     fn new(name: &str) -> Self {
         let folder =
             std::env::temp_dir().join(format!("gleaner-new-{}-{name}", std::process::id()));
@@ -14,23 +14,23 @@ impl Scratch {
         Self(folder)
     }
 
-    fn lambda(&self, name: &str, kind: Kind) -> PathBuf {
+    fn lambda(&self, name: &str, kind: LambdaKind) -> PathBuf {
         let dir = self.0.join(name);
         make(&dir, &name.parse().unwrap(), kind).unwrap();
         dir
     }
 }
 
-impl Drop for Scratch {
+impl Drop for TempFolder {
     fn drop(&mut self) {
         drop(fs::remove_dir_all(&self.0));
     }
 }
 
 #[test]
-fn a_new_lambda_has_a_sound_manifest_with_its_own_name_and_entry() {
-    let scratch = Scratch::new("manifest");
-    for (kind, entry) in [(Kind::Wasm, "pot-hole.wasm"), (Kind::Python, "main.py")] {
+fn a_new_lambda_has_a_valid_manifest_with_its_name_and_entry() {
+    let scratch = TempFolder::new("manifest");
+    for (kind, entry) in [(LambdaKind::Wasm, "pot-hole.wasm"), (LambdaKind::Python, "main.py")] {
         let dir = scratch.lambda("pot-hole", kind);
         let manifest = Manifest::load(&dir).unwrap();
         assert_eq!((manifest.lambda.name.as_str(), manifest.lambda.kind), ("pot-hole", kind));
@@ -47,23 +47,23 @@ fn a_new_lambda_has_a_sound_manifest_with_its_own_name_and_entry() {
 }
 
 #[test]
-fn what_is_there_is_not_touched() {
-    let scratch = Scratch::new("there");
-    let dir = scratch.lambda("mine", Kind::Python);
+fn existing_files_are_not_changed() {
+    let scratch = TempFolder::new("there");
+    let dir = scratch.lambda("mine", LambdaKind::Python);
     fs::write(dir.join("main.py"), "precious").unwrap();
-    let again = make(&dir, &"mine".parse().unwrap(), Kind::Python).unwrap_err();
+    let again = make(&dir, &"mine".parse().unwrap(), LambdaKind::Python).unwrap_err();
     assert!(matches!(again, NewError::NotEmpty { .. }), "{again}");
     update(&dir).unwrap();
     assert_eq!(fs::read_to_string(dir.join("main.py")).unwrap(), "precious");
     let elsewhere = scratch.0.join("link");
     std::os::unix::fs::symlink(&dir, &elsewhere).unwrap();
-    assert!(make(&elsewhere, &"link".parse().unwrap(), Kind::Python).is_err());
+    assert!(make(&elsewhere, &"link".parse().unwrap(), LambdaKind::Python).is_err());
 }
 
 #[test]
-fn an_update_replaces_the_sdk_and_what_was_added_to_it() {
-    let scratch = Scratch::new("update");
-    for kind in [Kind::Wasm, Kind::Python] {
+fn an_update_replaces_the_whole_sdk_folder() {
+    let scratch = TempFolder::new("update");
+    for kind in [LambdaKind::Wasm, LambdaKind::Python] {
         let dir = scratch.lambda("mine", kind);
         let (stale, wit) = (dir.join(SDK).join("stale"), dir.join(SDK).join("wit"));
         fs::write(&stale, "").unwrap();
@@ -73,48 +73,48 @@ fn an_update_replaces_the_sdk_and_what_was_added_to_it() {
         assert!(!dir.join(".gleaner.old").exists() && !dir.join(".gleaner.partial").exists());
         fs::remove_dir_all(dir).unwrap();
     }
-    assert!(update(&scratch.0).unwrap_err().to_string().contains("there is no `"));
+    assert!(update(&scratch.0).unwrap_err().to_string().contains("does not exist"));
 }
 
 #[test]
-fn folders_above_are_made_as_well() {
-    let scratch = Scratch::new("above");
+fn parent_folders_are_created() {
+    let scratch = TempFolder::new("above");
     let dir = scratch.0.join("far/away");
-    make(&dir, &"away".parse().unwrap(), Kind::Python).unwrap();
+    make(&dir, &"away".parse().unwrap(), LambdaKind::Python).unwrap();
     assert!(dir.join("lambda.toml").is_file());
 }
 
 #[test]
 fn a_folder_needs_a_name_that_a_lambda_can_have() {
-    for (path, wanted) in [
-        ("/", "ends with no name"),
-        ("..", "ends with no name"),
+    for (path, message) in [
+        ("/", "does not end with a name"),
+        ("..", "does not end with a name"),
         ("My Lambda", "is no lambda name"),
     ] {
         let error = name_of(Path::new(path)).unwrap_err();
-        assert!(error.to_string().contains(wanted) && error.help().is_some(), "{error}");
+        assert!(error.to_string().contains(message) && error.help().is_some(), "{error}");
     }
     assert_eq!(name_of(Path::new("some/where/pot-hole/")).unwrap().as_str(), "pot-hole");
-    let scratch = Scratch::new("names");
+    let scratch = TempFolder::new("names");
     for name in ["test", "gleaner-rules", "gleaner-sdk", "type"] {
-        let made = make(&scratch.0.join(name), &name.parse().unwrap(), Kind::Wasm);
+        let made = make(&scratch.0.join(name), &name.parse().unwrap(), LambdaKind::Wasm);
         assert!(matches!(made, Err(NewError::CrateName { .. })), "{name}");
     }
 }
 
-/// What stands twice, since the copy has to work outside of this workspace.
+/// Versions are written twice, since the copy has to work outside of this workspace.
 #[test]
 fn the_packed_sdk_has_the_versions_of_this_workspace() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let read = |path: &str| fs::read_to_string(root.join(path)).unwrap().parse::<Table>().unwrap();
-    let (workspace, ours) = (read("Cargo.toml"), read("guest-sdk-rust/Cargo.toml"));
+    let (workspace, sdk) = (read("Cargo.toml"), read("guest-sdk-rust/Cargo.toml"));
     let packed =
         include_str!("files/sdk.toml").replace("VERSION", VERSION).parse::<Table>().unwrap();
-    assert_eq!(packed["features"], ours["features"]);
+    assert_eq!(packed["features"], sdk["features"]);
     // For all targets, for components, and natively.
     let targets =
         |table: &Table| table["target"].as_table().unwrap().keys().cloned().collect::<Vec<_>>();
-    assert_eq!((targets(&packed), targets(&packed).len()), (targets(&ours), 2));
+    assert_eq!((targets(&packed), targets(&packed).len()), (targets(&sdk), 2));
     let dependencies = |table: &Table| {
         let mut all =
             table.get("dependencies").and_then(Value::as_table).cloned().unwrap_or_default();
@@ -126,14 +126,14 @@ fn the_packed_sdk_has_the_versions_of_this_workspace() {
         all
     };
     let names = |table: &Table| dependencies(table).keys().cloned().collect::<Vec<_>>();
-    assert_eq!(names(&packed), names(&ours));
+    assert_eq!(names(&packed), names(&sdk));
     assert_eq!(names(&packed), ["gleaner-rules", "rustfft", "toml", "wit-bindgen"]);
     for name in names(&packed) {
         let plain = |table: &Table| {
             let mut value = dependencies(table)[&name].clone();
             if let Some(table) = value.as_table_mut() {
                 table.remove("optional");
-                // The folder lies beside that of the SDK, as it does here.
+                // The folder is beside that of the SDK in both places.
                 let path = table
                     .get("path")
                     .and_then(Value::as_str)

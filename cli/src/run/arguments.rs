@@ -1,10 +1,10 @@
-//! What the processes of a run are told.
+//! Builds the arguments of the processes of a run.
 
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
 use crate::args::RunArgs;
-use crate::sibling::starter;
+use crate::delegate::starter;
 
 /// The runtime's arguments.
 pub(super) fn runtime(
@@ -14,11 +14,11 @@ pub(super) fn runtime(
     restarts: u32,
 ) -> Vec<OsString> {
     let mut line: Vec<OsString> = vec!["run".into(), format!("--clock-offset={offset_ns}").into()];
-    line.extend(args.asked.settings());
-    line.push(word("--out", out(args)));
+    line.extend(args.target.settings());
+    line.push(option("--out", out(args)));
     for (flag, topic) in [("--rtt", &args.rtt), ("--decisions", &args.decisions)] {
         if let Some(topic) = topic {
-            line.push(word(flag, topic));
+            line.push(option(flag, topic));
         }
     }
     if restarts > 0 {
@@ -30,26 +30,28 @@ pub(super) fn runtime(
         }
     }
     line.extend(args.network.to_args());
-    line.extend(["--".into(), args.asked.lambda.clone().into()]);
+    line.extend(["--".into(), args.target.lambda.clone().into()]);
     line
 }
 
 /// The arguments of the runtime's shim.
 pub(super) fn shim(args: &RunArgs, exit_record: &Path, restarts: u32) -> Vec<OsString> {
     let mut line =
-        vec![word("--exit-record", exit_record), word("--results", out(args)), starter()];
+        vec![option("--exit-record", exit_record), option("--results", out(args)), starter()];
     line.extend((restarts > 0).then(|| "--again".into()));
-    line.extend(args.cgroup.as_ref().map(|folder| word("--cgroup", folder)));
+    line.extend(args.cgroup.as_ref().map(|folder| option("--cgroup", folder)));
     line
 }
 
-/// The recorder's arguments. `largest` is the largest sample that it will see, in bytes.
+/// The recorder's arguments. `largest` is the largest sample that it will receive, in bytes.
 pub(super) fn recorder(args: &RunArgs, largest: u64, offset_ns: i64) -> Vec<OsString> {
-    let mut line =
-        vec![word("--out", out(args)), word("--messages", args.asked.lambda.join("build/msg"))];
+    let mut line = vec![
+        option("--out", out(args)),
+        option("--messages", args.target.lambda.join("build/msg")),
+    ];
     line.push(format!("--clock-offset={offset_ns}").into());
     line.push(format!("--largest={largest}").into());
-    line.extend(args.commands.as_ref().map(|topic| word("--commands", topic)));
+    line.extend(args.commands.as_ref().map(|topic| option("--commands", topic)));
     let bounds = [
         ("disk-floor", args.disk_floor),
         ("clips-max", args.clips_max),
@@ -64,20 +66,20 @@ pub(super) fn recorder(args: &RunArgs, largest: u64, offset_ns: i64) -> Vec<OsSt
     line
 }
 
-/// Where the results go.
+/// The result folder.
 pub(super) fn out(args: &RunArgs) -> PathBuf {
-    args.out.clone().unwrap_or_else(|| args.asked.lambda.join("live"))
+    args.out.clone().unwrap_or_else(|| args.target.lambda.join("live"))
 }
 
-/// An argument in one word: its value may begin with a minus.
-fn word(flag: &str, value: impl AsRef<OsStr>) -> OsString {
-    let mut word = OsString::from(format!("{flag}="));
-    word.push(value);
-    word
+/// Makes one argument `FLAG=VALUE`, since the value may begin with a minus.
+fn option(flag: &str, value: impl AsRef<OsStr>) -> OsString {
+    let mut argument = OsString::from(format!("{flag}="));
+    argument.push(value);
+    argument
 }
 
-/// Other names for topics, as the recorder is told of them. They were checked when they were typed.
+/// The renamed topics for the recorder. The command line has checked their form.
 pub(super) fn remaps(args: &RunArgs) -> Vec<(String, String)> {
-    let pairs = args.asked.remap.iter().filter_map(|remap| remap.split_once(":="));
+    let pairs = args.target.remap.iter().filter_map(|remap| remap.split_once(":="));
     pairs.map(|(from, to)| (from.trim().to_owned(), to.trim().to_owned())).collect()
 }

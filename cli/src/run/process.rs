@@ -1,4 +1,4 @@
-//! One process of a run.
+//! Starts, reads and ends one process of a run.
 
 use std::ffi::OsString;
 use std::io::{BufReader, Read};
@@ -13,41 +13,41 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure, visible};
 use gleaner_parts::Parts;
-use gleaner_protocol::UNTIL_KILLED;
+use gleaner_protocol::SHUTDOWN_TIMEOUT;
 use rustix::process::{Pid, Signal, kill_process};
 use serde::de::DeserializeOwned;
 
-use super::LOOK;
-use super::ear::{Ear, Heard};
+use super::POLL_INTERVAL;
+use super::report_stream::{ChildOutput, ReportStream};
 use super::screen::Screen;
 use crate::runtime::next_report;
 
-/// How long a process may take for its end: a wake that runs, clips that are completed. A shim ends
-/// its runtime before.
-const PATIENCE: Duration = UNTIL_KILLED.saturating_add(Duration::from_secs(10));
+/// Time for a process to end, such as to finish a wake or to complete clips. A shim kills its
+/// runtime before.
+const END_TIMEOUT: Duration = SHUTDOWN_TIMEOUT.saturating_add(Duration::from_secs(10));
 
-/// A program of ours that reports.
-pub(super) struct Process {
+/// A Gleaner program that reports as JSON lines.
+pub(super) struct ChildProcess {
     name: &'static str,
     child: Child,
 }
 
-impl Process {
-    /// Starts it; its reports are `T`, and are heard as `heard` says. With `shim`, arguments of
-    /// gleaner-shim, it is a runtime.
+impl ChildProcess {
+    /// Starts the program `name`, whose reports are `T` and become outputs by `wrap`. `shim` are
+    /// the arguments of gleaner-shim, which starts the program if they are given.
     pub(super) fn start<T: DeserializeOwned + 'static>(
         parts: &Parts,
         name: &'static str,
         line: Vec<OsString>,
         stdin: Option<OwnedFd>,
         shim: Option<Vec<OsString>>,
-        heard: fn(T) -> Heard,
-        say: &SyncSender<Heard>,
+        wrap: fn(T) -> ChildOutput,
+        sender: &SyncSender<ChildOutput>,
     ) -> Result<Self, Failure> {
-        let (program, line) = watched(parts, name, line, shim)?;
+        let (program, line) = command_line(parts, name, line, shim)?;
         let mut child = Command::new(&program)
             .args(line)
-            // Ctrl-C is for us: we end them in order.
+            // Only `gleaner` receives Ctrl-C, and ends its processes in order.
             .process_group(0)
             .stdin(stdin.map_or_else(Stdio::null, Stdio::from))
             .stdout(Stdio::piped())
@@ -61,18 +61,21 @@ impl Process {
                 )
             })?;
         if let Some(reports) = child.stdout.take() {
-            let say = say.clone();
-            thread::spawn(move || follow(reports, heard, &say));
+            let sender = sender.clone();
+            thread::spawn(move || follow(reports, wrap, &sender));
         }
-        if let Some(says) = child.stderr.take() {
-            let say = say.clone();
-            let pass_on = move |piece: &[u8]| drop(say.send(Heard::Said(piece.to_vec())));
-            thread::spawn(move || crate::runtime::pass_on(says, &AtomicBool::new(false), pass_on));
+        if let Some(stderr) = child.stderr.take() {
+            let sender = sender.clone();
+            let pass_on =
+                move |piece: &[u8]| drop(sender.send(ChildOutput::Stderr(piece.to_vec())));
+            thread::spawn(move || {
+                crate::runtime::pass_on(stderr, &AtomicBool::new(false), pass_on)
+            });
         }
         Ok(Self { name, child })
     }
 
-    /// How it ended, if it has.
+    /// Its exit status, if it has ended.
     pub(super) fn status(&mut self) -> Result<Option<ExitStatus>, Failure> {
         let failed = |error| {
             Failure::caused_by(Exit::Internal, format!("cannot wait for {}", self.name), &error)
@@ -80,50 +83,47 @@ impl Process {
         self.child.try_wait().map_err(failed)
     }
 
-    /// Asks it to end, and waits for that.
+    /// Sends SIGTERM, and waits for its end.
     pub(super) fn end(
         &mut self,
-        ear: &mut Ear,
+        stream: &mut ReportStream,
         screen: &mut Screen,
     ) -> Result<ExitStatus, Failure> {
-        self.tell(Signal::TERM);
-        self.wait(ear, screen)
+        self.signal(Signal::TERM);
+        self.wait(stream, screen)
     }
 
-    /// Waits for its end, and forces it in the end.
+    /// Waits for its end, and kills it after [`END_TIMEOUT`].
     pub(super) fn wait(
         &mut self,
-        ear: &mut Ear,
+        stream: &mut ReportStream,
         screen: &mut Screen,
     ) -> Result<ExitStatus, Failure> {
-        let mut asked = Instant::now();
+        let mut requested = Instant::now();
         loop {
-            ear.look(screen, LOOK);
+            stream.poll(screen, POLL_INTERVAL);
             if let Some(status) = self.status()? {
                 return Ok(status);
             }
-            if asked.elapsed() > PATIENCE {
-                screen.warn(&format!(
-                    "{} did not end when it was asked to, and is killed",
-                    self.name
-                ));
-                self.tell(Signal::KILL);
-                asked = Instant::now();
+            if requested.elapsed() > END_TIMEOUT {
+                screen.warn(&format!("{} did not end on request; killing it", self.name));
+                self.signal(Signal::KILL);
+                requested = Instant::now();
             }
         }
     }
 
-    fn tell(&self, signal: Signal) {
-        // One that has just ended is not there to be told, which is as good.
+    fn signal(&self, signal: Signal) {
+        // Fails if the process has just ended.
         if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
             let _ = kill_process(pid, signal);
         }
     }
 }
 
-impl Drop for Process {
+impl Drop for ChildProcess {
     fn drop(&mut self) {
-        // Only where an error kept us from waiting for it.
+        // It is still running only if an error skipped the wait.
         if let Ok(None) = self.child.try_wait() {
             let _ = self.child.kill();
             let _ = self.child.wait();
@@ -131,8 +131,8 @@ impl Drop for Process {
     }
 }
 
-/// The program to start and its arguments: `name` itself, or the shim that starts it.
-fn watched(
+/// The program to start and its arguments: `name`, or the shim that starts it.
+fn command_line(
     parts: &Parts,
     name: &str,
     line: Vec<OsString>,
@@ -144,20 +144,24 @@ fn watched(
     Ok((parts.program("gleaner-shim")?, shim.into_iter().chain(below).chain(line).collect()))
 }
 
-fn follow<T: DeserializeOwned>(reports: impl Read, heard: fn(T) -> Heard, say: &SyncSender<Heard>) {
+fn follow<T: DeserializeOwned>(
+    reports: impl Read,
+    wrap: fn(T) -> ChildOutput,
+    sender: &SyncSender<ChildOutput>,
+) {
     let mut reports = BufReader::new(reports);
     let mut line = Vec::new();
     while next_report(&mut reports, &mut line).unwrap_or(false) {
-        // A shim ends the line that its runtime may have begun.
+        // A shim ends a line that its runtime left unfinished.
         if line == b"\n" {
             continue;
         }
-        let garbled = |_| {
-            Heard::Garbled(visible(
+        let unparsable = |_| {
+            ChildOutput::Unparsable(visible(
                 &String::from_utf8_lossy(&line).chars().take(200).collect::<String>(),
             ))
         };
-        if say.send(serde_json::from_slice(&line).map_or_else(garbled, heard)).is_err() {
+        if sender.send(serde_json::from_slice(&line).map_or_else(unparsable, wrap)).is_err() {
             return;
         }
     }

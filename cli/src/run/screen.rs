@@ -1,4 +1,4 @@
-//! What is shown while a lambda runs: lines that stay, and below them how it is doing.
+//! Prints the output of a live run: permanent lines, and below them the current statistics.
 
 use std::collections::HashSet;
 use std::io::{self, Write};
@@ -6,25 +6,25 @@ use std::io::{self, Write};
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::link::RecorderStatus;
-use gleaner_protocol::{Live, LiveTopic};
+use gleaner_protocol::{LiveStatus, LiveTopic};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
-use crate::show::{self, Paint};
+use crate::render::{self, Paint};
 
-/// How long a topic may be without a writer before somebody is told.
+/// Time without a writer after which a warning about a topic is printed, in s.
 const WAITING_S: f64 = 3.0;
 
-/// Standard output, and on a terminal the lines below it.
+/// Standard output, and on a terminal the statistics below it.
 pub(super) struct Screen {
     stats: bool,
     json: bool,
     paint: Paint,
-    /// Topics of which it was said that nobody writes them.
-    waited: HashSet<String>,
-    /// What was said last of the recorder.
+    /// Topics without a writer for which a warning was printed.
+    warned: HashSet<String>,
+    /// Last status of the recorder, formatted.
     recorder: String,
-    /// Hidden by itself where standard error is no terminal.
+    /// The statistics; indicatif hides them if standard error is not a terminal.
     below: ProgressBar,
 }
 
@@ -39,51 +39,51 @@ impl Screen {
             stats,
             json,
             paint: Paint::of_stdout(),
-            waited: HashSet::new(),
+            warned: HashSet::new(),
             recorder: String::new(),
             below: below.with_style(style),
         }
     }
 
-    /// A report as it came, where reports are wanted.
+    /// Prints a report with `--json`.
     pub(super) fn report(&self, report: &impl Serialize) {
         if self.json {
-            self.out(&show::json_line(report));
+            self.out(&render::json_line(report));
         }
     }
 
-    /// Something that stays, for people.
-    pub(super) fn say(&self, text: &str) {
+    /// Prints permanent text, unless `--json` is set.
+    pub(super) fn print(&self, text: &str) {
         if !self.json {
             self.out(text);
         }
     }
 
     pub(super) fn decision(&self, decision: &Decision) {
-        self.say(&show::decision(decision, self.paint));
+        self.print(&render::decision(decision, self.paint));
     }
 
     pub(super) fn clip(&self, clip: &Clip) {
-        self.say(&show::clip_line(clip, self.paint));
+        self.print(&render::clip_line(clip, self.paint));
     }
 
-    /// How the recorder is doing: below what is said of the lambda.
+    /// Updates the status of the recorder, which is shown below that of the lambda.
     pub(super) fn recorder(&mut self, status: &RecorderStatus) {
-        self.recorder = show::recorder(status, self.paint);
+        self.recorder = render::recorder(status, self.paint);
     }
 
-    /// How the recorder was.
+    /// Prints the final status of the recorder.
     pub(super) fn recorder_ended(&mut self, status: &RecorderStatus) {
-        self.say(&show::recorder(status, self.paint));
+        self.print(&render::recorder(status, self.paint));
     }
 
-    /// How it is doing.
-    pub(super) fn live(&mut self, live: &Live) {
-        self.say_who_waits(live);
+    /// Updates the status of the lambda.
+    pub(super) fn live(&mut self, live: &LiveStatus) {
+        self.warn_of_missing_writers(live);
         if !self.stats {
             return;
         }
-        let text = show::live(live, self.paint) + &self.recorder;
+        let text = render::live(live, self.paint) + &self.recorder;
         if self.below.is_hidden() {
             self.out(&text);
         } else {
@@ -92,30 +92,30 @@ impl Screen {
         }
     }
 
-    /// Says once for each topic that nobody writes it.
-    fn say_who_waits(&mut self, live: &Live) {
-        let is_alone = |topic: &&LiveTopic| topic.writers == Some(0) && topic.received == 0;
+    /// Warns once about each topic without a writer.
+    fn warn_of_missing_writers(&mut self, live: &LiveStatus) {
+        let has_no_writer = |topic: &&LiveTopic| topic.writers == Some(0) && topic.received == 0;
         if live.up_s < WAITING_S {
             return;
         }
-        for topic in live.topics.iter().filter(is_alone) {
-            if self.waited.insert(topic.topic.clone()) {
+        for topic in live.topics.iter().filter(has_no_writer) {
+            if self.warned.insert(topic.topic.clone()) {
                 let name = visible(&topic.topic);
                 let kind = visible(&topic.type_name);
                 self.warn(&format!(
-                    "nobody writes `{name}` ({kind}) yet; `gleaner topics` shows what is there"
+                    "no writer of `{name}` ({kind}) yet; `gleaner topics` lists the topics"
                 ));
             }
         }
     }
 
-    /// How it was.
-    pub(super) fn ended(&self, live: &Live) {
-        // It may start again, and then has lines below again.
+    /// Prints the final status of the lambda.
+    pub(super) fn ended(&self, live: &LiveStatus) {
+        // Clears the statistics. After a restart they are shown again.
         self.below.set_message("");
         self.below.tick();
-        self.say(&show::live(live, self.paint));
-        self.say(&format!(
+        self.print(&render::live(live, self.paint));
+        self.print(&format!(
             "  {}: decisions.jsonl, log.jsonl, summary.json\n",
             visible(&live.out.to_string_lossy())
         ));
@@ -125,14 +125,14 @@ impl Screen {
         self.err(format!("warning: {}\n", visible(text)).as_bytes());
     }
 
-    /// Passes on what a program said.
+    /// Prints a piece of a program's standard error.
     pub(super) fn err(&self, piece: &[u8]) {
-        // Nobody is left to tell if standard error is gone.
+        // An error of standard error itself cannot be reported.
         self.below.suspend(|| drop(io::stderr().write_all(piece)));
     }
 
     fn out(&self, text: &str) {
-        // A reader that is gone is no failure: the results are in files.
+        // A closed pipe is not an error, since the results are in files.
         self.below.suspend(|| {
             drop(io::stdout().write_all(text.as_bytes()).and_then(|()| io::stdout().flush()))
         });

@@ -1,100 +1,102 @@
-//! `summary.json` of a run, where `gleaner-shim` cannot write all of it: what the recorder counted,
-//! and what the processes of a lambda that was started again did together. Each counts for itself,
-//! and only who started them has seen them all.
+//! Completes `summary.json` of a run with the counts of the recorder and of restarted processes.
+//!
+//! Each process counts only its own events, and `gleaner-shim` writes only those of one process.
 
 use std::path::Path;
 
-use gleaner_base::{Exit, Failure, PlainFile, write_whole};
+use gleaner_base::{Exit, Failure, PlainFile, write_atomically};
 use gleaner_lambda::results::SUMMARY_MAX;
-use gleaner_protocol::Live;
+use gleaner_protocol::LiveStatus;
 use gleaner_protocol::link::RecorderStatus;
 
-/// What the processes of a run counted that have ended.
+/// Sum of the counts of ended processes of a run.
 #[derive(Default)]
 pub(super) struct Earlier {
-    counted: Option<Live>,
-    recorded: Option<Box<RecorderStatus>>,
-    /// Wakes that ended with their process, which so did not count them.
+    live: Option<LiveStatus>,
+    recorder: Option<Box<RecorderStatus>>,
+    /// Wakes during which their process ended, so that it did not count them.
     lost_wakes: u64,
 }
 
 impl Earlier {
-    /// One more of each has ended. `last` and `recorded` are what they said last: of one that
-    /// broke, up to a second of counts is missing.
+    /// Adds the last statuses of an ended lambda process and recorder. If a process failed, up to a
+    /// second of counts is missing.
     pub(super) fn add(
         &mut self,
-        last: Option<Live>,
-        recorded: Option<Box<RecorderStatus>>,
+        last: Option<LiveStatus>,
+        recorder: Option<Box<RecorderStatus>>,
         has_lost_wake: bool,
     ) {
         self.lost_wakes += u64::from(has_lost_wake);
-        self.add_recorded(recorded);
-        self.counted = match (last, self.counted.take()) {
+        self.add_recorded(recorder);
+        self.live = match (last, self.live.take()) {
             (Some(last), Some(before)) => Some(last.after(&before)),
             (last, before) => last.or(before),
         };
     }
 
-    fn add_recorded(&mut self, recorded: Option<Box<RecorderStatus>>) {
-        self.recorded = match (recorded, self.recorded.take()) {
+    fn add_recorded(&mut self, recorder: Option<Box<RecorderStatus>>) {
+        self.recorder = match (recorder, self.recorder.take()) {
             (Some(last), Some(before)) => Some(Box::new(last.after(&before))),
             (last, before) => last.or(before),
         };
     }
 
-    /// There will be no further one. Writes the counts of all, unless there are none but those of
-    /// `last`, which ended well and for which the shim has written its own.
+    /// Adds the last process and writes the sum. Writes nothing if there are only counts of one
+    /// successful lambda process, which the shim has written.
     ///
     /// # Errors
     ///
     /// A failure that names the file.
     pub(super) fn complete(
         mut self,
-        last: Option<Live>,
-        recorded: Option<Box<RecorderStatus>>,
+        last: Option<LiveStatus>,
+        recorder: Option<Box<RecorderStatus>>,
         out: &Path,
     ) -> Result<(), Failure> {
-        self.add_recorded(recorded);
-        let Self { counted, mut recorded, lost_wakes } = self;
-        // Sentences about writers of a thousand topics have no bound, and a summary has one.
-        recorded
+        self.add_recorded(recorder);
+        let Self { live, mut recorder, lost_wakes } = self;
+        // Warnings about a thousand topics could exceed the maximum size of a summary.
+        recorder
             .iter_mut()
             .flat_map(|status| &mut status.topics)
             .for_each(|topic| topic.qos_warnings.clear());
-        // Not where the report says: it comes from the lambda's process.
+        // Not the path in the report, which comes from the lambda's process.
         let path = out.join("summary.json");
         let last =
-            last.map(|last| Live { unwritten: last.unwritten.max(unwritten(&path)), ..last });
-        let sum = match (last, counted) {
+            last.map(|last| LiveStatus { unwritten: last.unwritten.max(unwritten(&path)), ..last });
+        let sum = match (last, live) {
             (Some(last), Some(before)) => last.after(&before),
             (None, Some(before)) => before,
-            (Some(last), None) if lost_wakes > 0 || recorded.is_some() => last,
+            (Some(last), None) if lost_wakes > 0 || recorder.is_some() => last,
             _ => return Ok(()),
         };
-        let sum =
-            Live { faults: sum.faults.saturating_add(lost_wakes), recording: recorded, ..sum };
+        let sum = LiveStatus {
+            faults: sum.faults.saturating_add(lost_wakes),
+            recording: recorder,
+            ..sum
+        };
         let mut text = serde_json::to_vec_pretty(&sum).expect("counts are plain data");
         text.push(b'\n');
         if text.len() as u64 > SUMMARY_MAX.bytes() {
             let failure = Failure::new(
                 Exit::Internal,
-                format!("`{}` lacks what the recorder counted", path.display()),
+                format!("`{}` lacks the counts of the recorder", path.display()),
             );
             return Err(
-                failure.with_help("give fewer topics to one lambda: a summary has 4 MiB at most")
+                failure.with_help("use fewer topics in one lambda: a summary has at most 4 MiB")
             );
         }
-        write_whole(&path, &text).map_err(|error| {
+        write_atomically(&path, &text).map_err(|error| {
             Failure::caused_by(Exit::Internal, format!("cannot write `{}`", path.display()), &error)
         })
     }
 }
 
-/// What the shim could not write of the last process: it alone knows what it met after the last
-/// report.
+/// Number of lines that the shim could not write. Only the shim knows those after the last report.
 fn unwritten(summary: &Path) -> u64 {
     let text = PlainFile::result(summary, SUMMARY_MAX).and_then(PlainFile::read_whole).ok();
-    text.and_then(|text| serde_json::from_slice::<Live>(&text).ok())
+    text.and_then(|text| serde_json::from_slice::<LiveStatus>(&text).ok())
         .map_or(0, |written| written.unwritten)
 }
 
@@ -102,27 +104,27 @@ fn unwritten(summary: &Path) -> u64 {
 mod tests {
     use std::fs;
 
-    use gleaner_protocol::Recording;
+    use gleaner_protocol::RecordingCounts;
 
     use super::*;
 
-    fn live(wakes: u64, unwritten: u64) -> Live {
+    fn live(wakes: u64, unwritten: u64) -> LiveStatus {
         let text = format!(
             r#"{{"lambda":"l","version":"1.0.0","kind":"wasm","out":"o","restarts":0,"up_s":1.0,"wakes":{wakes},"triggers":0,
             "faults":0,"skipped":0,"missed_ticks":0,"log_lines":0,"log_dropped":0,"triggers_refused":0,"backed_off":0,
-            "unwritten":{unwritten},"topics":[],"network":{{"domain":0,"participants":0,"buffer_asked":0,"buffer_granted":0,
+            "unwritten":{unwritten},"topics":[],"network":{{"domain":0,"participants":0,"buffer_requested":0,"buffer_granted":0,
             "socket_drops":0}},"rss_bytes":0,"cpu_s":0.0}}"#
         );
         serde_json::from_str(&text).unwrap()
     }
 
-    fn recorded(disk_suppressed: u64) -> Option<Box<RecorderStatus>> {
-        let recording = Recording { disk_suppressed, ..Recording::default() };
+    fn recorder(disk_suppressed: u64) -> Option<Box<RecorderStatus>> {
+        let recording = RecordingCounts { disk_suppressed, ..RecordingCounts::default() };
         Some(Box::new(RecorderStatus { recording, ..RecorderStatus::default() }))
     }
 
-    /// What is in `summary.json` after `complete`, where the shim has written `before`.
-    fn completed(before: &Live, complete: impl FnOnce(&Path)) -> Live {
+    /// `summary.json` after `complete`, if the shim has written `before`.
+    fn completed(before: &LiveStatus, complete: impl FnOnce(&Path)) -> LiveStatus {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("summary.json");
         fs::write(&path, serde_json::to_vec(before).unwrap()).unwrap();
@@ -131,16 +133,16 @@ mod tests {
     }
 
     #[test]
-    fn what_the_recorder_counted_is_added_to_what_the_shim_wrote() {
+    fn the_counts_of_the_recorder_are_added_to_those_of_the_shim() {
         let summary = completed(&live(5, 3), |out| {
-            Earlier::default().complete(Some(live(5, 1)), recorded(7), out).unwrap();
+            Earlier::default().complete(Some(live(5, 1)), recorder(7), out).unwrap();
         });
         assert_eq!((summary.wakes, summary.unwritten), (5, 3));
         assert_eq!(summary.recording.unwrap().recording.disk_suppressed, 7);
     }
 
     #[test]
-    fn what_the_shim_wrote_stays_where_nobody_knows_more() {
+    fn the_summary_of_the_shim_stays_if_there_is_nothing_to_add() {
         let summary = completed(&live(5, 3), |out| {
             Earlier::default().complete(Some(live(5, 1)), None, out).unwrap();
         });
@@ -148,12 +150,12 @@ mod tests {
     }
 
     #[test]
-    fn recorders_are_counted_together_also_those_whose_lambda_said_nothing() {
+    fn recorders_are_summed_up_even_if_their_lambda_reported_nothing() {
         let summary = completed(&live(5, 3), |out| {
             let mut earlier = Earlier::default();
-            earlier.add(Some(live(10, 0)), recorded(1), false);
-            earlier.add(None, recorded(20), true);
-            earlier.complete(Some(live(5, 1)), recorded(300), out).unwrap();
+            earlier.add(Some(live(10, 0)), recorder(1), false);
+            earlier.add(None, recorder(20), true);
+            earlier.complete(Some(live(5, 1)), recorder(300), out).unwrap();
         });
         assert_eq!((summary.wakes, summary.faults, summary.unwritten), (15, 1, 3));
         assert_eq!(summary.recording.unwrap().recording.disk_suppressed, 321);

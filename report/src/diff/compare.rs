@@ -1,37 +1,37 @@
-//! What differs between two wakes.
+//! Compares two wakes: their triggers, one by one, and their faults.
 
 use gleaner_lambda::{Decision, Fault, SCORE_TOLERANCE, Trigger, TriggerKind};
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-use crate::words::{cut, fault_kind, gist, score, seconds};
+use crate::format::{cut, fault_kind, gist, score, seconds};
 
-/// Most characters of what is said of one difference.
+/// Maximum number of characters of each text in a [`Difference`].
 const CHARS: usize = 300;
 
-/// What a difference is about.
+/// The part of a decision that differs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Of {
+pub enum DifferenceKind {
     /// A trigger.
     Trigger,
     /// A fault.
     Fault,
 }
 
-/// What became of it in the second run.
+/// The change from the first run to the second.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Is {
+pub enum ChangeKind {
     /// Only the first run has it.
-    Gone,
+    Removed,
     /// Only the second run has it.
-    New,
-    /// Both have it, not alike.
+    Added,
+    /// Both runs have it, with different values.
     Changed,
 }
 
-/// A trigger or a fault that both runs do not have alike.
+/// A trigger or a fault that differs between the runs.
 #[derive(Debug, PartialEq, Serialize)]
 pub struct Difference {
     /// Time of the wake, in ns since the epoch of the drive.
@@ -39,35 +39,35 @@ pub struct Difference {
     /// The same, in s after the start of the first run's drive.
     pub t: f64,
     /// A trigger or a fault.
-    pub of: Of,
-    /// What became of it.
-    pub is: Is,
-    /// The topic of the sample that woke it; `None` for a tick.
+    pub kind: DifferenceKind,
+    /// Removed, added or changed.
+    pub change: ChangeKind,
+    /// Topic of the sample that caused the wake; `None` for a tick.
     pub topic: Option<String>,
-    /// Its label; of a fault, its kind.
+    /// Label of the trigger, or kind of the fault.
     pub label: String,
-    /// Score or message; of what changed, before and after.
+    /// Score or message; for a change, the values before and after.
     pub detail: String,
 }
 
-/// What is alike and what is not, in one wake.
+/// The comparison of one wake.
 #[derive(Debug, Default)]
-pub(super) struct Found {
-    pub(super) same_triggers: u64,
-    pub(super) same_fault: bool,
+pub(super) struct WakeComparison {
+    pub(super) identical_triggers: u64,
+    pub(super) has_identical_fault: bool,
     pub(super) differences: Vec<Difference>,
 }
 
-/// Compares a wake of both runs; in one of them there may be none that triggered or faulted.
-pub(super) fn wakes(a: Option<&Decision>, b: Option<&Decision>, start_ns: i64) -> Found {
-    let mut found = Found::default();
-    let Some(wake) = a.or(b) else { return found };
-    let mut note = |of, is, label: &str, detail: String| {
-        found.differences.push(Difference {
+/// Compares a wake of both runs; `None` for a run in which it neither triggered nor faulted.
+pub(super) fn wakes(a: Option<&Decision>, b: Option<&Decision>, start_ns: i64) -> WakeComparison {
+    let mut compared = WakeComparison::default();
+    let Some(wake) = a.or(b) else { return compared };
+    let mut note = |kind, change, label: &str, detail: String| {
+        compared.differences.push(Difference {
             at_ns: wake.at_ns,
             t: seconds(wake.at_ns, start_ns),
-            of,
-            is,
+            kind,
+            change,
             topic: wake.topic.as_deref().map(short),
             label: short(label),
             detail: short(&detail),
@@ -75,36 +75,34 @@ pub(super) fn wakes(a: Option<&Decision>, b: Option<&Decision>, start_ns: i64) -
     };
 
     for (a, b) in pairs(triggers(a), triggers(b)) {
+        let trigger = DifferenceKind::Trigger;
         match (a, b) {
             (Some(a), Some(b)) => match changes(a, b) {
-                None => found.same_triggers += 1,
-                Some((label, detail)) => note(Of::Trigger, Is::Changed, &label, detail),
+                None => compared.identical_triggers += 1,
+                Some((label, detail)) => note(trigger, ChangeKind::Changed, &label, detail),
             },
-            (Some(a), None) => note(Of::Trigger, Is::Gone, &named(a), score(a)),
-            (None, Some(b)) => note(Of::Trigger, Is::New, &named(b), score(b)),
+            (Some(a), None) => note(trigger, ChangeKind::Removed, &named(a), score(a)),
+            (None, Some(b)) => note(trigger, ChangeKind::Added, &named(b), score(b)),
             (None, None) => {}
         }
     }
 
+    let kind = DifferenceKind::Fault;
     match (fault(a), fault(b)) {
         (None, None) => {}
-        (Some(a), None) => note(Of::Fault, Is::Gone, &kind(a), first_line(a)),
-        (None, Some(b)) => note(Of::Fault, Is::New, &kind(b), first_line(b)),
-        (Some(a), Some(b)) if a.kind == b.kind && a.message == b.message => found.same_fault = true,
-        (Some(a), Some(b)) if a.kind == b.kind => {
-            note(
-                Of::Fault,
-                Is::Changed,
-                &kind(a),
-                format!("{} → {}", first_line(a), first_line(b)),
-            );
+        (Some(a), None) => note(kind, ChangeKind::Removed, &fault_kind(a.kind), first_line(a)),
+        (None, Some(b)) => note(kind, ChangeKind::Added, &fault_kind(b.kind), first_line(b)),
+        (Some(a), Some(b)) if a.kind == b.kind && a.message == b.message => {
+            compared.has_identical_fault = true;
         }
         (Some(a), Some(b)) => {
-            let kinds = format!("{} → {}", kind(a), kind(b));
-            note(Of::Fault, Is::Changed, &kinds, format!("{} → {}", first_line(a), first_line(b)));
+            let [kind_a, kind_b] = [a, b].map(|fault| fault_kind(fault.kind));
+            let kinds = if a.kind == b.kind { kind_a } else { format!("{kind_a} → {kind_b}") };
+            let lines = format!("{} → {}", first_line(a), first_line(b));
+            note(kind, ChangeKind::Changed, &kinds, lines);
         }
     }
-    found
+    compared
 }
 
 fn triggers(wake: Option<&Decision>) -> &[Trigger] {
@@ -115,15 +113,16 @@ fn fault(wake: Option<&Decision>) -> Option<&Fault> {
     wake?.fault.as_ref()
 }
 
-/// Triggers of one wake in pairs: first those of one kind and label, in their order; of the others,
-/// those at the same place.
+/// Pairs the triggers of one wake: first by kind and label, in their order; then the others by
+/// position.
 fn pairs<'a>(
     a: &'a [Trigger],
     b: &'a [Trigger],
 ) -> Vec<(Option<&'a Trigger>, Option<&'a Trigger>)> {
     let mut left: Vec<Option<&Trigger>> = b.iter().map(Some).collect();
     let mut take = |wanted: &Trigger| {
-        let is_it = |other: &Option<&Trigger>| other.is_some_and(|other| is_alike(wanted, other));
+        let is_it =
+            |other: &Option<&Trigger>| other.is_some_and(|other| has_same_name(wanted, other));
         left.iter_mut().find(|other| is_it(other)).and_then(Option::take)
     };
     let mut pairs: Vec<_> = a.iter().map(|a| (Some(a), take(a))).collect();
@@ -135,14 +134,15 @@ fn pairs<'a>(
     pairs
 }
 
-fn is_alike(a: &Trigger, b: &Trigger) -> bool {
+fn has_same_name(a: &Trigger, b: &Trigger) -> bool {
     a.kind == b.kind && a.label == b.label
 }
 
-/// Label, and what else is not the same, if anything is not.
+/// Returns the label and the other values that differ; `None` if the triggers are identical.
 fn changes(a: &Trigger, b: &Trigger) -> Option<(String, String)> {
-    let label = if is_alike(a, b) { named(a) } else { format!("{} → {}", named(a), named(b)) };
-    let mut said = Vec::new();
+    let label =
+        if has_same_name(a, b) { named(a) } else { format!("{} → {}", named(a), named(b)) };
+    let mut values = Vec::new();
     let same_score = match (a.score, b.score) {
         (Some(a), Some(b)) => is_near(a, b),
         (None, None) => true,
@@ -151,23 +151,24 @@ fn changes(a: &Trigger, b: &Trigger) -> Option<(String, String)> {
     if !same_score {
         let both = [a, b].map(score);
         let both = if both[0] == both[1] { [a, b].map(exact) } else { both };
-        said.push(format!("score {} → {}", both[0], both[1]));
+        values.push(format!("score {} → {}", both[0], both[1]));
     }
-    said.extend(attributes(&a.attributes, &b.attributes));
-    (!said.is_empty() || !is_alike(a, b)).then(|| (label, said.join(", ")))
+    values.extend(attributes(&a.attributes, &b.attributes));
+    (!values.is_empty() || !has_same_name(a, b)).then(|| (label, values.join(", ")))
 }
 
 fn attributes(a: &Map<String, Value>, b: &Map<String, Value>) -> Vec<String> {
     let word = |value: Option<&Value>| value.map_or("none".to_owned(), Value::to_string);
     let changed =
         a.iter().filter(|(key, value)| !b.get(*key).is_some_and(|other| is_same(value, other)));
-    let gone =
+    let removed =
         changed.map(|(key, value)| format!("{key} {} → {}", word(Some(value)), word(b.get(key))));
-    let new = b.iter().filter(|(key, _)| !a.contains_key(*key));
-    gone.chain(new.map(|(key, value)| format!("{key} none → {}", word(Some(value))))).collect()
+    let added = b.iter().filter(|(key, _)| !a.contains_key(*key));
+    removed.chain(added.map(|(key, value)| format!("{key} none → {}", word(Some(value))))).collect()
 }
 
-/// Numbers with a fraction within the tolerance of scores, all else exactly.
+/// Returns whether numbers with a fraction are within the tolerance of scores, and other values are
+/// equal.
 fn is_same(a: &Value, b: &Value) -> bool {
     match (a, b) {
         (Value::Number(x), Value::Number(y)) if x.is_f64() || y.is_f64() => {
@@ -192,15 +193,11 @@ fn exact(trigger: &Trigger) -> String {
     trigger.score.map_or("-".to_owned(), |score| score.to_string())
 }
 
-fn kind(fault: &Fault) -> String {
-    fault_kind(fault.kind)
-}
-
 fn first_line(fault: &Fault) -> String {
     gist(&fault.message).to_owned()
 }
 
-/// `text`, or its begin.
+/// Cuts `text` to [`CHARS`] characters.
 pub(super) fn short(text: &str) -> String {
     cut(text, CHARS)
 }

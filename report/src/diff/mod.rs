@@ -1,62 +1,63 @@
-//! What differs between two runs, decision by decision.
+//! Compares two runs decision by decision.
 //!
-//! `wakes` walks through both files at once and pairs the wakes, `compare` says what differs within
-//! a pair, and `whole` compares what the runs say of themselves.
+//! `wakes` reads both files side by side and pairs the wakes, `compare` compares the two wakes of a
+//! pair, and `summaries` compares `summary.json`, `signals.json` and `clips.jsonl`.
 
 mod compare;
+mod summaries;
 #[cfg(test)]
 mod tests;
 mod wakes;
-mod whole;
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use gleaner_base::{Exit, Explain};
 use gleaner_lambda::Decision;
-use gleaner_lambda::manifest::Kind;
+use gleaner_lambda::manifest::LambdaKind;
 use serde::Serialize;
 
 use crate::results::{Decisions, ResultsError};
 use crate::run_summary::OutputError;
 
-pub use compare::{Difference, Is, Of};
+pub use compare::{ChangeKind, Difference, DifferenceKind};
 
-/// So many differences are listed; of those that are rare, so many in any case. The others are
-/// counted.
+/// Maximum number of differences that are listed. The others are only counted.
 const LISTED: usize = 1_000;
+/// Differences of each kind and change that are listed even beyond [`LISTED`], so that rare ones
+/// are not crowded out.
 const LISTED_OF_EACH: usize = 20;
 
-/// What differs between two runs.
+/// The differences between two runs.
 #[derive(Debug, Serialize)]
 pub struct Diff {
-    /// No decision differs.
-    pub same: bool,
+    /// True if no decision differs.
+    pub identical: bool,
     /// The first run.
-    pub a: Side,
-    /// The second.
-    pub b: Side,
-    /// What makes them hard to compare, such as another drive.
+    pub a: ComparedRun,
+    /// The second run.
+    pub b: ComparedRun,
+    /// Reasons why the runs are hard to compare, such as different drives.
     pub notes: Vec<String>,
-    /// Values of the config that differ, of at most 200 keys.
-    pub config: Vec<Change>,
+    /// Config values that differ, of at most 200 keys.
+    pub config: Vec<ValueChange>,
     /// Counts that differ.
-    pub counts: Vec<Change>,
-    /// What a wake costs, so far as a run has it.
+    pub counts: Vec<ValueChange>,
+    /// Median cost of a wake, as far as the runs have it.
     pub cost: Vec<Cost>,
-    /// How many triggers differ.
-    pub triggers: Tally,
-    /// How many faults differ.
-    pub faults: Tally,
-    /// Those that are listed, in the order of their wakes.
+    /// Counts of triggers by change.
+    pub triggers: ChangeCounts,
+    /// Counts of faults by change.
+    pub faults: ChangeCounts,
+    /// The listed differences, in the order of their wakes.
     pub differences: Vec<Difference>,
-    /// Differences that are not listed.
-    pub left_out: u64,
+    /// Number of differences that are not listed.
+    pub omitted: u64,
 }
 
-/// One of both.
+/// One of the two runs.
 #[derive(Debug, Serialize)]
-pub struct Side {
+pub struct ComparedRun {
     /// Its folder.
     pub out: String,
     /// The name of its lambda.
@@ -64,16 +65,16 @@ pub struct Side {
     /// The version of its lambda.
     pub version: String,
     /// The kind of its lambda.
-    pub kind: Kind,
-    /// The files of its drive; none if it was live.
+    pub kind: LambdaKind,
+    /// The files of its drive; empty for a live run.
     pub drive: Vec<String>,
-    /// When its drive starts, in ns; `None` if it was live.
+    /// Start of its drive, in ns; `None` for a live run.
     pub start_ns: Option<i64>,
 }
 
-/// A value that is not the same; `None` where there is none, or nobody knows it.
+/// A value that differs; `None` where it is missing or unknown.
 #[derive(Debug, PartialEq, Eq, Serialize)]
-pub struct Change {
+pub struct ValueChange {
     /// Its name, in words or as a key of the config.
     pub what: String,
     /// In the first run.
@@ -82,10 +83,10 @@ pub struct Change {
     pub b: Option<String>,
 }
 
-/// What half of the wakes took at most.
+/// Median cost of a wake.
 #[derive(Debug, PartialEq, Serialize)]
 pub struct Cost {
-    /// What was measured, in words.
+    /// The measured quantity, in words.
     pub what: &'static str,
     /// `ns` or `fuel`.
     pub unit: &'static str,
@@ -97,30 +98,34 @@ pub struct Cost {
     pub ratio: Option<f64>,
 }
 
-/// How many of each.
+/// Numbers of triggers or faults by change.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq, Serialize)]
-pub struct Tally {
-    /// Both runs have them alike.
-    pub same: u64,
-    /// Only the first run has them.
-    pub gone: u64,
-    /// Only the second has them.
-    pub new: u64,
-    /// Both have them, not alike.
+pub struct ChangeCounts {
+    /// Identical in both runs.
+    pub identical: u64,
+    /// Only in the first run.
+    pub removed: u64,
+    /// Only in the second run.
+    pub added: u64,
+    /// In both runs, with different values.
     pub changed: u64,
 }
 
-/// Why two runs cannot be compared.
+/// Errors of [`Diff::between`].
 #[derive(Debug, thiserror::Error)]
 pub enum DiffError {
-    /// A folder holds no results.
+    /// A folder does not hold results.
     #[error(transparent)]
     Output(#[from] OutputError),
-    /// A file of lines cannot be read to its end.
+    /// A file of JSON lines cannot be read to its end.
     #[error(transparent)]
     Read(ResultsError),
-    /// More happened at one instant than is held in memory.
-    #[error("`{out}` has more than {} wakes, or more than {} MiB of them, at one instant", wakes::AT_ONCE, wakes::BYTES_AT_ONCE >> 20)]
+    /// A run has more wakes at one instant than are held in memory.
+    #[error(
+        "`{out}` has more than {} wakes, or more than {} MiB of them, at one instant",
+        wakes::WAKES_PER_INSTANT,
+        wakes::BYTES_PER_INSTANT >> 20
+    )]
     Crowded {
         /// The folder of the run.
         out: String,
@@ -132,8 +137,7 @@ impl Explain for DiffError {
         match self {
             Self::Output(error) => error.help(),
             Self::Read(_) | Self::Crowded { .. } => Some(
-                "name two folders that `gleaner replay` or `gleaner run` wrote to, whole"
-                    .to_owned(),
+                "name two complete result folders of `gleaner replay` or `gleaner run`".to_owned(),
             ),
         }
     }
@@ -144,17 +148,18 @@ impl Explain for DiffError {
 }
 
 impl Diff {
-    /// What differs between the runs in these folders. Both are read once, side by side; the memory
-    /// that it takes does not grow with their length.
+    /// Compares the runs in these folders. Both are read once, side by side; memory use does not
+    /// grow with their length.
     ///
     /// # Errors
     ///
-    /// [`DiffError`] if one of them holds no results, or a file of it cannot be read to its end.
+    /// [`DiffError`] if a folder does not hold results, or one of its files cannot be read to its
+    /// end.
     pub fn between(a: &Path, b: &Path) -> Result<Diff, DiffError> {
-        let mut diff = whole::compared(a, b)?;
-        // Of a live run nothing says when it began: seconds count from its first decision.
-        let mut list = List { start_ns: diff.a.start_ns, ..List::default() };
-        let (mut wakes_a, mut wakes_b) = (decisions(a)?.weighed(), decisions(b)?.weighed());
+        let mut diff = summaries::compared(a, b)?;
+        // The start of a live run is not recorded: seconds count from its first decision.
+        let mut list = DifferenceList { start_ns: diff.a.start_ns, ..DifferenceList::default() };
+        let (mut wakes_a, mut wakes_b) = (decisions(a)?.with_sizes(), decisions(b)?.with_sizes());
         for pair in wakes::Pairs::new(&mut wakes_a, &mut wakes_b) {
             let pair = pair.map_err(|error| match error {
                 wakes::WakesError::Read(source) => DiffError::Read(source),
@@ -165,15 +170,17 @@ impl Diff {
             if pair.out_of_order && !list.out_of_order {
                 list.out_of_order = true;
                 diff.notes.push(
-                    "the wakes are not in the order of their times: some may be listed as gone and new".to_owned(),
+                    "the wakes are not in the order of their times: some may be listed as removed \
+                     and added"
+                        .to_owned(),
                 );
             }
             list.add(pair.a.as_ref(), pair.b.as_ref());
         }
         diff.triggers = list.triggers;
         diff.faults = list.faults;
-        diff.same = list.triggers.is_same() && list.faults.is_same();
-        diff.left_out = list.left_out;
+        diff.identical = list.triggers.is_identical() && list.faults.is_identical();
+        diff.omitted = list.omitted;
         diff.differences = list.listed;
         Ok(diff)
     }
@@ -183,53 +190,53 @@ fn decisions(out: &Path) -> Result<Decisions, DiffError> {
     Decisions::open(out).map_err(DiffError::Read)
 }
 
-/// The differences, some of them by word, all of them by count.
+/// Collects differences: lists the first ones, counts all.
 #[derive(Default)]
-struct List {
+struct DifferenceList {
     start_ns: Option<i64>,
     listed: Vec<Difference>,
-    of_each: BTreeMap<(Of, Is), usize>,
-    left_out: u64,
-    triggers: Tally,
-    faults: Tally,
+    of_each: BTreeMap<(DifferenceKind, ChangeKind), usize>,
+    omitted: u64,
+    triggers: ChangeCounts,
+    faults: ChangeCounts,
     out_of_order: bool,
 }
 
-impl List {
+impl DifferenceList {
     fn add(&mut self, a: Option<&Decision>, b: Option<&Decision>) {
         let Some(either) = a.or(b) else { return };
         let start_ns = *self.start_ns.get_or_insert(either.at_ns);
-        let found = compare::wakes(a, b, start_ns);
-        self.triggers.same += found.same_triggers;
-        self.faults.same += u64::from(found.same_fault);
-        for difference in found.differences {
-            let tally = match difference.of {
-                Of::Trigger => &mut self.triggers,
-                Of::Fault => &mut self.faults,
+        let compared = compare::wakes(a, b, start_ns);
+        self.triggers.identical += compared.identical_triggers;
+        self.faults.identical += u64::from(compared.has_identical_fault);
+        for difference in compared.differences {
+            let counts = match difference.kind {
+                DifferenceKind::Trigger => &mut self.triggers,
+                DifferenceKind::Fault => &mut self.faults,
             };
-            tally.count(difference.is);
-            let alike = self.of_each.entry((difference.of, difference.is)).or_default();
+            counts.count(difference.change);
+            let alike = self.of_each.entry((difference.kind, difference.change)).or_default();
             if self.listed.len() < LISTED || *alike < LISTED_OF_EACH {
                 *alike += 1;
                 self.listed.push(difference);
             } else {
-                self.left_out += 1;
+                self.omitted += 1;
             }
         }
     }
 }
 
-impl Tally {
-    /// Whether nothing differs.
-    pub fn is_same(self) -> bool {
-        self.gone == 0 && self.new == 0 && self.changed == 0
+impl ChangeCounts {
+    /// Returns whether nothing differs.
+    pub fn is_identical(self) -> bool {
+        self.removed == 0 && self.added == 0 && self.changed == 0
     }
 
-    fn count(&mut self, is: Is) {
-        match is {
-            Is::Gone => self.gone += 1,
-            Is::New => self.new += 1,
-            Is::Changed => self.changed += 1,
+    fn count(&mut self, change: ChangeKind) {
+        match change {
+            ChangeKind::Removed => self.removed += 1,
+            ChangeKind::Added => self.added += 1,
+            ChangeKind::Changed => self.changed += 1,
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The wakes of two runs in pairs, out of two files that are read once, side by side.
+//! Pairs the wakes of two runs. Both files are read once, side by side.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -6,37 +6,37 @@ use gleaner_lambda::{Cause, Decision};
 
 use crate::results::ResultsError;
 
-/// Most wakes at one instant, and most bytes of their lines if they are several: so much of each
-/// run is held in memory.
-pub(super) const AT_ONCE: usize = 65_536;
-pub(super) const BYTES_AT_ONCE: usize = 32 << 20;
+/// Maximum number of wakes at one instant; those of each run are held in memory.
+pub(super) const WAKES_PER_INSTANT: usize = 65_536;
+/// Maximum number of bytes of their lines, if there are several.
+pub(super) const BYTES_PER_INSTANT: usize = 32 << 20;
 
-/// Why there are no further pairs.
+/// Errors of [`Pairs`].
 #[derive(Debug)]
 pub(super) enum WakesError {
     Read(ResultsError),
-    /// In the first of both, or in the second.
+    /// Too many wakes at one instant, in the first run or in the second.
     Crowded {
         first: bool,
     },
 }
 
-/// A wake, as both runs have it; `None` where a run has it not, or where it neither triggered nor
+/// A wake of both runs; `None` for a run that lacks it, or in which it neither triggered nor
 /// faulted.
 #[derive(Debug)]
 pub(super) struct Pair {
     pub(super) a: Option<Decision>,
     pub(super) b: Option<Decision>,
-    /// It comes after one with a later time.
+    /// True if a wake with a later time came before.
     pub(super) out_of_order: bool,
 }
 
-/// Walks through both.
+/// Iterates over the pairs.
 pub(super) struct Pairs<'a, A, B> {
-    a: Side<'a, A>,
-    b: Side<'a, B>,
+    a: WakeStream<'a, A>,
+    b: WakeStream<'a, B>,
     ready: VecDeque<Pair>,
-    /// Nothing comes after an error.
+    /// Set after an error, which is the last item.
     ended: bool,
 }
 
@@ -46,11 +46,11 @@ where
     B: Iterator<Item = Result<(Decision, usize), ResultsError>>,
 {
     pub(super) fn new(a: &'a mut A, b: &'a mut B) -> Self {
-        let (a, b) = (Side::new(a, true), Side::new(b, false));
+        let (a, b) = (WakeStream::new(a, true), WakeStream::new(b, false));
         Self { a, b, ready: VecDeque::new(), ended: false }
     }
 
-    /// Pairs the wakes of the next instant at which there are any.
+    /// Pairs the wakes of the next instant that has any.
     fn fill(&mut self) -> Result<(), WakesError> {
         let instant = match (self.a.peek()?, self.b.peek()?) {
             (Some(a), Some(b)) => a.min(b),
@@ -62,7 +62,7 @@ where
         let out_of_order = late_a || late_b;
         let (mut by_number, mut by_name) = (HashMap::new(), HashMap::new());
         for (place, decision) in of_b.iter().enumerate() {
-            let name = Name::of(decision);
+            let name = WakeKey::of(decision);
             by_number
                 .entry((name.clone(), decision.seq))
                 .or_insert_with(VecDeque::new)
@@ -75,13 +75,13 @@ where
             std::iter::from_fn(|| places.pop_front()).find_map(|place| left[place].take())
         };
         for decision in of_a {
-            let b = take(by_number.get_mut(&(Name::of(&decision), decision.seq)));
+            let b = take(by_number.get_mut(&(WakeKey::of(&decision), decision.seq)));
             self.ready.push_back(Pair { a: Some(decision), b, out_of_order });
         }
-        // Then those of other numbers, in the order of the files: of a part of a drive, samples may
-        // be counted from its begin.
+        // Then those with other sequence numbers, in the order of the files: if a part of a drive
+        // was replayed, its samples may be numbered from its start.
         for pair in self.ready.iter_mut().filter(|pair| pair.b.is_none()) {
-            pair.b = pair.a.as_ref().and_then(|a| take(by_name.get_mut(&Name::of(a))));
+            pair.b = pair.a.as_ref().and_then(|a| take(by_name.get_mut(&WakeKey::of(a))));
         }
         let rest = left.into_iter().flatten();
         self.ready.extend(rest.map(|b| Pair { a: None, b: Some(b), out_of_order }));
@@ -108,48 +108,48 @@ where
     }
 }
 
-/// What a wake is known by, beside its time.
+/// Identity of a wake within a run.
 #[derive(Clone, PartialEq, Eq, Hash)]
-struct Name {
+struct WakeKey {
     at_ns: i64,
     cause: Cause,
     topic: Option<String>,
 }
 
-impl Name {
+impl WakeKey {
     fn of(decision: &Decision) -> Self {
         let Decision { at_ns, cause, topic, .. } = decision;
         Self { at_ns: *at_ns, cause: *cause, topic: topic.clone() }
     }
 }
 
-/// One run, instant by instant.
-struct Side<'a, I> {
+/// Reads the wakes of one run instant by instant.
+struct WakeStream<'a, I> {
     decisions: &'a mut I,
     is_first: bool,
-    /// The next one that triggered or faulted, the instant that it counts to, and the bytes of its
-    /// line.
+    /// The next decision with a trigger or a fault, the instant that it counts to, and the bytes of
+    /// its line.
     next: Option<(i64, Decision, usize)>,
-    /// The latest time so far: who comes later with an earlier one counts to this instant, so that
+    /// The latest time so far. A later line with an earlier time counts to this instant, so that
     /// instants never go back.
     latest: i64,
-    asked: bool,
+    has_read_next: bool,
 }
 
-impl<'a, I: Iterator<Item = Result<(Decision, usize), ResultsError>>> Side<'a, I> {
+impl<'a, I: Iterator<Item = Result<(Decision, usize), ResultsError>>> WakeStream<'a, I> {
     fn new(decisions: &'a mut I, is_first: bool) -> Self {
-        Self { decisions, is_first, next: None, latest: i64::MIN, asked: false }
+        Self { decisions, is_first, next: None, latest: i64::MIN, has_read_next: false }
     }
 
     fn peek(&mut self) -> Result<Option<i64>, WakesError> {
-        if !self.asked {
-            self.asked = true;
-            // With `--all` a run has quiet wakes, too: they are as good as none.
-            let speaks =
+        if !self.has_read_next {
+            self.has_read_next = true;
+            // With `--all` a run lists quiet wakes, too. They are ignored.
+            let is_relevant =
                 |decision: &Decision| !decision.triggers.is_empty() || decision.fault.is_some();
             let next = self
                 .decisions
-                .find(|next| next.as_ref().map_or(true, |(decision, _)| speaks(decision)));
+                .find(|next| next.as_ref().map_or(true, |(decision, _)| is_relevant(decision)));
             let next = next.transpose().map_err(WakesError::Read)?;
             self.next = next.map(|(decision, bytes)| {
                 self.latest = self.latest.max(decision.at_ns);
@@ -159,14 +159,14 @@ impl<'a, I: Iterator<Item = Result<(Decision, usize), ResultsError>>> Side<'a, I
         Ok(self.next.as_ref().map(|(instant, ..)| *instant))
     }
 
-    /// The wakes of `instant`, and whether any has another time.
+    /// Returns the wakes of `instant`, and whether any of them has another time.
     fn at(&mut self, instant: i64) -> Result<(Vec<Decision>, bool), WakesError> {
         let (mut wakes, mut held, mut is_late) = (Vec::new(), 0, false);
         while self.peek()? == Some(instant) {
-            self.asked = false;
+            self.has_read_next = false;
             let Some((_, decision, bytes)) = self.next.take() else { continue };
             held += bytes;
-            if wakes.len() == AT_ONCE || (held > BYTES_AT_ONCE && !wakes.is_empty()) {
+            if wakes.len() == WAKES_PER_INSTANT || (held > BYTES_PER_INSTANT && !wakes.is_empty()) {
                 return Err(WakesError::Crowded { first: self.is_first });
             }
             is_late |= decision.at_ns != instant;

@@ -1,11 +1,10 @@
-//! How often something happened over time, in little memory: bins that grow wider as more is
-//! counted.
+//! Counts events over time in bounded memory: bins become wider as more of them are needed.
 
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-/// Most bins of all lanes together.
+/// Maximum number of bins of all lanes together.
 const BINS_MAX: usize = 4096;
 
 /// Width of the first bins, as a power of two, in ns: about a millisecond.
@@ -14,14 +13,14 @@ const FIRST_SHIFT: u32 = 20;
 /// Counts by lane and time.
 #[derive(Debug)]
 pub(super) struct Density {
-    /// A bin is `1 << shift` ns wide.
+    /// Bins are `1 << shift` ns wide.
     shift: u32,
     bins: BTreeMap<(usize, i64), u64>,
 }
 
-/// `count` things in `lane`, from `from` to `to`, in s.
+/// Number of events in `lane` from `from` to `to`, in s.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct Dense {
+pub(crate) struct DensityBin {
     pub(crate) lane: usize,
     pub(crate) from: f64,
     pub(crate) to: f64,
@@ -33,10 +32,10 @@ impl Density {
         Self { shift: FIRST_SHIFT, bins: BTreeMap::new() }
     }
 
-    /// Counts one in `lane`, `after_ns` after the start.
+    /// Counts an event in `lane`, `after_ns` after the start.
     pub(super) fn add(&mut self, lane: usize, after_ns: i64) {
         *self.bins.entry((lane, after_ns >> self.shift)).or_default() += 1;
-        // Where lanes alone are as many as bins, wider ones would not be fewer.
+        // If there are as many lanes as bins, wider bins would not be fewer.
         while self.bins.len() > BINS_MAX && self.shift < 62 {
             self.shift += 1;
             let narrow = std::mem::take(&mut self.bins);
@@ -46,9 +45,9 @@ impl Density {
         }
     }
 
-    pub(super) fn bins(&self) -> Vec<Dense> {
+    pub(super) fn bins(&self) -> Vec<DensityBin> {
         let seconds = |bin: i64| (i128::from(bin) << self.shift) as f64 / 1e9;
-        let dense = |(&(lane, bin), &count): (&(usize, i64), &u64)| Dense {
+        let dense = |(&(lane, bin), &count): (&(usize, i64), &u64)| DensityBin {
             lane,
             from: seconds(bin),
             to: seconds(bin.saturating_add(1)),
@@ -63,10 +62,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_million_moments_stay_few_bins_and_none_is_forgotten() {
+    fn a_million_events_are_counted_in_few_bins() {
         let mut density = Density::new();
-        for moment in 0..1_000_000_i64 {
-            density.add((moment % 3) as usize, moment * 10_000_000);
+        for event in 0..1_000_000_i64 {
+            density.add((event % 3) as usize, event * 10_000_000);
         }
         let bins = density.bins();
         assert!(bins.len() <= BINS_MAX && bins.len() > BINS_MAX / 4, "{}", bins.len());

@@ -1,26 +1,25 @@
-//! The page as one file: its style, its script and its data, and nothing that it would have to
-//! fetch.
+//! Renders the page as one file with its style, script and data.
 //!
-//! All that comes from files is in the data, and the data is no program: a browser runs only the
-//! script whose digest the page names.
+//! Everything that comes from result files is in the data. The content security policy lets a
+//! browser run only the script whose digest the page names.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
-use super::Page;
+use super::ReportPage;
 
 const PAGE: &str = include_str!("../../assets/page/page.html");
 const STYLE: [&str; 2] =
     [include_str!("../../assets/uPlot.min.css"), include_str!("../../assets/page/page.css")];
-/// The plots, which others made.
+/// uPlot, which draws the plots.
 const PLOTS: &str = include_str!("../../assets/uPlot.iife.min.js");
 const PLOTS_LICENSE: &str = include_str!("../../assets/uPlot.LICENSE");
-/// In the order in which they use each other.
+/// The scripts, each after those that it uses.
 const SCRIPTS: &[&str] = &[
     include_str!("../../assets/page/elements.js"),
-    include_str!("../../assets/page/words.js"),
+    include_str!("../../assets/page/format.js"),
     include_str!("../../assets/page/colours.js"),
     include_str!("../../assets/page/timeline.js"),
     include_str!("../../assets/page/lanes.js"),
@@ -34,8 +33,8 @@ const SCRIPTS: &[&str] = &[
     include_str!("../../assets/page/main.js"),
 ];
 
-/// The page for `page`.
-pub(super) fn html(page: &Page) -> String {
+/// Renders `page`.
+pub(super) fn html(page: &ReportPage) -> String {
     let script = script();
     let policy = format!(
         "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{}'; base-uri 'none'; form-action 'none'",
@@ -53,23 +52,23 @@ pub(super) fn html(page: &Page) -> String {
             "style" => STYLE.iter().for_each(|style| text.push_str(style)),
             "data" => text.push_str(&json(page)),
             "script" => text.push_str(&script),
-            other => unreachable!("page.html asks for `{other}`"),
+            other => unreachable!("page.html has a placeholder `{other}`"),
         }
         text.push_str(after);
     }
     text
 }
 
-/// One closed function, so that the page has no names of ours beside those of the browser.
+/// The script as one function, so that it adds no global names.
 fn script() -> String {
     format!("\n{PLOTS}\n(() => {{\n\"use strict\";\n{}\n}})();\n", SCRIPTS.join("\n"))
 }
 
-/// `value` as JSON that ends no element of a page, and no line of a script, whatever its texts are.
+/// `value` as JSON without characters that could end an HTML element or a line of a script.
 pub(super) fn json(value: &impl Serialize) -> String {
-    let plain = serde_json::to_string(value).expect("what a page shows has text keys");
+    let plain = serde_json::to_string(value).expect("page data has only text keys");
     let mut text = String::with_capacity(plain.len());
-    // Outside of texts JSON has none of these characters.
+    // JSON has these characters only inside texts.
     for character in plain.chars() {
         match character {
             '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => {
@@ -81,7 +80,7 @@ pub(super) fn json(value: &impl Serialize) -> String {
     text
 }
 
-/// The address of a picture that is in the page itself.
+/// The `data:` URL of a JPEG.
 pub(super) fn jpeg_address(jpeg: &[u8]) -> String {
     format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg))
 }
@@ -91,7 +90,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn no_text_ends_the_element_that_it_is_in() {
+    fn no_text_can_end_its_element() {
         let text = "</script><script>alert(1)</script>&amp;\u{2028}\u{2029}\\\"";
         let json = json(&text);
         assert!(json.is_ascii() && !json.contains(['<', '>', '&']), "{json}");
@@ -99,12 +98,12 @@ mod tests {
     }
 
     #[test]
-    fn the_script_stands_in_its_element_as_it_is_hashed() {
-        let page = html(&Page { made_by: String::new(), runs: Vec::new(), diff: None });
+    fn the_hash_is_that_of_the_script_in_its_element() {
+        let page = html(&ReportPage { made_by: String::new(), runs: Vec::new(), diff: None });
         let (_, after) = page.split_once("<script>").unwrap();
         let (inside, rest) = after.split_once("</script>").unwrap();
         assert_eq!(inside, script());
-        // A comment of HTML in a script changes where it ends.
+        // An HTML comment in a script would change where it ends.
         assert!(!inside.contains("<!--") && !inside.contains('\r'));
         assert!(!rest.contains("<script"));
         let hash = STANDARD.encode(Sha256::digest(inside));

@@ -1,60 +1,60 @@
-//! The data of the page, as its script reads it. Times are in s after the start of the drive, of
-//! two runs that of the first; numbers that a script would round are texts.
+//! The data of the page, in the form that its script reads. Times are in s after the start of the
+//! drive (of the first run's, if there are two). Numbers that a script would round are texts.
 
 use std::collections::BTreeMap;
 
-use gleaner_lambda::manifest::{ConfigValue, Kind};
+use gleaner_lambda::manifest::{ConfigValue, LambdaKind};
 use gleaner_lambda::{Cause, FaultKind};
 use serde::Serialize;
 
-use super::density::Dense;
-use crate::run_summary::Losses;
+use super::density::DensityBin;
+use crate::run_summary::TopicCounts;
 
-/// What one output holds.
+/// The results of one run.
 #[derive(Debug, Serialize)]
-pub(crate) struct Run {
+pub(crate) struct PageRun {
     pub(crate) out: String,
     pub(crate) lambda: String,
     pub(crate) version: String,
-    pub(crate) kind: Kind,
+    pub(crate) kind: LambdaKind,
     pub(crate) is_live: bool,
     pub(crate) drive: Vec<String>,
-    /// What times count from.
+    /// Origin of the times, in ns.
     #[serde(skip)]
     pub(crate) start_ns: i64,
-    /// The same in ms since 1970: what a date of the page is made from.
+    /// The same in ms since 1970, for dates on the page.
     pub(crate) start_ms: f64,
-    /// What the page shows, in s.
+    /// Start and end of the time line, in s.
     pub(crate) from: f64,
     pub(crate) to: f64,
-    /// Only a part of the drive was replayed.
+    /// True if only a part of the drive was replayed.
     pub(crate) is_part: bool,
-    /// `None` if nothing tells.
+    /// `None` if unknown.
     pub(crate) config: Option<BTreeMap<String, ConfigValue>>,
     pub(crate) counts: BTreeMap<&'static str, u64>,
     pub(crate) damaged: Option<String>,
     pub(crate) stopped: Option<String>,
-    /// What is missing on the page, and why.
+    /// Missing parts of the page, with reasons.
     pub(crate) notes: Vec<String>,
-    /// What it took, in words.
+    /// Cost and speed of the run, as text.
     pub(crate) facts: Vec<Fact>,
     pub(crate) labels: Vec<String>,
-    pub(crate) triggers: Vec<Mark>,
-    /// All triggers by label, if `triggers` has not all of them; else none.
-    pub(crate) trigger_density: Vec<Dense>,
+    pub(crate) triggers: Vec<TriggerEvent>,
+    /// All triggers by label and time, if `triggers` is incomplete; else empty.
+    pub(crate) trigger_density: Vec<DensityBin>,
     pub(crate) fault_kinds: Vec<FaultKind>,
-    pub(crate) faults: Vec<FaultMark>,
-    /// All faults by kind, likewise.
-    pub(crate) fault_density: Vec<Dense>,
+    pub(crate) faults: Vec<FaultEvent>,
+    /// All faults by kind and time, if `faults` is incomplete; else empty.
+    pub(crate) fault_density: Vec<DensityBin>,
     pub(crate) fault_causes: Vec<FaultCause>,
-    pub(crate) clips: Vec<ClipShown>,
-    pub(crate) curves: Vec<CurveShown>,
-    pub(crate) spreads: Vec<SpreadShown>,
-    pub(crate) topics: Vec<Losses>,
+    pub(crate) clips: Vec<PageClip>,
+    pub(crate) curves: Vec<PageCurve>,
+    pub(crate) spreads: Vec<PageSpread>,
+    pub(crate) topics: Vec<TopicCounts>,
     pub(crate) missed: Vec<(&'static str, u64)>,
-    pub(crate) pictures: Vec<PictureShown>,
-    pub(crate) log: Vec<LogShown>,
-    /// How many there are, of which the page shows some.
+    pub(crate) pictures: Vec<PagePicture>,
+    pub(crate) log: Vec<PageLogLine>,
+    /// Total numbers, of which the page may show fewer.
     pub(crate) totals: Totals,
 }
 
@@ -62,8 +62,8 @@ pub(crate) struct Run {
 pub(crate) struct Totals {
     pub(crate) triggers: u64,
     pub(crate) faults: u64,
-    /// Faults whose cause is in no line of the table.
-    pub(crate) faults_in_no_line: u64,
+    /// Faults whose cause is not in the table.
+    pub(crate) unlisted_faults: u64,
     pub(crate) clips: u64,
     pub(crate) pictures_omitted: u64,
     pub(crate) curves_omitted: u64,
@@ -78,51 +78,51 @@ pub(crate) struct Fact {
 
 /// A trigger.
 #[derive(Debug, Serialize)]
-pub(crate) struct Mark {
+pub(crate) struct TriggerEvent {
     pub(crate) t: f64,
     #[serde(skip)]
     pub(crate) at_ns: i64,
-    /// Which of `labels`.
+    /// Index into `labels`.
     pub(crate) label: usize,
     pub(crate) kind: &'static str,
     pub(crate) score: Option<f64>,
-    /// As they stand in the file; empty with `attributes_cut`, if there are more than the page has
-    /// room for.
+    /// Names and values as in the file; empty if `attributes_omitted`.
     pub(crate) attributes: Vec<(String, String)>,
-    pub(crate) attributes_cut: bool,
+    /// True if the attributes are too large for the page.
+    pub(crate) attributes_omitted: bool,
     pub(crate) cause: Cause,
     pub(crate) topic: Option<String>,
     pub(crate) seq: Option<String>,
     pub(crate) fuel: Option<u64>,
     pub(crate) run_ns: u64,
-    /// Which of `pictures`.
+    /// Indices into `pictures`.
     pub(crate) pictures: Vec<usize>,
 }
 
 /// A wake that ended in a fault.
 #[derive(Debug, Serialize)]
-pub(crate) struct FaultMark {
+pub(crate) struct FaultEvent {
     pub(crate) t: f64,
-    /// Which of `fault_kinds`.
+    /// Index into `fault_kinds`.
     pub(crate) lane: usize,
     pub(crate) message: String,
     pub(crate) amounts: Amounts,
     pub(crate) topic: Option<String>,
 }
 
-/// What was used of what is allowed, in words.
+/// Used and allowed amounts, as text.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct Amounts {
     pub(crate) used: Option<String>,
     pub(crate) allowed: Option<String>,
 }
 
-/// Faults with one cause.
+/// Faults with the same cause.
 #[derive(Debug, Serialize)]
 pub(crate) struct FaultCause {
     pub(crate) kind: FaultKind,
     pub(crate) message: String,
-    /// Of the first.
+    /// Amounts of the first fault.
     pub(crate) amounts: Amounts,
     pub(crate) count: u64,
     pub(crate) first: f64,
@@ -130,7 +130,7 @@ pub(crate) struct FaultCause {
 }
 
 #[derive(Debug, Serialize)]
-pub(crate) struct ClipShown {
+pub(crate) struct PageClip {
     pub(crate) file: String,
     pub(crate) from: f64,
     pub(crate) to: f64,
@@ -138,14 +138,14 @@ pub(crate) struct ClipShown {
     pub(crate) span_ns: [i64; 2],
     pub(crate) bytes: u64,
     pub(crate) triggers: u64,
-    /// What is in it, in words.
+    /// Its contents, as text.
     pub(crate) contents: String,
-    /// Why it holds less than was asked for.
-    pub(crate) short: Vec<String>,
+    /// Reasons why it lacks data of its window.
+    pub(crate) incomplete: Vec<String>,
 }
 
 #[derive(Debug, Serialize)]
-pub(crate) struct CurveShown {
+pub(crate) struct PageCurve {
     pub(crate) input: String,
     pub(crate) topic: String,
     pub(crate) path: String,
@@ -154,35 +154,35 @@ pub(crate) struct CurveShown {
     pub(crate) per_point: u64,
     pub(crate) t: Vec<f64>,
     pub(crate) min: Vec<f64>,
-    /// Empty if each is as its `min`.
+    /// Empty if equal to `min`.
     pub(crate) max: Vec<f64>,
 }
 
 #[derive(Debug, Serialize)]
-pub(crate) struct SpreadShown {
+pub(crate) struct PageSpread {
     pub(crate) what: &'static str,
     /// `ns` or `fuel`.
     pub(crate) unit: &'static str,
     pub(crate) count: u64,
-    /// The key of each is a word of the page: `half`, `90 %`.
-    pub(crate) marks: Vec<(&'static str, u64)>,
-    /// From, to, count; none if nobody kept them.
+    /// Names, such as `p50`, and values.
+    pub(crate) quantiles: Vec<(&'static str, u64)>,
+    /// From, to, count; empty for a live run, which does not keep them.
     pub(crate) bins: Vec<[u64; 3]>,
 }
 
 #[derive(Debug, Serialize)]
-pub(crate) struct PictureShown {
+pub(crate) struct PagePicture {
     pub(crate) t: f64,
-    /// Of a camera, or of a clip.
-    pub(crate) of: String,
-    /// How long before the trigger it was taken, in s, if it is known.
+    /// Topic of the camera, or file of the clip.
+    pub(crate) source: String,
+    /// Time from the picture to the trigger, in s; `None` for a thumbnail of a clip.
     pub(crate) age: Option<f64>,
     /// A `data:` address.
     pub(crate) src: String,
 }
 
 #[derive(Debug, Serialize)]
-pub(crate) struct LogShown {
+pub(crate) struct PageLogLine {
     pub(crate) t: f64,
     pub(crate) level: String,
     pub(crate) message: String,

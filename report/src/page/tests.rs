@@ -1,25 +1,25 @@
-//! The report of outputs that the tests write, whole and hostile.
+//! Tests of the page on results that the tests write, valid and hostile.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use gleaner_protocol::Recording;
+use gleaner_protocol::RecordingCounts;
 use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
 use serde_json::{Value, json};
 
 use gleaner_base::{Exit, Failure};
 
-use super::{Page, gather};
+use super::{ReportPage, collect};
 use crate::diff::Diff;
 
-/// A folder of results, removed when the test ends. It is also what the tests of `diff` compare.
+/// A result folder, removed when the test ends. The tests of `diff` use it, too.
 pub(crate) struct Out(PathBuf);
 
 pub(crate) const START_NS: i64 = 1_700_000_000_000_000_000;
 
 impl Out {
-    /// Results without any wake.
+    /// Results without decisions.
     pub(crate) fn new() -> Out {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let name = format!(
@@ -55,7 +55,7 @@ impl Out {
     }
 
     fn data(&self) -> Value {
-        serde_json::to_value(gather::gather(&self.0, 1, None).unwrap()).unwrap()
+        serde_json::to_value(collect::collect(&self.0, 1, None).unwrap()).unwrap()
     }
 }
 
@@ -110,13 +110,13 @@ const JPEG: &[u8] = &[0xff, 0xd8, 0xff, 0xe0, 1, 2, 3];
 fn clip(thumbnail: &str) -> Value {
     json!({
         "file": "clips/a.mcap", "thumbnail": thumbnail, "bytes": 4096, "from_ns": START_NS, "to_ns": START_NS + 9_000_000_000_i64,
-        "first_ns": null, "last_ns": null, "lambdas": [], "triggers": 1, "moments": [], "topics": [], "short": ["it is short"],
+        "first_ns": null, "last_ns": null, "lambdas": [], "triggers": 1, "moments": [], "topics": [], "incomplete": ["it is short"],
         "recovered": null,
     })
 }
 
 #[test]
-fn the_page_has_what_the_files_say() {
+fn the_page_has_the_data_of_the_files() {
     let out = Out::new();
     let fault = json!({"kind": "fuel", "message": "out of fuel", "used": 50_000_001, "allowed": 50_000_000});
     out.decisions(&[
@@ -134,7 +134,7 @@ fn the_page_has_what_the_files_say() {
 
     assert_eq!(run["labels"], json!(["brake", "dark"]));
     assert_eq!(run["triggers"][0]["t"], 1.5);
-    // A script would make another number of it.
+    // A script would round this number.
     assert_eq!(
         run["triggers"][0]["attributes"],
         json!([["mps2", "-1.5"], ["serial", "9007199254740993"]])
@@ -152,8 +152,8 @@ fn the_page_has_what_the_files_say() {
     );
     assert_eq!(run["spreads"][1]["bins"], json!([[1000, 2000, 150], [2000, 9001, 250]]));
     assert_eq!(run["topics"][0]["lost"], Value::Null, "unknown is never 0");
-    assert_eq!(run["clips"][0]["short"], json!(["it is short"]));
-    // Both triggers are in the clip, whose thumbnail serves until there is something better.
+    assert_eq!(run["clips"][0]["incomplete"], json!(["it is short"]));
+    // Both triggers are in the clip, whose thumbnail is shown unless there is a camera picture.
     assert_eq!(
         (&run["triggers"][0]["pictures"], &run["triggers"][1]["pictures"]),
         (&json!([0]), &json!([0]))
@@ -163,7 +163,7 @@ fn the_page_has_what_the_files_say() {
 }
 
 #[test]
-fn a_picture_of_the_moment_is_preferred_to_a_thumbnail() {
+fn a_camera_picture_is_preferred_to_a_thumbnail() {
     let out = Out::new();
     out.decisions(&[wake(1500, json!([trigger("brake", 1.5)]), Value::Null)]);
     let mut signals = signals();
@@ -176,7 +176,7 @@ fn a_picture_of_the_moment_is_preferred_to_a_thumbnail() {
     let run = out.data();
     assert_eq!(run["pictures"].as_array().unwrap().len(), 1);
     assert_eq!(
-        (&run["pictures"][0]["of"], &run["pictures"][0]["age"]),
+        (&run["pictures"][0]["source"], &run["pictures"][0]["age"]),
         (&json!("/camera"), &json!(0.02))
     );
     assert_eq!(run["triggers"][0]["pictures"], json!([0]));
@@ -205,14 +205,14 @@ fn two_runs_count_from_the_start_of_the_first() {
         [(&a, &b, 20.0, [0.0, 12.0]), (&b, &a, 10.0, [2.0, -10.0])]
     {
         let diff = Diff::between(first.path(), second.path()).unwrap();
-        let html = Page::of_both(first.path(), second.path(), diff).unwrap().to_html();
+        let html = ReportPage::of_both(first.path(), second.path(), diff).unwrap().to_html();
         let (_, data) = html.split_once("application/json\">").unwrap();
         let data: Value = serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap();
         let run = |n: usize| &data["runs"][n];
         assert_eq!(
             run(0)["triggers"][0]["t"],
             run(1)["triggers"][0]["t"],
-            "one instant stands at one place"
+            "one instant has one time in both runs"
         );
         assert_eq!((&run(0)["from"], &run(1)["from"]), (&json!(from_a), &json!(from_b)));
         assert_eq!(
@@ -223,7 +223,7 @@ fn two_runs_count_from_the_start_of_the_first() {
 }
 
 #[test]
-fn without_signals_the_report_does_without() {
+fn a_run_without_signals_has_a_report() {
     let run = Out::new().data();
     assert_eq!(
         (&run["config"], &run["curves"], &run["spreads"]),
@@ -247,15 +247,15 @@ fn hostile_texts_stay_texts() {
         "log.jsonl",
         format!("{}\n", json!({"at_ns": START_NS, "level": hostile, "message": hostile})),
     );
-    let html = Page::of(out.path()).unwrap().to_html();
+    let html = ReportPage::of(out.path()).unwrap().to_html();
     assert!(!html.contains("<script>alert") && !html.contains('\u{2028}'));
     let (_, data) = html.split_once("application/json\">").unwrap();
     let data: Value = serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap();
-    assert_eq!(data["runs"][0]["labels"][0], hostile, "what it said is there as it was said");
+    assert_eq!(data["runs"][0]["labels"][0], hostile, "the label is in the data unchanged");
 }
 
 #[test]
-fn lines_that_say_nothing_are_counted_and_the_others_are_shown() {
+fn lines_that_cannot_be_parsed_are_counted_and_the_others_are_shown() {
     let out = Out::new();
     let long = format!("{{\"at_ns\":{}}}", "1".repeat(20 << 20));
     let good = wake(1500, json!([trigger("brake", 1.5)]), Value::Null);
@@ -264,14 +264,14 @@ fn lines_that_say_nothing_are_counted_and_the_others_are_shown() {
     assert_eq!(run["triggers"].as_array().unwrap().len(), 1);
     let note = run["notes"][0].as_str().unwrap();
     assert!(
-        note.starts_with("4 lines of `decisions.jsonl` left out; the first: ")
+        note.starts_with("4 lines of `decisions.jsonl` omitted; the first: ")
             && note.contains("line 1"),
         "{note}"
     );
 }
 
 #[test]
-fn nothing_outside_of_the_output_is_read() {
+fn nothing_outside_of_the_result_folder_is_read() {
     let (out, elsewhere) = (Out::new(), Out::new());
     elsewhere.write("secret.jpg", JPEG);
     let secret = elsewhere.path().join("secret.jpg");
@@ -281,14 +281,14 @@ fn nothing_outside_of_the_output_is_read() {
     let up = format!("../{}/secret.jpg", elsewhere.path().file_name().unwrap().to_str().unwrap());
     out.decisions(&[wake(1500, json!([trigger("brake", 1.5)]), Value::Null)]);
     for (file, why) in [
-        (up.as_str(), "outside of the output"),
-        (secret.to_str().unwrap(), "outside of the output"),
+        (up.as_str(), "outside of the result folder"),
+        (secret.to_str().unwrap(), "outside of the result folder"),
         ("link.jpg", "secret.jpg`, outside of"),
-        ("../../x", "outside of the output"),
-        ("note.jpg", "no JPEG"),
+        ("../../x", "outside of the result folder"),
+        ("note.jpg", "not a JPEG file"),
         ("large.jpg", "at most 1 MiB are read"),
         ("none.jpg", "No such file"),
-        ("", "it is no file"),
+        ("", "it is not a regular file"),
     ] {
         out.write("clips.jsonl", format!("{}\n", clip(file)));
         let run = out.data();
@@ -299,7 +299,7 @@ fn nothing_outside_of_the_output_is_read() {
 }
 
 #[test]
-fn a_page_has_bounds_and_says_what_is_beyond_them() {
+fn a_page_has_bounds_and_counts_what_it_omits() {
     let out = Out::new();
     let fault = |n: usize| json!({"kind": "exception", "message": format!("cause {n}"), "used": null, "allowed": null});
     let many: Vec<_> = (0..6000)
@@ -315,17 +315,17 @@ fn a_page_has_bounds_and_says_what_is_beyond_them() {
     let length = |key: &str| run[key].as_array().unwrap().len();
     assert_eq!((length("triggers"), &run["totals"]["triggers"]), (5000, &json!(6000)));
     assert_eq!((length("faults"), &run["totals"]["faults"]), (500, &json!(6000)));
-    assert_eq!((length("fault_causes"), &run["totals"]["faults_in_no_line"]), (100, &json!(4000)));
-    assert_eq!(length("labels"), 25, "the last one stands for all others");
+    assert_eq!((length("fault_causes"), &run["totals"]["unlisted_faults"]), (100, &json!(4000)));
+    assert_eq!(length("labels"), 25, "the last one is for all other labels");
     let dense = |key: &str| {
         run[key].as_array().unwrap().iter().map(|bin| bin["count"].as_u64().unwrap()).sum::<u64>()
     };
     assert_eq!((dense("trigger_density"), dense("fault_density")), (6000, 6000));
     assert!(
         length("log") < 2000 && run["totals"]["log"] == 3000,
-        "each line is cut, and all of them share a room"
+        "each line is cut, and all share a budget"
     );
-    let html = Page::of(out.path()).unwrap().to_html();
+    let html = ReportPage::of(out.path()).unwrap().to_html();
     assert!(html.len() < 10 << 20, "{}", html.len());
 }
 
@@ -355,9 +355,9 @@ fn names_values_and_lists_have_bounds_too() {
         (50, 256)
     );
     assert_eq!(run["config"].as_object().unwrap().len(), 200);
-    let said = run["notes"].to_string();
-    for left_out in ["10 of 60 drives", "14 of 270 topics", "50 of 250 config values"] {
-        assert!(said.contains(left_out), "{said}");
+    let notes = run["notes"].to_string();
+    for omitted in ["10 of 60 drives", "14 of 270 topics", "50 of 250 config values"] {
+        assert!(notes.contains(omitted), "{notes}");
     }
     signals["config"] = json!({});
     other.write("signals.json", signals.to_string());
@@ -367,12 +367,12 @@ fn names_values_and_lists_have_bounds_too() {
         "{:?}",
         diff.notes
     );
-    let bytes = Page::of_both(out.path(), other.path(), diff).unwrap().to_html().len();
+    let bytes = ReportPage::of_both(out.path(), other.path(), diff).unwrap().to_html().len();
     assert!(bytes < 8 << 20, "{bytes}");
 }
 
 #[test]
-fn texts_that_grow_on_the_page_find_no_more_room_than_others() {
+fn the_budget_counts_escaped_texts() {
     let out = Out::new();
     let mut one = trigger("x", 1.0);
     one["attributes"] = json!({"text": "<".repeat(300)});
@@ -383,54 +383,56 @@ fn texts_that_grow_on_the_page_find_no_more_room_than_others() {
     assert_eq!(run["totals"]["triggers"], 5000);
     assert!(
         run["trigger_density"].as_array().is_some_and(|bins| !bins.is_empty()),
-        "the others are seen where they are"
+        "the omitted ones are in the density"
     );
 }
 
 #[test]
-fn signals_that_contradict_themselves_are_left_out_and_named() {
+fn inconsistent_curves_are_omitted_with_a_note() {
     let out = Out::new();
     let mut signals = signals();
     signals["curves"][0]["min"] = json!([1.0]);
     out.write("signals.json", signals.to_string());
     let run = out.data();
     assert_eq!(run["curves"], json!([]));
-    assert!(run["notes"][0].as_str().unwrap().contains("1 of 1 curves"), "{}", run["notes"]);
-    out.write("signals.json", "{");
     assert!(
-        out.data()["notes"][0].as_str().unwrap().starts_with("`signals.json` cannot be understood")
+        run["notes"][0].as_str().unwrap().contains("1 of 1 inconsistent curves"),
+        "{}",
+        run["notes"]
     );
+    out.write("signals.json", "{");
+    assert!(out.data()["notes"][0].as_str().unwrap().starts_with("cannot parse `signals.json`"));
 }
 
 #[test]
-fn a_folder_without_results_is_refused_with_a_way_out() {
+fn a_folder_without_results_is_refused_with_help() {
     let out = Out::new();
     out.write("hello/summary.json", summary().to_string());
     fs::remove_file(out.path().join("summary.json")).unwrap();
-    let failure = Failure::from(Page::of(out.path()).unwrap_err());
+    let failure = Failure::from(ReportPage::of(out.path()).unwrap_err());
     assert_eq!(failure.exit, Exit::Usage);
     assert!(failure.help.as_ref().unwrap().contains("hello`"), "{failure}");
     out.write("summary.json", "{}");
-    let failure = Failure::from(Page::of(out.path()).unwrap_err());
+    let failure = Failure::from(ReportPage::of(out.path()).unwrap_err());
     assert!(failure.to_string().contains("missing field `lambda`"), "{failure}");
 }
 
 #[test]
-fn a_live_run_has_a_report_that_begins_with_what_it_saw_first() {
+fn the_report_of_a_live_run_begins_with_its_first_event() {
     let out = Out::new();
     let topic = json!({"name": "imu", "topic": "/imu", "type_name": "sensor_msgs/msg/Imu", "writers": 1, "rate_hz": 100.0, "received": 7,
         "lost": 2, "malformed": 1, "overwritten": 0, "no_slot": 0, "too_big": 0, "skipped": 0, "age_ns": null, "qos": null, "qos_warnings": ["it is far"]});
     let recorded = RecordedTopic { no_slot: 8, ..RecordedTopic::default() };
     let recording = RecorderStatus {
-        recording: Recording { disk_suppressed: 6, ..Recording::default() },
+        recording: RecordingCounts { disk_suppressed: 6, ..RecordingCounts::default() },
         topics: vec![recorded],
         ..RecorderStatus::default()
     };
     let live = json!({"lambda": "hello", "version": "0.1.0", "kind": "python", "out": "x", "restarts": 1, "up_s": 3.0, "wakes": 7, "triggers": 1,
         "faults": 0, "skipped": 0, "missed_ticks": 0, "log_lines": 0, "log_dropped": 0, "triggers_refused": 0, "backed_off": 0,
-        "unwritten": 4, "unsent": 0, "wake_latency": null, "run": {"n": 7, "p50_ns": 10, "p99_ns": 20, "max_ns": 30}, "decision_latency": null,
-        "topics": [topic], "network": {"domain": 0, "participants": 1, "buffer_asked": 1, "buffer_granted": 1, "socket_drops": 5},
-        "recorder": null, "recording": recording, "rss_bytes": 1, "cpu_s": 0.5});
+        "unwritten": 4, "unsent": 0, "wake_latency": null, "run_time": {"n": 7, "p50_ns": 10, "p99_ns": 20, "max_ns": 30}, "decision_latency": null,
+        "topics": [topic], "network": {"domain": 0, "participants": 1, "buffer_requested": 1, "buffer_granted": 1, "socket_drops": 5},
+        "recorder_link": null, "recording": recording, "rss_bytes": 1, "cpu_s": 0.5});
     out.write("summary.json", live.to_string());
     out.decisions(&[wake(1500, json!([trigger("brake", 1.5)]), Value::Null)]);
     let run = out.data();
@@ -438,12 +440,12 @@ fn a_live_run_has_a_report_that_begins_with_what_it_saw_first() {
         (&run["is_live"], &run["triggers"][0]["t"], &run["kind"]),
         (&json!(true), &json!(0.0), &json!("python"))
     );
-    assert_eq!(run["spreads"][0]["marks"], json!([["half", 10], ["99 %", 20], ["most", 30]]));
+    assert_eq!(run["spreads"][0]["quantiles"], json!([["p50", 10], ["p99", 20], ["max", 30]]));
     assert_eq!((&run["topics"][0]["lost"], &run["topics"][0]["malformed"]), (&json!(2), &json!(1)));
     for missed in [
         json!(["decisions and log lines not written", 4]),
         json!(["triggers without a window: the disk was too full", 6]),
-        json!(["samples to be recorded, without room as the recorder was busy", 8]),
+        json!(["samples to record, no free slot: recorder busy", 8]),
     ] {
         assert!(run["missed"].as_array().unwrap().contains(&missed), "{missed}: {}", run["missed"]);
     }

@@ -7,7 +7,7 @@ use std::process::{Command, Output, Stdio};
 use std::time::Instant;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_protocol::{Summary, Verified};
+use gleaner_protocol::{ReplaySummary, Verified};
 
 use super::compare::{Replayed, read};
 use crate::checkout::Checkout;
@@ -172,7 +172,7 @@ impl Case {
             replay.arg("--vehicle").arg(vehicle);
         }
         let started = Instant::now();
-        let summary: Summary = machine.report(replay)?;
+        let summary: ReplaySummary = machine.report(replay)?;
         read(&folder, summary.wakes, started.elapsed().as_secs_f64())
     }
 

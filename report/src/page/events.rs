@@ -1,5 +1,5 @@
-//! Triggers and faults out of `decisions.jsonl`, of which there may be millions: some in detail,
-//! all by time, and how many there are.
+//! Collects triggers and faults from `decisions.jsonl`, which may have millions: some of them in
+//! detail, all of them by time and by count.
 
 use std::collections::HashMap;
 
@@ -7,36 +7,38 @@ use gleaner_lambda::{Decision, Fault, FaultKind, Trigger};
 
 use super::density::Density;
 use super::html;
-use super::model::{Amounts, FaultCause, FaultMark, Mark};
-use crate::words::{cut, grouped, seconds, size};
+use super::model::{Amounts, FaultCause, FaultEvent, TriggerEvent};
+use crate::format::{cut, grouped, seconds, size};
 
-/// Most triggers with all that is known of them, most faults, and most lines of the table of
-/// faults.
+/// Maximum number of triggers with details.
 pub(super) const TRIGGERS_MAX: usize = 5_000;
+/// Maximum number of faults with details.
 pub(super) const FAULTS_MAX: usize = 500;
+/// Maximum number of rows in the table of faults.
 const CAUSES_MAX: usize = 100;
 
-/// Labels with a lane of their own; the others share one.
+/// Labels with their own lane; the others share one.
 const LABELS_MAX: usize = 24;
 const OTHER_LABELS: &str = "(other labels)";
 
-/// Most characters of a label, and of a fault's message; most bytes of attributes.
+/// Maximum number of characters of a label.
 const LABEL_CHARS: usize = 120;
+/// Maximum number of characters of a fault's message.
 const MESSAGE_CHARS: usize = 2_000;
+/// Maximum size of the attributes of a trigger, in bytes of JSON.
 const ATTRIBUTE_BYTES: usize = 2_048;
 
-/// Bytes that texts may take on the page: hostile ones are six times as long there as in their
-/// file.
+/// Remaining bytes for texts on the page. Escaped texts may take six times their size in the file.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Room(pub(super) usize);
+pub(super) struct TextBudget(pub(super) usize);
 
-impl Room {
-    /// Whether something found none.
+impl TextBudget {
+    /// Returns whether a text has been omitted.
     fn is_full(self) -> bool {
         self.0 == 0
     }
 
-    /// Whether `value` found room.
+    /// Takes the bytes of `value`; returns false if they exceed the budget.
     pub(super) fn take(&mut self, value: &impl serde::Serialize) -> bool {
         let bytes = html::json(value).len();
         match self.0.checked_sub(bytes) {
@@ -45,8 +47,8 @@ impl Room {
                 true
             }
             None => {
-                // What comes later is smaller perhaps, but a page with holes would not say where
-                // they are.
+                // A later, smaller value might fit, but the gaps in such a page would not be
+                // visible.
                 self.0 = 0;
                 false
             }
@@ -54,45 +56,45 @@ impl Room {
     }
 }
 
-/// Collects them.
-pub(super) struct Marks {
+/// The collected triggers and faults.
+pub(super) struct Events {
     start_ns: i64,
     pub(super) labels: Vec<String>,
-    numbers: HashMap<String, usize>,
-    pub(super) triggers: Vec<Mark>,
+    label_numbers: HashMap<String, usize>,
+    pub(super) triggers: Vec<TriggerEvent>,
     pub(super) trigger_density: Density,
     pub(super) fault_kinds: Vec<FaultKind>,
-    pub(super) faults: Vec<FaultMark>,
+    pub(super) faults: Vec<FaultEvent>,
     pub(super) fault_density: Density,
     pub(super) causes: Vec<FaultCause>,
-    of_cause: HashMap<(FaultKind, String), usize>,
+    cause_numbers: HashMap<(FaultKind, String), usize>,
     pub(super) triggers_seen: u64,
     pub(super) faults_seen: u64,
-    pub(super) faults_in_no_line: u64,
-    trigger_room: Room,
-    fault_room: Room,
+    pub(super) unlisted_faults: u64,
+    trigger_budget: TextBudget,
+    fault_budget: TextBudget,
 }
 
-impl Marks {
-    /// None yet, of a drive that starts at `start_ns`; texts of triggers may take `room`, those of
-    /// faults half of it.
-    pub(super) fn new(start_ns: i64, room: usize) -> Self {
+impl Events {
+    /// An empty collection for a run that starts at `start_ns`. Texts of triggers may take `budget`
+    /// bytes, those of faults half of it.
+    pub(super) fn new(start_ns: i64, budget: usize) -> Self {
         Self {
             start_ns,
             labels: Vec::new(),
-            numbers: HashMap::new(),
+            label_numbers: HashMap::new(),
             triggers: Vec::new(),
             trigger_density: Density::new(),
             fault_kinds: Vec::new(),
             faults: Vec::new(),
             fault_density: Density::new(),
             causes: Vec::new(),
-            of_cause: HashMap::new(),
+            cause_numbers: HashMap::new(),
             triggers_seen: 0,
             faults_seen: 0,
-            faults_in_no_line: 0,
-            trigger_room: Room(room),
-            fault_room: Room(room / 2),
+            unlisted_faults: 0,
+            trigger_budget: TextBudget(budget),
+            fault_budget: TextBudget(budget / 2),
         }
     }
 
@@ -107,28 +109,28 @@ impl Marks {
 
     fn trigger(&mut self, decision: &Decision, trigger: &Trigger) {
         self.triggers_seen += 1;
-        let label = self.number(&trigger.label);
+        let label = self.label_number(&trigger.label);
         self.trigger_density.add(label, decision.at_ns.saturating_sub(self.start_ns));
-        if self.triggers.len() == TRIGGERS_MAX || self.trigger_room.is_full() {
+        if self.triggers.len() == TRIGGERS_MAX || self.trigger_budget.is_full() {
             return;
         }
-        let attributes_cut = html::json(&trigger.attributes).len() > ATTRIBUTE_BYTES;
+        let attributes_omitted = html::json(&trigger.attributes).len() > ATTRIBUTE_BYTES;
         let shown = |(name, value): (&String, &serde_json::Value)| {
-            // A script would round large whole numbers.
+            // As text, since a script would round large integers.
             (name.clone(), value.as_str().map_or_else(|| value.to_string(), str::to_owned))
         };
-        let mark = Mark {
+        let event = TriggerEvent {
             t: seconds(decision.at_ns, self.start_ns),
             at_ns: decision.at_ns,
             label,
             kind: trigger.kind.as_str(),
             score: trigger.score,
-            attributes: if attributes_cut {
+            attributes: if attributes_omitted {
                 Vec::new()
             } else {
                 trigger.attributes.iter().map(shown).collect()
             },
-            attributes_cut,
+            attributes_omitted,
             cause: decision.cause,
             topic: decision.topic.as_deref().map(|topic| cut(topic, LABEL_CHARS)),
             seq: decision.seq.map(|seq| seq.to_string()),
@@ -136,19 +138,19 @@ impl Marks {
             run_ns: decision.run_ns,
             pictures: Vec::new(),
         };
-        if self.trigger_room.take(&mark) {
-            self.triggers.push(mark);
+        if self.trigger_budget.take(&event) {
+            self.triggers.push(event);
         }
     }
 
-    fn number(&mut self, label: &str) -> usize {
+    fn label_number(&mut self, label: &str) -> usize {
         let label = cut(label, LABEL_CHARS);
-        if let Some(number) = self.numbers.get(&label) {
+        if let Some(number) = self.label_numbers.get(&label) {
             return *number;
         }
         let number = self.labels.len().min(LABELS_MAX);
         if number < LABELS_MAX {
-            self.numbers.insert(label.clone(), number);
+            self.label_numbers.insert(label.clone(), number);
             self.labels.push(label);
         } else if self.labels.len() == LABELS_MAX {
             self.labels.push(OTHER_LABELS.to_owned());
@@ -167,25 +169,25 @@ impl Marks {
         let t = seconds(decision.at_ns, self.start_ns);
         let message = cut(&fault.message, MESSAGE_CHARS);
         self.count(fault, &message, t);
-        if self.faults.len() == FAULTS_MAX || self.fault_room.is_full() {
+        if self.faults.len() == FAULTS_MAX || self.fault_budget.is_full() {
             return;
         }
         let topic = decision.topic.as_deref().map(|topic| cut(topic, LABEL_CHARS));
-        let mark = FaultMark { t, lane, message, amounts: amounts(fault), topic };
-        if self.fault_room.take(&mark) {
-            self.faults.push(mark);
+        let event = FaultEvent { t, lane, message, amounts: amounts(fault), topic };
+        if self.fault_budget.take(&event) {
+            self.faults.push(event);
         }
     }
 
     fn count(&mut self, fault: &Fault, message: &str, t: f64) {
         let cause = (fault.kind, message.to_owned());
-        if let Some(number) = self.of_cause.get(&cause) {
+        if let Some(number) = self.cause_numbers.get(&cause) {
             let cause = &mut self.causes[*number];
             cause.count += 1;
             cause.last = t;
         } else if self.causes.len() < CAUSES_MAX {
             let (kind, message) = cause.clone();
-            self.of_cause.insert(cause, self.causes.len());
+            self.cause_numbers.insert(cause, self.causes.len());
             self.causes.push(FaultCause {
                 kind,
                 message,
@@ -195,12 +197,12 @@ impl Marks {
                 last: t,
             });
         } else {
-            self.faults_in_no_line += 1;
+            self.unlisted_faults += 1;
         }
     }
 }
 
-/// In the unit of the limit.
+/// Used and allowed amounts, in the unit of the limit.
 fn amounts(fault: &Fault) -> Amounts {
     let words = |amount: u64| match fault.kind {
         FaultKind::Memory => size(amount),

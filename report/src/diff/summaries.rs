@@ -1,5 +1,4 @@
-//! What two runs say of themselves: which lambda, which drive, with which config, how much of what,
-//! at which cost.
+//! Compares the summaries of two runs: lambda, drive, config, counts and cost.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -7,43 +6,42 @@ use std::path::Path;
 use gleaner_lambda::Clip;
 use gleaner_lambda::manifest::ConfigValue;
 use gleaner_lambda::signals::Signals;
-use gleaner_protocol::Live;
+use gleaner_protocol::LiveStatus;
 
 use super::compare::short;
-use super::{Change, Cost, Diff, DiffError, Side, Tally};
+use super::{ChangeCounts, ComparedRun, Cost, Diff, DiffError, ValueChange};
+use crate::format::{grouped, size};
 use crate::results::JsonLines;
-use crate::run_summary::{Losses, RunSummary, signals};
-use crate::words::{grouped, size};
+use crate::run_summary::{RunSummary, TopicCounts, signals};
 
-/// Most values of a config that are listed.
+/// Maximum number of config changes that are listed.
 const CHANGES_MAX: usize = 200;
 
-/// All that can be said without looking at a decision.
+/// Compares everything but the decisions.
 pub(super) fn compared(a: &Path, b: &Path) -> Result<Diff, DiffError> {
     let mut notes = Vec::new();
-    let (told_a, told_b) =
-        (RunSummary::bounded(a, &mut notes)?, RunSummary::bounded(b, &mut notes)?);
-    apart(&told_a, &told_b, &mut notes);
+    let (run_a, run_b) = (RunSummary::bounded(a, &mut notes)?, RunSummary::bounded(b, &mut notes)?);
+    add_warnings(&run_a, &run_b, &mut notes);
     let (read_a, read_b) = (signals(a, &mut notes)?, signals(b, &mut notes)?);
     let clips = [clips(a)?, clips(b)?];
     Ok(Diff {
-        same: false,
-        a: side(a, &told_a),
-        b: side(b, &told_b),
+        identical: false,
+        a: compared_run(a, &run_a),
+        b: compared_run(b, &run_b),
         config: config(read_a.as_ref(), read_b.as_ref(), &mut notes),
-        counts: counts(&told_a, &told_b, clips),
-        cost: cost((&told_a, read_a.as_ref()), (&told_b, read_b.as_ref())),
+        counts: counts(&run_a, &run_b, clips),
+        cost: cost((&run_a, read_a.as_ref()), (&run_b, read_b.as_ref())),
         notes,
-        triggers: Tally::default(),
-        faults: Tally::default(),
+        triggers: ChangeCounts::default(),
+        faults: ChangeCounts::default(),
         differences: Vec::new(),
-        left_out: 0,
+        omitted: 0,
     })
 }
 
-fn side(out: &Path, told: &RunSummary) -> Side {
-    let (lambda, version, kind) = told.lambda();
-    let (drive, start_ns) = match told {
+fn compared_run(out: &Path, run: &RunSummary) -> ComparedRun {
+    let (lambda, version, kind) = run.lambda();
+    let (drive, start_ns) = match run {
         RunSummary::Replay(summary) => (
             summary.drive.iter().map(|path| path.display().to_string()).collect(),
             Some(summary.start_ns),
@@ -51,11 +49,11 @@ fn side(out: &Path, told: &RunSummary) -> Side {
         RunSummary::Live(_) => (Vec::new(), None),
     };
     let (lambda, version) = (lambda.to_owned(), version.to_owned());
-    Side { out: out.display().to_string(), lambda, version, kind, drive, start_ns }
+    ComparedRun { out: out.display().to_string(), lambda, version, kind, drive, start_ns }
 }
 
-/// What makes a comparison doubtful: it is said before all else.
-fn apart(a: &RunSummary, b: &RunSummary, notes: &mut Vec<String>) {
+/// Adds notes on what makes the comparison doubtful. They are shown first.
+fn add_warnings(a: &RunSummary, b: &RunSummary, notes: &mut Vec<String>) {
     let [(name_a, version_a, kind_a), (name_b, version_b, kind_b)] = [a.lambda(), b.lambda()];
     if name_a != name_b {
         notes.push(format!("different lambdas: `{name_a}` and `{name_b}`"));
@@ -92,12 +90,10 @@ fn apart(a: &RunSummary, b: &RunSummary, notes: &mut Vec<String>) {
     }
 }
 
-fn config(a: Option<&Signals>, b: Option<&Signals>, notes: &mut Vec<String>) -> Vec<Change> {
+fn config(a: Option<&Signals>, b: Option<&Signals>, notes: &mut Vec<String>) -> Vec<ValueChange> {
     let (Some(a), Some(b)) = (a, b) else {
-        notes.push(
-            "config not compared: an output without `signals.json` does not tell which held"
-                .to_owned(),
-        );
+        notes
+            .push("config not compared: it is unknown for a run without `signals.json`".to_owned());
         return Vec::new();
     };
     let word = |of: &BTreeMap<String, ConfigValue>, key: &str| {
@@ -108,17 +104,17 @@ fn config(a: Option<&Signals>, b: Option<&Signals>, notes: &mut Vec<String>) -> 
     let mut changed = both.filter(|(_, a, b)| a != b);
     let shown = |(key, a, b): (&String, Option<String>, Option<String>)| {
         let [a, b] = [a, b].map(|value| value.as_deref().map(short));
-        Change { what: short(key), a, b }
+        ValueChange { what: short(key), a, b }
     };
     let changes = changed.by_ref().take(CHANGES_MAX).map(shown).collect();
-    let left_out = changed.count();
-    if left_out > 0 {
-        notes.push(format!("{left_out} more config values differ"));
+    let omitted = changed.count();
+    if omitted > 0 {
+        notes.push(format!("{omitted} more config values differ"));
     }
     changes
 }
 
-/// How many clips there are, and their bytes.
+/// Returns the number of clips and their bytes.
 fn clips(out: &Path) -> Result<[u64; 2], DiffError> {
     let path = out.join("clips.jsonl");
     if !path.exists() {
@@ -133,16 +129,16 @@ fn clips(out: &Path) -> Result<[u64; 2], DiffError> {
     Ok(found)
 }
 
-fn counts(a: &RunSummary, b: &RunSummary, clips: [[u64; 2]; 2]) -> Vec<Change> {
+fn counts(a: &RunSummary, b: &RunSummary, clips: [[u64; 2]; 2]) -> Vec<ValueChange> {
     let mut changes = Vec::new();
     let mut add = |what: String, a: Option<String>, b: Option<String>| {
         if a != b {
-            changes.push(Change { what, a, b });
+            changes.push(ValueChange { what, a, b });
         }
     };
-    // The same things in the same order, first those that both have.
+    // All names in one order, first those that the first run has.
     let numbers =
-        |told: &RunSummary| told.wakes().into_iter().chain(told.missed()).collect::<Vec<_>>();
+        |run: &RunSummary| run.wakes().into_iter().chain(run.missed()).collect::<Vec<_>>();
     let (of_a, of_b) = (numbers(a), numbers(b));
     let find = |list: &[(&'static str, u64)], what: &str| {
         list.iter().find(|(name, _)| *name == what).map(|(_, count)| grouped(*count))
@@ -156,33 +152,35 @@ fn counts(a: &RunSummary, b: &RunSummary, clips: [[u64; 2]; 2]) -> Vec<Change> {
     add("size of the clips".to_owned(), Some(size(bytes_a)), Some(size(bytes_b)));
 
     let (of_a, of_b) = (a.topics(), b.topics());
-    let of = |list: &[Losses], input: &str| list.iter().find(|topic| topic.input == input).cloned();
+    let of =
+        |list: &[TopicCounts], input: &str| list.iter().find(|topic| topic.input == input).cloned();
     let only_b = of_b.iter().filter(|topic| of(&of_a, &topic.input).is_none());
-    for Losses { input, .. } in of_a.iter().chain(only_b) {
+    for TopicCounts { input, .. } in of_a.iter().chain(only_b) {
         let (a, b) = (of(&of_a, input), of(&of_b, input));
-        type Number = fn(&Losses) -> Option<u64>;
+        type Number = fn(&TopicCounts) -> Option<u64>;
         let numbers: [(&str, Number); 5] = [
             ("received", |topic| Some(topic.received)),
-            ("lost before they reached us", |topic| topic.lost),
+            ("lost upstream", |topic| topic.lost),
             ("without a free slot", |topic| Some(topic.no_slot)),
             ("larger than `max_size`", |topic| Some(topic.too_big)),
             ("malformed", |topic| topic.malformed),
         ];
         if a.as_ref().map(|a| &a.topic) != b.as_ref().map(|b| &b.topic) {
-            let name = |topic: &Option<Losses>| topic.as_ref().map(|topic| topic.topic.clone());
+            let name =
+                |topic: &Option<TopicCounts>| topic.as_ref().map(|topic| topic.topic.clone());
             add(format!("topic of `{input}`"), name(&a), name(&b));
         }
         for (what, number) in numbers {
-            let word = |topic: &Option<Losses>| topic.as_ref().and_then(number).map(grouped);
+            let word = |topic: &Option<TopicCounts>| topic.as_ref().and_then(number).map(grouped);
             add(format!("samples of `{input}`, {what}"), word(&a), word(&b));
         }
     }
     changes
 }
 
-/// Of a run without `signals.json`, what its summary tells.
+/// Median costs; of a run without `signals.json`, those of its summary.
 fn cost(a: (&RunSummary, Option<&Signals>), b: (&RunSummary, Option<&Signals>)) -> Vec<Cost> {
-    let time = |(told, signals): (&RunSummary, Option<&Signals>)| match (signals, told) {
+    let time = |(summary, signals): (&RunSummary, Option<&Signals>)| match (signals, summary) {
         (Some(signals), _) => Some(signals.run_ns.p50).filter(|_| signals.run_ns.count > 0),
         (None, RunSummary::Live(live)) => run(live),
         (None, RunSummary::Replay(_)) => None,
@@ -197,13 +195,10 @@ fn cost(a: (&RunSummary, Option<&Signals>), b: (&RunSummary, Option<&Signals>)) 
         let ratio = a.zip(b).filter(|(a, _)| *a > 0).map(|(a, b)| b as f64 / a as f64);
         (a.is_some() || b.is_some()).then_some(Cost { what, unit, a, b, ratio })
     };
-    let all = [
-        cost("time in the lambda", "ns", time(a), time(b)),
-        cost("fuel", "fuel", fuel(a), fuel(b)),
-    ];
+    let all = [cost("run time", "ns", time(a), time(b)), cost("fuel", "fuel", fuel(a), fuel(b))];
     all.into_iter().flatten().collect()
 }
 
-fn run(live: &Live) -> Option<u64> {
-    live.run.map(|run| run.p50_ns)
+fn run(live: &LiveStatus) -> Option<u64> {
+    live.run_time.map(|run| run.p50_ns)
 }

@@ -1,17 +1,19 @@
-//! What a person sees of a comparison.
+//! Formats a comparison of two runs.
 
 use std::fmt::{self, Write};
 
 use gleaner_base::visible;
-use gleaner_report::words::{counted, grouped, three_digits};
-use gleaner_report::{Change, Cost, Diff, Difference, Is, Of, Side, Tally};
+use gleaner_report::format::{counted, grouped, three_digits};
+use gleaner_report::{
+    ChangeCounts, ChangeKind, ComparedRun, Cost, Diff, Difference, DifferenceKind, ValueChange,
+};
 
 use super::Paint;
 
-/// As many of each kind are shown; the rest is counted.
+/// Maximum number of shown differences of each kind and change; the others are counted.
 const SHOWN: usize = 20;
 
-/// The differences, for a person.
+/// Formats the differences.
 pub(crate) fn diff(diff: &Diff, paint: Paint) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail.
@@ -27,28 +29,31 @@ fn write(text: &mut String, diff: &Diff, paint: Paint) -> fmt::Result {
         writeln!(text, "{sign} {}", paint.bold(&named(side)))?;
     }
     for change in &diff.config {
-        writeln!(text, "  config {}", in_words(change))?;
+        writeln!(text, "  config {}", value_change(change))?;
     }
-    for (thing, tally) in [("trigger", diff.triggers), ("fault", diff.faults)] {
-        writeln!(text, "  {}", tally_in_words(thing, tally, paint))?;
+    for (thing, counts) in [("trigger", diff.triggers), ("fault", diff.faults)] {
+        writeln!(text, "  {}", change_counts(thing, counts, paint))?;
     }
     for change in &diff.counts {
-        writeln!(text, "  {}", in_words(change))?;
+        writeln!(text, "  {}", value_change(change))?;
     }
     for cost in &diff.cost {
-        writeln!(text, "  {}", cost_in_words(cost))?;
+        writeln!(text, "  {}", cost_change(cost))?;
     }
-    for (of, thing, tally) in
-        [(Of::Trigger, "trigger", diff.triggers), (Of::Fault, "fault", diff.faults)]
-    {
-        for (is, count) in
-            [(Is::Gone, tally.gone), (Is::New, tally.new), (Is::Changed, tally.changed)]
-        {
+    for (kind, thing, counts) in [
+        (DifferenceKind::Trigger, "trigger", diff.triggers),
+        (DifferenceKind::Fault, "fault", diff.faults),
+    ] {
+        for (change, count) in [
+            (ChangeKind::Removed, counts.removed),
+            (ChangeKind::Added, counts.added),
+            (ChangeKind::Changed, counts.changed),
+        ] {
             let listed = diff
                 .differences
                 .iter()
-                .filter(|difference| difference.of == of && difference.is == is);
-            block(text, listed, is, &counted(count, thing), count, paint)?;
+                .filter(|difference| difference.kind == kind && difference.change == change);
+            block(text, listed, change, &counted(count, thing), count, paint)?;
         }
     }
     Ok(())
@@ -57,7 +62,7 @@ fn write(text: &mut String, diff: &Diff, paint: Paint) -> fmt::Result {
 fn block<'a>(
     text: &mut String,
     listed: impl Iterator<Item = &'a Difference>,
-    is: Is,
+    change: ChangeKind,
     title: &str,
     count: u64,
     paint: Paint,
@@ -65,10 +70,10 @@ fn block<'a>(
     if count == 0 {
         return Ok(());
     }
-    let (word, sign) = match is {
-        Is::Gone => ("gone", '-'),
-        Is::New => ("new", '+'),
-        Is::Changed => ("changed", '~'),
+    let (word, sign) = match change {
+        ChangeKind::Removed => ("removed", '-'),
+        ChangeKind::Added => ("added", '+'),
+        ChangeKind::Changed => ("changed", '~'),
     };
     writeln!(text, "{}", paint.bold(&format!("{title} {word}")))?;
     let mut shown = 0;
@@ -80,10 +85,10 @@ fn block<'a>(
             visible(&difference.detail)
         );
         let line = line.trim_end();
-        let line = match is {
-            Is::Gone => paint.red(line),
-            Is::New => paint.green(line),
-            Is::Changed => paint.yellow(line),
+        let line = match change {
+            ChangeKind::Removed => paint.red(line),
+            ChangeKind::Added => paint.green(line),
+            ChangeKind::Changed => paint.yellow(line),
         };
         writeln!(text, "{line}")?;
         shown += 1;
@@ -94,10 +99,10 @@ fn block<'a>(
     }
 }
 
-fn named(side: &Side) -> String {
+fn named(side: &ComparedRun) -> String {
     let drive: Vec<_> = side.drive.iter().map(|drive| visible(drive)).collect();
     let drive = if drive.is_empty() { "live".to_owned() } else { drive.join(", ") };
-    let Side { out, lambda, version, kind, .. } = side;
+    let ComparedRun { out, lambda, version, kind, .. } = side;
     format!(
         "{}: {} {} ({}), {drive}",
         visible(out),
@@ -107,70 +112,78 @@ fn named(side: &Side) -> String {
     )
 }
 
-fn in_words(Change { what, a, b }: &Change) -> String {
+fn value_change(ValueChange { what, a, b }: &ValueChange) -> String {
     let word = |value: &Option<String>| value.as_deref().map_or("unknown".to_owned(), visible);
     format!("{}: {} → {}", visible(what), word(a), word(b))
 }
 
-fn tally_in_words(thing: &str, tally: Tally, paint: Paint) -> String {
-    let Tally { same, gone, new, changed } = tally;
-    if tally.is_same() {
-        return match same {
-            0 => format!("no {thing} in either"),
-            same => paint.green(&format!("{} the same", counted(same, thing))),
+fn change_counts(thing: &str, counts: ChangeCounts, paint: Paint) -> String {
+    let ChangeCounts { identical, removed, added, changed } = counts;
+    if counts.is_identical() {
+        return match identical {
+            0 => format!("no {thing}s in either"),
+            count => paint.green(&format!("{} identical", counted(count, thing))),
         };
     }
-    let [same, gone, new, changed] = [same, gone, new, changed].map(grouped);
-    format!("{thing}s: {same} the same, {gone} gone, {new} new, {changed} changed")
+    let [identical, removed, added, changed] = [identical, removed, added, changed].map(grouped);
+    format!("{thing}s: {identical} identical, {removed} removed, {added} added, {changed} changed")
 }
 
-fn cost_in_words(Cost { what, unit, a, b, ratio }: &Cost) -> String {
+fn cost_change(Cost { what, unit, a, b, ratio }: &Cost) -> String {
     let word = |value: &Option<u64>| match (value, *unit) {
         (None, _) => "unknown".to_owned(),
         (Some(ns), "ns") => format!("{} µs", three_digits(*ns as f64 / 1e3)),
         (Some(count), _) => grouped(*count),
     };
     let by = ratio.map(|by| format!(" (x{})", three_digits(by))).unwrap_or_default();
-    format!("{what}, median: {} → {}{by}", word(a), word(b))
+    format!("{what}, p50: {} → {}{by}", word(a), word(b))
 }
 
 #[cfg(test)]
 mod tests {
-    use gleaner_lambda::manifest::Kind;
+    use gleaner_lambda::manifest::LambdaKind;
 
     use super::*;
 
-    fn side(out: &str) -> Side {
+    fn side(out: &str) -> ComparedRun {
         let [out, lambda, version] = [out, "hello", "0.1.0"].map(str::to_owned);
-        Side {
+        ComparedRun {
             out,
             lambda,
             version,
-            kind: Kind::Wasm,
+            kind: LambdaKind::Wasm,
             drive: vec!["a.mcap".to_owned()],
             start_ns: Some(0),
         }
     }
 
-    fn alike() -> Diff {
+    fn empty_diff() -> Diff {
         Diff {
-            same: true,
+            identical: true,
             a: side("a"),
             b: side("b"),
             notes: Vec::new(),
             config: Vec::new(),
             counts: Vec::new(),
             cost: Vec::new(),
-            triggers: Tally::default(),
-            faults: Tally::default(),
+            triggers: ChangeCounts::default(),
+            faults: ChangeCounts::default(),
             differences: Vec::new(),
-            left_out: 0,
+            omitted: 0,
         }
     }
 
-    fn difference(is: Is, t: f64, label: &str) -> Difference {
+    fn difference(change: ChangeKind, t: f64, label: &str) -> Difference {
         let (label, detail) = (label.to_owned(), "1".to_owned());
-        Difference { at_ns: (t * 1e9) as i64, t, of: Of::Trigger, is, topic: None, label, detail }
+        Difference {
+            at_ns: (t * 1e9) as i64,
+            t,
+            kind: DifferenceKind::Trigger,
+            change,
+            topic: None,
+            label,
+            detail,
+        }
     }
 
     fn text(changed: &Diff) -> String {
@@ -178,36 +191,36 @@ mod tests {
     }
 
     #[test]
-    fn what_makes_runs_hard_to_compare_is_said_first_and_unknown_is_no_number() {
+    fn notes_come_first_and_unknown_values_are_no_numbers() {
         let change = |what: &str, a: Option<&str>, b: &str| {
             let [a, b] = [a, Some(b)].map(|value| value.map(str::to_owned));
-            Change { what: what.to_owned(), a, b }
+            ValueChange { what: what.to_owned(), a, b }
         };
         let changed = Diff {
             notes: vec!["different lambdas: `hello` and `brake-dark`".to_owned()],
             config: vec![change("brake", Some("-1.4"), "-2.0")],
             counts: vec![
                 change("wakes", Some("400"), "500"),
-                change("samples of `imu`, lost", None, "4"),
+                change("samples of `imu`, lost upstream", None, "4"),
             ],
             cost: vec![Cost {
-                what: "time in the lambda",
+                what: "run time",
                 unit: "ns",
                 a: Some(2000),
                 b: Some(3000),
                 ratio: Some(1.5),
             }],
-            ..alike()
+            ..empty_diff()
         };
         let text = text(&changed);
         assert!(text.starts_with("different lambdas"), "{text}");
         for line in [
             "- a: hello 0.1.0 (wasm), a.mcap",
             "  config brake: -1.4 → -2.0",
-            "  no trigger in either",
+            "  no triggers in either",
             "  wakes: 400 → 500",
-            "  samples of `imu`, lost: unknown → 4",
-            "  time in the lambda, median: 2 µs → 3 µs (x1.5)",
+            "  samples of `imu`, lost upstream: unknown → 4",
+            "  run time, p50: 2 µs → 3 µs (x1.5)",
         ] {
             assert!(text.lines().any(|found| found == line), "{line}: {text}");
         }
@@ -215,28 +228,36 @@ mod tests {
 
     #[test]
     fn twenty_of_each_kind_are_shown_and_the_others_are_counted() {
-        let gone = (0..1000).map(|ms| difference(Is::Gone, f64::from(ms) / 1e3, "gone"));
-        let new = (3000..3020).map(|ms| difference(Is::New, f64::from(ms) / 1e3, "new"));
+        let removed =
+            (0..1000).map(|ms| difference(ChangeKind::Removed, f64::from(ms) / 1e3, "removed"));
+        let added =
+            (3000..3020).map(|ms| difference(ChangeKind::Added, f64::from(ms) / 1e3, "added"));
         let text = text(&Diff {
-            same: false,
-            triggers: Tally { same: 0, gone: 3000, new: 30, changed: 0 },
-            differences: gone.chain(new).collect(),
-            ..alike()
+            identical: false,
+            triggers: ChangeCounts { identical: 0, removed: 3000, added: 30, changed: 0 },
+            differences: removed.chain(added).collect(),
+            ..empty_diff()
         });
-        assert!(text.contains("  triggers: 0 the same, 3,000 gone, 30 new, 0 changed\n"), "{text}");
+        assert!(
+            text.contains("  triggers: 0 identical, 3,000 removed, 30 added, 0 changed\n"),
+            "{text}"
+        );
         assert!(
             text.contains("and 2,980 more")
-                && text.contains("+     3.000 s  new  1\n")
+                && text.contains("+     3.000 s  added  1\n")
                 && text.contains("and 10 more"),
             "{text}"
         );
     }
 
     #[test]
-    fn hostile_texts_do_not_act_on_a_terminal() {
-        let differences = vec![difference(Is::Gone, 0.0, "\u{1b}[2J")];
-        let text =
-            text(&Diff { triggers: Tally { gone: 1, ..Tally::default() }, differences, ..alike() });
+    fn control_characters_are_escaped() {
+        let differences = vec![difference(ChangeKind::Removed, 0.0, "\u{1b}[2J")];
+        let text = text(&Diff {
+            triggers: ChangeCounts { removed: 1, ..ChangeCounts::default() },
+            differences,
+            ..empty_diff()
+        });
         assert!(!text.contains('\u{1b}') && text.contains("\\u{1b}[2J"), "{text}");
     }
 }

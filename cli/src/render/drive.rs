@@ -1,25 +1,25 @@
-//! What is in a drive, for a person, and as tables for a manifest.
+//! Formats the contents of a drive, and `[[input]]` tables for a manifest.
 
 use std::collections::HashSet;
 use std::fmt::Write;
 
 use gleaner_base::visible;
-use gleaner_protocol::{DriveSeen, Picture, RecordedTopicSeen};
-use gleaner_report::words::{counted, grouped, seconds, size};
+use gleaner_protocol::{DriveInfo, DriveTopicInfo, PictureInfo};
+use gleaner_report::format::{counted, grouped, seconds, size};
 
 use super::live::table;
 
-/// Parts of a topic's name that say nothing of what is measured.
+/// Words of topic names that do not describe the measured quantity.
 const EMPTY_WORDS: [&str; 7] =
     ["data", "raw", "image", "image_raw", "image_color", "compressed", "msg"];
 
-/// How long the drive is, its topics as a table, and `[[input]]` tables.
-pub(crate) fn drive(drive: &DriveSeen) -> String {
+/// Formats the length of the drive, a table of its topics, and `[[input]]` tables.
+pub(crate) fn drive(drive: &DriveInfo) -> String {
     let (Some(start), Some(end)) = (drive.start_ns, drive.end_ns) else {
         return "no messages\n".to_owned();
     };
     let (whole, rest) = (start.div_euclid(1_000_000_000), start.rem_euclid(1_000_000_000));
-    let mut text = format!("{:.3} s, from @{whole}.{rest:09} on\n", seconds(end, start));
+    let mut text = format!("{:.3} s, starts at @{whole}.{rest:09}\n", seconds(end, start));
     if !drive.parts.is_empty() {
         let parts = drive.parts.iter().map(|[from, to]| {
             format!("{:.1} to {:.1} s", seconds(*from, start), seconds(*to, start))
@@ -27,7 +27,7 @@ pub(crate) fn drive(drive: &DriveSeen) -> String {
         let parts = parts.collect::<Vec<_>>().join(", ");
         // Writing to a string cannot fail, here and below.
         let _ =
-            writeln!(text, "rates, gaps and sizes are those of {parts}; --all reads everything");
+            writeln!(text, "rates, gaps and sizes are from {parts}; --all reads the whole drive");
     }
     if let Some(damaged) = &drive.damaged {
         let _ = writeln!(text, "damaged: {}", visible(damaged));
@@ -41,16 +41,16 @@ pub(crate) fn drive(drive: &DriveSeen) -> String {
     let rows = drive.topics.iter().map(|topic| row(topic, start));
     text += &table(std::iter::once(head).chain(rows).collect(), &[2, 3, 4, 5, 6, 7]);
     if drive.skipped > 0 {
-        let _ = writeln!(text, "and {}, not looked at", counted(drive.skipped, "more topic"));
+        let _ = writeln!(text, "and {}, not read", counted(drive.skipped, "more topic"));
     }
     text + &inputs(&drive.topics)
 }
 
-fn row(topic: &RecordedTopicSeen, start_ns: i64) -> [String; 9] {
+fn row(topic: &DriveTopicInfo, start_ns: i64) -> [String; 9] {
     let unknown = || "?".to_owned();
     let notes = [
-        topic.picture.as_ref().map(in_words),
-        (!topic.is_defined).then(|| "no definitions: read as bytes only".to_owned()),
+        topic.picture.as_ref().map(picture_text),
+        (!topic.is_defined).then(|| "no definition: read as bytes only".to_owned()),
         topic.unreadable.as_deref().map(visible),
     ];
     [
@@ -65,29 +65,29 @@ fn row(topic: &RecordedTopicSeen, start_ns: i64) -> [String; 9] {
             .longest_gap_at_ns
             .map_or_else(unknown, |at| format!("{:.3} s", seconds(at, start_ns))),
         topic.missing.map_or_else(unknown, grouped),
-        if topic.read > 0 { size(topic.largest_bytes) } else { unknown() },
+        if topic.messages_read > 0 { size(topic.largest_bytes) } else { unknown() },
         notes.into_iter().flatten().collect::<Vec<_>>().join("; "),
     ]
 }
 
-fn in_words(picture: &Picture) -> String {
+fn picture_text(picture: &PictureInfo) -> String {
     format!("{} {}x{}", visible(&picture.encoding), picture.width, picture.height)
 }
 
-/// By the median of the intervals: a gap is no other rate.
-fn rate_hz(topic: &RecordedTopicSeen) -> Option<f64> {
+/// Rate from the median interval, which gaps do not change.
+fn rate_hz(topic: &DriveTopicInfo) -> Option<f64> {
     topic
         .interval
         .filter(|interval| interval.p50_ns > 0)
         .map(|interval| 1e9 / interval.p50_ns as f64)
 }
 
-/// A table for each topic whose fields can be read.
-fn inputs(topics: &[RecordedTopicSeen]) -> String {
+/// Writes an `[[input]]` table for each topic whose fields can be read.
+fn inputs(topics: &[DriveTopicInfo]) -> String {
     let (mut text, mut names) = (String::new(), HashSet::new());
     for topic in topics
         .iter()
-        .filter(|topic| topic.is_defined && topic.unreadable.is_none() && topic.read > 0)
+        .filter(|topic| topic.is_defined && topic.unreadable.is_none() && topic.messages_read > 0)
     {
         let base = name_of(&topic.topic);
         let others = (2..).map(|n| format!("{base}_{n}"));
@@ -107,11 +107,11 @@ fn inputs(topics: &[RecordedTopicSeen]) -> String {
     if text.is_empty() { text } else { format!("\nfor lambda.toml:\n{text}") }
 }
 
-/// What differs from the defaults, with room for what was not seen.
-fn sizes(topic: &RecordedTopicSeen) -> String {
+/// Keys of an `[[input]]` table that differ from the defaults, with reserves.
+fn sizes(topic: &DriveTopicInfo) -> String {
     let kib = |bytes: u64| format!("{} KiB", bytes.div_ceil(1024));
-    if let Some(Picture { width, height, is_compressed, .. }) = &topic.picture {
-        // What a message says of itself may be anything.
+    if let Some(PictureInfo { width, height, is_compressed, .. }) = &topic.picture {
+        // Width and height are untrusted.
         let decoded = 3_u64.saturating_mul(u64::from(*width)).saturating_mul(u64::from(*height));
         return match is_compressed {
             true => format!(
@@ -137,7 +137,7 @@ fn sizes(topic: &RecordedTopicSeen) -> String {
     text
 }
 
-/// A name for an input, from the words of its topic.
+/// Makes a name for an input from the words of its topic.
 fn name_of(topic: &str) -> String {
     let words = topic.split('/').filter(|word| !word.is_empty() && !EMPTY_WORDS.contains(word));
     let words = words.map(str::to_ascii_lowercase).collect::<Vec<_>>();
@@ -153,20 +153,25 @@ fn name_of(topic: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_protocol::Spread;
+    use gleaner_protocol::DurationStats;
 
     use super::*;
 
-    fn topic(topic: &str) -> RecordedTopicSeen {
+    fn topic(topic: &str) -> DriveTopicInfo {
         let ms = |ms: u64| ms * 1_000_000;
-        RecordedTopicSeen {
+        DriveTopicInfo {
             topic: topic.to_owned(),
             type_name: "sensor_msgs/msg/Imu".to_owned(),
             messages: Some(12_345),
             is_defined: true,
             unreadable: None,
-            read: 12_345,
-            interval: Some(Spread { n: 12_344, p50_ns: ms(10), p99_ns: ms(11), max_ns: ms(52) }),
+            messages_read: 12_345,
+            interval: Some(DurationStats {
+                n: 12_344,
+                p50_ns: ms(10),
+                p99_ns: ms(11),
+                max_ns: ms(52),
+            }),
             longest_gap_at_ns: Some(1_500_000_001_250_000_000),
             missing: Some(0),
             largest_bytes: 324,
@@ -175,9 +180,9 @@ mod tests {
         }
     }
 
-    fn seen(topics: Vec<RecordedTopicSeen>) -> DriveSeen {
+    fn seen(topics: Vec<DriveTopicInfo>) -> DriveInfo {
         let [start_ns, end_ns] = [1_500_000_000_250_000_000, 1_500_000_002_000_000_000].map(Some);
-        DriveSeen {
+        DriveInfo {
             start_ns,
             end_ns,
             parts: Vec::new(),
@@ -190,19 +195,19 @@ mod tests {
 
     #[test]
     fn a_drive_is_shown_with_a_table_of_inputs() {
-        let unknown = RecordedTopicSeen {
+        let unknown = DriveTopicInfo {
             messages: None,
             is_defined: false,
-            read: 0,
+            messages_read: 0,
             interval: None,
             longest_gap_at_ns: None,
             missing: None,
             ..topic("/other")
         };
-        let expected = "1.750 s, from @1500000000.250000000 on
+        let expected = "1.750 s, starts at @1500000000.250000000
 topic      type                 messages     Hz  longest gap       at  missing  largest
 /imu/data  sensor_msgs/msg/Imu    12,345  100.0      52.0 ms  1.000 s        0    324 B
-/other     sensor_msgs/msg/Imu         ?      ?            ?        ?        ?        ?  no definitions: read as bytes only
+/other     sensor_msgs/msg/Imu         ?      ?            ?        ?        ?        ?  no definition: read as bytes only
 
 for lambda.toml:
 
@@ -213,18 +218,18 @@ type = \"sensor_msgs/msg/Imu\"
 depth = 128                 # 1.3 s
 ";
         assert_eq!(drive(&seen(vec![topic("/imu/data"), unknown])), expected);
-        assert_eq!(drive(&DriveSeen { start_ns: None, ..seen(Vec::new()) }), "no messages\n");
+        assert_eq!(drive(&DriveInfo { start_ns: None, ..seen(Vec::new()) }), "no messages\n");
     }
 
     #[test]
-    fn pictures_get_the_room_that_they_need() {
-        let shape = |is_compressed| Picture {
+    fn sizes_fit_the_pictures() {
+        let shape = |is_compressed| PictureInfo {
             encoding: "x".to_owned(),
             width: 1280,
             height: 720,
             is_compressed,
         };
-        let camera = |is_compressed, largest_bytes| RecordedTopicSeen {
+        let camera = |is_compressed, largest_bytes| DriveTopicInfo {
             picture: Some(shape(is_compressed)),
             largest_bytes,
             ..topic("/camera/front/compressed")
@@ -235,15 +240,14 @@ depth = 128                 # 1.3 s
         );
         assert_eq!(sizes(&camera(false, 2_764_900)), "max_size = \"2702 KiB\"\n");
         for is_compressed in [true, false] {
-            let picture = Picture { width: u32::MAX, height: u32::MAX, ..shape(is_compressed) };
-            let camera =
-                RecordedTopicSeen { picture: Some(picture), ..camera(is_compressed, 1024) };
+            let picture = PictureInfo { width: u32::MAX, height: u32::MAX, ..shape(is_compressed) };
+            let camera = DriveTopicInfo { picture: Some(picture), ..camera(is_compressed, 1024) };
             assert!(sizes(&camera).starts_with("max_size = \"2 KiB\"\n"));
         }
     }
 
     #[test]
-    fn names_are_those_that_a_manifest_takes_and_each_is_given_once() {
+    fn names_are_valid_and_unique() {
         for (topic, name) in [
             ("/imu/data", "imu"),
             ("/camera/front/compressed", "camera_front"),
@@ -262,8 +266,8 @@ depth = 128                 # 1.3 s
     }
 
     #[test]
-    fn what_was_not_read_and_what_is_damaged_is_said() {
-        let drive_of_parts = DriveSeen {
+    fn unread_and_damaged_parts_are_reported() {
+        let drive_of_parts = DriveInfo {
             parts: vec![[1_500_000_000_250_000_000, 1_500_000_000_750_000_000]],
             damaged: Some("cut\u{1b} off".to_owned()),
             out_of_order: 2,
@@ -271,8 +275,8 @@ depth = 128                 # 1.3 s
             ..seen(Vec::new())
         };
         let text = drive(&drive_of_parts);
-        assert!(text.contains("those of 0.0 to 0.5 s; --all reads everything\n"), "{text}");
+        assert!(text.contains("from 0.0 to 0.5 s; --all reads the whole drive\n"), "{text}");
         assert!(text.contains("damaged: cut\\u{1b} off\n2 messages out of order"), "{text}");
-        assert!(text.ends_with("\nand 61,439 more topics, not looked at\n"), "{text}");
+        assert!(text.ends_with("\nand 61,439 more topics, not read\n"), "{text}");
     }
 }

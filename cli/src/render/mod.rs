@@ -1,52 +1,52 @@
-//! What a person sees after a replay. Text in, text out: nothing is read or printed here.
+//! Formats results as text for the terminal. It reads and prints nothing.
 
 use std::fmt::{self, Write};
 use std::io::{self, IsTerminal};
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision, Fault, FaultKind, Trigger, TriggerKind};
-use gleaner_protocol::{Outcome, Recording, Summary, TopicReport, Verified};
+use gleaner_protocol::{LossOutcome, RecordingCounts, ReplaySummary, TopicReport, Verified};
 use gleaner_report::ResultsError;
-use gleaner_report::words::{counted, fault_kind, gist, grouped, seconds, three_digits};
+use gleaner_report::format::{counted, fault_kind, gist, grouped, seconds, three_digits};
 
-mod checked;
+mod check_report;
 mod clips;
 mod diff;
 mod drive;
 mod isolation;
 mod live;
 
-pub(crate) use checked::checked;
+pub(crate) use check_report::check_report;
 pub(crate) use diff::diff;
 pub(crate) use drive::drive;
 pub(crate) use isolation::isolation;
 pub(crate) use live::{clip_line, decision, live, recorder, topics};
 
-/// A report for programs: JSON, in one line.
+/// Formats a report as one line of JSON.
 pub(crate) fn json_line<T: serde::Serialize>(result: &T) -> String {
     serde_json::to_string(result).expect("a report has only text keys and finite numbers") + "\n"
 }
 
-/// As many bursts of triggers, and as many causes of faults, are shown; the rest is counted.
+/// Maximum number of shown trigger bursts, and of shown fault groups; the others are counted.
 const SHOWN: usize = 20;
 
-/// Characters of a fault's message that are shown; all of it is in `decisions.jsonl`.
+/// Shown characters of a fault's message; `decisions.jsonl` has the whole message.
 const MESSAGE_CHARS: usize = 200;
 
-/// Triggers of one label that are less than this apart are one burst: most lambdas see an event in
-/// several samples.
+/// Triggers with one label and a smaller distance than this are one burst: most lambdas trigger on
+/// several samples of an event.
 const BURST_GAP_S: f64 = 1.0;
 
-/// The part of the decisions that is shown. It stays small, however many decisions there are.
+/// A bounded extract of the decisions for display.
 #[derive(Debug, Default)]
 pub(crate) struct Digest {
     triggers: Vec<Burst>,
     other_triggers: u64,
-    causes: Vec<Cause>,
+    fault_groups: Vec<FaultGroup>,
     other_faults: u64,
 }
 
-/// Triggers of one label that follow each other at once, with no other in between.
+/// Consecutive triggers with one label.
 #[derive(Debug)]
 struct Burst {
     label: String,
@@ -56,9 +56,9 @@ struct Burst {
     highest_score: Option<f64>,
 }
 
-/// Faults with one cause.
+/// Faults with the same kind and message.
 #[derive(Debug)]
-struct Cause {
+struct FaultGroup {
     kind: FaultKind,
     message: String,
     count: u64,
@@ -66,7 +66,7 @@ struct Cause {
 }
 
 impl Digest {
-    /// The digest of `decisions` of a drive that starts at `start_ns`.
+    /// Digests the `decisions` of a drive that starts at `start_ns`.
     pub(crate) fn of(
         decisions: impl Iterator<Item = Result<Decision, ResultsError>>,
         start_ns: i64,
@@ -115,12 +115,14 @@ impl Digest {
 
     fn count(&mut self, fault: &Fault, first_seconds: f64) {
         let (kind, message) = (fault.kind, shown(gist(&fault.message)));
-        if let Some(cause) =
-            self.causes.iter_mut().find(|cause| cause.kind == kind && cause.message == message)
+        if let Some(cause) = self
+            .fault_groups
+            .iter_mut()
+            .find(|cause| cause.kind == kind && cause.message == message)
         {
             cause.count += 1;
-        } else if self.causes.len() < SHOWN {
-            self.causes.push(Cause { kind, message, count: 1, first_seconds });
+        } else if self.fault_groups.len() < SHOWN {
+            self.fault_groups.push(FaultGroup { kind, message, count: 1, first_seconds });
         } else {
             self.other_faults += 1;
         }
@@ -134,36 +136,41 @@ impl Burst {
         if first == last { format!("{first:>10} s") } else { format!("{first:>10} to {last} s") }
     }
 
-    /// The score of a single trigger; how many they are, and the highest of their scores.
-    fn size(&self) -> String {
+    /// The score of a single trigger; of several, their number and highest score.
+    fn extent(&self) -> String {
         let score = self.highest_score.map(three_digits);
         match (self.count, score) {
             (1, score) => score.unwrap_or("-".to_owned()),
             (count, None) => format!("{}x", grouped(count)),
-            (count, Some(score)) => format!("{}x, {score} at most", grouped(count)),
+            (count, Some(score)) => format!("{}x, max {score}", grouped(count)),
         }
     }
 }
 
-/// A fault's message, fit to print and no longer than a few lines of a terminal.
+/// A fault's message, escaped and cut to [`MESSAGE_CHARS`].
 pub(crate) fn shown(message: &str) -> String {
-    // What is written out takes more room than it did.
+    // Escaping makes the text longer.
     let text = visible(&message.chars().take(MESSAGE_CHARS + 1).collect::<String>());
     match text.char_indices().nth(MESSAGE_CHARS) {
-        Some((end, _)) => format!("{} … (all of it is in decisions.jsonl)", &text[..end]),
+        Some((end, _)) => format!("{} … (complete in decisions.jsonl)", &text[..end]),
         None => text,
     }
 }
 
-/// The summary of a replay, for a person.
-pub(crate) fn summary(summary: &Summary, digest: &Digest, clips: &[Clip], paint: Paint) -> String {
+/// Formats the summary of a replay.
+pub(crate) fn summary(
+    summary: &ReplaySummary,
+    digest: &Digest,
+    clips: &[Clip],
+    paint: Paint,
+) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail.
     let _ = write_summary(&mut text, summary, digest, clips, paint);
     text
 }
 
-/// How far a journal was proved, for a person.
+/// Formats the result of verifying a journal.
 pub(crate) fn verified(verified: &Verified, paint: Paint) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail.
@@ -176,16 +183,17 @@ fn write_verified(text: &mut String, verified: &Verified, paint: Paint) -> fmt::
     let compared = counted(verified.wakes.saturating_sub(verified.uncovered), "decision");
     let triggers =
         counted(verified.triggers.saturating_sub(verified.uncovered_triggers), "trigger");
-    let same = format!("{compared} with {triggers} made again, all the same");
+    let same = format!("{compared} with {triggers} repeated, all identical");
     writeln!(text, "{}: {}", paint.bold(&name), paint.green(&same))?;
     if verified.uncovered > 0 {
         let wakes = counted(verified.uncovered, "wake");
         let triggers = counted(verified.uncovered_triggers, "trigger");
-        let why = "not compared: the lambda looked at samples from before the clip";
+        let why = "not compared: the lambda read samples from before the clip";
         writeln!(text, "  {}", paint.yellow(&format!("{wakes} with {triggers} {why}")))?;
     }
     if verified.truncated {
-        let why = "the journal has no end: its writer died, or the drive was damaged; what it holds was compared";
+        let why = "the journal is truncated: its writer died, or the drive was damaged; compared \
+                   up to its end";
         writeln!(text, "  {}", paint.yellow(why))?;
     }
     for note in &verified.notes {
@@ -196,7 +204,7 @@ fn write_verified(text: &mut String, verified: &Verified, paint: Paint) -> fmt::
 
 fn write_summary(
     text: &mut String,
-    summary: &Summary,
+    summary: &ReplaySummary,
     digest: &Digest,
     clips: &[Clip],
     paint: Paint,
@@ -215,13 +223,13 @@ fn write_summary(
     )?;
 
     for burst in &digest.triggers {
-        writeln!(text, "{}  {}  {}", paint.green(&burst.time()), burst.label, burst.size())?;
+        writeln!(text, "{}  {}  {}", paint.green(&burst.time()), burst.label, burst.extent())?;
     }
     more(text, digest.other_triggers)?;
 
     if summary.faults > 0 {
         writeln!(text, "  {}", paint.red(&counted(summary.faults, "fault")))?;
-        for cause in &digest.causes {
+        for cause in &digest.fault_groups {
             let kind = fault_kind(cause.kind);
             writeln!(
                 text,
@@ -260,7 +268,7 @@ fn write_summary(
         writeln!(
             text,
             "  {}",
-            paint.red("the lambda's process ended before the drive did; the results end there")
+            paint.red("the lambda's process ended before the drive; the results end there")
         )?;
         writeln!(text, "    {}", visible(why))?;
     }
@@ -277,7 +285,7 @@ fn write_summary(
     if summary.wall_s > 0.0 && span_s > 0.0 {
         write!(text, " ({}x real time)", grouped((span_s / summary.wall_s).round() as u64))?;
     }
-    write!(text, ", {:.3} s in the lambda", summary.run_s)?;
+    write!(text, ", run time {:.3} s", summary.run_s)?;
     if summary.decode_s > 0.0 {
         write!(
             text,
@@ -285,7 +293,7 @@ fn write_summary(
             100.0 * summary.decode_s / summary.run_s.max(summary.decode_s)
         )?;
     }
-    writeln!(text, ", {:.1} MiB at most", mib(summary.peak_rss_bytes))?;
+    writeln!(text, ", peak memory {:.1} MiB", mib(summary.peak_rss_bytes))?;
     let clips = if clips.is_empty() { "" } else { ", clips.jsonl, clips/" };
     let files = format!(
         "{}: decisions.jsonl, log.jsonl, summary.json{clips}",
@@ -294,14 +302,14 @@ fn write_summary(
     writeln!(text, "  {}", paint.dim(&files))
 }
 
-/// What a recorder did not record, by cause.
-fn write_counted(text: &mut String, recording: &Recording, paint: Paint) -> fmt::Result {
+/// Counts of what a recorder did not record, by cause.
+fn write_counted(text: &mut String, recording: &RecordingCounts, paint: Paint) -> fmt::Result {
     for counted in recording.by_cause().into_iter().filter(|counted| counted.count > 0) {
         let line = counted.in_words();
         writeln!(
             text,
             "  {}",
-            if counted.outcome == Outcome::NoWindow {
+            if counted.outcome == LossOutcome::NoWindow {
                 paint.dim(&line)
             } else {
                 paint.yellow(&line)
@@ -318,16 +326,17 @@ fn more(text: &mut String, count: u64) -> fmt::Result {
     Ok(())
 }
 
-/// What was lost, by cause. A sample that a newer one pushed out is none: that is how a ring works.
-fn losses(summary: &Summary) -> Vec<String> {
+/// Losses by cause. Samples that newer ones overwrote in a ring do not count as lost.
+fn losses(summary: &ReplaySummary) -> Vec<String> {
     let of_topic = |topic: &TopicReport| {
-        let causes = [
-            (topic.lost.unwrap_or(0), "before they reached us"),
-            (topic.no_slot, "found no free slot, as the lambda held too many"),
+        let fault_groups = [
+            (topic.lost.unwrap_or(0), "upstream"),
+            (topic.no_slot, "no free slot: the lambda holds too many"),
             (topic.too_big, "larger than `max_size`"),
         ];
         let name = visible(&topic.topic);
-        causes.map(|(count, why)| (count, format!("{} of {name}, {why}", counted(count, "sample"))))
+        fault_groups
+            .map(|(count, why)| (count, format!("{} of {name}, {why}", counted(count, "sample"))))
     };
     let overall = [
         (summary.skipped, format!("{}, skipped", counted(summary.skipped, "event sample"))),
@@ -345,7 +354,7 @@ fn losses(summary: &Summary) -> Vec<String> {
         ),
         (
             summary.backed_off,
-            format!("{}, passed over after repeated faults", counted(summary.backed_off, "wake")),
+            format!("{}, backed off after repeated faults", counted(summary.backed_off, "wake")),
         ),
     ];
     let all = summary.topics.iter().flat_map(of_topic).chain(overall);
@@ -356,21 +365,21 @@ fn mib(bytes: u64) -> f64 {
     bytes as f64 / (1024.0 * 1024.0)
 }
 
-/// Colours, or none.
+/// Terminal colours, if enabled.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Paint {
     on: bool,
 }
 
 impl Paint {
-    /// Colours on a terminal, unless the user does not want any.
+    /// Enables colours on a terminal, unless `NO_COLOR` is set.
     ///
-    /// Source: no-color.org, by which `NO_COLOR` counts if it is not empty.
+    /// Source: no-color.org, by which an empty `NO_COLOR` counts as unset.
     pub(crate) fn new(terminal: bool) -> Paint {
         Paint { on: terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty()) }
     }
 
-    /// Colours if standard output is a terminal.
+    /// Enables colours if standard output is a terminal.
     pub(crate) fn of_stdout() -> Paint {
         Paint::new(io::stdout().is_terminal())
     }

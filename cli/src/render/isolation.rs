@@ -1,14 +1,14 @@
 use gleaner_base::visible;
 use gleaner_protocol::{Holds, Layer};
 
-/// The layers of isolation in a line: those that hold by name, the others with the reason.
+/// Formats the isolation layers in one line: active ones by name, the others with the reason.
 pub(crate) fn isolation(layers: &[Layer]) -> String {
     let named = |holds| layers.iter().filter(move |layer| layer.holds == holds);
     let mut parts = vec![format!(
-        "{} hold",
+        "{} active",
         named(Holds::Yes).map(|layer| visible(&layer.name)).collect::<Vec<_>>().join(", ")
     )];
-    for (holds, word) in [(Holds::Partly, "in part"), (Holds::No, "not here")] {
+    for (holds, word) in [(Holds::Partly, "partial"), (Holds::No, "missing")] {
         let those: Vec<_> = named(holds)
             .map(|layer| format!("{} ({})", visible(&layer.name), visible(&layer.note)))
             .collect();
@@ -24,7 +24,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_holds_is_named_and_what_does_not_has_its_reason() {
+    fn active_layers_are_named_and_missing_ones_have_a_reason() {
         let layers = [
             Layer::yes("files", "a"),
             Layer::yes("sockets", "b"),
@@ -32,7 +32,7 @@ mod tests {
         ];
         assert_eq!(
             isolation(&layers),
-            "isolation: files, sockets hold; not here: control group (none was delegated)\n"
+            "isolation: files, sockets active; missing: control group (none was delegated)\n"
         );
     }
 }

@@ -1,19 +1,19 @@
-//! Clips as people see them.
+//! Formats clips.
 
 use std::fmt::{self, Write};
 
 use gleaner_base::visible;
 use gleaner_lambda::Clip;
-use gleaner_protocol::Summary;
-use gleaner_report::words::{clip_contents, clip_span, counted, seconds};
+use gleaner_protocol::ReplaySummary;
+use gleaner_report::format::{clip_contents, clip_span, counted, seconds};
 
 use super::{Paint, SHOWN, more};
 
-/// A block for each clip: when it is, what is in it, and what is missing.
+/// Writes a block for each clip: its time, contents and gaps.
 pub(super) fn write(
     text: &mut String,
     clips: &[Clip],
-    summary: &Summary,
+    summary: &ReplaySummary,
     paint: Paint,
 ) -> fmt::Result {
     if clips.is_empty() {
@@ -27,15 +27,15 @@ pub(super) fn write(
     more(text, (clips.len() as u64).saturating_sub(SHOWN as u64))
 }
 
-/// A clip, and when it is in words.
+/// Writes a block for one clip, headed by its time `when`.
 pub(super) fn one(text: &mut String, clip: &Clip, when: &str, paint: Paint) -> fmt::Result {
     let file = visible(&clip.file.to_string_lossy());
     writeln!(text, "{}  {file}", paint.green(when))?;
     let thumbnail =
         clip.thumbnail.as_ref().map(|path| format!("; {}", visible(&path.to_string_lossy())));
     writeln!(text, "{:>14}{}{}", "", clip_contents(clip), thumbnail.unwrap_or_default())?;
-    for why in &clip.short {
-        writeln!(text, "{:>14}{}", "", paint.yellow(&format!("short: {}", visible(why))))?;
+    for why in &clip.incomplete {
+        writeln!(text, "{:>14}{}", "", paint.yellow(&format!("incomplete: {}", visible(why))))?;
     }
     for loss in losses(clip) {
         writeln!(text, "{:>14}{}", "", paint.yellow(&format!("lost: {loss}")))?;
@@ -43,7 +43,7 @@ pub(super) fn one(text: &mut String, clip: &Clip, when: &str, paint: Paint) -> f
     if let Some(recovered) = &clip.recovered {
         let what = format!(
             "recovered: {} ({} lost)",
-            visible(&recovered.what),
+            visible(&recovered.note),
             counted(recovered.lost_bytes, "byte")
         );
         writeln!(text, "{:>14}{}", "", paint.yellow(&what))?;
@@ -51,16 +51,12 @@ pub(super) fn one(text: &mut String, clip: &Clip, when: &str, paint: Paint) -> f
     Ok(())
 }
 
-/// What never came; what the recorder had to give up stands in `short`.
+/// Messages lost upstream. Losses of the recorder itself are in `incomplete`.
 fn losses(clip: &Clip) -> Vec<String> {
     let lost =
         clip.topics.iter().filter_map(|topic| Some((topic, topic.lost.filter(|lost| *lost > 0)?)));
     let lines = lost.map(|(topic, lost)| {
-        format!(
-            "{} of {}, before they reached the recorder",
-            counted(lost, "message"),
-            visible(&topic.topic)
-        )
+        format!("{} of {}, upstream", counted(lost, "message"), visible(&topic.topic))
     });
     lines.collect()
 }

@@ -1,4 +1,4 @@
-//! Commands that another program of ours does alone.
+//! Commands that another Gleaner program runs.
 
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
@@ -9,42 +9,39 @@ use gleaner_parts::Parts;
 use gleaner_protocol::Report;
 
 use crate::args::{InspectArgs, TopicsArgs};
-use crate::say::say;
-use crate::show;
+use crate::render;
+use crate::stdout::print;
 
-/// For `gleaner-shim`: that it ends its runtime when this process dies.
+/// The argument that makes `gleaner-shim` end its runtime when this process dies.
 pub(crate) fn starter() -> OsString {
     format!("--starter={}", std::process::id()).into()
 }
 
-/// Becomes `gleaner-player`.
+/// Replaces this process by `gleaner-player`.
 pub(crate) fn play(arguments: &[OsString]) -> Result<Exit, Failure> {
     let program = Parts::find()?.program("gleaner-player")?;
     let error = Command::new(&program).args(arguments).exec();
     Err(Failure::caused_by(Exit::Internal, format!("cannot start `{}`", program.display()), &error))
 }
 
-/// Asks `gleaner-runtime` for the live topics.
+/// Prints the live topics, which `gleaner-runtime` lists.
 pub(crate) fn topics(args: &TopicsArgs) -> Result<Exit, Failure> {
     let mut line: Vec<OsString> = vec!["topics".into()];
     line.extend(args.network.to_args());
     line.extend(args.wait.map(|wait| format!("--wait={wait}").into()));
     let text = match report(&line)? {
         Err(exit) => return Ok(exit),
-        Ok(Report::Topics { topics }) if args.json => show::json_line(&topics),
-        Ok(Report::Topics { topics }) => show::topics(&topics),
+        Ok(Report::Topics { topics }) if args.json => render::json_line(&topics),
+        Ok(Report::Topics { topics }) => render::topics(&topics),
         Ok(_) => {
-            return Err(Failure::new(
-                Exit::Internal,
-                "gleaner-runtime reported something else than topics",
-            ));
+            return Err(Failure::new(Exit::Internal, "gleaner-runtime did not report topics"));
         }
     };
-    say(&text)?;
+    print(&text)?;
     Ok(Exit::Ok)
 }
 
-/// Asks `gleaner-runtime` what is in a drive.
+/// Prints the contents of a drive, which `gleaner-runtime` reads.
 pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
     let mut line: Vec<OsString> = vec!["inspect".into()];
     line.extend(args.all.then(|| "--all".into()));
@@ -54,24 +51,21 @@ pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
         Err(exit) => return Ok(exit),
         Ok(Report::Drive(drive)) => drive,
         Ok(_) => {
-            return Err(Failure::new(
-                Exit::Internal,
-                "gleaner-runtime reported something else than a drive",
-            ));
+            return Err(Failure::new(Exit::Internal, "gleaner-runtime did not report a drive"));
         }
     };
-    say(&if args.json { show::json_line(&drive) } else { show::drive(&drive) })?;
+    print(&if args.json { render::json_line(&drive) } else { render::drive(&drive) })?;
     Ok(if drive.damaged.is_some() { Exit::DriveDamaged } else { Exit::Ok })
 }
 
-/// The one report of a `gleaner-runtime` that is given this command line, or how it ended without.
+/// Runs `gleaner-runtime` with these arguments; returns its report, or its exit code if it failed.
 fn report(line: &[OsString]) -> Result<Result<Report, Exit>, Failure> {
     let program = Parts::find()?.program("gleaner-runtime")?;
     let failed =
         |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
     let mut runtime = Command::new(&program);
     runtime.args(line);
-    // It says itself why it cannot.
+    // It prints its errors itself.
     let output = runtime.stderr(std::process::Stdio::inherit()).output();
     let output =
         output.map_err(|error| failed(&format!("cannot start `{}`", program.display()), &error))?;
@@ -81,10 +75,10 @@ fn report(line: &[OsString]) -> Result<Result<Report, Exit>, Failure> {
         None => {
             return Err(Failure::new(
                 Exit::Internal,
-                format!("gleaner-runtime did not end well ({})", output.status),
+                format!("gleaner-runtime failed ({})", output.status),
             ));
         }
     }
     let report = serde_json::from_slice(&output.stdout);
-    report.map(Ok).map_err(|error| failed("cannot understand what gleaner-runtime reports", &error))
+    report.map(Ok).map_err(|error| failed("cannot parse the report of gleaner-runtime", &error))
 }

@@ -1,24 +1,24 @@
-//! What a person sees of a lambda that runs live.
+//! Formats the status of a live lambda and its recorder, and the list of live topics.
 
 use std::fmt::{self, Write};
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, TriggerKind};
 use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
-use gleaner_protocol::{Live, LiveTopic, Network, Spread, TopicSeen};
-use gleaner_report::words::{clip_span, counted, fault_kind, grouped, three_digits};
+use gleaner_protocol::{DurationStats, LiveStatus, LiveTopic, NetworkStatus, TopicInfo};
+use gleaner_report::format::{clip_span, counted, fault_kind, grouped, three_digits};
 
 use super::{Paint, mib};
 
-/// How it is doing, in some lines.
-pub(crate) fn live(live: &Live, paint: Paint) -> String {
+/// Formats the status of a lambda.
+pub(crate) fn live(live: &LiveStatus, paint: Paint) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail.
     let _ = write_live(&mut text, live, paint);
     text
 }
 
-/// How the recorder is doing, in some lines.
+/// Formats the status of the recorder.
 pub(crate) fn recorder(status: &RecorderStatus, paint: Paint) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail.
@@ -26,8 +26,8 @@ pub(crate) fn recorder(status: &RecorderStatus, paint: Paint) -> String {
     text
 }
 
-/// The topics that are there, as a table.
-pub(crate) fn topics(topics: &[TopicSeen]) -> String {
+/// Formats the live topics as a table.
+pub(crate) fn topics(topics: &[TopicInfo]) -> String {
     if topics.is_empty() {
         return "no topics\n".to_owned();
     }
@@ -40,11 +40,11 @@ pub(crate) fn topics(topics: &[TopicSeen]) -> String {
             visible(&topic.qos.join("; ")),
         ]
     });
-    let head = ["topic", "type", "writers", "readers", "quality of service"].map(str::to_owned);
+    let head = ["topic", "type", "writers", "readers", "QoS"].map(str::to_owned);
     table(std::iter::once(head).chain(rows).collect(), &[2, 3])
 }
 
-/// A clip that was just completed.
+/// Formats a clip that was just completed.
 pub(crate) fn clip_line(clip: &Clip, paint: Paint) -> String {
     let [from, to] = clip_span(clip).map(time_of_day);
     let mut text = String::new();
@@ -53,7 +53,7 @@ pub(crate) fn clip_line(clip: &Clip, paint: Paint) -> String {
     text
 }
 
-/// A wake with a trigger or a fault, in a line for each.
+/// Formats a decision: a line for each trigger and fault.
 pub(crate) fn decision(decision: &gleaner_lambda::Decision, paint: Paint) -> String {
     let time = time_of_day(decision.at_ns);
     let mut text = String::new();
@@ -74,7 +74,7 @@ pub(crate) fn decision(decision: &gleaner_lambda::Decision, paint: Paint) -> Str
     text
 }
 
-fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
+fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result {
     writeln!(
         text,
         "{} ({}), domain {}, {:.0} s: {}, {}, {}",
@@ -91,16 +91,16 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
         },
     )?;
     let spreads = [
-        ("wake-up", live.wake_latency),
-        ("in the lambda", live.run),
-        ("handed out", live.decision_latency),
+        ("wake latency", live.wake_latency),
+        ("run time", live.run_time),
+        ("decision latency", live.decision_latency),
     ];
-    let told: Vec<String> = spreads
+    let latencies: Vec<String> = spreads
         .iter()
         .filter_map(|(what, spread)| spread.map(|spread| format!("{what} {}", in_ms(&spread))))
         .collect();
-    if !told.is_empty() {
-        writeln!(text, "  {} ms (median / 99 % / longest)", told.join(", "))?;
+    if !latencies.is_empty() {
+        writeln!(text, "  {} ms (p50 / p99 / max)", latencies.join(", "))?;
     }
     let head = [
         "input",
@@ -130,18 +130,18 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
         (live.missed_ticks, "tick", "missed"),
         (live.log_dropped, "log line", "over the rate limit"),
         (live.triggers_refused, "trigger", "refused: over `events_per_minute`"),
-        (live.backed_off, "wake", "passed over after repeated faults"),
+        (live.backed_off, "wake", "backed off after repeated faults"),
         (live.unwritten, "decision or log line", "not written"),
-        (live.unsent, "message", "not sent: a reader of `--rtt` or `--decisions` does not keep up"),
+        (live.unsent, "message", "not sent: a reader of `--rtt` or `--decisions` is too slow"),
         (
-            live.recorder.map_or(0, |recorder| recorder.wakes_dropped),
+            live.recorder_link.map_or(0, |recorder| recorder.wakes_dropped),
             "wake",
-            "not told to the recorder",
+            "not sent to the recorder",
         ),
         (
-            live.recorder.map_or(0, |recorder| recorder.triggers_lost),
+            live.recorder_link.map_or(0, |recorder| recorder.triggers_lost),
             "trigger",
-            "not told to the recorder",
+            "not sent to the recorder",
         ),
     ];
     for (count, thing, why) in losses.into_iter().filter(|(count, ..)| *count > 0) {
@@ -150,16 +150,17 @@ fn write_live(text: &mut String, live: &Live, paint: Paint) -> fmt::Result {
     write_network(text, &live.network, (live.rss_bytes, live.cpu_s), paint)
 }
 
-/// What the network lost, and what a process takes: bytes of memory, and seconds of CPU time.
+/// Writes the losses of the network, and the resources of a process: bytes of memory and seconds of
+/// CPU time.
 fn write_network(
     text: &mut String,
-    network: &Network,
+    network: &NetworkStatus,
     (rss_bytes, cpu_s): (u64, f64),
     paint: Paint,
 ) -> fmt::Result {
     let losses = [
-        (network.socket_drops, "dropped by the system: a socket buffer was full"),
-        (network.filtered, "dropped: fragments that claim too much, or of nobody known"),
+        (network.socket_drops, "dropped: socket buffer full"),
+        (network.filtered, "dropped: too large fragments, or fragments of unknown participants"),
     ];
     for (count, why) in losses.into_iter().filter(|(count, _)| *count > 0) {
         writeln!(
@@ -175,7 +176,7 @@ fn write_network(
         "{}, socket buffer {:.1} of {:.1} MiB, {:.1} MiB resident, {:.1} s of CPU time",
         counted(network.participants as u64, "participant"),
         mib(network.buffer_granted as u64),
-        mib(network.buffer_asked as u64),
+        mib(network.buffer_requested as u64),
         mib(rss_bytes),
         cpu_s,
     );
@@ -254,12 +255,12 @@ fn row(topic: &LiveTopic) -> [String; 12] {
     ]
 }
 
-fn in_ms(spread: &Spread) -> String {
+fn in_ms(spread: &DurationStats) -> String {
     let ms = |ns: u64| format!("{:.3}", ns as f64 / 1e6);
     format!("{} / {} / {}", ms(spread.p50_ns), ms(spread.p99_ns), ms(spread.max_ns))
 }
 
-/// Columns as wide as their widest cell; those of `numbers` end on the right.
+/// Formats a table. Columns are as wide as their widest cell; those in `numbers` are right-aligned.
 pub(super) fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -> String {
     let width =
         |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
@@ -280,7 +281,7 @@ pub(super) fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -
     text
 }
 
-/// Time of day in UTC: the vehicle's clock shows it.
+/// Time of day in UTC.
 fn time_of_day(at_ns: i64) -> String {
     let ms = at_ns.div_euclid(1_000_000).rem_euclid(86_400_000);
     let (hours, minutes, seconds) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60);
@@ -298,8 +299,8 @@ mod tests {
     }
 
     #[test]
-    fn what_a_network_says_of_a_topic_cannot_act_on_the_terminal() {
-        let seen = TopicSeen {
+    fn control_characters_of_topics_are_escaped() {
+        let seen = TopicInfo {
             topic: "/a\u{1b}[2J".to_owned(),
             type_name: "t\u{1b}".to_owned(),
             writers: 1,
@@ -311,11 +312,11 @@ mod tests {
     }
 
     #[test]
-    fn what_the_network_of_a_recorder_lost_is_shown() {
-        let network = Network {
+    fn network_losses_of_a_recorder_are_shown() {
+        let network = NetworkStatus {
             domain: 7,
             participants: 2,
-            buffer_asked: 8 << 20,
+            buffer_requested: 8 << 20,
             buffer_granted: 1 << 20,
             socket_drops: 3,
             filtered: 1,
@@ -334,14 +335,14 @@ mod tests {
             [
                 "  2 participants, socket buffer 1.0 of 8.0 MiB, 5.0 MiB resident, 1.0 s of CPU time",
                 "  no filter here",
-                "  lost: 1 datagram, dropped: fragments that claim too much, or of nobody known",
-                "  lost: 3 datagrams, dropped by the system: a socket buffer was full",
+                "  lost: 1 datagram, dropped: too large fragments, or fragments of unknown participants",
+                "  lost: 3 datagrams, dropped: socket buffer full",
             ]
         );
     }
 
     #[test]
-    fn a_time_of_day_is_that_of_utc() {
+    fn the_time_of_day_is_utc() {
         assert_eq!(time_of_day(1_533_199_491_136_999_999), "08:44:51.136");
     }
 }

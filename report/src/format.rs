@@ -1,15 +1,15 @@
-//! The words and digits in which results are shown, on a screen, on a page and in `expected.txt`.
+//! Formats results as text, for the terminal, the report page and `expected.txt`.
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision, FaultKind, Trigger};
 
 pub use gleaner_base::grouped;
 
-/// A line of `expected.txt` for each trigger of `decision`: `<seconds %.3f> <label> <score %.3g>`;
-/// no score is `-`.
+/// Returns a line of `expected.txt` for each trigger of `decision`:
+/// `<seconds %.3f> <label> <score %.3g>`; no score is `-`.
 ///
-/// `start_ns` is [`Summary::start_ns`](gleaner_protocol::Summary::start_ns): seconds count from the
-/// first message of the drive, of whatever topic.
+/// `start_ns` is [`ReplaySummary::start_ns`](gleaner_protocol::Summary::start_ns): seconds count
+/// from the first message of the drive on any topic.
 pub fn trigger_lines(decision: &Decision, start_ns: i64) -> impl Iterator<Item = String> {
     let seconds = seconds(decision.at_ns, start_ns);
     decision
@@ -18,12 +18,12 @@ pub fn trigger_lines(decision: &Decision, start_ns: i64) -> impl Iterator<Item =
         .map(move |trigger| format!("{seconds:.3} {} {}", visible(&trigger.label), score(trigger)))
 }
 
-/// The score of `trigger` in three significant digits, `-` if it has none.
+/// Score of `trigger` in three significant digits, `-` if it has none.
 pub fn score(trigger: &Trigger) -> String {
     trigger.score.map_or("-".to_owned(), three_digits)
 }
 
-/// `bytes` as people read it: `205 KiB`, `1.3 MiB`.
+/// `bytes` with a unit: `205 KiB`, `1.3 MiB`.
 pub fn size(bytes: u64) -> String {
     match bytes {
         0..1024 => format!("{bytes} B"),
@@ -32,7 +32,7 @@ pub fn size(bytes: u64) -> String {
     }
 }
 
-/// What is in a clip: `9.1 s, 205 KiB: messages /imu/data 950, /vehicle/speed 757`.
+/// Contents of a clip: `9.1 s, 205 KiB: messages /imu/data 950, /vehicle/speed 757`.
 pub fn clip_contents(clip: &Clip) -> String {
     let [from, to] = clip_span(clip);
     let topics = clip
@@ -47,7 +47,7 @@ pub fn clip_contents(clip: &Clip) -> String {
     )
 }
 
-/// Log times of a clip's first and last message; of what was asked for, if it has none.
+/// Log times of a clip's first and last message; of its window, if it has no messages.
 pub fn clip_span(clip: &Clip) -> [i64; 2] {
     [clip.first_ns.unwrap_or(clip.from_ns), clip.last_ns.unwrap_or(clip.to_ns)]
 }
@@ -57,8 +57,8 @@ pub fn seconds(at_ns: i64, start_ns: i64) -> f64 {
     at_ns.saturating_sub(start_ns) as f64 / 1e9
 }
 
-/// `value` as C's `printf("%.3g")` writes it: three significant digits, without zeros at the end,
-/// in scientific notation from 1000 on and below 0.0001.
+/// Formats `value` like C's `printf("%.3g")`: three significant digits without trailing zeros, in
+/// scientific notation from 1000 on and below 0.0001.
 ///
 /// Source: ISO C, `fprintf`, conversion `g`: with precision P and exponent X it is `%f` if P > X >=
 /// -4, else `%e`.
@@ -91,13 +91,13 @@ pub fn counted(count: u64, thing: &str) -> String {
     format!("{} {thing}{}", grouped(count), if count == 1 { "" } else { "s" })
 }
 
-/// The word for `kind` in `decisions.jsonl`.
+/// Name of `kind` in `decisions.jsonl`.
 pub fn fault_kind(kind: FaultKind) -> String {
     let word = serde_json::to_value(kind).ok();
     word.as_ref().and_then(|word| word.as_str()).unwrap_or("fault").to_owned()
 }
 
-/// The line of a fault's message that says most: the first, but the last of a Python traceback.
+/// Most informative line of a fault's message: the first, but of a Python traceback the last.
 pub fn gist(message: &str) -> &str {
     let mut lines = message.lines().map(str::trim).filter(|line| !line.is_empty());
     let traceback = message.contains("Traceback (most recent call last)");
@@ -105,7 +105,7 @@ pub fn gist(message: &str) -> &str {
     line.unwrap_or_default()
 }
 
-/// The first `chars` characters of `text`.
+/// Cuts `text` to `chars` characters and marks the cut with `…`.
 pub(crate) fn cut(text: &str, chars: usize) -> String {
     match text.char_indices().nth(chars) {
         Some((end, _)) => format!("{}…", &text[..end]),
@@ -118,7 +118,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn three_digits_are_those_of_printf() {
+    fn three_digits_match_printf() {
         // Right column: `printf '%.3g'` of a C library.
         for (value, text) in [
             (0.0, "0"),
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn a_size_has_the_unit_that_suits_it() {
+    fn a_size_has_a_suitable_unit() {
         let sizes = [0, 1023, 1024, 1025, 205_089, 1_048_576, 10_000_000].map(size);
         assert_eq!(sizes, ["0 B", "1023 B", "1 KiB", "2 KiB", "201 KiB", "1.0 MiB", "9.5 MiB"]);
     }
