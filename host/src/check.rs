@@ -1,9 +1,8 @@
-//! `gleaner-runtime check`: a lambda without any sample. It is loaded as on a vehicle, its rings
-//! are made, and its `init` is run, which finds inputs that the manifest lacks and fields that
-//! their types lack.
+//! `gleaner-runtime check`: checks a lambda without any sample. It loads the lambda as on a
+//! vehicle, allocates its rings and runs `init`, which finds inputs that the manifest lacks and
+//! fields that their types lack.
 //!
-//! What the types are is said by the definitions that lie with the lambda, on this machine, or in
-//! this program.
+//! Message definitions are those beside the lambda, on this machine, or in this program.
 
 use std::io::Write;
 use std::time::Instant;
@@ -15,110 +14,121 @@ use gleaner_jail::Paths;
 use gleaner_lambda::manifest::{Manifest, Store};
 use gleaner_lambda::{BuildDir, Fault};
 use gleaner_messages::Sources;
-use gleaner_protocol::{Checked, Need, Place, Report};
+use gleaner_protocol::{CheckReport, Need, NeedPlace, Report};
 use gleaner_transport::SampleMeta;
 use gleaner_transport::loopback::Loopback;
 
 use crate::api::frame::Info;
-use crate::input::{Live, Remap, live_slots, unfinished_bytes};
-use crate::isolation::{code, definitions};
-use crate::stage::{Asked, AskedArgs, Bounds, Load, Stage, not_started};
+use crate::input::{LiveInputs, Remap, live_slots, unfinished_bytes};
+use crate::isolation::{code_cache_dir, definition_dirs};
+use crate::session_setup::{
+    ConfiguredLambda, LambdaArgs, Load, RunMode, SessionSetup, not_started,
+};
 
-/// What the recorder may take beside the preroll: two staging areas, and what is on its way to the
-/// disk.
+/// Bytes that the recorder may need beside the preroll: two staging areas, and data on its way to
+/// the disk.
 const RECORDER: u64 = (2 * 256 + 16) << 20;
 
 /// Arguments of `check`.
 #[derive(Args, Clone, Debug)]
 pub struct CheckArgs {
     #[command(flatten)]
-    asked: AskedArgs,
+    lambda_args: LambdaArgs,
 }
 
-/// A lambda to look at.
-pub struct Job {
-    /// Which lambda.
-    pub asked: Asked,
+/// A lambda to check.
+pub struct CheckJob {
+    /// The lambda, with its settings.
+    pub lambda: ConfiguredLambda,
     /// Its manifest.
     pub manifest: Manifest,
 }
 
-impl Job {
+impl CheckJob {
     /// Checks the arguments against the build and its manifest.
     ///
     /// # Errors
     ///
     /// A failure that names the manifest's line, the key or the topic, and the way out.
     pub fn new(args: CheckArgs) -> Result<Self, Failure> {
-        let build = BuildDir::check_fresh(&args.asked.lambda)?;
+        let build = BuildDir::check_fresh(&args.lambda_args.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
-        let asked = Asked::new(args.asked, build, &mut manifest)?;
-        Ok(Self { asked, manifest })
+        let lambda = ConfiguredLambda::new(args.lambda_args, build, &mut manifest)?;
+        Ok(Self { lambda, manifest })
     }
 
-    /// What may be opened while `init` runs.
+    /// Paths that may be opened while `init` runs.
     pub fn paths(&self) -> Paths {
-        let mut read = definitions();
-        read.push(self.asked.lambda.clone());
-        read.extend(self.asked.vehicle.clone());
-        read.extend(code(self.manifest.lambda.kind));
+        let mut read = definition_dirs();
+        read.push(self.lambda.folder.clone());
+        read.extend(self.lambda.vehicle.clone());
+        read.extend(code_cache_dir(self.manifest.lambda.kind));
         Paths { read, write: Vec::new() }
     }
 
-    /// Does it, and reports what was found.
+    /// Runs the check and reports its result.
     ///
     /// # Errors
     ///
-    /// Why the lambda cannot start.
+    /// A failure that explains why the lambda cannot start.
     pub fn run(self, load: Load<'_>, reports: &mut dyn Write) -> Result<Exit, Failure> {
-        let Self { asked, manifest } = self;
-        let (mut topics, notes) = topics(&asked, &manifest)?;
-        let bounds = Bounds::Live(manifest.limits.deadline);
-        let mut stage =
-            Stage::set(&mut topics, &asked, &manifest, bounds, Some(&Live { bell: None }), load)?;
-        // Without its type, a field that is there would be missing.
+        let Self { lambda, manifest } = self;
+        let (mut topics, notes) = topics(&lambda, &manifest)?;
+        let mode = RunMode::Live(manifest.limits.deadline);
+        let mut setup = SessionSetup::load(
+            &mut topics,
+            &lambda,
+            &manifest,
+            mode,
+            Some(&LiveInputs { waker: None }),
+            load,
+        )?;
+        // `init` is skipped if a type is unknown: its fields would seem to be missing.
         let mut log = Vec::new();
         let mut started = |outcome: Result<(), Fault>| {
-            let (said, _) = stage.session.take_log();
-            outcome.map_err(|fault| not_started(manifest.lambda.name.as_str(), fault, &said))?;
-            log.extend(said.into_iter().map(|line| line.message));
+            let (lines, _) = setup.session.take_log();
+            outcome.map_err(|fault| not_started(manifest.lambda.name.as_str(), fault, &lines))?;
+            log.extend(lines.into_iter().map(|line| line.message));
             Ok::<_, Failure>(())
         };
-        started(stage.guest.prepare())?;
+        started(setup.guest.prepare())?;
         let mut init_ms = None;
         if notes.is_empty() {
             let begun = Instant::now();
-            started(stage.guest.init())?;
+            started(setup.guest.init())?;
             init_ms = Some(begun.elapsed().as_secs_f64() * 1e3);
         }
-        let checked = Checked {
+        let checked = CheckReport {
             lambda: manifest.lambda.name.to_string(),
             version: manifest.lambda.version.to_string(),
             kind: manifest.lambda.kind,
-            engine: stage.guest.engine(),
+            engine: setup.guest.engine(),
             init_ms,
-            resident_bytes: stage.guest.resident_bytes(),
-            needs: needs(&asked, &manifest),
+            resident_bytes: setup.guest.resident_bytes(),
+            needs: needs(&lambda, &manifest),
             log,
             notes,
         };
-        // Whoever asked may have gone.
+        // The reader may have ended.
         let _ = serde_json::to_writer(&mut *reports, &Report::Checked(Box::new(checked)));
         let _ = reports.write_all(b"\n");
         Ok(Exit::Ok)
     }
 }
 
-/// The lambda's topics, on which nothing comes; and notes on those whose type is not known here.
-fn topics(asked: &Asked, manifest: &Manifest) -> Result<(Loopback, Vec<String>), Failure> {
-    let sources = Sources::new(&[asked.build.path().join("msg")], &definitions());
+/// Returns the lambda's topics without samples, and notes on those of unknown type.
+fn topics(
+    lambda: &ConfiguredLambda,
+    manifest: &Manifest,
+) -> Result<(Loopback, Vec<String>), Failure> {
+    let sources = Sources::new(&[lambda.build.path().join("msg")], &definition_dirs());
     let (topics, mut notes) = (Loopback::new(), Vec::new());
     for input in &manifest.inputs {
         let type_name = input.type_name.as_str();
         let text = sources.find(type_name).map_err(|error| {
             Failure::caused_by(
                 Exit::Usage,
-                format!("the definition of `{type_name}` makes no sense"),
+                format!("cannot use the definition of `{type_name}`"),
                 &error,
             )
         })?;
@@ -130,7 +140,7 @@ fn topics(asked: &Asked, manifest: &Manifest) -> Result<(Loopback, Vec<String>),
             ));
         }
         topics.add_topic(
-            Remap::apply(&asked.remaps, input.topic.as_str()),
+            Remap::apply(&lambda.remaps, input.topic.as_str()),
             type_name,
             text.as_deref().unwrap_or(""),
         );
@@ -138,9 +148,9 @@ fn topics(asked: &Asked, manifest: &Manifest) -> Result<(Loopback, Vec<String>),
     Ok((topics, notes))
 }
 
-/// Those of the lambda's own process in the order of the manifest, then those of the recorder, then
-/// the disk.
-fn needs(asked: &Asked, manifest: &Manifest) -> Vec<Need> {
+/// Memory and disk that the lambda needs: its own process in the order of the manifest, then the
+/// recorder, then the disk.
+fn needs(lambda: &ConfiguredLambda, manifest: &Manifest) -> Vec<Need> {
     let limits = &manifest.limits;
     let mut needs = Vec::new();
     let mut need = |place, preallocated, purpose: String, bytes| {
@@ -150,48 +160,48 @@ fn needs(asked: &Asked, manifest: &Manifest) -> Vec<Need> {
         let (name, slots) = (&input.name, live_slots(input));
         let bytes = Pool::<SampleMeta>::bytes_needed(slots, input.max_size.as_usize());
         let purpose = format!("input `{name}`: {slots} slots of {}", input.max_size);
-        need(Place::Memory, true, purpose, bytes.map(|bytes| bytes as u64));
+        need(NeedPlace::Memory, true, purpose, bytes.map(|bytes| bytes as u64));
         if let Some(decoded) = input.decoded_size {
             let slots = input.decoded_slots();
             let bytes = Pool::<Info>::bytes_needed(slots, decoded.as_usize());
             let purpose = format!("input `{name}`: {slots} decoded pictures of {decoded}");
-            need(Place::Memory, true, purpose, bytes.map(|bytes| bytes as u64));
+            need(NeedPlace::Memory, true, purpose, bytes.map(|bytes| bytes as u64));
         }
     }
     need(
-        Place::Memory,
+        NeedPlace::Memory,
         false,
         "the lambda itself (`memory`)".to_owned(),
         Some(limits.memory.bytes()),
     );
     if manifest.inputs.iter().any(|input| input.type_name.is_frame()) {
         need(
-            Place::Memory,
+            NeedPlace::Memory,
             false,
-            "frames that it makes (`memory`, once more)".to_owned(),
+            "frames that the lambda creates (`memory` again)".to_owned(),
             Some(limits.memory.bytes()),
         );
     }
     if limits.scratch.bytes() > 0 {
         let bytes = limits.scratch.bytes().saturating_mul(2);
         need(
-            Place::Memory,
+            NeedPlace::Memory,
             false,
-            "what it keeps (`scratch`, twice while an entry grows)".to_owned(),
+            "its scratch entries (`scratch`, twice while an entry grows)".to_owned(),
             Some(bytes),
         );
     }
     let unfinished = Some(unfinished_bytes(manifest));
     need(
-        Place::Memory,
+        NeedPlace::Memory,
         false,
-        "decisions and messages on their way, while the network loses parts".to_owned(),
+        "queued decisions, and partial messages while the network loses packets".to_owned(),
         unfinished,
     );
     if let Some(record) = &manifest.record {
         let (place, preallocated) = match record.store {
-            Store::Ram => (Place::Memory, true),
-            Store::Disk => (Place::Disk, false),
+            Store::Ram => (NeedPlace::Memory, true),
+            Store::Disk => (NeedPlace::Disk, false),
         };
         need(
             place,
@@ -200,27 +210,27 @@ fn needs(asked: &Asked, manifest: &Manifest) -> Vec<Need> {
             Some(record.preroll_size.bytes()),
         );
         need(
-            Place::Memory,
+            NeedPlace::Memory,
             false,
-            "recorder: messages on their way, and clips being written".to_owned(),
+            "recorder: queued messages, and clips being written".to_owned(),
             Some(RECORDER),
         );
         need(
-            Place::Disk,
+            NeedPlace::Disk,
             false,
             "clips; `gleaner run --clips-max --bytes-max` bounds them".to_owned(),
             None,
         );
     }
     for model in &manifest.models {
-        let file = asked.build.path().join(model.file.as_path());
+        let file = lambda.build.path().join(model.file.as_path());
         need(
-            Place::Disk,
+            NeedPlace::Disk,
             true,
             format!("model `{}`", model.name),
             file.metadata().ok().map(|data| data.len()),
         );
     }
-    need(Place::Disk, false, "decisions.jsonl and log.jsonl".to_owned(), None);
+    need(NeedPlace::Disk, false, "decisions.jsonl and log.jsonl".to_owned(), None);
     needs
 }

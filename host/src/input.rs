@@ -1,17 +1,17 @@
-//! Where samples are held: one ring for each input of the manifest, filled from the transport's
+//! The rings that hold samples: one for each input of the manifest, filled by the transport's
 //! thread.
 //!
-//! All memory is taken and touched here, before the first sample. Delivering copies a sample once
-//! and never waits for a lambda.
+//! All memory is mapped and touched here, before the first sample. A delivery copies the sample
+//! once and never waits for a lambda.
 
 use std::io;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::Thread;
 use std::time::{Duration, Instant};
 
-use gleaner_buffers::{Draft, Pool, PoolError, Refusal, RingWriter, ring};
-use gleaner_lambda::manifest::{self, Durability, Input, Manifest, Reliability};
-use gleaner_transport::{Qos, SampleMeta, Sink, TopicSpec, Transport, TransportError, Verdict};
+use gleaner_buffers::{Draft, DraftError, Pool, PoolError, RingWriter, ring};
+use gleaner_lambda::manifest::{self, Durability, InputSpec, Manifest, Reliability};
+use gleaner_transport::{Delivery, Qos, SampleMeta, Sink, TopicSpec, Transport, TransportError};
 
 use tracing::warn;
 
@@ -20,7 +20,7 @@ use crate::api::frame::{Budget, Images};
 use crate::api::trace::Arrivals;
 use crate::memory::Mapping;
 
-/// Why an input could not be set up.
+/// An input that could not be set up.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum InputError {
@@ -48,47 +48,47 @@ impl Remap {
     }
 }
 
-/// Wakes the thread that waits for samples of one input.
+/// The thread to unpark when an input receives a sample.
 #[derive(Clone, Debug)]
-pub struct Bell {
+pub struct InputWaker {
     /// The input.
     pub input: String,
-    /// Who waits.
+    /// The waiting thread.
     pub thread: Thread,
 }
 
-/// What differs where samples arrive while the lambda runs.
+/// Settings of inputs whose samples arrive while the lambda runs.
 #[derive(Clone, Debug)]
-pub struct Live {
-    /// Whom samples of the input that wakes the lambda wake, if one does.
-    pub bell: Option<Bell>,
+pub struct LiveInputs {
+    /// The thread to unpark when the event input receives a sample; `None` for a periodic schedule.
+    pub waker: Option<InputWaker>,
 }
 
-/// Samples up to this size are small: a ring has room for as many again as it shows.
+/// Samples up to this size are small: their ring has spare slots for as many samples as it shows.
 const SMALL_BYTES: u64 = 64 << 10;
-/// As many large samples may arrive during a wake without one leaving that it may see.
+/// Spare slots for large samples: as many may arrive during a wake before one that it sees leaves.
 const SPARE_LARGE: usize = 2;
 
-/// How much deeper a ring is than the lambda sees, so that what it may see does not leave while it
-/// runs.
-fn spare(input: &Input) -> usize {
+/// Number of slots beyond the depth that the lambda sees, so that visible samples do not leave the
+/// ring during a wake.
+fn spare(input: &InputSpec) -> usize {
     if input.max_size.bytes() <= SMALL_BYTES { input.depth } else { input.depth.min(SPARE_LARGE) }
 }
 
-/// Bytes beside the rings that a process takes on a vehicle at most: decisions that wait to be
-/// written, and messages that the network puts together.
+/// Upper bound of the bytes that a live process needs beside its rings: decisions that wait to be
+/// written, and partial messages of the network.
 pub fn unfinished_bytes(manifest: &Manifest) -> u64 {
     const LINES: u64 = 48 << 20;
-    // So many unfinished messages does RustDDS keep of a writer, and where memory is refused to it,
-    // it ends the process.
+    // RustDDS keeps up to 130 partial messages per writer, and ends the process if an allocation
+    // fails.
     const MESSAGES: u64 = 130;
     let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes().saturating_mul(MESSAGES));
     sizes.fold(LINES, u64::saturating_add)
 }
 
-/// Slots for the samples of an input on a vehicle: one more is for the newest of those that a wake
-/// sees, which is held while it runs.
-pub fn live_slots(input: &Input) -> usize {
+/// Number of slots of an input in a live run. One of them is for the newest sample that a wake
+/// sees, which is pinned while the wake runs.
+pub fn live_slots(input: &InputSpec) -> usize {
     input.slots() + spare(input) + 1
 }
 
@@ -101,14 +101,14 @@ pub fn open_inputs(
     manifest: &Manifest,
     remaps: &[Remap],
     transport: &mut dyn Transport,
-    live: Option<&Live>,
+    live: Option<&LiveInputs>,
 ) -> Result<Vec<Arc<Topic>>, InputError> {
     let limits = &manifest.limits;
     let frames = usize::try_from(limits.frames).unwrap_or(usize::MAX);
-    let shared = Shared {
+    let shared = SharedLimits {
         made: Budget::new(frames, limits.memory.as_usize()),
         per_call: PerCall::new(limits),
-        ask_until: Instant::now() + ASK_ALL,
+        query_until: Instant::now() + QUERY_TIMEOUT,
     };
     manifest
         .inputs
@@ -117,20 +117,20 @@ pub fn open_inputs(
         .collect()
 }
 
-/// What all inputs of a lambda have together.
-struct Shared {
-    /// Until when nodes are asked what is not known here.
-    ask_until: Instant,
+/// Limits that all inputs of a lambda share.
+struct SharedLimits {
+    /// Deadline of type queries to other nodes.
+    query_until: Instant,
     made: Budget,
     per_call: PerCall,
 }
 
 fn open_input(
-    input: &Input,
+    input: &InputSpec,
     remaps: &[Remap],
     transport: &mut dyn Transport,
-    live: Option<&Live>,
-    shared: &Shared,
+    live: Option<&LiveInputs>,
+    shared: &SharedLimits,
 ) -> Result<Arc<Topic>, InputError> {
     let layout = |source| InputError::Layout { input: input.name.to_string(), source };
     let subscribe = |source| InputError::Subscribe { input: input.name.to_string(), source };
@@ -156,24 +156,24 @@ fn open_input(
     let images = (Images::new(decoded, shared.made.clone()), shared.per_call.clone());
     let arrivals = Arc::new(Arrivals::new(input.depth + spare));
     let ingest = Arc::new(Ingest {
-        end: Mutex::new(End { ring: writer, copied: None }),
+        fill: Mutex::new(RingFill { ring: writer, copied: None }),
         arrivals: arrivals.clone(),
         input: input.name.to_string(),
         topic: spec.topic.clone(),
-        refused: Default::default(),
-        bell: live
-            .and_then(|live| live.bell.clone())
-            .filter(|bell| bell.input == input.name.as_str()),
+        refusals: Default::default(),
+        waker: live
+            .and_then(|live| live.waker.clone())
+            .filter(|waker| waker.input == input.name.as_str()),
     });
     transport.subscribe(&spec, ingest).map_err(subscribe)?;
-    // Whoever writes a topic that is there already can say what it is, if nobody here can.
+    // A node that writes the topic can describe its type, where no local definition does.
     let found = loop {
         match transport.definitions(&spec.topic) {
             Err(TransportError::NoDefinitions { .. })
-                if Instant::now() < shared.ask_until
+                if Instant::now() < shared.query_until
                     && transport.definitions_may_come(&spec.topic) =>
             {
-                std::thread::sleep(ASK_EVERY);
+                std::thread::sleep(QUERY_POLL);
             }
             found => break found,
         }
@@ -209,7 +209,7 @@ fn qos(qos: manifest::Qos) -> Qos {
 }
 
 fn pool<M: Copy + Send + Sync + 'static>(
-    input: &Input,
+    input: &InputSpec,
     slots: usize,
     slot_bytes: usize,
 ) -> Result<Pool<M>, InputError> {
@@ -226,74 +226,75 @@ fn pool<M: Copy + Send + Sync + 'static>(
     Pool::new(region, slots, slot_bytes).map_err(layout)
 }
 
-/// How long a start may wait for what others know, for all inputs together.
-const ASK_ALL: Duration = Duration::from_secs(6);
-/// How often it is looked whether definitions have come.
-const ASK_EVERY: Duration = Duration::from_millis(20);
-/// How often a refusal is said again, with how many there were: what a lambda can cause in a loop
-/// must not fill a log.
-const SAY_EVERY: Duration = Duration::from_secs(10);
+/// Time that a start may wait for definitions from other nodes, for all inputs together.
+const QUERY_TIMEOUT: Duration = Duration::from_secs(6);
+/// Interval at which arrived definitions are checked for.
+const QUERY_POLL: Duration = Duration::from_millis(20);
+/// Interval at which refused samples are logged, with their number: what a lambda can cause in a
+/// loop must not fill a log.
+const LOG_INTERVAL: Duration = Duration::from_secs(10);
 
-/// The transport's end of a ring. The lock is only ever taken by the transport's own thread.
+/// The transport's end of a ring. Only the transport's own thread takes the lock.
 struct Ingest {
-    end: Mutex<End>,
+    fill: Mutex<RingFill>,
     arrivals: Arc<Arrivals>,
     input: String,
-    /// After remapping.
+    /// Name of the topic after remapping.
     topic: String,
-    /// By kind. Each loss is counted in the ring's status, too.
-    refused: [Mutex<Refused>; 2],
-    bell: Option<Bell>,
+    /// One for each kind of refusal. The ring's status counts each loss, too.
+    refusals: [Mutex<RefusalLog>; 2],
+    waker: Option<InputWaker>,
 }
 
-struct End {
+struct RingFill {
     ring: RingWriter<SampleMeta>,
-    /// What was copied last, until it is known whose sample it is.
-    copied: Option<Result<Draft<SampleMeta>, Refusal>>,
+    /// The last copy, until its sample is accepted.
+    copied: Option<Result<Draft<SampleMeta>, DraftError>>,
 }
 
 #[derive(Default)]
-struct Refused {
-    unsaid: u64,
-    said: Option<Instant>,
+struct RefusalLog {
+    /// Refusals since the last log line.
+    unlogged: u64,
+    logged: Option<Instant>,
 }
 
 impl Sink for Ingest {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
-        let verdict = self.fill(cdr);
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
+        let verdict = self.copy_in(cdr);
         self.accept(meta);
         verdict
     }
 
     fn too_big(&self, _: &SampleMeta, len: usize) {
-        // A ring refuses such a length by itself, and counts it.
-        let refused = self.end().ring.draft(len).err();
+        // The ring refuses such a length, and counts it.
+        let refused = self.fill().ring.draft(len).err();
         self.arrivals.refuse();
         if let Some(refusal) = refused {
-            self.say(refusal);
+            self.log(refusal);
         }
     }
 
-    fn copy(&self, cdr: &[u8]) -> Option<Verdict> {
-        Some(self.fill(cdr))
+    fn copy(&self, cdr: &[u8]) -> Option<Delivery> {
+        Some(self.copy_in(cdr))
     }
 
     fn accept(&self, meta: &SampleMeta) {
-        let mut end = self.end();
-        match end.copied.take() {
+        let mut fill = self.fill();
+        match fill.copied.take() {
             Some(Ok(draft)) => {
                 self.arrivals.add(meta, &draft);
-                let published = end.ring.publish(draft, *meta);
-                drop(end);
+                let published = fill.ring.publish(draft, *meta);
+                drop(fill);
                 published.map(drop).expect("the draft is this ring's own");
-                if let Some(bell) = &self.bell {
-                    bell.thread.unpark();
+                if let Some(waker) = &self.waker {
+                    waker.thread.unpark();
                 }
             }
             Some(Err(refusal)) => {
-                drop(end);
+                drop(fill);
                 self.arrivals.refuse();
-                self.say(refusal);
+                self.log(refusal);
             }
             None => {}
         }
@@ -301,41 +302,41 @@ impl Sink for Ingest {
 }
 
 impl Ingest {
-    fn end(&self) -> MutexGuard<'_, End> {
-        self.end.lock().unwrap_or_else(PoisonError::into_inner)
+    fn fill(&self) -> MutexGuard<'_, RingFill> {
+        self.fill.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The one copy.
-    fn fill(&self, cdr: &[u8]) -> Verdict {
-        let mut end = self.end();
-        // First, so that the slot of one that was never accepted is free again.
-        end.copied = None;
-        let drafted = end.ring.draft(cdr.len()).map(|mut draft| {
+    /// Copies a sample into a slot of the ring; the only copy of it.
+    fn copy_in(&self, cdr: &[u8]) -> Delivery {
+        let mut fill = self.fill();
+        // First, so that the slot of a copy that was never accepted is free again.
+        fill.copied = None;
+        let drafted = fill.ring.draft(cdr.len()).map(|mut draft| {
             draft.copy_from_slice(cdr);
             draft
         });
         let verdict = match drafted {
-            Ok(_) => Verdict::Taken,
-            Err(Refusal::NoSlot) => Verdict::NoSlot,
-            Err(Refusal::TooBig { .. }) => Verdict::TooBig,
+            Ok(_) => Delivery::Taken,
+            Err(DraftError::NoSlot) => Delivery::NoSlot,
+            Err(DraftError::TooBig { .. }) => Delivery::TooBig,
         };
-        end.copied = Some(drafted);
+        fill.copied = Some(drafted);
         verdict
     }
 
-    fn say(&self, refusal: Refusal) {
-        let refused = match refusal {
-            Refusal::NoSlot => &self.refused[0],
-            Refusal::TooBig { .. } => &self.refused[1],
+    fn log(&self, refusal: DraftError) {
+        let refusals = match refusal {
+            DraftError::NoSlot => &self.refusals[0],
+            DraftError::TooBig { .. } => &self.refusals[1],
         };
-        let Some(samples) = refused.lock().unwrap_or_else(PoisonError::into_inner).due() else {
+        let Some(samples) = refusals.lock().unwrap_or_else(PoisonError::into_inner).due() else {
             return;
         };
         match refusal {
-            Refusal::NoSlot => {
+            DraftError::NoSlot => {
                 warn!(input = %self.input, topic = %self.topic, samples, "samples dropped: the lambda holds all slots");
             }
-            Refusal::TooBig { len, max } => {
+            DraftError::TooBig { len, max } => {
                 let topic = &self.topic;
                 warn!(input = %self.input, %topic, samples, bytes = len, max_size = max, "samples dropped: larger than max_size");
             }
@@ -343,15 +344,15 @@ impl Ingest {
     }
 }
 
-impl Refused {
-    /// One more; how many are to be said now, if it is time.
+impl RefusalLog {
+    /// Counts a refusal; returns the number to log, if a log line is due.
     fn due(&mut self) -> Option<u64> {
-        self.unsaid += 1;
-        if self.said.is_some_and(|said| said.elapsed() < SAY_EVERY) {
+        self.unlogged += 1;
+        if self.logged.is_some_and(|logged| logged.elapsed() < LOG_INTERVAL) {
             return None;
         }
-        self.said = Some(Instant::now());
-        Some(std::mem::take(&mut self.unsaid))
+        self.logged = Some(Instant::now());
+        Some(std::mem::take(&mut self.unlogged))
     }
 }
 
@@ -369,9 +370,10 @@ mod tests {
             HeapRegion::zeroed(Pool::<SampleMeta>::bytes_needed(slots, slot_bytes).unwrap())
                 .unwrap();
         let (ring, reader) = ring(Pool::new(region, slots, slot_bytes).unwrap(), 2).unwrap();
-        let (end, arrivals) = (Mutex::new(End { ring, copied: None }), Arc::new(Arrivals::new(2)));
+        let (fill, arrivals) =
+            (Mutex::new(RingFill { ring, copied: None }), Arc::new(Arrivals::new(2)));
         let (input, topic) = ("camera".to_owned(), "/camera".to_owned());
-        (Ingest { end, arrivals, input, topic, refused: Default::default(), bell: None }, reader)
+        (Ingest { fill, arrivals, input, topic, refusals: Default::default(), waker: None }, reader)
     }
 
     fn meta(seq: u64) -> SampleMeta {
@@ -380,26 +382,26 @@ mod tests {
     }
 
     #[test]
-    fn what_is_copied_is_seen_once_it_is_accepted() {
+    fn a_copy_is_visible_once_it_is_accepted() {
         let (ingest, reader) = ingest();
-        assert_eq!(ingest.copy(b"first"), Some(Verdict::Taken));
+        assert_eq!(ingest.copy(b"first"), Some(Delivery::Taken));
         assert!(reader.newest().is_none());
         ingest.accept(&meta(1));
         let newest = reader.newest().unwrap();
         assert_eq!((&*newest, newest.meta().seq), (b"first".as_slice(), 1));
         ingest.accept(&meta(2));
-        assert_eq!(reader.counts().received, 1, "there was nothing to accept");
+        assert_eq!(reader.counts().received, 1, "nothing was copied before this call");
     }
 
     #[test]
-    fn copies_that_are_never_accepted_leave_nothing_behind() {
+    fn copies_that_are_never_accepted_take_no_slot() {
         let (ingest, reader) = ingest();
         for _ in 0..10 {
-            assert_eq!(ingest.copy(b"nobody's"), Some(Verdict::Taken));
+            assert_eq!(ingest.copy(b"dropped"), Some(Delivery::Taken));
         }
-        assert_eq!(ingest.copy(b"mine"), Some(Verdict::Taken));
+        assert_eq!(ingest.copy(b"kept"), Some(Delivery::Taken));
         ingest.accept(&meta(1));
-        assert_eq!(&*reader.newest().unwrap(), b"mine");
+        assert_eq!(&*reader.newest().unwrap(), b"kept");
         let counts = reader.counts();
         assert_eq!(
             (counts.received, counts.overwritten, counts.no_slot, counts.too_big),
@@ -408,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sample_that_is_told_of_as_too_big_counts_as_one_that_was_shown() {
+    fn a_sample_reported_as_too_big_is_counted_like_a_delivered_one() {
         let (ingest, reader) = ingest();
         ingest.too_big(&meta(1), 9);
         assert!(reader.newest().is_none());
@@ -416,13 +418,13 @@ mod tests {
     }
 
     #[test]
-    fn a_copy_that_is_refused_is_counted_and_not_taken_for_the_one_before() {
+    fn a_refused_copy_is_counted_and_does_not_publish_the_previous_one() {
         let (ingest, reader) = ingest();
-        assert_eq!(ingest.copy(b"old"), Some(Verdict::Taken));
-        assert_eq!(ingest.copy(b"too large"), Some(Verdict::TooBig));
+        assert_eq!(ingest.copy(b"old"), Some(Delivery::Taken));
+        assert_eq!(ingest.copy(b"too large"), Some(Delivery::TooBig));
         ingest.accept(&meta(1));
         assert!(reader.newest().is_none());
-        assert_eq!(ingest.deliver(&meta(2), b"new"), Verdict::Taken);
+        assert_eq!(ingest.deliver(&meta(2), b"new"), Delivery::Taken);
         assert_eq!((reader.counts().too_big, reader.newest().unwrap().meta().seq), (1, 2));
     }
 }

@@ -1,17 +1,17 @@
 //! Hosts one lambda. The rooms follow the path of a sample: `input` holds it, `schedule` notices
-//! it, `judge` lets the guest decide over `api`, `replay` drives the whole from a recorded drive,
-//! `live` from the topics of a vehicle; what both need is in `stage`.
+//! it, `invoker` has the guest decide over `api`. `replay` feeds them from a recorded drive, `live`
+//! from the topics of a vehicle; both begin with `session_setup`.
 //!
 //! The same library runs in `gleaner-runtime` (WebAssembly) and, loaded as `_gleaner`, in a Python
-//! interpreter. Nothing outside `guest` knows which kind of lambda it runs.
+//! interpreter. Nothing outside `guest` depends on the kind of lambda.
 
 pub mod api;
 mod check;
 pub mod guest;
 pub mod input;
+pub mod invoker;
 pub mod isolation;
 pub mod journal;
-pub mod judge;
 pub mod live;
 pub mod memory;
 #[cfg(feature = "dds")]
@@ -19,6 +19,6 @@ mod network;
 pub mod program;
 pub mod replay;
 pub mod schedule;
-pub mod stage;
+pub mod session_setup;
 #[cfg(feature = "dds")]
 mod topics;

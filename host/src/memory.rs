@@ -1,9 +1,8 @@
-//! Memory for samples: mapped from the kernel, touched before the first sample, and given back
+//! Memory for samples: mapped from the kernel, touched before the first sample, and unmapped as a
 //! whole.
 //!
-//! Not from the allocator. glibc's learns from each large block that is freed to keep the next one:
-//! a process that replayed ten times grew from 8.6 to 13.1 MB in WebAssembly, and from 52 to 61 MB
-//! in Python.
+//! The allocator is not used. glibc keeps large blocks once it has seen one freed: a process that
+//! replayed ten times grew from 8.6 to 13.1 MB in WebAssembly, and from 52 to 61 MB in Python.
 #![allow(unsafe_code)]
 
 use std::io;
@@ -14,39 +13,38 @@ use gleaner_buffers::Region;
 use gleaner_vitals::own::LARGE_BYTES;
 use rustix::mm::{MapFlags, ProtFlags, mmap_anonymous, munmap};
 
-/// Keeps the allocator from holding on to large blocks: it maps each and gives it back when it is
-/// freed, as it does before it learns otherwise. Call it once, at the start of a program.
+/// Makes the allocator map each large block and unmap it when it is freed, which is also its
+/// initial behaviour. Call it once, at the start of a program.
 pub fn give_large_blocks_back() {
     #[cfg(target_env = "gnu")]
-    // SAFETY: `mallopt` takes two numbers by value and locks what it changes. It fails only for a
-    // parameter it does not know, and then nothing has changed.
+    // SAFETY: `mallopt` takes two numbers by value and locks what it changes. It fails only for an
+    // unknown parameter, and then nothing has changed.
     unsafe {
         libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BYTES as libc::c_int);
     }
 }
 
-/// Gives back to the system what the allocator keeps of memory that was freed.
+/// Returns freed memory that the allocator keeps to the system.
 pub fn give_freed_back() {
     #[cfg(target_env = "gnu")]
-    // SAFETY: `malloc_trim` takes a number by value, and locks what it gives back, which nothing
-    // uses.
+    // SAFETY: `malloc_trim` takes a number by value, and locks what it releases, which is unused.
     unsafe {
         libc::malloc_trim(0);
     }
 }
 
-/// Zeroed memory of this process alone.
+/// Zeroed memory, private to this process.
 pub struct Mapping {
     base: NonNull<u8>,
     len: usize,
 }
 
 impl Mapping {
-    /// Maps `len` bytes, 1 at least, and has the kernel bring in every page.
+    /// Maps `len` bytes, 1 at least, with every page present.
     ///
     /// # Errors
     ///
-    /// What the kernel says: no memory, or an address space that is too small.
+    /// The kernel's error: out of memory, or an address space that is too small.
     pub fn populated(len: usize) -> io::Result<Self> {
         let len = len.max(1);
         let flags = MapFlags::PRIVATE | MapFlags::POPULATE;
@@ -62,13 +60,13 @@ impl Mapping {
 impl Drop for Mapping {
     fn drop(&mut self) {
         // SAFETY: `populated` mapped exactly these bytes, and a pool drops its region after the
-        // last lease. It can only fail for arguments that no mapping has.
+        // last lease. It fails only for arguments that no mapping has.
         let _ = unsafe { munmap(self.base.as_ptr().cast(), self.len) };
     }
 }
 
 // SAFETY: the mapping is owned, at a fixed place, readable and writable for `len` bytes until it is
-// dropped, and reached only through the pool that it is given to.
+// dropped, and reached only through the pool that owns it.
 unsafe impl Region for Mapping {
     fn base(&self) -> NonNull<u8> {
         self.base
@@ -79,10 +77,10 @@ unsafe impl Region for Mapping {
     }
 }
 
-// SAFETY: bytes have no thread of their own; the pool that owns the mapping decides who touches
+// SAFETY: bytes have no thread of their own; the pool that owns the mapping controls access to
 // them.
 unsafe impl Send for Mapping {}
-// SAFETY: as above; a shared `Mapping` gives out no more than its address and length.
+// SAFETY: as above; a shared `Mapping` exposes only its address and length.
 unsafe impl Sync for Mapping {}
 
 #[cfg(test)]

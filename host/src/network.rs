@@ -1,15 +1,15 @@
-//! What it means for a user that a network cannot be joined.
+//! Turns DDS errors into failures with an exit code and help.
 
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_dds::DdsError;
 
-/// Why DDS does not do what it was asked for.
+/// A DDS error, for users.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
 pub(crate) struct NetworkError(DdsError);
 
 impl NetworkError {
-    /// For `map_err`.
+    /// Converts `error`; for `map_err`.
     pub(crate) fn failure(error: DdsError) -> Failure {
         Self(error).into()
     }

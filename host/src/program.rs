@@ -1,5 +1,5 @@
-//! The program `gleaner-runtime`: reads its arguments, chooses the guest by the manifest's kind,
-//! ends with an exit code.
+//! The program `gleaner-runtime`: parses its arguments, chooses the guest by the manifest's kind,
+//! and ends with an exit code.
 
 use std::ffi::OsString;
 use std::fs::File;
@@ -12,7 +12,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_buffers::Pool;
 #[cfg(feature = "python")]
 use gleaner_jail::cgroup;
-use gleaner_lambda::manifest::{Kind, Manifest};
+use gleaner_lambda::manifest::{LambdaKind, Manifest};
 use gleaner_transport::SampleMeta;
 #[cfg(feature = "python")]
 use rustix::process::Signal;
@@ -21,20 +21,20 @@ use crate::api::Session;
 use crate::api::frame::Info;
 use crate::check::{self, CheckArgs};
 use crate::guest::Guest;
-use crate::guest::watched::{Patience, Watched};
+use crate::guest::sandboxed::{KillTimeouts, SandboxedGuest};
+use crate::guest::worker::{MessageSender, SendingGuest};
 #[cfg(feature = "python")]
-use crate::guest::worker::{NotReady, Remote};
-use crate::guest::worker::{Reports, Sender};
+use crate::guest::worker::{RemoteGuest, WorkerStartError};
 use crate::input::live_slots;
 #[cfg(feature = "python")]
 use crate::isolation;
-use crate::isolation::{Inside, Isolation, place_of_results};
+use crate::isolation::{Isolation, SandboxPermissions, create_results_dir};
 #[cfg(feature = "dds")]
 use crate::live;
 #[cfg(feature = "python")]
 use crate::replay::Packed;
 use crate::replay::{self, InspectArgs, ReplayArgs, UnpackedArgs, VerifyArgs};
-use crate::stage::{Asked, Bounds, Load};
+use crate::session_setup::{ConfiguredLambda, Load, RunMode};
 #[cfg(feature = "dds")]
 use crate::topics::TopicsArgs;
 
@@ -49,49 +49,49 @@ struct Cli {
     #[command(flatten)]
     unpacked: UnpackedArgs,
     #[command(subcommand)]
-    command: Command,
+    command: RuntimeCommand,
 }
 
 #[derive(Subcommand)]
-enum Command {
+enum RuntimeCommand {
     /// Runs a built lambda over recorded drives.
     Replay(ReplayArgs),
     /// Makes the decisions in a clip again and compares.
     Verify(VerifyArgs),
     /// Runs the `init` of a built lambda, and reports what it will need.
     Check(CheckArgs),
-    /// Reports what is in recorded drives.
+    /// MessageSender what is in recorded drives.
     Inspect(InspectArgs),
     /// Runs a built lambda on live topics, until SIGTERM.
     #[cfg(feature = "dds")]
     Run(live::RunArgs),
-    /// Reports the topics that are there.
+    /// Reports the topics of the network.
     #[cfg(feature = "dds")]
     Topics(TopicsArgs),
 }
 
-/// A task with a lambda. There is one in a process, so that its size matters little.
+/// A task with a lambda. A process has one, so that its size matters little.
 #[allow(clippy::large_enum_variant)]
-enum Job {
-    Replay(replay::Job),
-    Check(check::Job),
+enum RuntimeJob {
+    Replay(replay::ReplayJob),
+    Check(check::CheckJob),
     #[cfg(feature = "dds")]
-    Live(live::Job),
+    Live(live::LiveJob),
 }
 
-impl Job {
-    fn lambda(&self) -> (&Asked, &Manifest) {
+impl RuntimeJob {
+    fn lambda(&self) -> (&ConfiguredLambda, &Manifest) {
         match self {
-            Self::Replay(job) => (&job.options.asked, &job.manifest),
-            Self::Check(job) => (&job.asked, &job.manifest),
+            Self::Replay(job) => (&job.options.lambda, &job.manifest),
+            Self::Check(job) => (&job.lambda, &job.manifest),
             #[cfg(feature = "dds")]
-            Self::Live(job) => (&job.asked, &job.manifest),
+            Self::Live(job) => (&job.lambda, &job.manifest),
         }
     }
 
-    /// What a process needs from its start: the place of its results, which is made, and memory for
-    /// itself and its rings.
-    fn around(&self, is_worker: bool) -> Result<Inside, Failure> {
+    /// Returns the permissions that a process needs from its start on: the folder of its results,
+    /// which is created, and memory for itself and its rings.
+    fn start_permissions(&self, is_worker: bool) -> Result<SandboxPermissions, Failure> {
         let results = match self {
             _ if is_worker => None,
             Self::Replay(job) => {
@@ -103,17 +103,18 @@ impl Job {
             #[cfg(feature = "dds")]
             Self::Live(_) => None,
         };
-        let mut inside = self.inside(is_worker);
+        let mut permissions = self.permissions(is_worker);
         if let Some(folder) = results {
-            inside.paths.write.push(place_of_results(folder, &self.lambda().0.lambda)?);
+            permissions.paths.write.push(create_results_dir(folder, &self.lambda().0.folder)?);
         }
-        inside.memory = inside.memory.map(|more| more.saturating_add(at_start(self.lambda().1)));
-        Ok(inside)
+        permissions.memory =
+            permissions.memory.map(|more| more.saturating_add(at_start(self.lambda().1)));
+        Ok(permissions)
     }
 
     /// Returns the permissions of the process after the lambda is loaded. A worker writes nothing.
-    fn inside(&self, is_worker: bool) -> Inside {
-        let (mut paths, ours) = match self {
+    fn permissions(&self, is_worker: bool) -> SandboxPermissions {
+        let (mut paths, own_memory) = match self {
             Self::Replay(job) => (job.paths(), job.own_memory()),
             Self::Check(job) => (job.paths(), 0),
             #[cfg(feature = "dds")]
@@ -123,14 +124,18 @@ impl Job {
             paths.write.clear();
         }
         let manifest = self.lambda().1;
-        // What grows in place may be there twice for a moment.
+        // An entry that grows may exist twice for a moment.
         let kept = 2 * manifest.limits.scratch.bytes();
-        let memory = manifest.limits.memory.bytes().saturating_add(kept).saturating_add(ours);
-        // Frames that a lambda makes may take `memory` once more.
+        let memory = manifest.limits.memory.bytes().saturating_add(kept).saturating_add(own_memory);
+        // Frames that a lambda creates may take `memory` again.
         let all = memory
             .saturating_add(manifest.limits.memory.bytes())
             .saturating_add(at_start(manifest));
-        Inside { paths, memory: (manifest.lambda.kind == Kind::Python).then_some(memory), all }
+        SandboxPermissions {
+            paths,
+            memory: (manifest.lambda.kind == LambdaKind::Python).then_some(memory),
+            all,
+        }
     }
 
     /// Returns whether the job is a live run. If not, a Python lambda runs in a worker.
@@ -143,7 +148,7 @@ impl Job {
         }
     }
 
-    /// Does what is not live, with guests in this process or in a worker.
+    /// Runs a job that is not live, with guests in this process or in a worker.
     fn run_offline(self, load: Load<'_>, reports: &mut dyn Write) -> Result<Exit, Failure> {
         match self {
             Self::Replay(job) => job.run(load, reports),
@@ -153,7 +158,7 @@ impl Job {
         }
     }
 
-    fn work(self, load: Load<'_>, reports: &mut Reports) -> Result<Exit, Failure> {
+    fn work(self, load: Load<'_>, reports: &mut MessageSender) -> Result<Exit, Failure> {
         match self {
             Self::Replay(job) => job.work(load, reports),
             Self::Check(job) => job.run(load, reports),
@@ -168,9 +173,9 @@ fn no_worker() -> Failure {
     Failure::new(Exit::Usage, "a live run has no worker").with_help("leave `--worker` out")
 }
 
-/// Memory that a process takes before the lambda is in it, at most: an interpreter with numpy and
-/// our own part take some 100 MB, and numpy's threads more where a user asks for many; and the
-/// rings.
+/// Upper bound of the memory in bytes that a process uses before the lambda is loaded: the rings,
+/// and an interpreter with numpy and Gleaner's own code, which take some 100 MB, or more if the
+/// user requests many threads of numpy.
 fn at_start(manifest: &Manifest) -> u64 {
     const INTERPRETER: u64 = 1 << 30;
     let rings = manifest.inputs.iter().flat_map(|input| {
@@ -182,27 +187,27 @@ fn at_start(manifest: &Manifest) -> u64 {
 }
 
 impl Cli {
-    /// The job, or how it ended where no lambda is needed for it.
-    fn job(self) -> Result<Result<Job, Exit>, Failure> {
+    /// Returns the job, or the exit of a command that needs no lambda.
+    fn job(self) -> Result<Result<RuntimeJob, Exit>, Failure> {
         let Self { unpacked, command, .. } = self;
         let mut job = command.job()?;
-        if let Ok(Job::Replay(job)) = &mut job {
+        if let Ok(RuntimeJob::Replay(job)) = &mut job {
             job.take(unpacked)?;
         }
         Ok(job)
     }
 }
 
-impl Command {
-    /// The job, or how it ended where no lambda is needed for it.
-    fn job(self) -> Result<Result<Job, Exit>, Failure> {
+impl RuntimeCommand {
+    /// Returns the job, or the exit of a command that needs no lambda.
+    fn job(self) -> Result<Result<RuntimeJob, Exit>, Failure> {
         Ok(match self {
-            Self::Replay(args) => Ok(Job::Replay(replay::Job::replay(args)?)),
-            Self::Verify(args) => Ok(Job::Replay(replay::Job::verify(args)?)),
-            Self::Check(args) => Ok(Job::Check(check::Job::new(args)?)),
+            Self::Replay(args) => Ok(RuntimeJob::Replay(replay::ReplayJob::replay(args)?)),
+            Self::Verify(args) => Ok(RuntimeJob::Replay(replay::ReplayJob::verify(args)?)),
+            Self::Check(args) => Ok(RuntimeJob::Check(check::CheckJob::new(args)?)),
             Self::Inspect(args) => Err(replay::inspect(&args, &mut reports()?)?),
             #[cfg(feature = "dds")]
-            Self::Run(args) => Ok(Job::Live(live::Job::new(args)?)),
+            Self::Run(args) => Ok(RuntimeJob::Live(live::LiveJob::new(args)?)),
             #[cfg(feature = "dds")]
             Self::Topics(args) => Err(crate::topics::run(args, &mut reports()?)?),
         })
@@ -217,8 +222,8 @@ pub fn main() -> ExitCode {
     end(cli.job().and_then(|job| job.map_or_else(Ok, |job| run_any(job, worker))))
 }
 
-/// What `_gleaner` does inside the interpreter, with the arguments that `gleaner-runtime` was
-/// given: their job, with the guest that `load` makes. Returns the exit code.
+/// Runs the job inside the interpreter, for `_gleaner`: with the arguments of `gleaner-runtime` and
+/// the guest that `load` creates. Returns the exit code.
 pub fn run_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
     prepare();
     let cli = match Cli::try_parse_from(args) {
@@ -234,20 +239,20 @@ pub fn run_in_python(args: Vec<OsString>, load: Load<'_>) -> u8 {
     }))
 }
 
-fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
-    #[allow(unused_variables, reason = "the folder is looked at only where Python can be hosted")]
-    let (asked, manifest) = job.lambda();
+fn run_any(job: RuntimeJob, is_worker: bool) -> Result<Exit, Failure> {
+    #[allow(unused_variables, reason = "used only with the feature `python`")]
+    let (lambda, manifest) = job.lambda();
     #[allow(unused_variables, reason = "the same")]
-    let around = job.around(is_worker)?;
+    let around = job.start_permissions(is_worker)?;
     match manifest.lambda.kind {
         #[cfg(feature = "wasm")]
-        Kind::Wasm => run(job, &mut wasm::load),
+        LambdaKind::Wasm => run(job, &mut wasm::load),
         #[cfg(feature = "python")]
-        Kind::Python if !is_worker && !job.is_live() => run_with_worker(job),
+        LambdaKind::Python if !is_worker && !job.is_live() => run_with_worker(job),
         #[cfg(feature = "python")]
-        Kind::Python => {
+        LambdaKind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
-            let error = crate::guest::python::become_interpreter(&asked.lambda, &args, around);
+            let error = crate::guest::python::become_interpreter(&lambda.folder, &args, around);
             Err(Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))
         }
         #[allow(unreachable_patterns)]
@@ -258,22 +263,22 @@ fn run_any(job: Job, is_worker: bool) -> Result<Exit, Failure> {
     }
 }
 
-/// Does `job` but for what its worker does.
+/// Runs `job` except for the part that its worker runs.
 #[cfg(feature = "python")]
-fn run_with_worker(job: Job) -> Result<Exit, Failure> {
+fn run_with_worker(job: RuntimeJob) -> Result<Exit, Failure> {
     isolation::end_with_starter(Signal::TERM)?;
-    // The group of this process is that of its worker, too.
-    let group = cgroup::fit(job.inside(false).all);
-    let packed = if let Job::Replay(job) = &job { Some(job.packed()) } else { None };
+    // The worker is in the control group of this process.
+    let group = cgroup::limit_memory(job.permissions(false).all);
+    let packed = if let RuntimeJob::Replay(job) = &job { Some(job.packed()) } else { None };
     let mut explained = None;
-    let mut remote = |_: &Asked, manifest: &Manifest, session, _| {
-        let lent = packed.as_ref().map(Packed::lend).transpose()?;
-        let arguments = lent.iter().flat_map(|lent| lent.arguments.clone()).collect();
-        // When it is ready it has opened its drives.
-        match Remote::start(arguments, manifest, session, group.clone()) {
+    let mut remote = |_: &ConfiguredLambda, manifest: &Manifest, session, _| {
+        let contents = packed.as_ref().map(Packed::unpack_for_worker).transpose()?;
+        let arguments = contents.iter().flat_map(|contents| contents.arguments.clone()).collect();
+        // A worker that is ready has opened its drives.
+        match RemoteGuest::start(arguments, manifest, session, group.clone()) {
             Ok(guest) => Ok(Box::new(guest) as _),
-            Err(NotReady::Failed(failure)) => Err(failure),
-            Err(NotReady::Explained(exit)) => {
+            Err(WorkerStartError::Failed(failure)) => Err(failure),
+            Err(WorkerStartError::Explained(exit)) => {
                 explained = Some(exit);
                 Err(Failure::new(exit, "the lambda's process could not start"))
             }
@@ -283,47 +288,47 @@ fn run_with_worker(job: Job) -> Result<Exit, Failure> {
     explained.map_or(ended, Ok)
 }
 
-fn run(job: Job, load: Load<'_>) -> Result<Exit, Failure> {
-    let isolation = Arc::new(Isolation::of_this_process(job.inside(false))?);
-    let mut watched = watched(load, &isolation);
+fn run(job: RuntimeJob, load: Load<'_>) -> Result<Exit, Failure> {
+    let isolation = Arc::new(Isolation::of_this_process(job.permissions(false))?);
+    let mut sandboxed = sandboxed(load, &isolation);
     match job {
         #[cfg(feature = "dds")]
-        Job::Live(job) => job.run(&mut watched, &isolation, reports()?),
-        job => job.run_offline(&mut watched, &mut reports()?),
+        RuntimeJob::Live(job) => job.run(&mut sandboxed, &isolation, reports()?),
+        job => job.run_offline(&mut sandboxed, &mut reports()?),
     }
 }
 
-/// Does the part of `job` that is the worker's. Once the lambda may have run, what goes wrong is no
-/// longer printed: the process that reads the outcomes finds it too, and nothing here is to be
-/// taken for its words.
-fn work(job: Job, load: Load<'_>) -> Result<Exit, Failure> {
-    let isolation = Arc::new(Isolation::of_this_process(job.inside(true))?);
-    let reports = Reports::to(reports()?);
-    let mut watched = watched(load, &isolation);
-    let mut sending = |asked: &Asked, manifest: &Manifest, session: Session, bounds| {
-        let guest: Box<dyn Guest> = watched(asked, manifest, session.clone(), bounds)?;
+/// Runs the worker's part of `job`. Once the lambda may have run, errors are no longer printed: the
+/// process that reads the outcomes finds them too, and must not trust this one's output.
+fn work(job: RuntimeJob, load: Load<'_>) -> Result<Exit, Failure> {
+    let isolation = Arc::new(Isolation::of_this_process(job.permissions(true))?);
+    let reports = MessageSender::to(reports()?);
+    let mut sandboxed = sandboxed(load, &isolation);
+    let mut sending = |lambda: &ConfiguredLambda, manifest: &Manifest, session: Session, mode| {
+        let guest: Box<dyn Guest> = sandboxed(lambda, manifest, session.clone(), mode)?;
         let layers = guest.layers()?;
-        Ok(Box::new(Sender::begin(guest, session, reports.clone(), layers)) as _)
+        Ok(Box::new(SendingGuest::begin(guest, session, reports.clone(), layers)) as _)
     };
     let ended = job.work(&mut sending, &mut reports.clone());
     if reports.is_ready() { Ok(ended.unwrap_or(Exit::Ok)) } else { ended }
 }
 
 /// Has the guests that `load` makes entered only once this process is sandboxed.
-fn watched<'a>(
+fn sandboxed<'a>(
     load: Load<'a>,
     isolation: &'a Arc<Isolation>,
-) -> impl FnMut(&Asked, &Manifest, Session, Bounds) -> Result<Box<dyn Guest>, Failure> + 'a {
-    move |asked, manifest, session, bounds| {
+) -> impl FnMut(&ConfiguredLambda, &Manifest, Session, RunMode) -> Result<Box<dyn Guest>, Failure> + 'a
+{
+    move |lambda, manifest, session, mode| {
         let limits = &manifest.limits;
-        let patience = match bounds {
-            Bounds::Replay => Patience::replay(limits.init_deadline, limits.deadline),
-            Bounds::Live(deadline) => Patience::live(limits.init_deadline, deadline),
+        let timeouts = match mode {
+            RunMode::Replay => KillTimeouts::replay(limits.init_deadline, limits.deadline),
+            RunMode::Live(deadline) => KillTimeouts::live(limits.init_deadline, deadline),
         };
-        // A component's is counted as it grows.
-        let memory = (manifest.lambda.kind == Kind::Python).then_some(limits.memory.bytes());
-        let guest = load(asked, manifest, session, bounds)?;
-        Ok(Box::new(Watched::new(guest, Arc::clone(isolation), patience, memory)) as _)
+        // The memory of a component is counted as it grows.
+        let memory = (manifest.lambda.kind == LambdaKind::Python).then_some(limits.memory.bytes());
+        let guest = load(lambda, manifest, session, mode)?;
+        Ok(Box::new(SandboxedGuest::new(guest, Arc::clone(isolation), timeouts, memory)) as _)
     }
 }
 
@@ -343,13 +348,13 @@ mod wasm {
     use crate::api::Session;
     use crate::guest::Guest;
     use crate::guest::wasm::{Deadline, Loaded, WasmError, WasmGuest};
-    use crate::stage::{Asked, Bounds};
+    use crate::session_setup::{ConfiguredLambda, RunMode};
 
     pub(super) fn load(
-        asked: &Asked,
+        lambda: &ConfiguredLambda,
         manifest: &Manifest,
         session: Session,
-        bounds: Bounds,
+        mode: RunMode,
     ) -> Result<Box<dyn Guest>, Failure> {
         let cannot = |error: &WasmError| {
             Failure::because(format!("cannot load lambda `{}`", manifest.lambda.name), error)
@@ -358,14 +363,14 @@ mod wasm {
         let limits = &manifest.limits;
         let nans = if manifest.lambda.deterministic { Nans::Canonical } else { Nans::AsMade };
         let loaded =
-            Loaded::open(&asked.build.entry_path(manifest), &cache, limits.stack.as_usize(), nans)
+            Loaded::open(&lambda.build.entry_path(manifest), &cache, limits.stack.as_usize(), nans)
                 .map_err(|error| cannot(&error))?;
         let failed = |error: std::io::Error| {
-            Failure::caused_by(Exit::Internal, "cannot make a guest", &error)
+            Failure::caused_by(Exit::Internal, "cannot create a guest", &error)
         };
-        let deadline = match bounds {
-            Bounds::Replay => None,
-            Bounds::Live(allowed) => Some(
+        let deadline = match mode {
+            RunMode::Replay => None,
+            RunMode::Live(allowed) => Some(
                 Deadline::new(loaded.engine(), allowed.min(limits.init_deadline))
                     .map_err(failed)?,
             ),
@@ -377,7 +382,7 @@ mod wasm {
 
 fn prepare() {
     crate::memory::give_large_blocks_back();
-    gleaner_vitals::log::prepare();
+    gleaner_vitals::log::init();
 }
 
 fn end(result: Result<Exit, Failure>) -> ExitCode {

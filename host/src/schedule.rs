@@ -1,19 +1,19 @@
-//! When a lambda runs, by `gleaner_rules::schedule` over the rings of its inputs.
+//! Schedules a lambda: `gleaner_rules::schedule` over the rings of its inputs.
 
 use std::sync::Arc;
 
-use gleaner_lambda::manifest::{Backlog as DeclaredBacklog, Manifest, Schedule as Declared};
+use gleaner_lambda::manifest::{Backlog as BacklogSpec, Manifest, ScheduleSpec};
 use gleaner_rules::schedule::{self as rules, Backlog};
 
 use crate::api::data::{Sample, Topic, Wake};
 
 /// The schedule of one lambda.
-pub struct Schedule(rules::Schedule<Input>);
+pub struct WakeSchedule(rules::Schedule<EventInput>);
 
 /// The input whose samples wake the lambda.
-struct Input(Arc<Topic>);
+struct EventInput(Arc<Topic>);
 
-impl rules::Ring for Input {
+impl rules::Ring for EventInput {
     type Sample = Sample;
 
     fn head(&self) -> u64 {
@@ -38,40 +38,40 @@ impl rules::Ring for Input {
     }
 }
 
-impl Schedule {
+impl WakeSchedule {
     /// The schedule that `manifest` declares, over its inputs in the manifest's order.
     pub fn new(manifest: &Manifest, inputs: &[Arc<Topic>]) -> Self {
         Self(match &manifest.schedule {
-            Declared::Event { input, backlog } => {
+            ScheduleSpec::Event { input, backlog } => {
                 let topic = inputs.iter().find(|topic| topic.name() == input.as_str());
                 let backlog = match backlog {
-                    DeclaredBacklog::Each => Backlog::Each,
-                    DeclaredBacklog::Latest => Backlog::Latest,
+                    BacklogSpec::Each => Backlog::Each,
+                    BacklogSpec::Latest => Backlog::Latest,
                 };
                 rules::Schedule::event(
-                    Input(Arc::clone(topic.expect("the manifest was checked"))),
+                    EventInput(Arc::clone(topic.expect("the manifest was checked"))),
                     backlog,
                 )
             }
-            Declared::Periodic { period } => {
+            ScheduleSpec::Periodic { period } => {
                 rules::Schedule::periodic(i64::try_from(period.as_nanos()).unwrap_or(i64::MAX))
             }
         })
     }
 
-    /// The same where time does not wait: it is `now_ns`, and the first tick comes a period later.
+    /// The same for a live run that starts at `now_ns`: the first tick is due a period later.
     pub fn live(manifest: &Manifest, inputs: &[Arc<Topic>], now_ns: i64) -> Self {
         let mut schedule = Self::new(manifest, inputs);
         schedule.0.begin_live(now_ns);
         schedule
     }
 
-    /// Time begins, in a replay: the first tick comes a period later.
+    /// Sets the start time of a replay: the first tick is due a period later.
     pub fn begin(&mut self, at_ns: i64) {
         self.0.begin(at_ns);
     }
 
-    /// When the next tick is due, if time causes any.
+    /// Due time of the next tick; `None` for a schedule by events.
     pub fn next_due(&self) -> Option<i64> {
         self.0.next_due()
     }
@@ -86,12 +86,12 @@ impl Schedule {
         self.0.next_tick(now_ns).map(Wake::Tick)
     }
 
-    /// At the end: what has arrived and woken nobody was skipped.
+    /// Ends the schedule: samples that have arrived and caused no wake count as skipped.
     pub fn finish(&mut self) {
         self.0.finish();
     }
 
-    /// Ticks that were due and did not happen.
+    /// Number of ticks that were due and did not happen.
     pub fn missed(&self) -> u64 {
         self.0.missed()
     }

@@ -1,4 +1,4 @@
-//! `gleaner-runtime topics`: what is there to subscribe.
+//! `gleaner-runtime topics`: lists the topics of the network.
 
 use std::io::Write;
 use std::time::{Duration, Instant};
@@ -6,12 +6,12 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use gleaner_base::{Exit, Failure};
 use gleaner_dds::{Dds, NetworkArgs};
-use gleaner_protocol::{Report, TopicSeen};
+use gleaner_protocol::{Report, TopicInfo};
 
 use crate::network::NetworkError;
 
-/// How long to listen if nothing else is said: announcements of participants come every few
-/// seconds, and those who are there answer a new one at once.
+/// Default time to listen: participants announce themselves every few seconds, and answer a new
+/// one at once.
 const WAIT_S: f64 = 2.0;
 const WAIT_MAX: Duration = Duration::from_secs(3600);
 
@@ -20,12 +20,12 @@ const WAIT_MAX: Duration = Duration::from_secs(3600);
 pub struct TopicsArgs {
     #[command(flatten)]
     network: NetworkArgs,
-    /// How long to listen, in seconds.
+    /// Time to listen, in seconds.
     #[arg(long, value_name = "SECONDS", default_value_t = WAIT_S)]
     wait: f64,
 }
 
-/// Listens for a while, and reports what there was.
+/// Listens for a while, and reports the topics that were discovered.
 pub(crate) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<Exit, Failure> {
     let wait = Duration::try_from_secs_f64(args.wait).ok().filter(|wait| *wait <= WAIT_MAX);
     let wait = wait.ok_or_else(|| {
@@ -39,7 +39,7 @@ pub(crate) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<Exit, Fa
     while let Some(left) = until.checked_duration_since(Instant::now()) {
         std::thread::sleep(left);
     }
-    let seen = dds.discovered().into_iter().map(|topic| TopicSeen {
+    let seen = dds.discovered().into_iter().map(|topic| TopicInfo {
         topic: topic.topic,
         type_name: topic.type_name,
         writers: topic.writers,
@@ -47,7 +47,7 @@ pub(crate) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<Exit, Fa
         qos: topic.qos,
     });
     let report = Report::Topics { topics: seen.collect() };
-    // Whoever asked may have gone.
+    // The reader may have ended.
     let _ = serde_json::to_writer(&mut *reports, &report);
     let _ = reports.write_all(b"\n");
     Ok(Exit::Ok)

@@ -1,5 +1,5 @@
-//! What one call of a lambda may take: bytes, items, fuel and time. Neither fuel nor a deadline
-//! ends a call from outside.
+//! Limits of one call of a lambda: bytes, items, fuel and time. Neither fuel nor a deadline
+//! interrupts a call from outside.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,21 +11,21 @@ use gleaner_rules::clamps;
 use super::error::DataError;
 use super::fuel::{Fuel, OutOfFuel};
 
-/// What one call may take, for all inputs of a lambda.
+/// Limits of one call, shared by all inputs of a lambda.
 #[derive(Clone)]
 pub struct PerCall {
-    /// Bytes that it copies out.
+    /// Maximum number of bytes that it copies out.
     pub(super) bytes: usize,
-    /// Values of a column or of a list.
+    /// Maximum number of values of a column or of a list.
     pub(super) items: usize,
-    /// When it has to end.
+    /// Time at which it has to end.
     pub(super) due: Due,
-    /// What all of them have cost in this wake.
+    /// Fuel that the calls of this wake have used.
     pub(super) fuel: Fuel,
 }
 
 impl PerCall {
-    /// By these limits, without end and without a price.
+    /// Creates the limits of a call, without a deadline and without a fuel allowance.
     pub fn new(limits: &Limits) -> Self {
         let items = usize::try_from(limits.call_items).unwrap_or(usize::MAX);
         Self {
@@ -36,40 +36,40 @@ impl PerCall {
         }
     }
 
-    /// Charges a call that touches so many bytes. Each call of a lambda is charged once, before its
+    /// Charges a call that touches `bytes` bytes. Each call of a lambda is charged once, before its
     /// work.
     pub(super) fn charge(&self, bytes: impl FnOnce() -> usize) -> Result<(), OutOfFuel> {
         self.fuel.charge(bytes)
     }
 
-    /// What it hands out at most.
+    /// Limits of its result.
     pub(super) fn clamps(&self) -> clamps::PerCall {
         clamps::PerCall { bytes: self.bytes, items: self.items }
     }
 }
 
-/// Never.
+/// Value of [`DueTime::at`] without a deadline.
 const NEVER: u64 = 0;
 
-/// When the lambda that runs has to end: what takes long looks at it now and then. Never, in a
-/// replay.
+/// Time at which the current call into the lambda has to end; long operations check it regularly. A
+/// replay has none.
 #[derive(Clone)]
-pub struct Due(Arc<Clock>);
+pub struct Due(Arc<DueTime>);
 
-struct Clock {
+struct DueTime {
     base: Instant,
-    /// In ns since `base`.
+    /// Due time in ns since `base`.
     at: AtomicU64,
 }
 
 impl Default for Due {
     fn default() -> Self {
-        Self(Arc::new(Clock { base: Instant::now(), at: AtomicU64::new(NEVER) }))
+        Self(Arc::new(DueTime { base: Instant::now(), at: AtomicU64::new(NEVER) }))
     }
 }
 
 impl Due {
-    /// From now on it is at that time, or never.
+    /// Sets the due time; `None` for no deadline.
     pub fn set(&self, at: Option<Instant>) {
         let since = |at: Instant| {
             at.saturating_duration_since(self.0.base).max(Duration::from_nanos(NEVER + 1))
@@ -78,14 +78,14 @@ impl Due {
         self.0.at.store(ns, Ordering::Relaxed);
     }
 
-    /// Refuses to go on once it is over.
+    /// Returns an error if the due time has passed.
     pub(super) fn check(&self) -> Result<(), DataError> {
         self.allows(0, 1)
     }
 
-    /// Refuses to begin what nothing could end: `bytes` that no machine goes through in the time
-    /// that is left. So what is begun takes longer than allowed by no more than this machine is
-    /// slower than `fastest`, in bytes for each microsecond.
+    /// Refuses work on `bytes` that no machine can do in the remaining time, since the work cannot
+    /// be interrupted. `fastest` is the speed of the fastest machine in bytes per microsecond, so
+    /// the deadline is exceeded at most by the factor by which this machine is slower.
     pub(super) fn allows(&self, bytes: usize, fastest: u64) -> Result<(), DataError> {
         let at = self.0.at.load(Ordering::Relaxed);
         if at == NEVER {
@@ -102,7 +102,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_due_in_the_past_is_over_and_what_is_never_due_is_not() {
+    fn a_due_time_in_the_past_is_over_and_no_due_time_is_not() {
         let due = Due::default();
         assert!(due.check().is_ok());
         due.set(Some(Instant::now() + Duration::from_secs(3600)));
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn what_could_not_end_in_time_does_not_begin() {
+    fn work_that_cannot_end_in_time_does_not_begin() {
         let due = Due::default();
         due.set(Some(Instant::now() + Duration::from_secs(3600)));
         assert!(due.allows(3_000_000_000, 1).is_ok());

@@ -1,7 +1,6 @@
-//! What a lambda read of its samples, number by number, for the report of a replay.
+//! Records the numbers that a lambda reads from its samples, for the report of a replay.
 //!
-//! Nothing here changes what a lambda sees or what it costs in fuel. Live nobody asks for it, and
-//! nothing is kept.
+//! This changes neither the data that a lambda sees nor its fuel. A live run records nothing.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,96 +9,96 @@ use gleaner_lambda::signals::{Curve, Signals};
 
 use super::data::{Column, Topic};
 
-/// Paths beyond those that have a curve which are told apart: more are not counted.
-const LEFT_OUT_MAX: usize = 1000;
+/// Maximum number of distinct paths without a curve that are counted.
+const OMITTED_MAX: usize = 1000;
 
 /// The curves of one lambda, for all of its inputs.
 #[derive(Default)]
-pub struct Curves(Mutex<List>);
+pub struct Curves(Mutex<CurveList>);
 
 #[derive(Default)]
-struct List {
-    kept: Vec<(Source, Arc<Pen>)>,
-    left_out: BTreeSet<Source>,
+struct CurveList {
+    kept: Vec<(CurveKey, Arc<CurveWriter>)>,
+    omitted: BTreeSet<CurveKey>,
 }
 
-/// What a curve is of.
+/// Identity of a curve.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Source {
+struct CurveKey {
     input: String,
     topic: String,
     path: String,
 }
 
 impl Curves {
-    /// Curves of what is read of `inputs` from now on, of fields that are compiled from now on.
+    /// Starts to record the values of fields of `inputs` that are compiled from now on.
     pub fn of(inputs: &[Arc<Topic>]) -> Arc<Self> {
         let curves = Arc::new(Self::default());
         for topic in inputs {
-            topic.keep(&curves);
+            topic.record_curves(&curves);
         }
         curves
     }
 
-    /// The curve of `path` in the messages of `topic`; none if there are too many.
-    pub(super) fn pen(&self, topic: &Topic, path: String) -> Option<Arc<Pen>> {
+    /// The writer of the curve of `path` in the messages of `topic`; `None` if there are too many.
+    pub(super) fn curve_writer(&self, topic: &Topic, path: String) -> Option<Arc<CurveWriter>> {
         let source =
-            Source { input: topic.name().to_owned(), topic: topic.ros_topic().to_owned(), path };
+            CurveKey { input: topic.name().to_owned(), topic: topic.ros_topic().to_owned(), path };
         let mut list = self.lock();
-        if let Some((_, pen)) = list.kept.iter().find(|(kept, _)| *kept == source) {
-            return Some(Arc::clone(pen));
+        if let Some((_, writer)) = list.kept.iter().find(|(kept, _)| *kept == source) {
+            return Some(Arc::clone(writer));
         }
         if list.kept.len() >= Signals::CURVES_MAX {
-            if list.left_out.len() < LEFT_OUT_MAX {
-                list.left_out.insert(source);
+            if list.omitted.len() < OMITTED_MAX {
+                list.omitted.insert(source);
             }
             return None;
         }
-        let pen = Arc::new(Pen::default());
-        list.kept.push((source, Arc::clone(&pen)));
-        Some(pen)
+        let writer = Arc::new(CurveWriter::default());
+        list.kept.push((source, Arc::clone(&writer)));
+        Some(writer)
     }
 
-    /// The curves so far, without those of what is no number; and how many fields have none, since
-    /// there were too many.
+    /// Returns the curves so far, without those of fields that are no numbers, and the number of
+    /// fields that have no curve because there were too many.
     pub fn take(&self) -> (Vec<Curve>, u64) {
         let list = self.lock();
-        let drawn = list.kept.iter().filter_map(|(source, pen)| pen.lock().curve(source)).collect();
-        (drawn, list.left_out.len() as u64)
+        let drawn =
+            list.kept.iter().filter_map(|(source, writer)| writer.lock().curve(source)).collect();
+        (drawn, list.omitted.len() as u64)
     }
 
-    fn lock(&self) -> MutexGuard<'_, List> {
+    fn lock(&self) -> MutexGuard<'_, CurveList> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Draws one curve.
+/// Writes one curve.
 #[derive(Default)]
-pub(super) struct Pen(Mutex<Points>);
+pub(super) struct CurveWriter(Mutex<CurvePoints>);
 
-/// Sums of neighbouring samples. When there is no room for a further one, each two become one: a
-/// curve gets coarser as it gets longer, evenly over all of its time.
+/// Minimum and maximum of neighbouring samples. When a curve is full, each two points are merged: a
+/// longer curve is coarser, evenly over its whole time.
 #[derive(Default)]
-struct Points {
+struct CurvePoints {
     last_ns: Option<i64>,
     samples: u64,
     non_finite: u64,
     per_point: u64,
-    /// Samples in the last point.
+    /// Number of samples in the last point.
     in_last: u64,
     at_ns: Vec<i64>,
     min: Vec<f64>,
     max: Vec<f64>,
 }
 
-impl Pen {
-    /// The number of the sample of `at_ns` is `value`. What was read before, or of an older sample,
-    /// is no news.
+impl CurveWriter {
+    /// Adds `value` of the sample of `at_ns`, unless this sample or a newer one was added before.
     pub(super) fn number(&self, at_ns: i64, value: f64) {
         self.lock().add(at_ns, value);
     }
 
-    /// The same for a column, whose samples are oldest first.
+    /// Adds a column, whose samples are oldest first.
     pub(super) fn column(&self, column: &Column) {
         let mut points = self.lock();
         let new = column
@@ -110,12 +109,12 @@ impl Pen {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, Points> {
+    fn lock(&self) -> MutexGuard<'_, CurvePoints> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Points {
+impl CurvePoints {
     fn add(&mut self, at_ns: i64, value: f64) {
         if self.last_ns.is_some_and(|last_ns| at_ns <= last_ns) {
             return;
@@ -143,7 +142,7 @@ impl Points {
         self.max.push(value);
     }
 
-    /// Each two points become one. All are full then.
+    /// Merges each two points into one. All points are full then.
     fn halve(&mut self) {
         let half = self.at_ns.len() / 2;
         for point in 0..half {
@@ -157,8 +156,8 @@ impl Points {
         self.per_point *= 2;
     }
 
-    fn curve(&self, source: &Source) -> Option<Curve> {
-        let Source { input, topic, path } = source.clone();
+    fn curve(&self, source: &CurveKey) -> Option<Curve> {
+        let CurveKey { input, topic, path } = source.clone();
         let Self { samples, non_finite, per_point, at_ns, min, max, .. } = self;
         (*samples > 0).then(|| Curve {
             input,
@@ -178,18 +177,18 @@ impl Points {
 mod tests {
     use super::*;
 
-    fn source() -> Source {
-        Source { input: "imu".to_owned(), topic: "/imu".to_owned(), path: "x".to_owned() }
+    fn source() -> CurveKey {
+        CurveKey { input: "imu".to_owned(), topic: "/imu".to_owned(), path: "x".to_owned() }
     }
 
     #[test]
     fn a_long_curve_gets_coarser_and_loses_no_extreme() {
-        let pen = Pen::default();
+        let writer = CurveWriter::default();
         let samples = 5 * Signals::POINTS_MAX as i64 + 17;
         for n in 0..samples {
-            pen.number(10 * n, if n == 7777 { 99.0 } else { f64::from((n % 3) as i32) });
+            writer.number(10 * n, if n == 7777 { 99.0 } else { f64::from((n % 3) as i32) });
         }
-        let curve = pen.lock().curve(&source()).unwrap();
+        let curve = writer.lock().curve(&source()).unwrap();
         assert_eq!((curve.samples, curve.per_point), (samples as u64, 8));
         assert_eq!(curve.at_ns.len(), (samples as usize).div_ceil(8));
         assert!(curve.at_ns.len() <= Signals::POINTS_MAX);
@@ -201,12 +200,12 @@ mod tests {
 
     #[test]
     fn a_sample_that_is_read_twice_is_drawn_once() {
-        let pen = Pen::default();
-        pen.column(&Column { at_ns: vec![1, 2, 3], values: vec![1.0, 2.0, 3.0] });
-        pen.column(&Column { at_ns: vec![2, 3, 4], values: vec![2.0, 3.0, 4.0] });
-        pen.number(4, 4.0);
-        pen.number(1, 1.0);
-        let curve = pen.lock().curve(&source()).unwrap();
+        let writer = CurveWriter::default();
+        writer.column(&Column { at_ns: vec![1, 2, 3], values: vec![1.0, 2.0, 3.0] });
+        writer.column(&Column { at_ns: vec![2, 3, 4], values: vec![2.0, 3.0, 4.0] });
+        writer.number(4, 4.0);
+        writer.number(1, 1.0);
+        let curve = writer.lock().curve(&source()).unwrap();
         assert_eq!(
             (curve.at_ns, curve.max, curve.samples),
             (vec![1, 2, 3, 4], vec![1.0, 2.0, 3.0, 4.0], 4)
@@ -214,13 +213,13 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_is_counted_and_not_drawn() {
-        let pen = Pen::default();
+    fn non_finite_values_are_counted_and_not_drawn() {
+        let writer = CurveWriter::default();
         for (at_ns, value) in [(1, f64::NAN), (2, f64::INFINITY), (3, 5.0)] {
-            pen.number(at_ns, value);
+            writer.number(at_ns, value);
         }
-        let curve = pen.lock().curve(&source()).unwrap();
+        let curve = writer.lock().curve(&source()).unwrap();
         assert_eq!((curve.samples, curve.non_finite, curve.at_ns), (3, 2, vec![3]));
-        assert_eq!(Pen::default().lock().curve(&source()), None);
+        assert_eq!(CurveWriter::default().lock().curve(&source()), None);
     }
 }

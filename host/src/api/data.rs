@@ -1,7 +1,6 @@
-//! Samples, fields and frames, as a lambda reads them.
+//! Topics as a lambda reads them: samples, fields and columns.
 //!
-//! Every number that a lambda passes is clamped here, and nothing is allocated in proportion to it
-//! beyond the clamps below.
+//! Every number that a lambda passes is clamped here. No allocation exceeds the clamps.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -13,7 +12,7 @@ pub use gleaner_rules::clamps::{PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD};
 use gleaner_transport::SampleMeta;
 
 pub use super::call::{Due, PerCall};
-use super::curves::{Curves, Pen};
+use super::curves::{CurveWriter, Curves};
 pub use super::error::{DataError, DataErrorKind};
 use super::field::FIELD_BYTES;
 pub use super::field::Field;
@@ -21,14 +20,14 @@ use super::frame::Images;
 use super::fuel::Fuel;
 pub use super::fuel::OutOfFuel;
 pub use super::sample::Sample;
-use super::trace::{Arrivals, Looked};
+use super::trace::{Arrivals, LookBack};
 pub use super::values::{Column, Counts, Identity, Stamps, Tick};
 
-/// Samples of a column between two looks at the time, and bytes of those that are walked over.
-const SAMPLES_PER_LOOK: usize = 1024;
-const BYTES_PER_LOOK: usize = 1 << 20;
+/// Samples of a column, and bytes of samples that are parsed, between two checks of the deadline.
+const SAMPLES_PER_CHECK: usize = 1024;
+const BYTES_PER_CHECK: usize = 1 << 20;
 
-/// A count that nobody knows.
+/// Value of a count that is unknown.
 const UNKNOWN: u64 = u64::MAX;
 
 /// The ring of one input, as its lambda sees it.
@@ -37,26 +36,26 @@ pub struct Topic {
     pub(super) topic: String,
     pub(super) type_name: String,
     reader: RingReader<SampleMeta>,
-    /// How many samples the lambda sees; the ring may be deeper.
+    /// Number of samples that the lambda sees; the ring may be deeper.
     depth: usize,
-    /// None if nobody has any: the lambda then reads bytes, but no fields.
+    /// `None` if there are none: the lambda can then read bytes, but no fields.
     definitions: Option<Arc<Definitions>>,
     pub(super) header: Option<HeaderStamp>,
     pub(super) images: Images,
     pub(super) per_call: PerCall,
     skipped: AtomicU64,
-    /// Samples at this position in the ring and beyond came after the wake began: the lambda does
-    /// not see them.
+    /// Position in the ring from which on samples arrived after the wake began: the lambda does not
+    /// see them.
     until: AtomicU64,
-    /// The newest that it sees, held while it runs: however many arrive meanwhile, this one stays.
+    /// The newest sample that it sees, pinned while it runs: however many arrive, this one stays.
     newest: Mutex<Option<Lease<SampleMeta>>>,
-    /// Lost before they reached this process, and whether anybody knows.
+    /// Samples lost before they reached this process, or [`UNKNOWN`].
     lost: AtomicU64,
     pub(super) arrivals: Arc<Arrivals>,
-    pub(super) looked: Looked,
+    pub(super) look_back: LookBack,
     /// Reused between column reads, so that they allocate nothing but their result.
     scratch: Mutex<Vec<Lease<SampleMeta>>>,
-    /// Where what is read is drawn, if anybody asked for that.
+    /// Curves of the values that are read, if they are recorded.
     curves: OnceLock<Arc<Curves>>,
 }
 
@@ -87,7 +86,7 @@ impl Topic {
             until: AtomicU64::new(u64::MAX),
             lost: AtomicU64::new(UNKNOWN),
             arrivals,
-            looked: Looked::default(),
+            look_back: LookBack::default(),
             scratch: Mutex::default(),
             curves: OnceLock::new(),
         })
@@ -108,15 +107,15 @@ impl Topic {
         &self.type_name
     }
 
-    /// Newest sample; none before the first.
+    /// Returns the newest sample; `None` before the first.
     pub fn newest(self: &Arc<Self>) -> Option<Sample> {
         let newest = self.reader.newest_before(self.until()).or_else(|| self.pinned());
-        self.looked.at(newest.as_ref());
+        self.look_back.at(newest.as_ref());
         newest.map(|lease| self.sample(lease))
     }
 
-    /// The `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`], and what `[limits]`
-    /// allows.
+    /// Returns the `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`], and as many as
+    /// `[limits]` allows.
     ///
     /// # Errors
     ///
@@ -131,8 +130,8 @@ impl Topic {
         self.hand_out(leases)
     }
 
-    /// Samples received later than `since_ns`, oldest first; as many of the newest as
-    /// [`Topic::last`] gives at most.
+    /// Returns the samples received later than `since_ns`, oldest first; at most as many of the
+    /// newest as [`Topic::last`] returns.
     ///
     /// # Errors
     ///
@@ -153,12 +152,12 @@ impl Topic {
         self: &Arc<Self>,
         leases: Vec<Lease<SampleMeta>>,
     ) -> Result<Vec<Sample>, OutOfFuel> {
-        self.looked.at(leases.first());
+        self.look_back.at(leases.first());
         self.per_call.charge(|| leases.len() * FIELD_BYTES)?;
         Ok(leases.into_iter().map(|lease| self.sample(lease)).collect())
     }
 
-    /// What became of the samples.
+    /// Counts of samples since the start.
     pub fn counts(&self) -> Counts {
         let RingCounts { received, overwritten, no_slot, too_big } = self.reader.counts();
         let skipped = self.skipped.load(Ordering::Relaxed);
@@ -176,16 +175,20 @@ impl Topic {
         clamps::path(path)?;
         let Some(definitions) = &self.definitions else {
             let why = format!(
-                "cannot be found: nobody here has message definitions of `{}`",
+                "cannot be found: there are no message definitions of `{}`",
                 self.type_name
             );
             return Err(WrongField::new(path, why).into());
         };
         let path = FieldPath::compile(definitions, path).map_err(DataError::NoSuchField)?;
-        Ok(Field { topic: Arc::clone(self), pen: self.pen(|| path.path().to_owned()), path })
+        Ok(Field {
+            topic: Arc::clone(self),
+            curve: self.curve_writer(|| path.path().to_owned()),
+            path,
+        })
     }
 
-    /// `field` of the `n` newest samples; at most `call_items` of `[limits]`.
+    /// Returns `field` of the `n` newest samples; at most `call_items` of `[limits]`.
     ///
     /// # Errors
     ///
@@ -199,7 +202,8 @@ impl Topic {
         })
     }
 
-    /// `field` of all samples received later than `since_ns`; at most `call_items` of `[limits]`.
+    /// Returns `field` of all samples received later than `since_ns`; at most `call_items` of
+    /// `[limits]`.
     ///
     /// # Errors
     ///
@@ -209,8 +213,8 @@ impl Topic {
         field: &Field,
         since_ns: i64,
     ) -> Result<Column, DataError> {
-        // How many samples it is shows only on the way. At fixed places they cost little, and are
-        // charged afterwards.
+        // The number of samples is known only after the read. Fields at fixed offsets cost little,
+        // and are charged afterwards.
         let whole_ring = || self.column_work(field, usize::MAX);
         if field.walks() {
             self.per_call.charge(whole_ring)?;
@@ -235,36 +239,36 @@ impl Topic {
         field.must_belong_to(self)?;
         let mut leases = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
         select(&self.reader, &mut leases);
-        self.looked.at(leases.first());
-        let mut unlooked = 0;
+        self.look_back.at(leases.first());
+        let mut unchecked = 0;
         let column =
             leases.iter().try_fold(Column::with_capacity(leases.len()), |mut column, lease| {
-                unlooked += field.work(lease.len()).max(BYTES_PER_LOOK / SAMPLES_PER_LOOK);
-                if unlooked >= BYTES_PER_LOOK {
-                    unlooked = 0;
+                unchecked += field.work(lease.len()).max(BYTES_PER_CHECK / SAMPLES_PER_CHECK);
+                if unchecked >= BYTES_PER_CHECK {
+                    unchecked = 0;
                     self.per_call.due.check()?;
                 }
                 column.values.push(self.number(&field.path, lease)?);
                 column.at_ns.push(lease.meta().at_ns);
                 Ok(column)
             });
-        // Nothing of the ring may stay pinned between two calls.
+        // No slot of the ring may stay pinned between two calls.
         leases.clear();
-        if let (Some(pen), Ok(column)) = (&field.pen, &column) {
-            pen.column(column);
+        if let (Some(curve), Ok(column)) = (&field.curve, &column) {
+            curve.column(column);
         }
         column
     }
 
-    /// From now on what is read of compiled paths goes into these curves.
-    pub(super) fn keep(&self, curves: &Arc<Curves>) {
-        // Whoever asked first has it.
+    /// Records values of fields that are compiled from now on in `curves`.
+    pub(super) fn record_curves(&self, curves: &Arc<Curves>) {
+        // The first request wins.
         let _ = self.curves.set(Arc::clone(curves));
     }
 
-    /// What draws the curve of this name, if any is drawn.
-    pub(super) fn pen(&self, name: impl FnOnce() -> String) -> Option<Arc<Pen>> {
-        self.curves.get().and_then(|curves| curves.pen(self, name()))
+    /// The writer of the curve of this name, if curves are recorded.
+    pub(super) fn curve_writer(&self, name: impl FnOnce() -> String) -> Option<Arc<CurveWriter>> {
+        self.curves.get().and_then(|curves| curves.curve_writer(self, name()))
     }
 
     pub(super) fn number(
@@ -286,15 +290,15 @@ impl Topic {
         }
     }
 
-    /// Bytes that a column of `field` over `n` samples may touch, judged by the newest sample; the
-    /// ring holds no more than its depth.
+    /// Number of bytes that a column of `field` over `n` samples may touch, estimated by the newest
+    /// sample; the ring holds no more than its depth.
     fn column_work(&self, field: &Field, n: usize) -> usize {
         let held = usize::try_from(self.reader.head()).unwrap_or(usize::MAX).min(self.depth);
         let message_bytes = self.reader.newest_before(self.until()).map_or(0, |lease| lease.len());
         n.min(held).min(self.per_call.items).saturating_mul(field.work(message_bytes))
     }
 
-    /// The end of what the lambda sees, as a position in the ring.
+    /// Position in the ring at which the lambda's view ends, exclusive.
     pub(crate) fn until(&self) -> u64 {
         self.until.load(Ordering::Relaxed)
     }
@@ -303,17 +307,17 @@ impl Topic {
         self.newest.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// When a call has to end, for all inputs of the lambda.
+    /// Due time of calls, shared by all inputs of the lambda.
     pub(super) fn due(&self) -> Due {
         self.per_call.due.clone()
     }
 
-    /// What calls cost, for all inputs of the lambda.
+    /// Fuel account of calls, shared by all inputs of the lambda.
     pub(super) fn fuel(&self) -> Fuel {
         self.per_call.fuel.clone()
     }
 
-    /// How many samples the lambda sees at most.
+    /// Maximum number of samples that the lambda sees.
     pub(crate) fn depth(&self) -> usize {
         self.depth
     }
@@ -330,16 +334,16 @@ impl Topic {
         self.skipped.fetch_add(samples, Ordering::Relaxed);
     }
 
-    /// Nanoseconds spent in decoding JPEG and PNG for this topic.
+    /// Time spent in decoding JPEG and PNG for this topic, in ns.
     pub fn decode_ns(&self) -> u64 {
         self.images.decode_ns()
     }
 }
 
-/// What only matters while time passes.
+/// Methods for live runs.
 impl Topic {
-    /// From now on the lambda sees the samples received until `at_ns`, and `woken_by` at most: what
-    /// arrives while it runs belongs to the next wake, as in a replay.
+    /// Limits the lambda's view to samples received until `at_ns`, or up to `woken_by`: samples
+    /// that arrive while it runs belong to the next wake, as in a replay.
     pub(crate) fn see_until(&self, at_ns: i64, woken_by: Option<u64>) {
         let until = woken_by.map_or_else(|| self.received_until(at_ns), |position| position + 1);
         self.until.store(until, Ordering::Relaxed);
@@ -361,17 +365,17 @@ impl Topic {
         self.reader.newest().map(|lease| lease.meta().at_ns)
     }
 
-    /// Notes how many samples were lost before they reached this process.
+    /// Sets the number of samples that were lost before they reached this process.
     pub(crate) fn set_lost(&self, lost: u64) {
         self.lost.store(lost, Ordering::Relaxed);
     }
 }
 
-/// Why a lambda runs.
+/// The cause of a wake.
 pub enum Wake {
     /// A new sample on the input that the schedule names.
     Event(Sample),
-    /// The period is over.
+    /// A tick of the period.
     Tick(Tick),
 }
 

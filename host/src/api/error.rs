@@ -1,4 +1,4 @@
-//! Why a read of data failed, in words for the lambda's author.
+//! Errors of reads, with texts for the lambda's author.
 
 use gleaner_image::ImageError;
 use gleaner_messages::{CdrError, PathError};
@@ -8,7 +8,7 @@ use gleaner_rules::refused;
 
 use super::fuel::OutOfFuel;
 
-/// Why a read of data failed.
+/// A failed read of data.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum DataError {
@@ -38,7 +38,7 @@ pub enum DataError {
     OutOfFuel(#[from] OutOfFuel),
 }
 
-/// Which of the refusals of `wit/types.wit` a lambda gets.
+/// Cases of `data-error` in `wit/types.wit`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum DataErrorKind {
@@ -67,7 +67,7 @@ impl DataErrorKind {
 }
 
 impl DataError {
-    /// The refusal that a lambda gets.
+    /// The case that the lambda receives.
     pub fn kind(&self) -> DataErrorKind {
         match self {
             Self::NoSuchInput { .. } => DataErrorKind::NoSuchInput,
@@ -77,7 +77,7 @@ impl DataError {
             Self::NoImageType { .. } | Self::NotAFrame { .. } => DataErrorKind::NotAFrame,
             Self::TooLarge { .. } | Self::NoSlot { .. } | Self::NoRoom(_) => DataErrorKind::NoRoom,
             Self::OutOfRange(_) => DataErrorKind::OutOfRange,
-            // Whoever can end a guest ends it instead.
+            // A guest that can be interrupted is ended instead.
             Self::OutOfTime | Self::OutOfFuel(_) => DataErrorKind::NoRoom,
         }
     }

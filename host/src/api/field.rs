@@ -5,28 +5,28 @@ use std::sync::Arc;
 use gleaner_messages::FieldPath;
 use gleaner_rules::clamps::WrongField;
 
-use super::curves::Pen;
+use super::curves::CurveWriter;
 use super::data::{DataError, Topic};
 
-/// What reading a field at a fixed place costs, in bytes: the walk to it, and its value.
+/// Cost of reading a field at a fixed offset, in bytes: its path and its value.
 pub(super) const FIELD_BYTES: usize = 64;
 
 /// A compiled path into the messages of one topic.
 pub struct Field {
     pub(super) topic: Arc<Topic>,
     pub(super) path: FieldPath,
-    pub(super) pen: Option<Arc<Pen>>,
+    pub(super) curve: Option<Arc<CurveWriter>>,
 }
 
 impl Field {
-    /// Whether elements of varying size lie before it, so that reading it walks over much of a
+    /// Returns whether elements of varying size precede it, so that reading it parses much of the
     /// message.
     pub(super) fn walks(&self) -> bool {
         self.path.walks()
     }
 
-    /// Bytes that reading it from a message of `message_bytes` may touch: all of them if elements
-    /// of varying size lie before it.
+    /// Number of bytes that reading it from a message of `message_bytes` may touch: all of them if
+    /// elements of varying size precede it.
     pub(super) fn work(&self, message_bytes: usize) -> usize {
         if self.walks() { message_bytes.max(FIELD_BYTES) } else { FIELD_BYTES }
     }
@@ -36,10 +36,10 @@ impl Field {
         self.path.path()
     }
 
-    /// Notes what was read of the sample of `at_ns`.
+    /// Adds the value of the sample of `at_ns` to the field's curve.
     pub(super) fn draw(&self, at_ns: i64, value: f64) {
-        if let Some(pen) = &self.pen {
-            pen.number(at_ns, value);
+        if let Some(curve) = &self.curve {
+            curve.number(at_ns, value);
         }
     }
 

@@ -1,16 +1,16 @@
-//! A sample seen as an image: raw pixels in place, JPEG and PNG decoded lazily into slots of their
-//! own.
+//! Frames: samples as images. Raw pixels are used in place; JPEG and PNG are decoded on demand into
+//! separate slots.
 
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, PoisonError};
 use std::time::Instant;
 
-use gleaner_buffers::{Lease, Pool, Refusal};
+use gleaner_buffers::{DraftError, Lease, Pool};
 use gleaner_messages::{CdrError, CompressedView, Endian, ImageView};
 
 use super::data::{DataError, Identity, OutOfFuel, Sample, Stamps};
 pub use super::images::Images;
-use super::piece::Piece;
+use super::shared_bytes::SharedBytes;
 use gleaner_image::{
     self as image, Encoding, ImageError, Pace, PixelError, PixelErrorKind, Roi, View, ops,
 };
@@ -18,23 +18,23 @@ pub use gleaner_rules::frames::Budget;
 use gleaner_rules::frames::Taken;
 use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 
-/// Bytes of pixels that the fastest machine decodes in a microsecond: four times what was measured
+/// Bytes of pixels that the fastest machine decodes per microsecond: four times the measured speed
 /// (0.5 GB/s on an x86-64 server).
 const FASTEST_DECODE: u64 = 2_000;
 
-/// Bytes that are copied while one is worked on, if a copy makes 22 GB/s: then 8 bytes of it take
-/// as long as a unit of fuel. Measured on an x86-64 server: 2.7 and 4.3 to 41 GB/s, and 0.5 GB/s
-/// for decoding, which costs `images::DECODE`.
+/// Number of bytes that are copied in the time of processing one, at 22 GB/s for a copy, of which 8
+/// bytes take as long as a unit of fuel. Measured on an x86-64 server: 2.7 and 4.3 to 41 GB/s, and
+/// 0.5 GB/s for decoding, which costs `images::DECODE`.
 const HISTOGRAM: u64 = 8;
 const GRAY: u64 = 4;
 
 /// An operation on the pixels of a frame. [`Frame::work`] has the price of each.
 #[derive(Clone, Copy)]
-enum Operation {
+enum PixelOperation {
     MeanLuma(Option<Roi>),
     Histogram(Option<Roi>),
     ToGray,
-    /// To width and height.
+    /// Width and height of the result.
     Resize(u32, u32),
 }
 
@@ -60,14 +60,14 @@ impl Info {
     }
 }
 
-/// A message of an image type, taken apart but not yet believed.
-pub(super) enum Picture<'a> {
+/// A parsed message of an image type, whose values are not checked yet.
+pub(super) enum ImageMessage<'a> {
     Raw(ImageView<'a>),
     Compressed(CompressedView<'a>),
 }
 
-impl<'a> Picture<'a> {
-    /// None if the type is no image.
+impl<'a> ImageMessage<'a> {
+    /// Parses a message; `None` if its type is no image.
     pub(super) fn of(
         type_name: &str,
         cdr: &'a [u8],
@@ -81,17 +81,17 @@ impl<'a> Picture<'a> {
     }
 }
 
-/// A sample seen as an image. Holds its pixels until dropped.
+/// A sample as an image. Holds its pixels until dropped.
 pub struct Frame {
-    source: Source,
+    source: FrameOrigin,
     info: Info,
-    pixels: Piece,
+    pixels: SharedBytes,
     _taken: Taken,
 }
 
-/// What a frame remembers of its sample without holding it.
+/// The sample of a frame: its topic, identity and stamps, without its slot.
 #[derive(Clone)]
-struct Source {
+struct FrameOrigin {
     topic: Arc<super::data::Topic>,
     identity: Identity,
     stamps: Stamps,
@@ -99,7 +99,7 @@ struct Source {
 
 impl Frame {
     pub(super) fn of(sample: &Sample) -> Result<Self, DataError> {
-        let source = Source {
+        let source = FrameOrigin {
             topic: Arc::clone(sample.topic()),
             identity: sample.identity(),
             stamps: sample.stamps(),
@@ -107,15 +107,15 @@ impl Frame {
         let picture = sample.picture()?;
         let taken = source.topic.images.made.take(0)?;
         match picture {
-            Picture::Raw(raw) => Self::raw(source, sample, &raw, taken),
-            Picture::Compressed(compressed) => {
+            ImageMessage::Raw(raw) => Self::raw(source, sample, &raw, taken),
+            ImageMessage::Compressed(compressed) => {
                 Self::decoded(source, sample, compressed.data, taken)
             }
         }
     }
 
     fn raw(
-        source: Source,
+        source: FrameOrigin,
         sample: &Sample,
         raw: &ImageView<'_>,
         taken: Taken,
@@ -132,12 +132,12 @@ impl Frame {
         let view = info.view(raw.data).map_err(|error| source.not_a_frame(error))?;
         // The pixels were borrowed from the message, so they lie within it.
         let start = raw.data.as_ptr().addr() - sample.bytes().as_ptr().addr();
-        let pixels = Piece::of_message(sample.lease()).part(start as u64, view.bytes().len());
+        let pixels = SharedBytes::of_message(sample.lease()).part(start as u64, view.bytes().len());
         Ok(Self { source, info, pixels, _taken: taken })
     }
 
     fn decoded(
-        source: Source,
+        source: FrameOrigin,
         sample: &Sample,
         data: &[u8],
         taken: Taken,
@@ -168,8 +168,8 @@ impl Frame {
         Ok(Self::of_decoded(source, lease, taken))
     }
 
-    fn of_decoded(source: Source, lease: Lease<Info>, taken: Taken) -> Self {
-        Self { source, info: *lease.meta(), pixels: Piece::of_decoded(lease), _taken: taken }
+    fn of_decoded(source: FrameOrigin, lease: Lease<Info>, taken: Taken) -> Self {
+        Self { source, info: *lease.meta(), pixels: SharedBytes::of_decoded(lease), _taken: taken }
     }
 
     /// The shape.
@@ -177,34 +177,35 @@ impl Frame {
         self.info
     }
 
-    /// Identity of the sample behind it.
+    /// Identity of its sample.
     pub fn identity(&self) -> &Identity {
         &self.source.identity
     }
 
-    /// Stamps of the sample behind it.
+    /// Stamps of its sample.
     pub fn stamps(&self) -> Stamps {
         self.source.stamps
     }
 
-    /// Work of an operation, in bytes that are copied in the same time: the price of a call, on
-    /// whatever machine.
-    fn work(&self, operation: Operation) -> usize {
+    /// Work of an operation, as the number of bytes that are copied in the same time: the price of
+    /// a call, equal on every machine.
+    fn work(&self, operation: PixelOperation) -> usize {
         let work = self.view().and_then(|view| {
             let work = match operation {
-                Operation::MeanLuma(roi) => ops::work(&view, roi),
-                Operation::Histogram(roi) => ops::work(&view, roi).map(|bytes| HISTOGRAM * bytes),
-                Operation::ToGray => ops::work(&view, None).map(|bytes| GRAY * bytes),
-                Operation::Resize(width, height) => {
-                    ops::resized(&view, width, height).and_then(|(_, bytes)| {
+                PixelOperation::MeanLuma(roi) => ops::work(&view, roi),
+                PixelOperation::Histogram(roi) => {
+                    ops::work(&view, roi).map(|bytes| HISTOGRAM * bytes)
+                }
+                PixelOperation::ToGray => ops::work(&view, None).map(|bytes| GRAY * bytes),
+                PixelOperation::Resize(width, height) => ops::resized(&view, width, height)
+                    .and_then(|(_, bytes)| {
                         let has_room = self.source.topic.images.made.has(bytes);
                         if has_room { ops::resize_work(&view, width, height) } else { Ok(0) }
-                    })
-                }
+                    }),
             };
             work.map_err(|error| self.source.refused(error))
         });
-        // What is refused costs as much as a look at the frame.
+        // A refused operation costs as much as reading the frame.
         work.map_or(self.bytes().len(), |work| usize::try_from(work).unwrap_or(usize::MAX))
     }
 
@@ -218,7 +219,7 @@ impl Frame {
     /// # Errors
     ///
     /// [`OutOfFuel`].
-    pub fn read(&self, offset: u64, len: u32) -> Result<Piece, OutOfFuel> {
+    pub fn read(&self, offset: u64, len: u32) -> Result<SharedBytes, OutOfFuel> {
         let per_call = &self.source.topic.per_call;
         let piece = self.pixels.part(offset, per_call.bytes.min(len as usize));
         per_call.charge(|| piece.len())?;
@@ -232,7 +233,8 @@ impl Frame {
     /// [`DataError::OutOfRange`] for a region outside the frame; [`DataError::NotAFrame`] for Bayer
     /// encodings; [`DataError::OutOfTime`].
     pub fn mean_luma(&self, roi: Option<Roi>) -> Result<f64, DataError> {
-        let luma = self.begin(Operation::MeanLuma(roi))?.work(|view| ops::mean_luma(view, roi))?;
+        let luma =
+            self.begin(PixelOperation::MeanLuma(roi))?.work(|view| ops::mean_luma(view, roi))?;
         self.source.draw_luma(roi, luma);
         Ok(luma)
     }
@@ -243,36 +245,36 @@ impl Frame {
     ///
     /// As [`Frame::mean_luma`].
     pub fn histogram(&self, roi: Option<Roi>) -> Result<[u32; 256], DataError> {
-        self.begin(Operation::Histogram(roi))?.work(|view| ops::histogram(view, roi))
+        self.begin(PixelOperation::Histogram(roi))?.work(|view| ops::histogram(view, roi))
     }
 
-    /// Charges an operation. What it returns is the way to the pixels.
-    fn begin(&self, operation: Operation) -> Result<Paid<'_>, DataError> {
+    /// Charges an operation, and returns access to the pixels.
+    fn begin(&self, operation: PixelOperation) -> Result<Paid<'_>, DataError> {
         self.source.topic.per_call.charge(|| self.work(operation))?;
         Ok(Paid(self))
     }
 
-    /// A new frame of that size: rgb8, or mono8 for grey encodings.
+    /// Returns a new frame of that size: rgb8, or mono8 for grey encodings.
     ///
     /// # Errors
     ///
     /// [`DataError::OutOfRange`] for sides of 0 or above [`ops::MAX_RESIZED_SIDE`];
     /// [`DataError::NoRoom`]; as [`Frame::mean_luma`].
     pub fn resize(&self, width: u32, height: u32) -> Result<Self, DataError> {
-        let paid = self.begin(Operation::Resize(width, height))?;
+        let paid = self.begin(PixelOperation::Resize(width, height))?;
         let (encoding, _) = ops::resized(&self.view()?, width, height)
             .map_err(|error| self.source.refused(error))?;
         let info = Info::tight(width, height, encoding);
         paid.make(info, |view, out| ops::resize(view, width, height, out).map(drop))
     }
 
-    /// A new mono8 frame of the same size.
+    /// Returns a new mono8 frame of the same size.
     ///
     /// # Errors
     ///
     /// [`DataError::NoRoom`]; as [`Frame::mean_luma`].
     pub fn to_gray(&self) -> Result<Self, DataError> {
-        let paid = self.begin(Operation::ToGray)?;
+        let paid = self.begin(PixelOperation::ToGray)?;
         paid.make(Info::tight(self.info.width, self.info.height, Encoding::Mono8), ops::to_gray)
     }
 
@@ -281,11 +283,11 @@ impl Frame {
     }
 }
 
-/// A frame whose pixels may be worked on, since the operation is paid for.
+/// Access to the pixels of a frame for an operation that was charged.
 struct Paid<'a>(&'a Frame);
 
 impl Paid<'_> {
-    /// Works on the pixels until the call is due.
+    /// Runs `work` on the pixels, until the call is due.
     fn work<T>(
         self,
         work: impl FnOnce(&View<'_>) -> Result<T, PixelError>,
@@ -295,7 +297,7 @@ impl Paid<'_> {
         work(&self.0.view()?.paced(&Pace::new(&in_time))).map_err(|error| source.refused(error))
     }
 
-    /// Makes a new frame.
+    /// Creates a new frame.
     fn make(
         self,
         info: Info,
@@ -306,7 +308,7 @@ impl Paid<'_> {
         let taken = source.topic.images.made.take(len)?;
         let mut bytes = vec![0; len].into_boxed_slice();
         self.work(|view| fill(view, &mut bytes))?;
-        Ok(Frame { source, info, pixels: Piece::made(bytes), _taken: taken })
+        Ok(Frame { source, info, pixels: SharedBytes::made(bytes), _taken: taken })
     }
 }
 
@@ -316,7 +318,7 @@ impl Info {
     }
 }
 
-impl Source {
+impl FrameOrigin {
     fn draw_luma(&self, roi: Option<Roi>, luma: f64) {
         let name = || match roi {
             None => "mean luma".to_owned(),
@@ -324,8 +326,8 @@ impl Source {
                 format!("mean luma of {width}x{height} at {x},{y}")
             }
         };
-        if let Some(pen) = self.topic.pen(name) {
-            pen.number(self.stamps.at_ns, luma);
+        if let Some(writer) = self.topic.curve_writer(name) {
+            writer.number(self.stamps.at_ns, luma);
         }
     }
 
@@ -343,7 +345,7 @@ impl Source {
     }
 }
 
-fn decode(source: &Source, pool: &Pool<Info>, data: &[u8]) -> Result<Lease<Info>, DataError> {
+fn decode(source: &FrameOrigin, pool: &Pool<Info>, data: &[u8]) -> Result<Lease<Info>, DataError> {
     let topic = || source.identity.topic.clone();
     let header = image::probe(data).map_err(|error| source.not_a_frame(error))?;
     let allowed = pool.slot_bytes();
@@ -357,10 +359,10 @@ fn decode(source: &Source, pool: &Pool<Info>, data: &[u8]) -> Result<Lease<Info>
     };
     let len = header.rgb8_len().ok_or_else(too_large)?;
     let mut draft = pool.draft(len).map_err(|refusal| match refusal {
-        Refusal::NoSlot => {
+        DraftError::NoSlot => {
             DataError::NoSlot { topic: topic(), input: source.topic.name().to_owned() }
         }
-        Refusal::TooBig { .. } => too_large(),
+        DraftError::TooBig { .. } => too_large(),
     })?;
     let in_time = || source.topic.per_call.due.check().is_ok();
     image::decode_rgb8_paced(data, &header, allowed, &mut draft, &Pace::new(&in_time))

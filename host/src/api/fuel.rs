@@ -1,22 +1,21 @@
-//! What calls of a lambda cost: units of fuel for the bytes that the host touches.
+//! Charges calls of a lambda: units of fuel for the bytes that the host touches.
 //!
-//! Each call is charged here, by the room that does its work, before the work is done. So the price
-//! of a call is the same for every kind of guest; only a guest that has an allowance can run out of
-//! it.
+//! Each call is charged by the room that does its work, before the work is done. So the price of a
+//! call is the same for every kind of guest. Only a guest with an allowance can run out of fuel.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Bytes that the host touches for one unit of fuel: roughly what an instruction of a guest does in
-/// the same time.
+/// Bytes that the host touches for one unit of fuel: they take about the time of one instruction of
+/// a guest.
 const BYTES_PER_FUEL: u64 = 8;
 /// Fuel for the call itself.
 const FUEL_PER_CALL: u64 = 20;
-/// The allowance of guests that nobody charges.
+/// The allowance of guests that are not charged.
 const ENDLESS: u64 = u64::MAX;
 
-/// The work of host calls in the current wake. A guest's own instructions are counted elsewhere.
-/// Clones share one account, which one thread uses.
+/// Account of the work of host calls in the current wake. A guest's own instructions are counted
+/// elsewhere. Clones share one account, which one thread uses.
 #[derive(Clone)]
 pub struct Fuel(Arc<Account>);
 
@@ -25,31 +24,31 @@ struct Account {
     allowed: AtomicU64,
 }
 
-/// The host has done as much for a guest as its fuel allows.
+/// The fuel of a guest is used up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("host calls used all fuel")]
 pub struct OutOfFuel;
 
 impl Default for Fuel {
-    /// Without an allowance: nothing is refused.
+    /// An account without an allowance, which refuses nothing.
     fn default() -> Self {
         Self(Arc::new(Account { used: AtomicU64::new(0), allowed: AtomicU64::new(ENDLESS) }))
     }
 }
 
 impl Fuel {
-    /// Begins a call into the guest, during which the host may use as much.
+    /// Begins a call into the guest, for which host calls may use `allowed` units.
     pub fn begin(&self, allowed: u64) {
         self.0.used.store(0, Ordering::Relaxed);
         self.0.allowed.store(allowed, Ordering::Relaxed);
     }
 
-    /// Units used since [`Fuel::begin`].
+    /// Number of units used since [`Fuel::begin`].
     pub fn used(&self) -> u64 {
         self.0.used.load(Ordering::Relaxed)
     }
 
-    /// Charges one call that only looks at what is there.
+    /// Charges one call that only reads a value.
     ///
     /// # Errors
     ///
@@ -58,8 +57,8 @@ impl Fuel {
         self.charge(|| 0)
     }
 
-    /// Charges one call that touches so many bytes. They are not even computed for a guest without
-    /// an allowance.
+    /// Charges one call that touches `bytes` bytes, which are not computed for a guest without an
+    /// allowance.
     ///
     /// # Errors
     ///
@@ -71,7 +70,7 @@ impl Fuel {
         self.charge_units(bytes() as u64 / BYTES_PER_FUEL)
     }
 
-    /// Charges one call that takes as long as so many instructions.
+    /// Charges one call that takes as long as `units` instructions.
     ///
     /// # Errors
     ///
@@ -102,7 +101,7 @@ mod tests {
     #[test]
     fn a_guest_without_an_allowance_is_not_charged() {
         let fuel = Fuel::default();
-        assert_eq!(fuel.charge(|| unreachable!("nobody pays for it")), Ok(()));
+        assert_eq!(fuel.charge(|| unreachable!("not charged")), Ok(()));
         assert_eq!(fuel.used(), 0);
     }
 }

@@ -1,4 +1,4 @@
-//! Room for images: slots for decoded ones, and a budget for those that a lambda makes.
+//! Memory for images: slots for decoded ones, and a budget for those that a lambda creates.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -9,11 +9,11 @@ use gleaner_rules::frames::Budget;
 
 use super::frame::Info;
 
-/// Bytes that are copied in the time in which one is decoded; see `HISTOGRAM` in `frame`.
+/// Number of bytes that are copied in the time of decoding one; see `HISTOGRAM` in `frame`.
 const DECODE: usize = 40;
 
-/// Room for the images of one input, beyond the ring: decoded ones in slots, made ones out of a
-/// budget.
+/// Memory for the images of one input, beside the ring: slots for decoded images, and a budget for
+/// created ones.
 pub struct Images {
     pub(super) decoded: Option<Pool<Info>>,
     pub(super) made: Budget,
@@ -23,14 +23,14 @@ pub struct Images {
 }
 
 impl Images {
-    /// `decoded` holds what JPEG and PNG become (none for raw images); `made` is shared by all
-    /// inputs of a lambda.
+    /// `decoded` holds decoded JPEG and PNG (`None` for raw images). All inputs of a lambda share
+    /// `made`.
     pub fn new(decoded: Option<Pool<Info>>, made: Budget) -> Self {
         Self { decoded, made, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
     }
 
-    /// Work of decoding `data`, by its header, in bytes; none if it is the newest decoded image
-    /// already.
+    /// Work of decoding `data` in bytes, estimated by its header; 0 if it is the newest decoded
+    /// image.
     pub(super) fn decode_work(&self, position: Option<u64>, data: &[u8]) -> usize {
         let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
         if newest.as_ref().is_some_and(|(at, _)| Some(*at) == position) {

@@ -1,8 +1,8 @@
-//! Models that run on the host. This build has no model runtime: every call says so.
+//! Models that run on the host. This build has no model runtime: every call returns that error.
 
 use super::fuel::{Fuel, OutOfFuel};
 
-/// Why a model could not be opened or run.
+/// A model that could not be opened or run.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InferenceError {
     /// The host was built without a model runtime.
@@ -13,7 +13,7 @@ pub enum InferenceError {
     OutOfFuel(#[from] OutOfFuel),
 }
 
-/// Which of the refusals of `wit/inference.wit` a lambda gets.
+/// Cases of `inference-error` in `wit/inference.wit`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum InferenceErrorKind {
@@ -30,16 +30,16 @@ impl InferenceErrorKind {
 }
 
 impl InferenceError {
-    /// The refusal that a lambda gets.
+    /// The case that the lambda receives.
     pub fn kind(&self) -> InferenceErrorKind {
         match self {
-            // Whoever can end a guest for want of fuel ends it instead.
+            // A guest with a fuel allowance is ended instead.
             Self::NoRuntime | Self::OutOfFuel(_) => InferenceErrorKind::NoRuntime,
         }
     }
 }
 
-/// Numbers on the host. Cannot be made in this build.
+/// Numbers on the host. Cannot be created in this build.
 #[derive(Debug)]
 pub enum Tensor {}
 
@@ -48,7 +48,7 @@ pub enum Tensor {}
 pub enum Model {}
 
 impl Tensor {
-    /// Makes a tensor from numbers that take so many bytes with its shape.
+    /// Creates a tensor from numbers that take `bytes` bytes with its shape.
     ///
     /// # Errors
     ///
@@ -58,7 +58,7 @@ impl Tensor {
         Self::new(fuel)
     }
 
-    /// Makes a tensor from a frame.
+    /// Creates a tensor from a frame.
     ///
     /// # Errors
     ///

@@ -1,13 +1,13 @@
-//! What a lambda may do, written once, in plain Rust.
+//! The API of lambdas, written once, in plain Rust.
 //!
 //! Five of the files beside this one carry the names of the five WIT interfaces. WebAssembly
 //! (`guest::wasm`) and Python (`host/python`) are thin skins over them: they convert arguments and
-//! errors, and decide nothing. What is here knows neither.
+//! errors, and decide nothing. This room depends on neither.
 //!
-//! So each call does three things here: it is charged ([`fuel`]), before its work wherever that is
-//! known; what takes long looks at the deadline as it goes (`call`); and a refusal says which one
-//! of the WIT it is (`kind`). A call that only looks at a value costs what any call costs, which a
-//! skin charges where it looks up what a handle stands for.
+//! So each call does three things here. It is charged ([`fuel`]), before its work if the work is
+//! known by then. Long work checks the deadline as it proceeds (`call`). And an error names its
+//! case in the WIT (`kind`). A call that only reads a value has the base price, which a skin
+//! charges when it resolves the handle.
 
 mod call;
 pub mod curves;
@@ -19,36 +19,36 @@ pub mod fuel;
 mod images;
 pub mod inference;
 pub mod log;
-mod piece;
 pub mod relayed;
 mod sample;
 pub mod scratch;
+mod shared_bytes;
 pub mod trace;
 pub mod trigger;
 mod values;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use gleaner_journal::Said;
+use gleaner_journal::LogDigest;
 use gleaner_lambda::Trigger;
 use gleaner_lambda::manifest::{ConfigValue, Limits};
 
 use data::{DataError, Due, Topic};
 use field::FIELD_BYTES;
 use fuel::{Fuel, OutOfFuel};
-use log::{Line, Log};
+use log::{Log, LogLine};
 use scratch::Scratch;
 use trigger::Triggers;
 
-/// What one lambda sees and causes, lent to its guest. One lock, held for the length of one call,
-/// by one thread.
+/// Inputs, triggers, log and scratch of one lambda, shared with its guest. One lock, held for the
+/// length of one call, by one thread.
 #[derive(Clone)]
 pub struct Session {
-    state: Arc<Mutex<State>>,
+    state: Arc<Mutex<SessionState>>,
     fuel: Fuel,
 }
 
-struct State {
+struct SessionState {
     inputs: Vec<Arc<Topic>>,
     config: Vec<(String, ConfigValue)>,
     now_ns: i64,
@@ -60,36 +60,35 @@ struct State {
 }
 
 impl Session {
-    /// A session over these inputs, in the manifest's order, and this configuration, within these
-    /// limits.
+    /// A session over `inputs`, in the manifest's order, with `config`, within `limits`.
     pub fn new(
         inputs: Vec<Arc<Topic>>,
         config: Vec<(String, ConfigValue)>,
         limits: &Limits,
     ) -> Self {
-        // All inputs of a lambda have the same.
+        // All inputs of a lambda share them.
         let due = inputs.first().map(|topic| topic.due());
         let fuel = inputs.first().map(|topic| topic.fuel()).unwrap_or_default();
         let (triggers, log) = (Triggers::new(limits.events_per_minute), Log::new(limits));
         let scratch = Scratch::new(limits.scratch.bytes(), limits.call_bytes.as_usize());
-        let state = State { inputs, config, now_ns: 0, triggers, log, scratch, due, backed_off: 0 };
+        let state =
+            SessionState { inputs, config, now_ns: 0, triggers, log, scratch, due, backed_off: 0 };
         Self { state: Arc::new(Mutex::new(state)), fuel }
     }
 
-    /// Begins a wake at `now_ns`: what an earlier wake left behind is dropped.
+    /// Begins a wake at `now_ns`, and drops triggers of an earlier one.
     pub fn begin(&self, now_ns: i64) {
         let mut state = self.lock();
         state.now_ns = now_ns;
         state.triggers.begin();
     }
 
-    /// Ends a wake and takes what it caused, in the order of the calls.
+    /// Ends a wake and returns its triggers, in the order of the calls.
     pub fn end(&self) -> Vec<Trigger> {
         self.lock().triggers.end()
     }
 
-    /// Runs an `init`, which may come in the middle of a wake but is no part of it: it can cause
-    /// nothing.
+    /// Runs an `init`, which may happen during a wake but is no part of it: it cannot trigger.
     pub fn during_init<R>(&self, init: impl FnOnce() -> R) -> R {
         let triggers = self.lock().triggers.suspend();
         let result = init();
@@ -97,37 +96,37 @@ impl Session {
         result
     }
 
-    /// Takes the log lines written since the last call, and what a journal notes of them.
-    pub fn take_log(&self) -> (Vec<Line>, Said) {
+    /// Takes the log lines written since the last call, and their digest for the journal.
+    pub fn take_log(&self) -> (Vec<LogLine>, LogDigest) {
         self.lock().log.take()
     }
 
-    /// Log lines dropped by the rate limit, since the start.
+    /// Number of log lines dropped by the rate limit, since the start.
     pub fn log_dropped(&self) -> u64 {
         self.lock().log.dropped()
     }
 
-    /// Triggers refused by the rate limit, since the start.
+    /// Number of triggers refused by the rate limit, since the start.
     pub fn triggers_refused(&self) -> u64 {
         self.lock().triggers.refused()
     }
 
-    /// Counts a wake that did not happen, because the lambda had faulted again and again.
-    pub fn pass_over(&self) {
+    /// Counts a wake that was skipped because the lambda backs off after faults.
+    pub fn count_backed_off(&self) {
         self.lock().backed_off += 1;
     }
 
-    /// Wakes passed over, since the start.
+    /// Number of wakes skipped by back-off, since the start.
     pub fn backed_off(&self) -> u64 {
         self.lock().backed_off
     }
 
-    /// When calls of the lambda have to end; none without inputs, where no call takes long.
+    /// Due time of the lambda's calls; `None` without inputs, where no call is long.
     pub fn due(&self) -> Option<Due> {
         self.lock().due.clone()
     }
 
-    /// What calls of the lambda cost. Nothing, unless its guest begins an allowance.
+    /// Fuel account of the lambda's calls. Nothing is charged unless its guest begins an allowance.
     pub fn fuel(&self) -> &Fuel {
         &self.fuel
     }
@@ -162,7 +161,7 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`DataError::NoSuchInput`] names those that exist; [`DataError::OutOfFuel`].
+    /// [`DataError::NoSuchInput`], which names the existing inputs; [`DataError::OutOfFuel`].
     pub fn input(&self, name: &str) -> Result<Arc<Topic>, DataError> {
         self.fuel.charge(|| name.len())?;
         let state = self.lock();
@@ -173,9 +172,8 @@ impl Session {
         })
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
-        // No call leaves the state half changed, so a poisoned lock holds nothing worse than a
-        // shorter list.
+    fn lock(&self) -> MutexGuard<'_, SessionState> {
+        // No call leaves the state half changed, so after a panic at worst a list is shorter.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

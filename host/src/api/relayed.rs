@@ -1,14 +1,14 @@
-//! What a lambda caused in another process: read out there, and taken over here by the rules that
-//! hold for its calls.
+//! Relays triggers, log and counts of a lambda from another process, which reads them from its
+//! session; this process checks them like calls.
 
-use gleaner_journal::Said;
+use gleaner_journal::LogDigest;
 use gleaner_lambda::{Trigger, TriggerKind};
 use gleaner_rules::triggers::TriggerError as Refusal;
 use serde_json::Value;
 
 use super::Session;
 use super::data::Topic;
-use super::log::Line;
+use super::log::LogLine;
 use super::trigger::{Attribute, AttributeValue, TriggerError};
 
 impl Session {
@@ -17,16 +17,16 @@ impl Session {
         self.lock().triggers.list().to_vec()
     }
 
-    /// Log lines that wait to be taken.
+    /// Number of log lines that wait to be taken.
     pub fn lines(&self) -> usize {
         self.lock().log.behind(0).0.len()
     }
 
-    /// The lines behind the first `n` of them, which stay, and what a journal notes of all.
-    pub fn lines_behind(&self, n: usize) -> (Vec<Line>, Said) {
+    /// Returns the lines after the first `n`, without removing them, and the digest of all lines.
+    pub fn lines_behind(&self, n: usize) -> (Vec<LogLine>, LogDigest) {
         let state = self.lock();
-        let (lines, said) = state.log.behind(n);
-        (lines.to_vec(), said)
+        let (lines, digest) = state.log.behind(n);
+        (lines.to_vec(), digest)
     }
 
     /// Takes a trigger over from another process.
@@ -55,12 +55,12 @@ impl Session {
         }
     }
 
-    /// Takes over what another process counted in a call: all lines that the lambda logged, of
-    /// which those that passed the rate limit were taken over by `Session::write`, and what was
-    /// dropped and refused.
-    pub fn relay_counts(&self, said: Said, log_dropped: u64, triggers_refused: u64) {
+    /// Takes over the counts of a call from another process: the digest of all lines that the
+    /// lambda logged, and the numbers of dropped lines and refused triggers. `Session::write` takes
+    /// over the lines that passed the rate limit.
+    pub fn relay_counts(&self, digest: LogDigest, log_dropped: u64, triggers_refused: u64) {
         let mut state = self.lock();
-        state.log.relay(said, log_dropped);
+        state.log.relay(digest, log_dropped);
         state.triggers.add_refused(triggers_refused);
     }
 }
@@ -78,19 +78,20 @@ fn attribute(value: Value) -> Option<AttributeValue> {
 }
 
 impl Topic {
-    /// Forgets how far back the lambda has looked.
-    pub fn forget_looked(&self) {
-        self.looked.forget();
+    /// Resets how far back the lambda has looked.
+    pub fn reset_look_back(&self) {
+        self.look_back.reset();
     }
 
-    /// How many samples back from the newest the lambda has looked in this wake; none if at none.
-    pub fn looked_back(&self) -> Option<u64> {
-        self.looked.oldest().map(|oldest| self.reader().head().saturating_sub(oldest))
+    /// Number of samples, back from the newest, at which the lambda has looked in this wake; `None`
+    /// if it looked at none.
+    pub fn look_back(&self) -> Option<u64> {
+        self.look_back.oldest().map(|oldest| self.reader().head().saturating_sub(oldest))
     }
 
-    /// Notes that the lambda, in another process, has looked so many samples back from the newest.
-    pub fn relay_looked(&self, back: u64) {
-        self.looked.at_position(self.reader().head().saturating_sub(back));
+    /// Notes that the lambda, in another process, has looked `back` samples back from the newest.
+    pub fn relay_look_back(&self, back: u64) {
+        self.look_back.at_position(self.reader().head().saturating_sub(back));
     }
 }
 
@@ -112,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn a_trigger_is_taken_over_as_it_was_caused() {
+    fn a_relayed_trigger_is_unchanged() {
         let attributes = json!({"n": 1, "x": 1.0, "far": -2.5e300, "is": true, "text": "ä\u{1b}"});
         let there = [
             trigger(json!({"kind": "event", "label": "a", "score": 1.0, "attributes": attributes})),

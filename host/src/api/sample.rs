@@ -1,18 +1,18 @@
-//! One message, as a lambda reads it: fields, bytes, stamps, and its picture if it is one.
+//! One message, as a lambda reads it: fields, bytes, stamps, and its image if it is one.
 
 use std::sync::Arc;
 
 use gleaner_buffers::Lease;
-use gleaner_messages::{Endian, Value};
+use gleaner_messages::{Endian, MessageValue};
 use gleaner_rules::clamps::Length;
 use gleaner_transport::SampleMeta;
 
 use super::data::{DataError, Field, OutOfFuel, Topic};
-use super::frame::{Frame, Picture};
-use super::piece::Piece;
+use super::frame::{Frame, ImageMessage};
+use super::shared_bytes::SharedBytes;
 use super::values::{Identity, Stamps};
 
-/// One message; holds its cell of the ring until dropped.
+/// One message; holds its slot of the ring until dropped.
 #[derive(Clone)]
 pub struct Sample {
     topic: Arc<Topic>,
@@ -20,18 +20,18 @@ pub struct Sample {
 }
 
 impl Sample {
-    /// The message of `topic` in this cell of its ring.
+    /// The message of `topic` in this slot of its ring.
     pub(super) fn new(topic: Arc<Topic>, lease: Lease<SampleMeta>) -> Self {
         Self { topic, lease }
     }
 
-    /// What makes it different from every other sample.
+    /// Unique identity of the sample.
     pub fn identity(&self) -> Identity {
         let meta = self.lease.meta();
         Identity { topic: self.topic.topic.clone(), writer: meta.writer, seq: meta.seq }
     }
 
-    /// When it came to be.
+    /// Timestamps of the sample.
     pub fn stamps(&self) -> Stamps {
         let meta = self.lease.meta();
         let header_ns = self
@@ -42,14 +42,14 @@ impl Sample {
         Stamps { at_ns: meta.at_ns, publish_ns: meta.publish_ns, header_ns }
     }
 
-    /// Any field.
+    /// Returns the value of any field.
     ///
     /// # Errors
     ///
     /// [`DataError::WrongField`] if the field belongs to another topic or is longer than one call
-    /// hands out; [`DataError::Malformed`].
-    pub fn get(&self, field: &Field) -> Result<Value<'_>, DataError> {
-        // A path may walk over the whole message, and the value may be most of it.
+    /// may return; [`DataError::Malformed`].
+    pub fn get(&self, field: &Field) -> Result<MessageValue<'_>, DataError> {
+        // A path may require parsing the whole message, and the value may be most of it.
         self.topic.per_call.charge(|| self.lease.len())?;
         field.must_belong_to(&self.topic)?;
         let value = field
@@ -60,17 +60,20 @@ impl Sample {
             field.draw(self.lease.meta().at_ns, number);
         }
         let length = match &value {
-            Value::Text(text) => Length::Text(text.len()),
-            Value::Bytes(bytes) => Length::Bytes(bytes.len()),
-            Value::Numbers(numbers) => Length::Numbers(numbers.len()),
-            Value::Texts(texts) => Length::Texts(texts.len()),
-            Value::Bool(_) | Value::Signed(_) | Value::Unsigned(_) | Value::Real(_) => Length::One,
+            MessageValue::Text(text) => Length::Text(text.len()),
+            MessageValue::Bytes(bytes) => Length::Bytes(bytes.len()),
+            MessageValue::Numbers(numbers) => Length::Numbers(numbers.len()),
+            MessageValue::Texts(texts) => Length::Texts(texts.len()),
+            MessageValue::Bool(_)
+            | MessageValue::Signed(_)
+            | MessageValue::Unsigned(_)
+            | MessageValue::Real(_) => Length::One,
         };
         self.topic.per_call.clamps().value(field.path(), length)?;
         Ok(value)
     }
 
-    /// A numeric or boolean field.
+    /// Returns the value of a numeric or boolean field.
     ///
     /// # Errors
     ///
@@ -88,7 +91,7 @@ impl Sample {
         &self.lease
     }
 
-    /// Whether the message is big-endian.
+    /// Returns whether the message is big-endian.
     pub fn big_endian(&self) -> bool {
         self.lease.meta().endian == Endian::Big
     }
@@ -99,25 +102,26 @@ impl Sample {
     /// # Errors
     ///
     /// [`OutOfFuel`].
-    pub fn cdr(&self, offset: u64, len: u32) -> Result<Piece, OutOfFuel> {
+    pub fn cdr(&self, offset: u64, len: u32) -> Result<SharedBytes, OutOfFuel> {
         let per_call = &self.topic.per_call;
-        let piece = Piece::of_message(&self.lease).part(offset, per_call.bytes.min(len as usize));
+        let piece =
+            SharedBytes::of_message(&self.lease).part(offset, per_call.bytes.min(len as usize));
         per_call.charge(|| piece.len())?;
         Ok(piece)
     }
 
-    /// Work of [`Sample::as_frame`], by the header of what it has to decode, in bytes; none if that
-    /// is done already.
+    /// Work of [`Sample::as_frame`] in bytes, estimated by the header of the image; 0 if it is
+    /// decoded already.
     fn decode_work(&self) -> usize {
         match self.picture() {
-            Ok(Picture::Compressed(compressed)) => {
+            Ok(ImageMessage::Compressed(compressed)) => {
                 self.topic.images.decode_work(self.lease.position(), compressed.data)
             }
-            Ok(Picture::Raw(_)) | Err(_) => 0,
+            Ok(ImageMessage::Raw(_)) | Err(_) => 0,
         }
     }
 
-    /// The message as an image; JPEG and PNG are decoded now, once for each sample.
+    /// Returns the message as an image; JPEG and PNG are decoded now, once for each sample.
     ///
     /// # Errors
     ///
@@ -128,9 +132,9 @@ impl Sample {
         Frame::of(self)
     }
 
-    pub(super) fn picture(&self) -> Result<Picture<'_>, DataError> {
+    pub(super) fn picture(&self) -> Result<ImageMessage<'_>, DataError> {
         let Topic { topic, type_name, .. } = &*self.topic;
-        Picture::of(type_name, &self.lease, self.lease.meta().endian)
+        ImageMessage::of(type_name, &self.lease, self.lease.meta().endian)
             .map_err(|source| DataError::Malformed {
                 topic: topic.clone(),
                 type_name: type_name.clone(),
@@ -142,7 +146,7 @@ impl Sample {
             })
     }
 
-    /// Where it stands in its ring.
+    /// Its position in the ring.
     pub(crate) fn position(&self) -> Option<u64> {
         self.lease.position()
     }
@@ -161,13 +165,16 @@ impl Sample {
     }
 }
 
-/// A single number, as [`Sample::number`] gives it.
-fn number(value: &Value<'_>) -> Option<f64> {
+/// Converts a value to a number, like [`Sample::number`]; `None` if it is none.
+fn number(value: &MessageValue<'_>) -> Option<f64> {
     match value {
-        Value::Bool(value) => Some(f64::from(u8::from(*value))),
-        Value::Signed(value) => Some(*value as f64),
-        Value::Unsigned(value) => Some(*value as f64),
-        Value::Real(value) => Some(*value),
-        Value::Text(_) | Value::Bytes(_) | Value::Numbers(_) | Value::Texts(_) => None,
+        MessageValue::Bool(value) => Some(f64::from(u8::from(*value))),
+        MessageValue::Signed(value) => Some(*value as f64),
+        MessageValue::Unsigned(value) => Some(*value as f64),
+        MessageValue::Real(value) => Some(*value),
+        MessageValue::Text(_)
+        | MessageValue::Bytes(_)
+        | MessageValue::Numbers(_)
+        | MessageValue::Texts(_) => None,
     }
 }

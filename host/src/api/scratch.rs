@@ -1,8 +1,8 @@
-//! What the host keeps for a lambda, by name, within `scratch` of `[limits]`; the rules are those
-//! of `gleaner_rules::scratch`.
+//! Named entries that the host keeps for a lambda, within `scratch` of `[limits]`. The rules are in
+//! `gleaner_rules::scratch`.
 //!
-//! Memory and no folder: so its bound is exact, no call waits for a disk, a replay finds what the
-//! vehicle found, and the jail around the lambda needs no hole.
+//! Entries are in memory, not in a folder: so the limit is exact, no call waits for a disk, a
+//! replay reads the same as the vehicle, and the sandbox needs no exception.
 
 pub use gleaner_rules::scratch::Entry;
 pub(super) use gleaner_rules::scratch::Scratch;
@@ -11,10 +11,10 @@ use gleaner_rules::scratch::ScratchError as Refusal;
 use super::Session;
 use super::fuel::OutOfFuel;
 
-/// What an entry of the list costs besides its name.
+/// Cost of a list entry beside its name, in bytes.
 const LISTED_BYTES: usize = 64;
 
-/// Why something was not kept or not found.
+/// A refused call; nothing has changed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(transparent)]
 pub enum ScratchError {
@@ -24,7 +24,7 @@ pub enum ScratchError {
     OutOfFuel(#[from] OutOfFuel),
 }
 
-/// Which of the refusals of `wit/scratch.wit` a lambda gets.
+/// Cases of `scratch-error` in `wit/scratch.wit`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum ScratchErrorKind {
@@ -45,10 +45,10 @@ impl ScratchErrorKind {
 }
 
 impl ScratchError {
-    /// The refusal that a lambda gets.
+    /// The case that the lambda receives.
     pub fn kind(&self) -> ScratchErrorKind {
         match self {
-            // Whoever can end a guest for want of fuel ends it instead.
+            // A guest with a fuel allowance is ended instead.
             Self::Refused(Refusal::NoRoom { .. } | Refusal::TooMany(_)) | Self::OutOfFuel(_) => {
                 ScratchErrorKind::NoRoom
             }
@@ -59,7 +59,7 @@ impl ScratchError {
 }
 
 impl Session {
-    /// Keeps `bytes` under a name, in place of what was there.
+    /// Stores `bytes` under a name, and replaces an existing entry.
     ///
     /// # Errors
     ///
@@ -69,7 +69,7 @@ impl Session {
         Ok(self.lock().scratch.put(name, bytes)?)
     }
 
-    /// Keeps `bytes` behind what is there already under that name.
+    /// Appends `bytes` to the entry of that name, or creates it.
     ///
     /// # Errors
     ///
@@ -79,8 +79,7 @@ impl Session {
         Ok(self.lock().scratch.append(name, bytes)?)
     }
 
-    /// Bytes from `offset`, `len` at most; clamped to what is there, and to `call_bytes` of
-    /// `[limits]`.
+    /// Bytes from `offset`, `len` at most; clamped to the entry, and to `call_bytes` of `[limits]`.
     ///
     /// # Errors
     ///
@@ -91,7 +90,7 @@ impl Session {
         Ok(got?)
     }
 
-    /// Forgets what is kept under a name.
+    /// Removes the entry of a name.
     ///
     /// # Errors
     ///
@@ -101,7 +100,7 @@ impl Session {
         Ok(self.lock().scratch.remove(name)?)
     }
 
-    /// Everything that is kept, in the order of the names' bytes.
+    /// All entries, in the order of the names' bytes.
     ///
     /// # Errors
     ///
@@ -112,7 +111,7 @@ impl Session {
         Ok(entries)
     }
 
-    /// Bytes for which there is room.
+    /// Number of bytes that are free.
     pub fn free(&self) -> u64 {
         self.lock().scratch.free()
     }

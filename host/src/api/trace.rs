@@ -1,34 +1,34 @@
-//! What a journal notes of one topic: which samples came since the wake before, and how far back
-//! the lambda looked.
+//! Traces one topic for the journal: the samples since the previous wake, and how far back the
+//! lambda looked.
 
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 
 use gleaner_buffers::{Lease, RingCounts};
-use gleaner_journal::Seen;
+use gleaner_journal::InputView;
 use gleaner_transport::SampleMeta;
 
 use super::data::Topic;
 
-/// No sample was looked at in this wake.
+/// Value for a wake that looked at no sample.
 const NONE: u64 = u64::MAX;
 
-/// What arrived at a ring, summed up by the thread that fills it: as of each sample, so that a wake
-/// can be told what it saw while further samples arrive.
+/// Sums over the samples that arrived at a ring, updated by the thread that fills it. They are kept
+/// per sample, so that those of a wake are known while further samples arrive.
 pub struct Arrivals {
-    wanted: AtomicBool,
-    /// Changed by the filling thread only, as are those below.
+    is_enabled: AtomicBool,
+    /// Position of the next sample. Only the filling thread changes this and the fields below.
     next: AtomicU64,
     digest: AtomicU32,
     refused: AtomicU64,
-    marks: Box<[Mark]>,
+    marks: Box<[ArrivalMark]>,
 }
 
-/// What had arrived with a sample.
+/// Sums up to and including a sample.
 #[derive(Default)]
-struct Mark {
+struct ArrivalMark {
     /// The lower half of its position in the ring, and the sum of digests.
     digest: AtomicU64,
-    /// Samples that found no room before it.
+    /// Number of samples refused before it.
     refused: AtomicU64,
 }
 
@@ -40,16 +40,16 @@ struct Sums {
 }
 
 impl Arrivals {
-    /// For a ring of `depth`, which is still empty.
+    /// Sums of a ring of `depth`, which is still empty.
     pub fn new(depth: usize) -> Self {
         Self {
-            wanted: AtomicBool::new(false),
+            is_enabled: AtomicBool::new(false),
             next: AtomicU64::new(0),
             digest: AtomicU32::new(0),
             refused: AtomicU64::new(0),
-            // Twice the samples that a ring shows: a mark that is asked for was among them a moment
-            // ago.
-            marks: (0..2 * (depth + 1)).map(|_| Mark::default()).collect(),
+            // Twice the visible samples: a requested mark belongs to a sample that was visible a
+            // moment ago.
+            marks: (0..2 * (depth + 1)).map(|_| ArrivalMark::default()).collect(),
         }
     }
 
@@ -57,22 +57,22 @@ impl Arrivals {
     pub fn add(&self, meta: &SampleMeta, cdr: &[u8]) {
         let position = self.next.load(Ordering::Relaxed);
         self.next.store(position + 1, Ordering::Relaxed);
-        if self.wanted.load(Ordering::Relaxed) {
+        if self.is_enabled.load(Ordering::Relaxed) {
             let digest = self.digest.load(Ordering::Relaxed).wrapping_add(sample_digest(meta, cdr));
             self.digest.store(digest, Ordering::Relaxed);
             let mark = &self.marks[(position % self.marks.len() as u64) as usize];
             mark.refused.store(self.refused.load(Ordering::Relaxed), Ordering::Relaxed);
-            // The ring publishes the sample after this: who sees it there sees its mark.
+            // The ring publishes the sample after this, so a reader of the sample sees its mark.
             mark.digest.store(position << 32 | u64::from(digest), Ordering::Release);
         }
     }
 
-    /// Adds a sample that found no room.
+    /// Counts a refused sample.
     pub fn refuse(&self) {
         self.refused.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The sums as of the sample at `position`; `None` if so many came since that they are gone.
+    /// The sums up to the sample at `position`; `None` if newer samples have overwritten them.
     fn at(&self, position: u64) -> Option<Sums> {
         let mark = &self.marks[(position % self.marks.len() as u64) as usize];
         let digest = mark.digest.load(Ordering::Acquire);
@@ -88,8 +88,8 @@ impl Arrivals {
     }
 }
 
-/// CRC-32 of a sample, plus its stamps: any flipped byte changes it. The stamps are not worth a CRC
-/// of their own, which would cost as much as that of a small sample.
+/// CRC-32 of a sample, plus its stamps: any changed byte changes it. A CRC of the stamps would cost
+/// as much as that of a small sample.
 fn sample_digest(meta: &SampleMeta, cdr: &[u8]) -> u32 {
     let fold = |stamp: i64| stamp as u32 ^ (stamp >> 32) as u32;
     let stamps =
@@ -97,32 +97,32 @@ fn sample_digest(meta: &SampleMeta, cdr: &[u8]) -> u32 {
     crc32fast::hash(cdr).wrapping_add(stamps)
 }
 
-/// Samples of `topic` so far, those included that found no room in its ring.
+/// Number of samples of `topic` so far, including refused ones.
 pub fn offered(topic: &Topic) -> u64 {
     let RingCounts { received, no_slot, too_big, .. } = topic.reader().counts();
     received + no_slot + too_big
 }
 
-/// How far back the lambda has looked in this wake. Written by its thread alone.
-pub(super) struct Looked(AtomicU64);
+/// The oldest sample at which the lambda has looked in this wake. Only its thread writes it.
+pub(super) struct LookBack(AtomicU64);
 
-impl Default for Looked {
+impl Default for LookBack {
     fn default() -> Self {
         Self(AtomicU64::new(NONE))
     }
 }
 
-impl Looked {
-    pub(super) fn forget(&self) {
+impl LookBack {
+    pub(super) fn reset(&self) {
         self.0.store(NONE, Ordering::Relaxed);
     }
 
-    /// Position of the oldest sample that was handed out.
+    /// Position of the oldest sample that a call returned.
     pub(super) fn oldest(&self) -> Option<u64> {
         Some(self.0.load(Ordering::Relaxed)).filter(|position| *position != NONE)
     }
 
-    /// Notes the oldest of the samples that a call hands out.
+    /// Notes the oldest of the samples that a call returns.
     pub(super) fn at(&self, oldest: Option<&Lease<SampleMeta>>) {
         if let Some(position) = oldest.and_then(Lease::position) {
             self.at_position(position);
@@ -136,7 +136,7 @@ impl Looked {
     }
 }
 
-/// Follows one topic from wake to wake, by what the lambda may see of it.
+/// Traces the visible samples of one topic from wake to wake.
 pub struct Trace {
     offered: u64,
     until: u64,
@@ -144,20 +144,24 @@ pub struct Trace {
 }
 
 impl Trace {
-    /// Begins with what is in the ring of `topic` now; from here on its samples are summed up.
+    /// Starts the trace: the samples of `topic` are summed up from now on.
     pub fn of(topic: &Topic) -> Self {
-        topic.arrivals.wanted.store(true, Ordering::Relaxed);
+        topic.arrivals.is_enabled.store(true, Ordering::Relaxed);
         Self { offered: offered(topic), until: topic.reader().head(), digest: 0 }
     }
 
-    /// Before a wake: notes what came since the one before. If a sample of this topic wakes the
-    /// lambda, `woken_by` is its place in the ring, and itself: most often it is the newest, and
-    /// need not be looked for.
-    pub fn begin(&mut self, topic: &Topic, woken_by: Option<(u64, &SampleMeta)>, seen: &mut Seen) {
+    /// Notes the samples since the previous wake; call it before each wake. If a sample of this
+    /// topic causes the wake, `woken_by` has its position in the ring and its metadata, which saves
+    /// a lookup if it is the newest.
+    pub fn begin(
+        &mut self,
+        topic: &Topic,
+        woken_by: Option<(u64, &SampleMeta)>,
+        seen: &mut InputView,
+    ) {
         let head = topic.reader().head();
         let until = topic.until().min(head);
-        // Where samples arrive meanwhile, only the mark of the last one that is seen tells what had
-        // come with it.
+        // Where samples arrive during the wake, only the mark of the last visible one has the sums.
         let is_still = topic.until() == u64::MAX;
         let sums = if is_still {
             None
@@ -180,13 +184,13 @@ impl Trace {
                 _ => topic.reader().newest_before(until).map(|lease| identity(lease.meta())),
             };
         }
-        topic.looked.forget();
+        topic.look_back.reset();
     }
 
-    /// After a wake that `woken_by` caused, if it is a sample of this topic: notes how far back the
-    /// lambda looked.
-    pub fn end(&self, topic: &Topic, woken_by: Option<u64>, seen: &mut Seen) {
-        let oldest = topic.looked.0.load(Ordering::Relaxed).min(woken_by.unwrap_or(NONE));
+    /// Notes how far back the lambda looked; call it after each wake. `woken_by` is the position of
+    /// the sample that caused it, if it is one of this topic.
+    pub fn end(&self, topic: &Topic, woken_by: Option<u64>, seen: &mut InputView) {
+        let oldest = topic.look_back.0.load(Ordering::Relaxed).min(woken_by.unwrap_or(NONE));
         seen.reach = self.until.saturating_sub(oldest);
     }
 }

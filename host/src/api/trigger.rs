@@ -1,4 +1,4 @@
-//! What a lambda causes: events, and the start and stop of recordings.
+//! Triggers of a lambda: events, and the start and stop of recordings.
 
 use gleaner_lambda::{Trigger, TriggerKind};
 pub(super) use gleaner_rules::triggers::Triggers;
@@ -19,7 +19,7 @@ pub enum TriggerError {
     OutOfFuel(#[from] OutOfFuel),
 }
 
-/// Which of the refusals of `wit/trigger.wit` a lambda gets.
+/// Cases of `trigger-error` in `wit/trigger.wit`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum TriggerErrorKind {
@@ -38,18 +38,18 @@ impl TriggerErrorKind {
 }
 
 impl TriggerError {
-    /// The refusal that a lambda gets.
+    /// The case that the lambda receives.
     pub fn kind(&self) -> TriggerErrorKind {
         match self {
             Self::Refused(refusal) if !refusal.is_too_many() => TriggerErrorKind::Invalid,
-            // Whoever can end a guest for want of fuel ends it instead.
+            // A guest with a fuel allowance is ended instead.
             Self::Refused(_) | Self::OutOfFuel(_) => TriggerErrorKind::TooMany,
         }
     }
 }
 
-/// What an attribute costs, in bytes, besides its texts: it was made for the host before it could
-/// be refused.
+/// Cost of an attribute in bytes, beside its texts: it is copied into the host before it can be
+/// refused.
 const ATTRIBUTE_BYTES: usize = 64;
 
 fn work(attribute: &Attribute) -> usize {
@@ -61,11 +61,12 @@ fn work(attribute: &Attribute) -> usize {
 }
 
 impl Session {
-    /// Something worth keeping happened. `score` says how strongly, in the lambda's own unit.
+    /// Triggers an event, a moment worth recording. `score` is its strength, in the lambda's own
+    /// unit.
     ///
     /// # Errors
     ///
-    /// [`TriggerError`] if a limit of this file is passed; nothing is caused then.
+    /// [`TriggerError`] if a limit is exceeded; there is no trigger then.
     pub fn event(
         &self,
         label: &str,
@@ -179,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn outside_of_a_wake_nothing_can_be_caused() {
+    fn outside_of_a_wake_nothing_can_trigger() {
         let session = session();
         session.event("before", 1.0, Vec::new()).unwrap();
         assert_eq!(

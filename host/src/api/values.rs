@@ -1,43 +1,43 @@
-//! Plain values that a lambda is given: they hold nothing and ask nobody.
+//! Plain values returned to a lambda.
 
 pub use gleaner_rules::schedule::Tick;
 use gleaner_transport::Guid;
 use serde::{Deserialize, Serialize};
 
-/// What became of a topic's samples since the lambda started.
+/// Counts of a topic's samples since the lambda started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
-    /// Entered the ring.
+    /// Samples that entered the ring.
     pub received: u64,
-    /// Known to be lost before they reached this process; none where the transport cannot know.
+    /// Samples lost before they reached this process; `None` if the transport cannot detect losses.
     pub lost: Option<u64>,
-    /// Left the ring to make room for newer ones.
+    /// Samples that newer ones replaced in the ring.
     pub overwritten: u64,
-    /// Refused because every cell was held.
+    /// Samples refused because every slot was held.
     pub no_slot: u64,
-    /// Refused because they exceed `max_size`.
+    /// Samples refused because they exceed `max_size`.
     pub too_big: u64,
-    /// Should have woken the lambda and did not.
+    /// Samples that should have caused a wake and did not.
     pub skipped: u64,
 }
 
-/// What makes a sample different from every other one.
+/// Unique identity of a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Identity {
-    /// ROS topic as the manifest names it.
+    /// ROS topic, as in the manifest.
     pub topic: String,
-    /// Who sent it.
+    /// The writer that sent it.
     pub writer: Guid,
-    /// Rises strictly for each writer.
+    /// Sequence number, strictly increasing for each writer.
     pub seq: u64,
 }
 
-/// When a sample came to be, in nanoseconds of three clocks.
+/// Timestamps of a sample, in nanoseconds of three clocks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stamps {
-    /// When the vehicle received it: the clock that orders everything.
+    /// Time of reception by the vehicle: the clock that orders everything.
     pub at_ns: i64,
-    /// When the writer published it.
+    /// Time of publication by the writer.
     pub publish_ns: i64,
     /// `header.stamp`, where the type starts with a header.
     pub header_ns: Option<i64>,

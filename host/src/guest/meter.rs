@@ -1,21 +1,21 @@
-//! Memory that a lambda takes of a process that it shares with our code.
+//! Measures the memory of a lambda in a process that it shares with Gleaner's own code.
 //!
-//! The kernel's own limit (RLIMIT_DATA) has room for our code, too, and does not count what was
-//! filled and then made read-only. So the pages that the process really has are counted here after
-//! its wakes, and by `gleaner-shim` ten times a second.
+//! The kernel's own limit (RLIMIT_DATA) includes Gleaner's code, and does not count pages that were
+//! filled and then made read-only. So the resident pages of the process are counted here after its
+//! wakes, and by `gleaner-shim` ten times a second.
 
 use std::io;
 use std::time::{Duration, Instant};
 
 use gleaner_lambda::{Fault, FaultKind};
-use gleaner_vitals::usage::{PrivatePages, Process};
+use gleaner_vitals::usage::{PrivatePages, ProcessUsage};
 use gleaner_vitals::{Pulse, Share, own};
 
-/// Time between two looks, at least. One takes about a microsecond, and a wake of a fast replay
-/// seven.
+/// Shortest time between two measurements. One takes about a microsecond, and a wake of a fast
+/// replay seven.
 const BETWEEN: Duration = Duration::from_millis(1);
 
-/// Counts for one lambda.
+/// The meter of one lambda.
 pub(super) struct Meter {
     pages: PrivatePages,
     share: Share,
@@ -23,12 +23,12 @@ pub(super) struct Meter {
 }
 
 impl Meter {
-    /// Counts what the process takes from now on; `most` bytes of it are the lambda's. The shim
-    /// counts, too.
+    /// Counts the memory that the process allocates from now on; `most` bytes of it are allowed to
+    /// the lambda. The shim counts, too.
     pub(super) fn start(most: u64, pulse: &Pulse) -> io::Result<Self> {
         let unreadable = || io::Error::other("/proc/self does not show the memory of this process");
         let pages = PrivatePages::open()?;
-        let (private, held) = (pages.bytes(), Process::seen(None).map(|seen| seen.held));
+        let (private, held) = (pages.bytes(), ProcessUsage::of(None).map(|seen| seen.held));
         let own = own::held();
         let share = |taken: Option<u64>| {
             let base = taken.ok_or_else(unreadable)?.saturating_sub(own);
@@ -38,7 +38,7 @@ impl Meter {
         Ok(Self { pages, share: share(private)?, looked: None })
     }
 
-    /// The fault of a lambda that has taken more than it may.
+    /// The fault of a lambda that uses more memory than allowed.
     pub(super) fn fault(&mut self) -> Option<Fault> {
         if self.looked.is_some_and(|looked| looked.elapsed() < BETWEEN) {
             return None;

@@ -1,6 +1,7 @@
-//! Where lambdas run. One thread owns a guest; nothing outside this room knows which kind it is.
+//! Guests, which run lambdas. One thread owns a guest; nothing outside this room depends on its
+//! kind.
 //!
-//! A guest that faults is never entered again: the next wake finds a fresh one, after its `init`.
+//! A guest that faults is never entered again: the next wake runs a fresh one, after its `init`.
 
 #[cfg(feature = "wasm")]
 pub mod wasm;
@@ -9,7 +10,7 @@ pub mod wasm;
 pub mod python;
 
 mod meter;
-pub mod watched;
+pub mod sandboxed;
 pub mod worker;
 
 use std::sync::Arc;
@@ -24,18 +25,18 @@ use gleaner_vitals::usage;
 use crate::api::curves::Curves;
 use crate::api::data::{Counts, Topic, Wake};
 
-/// Whether a call that came back by itself after `elapsed` is a fault, though nothing ended it when
-/// `allowed` was over. All time counts, also that in which the machine did something else.
+/// Returns whether a call that returned after `elapsed` is a fault, though it was not interrupted
+/// after `allowed`. All time counts, also that of other processes.
 pub fn is_late(elapsed: Duration, allowed: Duration) -> bool {
-    /// What would have ended it comes about so late.
+    /// Delay with which an interruption may take effect.
     const TOLERANCE: Duration = Duration::from_millis(2);
     elapsed > allowed.saturating_add(TOLERANCE)
 }
 
 /// A lambda that can be woken.
 pub trait Guest {
-    /// Runs what comes before the lambda and is as foreign as it. Called once, before the first
-    /// `init`, or by that.
+    /// Runs untrusted start-up code (site packages, numpy) before `init`. Called once, before the
+    /// first `init`, or by that.
     ///
     /// # Errors
     ///
@@ -44,27 +45,28 @@ pub trait Guest {
         Ok(())
     }
 
-    /// Runs `init`. Called once before the first wake; a guest repeats it by itself after a fault.
+    /// Runs `init`. Called once before the first wake; after a fault the guest repeats it itself.
     ///
     /// # Errors
     ///
     /// The fault that ended `init`.
     fn init(&mut self) -> Result<(), Fault>;
 
-    /// Whether the lambda runs at `wake`: in another process, the sample that is to wake it may
-    /// have found no room.
+    /// Returns whether the lambda runs at `wake`: in another process, the ring may have had no slot
+    /// for the sample that causes it.
     fn expects(&mut self, _wake: &Wake) -> bool {
         true
     }
 
     /// Runs one wake to its end.
-    fn wake(&mut self, wake: Wake) -> Outcome;
+    fn wake(&mut self, wake: Wake) -> WakeOutcome;
 
-    /// Gives up the lambda after a wake that was good in itself, as after a fault: the next wake
-    /// begins with a fresh one.
+    /// Discards the lambda after a wake without a fault of its own: the next wake begins with a
+    /// fresh one, as after a fault.
     fn discard(&mut self) {}
 
-    /// What runs the lambda, with its version: a decision is only the same again on the same.
+    /// The engine that runs the lambda, with its version: a decision is only reproducible on the
+    /// same engine.
     fn engine(&self) -> String;
 
     /// The layers around the process that runs the lambda. Called before the first `init`.
@@ -81,17 +83,17 @@ pub trait Guest {
         usage::resident()
     }
 
-    /// The most that it was.
+    /// Peak resident memory of that process, in bytes.
     fn most_resident_bytes(&self) -> u64 {
-        usage::most_resident()
+        usage::peak_resident()
     }
 
-    /// Ends a lambda that runs in another process, after its last wake; returns what is known there
-    /// alone.
+    /// Ends a lambda that runs in another process, after its last wake; returns the totals that
+    /// only that process has.
     ///
     /// # Errors
     ///
-    /// The fault with which that process ended instead.
+    /// The fault with which that process ended.
     fn finish(&mut self) -> Result<Option<Totals>, Fault> {
         Ok(None)
     }
@@ -103,14 +105,14 @@ pub struct Totals {
     pub counts: Vec<Counts>,
     /// Time spent decoding images, in ns.
     pub decode_ns: u64,
-    /// Values that the lambda read.
+    /// Curves of the values that the lambda read.
     pub curves: Vec<Curve>,
-    /// Fields that it read and that have no curve.
+    /// Number of fields that it read and that have no curve.
     pub curves_omitted: u64,
 }
 
 impl Totals {
-    /// Of a lambda over `inputs` in this process, with what it read of them.
+    /// Totals of a lambda over `inputs` in this process, with the curves of what it read.
     pub fn of(inputs: &[Arc<Topic>], curves: &Curves) -> Self {
         let (curves, curves_omitted) = curves.take();
         Self {
@@ -122,12 +124,12 @@ impl Totals {
     }
 }
 
-/// How a wake ended.
-pub struct Outcome {
-    /// What went wrong, if anything did.
+/// Outcome of a wake.
+pub struct WakeOutcome {
+    /// The fault that ended it, if any.
     pub result: Result<(), Fault>,
-    /// Fuel used by this wake, where the kind counts it and it is the same on every machine.
+    /// Fuel used, where the kind counts it and it is the same on every machine.
     pub fuel: Option<u64>,
-    /// Time in the lambda, if it was measured elsewhere.
+    /// Time in the lambda, if another process measured it.
     pub run_ns: Option<u64>,
 }

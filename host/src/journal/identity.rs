@@ -1,19 +1,19 @@
-//! Which lambda made a decision: its files with their digests, its config, and what it ran on.
+//! Identifies the lambda that made a decision: files with digests, config, engine and machine.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Explain, PlainFile, hex};
-use gleaner_journal::{FileDigest, Header, JournalInput, Part};
+use gleaner_journal::{FileDigest, JournalHeader, JournalInput, TimeRange};
 use gleaner_lambda::layout::FILE_MAX;
-use gleaner_lambda::manifest::{ConfigValue, Manifest, Schedule};
+use gleaner_lambda::manifest::{ConfigValue, Manifest, ScheduleSpec};
 use gleaner_lambda::{BuildDir, LayoutError};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
 use crate::input::Remap;
 
-/// Why a build cannot be identified.
+/// A build that cannot be identified.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum IdentityError {
@@ -39,40 +39,40 @@ impl Explain for IdentityError {
     }
 }
 
-/// What makes a lambda what it is.
-pub struct Identity<'a> {
+/// Everything that a decision of a lambda can depend on, except its samples.
+pub struct LambdaIdentity<'a> {
     /// Its manifest.
     pub manifest: &'a Manifest,
     /// Its build.
     pub build: &'a BuildDir,
-    /// All of `[config]`, as the lambda gets it.
+    /// All of `[config]`, with overrides.
     pub config: &'a [(String, ConfigValue)],
     /// Other names for topics of the manifest.
     pub remaps: &'a [Remap],
-    /// What runs it, with its version.
+    /// The engine that runs it, with its version.
     pub engine: String,
-    /// What the times of the journal are.
+    /// The clock of the journal's times.
     pub clock: &'a str,
-    /// What it is given of a drive.
-    pub part: Part,
+    /// The part of a drive that it receives.
+    pub part: TimeRange,
 }
 
-impl Identity<'_> {
+impl LambdaIdentity<'_> {
     /// The first block of a journal.
     ///
     /// # Errors
     ///
     /// [`IdentityError`] names the file that cannot be read.
-    pub fn header(self) -> Result<Header, IdentityError> {
+    pub fn header(self) -> Result<JournalHeader, IdentityError> {
         let Self { manifest, build, config, remaps, engine, clock, part } = self;
         let lambda = &manifest.lambda;
         let event = match &manifest.schedule {
-            Schedule::Event { input, .. } => {
+            ScheduleSpec::Event { input, .. } => {
                 manifest.inputs.iter().position(|known| known.name == *input)
             }
-            Schedule::Periodic { .. } => None,
+            ScheduleSpec::Periodic { .. } => None,
         };
-        Ok(Header {
+        Ok(JournalHeader {
             gleaner: env!("CARGO_PKG_VERSION").to_owned(),
             engine,
             machine: std::env::consts::ARCH.to_owned(),
@@ -97,7 +97,8 @@ impl Identity<'_> {
     }
 }
 
-/// Of what a decision can depend on; limits stand in the header themselves.
+/// Digest of the parts of a manifest on which a decision can depend. Limits are in the header
+/// themselves.
 fn manifest_digest(manifest: &Manifest) -> String {
     let mut json = manifest.to_json();
     if let Some(table) = json.as_object_mut() {
@@ -119,11 +120,11 @@ fn without_descriptions(json: &mut Value) {
     }
 }
 
-fn model(model: &gleaner_lambda::manifest::Model) -> FileDigest {
+fn model(model: &gleaner_lambda::manifest::ModelSpec) -> FileDigest {
     FileDigest { path: model.file.to_string(), bytes: 0, sha256: model.sha256.to_string() }
 }
 
-fn journal_input(input: &gleaner_lambda::manifest::Input, remaps: &[Remap]) -> JournalInput {
+fn journal_input(input: &gleaner_lambda::manifest::InputSpec, remaps: &[Remap]) -> JournalInput {
     let topic = input.topic.as_str();
     JournalInput {
         name: input.name.to_string(),
@@ -142,7 +143,7 @@ fn json(value: &ConfigValue) -> Value {
     }
 }
 
-/// Every file of a build, by its path in it.
+/// Digests of all files of a build, by their paths in it.
 fn build_digests(build: &BuildDir) -> Result<Vec<FileDigest>, IdentityError> {
     build.files()?.iter().map(|path| digest_of_file(build, path)).collect()
 }

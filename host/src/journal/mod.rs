@@ -1,61 +1,61 @@
-//! What is written down of each wake, so that the decision can be made again and compared. The
-//! format is `gleaner_journal`; here it is filled in.
+//! Builds the journal entry of each wake, from which the decision can be made again and compared.
+//! The format is `gleaner_journal`.
 
 mod identity;
 
-pub use identity::{Identity, IdentityError};
+pub use identity::{IdentityError, LambdaIdentity};
 
 use std::sync::Arc;
 
-use gleaner_journal::{Entry, Said, Seen, Woken};
+use gleaner_journal::{InputView, JournalEntry, LogDigest, WakeSource};
 use gleaner_lambda::Decision;
 
 use crate::api::data::{Topic, Wake};
 use crate::api::trace::Trace;
 
-/// What the times of a replay's journal are.
+/// Clock of a replay's journal.
 pub const CLOCK_OF_DRIVE: &str = "log time of the drive";
-/// What the times of a live journal are.
+/// Clock of a live journal.
 pub const CLOCK_OF_VEHICLE: &str = "CLOCK_MONOTONIC of the vehicle, set to the time of day once";
 
-/// Follows a lambda from wake to wake. It reuses its memory, so that a wake costs no allocation.
-pub struct Scribe {
+/// Builds the entries of one lambda. It reuses its memory, so that a wake costs no allocation.
+pub struct EntryBuilder {
     topics: Vec<(Arc<Topic>, Trace)>,
     /// The topic, and the position in its ring, of the sample that caused the wake.
     woken_by: Option<(usize, u64)>,
-    entry: Entry,
+    entry: JournalEntry,
 }
 
-impl Scribe {
-    /// Begins with what is in the rings now.
+impl EntryBuilder {
+    /// A builder that counts samples from now on.
     pub fn new(inputs: &[Arc<Topic>]) -> Self {
         let topics: Vec<_> =
             inputs.iter().map(|topic| (Arc::clone(topic), Trace::of(topic))).collect();
-        let entry = Entry {
+        let entry = JournalEntry {
             at_ns: 0,
-            cause: Woken::Tick { missed: 0 },
-            seen: vec![Seen::default(); topics.len()],
+            cause: WakeSource::Tick { missed: 0 },
+            seen: vec![InputView::default(); topics.len()],
             triggers: Vec::new(),
             fault: None,
             fuel: None,
-            log: Said::default(),
+            log: LogDigest::default(),
         };
         Self { topics, woken_by: None, entry }
     }
 
-    /// Before a wake.
+    /// Notes the state of the inputs; call it before each wake.
     pub fn begin(&mut self, wake: &Wake) {
         self.entry.at_ns = wake.at_ns();
         self.woken_by = None;
         match wake {
             Wake::Event(sample) => {
                 let meta = sample.meta();
-                self.entry.cause = Woken::Sample { writer: meta.writer.0, seq: meta.seq };
+                self.entry.cause = WakeSource::Sample { writer: meta.writer.0, seq: meta.seq };
                 let input =
                     self.topics.iter().position(|(topic, _)| Arc::ptr_eq(topic, sample.topic()));
                 self.woken_by = input.zip(sample.position());
             }
-            Wake::Tick(tick) => self.entry.cause = Woken::Tick { missed: tick.missed },
+            Wake::Tick(tick) => self.entry.cause = WakeSource::Tick { missed: tick.missed },
         }
         for (index, ((topic, trace), seen)) in
             self.topics.iter_mut().zip(&mut self.entry.seen).enumerate()
@@ -67,15 +67,16 @@ impl Scribe {
         }
     }
 
-    /// Forgets what came since the wake before.
+    /// Skips the samples since the previous wake.
     pub fn skip(&mut self) {
         for ((topic, trace), seen) in self.topics.iter_mut().zip(&mut self.entry.seen) {
             trace.begin(topic, None, seen);
         }
     }
 
-    /// After a wake that led to `decision` and said `log`.
-    pub fn end(&mut self, decision: &Decision, log: Said) -> &Entry {
+    /// Completes the entry of a wake that led to `decision` and logged `log`; call it after the
+    /// wake.
+    pub fn end(&mut self, decision: &Decision, log: LogDigest) -> &JournalEntry {
         for (index, ((topic, trace), seen)) in
             self.topics.iter().zip(&mut self.entry.seen).enumerate()
         {

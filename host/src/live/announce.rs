@@ -1,5 +1,4 @@
-//! On request, decisions with a trigger or a fault are published, for recorders and dashboards of
-//! others.
+//! Publishes decisions with a trigger or a fault, on request, for other recorders and dashboards.
 //!
 //! `std_msgs/msg/String`, a type that every ROS 2 has; its text is a line of `decisions.jsonl`,
 //! with the lambda's name before it: `{"lambda": "hello", "decision": {...}}`.
@@ -9,14 +8,14 @@ use gleaner_lambda::Decision;
 use gleaner_transport::LiveSource;
 use serde::Serialize;
 
-use super::speaker::Speaker;
+use super::topic_publisher::TopicPublisher;
 
 const TYPE: &str = "std_msgs/msg/String";
-/// Decisions that are kept for a reader that is slow to take them.
+/// Queue length for a slow reader.
 const DEPTH: usize = 256;
 
 pub(super) struct Announcer {
-    speaker: Speaker,
+    publisher: TopicPublisher,
     lambda: String,
 }
 
@@ -33,15 +32,18 @@ impl Announcer {
         topic: &str,
         lambda: &str,
     ) -> Result<Self, Failure> {
-        Ok(Self { speaker: Speaker::open(source, topic, TYPE, DEPTH)?, lambda: lambda.to_owned() })
+        Ok(Self {
+            publisher: TopicPublisher::open(source, topic, TYPE, DEPTH)?,
+            lambda: lambda.to_owned(),
+        })
     }
 
-    /// Decisions that were not sent.
+    /// Number of decisions that were not sent.
     pub(super) fn unsent(&self) -> u64 {
-        self.speaker.unsent()
+        self.publisher.unsent()
     }
 
-    /// Publishes a decision, if it is one to tell.
+    /// Publishes a decision, if it has a trigger or a fault.
     pub(super) fn decision(&mut self, decision: &Decision) {
         if decision.triggers.is_empty() && decision.fault.is_none() {
             return;
@@ -49,6 +51,6 @@ impl Announcer {
         let announced = Announced { lambda: &self.lambda, decision };
         let text =
             serde_json::to_string(&announced).expect("a decision has text keys and finite numbers");
-        self.speaker.say(|message| message.string(&text));
+        self.publisher.publish(|message| message.string(&text));
     }
 }

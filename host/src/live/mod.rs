@@ -1,25 +1,24 @@
-//! A lambda live: on the topics of a vehicle, in its time, with a deadline, until it is told to
-//! stop.
+//! Runs a lambda on live topics: in real time, with deadlines, until SIGTERM.
 //!
-//! One thread owns the lambda and waits here; the transport's thread fills the rings and rings a
-//! bell. Files of results are written by another process, and reports to the starter by a thread of
-//! their own. Nothing here knows which kind of lambda runs, nor which network its samples come
-//! over; `process` does, and has the process to itself.
+//! One thread owns the lambda and waits here; the transport's thread fills the rings and unparks
+//! it. Another process writes the result files, and a separate thread the reports to the parent.
+//! Nothing here depends on the kind of the lambda or on the network, except `process`, which sets
+//! up the process.
 
 mod announce;
-mod course;
-mod ledger;
-mod pages;
+mod event_loop;
 #[cfg(feature = "dds")]
 mod process;
 mod recorder;
+mod results_pipe;
+mod results_writer;
 mod round_trip;
-mod speaker;
 mod status;
+mod topic_publisher;
 
-pub use pages::Pages;
 #[cfg(feature = "dds")]
-pub use process::{Job, RunArgs};
+pub use process::{LiveJob, RunArgs};
+pub use results_pipe::ResultsPipe;
 
 use std::io::Write;
 use std::os::fd::OwnedFd;
@@ -27,55 +26,55 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_journal::Part;
-use gleaner_lambda::manifest::{Manifest, Schedule as Declared};
-use gleaner_protocol::{Layer, Page, Report, WokenBy};
+use gleaner_journal::TimeRange;
+use gleaner_lambda::manifest::{Manifest, ScheduleSpec};
+use gleaner_protocol::{Layer, Report, ResultItem, WokenBy};
 use gleaner_transport::{Clock, LiveSource};
 use gleaner_vitals::Pulse;
 
 use self::announce::Announcer;
-use self::course::Course;
-use self::ledger::Ledger;
-use self::recorder::ToRecorder;
+use self::event_loop::LiveEventLoop;
+use self::recorder::RecorderSender;
+use self::results_writer::ResultsWriter;
 use self::round_trip::RoundTrip;
-use self::status::{Around, Watch};
-use crate::input::{Bell, Live};
-use crate::journal::{CLOCK_OF_VEHICLE, Identity};
-use crate::judge::Judge;
-use crate::schedule::Schedule;
-use crate::stage::{Asked, Bounds, Load, Stage, not_started};
+use self::status::{Around, StatusReporter};
+use crate::input::{InputWaker, LiveInputs};
+use crate::invoker::Invoker;
+use crate::journal::{CLOCK_OF_VEHICLE, LambdaIdentity};
+use crate::schedule::WakeSchedule;
+use crate::session_setup::{ConfiguredLambda, Load, RunMode, SessionSetup, not_started};
 
-/// A live run, apart from the process that has nothing else to do.
-pub struct Run<'a> {
+/// A live run, without the set-up of its process.
+pub struct LiveRun<'a> {
     /// The lambda.
-    pub asked: Asked,
+    pub lambda: ConfiguredLambda,
     /// Its manifest, with the limits that hold.
     pub manifest: Manifest,
-    /// How it runs.
+    /// Its settings.
     pub settings: Settings,
-    /// Where samples come from.
+    /// The source of samples.
     pub source: Box<dyn LiveSource>,
-    /// The socket to the recorder, where there is one.
+    /// The socket to the recorder, if there is one.
     pub recorder: Option<OwnedFd>,
-    /// Where results go.
-    pub results: Pages,
-    /// The page that shows how long this thread may be away.
+    /// The pipe for results.
+    pub results: ResultsPipe,
+    /// The page that shows the shim how long this thread may be busy.
     pub pulse: Pulse,
-    /// Gives up what the process does not need any more, before the lambda is entered; returns what
-    /// holds.
+    /// Drops the privileges that the process no longer needs, before the lambda is entered; returns
+    /// the layers of the sandbox.
     pub close: &'a mut dyn FnMut() -> Result<Vec<Layer>, Failure>,
-    /// Raised when the run is to end.
+    /// Set to end the run.
     pub stop: &'a AtomicBool,
 }
 
-/// How a lambda runs live.
+/// Settings of a live run.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// Where the results go, for reports.
+    /// Folder of the results, for reports.
     pub out: PathBuf,
-    /// Whether decisions without trigger and fault are results, too.
+    /// Set if decisions without trigger and fault are results, too.
     pub all: bool,
-    /// How often this lambda's process was started before.
+    /// Number of earlier starts of this lambda's process.
     pub restarts: u32,
     /// The vehicle's clock.
     pub clock: Clock,
@@ -85,7 +84,7 @@ pub struct Settings {
     pub announce: Option<String>,
 }
 
-impl Run<'_> {
+impl LiveRun<'_> {
     /// Runs the lambda until it is stopped, and writes reports to `reports`.
     ///
     /// The exit is [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
@@ -93,38 +92,44 @@ impl Run<'_> {
     /// # Errors
     ///
     /// A failure if it cannot start, if the network or the recorder fails, or if results could not
-    /// be handed on.
+    /// be sent.
     pub fn run(
         self,
         load: Load<'_>,
         reports: impl Write + Send + 'static,
     ) -> Result<Exit, Failure> {
-        let Self { asked, manifest, settings, mut source, recorder, results, pulse, close, stop } =
+        let Self { lambda, manifest, settings, mut source, recorder, results, pulse, close, stop } =
             self;
         let clock = settings.clock;
-        let bell = match &manifest.schedule {
-            Declared::Event { input, .. } => {
-                Some(Bell { input: input.to_string(), thread: std::thread::current() })
+        let waker = match &manifest.schedule {
+            ScheduleSpec::Event { input, .. } => {
+                Some(InputWaker { input: input.to_string(), thread: std::thread::current() })
             }
-            Declared::Periodic { .. } => None,
+            ScheduleSpec::Periodic { .. } => None,
         };
-        let bounds = Bounds::Live(manifest.limits.deadline);
-        let Stage { inputs, session, mut guest } =
-            Stage::set(&mut *source, &asked, &manifest, bounds, Some(&Live { bell }), load)?;
+        let mode = RunMode::Live(manifest.limits.deadline);
+        let SessionSetup { inputs, session, mut guest } = SessionSetup::load(
+            &mut *source,
+            &lambda,
+            &manifest,
+            mode,
+            Some(&LiveInputs { waker }),
+            load,
+        )?;
         let recorder = match recorder {
             Some(socket) => {
-                let (build, config, remaps) = (&asked.build, &asked.config, &asked.remaps);
+                let (build, config, remaps) = (&lambda.build, &lambda.config, &lambda.remaps);
                 let engine = guest.engine();
-                let identity = Identity {
+                let identity = LambdaIdentity {
                     manifest: &manifest,
                     build,
                     config,
                     remaps,
                     engine,
                     clock: CLOCK_OF_VEHICLE,
-                    part: Part::default(),
+                    part: TimeRange::default(),
                 };
-                Some(ToRecorder::join(socket, &identity.header()?, &inputs)?)
+                Some(RecorderSender::join(socket, &identity.header()?, &inputs)?)
             }
             None => None,
         };
@@ -135,26 +140,27 @@ impl Run<'_> {
             .transpose()?;
         let announcer =
             settings.announce.map(|topic| Announcer::open(&*source, &topic, name)).transpose()?;
-        let mut ledger = Ledger::start(results, settings.all, reports)?;
-        ledger.page(&Page::Woken(WokenBy::schedule_of(&manifest)));
-        ledger.report(Report::Isolation { layers: close()? });
+        let mut results = ResultsWriter::start(results, settings.all, reports)?;
+        results.page(&ResultItem::Woken(WokenBy::schedule_of(&manifest)));
+        results.report(Report::Isolation { layers: close()? });
         let initialised = guest.init();
         let (said, _) = session.take_log();
-        ledger.log(said);
+        results.log(said);
         if let Err(fault) = initialised {
-            // What it said on the way may be why.
-            ledger.finish(None)?;
+            // Its log may explain the fault.
+            results.finish(None)?;
             return Err(not_started(name, fault, &[]));
         }
-        ledger.report(Report::Ready);
-        let schedule = Schedule::live(&manifest, &inputs, clock.now());
-        let watch = Watch::new(&manifest, &asked.remaps, settings.out, settings.restarts, clock);
-        let mut course = Course {
-            judge: Judge::new(session.clone(), guest),
+        results.report(Report::Ready);
+        let schedule = WakeSchedule::live(&manifest, &inputs, clock.now());
+        let watch =
+            StatusReporter::new(&manifest, &lambda.remaps, settings.out, settings.restarts, clock);
+        let mut event_loop = LiveEventLoop {
+            invoker: Invoker::new(session.clone(), guest),
             schedule,
             session,
             inputs,
-            ledger,
+            results,
             recorder,
             round_trip,
             announcer,
@@ -163,23 +169,24 @@ impl Run<'_> {
             clock,
             pulse,
         };
-        let ended = course.run(stop);
-        let faults = course.watch.faults();
-        course.schedule.finish();
-        let unsent = course.unsent();
-        let Course { ledger, watch, inputs, schedule, session, recorder, source, .. } = course;
-        let dropped = recorder.map(ToRecorder::leave);
+        let ended = event_loop.run(stop);
+        let faults = event_loop.watch.faults();
+        event_loop.schedule.finish();
+        let unsent = event_loop.unsent();
+        let LiveEventLoop { results, watch, inputs, schedule, session, recorder, source, .. } =
+            event_loop;
+        let dropped = recorder.map(RecorderSender::leave);
         let last = watch.ended(&Around {
             source: &*source,
             health: &source.health(),
             inputs: &inputs,
             schedule: &schedule,
             session: &session,
-            unwritten: ledger.unwritten(),
+            unwritten: results.unwritten(),
             unsent,
-            recorder: dropped,
+            recorder_link: dropped,
         });
-        ledger.finish(Some(last))?;
+        results.finish(Some(last))?;
         ended?;
         Ok(if faults > 0 { Exit::LambdaFaulted } else { Exit::Ok })
     }

@@ -1,5 +1,4 @@
-//! The process of a live run: its arguments, the network that it joins, its socket to the recorder,
-//! its signals.
+//! Sets up the process of a live run: arguments, network, socket to the recorder, signals.
 
 use std::io::{self, Write};
 use std::os::fd::OwnedFd;
@@ -7,26 +6,26 @@ use std::path::PathBuf;
 
 use clap::Args;
 use gleaner_base::{Exit, Failure};
-use gleaner_dds::{Dds, NetworkArgs, Options};
+use gleaner_dds::{Dds, DdsOptions, NetworkArgs};
 use gleaner_jail::Paths;
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_transport::Clock;
 use gleaner_vitals::start::stop_flag;
 
-use super::{Pages, Run, Settings};
+use super::{LiveRun, ResultsPipe, Settings};
 use crate::input::unfinished_bytes;
-use crate::isolation::{Isolation, definitions};
+use crate::isolation::{Isolation, definition_dirs};
 use crate::network::NetworkError;
-use crate::stage::{Asked, AskedArgs, Load};
+use crate::session_setup::{ConfiguredLambda, LambdaArgs, Load};
 
 /// Arguments of `run`.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
-    pub asked: AskedArgs,
-    /// Where the results go, for reports: the process that made the pipe for them writes there.
+    pub lambda_args: LambdaArgs,
+    /// Folder of the results, for reports: the process that created their pipe writes there.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Write every decision, not only those with a trigger or a fault.
@@ -38,7 +37,7 @@ pub struct RunArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub network: NetworkArgs,
-    /// How far the vehicle's clock is ahead of CLOCK_MONOTONIC, in ns.
+    /// Offset of the vehicle's clock from CLOCK_MONOTONIC, in ns.
     #[arg(long, value_name = "NS", allow_hyphen_values = true)]
     pub clock_offset: Option<i64>,
     /// Answer each wake on this topic, as sensor_msgs/msg/TimeReference.
@@ -47,33 +46,33 @@ pub struct RunArgs {
     /// Publish decisions with a trigger or a fault on this topic, as std_msgs/msg/String.
     #[arg(long, value_name = "TOPIC")]
     pub decisions: Option<String>,
-    /// How often this lambda's process was started before.
+    /// Number of earlier starts of this lambda's process.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub restarts: u32,
 }
 
 /// A lambda to run live.
-pub struct Job {
-    /// Which lambda.
-    pub asked: Asked,
+pub struct LiveJob {
+    /// The lambda, with its settings.
+    pub lambda: ConfiguredLambda,
     /// Its manifest.
     pub manifest: Manifest,
     settings: Settings,
     has_recorder: bool,
-    dds: Options,
+    dds: DdsOptions,
 }
 
-impl Job {
-    /// What may be opened while the lambda runs.
+impl LiveJob {
+    /// Paths that may be opened while the lambda runs.
     pub fn paths(&self) -> Paths {
-        let mut read = definitions();
-        read.push(self.asked.lambda.clone());
-        read.extend(self.asked.vehicle.clone());
+        let mut read = definition_dirs();
+        read.push(self.lambda.folder.clone());
+        read.extend(self.lambda.vehicle.clone());
         Paths { read, write: Vec::new() }
     }
 
-    /// Memory that our own threads may still take, in bytes: messages that the network puts
-    /// together, beside those in the rings.
+    /// Memory that Gleaner's own threads may still allocate, in bytes: partial messages of the
+    /// network, beside the rings.
     pub fn own_memory(&self) -> u64 {
         unfinished_bytes(&self.manifest)
     }
@@ -84,10 +83,10 @@ impl Job {
     ///
     /// A failure that names the manifest's line, the key or the topic, and the way out.
     pub fn new(args: RunArgs) -> Result<Self, Failure> {
-        let build = BuildDir::check_fresh(&args.asked.lambda)?;
+        let build = BuildDir::check_fresh(&args.lambda_args.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
         let messages = vec![build.path().join("msg")];
-        let asked = Asked::new(args.asked, build, &mut manifest)?;
+        let lambda = ConfiguredLambda::new(args.lambda_args, build, &mut manifest)?;
         let name: String = manifest
             .lambda
             .name
@@ -97,7 +96,7 @@ impl Job {
             .collect();
         let mut dds =
             args.network.options(format!("/gleaner/{name}")).map_err(NetworkError::failure)?;
-        dds.clock = args.clock_offset.map_or_else(Clock::of_today, Clock::new);
+        dds.clock = args.clock_offset.map_or_else(Clock::from_time_of_day, Clock::new);
         dds.largest =
             manifest.inputs.iter().map(|input| input.max_size.as_usize()).max().unwrap_or(0);
         dds.messages = messages;
@@ -109,33 +108,33 @@ impl Job {
             round_trip: args.rtt,
             announce: args.decisions,
         };
-        Ok(Self { asked, manifest, settings, has_recorder: args.recorder, dds })
+        Ok(Self { lambda, manifest, settings, has_recorder: args.recorder, dds })
     }
 
     /// Joins the network and runs the lambda until SIGTERM, with reports to `reports`.
     ///
     /// # Errors
     ///
-    /// As [`Run::run`], and a failure if the network cannot be joined.
+    /// As [`LiveRun::run`], and a failure if the network cannot be joined.
     pub fn run(
         self,
         load: Load<'_>,
         isolation: &Isolation,
         reports: impl Write + Send + 'static,
     ) -> Result<Exit, Failure> {
-        let Self { asked, manifest, settings, has_recorder, dds } = self;
+        let Self { lambda, manifest, settings, has_recorder, dds } = self;
         let stop = stop_flag().map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error)
         })?;
         let source = Dds::open(dds).map_err(NetworkError::failure)?;
         let pulse = isolation.pulse().clone();
-        let run = Run {
-            asked,
+        let run = LiveRun {
+            lambda,
             manifest,
             settings,
             source: Box::new(source),
             recorder: has_recorder.then(take_stdin).transpose()?,
-            results: Pages::open(pulse.clone())?,
+            results: ResultsPipe::open(pulse.clone())?,
             pulse,
             close: &mut || isolation.close().map(<[_]>::to_vec),
             stop: &stop,
@@ -144,7 +143,7 @@ impl Job {
     }
 }
 
-/// Takes the socket that standard input is, and leaves nothing there: a lambda may read its
+/// Takes the socket from standard input and replaces it by /dev/null: a lambda may read its
 /// standard input.
 fn take_stdin() -> Result<OwnedFd, Failure> {
     let failed = |error: io::Error| {

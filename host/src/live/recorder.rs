@@ -1,75 +1,75 @@
-//! The recorder, as the lambda's side of the socket sees it: every wake is told, and nothing here
-//! waits for it.
+//! Sends every wake to the recorder without blocking.
 
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_journal::{Header, Said};
+use gleaner_journal::{JournalHeader, LogDigest};
 use gleaner_lambda::Decision;
-use gleaner_protocol::ToRecorder as Dropped;
+use gleaner_protocol::LinkLosses;
 use gleaner_protocol::link::{LinkError, RecorderLink};
 
 use crate::api::data::{Topic, Wake};
-use crate::journal::Scribe;
+use crate::journal::EntryBuilder;
 
-/// How long the recorder may take to get ready: on a busy machine, with a large preroll to take
-/// from the system. What an earlier one left it recovers afterwards.
+/// Timeout of the recorder's start: on a busy machine, with a large preroll to allocate. Clips of
+/// an earlier recorder are recovered afterwards.
 const READY: Duration = Duration::from_secs(120);
-/// How long it may take for the last wakes.
+/// Timeout of the last wakes.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// The lambda's end, and what fills in the wakes.
-pub(super) struct ToRecorder {
+/// The lambda's end of the link, and the builder of its entries.
+pub(super) struct RecorderSender {
     link: RecorderLink,
-    scribe: Scribe,
+    entry_builder: EntryBuilder,
 }
 
-impl ToRecorder {
-    /// Says which lambda this is, and waits until the recorder is ready for it.
+impl RecorderSender {
+    /// Registers the lambda, and waits until the recorder is ready for it.
     pub(super) fn join(
         socket: OwnedFd,
-        header: &Header,
+        header: &JournalHeader,
         inputs: &[Arc<Topic>],
     ) -> Result<Self, Failure> {
         let mut link = RecorderLink::new(socket);
         link.hello(header, READY).map_err(failed)?;
-        Ok(Self { link, scribe: Scribe::new(inputs) })
+        Ok(Self { link, entry_builder: EntryBuilder::new(inputs) })
     }
 
-    /// Before a wake.
+    /// Notes the state of the inputs; call it before each wake.
     pub(super) fn begin(&mut self, wake: &Wake) {
-        self.scribe.begin(wake);
+        self.entry_builder.begin(wake);
     }
 
-    /// After a wake. `decided_ns` is the CLOCK_MONOTONIC at which the lambda was left.
+    /// Sends a wake; call it after each. `decided_ns` is the CLOCK_MONOTONIC at which the lambda
+    /// returned.
     pub(super) fn end(
         &mut self,
         decision: &Decision,
-        said: Said,
+        digest: LogDigest,
         decided_ns: i64,
     ) -> Result<(), Failure> {
-        let entry = self.scribe.end(decision, said);
+        let entry = self.entry_builder.end(decision, digest);
         self.link.wake(entry, decided_ns).map_err(failed)
     }
 
-    /// Now and then: sends what waits.
+    /// Sends waiting wakes; call it regularly.
     pub(super) fn poll(&mut self) -> Result<(), Failure> {
         self.link.poll().map(drop).map_err(failed)
     }
 
-    /// What could not be told.
-    pub(super) fn dropped(&self) -> Dropped {
+    /// Wakes and triggers that could not be sent.
+    pub(super) fn dropped(&self) -> LinkLosses {
         self.link.dropped()
     }
 
-    /// Says good-bye, and what could not be told.
-    pub(super) fn leave(self) -> Dropped {
+    /// Closes the link; returns what could not be sent.
+    pub(super) fn leave(self) -> LinkLosses {
         self.link.bye(PATIENCE)
     }
 }
 
 fn failed(error: LinkError) -> Failure {
-    Failure::caused_by(Exit::Internal, "the recorder cannot be told of wakes", &error)
+    Failure::caused_by(Exit::Internal, "cannot send wakes to the recorder", &error)
 }

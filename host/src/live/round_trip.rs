@@ -1,4 +1,4 @@
-//! On request each wake is answered on a topic, so that a bench can measure the way from a sensor
+//! Answers each wake on a topic, on request, so that a bench can measure the latency from a sensor
 //! to a decision.
 //!
 //! `sensor_msgs/msg/TimeReference`, a type that every ROS 2 has: `header.stamp` is that of the
@@ -11,22 +11,22 @@ use gleaner_base::Failure;
 use gleaner_lambda::Decision;
 use gleaner_transport::{Clock, LiveSource};
 
-use super::speaker::Speaker;
+use super::topic_publisher::TopicPublisher;
 use crate::api::data::Wake;
 
 const TYPE: &str = "sensor_msgs/msg/TimeReference";
-/// A bench that is a second behind has lost.
+/// Queue of one second at 1 kHz; older answers are dropped.
 const DEPTH: usize = 1024;
 
 pub(super) struct RoundTrip {
-    speaker: Speaker,
+    publisher: TopicPublisher,
     clock: Clock,
     lambda: String,
     wakes: u64,
 }
 
 impl RoundTrip {
-    /// Answers of `lambda` on `topic`.
+    /// Opens `topic` for the answers of `lambda`.
     pub(super) fn open(
         source: &dyn LiveSource,
         topic: &str,
@@ -34,14 +34,14 @@ impl RoundTrip {
         lambda: &str,
     ) -> Result<Self, Failure> {
         Ok(Self {
-            speaker: Speaker::open(source, topic, TYPE, DEPTH)?,
+            publisher: TopicPublisher::open(source, topic, TYPE, DEPTH)?,
             clock,
             lambda: lambda.to_owned(),
             wakes: 0,
         })
     }
 
-    /// The stamp of what woke the lambda, in ns.
+    /// Stamp of the cause of a wake, in ns.
     pub(super) fn cause(wake: &Wake, clock: Clock) -> i64 {
         match wake {
             Wake::Event(sample) => {
@@ -52,9 +52,9 @@ impl RoundTrip {
         }
     }
 
-    /// Answers that were not sent.
+    /// Number of answers that were not sent.
     pub(super) fn unsent(&self) -> u64 {
-        self.speaker.unsent()
+        self.publisher.unsent()
     }
 
     /// Sends the answer to one wake.
@@ -64,6 +64,7 @@ impl RoundTrip {
         let source = format!("{}:{}:{}", self.lambda, self.wakes, labels.join(","));
         self.wakes += 1;
         let now = self.clock.monotonic(self.clock.now());
-        self.speaker.say(|message| message.time(cause_ns).string("").time(now).string(&source));
+        self.publisher
+            .publish(|message| message.time(cause_ns).string("").time(now).string(&source));
     }
 }

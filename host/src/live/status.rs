@@ -1,65 +1,65 @@
-//! How the lambda is doing: counted at each wake, told once a second.
+//! The status of a live lambda: counters per wake, reported once a second.
 
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use gleaner_lambda::Decision;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_protocol::{Live, LiveTopic, Network, Spread, ToRecorder};
+use gleaner_protocol::{DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus};
 use gleaner_transport::{Clock, Health, LiveSource, Subscription};
-use gleaner_vitals::{Spreads, usage};
+use gleaner_vitals::{IntervalDurations, usage};
 
 use crate::api::Session;
 use crate::api::data::Topic;
 use crate::input::Remap;
-use crate::schedule::Schedule;
+use crate::schedule::WakeSchedule;
 
 /// Time between two reports.
 const EVERY_NS: i64 = 1_000_000_000;
 
-/// When what happened in a wake, in ns of the vehicle's clock.
+/// Times of a wake, in ns of the vehicle's clock.
 pub(super) struct Times {
-    /// Sample received, or tick due.
+    /// Reception of the sample, or due time of the tick.
     pub(super) at: i64,
-    /// Lambda entered.
+    /// Start of the lambda's call.
     pub(super) entered: i64,
-    /// Lambda left.
+    /// End of the lambda's call.
     pub(super) left: i64,
-    /// Decision out.
+    /// Time at which the decision was sent.
     pub(super) out: i64,
 }
 
-/// What else a report tells of.
+/// Other sources of a report.
 pub(super) struct Around<'a> {
     pub(super) source: &'a dyn LiveSource,
     pub(super) health: &'a Health,
     pub(super) inputs: &'a [Arc<Topic>],
-    pub(super) schedule: &'a Schedule,
+    pub(super) schedule: &'a WakeSchedule,
     pub(super) session: &'a Session,
-    /// Decisions and lines that could not be written.
+    /// Number of decisions and lines that could not be written.
     pub(super) unwritten: u64,
-    /// Messages that were not sent on topics that were asked for.
+    /// Number of messages that were not sent on requested topics.
     pub(super) unsent: u64,
-    /// Where there is a recorder, what it could not be told.
-    pub(super) recorder: Option<ToRecorder>,
+    /// Wakes and triggers that could not be sent to the recorder, if there is one.
+    pub(super) recorder_link: Option<LinkLosses>,
 }
 
 /// Counts and spreads of one lambda.
-pub(super) struct Watch {
-    base: Live,
+pub(super) struct StatusReporter {
+    base: LiveStatus,
     clock: Clock,
     started: i64,
     reported: i64,
-    wake_latency: Spreads,
-    run: Spreads,
-    decision_latency: Spreads,
-    /// Samples that each input had received at the report before.
+    wake_latency: IntervalDurations,
+    run: IntervalDurations,
+    decision_latency: IntervalDurations,
+    /// Samples that each input had received at the previous report.
     before: Vec<u64>,
     /// Topics after remapping.
     wire: Vec<String>,
 }
 
-impl Watch {
+impl StatusReporter {
     pub(super) fn new(
         manifest: &Manifest,
         remaps: &[Remap],
@@ -68,7 +68,7 @@ impl Watch {
         clock: Clock,
     ) -> Self {
         let now = clock.now();
-        let base = Live {
+        let base = LiveStatus {
             lambda: manifest.lambda.name.to_string(),
             version: manifest.lambda.version.to_string(),
             kind: manifest.lambda.kind,
@@ -87,11 +87,11 @@ impl Watch {
             unwritten: 0,
             unsent: 0,
             wake_latency: None,
-            run: None,
+            run_time: None,
             decision_latency: None,
             topics: Vec::new(),
-            network: Network::default(),
-            recorder: None,
+            network: NetworkStatus::default(),
+            recorder_link: None,
             recording: None,
             rss_bytes: 0,
             cpu_s: 0.0,
@@ -105,15 +105,15 @@ impl Watch {
             clock,
             started: now,
             reported: now,
-            wake_latency: Spreads::new(),
-            run: Spreads::new(),
-            decision_latency: Spreads::new(),
+            wake_latency: IntervalDurations::new(),
+            run: IntervalDurations::new(),
+            decision_latency: IntervalDurations::new(),
             before: vec![0; manifest.inputs.len()],
             wire: wire.collect(),
         }
     }
 
-    /// A wake is over.
+    /// Counts a wake.
     pub(super) fn woke(&mut self, decision: &Decision, log_lines: usize, times: Times) {
         self.base.wakes += 1;
         self.base.triggers += decision.triggers.len() as u64;
@@ -124,24 +124,24 @@ impl Watch {
         self.decision_latency.add(times.out.saturating_sub(times.left));
     }
 
-    /// Wakes that ended in a fault.
+    /// Number of wakes that ended in a fault.
     pub(super) fn faults(&self) -> u64 {
         self.base.faults
     }
 
-    /// Whether it is time for a report.
+    /// Returns whether a report is due.
     pub(super) fn is_due(&self, now: i64) -> bool {
         now.saturating_sub(self.reported) >= EVERY_NS
     }
 
-    /// How it is now.
-    pub(super) fn report(&mut self, around: &Around) -> Live {
+    /// The status since the last report.
+    pub(super) fn report(&mut self, around: &Around) -> LiveStatus {
         let spreads = [self.wake_latency.take(), self.run.take(), self.decision_latency.take()];
         self.as_of_now(around, spreads)
     }
 
-    /// How it was.
-    pub(super) fn ended(mut self, around: &Around) -> Live {
+    /// The status of the whole run.
+    pub(super) fn ended(mut self, around: &Around) -> LiveStatus {
         self.reported = self.started;
         self.before.fill(0);
         let spreads = [self.wake_latency.all(), self.run.all(), self.decision_latency.all()];
@@ -151,9 +151,9 @@ impl Watch {
     fn as_of_now(
         &mut self,
         around: &Around,
-        [wake_latency, run, decision_latency]: [Option<Spread>; 3],
-    ) -> Live {
-        let Around { source, health, inputs, schedule, session, unwritten, unsent, recorder } =
+        [wake_latency, run, decision_latency]: [Option<DurationStats>; 3],
+    ) -> LiveStatus {
+        let Around { source, health, inputs, schedule, session, unwritten, unsent, recorder_link } =
             *around;
         let now = self.clock.now();
         let seconds = now.saturating_sub(self.reported) as f64 / 1e9;
@@ -187,7 +187,7 @@ impl Watch {
                 qos_warnings: status.qos_warnings,
             });
         }
-        Live {
+        LiveStatus {
             up_s: now.saturating_sub(self.started) as f64 / 1e9,
             skipped: topics.iter().map(|topic| topic.skipped).sum(),
             missed_ticks: schedule.missed(),
@@ -196,9 +196,9 @@ impl Watch {
             backed_off: session.backed_off(),
             unwritten,
             unsent,
-            recorder,
+            recorder_link,
             wake_latency,
-            run,
+            run_time: run,
             decision_latency,
             topics,
             network: health.network.clone().unwrap_or_default(),

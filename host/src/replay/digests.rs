@@ -1,4 +1,4 @@
-//! The checksums of the drives: which files they were, byte for byte.
+//! Computes the checksums of the drives, which identify their files byte for byte.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -8,10 +8,10 @@ use std::thread::{self, JoinHandle};
 use gleaner_base::Explain;
 use gleaner_journal::DriveDigest;
 
-/// Read at once.
+/// Bytes that are read at a time.
 const PIECE: usize = 64 << 10;
 
-/// A drive cannot be read a second time.
+/// A drive that cannot be read a second time.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot take the checksum of drive `{}`", path.display())]
 pub(super) struct DigestError {
@@ -21,8 +21,7 @@ pub(super) struct DigestError {
 
 impl Explain for DigestError {}
 
-/// Checksums that are taken on a thread of its own while the lambda runs, from the files that it is
-/// about to read anyway.
+/// Checksums of the drives, computed by a thread while the lambda runs over the same files.
 pub(super) struct Digests(JoinHandle<Result<Vec<DriveDigest>, DigestError>>);
 
 impl Digests {
@@ -30,7 +29,7 @@ impl Digests {
         Self(thread::spawn(move || drives.iter().map(|drive| digest(drive)).collect()))
     }
 
-    /// Waits for them.
+    /// Waits for the checksums.
     pub(super) fn take(self) -> Result<Vec<DriveDigest>, DigestError> {
         self.0.join().expect("reading a file does not panic")
     }
@@ -51,7 +50,7 @@ fn digest(path: &Path) -> Result<DriveDigest, DigestError> {
             Err(error) => return Err(failed(error)),
         }
     }
-    // Where a drive lay says nothing about it.
+    // The folder does not identify a drive.
     let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
     Ok(DriveDigest { name, bytes, crc32: crc.finalize() })
 }

@@ -1,4 +1,4 @@
-//! `gleaner-runtime inspect`: what is in a recorded drive, without a lambda.
+//! `gleaner-runtime inspect`: reports the content of a recorded drive, without a lambda.
 
 use std::collections::HashMap;
 use std::io::Write;
@@ -7,27 +7,27 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use clap::Args;
 use gleaner_base::{Exit, Failure};
-use gleaner_drives::{Options, Replay, Step, files_of};
+use gleaner_drives::{DriveOptions, Replay, ReplayStep, files_of};
 use gleaner_messages::{CompressedView, ImageView, Sources};
-use gleaner_protocol::{DriveSeen, Picture, RecordedTopicSeen, Report, Spread};
+use gleaner_protocol::{DriveInfo, DriveTopicInfo, DurationStats, PictureInfo, Report};
 use gleaner_transport::{
-    DiscoveredTopic, Gaps, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict,
+    Delivery, DiscoveredTopic, Gaps, Qos, SampleMeta, Sink, TopicSpec, Transport,
 };
 use gleaner_vitals::Durations;
 
 use super::open::DriveError;
-use crate::isolation::definitions;
+use crate::isolation::definition_dirs;
 
-/// A larger drive is looked at in parts: so many bytes are read in about a second.
+/// Size in bytes above which only parts of a drive are read; this much takes about a second.
 const WHOLE_BYTES: u64 = 256 << 20;
-/// Its parts: from its begin, its middle and its end.
+/// Number of parts of a large drive: its beginning, its middle and its end.
 const PARTS: i64 = 3;
 const PART_NS: i64 = 2_000_000_000;
-/// A part ends early after so many bytes of messages.
+/// Bytes of messages after which a part ends early.
 const PART_BYTES: u64 = 64 << 20;
-/// The largest message that is unpacked to be looked at.
+/// Size in bytes of the largest message that is unpacked.
 const LARGEST: usize = 256 << 20;
-/// The most topics that are looked at. A vehicle has some hundreds; a file can name 65,536.
+/// Maximum number of topics. A vehicle has some hundreds; a file can name 65,536.
 const TOPICS: usize = 4096;
 
 /// Arguments of `inspect`.
@@ -36,23 +36,25 @@ pub struct InspectArgs {
     /// MCAP files, databases and directories of rosbag2.
     #[arg(required = true)]
     pub drives: Vec<PathBuf>,
-    /// Read all of it, however large it is.
+    /// Read the whole drive, whatever its size.
     #[arg(long)]
     pub all: bool,
 }
 
-/// Looks into the drives, and reports what is in them.
+/// Reads the drives and reports their content.
 ///
 /// # Errors
 ///
 /// A failure that names the drive that cannot be opened.
 pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Failure> {
-    let options =
-        Options { sources: Some(Sources::new(&[], &definitions())), ..Options::default() };
+    let options = DriveOptions {
+        sources: Some(Sources::new(&[], &definition_dirs())),
+        ..DriveOptions::default()
+    };
     let open = || Replay::open_as(&args.drives, &options).map_err(DriveError);
     let mut drive = open()?;
     let (start_ns, end_ns) = (drive.start_ns(), drive.end_ns());
-    let (mut topics, skipped) = looks(drive.topics());
+    let (mut topics, skipped) = inspections(drive.topics());
     let mut parts = if args.all || bytes(&args.drives)? <= WHOLE_BYTES {
         Vec::new()
     } else {
@@ -73,30 +75,30 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
         out_of_order += drive.out_of_order();
         damaged = damaged.or(broken);
     }
-    let mut topics: Vec<_> = topics.into_iter().map(Look::seen).collect();
-    // One who numbers the messages of all topics together leaves as many out in each as there are
-    // in the others.
+    let mut topics: Vec<_> = topics.into_iter().map(TopicInspection::seen).collect();
+    // A writer that numbers the messages of all topics together leaves gaps in each topic, one for
+    // each message of the others.
     let (read, missing) = topics.iter().fold((0, 0), |(read, missing), topic| {
-        (read + topic.read, topic.missing.unwrap_or(0).saturating_add(missing))
+        (read + topic.messages_read, topic.missing.unwrap_or(0).saturating_add(missing))
     });
     if missing > read / 2 {
         topics.iter_mut().for_each(|topic| topic.missing = None);
     }
-    let seen = DriveSeen { start_ns, end_ns, parts, out_of_order, damaged, topics, skipped };
+    let seen = DriveInfo { start_ns, end_ns, parts, out_of_order, damaged, topics, skipped };
     super::report(reports, &Report::Drive(seen));
     Ok(Exit::Ok)
 }
 
-/// The topics that are looked at, by name, and how many there are beyond: those with messages come
-/// first.
-fn looks(mut found: Vec<DiscoveredTopic>) -> (Vec<Look>, u64) {
+/// Returns the topics to inspect, by name, and the number of those left out; topics without
+/// messages are left out first.
+fn inspections(mut found: Vec<DiscoveredTopic>) -> (Vec<TopicInspection>, u64) {
     let skipped = found.len().saturating_sub(TOPICS);
     if skipped > 0 {
         found.sort_by_key(|topic| topic.messages == Some(0));
         found.truncate(TOPICS);
         found.sort_by(|a, b| a.topic.cmp(&b.topic));
     }
-    (found.into_iter().map(Look::new).collect(), skipped as u64)
+    (found.into_iter().map(TopicInspection::new).collect(), skipped as u64)
 }
 
 fn bytes(drives: &[PathBuf]) -> Result<u64, DriveError> {
@@ -104,24 +106,24 @@ fn bytes(drives: &[PathBuf]) -> Result<u64, DriveError> {
     Ok(files.iter().filter_map(|file| file.metadata().ok()).map(|data| data.len()).sum())
 }
 
-/// The parts of a large drive; none if it is shorter than they are.
+/// The parts of a large drive; none if it is shorter than all parts together.
 fn spread(start_ns: Option<i64>, end_ns: Option<i64>) -> Vec<[i64; 2]> {
     let (Some(start), Some(end)) = (start_ns, end_ns) else { return Vec::new() };
     let length = end.saturating_sub(start);
     if length <= PARTS * PART_NS {
         return Vec::new();
     }
-    // The end does not belong to a part, and the last message is to.
+    // The end of a part is exclusive, and the last part is to contain the last message.
     let room = i128::from(length) + 1 - i128::from(PART_NS);
     let from = |n: i64| start + (room * i128::from(n) / i128::from(PARTS - 1)) as i64;
     (0..PARTS).map(|n| [from(n), from(n).saturating_add(PART_NS)]).collect()
 }
 
-/// Reads what it is restricted to, at most so many bytes of messages. Until when it read, if it
-/// ended before; and why, if it is damaged.
+/// Reads the range to which `drive` is restricted, at most `most` bytes of messages. Returns the
+/// end of the part that was read, if it ended early, and the damage, if there is any.
 fn read(
     drive: &mut Replay,
-    topics: &mut [Look],
+    topics: &mut [TopicInspection],
     most: Option<u64>,
 ) -> (Option<i64>, Option<String>) {
     let mut subscribed = HashMap::new();
@@ -150,28 +152,28 @@ fn read(
     }
 }
 
-/// What was seen of a topic so far.
-struct Look {
-    seen: RecordedTopicSeen,
-    first: Arc<First>,
-    /// There from the second message on: most of what a file names may have none.
+/// Statistics of one topic so far.
+struct TopicInspection {
+    seen: DriveTopicInfo,
+    first: Arc<FirstMessage>,
+    /// Set from the second message on: most topics of a file may have none.
     intervals: Option<Durations>,
     longest_ns: i64,
-    /// Of this part.
+    /// Stamp of the last message of this part.
     last_ns: Option<i64>,
     gaps: Gaps,
 }
 
-impl Look {
+impl TopicInspection {
     fn new(found: DiscoveredTopic) -> Self {
-        let first = First { type_name: found.type_name.clone(), picture: Mutex::new(None) };
-        let seen = RecordedTopicSeen {
+        let first = FirstMessage { type_name: found.type_name.clone(), picture: Mutex::new(None) };
+        let seen = DriveTopicInfo {
             topic: found.topic,
             type_name: found.type_name,
             messages: found.messages,
             is_defined: found.definitions_text.is_some(),
             unreadable: None,
-            read: 0,
+            messages_read: 0,
             interval: None,
             longest_gap_at_ns: None,
             missing: Some(0),
@@ -184,12 +186,12 @@ impl Look {
     }
 
     fn spec(&self) -> TopicSpec {
-        let RecordedTopicSeen { topic, type_name, .. } = &self.seen;
+        let DriveTopicInfo { topic, type_name, .. } = &self.seen;
         let (topic, type_name) = (topic.clone(), type_name.clone());
         TopicSpec { topic, type_name, queue: 1, max_bytes: LARGEST, qos: Qos::Auto }
     }
 
-    /// Another part: what lies between two is no gap.
+    /// Begins another part: the time between two parts is no gap.
     fn begin(&mut self) {
         self.last_ns = None;
         self.seen.missing = self
@@ -198,8 +200,8 @@ impl Look {
             .map(|missing| missing.saturating_add(std::mem::take(&mut self.gaps).lost()));
     }
 
-    fn add(&mut self, step: &Step) {
-        self.seen.read += 1;
+    fn add(&mut self, step: &ReplayStep) {
+        self.seen.messages_read += 1;
         self.seen.bytes += step.bytes as u64;
         self.seen.largest_bytes = self.seen.largest_bytes.max(step.bytes as u64);
         self.gaps.note(step.meta.writer, step.meta.seq);
@@ -214,45 +216,53 @@ impl Look {
         self.last_ns = Some(step.at_ns);
     }
 
-    fn seen(mut self) -> RecordedTopicSeen {
+    fn seen(mut self) -> DriveTopicInfo {
         self.begin();
         let picture = self.first.picture.lock().unwrap_or_else(PoisonError::into_inner).take();
-        // Of those kept only two digits are, and no more than a day.
+        // The histogram keeps two digits, and no more than a day.
         let max_ns = u64::try_from(self.longest_ns).unwrap_or(0);
-        let interval =
-            self.intervals.as_ref().and_then(Durations::all).map(|kept| Spread { max_ns, ..kept });
-        RecordedTopicSeen { interval, picture: picture.flatten(), ..self.seen }
+        let interval = self
+            .intervals
+            .as_ref()
+            .and_then(Durations::all)
+            .map(|kept| DurationStats { max_ns, ..kept });
+        DriveTopicInfo { interval, picture: picture.flatten(), ..self.seen }
     }
 }
 
-/// Looks at the first message of a topic.
-struct First {
+/// Inspects the first message of a topic.
+struct FirstMessage {
     type_name: String,
-    /// `None` until there was one.
-    picture: Mutex<Option<Option<Picture>>>,
+    /// `None` before the first message.
+    picture: Mutex<Option<Option<PictureInfo>>>,
 }
 
-impl Sink for First {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+impl Sink for FirstMessage {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
         let mut picture = self.picture.lock().unwrap_or_else(PoisonError::into_inner);
         picture.get_or_insert_with(|| self.picture(meta, cdr));
-        Verdict::Taken
+        Delivery::Taken
     }
 }
 
-impl First {
-    fn picture(&self, meta: &SampleMeta, cdr: &[u8]) -> Option<Picture> {
+impl FirstMessage {
+    fn picture(&self, meta: &SampleMeta, cdr: &[u8]) -> Option<PictureInfo> {
         match self.type_name.as_str() {
             "sensor_msgs/msg/Image" => {
                 let ImageView { width, height, encoding, .. } =
                     ImageView::read(cdr, meta.endian).ok()?;
-                Some(Picture { encoding: encoding.to_owned(), width, height, is_compressed: false })
+                Some(PictureInfo {
+                    encoding: encoding.to_owned(),
+                    width,
+                    height,
+                    is_compressed: false,
+                })
             }
             "sensor_msgs/msg/CompressedImage" => {
                 let view = CompressedView::read(cdr, meta.endian).ok()?;
                 let header = gleaner_image::probe(view.data).ok()?;
                 let encoding = header.format.to_string();
-                Some(Picture {
+                Some(PictureInfo {
                     encoding,
                     width: header.width,
                     height: header.height,

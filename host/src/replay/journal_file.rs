@@ -1,25 +1,25 @@
-//! The journal of a replay, where one is wanted.
+//! The journal file of a replay.
 
 use std::fs::{File, TryLockError};
 use std::io::{self, Seek};
 use std::path::{Path, PathBuf};
 
-use gleaner_base::own_file::{self, InTheWay};
+use gleaner_base::safe_file::{self, UnsafePath};
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_journal as journal;
-use gleaner_journal::{End, Entry, Header, JournalError, Reader};
+use gleaner_journal::{JournalEnd, JournalEntry, JournalError, JournalHeader, JournalReader};
 
-use crate::stage::OutputError;
+use crate::session_setup::OutputError;
 
-/// Opens the file `path` for a journal; it is made if there is none.
+/// Opens the file `path` for a journal, and creates it if there is none.
 ///
 /// # Errors
 ///
 /// A failure that names it.
 pub(super) fn open(path: &Path) -> Result<File, Failure> {
-    own_file::write(path).map_err(|source| match InTheWay::of(&source) {
-        // A pipe would never end, a device is no file to verify later, and a link leads to what is
-        // not named here.
+    safe_file::write(path).map_err(|source| match UnsafePath::of(&source) {
+        // A pipe would never end, a device cannot be verified later, and a link leads to a file
+        // that the user did not name.
         Some(why) => {
             let mut failure = no_journal(path);
             failure.causes = vec![why.to_string()];
@@ -29,16 +29,16 @@ pub(super) fn open(path: &Path) -> Result<File, Failure> {
     })
 }
 
-/// Why a journal cannot be locked.
+/// A journal that cannot be locked.
 #[derive(Debug, thiserror::Error)]
-enum HeldError {
+enum JournalLockError {
     #[error("another process writes or verifies journal `{}`", path.display())]
     Busy { path: PathBuf },
     #[error("cannot lock journal `{}`", path.display())]
     Lock { path: PathBuf, source: io::Error },
 }
 
-impl Explain for HeldError {
+impl Explain for JournalLockError {
     fn help(&self) -> Option<String> {
         Some(match self {
             Self::Busy { .. } => {
@@ -55,83 +55,84 @@ impl Explain for HeldError {
     }
 }
 
-/// Opens the journal `path` to read it. As long as it is open, no replay writes into it.
+/// Opens the journal `path` for reading. While it is open, no replay writes into it.
 ///
 /// # Errors
 ///
-/// A failure that names it, also while a replay writes into it: its end would look like damage.
+/// A failure that names it; also while a replay writes into it, since its end would look like
+/// damage.
 pub(super) fn read(path: &Path) -> Result<File, Failure> {
-    let file = own_file::read_named(path).map_err(|error| {
+    let file = safe_file::read_named(path).map_err(|error| {
         Failure::caused_by(Exit::Usage, format!("cannot open journal `{}`", path.display()), &error)
     })?;
     match file.try_lock_shared() {
         Err(TryLockError::WouldBlock) => {
-            let message = format!("a replay writes journal `{}` now", path.display());
+            let message = format!("a replay is writing journal `{}`", path.display());
             Err(Failure::new(Exit::Usage, message).with_help("wait until it ends"))
         }
-        // On a file system without locks, a journal can be read all the same.
+        // On a file system without locks, a journal can still be read.
         Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
     }
 }
 
 fn no_journal(path: &Path) -> Failure {
-    let message = format!("`{}` is there and is no journal", path.display());
+    let message = format!("`{}` exists and is no journal", path.display());
     Failure::new(Exit::Usage, message).with_help("choose another name: --journal FILE")
 }
 
-/// Returns whether a file begins as a journal does, be it of another version, damaged or cut off:
-/// such a one may be replaced.
+/// Returns whether a file begins like a journal, which may be of another version, damaged or
+/// truncated: such a file may be replaced.
 fn is_journal(file: &File) -> bool {
-    !matches!(Reader::open(file), Err(JournalError::NotAJournal | JournalError::Read { .. }))
+    !matches!(JournalReader::open(file), Err(JournalError::NotAJournal | JournalError::Read { .. }))
 }
 
 /// The journal of a replay.
 pub struct JournalFile {
     path: PathBuf,
-    writer: journal::Writer<File>,
+    writer: journal::JournalWriter<File>,
 }
 
 impl JournalFile {
-    /// Begins the journal `path` anew. A file there that is no journal is left alone: it may be a
-    /// drive, named by mistake.
-    pub fn create(path: &Path, header: &Header) -> Result<Self, Failure> {
+    /// Creates or replaces the journal `path`. An existing file that is no journal is kept: it may
+    /// be a drive that was named by mistake.
+    pub fn create(path: &Path, header: &JournalHeader) -> Result<Self, Failure> {
         let failed = |source| OutputError { path: path.to_owned(), source };
         let mut file = open(path)?;
-        // A journal that another process writes must not be emptied. The lock lasts as long as the
-        // file is open.
+        // A journal that another process writes must not be truncated. The lock is held as long as
+        // the file is open.
         match file.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
-                return Err(HeldError::Busy { path: path.to_owned() }.into());
+                return Err(JournalLockError::Busy { path: path.to_owned() }.into());
             }
             Err(TryLockError::Error(source)) => {
-                return Err(HeldError::Lock { path: path.to_owned(), source }.into());
+                return Err(JournalLockError::Lock { path: path.to_owned(), source }.into());
             }
         }
         if file.metadata().map_err(failed)?.len() > 0 && !is_journal(&file) {
             return Err(no_journal(path));
         }
         file.set_len(0).and_then(|()| file.rewind()).map_err(failed)?;
-        let writer = journal::Writer::begin(file, header).map_err(failed)?;
+        let writer = journal::JournalWriter::begin(file, header).map_err(failed)?;
         Ok(Self { path: path.to_owned(), writer })
     }
 
-    /// Adds a wake. One with triggers is written at once, as its clip may be listed next.
-    pub fn wake(&mut self, entry: &Entry) -> Result<(), OutputError> {
+    /// Adds a wake. One with triggers is flushed at once, since its clip may be listed next.
+    pub fn wake(&mut self, entry: &JournalEntry) -> Result<(), OutputError> {
         let written = self.writer.wake(entry);
         let written = written
             .and_then(|()| if entry.triggers.is_empty() { Ok(()) } else { self.writer.flush() });
         written.map_err(|source| OutputError { path: self.path.clone(), source })
     }
 
-    /// Writes what waits. Where that happens at a time of the clock, the journals of equal replays
-    /// differ.
+    /// Flushes buffered entries. If this is done at times of the wall clock, journals of equal
+    /// replays differ.
     pub fn flush(&mut self) -> Result<(), OutputError> {
         self.writer.flush().map_err(|source| OutputError { path: self.path.clone(), source })
     }
 
-    /// Ends the journal. Without `end` it reads like one whose writer died.
-    pub fn finish(mut self, end: Option<&End>) -> Result<(), OutputError> {
+    /// Ends the journal. Without `end`, readers see a journal whose writer died.
+    pub fn finish(mut self, end: Option<&JournalEnd>) -> Result<(), OutputError> {
         let failed = |source| OutputError { path: self.path.clone(), source };
         match end {
             Some(end) => self.writer.finish(end).map(drop).map_err(failed),
@@ -147,7 +148,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_journal_is_made_and_a_link_is_none() {
+    fn a_journal_is_created_and_a_link_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let [journal, target, link] =
             ["drive.journal", "target", "link"].map(|name| folder.path().join(name));
@@ -157,12 +158,12 @@ mod tests {
         let failure = open(&link).unwrap_err();
         let text = failure.to_string();
         assert!(
-            text.contains("link` is there and is no journal") && text.contains("it is a link"),
+            text.contains("link` exists and is no journal") && text.contains("it is a link"),
             "{text}"
         );
         assert_eq!(failure.exit, Exit::Usage);
         assert!(!target.exists());
         fs::hard_link(&journal, &target).unwrap();
-        assert!(open(&target).unwrap_err().to_string().contains("the file has other names"));
+        assert!(open(&target).unwrap_err().to_string().contains("the file has other hard links"));
     }
 }

@@ -1,28 +1,28 @@
-//! A built lambda over recorded drives: the very same artifact as on the vehicle, pulled as fast as
-//! the machine goes.
+//! Replays recorded drives to a built lambda: the same artifact as on the vehicle, as fast as the
+//! machine allows.
 //!
-//! Time is the drive's. A sample is delivered, the lambda runs if its schedule says so, then the
-//! next: nothing is skipped, and nothing depends on how fast the machine is.
+//! Time is the drive's. Each sample is delivered and the lambda runs if its schedule requests it,
+//! then the next: nothing is skipped, and nothing depends on the speed of the machine.
 
-mod chosen;
-mod course;
 mod digests;
-mod hold;
+mod drive_loop;
 mod inspect;
 mod journal_file;
 mod open;
 mod options;
+mod output_lock;
 mod packed;
-mod part;
 mod pictures;
 mod record;
 mod round;
 mod signals;
+mod time_range;
+mod topic_filter;
 mod verify;
-mod work;
+mod worker_loop;
 
 pub use inspect::{InspectArgs, inspect};
-pub use options::{Job, Options, ReplayArgs, VerifyArgs};
+pub use options::{ReplayArgs, ReplayJob, ReplayOptions, VerifyArgs};
 pub use packed::{Packed, UnpackedArgs};
 
 use std::io::Write;
@@ -31,20 +31,20 @@ use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::Manifest;
 use gleaner_protocol::Report;
 
-use self::hold::Hold;
 use self::options::{Results, Task};
-use self::round::Ended;
-use crate::guest::worker::Reports;
-use crate::stage::Load;
+use self::output_lock::OutputLock;
+use self::round::ReplayOutcome;
+use crate::guest::worker::MessageSender;
+use crate::session_setup::Load;
 
-/// What the times of a replay are.
+/// Clock of the times of a replay.
 const CLOCK: &str = crate::journal::CLOCK_OF_DRIVE;
 
-impl Job {
-    /// Does it, and writes reports to `reports`.
+impl ReplayJob {
+    /// Runs the replay or the comparison, and writes reports to `reports`.
     ///
-    /// For a replay, the exit is [`Exit::DriveDamaged`] if the drive ended in damage, or
-    /// [`Exit::Internal`] if it could not be read further (results up to there are kept); else
+    /// For a replay, the exit is [`Exit::DriveDamaged`] if the drive is damaged, or
+    /// [`Exit::Internal`] if it could not be read to its end (results up to there are kept); else
     /// [`Exit::LambdaFaulted`] if a wake faulted, else [`Exit::Ok`].
     ///
     /// # Errors
@@ -55,47 +55,48 @@ impl Job {
         let Self { options, manifest, task } = self;
         match task {
             Task::Replay(results) => replay(&options, &results, &manifest, load, reports),
-            Task::Verify(mut claim) => {
-                let verified = verify::run(&options, &manifest, &mut claim, load)?;
+            Task::Verify(mut reference) => {
+                let verified = verify::run(&options, &manifest, &mut reference, load)?;
                 report(reports, &Report::Verified(verified));
                 Ok(Exit::Ok)
             }
         }
     }
 
-    /// Does what a worker has to do for it: the guest that `load` makes sends the outcome of each
-    /// wake, and the rest goes to `reports`.
+    /// Runs the worker's part: the guest that `load` creates sends the outcome of each wake, and
+    /// the rest goes to `reports`.
     ///
     /// # Errors
     ///
-    /// A failure if it cannot start. What is found wrong later, the process that reads the outcomes
-    /// finds as well.
-    pub fn work(self, load: Load<'_>, reports: &Reports) -> Result<Exit, Failure> {
+    /// A failure if it cannot start. The process that reads the outcomes finds later errors itself.
+    pub fn work(self, load: Load<'_>, reports: &MessageSender) -> Result<Exit, Failure> {
         let Self { options, manifest, task } = self;
         match task {
             Task::Replay(results) => {
-                work::work(&options, results.record, &manifest, load, reports)?
+                worker_loop::run(&options, results.record, &manifest, load, reports)?
             }
-            // Over a drive the schedule leads, whatever the journal holds; in a clip, the journal.
-            Task::Verify(claim) if claim.clip.is_none() => {
-                work::work(&options, false, &manifest, load, reports)?
+            // Over a drive, the schedule decides on the wakes; in a clip, the journal.
+            Task::Verify(reference) if reference.clip.is_none() => {
+                worker_loop::run(&options, false, &manifest, load, reports)?
             }
-            Task::Verify(mut claim) => drop(verify::run(&options, &manifest, &mut claim, load)?),
+            Task::Verify(mut reference) => {
+                drop(verify::run(&options, &manifest, &mut reference, load)?)
+            }
         }
         Ok(Exit::Ok)
     }
 }
 
 fn replay(
-    options: &Options,
+    options: &ReplayOptions,
     results: &Results,
     manifest: &Manifest,
     load: Load<'_>,
     reports: &mut dyn Write,
 ) -> Result<Exit, Failure> {
-    let _hold = Hold::take(&results.out)?;
+    let _hold = OutputLock::take(&results.out)?;
     let mut n = 1;
-    let Ended { summary, broken, incomplete } = loop {
+    let ReplayOutcome { summary, broken, incomplete } = loop {
         let ended = round::replay(options, results, manifest, &mut *load, reports, n == 1)?;
         if results.repeat > 1 {
             report(reports, &Report::Round(round::report(n, &ended.summary)));
@@ -113,7 +114,7 @@ fn replay(
     Err(Failure { exit: if exit == Exit::Ok { failure.exit } else { exit }, ..failure })
 }
 
-/// Whoever listens may have gone; the results are in files.
+/// Writes a report. Errors are ignored: the reader may have ended, and the results are in files.
 fn report(reports: &mut dyn Write, report: &Report) {
     if let Ok(mut line) = serde_json::to_string(report) {
         line.push('\n');

@@ -1,22 +1,22 @@
-//! Opening drives, and what it means that one cannot be read.
+//! Opens drives, and turns their errors into failures with an exit code and help.
 
 use std::path::PathBuf;
 
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_drives as replay;
 use gleaner_drives::{Replay, ReplayError, files_of};
-use gleaner_journal::Part;
+use gleaner_journal::TimeRange;
 use gleaner_messages::Sources;
 
-use super::Options;
+use super::ReplayOptions;
 use super::options::Drives;
-use crate::isolation::definitions;
+use crate::isolation::definition_dirs;
 
 impl Drives {
-    /// What these paths name.
+    /// Finds the files of these paths.
     pub(super) fn find(named: Vec<PathBuf>) -> Result<Self, Failure> {
         let files = files_of(&named).map_err(DriveError)?;
-        // Under whatever name.
+        // A file counts as the same under any name.
         let mut seen = std::collections::HashSet::new();
         match files
             .iter()
@@ -28,30 +28,30 @@ impl Drives {
     }
 }
 
-/// Opens the drives, merged by time, and says which part of them is replayed.
-pub(super) fn open_drives(options: &Options) -> Result<(Replay, Part), Failure> {
+/// Opens the drives, merged by time, and returns the range of them that is replayed.
+pub(super) fn open_drives(options: &ReplayOptions) -> Result<(Replay, TimeRange), Failure> {
     let mut drive = open(options).map_err(DriveError)?;
-    let part = options.part.restrict(&mut drive)?;
+    let part = options.range.restrict(&mut drive)?;
     Ok((drive, part))
 }
 
 /// Opens the drives, merged by time.
 ///
-/// What a drive does not say of its types is looked for as live: beside the lambda, among those
-/// that are bundled, where ROS 2 is installed.
-pub(super) fn open(options: &Options) -> Result<Replay, ReplayError> {
-    let sources = Sources::new(&[options.asked.build.path().join("msg")], &definitions());
+/// Definitions that a drive lacks are searched for as in a live run: beside the lambda, among the
+/// bundled ones, and where ROS 2 is installed.
+pub(super) fn open(options: &ReplayOptions) -> Result<Replay, ReplayError> {
+    let sources = Sources::new(&[options.lambda.build.path().join("msg")], &definition_dirs());
     let (unpack_in, unpacked) = (options.unpack_in.clone(), options.unpacked.clone());
-    let opening = replay::Options {
+    let opening = replay::DriveOptions {
         sources: Some(sources),
         unpack_in,
         unpacked,
-        ..replay::Options::default()
+        ..replay::DriveOptions::default()
     };
     Replay::open_as(&options.drives.named, &opening)
 }
 
-/// A drive that cannot be read.
+/// An error of a drive, for users.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
 pub(super) struct DriveError(pub(super) ReplayError);

@@ -1,4 +1,4 @@
-//! What to do: the arguments as typed, and what they mean once checked against the build.
+//! Arguments of replays and comparisons, and their check against the build.
 
 use std::path::{Path, PathBuf};
 
@@ -11,17 +11,17 @@ use gleaner_lambda::manifest::Manifest;
 use gleaner_protocol::DriveTime;
 
 use super::journal_file;
-use super::part::Wanted;
-use super::verify::Claim;
-use crate::isolation::{code, definitions};
-use crate::stage::{Asked, AskedArgs, RESULTS};
+use super::time_range::RequestedRange;
+use super::verify::ReferenceJournal;
+use crate::isolation::{code_cache_dir, definition_dirs};
+use crate::session_setup::{ConfiguredLambda, LambdaArgs, RESULTS};
 
 /// Arguments of `replay`.
 #[derive(Args, Clone, Debug)]
 pub struct ReplayArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
-    pub asked: AskedArgs,
+    pub lambda_args: LambdaArgs,
     /// MCAP files, databases and directories of rosbag2; several are merged by time.
     #[arg(required = true)]
     pub drives: Vec<PathBuf>,
@@ -31,7 +31,7 @@ pub struct ReplayArgs {
     /// Replay until before this time, given likewise.
     #[arg(long, value_name = "TIME")]
     pub to: Option<DriveTime>,
-    /// Where the results go; `DIR/out` if not given.
+    /// Folder of the results; `DIR/out` if not given.
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Write every decision, not only those with a trigger or a fault.
@@ -40,8 +40,8 @@ pub struct ReplayArgs {
     /// Leave out the clips that the table `record` of the manifest asks for.
     #[arg(long)]
     pub no_record: bool,
-    /// Have clips hold these topics of the drive instead of those of the manifest; a `*` stands for
-    /// any letters.
+    /// Record these topics of the drive in clips, instead of those of the manifest; a `*` stands
+    /// for any letters.
     #[arg(long, value_name = "PATTERN", conflicts_with_all = ["no_record", "verify"])]
     pub topics: Vec<String>,
     /// Write a journal of every wake.
@@ -68,67 +68,67 @@ pub struct VerifyArgs {
     pub vehicle: Option<PathBuf>,
 }
 
-/// Which lambda judges which drives.
-pub struct Options {
+/// A lambda and the drives to run it over.
+pub struct ReplayOptions {
     /// The lambda.
-    pub asked: Asked,
+    pub lambda: ConfiguredLambda,
     /// The drives, merged by time.
     pub drives: Drives,
-    /// What is replayed of them.
-    pub part: Wanted,
-    /// Which topics of the drive its clips hold, if not those of the manifest.
+    /// The time range that is replayed.
+    pub range: RequestedRange,
+    /// Patterns of the topics that clips hold; empty for those of the manifest.
     pub topics: Vec<String>,
-    /// The folder for what packed drives hold, if there is one of ours.
+    /// The folder for the contents of packed drives, if this process may write to one.
     pub unpack_in: Option<PathBuf>,
-    /// What packed drives hold, where that is open already.
+    /// Contents of packed drives that are open already.
     pub unpacked: Vec<Unpacked>,
 }
 
-/// Drives, as they were named and as they are.
+/// Drives: the paths that the user named, and their files.
 pub struct Drives {
     /// Files and directories.
     pub named: Vec<PathBuf>,
-    /// The files, and those of the directories.
+    /// The named files, and those in the named directories.
     pub files: Vec<PathBuf>,
 }
 
-/// What a replay leaves.
+/// The results that a replay writes.
 pub(super) struct Results {
-    /// Where results are written.
+    /// Folder of the results.
     pub(super) out: PathBuf,
-    /// Whether every decision is written.
+    /// Set if every decision is written.
     pub(super) all: bool,
-    /// Whether clips are made.
+    /// Set if clips are written.
     pub(super) record: bool,
-    /// Where the journal is written.
+    /// Path of the journal, if one is written.
     pub(super) journal: Option<PathBuf>,
-    /// How often to replay.
+    /// Number of replays.
     pub(super) repeat: u32,
 }
 
-/// What to do with the decisions.
+/// The use of the decisions: written, or compared with a journal.
 pub(super) enum Task {
     Replay(Results),
-    Verify(Box<Claim>),
+    Verify(Box<ReferenceJournal>),
 }
 
-/// A lambda, its drives, and what to do with its decisions.
-pub struct Job {
-    /// Which lambda judges which drives.
-    pub options: Options,
+/// A replay, or a comparison with a journal.
+pub struct ReplayJob {
+    /// The lambda and its drives.
+    pub options: ReplayOptions,
     /// The lambda's manifest.
     pub manifest: Manifest,
     pub(super) task: Task,
 }
 
-impl Job {
-    /// What a replay may open while the lambda runs: drives again in a further pass, the results,
-    /// the code that was compiled.
+impl ReplayJob {
+    /// Paths that may be opened while the lambda runs: drives again in a further pass, the results,
+    /// the compiled code.
     pub fn paths(&self) -> Paths {
-        let Options { asked, drives, unpacked, .. } = &self.options;
-        let mut read = definitions();
-        read.push(asked.lambda.clone());
-        read.extend(asked.vehicle.clone());
+        let ReplayOptions { lambda, drives, unpacked, .. } = &self.options;
+        let mut read = definition_dirs();
+        read.push(lambda.folder.clone());
+        read.extend(lambda.vehicle.clone());
         read.extend(drives.named.iter().chain(&drives.files).cloned());
         read.extend(unpacked.iter().filter_map(Unpacked::given_name).map(Path::to_owned));
         read.extend(
@@ -138,10 +138,10 @@ impl Job {
                 .flat_map(|file| journals_of(file))
                 .filter(|journal| journal.is_file()),
         );
-        if let Task::Verify(claim) = &self.task {
-            read.push(claim.path().to_owned());
+        if let Task::Verify(reference) = &self.task {
+            read.push(reference.path().to_owned());
         }
-        read.extend(code(self.manifest.lambda.kind));
+        read.extend(code_cache_dir(self.manifest.lambda.kind));
         let journal =
             if let Task::Replay(results) = &self.task { results.journal.clone() } else { None };
         Paths {
@@ -150,14 +150,14 @@ impl Job {
         }
     }
 
-    /// Memory that our own part of the process may still take, in bytes: chunks of drives,
-    /// unpacked, and of clips.
+    /// Memory that Gleaner's own code may still allocate, in bytes: unpacked chunks of drives, and
+    /// chunks of clips.
     pub fn own_memory(&self) -> u64 {
         512 << 20
     }
 
-    /// Makes an empty journal where none is: nothing but what exists can be granted, and nothing
-    /// but a file of ours is.
+    /// Creates an empty journal if there is none: the sandbox can only grant access to an existing
+    /// file.
     ///
     /// # Errors
     ///
@@ -167,7 +167,7 @@ impl Job {
         journal_file::open(path).map(drop)
     }
 
-    /// The folder of the results, where there are some.
+    /// The folder of the results; `None` for a comparison.
     pub fn results(&self) -> Option<&Path> {
         match &self.task {
             Task::Replay(results) => Some(&results.out),
@@ -180,20 +180,20 @@ impl Job {
     ///
     /// # Errors
     ///
-    /// A failure that names the manifest's line, the key, the topic or what differs from the
+    /// A failure that names the manifest's line, the key, the topic or the difference from the
     /// journal, and the way out.
     pub fn replay(args: ReplayArgs) -> Result<Self, Failure> {
-        let build = BuildDir::check_fresh(&args.asked.lambda)?;
+        let build = BuildDir::check_fresh(&args.lambda_args.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
         let drives = Drives::find(args.drives)?;
         if let Some(journal) = args.verify {
-            let mut claim = Claim::journal(&journal)?;
-            let options = claim.options(args.asked, build, &mut manifest, drives)?;
-            return Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) });
+            let mut reference = ReferenceJournal::journal(&journal)?;
+            let options = reference.options(args.lambda_args, build, &mut manifest, drives)?;
+            return Ok(Self { options, manifest, task: Task::Verify(Box::new(reference)) });
         }
-        let asked = Asked::new(args.asked, build, &mut manifest)?;
-        let (lambda, build) = (&asked.lambda, &asked.build);
-        let out = args.out.unwrap_or_else(|| lambda.join("out"));
+        let lambda = ConfiguredLambda::new(args.lambda_args, build, &mut manifest)?;
+        let (folder, build) = (&lambda.folder, &lambda.build);
+        let out = args.out.unwrap_or_else(|| folder.join("out"));
         if lies_in(&out, build.path()) {
             let message =
                 format!("`{}` lies in the build, and would change the lambda", out.display());
@@ -221,10 +221,16 @@ impl Job {
             journal: args.journal,
             repeat: args.repeat,
         };
-        let part = Wanted { from: args.from, to: args.to };
+        let range = RequestedRange { from: args.from, to: args.to };
         let unpack_in = Some(results.out.clone());
-        let options =
-            Options { asked, drives, part, topics: args.topics, unpack_in, unpacked: Vec::new() };
+        let options = ReplayOptions {
+            lambda,
+            drives,
+            range,
+            topics: args.topics,
+            unpack_in,
+            unpacked: Vec::new(),
+        };
         Ok(Self { options, manifest, task: Task::Replay(results) })
     }
 
@@ -232,25 +238,25 @@ impl Job {
     ///
     /// # Errors
     ///
-    /// As [`Job::replay`].
+    /// As [`ReplayJob::replay`].
     pub fn verify(args: VerifyArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
-        let mut claim = Claim::clip(&args.clip, manifest.lambda.name.as_str())?;
-        let asked = AskedArgs {
+        let mut reference = ReferenceJournal::clip(&args.clip, manifest.lambda.name.as_str())?;
+        let lambda = LambdaArgs {
             lambda: args.lambda,
             set: Vec::new(),
             remap: Vec::new(),
             vehicle: args.vehicle,
         };
         let clip = Drives { named: vec![args.clip.clone()], files: vec![args.clip] };
-        let options = claim.options(asked, build, &mut manifest, clip)?;
-        Ok(Self { options, manifest, task: Task::Verify(Box::new(claim)) })
+        let options = reference.options(lambda, build, &mut manifest, clip)?;
+        Ok(Self { options, manifest, task: Task::Verify(Box::new(reference)) })
     }
 }
 
-/// Whether `path` is within `folder`, under whatever name. What is not there yet is where the
-/// nearest folder is that is.
+/// Returns whether `path` is within `folder`, after links are resolved. A path that does not exist
+/// yet counts as being in its nearest existing ancestor.
 fn lies_in(path: &Path, folder: &Path) -> bool {
     let Ok(folder) = folder.canonicalize() else { return path.starts_with(folder) };
     let Ok(path) = std::path::absolute(path) else { return false };
@@ -258,7 +264,7 @@ fn lies_in(path: &Path, folder: &Path) -> bool {
     real.is_some_and(|real| real.starts_with(folder))
 }
 
-/// Whether `path` is one of the files that a replay writes into `out` anyway.
+/// Returns whether `path` is one of the files that a replay writes into `out`.
 fn is_result(path: &Path, out: &Path) -> bool {
     if ["clips", "pictures"].iter().any(|folder| path.starts_with(out.join(folder))) {
         return true;

@@ -1,21 +1,21 @@
-//! Packed drives, which a process that may write unpacks for its worker, too.
+//! Unpacks packed drives for a worker, which may not write itself.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
 
 use gleaner_base::{Exit, Failure};
 use gleaner_drives as replay;
-use gleaner_drives::{Name, Unpacked, unpack};
+use gleaner_drives::{ContentName, Unpacked, unpack};
 
 use super::open::DriveError;
-use super::{Job, Options};
+use super::{ReplayJob, ReplayOptions};
 
-/// The argument of a worker with a packed file and the name of its content.
+/// The argument of a worker that gives a packed file and the name of its content.
 const UNPACKED: &str = "--unpacked";
-/// The argument with a packed file whose content is not whole, and why not.
+/// The argument that gives a packed file whose content is incomplete, and the reason.
 const BROKEN: &str = "--unpacked-in-part";
 
-/// Contents of packed drives, as a worker is given them.
+/// Contents of packed drives, as arguments of a worker.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct UnpackedArgs {
     #[arg(long, hide = true, num_args = 2, allow_hyphen_values = true)]
@@ -24,34 +24,36 @@ pub struct UnpackedArgs {
     unpacked_in_part: Vec<OsString>,
 }
 
-/// Packed drives, where a worker may have to be given their contents.
+/// Drives of a job, of which a worker needs the packed ones unpacked.
 pub struct Packed {
     named: Vec<PathBuf>,
-    options: replay::Options,
+    options: replay::DriveOptions,
 }
 
-/// Contents of packed drives that a worker is about to open.
-pub struct Lent {
-    /// Those of the worker that name them.
+/// Contents of packed drives, unpacked for a worker to open.
+pub struct WorkerContents {
+    /// Arguments of the worker that name the contents.
     pub arguments: Vec<OsString>,
-    /// Names that last as long as this.
-    _names: Vec<Name>,
+    /// Temporary names, removed on drop.
+    _names: Vec<ContentName>,
 }
 
-impl Job {
+impl ReplayJob {
     /// The packed files among the drives.
     pub fn packed(&self) -> Packed {
-        let Options { drives, unpack_in, .. } = &self.options;
-        let options =
-            replay::Options { unpack_in: unpack_in.clone(), ..replay::Options::default() };
+        let ReplayOptions { drives, unpack_in, .. } = &self.options;
+        let options = replay::DriveOptions {
+            unpack_in: unpack_in.clone(),
+            ..replay::DriveOptions::default()
+        };
         Packed { named: drives.named.clone(), options }
     }
 
-    /// Has this process, a worker, read contents that it was given.
+    /// Makes this process, a worker, read the contents that its arguments name.
     ///
     /// # Errors
     ///
-    /// A failure that names the content which cannot be opened.
+    /// A failure that names the content that cannot be opened.
     pub fn take(&mut self, args: UnpackedArgs) -> Result<(), Failure> {
         let UnpackedArgs { unpacked, unpacked_in_part } = args;
         let broken = |path: &PathBuf| {
@@ -75,13 +77,13 @@ impl Job {
 }
 
 impl Packed {
-    /// Unpacks the files again for a worker: the content that this process reads has no name any
-    /// more, and cannot be given one.
+    /// Unpacks the files again for a worker: the content that this process reads has lost its name,
+    /// and cannot get another.
     ///
     /// # Errors
     ///
     /// A failure that names the file.
-    pub fn lend(&self) -> Result<Lent, Failure> {
+    pub fn unpack_for_worker(&self) -> Result<WorkerContents, Failure> {
         let (mut arguments, mut names) = (Vec::new(), Vec::new());
         for unpacked in unpack(&self.named, &self.options).map_err(DriveError)? {
             let name = unpacked.name(&self.options).map_err(DriveError)?;
@@ -92,6 +94,6 @@ impl Packed {
             }
             names.push(name);
         }
-        Ok(Lent { arguments, _names: names })
+        Ok(WorkerContents { arguments, _names: names })
     }
 }

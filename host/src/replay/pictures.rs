@@ -1,33 +1,33 @@
-//! What a camera saw when a lambda triggered: small pictures, for the report.
+//! Makes small pictures of a camera's image at each trigger, for the report.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gleaner_base::own_file;
+use gleaner_base::safe_file;
 use gleaner_lambda::Decision;
-use gleaner_lambda::signals::{Picture, Signals};
+use gleaner_lambda::signals::{Signals, TriggerPicture};
 use gleaner_recorder::{is_image, thumbnail};
 use gleaner_transport::SampleMeta;
 
 use crate::api::data::Topic;
-use crate::stage::OutputError;
+use crate::session_setup::OutputError;
 
-/// The folder of the pictures, below that of the results.
+/// Folder of the pictures, below that of the results.
 const FOLDER: &str = "pictures";
 
-/// Begins the names of our pictures: by it they are told from others.
+/// Prefix of the file names, which distinguishes these pictures from others.
 const PREFIX: &str = "trigger-";
 
-/// The newest image of a topic that is recorded, and that the lambda itself does not see.
-pub(super) struct Camera {
+/// The newest image of a recorded topic that is no input of the lambda.
+pub(super) struct RecordedCamera {
     topic: String,
     type_name: String,
     newest: Mutex<Option<(SampleMeta, Vec<u8>)>>,
 }
 
-impl Camera {
+impl RecordedCamera {
     pub(super) fn new(topic: &str, type_name: &str) -> Arc<Self> {
         Arc::new(Self {
             topic: topic.to_owned(),
@@ -45,14 +45,14 @@ impl Camera {
     }
 }
 
-/// Pictures at the triggers of one pass over a drive. Where there are too many, every second is
-/// given up, again and again, so that those that stay are spread over all of the drive.
-pub(super) struct Pictures {
+/// Pictures at the triggers of one pass over a drive. When there are too many, every second one is
+/// dropped, so that the rest are spread over the whole drive.
+pub(super) struct TriggerPictures {
     inputs: Vec<Arc<Topic>>,
-    camera: Option<Arc<Camera>>,
-    /// Wakes that triggered.
+    camera: Option<Arc<RecordedCamera>>,
+    /// Number of wakes with a trigger.
     wakes: u64,
-    /// Each so many of them has a picture.
+    /// One of so many such wakes has a picture.
     every: u64,
     made: Vec<Made>,
 }
@@ -65,19 +65,19 @@ struct Made {
     jpeg: Vec<u8>,
 }
 
-impl Pictures {
+impl TriggerPictures {
     /// Pictures of the first of `inputs` that has images, or else of `camera`.
-    pub(super) fn new(inputs: &[Arc<Topic>], camera: Option<Arc<Camera>>) -> Self {
+    pub(super) fn new(inputs: &[Arc<Topic>], camera: Option<Arc<RecordedCamera>>) -> Self {
         let inputs = inputs.iter().filter(|topic| is_image(topic.type_name())).cloned().collect();
         Self { inputs, camera, wakes: 0, every: 1, made: Vec::new() }
     }
 
-    /// Wakes that triggered so far.
+    /// Number of wakes with a trigger so far.
     pub(super) fn wakes(&self) -> u64 {
         self.wakes
     }
 
-    /// After a wake.
+    /// Makes a picture if `decision` has a trigger; call it after each wake.
     pub(super) fn wake(&mut self, decision: &Decision) {
         if decision.triggers.is_empty() {
             return;
@@ -104,7 +104,7 @@ impl Pictures {
             jpeg,
         };
         for topic in &self.inputs {
-            // Not as the lambda would: a journal notes how far that one looked back.
+            // Not by the lambda's own calls: the journal notes how far the lambda looked back.
             let Some(lease) = topic.reader().newest() else { continue };
             let meta = *lease.meta();
             let jpeg = self
@@ -120,39 +120,39 @@ impl Pictures {
         jpeg.map(|jpeg| made(&camera.topic, meta.at_ns, jpeg))
     }
 
-    /// The picture of the wake before, if it is of the same image.
+    /// The previous picture, if it is of the same image.
     fn as_before(&self, image_ns: i64) -> Option<Vec<u8>> {
         self.made.last().filter(|made| made.image_ns == image_ns).map(|made| made.jpeg.clone())
     }
 
-    /// Writes them below `out`, in place of those that were there; also says how many wakes that
-    /// triggered have none.
-    pub(super) fn write(self, out: &Path) -> Result<(Vec<Picture>, u64), OutputError> {
+    /// Writes the pictures below `out` and removes those of an earlier replay; also returns the
+    /// number of wakes with a trigger that have no picture.
+    pub(super) fn write(self, out: &Path) -> Result<(Vec<TriggerPicture>, u64), OutputError> {
         let folder = out.join(FOLDER);
         remove(&folder)?;
-        let left_out = self.wakes - self.made.len() as u64;
+        let omitted = self.wakes - self.made.len() as u64;
         if self.made.is_empty() {
-            return Ok((Vec::new(), left_out));
+            return Ok((Vec::new(), omitted));
         }
-        own_file::folder(&folder).map_err(|source| OutputError { path: folder, source })?;
+        safe_file::folder(&folder).map_err(|source| OutputError { path: folder, source })?;
         let written = self.made.into_iter().map(|Made { at_ns, topic, image_ns, jpeg, wake }| {
             let file = Path::new(FOLDER).join(format!("{PREFIX}{wake:06}.jpg"));
             let path = out.join(&file);
-            // A new one: what is there may be a link to somewhere else.
+            // Always a new file: an existing one may be a link to another place.
             let written = File::create_new(&path).and_then(|mut file| file.write_all(&jpeg));
             written.map_err(|source| OutputError { path, source })?;
-            Ok(Picture { at_ns, topic, image_ns, file })
+            Ok(TriggerPicture { at_ns, topic, image_ns, file })
         });
-        Ok((written.collect::<Result<_, _>>()?, left_out))
+        Ok((written.collect::<Result<_, _>>()?, omitted))
     }
 }
 
-/// Deletes the pictures of an earlier replay, and nothing else that somebody put there.
+/// Deletes the pictures of an earlier replay, and no other file in the folder.
 fn remove(folder: &Path) -> Result<(), OutputError> {
     let failed = |source| OutputError { path: folder.to_owned(), source };
-    // A link may lead to somebody's pictures.
+    // A link may lead to a user's pictures.
     if folder.symlink_metadata().is_ok() {
-        own_file::folder(folder).map_err(failed)?;
+        safe_file::folder(folder).map_err(failed)?;
     }
     let entries = match fs::read_dir(folder) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
@@ -171,7 +171,7 @@ fn remove(folder: &Path) -> Result<(), OutputError> {
                 .map_err(|source| OutputError { path: entry.path(), source })?;
         }
     }
-    // It stays if it holds what is not ours.
+    // The folder stays if it holds other files.
     let _ = fs::remove_dir(folder);
     Ok(())
 }
@@ -228,30 +228,30 @@ mod tests {
     }
 
     #[test]
-    fn pictures_are_spread_over_all_triggers_and_replace_those_of_before() {
+    fn pictures_are_spread_over_all_triggers_and_replace_earlier_ones() {
         let out = tempfile::tempdir().unwrap();
         let folder = out.path().join(FOLDER);
         fs::create_dir(&folder).unwrap();
         for name in ["trigger-000007.jpg", "000007.jpg", "mine.jpg"] {
             fs::write(folder.join(name), "old").unwrap();
         }
-        let camera = Camera::new("/cam", "sensor_msgs/msg/Image");
-        let mut pictures = Pictures::new(&[], Some(camera.clone()));
+        let camera = RecordedCamera::new("/cam", "sensor_msgs/msg/Image");
+        let mut pictures = TriggerPictures::new(&[], Some(camera.clone()));
         pictures.wake(&Decision { triggers: Vec::new(), ..decision(0) });
         pictures.wake(&decision(0));
         for n in 1..1000 {
             camera.see(&meta(10 * n), &image(n as u8));
             pictures.wake(&decision(10 * n + 1));
         }
-        let (written, left_out) = pictures.write(out.path()).unwrap();
+        let (written, omitted) = pictures.write(out.path()).unwrap();
         assert!(
             written.len() <= Signals::PICTURES_MAX && written.len() > Signals::PICTURES_MAX / 3,
             "{}",
             written.len()
         );
-        assert_eq!(written.len() as u64 + left_out, 1000);
+        assert_eq!(written.len() as u64 + omitted, 1000);
         assert!(written.last().unwrap().at_ns > 9000, "the end of the drive has pictures");
-        for Picture { at_ns, topic, image_ns, file } in written {
+        for TriggerPicture { at_ns, topic, image_ns, file } in written {
             assert_eq!((topic.as_str(), at_ns), ("/cam", image_ns + 1));
             assert!(fs::read(out.path().join(file)).unwrap().starts_with(&[0xff, 0xd8]));
         }
@@ -265,15 +265,15 @@ mod tests {
         let (out, others) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         fs::write(others.path().join("trigger-000001.jpg"), "precious").unwrap();
         std::os::unix::fs::symlink(others.path(), out.path().join(FOLDER)).unwrap();
-        assert!(Pictures::new(&[], None).write(out.path()).is_err());
+        assert!(TriggerPictures::new(&[], None).write(out.path()).is_err());
         assert!(others.path().join("trigger-000001.jpg").exists());
     }
 
     #[test]
     fn an_image_that_cannot_be_read_makes_no_picture() {
         let out = tempfile::tempdir().unwrap();
-        let camera = Camera::new("/cam", "sensor_msgs/msg/Image");
-        let mut pictures = Pictures::new(&[], Some(camera.clone()));
+        let camera = RecordedCamera::new("/cam", "sensor_msgs/msg/Image");
+        let mut pictures = TriggerPictures::new(&[], Some(camera.clone()));
         camera.see(&meta(1), b"no image");
         pictures.wake(&decision(2));
         assert_eq!(pictures.write(out.path()).unwrap(), (Vec::new(), 1));

@@ -1,67 +1,69 @@
-//! Clips in a replay: the recorder sees the drive's samples beside the lambda, and every wake after
-//! it.
+//! Records clips in a replay: the recorder receives the drive's samples beside the lambda, and
+//! every wake after it.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_drives::Replay;
-use gleaner_journal::{Entry, Header};
+use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::Clip;
-use gleaner_lambda::manifest::{Manifest, Record};
+use gleaner_lambda::manifest::{Manifest, RecordSpec};
 use gleaner_recorder::{
-    Earlier, Folder, LambdaId, Member, RecordError, Recorder, Settings, Topic, TopicId, is_image,
-    lambda_digest,
+    EarlierClips, LambdaId, LambdaSpec, RecordError, Recorder, RecordingFolder, Settings, TopicId,
+    TopicSchema, is_image, lambda_digest,
 };
-use gleaner_transport::{DiscoveredTopic, SampleMeta, Sink, Transport, Verdict};
+use gleaner_transport::{Delivery, DiscoveredTopic, SampleMeta, Sink, Transport};
 
-use super::chosen;
-use super::pictures::Camera;
-use super::{CLOCK, Options};
+use super::pictures::RecordedCamera;
+use super::topic_filter;
+use super::{CLOCK, ReplayOptions};
 
 /// A recorder over one lambda's `[record]`.
 pub(super) struct ReplayRecorder {
-    shared: Arc<Mutex<Shared>>,
-    /// One for each topic, with what the recorder calls it.
-    lanes: Vec<Arc<Lane>>,
-    rules: Record,
-    /// What an earlier replay left, and what of it was recovered only now; until it is replaced.
-    earlier: Option<(Earlier, Vec<Clip>)>,
+    shared: Arc<Mutex<SharedRecorder>>,
+    /// The recorded topics.
+    topics: Vec<Arc<TopicRecorder>>,
+    rules: RecordSpec,
+    /// Clips of an earlier replay, and those of them that were recovered now; until they are
+    /// replaced.
+    earlier: Option<(EarlierClips, Vec<Clip>)>,
     lambda: Option<LambdaId>,
 }
 
-struct Shared {
-    /// There once the folder is ours.
+struct SharedRecorder {
+    /// Set once the folder is locked.
     recorder: Option<Recorder>,
-    /// Why it stopped. A sink can only say that a sample was not taken.
+    /// The error that stopped it. A sink can only report that a sample was not taken.
     failed: Option<RecordError>,
 }
 
 /// One recorded topic.
-struct Lane {
-    shared: Arc<Mutex<Shared>>,
-    topic: Topic,
-    /// Whether the drive has it.
-    is_there: bool,
+struct TopicRecorder {
+    shared: Arc<Mutex<SharedRecorder>>,
+    topic: TopicSchema,
+    /// Set if the drive has it.
+    exists: bool,
     id: Mutex<Option<TopicId>>,
-    camera: Option<Arc<Camera>>,
+    camera: Option<Arc<RecordedCamera>>,
 }
 
-impl Sink for Lane {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+impl Sink for TopicRecorder {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
         if let Some(camera) = &self.camera {
             camera.see(meta, cdr);
         }
         let mut shared = lock(&self.shared);
-        let Shared { recorder: Some(recorder), failed: failed @ None } = &mut *shared else {
-            return Verdict::NoSlot;
+        let SharedRecorder { recorder: Some(recorder), failed: failed @ None } = &mut *shared
+        else {
+            return Delivery::NoSlot;
         };
-        let Some(id) = *lock(&self.id) else { return Verdict::NoSlot };
+        let Some(id) = *lock(&self.id) else { return Delivery::NoSlot };
         match recorder.sample(id, meta, cdr) {
-            Ok(()) => Verdict::Taken,
+            Ok(()) => Delivery::Taken,
             Err(error) => {
                 *failed = Some(error);
-                Verdict::NoSlot
+                Delivery::NoSlot
             }
         }
     }
@@ -71,61 +73,63 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// What an earlier replay left in `out`, if it left clips: this one makes none, and results of two
-/// would lie side by side.
+/// Removes the clips of an earlier replay in `out`: this replay writes none, and results of two
+/// would be mixed. Returns their number.
 pub(super) fn remove_clips(out: &Path) -> Result<u64, Failure> {
     if !out.join("clips.jsonl").exists() {
         return Ok(0);
     }
-    let (mut folder, recovered) = Folder::open(out)?;
+    let (mut folder, recovered) = RecordingFolder::open(out)?;
     Ok(folder.replace(&recovered)?)
 }
 
 impl ReplayRecorder {
-    /// Subscribes the topics of `[record]`; none if the manifest has no such table.
+    /// Subscribes the topics of `[record]`; returns `None` if the manifest has no such table.
     ///
     /// A topic that the drive does not have is no error: a vehicle's sensors differ from drive to
-    /// drive. Its clips say so. Subscribed before the lambda's inputs, the recorder has the sample
-    /// that a trigger is about.
+    /// drive. The clips note it. Call this before the lambda's inputs are subscribed, so that the
+    /// recorder has the sample that causes a trigger.
     pub(super) fn subscribe(
         manifest: &Manifest,
-        options: &Options,
+        options: &ReplayOptions,
         drive: &mut Replay,
     ) -> Result<Option<Self>, Failure> {
         let Some(rules) = &manifest.record else {
             if options.topics.is_empty() {
                 return Ok(None);
             }
-            let failure =
-                Failure::new(Exit::Usage, "there are no clips whose topics --topics could choose");
+            let failure = Failure::new(
+                Exit::Usage,
+                "--topics selects the topics of clips, and this lambda records none",
+            );
             return Err(failure
-                .with_help("add a table [record] to lambda.toml, which says how long clips are"));
+                .with_help("add a table [record] to lambda.toml, which sets the length of clips"));
         };
-        let shared = Arc::new(Mutex::new(Shared { recorder: None, failed: None }));
+        let shared = Arc::new(Mutex::new(SharedRecorder { recorder: None, failed: None }));
         let known = drive.topics();
-        let mut lanes = Vec::new();
-        // One whose images the lambda sees anyway is not kept a second time.
+        let mut topics = Vec::new();
+        // No camera is kept if the lambda itself has an input with images.
         let mut is_seen = manifest.inputs.iter().any(|input| is_image(input.type_name.as_str()));
-        for name in chosen::topics(rules, options, drive, &known)? {
+        for name in topic_filter::topics(rules, options, drive, &known)? {
             let name = name.as_str();
             let found = known
                 .binary_search_by(|topic| topic.topic.as_str().cmp(name))
                 .ok()
                 .map(|at| &known[at]);
             if found.is_none() {
-                tracing::warn!(topic = %name, "the drive does not have this topic of [record]: clips are made without it");
+                tracing::warn!(topic = %name, "clips are made without this topic of [record]: the drive does not have it");
             }
             let camera = found.filter(|found| !is_seen && is_image(&found.type_name));
             is_seen |= camera.is_some();
-            let lane = Arc::new(Lane {
+            let recorded = Arc::new(TopicRecorder {
                 shared: Arc::clone(&shared),
                 topic: topic(name, found),
-                is_there: found.is_some(),
+                exists: found.is_some(),
                 id: Mutex::new(None),
-                camera: camera.map(|found| Camera::new(name, &found.type_name)),
+                camera: camera.map(|found| RecordedCamera::new(name, &found.type_name)),
             });
             if let Some(found) = found
-                && let Err(error) = drive.subscribe(&chosen::spec_of(found), lane.clone())
+                && let Err(error) = drive.subscribe(&topic_filter::spec_of(found), recorded.clone())
             {
                 let failure = Failure::caused_by(
                     Exit::Usage,
@@ -136,37 +140,37 @@ impl ReplayRecorder {
                     "remove the topic from [record], or replay without clips: --no-record",
                 ));
             }
-            lanes.push(lane);
+            topics.push(recorded);
         }
-        if !lanes.iter().any(|lane| lane.is_there) {
+        if !topics.iter().any(|recorded| recorded.exists) {
             let mut failure =
                 Failure::new(Exit::Usage, "the drive has none of the topics of [record]");
             let list = |names: Vec<&str>| names.join("`, `");
             failure.causes = vec![format!(
                 "[record] has `{}`",
-                list(lanes.iter().map(|lane| lane.topic.name.as_str()).collect())
+                list(topics.iter().map(|recorded| recorded.topic.name.as_str()).collect())
             )];
             let help = format!(
                 "the drive has {}; pass --remap FROM:=TO, or replay without clips: --no-record",
-                chosen::list(&known)
+                topic_filter::list(&known)
             );
             return Err(failure.with_help(help));
         }
-        Ok(Some(Self { shared, lanes, rules: rules.clone(), earlier: None, lambda: None }))
+        Ok(Some(Self { shared, topics, rules: rules.clone(), earlier: None, lambda: None }))
     }
 
-    /// What sees the images of a recorded topic, if the lambda has none.
-    pub(super) fn camera(&self) -> Option<Arc<Camera>> {
-        self.lanes.iter().find_map(|lane| lane.camera.clone())
+    /// The camera of a recorded topic, if the lambda has no input with images.
+    pub(super) fn camera(&self) -> Option<Arc<RecordedCamera>> {
+        self.topics.iter().find_map(|recorded| recorded.camera.clone())
     }
 
-    /// Makes the recorder, which takes hold of the clips in `out`. What a killed replay left there
-    /// is recovered, kept until the next, and said; what an earlier one left stays until
+    /// Creates the recorder, which locks the clips in `out`. Unfinished clips of a killed replay
+    /// are recovered, logged, and kept until the next replay; clips of an earlier replay stay until
     /// [`ReplayRecorder::replace`].
-    pub(super) fn start(&mut self, out: &Path, header: &Header) -> Result<(), Failure> {
-        let (folder, recovered) = Folder::open(out)?;
+    pub(super) fn start(&mut self, out: &Path, header: &JournalHeader) -> Result<(), Failure> {
+        let (folder, recovered) = RecordingFolder::open(out)?;
         for clip in &recovered {
-            tracing::warn!(clip = %clip.file.display(), "recovered a clip of an earlier replay, which did not end well");
+            tracing::warn!(clip = %clip.file.display(), "recovered an unfinished clip of an earlier replay");
         }
         self.earlier = Some((folder.earlier(), recovered));
         let settings = Settings {
@@ -179,37 +183,42 @@ impl ReplayRecorder {
         };
         let mut recorder = Recorder::new(folder, settings)?;
         let mut topics = Vec::new();
-        for lane in &self.lanes {
-            let id = if lane.is_there {
-                recorder.add_topic(lane.topic.clone())?
+        for recorded in &self.topics {
+            let id = if recorded.exists {
+                recorder.add_topic(recorded.topic.clone())?
             } else {
-                recorder.add_missing_topic(&lane.topic.name)?
+                recorder.add_missing_topic(&recorded.topic.name)?
             };
-            *lock(&lane.id) = Some(id);
+            *lock(&recorded.id) = Some(id);
             topics.push(id);
         }
         let (header, digest) = (header.clone(), lambda_digest(&header.files));
-        self.lambda =
-            Some(recorder.add_lambda(Member { header, rules: self.rules.clone(), digest, topics }));
+        self.lambda = Some(recorder.add_lambda(LambdaSpec {
+            header,
+            rules: self.rules.clone(),
+            digest,
+            topics,
+        }));
         lock(&self.shared).recorder = Some(recorder);
         Ok(())
     }
 
-    /// Replaces the clips of an earlier replay, but not those that were recovered; returns how
-    /// many.
+    /// Removes the clips of an earlier replay, except those that were recovered; returns their
+    /// number.
     pub(super) fn replace(&mut self) -> Result<u64, Failure> {
         Ok(self.earlier.take().map_or(Ok(0), |(earlier, recovered)| earlier.replace(&recovered))?)
     }
 
-    /// After a wake: what it triggered opens or closes windows.
-    pub(super) fn wake(&self, entry: &Entry) -> Result<(), Failure> {
-        self.with(|recorder| match self.lambda {
+    /// Adds a wake, whose triggers open or close windows.
+    pub(super) fn wake(&self, entry: &JournalEntry) -> Result<(), Failure> {
+        self.with_recorder(|recorder| match self.lambda {
             Some(lambda) => recorder.wake(lambda, entry),
             None => Ok(()),
         })
     }
 
-    /// After a sample: whether it could be kept.
+    /// Returns the error of the recorder, if a sample could not be stored; call it after each
+    /// sample.
     pub(super) fn check(&self) -> Result<(), Failure> {
         match lock(&self.shared).failed.take() {
             None => Ok(()),
@@ -217,15 +226,15 @@ impl ReplayRecorder {
         }
     }
 
-    /// At the end of the drive: closes what is open.
-    pub(super) fn finish(&self, end_ns: i64) -> Result<gleaner_protocol::Recording, Failure> {
-        self.with(|recorder| {
+    /// Closes open windows, at the end of the drive.
+    pub(super) fn finish(&self, end_ns: i64) -> Result<gleaner_protocol::RecordingCounts, Failure> {
+        self.with_recorder(|recorder| {
             recorder.finish(end_ns)?;
             Ok(recorder.counts().recording)
         })
     }
 
-    fn with<T: Default>(
+    fn with_recorder<T: Default>(
         &self,
         act: impl FnOnce(&mut Recorder) -> Result<T, RecordError>,
     ) -> Result<T, Failure> {
@@ -236,8 +245,8 @@ impl ReplayRecorder {
     }
 }
 
-fn topic(name: &str, found: Option<&DiscoveredTopic>) -> Topic {
-    Topic {
+fn topic(name: &str, found: Option<&DiscoveredTopic>) -> TopicSchema {
+    TopicSchema {
         name: name.to_owned(),
         type_name: found.map(|topic| topic.type_name.clone()).unwrap_or_default(),
         definitions: found.and_then(|topic| topic.definitions_text.clone()),

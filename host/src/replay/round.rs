@@ -1,4 +1,4 @@
-//! One pass of a lambda over its drives.
+//! Runs one replay of a lambda over its drives, and writes its results.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -6,85 +6,86 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Explain, Failure};
-use gleaner_drives::{Progress, Replay, Step};
-use gleaner_journal::{End, Part};
+use gleaner_drives::{Progress, Replay, ReplayStep};
+use gleaner_journal::{JournalEnd, TimeRange};
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_protocol::{Report, Round, Summary, TopicReport, WokenBy};
+use gleaner_protocol::{ReplaySummary, Report, Round, TopicReport, WokenBy};
 use gleaner_vitals::usage;
 
-use super::course::{self, Course, Reached, Span};
 use super::digests::Digests;
+use super::drive_loop::{self, DriveHandler, Reached, Span};
 use super::journal_file::JournalFile;
 use super::open::{DriveError, open_drives};
 use super::options::Results;
 use super::record::{ReplayRecorder, remove_clips};
-use super::signals::Gathered;
-use super::{CLOCK, Options, report as send};
+use super::signals::SignalCollector;
+use super::{CLOCK, ReplayOptions, report as send};
 use crate::api::Session;
 use crate::api::data::{Counts, Topic, Wake};
-use crate::api::log::Line;
+use crate::api::log::LogLine;
 use crate::api::trace::offered;
 use crate::guest::Totals;
-use crate::journal::{Identity, Scribe};
-use crate::judge::Judge;
-use crate::schedule::Schedule;
-use crate::stage::{Asked, Bounds, Load, Output, OutputError, Stage, not_started};
+use crate::invoker::Invoker;
+use crate::journal::{EntryBuilder, LambdaIdentity};
+use crate::schedule::WakeSchedule;
+use crate::session_setup::{
+    ConfiguredLambda, Load, Output, OutputError, RunMode, SessionSetup, not_started,
+};
 
-/// How often progress is reported; a person sees no more.
+/// Interval of progress reports; a shorter one is not visible to a user.
 const PROGRESS: Duration = Duration::from_millis(100);
-/// The clock is read once in so many samples.
+/// Number of samples between two readings of the clock.
 const SAMPLES_PER_LOOK: u64 = 256;
 
-struct Pass<'a> {
-    judge: Judge,
-    schedule: Schedule,
+struct ReplayLoop<'a> {
+    invoker: Invoker,
+    schedule: WakeSchedule,
     session: Session,
     output: &'a mut Output,
     reports: &'a mut dyn Write,
-    /// Fills in what the journal and the clips say of a wake; none where there is neither.
-    scribe: Option<Scribe>,
+    /// Builds the entries of the journal and the clips; `None` if there is neither.
+    entry_builder: Option<EntryBuilder>,
     journal: Option<JournalFile>,
     recording: Option<ReplayRecorder>,
-    gathered: Gathered,
-    part: Part,
+    signals: SignalCollector,
+    part: TimeRange,
     wakes: u64,
     triggers: u64,
     faults: u64,
-    /// Why the lambda's process could not go on.
+    /// The fault with which the lambda's process ended early.
     stopped: Option<String>,
     log_lines: u64,
     samples: u64,
     looked: Instant,
 }
 
-impl Course for Pass<'_> {
-    fn schedule(&mut self) -> &mut Schedule {
+impl DriveHandler for ReplayLoop<'_> {
+    fn schedule(&mut self) -> &mut WakeSchedule {
         &mut self.schedule
     }
 
     fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
-        if self.judge.is_backing_off(&wake) {
+        if self.invoker.is_backing_off(&wake) {
             return Ok(true);
         }
-        if let Some(scribe) = &mut self.scribe {
-            scribe.begin(&wake);
+        if let Some(entry_builder) = &mut self.entry_builder {
+            entry_builder.begin(&wake);
         }
-        let decision = self.judge.judge(wake);
+        let decision = self.invoker.invoke(wake);
         self.wakes += 1;
         self.triggers += decision.triggers.len() as u64;
         self.faults += u64::from(decision.fault.is_some());
         self.output.decision(&decision)?;
-        self.gathered.wake(&decision);
-        let (log, said) = self.session.take_log();
-        self.keep(&log)?;
-        if let Some(scribe) = &mut self.scribe {
-            let entry = scribe.end(&decision, said);
+        self.signals.wake(&decision);
+        let (log, digest) = self.session.take_log();
+        self.write_log(&log)?;
+        if let Some(entry_builder) = &mut self.entry_builder {
+            let entry = entry_builder.end(&decision, digest);
             if let Some(journal) = &mut self.journal {
                 journal.wake(entry)?;
             }
-            // A clip is listed after the decisions that it is about, wherever a kill meets this
-            // process.
+            // A clip is listed after its decisions, even if this process is killed in between.
             if !entry.triggers.is_empty() {
                 self.output.flush()?;
             }
@@ -92,8 +93,8 @@ impl Course for Pass<'_> {
                 recording.wake(entry)?;
             }
         }
-        // In a replay a killed process is not started again: what it kept is gone, and what would
-        // follow is no replay of the vehicle.
+        // A replay does not restart a killed process: its state is lost, and the rest would not be
+        // a replay of the vehicle.
         self.stopped = decision
             .fault
             .filter(|fault| fault.kind == FaultKind::Killed)
@@ -101,7 +102,7 @@ impl Course for Pass<'_> {
         Ok(self.stopped.is_none())
     }
 
-    fn sample(&mut self, drive: &Replay, step: &Step) -> Result<(), Failure> {
+    fn sample(&mut self, drive: &Replay, step: &ReplayStep) -> Result<(), Failure> {
         if let Some(recording) = &self.recording {
             recording.check()?;
         }
@@ -118,21 +119,21 @@ impl Course for Pass<'_> {
     }
 }
 
-impl Pass<'_> {
-    fn keep(&mut self, log: &[Line]) -> Result<(), Failure> {
+impl ReplayLoop<'_> {
+    fn write_log(&mut self, log: &[LogLine]) -> Result<(), Failure> {
         self.log_lines += log.len() as u64;
         Ok(self.output.log(log)?)
     }
 
-    /// Writes what waits.
+    /// Flushes the results and the journal.
     fn flush(&mut self) -> Result<(), Failure> {
         self.output.flush()?;
         Ok(self.journal.as_mut().map_or(Ok(()), JournalFile::flush)?)
     }
 
-    /// Ends the lambda's process after its last wake, where it has one of its own.
+    /// Ends the lambda's own process after its last wake, if it has one.
     fn finish(&mut self, at_ns: i64, manifest: &Manifest) -> Result<Option<Totals>, Failure> {
-        match self.judge.finish() {
+        match self.invoker.finish() {
             Ok(totals) => Ok(totals),
             Err(fault) => {
                 self.faults += 1;
@@ -143,14 +144,14 @@ impl Pass<'_> {
         }
     }
 
-    /// Goes through the drive, and closes what is recorded.
+    /// Runs the lambda over the drive, and closes open clips.
     fn run(
         &mut self,
         drive: &mut Replay,
-    ) -> Result<(Reached, gleaner_protocol::Recording), Failure> {
+    ) -> Result<(Reached, gleaner_protocol::RecordingCounts), Failure> {
         let span = Span::of(drive, self.part);
-        let reached = course::take(drive, span, self)?;
-        // Of a damaged drive nobody knows what came after the last sample.
+        let reached = drive_loop::run(drive, span, self)?;
+        // The end of a damaged drive is unknown: its last sample counts.
         let is_whole = reached.broken.is_none() && !reached.stopped;
         let end_ns = span.end_ns.filter(|_| is_whole).unwrap_or(reached.at_ns);
         let recorded = self
@@ -161,23 +162,23 @@ impl Pass<'_> {
     }
 }
 
-/// How a pass ended.
-pub(super) struct Ended {
-    pub(super) summary: Summary,
-    /// Why the drive could not be read to its end.
+/// Outcome of a replay.
+pub(super) struct ReplayOutcome {
+    pub(super) summary: ReplaySummary,
+    /// Exit of a drive that could not be read to its end.
     pub(super) broken: Option<Exit>,
-    /// Why signals or pictures are missing.
+    /// The error that prevented signals or pictures.
     pub(super) incomplete: Option<OutputError>,
 }
 
 pub(super) fn replay(
-    options: &Options,
+    options: &ReplayOptions,
     results: &Results,
     manifest: &Manifest,
     load: Load<'_>,
     reports: &mut dyn Write,
     is_first: bool,
-) -> Result<Ended, Failure> {
+) -> Result<ReplayOutcome, Failure> {
     let name = manifest.lambda.name.as_str();
     let (mut drive, part) = open_drives(options)?;
     let mut recording = if results.record {
@@ -185,14 +186,14 @@ pub(super) fn replay(
     } else {
         None
     };
-    let Stage { inputs, session, mut guest } =
-        Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
+    let SessionSetup { inputs, session, mut guest } =
+        SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, None, load)?;
     let started = Instant::now();
     let mut header = None;
     if results.journal.is_some() || recording.is_some() {
-        let Asked { build, config, remaps, .. } = &options.asked;
+        let ConfiguredLambda { build, config, remaps, .. } = &options.lambda;
         header = Some(
-            Identity {
+            LambdaIdentity {
                 manifest,
                 build,
                 config,
@@ -204,22 +205,21 @@ pub(super) fn replay(
             .header()?,
         );
     }
-    // The memory of its preroll is none of the lambda's, which is bounded from `init` on.
+    // Its preroll is allocated before `init`, from which on memory counts as the lambda's.
     if let (Some(recording), Some(header)) = (&mut recording, &header) {
         recording.start(&results.out, header)?;
     }
     let digests = results.journal.as_ref().map(|_| Digests::start(options.drives.files.clone()));
-    let gathered = Gathered::of(&inputs, recording.as_ref().and_then(ReplayRecorder::camera));
+    let signals = SignalCollector::of(&inputs, recording.as_ref().and_then(ReplayRecorder::camera));
     let layers = guest.layers()?;
     if is_first {
         send(reports, &Report::Isolation { layers });
     }
     let initialised = guest.init();
-    // What `init` says is no part of a wake.
-    let (said, _) = session.take_log();
-    initialised.map_err(|fault| not_started(name, fault, &said))?;
-    // Only now does it cost the results of an earlier replay: what could not start must not touch
-    // them.
+    // The log of `init` belongs to no wake.
+    let (init_log, _) = session.take_log();
+    initialised.map_err(|fault| not_started(name, fault, &init_log))?;
+    // The results of an earlier replay are removed only now: a failed start must not touch them.
     let journal = results.journal.as_deref().zip(header.as_ref());
     let journal = journal.map(|(path, header)| JournalFile::create(path, header)).transpose()?;
     let mut output = Output::create(&results.out, results.all)?;
@@ -227,16 +227,16 @@ pub(super) fn replay(
         Some(recording) => recording.replace()?,
         None => remove_clips(&results.out)?,
     };
-    let mut pass = Pass {
-        schedule: Schedule::new(manifest, &inputs),
-        judge: Judge::new(session.clone(), guest),
+    let mut replay_loop = ReplayLoop {
+        schedule: WakeSchedule::new(manifest, &inputs),
+        invoker: Invoker::new(session.clone(), guest),
         session,
         output: &mut output,
         reports,
-        scribe: header.is_some().then(|| Scribe::new(&inputs)),
+        entry_builder: header.is_some().then(|| EntryBuilder::new(&inputs)),
         journal,
         recording,
-        gathered,
+        signals,
         part,
         wakes: 0,
         triggers: 0,
@@ -246,51 +246,55 @@ pub(super) fn replay(
         samples: 0,
         looked: Instant::now(),
     };
-    pass.keep(&said)?;
+    replay_loop.write_log(&init_log)?;
 
-    let ran = pass.run(&mut drive);
-    // Whatever ended it, what was decided until then is kept.
-    let flushed = pass.flush();
+    let ran = replay_loop.run(&mut drive);
+    // Decisions up to an error are kept.
+    let flushed = replay_loop.flush();
     let (reached, recorded) = ran?;
     flushed?;
     let broken = reached.broken.map(DriveError);
-    let totals = if pass.stopped.is_none() { pass.finish(reached.at_ns, manifest)? } else { None };
-    if let (Some(journal), Some(digests)) = (pass.journal.take(), digests) {
+    let totals = if replay_loop.stopped.is_none() {
+        replay_loop.finish(reached.at_ns, manifest)?
+    } else {
+        None
+    };
+    if let (Some(journal), Some(digests)) = (replay_loop.journal.take(), digests) {
         let samples = inputs.iter().map(|topic| offered(topic)).collect();
-        // A journal of a damaged drive, or of a lambda that was killed, has no end: it cannot say
-        // what comes there.
-        let end = End { wakes: pass.wakes, samples, drives: digests.take()? };
-        journal.finish((broken.is_none() && pass.stopped.is_none()).then_some(&end))?;
+        // A journal of a damaged drive, or of a lambda that was killed, gets no end, which would
+        // claim to be complete.
+        let end = JournalEnd { wakes: replay_loop.wakes, samples, drives: digests.take()? };
+        journal.finish((broken.is_none() && replay_loop.stopped.is_none()).then_some(&end))?;
     }
-    let totals = totals.unwrap_or_else(|| Totals::of(&inputs, pass.gathered.curves()));
+    let totals = totals.unwrap_or_else(|| Totals::of(&inputs, replay_loop.signals.curves()));
     let wall_s = started.elapsed().as_secs_f64();
-    let summary = Summary {
+    let summary = ReplaySummary {
         lambda: name.to_owned(),
         version: manifest.lambda.version.to_string(),
         kind: manifest.lambda.kind,
         drive: options.drives.named.iter().map(|drive| shown(drive)).collect(),
         out: shown(&results.out),
-        wakes: pass.wakes,
-        triggers: pass.triggers,
-        faults: pass.faults,
+        wakes: replay_loop.wakes,
+        triggers: replay_loop.triggers,
+        faults: replay_loop.faults,
         skipped: totals
             .counts
             .iter()
             .fold(0, |sum: u64, counts| sum.saturating_add(counts.skipped)),
-        missed_ticks: pass.schedule.missed(),
+        missed_ticks: replay_loop.schedule.missed(),
         out_of_order: drive.out_of_order(),
-        log_lines: pass.log_lines,
-        log_dropped: pass.session.log_dropped(),
-        triggers_refused: pass.session.triggers_refused(),
-        backed_off: pass.session.backed_off(),
+        log_lines: replay_loop.log_lines,
+        log_dropped: replay_loop.session.log_dropped(),
+        triggers_refused: replay_loop.session.triggers_refused(),
+        backed_off: replay_loop.session.backed_off(),
         start_ns: drive.start_ns().unwrap_or(0),
         end_ns: drive.end_ns().unwrap_or(reached.at_ns.max(drive.start_ns().unwrap_or(0))),
         part,
         wall_s,
-        run_s: pass.judge.run().as_secs_f64(),
+        run_s: replay_loop.invoker.run().as_secs_f64(),
         decode_s: totals.decode_ns as f64 / 1e9,
-        wakes_per_s: if wall_s > 0.0 { pass.wakes as f64 / wall_s } else { 0.0 },
-        peak_rss_bytes: pass.judge.most_resident_bytes(),
+        wakes_per_s: if wall_s > 0.0 { replay_loop.wakes as f64 / wall_s } else { 0.0 },
+        peak_rss_bytes: replay_loop.invoker.most_resident_bytes(),
         topics: inputs.iter().zip(&totals.counts).map(topic_report).collect(),
         recording: recorded,
         clips_replaced,
@@ -299,16 +303,18 @@ pub(super) fn replay(
             failure.causes.push(read_so_far(&drive, reached.at_ns));
             failure.to_string()
         }),
-        stopped: pass.stopped.clone(),
+        stopped: replay_loop.stopped.clone(),
     };
-    // A report is drawn from these. The other results are whole without them.
-    let incomplete =
-        pass.gathered.write(&results.out, pass.output, &options.asked.config, totals).err();
+    // Only the HTML report needs these. The other results are complete without them.
+    let incomplete = replay_loop
+        .signals
+        .write(&results.out, replay_loop.output, &options.lambda.config, totals)
+        .err();
     output.finish(&summary)?;
-    Ok(Ended { summary, broken: broken.map(|error| error.exit()), incomplete })
+    Ok(ReplayOutcome { summary, broken: broken.map(|error| error.exit()), incomplete })
 }
 
-/// What was read of a drive that is damaged: what is lost is the rest.
+/// Describes the part of a damaged drive that was read.
 fn read_so_far(drive: &Replay, at_ns: i64) -> String {
     let Progress { done, total } = drive.progress();
     let seconds = at_ns.saturating_sub(drive.start_ns().unwrap_or(0)) as f64 / 1e9;
@@ -316,15 +322,15 @@ fn read_so_far(drive: &Replay, at_ns: i64) -> String {
         Some(total) if done > 0 => {
             format!("read: {done} of {total} messages, up to {seconds:.3} s")
         }
-        // Without an index, nobody knows how many there were.
+        // Without an index, the total is unknown.
         None if done > 0 => {
-            format!("read: {done} messages, up to {seconds:.3} s; what came later is lost")
+            format!("read: {done} messages, up to {seconds:.3} s; later messages are lost")
         }
         _ => "read: no message of these topics".to_owned(),
     }
 }
 
-pub(super) fn report(n: u32, summary: &Summary) -> Round {
+pub(super) fn report(n: u32, summary: &ReplaySummary) -> Round {
     Round {
         n,
         wakes: summary.wakes,
@@ -348,7 +354,7 @@ fn topic_report((topic, counts): (&Arc<Topic>, &Counts)) -> TopicReport {
     }
 }
 
-/// A path as JSON can hold it: what is no UTF-8 is replaced.
+/// A path as JSON can hold it: invalid UTF-8 is replaced.
 fn shown(path: &Path) -> PathBuf {
     PathBuf::from(path.to_string_lossy().into_owned())
 }

@@ -1,5 +1,5 @@
-//! What the report of a replay is drawn from, beside its results: what the lambda read, what its
-//! wakes cost, what a camera saw.
+//! Collects the data of a replay's report beside its results: values that the lambda read, costs of
+//! its wakes, and camera pictures.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -7,38 +7,39 @@ use std::sync::Arc;
 
 use gleaner_lambda::Decision;
 use gleaner_lambda::manifest::ConfigValue;
-use gleaner_lambda::signals::{Bin, Signals, Spread};
+use gleaner_lambda::signals::{Bin, Distribution, Signals};
 use hdrhistogram::Histogram;
 
-use super::pictures::{Camera, Pictures};
+use super::pictures::{RecordedCamera, TriggerPictures};
 use crate::api::curves::Curves;
 use crate::api::data::Topic;
 use crate::guest::Totals;
-use crate::stage::{Output, OutputError};
+use crate::session_setup::{Output, OutputError};
 
-/// Bins between a number and ten times as much.
+/// Number of histogram bins per decade.
 const BINS_PER_DECADE: f64 = 12.0;
 
-/// What is more counts as this: 13 days in ns, and more fuel than a wake may have.
+/// Largest value, to which greater ones are clamped: 13 days in ns, and more fuel than a wake may
+/// have.
 const MOST: u64 = 1 << 50;
 
-/// Gathers it, wake by wake.
-pub(super) struct Gathered {
+/// Collects the signals, wake by wake.
+pub(super) struct SignalCollector {
     curves: Arc<Curves>,
     run: Histogram<u64>,
     fuel: Histogram<u64>,
-    pictures: Pictures,
+    pictures: TriggerPictures,
 }
 
-impl Gathered {
-    /// Of a lambda over these inputs, before its `init`.
-    pub(super) fn of(inputs: &[Arc<Topic>], camera: Option<Arc<Camera>>) -> Self {
-        let empty = || Histogram::new_with_max(MOST, 3).expect("three digits are no problem");
-        let pictures = Pictures::new(inputs, camera);
+impl SignalCollector {
+    /// A collector for a lambda over these inputs; create it before `init`.
+    pub(super) fn of(inputs: &[Arc<Topic>], camera: Option<Arc<RecordedCamera>>) -> Self {
+        let empty = || Histogram::new_with_max(MOST, 3).expect("three digits are valid");
+        let pictures = TriggerPictures::new(inputs, camera);
         Self { curves: Curves::of(inputs), run: empty(), fuel: empty(), pictures }
     }
 
-    /// After a wake.
+    /// Adds a wake.
     pub(super) fn wake(&mut self, decision: &Decision) {
         self.run.saturating_record(decision.run_ns);
         if let Some(fuel) = decision.fuel {
@@ -47,17 +48,17 @@ impl Gathered {
         self.pictures.wake(decision);
     }
 
-    /// What the lambda reads in this process.
+    /// Curves of the values that the lambda reads in this process.
     pub(super) fn curves(&self) -> &Curves {
         &self.curves
     }
 
-    /// Writes it into the folder `out`, which is that of `output`.
+    /// Writes the signals into the folder `out`, which is that of `output`.
     ///
     /// # Errors
     ///
-    /// [`OutputError`] of the first file that cannot be written. Without pictures, the signals are
-    /// written all the same.
+    /// [`OutputError`] of the first file that cannot be written. If pictures cannot be written, the
+    /// signals are still written.
     pub(super) fn write(
         self,
         out: &Path,
@@ -69,7 +70,7 @@ impl Gathered {
         let triggered = self.pictures.wakes();
         let (written, failed) = match self.pictures.write(out) {
             Ok(written) => (written, Ok(())),
-            // The signals are of use without them.
+            // The signals are useful without pictures.
             Err(error) => ((Vec::new(), triggered), Err(error)),
         };
         let (pictures, pictures_omitted) = written;
@@ -86,9 +87,8 @@ impl Gathered {
     }
 }
 
-fn spread(of: &Histogram<u64>) -> Spread {
-    // A histogram rounds to three digits; rounded up, a wake could seem to have used more than it
-    // may.
+fn spread(of: &Histogram<u64>) -> Distribution {
+    // A histogram rounds to three digits. Rounded up, a wake could seem to exceed its limit.
     let down = |value: u64| of.lowest_equivalent(value);
     let mut bins: Vec<Bin> = Vec::new();
     for value in of.iter_recorded() {
@@ -98,7 +98,7 @@ fn spread(of: &Histogram<u64>) -> Spread {
             None => bins.push(Bin { from, to, count: value.count_since_last_iteration() }),
         }
     }
-    Spread {
+    Distribution {
         count: of.len(),
         min: of.min(),
         p50: down(of.value_at_quantile(0.5)),
@@ -109,14 +109,14 @@ fn spread(of: &Histogram<u64>) -> Spread {
     }
 }
 
-/// The bin that a number falls into. Below 10 each number has its own.
+/// The bin of `value`: lower bound, inclusive, and upper bound. Each number below 10 has its own.
 fn bin(value: u64) -> (u64, u64) {
     if value < 10 {
         return (value, value + 1);
     }
     let step = ((value as f64).log10() * BINS_PER_DECADE).floor();
     let edge = |step: f64| 10_f64.powf(step / BINS_PER_DECADE).ceil() as u64;
-    // Rounding may put an edge just beyond its own value.
+    // Rounding may put an edge just above its own value.
     let step = if edge(step) > value { step - 1.0 } else { step };
     (edge(step), edge(step + 1.0))
 }
@@ -126,7 +126,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bins_lie_side_by_side_and_hold_what_falls_into_them() {
+    fn bins_are_adjacent_and_contain_their_values() {
         let mut last = bin(0);
         assert_eq!(last, (0, 1));
         for value in 1..2_000_000 {
@@ -139,11 +139,11 @@ mod tests {
 
     #[test]
     fn every_wake_is_in_one_bin() {
-        let mut gathered = Gathered::of(&[], None);
+        let mut signals = SignalCollector::of(&[], None);
         for run_ns in [0, 1, 9, 10, 11, 500, 500, 1_000_000] {
-            gathered.run.saturating_record(run_ns);
+            signals.run.saturating_record(run_ns);
         }
-        let Spread { count, min, max, bins, .. } = spread(&gathered.run);
+        let Distribution { count, min, max, bins, .. } = spread(&signals.run);
         assert_eq!((count, min, bins.iter().map(|bin| bin.count).sum::<u64>()), (8, 0, 8));
         assert!((999_000..=1_000_000).contains(&max), "{max}");
         assert!(bins.windows(2).all(|pair| pair[0].to <= pair[1].from));

@@ -1,4 +1,5 @@
-//! What a call into the host does in pieces is the same as in one, and ends when the lambda has to.
+//! Calls into the host that work in pieces: the result is the same as in one piece, and they end at
+//! the deadline of the lambda.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -29,9 +30,9 @@ fn pixels() -> Vec<u8> {
     noise.take((STEP * HEIGHT) as usize).collect()
 }
 
-/// What calls work on: a large raw picture, a coded one that nobody has decoded yet, and many small
+/// Data for calls: a large raw picture, a compressed one that is not decoded yet, and many small
 /// samples.
-struct Seen {
+struct HostedData {
     session: Session,
     topic: Arc<Topic>,
     field: Field,
@@ -42,7 +43,7 @@ struct Seen {
     x: Field,
 }
 
-impl Seen {
+impl HostedData {
     fn new(raw: &[u8]) -> Self {
         let input = |name: &str, type_name: &str| {
             format!(
@@ -75,7 +76,7 @@ impl Seen {
         Self { session, topic, field, sample, coded, frame, many, x }
     }
 
-    /// Calls an operation, and says what of its answer the deadline can change.
+    /// Calls an operation; returns the part of its result that the deadline can change.
     fn call(&self, operation: Operation) -> Result<(), DataError> {
         let Self { session, topic, field, sample, coded, frame, many, x } = self;
         match operation {
@@ -112,11 +113,11 @@ impl Seen {
             Operation::Event => answered(session.event("e", 1.0, Vec::new())),
             Operation::Start => answered(session.start("s", Vec::new())),
             Operation::Stop => answered(session.stop("s")),
-            Operation::Log => answered(session.log(Level::Info, "said")),
+            Operation::Log => answered(session.log(Level::Info, "line")),
             Operation::FromValues => answered(Tensor::from_values(64, session.fuel())),
             Operation::FromFrame => answered(Tensor::from_frame(session.fuel())),
             Operation::Open => answered(Model::open("m", session.fuel())),
-            // Nothing makes what these are methods of.
+            // No value of their types can be created.
             Operation::Shape | Operation::TensorRead | Operation::Run | Operation::Detect => Ok(()),
             Operation::ScratchPut => answered(session.put("a", b"bytes")),
             Operation::Append => answered(session.append("a", b"bytes")),
@@ -128,7 +129,7 @@ impl Seen {
     }
 }
 
-/// An answer that has no case for a deadline.
+/// Discards a result that has no case for a deadline.
 fn answered<T>(_: T) -> Result<(), DataError> {
     Ok(())
 }
@@ -136,7 +137,7 @@ fn answered<T>(_: T) -> Result<(), DataError> {
 #[test]
 fn a_histogram_and_a_grey_image_made_in_pieces_miss_no_row() {
     let pixels = pixels();
-    let Seen { frame, .. } = Seen::new(&image(WIDTH, HEIGHT, "rgb8", STEP, &pixels));
+    let HostedData { frame, .. } = HostedData::new(&image(WIDTH, HEIGHT, "rgb8", STEP, &pixels));
     let grey = |x: u32, y: u32| {
         let at = (y * STEP + 3 * x) as usize;
         let [r, g, b] = [0, 1, 2].map(|channel| u32::from(pixels[at + channel]));
@@ -153,16 +154,16 @@ fn a_histogram_and_a_grey_image_made_in_pieces_miss_no_row() {
 }
 
 #[test]
-fn what_takes_long_ends_when_the_lambda_has_to() {
+fn long_calls_end_at_the_deadline_of_the_lambda() {
     let picture = image(WIDTH, HEIGHT, "rgb8", STEP, &pixels());
     for operation in Operation::ALL {
-        let seen = Seen::new(&picture);
-        let due = seen.session.due().unwrap();
+        let data = HostedData::new(&picture);
+        let due = data.session.due().unwrap();
         due.set(Some(Instant::now()));
-        let ended = matches!(seen.call(*operation), Err(DataError::OutOfTime));
-        // What is short is not asked.
-        assert_eq!(ended, operation.deadline() == Deadline::Looked, "{}", operation.name());
+        let ended = matches!(data.call(*operation), Err(DataError::OutOfTime));
+        // Short calls do not check the deadline.
+        assert_eq!(ended, operation.deadline() == Deadline::Checked, "{}", operation.name());
         due.set(None);
-        assert!(seen.call(*operation).is_ok(), "{}", operation.name());
+        assert!(data.call(*operation).is_ok(), "{}", operation.name());
     }
 }

@@ -1,10 +1,9 @@
-//! A lambda that faults for ever leaves the host as it was. How often it does here is
-//! `GLEANER_FAULTS`.
+//! Repeated faults of a lambda do not change the host. `GLEANER_FAULTS` sets their number.
 
 use std::sync::Arc;
 
-use crate::alone::ran_elsewhere;
-use crate::greedy::{Room, component, limits};
+use crate::greedy::{TestGuest, component, limits};
+use crate::own_process::ran_elsewhere;
 use gleaner_base::ByteSize;
 use gleaner_host::guest::Guest;
 use gleaner_lambda::FaultKind;
@@ -12,36 +11,36 @@ use gleaner_lambda::manifest::Limits;
 use gleaner_tests::times;
 use gleaner_vitals::usage;
 
-/// What the allocator and the kernel may keep, over any number of faults.
+/// Growth in bytes that is allowed to the allocator and the kernel, over any number of faults.
 const SLACK_BYTES: u64 = 4 << 20;
 
 fn small() -> Limits {
     let mut limits = limits();
-    // Enough for a good wake, and soon used by a bad one.
+    // Enough for a good wake, and soon used up by a bad one.
     (limits.fuel, limits.memory, limits.handles) = (100_000, ByteSize::mib(4), 256);
     limits
 }
 
-/// A component that gives back a sample that it never had.
-fn misuse() -> Room {
+/// A component that drops a sample that it never had.
+fn misuse() -> TestGuest {
     let parts = r#"(alias export $data "sample" (type $a-sample)) (core func $drop (canon resource.drop $a-sample))
         (core instance $host (export "drop" (func $drop)))"#;
     let body = "(import \"host\" \"drop\" (func $drop (param i32))) (func $wake (call $drop (i32.const 99)))";
-    Room::written_within(&component(parts, "(with \"host\" (instance $host))", body), &small())
+    TestGuest::written_within(&component(parts, "(with \"host\" (instance $host))", body), &small())
 }
 
 fn descriptors() -> usize {
     std::fs::read_dir("/proc/self/fd").unwrap().count()
 }
 
-/// In one test, since memory is counted for the whole program.
+/// One test, since memory is measured for the whole program.
 #[test]
-fn faults_in_a_row_leave_memory_slots_and_handles_where_they_were() {
-    if ran_elsewhere("faults::faults_in_a_row_leave_memory_slots_and_handles_where_they_were") {
+fn repeated_faults_leave_memory_slots_and_handles_unchanged() {
+    if ran_elsewhere("faults::repeated_faults_leave_memory_slots_and_handles_unchanged") {
         return;
     }
     let faults = times("GLEANER_FAULTS", 2000);
-    let greedy = |behaviour: &str| Room::within(behaviour, 0, &small());
+    let greedy = |behaviour: &str| TestGuest::within(behaviour, 0, &small());
     // Memory costs fuel by the byte.
     let mut roomy = small();
     roomy.fuel *= 10;
@@ -51,22 +50,22 @@ fn faults_in_a_row_leave_memory_slots_and_handles_where_they_were() {
     let rooms = [
         ("fuel", greedy("endless"), FaultKind::Fuel),
         ("trap", greedy("panic"), FaultKind::Trap),
-        ("memory", Room::within("memory", 0, &roomy), FaultKind::Memory),
-        ("stack", Room::written_within(&endless, &stacked), FaultKind::Stack),
+        ("memory", TestGuest::within("memory", 0, &roomy), FaultKind::Memory),
+        ("stack", TestGuest::written_within(&endless, &stacked), FaultKind::Stack),
         ("handles kept", greedy("topics"), FaultKind::HostCall),
         ("a handle of nothing", misuse(), FaultKind::HostCall),
         ("frames kept", greedy("frames"), FaultKind::HostCall),
     ];
-    for (name, mut room, kind) in rooms {
-        room.guest.init().unwrap();
+    for (name, mut test, kind) in rooms {
+        test.guest.init().unwrap();
         let mut go_on = |times: u32| {
             for _ in 0..times {
-                let fault = room.fault();
+                let fault = test.fault();
                 assert_eq!(fault.kind, kind, "{name}: {}", fault.message);
-                room.session.end();
-                room.session.take_log();
+                test.session.end();
+                test.session.take_log();
             }
-            (usage::resident(), Arc::strong_count(&room.topic), descriptors())
+            (usage::resident(), Arc::strong_count(&test.topic), descriptors())
         };
         let (resident, owners, open) = go_on(500);
         let (resident_now, owners_now, open_now) = go_on(faults);
@@ -76,11 +75,11 @@ fn faults_in_a_row_leave_memory_slots_and_handles_where_they_were() {
         );
         assert!(resident_now < resident + SLACK_BYTES, "{name}: from {before} to {now} KiB");
         assert_eq!((owners_now, open_now), (owners, open), "{name}");
-        let counts = room.topic.counts();
+        let counts = test.topic.counts();
         assert_eq!((counts.received, counts.no_slot), (u64::from(faults) + 500, 0), "{name}");
-        // What it held last went with it: all frames can be had again.
+        // Its frames were released with it: all can be created again.
         let frames: Vec<_> =
-            (0..small().frames).map(|_| room.topic.newest().unwrap().as_frame().unwrap()).collect();
+            (0..small().frames).map(|_| test.topic.newest().unwrap().as_frame().unwrap()).collect();
         assert_eq!(frames.len() as u64, small().frames, "{name}");
     }
 }

@@ -1,5 +1,5 @@
-//! Guests by themselves: the lambda `greedy` or a component written by hand, with the transport
-//! that feeds it.
+//! Guests under test: the lambda `greedy` or a hand-written component, with the transport that
+//! feeds them.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use gleaner_compile::Nans;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Topic, Wake};
 use gleaner_host::guest::wasm::{Deadline, Loaded, WasmGuest};
-use gleaner_host::guest::{Guest, Outcome};
+use gleaner_host::guest::{Guest, WakeOutcome};
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::Fault;
 use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
@@ -18,7 +18,7 @@ use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Guid, SampleMeta};
 
 use gleaner_tests::drive::{IMAGE, image};
-use gleaner_tests::{Folder, root};
+use gleaner_tests::{TempFolder, root};
 
 /// Fuel of a wake.
 pub const FUEL: u64 = 5_000_000;
@@ -29,7 +29,7 @@ pub const PICTURE: u32 = 300_000;
 
 const CAMERA: &str = "/camera/front/image_raw";
 
-/// What the guests of a test may use, unless it says otherwise.
+/// Default limits of the guests.
 pub fn limits() -> Limits {
     let mut limits = Limits::default();
     (limits.fuel, limits.init_fuel, limits.memory) = (FUEL, 20 * FUEL, ByteSize::new(MEMORY));
@@ -37,10 +37,10 @@ pub fn limits() -> Limits {
 }
 
 /// A guest, and the transport that feeds it.
-pub struct Room {
+pub struct TestGuest {
     /// The guest.
     pub guest: WasmGuest,
-    /// What it sees and causes.
+    /// Its session.
     pub session: Session,
     /// Its one input, a camera.
     pub topic: Arc<Topic>,
@@ -49,13 +49,13 @@ pub struct Room {
     sent: u64,
 }
 
-impl Room {
-    /// `greedy`, with its configuration.
+impl TestGuest {
+    /// The lambda `greedy`, with its configuration.
     pub fn greedy(behaviour: &str, bytes: u32) -> Self {
         Self::within(behaviour, bytes, &limits())
     }
 
-    /// As [`Room::greedy`], within `limits`.
+    /// As [`TestGuest::greedy`], within `limits`.
     ///
     /// # Panics
     ///
@@ -64,17 +64,17 @@ impl Room {
         Self::new(&greedy(), config(behaviour, bytes), limits, false)
     }
 
-    /// As [`Room::within`], with the deadlines, which replays do not have.
+    /// As [`TestGuest::within`], with the deadlines, which replays do not have.
     pub fn timed(behaviour: &str, bytes: u32, limits: &Limits) -> Self {
         Self::new(&greedy(), config(behaviour, bytes), limits, true)
     }
 
-    /// A component written by hand, for what no compiler makes.
+    /// A hand-written component, for code that no compiler generates.
     pub fn written(text: &str) -> Self {
         Self::written_within(text, &limits())
     }
 
-    /// As [`Room::written`], within `limits`.
+    /// As [`TestGuest::written`], within `limits`.
     ///
     /// # Panics
     ///
@@ -83,7 +83,7 @@ impl Room {
         Self::of_text(text, limits, false)
     }
 
-    /// As [`Room::written_within`], with the deadlines, which replays do not have.
+    /// As [`TestGuest::written_within`], with the deadlines, which replays do not have.
     ///
     /// # Panics
     ///
@@ -93,7 +93,7 @@ impl Room {
     }
 
     fn of_text(text: &str, limits: &Limits, timed: bool) -> Self {
-        let folder = Folder::new();
+        let folder = TempFolder::new();
         let component = wat::parse_str(text).unwrap_or_else(|error| panic!("{error}"));
         Self::new(&folder.write("written.wasm", component), Vec::new(), limits, timed)
     }
@@ -122,7 +122,7 @@ impl Room {
     }
 
     /// Runs a wake.
-    pub fn wake(&mut self) -> Outcome {
+    pub fn wake(&mut self) -> WakeOutcome {
         let at_ns = self.sent as i64 + 1;
         self.wake_at(at_ns)
     }
@@ -132,14 +132,14 @@ impl Room {
     /// # Panics
     ///
     /// If the ring has no room.
-    pub fn wake_at(&mut self, at_ns: i64) -> Outcome {
+    pub fn wake_at(&mut self, at_ns: i64) -> WakeOutcome {
         self.sent += 1;
         publish(&mut self.transport, CAMERA, self.sent, &self.picture);
         self.session.begin(at_ns);
         self.guest.wake(Wake::Event(self.topic.newest().expect("a picture")))
     }
 
-    /// The fault of a wake.
+    /// Runs a wake, and returns its fault.
     ///
     /// # Panics
     ///
@@ -148,7 +148,7 @@ impl Room {
         self.wake().result.expect_err("a fault")
     }
 
-    /// Fuel of a wake that follows a first one, in which the guest still grows.
+    /// Runs two wakes, and returns the fuel of the second: in the first one the guest still grows.
     ///
     /// # Panics
     ///
@@ -172,7 +172,8 @@ fn config(behaviour: &str, bytes: u32) -> Vec<(String, ConfigValue)> {
     vec![behaviour, ("bytes".to_owned(), ConfigValue::Int(bytes.into()))]
 }
 
-/// The one input of `manifest`, whose type has this definition, and the transport that feeds it.
+/// Opens the one input of `manifest`, whose type has this definition; also returns the transport
+/// that feeds it.
 ///
 /// # Panics
 ///
@@ -184,7 +185,7 @@ pub fn subscribed(manifest: &Manifest, definition: &str) -> (Loopback, Arc<Topic
     (transport, topic)
 }
 
-/// Publishes a message, at as many nanoseconds as its number says.
+/// Publishes a message; its time in ns equals its number.
 ///
 /// # Panics
 ///
@@ -195,8 +196,8 @@ pub fn publish(transport: &mut Loopback, topic: &str, seq: u64, cdr: &[u8]) {
     transport.publish(topic, &meta, cdr).expect("a topic");
 }
 
-/// A component of this world, by hand. `parts` come before the module `lambda`, which has `body`
-/// and gets `with`.
+/// A hand-written component of this world. `parts` precede the module `lambda`, which has `body`
+/// and is instantiated with `with`.
 pub fn component(parts: &str, with: &str, body: &str) -> String {
     format!(
         r#"(component
@@ -216,7 +217,7 @@ pub fn component(parts: &str, with: &str, body: &str) -> String {
                 {body}
                 (memory (export "memory") 1)
                 (func (export "realloc") (param i32 i32 i32 i32) (result i32) (i32.const 1024))
-                ;; An answer at 0 is one without an error, as long as nobody writes there.
+                ;; The result at 0 has no error, as long as nothing is written there.
                 (func (export "init") (param i32 i32) (result i32) (i32.const 0))
                 (func (export "on-wake") (param i32 i64 i64) (result i32) (call $wake) (i32.const 0)))
             (core instance $lambda (instantiate $lambda {with}))

@@ -1,8 +1,8 @@
-//! Calls through the WIT, from the lambda `driver`. Each is paid for. In every order, with whatever
-//! arguments: the host stays whole, gives back what it lent, and decides the same again. Programs
-//! are made up by a generator of numbers that always begins with the same one.
+//! Calls through the WIT, from the lambda `driver`. Each is charged. For any order and any
+//! arguments, the host stays intact, releases its resources, and decides the same again. Programs
+//! come from a random generator with a fixed seed.
 //!
-//! `GLEANER_HOST_CALLS` says how many programs; 10,000 take half a minute, a million an hour.
+//! `GLEANER_HOST_CALLS` sets the number of programs; 10,000 take half a minute, a million an hour.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -16,23 +16,23 @@ use gleaner_host::input::open_inputs;
 use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_lambda::{Fault, Trigger};
 use gleaner_messages::Endian;
-use gleaner_operations::{MESSAGE, Operation, Step, setup};
-use gleaner_tests::drive::{COMPRESSED, Cdr, IMAGE, compressed, image};
+use gleaner_operations::{DriverStep, MESSAGE, Operation, setup};
+use gleaner_tests::drive::{COMPRESSED, CdrBuilder, IMAGE, compressed, image};
 use gleaner_tests::{root, times};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Guid, SampleMeta};
 use gleaner_vitals::usage;
 
-use crate::alone::ran_elsewhere;
+use crate::own_process::ran_elsewhere;
 
-/// Most memory by which the process may grow over all programs. What it holds at a time is bounded
-/// by the limits of `driver`.
+/// Maximum growth of the process over all programs, in bytes. The limits of `driver` bound its
+/// memory at any time.
 const GROWTH_BYTES: u64 = 32 << 20;
 
-/// xorshift64: good enough to make up arguments, and the same everywhere.
-struct Numbers(u64);
+/// xorshift64: good enough to generate arguments, and the same on every machine.
+struct RandomNumbers(u64);
 
-impl Numbers {
+impl RandomNumbers {
     fn next(&mut self) -> u64 {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;
@@ -44,7 +44,7 @@ impl Numbers {
         self.next() % n
     }
 
-    /// Bytes of which some are the kind that breaks things.
+    /// Random bytes, of which some are edge cases.
     fn hostile(&mut self, n: u64) -> Vec<u8> {
         let length = self.below(n + 1);
         let edge = [0, 1, 2, 3, 16, 0x7f, 0x80, 0xff];
@@ -56,9 +56,9 @@ impl Numbers {
         (0..length).map(|_| byte(self)).collect()
     }
 
-    /// A sound message, one with some bytes changed, or none at all.
-    fn message(&mut self, sound: &[u8]) -> Vec<u8> {
-        let mut message = sound.to_vec();
+    /// Returns a valid message, one with some bytes changed, or random bytes.
+    fn message(&mut self, valid: &[u8]) -> Vec<u8> {
+        let mut message = valid.to_vec();
         match self.below(4) {
             0 => return self.hostile(200),
             1 => {
@@ -74,11 +74,11 @@ impl Numbers {
     }
 }
 
-/// What of a wake must be the same again.
-type Outcome = (Result<(), Fault>, Option<u64>, Vec<Trigger>);
+/// The part of a wake's outcome that must be reproducible.
+type ComparedOutcome = (Result<(), Fault>, Option<u64>, Vec<Trigger>);
 
-/// The lambda `driver` and what it sees.
-struct Driver {
+/// The lambda `driver` and its inputs.
+struct DriverGuest {
     guest: WasmGuest,
     session: Session,
     transport: Loopback,
@@ -86,7 +86,7 @@ struct Driver {
     sent: u64,
 }
 
-impl Driver {
+impl DriverGuest {
     fn new(timed: bool) -> Self {
         let lambda = root().join("tests/lambdas/driver/rust/build");
         let manifest = Manifest::load(&lambda).expect("driver is built; run: cargo xtask test");
@@ -128,13 +128,13 @@ impl Driver {
     }
 
     /// Runs a program over these pictures.
-    fn run(&mut self, raw: &[u8], coded: &[u8], program: &[u8]) -> Outcome {
+    fn run(&mut self, raw: &[u8], coded: &[u8], program: &[u8]) -> ComparedOutcome {
         self.publish("/camera/raw", raw);
         self.publish("/camera/coded", coded);
-        self.publish("/program", &Cdr::default().bytes(program).done());
+        self.publish("/program", &CdrBuilder::default().bytes(program).done());
         self.session.begin(self.sent as i64 * 1_000_000);
-        // It keeps what it likes: then there may be no room for the program, and the one before
-        // runs again.
+        // It may hold all slots: then there is no room for the program, and the previous one runs
+        // again.
         let Some(sample) = self.inputs[0].newest() else { return (Ok(()), None, Vec::new()) };
         let outcome = self.guest.wake(Wake::Event(sample));
         self.session.take_log();
@@ -155,40 +155,44 @@ fn pictures() -> Vec<(Vec<u8>, Vec<u8>)> {
     .to_vec()
 }
 
-/// What the host did for each of some calls behind [`setup`], in units of fuel.
+/// Fuel that the host charges for a call after [`setup`].
 fn paid(operation: Operation, arguments: &[u8]) -> u64 {
     let (raw, coded) = &pictures()[0];
-    assert_eq!(raw.len() as u64, MESSAGE, "the list counts on the length of this message");
+    assert_eq!(raw.len() as u64, MESSAGE, "the price list depends on the length of this message");
     let used = |program: &[u8]| {
-        let mut driver = Driver::new(false);
+        let mut driver = DriverGuest::new(false);
         let mut used = 0;
-        // Until the rings are full, and the memory of the guest has grown to what it needs.
+        // Until the rings are full, and the guest's memory has its final size.
         for _ in 0..6 {
             let (result, _, _) = driver.run(raw, coded, program);
             assert_eq!(result, Ok(()), "{}", operation.name());
             used = driver.session.fuel().used();
         }
-        // It reads its program by a call, too.
+        // It reads its program with a call, too.
         used - program.len() as u64 / 8
     };
-    let call = Step::Call(operation).with(arguments);
+    let call = DriverStep::Call(operation).with(arguments);
     used(&[setup(), call].concat()) - used(&setup())
 }
 
 #[test]
-fn every_call_costs_what_the_list_says() {
+fn every_call_costs_its_listed_price() {
     let mut problems = Vec::new();
     for operation in Operation::ALL {
         let name = operation.name();
         let Some(calls) = operation.price().calls() else {
-            assert_eq!(paid(*operation, &[]), 0, "`{name}` can be called now: what does it cost?");
+            assert_eq!(
+                paid(*operation, &[]),
+                0,
+                "`{name}` can be called now: add its price to the list"
+            );
             continue;
         };
         for (arguments, price) in calls {
             let paid = paid(*operation, arguments);
             if paid != price {
                 problems.push(format!(
-                    "`{name}` {arguments:?} cost {paid} units of fuel; the list says {price}"
+                    "`{name}` {arguments:?} cost {paid} units of fuel; the listed price is {price}"
                 ));
             }
         }
@@ -197,16 +201,16 @@ fn every_call_costs_what_the_list_says() {
 }
 
 #[test]
-fn whatever_a_lambda_calls_the_host_stays_whole() {
-    if ran_elsewhere("host_calls::whatever_a_lambda_calls_the_host_stays_whole") {
+fn no_sequence_of_calls_damages_the_host() {
+    if ran_elsewhere("host_calls::no_sequence_of_calls_damages_the_host") {
         return;
     }
     let programs = times("GLEANER_HOST_CALLS", 10_000);
     let pictures = pictures();
-    let mut numbers = Numbers(0x9e37_79b9_7f4a_7c15);
-    // The same calls twice, and once more with a deadline.
+    let mut numbers = RandomNumbers(0x9e37_79b9_7f4a_7c15);
+    // The same calls twice, and a third time with a deadline.
     let (mut first, mut second, mut timed) =
-        (Driver::new(false), Driver::new(false), Driver::new(true));
+        (DriverGuest::new(false), DriverGuest::new(false), DriverGuest::new(true));
     let (mut faults, mut triggers, mut longest) = ([0_u32; 9], 0, Duration::ZERO);
     let mut resident = None;
     for number in 0..programs {
@@ -238,9 +242,9 @@ fn whatever_a_lambda_calls_the_host_stays_whole() {
     println!("{} KiB resident after a tenth, {} KiB at the end", before / 1024, now / 1024);
     assert!(now < before + GROWTH_BYTES, "from {before} to {now} bytes");
     assert!(faults.iter().sum::<u32>() > 0 && triggers > 0, "the programs do nothing");
-    // What the guests held goes with them, and nothing else holds the inputs.
+    // The guests release what they hold, and nothing else holds the inputs.
     for driver in [first, second, timed] {
-        let Driver { guest, session, transport, inputs, .. } = driver;
+        let DriverGuest { guest, session, transport, inputs, .. } = driver;
         drop((guest, session, transport));
         assert_eq!(inputs.iter().map(Arc::strong_count).collect::<Vec<_>>(), [1; 3]);
     }

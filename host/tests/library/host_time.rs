@@ -1,16 +1,16 @@
-//! What is not counted by instructions: calls of WASI cost fuel by what they make the host do, and
-//! a wake that comes back late is a fault.
+//! Work of the host that instructions do not count: WASI calls cost fuel by that work, and a wake
+//! that returns late is a fault.
 
 use std::time::Duration;
 
-use crate::greedy::{FUEL, Room, component, limits};
+use crate::greedy::{FUEL, TestGuest, component, limits};
 use gleaner_base::ByteSize;
 use gleaner_host::guest::Guest;
 use gleaner_lambda::FaultKind;
 
-/// A component with these imports of WASI, of which `functions` are known to its module by name;
-/// `fill` writes a number there as often as it is told, from 16 on, where the host reads, and
-/// `read` gives what is so far behind that.
+/// A component with these WASI imports. Its module can call `functions` by name; `fill` writes a
+/// number several times from offset 16 on, where the host reads, and `read` returns the number at
+/// an offset from there.
 fn calls_wasi(imports: &str, functions: &[&str], wake: &str) -> String {
     let lowered: String = functions
         .iter()
@@ -42,8 +42,8 @@ fn calls_wasi(imports: &str, functions: &[&str], wake: &str) -> String {
     component(&parts, r#"(with "host" (instance $host))"#, wake)
 }
 
-/// Asks for so many random bytes, as `wake` says.
-fn random(bytes: u32, wake: &str) -> Room {
+/// Requests `bytes` random bytes; `wake` is the body of the wake.
+fn random(bytes: u32, wake: &str) -> TestGuest {
     let imports = r#"
         (import "wasi:random/random@0.2.0" (instance $random
             (export "get-random-bytes" (func (param "len" u64) (result (list u8))))))
@@ -53,7 +53,7 @@ fn random(bytes: u32, wake: &str) -> Room {
            (func $random (call $bytes (i64.const {bytes}) (i32.const 16)))
            (func $wake {wake})"#
     );
-    Room::written(&calls_wasi(imports, &["bytes"], &body))
+    TestGuest::written(&calls_wasi(imports, &["bytes"], &body))
 }
 
 #[test]
@@ -62,14 +62,14 @@ fn random_numbers_cost_fuel_by_the_byte() {
     assert_eq!((more - some, most - more), (4 * 1000, 4 * 2000));
     let outcome = random(4096, "(loop (call $random) (br 0))").wake();
     assert_eq!(outcome.result.unwrap_err().kind, FaultKind::Fuel);
-    // The host's part alone ends it, and the last call is not made.
+    // The host's part alone uses up the fuel, and the last call is not made.
     let fuel = outcome.fuel.unwrap();
     assert!((FUEL..FUEL + FUEL / 20).contains(&fuel), "{fuel}");
     assert_eq!(random(4097, "(call $random)").fault().kind, FaultKind::HostCall);
 }
 
-/// Waits for so many things, all of them the output, with this fuel.
-fn waits_for(these: u32, fuel: u64) -> Room {
+/// Waits for `these` pollables, all of the output, with `fuel`.
+fn waits_for(these: u32, fuel: u64) -> TestGuest {
     let imports = r#"
         (import "wasi:io/poll@0.2.0" (instance $poll
             (export "pollable" (type $pollable (sub resource)))
@@ -97,20 +97,23 @@ fn waits_for(these: u32, fuel: u64) -> Room {
     );
     let mut limits = limits();
     limits.fuel = fuel;
-    Room::written_within(&calls_wasi(imports, &["stdout", "subscribe", "wait"], &body), &limits)
+    TestGuest::written_within(
+        &calls_wasi(imports, &["stdout", "subscribe", "wait"], &body),
+        &limits,
+    )
 }
 
 #[test]
-fn a_long_list_of_things_to_wait_for_is_paid_for() {
+fn a_long_list_of_pollables_is_charged() {
     let [some, more] = [1000, 2000].map(|these| waits_for(these, FUEL).fuel());
     assert_eq!(more - some, 400 * 1000);
-    // It ends as soon as more is asked for than the guest can pay.
+    // It ends as soon as the guest lacks fuel for the list.
     assert_eq!(waits_for(2000, more - 1).fault().kind, FaultKind::Fuel);
 }
 
-/// Looks up a name of so many bytes, as `wake` says, which has the answer at 16: whether it is an
-/// error, and its code.
-fn looks_up(bytes: u32, wake: &str) -> Room {
+/// Resolves a host name of `bytes` bytes; `wake` is the body of the wake, and finds the result at
+/// offset 16: whether it is an error, and its code.
+fn looks_up(bytes: u32, wake: &str) -> TestGuest {
     let imports = r#"
         (import "wasi:sockets/network@0.2.0" (instance $network
             (export "network" (type $a-network (sub resource)))
@@ -141,11 +144,11 @@ fn looks_up(bytes: u32, wake: &str) -> Room {
                (call $resolve (local.get $network) (i32.const 1024) (i32.const {bytes}) (i32.const 16)))
            (func $wake {wake})"#
     );
-    Room::written(&calls_wasi(imports, &["ours", "resolve"], &body))
+    TestGuest::written(&calls_wasi(imports, &["ours", "resolve"], &body))
 }
 
 #[test]
-fn a_name_of_another_machine_is_not_looked_up_and_costs_fuel_by_the_byte() {
+fn a_host_name_is_not_resolved_and_costs_fuel_by_the_byte() {
     let code = "(if (i32.ne (call $read (i32.const 4)) (i32.const 20)) (then (unreachable)))";
     let error = "(if (i32.ne (call $read (i32.const 0)) (i32.const 1)) (then (unreachable)))";
     let answered = format!("(call $look_up (call $ours)) {error} {code}");
@@ -159,8 +162,8 @@ fn a_name_of_another_machine_is_not_looked_up_and_costs_fuel_by_the_byte() {
     assert!((FUEL..FUEL + FUEL / 20).contains(&fuel), "{fuel}");
 }
 
-/// Tries to open a model whose name has so many bytes.
-fn opens_model(bytes: u32) -> Room {
+/// Tries to open a model whose name has `bytes` bytes.
+fn opens_model(bytes: u32) -> TestGuest {
     let imports = r#"
         (import "gleaner:lambda/inference@0.1.0" (instance $inference
             (export "model" (type $model (sub resource)))
@@ -173,7 +176,7 @@ fn opens_model(bytes: u32) -> Room {
         r#"(import "host" "open" (func $open (param i32 i32 i32)))
            (func $wake (call $open (i32.const 1024) (i32.const {bytes}) (i32.const 16)))"#
     );
-    Room::written(&calls_wasi(imports, &["open"], &body))
+    TestGuest::written(&calls_wasi(imports, &["open"], &body))
 }
 
 #[test]
@@ -182,7 +185,7 @@ fn the_name_of_a_model_costs_fuel_by_the_byte() {
     assert_eq!(more - some, 100_000 / 8);
 }
 
-/// Fills a memory of 256 MiB by one instruction, which no epoch ends.
+/// Fills a memory of 256 MiB by one instruction, which no epoch interrupts.
 fn fills() -> String {
     let parts = r#"
         (core module $large (memory (export "memory") 4096))
@@ -194,14 +197,14 @@ fn fills() -> String {
 }
 
 #[test]
-fn a_wake_that_comes_back_late_is_a_fault_though_nothing_ended_it() {
+fn a_wake_that_returns_late_is_a_fault_though_it_was_not_interrupted() {
     let mut limits = limits();
     limits.memory = ByteSize::mib(300);
     limits.fuel = u64::from(u32::MAX);
     limits.deadline = Duration::from_millis(2);
-    let mut room = Room::written_timed(&fills(), &limits);
-    room.guest.init().unwrap();
-    let fault = room.fault();
+    let mut test = TestGuest::written_timed(&fills(), &limits);
+    test.guest.init().unwrap();
+    let fault = test.fault();
     assert_eq!(
         (fault.kind, fault.allowed),
         (FaultKind::Deadline, Some(2_000_000)),
@@ -210,18 +213,18 @@ fn a_wake_that_comes_back_late_is_a_fault_though_nothing_ended_it() {
     );
     assert!(fault.used > Some(4_000_000), "{}", fault.message);
     assert!(fault.message.ends_with("ms; the deadline is 2.0 ms"), "{}", fault.message);
-    // A replay has no deadline, and a wake that is in time is none.
-    Room::written_within(&fills(), &limits).wake().result.unwrap();
+    // A replay has no deadline, and a wake in time is no fault.
+    TestGuest::written_within(&fills(), &limits).wake().result.unwrap();
     limits.deadline = Duration::from_secs(60);
-    Room::written_timed(&fills(), &limits).wake().result.unwrap();
+    TestGuest::written_timed(&fills(), &limits).wake().result.unwrap();
 }
 
 #[test]
 fn a_start_function_that_grows_a_memory_for_ever_is_ended_by_its_fuel() {
     let grow = "(start $grow) (func $grow (loop (drop (memory.grow $large (i32.const 1))) (br 0))) (func $wake)";
     let text = component("", "", &format!("(memory $large 1) {grow}"));
-    let fault = Room::written(&text).guest.init().unwrap_err();
-    // The host's part alone ends it: 64 KiB cost 8,192 units, and so does a refusal.
+    let fault = TestGuest::written(&text).guest.init().unwrap_err();
+    // The host's part alone uses up the fuel: 64 KiB cost 8,192 units, and so does a refusal.
     assert_eq!(
         (fault.kind, fault.allowed),
         (FaultKind::Fuel, Some(20 * FUEL)),

@@ -1,28 +1,28 @@
-//! What a lambda may have at most, limit by limit: a greedy guest is stopped with the cause, and
-//! the host stays small.
+//! Default and maximum limits of a lambda: a greedy guest is stopped with the cause, and the host
+//! stays small.
 
 use std::sync::Arc;
 
-use crate::greedy::{FUEL, MEMORY, PICTURE, Room, component, publish, subscribed};
+use crate::greedy::{FUEL, MEMORY, PICTURE, TestGuest, component, publish, subscribed};
 use gleaner_host::api::data::{DataError, PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD, Topic};
 use gleaner_host::guest::Guest;
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::{Limits, Manifest};
-use gleaner_tests::drive::{Cdr, IMAGE, image};
+use gleaner_tests::drive::{CdrBuilder, IMAGE, image};
 use gleaner_vitals::usage;
 
-/// What one call gives at most.
-const BYTES_PER_CALL: usize = Limits::MOST.call_bytes.bytes() as usize;
-const COLUMN_LEN: usize = Limits::MOST.call_items as usize;
+/// Maximum result of one call.
+const BYTES_PER_CALL: usize = Limits::MAX.call_bytes.bytes() as usize;
+const COLUMN_LEN: usize = Limits::MAX.call_items as usize;
 const PAGE: u64 = 64 << 10;
 
 #[test]
 fn a_guest_that_keeps_handles_is_stopped_and_the_next_one_starts_with_none() {
     for behaviour in ["topics", "fields"] {
-        let mut room = Room::greedy(behaviour, 0);
-        room.guest.init().unwrap();
-        let owners = Arc::strong_count(&room.topic);
-        let first = room.fault();
+        let mut test = TestGuest::greedy(behaviour, 0);
+        test.guest.init().unwrap();
+        let owners = Arc::strong_count(&test.topic);
+        let first = test.fault();
         assert_eq!(first.kind, FaultKind::HostCall, "{behaviour}: {first:?}");
         let allowed = Limits::DEFAULT.handles;
         assert!(
@@ -31,15 +31,15 @@ fn a_guest_that_keeps_handles_is_stopped_and_the_next_one_starts_with_none() {
             first.message
         );
         assert_eq!((first.used, first.allowed), (Some(allowed + 1), Some(allowed)), "{behaviour}");
-        // What the guest held went with it, so the second one comes as far as the first.
-        assert!(Arc::strong_count(&room.topic) < owners, "{behaviour}");
-        assert_eq!(room.fault(), first, "{behaviour}");
+        // The guest released its handles, so the second one reaches the same number.
+        assert!(Arc::strong_count(&test.topic) < owners, "{behaviour}");
+        assert_eq!(test.fault(), first, "{behaviour}");
     }
 }
 
 #[test]
 fn an_endless_init_ends_with_its_fuel() {
-    let fault = Room::greedy("endless_init", 0).guest.init().unwrap_err();
+    let fault = TestGuest::greedy("endless_init", 0).guest.init().unwrap_err();
     let allowed = 20 * FUEL;
     assert_eq!((fault.kind, fault.allowed), (FaultKind::Fuel, Some(allowed)));
     assert_eq!(fault.message, format!("in init: used {allowed} of {allowed} units of fuel"));
@@ -49,30 +49,30 @@ fn an_endless_init_ends_with_its_fuel() {
 fn the_work_of_the_host_costs_fuel_by_the_byte() {
     for behaviour in ["read_cdr", "read_frame"] {
         let [some, more, most] =
-            [50_000, 100_000, 200_000].map(|bytes| Room::greedy(behaviour, bytes).fuel());
-        // A unit for each eight bytes, and what the guest does itself does not depend on them.
+            [50_000, 100_000, 200_000].map(|bytes| TestGuest::greedy(behaviour, bytes).fuel());
+        // One unit per eight bytes; the guest's own work does not depend on them.
         let near = |fuel: u64, bytes: u64| fuel.abs_diff(bytes / 8) < 500;
         assert!(
             near(more - some, 50_000) && near(most - more, 100_000),
             "{behaviour}: {some} {more} {most}"
         );
     }
-    let (luma, idle) = (Room::greedy("mean_luma", 0).fuel(), Room::greedy("ok", 0).fuel());
+    let (luma, idle) =
+        (TestGuest::greedy("mean_luma", 0).fuel(), TestGuest::greedy("ok", 0).fuel());
     assert!(luma - idle >= u64::from(PICTURE) / 8, "{luma} and {idle}");
 }
 
 #[test]
-fn a_long_text_is_refused_by_its_length_and_paid_for() {
-    let mut room = Room::greedy("long_label", 100_000);
-    let outcome = room.wake();
+fn a_long_text_is_refused_by_its_length_and_charged() {
+    let mut test = TestGuest::greedy("long_label", 100_000);
+    let outcome = test.wake();
     let fault = outcome.result.unwrap_err();
     assert_eq!(fault.kind, FaultKind::Exception);
     assert!(fault.message.contains("the label has 100000 bytes"), "{}", fault.message);
     assert!(outcome.fuel.unwrap() >= 100_000 / 8);
 }
 
-/// A component with two more memories or tables, each in a module of its own, that `$a` and `$b`
-/// grow.
+/// A component with two more memories or tables, each in its own module; `$a` and `$b` grow them.
 fn two_stores([a, b]: [&str; 2], wake: &str) -> String {
     let parts = format!(
         r#"(core module $a {a}) (core instance $a (instantiate $a))
@@ -86,32 +86,32 @@ fn two_stores([a, b]: [&str; 2], wake: &str) -> String {
     component(&parts, r#"(with "a" (instance $a)) (with "b" (instance $b))"#, &body)
 }
 
-/// A store of `pages`, as in `1` or `1 2`.
+/// A module with a memory of `pages`, as in `1` or `1 2`.
 fn memory(pages: &str) -> String {
     format!(
         r#"(memory {pages}) (func (export "grow") (param i32) (result i32) (memory.grow (local.get 0)))"#
     )
 }
 
-/// A store of elements, likewise.
+/// A module with a table of `elements`, likewise.
 fn table(elements: &str) -> String {
     let grow = "(param i32) (result i32) (table.grow (ref.null func) (local.get 0))";
     format!(r#"(table {elements} funcref) (func (export "grow") {grow})"#)
 }
 
-/// What a growth answers must not, or must, be a refusal.
+/// Traps if a growth was refused, or if it was not.
 const MUST: &str = "(if (i32.eq (i32.const -1)) (then (unreachable)))";
 const MUST_NOT: &str = "(if (i32.ne (i32.const -1)) (then (unreachable)))";
 
 #[test]
 fn the_memories_of_a_component_count_together() {
-    // 100 pages for each are within the cap of 256; 200 for the one and then for the other are not.
+    // 100 pages for each are within the cap of 256; 200 for each are not.
     let grow = |pages| {
         format!("(call $a (i32.const {pages})) {MUST} (call $b (i32.const {pages})) {MUST}")
     };
     let stores = [memory("1"), memory("1")];
     let wake = |pages| {
-        Room::written(&two_stores(stores.each_ref().map(String::as_str), &grow(pages))).wake()
+        TestGuest::written(&two_stores(stores.each_ref().map(String::as_str), &grow(pages))).wake()
     };
     wake(100).result.unwrap();
     let fault = wake(200).result.unwrap_err();
@@ -125,7 +125,7 @@ fn the_memories_of_a_component_count_together() {
 #[test]
 fn a_component_that_starts_with_more_memory_than_it_may_have_does_not_start() {
     let large = memory("200");
-    let fault = Room::written(&two_stores([&large, &large], "")).guest.init().unwrap_err();
+    let fault = TestGuest::written(&two_stores([&large, &large], "")).guest.init().unwrap_err();
     assert_eq!(
         (fault.kind, fault.used, fault.allowed),
         (FaultKind::Memory, Some(400 * PAGE), Some(MEMORY))
@@ -135,16 +135,18 @@ fn a_component_that_starts_with_more_memory_than_it_may_have_does_not_start() {
 
 #[test]
 fn memory_that_was_asked_for_and_not_given_is_not_counted() {
-    // Beyond its own maximum no memory grows, whatever the cap: 250 pages stay for the other one.
+    // A memory does not grow beyond its own maximum, whatever the cap: 250 pages remain for the
+    // other.
     let wake = format!("(call $a (i32.const 200)) {MUST_NOT} (call $b (i32.const 250)) {MUST}");
-    Room::written(&two_stores([&memory("1 2"), &memory("1")], &wake)).wake().result.unwrap();
+    TestGuest::written(&two_stores([&memory("1 2"), &memory("1")], &wake)).wake().result.unwrap();
 }
 
 #[test]
 fn the_tables_of_a_component_count_together() {
     let grow = |n| format!("(call $a (i32.const {n})) {MUST} (call $b (i32.const {n}))");
-    let wake =
-        |wake: String| Room::written(&two_stores([&table("1"), &table("1")], &wake)).wake().result;
+    let wake = |wake: String| {
+        TestGuest::written(&two_stores([&table("1"), &table("1")], &wake)).wake().result
+    };
     wake(grow(9000) + MUST).unwrap();
     wake(grow(15_000) + MUST_NOT).unwrap();
 }
@@ -152,11 +154,11 @@ fn the_tables_of_a_component_count_together() {
 #[test]
 fn elements_that_were_asked_for_and_not_given_are_not_counted() {
     let wake = format!("(call $a (i32.const 15000)) {MUST_NOT} (call $b (i32.const 15000)) {MUST}");
-    Room::written(&two_stores([&table("1 2"), &table("1")], &wake)).wake().result.unwrap();
+    TestGuest::written(&two_stores([&table("1 2"), &table("1")], &wake)).wake().result.unwrap();
 }
 
-/// A component that at each wake does `first`, and then causes an event with 4,096 attributes whose
-/// keys are all the same: the second mebibyte of a memory that is zero.
+/// A component that at each wake runs `first`, and then triggers an event with 4,096 attributes
+/// with the same key: the second mebibyte of a zeroed memory.
 fn four_gibibytes(first: &str) -> String {
     let parts = r#"
         (import "gleaner:lambda/trigger@0.1.0" (instance $trigger
@@ -194,26 +196,26 @@ fn four_gibibytes(first: &str) -> String {
 
 #[test]
 fn one_mebibyte_named_four_thousand_times_never_becomes_four_gibibytes() {
-    let mut room = Room::written(&four_gibibytes(""));
-    room.guest.init().unwrap();
-    // Of the whole process; other tests run in it too, and none has a gigabyte.
-    let before = usage::most_resident();
-    let fault = room.fault();
+    let mut test = TestGuest::written(&four_gibibytes(""));
+    test.guest.init().unwrap();
+    // Peak of the whole process; other tests run in it too, and none uses a gigabyte.
+    let before = usage::peak_resident();
+    let fault = test.fault();
     assert_eq!(fault.kind, FaultKind::HostCall);
     assert!(fault.message.contains("too much data"), "{}", fault.message);
-    assert!(before > 0 && usage::most_resident() - before < 1 << 30);
-    assert_eq!(room.fault(), fault);
+    assert!(before > 0 && usage::peak_resident() - before < 1 << 30);
+    assert_eq!(test.fault(), fault);
 }
 
 #[test]
-fn a_refusal_of_memory_that_a_guest_survives_is_not_the_cause_of_what_the_host_refuses_later() {
+fn a_survived_refusal_of_memory_is_not_the_cause_of_a_later_refusal() {
     let refused = format!("(memory.grow $heap (i32.const 1000)) {MUST_NOT}");
-    let fault = Room::written(&four_gibibytes(&refused)).fault();
+    let fault = TestGuest::written(&four_gibibytes(&refused)).fault();
     assert_eq!(fault.kind, FaultKind::HostCall, "{}", fault.message);
 }
 
-/// An input without a guest, and so many of the same message in its ring. Of a type its name and
-/// definition are needed.
+/// An input without a guest, with `messages` copies of a message in its ring. The type is given by
+/// name and definition.
 fn topic(
     (name, text): (&str, &str),
     depth: usize,
@@ -262,7 +264,8 @@ fn a_column_has_the_newest_65_536_values() {
 #[test]
 fn one_call_hands_out_one_mebibyte_of_a_message() {
     let bytes = vec![7; BYTES_PER_CALL + 1];
-    let topic = topic(only("uint8[] x\n"), 1, "2 MiB", 1, &Cdr::default().bytes(&bytes).done());
+    let topic =
+        topic(only("uint8[] x\n"), 1, "2 MiB", 1, &CdrBuilder::default().bytes(&bytes).done());
     let sample = topic.newest().unwrap();
     let size = sample.bytes().len() as u64;
     assert_eq!(sample.cdr(0, u32::MAX).unwrap().len(), BYTES_PER_CALL);
@@ -292,7 +295,8 @@ fn one_call_hands_out_one_mebibyte_of_a_frame() {
 
 #[test]
 fn a_list_that_is_longer_than_one_call_hands_out_is_refused_and_not_cut() {
-    let texts = |n: usize| (0..n).fold(Cdr::default().u32(n as u32), |cdr, _| cdr.text("x")).done();
+    let texts =
+        |n: usize| (0..n).fold(CdrBuilder::default().u32(n as u32), |cdr, _| cdr.text("x")).done();
     let numbers = |n: usize| [&(n as u32).to_le_bytes(), vec![0_u8; 2 * n].as_slice()].concat();
     let get = |definition, cdr: &[u8]| {
         let topic = topic(only(definition), 1, "1 MiB", 1, cdr);

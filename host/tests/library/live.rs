@@ -1,5 +1,5 @@
-//! A whole live run over a loopback: time, results, reports and what is published, without DDS, a
-//! shim or a sandbox.
+//! A complete live run over a loopback: time, results, reports and published decisions, without
+//! DDS, shim or sandbox.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, PipeReader, Read, pipe};
@@ -14,15 +14,15 @@ use std::time::Duration;
 use gleaner_base::{Exit, Failure};
 use gleaner_host::api::Session;
 use gleaner_host::api::data::Wake;
-use gleaner_host::guest::{Guest, Outcome};
-use gleaner_host::live::{Pages, Run, Settings};
-use gleaner_host::stage::Asked;
+use gleaner_host::guest::{Guest, WakeOutcome};
+use gleaner_host::live::{LiveRun, ResultsPipe, Settings};
+use gleaner_host::session_setup::ConfiguredLambda;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_lambda::{BuildDir, Fault, FaultKind};
 use gleaner_messages::Endian;
-use gleaner_protocol::{Page, Report};
+use gleaner_protocol::{Report, ResultItem};
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Clock, Guid, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::{Clock, Delivery, Guid, Qos, SampleMeta, Sink, TopicSpec, Transport};
 use gleaner_vitals::Pulse;
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -30,14 +30,14 @@ const NUMBERS: &str = "/numbers";
 const DECISIONS: &str = "/decisions";
 
 /// Triggers with the number of each sample; a negative one is a fault.
-struct Numbers(Session);
+struct NumbersGuest(Session);
 
-impl Guest for Numbers {
+impl Guest for NumbersGuest {
     fn init(&mut self) -> Result<(), Fault> {
         Ok(())
     }
 
-    fn wake(&mut self, wake: Wake) -> Outcome {
+    fn wake(&mut self, wake: Wake) -> WakeOutcome {
         let Wake::Event(sample) = wake else { panic!("samples wake this lambda") };
         let value = sample.number(&sample.topic().field("value").unwrap()).unwrap();
         self.0.event("number", value, Vec::new()).unwrap();
@@ -47,7 +47,11 @@ impl Guest for Numbers {
             used: None,
             allowed: None,
         };
-        Outcome { result: if value < 0.0 { Err(fault) } else { Ok(()) }, fuel: None, run_ns: None }
+        WakeOutcome {
+            result: if value < 0.0 { Err(fault) } else { Ok(()) },
+            fuel: None,
+            run_ns: None,
+        }
     }
 
     fn engine(&self) -> String {
@@ -74,7 +78,7 @@ impl Running {
                         [[input]]\nname = \"numbers\"\ntopic = \"/numbers\"\ntype = \"test_msgs/msg/Number\"\n";
         let manifest = Manifest::parse(manifest, "lambda.toml").unwrap();
         let (loopback, clock, stop) =
-            (Loopback::new(), Clock::of_today(), Arc::<AtomicBool>::default());
+            (Loopback::new(), Clock::from_time_of_day(), Arc::<AtomicBool>::default());
         loopback.add_topic(NUMBERS, "test_msgs/msg/Number", "int64 value\n");
         loopback.add_topic(DECISIONS, "std_msgs/msg/String", "string data\n");
         let (reports, to_reports) = pipe().unwrap();
@@ -82,12 +86,12 @@ impl Running {
         let (source, stopped, announce) =
             (loopback.clone(), Arc::clone(&stop), announce.map(str::to_owned));
         let run = thread::spawn(move || {
-            let pulse = Pulse::make().unwrap().0;
+            let pulse = Pulse::create().unwrap().0;
             let folder = PathBuf::from("numbers");
-            let run = Run {
-                asked: Asked {
+            let run = LiveRun {
+                lambda: ConfiguredLambda {
                     build: BuildDir::of(&folder),
-                    lambda: folder.clone(),
+                    folder: folder.clone(),
                     config: Vec::new(),
                     remaps: Vec::new(),
                     vehicle: None,
@@ -103,13 +107,13 @@ impl Running {
                 },
                 source: Box::new(source),
                 recorder: None,
-                results: Pages::over(File::from(OwnedFd::from(to_results)), pulse.clone()),
+                results: ResultsPipe::over(File::from(OwnedFd::from(to_results)), pulse.clone()),
                 pulse,
                 close: &mut || Ok(Vec::new()),
                 stop: &stopped,
             };
-            let mut load = |_: &Asked, _: &Manifest, session: Session, _| {
-                Ok(Box::new(Numbers(session)) as Box<dyn Guest>)
+            let mut load = |_: &ConfiguredLambda, _: &Manifest, session: Session, _| {
+                Ok(Box::new(NumbersGuest(session)) as Box<dyn Guest>)
             };
             run.run(&mut load, File::from(OwnedFd::from(to_reports)))
         });
@@ -133,7 +137,7 @@ impl Running {
         self.loopback.publish(NUMBERS, &meta, &value.to_le_bytes()).unwrap();
     }
 
-    /// Reads reports until one is what is looked for.
+    /// Reads reports until `looked_for` accepts one.
     fn until<T>(&mut self, mut looked_for: impl FnMut(Report) -> Option<T>) -> T {
         loop {
             let mut line = String::new();
@@ -152,7 +156,7 @@ impl Running {
     }
 
     /// Stops the run; returns its end, and its results.
-    fn stop(mut self) -> (Result<Exit, Failure>, Vec<Page>) {
+    fn stop(mut self) -> (Result<Exit, Failure>, Vec<ResultItem>) {
         self.stop.store(true, Ordering::Relaxed);
         let ended = self.run.join().unwrap();
         let mut text = String::new();
@@ -171,41 +175,41 @@ fn each_sample_wakes_the_lambda_and_each_decision_is_a_report_and_a_result() {
     let (ended, pages) = running.stop();
     assert_eq!(ended.unwrap(), Exit::Ok);
     let [
-        Page::Woken(woken_by),
-        Page::Decision(_),
-        Page::Decision(_),
-        Page::Decision(_),
-        Page::Last(last),
+        ResultItem::Woken(woken_by),
+        ResultItem::Decision(_),
+        ResultItem::Decision(_),
+        ResultItem::Decision(_),
+        ResultItem::Last(last),
     ] = &pages[..]
     else {
         panic!("{pages:?}");
     };
     assert_eq!(woken_by.topic.as_deref(), Some(NUMBERS));
     assert_eq!((last.wakes, last.triggers, last.faults, last.topics[0].received), (3, 3, 0, 3));
-    assert_eq!(last.network, gleaner_protocol::Network::default(), "a loopback has none");
+    assert_eq!(last.network, gleaner_protocol::NetworkStatus::default(), "a loopback has none");
 }
 
 #[test]
-fn a_fault_is_a_decision_the_run_goes_on_and_its_exit_says_so() {
+fn after_a_fault_the_run_goes_on_and_its_exit_code_reports_it() {
     let mut running = Running::start(None);
     running.publish(-1);
-    assert_eq!(running.decided(), -1.0, "what it triggered before counts");
+    assert_eq!(running.decided(), -1.0, "triggers before the fault count");
     running.publish(5);
     assert_eq!(running.decided(), 5.0);
     let (ended, pages) = running.stop();
     assert_eq!(ended.unwrap(), Exit::LambdaFaulted);
     let faults = pages
         .iter()
-        .filter(|page| matches!(page, Page::Decision(decision) if decision.fault.is_some()));
+        .filter(|page| matches!(page, ResultItem::Decision(decision) if decision.fault.is_some()));
     assert_eq!(faults.count(), 1);
 }
 
 #[test]
-fn a_source_that_dies_ends_the_run_with_its_reason_and_the_results_are_whole() {
+fn a_source_that_dies_ends_the_run_with_its_reason_and_the_results_are_complete() {
     let mut running = Running::start(None);
     running.publish(4);
     assert_eq!(running.decided(), 4.0);
-    running.loopback.die("the cable is cut");
+    running.loopback.fail("the cable is cut");
     running.until(|report| matches!(report, Report::Ended(_)).then_some(()));
     let (ended, pages) = running.stop();
     let failure = ended.unwrap_err();
@@ -213,20 +217,20 @@ fn a_source_that_dies_ends_the_run_with_its_reason_and_the_results_are_whole() {
         (failure.exit, failure.causes),
         (Exit::Unreachable, vec!["the cable is cut".to_owned()])
     );
-    assert!(matches!(pages.last(), Some(Page::Last(last)) if last.wakes == 1), "{pages:?}");
+    assert!(matches!(pages.last(), Some(ResultItem::Last(last)) if last.wakes == 1), "{pages:?}");
 }
 
-/// Sends the messages of a topic on.
-struct Heard(Mutex<SyncSender<Vec<u8>>>);
+/// Forwards the messages of a topic.
+struct ForwardingSink(Mutex<SyncSender<Vec<u8>>>);
 
-impl Sink for Heard {
-    fn deliver(&self, _: &SampleMeta, cdr: &[u8]) -> Verdict {
+impl Sink for ForwardingSink {
+    fn deliver(&self, _: &SampleMeta, cdr: &[u8]) -> Delivery {
         self.0.lock().unwrap().send(cdr.to_vec()).unwrap();
-        Verdict::Taken
+        Delivery::Taken
     }
 }
 
-fn heard(loopback: &Loopback, topic: &str) -> Receiver<Vec<u8>> {
+fn subscribe(loopback: &Loopback, topic: &str) -> Receiver<Vec<u8>> {
     let (sender, receiver) = sync_channel(64);
     let spec = TopicSpec {
         topic: topic.to_owned(),
@@ -235,14 +239,14 @@ fn heard(loopback: &Loopback, topic: &str) -> Receiver<Vec<u8>> {
         max_bytes: 1 << 20,
         qos: Qos::Auto,
     };
-    loopback.clone().subscribe(&spec, Arc::new(Heard(Mutex::new(sender)))).unwrap();
+    loopback.clone().subscribe(&spec, Arc::new(ForwardingSink(Mutex::new(sender)))).unwrap();
     receiver
 }
 
 #[test]
-fn decisions_are_published_on_the_topic_that_was_asked_for() {
+fn decisions_are_published_on_the_requested_topic() {
     let mut running = Running::start(Some(DECISIONS));
-    let decisions = heard(&running.loopback, DECISIONS);
+    let decisions = subscribe(&running.loopback, DECISIONS);
     running.publish(6);
     let message = decisions.recv_timeout(PATIENCE).unwrap();
     // A string in CDR: its length with the zero at its end, and that zero.

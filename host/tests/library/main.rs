@@ -1,14 +1,14 @@
-//! What the host's library does with guests and inputs that a test feeds by hand, as one program:
-//! each file is a subject. Tests that start programs lie in the workspace's `tests/`.
+//! Tests of the host's library with guests and inputs that a test feeds directly, as one program
+//! with a file for each subject. Tests that start programs are in the workspace's `tests/`.
 
-mod alone;
 mod calls;
 mod faults;
 mod greedy;
-mod guest_room;
 mod host_calls;
 mod host_time;
 mod limits;
 mod live;
+mod misbehaving;
+mod own_process;
 mod schedule;
-mod tight;
+mod small_limits;

@@ -1,5 +1,5 @@
-//! When a lambda runs, over a transport that the test feeds by hand. Ticks over a drive:
-//! `tests/tests/programs/schedule.rs`.
+//! Tests of the schedule over a transport that the test feeds directly. Ticks over a drive are
+//! tested in `tests/tests/programs/schedule.rs`.
 
 use std::sync::Arc;
 use std::thread;
@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use gleaner_host::api::data::{Sample, Topic, Wake};
 use gleaner_host::input::open_inputs;
-use gleaner_host::schedule::Schedule;
+use gleaner_host::schedule::WakeSchedule;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_messages::Endian;
 use gleaner_tests::root;
@@ -16,7 +16,7 @@ use gleaner_transport::{Guid, SampleMeta};
 
 const MS: i64 = 1_000_000;
 
-/// As much of `sensor_msgs/msg/Imu` as `ticker` reads.
+/// The part of `sensor_msgs/msg/Imu` that `ticker` reads.
 const IMU: &str = "std_msgs/Header header\ngeometry_msgs/Vector3 linear_acceleration\n\
 ================================================================================\n\
 MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n\
@@ -25,16 +25,16 @@ MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
 ================================================================================\n\
 MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
 
-/// One input that wakes, and the transport that feeds it.
-struct Feed {
+/// An event input, and the transport that feeds it.
+struct EventFeed {
     transport: Loopback,
     topic: Arc<Topic>,
-    schedule: Schedule,
+    schedule: WakeSchedule,
     sent: u64,
 }
 
-impl Feed {
-    /// `depth` samples are shown, and one more can be held; each may have `max_size`.
+impl EventFeed {
+    /// An input that shows `depth` samples of up to `max_size`; one more can be held.
     fn new(backlog: &str, depth: usize, max_size: &str) -> Self {
         let manifest = format!(
             "[lambda]\nname = \"fed\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"fed.wasm\"\n\
@@ -49,12 +49,12 @@ impl Feed {
         Self {
             transport,
             topic: Arc::clone(&inputs[0]),
-            schedule: Schedule::new(&manifest, &inputs),
+            schedule: WakeSchedule::new(&manifest, &inputs),
             sent: 0,
         }
     }
 
-    /// Publishes so many samples, numbered from 1.
+    /// Publishes `samples` samples, numbered from 1.
     fn publish(&mut self, samples: u64) {
         for _ in 0..samples {
             self.sent += 1;
@@ -66,7 +66,7 @@ impl Feed {
         self.schedule.next_event().map(sample)
     }
 
-    /// Numbers of the samples that wake until there is none.
+    /// Numbers of the samples that cause wakes, until there is none.
     fn wakes(&mut self) -> Vec<u64> {
         std::iter::from_fn(|| self.next()).map(|sample| sample.identity().seq).collect()
     }
@@ -98,7 +98,7 @@ fn sample(wake: Wake) -> Sample {
 
 #[test]
 fn each_sample_wakes_once_and_in_order() {
-    let mut feed = Feed::new("each", 4, "4 KiB");
+    let mut feed = EventFeed::new("each", 4, "4 KiB");
     assert!(feed.wakes().is_empty());
     feed.publish(3);
     assert_eq!(feed.wakes(), [1, 2, 3]);
@@ -108,15 +108,15 @@ fn each_sample_wakes_once_and_in_order() {
 }
 
 #[test]
-fn what_left_the_ring_before_it_could_wake_is_counted_as_skipped() {
-    let mut feed = Feed::new("each", 4, "4 KiB");
+fn samples_that_leave_the_ring_before_their_wake_are_counted_as_skipped() {
+    let mut feed = EventFeed::new("each", 4, "4 KiB");
     feed.publish(10);
     assert_eq!((feed.wakes(), feed.skipped()), (vec![7, 8, 9, 10], 6));
 }
 
 #[test]
 fn the_latest_sample_wakes_once_and_those_before_it_are_counted_as_skipped() {
-    let mut feed = Feed::new("latest", 4, "4 KiB");
+    let mut feed = EventFeed::new("latest", 4, "4 KiB");
     feed.publish(3);
     assert_eq!((feed.wakes(), feed.skipped()), (vec![3], 2));
     assert!(feed.wakes().is_empty());
@@ -126,18 +126,18 @@ fn the_latest_sample_wakes_once_and_those_before_it_are_counted_as_skipped() {
 
 #[test]
 fn a_period_is_not_woken_by_samples_and_an_event_not_by_time() {
-    let mut feed = Feed::new("each", 4, "4 KiB");
+    let mut feed = EventFeed::new("each", 4, "4 KiB");
     feed.publish(1);
     assert!(feed.schedule.next_tick(i64::MAX).is_none());
     assert_eq!(feed.schedule.missed(), 0);
     let manifest = Manifest::load(root().join("tests/lambdas/ticker/rust")).unwrap();
-    assert!(Schedule::new(&manifest, &[]).next_event().is_none());
+    assert!(WakeSchedule::new(&manifest, &[]).next_event().is_none());
 }
 
 #[test]
-fn a_lambda_that_holds_every_sample_is_woken_by_none_twice_and_by_newer_ones_once_it_lets_go() {
+fn a_lambda_that_holds_every_sample_wakes_for_none_twice_and_for_newer_ones_after_release() {
     for backlog in ["each", "latest"] {
-        let mut feed = Feed::new(backlog, 2, "4 KiB");
+        let mut feed = EventFeed::new(backlog, 2, "4 KiB");
         let mut held = Vec::new();
         for _ in 0..10 {
             feed.publish(1);
@@ -155,13 +155,13 @@ fn a_lambda_that_holds_every_sample_is_woken_by_none_twice_and_by_newer_ones_onc
 }
 
 #[test]
-fn no_sample_wakes_twice_or_after_a_newer_one_while_the_ring_takes_back_what_nobody_holds() {
+fn no_sample_wakes_twice_or_after_a_newer_one_while_the_ring_reuses_released_slots() {
     const DEPTH: u64 = 64;
     for backlog in ["each", "latest"].repeat(4) {
-        let mut feed = Feed::new(backlog, DEPTH as usize, "1 MiB");
+        let mut feed = EventFeed::new(backlog, DEPTH as usize, "1 MiB");
         let mut held = Vec::new();
-        // All cells but one are held, so each sample is written over the one before it. As long as
-        // that takes, the newest sample that the ring shows is one that has been judged.
+        // All slots but one are held, so each sample overwrites the previous one. Meanwhile the
+        // newest visible sample is one that has caused a wake.
         while feed.topic.counts().no_slot == 0 {
             feed.publish(1);
             held.extend(feed.next());
@@ -176,14 +176,14 @@ fn no_sample_wakes_twice_or_after_a_newer_one_while_the_ring_takes_back_what_nob
         let mut seqs = Vec::new();
         while !writer.is_finished() {
             seqs.extend(feed.next().map(|sample| sample.identity().seq));
-            // Judging takes time, in which samples come and go.
+            // A wake takes time, in which samples come and go.
             thread::sleep(Duration::from_micros(50));
         }
         writer.join().unwrap();
         seqs.extend(feed.wakes());
         assert!(seqs.first().is_some_and(|seq| *seq >= first), "{backlog}: {seqs:?}");
         assert!(seqs.is_sorted_by(|a, b| a < b), "{backlog}: {seqs:?}");
-        // Each that was received has woken the lambda, or is counted.
+        // Each received sample has caused a wake, or is counted.
         let counts = feed.topic.counts();
         assert_eq!(seqs.len() as u64 + counts.skipped, counts.received - received, "{backlog}");
     }

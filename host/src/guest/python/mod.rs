@@ -1,8 +1,8 @@
-//! Python lambdas: this process becomes the interpreter of the lambda's environment.
+//! Starts Python lambdas: this process becomes the interpreter of the lambda's environment.
 //!
 //! `gleaner-runtime` links no libpython. It replaces itself by `python3 -I -S start.py`, which
-//! loads `_gleaner` (crate `host/python`), and that runs the same library again, now inside the
-//! interpreter. So any virtual environment works.
+//! loads `_gleaner` (crate `host/python`), which runs this library again inside the interpreter. So
+//! any virtual environment works.
 
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
@@ -14,14 +14,14 @@ use gleaner_jail::cgroup::CGROUP_ENV;
 use gleaner_parts::{Looked, Parts, PartsError};
 use gleaner_protocol::LAYERS_ENV;
 
-use crate::isolation::{self, Inside};
+use crate::isolation::{self, SandboxPermissions};
 
-/// Threads of numpy's linear algebra, unless the user says otherwise: receivers share the cores,
-/// and with its default OpenBLAS hangs where memory is capped.
+/// Variables that limit numpy's linear algebra to one thread, unless the user sets them: receivers
+/// share the cores, and with its default, OpenBLAS hangs where memory is capped.
 const ONE_THREAD: [&str; 4] =
     ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"];
 
-/// Why Python cannot be started.
+/// A Python interpreter that cannot be started.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum PythonError {
@@ -49,11 +49,15 @@ impl Explain for PythonError {
     }
 }
 
-/// Becomes the interpreter that hosts the lambda in `lambda_dir`, with `args` for our library in
-/// it, which can open no files but those of `inside`, its own and ours, and have as much memory.
-/// Returns only errors.
-pub fn become_interpreter(lambda_dir: &Path, args: &[OsString], inside: Inside) -> PythonError {
-    match interpreter(lambda_dir, args, inside) {
+/// Becomes the interpreter that hosts the lambda in `lambda_dir`, with `args` for Gleaner's library
+/// in it. It can open only the files of `permissions`, its own and Gleaner's, and its memory is
+/// limited. Returns only errors.
+pub fn become_interpreter(
+    lambda_dir: &Path,
+    args: &[OsString],
+    permissions: SandboxPermissions,
+) -> PythonError {
+    match interpreter(lambda_dir, args, permissions) {
         Ok((python, mut command)) => PythonError::Start { python, source: command.exec() },
         Err(error) => error.into(),
     }
@@ -62,7 +66,7 @@ pub fn become_interpreter(lambda_dir: &Path, args: &[OsString], inside: Inside) 
 fn interpreter(
     lambda_dir: &Path,
     args: &[OsString],
-    mut inside: Inside,
+    mut permissions: SandboxPermissions,
 ) -> Result<(PathBuf, Command), PartsError> {
     let parts = Parts::find()?;
     let (python, unused) = parts.python_or_why(Some(lambda_dir))?;
@@ -73,13 +77,14 @@ fn interpreter(
     let mut command = Command::new(&python);
     // Isolated: neither PYTHONPATH nor the current folder decides what a lambda imports.
     let (home, extension) = (parts.python_home()?, parts.extension()?);
-    // Without `site`: what the environment starts by itself is the lambda's, and waits until this
-    // process is shut.
+    // Without `site`: start-up code of the environment is untrusted, and runs once this process is
+    // sandboxed.
     command.args(["-I", "-S"]).arg(home.join("start.py")).arg(&extension).args(args);
-    inside.paths.read.extend([home, extension]);
-    // It may be any program that calls itself Python, and its libraries are found by what lies
-    // around it.
-    command.env(LAYERS_ENV, isolation::before_interpreter(inside, &python)).env_remove(CGROUP_ENV);
+    permissions.paths.read.extend([home, extension]);
+    // It may be any program named Python, which finds its libraries relative to its own path.
+    command
+        .env(LAYERS_ENV, isolation::before_interpreter(permissions, &python))
+        .env_remove(CGROUP_ENV);
     for name in ONE_THREAD {
         if std::env::var_os(name).is_none() {
             command.env(name, "1");

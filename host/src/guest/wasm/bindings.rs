@@ -1,4 +1,4 @@
-//! What wasmtime generates from `wit/`, with our own types behind the handles.
+//! Bindings that wasmtime generates from `wit/`, with the host's types behind the handles.
 #![allow(missing_docs)]
 
 use std::sync::Arc;

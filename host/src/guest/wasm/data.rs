@@ -14,15 +14,15 @@ use crate::api::data::DataErrorKind as Kind;
 use crate::api::{data, frame};
 use gleaner_image as image;
 
-/// As in `wit/`.
+/// Name of the interface, as in `wit/`.
 const DATA: &str = "gleaner:lambda/data@0.1.0";
 
-type Answer<T> = wasmtime::Result<Result<T, DataError>>;
+type DataResult<T> = wasmtime::Result<Result<T, DataError>>;
 
 impl types::Host for Hosted {}
 
 impl Host for Hosted {
-    fn input(&mut self, name: String) -> Answer<Resource<Topic>> {
+    fn input(&mut self, name: String) -> DataResult<Resource<Topic>> {
         let input = self.session.input(&name);
         self.hand_out(input)
     }
@@ -75,12 +75,17 @@ impl HostTopic for Hosted {
         Ok(Counts { received, lost, overwritten, no_slot, too_big, skipped })
     }
 
-    fn field(&mut self, topic: Resource<Topic>, path: String) -> Answer<Resource<Field>> {
+    fn field(&mut self, topic: Resource<Topic>, path: String) -> DataResult<Resource<Field>> {
         let field = self.handles.get(&topic)?.field(&path);
         self.hand_out(field)
     }
 
-    fn column(&mut self, topic: Resource<Topic>, field: Resource<Field>, n: u32) -> Answer<Column> {
+    fn column(
+        &mut self,
+        topic: Resource<Topic>,
+        field: Resource<Field>,
+        n: u32,
+    ) -> DataResult<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
         answer(topic.column(field, n as usize).map(column_out))
     }
@@ -90,7 +95,7 @@ impl HostTopic for Hosted {
         topic: Resource<Topic>,
         field: Resource<Field>,
         since_ns: i64,
-    ) -> Answer<Column> {
+    ) -> DataResult<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
         answer(topic.column_since(field, since_ns).map(column_out))
     }
@@ -121,12 +126,12 @@ impl HostSample for Hosted {
         Ok(stamps(self.look(&sample)?.stamps()))
     }
 
-    fn get(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> Answer<Value> {
+    fn get(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> DataResult<Value> {
         let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
         answer(sample.get(field).map(value))
     }
 
-    fn number(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> Answer<f64> {
+    fn number(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> DataResult<f64> {
         let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
         answer(sample.number(field))
     }
@@ -149,7 +154,7 @@ impl HostSample for Hosted {
         Ok(self.sample_cdr(&sample, offset, len)?.to_vec())
     }
 
-    fn as_frame(&mut self, sample: Resource<Sample>) -> Answer<Resource<Frame>> {
+    fn as_frame(&mut self, sample: Resource<Sample>) -> DataResult<Resource<Frame>> {
         let frame = self.handles.get(&sample)?.as_frame();
         self.hand_out(frame)
     }
@@ -176,11 +181,11 @@ impl HostFrame for Hosted {
         Ok(stamps(self.look(&frame)?.stamps()))
     }
 
-    fn mean_luma(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> Answer<f64> {
+    fn mean_luma(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> DataResult<f64> {
         answer(self.handles.get(&frame)?.mean_luma(roi.map(roi_in)))
     }
 
-    fn histogram(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> Answer<Vec<u32>> {
+    fn histogram(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> DataResult<Vec<u32>> {
         answer(self.handles.get(&frame)?.histogram(roi.map(roi_in)).map(Vec::from))
     }
 
@@ -189,12 +194,12 @@ impl HostFrame for Hosted {
         frame: Resource<Frame>,
         width: u32,
         height: u32,
-    ) -> Answer<Resource<Frame>> {
+    ) -> DataResult<Resource<Frame>> {
         let resized = self.handles.get(&frame)?.resize(width, height);
         self.hand_out(resized)
     }
 
-    fn to_gray(&mut self, frame: Resource<Frame>) -> Answer<Resource<Frame>> {
+    fn to_gray(&mut self, frame: Resource<Frame>) -> DataResult<Resource<Frame>> {
         let gray = self.handles.get(&frame)?.to_gray();
         self.hand_out(gray)
     }
@@ -210,8 +215,8 @@ impl HostFrame for Hosted {
     }
 }
 
-/// Defines what hands out bytes once more, so that they go from their cell into the guest's memory
-/// in one copy: what is generated wants them as a `Vec`.
+/// Redefines the functions that return bytes, so that these are copied once, from their slot into
+/// the guest's memory: the generated functions need a `Vec`.
 pub(super) fn add_reads_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
     linker.allow_shadowing(true);
     let mut data = linker.instance(DATA)?;
@@ -253,7 +258,7 @@ impl Hosted {
     fn hand_out<T: Send + 'static>(
         &mut self,
         made: Result<T, data::DataError>,
-    ) -> Answer<Resource<T>> {
+    ) -> DataResult<Resource<T>> {
         Ok(match answer(made)? {
             Ok(value) => Ok(self.handles.push(value)?),
             Err(refused) => Err(refused),
@@ -264,16 +269,16 @@ impl Hosted {
         samples.into_iter().map(|sample| Ok(self.handles.push(sample)?)).collect()
     }
 
-    /// What a handle stands for, for a call that only looks at it: one that is charged nowhere
-    /// else.
+    /// Resolves a handle for a call that only reads a value, and charges the call, which is charged
+    /// nowhere else.
     fn look<T: 'static>(&self, handle: &Resource<T>) -> wasmtime::Result<&T> {
         self.session.fuel().charge_call()?;
         Ok(self.handles.get(handle)?)
     }
 }
 
-/// What a guest is answered; what it could not pay for, or could not end in time, ends it.
-fn answer<T>(made: Result<T, data::DataError>) -> Answer<T> {
+/// Converts a result for the guest. Errors for lack of fuel or time end the guest.
+fn answer<T>(made: Result<T, data::DataError>) -> DataResult<T> {
     match made {
         Ok(value) => Ok(Ok(value)),
         Err(data::DataError::OutOfFuel(error)) => Err(error.into()),
@@ -300,8 +305,8 @@ fn roi_in(Roi { x, y, width, height }: Roi) -> image::Roi {
     image::Roi { x, y, width, height }
 }
 
-fn value(value: gleaner_messages::Value<'_>) -> Value {
-    use gleaner_messages::Value as Read;
+fn value(value: gleaner_messages::MessageValue<'_>) -> Value {
+    use gleaner_messages::MessageValue as Read;
     match value {
         Read::Bool(value) => Value::Boolean(value),
         Read::Signed(value) => Value::Signed(value),

@@ -1,5 +1,5 @@
-//! Wall-clock deadlines: a thread looks whether a call is over its time, and advances the engine's
-//! epoch then, upon which the guest traps.
+//! Wall-clock deadlines: a thread checks whether a call is overdue, and then advances the engine's
+//! epoch, at which the guest traps.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -11,39 +11,38 @@ use wasmtime::{Engine, Store, Trap, UpdateDeadline};
 use super::Hosted;
 use crate::guest::is_late;
 
-/// How long nothing must have run for the ticker to sleep until something does. A lambda at 1 Hz
-/// wakes it with each call, one at 100 Hz never: waking a thread costs a call more than all else
-/// that hosting does.
+/// Idle time after which the ticker sleeps until the next call. A lambda at 1 Hz wakes it with each
+/// call, one at 100 Hz never: waking a thread costs a call more than the rest of hosting.
 const IDLE: Duration = Duration::from_millis(500);
 
-/// No call runs.
+/// Value of [`TickerState::due`] while no call runs.
 const NONE: u64 = 0;
 
-/// Ends each call into a guest that takes longer than it may.
+/// Ends each call into a guest that exceeds its time.
 pub struct Deadline {
-    shared: Arc<Shared>,
+    shared: Arc<TickerState>,
     ticker: Option<JoinHandle<()>>,
 }
 
-struct Shared {
+struct TickerState {
     base: Instant,
-    /// When the call that runs has to end, in ns since `base`.
+    /// Due time of the current call, in ns since `base`.
     due: AtomicU64,
-    /// The ticker sleeps until it is woken.
+    /// Set while the ticker sleeps until it is woken.
     sleeps: AtomicBool,
     stop: AtomicBool,
 }
 
-/// How long a call took, and how long it might.
+/// Duration of a call, and its limit.
 #[derive(Clone, Copy)]
-pub(super) struct Taken {
+pub(super) struct CallTime {
     elapsed: Duration,
     allowed: Duration,
 }
 
-impl Taken {
-    /// Whether it came back too late. An instruction that fills or copies a large memory is not
-    /// ended by an epoch, and if it was the last, nothing else asks.
+impl CallTime {
+    /// Returns whether the call returned too late. An epoch does not interrupt an instruction that
+    /// fills or copies a large memory, and no check follows if it is the last one.
     pub(super) fn is_late(self) -> bool {
         is_late(self.elapsed, self.allowed)
     }
@@ -55,21 +54,21 @@ impl Taken {
 }
 
 /// A running call.
-pub(super) struct Armed<'a> {
+pub(super) struct ArmedCall<'a> {
     deadline: &'a Deadline,
     started: Instant,
     allowed: Duration,
 }
 
 impl Deadline {
-    /// A deadline for the guests of `engine`, whose calls may take `shortest` or longer. Starts the
+    /// A deadline for the guests of `engine`, whose limits are `shortest` or longer. Starts the
     /// ticker, which sleeps until a call runs.
     ///
     /// # Errors
     ///
-    /// If the thread cannot be started.
+    /// An error if the thread cannot be started.
     pub fn new(engine: &Engine, shortest: Duration) -> std::io::Result<Self> {
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(TickerState {
             base: Instant::now(),
             due: AtomicU64::new(NONE),
             sleeps: AtomicBool::new(false),
@@ -82,17 +81,17 @@ impl Deadline {
     }
 
     /// Begins a call that may take `allowed`.
-    pub(super) fn arm(&self, store: &mut Store<Hosted>, allowed: Duration) -> Armed<'_> {
+    pub(super) fn arm(&self, store: &mut Store<Hosted>, allowed: Duration) -> ArmedCall<'_> {
         let started = Instant::now();
         store.data_mut().due = Some(started + allowed);
         store.set_epoch_deadline(1);
         let due = started.duration_since(self.shared.base) + allowed;
         self.shared.due.store((due.as_nanos() as u64).max(NONE + 1), Ordering::SeqCst);
-        // Either the ticker sees the call before it sleeps, or we see that it sleeps.
+        // Either the ticker sees the call before it sleeps, or this thread sees that it sleeps.
         if self.shared.sleeps.load(Ordering::SeqCst) {
             self.wake();
         }
-        Armed { deadline: self, started, allowed }
+        ArmedCall { deadline: self, started, allowed }
     }
 
     fn wake(&self) {
@@ -102,10 +101,10 @@ impl Deadline {
     }
 }
 
-impl Shared {
+impl TickerState {
     fn tick(&self, engine: &Engine, shortest: Duration) {
-        // A look at least every half of the shortest time finds each call before it is due, and
-        // sleeps exactly until then.
+        // With a check at least every half of the shortest limit, the ticker finds each call before
+        // it is due, and sleeps exactly until then.
         let step = (shortest / 2).max(Duration::from_micros(500));
         let mut quiet = Instant::now();
         while !self.stop.load(Ordering::SeqCst) {
@@ -117,7 +116,7 @@ impl Shared {
                 if left.is_zero() {
                     engine.increment_epoch();
                 }
-                // A call in the host, which ends by itself, is asked again when it is back in the
+                // A call into the host ends by itself; the epoch is checked when it returns to the
                 // guest.
                 thread::park_timeout(left.clamp(Duration::from_micros(500), step));
             } else if now.duration_since(quiet) < IDLE {
@@ -134,8 +133,9 @@ impl Shared {
     }
 }
 
-/// What a guest does when the epoch advances: the ticker may have meant the call before.
-pub(super) fn ask_at_each_epoch(store: &mut Store<Hosted>) {
+/// Sets the callback of a guest at which the epoch advances: it traps only if its own call is due,
+/// since the ticker may have meant an earlier one.
+pub(super) fn check_due_at_epoch(store: &mut Store<Hosted>) {
     store.epoch_deadline_callback(|context| match context.data().due {
         Some(due) if Instant::now() < due => Ok(UpdateDeadline::Continue(1)),
         _ => Err(Trap::Interrupt.into()),
@@ -152,14 +152,14 @@ impl Drop for Deadline {
     }
 }
 
-impl Armed<'_> {
-    /// How long the call has been running.
-    pub(super) fn taken(&self) -> Taken {
-        Taken { elapsed: self.started.elapsed(), allowed: self.allowed }
+impl ArmedCall<'_> {
+    /// Time for which the call has been running, and its limit.
+    pub(super) fn taken(&self) -> CallTime {
+        CallTime { elapsed: self.started.elapsed(), allowed: self.allowed }
     }
 }
 
-impl Drop for Armed<'_> {
+impl Drop for ArmedCall<'_> {
     fn drop(&mut self) {
         self.deadline.shared.due.store(NONE, Ordering::SeqCst);
     }

@@ -1,4 +1,4 @@
-//! From a trap to a fault with a named cause.
+//! Converts a trap to a fault with a named cause.
 
 use gleaner_lambda::{Fault, FaultKind};
 use wasmtime::component::ResourceTableError;
@@ -6,12 +6,12 @@ use wasmtime::{Trap, WasmBacktrace};
 use wasmtime_wasi::I32Exit;
 
 use super::Hosted;
-use super::limits::Refused;
-use super::wasi::Asleep;
+use super::limits::RefusedGrowth;
+use super::wasi::SleepError;
 use crate::api::data::DataError;
 use crate::api::fuel::OutOfFuel;
 
-/// How wasmtime begins to say that a lambda passed more than `call_bytes`.
+/// Prefix of wasmtime's error for a lambda that passes more than `call_bytes`.
 const TOO_MUCH_DATA: &str = "too much data is being copied between the host and the guest";
 
 pub(super) fn fuel(used: u64, allowed: u64) -> Fault {
@@ -26,7 +26,7 @@ pub(super) fn deadline(time: Option<(u64, u64)>) -> Fault {
     Fault { kind: FaultKind::Deadline, message, used, allowed }
 }
 
-/// `fuel` and `time` are what was used and what was allowed.
+/// Converts an error of a call. The pairs are fuel, and time in ns: used and allowed.
 pub(super) fn from_error(
     error: &wasmtime::Error,
     hosted: &Hosted,
@@ -47,7 +47,7 @@ pub(super) fn from_error(
         return Fault { kind: FaultKind::Deadline, message, used, allowed };
     }
     if trap == Some(&Trap::StackOverflow) {
-        // How much it was that one call more would have taken nobody knows.
+        // The stack that another call would have needed is unknown.
         let allowed = Some(hosted.allowed.stack.bytes());
         return Fault {
             kind: FaultKind::Stack,
@@ -57,8 +57,8 @@ pub(super) fn from_error(
         };
     }
     let plain = |kind, message| Fault { kind, message, used: None, allowed: None };
-    if error.downcast_ref::<Asleep>().is_some() {
-        return plain(FaultKind::HostCall, Asleep.to_string());
+    if error.downcast_ref::<SleepError>().is_some() {
+        return plain(FaultKind::HostCall, SleepError.to_string());
     }
     if error.downcast_ref::<I32Exit>().is_some() {
         return plain(FaultKind::Trap, "the lambda called exit".to_owned());
@@ -83,14 +83,15 @@ pub(super) fn from_error(
             allowed: Some(allowed.bytes()),
         };
     }
-    let said = hosted.printed.reason();
+    let printed = hosted.output.reason();
     // A guest that is refused memory at its start has no trap; later it aborts, and the refusal is
-    // the cause. But a guest may also survive the refusal and panic for another reason. A guest is
-    // on the stack if it called the host, and not yet while its memories are made.
+    // the cause. But a guest may also survive the refusal and panic for another reason. The
+    // backtrace has a guest if it called the host, and none while its memories are created.
     let starting = trap.is_none() && error.downcast_ref::<WasmBacktrace>().is_none();
     let aborted = starting || trap == Some(&Trap::UnreachableCodeReached);
-    let for_memory = said.as_ref().is_none_or(|said| said.contains("memory allocation of"));
-    if let Some(Refused { what, asked, allowed }) =
+    let for_memory =
+        printed.as_ref().is_none_or(|printed| printed.contains("memory allocation of"));
+    if let Some(RefusedGrowth { what, asked, allowed }) =
         hosted.caps.refused().filter(|_| aborted && for_memory)
     {
         let message = format!("asked for {asked} {what}; {allowed} are allowed");
@@ -102,14 +103,13 @@ pub(super) fn from_error(
         };
     }
     match trap {
-        // A compiler keeps what it needs for calls at the low end of `memory`, beyond which a deep
-        // recursion gets.
-        Some(trap @ Trap::MemoryOutOfBounds) if said.is_none() => plain(
+        // A compiler's own stack is at the low end of `memory`, and a deep recursion goes below it.
+        Some(trap @ Trap::MemoryOutOfBounds) if printed.is_none() => plain(
             FaultKind::Trap,
             format!("{trap}; perhaps its stack is exhausted by a deep recursion"),
         ),
-        // A panic says why on standard error, and the trap only says that it happened.
-        Some(trap) => plain(FaultKind::Trap, said.unwrap_or_else(|| trap.to_string())),
+        // A panic prints its reason to standard error; the trap has none.
+        Some(trap) => plain(FaultKind::Trap, printed.unwrap_or_else(|| trap.to_string())),
         None => plain(FaultKind::HostCall, format!("{}", error.root_cause())),
     }
 }

@@ -9,12 +9,16 @@ use super::bindings::gleaner::lambda::inference::{
 use crate::api::frame::Frame;
 use crate::api::inference::{self, InferenceErrorKind, Model, Tensor};
 
-type Answer<T> = wasmtime::Result<Result<T, InferenceError>>;
+type InferenceResult<T> = wasmtime::Result<Result<T, InferenceError>>;
 
 impl Host for Hosted {}
 
 impl HostTensor for Hosted {
-    fn from_values(&mut self, shape: Vec<u32>, values: Vec<f32>) -> Answer<Resource<Tensor>> {
+    fn from_values(
+        &mut self,
+        shape: Vec<u32>,
+        values: Vec<f32>,
+    ) -> InferenceResult<Resource<Tensor>> {
         let made =
             Tensor::from_values(size_of_val(&*shape) + size_of_val(&*values), self.session.fuel());
         self.answer(made)
@@ -24,7 +28,7 @@ impl HostTensor for Hosted {
         &mut self,
         _frame: Resource<Frame>,
         _how: Preprocess,
-    ) -> Answer<Resource<Tensor>> {
+    ) -> InferenceResult<Resource<Tensor>> {
         let made = Tensor::from_frame(self.session.fuel());
         self.answer(made)
     }
@@ -48,7 +52,7 @@ impl HostTensor for Hosted {
 }
 
 impl HostModel for Hosted {
-    fn open(&mut self, name: String) -> Answer<Resource<Model>> {
+    fn open(&mut self, name: String) -> InferenceResult<Resource<Model>> {
         let opened = Model::open(&name, self.session.fuel());
         self.answer(opened)
     }
@@ -57,7 +61,7 @@ impl HostModel for Hosted {
         &mut self,
         model: Resource<Model>,
         _inputs: Vec<Resource<Tensor>>,
-    ) -> Answer<Vec<Resource<Tensor>>> {
+    ) -> InferenceResult<Vec<Resource<Tensor>>> {
         match *self.handles.get(&model)? {}
     }
 
@@ -66,7 +70,7 @@ impl HostModel for Hosted {
         model: Resource<Model>,
         _frame: Resource<Frame>,
         _options: DetectOptions,
-    ) -> Answer<Vec<Detection>> {
+    ) -> InferenceResult<Vec<Detection>> {
         match *self.handles.get(&model)? {}
     }
 
@@ -79,7 +83,7 @@ impl Hosted {
     fn answer<T: Send + 'static>(
         &mut self,
         made: Result<T, inference::InferenceError>,
-    ) -> Answer<Resource<T>> {
+    ) -> InferenceResult<Resource<T>> {
         let error = match made {
             Ok(value) => return Ok(Ok(self.handles.push(value)?)),
             Err(inference::InferenceError::OutOfFuel(error)) => return Err(error.into()),

@@ -1,4 +1,4 @@
-//! What a store refuses: memory and tables beyond the cap.
+//! Caps the memory and the tables of a store.
 
 use gleaner_lambda::manifest::Limits;
 use wasmtime::ResourceLimiter;
@@ -8,21 +8,21 @@ use crate::api::fuel::Fuel;
 /// Bytes of a page of linear memory.
 const PAGE: usize = 64 << 10;
 
-/// Caps memory and tables, and remembers what it refused, since a guest only traps afterwards.
+/// Caps memory and tables, and keeps the last refusal, since a guest traps only afterwards.
 pub(super) struct Caps {
     memory_allowed: usize,
     tables_allowed: usize,
-    /// Of all linear memories together: a component may have several.
+    /// Size of all linear memories together: a component may have several.
     memory_bytes: usize,
-    /// Of all tables together.
+    /// Number of elements of all tables together.
     table_elements: usize,
-    refused: Option<Refused>,
+    refused: Option<RefusedGrowth>,
     fuel: Fuel,
 }
 
-/// What was asked for beyond a cap.
+/// A request beyond a cap.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Refused {
+pub(super) struct RefusedGrowth {
     /// `bytes of memory` or `elements of tables`.
     pub(super) what: &'static str,
     pub(super) asked: u64,
@@ -30,7 +30,7 @@ pub(super) struct Refused {
 }
 
 impl Caps {
-    /// The caps in `limits`; what grows is charged to `fuel`.
+    /// The caps in `limits`; growth is charged to `fuel`.
     pub(super) fn new(limits: &Limits, fuel: Fuel) -> Self {
         let tables_allowed = usize::try_from(limits.tables).unwrap_or(usize::MAX);
         let memory_allowed = limits.memory.as_usize();
@@ -48,8 +48,8 @@ impl Caps {
         self.refused = None;
     }
 
-    /// What was refused last.
-    pub(super) fn refused(&self) -> Option<Refused> {
+    /// The last refusal.
+    pub(super) fn refused(&self) -> Option<RefusedGrowth> {
         self.refused
     }
 }
@@ -64,16 +64,16 @@ impl ResourceLimiter for Caps {
         let more = desired.saturating_sub(now);
         let total = self.memory_bytes.saturating_add(more);
         let fits = total <= self.memory_allowed;
-        // Beyond its own maximum it does not grow, and must not be counted as if it had.
+        // Beyond its own maximum it does not grow, and must not be counted.
         let grows = fits && max.is_none_or(|max| desired <= max);
-        // One instruction has the kernel clear all these pages, and a loop of refusals takes time,
-        // too. A memory's first bytes belong to its instance, which is no work of a loop.
+        // One instruction makes the kernel clear all these pages, and a loop of refusals takes
+        // time, too. The initial size of a memory is free, since no loop can repeat it.
         if now > 0 {
             self.fuel.charge(|| if grows { more } else { PAGE })?;
         }
         if !fits {
             let (asked, allowed) = (total as u64, self.memory_allowed as u64);
-            self.refused = Some(Refused { what: "bytes of memory", asked, allowed });
+            self.refused = Some(RefusedGrowth { what: "bytes of memory", asked, allowed });
             return Ok(false);
         }
         if grows {
@@ -91,7 +91,7 @@ impl ResourceLimiter for Caps {
         let total = self.table_elements.saturating_add(desired.saturating_sub(now));
         if total > self.tables_allowed {
             let (asked, allowed) = (total as u64, self.tables_allowed as u64);
-            self.refused = Some(Refused { what: "elements of tables", asked, allowed });
+            self.refused = Some(RefusedGrowth { what: "elements of tables", asked, allowed });
             return Ok(false);
         }
         let grows = max.is_none_or(|max| desired <= max);
@@ -120,7 +120,7 @@ mod tests {
     use crate::api::fuel::OutOfFuel;
 
     #[test]
-    fn a_refused_growth_is_remembered() {
+    fn the_last_refused_growth_is_kept() {
         let mut caps = caps();
         assert!(caps.memory_growing(0, MIB, None).unwrap());
         assert_eq!(caps.refused(), None);
@@ -128,21 +128,21 @@ mod tests {
         let asked = MIB as u64 + 1;
         assert_eq!(
             caps.refused(),
-            Some(Refused { what: "bytes of memory", asked, allowed: asked - 1 })
+            Some(RefusedGrowth { what: "bytes of memory", asked, allowed: asked - 1 })
         );
         caps.forget_refusal();
         assert!(!caps.table_growing(0, 101, None).unwrap());
         assert_eq!(
             caps.refused(),
-            Some(Refused { what: "elements of tables", asked: 101, allowed: 100 })
+            Some(RefusedGrowth { what: "elements of tables", asked: 101, allowed: 100 })
         );
     }
 
     const MIB: usize = 1 << 20;
-    /// Of the call that grows something.
+    /// Fuel of the call that grows a memory.
     const FUEL_PER_CALL: u64 = 20;
 
-    /// Of a mebibyte and 100 elements.
+    /// Caps of a mebibyte and 100 elements.
     fn caps() -> Caps {
         let mut limits = Limits::default();
         (limits.memory, limits.tables) = (gleaner_base::ByteSize::mib(1), 100);

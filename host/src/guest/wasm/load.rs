@@ -1,5 +1,5 @@
-//! From a component to code that can be instantiated: found in the cache, or compiled there by
-//! `gleaner-compile`.
+//! Loads a component: takes its native code from the cache, or has `gleaner-compile` compile it
+//! there.
 #![allow(unsafe_code)]
 
 use std::os::unix::process::ExitStatusExt;
@@ -21,7 +21,7 @@ use super::bindings::{Lambda, LambdaPre};
 use super::data::add_reads_to_linker;
 use super::wasi;
 
-/// Why a component cannot be run.
+/// A component that cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum WasmError {
@@ -34,12 +34,12 @@ pub enum WasmError {
     #[error("{message}")]
     Compiler {
         message: String,
-        source: Option<Box<CompilerSaid>>,
+        source: Option<Box<CompilerMessage>>,
         help: Option<String>,
         exit: Exit,
     },
     #[error("cannot compile component `{}`", path.display())]
-    Limit { path: PathBuf, source: CompilerSaid },
+    Limit { path: PathBuf, source: CompilerMessage },
     #[error("cannot load native code `{}`", path.display())]
     Load { path: PathBuf, source: Box<dyn std::error::Error + Send + Sync> },
     #[error("component `{}` does not fit the world `gleaner:lambda/lambda`", path.display())]
@@ -49,9 +49,9 @@ pub enum WasmError {
 /// A cause that `gleaner-compile` printed when it failed, or the limit that ended it.
 #[derive(Debug, thiserror::Error)]
 #[error("{text}")]
-pub struct CompilerSaid {
+pub struct CompilerMessage {
     text: String,
-    source: Option<Box<CompilerSaid>>,
+    source: Option<Box<CompilerMessage>>,
 }
 
 impl Explain for WasmError {
@@ -66,10 +66,10 @@ impl Explain for WasmError {
             ),
             Self::Compiler { help, .. } => help.clone(),
             Self::Limit { .. } => {
-                Some("leave out what the lambda does not need, or move data to files of a model".to_owned())
+                Some("remove code that the lambda does not need, or move data to files of a model".to_owned())
             }
             Self::Load { path, .. } => Some(format!(
-                "start it again; if that does not help, delete the file, it will be made again: rm '{}'",
+                "start again; if that does not help, delete the file, which will be created again: rm '{}'",
                 path.display()
             )),
             Self::Start { .. } => None,
@@ -97,12 +97,12 @@ pub struct Loaded {
 }
 
 impl Loaded {
-    /// Loads the component at `path`, compiling it into `cache` first if it is not there. It gets a
-    /// stack of that many bytes, and NaNs of this kind.
+    /// Loads the component at `path`, and compiles it into `cache` first if necessary. It gets a
+    /// stack of `stack_bytes`, and NaNs of this kind.
     ///
     /// # Errors
     ///
-    /// [`WasmError`] names the component and what does not fit.
+    /// [`WasmError`] names the component and the reason.
     pub fn open(
         path: &Path,
         cache: &Path,
@@ -113,8 +113,8 @@ impl Loaded {
         let engine = gleaner_compile::engine(stack_bytes, nans)?;
         let entry = Entry::of(cache, &component, nans);
         let code = native_code(&entry, path, cache, nans)?;
-        // SAFETY: these bytes are in memory of our own, where `Entry::read` found their digest to
-        // be that which `gleaner-compile` wrote for this component, engine and CPU, in a file and
+        // SAFETY: these bytes are in this process's memory. `Entry::read` found that their digest
+        // is the one that `gleaner-compile` wrote for this component, engine and CPU, in a file and
         // below folders to which only this user or root may write.
         let code = unsafe { Component::deserialize(&engine, &code) }.map_err(|source| {
             WasmError::Load { path: entry.path().to_owned(), source: source.into() }
@@ -145,7 +145,7 @@ impl Loaded {
         &self.engine
     }
 
-    /// Wasmtime's version, and what the code was compiled with.
+    /// Wasmtime's version, and the settings of the compiler.
     pub(super) fn settings(&self) -> &'static str {
         self.nans.settings()
     }
@@ -159,7 +159,7 @@ impl Loaded {
     }
 }
 
-/// The code in `entry`; compiled into it first if it is not there, or not as it was written.
+/// Returns the code in `entry`, and compiles it first if it is missing or damaged.
 fn native_code(entry: &Entry, path: &Path, cache: &Path, nans: Nans) -> Result<Vec<u8>, WasmError> {
     make_cache(cache)?;
     match entry.read()? {
@@ -167,20 +167,22 @@ fn native_code(entry: &Entry, path: &Path, cache: &Path, nans: Nans) -> Result<V
         Found::Nothing => {}
         Found::Damaged(why) => {
             let file = entry.path().display();
-            tracing::warn!(%file, %why, "native code in the cache is damaged: the component is compiled again");
+            tracing::warn!(%file, %why, "native code in the cache is damaged; compiling the component again");
         }
     }
     compile(path, cache, nans)?;
     let why = match entry.read()? {
         Found::Code(code) => return Ok(code),
-        Found::Nothing => "it is gone: the component or the cache was changed meanwhile".to_owned(),
-        Found::Damaged(why) => format!("it was just written, and {why}"),
+        Found::Nothing => {
+            "the code is missing: the component or the cache was changed meanwhile".to_owned()
+        }
+        Found::Damaged(why) => format!("the code was just written, and {why}"),
     };
     Err(WasmError::Load { path: entry.path().to_owned(), source: why.into() })
 }
 
-/// Most threads that compile at once. Each takes addresses, of which there is a bound, and a
-/// lambda's code is soon compiled.
+/// Maximum number of compiler threads. Each needs address space, which is limited, and a lambda's
+/// code compiles quickly.
 const COMPILE_THREADS: usize = 8;
 
 fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
@@ -193,7 +195,7 @@ fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
         .arg(cache)
         .args((nans == Nans::Canonical).then_some("--deterministic"))
         .env("RAYON_NUM_THREADS", threads.to_string())
-        // Else the allocator reserves addresses for each of them.
+        // Otherwise the allocator reserves address space for each of them.
         .env("MALLOC_ARENA_MAX", "2")
         .output()
         .map_err(|source| WasmError::Start { program, source })?;
@@ -205,23 +207,23 @@ fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
         let memory = COMPILE_MEMORY_BYTES >> 20;
         let said = match signal {
             libc::SIGXCPU => {
-                format!("it takes more than {COMPILE_CPU_SECONDS} s of CPU time to compile")
+                format!("compiling takes more than {COMPILE_CPU_SECONDS} s of CPU time")
             }
-            libc::SIGABRT => format!("it takes more than {memory} MiB of memory to compile"),
+            libc::SIGABRT => format!("compiling takes more than {memory} MiB of memory"),
             _ => format!(
-                "it takes more than {memory} MiB of memory or {COMPILE_CPU_SECONDS} s to compile"
+                "compiling takes more than {memory} MiB of memory or {COMPILE_CPU_SECONDS} s"
             ),
         };
         return Err(WasmError::Limit {
             path: path.to_owned(),
-            source: CompilerSaid { text: said, source: None },
+            source: CompilerMessage { text: said, source: None },
         });
     }
     let said = String::from_utf8_lossy(&output.stderr);
     let exit = output.status.code().and_then(Exit::from_code).unwrap_or(Exit::Internal);
     let Failure { exit, message, causes, help } = Failure::parse(&said, exit)
         .unwrap_or_else(|| Failure::new(exit, format!("gleaner-compile: {}", said.trim())));
-    let chain = |source, text| Some(Box::new(CompilerSaid { text, source }));
+    let chain = |source, text| Some(Box::new(CompilerMessage { text, source }));
     Err(WasmError::Compiler {
         message,
         source: causes.into_iter().rev().fold(None, chain),

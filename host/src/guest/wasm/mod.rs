@@ -1,9 +1,8 @@
-//! WebAssembly components: one store on one thread, fuel and a memory cap always on, a deadline
-//! where the clock is real.
+//! Runs WebAssembly components: one store on one thread, always with fuel and a memory cap, and
+//! with a deadline in a live run.
 //!
-//! The five files named as the WIT interfaces are thin: they convert, and leave everything else to
-//! `api`, prices too. A trap ends the store; the next wake gets a new one. Nothing here compiles
-//! code.
+//! The five files named as the WIT interfaces only convert, and leave everything else to `api`,
+//! including prices. A trap ends the store; the next wake gets a new one. No code is compiled here.
 
 mod bindings;
 mod data;
@@ -32,37 +31,37 @@ use wasmtime_wasi::{WasiCtx, WasiCtxView, WasiView};
 use self::bindings::gleaner::lambda::data as wit;
 use self::bindings::{ConfigEntry, ConfigValue as WitConfigValue, Lambda};
 use self::limits::Caps;
-use self::wasi::Printed;
-use super::{Guest, Outcome};
+use self::wasi::GuestOutput;
+use super::{Guest, WakeOutcome};
 use crate::api::Session;
 use crate::api::data::Wake;
 
-/// A component and the session that it works on.
+/// A component and its session.
 pub struct WasmGuest {
     loaded: Loaded,
     session: Session,
     limits: Limits,
     deadline: Option<Deadline>,
-    /// For the few calls of WASI that wait. Without one, the first print would start a thread for
-    /// each core.
+    /// For the few WASI calls that block. Without it, the first print would start a thread for each
+    /// core.
     waiting: Runtime,
-    live: Option<Live>,
+    live: Option<LiveInstance>,
 }
 
-struct Live {
+struct LiveInstance {
     store: Store<Hosted>,
     lambda: Lambda,
 }
 
-/// What the host keeps for one instance; gone with its store.
+/// State of the host for one instance, dropped with its store.
 struct Hosted {
     session: Session,
     handles: ResourceTable,
     wasi: WasiCtx,
-    printed: Printed,
+    output: GuestOutput,
     allowed: Limits,
     caps: Caps,
-    /// When the call that runs has to end, where there is a deadline.
+    /// Due time of the current call, if there is a deadline.
     due: Option<Instant>,
 }
 
@@ -78,7 +77,7 @@ impl WasmGuest {
     ///
     /// # Errors
     ///
-    /// If the system has no more descriptors or memory.
+    /// An error if the system has no more descriptors or memory.
     pub fn new(
         loaded: Loaded,
         session: Session,
@@ -89,10 +88,10 @@ impl WasmGuest {
         Ok(Self { loaded, session, limits: *limits, deadline, waiting, live: None })
     }
 
-    fn start(&mut self) -> Result<Live, Fault> {
+    fn start(&mut self) -> Result<LiveInstance, Fault> {
         let mut store = self.new_store();
         let deadline = self.deadline.as_ref().map(|deadline| (deadline, self.limits.init_deadline));
-        let mut call = Call::begin(&mut store, self.limits.init_fuel, deadline);
+        let mut call = GuestCall::begin(&mut store, self.limits.init_fuel, deadline);
         let lambda = self.loaded.instantiate(call.store());
         let result = lambda.and_then(|lambda| {
             let config = self.session.config().into_iter().map(config_entry).collect::<Vec<_>>();
@@ -100,25 +99,26 @@ impl WasmGuest {
         });
         let (answer, lambda) = call.end(result).1.map_err(in_init)?;
         answer.map_err(|message| in_init(exception(message)))?;
-        Ok(Live { store, lambda })
+        Ok(LiveInstance { store, lambda })
     }
 
     fn new_store(&self) -> Store<Hosted> {
-        let printed = Printed::new(&self.session);
+        let output = GuestOutput::new(&self.session);
         let hosted = Hosted {
             session: self.session.clone(),
             handles: handle_table(&self.limits),
-            wasi: wasi::context(&self.session, &printed, self.loaded.seed()),
-            printed,
+            wasi: wasi::context(&self.session, &output, self.loaded.seed()),
+            output,
             allowed: self.limits,
             caps: Caps::new(&self.limits, self.session.fuel().clone()),
             due: None,
         };
         let mut store = Store::new(self.loaded.engine(), hosted);
         store.limiter(|hosted| &mut hosted.caps);
-        deadline::ask_at_each_epoch(&mut store);
+        deadline::check_due_at_epoch(&mut store);
         store.set_hostcall_fuel(self.limits.call_bytes.as_usize());
-        // Our table refuses first, by name: a call lends some handles beside those that are held.
+        // The resource table refuses first, with a clear error: a call lends some handles beside
+        // those that are held.
         store.set_max_component_handles(2 * handles(&self.limits));
         store
     }
@@ -133,7 +133,7 @@ impl Guest for WasmGuest {
         Ok(())
     }
 
-    fn wake(&mut self, wake: Wake) -> Outcome {
+    fn wake(&mut self, wake: Wake) -> WakeOutcome {
         let waiting = self.waiting.handle().clone();
         let _waiting = waiting.enter();
         let mut live = match self
@@ -142,10 +142,10 @@ impl Guest for WasmGuest {
             .map_or_else(|| self.session.clone().during_init(|| self.start()), Ok)
         {
             Ok(live) => live,
-            Err(fault) => return Outcome { result: Err(fault), fuel: None, run_ns: None },
+            Err(fault) => return WakeOutcome { result: Err(fault), fuel: None, run_ns: None },
         };
         let deadline = self.deadline.as_ref().map(|deadline| (deadline, self.limits.deadline));
-        let mut call = Call::begin(&mut live.store, self.limits.fuel, deadline);
+        let mut call = GuestCall::begin(&mut live.store, self.limits.fuel, deadline);
         let result =
             call.hand_over(wake).and_then(|wake| live.lambda.call_on_wake(call.store(), wake));
         let (fuel, result) = call.end(result);
@@ -153,10 +153,10 @@ impl Guest for WasmGuest {
         if result.is_ok() {
             self.live = Some(live);
         }
-        // How deep a stack reaches depends on the processor, for which the code was compiled, and
-        // so does the fuel until it is full.
+        // The depth of a full stack depends on the processor for which the code was compiled, and
+        // so does the fuel until then.
         let stacked = result.as_ref().is_err_and(|fault| fault.kind == FaultKind::Stack);
-        Outcome { result, fuel: (!stacked).then_some(fuel), run_ns: None }
+        WakeOutcome { result, fuel: (!stacked).then_some(fuel), run_ns: None }
     }
 
     fn engine(&self) -> String {
@@ -174,14 +174,15 @@ fn handle_table(limits: &Limits) -> ResourceTable {
     table
 }
 
-/// One call into a guest: fuel and deadline are set at its beginning, accounts are made at its end.
-struct Call<'a> {
+/// One call into a guest: sets fuel and deadline at its beginning, and reads what was used at its
+/// end.
+struct GuestCall<'a> {
     store: &'a mut Store<Hosted>,
     fuel: u64,
-    armed: Option<deadline::Armed<'a>>,
+    armed: Option<deadline::ArmedCall<'a>>,
 }
 
-impl<'a> Call<'a> {
+impl<'a> GuestCall<'a> {
     fn begin(
         store: &'a mut Store<Hosted>,
         fuel: u64,
@@ -191,7 +192,7 @@ impl<'a> Call<'a> {
         let hosted = store.data_mut();
         hosted.session.fuel().begin(fuel);
         hosted.caps.forget_refusal();
-        hosted.printed.begin();
+        hosted.output.begin();
         let armed = deadline.map(|(deadline, allowed)| deadline.arm(store, allowed));
         if armed.is_none() {
             store.set_epoch_deadline(u64::MAX / 2);
@@ -216,19 +217,19 @@ impl<'a> Call<'a> {
         })
     }
 
-    /// Fuel used, and the result with its trap turned into a fault.
+    /// Ends the call; returns the fuel used, and the result with a trap converted to a fault.
     fn end<T>(self, result: wasmtime::Result<T>) -> (u64, Result<T, Fault>) {
-        let taken = self.armed.as_ref().map(deadline::Armed::taken);
+        let taken = self.armed.as_ref().map(deadline::ArmedCall::taken);
         drop(self.armed);
-        self.store.data().printed.end();
+        self.store.data().output.end();
         let left = self.store.get_fuel().unwrap_or(0);
         let used = (self.fuel - left.min(self.fuel))
             .saturating_add(self.store.data().session.fuel().used());
-        let time = taken.map(deadline::Taken::elapsed_and_allowed);
+        let time = taken.map(deadline::CallTime::elapsed_and_allowed);
         let result = match result {
-            // Guest and host each kept within the allowance; together they must as well.
+            // Guest and host each stayed within the allowance, but their sum must as well.
             Ok(_) if used > self.fuel => Err(fault::fuel(used, self.fuel)),
-            Ok(_) if taken.is_some_and(deadline::Taken::is_late) => Err(fault::deadline(time)),
+            Ok(_) if taken.is_some_and(deadline::CallTime::is_late) => Err(fault::deadline(time)),
             Ok(value) => Ok(value),
             Err(error) => {
                 Err(fault::from_error(&error, self.store.data(), (used, self.fuel), time))

@@ -4,22 +4,22 @@ use super::Hosted;
 use super::bindings::gleaner::lambda::scratch::{Entry, Host, ScratchError};
 use crate::api::scratch::{self, ScratchErrorKind};
 
-type Answer<T> = wasmtime::Result<Result<T, ScratchError>>;
+type ScratchResult<T> = wasmtime::Result<Result<T, ScratchError>>;
 
 impl Host for Hosted {
-    fn put(&mut self, name: String, bytes: Vec<u8>) -> Answer<()> {
+    fn put(&mut self, name: String, bytes: Vec<u8>) -> ScratchResult<()> {
         answer(self.session.put(&name, &bytes))
     }
 
-    fn append(&mut self, name: String, bytes: Vec<u8>) -> Answer<()> {
+    fn append(&mut self, name: String, bytes: Vec<u8>) -> ScratchResult<()> {
         answer(self.session.append(&name, &bytes))
     }
 
-    fn get(&mut self, name: String, offset: u64, len: u32) -> Answer<Vec<u8>> {
+    fn get(&mut self, name: String, offset: u64, len: u32) -> ScratchResult<Vec<u8>> {
         answer(self.session.get(&name, offset, u64::from(len)))
     }
 
-    fn remove(&mut self, name: String) -> Answer<()> {
+    fn remove(&mut self, name: String) -> ScratchResult<()> {
         answer(self.session.remove(&name))
     }
 
@@ -37,7 +37,7 @@ impl Host for Hosted {
     }
 }
 
-fn answer<T>(made: Result<T, scratch::ScratchError>) -> Answer<T> {
+fn answer<T>(made: Result<T, scratch::ScratchError>) -> ScratchResult<T> {
     let error = match made {
         Ok(value) => return Ok(Ok(value)),
         Err(scratch::ScratchError::OutOfFuel(error)) => return Err(error.into()),

@@ -4,18 +4,18 @@ use super::Hosted;
 use super::bindings::gleaner::lambda::trigger::{Attribute, AttributeValue, Host, TriggerError};
 use crate::api::trigger::{self, TriggerErrorKind};
 
-type Answer = wasmtime::Result<Result<(), TriggerError>>;
+type TriggerResult = wasmtime::Result<Result<(), TriggerError>>;
 
 impl Host for Hosted {
-    fn event(&mut self, label: String, score: f64, attributes: Vec<Attribute>) -> Answer {
+    fn event(&mut self, label: String, score: f64, attributes: Vec<Attribute>) -> TriggerResult {
         answer(self.session.event(&label, score, attributes.into_iter().map(attribute).collect()))
     }
 
-    fn start(&mut self, label: String, attributes: Vec<Attribute>) -> Answer {
+    fn start(&mut self, label: String, attributes: Vec<Attribute>) -> TriggerResult {
         answer(self.session.start(&label, attributes.into_iter().map(attribute).collect()))
     }
 
-    fn stop(&mut self, label: String) -> Answer {
+    fn stop(&mut self, label: String) -> TriggerResult {
         answer(self.session.stop(&label))
     }
 }
@@ -30,7 +30,7 @@ fn attribute(Attribute { key, value }: Attribute) -> trigger::Attribute {
     trigger::Attribute { key, value }
 }
 
-fn answer(made: Result<(), trigger::TriggerError>) -> Answer {
+fn answer(made: Result<(), trigger::TriggerError>) -> TriggerResult {
     let Err(error) = made else { return Ok(Ok(())) };
     if let trigger::TriggerError::OutOfFuel(error) = error {
         return Err(error.into());

@@ -1,9 +1,9 @@
-//! WASI as far as a lambda needs it: output becomes log lines, the clock is the wake's, random
+//! The part of WASI that a lambda needs: output becomes log lines, the clock is the wake's, random
 //! numbers are seeded.
 //!
-//! There are no files, no environment, no arguments, no sockets and no names of other machines:
-//! such calls answer with an error. Sleeping is a fault, since neither fuel nor a deadline could
-//! end it. What takes longer the more is asked for costs fuel, as other host calls do.
+//! There are no files, environment, arguments, sockets or host names: such calls return an error.
+//! Sleeping is a fault, since neither fuel nor a deadline could interrupt it. Calls whose work
+//! grows with an argument cost fuel, as other host calls do.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -27,23 +27,23 @@ use crate::api::Session;
 use crate::api::fuel::OutOfFuel;
 use crate::api::log::{LINE_BYTES, Level, cut};
 
-/// How the standard library begins to tell a panic, behind the name of the thread.
+/// Text of the standard library before the message of a panic, after the name of the thread.
 const PANICKED: &str = "panicked at ";
 
-/// The interface that looks names up, as wasmtime-wasi calls it.
+/// The interface that resolves host names, as wasmtime-wasi names it.
 const NAMES: &str = "wasi:sockets/ip-name-lookup@0.2.12";
 
-/// Random bytes that one call hands out.
+/// Maximum number of random bytes of one call.
 const RANDOM_BYTES: u64 = 4096;
-/// Fuel for a random byte: each is drawn by itself.
+/// Fuel for a random byte: each is generated separately.
 const FUEL_PER_RANDOM_BYTE: u64 = 4;
-/// Fuel for something that is waited for.
+/// Fuel for each pollable that a call waits for.
 const FUEL_PER_POLLABLE: u64 = 400;
 
 /// The lambda tried to sleep.
 #[derive(Debug, thiserror::Error)]
 #[error("a lambda cannot sleep: it is woken by samples or by a period")]
-pub(super) struct Asleep;
+pub(super) struct SleepError;
 
 pub(super) fn add_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
     wasmtime_wasi::p2::add_to_linker_sync(linker)?;
@@ -57,8 +57,8 @@ pub(super) fn add_to_linker(linker: &mut Linker<Hosted>) -> wasmtime::Result<()>
     Ok(())
 }
 
-/// Has names of other machines looked up by nobody. What is generated would take a name of any
-/// length for nothing.
+/// Refuses to resolve host names. The generated function would accept a name of any length without
+/// charging it.
 fn refuse_names(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
     linker.instance(NAMES)?.func_wrap(
         "resolve-addresses",
@@ -73,18 +73,18 @@ fn refuse_names(linker: &mut Linker<Hosted>) -> wasmtime::Result<()> {
 }
 
 /// A context that grants nothing but output, the wake's time and numbers from `seed`.
-pub(super) fn context(session: &Session, printed: &Printed, seed: [u8; 32]) -> WasiCtx {
+pub(super) fn context(session: &Session, output: &GuestOutput, seed: [u8; 32]) -> WasiCtx {
     WasiCtx::builder()
-        .stdout(printed.stdout.clone())
-        .stderr(printed.stderr.clone())
+        .stdout(output.stdout.clone())
+        .stderr(output.stderr.clone())
         .wall_clock(Wall(session.clone()))
         .secure_random(StdRng::from_seed(seed))
         .insecure_random(StdRng::from_seed(seed))
-        // Neither fuel nor a deadline ends a call, so no call may be long.
+        // Neither fuel nor a deadline interrupts a call, so no call may be long.
         .max_random_size(RANDOM_BYTES)
         .insecure_random_seed(u128::from_le_bytes(std::array::from_fn(|i| seed[i])))
         .allow_blocking_current_thread(true)
-        // None is made, not even one that leads nowhere.
+        // No socket is created, not even an unconnected one.
         .allow_tcp(false)
         .allow_udp(false)
         .allow_ip_name_lookup(false)
@@ -103,14 +103,14 @@ impl HostWallClock for Wall {
     }
 }
 
-/// What of WASI is ours, and bounded.
+/// Marks the WASI interfaces that are implemented here, with bounds.
 struct Bounded;
 
 impl HasData for Bounded {
     type Data<'a> = &'a mut Hosted;
 }
 
-/// Standing still within a wake.
+/// A clock that stands still during a wake.
 impl monotonic_clock::Host for Hosted {
     fn now(&mut self) -> wasmtime::Result<u64> {
         Ok(u64::try_from(self.session.now_ns()).unwrap_or(0))
@@ -121,11 +121,11 @@ impl monotonic_clock::Host for Hosted {
     }
 
     fn subscribe_instant(&mut self, _when: u64) -> wasmtime::Result<Resource<DynPollable>> {
-        Err(Asleep.into())
+        Err(SleepError.into())
     }
 
     fn subscribe_duration(&mut self, _duration: u64) -> wasmtime::Result<Resource<DynPollable>> {
-        Err(Asleep.into())
+        Err(SleepError.into())
     }
 }
 
@@ -136,7 +136,7 @@ impl Hosted {
     }
 
     fn charge_random(&self, bytes: u64) -> Result<(), OutOfFuel> {
-        // More is refused, without being drawn.
+        // A larger request is refused and generates nothing.
         self.session.fuel().charge_units(bytes.min(RANDOM_BYTES) * FUEL_PER_RANDOM_BYTE)
     }
 }
@@ -165,7 +165,7 @@ impl insecure::Host for Hosted {
     }
 }
 
-/// Output is all that can be waited for, and always ready.
+/// Only output can be polled, and it is always ready.
 impl poll::Host for Hosted {
     fn poll(&mut self, these: Vec<Resource<DynPollable>>) -> wasmtime::Result<Vec<u32>> {
         self.session.fuel().charge_units(FUEL_PER_POLLABLE.saturating_mul(these.len() as u64))?;
@@ -190,36 +190,39 @@ impl poll::HostPollable for Hosted {
 }
 
 /// Standard output and standard error of a guest.
-pub(super) struct Printed {
-    stdout: Lines,
-    stderr: Lines,
+pub(super) struct GuestOutput {
+    stdout: LogStream,
+    stderr: LogStream,
 }
 
-impl Printed {
+impl GuestOutput {
     pub(super) fn new(session: &Session) -> Self {
-        Self { stdout: Lines::new(session, Level::Info), stderr: Lines::new(session, Level::Warn) }
+        Self {
+            stdout: LogStream::new(session, Level::Info),
+            stderr: LogStream::new(session, Level::Warn),
+        }
     }
 
-    /// Forgets what an earlier call said on standard error.
+    /// Clears the standard error of the previous call.
     pub(super) fn begin(&self) {
         let mut stderr = self.stderr.lock();
-        stderr.said.clear();
+        stderr.beginning.clear();
         stderr.panicking = false;
     }
 
-    /// Writes down what did not end with a newline.
+    /// Logs partial lines, without a newline at their end.
     pub(super) fn end(&self) {
         for lines in [&self.stdout, &self.stderr] {
             lines.lock().flush(&lines.session, lines.level);
         }
     }
 
-    /// What this call said last on standard error: the reason of a panic, without what the standard
-    /// library adds to it.
+    /// Standard error of this call: the reason of a panic, without the additions of the standard
+    /// library.
     pub(super) fn reason(&self) -> Option<String> {
         let state = self.stderr.lock();
         let lines = state
-            .said
+            .beginning
             .lines()
             .filter(|line| !line.trim().is_empty() && !line.starts_with("note: run with"));
         let message = lines.collect::<Vec<_>>().join("\n");
@@ -232,35 +235,36 @@ impl Printed {
     }
 }
 
-/// Output of a guest, line by line into its log.
+/// Output of a guest, logged line by line.
 #[derive(Clone)]
-struct Lines {
+struct LogStream {
     session: Session,
     level: Level,
-    state: Arc<Mutex<Unfinished>>,
+    state: Arc<Mutex<PartialLine>>,
 }
 
 #[derive(Default)]
-struct Unfinished {
-    /// Bytes since the last newline, at most [`LINE_BYTES`]: a line is rarely written in one piece.
+struct PartialLine {
+    /// Bytes since the last newline, at most [`LINE_BYTES`]: a line is often written in several
+    /// pieces.
     line: Vec<u8>,
-    /// Beginning of what this call wrote, at most [`LINE_BYTES`].
-    said: String,
-    /// The standard library is telling a panic in this call.
+    /// Beginning of the output of this call, at most [`LINE_BYTES`].
+    beginning: String,
+    /// Set if the standard library has printed a panic in this call.
     panicking: bool,
 }
 
-impl Lines {
+impl LogStream {
     fn new(session: &Session, level: Level) -> Self {
         Self { session: session.clone(), level, state: Arc::default() }
     }
 
-    fn lock(&self) -> MutexGuard<'_, Unfinished> {
+    fn lock(&self) -> MutexGuard<'_, PartialLine> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Unfinished {
+impl PartialLine {
     fn write(&mut self, bytes: &[u8], session: &Session, level: Level) {
         for piece in bytes.split_inclusive(|byte| *byte == b'\n') {
             self.line.extend_from_slice(piece);
@@ -273,10 +277,10 @@ impl Unfinished {
     fn flush(&mut self, session: &Session, level: Level) {
         let line = std::mem::take(&mut self.line);
         let line = String::from_utf8_lossy(&line);
-        let room = LINE_BYTES.saturating_sub(self.said.len());
-        self.said.push_str(cut(&line, room));
+        let room = LINE_BYTES.saturating_sub(self.beginning.len());
+        self.beginning.push_str(cut(&line, room));
         let line = line.trim_end();
-        // A panic is told by the fault; in the log it would only take the room of other lines.
+        // The fault contains the panic; in the log it would only displace other lines.
         self.panicking |= line.contains(PANICKED);
         if !line.is_empty() && !self.panicking {
             session.write(level, line);
@@ -284,15 +288,15 @@ impl Unfinished {
     }
 }
 
-impl IsTerminal for Lines {
+impl IsTerminal for LogStream {
     fn is_terminal(&self) -> bool {
         false
     }
 }
 
-impl StdoutStream for Lines {
+impl StdoutStream for LogStream {
     fn async_stream(&self) -> Box<dyn tokio::io::AsyncWrite + Send + Sync> {
-        // Only WASI 0.3 asks for this one, and it is not linked.
+        // Only WASI 0.3 uses this function, and it is not linked.
         Box::new(tokio::io::sink())
     }
 
@@ -301,10 +305,10 @@ impl StdoutStream for Lines {
     }
 }
 
-impl OutputStream for Lines {
+impl OutputStream for LogStream {
     fn write(&mut self, bytes: Bytes) -> StreamResult<()> {
         if bytes.len() > LINE_BYTES {
-            return Err(StreamError::trap("a lambda wrote more than its stream had said to take"));
+            return Err(StreamError::trap("a lambda wrote more than its stream accepts"));
         }
         self.session
             .fuel()
@@ -324,6 +328,6 @@ impl OutputStream for Lines {
 }
 
 #[wasmtime_wasi::async_trait]
-impl Pollable for Lines {
+impl Pollable for LogStream {
     async fn ready(&mut self) {}
 }

@@ -1,14 +1,13 @@
-//! A lambda in a process of its own, the *worker*: so a Python lambda runs in a replay.
+//! Runs a lambda in a separate process, the *worker*: the way a Python lambda runs in a replay.
 //!
-//! The worker opens the drives itself, follows the same schedule as the process that started it,
-//! and sends one message for each wake through what was its standard output. The process that
-//! started it reads the same drives, takes each outcome over as if the lambda had run there
-//! ([`Remote`]), and writes all results. So the worker needs no file that it may write, and nothing
-//! that native code in it does can change the cause of a decision, an exit code, or the results of
-//! an earlier wake.
+//! The worker opens the drives itself, follows the same schedule as its parent, and sends one
+//! message for each wake through its original standard output. The parent reads the same drives,
+//! takes over each outcome as if the lambda had run there ([`RemoteGuest`]), and writes all
+//! results. So the worker needs no writable file, and native code in it cannot change the cause of
+//! a decision, an exit code, or the results of an earlier wake.
 //!
-//! Messages flow one way: the worker never waits for an answer. The reader trusts none of them:
-//! lengths are bounded, triggers and log lines pass the same checks as calls of a lambda, and a
+//! Messages flow one way: the worker never waits for an answer. The parent trusts none of them:
+//! lengths are limited, triggers and log lines pass the same checks as calls of a lambda, and a
 //! message that does not fit the schedule ends the replay.
 
 #[cfg(feature = "python")]
@@ -23,13 +22,13 @@ use gleaner_protocol::Layer;
 use serde::{Deserialize, Serialize};
 
 #[cfg(feature = "python")]
-pub use remote::{NotReady, Remote};
-pub use sender::{Reports, Sender};
+pub use remote::{RemoteGuest, WorkerStartError};
+pub use sender::{MessageSender, SendingGuest};
 
 use crate::api::data::Counts;
 use crate::api::log::Level;
 
-/// Longest message in bytes: a wake with all triggers and attributes that it may have, each
+/// Maximum length of a message in bytes: a wake with the maximum of triggers and attributes, each
 /// character escaped, has some 2 MB.
 #[cfg(feature = "python")]
 const MESSAGE_MAX: u64 = 4 << 20;
@@ -37,31 +36,30 @@ const MESSAGE_MAX: u64 = 4 << 20;
 /// One line that a worker sends, as JSON.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Message {
-    /// Sent first: the process is sandboxed, and nothing of the lambda has run yet.
+enum WorkerMessage {
+    /// Sent first: the process is sandboxed, and no code of the lambda has run yet.
     Ready { engine: String, layers: Vec<Layer> },
     /// A line that the lambda logged; sent before the message of the call that it belongs to.
     Log { level: Level, message: String },
-    /// The start of the lambda's environment has ended.
-    Prepared(Called),
+    /// The start-up code of the lambda's environment has ended.
+    Prepared(CallOutcome),
     /// `init` has ended.
-    Initialised(Called),
+    Initialised(CallOutcome),
     /// A wake has ended.
-    Woken(Woken),
-    /// The course is over.
-    Done(Done),
-    /// Values of one field that the lambda read. [`Message::Done`] says how many of these follow
-    /// it.
+    Woken(WakeMessage),
+    /// The drive has ended.
+    Done(TotalsMessage),
+    /// Curve of one field that the lambda read. [`WorkerMessage::Done`] gives the number of curves
+    /// that follow it.
     Curve(Curve),
 }
 
 /// Outcome of a call into the lambda.
 #[derive(Debug, Default, Serialize, Deserialize)]
-struct Called {
+struct CallOutcome {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     fault: Option<Fault>,
-    /// Lines that the lambda logged, and their checksum: those included that its rate limit
-    /// dropped.
+    /// Number and checksum of the lines that the lambda logged, including dropped ones.
     said: (u64, u32),
     /// Log lines that the rate limit dropped.
     #[serde(default, skip_serializing_if = "is_zero")]
@@ -76,23 +74,23 @@ struct Called {
 
 /// The outcome of one wake.
 #[derive(Debug, Serialize, Deserialize)]
-struct Woken {
+struct WakeMessage {
     at_ns: i64,
     run_ns: u64,
-    call: Called,
+    call: CallOutcome,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     triggers: Vec<Trigger>,
-    /// For each input, how many samples back from the newest the lambda looked, if it did.
+    /// Number of samples, back from the newest, at which the lambda looked: for each input, if any.
     looked: Vec<Option<u64>>,
-    /// Samples of all inputs that found no room so far, since the lambda holds others.
+    /// Number of samples of all inputs refused so far, since the lambda holds all slots.
     #[serde(default, skip_serializing_if = "is_zero")]
     no_slot: u64,
 }
 
-/// Totals of the course, sent after the last wake.
+/// Totals of the replay, sent after the last wake.
 #[derive(Debug, Serialize, Deserialize)]
-struct Done {
-    /// Of each input, in the manifest's order.
+struct TotalsMessage {
+    /// Counts of each input, in the manifest's order.
     counts: Vec<Counts>,
     decode_ns: u64,
     curves: usize,
@@ -100,7 +98,7 @@ struct Done {
 }
 
 #[cfg(feature = "python")]
-impl Done {
+impl TotalsMessage {
     fn no_slot(&self) -> u64 {
         self.counts.iter().fold(0, |sum: u64, counts| sum.saturating_add(counts.no_slot))
     }

@@ -1,4 +1,4 @@
-//! The worker as a process: started below `gleaner-shim`, read, and ended.
+//! The process of a worker: starts it below `gleaner-shim`, reads its messages, and ends it.
 
 use std::ffi::OsString;
 use std::io::{self, BufRead, BufReader, Read, Write};
@@ -14,41 +14,42 @@ use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::ioctl_fionbio;
 use rustix::process::{Pid, Signal, kill_process};
 
-use super::{MESSAGE_MAX, Message};
+use super::{MESSAGE_MAX, WorkerMessage};
 
 /// The argument that makes `gleaner-runtime` a worker; it comes first.
 pub const WORKER: &str = "--worker";
 
-/// How long a worker may take to end once that was requested. What it wrote to standard error may
-/// take as long.
+/// Time after SIGTERM until a worker is killed. Its standard error may take as long.
 const UNTIL_KILLED: Duration = Duration::from_secs(2);
-/// Bytes of standard error that are held while it is not known whether they come from the lambda.
-const HELD: usize = 4 << 20;
+/// Bytes of standard error that are buffered until it is known whether they may come from the
+/// lambda.
+const BUFFERED_MAX: usize = 4 << 20;
 
 /// A worker that was started.
-pub(super) struct Process {
+pub(super) struct WorkerProcess {
     shim: Child,
-    /// None once they are not read any more.
-    messages: Option<BufReader<Napping>>,
+    /// `None` once they are not read any more.
+    messages: Option<BufReader<PollingReader>>,
     line: Vec<u8>,
-    /// How it ended, as the shim sent it last.
+    /// The exit record, which the shim sends last.
     record: Option<ExitRecord>,
     /// Receives, once, whether standard error may come from the lambda.
     is_ready: Sender<bool>,
-    /// Receives whether the worker printed an error of our own, once its standard error has ended.
-    passed_on: Receiver<bool>,
+    /// Receives whether the worker printed an error of Gleaner's own code, once its standard error
+    /// has ended.
+    is_explained: Receiver<bool>,
 }
 
-/// The reading end of the messages. It looks for them now and then and does not wait in the kernel,
-/// where each message would have to wake it: of a lambda that does nothing, a replay made 135,000
-/// wakes a second with such wake-ups, and 190,000 without.
-struct Napping {
+/// The reading end of the messages, which polls with pauses. A blocking read would be woken by each
+/// message: with an empty lambda, a replay made 135,000 wakes a second with blocking reads, and
+/// 190,000 without.
+struct PollingReader {
     messages: ChildStdout,
-    /// Whether there may come more.
+    /// Set while further messages may come.
     waits: bool,
 }
 
-impl Napping {
+impl PollingReader {
     /// The first pause; each further one without a message is twice as long.
     const FIRST: Duration = Duration::from_micros(100);
     const LONGEST: Duration = Duration::from_millis(2);
@@ -59,7 +60,7 @@ impl Napping {
     }
 }
 
-impl Read for Napping {
+impl Read for PollingReader {
     fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
         let mut pause = Self::FIRST;
         loop {
@@ -71,27 +72,27 @@ impl Read for Napping {
                 thread::sleep(pause);
                 pause *= 2;
             } else {
-                // A long wake: one wake-up costs less than looking again and again. A signal may
-                // end it early.
+                // A long wake: one blocking poll costs less than many pauses. A signal may end it
+                // early.
                 let _ = poll(&mut [PollFd::new(&self.messages, PollFlags::IN)], None);
             }
         }
     }
 }
 
-/// How a worker ended.
-pub(super) struct Ended {
-    /// As the shim wrote it down, if it lived to do so.
+/// Exit of a worker.
+pub(super) struct WorkerExit {
+    /// The record of the shim, if it could send one.
     pub(super) record: Option<ExitRecord>,
     /// Exit code of the shim, which ends as its runtime does.
     pub(super) code: Option<i32>,
-    /// This process has ended it.
+    /// Set if this process has ended it.
     pub(super) was_forced: bool,
-    /// Our own part of it printed why, before anything of the lambda could run.
+    /// Set if Gleaner's own code printed the error, before any code of the lambda could run.
     pub(super) is_explained: bool,
 }
 
-/// Why there is no further message.
+/// The reason why there is no further message.
 pub(super) enum NoMessage {
     /// The process has ended, or has closed its standard output.
     Ended,
@@ -99,9 +100,8 @@ pub(super) enum NoMessage {
     Malformed(String),
 }
 
-impl Process {
-    /// Starts this program again as a worker, with `arguments` and those that this process was
-    /// given.
+impl WorkerProcess {
+    /// Starts this program again as a worker, with `arguments` and those of this process.
     pub(super) fn start(arguments: Vec<OsString>) -> Result<Self, Failure> {
         let failed = |what: &str, error: &dyn std::error::Error| {
             Failure::caused_by(Exit::Internal, what, error)
@@ -116,24 +116,24 @@ impl Process {
         let mut shim = command
             .spawn()
             .map_err(|error| failed(&format!("cannot start `{}`", shim.display()), &error))?;
-        let messages = Napping::over(shim.stdout.take().expect("it is piped"));
+        let messages = PollingReader::over(shim.stdout.take().expect("it is piped"));
         let messages =
             messages.map_err(|error| failed("cannot read from the lambda's process", &error))?;
         let messages = Some(BufReader::with_capacity(1 << 16, messages));
         let (is_ready, decided) = mpsc::channel();
-        let (end, passed_on) = mpsc::channel();
+        let (end, is_explained) = mpsc::channel();
         let from = shim.stderr.take().expect("it is piped");
-        thread::spawn(move || pass_on(from, &decided, &end));
-        Ok(Self { shim, messages, line: Vec::new(), record: None, is_ready, passed_on })
+        thread::spawn(move || forward_stderr(from, &decided, &end));
+        Ok(Self { shim, messages, line: Vec::new(), record: None, is_ready, is_explained })
     }
 
     /// Waits for the next message.
-    pub(super) fn next(&mut self) -> Result<Message, NoMessage> {
+    pub(super) fn next(&mut self) -> Result<WorkerMessage, NoMessage> {
         let Some(messages) = &mut self.messages else { return Err(NoMessage::Ended) };
         loop {
             self.line.clear();
             let read = messages.take(MESSAGE_MAX).read_until(b'\n', &mut self.line);
-            // A process that is killed while it writes leaves a part of a message, which the shim
+            // A process that is killed while it writes leaves a partial message, which the shim
             // ends before its own.
             match (read, &*self.line) {
                 (Ok(1..), b"\n") => {}
@@ -152,22 +152,21 @@ impl Process {
                     self.record = Some(record);
                     NoMessage::Ended
                 }
-                Err(_) => NoMessage::Malformed(error.to_string()),
+                Err(_) => NoMessage::Malformed(format!("a malformed message ({error})")),
             }
         })
     }
 
-    /// From now on what the process writes to standard error may come from the lambda: each line is
-    /// marked as such.
+    /// Marks each further line of the process's standard error as possible output of the lambda.
     pub(super) fn ready(&self) {
         let _ = self.is_ready.send(true);
     }
 
-    /// Ends the process, or with `patience` waits so long for its own end; returns how it ended.
-    pub(super) fn end(mut self, patience: Duration) -> io::Result<Ended> {
+    /// Waits at most `timeout` for the process to end, then ends it; returns its exit.
+    pub(super) fn end(mut self, timeout: Duration) -> io::Result<WorkerExit> {
         let _ = self.is_ready.send(false);
-        if patience.is_zero() {
-            // What it would still write could keep it, and its shim, from ending.
+        if timeout.is_zero() {
+            // A full pipe could keep the process, and its shim, from ending.
             self.messages = None;
         }
         let started = Instant::now();
@@ -176,21 +175,21 @@ impl Process {
             if let Some(status) = self.shim.try_wait()? {
                 break status;
             }
-            if !was_forced && started.elapsed() >= patience {
+            if !was_forced && started.elapsed() >= timeout {
                 was_forced = true;
                 let _ = kill_process(Pid::from_child(&self.shim), Signal::TERM);
             }
             // Native code may ignore that. The runtime does not outlive its shim.
-            if !is_killed && started.elapsed() >= patience + UNTIL_KILLED {
+            if !is_killed && started.elapsed() >= timeout + UNTIL_KILLED {
                 is_killed = true;
                 let _ = kill_process(Pid::from_child(&self.shim), Signal::KILL);
             }
             thread::sleep(Duration::from_millis(1));
         };
-        // A process that the worker left behind may hold its standard error open.
-        let is_explained = self.passed_on.recv_timeout(UNTIL_KILLED).unwrap_or(false);
-        // The last line is the shim's, whatever the lambda wrote before. A pipe holds less than a
-        // message may have.
+        // An orphan of the worker may hold its standard error open.
+        let is_explained = self.is_explained.recv_timeout(UNTIL_KILLED).unwrap_or(false);
+        // The last line is the shim's, whatever the lambda wrote before. A pipe holds less than the
+        // maximum of a message.
         if let Some(messages) = &mut self.messages {
             messages.get_mut().waits = false;
             let mut rest = Vec::new();
@@ -199,21 +198,24 @@ impl Process {
             self.record = last.and_then(|line| serde_json::from_slice(line).ok()).or(self.record);
         }
         let record = self.record;
-        Ok(Ended { record, code: status.code(), was_forced, is_explained })
+        Ok(WorkerExit { record, code: status.code(), was_forced, is_explained })
     }
 }
 
-/// Passes on what a worker writes to standard error: as it is if the worker never became ready, and
-/// else with a mark. Sends to `end` whether it was an error of our own.
-fn pass_on(mut from: ChildStderr, is_ready: &Receiver<bool>, end: &Sender<bool>) {
-    let mut held = Vec::new();
-    // Nothing of the lambda has run until it is decided, and our own part writes no more than this.
+/// Forwards a worker's standard error: unchanged if the worker never became ready, otherwise with a
+/// mark. Sends to `end` whether it was an error of Gleaner's own code.
+fn forward_stderr(mut from: ChildStderr, is_ready: &Receiver<bool>, end: &Sender<bool>) {
+    let mut buffered = Vec::new();
+    // No code of the lambda runs before this is decided, and Gleaner's own code writes less than
+    // this.
     let mut piece = [0; 8192];
     let is_ready = loop {
         match from.read(&mut piece) {
-            Ok(read @ 1..) if held.len() < HELD => held.extend_from_slice(&piece[..read]),
+            Ok(read @ 1..) if buffered.len() < BUFFERED_MAX => {
+                buffered.extend_from_slice(&piece[..read])
+            }
             Ok(read) => {
-                held.extend_from_slice(&piece[..read]);
+                buffered.extend_from_slice(&piece[..read]);
                 break is_ready.recv();
             }
             Err(_) => break is_ready.recv(),
@@ -224,14 +226,14 @@ fn pass_on(mut from: ChildStderr, is_ready: &Receiver<bool>, end: &Sender<bool>)
     };
     let mark = if is_ready == Ok(true) { "lambda: " } else { "" };
     let mut is_explained = false;
-    let is_whole = each_piece(io::Cursor::new(held).chain(from), |piece| {
+    let is_whole = each_piece(io::Cursor::new(buffered).chain(from), |piece| {
         is_explained |= mark.is_empty() && piece.is_failure();
-        // In one write, so that no other line of this process comes between.
+        // In one write, so that no other line of this process is mixed in.
         let text = [if piece.begins_line { mark.as_bytes() } else { b"" }, piece.bytes].concat();
         let _ = io::stderr().write_all(&text);
     });
     if !is_whole {
-        // Else the next line of this process would be a part of it.
+        // Otherwise the next line of this process would continue it.
         let _ = io::stderr().write_all(b"\n");
     }
     let _ = end.send(is_explained);

@@ -1,63 +1,63 @@
-//! The part of a journal against the clip that holds it: the journal leads.
+//! Compares a part of a journal over the clip that holds it: the journal decides on the wakes.
 
 use std::path::Path;
 use std::sync::Arc;
 
 use gleaner_base::{Exit, Failure, excerpt};
 use gleaner_drives::Replay;
-use gleaner_journal::{Difference, Entry, Header, Woken};
+use gleaner_journal::{Difference, JournalEntry, JournalHeader, WakeSource};
 use gleaner_lambda::manifest::Manifest;
-use gleaner_recorder::{RecordError, Stated};
+use gleaner_recorder::{ClipStatements, RecordError};
 use gleaner_transport::{SampleMeta, Transport};
 
-use super::claim::{unreadable_clip, untrue};
-use super::paced::{PaceError, Paced};
-use super::triggers::Triggers;
-use super::{Claim, Proved, Remake, counts_differ, different, seconds};
+use super::lockstep::{LockstepDrive, LockstepError};
+use super::reference::{unreadable_clip, untrue};
+use super::triggers::JournalTriggers;
+use super::{ReferenceJournal, Rerun, VerifyOutcome, counts_differ, different, seconds};
 use crate::api::data::{Tick, Topic, Wake};
 use crate::api::trace::offered;
-use crate::replay::Options;
+use crate::replay::ReplayOptions;
 use crate::replay::open::open;
-use crate::stage::Load;
+use crate::session_setup::Load;
 
-/// A sample may be newer than the one that caused a wake by so much, where each topic has a thread
-/// of its own.
+/// Time by which a visible sample may be newer than the one that caused the wake, where each topic
+/// has a thread of its own.
 const SLACK_NS: i64 = 1_000_000_000;
 
-pub(super) fn prove(
-    options: &Options,
+pub(super) fn verify(
+    options: &ReplayOptions,
     manifest: &Manifest,
-    claim: &mut Claim,
+    reference: &mut ReferenceJournal,
     load: Load<'_>,
-) -> Result<Proved, Failure> {
+) -> Result<VerifyOutcome, Failure> {
     let clip = open(options).map_err(unreadable_clip)?;
-    let header = claim.header().clone();
+    let header = reference.header().clone();
     holds_all_inputs(&clip, &header)?;
-    let stated = claim.clip.take().expect("a part of a journal is in a clip");
-    holds_what_it_states(claim.path(), &stated)?;
-    let (remake, clip, inputs) = Remake::start(Paced::new(clip), options, manifest, load)?;
-    let engine = remake.engine.clone();
-    let mut proof = Proof {
+    let stated = reference.clip.take().expect("a part of a journal is in a clip");
+    holds_what_it_states(reference.path(), &stated)?;
+    let (rerun, clip, inputs) = Rerun::start(LockstepDrive::new(clip), options, manifest, load)?;
+    let engine = rerun.engine.clone();
+    let mut verify_loop = ClipVerifyLoop {
         header: &header,
         start_ns: clip.start_ns(),
-        remake,
+        rerun,
         clip,
         inputs,
         wakes: 0,
         uncovered: 0,
         uncovered_triggers: 0,
         losses: losses(&stated),
-        triggers: Triggers::of(&header.lambda),
+        triggers: JournalTriggers::of(&header.lambda),
     };
-    while let Some(entry) = claim.next()? {
-        proof.wake(&entry)?;
+    while let Some(entry) = reference.next()? {
+        verify_loop.wake(&entry)?;
     }
-    let Proof { wakes, uncovered, uncovered_triggers, triggers, .. } = proof;
+    let ClipVerifyLoop { wakes, uncovered, uncovered_triggers, triggers, .. } = verify_loop;
     if wakes == 0 {
-        return Err(claim.empty());
+        return Err(reference.empty());
     }
-    let Some(end) = claim.reader().end() else {
-        let message = format!("the journal in clip `{}` has no end", claim.path().display());
+    let Some(end) = reference.reader().end() else {
+        let message = format!("the journal in clip `{}` has no end", reference.path().display());
         return Err(Failure::new(Exit::Differs, message).with_help(CHANGED));
     };
     let wrong = counts_differ("wakes", end.wakes, wakes).or_else(|| triggers.differ(&stated));
@@ -70,20 +70,20 @@ pub(super) fn prove(
         let message = format!("the clip alone proves no trigger of lambda `{}`", header.lambda);
         let mut failure = Failure::new(Exit::Usage, message);
         let what =
-            "in each wake that could show one, it had looked at samples from before the clip";
+            "in each wake that could prove one, the lambda had read samples from before the clip";
         failure.causes = vec![format!("{what} ({uncovered} of {wakes} wakes)")];
         return Err(failure.with_help(
             "make `preroll` longer than the lambda looks back; this clip can be verified against its drive: \
              gleaner replay DIR DRIVE --verify JOURNAL",
         ));
     }
-    Ok(Proved { engine, wakes, triggers, uncovered, uncovered_triggers })
+    Ok(VerifyOutcome { engine, wakes, triggers, uncovered, uncovered_triggers })
 }
 
-const CHANGED: &str = "the clip, or its journal, was changed since it was made";
+const CHANGED: &str = "the clip, or its journal, was changed after it was written";
 
-/// A clip cannot prove a decision over a topic that it does not hold.
-fn holds_all_inputs(clip: &Replay, header: &Header) -> Result<(), Failure> {
+/// Refuses a clip that lacks the topic of an input.
+fn holds_all_inputs(clip: &Replay, header: &JournalHeader) -> Result<(), Failure> {
     let topics = clip.topics();
     let missing = header
         .inputs
@@ -100,7 +100,7 @@ fn holds_all_inputs(clip: &Replay, header: &Header) -> Result<(), Failure> {
 }
 
 /// Refuses a clip whose messages contradict its records.
-fn holds_what_it_states(path: &Path, stated: &Stated) -> Result<(), Failure> {
+fn holds_what_it_states(path: &Path, stated: &ClipStatements) -> Result<(), Failure> {
     match stated.contradicted(path) {
         Ok(None) => Ok(()),
         Ok(Some(error)) => Err(untrue(path, &error)),
@@ -109,11 +109,11 @@ fn holds_what_it_states(path: &Path, stated: &Stated) -> Result<(), Failure> {
     }
 }
 
-/// Losses that the clip states, in words; none if there are none.
-fn losses(stated: &Stated) -> Option<String> {
+/// Describes the losses that the clip states; `None` if there are none.
+fn losses(stated: &ClipStatements) -> Option<String> {
     let count = |count: Option<u64>| count.map_or("unknown".to_owned(), |count| count.to_string());
     let lost = stated.clip().topics.iter().flat_map(|topic| {
-        let causes = [(topic.overwritten, "pushed out"), (topic.too_big, "too big")];
+        let causes = [(topic.overwritten, "overwritten"), (topic.too_big, "too big")];
         let lost = causes.into_iter().filter(|(lost, _)| *lost != Some(0));
         lost.map(|(lost, why)| format!("{}: {} {why}", excerpt(&topic.topic), count(lost)))
     });
@@ -121,25 +121,25 @@ fn losses(stated: &Stated) -> Option<String> {
     (!lost.is_empty()).then(|| lost.join(", "))
 }
 
-/// A lambda that runs again from the begin of a clip.
-struct Proof<'a> {
-    header: &'a Header,
-    remake: Remake,
-    clip: Paced,
+/// The loop of a comparison over a clip.
+struct ClipVerifyLoop<'a> {
+    header: &'a JournalHeader,
+    rerun: Rerun,
+    clip: LockstepDrive,
     start_ns: i64,
     inputs: Vec<Arc<Topic>>,
     wakes: u64,
-    /// Wakes in which the lambda had looked at samples from before the clip, and their triggers.
+    /// Wakes in which the lambda had read samples from before the clip, and their triggers.
     uncovered: u64,
     uncovered_triggers: u64,
     /// Losses that the clip states.
     losses: Option<String>,
     /// The triggers of the journal.
-    triggers: Triggers,
+    triggers: JournalTriggers,
 }
 
-impl Proof<'_> {
-    fn wake(&mut self, entry: &Entry) -> Result<(), Failure> {
+impl ClipVerifyLoop<'_> {
+    fn wake(&mut self, entry: &JournalEntry) -> Result<(), Failure> {
         let before: Vec<_> = self.inputs.iter().map(|topic| offered(topic)).collect();
         if self.wakes == 0 {
             self.join(entry)?
@@ -147,11 +147,11 @@ impl Proof<'_> {
             self.deliver(entry.seen.iter().map(|seen| seen.new))?
         }
         let wake = self.cause(entry)?;
-        let mut now = self.remake.wake(wake).clone();
+        let mut now = self.rerun.wake(wake).clone();
         for ((topic, before), (now, journal)) in
             self.inputs.iter().zip(before).zip(now.seen.iter_mut().zip(&entry.seen))
         {
-            // Of a clip's first wake, some of the samples before it may lie before the clip.
+            // Some samples before the first wake may lie before the clip.
             if self.wakes == 0 && offered(topic) - before < journal.new {
                 (now.new, now.digest) = (journal.new, journal.digest);
                 now.newest = now.newest.or(journal.newest);
@@ -159,12 +159,12 @@ impl Proof<'_> {
         }
         let is_covered = self.covers(entry);
         if !is_covered {
-            let Entry { triggers, fault, log, .. } = entry.clone();
-            now = Entry { triggers, fault, log, ..now };
+            let JournalEntry { triggers, fault, log, .. } = entry.clone();
+            now = JournalEntry { triggers, fault, log, ..now };
         }
         if !is_covered || self.header.wakes_before > 0 {
-            // What the lambda keeps in its own variables since before the clip may cost it another
-            // step, or another look.
+            // State from before the clip may change the lambda's fuel and the samples that it
+            // reads.
             now.fuel = entry.fuel;
             for (now, journal) in now.seen.iter_mut().zip(&entry.seen) {
                 now.reach = journal.reach;
@@ -185,17 +185,17 @@ impl Proof<'_> {
         Ok(())
     }
 
-    /// Delivers what the clip holds up to the samples that were newest in its first wake. What came
-    /// since the wake before is summed up by itself.
-    fn join(&mut self, entry: &Entry) -> Result<(), Failure> {
+    /// Delivers the samples up to those that were newest in the first wake. Samples since the wake
+    /// before it are summed up separately.
+    fn join(&mut self, entry: &JournalEntry) -> Result<(), Failure> {
         let until_ns = entry.at_ns.saturating_add(SLACK_NS);
         let (mut earlier, mut new) = (Vec::new(), Vec::new());
-        for (lane, seen) in entry.seen.iter().enumerate() {
+        for (input, seen) in entry.seen.iter().enumerate() {
             let is_newest =
                 |meta: &SampleMeta| seen.newest.is_some_and(|newest| is_sample(meta, newest));
             let ahead = match seen.newest {
                 Some(_) => {
-                    self.clip.ahead(lane, until_ns, is_newest).map_err(unreadable)?.unwrap_or(0)
+                    self.clip.ahead(input, until_ns, is_newest).map_err(unreadable)?.unwrap_or(0)
                 }
                 None => 0,
             };
@@ -203,7 +203,7 @@ impl Proof<'_> {
             new.push(ahead.min(seen.new));
         }
         self.deliver(earlier.into_iter())?;
-        self.remake.scribe.skip();
+        self.rerun.entry_builder.skip();
         self.deliver(new.into_iter())
     }
 
@@ -211,17 +211,17 @@ impl Proof<'_> {
         self.clip.deliver(owed).map_err(unreadable)
     }
 
-    fn cause(&self, entry: &Entry) -> Result<Wake, Failure> {
+    fn cause(&self, entry: &JournalEntry) -> Result<Wake, Failure> {
         let (writer, seq) = match (entry.cause, self.header.event_input) {
-            (Woken::Tick { missed }, None) => {
+            (WakeSource::Tick { missed }, None) => {
                 return Ok(Wake::Tick(Tick { at_ns: entry.at_ns, missed }));
             }
-            (Woken::Tick { .. }, Some(_)) => {
+            (WakeSource::Tick { .. }, Some(_)) => {
                 let (journal, now) = ("a tick".to_owned(), "samples, by its manifest".to_owned());
                 let what = "what woke the lambda".to_owned();
                 return Err(self.differs(entry, &Difference { what, journal, now }));
             }
-            (Woken::Sample { writer, seq }, _) => (writer, seq),
+            (WakeSource::Sample { writer, seq }, _) => (writer, seq),
         };
         let topic = self.header.event_input.and_then(|input| self.inputs.get(input));
         let found = topic.and_then(|topic| {
@@ -237,22 +237,22 @@ impl Proof<'_> {
             let difference = Difference {
                 what: "the sample that woke the lambda".to_owned(),
                 journal: format!("number {seq}"),
-                now: "it is not there".to_owned(),
+                now: "missing".to_owned(),
             };
             self.differs(entry, &difference)
         })
     }
 
-    /// Whether everything that the lambda looked at in this wake is there. It cannot look further
-    /// back than its ring.
-    fn covers(&self, entry: &Entry) -> bool {
+    /// Returns whether the clip holds every sample that the lambda read in this wake. It cannot
+    /// read further back than its ring.
+    fn covers(&self, entry: &JournalEntry) -> bool {
         let mut inputs = self.inputs.iter().zip(&entry.seen);
         inputs.all(|(topic, seen)| {
             seen.reach.min(topic.reader().depth() as u64) <= topic.reader().head()
         })
     }
 
-    fn differs(&self, entry: &Entry, difference: &Difference) -> Failure {
+    fn differs(&self, entry: &JournalEntry, difference: &Difference) -> Failure {
         match &self.losses {
             None => different(format!("{} differs", self.wake_in_words(entry)), difference)
                 .with_help(CHANGED),
@@ -261,44 +261,44 @@ impl Proof<'_> {
                     format!("the clip alone does not settle {}", self.wake_in_words(entry));
                 let failure = Failure { exit: Exit::Usage, ..different(message, difference) };
                 failure.with_help(format!(
-                    "the clip itself says that messages are missing in it ({losses}): raise `preroll_size`; \
+                    "the clip states that it lacks messages ({losses}): raise `preroll_size`; \
                      gleaner replay DIR DRIVE --verify JOURNAL settles it"
                 ))
             }
         }
     }
 
-    /// The lambda saw the same and decided otherwise: that may be due to what it remembers from
-    /// before the clip.
-    fn unsettled(&self, entry: &Entry, difference: &Difference) -> Failure {
+    /// The failure of a wake with the same inputs and another decision, which may depend on state
+    /// from before the clip.
+    fn unsettled(&self, entry: &JournalEntry, difference: &Difference) -> Failure {
         let message = format!("the clip alone does not settle {}", self.wake_in_words(entry));
         let failure = Failure { exit: Exit::Usage, ..different(message, difference) };
         failure.with_help(format!(
-            "the lambda had run {} times before the clip begins; what it kept in its own variables since then is not in the clip: \
+            "the lambda had run {} times before the clip begins, and its variables from then are not in the clip: \
              gleaner replay DIR DRIVE --verify JOURNAL settles it",
             self.header.wakes_before
         ))
     }
 
-    fn wake_in_words(&self, entry: &Entry) -> String {
+    fn wake_in_words(&self, entry: &JournalEntry) -> String {
         let number = self.header.wakes_before.saturating_add(self.wakes).saturating_add(1);
         let at = seconds(entry.at_ns, self.start_ns);
         format!("wake {number} of lambda `{}`, at {at:.6} s of the clip,", self.header.lambda)
     }
 }
 
-/// Whether `meta` is of the sample of this writer and number. A clip keeps the lower 32 bits of a
-/// number.
+/// Returns whether `meta` is of the sample of this writer and number, of which a clip keeps the
+/// lower 32 bits.
 fn is_sample(meta: &SampleMeta, (writer, seq): ([u8; 16], u64)) -> bool {
     meta.writer.0 == writer && meta.seq as u32 == seq as u32
 }
 
-fn unreadable(error: PaceError) -> Failure {
+fn unreadable(error: LockstepError) -> Failure {
     match error {
-        PaceError::Drive(error) => unreadable_clip(error),
-        PaceError::TooFarAhead => Failure::caused_by(
+        LockstepError::Drive(error) => unreadable_clip(error),
+        LockstepError::TooFarAhead => Failure::caused_by(
             Exit::Differs,
-            "this clip does not have its samples in the order of the journal",
+            "the samples of this clip are not in the order of the journal",
             &error,
         ),
     }

@@ -1,30 +1,31 @@
-//! A journal against its drive: the schedule leads, and each wake must be the next in the journal.
+//! Compares a journal over its drive: the schedule decides on the wakes, and each must be the next
+//! in the journal.
 
 use std::sync::Arc;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_drives::{Replay, Step};
-use gleaner_journal::{Difference, DriveDigest, End, Entry, Woken};
+use gleaner_drives::{Replay, ReplayStep};
+use gleaner_journal::{Difference, DriveDigest, JournalEnd, JournalEntry, WakeSource};
 use gleaner_lambda::manifest::Manifest;
 
-use super::{Claim, Proved, Remake, counts_differ, different, seconds};
+use super::{ReferenceJournal, Rerun, VerifyOutcome, counts_differ, different, seconds};
 use crate::api::data::{Topic, Wake};
 use crate::api::trace::offered;
-use crate::replay::Options;
-use crate::replay::course::{self, Course, Span};
+use crate::replay::ReplayOptions;
 use crate::replay::digests::Digests;
+use crate::replay::drive_loop::{self, DriveHandler, Span};
 use crate::replay::open::{DriveError, open_drives};
-use crate::schedule::Schedule;
-use crate::stage::Load;
+use crate::schedule::WakeSchedule;
+use crate::session_setup::Load;
 
-pub(super) fn prove(
-    options: &Options,
+pub(super) fn verify(
+    options: &ReplayOptions,
     manifest: &Manifest,
-    claim: &mut Claim,
+    reference: &mut ReferenceJournal,
     load: Load<'_>,
-) -> Result<Proved, Failure> {
+) -> Result<VerifyOutcome, Failure> {
     if let Some(difference) =
-        counts_differ("wakes before the first one", claim.header().wakes_before, 0)
+        counts_differ("wakes before the first one", reference.header().wakes_before, 0)
     {
         let failure = different("this journal does not begin with its lambda", &difference);
         return Err(failure.with_help(
@@ -35,64 +36,66 @@ pub(super) fn prove(
     let (drive, part) = open_drives(options)?;
     let span = Span::of(&drive, part);
     let start_ns = drive.start_ns().unwrap_or(0);
-    let (remake, mut drive, inputs) = Remake::start(drive, options, manifest, load)?;
-    let schedule = Schedule::new(manifest, &inputs);
-    let mut proof = Proof { remake, schedule, claim, start_ns, wakes: 0, triggers: 0 };
-    let outcome =
-        course::take(&mut drive, span, &mut proof).and_then(|reached| match reached.broken {
-            Some(error) => Err(damaged(error, proof.wakes)),
+    let (rerun, mut drive, inputs) = Rerun::start(drive, options, manifest, load)?;
+    let schedule = WakeSchedule::new(manifest, &inputs);
+    let mut verify_loop =
+        VerifyLoop { rerun, schedule, reference, start_ns, wakes: 0, triggers: 0 };
+    let outcome = drive_loop::run(&mut drive, span, &mut verify_loop).and_then(|reached| {
+        match reached.broken {
+            Some(error) => Err(damaged(error, verify_loop.wakes)),
             None if reached.stopped => Ok(()),
-            None => proof.end(&inputs),
-        });
-    let Proof { remake, wakes, triggers, claim, .. } = proof;
+            None => verify_loop.end(&inputs),
+        }
+    });
+    let VerifyLoop { rerun, wakes, triggers, reference, .. } = verify_loop;
     if let Err(failure) = outcome {
-        return Err(with_drive(failure, claim, digests));
+        return Err(with_drive(failure, reference, digests));
     }
-    match claim.reader().end() {
+    match reference.reader().end() {
         Some(end) => {
             if let Some(difference) = drives_differ(end, digests)? {
                 return Err(different(
-                    "every decision is the same, but not the drive",
+                    "every decision is the same, but the drive differs",
                     &difference,
                 ));
             }
         }
-        None if wakes == 0 => return Err(claim.empty()),
+        None if wakes == 0 => return Err(reference.empty()),
         None => {}
     }
-    Ok(Proved { engine: remake.engine, wakes, triggers, uncovered: 0, uncovered_triggers: 0 })
+    Ok(VerifyOutcome { engine: rerun.engine, wakes, triggers, uncovered: 0, uncovered_triggers: 0 })
 }
 
-struct Proof<'a> {
-    remake: Remake,
-    schedule: Schedule,
-    claim: &'a mut Claim,
+struct VerifyLoop<'a> {
+    rerun: Rerun,
+    schedule: WakeSchedule,
+    reference: &'a mut ReferenceJournal,
     start_ns: i64,
     wakes: u64,
     triggers: u64,
 }
 
-impl Course for Proof<'_> {
-    fn schedule(&mut self) -> &mut Schedule {
+impl DriveHandler for VerifyLoop<'_> {
+    fn schedule(&mut self) -> &mut WakeSchedule {
         &mut self.schedule
     }
 
     fn wake(&mut self, wake: Wake) -> Result<bool, Failure> {
         let at_ns = wake.at_ns();
-        if self.remake.judge.is_backing_off(&wake) {
+        if self.rerun.invoker.is_backing_off(&wake) {
             return Ok(true);
         }
-        let Some(entry) = self.claim.next()? else {
-            // Its writer died: what it holds is proved.
-            if self.claim.reader().end().is_none() {
+        let Some(entry) = self.reference.next()? else {
+            // The writer of the journal died: all of it was compared.
+            if self.reference.reader().end().is_none() {
                 return Ok(false);
             }
             let (what, now) = ("wake".to_owned(), in_words(at_ns, self.start_ns));
             return Err(self
-                .differs(at_ns, &Difference { what, journal: "no further one".to_owned(), now }));
+                .differs(at_ns, &Difference { what, journal: "no further wake".to_owned(), now }));
         };
-        let now = self.remake.wake(wake);
-        if let Some(difference) = entry.differs_from(now, &self.claim.header().inputs, true) {
+        let now = self.rerun.wake(wake);
+        if let Some(difference) = entry.differs_from(now, &self.reference.header().inputs, true) {
             return Err(self.differs(at_ns, &difference));
         }
         self.wakes += 1;
@@ -100,22 +103,22 @@ impl Course for Proof<'_> {
         Ok(true)
     }
 
-    fn sample(&mut self, _: &Replay, _: &Step) -> Result<(), Failure> {
+    fn sample(&mut self, _: &Replay, _: &ReplayStep) -> Result<(), Failure> {
         Ok(())
     }
 }
 
-impl Proof<'_> {
-    /// The drive must end as the journal does.
+impl VerifyLoop<'_> {
+    /// Checks that the drive ends like the journal.
     fn end(&mut self, inputs: &[Arc<Topic>]) -> Result<(), Failure> {
-        if let Some(Entry { at_ns, cause, .. }) = self.claim.next()? {
-            let kind = if matches!(cause, Woken::Tick { .. }) { "a tick" } else { "a sample" };
+        if let Some(JournalEntry { at_ns, cause, .. }) = self.reference.next()? {
+            let kind = if matches!(cause, WakeSource::Tick { .. }) { "a tick" } else { "a sample" };
             let journal = format!("{kind}, {}", in_words(at_ns, self.start_ns));
             let difference =
-                Difference { what: "wake".to_owned(), journal, now: "no further one".to_owned() };
+                Difference { what: "wake".to_owned(), journal, now: "no further wake".to_owned() };
             return Err(self.differs(at_ns, &difference));
         }
-        let Some(end) = self.claim.reader().end() else { return Ok(()) };
+        let Some(end) = self.reference.reader().end() else { return Ok(()) };
         let samples = inputs.iter().enumerate().find_map(|(input, topic)| {
             let journal = end.samples.get(input).copied().unwrap_or(0);
             counts_differ(
@@ -127,7 +130,7 @@ impl Proof<'_> {
         match counts_differ("wakes", end.wakes, self.wakes).or(samples) {
             None => Ok(()),
             Some(difference) => {
-                let name = &self.remake.lambda;
+                let name = &self.rerun.lambda;
                 Err(different(
                     format!("the drive of lambda `{name}` does not end as in the journal"),
                     &difference,
@@ -140,7 +143,7 @@ impl Proof<'_> {
         let number = self.wakes + 1;
         let at = seconds(at_ns, self.start_ns);
         different(
-            format!("wake {number} of lambda `{}`, at {at:.6} s, differs", self.remake.lambda),
+            format!("wake {number} of lambda `{}`, at {at:.6} s, differs", self.rerun.lambda),
             difference,
         )
     }
@@ -157,9 +160,9 @@ fn damaged(error: gleaner_drives::ReplayError, wakes: u64) -> Failure {
     Failure::from(DriveError(error)).with_help(help)
 }
 
-/// What is different about the drives as files, byte for byte: a byte that no lambda reads may have
-/// changed, too.
-fn drives_differ(end: &End, digests: Digests) -> Result<Option<Difference>, Failure> {
+/// Returns the difference of the drives as files: a byte that no lambda reads may have changed,
+/// too.
+fn drives_differ(end: &JournalEnd, digests: Digests) -> Result<Option<Difference>, Failure> {
     let now = digests.take()?;
     let mut pairs = end.drives.iter().zip(&now);
     let changed =
@@ -182,14 +185,15 @@ fn drives_differ(end: &End, digests: Digests) -> Result<Option<Difference>, Fail
     Ok(changed.or_else(number))
 }
 
-/// The failure, with what is different about the drives as files, if the journal has an end to
-/// tell.
-fn with_drive(mut failure: Failure, claim: &mut Claim, digests: Digests) -> Failure {
+/// Adds the difference of the drives as files to the failure, if the journal has an end, which
+/// names them.
+fn with_drive(mut failure: Failure, reference: &mut ReferenceJournal, digests: Digests) -> Failure {
     if failure.exit != Exit::Differs {
         return failure;
     }
-    while let Ok(Some(_)) = claim.next() {}
-    if let Some(Ok(Some(difference))) = claim.reader().end().map(|end| drives_differ(end, digests))
+    while let Ok(Some(_)) = reference.next() {}
+    if let Some(Ok(Some(difference))) =
+        reference.reader().end().map(|end| drives_differ(end, digests))
     {
         failure.causes.extend(different("", &difference).causes);
     }

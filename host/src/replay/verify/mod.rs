@@ -1,69 +1,69 @@
-//! Makes every decision of a journal again and ends at the first that differs.
+//! Makes every decision of a journal again, up to the first difference.
 //!
-//! From a drive, the schedule leads, as in the replay that wrote the journal: whatever wakes the
-//! lambda must stand in the journal next. From a clip, which begins in the middle, the journal
-//! leads: before a wake, as many samples of each input are delivered as it says. Both compare, bit
-//! for bit, what the lambda was shown and what it decided.
+//! Over a drive, the schedule decides on the wakes, as in the replay that wrote the journal: each
+//! wake must be the next in the journal. Over a clip, which begins in the middle, the journal
+//! decides: before each wake, as many samples of each input are delivered as it notes. Both compare
+//! the inputs and the decision of each wake bit for bit.
 
-mod claim;
 mod clip;
 mod drive;
-mod paced;
+mod lockstep;
+mod reference;
 mod triggers;
 
-pub(super) use claim::Claim;
+pub(super) use reference::ReferenceJournal;
 
 use std::sync::Arc;
 use std::time::Instant;
 
 use gleaner_base::Failure;
-use gleaner_journal::{Difference, Entry};
+use gleaner_journal::{Difference, JournalEntry};
 use gleaner_lambda::manifest::Manifest;
 use gleaner_protocol::Verified;
 use gleaner_transport::Transport;
 
-use self::claim::different;
-use super::Options;
+use self::reference::different;
+use super::ReplayOptions;
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
-use crate::journal::Scribe;
-use crate::judge::Judge;
-use crate::stage::{Bounds, Load, Stage, not_started};
+use crate::invoker::Invoker;
+use crate::journal::EntryBuilder;
+use crate::session_setup::{Load, RunMode, SessionSetup, not_started};
 
 pub(super) fn run(
-    options: &Options,
+    options: &ReplayOptions,
     manifest: &Manifest,
-    claim: &mut Claim,
+    reference: &mut ReferenceJournal,
     load: Load<'_>,
 ) -> Result<Verified, Failure> {
     let started = Instant::now();
-    let proved = match claim.clip.is_some() {
-        true => clip::prove(options, manifest, claim, load)?,
-        false => drive::prove(options, manifest, claim, load)?,
+    let outcome = match reference.clip.is_some() {
+        true => clip::verify(options, manifest, reference, load)?,
+        false => drive::verify(options, manifest, reference, load)?,
     };
-    let (header, truncated) = (claim.header(), claim.reader().truncated());
+    let (header, truncated) = (reference.header(), reference.reader().truncated());
     let noted = |what: &str, journal: &str, now: &str| {
         (journal != now).then(|| format!("{what}: {journal} in the journal, {now} now"))
     };
     let notes = [
-        noted("runs on", &header.engine, &proved.engine),
+        noted("runs on", &header.engine, &outcome.engine),
         noted("version of gleaner", &header.gleaner, env!("CARGO_PKG_VERSION")),
         noted("machine", &header.machine, std::env::consts::ARCH),
     ];
     Ok(Verified {
         lambda: header.lambda.clone(),
-        wakes: proved.wakes,
-        triggers: proved.triggers,
-        uncovered: proved.uncovered,
-        uncovered_triggers: proved.uncovered_triggers,
+        wakes: outcome.wakes,
+        triggers: outcome.triggers,
+        uncovered: outcome.uncovered,
+        uncovered_triggers: outcome.uncovered_triggers,
         truncated,
         wall_s: started.elapsed().as_secs_f64(),
-        notes: notes.into_iter().flatten().chain(claim.limits.iter().cloned()).collect(),
+        notes: notes.into_iter().flatten().chain(reference.limits.iter().cloned()).collect(),
     })
 }
 
-/// How far a journal was proved.
-struct Proved {
+/// Counts of a comparison without a difference.
+struct VerifyOutcome {
     engine: String,
     wakes: u64,
     triggers: u64,
@@ -71,45 +71,49 @@ struct Proved {
     uncovered_triggers: u64,
 }
 
-/// A lambda that runs again.
-struct Remake {
+/// A lambda that runs again, for comparison.
+struct Rerun {
     lambda: String,
     session: Session,
-    scribe: Scribe,
-    judge: Judge,
+    entry_builder: EntryBuilder,
+    invoker: Invoker,
     engine: String,
 }
 
-impl Remake {
-    /// The lambda after its `init`, with the drive that fills its inputs.
+impl Rerun {
+    /// Starts the lambda and runs its `init`; also returns the drive that fills its inputs.
     fn start<T: Transport>(
         mut drive: T,
-        options: &Options,
+        options: &ReplayOptions,
         manifest: &Manifest,
         load: Load<'_>,
     ) -> Result<(Self, T, Vec<Arc<Topic>>), Failure> {
-        let Stage { inputs, session, mut guest } =
-            Stage::set(&mut drive, &options.asked, manifest, Bounds::Replay, None, load)?;
+        let SessionSetup { inputs, session, mut guest } =
+            SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, None, load)?;
         let lambda = manifest.lambda.name.to_string();
         let engine = guest.engine();
         let initialised = guest.init();
-        // What `init` says is no part of a wake.
-        let (said, _) = session.take_log();
-        initialised.map_err(|fault| not_started(&lambda, fault, &said))?;
-        let judge = Judge::new(session.clone(), guest);
-        Ok((Self { lambda, session, scribe: Scribe::new(&inputs), judge, engine }, drive, inputs))
+        // The log of `init` belongs to no wake.
+        let (init_log, _) = session.take_log();
+        initialised.map_err(|fault| not_started(&lambda, fault, &init_log))?;
+        let invoker = Invoker::new(session.clone(), guest);
+        Ok((
+            Self { lambda, session, entry_builder: EntryBuilder::new(&inputs), invoker, engine },
+            drive,
+            inputs,
+        ))
     }
 
     /// Runs a wake.
-    fn wake(&mut self, wake: Wake) -> &Entry {
-        self.scribe.begin(&wake);
-        let decision = self.judge.judge(wake);
-        let (_, said) = self.session.take_log();
-        self.scribe.end(&decision, said)
+    fn wake(&mut self, wake: Wake) -> &JournalEntry {
+        self.entry_builder.begin(&wake);
+        let decision = self.invoker.invoke(wake);
+        let (_, digest) = self.session.take_log();
+        self.entry_builder.end(&decision, digest)
     }
 }
 
-/// A difference in numbers, where there is one.
+/// Returns the difference of two counts, if they differ.
 fn counts_differ(what: impl Into<String>, journal: u64, now: u64) -> Option<Difference> {
     (journal != now).then(|| Difference {
         what: what.into(),

@@ -1,32 +1,32 @@
-//! The triggers of a clip, compared with those of its journal.
+//! Compares the triggers in a clip's metadata with those in its journal.
 
 use gleaner_base::excerpt;
-use gleaner_journal::{Difference, Entry};
+use gleaner_journal::{Difference, JournalEntry};
 use gleaner_lambda::Moment;
-use gleaner_recorder::Stated;
+use gleaner_recorder::ClipStatements;
 
 use super::counts_differ;
 
-/// As many triggers as a clip keeps.
+/// Maximum number of triggers that a clip lists.
 const KEPT: usize = 10_000;
 
-/// The triggers in the part of a journal.
-pub(super) struct Triggers {
+/// The triggers in a part of a journal.
+pub(super) struct JournalTriggers {
     lambda: String,
     pub(super) count: u64,
-    /// The first of them.
+    /// The first [`KEPT`] of them.
     moments: Vec<Moment>,
     /// Stamps of the first and the last wake.
     span: Option<(i64, i64)>,
 }
 
-impl Triggers {
+impl JournalTriggers {
     pub(super) fn of(lambda: &str) -> Self {
         Self { lambda: lambda.to_owned(), count: 0, moments: Vec::new(), span: None }
     }
 
-    /// Adds those of a wake.
-    pub(super) fn add(&mut self, entry: &Entry) {
+    /// Adds the triggers of a wake.
+    pub(super) fn add(&mut self, entry: &JournalEntry) {
         let (first, _) = self.span.unwrap_or((entry.at_ns, entry.at_ns));
         self.span = Some((first, entry.at_ns));
         for trigger in &entry.triggers {
@@ -37,21 +37,21 @@ impl Triggers {
         }
     }
 
-    /// The first difference between these and the triggers that the clip names.
-    pub(super) fn differ(&self, stated: &Stated) -> Option<Difference> {
+    /// Returns the first difference from the triggers that the clip lists.
+    pub(super) fn differ(&self, stated: &ClipStatements) -> Option<Difference> {
         let clip = stated.clip();
-        // In `short`, a clip states that its journal lacks wakes; the triggers of these cannot be
-        // made again.
+        // In `incomplete`, a clip notes that its journal lacks wakes, whose triggers cannot be
+        // reproduced.
         let lacking = format!("the journal of {} lacks ", self.lambda);
-        let is_short = clip.short.iter().any(|why| why.starts_with(&lacking));
+        let is_short = clip.incomplete.iter().any(|why| why.starts_with(&lacking));
         let is_here = |at_ns: i64| {
             !is_short || self.span.is_some_and(|(first, last)| (first..=last).contains(&at_ns))
         };
-        // A command is no trigger of the lambda: its journal does not have it.
+        // A command is no trigger of the lambda, and not in its journal.
         let ours = |moment: &&Moment| moment.lambda == self.lambda && moment.source.is_none();
         let mut named = stated.moments().iter().filter(ours).filter(|moment| is_here(moment.at_ns));
         let mut made = self.moments.iter();
-        // The limit of the clip is for all its lambdas.
+        // All lambdas of a clip share its limit.
         let is_full = stated.moments().len() >= KEPT;
         for number in 1.. {
             let (journal, now) = (made.next(), named.next());

@@ -1,7 +1,7 @@
-//! What every run of a lambda needs, be it over drives or live: what was asked for, rings that a
-//! transport fills, a guest that sees them, and the files of its decisions.
+//! Sets up a lambda's session, over drives or live: its arguments, the rings that a transport
+//! fills, and the guest that reads them. Also re-exports the writer of its decisions.
 
-mod asked;
+mod lambda_args;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,66 +11,69 @@ use gleaner_lambda::Fault;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_transport::{Transport, TransportError};
 
-pub use asked::{Asked, AskedArgs, tighten};
 pub use gleaner_lambda::{LOCK, Output, OutputError, RESULTS};
+pub use lambda_args::{ConfiguredLambda, LambdaArgs, tighten};
 
 use crate::api::Session;
 use crate::api::data::Topic;
-use crate::api::log::Line;
+use crate::api::log::LogLine;
 use crate::guest::Guest;
-use crate::input::{InputError, Live, open_inputs};
+use crate::input::{InputError, LiveInputs, open_inputs};
 
-/// Makes the guest of a lambda whose kind the caller can host.
-pub type Load<'a> =
-    &'a mut dyn FnMut(&Asked, &Manifest, Session, Bounds) -> Result<Box<dyn Guest>, Failure>;
+/// Creates the guest of a lambda; the caller can host its kind.
+pub type Load<'a> = &'a mut dyn FnMut(
+    &ConfiguredLambda,
+    &Manifest,
+    Session,
+    RunMode,
+) -> Result<Box<dyn Guest>, Failure>;
 
-/// What bounds a wake beside fuel and memory.
+/// Limit on the time of a wake, beside fuel and memory.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub enum Bounds {
-    /// Nothing: a deadline would make decisions depend on the machine.
+pub enum RunMode {
+    /// No limit: a deadline would make decisions depend on the machine.
     Replay,
     /// A deadline for each wake.
     Live(Duration),
 }
 
-/// A lambda before its `init`, over a transport that has not begun.
-pub struct Stage {
+/// A lambda before its `init`, over a transport that has delivered nothing yet.
+pub struct SessionSetup {
     /// The lambda's topics, in the order of its manifest.
     pub inputs: Vec<Arc<Topic>>,
-    /// What it sees and causes.
+    /// The lambda's view of inputs, and its triggers and log.
     pub session: Session,
-    /// What runs it.
+    /// The guest that runs it.
     pub guest: Box<dyn Guest>,
 }
 
-impl Stage {
-    /// Opens the inputs and loads the lambda. `live` says what differs where samples arrive while
-    /// it runs.
+impl SessionSetup {
+    /// Opens the inputs and loads the lambda. `live` is set where samples arrive while it runs.
     ///
     /// # Errors
     ///
-    /// Why it cannot start.
-    pub fn set(
+    /// A failure that explains why the lambda cannot start.
+    pub fn load(
         transport: &mut dyn Transport,
-        asked: &Asked,
+        lambda: &ConfiguredLambda,
         manifest: &Manifest,
-        bounds: Bounds,
-        live: Option<&Live>,
+        mode: RunMode,
+        live: Option<&LiveInputs>,
         load: Load<'_>,
     ) -> Result<Self, Failure> {
-        let inputs = open_inputs(manifest, &asked.remaps, transport, live).map_err(|error| {
+        let inputs = open_inputs(manifest, &lambda.remaps, transport, live).map_err(|error| {
             Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error)
         })?;
-        let session = Session::new(inputs.clone(), asked.config.clone(), &manifest.limits);
-        let guest = load(asked, manifest, session.clone(), bounds)?;
+        let session = Session::new(inputs.clone(), lambda.config.clone(), &manifest.limits);
+        let guest = load(lambda, manifest, session.clone(), mode)?;
         Ok(Self { inputs, session, guest })
     }
 }
 
-/// What a lambda's fault in `init` means for a run. What it `said` on the way may be why: what of
-/// that is in no file goes to standard error.
-pub fn not_started(lambda: &str, fault: Fault, said: &[Line]) -> Failure {
-    said.iter().for_each(|line| eprintln!("log: {}", visible(&line.message)));
+/// Returns the failure of a run whose lambda faulted in `init`. Prints `log` to standard error: the
+/// lines that are in no file, and may explain the fault.
+pub fn not_started(lambda: &str, fault: Fault, log: &[LogLine]) -> Failure {
+    log.iter().for_each(|line| eprintln!("log: {}", visible(&line.message)));
     let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{lambda}`"));
     failure.causes = vec![fault.message];
     failure

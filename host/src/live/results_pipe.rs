@@ -1,8 +1,8 @@
-//! Results on their way to `gleaner-shim`, which writes the files: this process holds none that it
-//! could write.
+//! The pipe that sends results to `gleaner-shim`, which writes the files: this process has no
+//! writable file.
 //!
-//! Nothing here waits while the lambda lives. What the pipe does not take waits in memory that was
-//! reserved before, and what has no room there is counted.
+//! Nothing here blocks while the lambda runs. Items that the pipe does not accept wait in memory
+//! that was reserved before; items without room there are counted.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -10,41 +10,42 @@ use std::io::{self, Write};
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_lambda::PAGE_BYTES;
-use gleaner_protocol::{Page, RESULTS_ENV};
+use gleaner_lambda::RESULT_ITEM_MAX;
+use gleaner_protocol::{RESULTS_ENV, ResultItem};
 use gleaner_vitals::{Pulse, inherited};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{FileType, fstat};
 
-/// Bytes that may wait: some seconds of a lambda at 1 kHz whose decisions are all written.
-const WAITING: usize = 2 * PAGE_BYTES;
-/// From so many bytes on they are sent, however little they matter.
+/// Maximum number of bytes that wait: some seconds of a lambda at 1 kHz whose decisions are all
+/// written.
+const WAITING: usize = 2 * RESULT_ITEM_MAX;
+/// Number of waiting bytes from which on they are sent in any case.
 const FULL: usize = 32 << 10;
 
 /// The pipe to the shim.
-pub struct Pages {
+pub struct ResultsPipe {
     pipe: File,
-    /// Lines that the pipe has not taken; of the first one it may have a part.
+    /// Lines that the pipe has not accepted; it may have accepted a part of the first.
     waiting: VecDeque<u8>,
-    /// The line that is made.
+    /// The line that is being built.
     line: Vec<u8>,
     unwritten: u64,
-    /// The shim counts there what it cannot write.
+    /// The page in which the shim counts what it cannot write.
     pulse: Pulse,
 }
 
-impl Pages {
-    /// The pipe that the shim has made: [`RESULTS_ENV`].
+impl ResultsPipe {
+    /// Opens the pipe that the shim has created: [`RESULTS_ENV`].
     ///
     /// # Errors
     ///
     /// A failure if this process was started without one.
     pub fn open(pulse: Pulse) -> Result<Self, Failure> {
         let cannot =
-            |error: &io::Error| Failure::caused_by(Exit::Internal, "cannot hand on results", error);
+            |error: &io::Error| Failure::caused_by(Exit::Internal, "cannot send results", error);
         let pipe = inherited(RESULTS_ENV).map_err(|error| cannot(&error))?.ok_or_else(|| {
-            Failure::new(Exit::Usage, "no process writes the results of this one")
-                .with_help("start it by `gleaner run`, or by `gleaner-shim --results DIR -- gleaner-runtime run`")
+            Failure::new(Exit::Usage, "no process writes the results of this process")
+                .with_help("start it with `gleaner run`, or with `gleaner-shim --results DIR -- gleaner-runtime run`")
         })?;
         let found = fstat(&pipe).map_err(|error| cannot(&error.into()))?;
         if FileType::from_raw_mode(found.st_mode) != FileType::Fifo {
@@ -56,21 +57,21 @@ impl Pages {
         Ok(Self::over(pipe.into(), pulse))
     }
 
-    /// Results go into `pipe`, which does not block; `pulse` shows what of them could not be
-    /// written.
+    /// A sender over `pipe`, which does not block; `pulse` has the number of items that could not
+    /// be written.
     pub fn over(pipe: File, pulse: Pulse) -> Self {
         let waiting = VecDeque::with_capacity(WAITING);
         Self { pipe, waiting, line: Vec::new(), unwritten: 0, pulse }
     }
 
-    /// Adds `page`, to be sent with what waits. Returns whether there was room.
-    pub(super) fn add(&mut self, page: &Page) -> bool {
+    /// Adds `item`, to be sent with the waiting ones. Returns whether there was room.
+    pub(super) fn add(&mut self, item: &ResultItem) -> bool {
         self.line.clear();
-        serde_json::to_writer(&mut self.line, page)
-            .expect("a page has text keys and finite numbers");
+        serde_json::to_writer(&mut self.line, item)
+            .expect("an item has text keys and finite numbers");
         self.line.push(b'\n');
         let has_room =
-            self.line.len() <= PAGE_BYTES && self.waiting.len() + self.line.len() <= WAITING;
+            self.line.len() <= RESULT_ITEM_MAX && self.waiting.len() + self.line.len() <= WAITING;
         if has_room {
             self.waiting.extend(&self.line);
         } else {
@@ -84,7 +85,7 @@ impl Pages {
         has_room
     }
 
-    /// Sends what the pipe takes.
+    /// Sends as much as the pipe accepts.
     pub(super) fn send(&mut self) {
         while !self.waiting.is_empty() {
             match self.pipe.write(self.waiting.as_slices().0) {
@@ -94,7 +95,7 @@ impl Pages {
                 Err(error) => {
                     let lines = self.waiting.iter().filter(|byte| **byte == b'\n').count() as u64;
                     if self.unwritten == 0 {
-                        tracing::error!(%error, "results cannot be handed to gleaner-shim; they are counted as not written");
+                        tracing::error!(%error, "cannot send results to gleaner-shim; they are counted as not written");
                     }
                     self.unwritten += lines;
                     self.waiting.clear();
@@ -105,11 +106,11 @@ impl Pages {
         self.waiting.clear();
     }
 
-    /// Sends all, for which it waits until `deadline`.
+    /// Sends all items, and waits until `deadline` for that.
     ///
     /// # Errors
     ///
-    /// A failure if something was not taken.
+    /// A failure if an item was not accepted.
     pub(super) fn finish(&mut self, deadline: Instant) -> Result<(), Failure> {
         loop {
             self.send();
@@ -120,22 +121,22 @@ impl Pages {
             if left.is_zero() {
                 let failure = Failure::new(
                     Exit::Internal,
-                    "results are not written: their disk has stood still too long",
+                    "results are not written: their disk did not respond in time",
                 );
                 return Err(failure.with_help("choose a folder on another disk: --out DIR"));
             }
             let patience = Timespec::try_from(left.min(Duration::from_secs(1))).ok();
-            // Whatever ends the wait, it is tried again.
+            // After any result of the wait, sending is tried again.
             let _ = poll(&mut [PollFd::new(&self.pipe, PollFlags::OUT)], patience.as_ref());
         }
     }
 
-    /// Pages that did not fit, here, and those that the shim could not write.
+    /// ResultsPipe that did not fit, here, and those that the shim could not write.
     pub(super) fn unwritten(&self) -> u64 {
         self.unwritten.saturating_add(self.pulse.unwritten())
     }
 
-    /// Pages that did not fit.
+    /// ResultsPipe that did not fit.
     pub(super) fn unsent(&self) -> u64 {
         self.unwritten
     }
@@ -151,18 +152,18 @@ mod tests {
 
     use super::*;
 
-    fn log(at_ns: i64) -> Page {
-        Page::Log(LogLine { at_ns, level: LogLevel::Info, message: "x".repeat(1000) })
+    fn log(at_ns: i64) -> ResultItem {
+        ResultItem::Log(LogLine { at_ns, level: LogLevel::Info, message: "x".repeat(1000) })
     }
 
-    fn pages() -> (impl Read, Pages) {
+    fn pages() -> (impl Read, ResultsPipe) {
         let (reader, writer) = pipe().unwrap();
         ioctl_fionbio(&writer, true).unwrap();
-        (reader, Pages::over(OwnedFd::from(writer).into(), Pulse::make().unwrap().0))
+        (reader, ResultsPipe::over(OwnedFd::from(writer).into(), Pulse::create().unwrap().0))
     }
 
     #[test]
-    fn what_the_pipe_does_not_take_waits_and_what_has_no_room_is_counted_and_cuts_no_line() {
+    fn items_wait_for_the_pipe_and_items_without_room_are_counted_and_cut_no_line() {
         let (reader, mut pages) = pages();
         let mut kept = Vec::new();
         for at_ns in 0.. {
@@ -176,7 +177,9 @@ mod tests {
         assert!(kept.len() > WAITING / 1100, "{} lines had room", kept.len());
         let read = std::thread::spawn(move || {
             let lines = BufReader::new(reader).lines();
-            lines.map(|line| serde_json::from_str(&line.unwrap()).unwrap()).collect::<Vec<Page>>()
+            lines
+                .map(|line| serde_json::from_str(&line.unwrap()).unwrap())
+                .collect::<Vec<ResultItem>>()
         });
         pages.finish(Instant::now() + Duration::from_secs(60)).unwrap();
         // There is room again.
@@ -189,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_sent_any_more_is_counted() {
+    fn items_that_cannot_be_sent_are_counted() {
         let (reader, mut pages) = pages();
         drop(reader);
         for at_ns in 0..3 {
@@ -202,10 +205,10 @@ mod tests {
     }
 
     #[test]
-    fn a_page_that_is_too_long_is_counted_and_not_sent() {
+    fn an_item_that_is_too_long_is_counted_and_not_sent() {
         let (_reader, mut pages) = pages();
-        let message = "x".repeat(PAGE_BYTES);
-        assert!(!pages.add(&Page::Log(LogLine { at_ns: 0, level: LogLevel::Info, message })));
+        let message = "x".repeat(RESULT_ITEM_MAX);
+        assert!(!pages.add(&ResultItem::Log(LogLine { at_ns: 0, level: LogLevel::Info, message })));
         assert_eq!((pages.unwritten(), pages.waiting.len()), (1, 0));
     }
 }

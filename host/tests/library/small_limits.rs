@@ -1,18 +1,18 @@
-//! Every limit of `[limits]`, made small and then hit: the cause is named with what was used and
-//! what was allowed.
+//! Every limit of `[limits]`, lowered and then hit: the fault names the cause, the use and the
+//! limit.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use crate::greedy::{Room, component, limits, publish, subscribed};
+use crate::greedy::{TestGuest, component, limits, publish, subscribed};
 use gleaner_base::ByteSize;
 use gleaner_host::api::data::{DataError, Topic};
 use gleaner_host::guest::Guest;
 use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_lambda::{Fault, FaultKind};
-use gleaner_tests::drive::Cdr;
+use gleaner_tests::drive::CdrBuilder;
 
-/// The limits of the suite, with a change.
+/// The default limits of the suite, with a change.
 fn with(change: impl FnOnce(&mut Limits)) -> Limits {
     let mut limits = limits();
     change(&mut limits);
@@ -32,8 +32,8 @@ fn is(fault: &Fault, kind: FaultKind, used: Option<u64>, allowed: u64) {
 #[test]
 fn fuel_of_a_wake_and_of_init_are_two_limits() {
     let limits = with(|limits| (limits.fuel, limits.init_fuel) = (300_000, 200_000));
-    is(&Room::within("endless", 0, &limits).fault(), FaultKind::Fuel, Some(300_000), 300_000);
-    let fault = Room::within("endless_init", 0, &limits).guest.init().unwrap_err();
+    is(&TestGuest::within("endless", 0, &limits).fault(), FaultKind::Fuel, Some(300_000), 300_000);
+    let fault = TestGuest::within("endless_init", 0, &limits).guest.init().unwrap_err();
     is(&fault, FaultKind::Fuel, Some(200_000), 200_000);
 }
 
@@ -42,12 +42,12 @@ fn the_deadline_of_a_wake_and_of_init_are_two_limits() {
     let ms = Duration::from_millis;
     for [wake, init] in [[20, 10_000], [10_000, 20]] {
         let limits = with(|limits| {
-            (limits.fuel, limits.init_fuel) = (Limits::MOST.fuel, Limits::MOST.fuel);
+            (limits.fuel, limits.init_fuel) = (Limits::MAX.fuel, Limits::MAX.fuel);
             (limits.deadline, limits.init_deadline) = (ms(wake), ms(init));
         });
         let behaviour = if wake < init { "endless" } else { "endless_init" };
-        let mut room = Room::timed(behaviour, 0, &limits);
-        let fault = if wake < init { room.fault() } else { room.guest.init().unwrap_err() };
+        let mut test = TestGuest::timed(behaviour, 0, &limits);
+        let fault = if wake < init { test.fault() } else { test.guest.init().unwrap_err() };
         assert_eq!(
             (fault.kind, fault.allowed),
             (FaultKind::Deadline, Some(20_000_000)),
@@ -59,22 +59,23 @@ fn the_deadline_of_a_wake_and_of_init_are_two_limits() {
 
 #[test]
 fn a_call_that_does_not_end_in_time_ends_between_two_rows() {
-    // 800 MB of pixels, for which no machine takes less than 150 ms; a limit that was computed once
-    // would let it begin.
+    // 800 MB of pixels, for which no machine takes less than 150 ms; a check before the work would
+    // let it begin.
     let limits = with(|limits| {
-        (limits.fuel, limits.memory) = (Limits::MOST.fuel, ByteSize::mib(1024));
+        (limits.fuel, limits.memory) = (Limits::MAX.fuel, ByteSize::mib(1024));
         limits.deadline = Duration::from_millis(150);
     });
-    Room::timed("mean_luma", 0, &limits).wake().result.unwrap();
-    let fault = Room::timed("huge", 0, &limits).fault();
+    TestGuest::timed("mean_luma", 0, &limits).wake().result.unwrap();
+    let fault = TestGuest::timed("huge", 0, &limits).fault();
     assert_eq!((fault.kind, fault.allowed), (FaultKind::Deadline, Some(150_000_000)), "{fault:?}");
-    // It ended within the call, and was not found to be late behind it.
+    // It ended within the call, and was not only found late after it.
     assert!(fault.message.contains("a call into the host"), "{}", fault.message);
 }
 
 #[test]
 fn memory_beyond_the_limit_is_a_fault_with_both_numbers() {
-    let fault = Room::within("memory", 0, &with(|limits| limits.memory = ByteSize::mib(4))).fault();
+    let fault =
+        TestGuest::within("memory", 0, &with(|limits| limits.memory = ByteSize::mib(4))).fault();
     assert_eq!((fault.kind, fault.allowed), (FaultKind::Memory, Some(4 << 20)), "{fault:?}");
     assert!(fault.used > fault.allowed, "{fault:?}");
 }
@@ -87,9 +88,9 @@ fn elements_of_tables_beyond_the_limit_are_a_fault_with_both_numbers() {
         component("", "", &format!("(table $t {elements} funcref) (func $wake {wake})"))
     };
     let limits = with(|limits| limits.tables = 200);
-    Room::written_within(&body(100), &limits).wake().result.unwrap();
-    is(&Room::written_within(&body(101), &limits).fault(), FaultKind::Memory, Some(201), 200);
-    let fault = Room::written_within(&body(201), &limits).guest.init().unwrap_err();
+    TestGuest::written_within(&body(100), &limits).wake().result.unwrap();
+    is(&TestGuest::written_within(&body(101), &limits).fault(), FaultKind::Memory, Some(201), 200);
+    let fault = TestGuest::written_within(&body(201), &limits).guest.init().unwrap_err();
     is(&fault, FaultKind::Memory, Some(201), 200);
     assert_eq!(fault.message, "in init: asked for 201 elements of tables; 200 are allowed");
 }
@@ -100,7 +101,7 @@ fn a_smaller_stack_is_full_earlier() {
     let endless = component("", "", "(func $wake (call $wake) (call $wake))");
     let deep = |stack: ByteSize| {
         let fuel_lasts = |fuel: &u64| {
-            let outcome = Room::written_within(
+            let outcome = TestGuest::written_within(
                 &endless,
                 &with(|limits| (limits.stack, limits.fuel) = (stack, *fuel)),
             )
@@ -108,8 +109,7 @@ fn a_smaller_stack_is_full_earlier() {
             let fault = outcome.result.unwrap_err();
             if fault.kind == FaultKind::Stack {
                 is(&fault, FaultKind::Stack, None, stack.bytes());
-                // A journal would not be the same on another processor, whose code takes another
-                // amount of stack.
+                // The fuel differs between processors, whose code needs different amounts of stack.
                 assert_eq!(outcome.fuel, None);
             }
             fault.kind == FaultKind::Stack
@@ -119,16 +119,16 @@ fn a_smaller_stack_is_full_earlier() {
             .find(fuel_lasts)
             .expect("some fuel lasts until the stack is full")
     };
-    let (least, most) = (deep(Limits::LEAST.stack), deep(Limits::MOST.stack));
+    let (least, most) = (deep(Limits::MIN.stack), deep(Limits::MAX.stack));
     assert!((16..=64).contains(&(most / least)), "{least} and {most}");
 }
 
 #[test]
 fn an_access_outside_of_memory_names_the_stack_as_a_possible_cause() {
-    // As of a compiler's stack, which lies at the low end of memory, when a recursion gets below
-    // it.
+    // Like a compiler's stack, which is at the low end of memory, when a recursion goes below it.
     let fault =
-        Room::written(&component("", "", "(func $wake (drop (i32.load (i32.const -8))))")).fault();
+        TestGuest::written(&component("", "", "(func $wake (drop (i32.load (i32.const -8))))"))
+            .fault();
     assert_eq!(fault.kind, FaultKind::Trap, "{}", fault.message);
     assert!(
         fault.message.ends_with(
@@ -140,35 +140,41 @@ fn an_access_outside_of_memory_names_the_stack_as_a_possible_cause() {
 }
 
 #[test]
-fn a_lambda_that_keeps_handles_is_told_how_many_it_may() {
+fn a_fault_for_too_many_handles_names_the_limit() {
     let limits = with(|limits| limits.handles = 64);
-    is(&Room::within("fields", 0, &limits).fault(), FaultKind::HostCall, Some(65), 64);
+    is(&TestGuest::within("fields", 0, &limits).fault(), FaultKind::HostCall, Some(65), 64);
 }
 
 #[test]
 fn a_lambda_that_keeps_frames_is_refused_the_next_one() {
     let limits = with(|limits| limits.frames = 3);
     for behaviour in ["frames", "resized"] {
-        let mut room = Room::within(behaviour, 0, &limits);
+        let mut test = TestGuest::within(behaviour, 0, &limits);
         for _ in 0..3 {
-            // They went with the lambda that held them: the next one comes as far.
-            let fault = room.fault();
+            // They were released with the lambda that held them: the next one reaches the same
+            // number.
+            let fault = test.fault();
             assert_eq!(fault.kind, FaultKind::Exception);
-            let said = "the lambda holds 3 frames; drop frames that are not needed, or raise `frames` in [limits]";
-            assert!(fault.message.contains(said), "{behaviour}: {}", fault.message);
+            let expected = "the lambda holds 3 frames; drop frames that are not needed, or raise `frames` in [limits]";
+            assert!(fault.message.contains(expected), "{behaviour}: {}", fault.message);
         }
     }
 }
 
 #[test]
-fn what_one_call_takes_from_a_lambda_is_limited() {
+fn the_arguments_of_one_call_are_limited() {
     let limits = with(|limits| limits.call_bytes = ByteSize::kib(64));
-    let fault = Room::within("long_label", 60_000, &limits).fault();
+    let fault = TestGuest::within("long_label", 60_000, &limits).fault();
     assert!(fault.message.contains("the label has 60000 bytes"), "{}", fault.message);
-    is(&Room::within("long_label", 70_000, &limits).fault(), FaultKind::HostCall, None, 64 << 10);
+    is(
+        &TestGuest::within("long_label", 70_000, &limits).fault(),
+        FaultKind::HostCall,
+        None,
+        64 << 10,
+    );
 }
 
-/// An input with so many messages of one type in its ring, for a lambda with these limits.
+/// An input with `messages` copies of a message in its ring, for a lambda with these limits.
 fn topic(definition: &str, limits: &str, messages: u64, cdr: &[u8]) -> Arc<Topic> {
     let manifest = format!(
         "[lambda]\nname = \"many\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"many.wasm\"\n\
@@ -183,10 +189,14 @@ fn topic(definition: &str, limits: &str, messages: u64, cdr: &[u8]) -> Arc<Topic
 }
 
 #[test]
-fn what_one_call_gives_is_limited() {
+fn the_bytes_that_one_call_returns_are_limited() {
     let bytes = vec![7; 100_000];
-    let topic =
-        topic("uint8[] x\n", "call_bytes = \"64 KiB\"", 1, &Cdr::default().bytes(&bytes).done());
+    let topic = topic(
+        "uint8[] x\n",
+        "call_bytes = \"64 KiB\"",
+        1,
+        &CdrBuilder::default().bytes(&bytes).done(),
+    );
     let sample = topic.newest().unwrap();
     assert_eq!(sample.cdr(0, u32::MAX).unwrap().len(), 64 << 10);
     let error = sample.get(&topic.field("x").unwrap()).map(drop).unwrap_err();
@@ -194,14 +204,15 @@ fn what_one_call_gives_is_limited() {
 }
 
 #[test]
-fn how_many_items_one_call_gives_is_limited() {
+fn the_items_that_one_call_returns_are_limited() {
     let few = "call_items = 20";
     let one = topic("uint8 x\n", few, 100, &[7]);
     let field = one.field("x").unwrap();
     let lists = [one.last(usize::MAX).unwrap().len(), one.since(0).unwrap().len()];
     let columns = [one.column(&field, usize::MAX).unwrap(), one.column_since(&field, 0).unwrap()];
     assert_eq!((lists, columns.map(|column| column.values.len())), ([20; 2], [20; 2]));
-    let texts = |n: usize| (0..n).fold(Cdr::default().u32(n as u32), |cdr, _| cdr.text("x")).done();
+    let texts =
+        |n: usize| (0..n).fold(CdrBuilder::default().u32(n as u32), |cdr, _| cdr.text("x")).done();
     let numbers = |n: usize| [&(n as u32).to_le_bytes(), vec![0_u8; 2 * n].as_slice()].concat();
     let get = |definition, cdr: &[u8]| {
         let topic = topic(definition, few, 1, cdr);
@@ -219,28 +230,28 @@ fn how_many_items_one_call_gives_is_limited() {
 
 #[test]
 fn log_lines_and_their_bytes_are_two_limits() {
-    let said = |length: u32, change: fn(&mut Limits)| {
-        let mut room = Room::within("log", length, &with(change));
-        room.wake().result.unwrap();
-        (room.session.take_log().0.len(), room.session.log_dropped())
+    let logged = |length: u32, change: fn(&mut Limits)| {
+        let mut test = TestGuest::within("log", length, &with(change));
+        test.wake().result.unwrap();
+        (test.session.take_log().0.len(), test.session.log_dropped())
     };
-    assert_eq!(said(1, |limits| limits.log_lines = 30), (30, 970));
-    assert_eq!(said(1000, |limits| limits.log_bytes = ByteSize::kib(8)), (8, 992));
+    assert_eq!(logged(1, |limits| limits.log_lines = 30), (30, 970));
+    assert_eq!(logged(1000, |limits| limits.log_bytes = ByteSize::kib(8)), (8, 992));
 }
 
 #[test]
-fn triggers_beyond_those_of_a_minute_are_refused_and_counted() {
-    let mut room = Room::within("events", 3, &with(|limits| limits.events_per_minute = 5));
-    room.wake().result.unwrap();
-    assert_eq!(room.session.end().len(), 3);
-    let fault = room.fault();
+fn triggers_beyond_the_limit_per_minute_are_refused_and_counted() {
+    let mut test = TestGuest::within("events", 3, &with(|limits| limits.events_per_minute = 5));
+    test.wake().result.unwrap();
+    assert_eq!(test.session.end().len(), 3);
+    let fault = test.fault();
     assert!(
         fault.message.contains("the lambda has caused 5 triggers in this minute already"),
         "{}",
         fault.message
     );
-    // Those before it count, and in the next minute all is well again.
-    assert_eq!((room.session.end().len(), room.session.triggers_refused()), (2, 1));
-    room.wake_at(60_000_000_000).result.unwrap();
-    assert_eq!((room.session.end().len(), room.session.triggers_refused()), (3, 1));
+    // Earlier ones count, and in the next minute triggers are accepted again.
+    assert_eq!((test.session.end().len(), test.session.triggers_refused()), (2, 1));
+    test.wake_at(60_000_000_000).result.unwrap();
+    assert_eq!((test.session.end().len(), test.session.triggers_refused()), (3, 1));
 }

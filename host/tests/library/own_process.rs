@@ -1,9 +1,9 @@
-//! A test that counts what its process has needs one without other tests: this program once more.
+//! Runs a test that measures its process in a process of its own: this program again.
 
 use std::env;
 use std::process::{Command, Stdio};
 
-/// Set in the process that runs one test only.
+/// Variable that is set in the process that runs only one test.
 const ALONE: &str = "GLEANER_ALONE";
 
 /// Runs the test `name` in a process of its own and returns `true`; in that process it returns
@@ -19,8 +19,9 @@ pub fn ran_elsewhere(name: &str) -> bool {
     let mut test = Command::new(env::current_exe().expect("a program has a path"));
     test.args(["--exact", name, "--nocapture"]).env(ALONE, "1").stdin(Stdio::null());
     let output = test.output().expect("this program starts once more");
-    let [said, errors] = [&output.stdout, &output.stderr].map(|text| String::from_utf8_lossy(text));
-    print!("{said}");
-    assert!(output.status.success() && said.contains("1 passed"), "{}; {errors}", output.status);
+    let [printed, errors] =
+        [&output.stdout, &output.stderr].map(|text| String::from_utf8_lossy(text));
+    print!("{printed}");
+    assert!(output.status.success() && printed.contains("1 passed"), "{}; {errors}", output.status);
     true
 }

@@ -1,4 +1,5 @@
-//! A drive that hands out samples input by input, as a journal says, instead of by time alone.
+//! A drive that delivers samples in lockstep with a journal: so many of each input, instead of in
+//! the order of time.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -7,58 +8,57 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use gleaner_drives::{Replay, ReplayError};
 use gleaner_messages::Definitions;
 use gleaner_transport::{
-    DiscoveredTopic, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict,
+    Delivery, DiscoveredTopic, SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError,
 };
 
-/// Most bytes that wait until their input's turn. Inputs take turns as they did in the drive, so
-/// that few wait.
+/// Upper bound of the bytes that wait for their input's turn. Inputs take turns as they did in the
+/// drive, so that few wait.
 const WAITING_BYTES: usize = 256 << 20;
 
-/// What a sample that waits takes beside its bytes: a clip may hold millions of empty ones.
+/// Overhead of a waiting sample in bytes: a clip may hold millions of empty samples.
 const WAITING_COST: usize = 128;
 
-/// Why the next sample of an input cannot be had.
+/// An error before the next sample of an input.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum PaceError {
+pub(super) enum LockstepError {
     #[error(transparent)]
     Drive(#[from] ReplayError),
-    #[error("more than {WAITING_BYTES} bytes of other inputs come before it")]
+    #[error("more than {WAITING_BYTES} bytes of other inputs precede it")]
     TooFarAhead,
 }
 
-/// A drive with a lane for each subscription.
-pub(super) struct Paced {
+/// A drive with a queue for each subscription.
+pub(super) struct LockstepDrive {
     drive: Replay,
-    lanes: Vec<Arc<Gate>>,
+    sinks: Vec<Arc<LockstepSink>>,
     waiting_bytes: Arc<AtomicUsize>,
     ended: bool,
 }
 
-/// One lane's way from the drive to its sink. The drive fills it and the comparison empties it, on
-/// one thread.
-struct Gate {
-    /// Where samples go when it is their turn.
+/// The queue from the drive to the sink of one subscription. Both ends run on one thread.
+struct LockstepSink {
+    /// Receives samples when it is their turn.
     sink: Arc<dyn Sink>,
-    state: Mutex<State>,
-    /// Bytes that wait, of all lanes.
+    state: Mutex<SinkState>,
+    /// Waiting bytes of all subscriptions.
     waiting_bytes: Arc<AtomicUsize>,
 }
 
-/// A sample, or the length of one that is too big.
-enum Held {
+/// A waiting sample, or the length of one that is too big.
+enum WaitingSample {
     Whole(Vec<u8>),
     TooBig(usize),
 }
 
 #[derive(Default)]
-struct State {
-    /// How many samples may pass.
+struct SinkState {
+    /// Number of samples that may pass.
     owed: u64,
-    /// Samples that came before their turn.
-    waiting: VecDeque<(SampleMeta, Held)>,
+    /// Samples that arrived before their turn.
+    waiting: VecDeque<(SampleMeta, WaitingSample)>,
 }
 
-impl Held {
+impl WaitingSample {
     fn cost(&self) -> usize {
         match self {
             Self::Whole(cdr) => WAITING_COST + cdr.len(),
@@ -67,17 +67,17 @@ impl Held {
     }
 }
 
-impl Gate {
-    fn lock(&self) -> MutexGuard<'_, State> {
+impl LockstepSink {
+    fn lock(&self) -> MutexGuard<'_, SinkState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn wait(&self, state: &mut State, meta: SampleMeta, held: Held) {
+    fn wait(&self, state: &mut SinkState, meta: SampleMeta, held: WaitingSample) {
         self.waiting_bytes.fetch_add(held.cost(), Ordering::Relaxed);
         state.waiting.push_back((meta, held));
     }
 
-    /// Lets `n` more samples pass: those that wait at once.
+    /// Lets `n` more samples pass; waiting samples pass at once.
     fn owe(&self, n: u64) {
         let mut state = self.lock();
         state.owed = state.owed.saturating_add(n);
@@ -86,22 +86,22 @@ impl Gate {
             state.owed -= 1;
             self.waiting_bytes.fetch_sub(held.cost(), Ordering::Relaxed);
             match held {
-                Held::Whole(cdr) => drop(self.sink.deliver(&meta, &cdr)),
-                Held::TooBig(len) => self.sink.too_big(&meta, len),
+                WaitingSample::Whole(cdr) => drop(self.sink.deliver(&meta, &cdr)),
+                WaitingSample::TooBig(len) => self.sink.too_big(&meta, len),
             }
         }
     }
 }
 
-impl Sink for Gate {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+impl Sink for LockstepSink {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
         let mut state = self.lock();
         if state.owed > 0 {
             state.owed -= 1;
             return self.sink.deliver(meta, cdr);
         }
-        self.wait(&mut state, *meta, Held::Whole(cdr.to_vec()));
-        Verdict::Taken
+        self.wait(&mut state, *meta, WaitingSample::Whole(cdr.to_vec()));
+        Delivery::Taken
     }
 
     fn too_big(&self, meta: &SampleMeta, len: usize) {
@@ -110,34 +110,34 @@ impl Sink for Gate {
             state.owed -= 1;
             return self.sink.too_big(meta, len);
         }
-        self.wait(&mut state, *meta, Held::TooBig(len));
+        self.wait(&mut state, *meta, WaitingSample::TooBig(len));
     }
 }
 
-impl Paced {
+impl LockstepDrive {
     pub(super) fn new(drive: Replay) -> Self {
-        Self { drive, lanes: Vec::new(), waiting_bytes: Arc::default(), ended: false }
+        Self { drive, sinks: Vec::new(), waiting_bytes: Arc::default(), ended: false }
     }
 
-    /// Delivers the next so many samples of each lane. Fewer pass where the drive ends before.
-    pub(super) fn deliver(&mut self, owed: impl Iterator<Item = u64>) -> Result<(), PaceError> {
-        self.lanes.iter().zip(owed).for_each(|(lane, n)| lane.owe(n));
-        while self.lanes.iter().any(|lane| lane.lock().owed > 0) && self.step()? {}
-        self.lanes.iter().for_each(|lane| lane.lock().owed = 0);
+    /// Delivers the next `owed` samples of each subscription, or fewer if the drive ends.
+    pub(super) fn deliver(&mut self, owed: impl Iterator<Item = u64>) -> Result<(), LockstepError> {
+        self.sinks.iter().zip(owed).for_each(|(sink, n)| sink.owe(n));
+        while self.sinks.iter().any(|sink| sink.lock().owed > 0) && self.step()? {}
+        self.sinks.iter().for_each(|sink| sink.lock().owed = 0);
         Ok(())
     }
 
-    /// How many samples of `lane` come up to and with the one that `is_wanted`; none if there is
-    /// none up to `until_ns`.
+    /// Number of samples of subscription `sink` up to and including the first that `is_wanted`;
+    /// `None` if there is none up to `until_ns`.
     pub(super) fn ahead(
         &mut self,
-        lane: usize,
+        sink: usize,
         until_ns: i64,
         is_wanted: impl Fn(&SampleMeta) -> bool,
-    ) -> Result<Option<u64>, PaceError> {
+    ) -> Result<Option<u64>, LockstepError> {
         let mut n = 0;
         loop {
-            let next = self.lanes[lane].lock().waiting.get(n).map(|(meta, _)| *meta);
+            let next = self.sinks[sink].lock().waiting.get(n).map(|(meta, _)| *meta);
             match next {
                 Some(meta) if is_wanted(&meta) => return Ok(Some(n as u64 + 1)),
                 Some(meta) if meta.at_ns > until_ns => return Ok(None),
@@ -148,15 +148,15 @@ impl Paced {
         }
     }
 
-    /// Reads one sample; false at the end.
-    fn step(&mut self) -> Result<bool, PaceError> {
+    /// Reads one sample; returns false at the end.
+    fn step(&mut self) -> Result<bool, LockstepError> {
         if self.ended {
             return Ok(false);
         }
         let step = self.drive.step();
         self.ended = !matches!(step, Ok(Some(_)));
         if step?.is_some() && self.waiting_bytes.load(Ordering::Relaxed) > WAITING_BYTES {
-            return Err(PaceError::TooFarAhead);
+            return Err(LockstepError::TooFarAhead);
         }
         Ok(!self.ended)
     }
@@ -166,7 +166,7 @@ impl Paced {
     }
 }
 
-impl Transport for Paced {
+impl Transport for LockstepDrive {
     fn topics(&self) -> Vec<DiscoveredTopic> {
         self.drive.topics()
     }
@@ -176,13 +176,13 @@ impl Transport for Paced {
         spec: &TopicSpec,
         sink: Arc<dyn Sink>,
     ) -> Result<Subscription, TransportError> {
-        let gate = Arc::new(Gate {
+        let queue = Arc::new(LockstepSink {
             sink,
             state: Mutex::default(),
             waiting_bytes: self.waiting_bytes.clone(),
         });
-        let subscription = self.drive.subscribe(spec, gate.clone())?;
-        self.lanes.push(gate);
+        let subscription = self.drive.subscribe(spec, queue.clone())?;
+        self.sinks.push(queue);
         Ok(subscription)
     }
 

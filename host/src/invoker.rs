@@ -1,4 +1,5 @@
-//! One wake from cause to decision: the same steps for every kind of guest, in replay and live.
+//! Invokes a lambda for one wake, from cause to decision: the same steps for every kind of guest,
+//! in replay and live.
 
 use std::time::{Duration, Instant};
 
@@ -9,34 +10,33 @@ use crate::api::Session;
 use crate::api::data::Wake;
 use crate::guest::{Guest, Totals};
 
-/// Runs one lambda and writes down what it decides.
-pub struct Judge {
+/// Runs one lambda and returns its decisions.
+pub struct Invoker {
     session: Session,
     guest: Box<dyn Guest>,
     run: Duration,
     faults: Faults,
 }
 
-impl Judge {
-    /// A judge over a guest whose `init` has succeeded, and the session that the guest was given.
+impl Invoker {
+    /// An invoker of `guest`, whose `init` has succeeded, with the session that the guest uses.
     pub fn new(session: Session, guest: Box<dyn Guest>) -> Self {
         Self { session, guest, run: Duration::ZERO, faults: Faults::default() }
     }
 
-    /// Returns whether to skip this wake. A lambda that rests after faults skips it, and it is
-    /// counted. So does a worker that had no room for the sample, which the worker counts.
+    /// Returns whether to skip this wake: the lambda backs off after faults, which is counted here,
+    /// or its worker had no slot for the sample, which the worker counts.
     pub fn is_backing_off(&mut self, wake: &Wake) -> bool {
-        let rests = self.faults.rests(wake.at_ns());
-        if rests {
-            self.session.pass_over();
+        let is_backing_off = self.faults.rests(wake.at_ns());
+        if is_backing_off {
+            self.session.count_backed_off();
         }
-        rests || !self.guest.expects(wake)
+        is_backing_off || !self.guest.expects(wake)
     }
 
-    /// Runs the lambda once. A fault becomes part of the decision; what the lambda triggered before
-    /// it still counts, since a moment that it found worth keeping must not be lost to a mistake
-    /// made afterwards.
-    pub fn judge(&mut self, wake: Wake) -> Decision {
+    /// Runs the lambda once. A fault becomes part of the decision. Triggers from before the fault
+    /// still count: a later mistake must not lose a moment that was worth keeping.
+    pub fn invoke(&mut self, wake: Wake) -> Decision {
         let mut decision = cause(&wake);
         self.session.begin(decision.at_ns);
         if let Some(note) = self.faults.begin() {
@@ -65,12 +65,12 @@ impl Judge {
         self.guest.finish()
     }
 
-    /// The most memory that the lambda's process had, in bytes.
+    /// Peak resident memory of the lambda's process, in bytes.
     pub fn most_resident_bytes(&self) -> u64 {
         self.guest.most_resident_bytes()
     }
 
-    /// Time spent in the lambda so far.
+    /// Total time spent in the lambda so far.
     pub fn run(&self) -> Duration {
         self.run
     }
@@ -108,9 +108,9 @@ mod tests {
 
     use super::*;
     use crate::api::data::Tick;
-    use crate::guest::Outcome;
+    use crate::guest::WakeOutcome;
 
-    /// Faults in every wake before that time.
+    /// A guest that faults in every wake before a time.
     struct Faulty {
         until_ns: i64,
     }
@@ -120,11 +120,11 @@ mod tests {
             Ok(())
         }
 
-        fn wake(&mut self, wake: Wake) -> Outcome {
+        fn wake(&mut self, wake: Wake) -> WakeOutcome {
             let fault =
                 Fault { kind: FaultKind::Trap, message: String::new(), used: None, allowed: None };
             let result = if wake.at_ns() < self.until_ns { Err(fault) } else { Ok(()) };
-            Outcome { result, fuel: None, run_ns: None }
+            WakeOutcome { result, fuel: None, run_ns: None }
         }
 
         fn engine(&self) -> String {
@@ -134,24 +134,24 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    /// A judge over a lambda that faults until then, and its session.
-    fn room(until_ns: i64) -> (Judge, Session) {
+    /// An invoker of a lambda that faults until then, and its session.
+    fn faulty_until(until_ns: i64) -> (Invoker, Session) {
         let session = Session::new(Vec::new(), Vec::new(), &Limits::default());
-        (Judge::new(session.clone(), Box::new(Faulty { until_ns })), session)
+        (Invoker::new(session.clone(), Box::new(Faulty { until_ns })), session)
     }
 
     fn tick(at_ns: i64) -> Wake {
         Wake::Tick(Tick { at_ns, missed: 0 })
     }
 
-    /// The times at which a lambda runs that is due every 10 ms.
-    fn runs(judge: &mut Judge, from_ms: i64, to_ms: i64) -> Vec<i64> {
+    /// Times in ms at which a lambda runs that is due every 10 ms.
+    fn runs(invoker: &mut Invoker, from_ms: i64, to_ms: i64) -> Vec<i64> {
         let due = (from_ms..to_ms).step_by(10);
         due.filter(|ms| {
             let at_ns = ms * MS;
-            let runs = !judge.is_backing_off(&tick(at_ns));
+            let runs = !invoker.is_backing_off(&tick(at_ns));
             if runs {
-                judge.judge(tick(at_ns));
+                invoker.invoke(tick(at_ns));
             }
             runs
         })
@@ -159,30 +159,30 @@ mod tests {
     }
 
     #[test]
-    fn after_eight_faults_in_a_row_a_lambda_rests_twice_as_long_after_each_further_one() {
-        let (mut judge, session) = room(i64::MAX);
-        let first = runs(&mut judge, 0, 2000);
+    fn after_eight_consecutive_faults_the_back_off_doubles_with_each_further_one() {
+        let (mut invoker, session) = faulty_until(i64::MAX);
+        let first = runs(&mut invoker, 0, 2000);
         assert_eq!(first, [0, 10, 20, 30, 40, 50, 60, 70, 170, 370, 770, 1570]);
         assert_eq!(session.backed_off(), 200 - 12);
-        // The longest rest is 10 s.
+        // The longest back-off is 10 s.
         assert_eq!(
-            runs(&mut judge, 2000, 60_000),
+            runs(&mut invoker, 2000, 60_000),
             [3170, 6370, 12_770, 22_770, 32_770, 42_770, 52_770]
         );
     }
 
     #[test]
-    fn that_a_lambda_was_made_anew_and_rests_is_in_its_log_and_nothing_that_it_said() {
-        let (mut judge, session) = room(i64::MAX);
-        runs(&mut judge, 0, 1000);
-        let (lines, said) = session.take_log();
+    fn a_restart_after_a_fault_and_back_off_are_logged_by_the_host_not_the_lambda() {
+        let (mut invoker, session) = faulty_until(i64::MAX);
+        runs(&mut invoker, 0, 1000);
+        let (lines, digest) = session.take_log();
         assert_eq!(
             lines.iter().map(|line| line.message.as_str()).collect::<Vec<_>>(),
             [MADE_ANEW, RESTS]
         );
-        assert_eq!((lines[0].at_ns, lines[1].at_ns, said.lines), (10 * MS, 70 * MS, 0));
+        assert_eq!((lines[0].at_ns, lines[1].at_ns, digest.lines), (10 * MS, 70 * MS, 0));
         // Again in the next second: state was lost again.
-        runs(&mut judge, 1000, 2000);
+        runs(&mut invoker, 1000, 2000);
         assert_eq!(session.take_log().0.len(), 1);
     }
 }

@@ -1,4 +1,4 @@
-//! Bytes of a message or of a picture that stay where they are for as long as somebody has them.
+//! Bytes of a message or a picture that stay in place while they are referenced.
 
 use std::ops::Deref;
 use std::sync::Arc;
@@ -9,61 +9,61 @@ use gleaner_transport::SampleMeta;
 
 use super::frame::Info;
 
-/// Bytes that nobody changes, without a copy of their own.
+/// A range of immutable bytes, shared with their owner without a copy.
 #[derive(Clone)]
-pub struct Piece {
-    held: Held,
+pub struct SharedBytes {
+    owner: BytesOwner,
     start: usize,
     len: usize,
 }
 
 #[derive(Clone)]
-enum Held {
-    /// In a cell of the ring.
+enum BytesOwner {
+    /// A slot of the ring.
     Message(Lease<SampleMeta>),
-    /// In a slot for decoded pictures.
+    /// A slot for decoded pictures.
     Decoded(Lease<Info>),
-    /// In memory of its own. Twice boxed, since what is boxed once would have to be copied.
+    /// Own memory. Boxed twice, since an `Arc<[u8]>` would need a copy.
     Made(Arc<Box<[u8]>>),
 }
 
-impl Piece {
-    /// All of a message.
+impl SharedBytes {
+    /// All bytes of a message.
     pub(super) fn of_message(lease: &Lease<SampleMeta>) -> Self {
-        Self { len: lease.len(), start: 0, held: Held::Message(lease.clone()) }
+        Self { len: lease.len(), start: 0, owner: BytesOwner::Message(lease.clone()) }
     }
 
-    /// All of a decoded picture.
+    /// All bytes of a decoded picture.
     pub(super) fn of_decoded(lease: Lease<Info>) -> Self {
-        Self { len: lease.len(), start: 0, held: Held::Decoded(lease) }
+        Self { len: lease.len(), start: 0, owner: BytesOwner::Decoded(lease) }
     }
 
     /// All of `bytes`.
     pub(super) fn made(bytes: Box<[u8]>) -> Self {
-        Self { len: bytes.len(), start: 0, held: Held::Made(Arc::new(bytes)) }
+        Self { len: bytes.len(), start: 0, owner: BytesOwner::Made(Arc::new(bytes)) }
     }
 
-    /// `len` bytes of it from `offset`, clamped to what it has.
+    /// Returns `len` bytes from `offset`, clamped to its length.
     pub(super) fn part(&self, offset: u64, len: usize) -> Self {
         let place = clamps::piece(self.len, offset, len);
-        Self { held: self.held.clone(), start: self.start + place.start, len: place.len() }
+        Self { owner: self.owner.clone(), start: self.start + place.start, len: place.len() }
     }
 }
 
-impl Deref for Piece {
+impl Deref for SharedBytes {
     type Target = [u8];
 
     fn deref(&self) -> &[u8] {
-        let whole: &[u8] = match &self.held {
-            Held::Message(lease) => lease,
-            Held::Decoded(lease) => lease,
-            Held::Made(bytes) => bytes,
+        let whole: &[u8] = match &self.owner {
+            BytesOwner::Message(lease) => lease,
+            BytesOwner::Decoded(lease) => lease,
+            BytesOwner::Made(bytes) => bytes,
         };
         &whole[self.start..self.start + self.len]
     }
 }
 
-impl AsRef<[u8]> for Piece {
+impl AsRef<[u8]> for SharedBytes {
     fn as_ref(&self) -> &[u8] {
         self
     }
@@ -74,8 +74,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_part_is_clamped_to_what_there_is() {
-        let whole = Piece::made((0..10).collect());
+    fn a_part_is_clamped_to_the_length() {
+        let whole = SharedBytes::made((0..10).collect());
         for (offset, len, expected) in [
             (0, 10, &[0, 1, 2, 3, 4, 5, 6, 7, 8, 9][..]),
             (8, 5, &[8, 9]),
@@ -88,8 +88,8 @@ mod tests {
     }
 
     #[test]
-    fn a_part_of_a_part_counts_from_its_begin_and_outlives_the_whole() {
-        let whole = Piece::made((0..10).collect());
+    fn a_part_of_a_part_is_relative_to_it_and_outlives_the_whole() {
+        let whole = SharedBytes::made((0..10).collect());
         let part = whole.part(4, 4);
         drop(whole);
         let last = part.part(2, 100);

@@ -1,5 +1,5 @@
-//! The course of time: wait, wake the lambda, hand out what it decided, and look after everything
-//! now and then.
+//! The live event loop: waits, runs the lambda, publishes its decisions, and does regular
+//! housekeeping.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,39 +12,39 @@ use gleaner_transport::{Clock, LiveSource};
 use gleaner_vitals::Pulse;
 
 use super::announce::Announcer;
-use super::ledger::Ledger;
-use super::recorder::ToRecorder;
+use super::recorder::RecorderSender;
+use super::results_writer::ResultsWriter;
 use super::round_trip::RoundTrip;
-use super::status::{Around, Times, Watch};
+use super::status::{Around, StatusReporter, Times};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
-use crate::judge::Judge;
-use crate::schedule::Schedule;
+use crate::invoker::Invoker;
+use crate::schedule::WakeSchedule;
 
-/// How long nobody looks at signals, the recorder and the time for a report. A wake does not wait
-/// for it.
+/// Interval at which signals, the recorder and the time of the next report are checked. A wake does
+/// not wait for it.
 const ROUND: Duration = Duration::from_millis(50);
-/// How long it may take until we are back here, all that stands still on the way included.
+/// Watchdog interval of the event loop, including stalls.
 const ALIVE: Duration = Duration::from_secs(30);
 
-/// A lambda and all that it takes to run it live.
-pub(super) struct Course {
-    pub(super) judge: Judge,
-    pub(super) schedule: Schedule,
+/// A lambda and the parts of its live run.
+pub(super) struct LiveEventLoop {
+    pub(super) invoker: Invoker,
+    pub(super) schedule: WakeSchedule,
     pub(super) session: Session,
     pub(super) inputs: Vec<Arc<Topic>>,
-    pub(super) ledger: Ledger,
-    pub(super) recorder: Option<ToRecorder>,
+    pub(super) results: ResultsWriter,
+    pub(super) recorder: Option<RecorderSender>,
     pub(super) round_trip: Option<RoundTrip>,
     pub(super) announcer: Option<Announcer>,
-    pub(super) watch: Watch,
+    pub(super) watch: StatusReporter,
     pub(super) source: Box<dyn LiveSource>,
     pub(super) clock: Clock,
     pub(super) pulse: Pulse,
 }
 
-impl Course {
-    /// Goes on until `stop`.
+impl LiveEventLoop {
+    /// Runs until `stop` is set.
     pub(super) fn run(&mut self, stop: &AtomicBool) -> Result<(), Failure> {
         let mut looked = self.clock.now();
         loop {
@@ -55,8 +55,8 @@ impl Course {
                     return Ok(());
                 }
                 self.pulse.alive(ALIVE);
-                self.ledger.flush();
-                self.look_after(now)?;
+                self.results.flush();
+                self.housekeeping(now)?;
             }
             if let Some(wake) = self.schedule.next_tick(now).or_else(|| self.schedule.next_event())
             {
@@ -68,7 +68,7 @@ impl Course {
                 .next_due()
                 .unwrap_or(i64::MAX)
                 .min(looked.saturating_add(nanoseconds(ROUND)));
-            // A bell that was rung meanwhile ends this at once.
+            // If this thread was unparked meanwhile, this returns at once.
             thread::park_timeout(Duration::from_nanos(
                 u64::try_from(due.saturating_sub(now)).unwrap_or(0),
             ));
@@ -77,7 +77,7 @@ impl Course {
 
     fn wake(&mut self, wake: Wake) -> Result<(), Failure> {
         let at_ns = wake.at_ns();
-        if self.judge.is_backing_off(&wake) {
+        if self.invoker.is_backing_off(&wake) {
             return Ok(());
         }
         let sample = if let Wake::Event(sample) = &wake { Some(sample) } else { None };
@@ -92,15 +92,15 @@ impl Course {
             recorder.begin(&wake);
         }
         let entered = self.clock.now();
-        let decision = self.judge.judge(wake);
+        let decision = self.invoker.invoke(wake);
         let left = self.clock.now();
         if let (Some(round_trip), Some(cause)) = (&mut self.round_trip, cause) {
             round_trip.answer(cause, &decision);
         }
-        let (log, said) = self.session.take_log();
-        // Should the recorder be gone, the decision is written all the same.
-        let told = match &mut self.recorder {
-            Some(recorder) => recorder.end(&decision, said, self.clock.monotonic(left)),
+        let (log, digest) = self.session.take_log();
+        // The decision is written even if the recorder has ended.
+        let recorded = match &mut self.recorder {
+            Some(recorder) => recorder.end(&decision, digest, self.clock.monotonic(left)),
             None => Ok(()),
         };
         let out = self.clock.now();
@@ -108,18 +108,18 @@ impl Course {
             announcer.decision(&decision);
         }
         self.watch.woke(&decision, log.len(), Times { at: at_ns, entered, left, out });
-        self.ledger.log(log);
-        self.ledger.decision(decision);
-        told
+        self.results.log(log);
+        self.results.decision(decision);
+        recorded
     }
 
-    /// Messages that were not sent on topics that were asked for.
+    /// Number of messages that were not sent on requested topics.
     pub(super) fn unsent(&self) -> u64 {
         let answers = self.round_trip.as_ref().map_or(0, RoundTrip::unsent);
         answers + self.announcer.as_ref().map_or(0, Announcer::unsent)
     }
 
-    fn look_after(&mut self, now: i64) -> Result<(), Failure> {
+    fn housekeeping(&mut self, now: i64) -> Result<(), Failure> {
         if let Some(recorder) = &mut self.recorder {
             recorder.poll()?;
         }
@@ -128,11 +128,11 @@ impl Course {
         }
         let health = self.source.health();
         if let Some(why) = &health.dead {
-            let mut failure =
-                Failure::new(Exit::Unreachable, "nothing of the network is handled any more");
+            let mut failure = Failure::new(Exit::Unreachable, "the DDS receive thread has stopped");
             failure.causes = vec![why.clone()];
-            return Err(failure
-                .with_help("start again; where it happens often, report it with these words"));
+            return Err(
+                failure.with_help("start again; if it happens often, report it with this text")
+            );
         }
         let live = self.watch.report(&Around {
             source: &*self.source,
@@ -140,11 +140,11 @@ impl Course {
             inputs: &self.inputs,
             schedule: &self.schedule,
             session: &self.session,
-            unwritten: self.ledger.unwritten(),
+            unwritten: self.results.unwritten(),
             unsent: self.unsent(),
-            recorder: self.recorder.as_ref().map(ToRecorder::dropped),
+            recorder_link: self.recorder.as_ref().map(RecorderSender::dropped),
         });
-        self.ledger.report(Report::Live(Box::new(live)));
+        self.results.report(Report::Live(Box::new(live)));
         Ok(())
     }
 }

@@ -1,67 +1,67 @@
-//! What a journal claims: which lambda decided what, and where that is written.
+//! The reference journal of a comparison: opens it and checks that it fits the lambda.
 
 use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 
-use gleaner_base::{Exit, Failure, excerpt, own_file};
+use gleaner_base::{Exit, Failure, excerpt, safe_file};
 use gleaner_drives::{ReplayError, read_extras};
-use gleaner_journal::{Difference, Entry, Header, JournalError, Reader};
+use gleaner_journal::{Difference, JournalEntry, JournalError, JournalHeader, JournalReader};
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, Tightened};
-use gleaner_recorder::{Stated, Untrue};
+use gleaner_recorder::{ClipStatements, FalseStatement};
 use serde_json::Value;
 
 use crate::input::Remap;
-use crate::journal::{CLOCK_OF_VEHICLE, Identity};
+use crate::journal::{CLOCK_OF_VEHICLE, LambdaIdentity};
 use crate::replay::journal_file;
 use crate::replay::open::DriveError;
-use crate::replay::options::{Drives, Options};
-use crate::replay::part::Wanted;
-use crate::stage::{Asked, AskedArgs, tighten};
+use crate::replay::options::{Drives, ReplayOptions};
+use crate::replay::time_range::RequestedRange;
+use crate::session_setup::{ConfiguredLambda, LambdaArgs, tighten};
 
-/// Most bytes of a clip's attachments and metadata that are read: a journal part has 64 MiB at
+/// Upper bound of the bytes read of a clip's attachments and metadata: a journal part has 64 MiB at
 /// most.
 const EXTRAS_BYTES: u64 = 256 << 20;
 
-/// A journal, opened.
-pub(in crate::replay) struct Claim {
+/// An open journal, with which decisions are compared.
+pub(in crate::replay) struct ReferenceJournal {
     path: PathBuf,
-    reader: Reader<Box<dyn Read + Send>>,
-    /// Statements of the clip that it is a part of, and begins in the middle of; none for the
-    /// journal of a replay.
-    pub(in crate::replay) clip: Option<Stated>,
-    /// Limits that held by the journal and not by the manifest.
+    reader: JournalReader<Box<dyn Read + Send>>,
+    /// Metadata of the clip that contains it, where it begins in the middle of a run; `None` for
+    /// the journal of a replay.
+    pub(in crate::replay) clip: Option<ClipStatements>,
+    /// Notes on limits for which the journal's value is used, not the manifest's.
     pub(super) limits: Vec<String>,
 }
 
-impl Claim {
-    /// The journal of a replay.
+impl ReferenceJournal {
+    /// Opens the journal of a replay.
     pub(in crate::replay) fn journal(path: &Path) -> Result<Self, Failure> {
         let file = journal_file::read(path)?;
         Self::open(path, Box::new(BufReader::new(file)))
     }
 
-    /// The file that it is in.
+    /// The file that contains it.
     pub(in crate::replay) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The part of the journal of `lambda` that a clip holds.
+    /// Opens the part of the journal of `lambda` that a clip holds.
     pub(in crate::replay) fn clip(path: &Path, lambda: &str) -> Result<Self, Failure> {
         let mut extras = read_extras(path, EXTRAS_BYTES).map_err(unreadable_clip)?;
         if !extras.is_whole {
-            let message = format!("clip `{}` is cut off or was never finished", path.display());
+            let message = format!("clip `{}` is truncated or was never finished", path.display());
             return Err(Failure::new(Exit::Usage, message)
-                .with_help("copy it again; a clip of Gleaner has its end"));
+                .with_help("copy it again; a complete clip of Gleaner has an end record"));
         }
         if let Some(misfit) = &extras.misfit {
             let mut failure = Failure::new(
                 Exit::Differs,
-                format!("clip `{}` is not as a recorder writes it", path.display()),
+                format!("clip `{}` was not written by a recorder in this form", path.display()),
             );
             failure.causes = vec![format!("it has {misfit}")];
             return Err(failure.with_help(
-                "it was changed since it was made; readers may see other messages in it",
+                "the clip was changed after it was written; readers may find other messages in it",
             ));
         }
         let wanted = format!("journal/{lambda}.journal");
@@ -73,27 +73,29 @@ impl Claim {
             let others =
                 names.filter(|name| name.starts_with("journal/")).map(excerpt).collect::<Vec<_>>();
             let help = if others.is_empty() {
-                "it was recovered after its recorder had died, or is no clip of Gleaner".to_owned()
+                "the clip was recovered after its recorder had died, or is no clip of Gleaner"
+                    .to_owned()
             } else {
                 format!("it holds `{}`: name that lambda with --lambda", others.join("`, `"))
             };
             return Err(Failure::new(Exit::Usage, message).with_help(help));
         };
         let part = std::mem::take(&mut part.data);
-        let mut claim = Self::open(path, Box::new(Cursor::new(part)))?;
-        let stated = Stated::read(&extras, claim.header()).map_err(|error| untrue(path, &error))?;
-        claim.clip = Some(stated);
-        Ok(claim)
+        let mut reference = Self::open(path, Box::new(Cursor::new(part)))?;
+        let stated = ClipStatements::read(&extras, reference.header())
+            .map_err(|error| untrue(path, &error))?;
+        reference.clip = Some(stated);
+        Ok(reference)
     }
 
     fn open(path: &Path, bytes: Box<dyn Read + Send>) -> Result<Self, Failure> {
-        let reader = Reader::open(bytes).map_err(|error| unusable(path, &error))?;
+        let reader = JournalReader::open(bytes).map_err(|error| unusable(path, &error))?;
         if reader.header().clock == CLOCK_OF_VEHICLE {
             let message =
-                format!("`{}` was recorded live, and cannot be verified yet", path.display());
+                format!("`{}` was recorded live, which cannot be verified yet", path.display());
             let mut failure = Failure::new(Exit::Usage, message);
             failure.causes = vec![
-                "lambda and recorder each received the samples by themselves, and the clip has the recorder's stamps"
+                "lambda and recorder received the samples independently, and the clip has the recorder's stamps"
                     .to_owned(),
             ];
             return Err(
@@ -103,38 +105,38 @@ impl Claim {
         Ok(Self { path: path.to_owned(), reader, clip: None, limits: Vec::new() })
     }
 
-    /// A comparison of nothing proves nothing.
+    /// The failure of a journal without a complete wake.
     pub(super) fn empty(&self) -> Failure {
-        let message = format!("the journal in `{}` holds no whole wake", self.path.display());
+        let message = format!("the journal in `{}` holds no complete wake", self.path.display());
         Failure::new(Exit::Usage, message)
-            .with_help("its writer died early, or it was cut off: write a new one")
+            .with_help("its writer died early, or the file was truncated: write a new one")
     }
 
-    pub(super) fn header(&self) -> &Header {
+    pub(super) fn header(&self) -> &JournalHeader {
         self.reader.header()
     }
 
-    /// The next wake; none at the end.
-    pub(super) fn next(&mut self) -> Result<Option<Entry>, Failure> {
+    /// Reads the next wake; `None` at the end.
+    pub(super) fn next(&mut self) -> Result<Option<JournalEntry>, Failure> {
         self.reader.next().map_err(|error| unusable(&self.path, &error))
     }
 
-    pub(super) fn reader(&self) -> &Reader<Box<dyn Read + Send>> {
+    pub(super) fn reader(&self) -> &JournalReader<Box<dyn Read + Send>> {
         &self.reader
     }
 
-    /// Returns what the journal was made with, unless `set`, `remaps` and the vehicle say
-    /// otherwise, which then has to be the same. Without a vehicle, limits of the journal that are
-    /// tighter than those of the manifest count as those of the vehicle of then, and are noted;
-    /// they cannot be wider.
+    /// Returns the options with which the journal was written. Values in `set`, `remaps` and the
+    /// vehicle take precedence, and must be equal to those of the journal. Without a vehicle,
+    /// limits of the journal that are lower than those of the manifest are taken for those of its
+    /// vehicle, and noted; they cannot be higher.
     pub(in crate::replay) fn options(
         &mut self,
-        args: AskedArgs,
+        args: LambdaArgs,
         build: BuildDir,
         manifest: &mut Manifest,
         drives: Drives,
-    ) -> Result<Options, Failure> {
-        let AskedArgs { lambda, set, remap: remaps, vehicle } = args;
+    ) -> Result<ReplayOptions, Failure> {
+        let LambdaArgs { lambda: folder, set, remap: remaps, vehicle } = args;
         let header = self.reader.header();
         match &vehicle {
             Some(file) => tighten(manifest, file)?,
@@ -143,7 +145,7 @@ impl Claim {
                 manifest.limits = limits;
                 let note = |Tightened { key, from, to }| {
                     format!(
-                        "limit `{key}`: {to} in the journal, which holds, {from} in lambda.toml; --vehicle FILE compares it"
+                        "limit `{key}`: {to} in the journal, which is used, {from} in lambda.toml; --vehicle FILE compares it"
                     )
                 };
                 self.limits = tightened.into_iter().map(note).collect();
@@ -155,19 +157,23 @@ impl Claim {
         } else {
             remaps
         };
-        let mut asked = Asked { lambda, build, config: Vec::new(), remaps, vehicle };
-        // The files first: in those of another lambda, the journal's config may not even exist.
-        let without_config = Header { config: serde_json::Map::new(), ..header.clone() };
-        compare(&without_config, &asked, manifest)?;
+        let mut lambda = ConfiguredLambda { folder, build, config: Vec::new(), remaps, vehicle };
+        // The files first: another lambda may not even have the keys of the journal's config.
+        let without_config = JournalHeader { config: serde_json::Map::new(), ..header.clone() };
+        compare(&without_config, &lambda, manifest)?;
         let set = if set.is_empty() { assignments(header) } else { set };
-        asked.config = ConfigSet::resolve(manifest, &set)?;
-        compare(header, &asked, manifest)?;
-        // A clip holds what it holds.
-        let part = if self.clip.is_some() { Wanted::default() } else { Wanted::from(header.part) };
-        Ok(Options {
-            asked,
+        lambda.config = ConfigSet::resolve(manifest, &set)?;
+        compare(header, &lambda, manifest)?;
+        // A clip is used as a whole.
+        let range = if self.clip.is_some() {
+            RequestedRange::default()
+        } else {
+            RequestedRange::from(header.part)
+        };
+        Ok(ReplayOptions {
+            lambda,
             drives,
-            part,
+            range,
             topics: Vec::new(),
             unpack_in: None,
             unpacked: Vec::new(),
@@ -175,11 +181,11 @@ impl Claim {
     }
 }
 
-/// The config of a journal, as `--set` would give it.
-fn assignments(header: &Header) -> Vec<(String, String)> {
+/// The config of a journal as arguments of `--set`.
+fn assignments(header: &JournalHeader) -> Vec<(String, String)> {
     let text = |value: &Value| match value {
         Value::String(text) => text.clone(),
-        // As the manifest writes a whole number that is a float.
+        // Floats with integer values are written as in the manifest.
         Value::Number(number) if number.is_f64() => {
             ConfigValue::Float(number.as_f64().unwrap_or(0.0)).to_string()
         }
@@ -188,19 +194,23 @@ fn assignments(header: &Header) -> Vec<(String, String)> {
     header.config.iter().map(|(key, value)| (key.clone(), text(value))).collect()
 }
 
-fn compare(header: &Header, asked: &Asked, manifest: &Manifest) -> Result<(), Failure> {
-    let Asked { build, config, remaps, .. } = asked;
+fn compare(
+    header: &JournalHeader,
+    lambda: &ConfiguredLambda,
+    manifest: &Manifest,
+) -> Result<(), Failure> {
+    let ConfiguredLambda { build, config, remaps, .. } = lambda;
     let (engine, clock, part) = (header.engine.clone(), header.clock.as_str(), header.part);
-    let now = Identity { manifest, build, config, remaps, engine, clock, part }.header()?;
+    let now = LambdaIdentity { manifest, build, config, remaps, engine, clock, part }.header()?;
     match header.differs_from(&now) {
         None => Ok(()),
         Some(difference) => Err(different("this is not the lambda that wrote the journal", &difference).with_help(
-            "name the folder of the lambda that wrote it, with the build, --set, --remap and --vehicle of then",
+            "name the folder of the lambda that wrote it, with the same build, --set, --remap and --vehicle",
         )),
     }
 }
 
-/// Two sides that should be equal.
+/// The failure for two values that should be equal.
 pub(super) fn different(message: impl Into<String>, difference: &Difference) -> Failure {
     let Difference { what, journal, now } = difference;
     let mut failure = Failure::new(Exit::Differs, message);
@@ -208,13 +218,16 @@ pub(super) fn different(message: impl Into<String>, difference: &Difference) -> 
     failure
 }
 
-/// A failure: the clip makes an untrue statement about itself.
-pub(super) fn untrue(path: &Path, Untrue { what, stated, found }: &Untrue) -> Failure {
+/// The failure of a clip whose metadata contradicts its messages or its journal.
+pub(super) fn untrue(
+    path: &Path,
+    FalseStatement { what, stated, found }: &FalseStatement,
+) -> Failure {
     let mut failure =
         Failure::new(Exit::Differs, format!("clip `{}` contradicts itself", path.display()));
-    failure.causes = vec![format!("{what}\nthe clip says:  {stated}\nit should be:   {found}")];
+    failure.causes = vec![format!("{what}\nstated:    {stated}\nexpected:  {found}")];
     failure.with_help(
-        "it was changed since it was made, or an older gleaner made it: replay the lambda over its drive again",
+        "the clip was changed after it was written, or an older gleaner wrote it: replay the lambda over its drive again",
     )
 }
 
@@ -225,22 +238,24 @@ fn unusable(path: &Path, error: &JournalError) -> Failure {
         error,
     );
     match error {
-        JournalError::Damaged { .. } => failure
-            .with_help("it was changed after it was written: copy it again, or write a new one"),
-        JournalError::NotAJournal if begins_as_mcap(path) => failure
-            .with_help("it is an MCAP file; to verify a clip: gleaner verify CLIP --lambda DIR"),
+        JournalError::Damaged { .. } => failure.with_help(
+            "the journal was changed after it was written: copy it again, or write a new one",
+        ),
+        JournalError::NotAJournal if begins_as_mcap(path) => failure.with_help(
+            "the file is an MCAP file; to verify a clip: gleaner verify CLIP --lambda DIR",
+        ),
         _ => failure.with_help("name a file that `gleaner replay --journal FILE` wrote"),
     }
 }
 
-/// A clip that cannot be read, or is damaged.
+/// The failure of a clip that is unreadable or damaged.
 pub(super) fn unreadable_clip(error: ReplayError) -> Failure {
     Failure::from(DriveError(error)).with_help("copy the clip again if you can")
 }
 
 fn begins_as_mcap(path: &Path) -> bool {
     let mut start = [0; 5];
-    own_file::read_named(path)
+    safe_file::read_named(path)
         .and_then(|mut file| file.read_exact(&mut start))
         .is_ok_and(|()| start == *b"\x89MCAP")
 }

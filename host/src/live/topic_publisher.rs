@@ -1,19 +1,19 @@
-//! A topic that a lambda's process writes on request. Nothing waits for it: what cannot be sent is
-//! counted, and said now and then.
+//! Publishes a topic of a lambda's process, without blocking. Messages that cannot be sent are
+//! counted, and logged at increasing intervals.
 
 use gleaner_base::Failure;
 use gleaner_messages::CdrWriter;
 use gleaner_transport::{LiveSource, Publisher};
 
-pub(super) struct Speaker {
+pub(super) struct TopicPublisher {
     topic: String,
     publisher: Box<dyn Publisher>,
     unsent: u64,
     message: CdrWriter,
 }
 
-impl Speaker {
-    /// Writes `topic`; its `depth` newest messages are kept for a reader that is slow to take them.
+impl TopicPublisher {
+    /// Opens `topic`; its `depth` newest messages are kept for a slow reader.
     pub(super) fn open(
         source: &dyn LiveSource,
         topic: &str,
@@ -24,19 +24,19 @@ impl Speaker {
         Ok(Self { topic: topic.to_owned(), publisher, unsent: 0, message: CdrWriter::new() })
     }
 
-    /// Messages that were not sent.
+    /// Number of messages that were not sent.
     pub(super) fn unsent(&self) -> u64 {
         self.unsent
     }
 
     /// Sends the message that `fill` writes.
-    pub(super) fn say(&mut self, fill: impl FnOnce(&mut CdrWriter) -> &mut CdrWriter) {
+    pub(super) fn publish(&mut self, fill: impl FnOnce(&mut CdrWriter) -> &mut CdrWriter) {
         self.message.clear();
         fill(&mut self.message);
         if let Err(error) = self.publisher.publish(self.message.bytes()) {
             self.unsent += 1;
             if self.unsent.is_power_of_two() {
-                tracing::warn!(topic = %self.topic, unsent = self.unsent, %error, "a message was not sent");
+                tracing::warn!(topic = %self.topic, unsent = self.unsent, %error, "message not sent");
             }
         }
     }

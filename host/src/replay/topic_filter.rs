@@ -1,24 +1,24 @@
-//! Which topics of a drive its clips hold: those of `[record]`, or those that the command line
-//! chooses instead.
+//! Selects the topics of a drive that clips hold: those of `[record]`, or those of `--topics`
+//! instead.
 
 use std::collections::HashSet;
 
 use gleaner_base::{Exit, Failure};
 use gleaner_drives::Replay;
-use gleaner_lambda::manifest::Record;
+use gleaner_lambda::manifest::RecordSpec;
 use gleaner_recorder::{MESSAGE_MAX, TOPICS_MAX};
 use gleaner_transport::{DiscoveredTopic, Qos, TopicSpec};
 
-use super::Options;
+use super::ReplayOptions;
 use crate::input::Remap;
 
-/// Most topics that are named in a message.
+/// Maximum number of topics that a message names.
 const NAMED: usize = 20;
 
-/// The names in the drive of the topics that clips are to hold, each once.
+/// Names of the topics that clips are to hold, as in the drive, each once.
 pub(super) fn topics(
-    rules: &Record,
-    options: &Options,
+    rules: &RecordSpec,
+    options: &ReplayOptions,
     drive: &Replay,
     known: &[DiscoveredTopic],
 ) -> Result<Vec<String>, Failure> {
@@ -33,7 +33,7 @@ pub(super) fn topics(
         rules
             .topics
             .iter()
-            .for_each(|topic| add(Remap::apply(&options.asked.remaps, topic.as_str())));
+            .for_each(|topic| add(Remap::apply(&options.lambda.remaps, topic.as_str())));
         return Ok(names);
     }
     for pattern in &options.topics {
@@ -60,7 +60,7 @@ pub(super) fn topics(
         if others.len() > NAMED {
             tracing::warn!(
                 topics = others.len() - NAMED,
-                "clips are made without further topics, for such reasons"
+                "clips are made without further topics that cannot be read"
             );
         }
         readable.iter().for_each(|topic| add(&topic.topic));
@@ -74,7 +74,7 @@ pub(super) fn topics(
     Ok(names)
 }
 
-/// How a topic of the drive is subscribed to be recorded.
+/// The subscription that records a topic of the drive.
 pub(super) fn spec_of(found: &DiscoveredTopic) -> TopicSpec {
     let (topic, type_name) = (found.topic.clone(), found.type_name.clone());
     TopicSpec { topic, type_name, queue: 1, max_bytes: MESSAGE_MAX, qos: Qos::Auto }
@@ -90,10 +90,10 @@ fn nothing_readable(
     let mut failure = Failure::new(Exit::Usage, message);
     failure.causes = errors.take(1).map(|error| error.to_string()).collect();
     let readable = known.iter().filter(|topic| drive.can_subscribe(&spec_of(topic)).is_ok());
-    failure.with_help(format!("the drive has {}, which can be", list(readable)))
+    failure.with_help(format!("the drive has {}, which can be recorded", list(readable)))
 }
 
-/// The names of some topics, for a message.
+/// Lists the names of some topics, for a message.
 pub(super) fn list<'a>(topics: impl IntoIterator<Item = &'a DiscoveredTopic>) -> String {
     let mut topics = topics.into_iter();
     let names: Vec<_> =
@@ -105,13 +105,13 @@ pub(super) fn list<'a>(topics: impl IntoIterator<Item = &'a DiscoveredTopic>) ->
     }
 }
 
-/// Whether `name` is what `pattern` says, in which a `*` stands for any letters, or none.
+/// Returns whether `name` matches `pattern`, in which a `*` stands for any number of letters.
 fn matches(pattern: &str, name: &str) -> bool {
     let mut parts = pattern.split('*');
     let Some(mut rest) = name.strip_prefix(parts.next().unwrap_or_default()) else { return false };
     let Some(last) = parts.next_back() else { return rest.is_empty() };
     for part in parts {
-        // The first place is as good as any: it leaves the most for what follows.
+        // The first match is the best: it leaves the most for the parts that follow.
         let Some(at) = rest.find(part) else { return false };
         rest = &rest[at + part.len()..];
     }

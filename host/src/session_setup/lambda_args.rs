@@ -1,4 +1,4 @@
-//! Which lambda is to run, with which settings.
+//! Arguments that name the lambda to run and its settings, and their check against the manifest.
 
 use std::path::{Path, PathBuf};
 
@@ -9,9 +9,9 @@ use gleaner_lambda::{BuildDir, Vehicle};
 
 use crate::input::Remap;
 
-/// Arguments that say which lambda is to run, with which settings.
+/// Arguments that name the lambda to run and its settings.
 #[derive(Args, Clone, Debug)]
-pub struct AskedArgs {
+pub struct LambdaArgs {
     /// The lambda's folder, built by `gleaner build`.
     pub lambda: PathBuf,
     /// A value of the table `config` of the manifest.
@@ -20,45 +20,48 @@ pub struct AskedArgs {
     /// Another name for a topic of the manifest.
     #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
     pub remap: Vec<Remap>,
-    /// The configuration of the vehicle, whose limits make those of the manifest smaller.
+    /// The configuration of the vehicle; its limits lower those of the manifest.
     #[arg(long, value_name = "FILE")]
     pub vehicle: Option<PathBuf>,
 }
 
-/// A lambda as it was asked for.
-pub struct Asked {
+/// A lambda with its settings, checked.
+pub struct ConfiguredLambda {
     /// Its folder.
-    pub lambda: PathBuf,
-    /// Its build, not older than its sources.
+    pub folder: PathBuf,
+    /// Its build, which is not older than its sources.
     pub build: BuildDir,
-    /// All of `[config]`, with the overrides laid over the defaults.
+    /// All of `[config]`: the defaults with the overrides applied.
     pub config: Vec<(String, ConfigValue)>,
     /// Other names for topics of the manifest.
     pub remaps: Vec<Remap>,
-    /// The configuration of the vehicle, which an interpreter reads once more.
+    /// The configuration of the vehicle, which an interpreter reads again.
     pub vehicle: Option<PathBuf>,
 }
 
-impl Asked {
-    /// Checks the overrides against the manifest, and has the vehicle tighten its limits: from here
-    /// on they are what holds.
+impl ConfiguredLambda {
+    /// Checks the overrides against the manifest, and applies the limits of the vehicle to
+    /// `manifest`.
     ///
     /// # Errors
     ///
     /// A failure that names the key or the topic, and the way out.
-    pub fn new(args: AskedArgs, build: BuildDir, manifest: &mut Manifest) -> Result<Self, Failure> {
-        let AskedArgs { lambda, set, remap: remaps, vehicle } = args;
+    pub fn new(
+        args: LambdaArgs,
+        build: BuildDir,
+        manifest: &mut Manifest,
+    ) -> Result<Self, Failure> {
+        let LambdaArgs { lambda, set, remap: remaps, vehicle } = args;
         if let Some(vehicle) = &vehicle {
             tighten(manifest, vehicle)?;
         }
         let config = ConfigSet::resolve(manifest, &set)?;
         known_topics(&remaps, manifest)?;
-        Ok(Self { lambda, build, config, remaps, vehicle })
+        Ok(Self { folder: lambda, build, config, remaps, vehicle })
     }
 }
 
-/// Makes the limits of `manifest` those of the vehicle described in `file`, where these are
-/// smaller.
+/// Lowers the limits of `manifest` to those of the vehicle described in `file`.
 ///
 /// # Errors
 ///
@@ -68,7 +71,7 @@ pub fn tighten(manifest: &mut Manifest, file: &Path) -> Result<(), Failure> {
     manifest.limits = limits;
     if !tightened.is_empty() {
         let limits = tightened.iter().map(Tightened::to_string).collect::<Vec<_>>().join(", ");
-        tracing::warn!(lambda = %manifest.lambda.name, by = %file.display(), %limits, "the vehicle allows less than the lambda asks for");
+        tracing::warn!(lambda = %manifest.lambda.name, by = %file.display(), %limits, "limits lowered by the vehicle's configuration");
     }
     Ok(())
 }

@@ -1,5 +1,5 @@
-//! The WebAssembly guest by itself: every limit is hit, every cause is named, and a fresh guest
-//! follows.
+//! The WebAssembly guest with the lambda `misbehave`: every limit is hit, every cause is named, and
+//! a fresh guest follows.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,7 +9,7 @@ use gleaner_compile::Nans;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Topic, Wake};
 use gleaner_host::guest::wasm::{Deadline, Loaded, WasmGuest};
-use gleaner_host::guest::{Guest, Outcome};
+use gleaner_host::guest::{Guest, WakeOutcome};
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::{ConfigValue, Limits, Manifest};
@@ -27,7 +27,7 @@ MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
 MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
 
 /// A misbehaving lambda and the transport that feeds it.
-struct Room {
+struct MisbehavingGuest {
     guest: WasmGuest,
     session: Session,
     transport: Loopback,
@@ -35,7 +35,7 @@ struct Room {
     sent: u64,
 }
 
-impl Room {
+impl MisbehavingGuest {
     fn new(behaviour: &str, fuel: u64, deadline: Option<Duration>) -> Self {
         let lambda = root().join("tests/lambdas/misbehave/rust/build");
         let manifest = Manifest::load(&lambda).expect("misbehave is built; run: cargo xtask test");
@@ -62,12 +62,12 @@ impl Room {
     }
 
     fn of(behaviour: &str) -> Self {
-        let mut room = Self::new(behaviour, FUEL, None);
-        room.guest.init().unwrap();
-        room
+        let mut test = Self::new(behaviour, FUEL, None);
+        test.guest.init().unwrap();
+        test
     }
 
-    fn wake(&mut self) -> Outcome {
+    fn wake(&mut self) -> WakeOutcome {
         self.sent += 1;
         let at_ns = self.sent as i64 * 1_000_000;
         let meta = SampleMeta {
@@ -84,7 +84,7 @@ impl Room {
         self.guest.wake(Wake::Event(sample))
     }
 
-    /// Kind and message of the fault of one wake.
+    /// Runs a wake; returns kind and message of its fault.
     fn fault(&mut self) -> (FaultKind, String) {
         let fault = self.wake().result.expect_err("a fault");
         (fault.kind, fault.message)
@@ -93,16 +93,16 @@ impl Room {
 
 #[test]
 fn a_good_wake_uses_some_fuel_and_causes_nothing() {
-    let mut room = Room::of("ok");
-    let outcome = room.wake();
+    let mut test = MisbehavingGuest::of("ok");
+    let outcome = test.wake();
     assert!(outcome.result.is_ok());
     assert!((1..100_000).contains(&outcome.fuel.unwrap()), "{:?}", outcome.fuel);
-    assert!(room.session.end().is_empty());
+    assert!(test.session.end().is_empty());
 }
 
 #[test]
 fn an_endless_loop_ends_with_its_fuel() {
-    let outcome = Room::of("endless").wake();
+    let outcome = MisbehavingGuest::of("endless").wake();
     let fault = outcome.result.unwrap_err();
     assert_eq!((fault.kind, fault.allowed), (FaultKind::Fuel, Some(FUEL)));
     assert_eq!(fault.message, format!("used {FUEL} of {FUEL} units of fuel"));
@@ -110,18 +110,18 @@ fn an_endless_loop_ends_with_its_fuel() {
 
 #[test]
 fn an_endless_loop_of_host_calls_ends_as_well() {
-    let (kind, _) = Room::of("host_calls").fault();
+    let (kind, _) = MisbehavingGuest::of("host_calls").fault();
     assert_eq!(kind, FaultKind::Fuel);
 }
 
 #[test]
 fn the_same_wake_uses_the_same_fuel_also_after_a_trap() {
-    let used = |room: &mut Room| room.wake().fuel.unwrap();
-    let mut room = Room::of("ok");
-    let (first, second) = (used(&mut room), used(&mut room));
-    let mut again = Room::of("ok");
+    let used = |test: &mut MisbehavingGuest| test.wake().fuel.unwrap();
+    let mut test = MisbehavingGuest::of("ok");
+    let (first, second) = (used(&mut test), used(&mut test));
+    let mut again = MisbehavingGuest::of("ok");
     assert_eq!((used(&mut again), used(&mut again)), (first, second));
-    let mut faulty = Room::of("error");
+    let mut faulty = MisbehavingGuest::of("error");
     let faults =
         [faulty.wake(), faulty.wake()].map(|outcome| (outcome.result.is_err(), outcome.fuel));
     assert_eq!(faults[0], faults[1]);
@@ -130,26 +130,26 @@ fn the_same_wake_uses_the_same_fuel_also_after_a_trap() {
 #[test]
 fn a_deadline_ends_what_fuel_would_allow() {
     let deadline = Duration::from_millis(20);
-    let mut room = Room::new("endless", 1_000_000_000_000, Some(deadline));
-    room.guest.init().unwrap();
-    let fault = room.wake().result.unwrap_err();
+    let mut test = MisbehavingGuest::new("endless", 1_000_000_000_000, Some(deadline));
+    test.guest.init().unwrap();
+    let fault = test.wake().result.unwrap_err();
     assert_eq!((fault.kind, fault.allowed), (FaultKind::Deadline, Some(20_000_000)));
     assert!(fault.used.unwrap() >= 20_000_000, "{fault:?}");
     assert!(fault.message.ends_with("the deadline is 20.0 ms"), "{}", fault.message);
     // The next guest has a deadline of its own.
-    assert_eq!(room.wake().result.unwrap_err().kind, FaultKind::Deadline);
+    assert_eq!(test.wake().result.unwrap_err().kind, FaultKind::Deadline);
 }
 
 #[test]
 fn memory_beyond_the_cap_is_named_with_both_numbers() {
-    let fault = Room::of("memory").wake().result.unwrap_err();
+    let fault = MisbehavingGuest::of("memory").wake().result.unwrap_err();
     assert_eq!((fault.kind, fault.allowed), (FaultKind::Memory, Some(MEMORY)));
     assert!(fault.used.unwrap() > MEMORY, "{fault:?}");
 }
 
 #[test]
 fn a_panic_says_what_and_where() {
-    let (kind, message) = Room::of("panic").fault();
+    let (kind, message) = MisbehavingGuest::of("panic").fault();
     assert_eq!(kind, FaultKind::Trap);
     assert!(
         message.starts_with("panicked at ") && message.ends_with(": wake 1 is one too many"),
@@ -160,53 +160,56 @@ fn a_panic_says_what_and_where() {
 
 #[test]
 fn deep_recursion_ends_as_a_fault() {
-    let (kind, message) = Room::of("recurse").fault();
+    let (kind, message) = MisbehavingGuest::of("recurse").fault();
     assert_eq!((kind, message.as_str()), (FaultKind::Stack, "the call stack is full"));
 }
 
 #[test]
 fn exit_and_sleep_are_faults_with_their_names() {
-    assert_eq!(Room::of("exit").fault(), (FaultKind::Trap, "the lambda called exit".to_owned()));
+    assert_eq!(
+        MisbehavingGuest::of("exit").fault(),
+        (FaultKind::Trap, "the lambda called exit".to_owned())
+    );
     let asleep = "a lambda cannot sleep: it is woken by samples or by a period".to_owned();
-    assert_eq!(Room::of("sleep").fault(), (FaultKind::HostCall, asleep));
+    assert_eq!(MisbehavingGuest::of("sleep").fault(), (FaultKind::HostCall, asleep));
 }
 
 #[test]
 fn files_and_sockets_do_not_exist() {
     for behaviour in ["read_file", "connect"] {
-        let (kind, message) = Room::of(behaviour).fault();
+        let (kind, message) = MisbehavingGuest::of(behaviour).fault();
         assert_eq!(kind, FaultKind::Exception, "{behaviour}: {message}");
     }
 }
 
 #[test]
 fn refusals_of_the_host_reach_the_lambda_as_errors() {
-    for (behaviour, said) in [
+    for (behaviour, expected) in [
         ("error", "I do not want to"),
         ("huge_label", "the label has 1000 bytes; at most 128 are allowed"),
         ("nan_score", "the score of `x` is NaN; it must be finite"),
         ("too_many_triggers", "this wake has caused 16 triggers already; further ones are refused"),
         ("not_a_frame", "a sample of `/imu/data` is no image: its type is `sensor_msgs/msg/Imu`"),
     ] {
-        let (kind, message) = Room::of(behaviour).fault();
+        let (kind, message) = MisbehavingGuest::of(behaviour).fault();
         assert_eq!(kind, FaultKind::Exception);
-        assert!(message.contains(said), "{behaviour}: {message}");
+        assert!(message.contains(expected), "{behaviour}: {message}");
     }
 }
 
 #[test]
 fn a_refusal_in_init_ends_the_start() {
-    for (behaviour, said) in [
+    for (behaviour, expected) in [
         ("error_in_init", "in init: no, not today"),
         ("bad_input", "no input `imo`; the manifest has `imu`"),
         ("bad_field", "linear_acceleration"),
         ("event_in_init", "triggers belong to a wake"),
     ] {
-        let fault = Room::new(behaviour, FUEL, None).guest.init().unwrap_err();
+        let fault = MisbehavingGuest::new(behaviour, FUEL, None).guest.init().unwrap_err();
         assert_eq!(fault.kind, FaultKind::Exception);
-        assert!(fault.message.contains(said), "{behaviour}: {}", fault.message);
+        assert!(fault.message.contains(expected), "{behaviour}: {}", fault.message);
     }
-    let fault = Room::new("panic_in_init", FUEL, None).guest.init().unwrap_err();
+    let fault = MisbehavingGuest::new("panic_in_init", FUEL, None).guest.init().unwrap_err();
     assert_eq!(fault.kind, FaultKind::Trap);
     assert!(
         fault.message.starts_with("in init: ") && fault.message.contains("no, not today"),
@@ -217,42 +220,42 @@ fn a_refusal_in_init_ends_the_start() {
 
 #[test]
 fn a_trigger_before_a_panic_still_counts() {
-    let mut room = Room::of("event_then_panic");
-    assert_eq!(room.fault().0, FaultKind::Trap);
-    assert_eq!(room.session.end()[0].label, "seen");
+    let mut test = MisbehavingGuest::of("event_then_panic");
+    assert_eq!(test.fault().0, FaultKind::Trap);
+    assert_eq!(test.session.end()[0].label, "seen");
 }
 
 #[test]
 fn a_fresh_guest_follows_each_fault_and_nothing_stays_held() {
-    let mut room = Room::of("panic");
+    let mut test = MisbehavingGuest::of("panic");
     for _ in 0..1000 {
-        // The count starts anew with each guest.
-        assert!(room.fault().1.contains("wake 1 is one too many"));
+        // The count restarts with each guest.
+        assert!(test.fault().1.contains("wake 1 is one too many"));
     }
-    assert_eq!(room.topic.counts().no_slot, 0);
+    assert_eq!(test.topic.counts().no_slot, 0);
 }
 
 #[test]
 fn a_guest_that_keeps_every_sample_makes_the_ring_refuse_and_count() {
-    let mut room = Room::of("hold");
-    // depth 16 and hold 8, and one cell to write into: the 26th sample finds no place.
+    let mut test = MisbehavingGuest::of("hold");
+    // depth 16 and hold 8, and one slot to write into: the 26th sample is refused.
     for _ in 0..40 {
-        assert!(room.wake().result.is_ok());
+        assert!(test.wake().result.is_ok());
     }
-    let counts = room.topic.counts();
+    let counts = test.topic.counts();
     assert_eq!((counts.received, counts.no_slot), (25, 15));
 }
 
 #[test]
 fn what_a_lambda_prints_becomes_log_lines_and_a_flood_is_counted() {
-    let mut room = Room::of("print");
-    assert!(room.wake().result.is_ok());
-    assert_eq!(room.session.take_log().0[0].message, "hello from 1");
-    let mut room = Room::of("print_in_pieces");
-    assert!(room.wake().result.is_ok());
-    let lines = room.session.take_log().0.into_iter().map(|line| line.message).collect::<Vec<_>>();
+    let mut test = MisbehavingGuest::of("print");
+    assert!(test.wake().result.is_ok());
+    assert_eq!(test.session.take_log().0[0].message, "hello from 1");
+    let mut test = MisbehavingGuest::of("print_in_pieces");
+    assert!(test.wake().result.is_ok());
+    let lines = test.session.take_log().0.into_iter().map(|line| line.message).collect::<Vec<_>>();
     assert_eq!(lines, ["wake 1 of print_in_pieces"]);
-    let mut room = Room::of("log_flood");
-    assert!(room.wake().result.is_ok());
-    assert_eq!((room.session.take_log().0.len(), room.session.log_dropped()), (100, 900));
+    let mut test = MisbehavingGuest::of("log_flood");
+    assert!(test.wake().result.is_ok());
+    assert_eq!((test.session.take_log().0.len(), test.session.log_dropped()), (100, 900));
 }
