@@ -4,9 +4,9 @@ use std::path::Path;
 
 use crate::safe_file;
 
-/// Writes `content` to the file `path` by way of one beside it, so that whatever happens there is
-/// the former file or this one, whole. After an error, the one beside it is removed: on a full
-/// disk, its room is needed.
+/// Writes `content` to the file `path` atomically, by way of a temporary file `PATH.part`: after a
+/// crash, `path` is the former file or the new one, never a part of it. After an error the
+/// temporary file is removed: on a full disk, its room is needed.
 ///
 /// # Errors
 ///
@@ -34,7 +34,7 @@ mod tests {
     use crate::test_folder::TestFolder;
 
     #[test]
-    fn what_was_there_is_replaced_and_a_link_in_the_way_is_not_followed() {
+    fn a_file_is_replaced_and_a_link_at_the_temporary_path_is_not_followed() {
         let folder = TestFolder::new();
         let (path, part) = (folder.path("summary.json"), folder.path("summary.json.part"));
         let elsewhere = folder.write("elsewhere", "precious");
@@ -47,7 +47,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_left_of_what_cannot_take_its_place() {
+    fn no_temporary_file_is_left_after_an_error() {
         let folder = TestFolder::new();
         let path = folder.path("report.html");
         fs::create_dir(&path).unwrap();

@@ -1,34 +1,34 @@
-/// How a Gleaner program ends: its exit code.
+/// The exit code of a Gleaner program.
 ///
 /// Scripts and the orchestrator act on these numbers, so a code never changes its meaning.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum Exit {
-    /// 0: everything asked for was done.
+    /// 0: success.
     Ok = 0,
-    /// 1: Gleaner itself failed, or the machine did (a full disk, no memory).
+    /// 1: an internal error, or a failure of the machine (a full disk, no memory).
     Internal = 1,
-    /// 2: the command line, a manifest or another input of the user cannot be used as it is.
+    /// 2: the command line, a manifest or another input of the user is invalid.
     Usage = 2,
-    /// 3: a grant, a signature or a permission denies it.
+    /// 3: denied by a grant, a signature or a permission.
     Denied = 3,
     /// 4: the wanted state was not reached in time, or two results that should be equal differ.
     Differs = 4,
     /// 5: a vehicle, the cloud or another program cannot be reached.
     Unreachable = 5,
-    /// 6: the program did its work, and a lambda faulted meanwhile.
+    /// 6: the program completed, but a lambda faulted.
     LambdaFaulted = 6,
     /// 7: a drive is damaged; the results up to the damage are kept.
     DriveDamaged = 7,
 }
 
 impl Exit {
-    /// The number that the operating system sees.
+    /// Returns the exit code.
     pub fn code(self) -> u8 {
         self as u8
     }
 
-    /// The meaning of a child's exit code, or `None` for a number that no Gleaner program uses.
+    /// Parses a child's exit code; `None` for a code that no Gleaner program uses.
     pub fn from_code(code: i32) -> Option<Exit> {
         Some(match code {
             0 => Exit::Ok,

@@ -4,22 +4,20 @@ use std::fmt;
 use crate::Exit;
 use crate::text::visible;
 
-/// An error that knows the way out of it. The error enum of a room implements this next to its
-/// messages.
+/// An error with help for the user. The error enum of a room implements this beside its messages.
 pub trait Explain: Error {
-    /// What the user can do about it, as a lower-case fragment; `None` if there is nothing but the
-    /// cause.
+    /// Help for the user, as a lower-case fragment; `None` if there is none.
     fn help(&self) -> Option<String> {
         None
     }
 
-    /// How a program ends that meets this error and cannot go on.
+    /// The exit code of a program that fails with this error.
     fn exit(&self) -> Exit {
         Exit::Internal
     }
 }
 
-/// How a user sees an error: what failed, why, and what to do.
+/// An error as the user sees it: what failed, why, and what to do.
 ///
 /// ```text
 /// error: cannot start lambda `brake-dark`
@@ -30,29 +28,29 @@ pub trait Explain: Error {
 /// `main` prints it on standard error and ends with [`Failure::exit`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Failure {
-    /// How the program ends.
+    /// The exit code of the program.
     pub exit: Exit,
-    /// What could not be done.
+    /// The failed action.
     pub message: String,
-    /// Why, from the nearest cause to the first one.
+    /// The causes, the nearest first.
     pub causes: Vec<String>,
-    /// The way out.
+    /// Help for the user.
     pub help: Option<String>,
 }
 
 impl Failure {
-    /// A failure without a deeper cause.
+    /// Creates a failure without causes.
     pub fn new(exit: Exit, message: impl Into<String>) -> Failure {
         Failure { exit, message: message.into(), causes: Vec::new(), help: None }
     }
 
-    /// `action`, for example ``cannot start lambda `brake-dark` ``, failed because of `error`.
+    /// Creates a failure of `action`, for example ``cannot start lambda `brake-dark` ``, caused by
+    /// `error`.
     pub fn because(action: impl Into<String>, error: &dyn Explain) -> Failure {
         Failure { help: error.help(), ..Failure::caused_by(error.exit(), action, error) }
     }
 
-    /// As [`because`](Self::because), for an error from elsewhere that knows neither a way out nor
-    /// an exit code.
+    /// As [`because`](Self::because), for an error that has neither help nor an exit code.
     pub fn caused_by(exit: Exit, action: impl Into<String>, error: &dyn Error) -> Failure {
         let mut failure = Failure::new(exit, action);
         failure.add_cause(error.to_string());
@@ -60,15 +58,15 @@ impl Failure {
         failure
     }
 
-    /// The same failure with this way out.
+    /// Sets the help.
     #[must_use]
     pub fn with_help(mut self, help: impl Into<String>) -> Failure {
         self.help = Some(help.into());
         self
     }
 
-    /// Reads what another program of ours printed as a failure, and ended with `exit`; `None` if
-    /// `text` is none.
+    /// Parses a failure that another Gleaner program printed before it exited with `exit`; `None`
+    /// if `text` is not a failure.
     pub fn parse(text: &str, exit: Exit) -> Option<Failure> {
         let mut lines = text.lines();
         let mut failure = Failure::new(exit, lines.next()?.strip_prefix(ERROR)?);
@@ -95,7 +93,8 @@ impl Failure {
         }
     }
 
-    /// Many libraries repeat the text of their source at the end of their own: said once is enough.
+    /// Adds a cause. Many libraries repeat the text of their source at the end of their own: such a
+    /// cause is skipped.
     fn add_cause(&mut self, cause: String) {
         let above = self.causes.last().unwrap_or(&self.message);
         if !above.ends_with(cause.trim_end()) {
@@ -108,7 +107,7 @@ const ERROR: &str = "error: ";
 const CAUSE: &str = "  cause: ";
 const HELP: &str = "  help:  ";
 
-/// The error's own message is what failed; its sources are the causes.
+/// The error's own message becomes the failed action; its sources are the causes.
 impl<E: Explain> From<E> for Failure {
     fn from(error: E) -> Failure {
         let mut failure =
@@ -133,8 +132,8 @@ impl fmt::Display for Failure {
     }
 }
 
-/// `text` behind `label`, with further lines of it below its first. Control characters, which a
-/// file or a lambda may have put there, are shown and not sent to the terminal.
+/// Writes `text` after `label`, with its further lines indented below its first. Control
+/// characters, which may come from a file or a lambda, are escaped.
 fn write_labelled(f: &mut fmt::Formatter<'_>, label: &str, text: &str) -> fmt::Result {
     f.write_str(label)?;
     for (index, line) in text.trim_end().lines().enumerate() {
@@ -161,16 +160,16 @@ mod tests {
     #[derive(Debug, thiserror::Error)]
     enum StartError {
         #[error("cannot start lambda `{0}`")]
-        Manifest(&'static str, #[source] Twice),
+        Manifest(&'static str, #[source] ListedTwice),
         #[error("cannot read `{0}`")]
         Read(&'static str, #[source] io::Error),
-        #[error("cannot talk: {0}")]
-        Talk(#[source] io::Error),
+        #[error("cannot send: {0}")]
+        Send(#[source] io::Error),
     }
 
     #[derive(Debug, thiserror::Error)]
     #[error("topic `/camera/front` is listed twice in lambda.toml, lines 8 and 14")]
-    struct Twice;
+    struct ListedTwice;
 
     impl Explain for StartError {
         fn help(&self) -> Option<String> {
@@ -184,8 +183,8 @@ mod tests {
     }
 
     #[test]
-    fn a_user_sees_what_failed_why_and_the_way_out() {
-        let failure = Failure::from(StartError::Manifest("brake-dark", Twice));
+    fn a_failure_is_printed_with_causes_and_help() {
+        let failure = Failure::from(StartError::Manifest("brake-dark", ListedTwice));
         assert_eq!(
             failure.to_string(),
             "error: cannot start lambda `brake-dark`\n  \
@@ -196,31 +195,34 @@ mod tests {
     }
 
     #[test]
-    fn an_action_stands_above_the_error_that_prevented_it() {
+    fn an_action_is_printed_above_the_error_that_caused_its_failure() {
         let error = StartError::Read("drive.mcap", io::Error::other("no such device"));
         let failure = Failure::because("cannot replay the drive", &error).with_help("plug it in");
         assert_eq!(
             failure.to_string(),
-            "error: cannot replay the drive\n  cause: cannot read `drive.mcap`\n  cause: no such device\n  help:  plug it in"
+            "error: cannot replay the drive\n  \
+               cause: cannot read `drive.mcap`\n  \
+               cause: no such device\n  \
+               help:  plug it in"
         );
         assert_eq!(failure.exit, Exit::Internal);
     }
 
     #[test]
-    fn a_cause_whose_text_was_just_said_is_skipped() {
-        let failure = Failure::from(StartError::Talk(io::Error::other("broken pipe")));
-        assert_eq!(failure.to_string(), "error: cannot talk: broken pipe");
+    fn a_cause_that_repeats_the_text_above_it_is_skipped() {
+        let failure = Failure::from(StartError::Send(io::Error::other("broken pipe")));
+        assert_eq!(failure.to_string(), "error: cannot send: broken pipe");
     }
 
     #[test]
-    fn further_lines_of_a_cause_stand_below_its_first() {
+    fn further_lines_of_a_cause_are_indented_below_its_first() {
         let error = io::Error::other("first\nsecond\n");
         let failure = Failure::caused_by(Exit::Unreachable, "cannot connect", &error);
         assert_eq!(failure.to_string(), "error: cannot connect\n  cause: first\n         second");
     }
 
     #[test]
-    fn what_was_printed_reads_back() {
+    fn a_printed_failure_is_parsed_back() {
         let mut failure = Failure::new(Exit::Denied, "cannot load\nit");
         for _ in 0..2 {
             for help in [None, Some("rm 'x'\nor wait".to_owned())] {
@@ -243,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn an_explained_error_becomes_a_failure_by_the_question_mark() {
+    fn the_question_mark_converts_an_explained_error_into_a_failure() {
         fn run() -> Result<(), Failure> {
             Err(StartError::Read("x", io::Error::other("gone")))?
         }

@@ -1,8 +1,7 @@
-//! What every program of Gleaner needs, and nothing of what it does: exit codes, errors as people
-//! read them, files that are safe to open and written whole, sizes and durations, words in
-//! messages.
+//! Basics for every Gleaner program: exit codes, errors for users, safe and atomic file access,
+//! sizes and durations, text of messages.
 //!
-//! Nothing here knows what a lambda is.
+//! Nothing here depends on what a lambda is.
 
 mod atomic_write;
 mod exit;

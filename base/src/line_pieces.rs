@@ -1,29 +1,29 @@
-//! What a program writes to standard error for people, as the program that started it passes it on.
+//! Splits the standard error of a child into lines of bounded length, to be forwarded.
 
 use std::io::{BufRead, BufReader, Read};
 
 /// Most bytes of a piece.
 const PIECE_MAX: u64 = 8192;
 
-/// A line, or a part of one that is longer than 8 KiB.
+/// A line, or a part of a line longer than 8 KiB.
 #[derive(Debug)]
 pub struct LinePiece<'a> {
-    /// Its bytes, with the end of the line if it has it.
+    /// Its bytes, including the line break, if any.
     pub bytes: &'a [u8],
-    /// It is the first of its line.
+    /// True if it is the first piece of its line.
     pub begins_line: bool,
 }
 
 impl LinePiece<'_> {
-    /// Whether it begins as a [`Failure`](crate::Failure) does. A lambda and its libraries may
-    /// write that, too.
+    /// Returns whether it begins as a [`Failure`](crate::Failure) does. A lambda and its libraries
+    /// may write that, too.
     pub fn is_failure(&self) -> bool {
         self.begins_line && self.bytes.starts_with(b"error: ")
     }
 }
 
-/// Gives `take` all that `from` has, to its end. A line is cut into pieces rather than held whole,
-/// however long it is. Returns whether the last line has its end.
+/// Calls `take` with each piece of `from`, up to its end. Long lines are cut rather than held
+/// whole. Returns whether the last line has a line break.
 pub fn each_piece(from: impl Read, mut take: impl FnMut(LinePiece<'_>)) -> bool {
     let mut from = BufReader::new(from);
     let (mut bytes, mut begins_line) = (Vec::new(), true);
@@ -40,7 +40,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_comes_in_pieces_of_bounded_length_and_only_the_first_begins_it() {
+    fn a_long_line_is_cut_into_pieces_and_only_the_first_begins_it() {
         let text = format!("one\n{}error: x\nlast", "y".repeat(2 * PIECE_MAX as usize));
         let mut pieces = Vec::new();
         let is_whole = each_piece(text.as_bytes(), |piece| {

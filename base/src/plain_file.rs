@@ -1,10 +1,10 @@
 //! Opens files that a user or another program provided: a lambda's folder and build, its
 //! environment, results.
 //!
-//! What is opened here is a regular file of a bounded length. A pipe is not waited for, a device is
-//! not opened, and a file that is too long, such as a sparse one, is refused before its first byte.
-//! Of a lambda's folder only what lies in it is opened, wherever links lead. What is checked is
-//! what was opened, so that a file which is replaced meanwhile makes no difference.
+//! Only regular files of a bounded length are opened. A pipe does not block, a device is not
+//! opened, and a file that is too long, such as a sparse one, is refused before its first byte is
+//! read. From a lambda's folder only files in it are opened, wherever links lead. The checks apply
+//! to the opened file, so that replacing it meanwhile makes no difference.
 
 use std::fs::{self, File, Metadata};
 use std::io::{self, Read};
@@ -16,40 +16,40 @@ use rustix::fs::OFlags;
 
 use crate::ByteSize;
 
-/// Why a file is not read. It is the cause in an [`io::Error`].
+/// The reason why a file is refused; the inner error of an [`io::Error`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NotPlain {
-    /// A symbolic link, where none belongs.
+    /// A symbolic link where none is allowed.
     #[error("it is a link")]
     Link,
     /// A folder, a pipe, a socket or a device.
-    #[error("it is no file")]
+    #[error("it is not a regular file")]
     NoFile,
-    /// A symbolic link, or a path with one in it, that leads out of the folder.
+    /// A symbolic link, or a path through one, that leads out of the folder.
     #[error("it is a link to `{}`, outside of `{}`", target.display(), folder.display())]
     Outside {
-        /// The end of the link.
+        /// The target of the link.
         target: PathBuf,
-        /// The folder, without links.
+        /// The folder, with links resolved.
         folder: PathBuf,
     },
     /// Longer than any file of its kind.
     #[error("it has {bytes} bytes; at most {most} are read")]
     TooLong {
-        /// Its length, or as much of it as was read.
+        /// Its length, or the number of bytes read so far.
         bytes: u64,
-        /// The bound.
+        /// The maximum.
         most: ByteSize,
     },
 }
 
 impl NotPlain {
-    /// The reason, if that is why something failed.
+    /// Returns the reason if `error` has one.
     pub fn of(error: &io::Error) -> Option<&Self> {
         error.get_ref()?.downcast_ref()
     }
 
-    /// The way out.
+    /// Help for the user.
     pub fn help(&self) -> String {
         match self {
             Self::Link | Self::NoFile => "put a file in its place, or remove it",
@@ -60,7 +60,7 @@ impl NotPlain {
     }
 }
 
-/// A regular file that was opened to be read, of which no more than a bound is read.
+/// A regular file that is open for reading up to a maximum length.
 #[derive(Debug)]
 pub struct PlainFile {
     file: File,
@@ -70,38 +70,37 @@ pub struct PlainFile {
 }
 
 impl PlainFile {
-    /// Opens the file `path`, which a user or one of our programs has named. It may be a link.
+    /// Opens the file `path`, which a user or a Gleaner program has named. It may be a link.
     ///
     /// # Errors
     ///
-    /// [`NotPlain`] if it is no file or longer than `most`; those of the file system.
+    /// [`NotPlain`] if it is not a regular file or is longer than `most`; those of the file system.
     pub fn named(path: &Path, most: ByteSize) -> io::Result<Self> {
-        Self::opened(Place::of(path, OFlags::empty())?, most)
+        Self::opened(PathHandle::of(path, OFlags::empty())?, most)
     }
 
-    /// Opens the file `path` of results.
+    /// Opens the result file `path`.
     ///
     /// # Errors
     ///
     /// As for [`named`](Self::named), and [`NotPlain::Link`].
     pub fn result(path: &Path, most: ByteSize) -> io::Result<Self> {
-        Self::opened(Place::of(path, OFlags::NOFOLLOW)?, most)
+        Self::opened(PathHandle::of(path, OFlags::NOFOLLOW)?, most)
     }
 
-    /// Opens the file `path` of the folder `folder`. Links may lead to files in that folder, and to
-    /// no others.
+    /// Opens the file `path` of the folder `folder`. Links may lead to files in that folder only.
     ///
     /// # Errors
     ///
     /// As for [`named`](Self::named), and [`NotPlain::Outside`].
     pub fn inside(folder: &Path, path: &Path, most: ByteSize) -> io::Result<Self> {
-        let place = Place::of(&folder.join(path), OFlags::empty())?;
-        place.must_lie_in(folder)?;
-        Self::opened(place, most)
+        let handle = PathHandle::of(&folder.join(path), OFlags::empty())?;
+        handle.must_lie_in(folder)?;
+        Self::opened(handle, most)
     }
 
-    fn opened(place: Place, most: ByteSize) -> io::Result<Self> {
-        let found = place.0.metadata()?;
+    fn opened(handle: PathHandle, most: ByteSize) -> io::Result<Self> {
+        let found = handle.0.metadata()?;
         if !found.is_file() {
             return Err(io::Error::other(if found.is_symlink() {
                 NotPlain::Link
@@ -112,21 +111,21 @@ impl PlainFile {
         if found.len() > most.bytes() {
             return Err(io::Error::other(NotPlain::TooLong { bytes: found.len(), most }));
         }
-        let file = place.open()?;
+        let file = handle.open()?;
         Ok(Self { file, found, most, left: most.bytes() })
     }
 
-    /// Length in bytes when it was opened.
+    /// Returns the length in bytes at the time of opening.
     pub fn length(&self) -> u64 {
         self.found.len()
     }
 
-    /// Permissions: read, write and execute of user, group and others.
+    /// Returns the permission bits: read, write and execute of user, group and others.
     pub fn mode(&self) -> u32 {
         self.found.permissions().mode() & 0o777
     }
 
-    /// Reads all of it.
+    /// Reads the whole file.
     ///
     /// # Errors
     ///
@@ -137,7 +136,7 @@ impl PlainFile {
         Ok(bytes)
     }
 
-    /// Copies all of it to `to`, by the kernel where that can.
+    /// Copies the whole file to `to`, in the kernel where possible.
     ///
     /// # Errors
     ///
@@ -147,7 +146,7 @@ impl PlainFile {
         self.count(copied)
     }
 
-    /// One byte more than is allowed: that is enough to see that it is too long.
+    /// Limits reading to one byte more than allowed, which is enough to notice an overlong file.
     fn within_bound(&mut self) -> io::Take<&mut File> {
         let most = self.left.saturating_add(1);
         (&mut self.file).take(most)
@@ -171,16 +170,17 @@ impl Read for PlainFile {
     }
 }
 
-/// A file that was found but not opened: nothing was done to a pipe or a device by that.
-struct Place(File);
+/// A path handle (`O_PATH`): the file is found but not opened, which does not affect a pipe or
+/// device.
+struct PathHandle(File);
 
-impl Place {
+impl PathHandle {
     fn of(path: &Path, flags: OFlags) -> io::Result<Self> {
         let flags = (flags | OFlags::PATH).bits().cast_signed();
         File::options().read(true).custom_flags(flags).open(path).map(Self)
     }
 
-    /// The name by which the kernel knows it in this process.
+    /// Returns its path below `/proc/self/fd`.
     fn name(&self) -> PathBuf {
         format!("/proc/self/fd/{}", self.0.as_raw_fd()).into()
     }
@@ -212,7 +212,7 @@ mod tests {
     const MOST: ByteSize = ByteSize::new(10);
 
     #[track_caller]
-    fn why(opened: io::Result<PlainFile>) -> NotPlain {
+    fn refusal(opened: io::Result<PlainFile>) -> NotPlain {
         NotPlain::of(&opened.unwrap_err()).unwrap().clone()
     }
 
@@ -241,15 +241,19 @@ mod tests {
         symlink("..", folder.join("up")).unwrap();
         for path in ["out.py", "twice.py", "up/secret", "../secret"] {
             let outside = NotPlain::Outside { target: secret.clone(), folder: folder.clone() };
-            assert_eq!(why(PlainFile::inside(&folder, Path::new(path), MOST)), outside, "{path}");
+            assert_eq!(
+                refusal(PlainFile::inside(&folder, Path::new(path), MOST)),
+                outside,
+                "{path}"
+            );
         }
-        // A folder whose name begins alike is another one.
+        // A folder whose name merely begins with the same letters is outside.
         scratch.write("lambda.more/x", "x");
         assert!(PlainFile::inside(&folder, Path::new("../lambda.more/x"), MOST).is_err());
     }
 
     #[test]
-    fn a_folder_may_itself_be_named_by_a_link() {
+    fn the_folder_itself_may_be_a_link() {
         let scratch = TestFolder::new();
         scratch.write("lambda/a.py", "a");
         symlink("lambda", scratch.path("link")).unwrap();
@@ -257,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_file_is_neither_waited_for_nor_opened() {
+    fn pipes_sockets_folders_and_devices_are_refused_without_blocking() {
         let scratch = TestFolder::new();
         let (pipe, socket, folder) =
             (scratch.path("pipe"), scratch.path("socket"), scratch.path("folder"));
@@ -265,32 +269,42 @@ mod tests {
         let _listener = UnixListener::bind(&socket).unwrap();
         fs::create_dir(&folder).unwrap();
         for path in [&pipe, &socket, &folder, Path::new("/dev/zero")] {
-            assert_eq!(why(PlainFile::named(path, MOST)), NotPlain::NoFile, "{}", path.display());
-            assert_eq!(why(PlainFile::result(path, MOST)), NotPlain::NoFile, "{}", path.display());
+            assert_eq!(
+                refusal(PlainFile::named(path, MOST)),
+                NotPlain::NoFile,
+                "{}",
+                path.display()
+            );
+            assert_eq!(
+                refusal(PlainFile::result(path, MOST)),
+                NotPlain::NoFile,
+                "{}",
+                path.display()
+            );
         }
         assert_eq!(
-            why(PlainFile::inside(scratch.root(), Path::new("pipe"), MOST)),
+            refusal(PlainFile::inside(scratch.root(), Path::new("pipe"), MOST)),
             NotPlain::NoFile
         );
         symlink("/dev/zero", scratch.path("device")).unwrap();
-        assert_eq!(why(PlainFile::named(&scratch.path("device"), MOST)), NotPlain::NoFile);
-        let outside = why(PlainFile::inside(scratch.root(), Path::new("device"), MOST));
+        assert_eq!(refusal(PlainFile::named(&scratch.path("device"), MOST)), NotPlain::NoFile);
+        let outside = refusal(PlainFile::inside(scratch.root(), Path::new("device"), MOST));
         assert!(
             matches!(outside, NotPlain::Outside { target, .. } if target == Path::new("/dev/zero"))
         );
     }
 
     #[test]
-    fn a_result_is_no_link_and_a_named_file_may_be_one() {
+    fn a_result_may_not_be_a_link_but_a_named_file_may() {
         let scratch = TestFolder::new();
         let link = scratch.path("link");
         symlink(scratch.write("log.jsonl", "x"), &link).unwrap();
-        assert_eq!(why(PlainFile::result(&link, MOST)), NotPlain::Link);
+        assert_eq!(refusal(PlainFile::result(&link, MOST)), NotPlain::Link);
         assert_eq!(text(PlainFile::named(&link, MOST)), "x");
     }
 
     #[test]
-    fn a_file_without_an_end_is_refused_before_it_is_read() {
+    fn an_overlong_file_is_refused_before_it_is_read() {
         let scratch = TestFolder::new();
         let sparse = scratch.write("sparse", "");
         File::options().write(true).open(&sparse).unwrap().set_len(1 << 40).unwrap();
@@ -300,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_grows_is_read_up_to_the_bound() {
+    fn a_growing_file_is_read_up_to_the_maximum() {
         let scratch = TestFolder::new();
         let path = scratch.write("file", "0123456789");
         let open = || PlainFile::named(&path, MOST).unwrap();

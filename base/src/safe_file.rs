@@ -1,8 +1,8 @@
-//! Files and folders of ours, where others may write as well: whoever made a lambda may have put
-//! links, pipes or devices into the folder of its results.
+//! Opens result files and folders safely: regular files only, no symbolic links, pipes, devices or
+//! hard links.
 //!
-//! What is opened here is what it seems to be. Nothing waits, and nothing is written to where a
-//! link leads.
+//! The author of a lambda may have put such things into the folder of its results. Nothing here
+//! blocks or writes to the target of a link.
 
 use std::fs::{self, File, Metadata, OpenOptions};
 use std::io;
@@ -13,7 +13,7 @@ use rustix::fs::OFlags;
 
 use crate::{Exit, Failure};
 
-/// Why something that has the name of a file or folder of ours is none. It is the cause in an
+/// The reason why a path is not used as a result file or folder; the inner error of an
 /// [`io::Error`].
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum UnsafePath {
@@ -21,55 +21,56 @@ pub enum UnsafePath {
     #[error("it is a link")]
     Link,
     /// A folder, a pipe, a socket or a device.
-    #[error("it is no file")]
+    #[error("it is not a regular file")]
     NoFile,
-    /// Something else than a folder.
-    #[error("it is no folder")]
+    /// Anything but a folder.
+    #[error("it is not a folder")]
     NoFolder,
-    /// A hard link: what is written appears elsewhere, too.
-    #[error("the file has other names")]
-    OtherNames,
+    /// A file with several hard links: writing to it would change the others, too.
+    #[error("the file has other hard links")]
+    HardLink,
 }
 
 impl UnsafePath {
-    /// The way out.
+    /// Help for the user.
     pub const HELP: &str = "remove it, or choose another folder: --out DIR";
 
-    /// What stands in the way, if that is why something failed.
+    /// Returns the reason if `error` has one.
     pub fn of(error: &io::Error) -> Option<Self> {
         error.get_ref()?.downcast_ref().copied()
     }
 }
 
-/// Opens the file `path` to add to it; it is made if there is none.
+/// Opens the file `path` for appending; creates it if it does not exist.
 ///
 /// # Errors
 ///
-/// [`UnsafePath`] if it is no file of ours; those of the file system.
+/// [`UnsafePath`] if it is not a regular file with one name; those of the file system.
 pub fn append(path: &Path) -> io::Result<File> {
-    own(path, File::options().append(true).create(true))
+    open_single(path, File::options().append(true).create(true))
 }
 
-/// Opens the file `path` to read and write it as it is; it is made if there is none.
+/// Opens the file `path` for reading and writing, without truncation; creates it if it does not
+/// exist.
 ///
 /// # Errors
 ///
 /// As for [`append`].
 pub fn write(path: &Path) -> io::Result<File> {
-    own(path, File::options().read(true).write(true).create(true).truncate(false))
+    open_single(path, File::options().read(true).write(true).create(true).truncate(false))
 }
 
-/// Opens the file `path`, which is there, to read and write it.
+/// Opens the existing file `path` for reading and writing.
 ///
 /// # Errors
 ///
-/// As for [`append`]; [`io::ErrorKind::NotFound`] if it is not there.
+/// As for [`append`]; [`io::ErrorKind::NotFound`] if it does not exist.
 pub fn edit(path: &Path) -> io::Result<File> {
-    own(path, File::options().read(true).write(true))
+    open_single(path, File::options().read(true).write(true))
 }
 
-/// Begins a new file `path`. What had the name loses it, and nothing else: a link goes, and not
-/// where it leads.
+/// Creates a new file `path` in place of any that exists: of a link the link is removed, not its
+/// target.
 ///
 /// # Errors
 ///
@@ -77,33 +78,33 @@ pub fn edit(path: &Path) -> io::Result<File> {
 pub fn create(path: &Path) -> io::Result<File> {
     match fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            return Err(in_the_way(path, error));
+            return Err(explained(path, error));
         }
         _ => {}
     }
-    own(path, File::options().write(true).create_new(true))
+    open_single(path, File::options().write(true).create_new(true))
 }
 
-/// Opens the file `path` of results to read it.
+/// Opens the result file `path` for reading.
 ///
 /// # Errors
 ///
-/// [`UnsafePath`] if it is a link or no file; those of the file system.
+/// [`UnsafePath`] if it is not a regular file; those of the file system.
 pub fn read(path: &Path) -> io::Result<File> {
     open(path, File::options().read(true), OFlags::NOFOLLOW).map(|(file, _)| file)
 }
 
-/// Opens the file `path`, which a user has named, to read it. It may be a link.
+/// Opens the file `path`, which a user has named, for reading. It may be a link.
 ///
 /// # Errors
 ///
-/// [`UnsafePath`] if it is no file; those of the file system.
+/// [`UnsafePath`] if it does not lead to a regular file; those of the file system.
 pub fn read_named(path: &Path) -> io::Result<File> {
     open(path, File::options().read(true), OFlags::empty()).map(|(file, _)| file)
 }
 
-/// Makes sure that `path` is a folder, and no link to one; it is made if there is none, with those
-/// that it is in. These may be links.
+/// Creates the folder `path` if it does not exist, with its parents. Parents may be links; `path`
+/// may not.
 ///
 /// # Errors
 ///
@@ -124,8 +125,8 @@ pub fn folder(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Refuses `folder`, of results, if it lies in the folder `lambda` by way of a link: whoever made
-/// the lambda may have put it there.
+/// Refuses the result folder `folder` if its path leads through a link inside the folder `lambda`:
+/// the author of the lambda may have put it there.
 ///
 /// # Errors
 ///
@@ -138,26 +139,26 @@ pub fn refuse_linked(folder: &Path, lambda: &Path) -> Result<(), Failure> {
     Err(Failure::new(Exit::Usage, message).with_help("remove it, or name the folder: --out DIR"))
 }
 
-/// A file that nobody but us sees under another name.
-fn own(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
+/// Opens a file that has no other hard links.
+fn open_single(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
     let (file, found) = open(path, options, OFlags::NOFOLLOW)?;
     if found.nlink() > 1 {
-        return Err(io::Error::other(UnsafePath::OtherNames));
+        return Err(io::Error::other(UnsafePath::HardLink));
     }
     Ok(file)
 }
 
 fn open(path: &Path, options: &mut OpenOptions, flags: OFlags) -> io::Result<(File, Metadata)> {
-    // A pipe would be waited for, and a terminal would become ours.
+    // Opening a pipe would block, and a terminal would become the controlling one.
     let flags = flags | OFlags::NONBLOCK | OFlags::NOCTTY;
     let opened = options.custom_flags(flags.bits().cast_signed()).open(path);
-    let file = opened.map_err(|error| in_the_way(path, error))?;
+    let file = opened.map_err(|error| explained(path, error))?;
     let found = file.metadata()?;
     if found.is_file() { Ok((file, found)) } else { Err(io::Error::other(UnsafePath::NoFile)) }
 }
 
-/// Why `path` could not be opened or removed, in words if that is due to what it is.
-fn in_the_way(path: &Path, error: io::Error) -> io::Error {
+/// Replaces `error` by an [`UnsafePath`] if `path` is the cause.
+fn explained(path: &Path, error: io::Error) -> io::Error {
     match fs::symlink_metadata(path).map(|found| found.file_type()) {
         Ok(found) if found.is_symlink() => io::Error::other(UnsafePath::Link),
         Ok(found) if !found.is_file() => io::Error::other(UnsafePath::NoFile),
@@ -177,7 +178,7 @@ mod tests {
     use super::*;
     use crate::test_folder::TestFolder;
 
-    /// What opens a file that is there, or makes it.
+    /// All functions that open an existing file.
     const OPEN: [fn(&Path) -> io::Result<File>; 4] = [append, write, edit, read];
 
     fn pipe(folder: &TestFolder) -> PathBuf {
@@ -186,12 +187,12 @@ mod tests {
         path
     }
 
-    fn why<T>(opened: io::Result<T>) -> Option<UnsafePath> {
+    fn refusal<T>(opened: io::Result<T>) -> Option<UnsafePath> {
         UnsafePath::of(&opened.err().unwrap())
     }
 
     #[test]
-    fn a_file_is_made_and_added_to_and_begun_anew() {
+    fn a_file_is_created_appended_to_and_replaced() {
         let folder = TestFolder::new();
         let path = folder.path("log.jsonl");
         assert_eq!(edit(&path).unwrap_err().kind(), io::ErrorKind::NotFound);
@@ -207,14 +208,14 @@ mod tests {
     }
 
     #[test]
-    fn a_link_is_not_followed_whether_it_leads_anywhere_or_not() {
+    fn a_link_is_not_followed_whether_its_target_exists_or_not() {
         let folder = TestFolder::new();
         let precious = folder.write("precious", "precious");
         for target in [precious.clone(), folder.path("nothing")] {
             let link = folder.path("link");
             symlink(&target, &link).unwrap();
             for open in OPEN {
-                assert_eq!(why(open(&link)), Some(UnsafePath::Link));
+                assert_eq!(refusal(open(&link)), Some(UnsafePath::Link));
             }
             create(&link).unwrap().write_all(b"new").unwrap();
             fs::remove_file(&link).unwrap();
@@ -224,37 +225,37 @@ mod tests {
     }
 
     #[test]
-    fn a_file_with_another_name_is_not_written_to() {
+    fn a_file_with_another_hard_link_is_not_written_to() {
         let folder = TestFolder::new();
         let precious = folder.write("precious", "precious");
         let path = folder.path("log.jsonl");
         fs::hard_link(&precious, &path).unwrap();
         for open in [append, write, edit] {
-            assert_eq!(why(open(&path)), Some(UnsafePath::OtherNames));
+            assert_eq!(refusal(open(&path)), Some(UnsafePath::HardLink));
         }
         create(&path).unwrap().write_all(b"new").unwrap();
         assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
     }
 
     #[test]
-    fn what_is_no_file_is_said_and_not_waited_for() {
+    fn pipes_sockets_folders_and_devices_are_refused_without_blocking() {
         let folder = TestFolder::new();
         let (pipe, socket, inner) = (pipe(&folder), folder.path("socket"), folder.path("folder"));
         let _listener = UnixListener::bind(&socket).unwrap();
         fs::create_dir(&inner).unwrap();
         for path in [pipe.as_path(), &socket, &inner, Path::new("/dev/null")] {
             for open in OPEN {
-                assert_eq!(why(open(path)), Some(UnsafePath::NoFile), "{}", path.display());
+                assert_eq!(refusal(open(path)), Some(UnsafePath::NoFile), "{}", path.display());
             }
-            assert_eq!(why(read_named(path)), Some(UnsafePath::NoFile), "{}", path.display());
+            assert_eq!(refusal(read_named(path)), Some(UnsafePath::NoFile), "{}", path.display());
         }
-        assert_eq!(why(create(&inner)), Some(UnsafePath::NoFile));
+        assert_eq!(refusal(create(&inner)), Some(UnsafePath::NoFile));
         create(&pipe).unwrap();
         assert!(pipe.is_file());
     }
 
     #[test]
-    fn what_a_user_has_named_may_be_a_link() {
+    fn a_named_file_may_be_a_link() {
         let folder = TestFolder::new();
         let link = folder.path("link");
         symlink(folder.write("drive.journal", "x"), &link).unwrap();
@@ -262,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn results_are_no_way_out_of_the_lambdas_folder() {
+    fn a_result_folder_may_not_lead_through_a_link_in_the_lambdas_folder() {
         let (lambda, elsewhere) = (TestFolder::new(), TestFolder::new());
         let live = lambda.path("live");
         refuse_linked(&live, lambda.root()).unwrap();
@@ -276,14 +277,14 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_is_made_with_those_above_it_and_is_no_link() {
+    fn a_folder_is_created_with_its_parents_and_may_not_be_a_link() {
         let folder_of_all = TestFolder::new();
         let clips = folder_of_all.path("out/clips");
         folder(&clips).unwrap();
         folder(&clips).unwrap();
         let link = folder_of_all.path("out/link");
         symlink(&clips, &link).unwrap();
-        assert_eq!(why(folder(&link)), Some(UnsafePath::Link));
-        assert_eq!(why(folder(&folder_of_all.write("file", ""))), Some(UnsafePath::NoFolder));
+        assert_eq!(refusal(folder(&link)), Some(UnsafePath::Link));
+        assert_eq!(refusal(folder(&folder_of_all.write("file", ""))), Some(UnsafePath::NoFolder));
     }
 }

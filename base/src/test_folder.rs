@@ -1,6 +1,6 @@
 //! A folder for one test, removed with everything in it when the test ends. Several crates include
 //! this file.
-// Each uses its own part.
+// Each crate uses only some of it.
 #![allow(dead_code)]
 
 use std::fs;
@@ -21,7 +21,7 @@ impl TestFolder {
         );
         let root = std::env::temp_dir().join(name);
         fs::create_dir(&root).unwrap();
-        // Without links, so that it compares equal to what programs find out about themselves.
+        // With links resolved, so that it equals the paths that programs find at run time.
         TestFolder { root: root.canonicalize().unwrap() }
     }
 
@@ -41,7 +41,7 @@ impl TestFolder {
         path
     }
 
-    /// As [`write`](Self::write), for a program that can be started.
+    /// As [`write`](Self::write), for an executable file.
     #[cfg(unix)]
     pub(crate) fn write_program(&self, relative: &str, text: &str) -> PathBuf {
         use std::os::unix::fs::PermissionsExt;
@@ -53,7 +53,7 @@ impl TestFolder {
 
 impl Drop for TestFolder {
     fn drop(&mut self) {
-        // A folder left behind disturbs nobody; a panic while another one unwinds would.
+        // A leftover folder is harmless; a panic during another panic would abort.
         let _ = fs::remove_dir_all(&self.root);
     }
 }

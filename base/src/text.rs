@@ -1,15 +1,14 @@
-//! Words in messages: lists of them, the nearest to a misspelt one, numbers, and foreign text made
-//! fit to print.
+//! Formats text for messages: lists of words, the nearest match of a misspelt word, numbers, and
+//! untrusted text made safe to print.
 
 use std::fmt::Display;
 use std::path::Path;
 
 pub use gleaner_rules::text::visible;
 
-/// The one of `known` that `word` was most likely meant to be.
+/// Returns the one of `known` that is most similar to `word`, if any is.
 pub fn nearest<'k>(word: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
-    // The distance takes time in proportion to both lengths, and nobody misspells a key with a page
-    // of text.
+    // The time grows with the product of both lengths, and a longer word is no misspelling.
     if word.len() > 64 {
         return None;
     }
@@ -27,7 +26,7 @@ pub fn hint(nearest: &Option<String>) -> String {
     nearest.as_ref().map(|name| format!(" (did you mean `{name}`?)")).unwrap_or_default()
 }
 
-/// `` `a` ``, `` `a` and `b` ``, `` `a`, `b` and `c` `` with `and` or another last word.
+/// Formats a list: `` `a` ``, `` `a` and `b` ``, `` `a`, `b` and `c` ``. `last` is `and` or `or`.
 pub fn list<W: AsRef<str>>(text: &[W], last: &str) -> String {
     let quoted: Vec<String> = text.iter().map(|word| format!("`{}`", word.as_ref())).collect();
     match quoted.split_last() {
@@ -36,8 +35,7 @@ pub fn list<W: AsRef<str>>(text: &[W], last: &str) -> String {
     }
 }
 
-/// A text from a file, short enough for a message and without characters that would act on a
-/// terminal.
+/// Shortens untrusted text for a message and escapes its control characters.
 pub fn excerpt(text: &str) -> String {
     const SHOWN: usize = 80;
     match text.char_indices().nth(SHOWN) {
@@ -46,7 +44,7 @@ pub fn excerpt(text: &str) -> String {
     }
 }
 
-/// `path` as a word of a shell command: quoted where a shell would take it apart.
+/// Returns `path` as one word of a shell command, quoted where necessary.
 pub fn shell_word(path: &Path) -> String {
     let text = path.to_string_lossy();
     let plain = |character: char| character.is_alphanumeric() || "/._-+=:,@%".contains(character);
@@ -56,12 +54,12 @@ pub fn shell_word(path: &Path) -> String {
     }
 }
 
-/// `bytes` in hexadecimal digits, as digests are written.
+/// Returns `bytes` as lower-case hexadecimal digits.
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// A whole number with a comma between thousands.
+/// Formats a whole number with commas between thousands.
 pub fn grouped(count: impl Display) -> String {
     let digits = count.to_string();
     let mut text = String::new();
@@ -79,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_nearest_word_is_offered_only_if_it_is_near() {
+    fn the_nearest_word_is_returned_only_if_it_is_similar() {
         let known = ["event", "period", "backlog"];
         assert_eq!(nearest("evnt", known), Some("event"));
         assert_eq!(nearest("peroid", known), Some("period"));
@@ -97,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_that_a_shell_would_take_apart_is_quoted() {
+    fn a_path_with_special_characters_is_quoted_for_a_shell() {
         for (path, word) in [
             ("examples/hello/rust-2", "examples/hello/rust-2"),
             ("föhr/a", "föhr/a"),
@@ -112,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn foreign_text_is_cut_and_cannot_act_on_a_terminal() {
+    fn an_excerpt_is_cut_and_has_no_control_characters() {
         assert_eq!(excerpt("plain"), "plain");
         assert_eq!(excerpt("\u{1b}[2J\n"), "\\u{1b}[2J\\n");
         assert_eq!(excerpt(&"ä".repeat(81)), format!("{}…", "ä".repeat(80)));

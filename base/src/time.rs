@@ -1,8 +1,8 @@
-//! Times as programs exchange them: whole nanoseconds.
+//! Converts durations to whole nanoseconds, the unit that programs exchange.
 
 use std::time::Duration;
 
-/// `duration` in ns. No duration in a manifest comes near to the largest one, 292 years.
+/// Returns `duration` in ns, at most 292 years, far above any duration in a manifest.
 pub fn nanoseconds(duration: Duration) -> i64 {
     i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)
 }

@@ -1,4 +1,4 @@
-//! Sizes and durations as people write them.
+//! Parses and formats sizes and durations with units.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,15 +9,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Exit, Explain};
 
-/// Why a text is no size or no duration.
+/// The text is not a size or not a duration.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{text}` is no {what}")]
+#[error("`{text}` is not a {what}")]
 pub struct UnitError {
     /// The text that was refused.
     pub text: String,
     /// `size` or `duration`.
     pub what: &'static str,
-    /// How it is written, for the help line.
+    /// The expected form, for the help line.
     pub rule: &'static str,
 }
 
@@ -56,13 +56,13 @@ impl ByteSize {
         ByteSize::mib(n.saturating_mul(1024))
     }
 
-    /// The number of bytes.
+    /// Returns the number of bytes.
     pub const fn bytes(self) -> u64 {
         self.0
     }
 
-    /// The number of bytes as a length in memory. No size of memory in a manifest exceeds 2 GiB, so
-    /// that none saturates.
+    /// Returns the number of bytes as a length in memory. No memory size in a manifest exceeds 2
+    /// GiB, so that none saturates.
     pub fn as_usize(self) -> usize {
         usize::try_from(self.0).unwrap_or(usize::MAX)
     }
@@ -86,13 +86,12 @@ impl fmt::Display for ByteSize {
     }
 }
 
-/// The duration that a text such as `5s`, `50ms`, `1.5s`, `2min` or `100us` stands for, exact to
-/// the nanosecond.
+/// Parses a duration such as `5s`, `50ms`, `1.5s`, `2min` or `100us`, exact to the nanosecond.
 ///
 /// # Errors
 ///
-/// [`UnitError`] for a text without a unit, of another form, with parts of a nanosecond, or beyond
-/// 584 years.
+/// [`UnitError`] for a text without a unit, of another form, with fractions of a nanosecond, or
+/// beyond 584 years.
 pub fn parse_duration(text: &str) -> Result<Duration, UnitError> {
     units::duration(text).map(Duration::from_nanos).ok_or_else(|| UnitError {
         text: text.to_owned(),
@@ -101,8 +100,8 @@ pub fn parse_duration(text: &str) -> Result<Duration, UnitError> {
     })
 }
 
-/// `duration` as [`parse_duration`] reads it, in the largest unit that keeps it whole: `1500ms`,
-/// `5s`, `2min`.
+/// Formats `duration` for [`parse_duration`], in the largest unit that gives a whole number:
+/// `1500ms`, `5s`, `2min`.
 pub fn format_duration(duration: Duration) -> String {
     units::duration_in_words(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX))
 }
@@ -194,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_shown_reads_back() {
+    fn formatted_values_parse_back() {
         for (size, text) in [
             (2 << 20, "2 MiB"),
             (1536, "1536 B"),
