@@ -6,61 +6,60 @@ use serde_json::{Map, Value};
 use crate::manifest::LambdaKind;
 use crate::{Trigger, TriggerKind};
 
-/// One clip that was written: one line of `clips.jsonl`.
+/// A written clip: one line of `clips.jsonl`.
 ///
-/// The order of the fields is the order of the keys in the file. A number that nobody knows is
-/// `null`, never 0.
+/// The order of the fields is the order of the keys in the file. An unknown number is `null`, never
+/// 0.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Clip {
     /// The file, relative to the folder that holds `clips.jsonl`, for example
     /// `clips/hello-20180802T083451.136Z.mcap`.
     pub file: PathBuf,
-    /// A small JPEG of the moment, relative to the same folder; `None` if the clip has no image.
+    /// A small JPEG of the event, relative to the same folder; `None` if the clip has no image.
     pub thumbnail: Option<PathBuf>,
-    /// Length of the file.
+    /// Length of the file, in bytes.
     pub bytes: u64,
-    /// Begin of what was asked for: of the earliest of its windows, in ns since the epoch of the
-    /// drive.
+    /// Start of its earliest window, in ns since the epoch of the drive.
     pub from_ns: i64,
-    /// End of what was asked for: of the latest of its windows, inclusive.
+    /// End of its latest window, inclusive.
     pub to_ns: i64,
     /// Stamp of its first message; `None` if it has none.
     pub first_ns: Option<i64>,
     /// Stamp of its last message; `None` if it has none.
     pub last_ns: Option<i64>,
-    /// The lambdas whose windows it holds.
+    /// The lambdas whose windows it contains.
     pub lambdas: Vec<ClipLambda>,
-    /// Triggers of these lambdas, and commands in their name, within it.
+    /// Number of triggers of these lambdas, and of commands in their name, within it.
     pub triggers: u64,
-    /// The first [`MOMENTS_MAX`](Self::MOMENTS_MAX) of the triggers; the file itself has more of
+    /// The first [`MOMENTS_MAX`](Self::MOMENTS_MAX) of the triggers; the MCAP file has more of
     /// them.
     pub moments: Vec<Moment>,
-    /// What was recorded, and what of it is missing.
+    /// The recorded topics, with the data that is missing.
     pub topics: Vec<ClipTopic>,
-    /// Why it holds less than was asked for, in words; empty if it holds all.
+    /// The reasons why it holds less than its windows cover; empty if it is complete.
     pub incomplete: Vec<String>,
-    /// How it was saved, if the recorder died while it wrote it.
+    /// Set if the recorder died while it wrote the clip, which was recovered later.
     pub recovered: Option<Recovered>,
 }
 
 impl Clip {
-    /// Most moments in one line, so that a lambda that triggers in every wake leaves a line that
-    /// people can read.
+    /// Maximum number of moments in one line, so that a lambda that triggers in every wake leaves a
+    /// readable line.
     pub const MOMENTS_MAX: usize = 100;
 }
 
-/// A lambda one or more of whose windows are in a clip.
+/// A lambda with windows in a clip.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClipLambda {
     /// Its name.
     pub name: String,
     /// Its version.
     pub version: String,
-    /// What kind of lambda it is.
+    /// Its kind.
     pub kind: LambdaKind,
-    /// SHA-256 over the digests of its files, in hexadecimal digits.
+    /// SHA-256 of the digests of its files, in hexadecimal digits.
     pub digest: String,
-    /// How many of its windows the clip holds.
+    /// Number of its windows in the clip.
     pub windows: u64,
 }
 
@@ -69,27 +68,27 @@ pub struct ClipLambda {
 pub struct Moment {
     /// The lambda that triggered, or whose `[record]` a command used.
     pub lambda: String,
-    /// What it asked for.
+    /// The kind of trigger.
     pub kind: TriggerKind,
-    /// Its word for what it saw.
+    /// The lambda's name for the event.
     pub label: String,
-    /// How sure or how strong; always finite.
+    /// Confidence or strength; always finite.
     pub score: Option<f64>,
-    /// What else the lambda said of it; `None` where that takes more than
-    /// [`Moment::ATTRIBUTE_BYTES`], and only the journal has it.
+    /// Further values from the lambda; `None` if they take more than [`Moment::ATTRIBUTE_BYTES`]:
+    /// then only the journal has them.
     pub attributes: Option<Map<String, Value>>,
     /// Stamp of the wake, in ns since the epoch of the drive.
     pub at_ns: i64,
-    /// Where it came from, in words, if not from the lambda itself: then no journal has it.
+    /// Its origin, if not the lambda itself: then no journal has it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub source: Option<String>,
 }
 
 impl Moment {
-    /// Most bytes of attributes, as JSON: thousands of moments may wait for their clip.
+    /// Maximum length of attributes as JSON: thousands of moments may wait for their clip.
     pub const ATTRIBUTE_BYTES: usize = 2048;
 
-    /// `trigger` of the lambda of this name, in a wake at `at_ns`.
+    /// Creates the moment of `trigger`, by the lambda of this name, in a wake at `at_ns`.
     pub fn of(lambda: &str, trigger: &Trigger, at_ns: i64) -> Moment {
         Moment {
             lambda: lambda.to_owned(),
@@ -104,8 +103,8 @@ impl Moment {
 }
 
 impl Moment {
-    /// The first key whose value is another in `other`, with both values as JSON; values are
-    /// compared as they are written, so that `-0.0` is not `0.0`.
+    /// Returns the first key whose value differs in `other`, with both values as JSON. Values are
+    /// compared as text, so that `-0.0` differs from `0.0`.
     pub fn differs_from(&self, other: &Moment) -> Option<(String, [String; 2])> {
         let values = [self, other]
             .map(|moment| serde_json::to_value(moment).expect("a moment is plain data"));
@@ -122,31 +121,31 @@ fn fits(attributes: &Map<String, Value>) -> bool {
     serde_json::to_string(attributes).is_ok_and(|text| text.len() <= Moment::ATTRIBUTE_BYTES)
 }
 
-/// A topic of a clip. `None` means that nobody knows, for example after the recorder died.
+/// A topic of a clip. `None` means unknown, for example after the recorder died.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClipTopic {
     /// The topic.
     pub topic: String,
-    /// Its message type; `None` if it was asked for and never appeared.
+    /// Its message type; `None` if it was requested and never appeared.
     pub type_name: Option<String>,
-    /// Messages of it in the clip.
+    /// Number of its messages in the clip.
     pub messages: u64,
-    /// Messages of it that reached the recorder within the windows of the clip.
+    /// Number of its messages that reached the recorder within the windows of the clip.
     pub received: Option<u64>,
-    /// Messages that were lost before they reached the recorder.
+    /// Number of messages lost before they reached the recorder.
     pub lost: Option<u64>,
-    /// Messages that the preroll had to give up before the clip was opened.
+    /// Number of messages that left the full preroll before the clip was opened.
     pub overwritten: Option<u64>,
-    /// Messages that were larger than the preroll.
+    /// Number of messages larger than the preroll.
     pub too_big: Option<u64>,
 }
 
-/// How a clip was saved after the recorder died.
+/// The recovery of a clip after the recorder died.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Recovered {
-    /// Bytes behind the last whole chunk, which were thrown away.
+    /// Bytes after the last whole chunk, which were discarded.
     pub lost_bytes: u64,
-    /// What happened and what is missing, in words.
+    /// A description of the event and of the missing data.
     pub note: String,
 }
 
@@ -211,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_moment_that_no_lambda_caused_says_whence_it_came() {
+    fn a_moment_that_no_lambda_caused_has_its_source() {
         let trigger = Trigger {
             kind: TriggerKind::Stop,
             label: "x".to_owned(),
@@ -243,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn attributes_that_would_fill_the_memory_are_left_to_the_journal() {
+    fn large_attributes_are_left_to_the_journal() {
         let trigger = |bytes: usize| Trigger {
             kind: TriggerKind::Event,
             label: "x".to_owned(),
@@ -255,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_nobody_knows_stays_unknown() {
+    fn an_unknown_number_is_null() {
         let mut unknown = clip();
         let topic = &mut unknown.topics[0];
         (topic.received, topic.lost, topic.overwritten, topic.too_big) = (None, None, None, None);

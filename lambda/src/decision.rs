@@ -2,36 +2,36 @@ use serde::{Deserialize, Serialize};
 
 /// The outcome of one wake of a lambda: one line of `decisions.jsonl`.
 ///
-/// The order of the fields is the order of the keys in the file. JSON has no number for infinities
-/// and NaN: whoever makes a decision refuses such scores and attributes first (a trigger with one
-/// is a fault of the lambda), because a line with one would carry `null` in its place.
+/// The order of the fields is the order of the keys in the file. JSON has no infinities and no NaN,
+/// and would carry `null` in their place; so the host refuses a trigger with such a score or
+/// attribute, as a fault of the lambda.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Decision {
     /// Log time of the sample or tick that woke the lambda, in ns since the epoch of the drive.
     pub at_ns: i64,
-    /// What woke the lambda.
+    /// The cause of the wake.
     pub cause: Cause,
     /// Name of the input that woke it; `None` for a tick.
     pub input: Option<String>,
     /// Topic of the waking sample; `None` for a tick.
     pub topic: Option<String>,
     /// GUID of the sample's writer, 32 hexadecimal digits; `None` for a tick, or if the drive does
-    /// not know it.
+    /// not contain it.
     pub writer: Option<String>,
     /// Sequence number of the waking sample among those of its writer.
     pub seq: Option<u64>,
-    /// What the lambda caused, in the order in which it did.
+    /// The triggers of the lambda, in their order.
     pub triggers: Vec<Trigger>,
-    /// Why the wake ended early, if it did. Triggers that came before the fault still count.
+    /// The fault that ended the wake early, if any. Triggers before it still count.
     pub fault: Option<Fault>,
-    /// Fuel that the wake burnt; `None` for Python, which has none, and after [`FaultKind::Stack`]:
-    /// how much it is until a stack is full depends on the processor.
+    /// Fuel that the wake burnt; `None` for Python, which has none, and after [`FaultKind::Stack`],
+    /// as the fuel burnt until a stack is full depends on the processor.
     pub fuel: Option<u64>,
     /// Time in the lambda, in ns. It differs from run to run, so twins are not compared by it.
     pub run_ns: u64,
 }
 
-/// What woke a lambda.
+/// The cause of a wake.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Cause {
@@ -44,17 +44,17 @@ pub enum Cause {
 /// An action that a lambda took.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Trigger {
-    /// What the recorder does about it.
+    /// The action of the recorder.
     pub kind: TriggerKind,
-    /// The lambda's word for what it saw, for example `hard-brake`.
+    /// The lambda's name for the event, for example `hard-brake`.
     pub label: String,
-    /// How sure or how strong, as the lambda defines it; always finite.
+    /// Confidence or strength, as the lambda defines it; always finite.
     pub score: Option<f64>,
-    /// Further values for whoever reads the clip, in the order in which the lambda gave them.
+    /// Further values for readers of the clip, in the order in which the lambda set them.
     pub attributes: serde_json::Map<String, serde_json::Value>,
 }
 
-/// What a trigger asks of the recorder.
+/// The action that a trigger requests from the recorder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TriggerKind {
@@ -67,7 +67,7 @@ pub enum TriggerKind {
 }
 
 impl TriggerKind {
-    /// The word of the file: `event`, `start` or `stop`.
+    /// Returns the word in files: `event`, `start` or `stop`.
     pub fn as_str(self) -> &'static str {
         match self {
             TriggerKind::Event => "event",
@@ -77,21 +77,20 @@ impl TriggerKind {
     }
 }
 
-/// Why a wake ended early.
+/// The reason why a wake ended early.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Fault {
-    /// The cause, for programs.
+    /// The kind of fault.
     pub kind: FaultKind,
-    /// The cause, for people.
+    /// A description for the user.
     pub message: String,
-    /// What the lambda used, in the unit of the limit: fuel units, ns for a deadline, bytes for
-    /// memory.
+    /// The amount used, in the unit of the limit: fuel units, ns for a deadline, bytes for memory.
     pub used: Option<u64>,
-    /// What it was allowed, in the same unit.
+    /// The limit, in the same unit.
     pub allowed: Option<u64>,
 }
 
-/// The causes of a fault.
+/// The kinds of fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FaultKind {
@@ -99,13 +98,13 @@ pub enum FaultKind {
     Fuel,
     /// The wake outlasted its deadline.
     Deadline,
-    /// More memory was asked for than is allowed.
+    /// The lambda requested more memory than allowed.
     Memory,
     /// The call stack overflowed.
     Stack,
     /// WebAssembly trapped: a panic, a division by zero, an access out of bounds.
     Trap,
-    /// A host function was called in a way it refuses.
+    /// A host function refused a call.
     HostCall,
     /// Python raised an exception, or a WebAssembly lambda returned an error.
     Exception,
@@ -113,11 +112,11 @@ pub enum FaultKind {
     Killed,
 }
 
-/// How far apart the scores of twins may be, relative to the larger magnitude of the two.
+/// Tolerance between the scores of twins, relative to the larger magnitude of the two.
 pub const SCORE_TOLERANCE: f64 = 1e-5;
 
-/// What differs between the decisions of two twins on the same wake, for a person; `None` if they
-/// agree.
+/// Compares the decisions of two twins on the same wake: describes the first difference; `None` if
+/// they agree.
 ///
 /// Twins agree when `at_ns`, `topic`, `seq`, and the kinds and labels of the triggers are equal and
 /// scores are within [`SCORE_TOLERANCE`] of the larger one. Fuel, time and attributes may differ:
@@ -199,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn a_decision_is_one_line_with_the_keys_in_the_order_of_the_design() {
+    fn a_decision_is_one_line_with_the_keys_in_the_order_of_its_fields() {
         let line = serde_json::to_string(&decision()).unwrap();
         assert_eq!(
             line,
@@ -265,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn what_differs_between_twins_is_said() {
+    fn the_first_difference_between_twins_is_described() {
         type Change = fn(&mut Decision);
         let cases: [(Change, &str); 6] = [
             (|twin| twin.at_ns = 5, "at_ns is 1700000000000000000 and 5"),

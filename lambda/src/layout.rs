@@ -1,10 +1,9 @@
-//! The build folder of a lambda, `DIR/build/`: what `gleaner build DIR` leaves and every other
-//! command uses.
+//! The build folder of a lambda, `DIR/build/`: `gleaner build DIR` creates it, and every other
+//! command uses it.
 //!
-//! It is complete: manifest, entry, models, and the message definitions in `msg/`, for when a
-//! transport cannot tell them. Nothing here builds, and no reader of a build folder writes into it.
-//! Whoever made the folder may have put anything there, so that its files are checked before one of
-//! them is used.
+//! It is complete: manifest, entry, models, and the message definitions in `msg/`, for transports
+//! that do not provide them. Nothing here builds, and no reader of a build folder writes into it.
+//! Its files are untrusted, and are checked before one of them is used.
 
 use std::fs;
 use std::io;
@@ -18,11 +17,11 @@ use gleaner_base::{ByteSize, Exit, Explain, NotPlain, PlainFile};
 /// Longest file of a build. No model is longer: ONNX is protobuf, whose messages end at 2 GiB.
 pub const FILE_MAX: ByteSize = ByteSize::gib(2);
 
-/// Most bytes of all files of a build together.
+/// Maximum length of all files of a build together.
 pub const BUILD_MAX: ByteSize = ByteSize::gib(4);
 
-/// Most files of a build: more than any has, by far. With names of 255 bytes they fit into the
-/// header of a journal.
+/// Maximum number of files of a build, far more than any has. With names of 255 bytes they fit into
+/// the header of a journal.
 pub const FILES_MAX: usize = 4_000;
 
 /// Longest component that is compiled.
@@ -35,20 +34,20 @@ pub struct BuildDir {
 }
 
 impl BuildDir {
-    /// The build folder of the lambda in `lambda_dir`, whether it exists or not.
+    /// Returns the build folder of the lambda in `lambda_dir`, whether it exists or not.
     pub fn of(lambda_dir: impl AsRef<Path>) -> BuildDir {
         BuildDir { path: lambda_dir.as_ref().join("build") }
     }
 
-    /// The build folder of the lambda in `lambda_dir`, if it is there and no source is newer.
+    /// Returns the build folder of the lambda in `lambda_dir`, if it exists and no source is newer.
     ///
-    /// The age of a build is that of its `lambda.toml`, which whoever builds writes last. What its
-    /// sources are, [`Sources`] says; one that is gone since makes no build old.
+    /// The age of a build is that of its `lambda.toml`, which the build writes last. [`Sources`]
+    /// lists its sources; one that was removed since does not count.
     ///
     /// # Errors
     ///
     /// [`LayoutError::NoFolder`], [`LayoutError::File`] or [`LayoutError::IsBuild`] if `lambda_dir`
-    /// is no lambda's folder, [`LayoutError::Missing`], [`LayoutError::Older`],
+    /// is not a lambda's folder, [`LayoutError::Missing`], [`LayoutError::Older`],
     /// [`LayoutError::Manifest`] if the build's manifest is refused, or [`LayoutError::Read`],
     /// [`LayoutError::TooMany`] and [`LayoutError::TooLarge`] as for [`files`](Self::files).
     pub fn check_fresh(lambda_dir: impl AsRef<Path>) -> Result<BuildDir, LayoutError> {
@@ -68,16 +67,16 @@ impl BuildDir {
                 return Err(LayoutError::Read { path: build.manifest_path(), source });
             }
         };
-        // Of a link, the age would be that of another file.
+        // This refuses links, whose age would be that of another file.
         let text = Manifest::read(build.path())?;
-        // An editor may have removed a file meanwhile: then it is no source.
+        // A file that an editor removed meanwhile does not count.
         let age = |source: &Path| modified(&dir.join(source)).ok().filter(|age| *age > built);
         let older = |source: &Path| LayoutError::Older {
             dir: dir.to_owned(),
             source_file: source.to_owned(),
         };
-        // Before what it says: a newer manifest may name other sources, and the old one need not
-        // suit this Gleaner.
+        // Checked before the build's manifest is parsed: a newer manifest may name other sources,
+        // and the old one need not be valid for this Gleaner.
         let manifest = Path::new("lambda.toml");
         if age(manifest).is_some() {
             return Err(older(manifest));
@@ -85,18 +84,18 @@ impl BuildDir {
         let sources = Sources::of(dir, &Manifest::parse(&text, build.manifest_path())?)?;
         match sources.iter().filter_map(|source| age(source).map(|age| (age, source))).max() {
             Some((_, source)) => Err(older(source)),
-            // The interpreter would wait for a pipe, and a digest of a file without an end would
-            // not end.
+            // Checks the files: a pipe would block the interpreter, and the digest of an endless
+            // file would not end.
             None => build.files().map(|_| build),
         }
     }
 
-    /// The paths of its files in it, in order. All of them are regular files that lie in it,
-    /// wherever links lead, and they are no more and no longer than those of a build may be.
+    /// Returns the paths of its files, relative and sorted. All of them are regular files in the
+    /// folder, wherever links lead, within the maximum number and length.
     ///
     /// # Errors
     ///
-    /// [`LayoutError::Read`] if a folder cannot be listed or one of them is something else,
+    /// [`LayoutError::Read`] if a folder cannot be listed or an entry is not such a file,
     /// [`LayoutError::TooMany`], [`LayoutError::TooLarge`].
     pub fn files(&self) -> Result<Vec<PathBuf>, LayoutError> {
         let (mut files, mut bytes, mut folders) = (Vec::new(), 0_u64, vec![PathBuf::new()]);
@@ -125,38 +124,38 @@ impl BuildDir {
         Ok(files)
     }
 
-    /// The folder itself.
+    /// Returns the path of the folder.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Its `lambda.toml`.
+    /// Returns the path of its `lambda.toml`.
     pub fn manifest_path(&self) -> PathBuf {
         self.path.join("lambda.toml")
     }
 
-    /// What `lambda.entry` of its manifest names.
+    /// Returns the path of the file that `lambda.entry` of its manifest names.
     pub fn entry_path(&self, manifest: &Manifest) -> PathBuf {
         self.path.join(manifest.lambda.entry.as_path())
     }
 }
 
-/// Why a build folder cannot be used.
+/// The reason why a build folder cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum LayoutError {
-    /// What should be a lambda's folder is not there.
+    /// The lambda's folder does not exist.
     #[error("there is no folder `{}`", dir.display())]
     NoFolder {
         /// The folder.
         dir: PathBuf,
     },
-    /// What should be a lambda's folder is a file.
-    #[error("`{}` is no folder", path.display())]
+    /// The lambda's folder is a file.
+    #[error("`{}` is not a folder", path.display())]
     File {
         /// The file.
         path: PathBuf,
     },
-    /// What should be a lambda's folder is the build in it.
+    /// The given folder is a build, not a lambda's folder.
     #[error("`{}` is the build folder of a lambda", build.display())]
     IsBuild {
         /// The build folder.
@@ -164,14 +163,18 @@ pub enum LayoutError {
         /// The lambda's folder.
         dir: PathBuf,
     },
-    /// There is none.
+    /// The lambda has no build folder.
     #[error("lambda `{}` is not built", dir.display())]
     Missing {
         /// The lambda's folder.
         dir: PathBuf,
     },
-    /// A source changed since.
-    #[error("the build of lambda `{}` is older than its source `{}`", dir.display(), source_file.display())]
+    /// A source is newer than the build.
+    #[error(
+        "the build of lambda `{}` is older than its source `{}`",
+        dir.display(),
+        source_file.display()
+    )]
     Older {
         /// The lambda's folder.
         dir: PathBuf,
@@ -181,13 +184,13 @@ pub enum LayoutError {
     /// The manifest of the build is refused.
     #[error(transparent)]
     Manifest(#[from] ManifestError),
-    /// More files than a build has.
+    /// Too many files for a build.
     #[error("`{}` holds more than {FILES_MAX} files", build.display())]
     TooMany {
         /// The build folder.
         build: PathBuf,
     },
-    /// More bytes than a build has.
+    /// Too many bytes for a build.
     #[error("the files in `{}` have more than {BUILD_MAX}", build.display())]
     TooLarge {
         /// The build folder.
@@ -198,7 +201,7 @@ pub enum LayoutError {
     Read {
         /// The file or folder.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: io::Error,
     },
 }
@@ -214,9 +217,9 @@ impl Explain for LayoutError {
                 Some(format!("run `gleaner build {}`", shell_word(dir)))
             }
             LayoutError::Manifest(error) => error.help(),
-            LayoutError::TooMany { .. } | LayoutError::TooLarge { .. } => Some(
-                "keep in the lambda's folder what belongs to it, and build it again".to_owned(),
-            ),
+            LayoutError::TooMany { .. } | LayoutError::TooLarge { .. } => {
+                Some("remove foreign files from the lambda's folder, and build it again".to_owned())
+            }
             LayoutError::Read { source, .. } => NotPlain::of(source).map(NotPlain::help),
         }
     }
@@ -226,7 +229,7 @@ impl Explain for LayoutError {
     }
 }
 
-/// Why there is no build in `dir`.
+/// Returns the reason why `dir` has no build.
 fn missing(dir: &Path) -> LayoutError {
     if dir.is_file() {
         return LayoutError::File { path: dir.to_owned() };
@@ -256,7 +259,7 @@ mod tests {
     use super::*;
     use crate::test_folder::TestFolder;
 
-    /// A lambda's folder with these files, each of a second more than the one before.
+    /// Creates a lambda's folder with these files, each a second newer than the one before.
     fn lambda(kind: &str, files: &[&str]) -> TestFolder {
         let entry = if kind == "python" { "main.py" } else { "x.wasm" };
         let manifest = format!(
@@ -312,13 +315,13 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_lambdas_folder_is_told_apart_from_one_that_is_not_built() {
+    fn a_folder_that_is_not_a_lambdas_is_distinguished_from_one_that_is_not_built() {
         let dir = lambda("wasm", &["lambda.toml", "build/lambda.toml"]);
         let root = dir.root().display();
         let folder_first = "name the lambda's folder; it comes before the drives".to_owned();
         for (name, message, help) in [
             ("nowhere", format!("there is no folder `{root}/nowhere`"), folder_first.clone()),
-            ("lambda.toml", format!("`{root}/lambda.toml` is no folder"), folder_first),
+            ("lambda.toml", format!("`{root}/lambda.toml` is not a folder"), folder_first),
             (
                 "build",
                 format!("`{root}/build` is the build folder of a lambda"),
@@ -332,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_with_a_space_is_quoted_in_the_command_that_is_suggested() {
+    fn a_folder_with_a_space_is_quoted_in_the_suggested_command() {
         let help = LayoutError::Missing { dir: "my lambda".into() }.help();
         assert_eq!(help.as_deref(), Some("run `gleaner build 'my lambda'`"));
     }
@@ -357,7 +360,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_built_in_may_be_newer() {
+    fn files_that_are_not_sources_may_be_newer() {
         for file in [
             "README.md",
             "tests/test_main.py",
@@ -376,16 +379,16 @@ mod tests {
     }
 
     #[test]
-    fn a_build_holds_files_of_its_own_of_a_bounded_number_and_length() {
+    fn a_build_may_not_have_links_outside_or_too_many_or_too_long_files() {
         let dir = lambda(
             "python",
             &["lambda.toml", "build/main.py", "build/msg/a/msg/B.msg", "build/lambda.toml"],
         );
-        let refused = |said: &str| {
+        let refused = |message: &str| {
             let error = BuildDir::check_fresh(dir.root()).unwrap_err();
             assert_eq!(error.exit(), Exit::Usage);
             let text = gleaner_base::Failure::from(error).to_string();
-            assert!(text.contains(said) && text.contains("help:"), "{text}");
+            assert!(text.contains(message) && text.contains("help:"), "{text}");
         };
         let build = BuildDir::check_fresh(dir.root()).unwrap();
         assert_eq!(
@@ -419,7 +422,7 @@ mod tests {
     }
 
     #[test]
-    fn an_old_build_may_have_a_manifest_that_is_refused_today_but_a_fresh_one_may_not() {
+    fn an_outdated_build_may_have_an_invalid_manifest_but_a_fresh_one_may_not() {
         let dir = lambda("wasm", &["lambda.toml", "build/lambda.toml"]);
         dir.write("build/lambda.toml", "colour = 1");
         let error = BuildDir::check_fresh(dir.root()).unwrap_err();

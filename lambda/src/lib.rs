@@ -1,4 +1,4 @@
-//! What a lambda and its results are: the manifest with its limits, the build folder, decisions,
+//! The data of a lambda and its results: the manifest with its limits, the build folder, decisions,
 //! clips, log lines, and the files of a run.
 //!
 //! Nothing here runs a lambda.

@@ -1,6 +1,6 @@
 use serde::{Deserialize, Serialize};
 
-/// How much a line of the log matters.
+/// The severity of a log line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[allow(missing_docs)]
@@ -12,13 +12,13 @@ pub enum LogLevel {
     Trace,
 }
 
-/// One line that a lambda logged: one line of `log.jsonl`.
+/// A line that a lambda logged: one line of `log.jsonl`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LogLine {
-    /// Time of the wake that wrote it, in nanoseconds.
+    /// Time of the wake that logged it, in ns.
     pub at_ns: i64,
-    /// How much it matters.
+    /// Its severity.
     pub level: LogLevel,
-    /// The text, cut to a bound by the host.
+    /// The text, cut by the host to a maximum length.
     pub message: String,
 }

@@ -1,5 +1,5 @@
-//! The files of a run: `decisions.jsonl`, `log.jsonl`, `summary.json`. Live, `gleaner-shim` writes
-//! them; in a replay, the runtime.
+//! Writes the result files of a run: `decisions.jsonl`, `log.jsonl`, `summary.json`. `gleaner-shim`
+//! writes those of a live run, the runtime those of a replay.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -14,32 +14,32 @@ use crate::{Decision, LogLine, RESULT_ITEM_MAX};
 use gleaner_base::safe_file::{self, UnsafePath};
 use gleaner_base::{Exit, Explain, write_atomically};
 
-/// What a run did, as a whole; there once it has ended.
+/// The summary of a run, written at its end.
 const SUMMARY: &str = "summary.json";
 
-/// What the lambda of a replay read, and what its wakes cost.
+/// The values that the lambda of a replay read, and the cost of its wakes.
 const SIGNALS: &str = "signals.json";
 
-/// The page that `gleaner` makes of all of it.
+/// The report that `gleaner` makes of the results.
 const REPORT: &str = "report.html";
 
-/// Earlier lines of a log that is shared out over two files.
-const LOG_BEFORE: &str = "log.before.jsonl";
+/// Earlier lines of a rotated log.
+const PREVIOUS_LOG: &str = "log.before.jsonl";
 
-/// What a replay locks, so that no other writes into the same folder.
+/// The lock file of a replay, so that no other replay writes into the same folder.
 pub const LOCK: &str = ".lock";
 
 /// The files of a run beside its clips.
 pub const RESULTS: [&str; 8] =
-    [LOCK, "clips.jsonl", "decisions.jsonl", "log.jsonl", LOG_BEFORE, REPORT, SIGNALS, SUMMARY];
+    [LOCK, "clips.jsonl", "decisions.jsonl", "log.jsonl", PREVIOUS_LOG, REPORT, SIGNALS, SUMMARY];
 
-/// Why results could not be written.
+/// A result file could not be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write `{}`", path.display())]
 pub struct OutputError {
     /// The file.
     pub path: PathBuf,
-    /// Why not.
+    /// The cause.
     pub source: io::Error,
 }
 
@@ -55,7 +55,7 @@ impl Explain for OutputError {
                     folder.display()
                 )
             }
-            _ => "make room or choose another folder: --out DIR".to_owned(),
+            _ => "make room on the disk, or choose another folder: --out DIR".to_owned(),
         })
     }
 
@@ -67,14 +67,15 @@ impl Explain for OutputError {
 /// Open result files.
 pub struct Output {
     folder: PathBuf,
-    decisions: Lines,
-    log: Lines,
+    decisions: LineWriter,
+    log: LineWriter,
+    /// True if decisions without trigger and fault are written, too.
     all: bool,
 }
 
 impl Output {
-    /// Makes `folder` and starts its files anew. With `all`, decisions without trigger and fault
-    /// are written too.
+    /// Creates `folder` and truncates its files. With `all`, decisions without trigger and fault
+    /// are written, too.
     ///
     /// # Errors
     ///
@@ -83,22 +84,22 @@ impl Output {
         Self::begin(folder, all, false)
     }
 
-    /// As [`Output::create`]; with `again`, lines are added to the files that are there.
+    /// As [`Output::create`]; with `append`, lines are appended to existing files.
     ///
     /// # Errors
     ///
     /// [`OutputError`] names the file.
-    pub fn begin(folder: &Path, all: bool, again: bool) -> Result<Self, OutputError> {
+    pub fn begin(folder: &Path, all: bool, append: bool) -> Result<Self, OutputError> {
         fs::create_dir_all(folder)
             .map_err(|source| OutputError { path: folder.to_owned(), source })?;
-        // A summary says that the files beside it are whole; what was read earlier, and a page
-        // about it, would be taken for this run's.
+        // A summary means that the files beside it are complete; earlier signals and an earlier
+        // report would be taken for those of this run.
         let replaced = [SUMMARY, SIGNALS, REPORT];
-        // A writer that was killed left its part: it takes room, and the next one may not come so
-        // far.
+        // A killed writer leaves its temporary file, which takes disk space; this run may never
+        // replace it.
         let of_earlier =
             replaced.iter().flat_map(|name| [(*name).to_owned(), format!("{name}.part")]);
-        for name in of_earlier.chain((!again).then(|| LOG_BEFORE.to_owned())) {
+        for name in of_earlier.chain((!append).then(|| PREVIOUS_LOG.to_owned())) {
             let path = folder.join(name);
             match fs::remove_file(&path) {
                 Err(source) if source.kind() != io::ErrorKind::NotFound => {
@@ -107,20 +108,19 @@ impl Output {
                 _ => {}
             }
         }
-        let decisions = Lines::begin(folder.join("decisions.jsonl"), again)?;
-        let log = Lines::begin(folder.join("log.jsonl"), again)?;
+        let decisions = LineWriter::open(folder.join("decisions.jsonl"), append)?;
+        let log = LineWriter::open(folder.join("log.jsonl"), append)?;
         Ok(Self { folder: folder.to_owned(), decisions, log, all })
     }
 
-    /// Keeps the log from growing for ever: beyond `bytes` it goes on in a new file, and of the
-    /// earlier ones only the last is kept.
+    /// Rotates the log when it exceeds `bytes`; of the earlier files only the last is kept.
     #[must_use]
-    pub fn with_log_of(mut self, bytes: u64) -> Self {
-        self.log.most = Some((bytes, self.folder.join(LOG_BEFORE)));
+    pub fn with_log_rotation(mut self, bytes: u64) -> Self {
+        self.log.rotation = Some((bytes, self.folder.join(PREVIOUS_LOG)));
         self
     }
 
-    /// Writes a decision, if it is one to keep.
+    /// Writes a decision, unless it has neither trigger nor fault and `all` is off.
     ///
     /// # Errors
     ///
@@ -132,7 +132,7 @@ impl Output {
         Ok(())
     }
 
-    /// Writes what the lambda said.
+    /// Writes log lines of the lambda.
     ///
     /// # Errors
     ///
@@ -141,7 +141,7 @@ impl Output {
         lines.iter().try_for_each(|line| self.log.write(line))
     }
 
-    /// Writes what waits, so that a reader sees how far the run is.
+    /// Writes pending lines, so that a reader sees the progress of the run.
     ///
     /// # Errors
     ///
@@ -151,7 +151,7 @@ impl Output {
         self.log.flush()
     }
 
-    /// Lines that were taken, and could not be written.
+    /// Returns the number of accepted lines that could not be written.
     pub fn lost(&self) -> u64 {
         self.decisions.lost + self.log.lost
     }
@@ -169,7 +169,7 @@ impl Output {
         write_atomically(&path, &text).map_err(|source| OutputError { path, source })
     }
 
-    /// Adds what the lambda read.
+    /// Writes `signals.json`.
     ///
     /// # Errors
     ///
@@ -181,32 +181,38 @@ impl Output {
     }
 }
 
-/// A file of lines. It grows by whole lines, so that it can be read whenever this process ends.
-/// Only a kill in the middle of a write leaves a part of one, which whoever goes on cuts off.
-struct Lines {
+/// Appends JSON lines to a file. It writes whole lines, so that the file can be read whenever this
+/// process ends. Only a kill in the middle of a write leaves a partial line, which the next writer
+/// cuts off.
+struct LineWriter {
     path: PathBuf,
     file: File,
     pending: Vec<u8>,
     /// Lines in `pending`.
-    waiting: u64,
-    /// Lines that were taken, and could not be written.
+    pending_lines: u64,
+    /// Accepted lines that could not be written.
     lost: u64,
-    /// From how many bytes on it goes on in a new file, and where this one is moved.
-    most: Option<(u64, PathBuf)>,
+    /// The length at which the file is rotated, and the path that it is moved to.
+    rotation: Option<(u64, PathBuf)>,
 }
 
-/// Bytes that wait for the next write.
+/// Length of pending lines at which they are written.
 const PENDING_BYTES: usize = 64 << 10;
 
-impl Lines {
-    fn begin(path: PathBuf, again: bool) -> Result<Self, OutputError> {
+impl LineWriter {
+    fn open(path: PathBuf, append: bool) -> Result<Self, OutputError> {
         let begun =
-            if again { end_in_a_whole_line(&path) } else { safe_file::create(&path).map(drop) };
+            if append { cut_partial_line(&path) } else { safe_file::create(&path).map(drop) };
         let opened = begun.and_then(|()| safe_file::append(&path));
         match opened {
-            Ok(file) => {
-                Ok(Self { path, file, pending: Vec::new(), waiting: 0, lost: 0, most: None })
-            }
+            Ok(file) => Ok(Self {
+                path,
+                file,
+                pending: Vec::new(),
+                pending_lines: 0,
+                lost: 0,
+                rotation: None,
+            }),
             Err(source) => Err(OutputError { path, source }),
         }
     }
@@ -215,27 +221,27 @@ impl Lines {
         let failed = |source| OutputError { path: self.path.clone(), source };
         serde_json::to_writer(&mut self.pending, line).map_err(io::Error::from).map_err(failed)?;
         self.pending.push(b'\n');
-        self.waiting += 1;
+        self.pending_lines += 1;
         if self.pending.len() < PENDING_BYTES { Ok(()) } else { self.flush() }
     }
 
     fn flush(&mut self) -> Result<(), OutputError> {
-        if self.waiting == 0 {
+        if self.pending_lines == 0 {
             return Ok(());
         }
-        let renewed = self.renew();
+        let rotated = self.rotate();
         let before = self.file.metadata().map(|metadata| metadata.len());
         let is_full = before
             .as_ref()
             .is_ok_and(|before| before + self.pending.len() as u64 > LINES_MAX.bytes());
-        let bounded = renewed
+        let bounded = rotated
             .and_then(|()| if is_full { Err(io::ErrorKind::FileTooLarge.into()) } else { Ok(()) });
         let written = bounded.and_then(|()| self.file.write_all(&self.pending));
-        let waited = std::mem::take(&mut self.waiting);
+        let count = std::mem::take(&mut self.pending_lines);
         self.pending.clear();
         written.map_err(|source| {
-            self.lost += waited;
-            // A part of a line would keep all that comes later from being read.
+            self.lost += count;
+            // A partial line would make all later lines unreadable.
             if let Ok(before) = before {
                 let _ = self.file.set_len(before);
             }
@@ -243,12 +249,12 @@ impl Lines {
         })
     }
 
-    /// Goes on in a new file if this one is as long as it may be; it is moved.
-    fn renew(&mut self) -> io::Result<()> {
-        let Some((most, moved)) = &self.most else { return Ok(()) };
+    /// Moves the file and opens a new one, if it has reached the length of rotation.
+    fn rotate(&mut self) -> io::Result<()> {
+        let Some((most, moved)) = &self.rotation else { return Ok(()) };
         if self.file.metadata().is_ok_and(|metadata| metadata.len() >= *most) {
             match fs::rename(&self.path, moved) {
-                // It was moved before, and no other could be opened.
+                // It was moved before, and a new one could not be opened.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 renamed => renamed?,
             }
@@ -258,8 +264,8 @@ impl Lines {
     }
 }
 
-/// Cuts off the part of a line that a process left when it was killed while it wrote.
-fn end_in_a_whole_line(path: &Path) -> io::Result<()> {
+/// Cuts off the partial line that a process left when it was killed during a write.
+fn cut_partial_line(path: &Path) -> io::Result<()> {
     let file = safe_file::write(path)?;
     let len = file.metadata()?.len();
     let start = len.saturating_sub(RESULT_ITEM_MAX as u64);
@@ -272,7 +278,8 @@ fn end_in_a_whole_line(path: &Path) -> io::Result<()> {
     match tail.iter().rposition(|byte| *byte == b'\n') {
         Some(end) => file.set_len(start + end as u64 + 1),
         None if start == 0 => file.set_len(0),
-        // No line of ours is as long as this. What follows is readable at least.
+        // No Gleaner program writes such a line. A line break makes at least the next lines
+        // readable.
         None => file.write_all_at(b"\n", len),
     }
 }
@@ -283,7 +290,7 @@ mod tests {
     use crate::LogLevel;
     use crate::test_folder::TestFolder;
 
-    fn said(folder: &Path, name: &str) -> Vec<i64> {
+    fn times(folder: &Path, name: &str) -> Vec<i64> {
         let text = fs::read_to_string(folder.join(name)).unwrap_or_default();
         text.lines()
             .map(|line| {
@@ -293,19 +300,22 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_file_of_ours_is_refused_in_words_and_left_as_it_is() {
+    fn a_link_or_pipe_in_place_of_a_result_file_is_refused_and_left_unchanged() {
         use std::os::unix::fs::symlink;
         type Put = (fn(&Path, &Path), &'static str);
         let put: [Put; 3] = [
             (|precious, path| symlink(precious, path).unwrap(), "it is a link"),
-            (|precious, path| fs::hard_link(precious, path).unwrap(), "the file has other names"),
+            (
+                |precious, path| fs::hard_link(precious, path).unwrap(),
+                "the file has other hard links",
+            ),
             (
                 |_, path| {
                     assert!(
                         std::process::Command::new("mkfifo").arg(path).status().unwrap().success()
                     )
                 },
-                "it is no file",
+                "it is not a regular file",
             ),
         ];
         let cases = ["decisions.jsonl", "log.jsonl"]
@@ -323,15 +333,15 @@ mod tests {
                 text.contains(&format!("`{}`", path.display())) && text.contains(why),
                 "{text}"
             );
-            // What begins anew takes its place.
+            // Without `append`, a new file replaces it.
             Output::begin(folder.root(), true, false).unwrap();
-            assert!(said(folder.root(), name).is_empty());
+            assert!(times(folder.root(), name).is_empty());
             assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
         }
     }
 
     #[test]
-    fn a_folder_that_is_missing_is_named_and_a_full_disk_wants_room() {
+    fn help_names_a_missing_folder_or_suggests_to_make_room_on_a_full_disk() {
         let help = |path: &str, kind: io::ErrorKind| {
             OutputError { path: path.into(), source: kind.into() }.help()
         };
@@ -342,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_program_would_read_is_not_written_and_counted() {
+    fn lines_beyond_the_length_that_readers_accept_are_not_written_but_counted() {
         let folder = TestFolder::new();
         let mut output = Output::create(folder.root(), true).unwrap();
         let log = File::options().write(true).open(folder.path("log.jsonl")).unwrap();
@@ -355,9 +365,9 @@ mod tests {
     }
 
     #[test]
-    fn a_log_that_was_replaced_by_a_link_goes_on_in_a_file_of_its_own() {
+    fn a_rotated_log_does_not_follow_a_link_at_its_path() {
         let folder = TestFolder::new();
-        let mut output = Output::create(folder.root(), true).unwrap().with_log_of(100);
+        let mut output = Output::create(folder.root(), true).unwrap().with_log_rotation(100);
         let line = LogLine { at_ns: 1, level: LogLevel::Info, message: "x".repeat(200) };
         output.log(std::slice::from_ref(&line)).unwrap();
         output.flush().unwrap();
@@ -368,29 +378,30 @@ mod tests {
         output.log(&[line]).unwrap();
         output.flush().unwrap();
         assert_eq!(fs::read_to_string(&precious).unwrap(), "precious");
-        assert_eq!(said(folder.root(), "log.jsonl"), [1]);
+        assert_eq!(times(folder.root(), "log.jsonl"), [1]);
     }
 
     #[test]
-    fn a_long_log_keeps_its_newest_lines_and_those_of_the_file_before() {
+    fn a_long_log_keeps_its_newest_lines_in_two_files() {
         let folder = TestFolder::new();
-        let mut output = Output::create(folder.root(), true).unwrap().with_log_of(1000);
+        let mut output = Output::create(folder.root(), true).unwrap().with_log_rotation(1000);
         let line = |at_ns| LogLine { at_ns, level: LogLevel::Info, message: "x".repeat(100) };
         for at_ns in 0..100 {
             output.log(&[line(at_ns)]).unwrap();
             output.flush().unwrap();
         }
-        let lines = [said(folder.root(), LOG_BEFORE), said(folder.root(), "log.jsonl")];
+        let lines = [times(folder.root(), PREVIOUS_LOG), times(folder.root(), "log.jsonl")];
         assert!(lines.iter().all(|lines| !lines.is_empty()), "{lines:?}");
         let lines = lines.concat();
         assert!(lines.len() >= 8 && lines.len() < 20, "{lines:?}");
         assert!(lines.iter().rev().copied().eq((0..100).rev().take(lines.len())), "{lines:?}");
-        // Those of an earlier run are not taken for this one's.
+        // Lines of an earlier run are removed.
         drop(Output::create(folder.root(), true).unwrap());
-        assert!(!folder.path(LOG_BEFORE).exists());
+        assert!(!folder.path(PREVIOUS_LOG).exists());
     }
+
     #[test]
-    fn a_part_of_a_line_that_a_killed_process_left_is_cut_off_and_whole_lines_stay() {
+    fn a_partial_line_of_a_killed_process_is_cut_off_and_whole_lines_stay() {
         let long = "x".repeat(RESULT_ITEM_MAX);
         let cases = [
             (String::new(), String::new()),

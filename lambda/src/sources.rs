@@ -7,33 +7,32 @@ use crate::manifest::LambdaKind;
 use crate::{LayoutError, Manifest};
 use gleaner_base::{ByteSize, NotPlain};
 
-/// Folders beside the manifest that hold no Python of the lambda: what tools made, and its tests.
-const LEFT_OUT: [&str; 4] = ["build", "out", "target", "tests"];
+/// Folders beside the manifest without Python code of the lambda: output of tools, and its tests.
+const SKIPPED_FOLDERS: [&str; 4] = ["build", "out", "target", "tests"];
 
-/// Longest Python file or message definition that a build takes. The longest of the standard
-/// library has 700 KiB.
+/// Longest Python file or message definition of a build. The longest of the standard library has
+/// 700 KiB.
 pub const SOURCE_MAX: ByteSize = ByteSize::mib(16);
 
-/// What a build is made of besides `lambda.toml`: the one rule for whoever builds, and for whoever
-/// asks whether a build is still good.
+/// The sources of a build besides `lambda.toml`: used to build, and to check whether a build is up
+/// to date.
 ///
-/// Paths are relative to the lambda's folder. What the manifest names is listed whether it exists
-/// or not; the rest is found in the folder. Hidden files and folders, `__pycache__/` and virtual
-/// environments (what holds a `pyvenv.cfg`) are left out, and links to folders are not followed:
-/// they may lead in circles.
+/// Paths are relative to the lambda's folder. Files that the manifest names are listed whether they
+/// exist or not; the others are found in the folder. Hidden files and folders, `__pycache__/` and
+/// virtual environments (folders with a `pyvenv.cfg`) are skipped, and links to folders are not
+/// followed, as they may lead in circles.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Sources {
-    /// What lies in the build under the same name: models, message definitions (`msg/**/*.msg`),
-    /// and of a Python lambda its entry and every `.py` file that is not in `build/`, `out/`,
-    /// `target/` or `tests/` beside the manifest.
+    /// Files copied into the build under the same name: models, message definitions
+    /// (`msg/**/*.msg`), and of a Python lambda its entry and every `.py` file that is not in
+    /// `build/`, `out/`, `target/` or `tests/` beside the manifest.
     pub copied: BTreeSet<PathBuf>,
-    /// What is compiled into the entry of a Rust lambda: `Cargo.toml`, `build.rs`, and everything
-    /// in `src/`.
+    /// Files compiled into the entry of a Rust lambda: `Cargo.toml`, `build.rs`, and all in `src/`.
     pub compiled: BTreeSet<PathBuf>,
 }
 
 impl Sources {
-    /// The sources of the lambda in `lambda_dir` that `manifest` declares.
+    /// Finds the sources of the lambda in `lambda_dir`, whose manifest is `manifest`.
     ///
     /// # Errors
     ///
@@ -47,8 +46,9 @@ impl Sources {
         match manifest.lambda.kind {
             LambdaKind::Python => {
                 sources.copied.insert(manifest.lambda.entry.as_path().to_owned());
-                let is_of_the_lambda =
-                    |folder: &Path| !LEFT_OUT.iter().any(|left_out| folder == Path::new(left_out));
+                let is_of_the_lambda = |folder: &Path| {
+                    !SKIPPED_FOLDERS.iter().any(|skipped| folder == Path::new(skipped))
+                };
                 sources
                     .copied
                     .extend(files(dir, "", is_of_the_lambda, |file| has_extension(file, "py"))?);
@@ -61,14 +61,14 @@ impl Sources {
         Ok(sources)
     }
 
-    /// All of them.
+    /// Returns all sources.
     pub fn iter(&self) -> impl Iterator<Item = &Path> {
         self.copied.iter().chain(&self.compiled).map(PathBuf::as_path)
     }
 }
 
-/// The files in the folder `start` of `dir`, which need not exist, and in the folders below that
-/// `enters` allows.
+/// Lists the files that `takes` accepts, in the folder `start` of `dir`, which need not exist, and
+/// in the folders below it that `enters` accepts.
 fn files(
     dir: &Path,
     start: &str,
@@ -91,7 +91,7 @@ fn files(
             if name.as_encoded_bytes().starts_with(b".") || name == "__pycache__" {
                 continue;
             }
-            // Of the entry itself, not of what a link leads to.
+            // The type of the entry itself, not of the target of a link.
             if entry.file_type().map_err(failed)?.is_dir() {
                 if enters(&relative) && !entry.path().join("pyvenv.cfg").is_file() {
                     folders.push(relative);
@@ -104,8 +104,8 @@ fn files(
     Ok(found)
 }
 
-/// Refuses the folder `start` of `dir` if it is a link that leads elsewhere: anything could be
-/// listed there.
+/// Refuses the folder `start` of `dir` if it is a link that leads out of `dir`, to any folder of
+/// the machine.
 fn lies_in(dir: &Path, start: &str) -> Result<(), LayoutError> {
     let path = dir.join(start);
     let (Ok(target), Ok(folder)) = (path.canonicalize(), dir.canonicalize()) else { return Ok(()) };
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn python_is_copied_but_for_what_tools_made_and_tests() {
+    fn python_files_are_copied_except_tests_and_output_of_tools() {
         let [copied, compiled] = sources(&folder(), "python", "main.py");
         assert_eq!(
             copied,
@@ -182,14 +182,14 @@ mod tests {
     }
 
     #[test]
-    fn rust_is_compiled_with_its_build_script_and_whatever_lies_in_src() {
+    fn rust_is_compiled_with_its_build_script_and_all_files_in_src() {
         let [copied, compiled] = sources(&folder(), "wasm", "x.wasm");
         assert_eq!(copied, ["models/m.onnx", "msg/a/msg/B.msg"]);
         assert_eq!(compiled, ["Cargo.toml", "build.rs", "src/data.bin", "src/inner/mod.rs"]);
     }
 
     #[test]
-    fn a_folder_of_sources_that_leads_elsewhere_is_refused_by_name() {
+    fn a_source_folder_that_links_elsewhere_is_refused_by_name() {
         let (dir, elsewhere) = (TestFolder::new(), folder());
         for (name, kind) in [("msg", "python"), ("src", "wasm")] {
             std::os::unix::fs::symlink(elsewhere.root(), dir.path(name)).unwrap();
@@ -197,7 +197,7 @@ mod tests {
                 "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = 'x' }}\nschedule.period = '1s'\n"
             );
             let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
-            let error = gleaner_failure(Sources::of(dir.root(), &manifest).unwrap_err());
+            let error = failure_text(Sources::of(dir.root(), &manifest).unwrap_err());
             assert!(
                 error.contains(&format!(
                     "{name}`\n  cause: it is a link to `{}`",
@@ -209,13 +209,13 @@ mod tests {
         }
     }
 
-    fn gleaner_failure(error: LayoutError) -> String {
+    fn failure_text(error: LayoutError) -> String {
         gleaner_base::Failure::from(error).to_string()
     }
 
     #[cfg(unix)]
     #[test]
-    fn a_link_back_into_the_folder_makes_no_circle() {
+    fn a_link_back_to_the_folder_does_not_loop() {
         let dir = folder();
         std::os::unix::fs::symlink(dir.root(), dir.path("again")).unwrap();
         std::os::unix::fs::symlink(dir.root(), dir.path("src/again")).unwrap();

@@ -1,36 +1,36 @@
-//! `vehicle.toml`: what the owner of a vehicle says about all lambdas on it. Read as a manifest is,
-//! and refused in the same words.
+//! `vehicle.toml`: limits for all lambdas on a vehicle. It is parsed as a manifest is, with the
+//! same error messages.
 
 use std::path::Path;
 
 use crate::manifest::{self, Limits, ManifestError};
 
-/// The configuration of a vehicle, checked.
+/// The validated configuration of a vehicle.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Vehicle {
-    /// `[limits]`: the most that a lambda gets here. What the file does not name is at the maximum
-    /// that any lambda may ask for.
+    /// `[limits]`: upper bounds of the limits of each lambda. Limits that the file does not name
+    /// are at the maximum of manifests.
     pub limits: Limits,
 }
 
 impl Vehicle {
-    /// The configuration that `text` holds. `file` is its name in messages, usually `vehicle.toml`.
+    /// Parses the configuration in `text`. `file` is its name in messages, usually `vehicle.toml`.
     ///
     /// # Errors
     ///
-    /// The first problem that is found, with its line: an unknown key, or a value that no lambda
-    /// could ask for.
+    /// The first problem that is found, with its line: an unknown key, or a value outside of the
+    /// range of manifests.
     pub fn parse(text: &str, file: impl AsRef<Path>) -> Result<Vehicle, ManifestError> {
         let file = file.as_ref().display().to_string();
         Ok(Vehicle { limits: manifest::vehicle_limits(text, &file)? })
     }
 
-    /// The configuration in the file `path`.
+    /// Loads the configuration from the file `path`.
     ///
     /// # Errors
     ///
-    /// As [`parse`](Self::parse), and if it cannot be read, is too long, or is no UTF-8.
+    /// As [`parse`](Self::parse), and if it cannot be read, is too long, or is not UTF-8.
     pub fn load(path: impl AsRef<Path>) -> Result<Vehicle, ManifestError> {
         let path = path.as_ref();
         Vehicle::parse(&manifest::read_text(path)?, path)
@@ -43,7 +43,7 @@ mod tests {
     use gleaner_base::Explain;
 
     #[test]
-    fn what_a_vehicle_does_not_name_is_at_its_maximum() {
+    fn limits_that_a_vehicle_does_not_name_are_at_their_maximum() {
         let vehicle =
             Vehicle::parse("[limits]\nfuel = 10_000_000\nmemory = \"32 MiB\"", "vehicle.toml")
                 .unwrap();
@@ -56,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_knows_or_could_ask_for_is_refused_with_its_line() {
+    fn unknown_keys_and_values_out_of_range_are_refused_with_their_line() {
         for (text, problem, help) in [
             (
                 "\n[limits]\nfule = 1",
@@ -83,7 +83,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_not_there_is_no_manifest_that_is_not_there() {
+    fn a_missing_vehicle_file_has_help_of_its_own() {
         let error = Vehicle::load("no/such/vehicle.toml").unwrap_err();
         assert_eq!(error.to_string(), "cannot read `no/such/vehicle.toml`");
         assert_eq!(error.help().as_deref(), Some("name the configuration of a vehicle"));

@@ -1,38 +1,38 @@
-//! The default, minimum and maximum of every number in a manifest, and why. Those of `[limits]`
-//! stand in its table, `limits.rs`.
+//! The default, minimum and maximum of every number in a manifest, with reasons. Those of
+//! `[limits]` are in its table, `limits.rs`.
 
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use super::ByteSize;
 
-/// What a number may be, and what it is when the manifest does not say.
+/// The range and the default of a number in a manifest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Bounds<T> {
-    /// The smallest value that is accepted.
+    /// The smallest accepted value.
     pub min: T,
     /// The value of a manifest that does not name the key.
     pub default: T,
-    /// The largest value that is accepted.
+    /// The largest accepted value.
     pub max: T,
 }
 
 impl<T: Copy> Bounds<T> {
-    /// From the smallest to the largest value.
+    /// Returns the range of accepted values.
     pub fn range(&self) -> RangeInclusive<T> {
         self.min..=self.max
     }
 }
 
-/// `input.depth` of small samples: how many the ring shows. Over a second of a typical IMU; the
-/// maximum is over a minute at 1 kHz.
+/// `input.depth` of small samples: the number of samples in the ring. The default is over half a
+/// second of a typical IMU; the maximum is over a minute at 1 kHz.
 pub const DEPTH_SMALL: Bounds<u64> = Bounds { min: 1, default: 64, max: 65_536 };
 
-/// `input.depth` of large samples, that is frames and point clouds.
+/// `input.depth` of large samples: frames and point clouds.
 pub const DEPTH_LARGE: Bounds<u64> = Bounds { default: 4, ..DEPTH_SMALL };
 
-/// `input.hold`: how many samples a lambda may hold on to beyond the ring. At least the one that
-/// woke it.
+/// `input.hold`: the number of samples that a lambda may hold beyond the ring, at least the one
+/// that woke it.
 pub const HOLD_SMALL: Bounds<u64> = Bounds { min: 1, default: 8, max: 1024 };
 
 /// `input.hold` of large samples.
@@ -48,27 +48,24 @@ pub const MAX_SIZE_LARGE: Bounds<ByteSize> = Bounds { default: ByteSize::mib(8),
 /// `input.decoded_size`: the largest compressed image, once decoded to rgb8. 1080p takes 6 MiB.
 pub const DECODED_SIZE: Bounds<ByteSize> = MAX_SIZE_LARGE;
 
-/// Most memory that the inputs of one lambda may ask for together. It is allocated before the first
-/// sample.
+/// Maximum memory of all inputs of one lambda. It is allocated before the first sample.
 pub const INPUTS_MEMORY_MAX: ByteSize = ByteSize::gib(2);
 
 /// `input.qos.depth`: the history that DDS keeps.
 pub const QOS_DEPTH: Bounds<u64> = Bounds { min: 1, default: 10, max: 65_536 };
 
-/// `schedule.period`; it has no default. Faster than 1 ms is no job for a function that is called
-/// per tick.
+/// `schedule.period`; it has no default. A period below 1 ms is too short for one call per tick.
 pub const PERIOD: RangeInclusive<Duration> = Duration::from_millis(1)..=Duration::from_secs(3600);
 
 /// `record.preroll` and `record.postroll`.
 pub const ROLL: Bounds<Duration> =
     Bounds { min: Duration::ZERO, default: Duration::from_secs(5), max: Duration::from_secs(600) };
 
-/// `record.cooldown`: how long after a trigger the next ones open no new window.
+/// `record.cooldown`: the time after a trigger in which further triggers open no new window.
 pub const COOLDOWN: Bounds<Duration> =
     Bounds { min: Duration::ZERO, default: Duration::ZERO, max: Duration::from_secs(3600) };
 
-/// `record.preroll_size` in memory: the most that waits there for a trigger. It holds 5 s at 12
-/// MiB/s.
+/// `record.preroll_size` in memory. The default holds 5 s at 12 MiB/s.
 pub const PREROLL_SIZE_RAM: Bounds<ByteSize> =
     Bounds { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(1) };
 
@@ -76,8 +73,8 @@ pub const PREROLL_SIZE_RAM: Bounds<ByteSize> =
 pub const PREROLL_SIZE_DISK: Bounds<ByteSize> =
     Bounds { min: ByteSize::mib(16), default: ByteSize::gib(1), max: ByteSize::gib(256) };
 
-/// `record.max_length`: the longest clip; what is longer goes on in a next one. So a `start` that
-/// no `stop` follows leaves files that can be moved and opened.
+/// `record.max_length`: a longer recording continues in the next clip, so that a `start` without
+/// `stop` leaves files that can be moved and opened.
 pub const MAX_LENGTH: Bounds<Duration> = Bounds {
     min: Duration::from_secs(1),
     default: Duration::from_secs(600),
@@ -87,8 +84,8 @@ pub const MAX_LENGTH: Bounds<Duration> = Bounds {
 /// `model.threads`; without it the vehicle chooses.
 pub const THREADS: RangeInclusive<u64> = 1..=64;
 
-/// Longest manifest that is read. The longest in use has 3 KiB.
+/// Longest accepted manifest. The longest in use has 3 KiB.
 pub const MANIFEST_MAX: ByteSize = ByteSize::mib(1);
 
-/// Most inputs, models, config items or recorded topics of one lambda.
+/// Maximum number of inputs, models, config items or recorded topics of one lambda.
 pub const ITEMS_MAX: usize = 256;

@@ -6,7 +6,7 @@ use super::{ItemName, Manifest};
 use gleaner_base::text::{excerpt, list, nearest};
 use gleaner_base::{Exit, Explain};
 
-/// `[config]`: a value that a deployment or `--set` may change.
+/// `[config]`: a setting that a deployment or `--set` may change.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct ConfigItem {
@@ -24,8 +24,8 @@ pub struct ConfigItem {
     pub description: Option<String>,
 }
 
-/// A value of `[config]`. Floating-point values are finite. The order between values of one type is
-/// that of the type; values of different types are never compared.
+/// A value of `[config]`. Floating-point values are finite. Values of one type have the order of
+/// that type; values of different types are never compared.
 #[derive(Debug, Clone, PartialEq, PartialOrd, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum ConfigValue {
@@ -40,7 +40,7 @@ pub enum ConfigValue {
 }
 
 impl ConfigValue {
-    /// `text` as a value of the same type as `self`; a whole number is also accepted as a
+    /// Parses `text` as a value of the type of `self`; a whole number is also accepted for a
     /// floating-point one.
     fn same_type(&self, text: &str) -> Option<ConfigValue> {
         match self {
@@ -53,7 +53,7 @@ impl ConfigValue {
         }
     }
 
-    fn type_in_words(&self) -> &'static str {
+    fn type_description(&self) -> &'static str {
         match self {
             ConfigValue::Bool(_) => "`true` or `false`",
             ConfigValue::Int(_) => "a whole number, for example 3",
@@ -68,7 +68,7 @@ impl fmt::Display for ConfigValue {
         match self {
             ConfigValue::Bool(truth) => truth.fmt(f),
             ConfigValue::Int(number) => number.fmt(f),
-            // With its point or exponent, so that 1e300 stays short and 50.0 is seen to be a float.
+            // With a point or exponent, so that 1e300 is short and 50.0 is visibly a float.
             ConfigValue::Float(number) => write!(f, "{number:?}"),
             ConfigValue::Text(text) => text.fmt(f),
         }
@@ -80,16 +80,16 @@ impl fmt::Display for ConfigValue {
 pub enum ConfigSet {}
 
 impl ConfigSet {
-    /// Every item of `manifest`, in its order, with its default or the last of `overrides` that
-    /// names it.
+    /// Returns every item of `manifest`, in its order, with its default or the last of `overrides`
+    /// that names it.
     ///
-    /// An override is a name and a text, as in `--set name=text`; the text is read as the item's
+    /// An override is a name and a text, as in `--set name=text`; the text is parsed as the item's
     /// type, and a whole number is accepted for a floating-point one.
     ///
     /// # Errors
     ///
-    /// [`ConfigError`] for the first override that names no item, or whose text is no value of that
-    /// item.
+    /// [`ConfigError`] for the first override that names no item, or whose text is not valid for
+    /// that item.
     pub fn resolve(
         manifest: &Manifest,
         overrides: &[(String, String)],
@@ -114,7 +114,7 @@ impl ConfigSet {
 }
 
 impl ConfigItem {
-    /// `text` as a value of this item.
+    /// Parses `text` as a value of this item.
     ///
     /// # Errors
     ///
@@ -125,7 +125,7 @@ impl ConfigItem {
             return Err(ConfigError::WrongType {
                 name,
                 text: excerpt(text),
-                wanted: self.default.type_in_words(),
+                wanted: self.default.type_description(),
             });
         };
         let too_small = self.min.as_ref().is_some_and(|min| value < *min);
@@ -142,7 +142,7 @@ impl ConfigItem {
     }
 }
 
-/// Why a config value cannot be set.
+/// The reason why a config value cannot be set.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ConfigError {
     /// The lambda has no such item.
@@ -150,29 +150,29 @@ pub enum ConfigError {
     Unknown {
         /// The lambda.
         lambda: String,
-        /// The name that was asked for.
+        /// The given name.
         name: String,
-        /// The item that it resembles.
+        /// An item with a similar name.
         near: Option<String>,
         /// All items.
         known: Vec<String>,
     },
-    /// The text is of another type.
+    /// The text has the wrong type.
     #[error("config value `{name}` cannot be `{text}`")]
     WrongType {
         /// The item.
         name: String,
-        /// The text that was given.
+        /// The given text.
         text: String,
-        /// What it should be.
+        /// The expected value.
         wanted: &'static str,
     },
-    /// The value is outside of the range that the manifest gives.
+    /// The value is outside of the range in the manifest.
     #[error("config value `{name}` cannot be {value}: {}", range(min, max))]
     OutOfRange {
         /// The item.
         name: String,
-        /// The value that was given.
+        /// The given value.
         value: ConfigValue,
         /// The smallest value.
         min: Option<ConfigValue>,
@@ -202,7 +202,7 @@ impl Explain for ConfigError {
             }
             ConfigError::WrongType { wanted, .. } => format!("give {wanted}"),
             ConfigError::OutOfRange { .. } => {
-                "the range stands in [config] of its lambda.toml".to_owned()
+                "the range is set in [config] of its lambda.toml".to_owned()
             }
         })
     }
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn an_override_is_read_as_the_type_of_its_item_and_the_last_one_counts() {
+    fn an_override_is_parsed_as_the_type_of_its_item_and_the_last_one_wins() {
         assert_eq!(set("brake_mps2", "-4").unwrap()[0].1, ConfigValue::Float(-4.0));
         assert_eq!(set("dark_luma", "255").unwrap()[1].1, ConfigValue::Int(255));
         assert_eq!(set("on", "false").unwrap()[2].1, ConfigValue::Bool(false));
@@ -302,7 +302,7 @@ mod tests {
 
     #[test]
     fn a_value_out_of_range_is_refused() {
-        let help = "the range stands in [config] of its lambda.toml";
+        let help = "the range is set in [config] of its lambda.toml";
         refused(
             "dark_luma",
             "256",

@@ -7,10 +7,10 @@ use super::bounds::INPUTS_MEMORY_MAX;
 use gleaner_base::text::list;
 use gleaner_base::{Exit, Explain, NotPlain};
 
-/// A key in a manifest, as a user finds it.
+/// The location of a key in a manifest.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeyLocation {
-    /// The manifest, as it was named.
+    /// The path of the manifest, as given.
     pub file: String,
     /// The line, from 1.
     pub line: usize,
@@ -24,109 +24,109 @@ impl fmt::Display for KeyLocation {
     }
 }
 
-/// Memory that one input asks for.
+/// The memory of one input.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct InputMemory {
     /// The input's name.
     pub name: String,
     /// The line of its entry.
     pub line: usize,
-    /// What its slots take.
-    pub asked: ByteSize,
+    /// Memory of its slots.
+    pub required: ByteSize,
 }
 
-/// Why a manifest is refused.
+/// The reason why a manifest is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ManifestError {
-    /// The file cannot be read, or is no UTF-8.
+    /// The file cannot be read, or is not UTF-8.
     #[error("cannot read `{}`", path.display())]
     Read {
         /// The manifest.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: io::Error,
     },
-    /// The file is longer than any manifest.
+    /// The file is too long for a manifest.
     #[error("`{}` is longer than {limit}", path.display())]
     TooLong {
         /// The manifest.
         path: PathBuf,
-        /// The most that is read.
+        /// The maximum length.
         limit: ByteSize,
     },
-    /// The text is no TOML.
-    #[error("{file}, line {line}: this is no TOML: {message}")]
+    /// The text is not TOML.
+    #[error("{file}, line {line}: invalid TOML: {message}")]
     Syntax {
-        /// The manifest, as it was named.
+        /// The path of the manifest, as given.
         file: String,
-        /// Where the parser gave up.
+        /// The line of the error.
         line: usize,
-        /// What the parser says.
+        /// The message of the parser.
         message: String,
     },
     /// A required table is missing.
     #[error("{file} has no [{table}] table")]
     MissingTable {
-        /// The manifest, as it was named.
+        /// The path of the manifest, as given.
         file: String,
         /// The table's name.
         table: &'static str,
-        /// What to write.
+        /// An example.
         example: &'static str,
     },
     /// A required key is missing.
     #[error("{file}, line {line}: {table} has no `{key}`")]
     MissingKey {
-        /// The manifest, as it was named.
+        /// The path of the manifest, as given.
         file: String,
         /// The line of the table.
         line: usize,
-        /// The table as it is written, for example `[lambda]`.
+        /// The header of the table, for example `[lambda]`.
         table: String,
         /// The key.
         key: &'static str,
-        /// What to write.
+        /// An example.
         example: &'static str,
     },
-    /// Nobody knows this key.
+    /// The key is unknown.
     #[error("{file}, line {line}: unknown key `{key}` {within}")]
     UnknownKey {
-        /// The manifest, as it was named.
+        /// The path of the manifest, as given.
         file: String,
         /// The line of the key.
         line: usize,
         /// The key.
         key: String,
-        /// Where it stands, for example `in [schedule]`.
+        /// Its table, for example `in [schedule]`.
         within: String,
-        /// The known key that it resembles.
+        /// A known key that is similar.
         near: Option<&'static str>,
-        /// All keys that may stand there.
+        /// All known keys of that table.
         known: &'static [&'static str],
     },
-    /// A value has another TOML type.
+    /// A value has the wrong TOML type.
     #[error("{at} is {found}")]
     WrongType {
         /// The key.
         at: Box<KeyLocation>,
-        /// The type it has.
+        /// Its type.
         found: &'static str,
-        /// What it should be.
+        /// The expected value.
         wanted: String,
     },
-    /// A text is not of the form that it needs.
-    #[error("{at} is `{text}`, which is no {what}")]
+    /// A text has the wrong form.
+    #[error("{at} is `{text}`, which is not a {what}")]
     WrongForm {
         /// The key.
         at: Box<KeyLocation>,
         /// Its value.
         text: String,
-        /// What it should be.
+        /// The expected kind of text.
         what: &'static str,
-        /// What such a text looks like.
+        /// The form of such a text.
         rule: &'static str,
     },
-    /// A text is none of the few words that are possible.
+    /// A text is not one of the possible words.
     #[error("{at} is `{text}`, not {}", list(choices, "or"))]
     NoChoice {
         /// The key.
@@ -135,7 +135,7 @@ pub enum ManifestError {
         text: String,
         /// The words.
         choices: Vec<&'static str>,
-        /// The word that it resembles.
+        /// A word that is similar.
         near: Option<&'static str>,
     },
     /// A number is too small.
@@ -162,57 +162,57 @@ pub enum ManifestError {
         /// The largest value.
         max: String,
     },
-    /// The same thing stands in two places.
+    /// Something is listed twice.
     #[error("{what} `{name}` is listed twice in {file}, lines {first} and {second}")]
     Twice {
         /// `topic`, `input`, `key` or the like.
         what: &'static str,
         /// Its name.
         name: String,
-        /// The manifest, as it was named.
+        /// The path of the manifest, as given.
         file: String,
         /// The first line.
         first: usize,
         /// The second line.
         second: usize,
-        /// What to keep.
-        way_out: &'static str,
+        /// Help for the user.
+        help: &'static str,
     },
-    /// The schedule waits for an input that does not exist.
-    #[error("{at} is `{name}`, which is the name of no input")]
+    /// The schedule names an input that does not exist.
+    #[error("{at} is `{name}`, which is not the name of an input")]
     NoSuchInput {
         /// The key.
         at: Box<KeyLocation>,
         /// The name.
         name: String,
-        /// The input that it resembles.
+        /// An input with a similar name.
         near: Option<String>,
         /// The inputs.
         inputs: Vec<String>,
     },
-    /// The inputs ask for too much memory together.
+    /// The inputs need too much memory together.
     #[error(
-        "the inputs in {file} ask for {} MiB together, above the maximum of {INPUTS_MEMORY_MAX}: {}",
+        "the inputs in {file} need {} MiB together, above the maximum of {INPUTS_MEMORY_MAX}: {}",
         mebibytes(*total),
         shares(inputs)
     )]
     TooMuchMemory {
-        /// The manifest, as it was named.
+        /// The path of the manifest, as given.
         file: String,
-        /// What they ask for together.
+        /// The memory of all inputs.
         total: ByteSize,
-        /// What each asks for.
+        /// The memory of each input.
         inputs: Vec<InputMemory>,
     },
-    /// A key does not fit the others around it.
+    /// A key conflicts with others.
     #[error("{at} {why}")]
     Misplaced {
         /// The key.
         at: Box<KeyLocation>,
-        /// What does not fit.
+        /// The conflict.
         why: String,
-        /// What to write.
-        way_out: String,
+        /// Help for the user.
+        help: String,
     },
 }
 
@@ -222,18 +222,28 @@ impl Explain for ManifestError {
         Some(match self {
             Read { path, source } if source.kind() == io::ErrorKind::NotFound => {
                 let is_manifest = path.ends_with("lambda.toml");
-                let wanted = if is_manifest { "a folder that has a lambda.toml" } else { "the configuration of a vehicle" };
+                let wanted = match is_manifest {
+                    true => "a folder that has a lambda.toml",
+                    false => "the configuration of a vehicle",
+                };
                 format!("name {wanted}")
             }
-            Read { source, .. } if source.kind() == io::ErrorKind::InvalidData => "save it as UTF-8".to_owned(),
+            Read { source, .. } if source.kind() == io::ErrorKind::InvalidData => {
+                "save it as UTF-8".to_owned()
+            }
             Read { source, .. } => return NotPlain::of(source).map(NotPlain::help),
-            TooLong { .. } => "check that this is a manifest; data of a lambda belongs into files of its own".to_owned(),
+            TooLong { .. } => {
+                "check that this is a manifest; data of a lambda belongs in files of its own".to_owned()
+            }
             Syntax { .. } => {
-                "write `key = value` with texts in quotes, and tables as [name], or as [[name]] where there can be several"
+                "write `key = value` with texts in quotes, and tables as [name], or as [[name]] where there \
+                 can be several"
                     .to_owned()
             }
             MissingTable { example, .. } | MissingKey { example, .. } => format!("add {example}"),
-            UnknownKey { near: Some(near), .. } | NoChoice { near: Some(near), .. } => format!("did you mean `{near}`?"),
+            UnknownKey { near: Some(near), .. } | NoChoice { near: Some(near), .. } => {
+                format!("did you mean `{near}`?")
+            }
             UnknownKey { known, .. } => format!("the known keys are {}", list(known, "and")),
             WrongType { wanted, .. } => format!("give {wanted}"),
             WrongForm { rule, .. } => (*rule).to_owned(),
@@ -243,20 +253,23 @@ impl Explain for ManifestError {
             }
             TooSmall { min, .. } => format!("give {min} or more"),
             TooLarge { max, .. } => format!("give {max} or less"),
-            Twice { way_out, .. } => (*way_out).to_owned(),
+            Twice { help, .. } => (*help).to_owned(),
             NoSuchInput { name, inputs, .. } if inputs.is_empty() => {
                 format!("add an [[input]] with name = \"{name}\"; there is none yet")
             }
             NoSuchInput { near, inputs, .. } => {
                 let inputs = format!("the inputs are {}", list(inputs, "and"));
-                near.as_ref().map_or(inputs.clone(), |near| format!("did you mean `{near}`? {inputs}"))
+                match near {
+                    Some(near) => format!("did you mean `{near}`? {inputs}"),
+                    None => inputs,
+                }
             }
             TooMuchMemory { .. } => {
-                "lower `depth`, `hold` or `max_size`: an input takes (depth + hold + 1) x max_size, and \
-                 (hold + 1) x decoded_size for compressed images"
+                "lower `depth`, `hold` or `max_size`: an input takes (depth + hold + 1) x max_size, \
+                 and (hold + 1) x decoded_size for compressed images"
                     .to_owned()
             }
-            Misplaced { way_out, .. } => way_out.clone(),
+            Misplaced { help, .. } => help.clone(),
         })
     }
 
@@ -265,14 +278,14 @@ impl Explain for ManifestError {
     }
 }
 
-/// Whole MiB, rounded up, so that a sum just above the maximum does not look equal to it.
+/// Returns whole MiB, rounded up, so that a sum just above the maximum does not look equal to it.
 fn mebibytes(size: ByteSize) -> u64 {
     size.bytes().div_ceil(1 << 20)
 }
 
 fn shares(inputs: &[InputMemory]) -> String {
     let share = |input: &InputMemory| {
-        format!("`{}` (line {}) {} MiB", input.name, input.line, mebibytes(input.asked))
+        format!("`{}` (line {}) {} MiB", input.name, input.line, mebibytes(input.required))
     };
     inputs.iter().map(share).collect::<Vec<_>>().join(", ")
 }

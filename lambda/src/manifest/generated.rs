@@ -1,5 +1,5 @@
-//! Files of the checkout that are made of the manifest's types and of the table of limits, wholly
-//! or in part. `cargo xtask bless` writes them, and a test compares them, so that no number is said
+//! Generates files of the checkout, or parts of them, from the manifest's types and the table of
+//! limits. `cargo xtask bless` writes them, and a test compares them, so that no number is written
 //! twice by hand.
 
 use std::fmt::Write;
@@ -8,15 +8,15 @@ use super::limit::Limit;
 use super::{Limits, reference};
 use gleaner_base::grouped;
 
-/// A file that is made of what stands in this crate.
+/// A file that is generated from this crate.
 #[derive(Debug, Clone, Copy)]
 pub struct Generated {
-    /// Where it lies in the checkout.
+    /// Its path in the checkout.
     pub path: &'static str,
     text: fn(&str) -> Result<String, String>,
 }
 
-/// All of them.
+/// All generated files.
 pub const GENERATED: &[Generated] = &[
     Generated { path: "docs/manifest.md", text: |_| Ok(reference()) },
     Generated { path: "docs/limits.md", text: page },
@@ -25,12 +25,12 @@ pub const GENERATED: &[Generated] = &[
 ];
 
 impl Generated {
-    /// The text that the file should have; `now` is the text that it has, of which what was written
-    /// by hand stays.
+    /// Returns the expected text of the file. `now` is its present text, whose handwritten parts
+    /// are kept.
     ///
     /// # Errors
     ///
-    /// In words, what has to be written by hand first.
+    /// A message with the part that has to be written by hand first.
     pub fn text(&self, now: &str) -> Result<String, String> {
         (self.text)(now).map_err(|why| format!("{}: {why}", self.path))
     }
@@ -39,9 +39,9 @@ impl Generated {
 const BEGIN: &str = "<!-- `cargo xtask bless` writes the columns default and maximum -->";
 const END: &str = "<!-- end of what it writes -->";
 
-/// The page on limits: defaults and maxima of the table are ours, all else is written by hand.
+/// Generates the page on limits: defaults and maxima of the table; all else is handwritten.
 fn page(now: &str) -> Result<String, String> {
-    let outside = || format!("the table stands between `{BEGIN}` and `{END}`");
+    let outside = || format!("the table must be between `{BEGIN}` and `{END}`");
     let (before, rest) = now.split_once(BEGIN).ok_or_else(outside)?;
     let (table, after) = rest.split_once(END).ok_or_else(outside)?;
     let mut missing: Vec<Limit> = Limits::table().into();
@@ -55,7 +55,7 @@ fn page(now: &str) -> Result<String, String> {
         };
         let limit =
             missing.iter().position(|limit| limit.key == key).map(|index| missing.remove(index));
-        let limit = limit.ok_or_else(|| format!("`{key}` is no limit, or has two rows"))?;
+        let limit = limit.ok_or_else(|| format!("`{key}` is not a limit, or has two rows"))?;
         let [_, default, max] = &limit.words;
         let (default, max) = (format!(" {default} "), format!(" {max} "));
         let places =
@@ -66,7 +66,7 @@ fn page(now: &str) -> Result<String, String> {
     match missing.first() {
         None => Ok(format!("{before}{BEGIN}{text}{END}{after}")),
         Some(limit) => Err(format!(
-            "`{}` has no row: write what it counts, and what happens beyond it",
+            "`{}` has no row: describe what it counts, and what happens beyond it",
             limit.key
         )),
     }
@@ -76,7 +76,8 @@ const ORIGIN: &str = "Made by `cargo xtask bless` of the table in `lambda/src/ma
 
 fn for_rust() -> String {
     let mut text = format!(
-        "//! `[limits]`: key, unit, and minimum, default and maximum; sizes in bytes, durations in ns.\n//!\n//! {ORIGIN}\n\n\
+        "//! `[limits]`: key, unit, and minimum, default and maximum; \
+         sizes in bytes, durations in ns.\n//!\n//! {ORIGIN}\n\n\
          use super::table::Bounds;\n\npub(super) const LIMITS: &[(&str, &str, Bounds)] = &[\n"
     );
     rows(&mut text);
@@ -85,7 +86,8 @@ fn for_rust() -> String {
 
 fn for_python() -> String {
     let mut text = format!(
-        "\"\"\"`[limits]`: key, unit, and minimum, default and maximum; sizes in bytes, durations in ns.\n\n{ORIGIN}\"\"\"\n\n\
+        "\"\"\"`[limits]`: key, unit, and minimum, default and maximum; \
+         sizes in bytes, durations in ns.\n\n{ORIGIN}\"\"\"\n\n\
          from typing import Tuple\n\nLIMITS: Tuple[Tuple[str, str, Tuple[int, int, int]], ...] = (\n"
     );
     rows(&mut text);
@@ -105,7 +107,8 @@ mod tests {
 
     fn table(rows: &str) -> String {
         format!(
-            "# Limits\n\n{BEGIN}\n| key | unit | default | maximum | counts |\n|---|---|---|---|---|\n{rows}{END}\nmore\n"
+            "# Limits\n\n{BEGIN}\n| key | unit | default | maximum | counts |\n\
+             |---|---|---|---|---|\n{rows}{END}\nmore\n"
         )
     }
 
@@ -114,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_on_a_page_are_mended_and_words_stay() {
+    fn numbers_on_a_page_are_updated_and_text_is_kept() {
         let limits = Limits::table();
         let stale: String = limits.iter().map(|limit| row(limit, "1", "2")).collect();
         let fresh: String =
@@ -134,6 +137,6 @@ mod tests {
         let lacking = page(&table(&rows[1..].concat())).unwrap_err();
         assert!(lacking.starts_with("`fuel` has no row"), "{lacking}");
         let twice = page(&table(&(rows.concat() + &rows[0]))).unwrap_err();
-        assert!(twice.starts_with("`fuel` is no limit, or has two rows"), "{twice}");
+        assert!(twice.starts_with("`fuel` is not a limit, or has two rows"), "{twice}");
     }
 }

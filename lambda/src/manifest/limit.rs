@@ -1,4 +1,4 @@
-//! One limit of the table in `limits.rs`: how its unit is read, written and shown.
+//! Parses and formats one limit of the table in `limits.rs`, by its unit.
 
 use std::time::Duration;
 
@@ -7,21 +7,21 @@ use super::table::TomlTable;
 use super::{ByteSize, ManifestError, format_duration};
 use gleaner_base::grouped;
 
-/// A type that a limit may have.
+/// A type of limit.
 pub(super) trait Unit: Copy + Ord {
-    /// The name of the unit on the page about the manifest.
+    /// The name of the unit in `docs/manifest.md`.
     const NAME: &'static str;
 
-    /// Reads the value of `key`, which is its default where the table does not have the key.
+    /// Parses the value of `key`; the default if the table does not have the key.
     fn read(table: &TomlTable, key: &str, bounds: &Bounds<Self>) -> Result<Self, ManifestError>;
 
-    /// Returns the value as it would be written in the file, without quotes.
+    /// Returns the value as it is written in the file, without quotes.
     fn in_words(self) -> String;
 
-    /// Returns the value as JSON and the SDKs have it: a number, bytes, or nanoseconds.
+    /// Returns the value as in JSON and the SDKs: a number, bytes, or nanoseconds.
     fn plain(self) -> u64;
 
-    /// The value that [`plain`](Self::plain) is that of.
+    /// Inverse of [`plain`](Self::plain).
     fn of_plain(plain: u64) -> Self;
 }
 
@@ -94,15 +94,15 @@ impl Unit for Duration {
     }
 }
 
-/// A limit, for pages and for files of other languages.
+/// A limit, for docs and for generated code.
 pub(super) struct Limit {
     pub(super) key: &'static str,
     pub(super) unit: &'static str,
-    /// The comment of the table, which begins with a space.
+    /// Its doc comment, which begins with a space.
     pub(super) meaning: &'static str,
     /// Minimum, default and maximum, plain.
     pub(super) plain: [u64; 3],
-    /// The same, as they are written in the file; large numbers are grouped.
+    /// The same, as written in the file; large numbers have commas.
     pub(super) words: [String; 3],
 }
 
@@ -121,14 +121,14 @@ impl Limit {
         Limit { key, unit: T::NAME, meaning, plain: values.map(T::plain), words: values.map(word) }
     }
 
-    /// The three, as they are typed.
+    /// Returns minimum, default and maximum, as typed in the file.
     pub(super) fn typed(&self) -> [String; 3] {
         let quoted = self.unit != "number";
         self.words.clone().map(|word| if quoted { format!("`\"{word}\"`") } else { word })
     }
 }
 
-/// Limits as JSON.
+/// Serializes limits for JSON.
 pub(super) mod plain {
     use serde::{Deserialize, Deserializer, Serializer};
 

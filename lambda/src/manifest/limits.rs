@@ -1,9 +1,9 @@
-//! `[limits]`: what a lambda may use, and how a vehicle tightens it.
+//! The table of `[limits]`: the resources that a lambda may use, and their reduction by a vehicle.
 //!
 //! A limit is one entry of the table below: its meaning, the reason for its numbers, key, unit, and
-//! bounds. The struct, its reader, its words and its JSON are made of the table here; the page on
-//! the manifest, two columns of `docs/limits.md` and the numbers of both SDKs' fake hosts by `cargo
-//! xtask bless` (`generated.rs`).
+//! bounds. The macro generates the struct, its parser, its text and its JSON; `cargo xtask bless`
+//! (`generated.rs`) generates `docs/manifest.md`, two columns of `docs/limits.md`, and the numbers
+//! of both SDKs' fake hosts.
 
 use std::fmt;
 use std::time::Duration;
@@ -15,14 +15,15 @@ use super::limit::{Limit, Unit, plain};
 use super::table::TomlTable;
 use super::{ByteSize, ManifestError};
 
-/// Makes all of the table. `as` gives the key that a limit has in JSON, where it is another one
-/// than in the file.
+/// Generates the code of the table. `as` gives the JSON key of a limit, if it differs from the
+/// file's.
 macro_rules! limits {
     ($($(#[doc = $meaning:literal])+ $key:ident $(as $json:literal)?: $unit:ty { $($bounds:tt)+ })+) => {
-        /// What a lambda may use. `docs/limits.md` says what happens where it wants more.
+        /// The resources that a lambda may use. `docs/limits.md` describes what happens beyond
+        /// them.
         ///
-        /// As JSON it has the file's keys; durations are `_ns`, sizes are in bytes. What is missing
-        /// there has its default.
+        /// As JSON it has the file's keys; durations are `_ns`, sizes are in bytes. Missing keys
+        /// have their default.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
         #[serde(default)]
         #[non_exhaustive]
@@ -33,7 +34,7 @@ macro_rules! limits {
         impl Limits {
             /// Every limit at its minimum.
             pub const MIN: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.min),+ };
-            /// Every limit as it is where a manifest does not name it.
+            /// Every limit at its default.
             pub const DEFAULT: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.default),+ };
             /// Every limit at its maximum.
             pub const MAX: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.max),+ };
@@ -46,7 +47,7 @@ macro_rules! limits {
                 [$(Limit::new(stringify!($key), concat!($($meaning),+), Bounds::<$unit> { $($bounds)+ })),+]
             }
 
-            /// The limits that `table` names; the others are those of `missing`.
+            /// Parses the limits in `table`; the others are those of `missing`.
             pub(super) fn read(table: &TomlTable, missing: Limits) -> Result<Limits, ManifestError> {
                 let (min, max) = (Limits::MIN, Limits::MAX);
                 Ok(Limits {
@@ -62,7 +63,7 @@ macro_rules! limits {
                 Limits { $($key: self.$key.min(most.$key)),+ }
             }
 
-            /// Each key with its value, as it would be written in the file.
+            /// Returns each key with its value, as written in the file.
             pub fn in_words(&self) -> [(&'static str, String); Limits::KEYS.len()] {
                 [$((stringify!($key), self.$key.in_words())),+]
             }
@@ -86,7 +87,7 @@ limits! {
     }
 
     /// Time after which `init` ends with a fault. Live only.
-    // Importing numpy and loading a model take seconds; nobody waits for five minutes.
+    // Importing numpy and loading a model take seconds; five minutes are enough for any start.
     init_deadline as "init_deadline_ns": Duration {
         min: Duration::from_millis(1), default: Duration::from_secs(10), max: Duration::from_secs(300)
     }
@@ -96,39 +97,39 @@ limits! {
     memory: ByteSize { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(1) }
 
     /// Elements of all tables of a component.
-    // A lambda built from Rust has some hundred, for its function pointers. The host keeps 8 bytes
-    // for each, beside `memory`: 8 MB at most.
+    // A Rust lambda has some hundred, for its function pointers. The host keeps 8 bytes for each,
+    // on top of `memory`: 8 MB at most.
     tables: u64 { min: 1, default: 20_000, max: 1_000_000 }
 
     /// Stack of a component.
-    // The thread that runs it has 8 MiB, of which the host needs some for its own calls below the
-    // guest's; half a mebibyte is a recursion some thousand deep.
+    // The thread that runs it has 8 MiB, which host calls use, too; half a mebibyte allows a
+    // recursion some thousand deep.
     stack: ByteSize { min: ByteSize::kib(16), default: ByteSize::kib(512), max: ByteSize::kib(512) }
 
     /// Handles of all kinds that a component holds at a time.
-    // Samples, frames, fields, topics and what WASI hands out. The host keeps some 200 bytes for
-    // each: 13 MB at most.
+    // Samples, frames, fields, topics and WASI resources. The host keeps some 200 bytes for each:
+    // 13 MB at most.
     handles: u64 { min: 16, default: 4096, max: 65_536 }
 
     /// Frames of all inputs that the lambda holds at a time.
-    // However they were made. Their pixels are bounded by `hold`, `decoded_size` and `memory`.
+    // Of any origin. Their pixels are limited by `hold`, `decoded_size` and `memory`.
     frames: u64 { min: 1, default: 256, max: 4096 }
 
     /// Bytes that one call takes or returns.
-    // A call is the shortest thing that a deadline can end, and a mebibyte takes 0.1 ms. The SDK
-    // reads frames in pieces of 64 KiB.
+    // A deadline cannot end a call half-way, and copying a mebibyte takes 0.1 ms. The SDK reads
+    // frames in pieces of 64 KiB.
     call_bytes: ByteSize { min: ByteSize::kib(64), default: ByteSize::mib(1), max: ByteSize::mib(1) }
 
     /// Samples, values or texts that one call returns.
-    // As many as the deepest ring has.
+    // The size of the deepest ring.
     call_items: u64 { min: 16, default: 65_536, max: 65_536 }
 
     /// Bytes that the host keeps for the lambda by name.
-    // It is memory, so nobody has some who does not ask for it.
+    // It takes memory, so it has to be requested.
     scratch: ByteSize { min: ByteSize::kib(0), default: ByteSize::kib(0), max: ByteSize::mib(256) }
 
     /// Log lines per second of the lambda's time.
-    // Nobody reads more, and a disk should last.
+    // More would fill the disk, and would not be read.
     log_lines: u64 { min: 1, default: 100, max: 10_000 }
 
     /// Bytes of log lines per second of the lambda's time.
@@ -136,19 +137,19 @@ limits! {
     log_bytes: ByteSize { min: ByteSize::kib(4), default: ByteSize::kib(400), max: ByteSize::mib(16) }
 
     /// Triggers per minute of the lambda's time.
-    // Of all kinds. The default is 200 a second, which is what a recorder takes for long from one
-    // lambda; the maximum one for each wake of the shortest period.
+    // Of all kinds. The default is 200 a second, the sustained rate that a recorder accepts from
+    // one lambda; the maximum is one for each wake of the shortest period.
     events_per_minute: u64 { min: 1, default: 12_000, max: 60_000 }
 }
 
-/// A limit that a vehicle made smaller.
+/// A limit that a vehicle reduced.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Tightened {
     /// Its key.
     pub key: &'static str,
-    /// What the manifest says.
+    /// The value in the manifest.
     pub from: String,
-    /// What holds.
+    /// The effective value.
     pub to: String,
 }
 
@@ -159,7 +160,7 @@ impl fmt::Display for Tightened {
 }
 
 impl Limits {
-    /// The smaller one of each pair, and where that is smaller than before.
+    /// Returns the smaller value of each pair, and the limits that `most` reduced.
     pub fn tightened_by(&self, most: &Limits) -> (Limits, Vec<Tightened>) {
         let tight = self.smaller(most);
         let pairs = self.in_words().into_iter().zip(tight.in_words());
@@ -179,7 +180,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_vehicle_makes_limits_smaller_and_never_larger() {
+    fn a_vehicle_reduces_limits_and_never_raises_them() {
         let mut vehicle = Limits::MAX;
         (vehicle.fuel, vehicle.deadline) = (10_000_000, Duration::from_millis(20));
         vehicle.memory = ByteSize::gib(1);
@@ -187,8 +188,8 @@ mod tests {
         let expected =
             Limits { fuel: 10_000_000, deadline: Duration::from_millis(20), ..Limits::default() };
         assert_eq!(limits, expected);
-        let said: Vec<_> = tightened.iter().map(Tightened::to_string).collect();
-        assert_eq!(said, ["fuel 50000000 -> 10000000", "deadline 50ms -> 20ms"]);
+        let texts: Vec<_> = tightened.iter().map(Tightened::to_string).collect();
+        assert_eq!(texts, ["fuel 50000000 -> 10000000", "deadline 50ms -> 20ms"]);
         assert_eq!(limits.tightened_by(&Limits::MAX), (limits, Vec::new()));
     }
 
@@ -206,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_in_json_has_its_default_and_what_is_there_reads_back() {
+    fn missing_limits_in_json_have_their_default_and_others_are_parsed_back() {
         let limits: Limits =
             serde_json::from_str(r#"{"fuel":5000,"of a newer version":1}"#).unwrap();
         assert_eq!(limits, Limits { fuel: 5000, ..Limits::default() });

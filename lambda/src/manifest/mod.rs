@@ -1,10 +1,9 @@
-//! `lambda.toml`: read once, and turned into types that cannot be wrong, so that no later code has
+//! Parses `lambda.toml` once, into types that are valid by construction, so that no later code has
 //! to check again.
 //!
-//! `table` and `value` walk the document, `read` says what each key is, `error` what a user sees
-//! when one is refused: the file, the line, the key, the cause and the way out. Nothing here looks
-//! at the file system except to read the manifest itself: whether `entry` exists is the business of
-//! [`layout`](crate::layout).
+//! `table` and `value` walk the document, `read` parses each key, and `error` has the messages of a
+//! refusal: the file, the line, the key, the cause and help. The file system is used only to read
+//! the manifest itself: [`layout`](crate::layout) checks whether `entry` exists.
 
 pub mod bounds;
 mod config;
@@ -43,11 +42,11 @@ use std::path::Path;
 
 use gleaner_base::{NotPlain, PlainFile};
 
-/// Name of the file.
+/// Name of the manifest file.
 const FILE: &str = "lambda.toml";
 
 impl Manifest {
-    /// The manifest that `text` holds. `file` is its name in messages, usually `lambda.toml`.
+    /// Parses the manifest `text`. `file` is its name in messages, usually `lambda.toml`.
     ///
     /// # Errors
     ///
@@ -57,7 +56,7 @@ impl Manifest {
         read::manifest(&table::Document { text, file: &file })
     }
 
-    /// The manifest in the folder `dir`: a lambda's own, or that of its build folder.
+    /// Loads the manifest in `dir`, the folder of a lambda or its build folder.
     ///
     /// # Errors
     ///
@@ -67,24 +66,24 @@ impl Manifest {
         Manifest::parse(&Manifest::read(dir)?, dir.join(FILE))
     }
 
-    /// The text of the manifest in the folder `dir`, for whoever needs its bytes as well.
+    /// Reads the text of the manifest in the folder `dir`, for callers that need its bytes as well.
     ///
     /// # Errors
     ///
-    /// If `dir/lambda.toml` cannot be read, is no file of that folder, is longer than
-    /// [`MANIFEST_MAX`](bounds::MANIFEST_MAX), or is no UTF-8.
+    /// If `dir/lambda.toml` cannot be read, is not a file of that folder, is longer than
+    /// [`MANIFEST_MAX`](bounds::MANIFEST_MAX), or is not UTF-8.
     pub fn read(dir: impl AsRef<Path>) -> Result<String, ManifestError> {
         let dir = dir.as_ref();
         text(&dir.join(FILE), PlainFile::inside(dir, Path::new(FILE), bounds::MANIFEST_MAX))
     }
 }
 
-/// The limits that `text` has for a vehicle; those that it does not name are at their maximum.
+/// Parses the limits of a vehicle in `text`; limits that it does not name are at their maximum.
 pub(crate) fn vehicle_limits(text: &str, file: &str) -> Result<Limits, ManifestError> {
     read_limits::vehicle(&table::Document { text, file })
 }
 
-/// The text of what is written as a manifest is, in a file that a user has named.
+/// Reads a file in the format of a manifest, which a user has named.
 pub(crate) fn read_text(path: &Path) -> Result<String, ManifestError> {
     text(path, PlainFile::named(path, bounds::MANIFEST_MAX))
 }

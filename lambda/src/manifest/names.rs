@@ -1,5 +1,4 @@
-//! Names that were checked once. Each is a text of one form, so that a path, a topic or a version
-//! in hand is a good one.
+//! Validated names: each type is a text of one form, so that every path, topic or version is valid.
 
 use std::fmt;
 use std::path::Path;
@@ -10,15 +9,15 @@ use serde::{Serialize, Serializer};
 
 use gleaner_base::{Exit, Explain};
 
-/// Why a text is no name of the wanted sort.
+/// A text that does not have the form of the expected name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{text}` is no {what}")]
+#[error("`{text}` is not a {what}")]
 pub struct NameError {
-    /// The text that was refused.
+    /// The refused text.
     pub text: String,
-    /// What it should have been, for example `topic name`.
+    /// The expected kind of name, for example `topic name`.
     pub what: &'static str,
-    /// What such a name looks like, for the help line.
+    /// The form of such a name, for the help line.
     pub rule: &'static str,
 }
 
@@ -39,7 +38,7 @@ macro_rules! checked_text {
         pub struct $name(String);
 
         impl $name {
-            /// The text itself.
+            /// Returns the text.
             pub fn as_str(&self) -> &str {
                 &self.0
             }
@@ -93,7 +92,8 @@ checked_text! {
     /// Name of a lambda: 1 to 63 lower-case letters, digits and hyphens, the first a letter. It
     /// becomes part of file names, host labels and URLs, hence the length of a DNS label.
     LambdaName, "lambda name",
-    "a lambda name has 1 to 63 lower-case letters, digits and hyphens and begins with a letter, for example `brake-dark`",
+    "a lambda name has 1 to 63 lower-case letters, digits and hyphens and begins with a letter, \
+     for example `brake-dark`",
     names::is_lambda
 }
 
@@ -101,7 +101,8 @@ checked_text! {
     /// Name of an input, a model or a config item: 1 to 63 lower-case letters, digits, `_` and `-`,
     /// the first a letter.
     ItemName, "name",
-    "a name has 1 to 63 lower-case letters, digits, `_` and `-` and begins with a letter, for example `front_camera`",
+    "a name has 1 to 63 lower-case letters, digits, `_` and `-` and begins with a letter, \
+     for example `front_camera`",
     names::is_item
 }
 
@@ -111,7 +112,8 @@ checked_text! {
     /// Source: the topic and service names page of the ROS 2 design; the length is rmw's
     /// `RMW_TOPIC_MAX_NAME_LENGTH`, the 255 bytes of DDS less 8 for prefixes.
     TopicName, "topic name",
-    "a topic begins with `/` and has parts of letters, digits and `_`, none beginning with a digit, for example `/camera/front`",
+    "a topic begins with `/` and has parts of letters, digits and `_`, none beginning with a digit, \
+     for example `/camera/front`",
     names::is_topic
 }
 
@@ -123,7 +125,8 @@ checked_text! {
 }
 
 checked_text! {
-    /// `major.minor.patch`, with an optional `-pre.release` part, as in semantic versioning.
+    /// A version `major.minor.patch`, with an optional `-pre.release` part, as in semantic
+    /// versioning.
     Version, "version",
     "a version is `major.minor.patch`, for example `0.1.0` or `1.0.0-rc.1`",
     is_version
@@ -145,25 +148,26 @@ checked_text! {
 }
 
 impl RelativePath {
-    /// The path, to be joined to the folder it is relative to.
+    /// Returns the path, to be joined to its folder.
     pub fn as_path(&self) -> &Path {
         Path::new(&self.0)
     }
 }
 
 impl TypeName {
-    /// `sensor_msgs/msg/CompressedImage`: a frame that is decoded when its pixels are first wanted.
+    /// Returns whether this is `sensor_msgs/msg/CompressedImage`: a frame that is decoded on the
+    /// first access to its pixels.
     pub fn is_compressed_image(&self) -> bool {
         self.0 == names::COMPRESSED_IMAGE
     }
 
-    /// Whether samples of this type are seen as frames: `sensor_msgs/msg/Image` and
+    /// Returns whether samples of this type are frames: `sensor_msgs/msg/Image` and
     /// `CompressedImage`.
     pub fn is_frame(&self) -> bool {
         names::is_frame(&self.0)
     }
 
-    /// Whether samples of this type are large, so that few of them are kept: frames and point
+    /// Returns whether samples of this type are large, so that few are kept: frames and point
     /// clouds.
     pub fn is_large(&self) -> bool {
         names::is_large(&self.0)
@@ -175,7 +179,7 @@ fn is_version(text: &str) -> bool {
         Some((core, pre)) => (core, Some(pre)),
         None => (text, None),
     };
-    // A leading zero would make two texts of one version.
+    // A leading zero would give one version two texts.
     let number = |part: &str| part.parse::<u32>().is_ok_and(|n| n.to_string() == part);
     let identifier = |part: &str| {
         !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-')
@@ -187,8 +191,8 @@ fn is_version(text: &str) -> bool {
 }
 
 fn is_relative_path(text: &str) -> bool {
-    // Checked as text, not by `Path::components`, which quietly drops `.` and doubled separators:
-    // one file, one text.
+    // Checked as text, not by `Path::components`, which drops `.` and doubled separators: each file
+    // has exactly one text.
     let part = |part: &str| !part.is_empty() && part != "." && part != "..";
     text.len() <= 255
         && text.split('/').all(part)

@@ -1,4 +1,4 @@
-//! What each key of `lambda.toml` is: one function per table, one line per key.
+//! Parses each key of `lambda.toml`: one function per table, one line per key.
 
 use toml::de::DeTable;
 
@@ -17,7 +17,7 @@ use gleaner_base::text::{excerpt, nearest};
 
 type Result<T> = std::result::Result<T, ManifestError>;
 
-/// The manifest that `document` holds.
+/// Parses the manifest in `document`.
 pub(super) fn manifest(document: &Document) -> Result<Manifest> {
     let entries =
         DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;
@@ -96,7 +96,7 @@ fn schedule(value: &TomlValue, inputs: &[InputSpec]) -> Result<ScheduleSpec> {
             let (_, second) =
                 if event.offset < period.offset { (event, period) } else { (period, event) };
             Err(second.misplaced(
-                "stands beside the other kind of schedule",
+                "conflicts with the other kind of schedule",
                 "keep `event` or `period`: a lambda runs on one input or on the clock",
             ))
         }
@@ -112,7 +112,7 @@ fn event_input<'i>(event: &TomlValue, inputs: &'i [InputSpec]) -> Result<&'i Inp
     inputs.iter().find(|input| input.name == name).ok_or_else(|| {
         let names = || inputs.iter().map(|input| input.name.as_str());
         ManifestError::NoSuchInput {
-            at: event.place(),
+            at: event.location(),
             name: excerpt(name),
             near: nearest(name, names()).map(str::to_owned),
             inputs: names().map(str::to_owned).collect(),
@@ -135,11 +135,11 @@ fn inputs(document: &Document, root: &TomlTable) -> Result<Vec<InputSpec>> {
         memory.push(InputMemory {
             name: input.name.to_string(),
             line: table.line(),
-            asked: input.memory(),
+            required: input.memory(),
         });
         inputs.push(input);
     }
-    let total = memory.iter().fold(0, |sum: u64, input| sum.saturating_add(input.asked.bytes()));
+    let total = memory.iter().fold(0, |sum: u64, input| sum.saturating_add(input.required.bytes()));
     if total > bounds::INPUTS_MEMORY_MAX.bytes() {
         let (file, total) = (document.file.to_owned(), ByteSize::new(total));
         return Err(ManifestError::TooMuchMemory { file, total, inputs: memory });
@@ -179,7 +179,8 @@ fn input(table: &TomlTable, name: &TomlValue, topic: &TomlValue) -> Result<Input
 }
 
 fn qos(value: &TomlValue) -> Result<Qos> {
-    let wanted = "\"auto\", or a table such as { reliability = \"reliable\", durability = \"volatile\", depth = 10 }";
+    let wanted = "\"auto\", or a table such as { reliability = \"reliable\", \
+                  durability = \"volatile\", depth = 10 }";
     if value.raw().is_str() {
         return value.choice(&[("auto", Qos::Auto)]);
     }
@@ -264,22 +265,22 @@ fn record(document: &Document, value: &TomlValue) -> Result<RecordSpec> {
     })
 }
 
-/// Counts in a manifest end far below the 32 bits that every address has.
+/// Converts a count, whose maximum in a manifest is far below 32 bits.
 fn count(n: u64) -> usize {
     usize::try_from(n).unwrap_or(usize::MAX)
 }
 
-/// Names of which each may come once.
+/// Names that may be listed once only.
 struct Unique<'a> {
     document: &'a Document<'a>,
     what: &'static str,
-    way_out: &'static str,
+    help: &'static str,
     seen: Vec<(String, usize)>,
 }
 
 impl<'a> Unique<'a> {
-    fn new(document: &'a Document<'a>, what: &'static str, way_out: &'static str) -> Unique<'a> {
-        Unique { document, what, way_out, seen: Vec::new() }
+    fn new(document: &'a Document<'a>, what: &'static str, help: &'static str) -> Unique<'a> {
+        Unique { document, what, help, seen: Vec::new() }
     }
 
     fn add(&mut self, name: &str, value: &TomlValue) -> Result<()> {
@@ -290,7 +291,7 @@ impl<'a> Unique<'a> {
                 file: self.document.file.to_owned(),
                 first: self.document.line(*first),
                 second: value.line(),
-                way_out: self.way_out,
+                help: self.help,
             });
         }
         self.seen.push((name.to_owned(), value.offset));

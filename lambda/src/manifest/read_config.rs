@@ -1,4 +1,4 @@
-//! `[config]`: the one table whose keys and types the author chooses.
+//! Parses `[config]`, the table whose keys and types the author chooses.
 
 use toml::de::DeValue;
 
@@ -10,7 +10,7 @@ use super::{ConfigItem, ConfigValue};
 
 type Result<T> = std::result::Result<T, ManifestError>;
 
-/// The items of `[config]`, in the order of the file.
+/// Parses the items of `[config]`, in the order of the file.
 pub(super) fn items(value: &TomlValue) -> Result<Vec<ConfigItem>> {
     let entries = value.open_table("[config]")?.entries();
     if entries.len() > ITEMS_MAX {
@@ -36,10 +36,10 @@ fn item(entry: &TomlValue) -> Result<ConfigItem> {
             description: None,
         });
     }
-    let title = format!("`{}`", entry.place().key);
+    let title = format!("`{}`", entry.location().key);
     let table = entry.table(&title, &["default", "min", "max", "unit", "description"])?;
     let given =
-        table.need("default", "default = 1.0, or another value that says what type it is")?;
+        table.need("default", "default = 1.0, or another value, whose type is that of the item")?;
     let default = scalar(&given, "a number, a text, or true or false")?;
     let min = limit(&table, "min", &default)?;
     let max = limit(&table, "max", &default)?;
@@ -63,7 +63,7 @@ fn item(entry: &TomlValue) -> Result<ConfigItem> {
     })
 }
 
-/// The limit `key` of an item, as a value of the type of `default`.
+/// Parses the limit `key` of an item, as a value of the type of `default`.
 fn limit<'a>(
     table: &TomlTable<'a>,
     key: &str,

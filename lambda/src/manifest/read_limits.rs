@@ -1,5 +1,5 @@
-//! `[limits]` in `lambda.toml`, where it is what the lambda wants, and in `vehicle.toml`, where it
-//! is the most that a lambda gets.
+//! Parses `[limits]`: of `lambda.toml`, the limits of the lambda; of `vehicle.toml`, the upper
+//! bounds for all lambdas.
 
 use toml::de::DeTable;
 
@@ -11,13 +11,13 @@ use super::value::TomlValue;
 
 type Result<T> = std::result::Result<T, ManifestError>;
 
-/// The table `[limits]`, if there is one; limits that it does not name are those of `missing`.
+/// Parses the table `[limits]`, if any; limits that it does not name are those of `missing`.
 pub(super) fn limits(value: Option<&TomlValue>, missing: Limits) -> Result<Limits> {
     value
         .map_or(Ok(missing), |value| Limits::read(&value.table("[limits]", Limits::KEYS)?, missing))
 }
 
-/// The limits of a vehicle.
+/// Parses the limits of a vehicle.
 pub(super) fn vehicle(document: &Document) -> Result<Limits> {
     let entries =
         DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;

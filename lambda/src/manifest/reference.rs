@@ -1,6 +1,6 @@
-//! `docs/manifest.md`: every key of a `lambda.toml`. Meanings are the comments of the types that
-//! hold the values, rules are those that a name is refused by, and numbers the bounds that it is
-//! checked against; so nothing is said twice, and nothing can go stale.
+//! Generates `docs/manifest.md`: every key of a `lambda.toml`. Meanings are the doc comments of the
+//! types, forms the rules that check names, and numbers the bounds that check values, so that
+//! nothing is written twice or outdated.
 
 use std::fmt::{Display, Write};
 use std::ops::RangeInclusive;
@@ -15,7 +15,7 @@ use super::{
 };
 use gleaner_base::grouped;
 
-/// Where the types are that a manifest becomes.
+/// The files that define the types of a manifest.
 const SOURCES: [&str; 2] = [include_str!("types.rs"), include_str!("config.rs")];
 
 const BEGIN: &str = r##"# The manifest
@@ -71,7 +71,7 @@ dark_luma = { default = 50.0, min = 0, max = 255, description = "mean grey below
 
 /// A table of the manifest.
 pub(super) struct Section {
-    /// As it is written, such as `[lambda]`.
+    /// Its header, such as `[lambda]`.
     pub(super) title: &'static str,
     note: String,
     pub(super) keys: Vec<Key>,
@@ -87,7 +87,7 @@ pub(super) struct Key {
 }
 
 impl Key {
-    /// The key `name` that becomes `field` of the type `of`.
+    /// Creates the key `name`, which is `field` of the type `of`.
     fn new(name: &'static str, of: &str, field: &str, form: impl Into<String>) -> Key {
         let meaning =
             meaning(of, field).unwrap_or_else(|| panic!("`{field}` of `{of}` has a comment"));
@@ -113,7 +113,7 @@ impl Key {
         self.default(&default).within(bounds.range(), show)
     }
 
-    /// With other bounds for images and clouds.
+    /// Adds the default for images and clouds.
     fn or_large<T: Copy + PartialEq>(
         mut self,
         large: &Bounds<T>,
@@ -124,16 +124,16 @@ impl Key {
     }
 }
 
-/// All tables, in the order of the page.
+/// Returns all tables, in the order of the page.
 pub(super) fn sections() -> Vec<Section> {
     vec![lambda(), schedule(), input(), qos(), record(), limits(), config(), model()]
 }
 
-/// The page `docs/manifest.md`.
+/// Generates the page `docs/manifest.md`.
 ///
 /// # Panics
 ///
-/// If a field that holds a key has no comment.
+/// If the field of a key has no doc comment.
 pub fn reference() -> String {
     let mut page = BEGIN.to_owned();
     for section in sections() {
@@ -166,9 +166,12 @@ fn schedule() -> Section {
         Key::new("backlog", "ScheduleSpec", "backlog", "`\"each\"`, `\"latest\"`")
             .default("`\"each\"`; of images and clouds `\"latest\"`"),
     ];
-    let note = "When the lambda runs. Required, with either `event` or `period`; `backlog` goes with `event`.\n\
-                With `\"each\"`, every sample wakes the lambda, in order, as far back as `depth` reaches.\n\
-                With `\"latest\"`, only the newest one does, and the others are counted as skipped.";
+    let note = "When the lambda runs. Required, with either `event` or `period`; \
+                `backlog` goes with `event`.\n\
+                With `\"each\"`, every sample wakes the lambda, in order, \
+                as far back as `depth` reaches.\n\
+                With `\"latest\"`, only the newest one does, \
+                and the others are counted as skipped.";
     Section { title: "[schedule]", note: note.to_owned(), keys }
 }
 
@@ -193,7 +196,8 @@ fn input() -> Section {
     let note = format!(
         "A topic that the lambda reads; any number of them, each with its own name and topic.\n\
          Memory is allocated before the first sample, {} at most for all inputs:\n\
-         (`depth` + `hold` + 1) × `max_size`, and for compressed images (`hold` + 1) × `decoded_size`.",
+         (`depth` + `hold` + 1) × `max_size`, \
+         and for compressed images (`hold` + 1) × `decoded_size`.",
         bounds::INPUTS_MEMORY_MAX
     );
     Section { title: "[[input]]", note, keys }
@@ -226,7 +230,8 @@ fn record() -> Section {
         key("store", "`\"ram\"`, `\"disk\"`").default("`\"ram\"`"),
         preroll_size,
     ];
-    let note = "The clip that a trigger cuts ([clips.md](clips.md)). Without this table, there are no clips.";
+    let note = "The clip that a trigger cuts ([clips.md](clips.md)). \
+                Without this table, there are no clips.";
     Section { title: "[record]", note: note.to_owned(), keys }
 }
 
@@ -273,7 +278,7 @@ fn model() -> Section {
     }
 }
 
-/// The rule that a name is refused by; no name is empty.
+/// Returns the rule for a type of name, from the error for an empty one.
 fn rule<T: FromStr<Err = NameError>>() -> &'static str {
     "".parse::<T>().err().map_or("a name", |refused| refused.rule)
 }
@@ -290,7 +295,7 @@ fn duration(duration: Duration) -> String {
     format!("`\"{}\"`", format_duration(duration))
 }
 
-/// The comment of a field, in one line; `of` is the struct or enum that has it.
+/// Returns the doc comment of `field` of the struct or enum `of`, in one line.
 fn meaning(of: &str, field: &str) -> Option<String> {
     let body = SOURCES.iter().find_map(|source| {
         let at = ["struct", "enum"]

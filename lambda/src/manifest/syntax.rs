@@ -4,7 +4,7 @@ use super::error::ManifestError;
 use super::table::Document;
 use gleaner_base::text::excerpt;
 
-/// What a user should see of an error of the TOML parser.
+/// Converts an error of the TOML parser to one for the user.
 pub(super) fn explain(document: &Document, error: &TomlError) -> ManifestError {
     let end = document.text.len();
     let span = error.span().unwrap_or(end..end);
@@ -14,21 +14,15 @@ pub(super) fn explain(document: &Document, error: &TomlError) -> ManifestError {
     if let Some(key) = key
         && let Some((what, first)) = earlier(document.text, key, line)
     {
-        let way_out = "keep one of the two";
-        return ManifestError::Twice {
-            what,
-            name: excerpt(key),
-            file,
-            first,
-            second: line,
-            way_out,
-        };
+        let help = "keep one of the two";
+        return ManifestError::Twice { what, name: excerpt(key), file, first, second: line, help };
     }
     ManifestError::Syntax { file, line, message: excerpt(error.message()) }
 }
 
-/// Where `key`, refused as a duplicate in `line`, stood first. The parser knows but does not tell,
-/// so its text is looked for: as the name of a table, or as a key above it in the same table.
+/// Finds the first line with `key`, which was refused as a duplicate in `line`. The parser does not
+/// report it, so the text is searched: for the name of a table, or for a key above in the same
+/// table.
 fn earlier(text: &str, key: &str, line: usize) -> Option<(&'static str, usize)> {
     let above: Vec<&str> = text.lines().take(line).map(str::trim_start).collect();
     let (second, above) = above.split_last()?;

@@ -1,7 +1,7 @@
-//! Walks a TOML document and remembers where everything stands, so that a refusal can say it.
+//! Walks a TOML document and keeps the location of each value for error messages.
 //!
-//! A [`TomlTable`] is made with the keys that it may have and refuses all others; a [`TomlValue`] is read
-//! as what it should be. Neither knows what a lambda is.
+//! A [`TomlTable`] is created with its known keys and refuses all others; a [`TomlValue`] is parsed
+//! as the expected type. Neither depends on what a lambda is.
 
 use std::time::Duration;
 
@@ -22,36 +22,36 @@ pub(super) struct Document<'a> {
 }
 
 impl Document<'_> {
-    /// The line, from 1, of the byte at `offset`.
+    /// Returns the line, from 1, of the byte at `offset`.
     pub(super) fn line(&self, offset: usize) -> usize {
         self.text.bytes().take(offset).filter(|byte| *byte == b'\n').count() + 1
     }
 }
 
-/// A table all of whose keys are known.
+/// A table of a TOML document.
 pub(super) struct TomlTable<'a> {
     pub(super) document: &'a Document<'a>,
     /// The path of its keys, for example `schedule`; empty at the top.
     pub(super) path: String,
-    /// As it is written, for example `[schedule]` or `[[input]]`.
+    /// Its header in the file, for example `[schedule]` or `[[input]]`.
     pub(super) title: String,
     pub(super) offset: usize,
     pub(super) entries: &'a DeTable<'a>,
 }
 
 impl<'a> TomlTable<'a> {
-    /// The document itself.
+    /// Returns the top level of the document.
     pub(super) fn root(
         document: &'a Document<'a>,
         entries: &'a DeTable<'a>,
         known: &'static [&'static str],
     ) -> Result<TomlTable<'a>> {
         TomlTable { document, path: String::new(), title: String::new(), offset: 0, entries }
-            .knowing(known)
+            .check_keys(known)
     }
 
-    /// The same table, if it has no key but these.
-    pub(super) fn knowing(self, known: &'static [&'static str]) -> Result<TomlTable<'a>> {
+    /// Refuses keys other than `known`.
+    pub(super) fn check_keys(self, known: &'static [&'static str]) -> Result<TomlTable<'a>> {
         let Some(value) = self.entries().into_iter().find(|value| !known.contains(&value.name))
         else {
             return Ok(self);
@@ -70,7 +70,7 @@ impl<'a> TomlTable<'a> {
         })
     }
 
-    /// All values, in the order of the file.
+    /// Returns all values, in the order of the file.
     pub(super) fn entries(&self) -> Vec<TomlValue<'a>> {
         let mut values: Vec<_> =
             self.entries.keys().filter_map(|key| self.get(key.get_ref())).collect();
@@ -94,7 +94,7 @@ impl<'a> TomlTable<'a> {
         })
     }
 
-    /// A value that must be there; `example` is what to write if it is not.
+    /// Returns a required value; the error suggests `example`.
     pub(super) fn need(&self, key: &'static str, example: &'static str) -> Result<TomlValue<'a>> {
         self.get(key).ok_or_else(|| ManifestError::MissingKey {
             file: self.document.file.to_owned(),
@@ -105,7 +105,7 @@ impl<'a> TomlTable<'a> {
         })
     }
 
-    /// The tables of `[[key]]`, none if there is no such key.
+    /// Returns the tables of `[[key]]`; none if the key is missing.
     pub(super) fn tables(
         &self,
         key: &str,
@@ -123,7 +123,7 @@ impl<'a> TomlTable<'a> {
         self.get(key).map(|value| value.text().map(str::to_owned)).transpose()
     }
 
-    /// `true` or `false`; `false` if it is not there.
+    /// Returns a boolean; `false` if the key is missing.
     pub(super) fn flag(&self, key: &str) -> Result<bool> {
         self.get(key).map_or(Ok(false), |value| value.boolean())
     }

@@ -7,14 +7,14 @@ use super::{
     Version,
 };
 
-/// What `lambda.toml` says, checked. As JSON it has the file's keys; durations are `_ns`, sizes are
-/// in bytes.
+/// The validated content of `lambda.toml`. As JSON it has the file's keys; durations are `_ns`,
+/// sizes are in bytes.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct Manifest {
-    /// `[lambda]`: what it is.
+    /// `[lambda]`: identity and code.
     pub lambda: LambdaSection,
-    /// `[schedule]`: when it runs.
+    /// `[schedule]`: the times at which it runs.
     pub schedule: ScheduleSpec,
     /// `[[input]]`, in the order of the file. Names and topics are unique; an event schedule names
     /// one of them.
@@ -25,13 +25,13 @@ pub struct Manifest {
     pub models: Vec<ModelSpec>,
     /// `[record]`: the clip that an event trigger opens; `None` if the lambda records nothing.
     pub record: Option<RecordSpec>,
-    /// `[limits]`: what it may use.
+    /// `[limits]`: the resources that it may use.
     pub limits: Limits,
     /// `[config]`, in the order of the file.
     pub config: Vec<ConfigItem>,
 }
 
-/// `[lambda]`: what it is.
+/// `[lambda]`: identity and code.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct LambdaSection {
@@ -61,7 +61,7 @@ pub enum LambdaKind {
 }
 
 impl LambdaKind {
-    /// The word of the file: `wasm` or `python`.
+    /// Returns the word in manifests: `wasm` or `python`.
     pub fn as_str(self) -> &'static str {
         match self {
             LambdaKind::Wasm => "wasm",
@@ -70,7 +70,7 @@ impl LambdaKind {
     }
 }
 
-/// `[schedule]`: when a lambda runs.
+/// `[schedule]`: the times at which a lambda runs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(untagged)]
 pub enum ScheduleSpec {
@@ -90,17 +90,17 @@ pub enum ScheduleSpec {
     },
 }
 
-/// What happens to event samples that arrive while the lambda runs.
+/// The treatment of event samples that arrive while the lambda runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Backlog {
-    /// Each wakes the lambda once, in order, as far as the ring reaches.
+    /// Each sample wakes the lambda once, in order, as far back as the ring reaches.
     Each,
-    /// The newest wakes it, the others are counted as skipped.
+    /// Only the newest sample wakes it; the others are counted as skipped.
     Latest,
 }
 
-/// `[[input]]`: one topic that the lambda sees.
+/// `[[input]]`: a topic that the lambda reads.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct InputSpec {
@@ -124,18 +124,18 @@ pub struct InputSpec {
 }
 
 impl InputSpec {
-    /// How many slots the samples of this input need: those in the ring, those held, and the one
-    /// being written.
+    /// Returns the number of slots for samples: those in the ring, those held, and the one being
+    /// written.
     pub fn slots(&self) -> usize {
         self.depth + self.hold + 1
     }
 
-    /// How many slots decoded images need: those held, and the one being decoded.
+    /// Returns the number of slots for decoded images: those held, and the one being decoded.
     pub fn decoded_slots(&self) -> usize {
         self.hold + 1
     }
 
-    /// Memory that this input takes before the first sample: its slots, and those of decoded
+    /// Returns the memory that is allocated before the first sample: for samples and decoded
     /// images.
     pub fn memory(&self) -> ByteSize {
         let decoded = self.decoded_size.map_or(0, ByteSize::bytes);
@@ -144,13 +144,14 @@ impl InputSpec {
     }
 }
 
-/// How a topic is subscribed.
+/// QoS of a subscription.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Qos {
     /// Adapts to what the publishers offer.
     Auto,
-    /// Exactly this. Keys that the table leaves out have the values of ROS 2's default profile.
+    /// Exactly this profile. Keys that the table leaves out have the values of ROS 2's default
+    /// profile.
     #[serde(untagged)]
     Fixed {
         /// Retransmission of lost samples.
@@ -162,23 +163,23 @@ pub enum Qos {
     },
 }
 
-/// Whether lost samples are sent again.
+/// Retransmission of lost samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Reliability {
-    /// They are.
+    /// Lost samples are sent again.
     Reliable,
-    /// They are not.
+    /// Lost samples are not sent again.
     BestEffort,
 }
 
-/// Whether a late subscriber gets samples from before it came.
+/// Delivery of earlier samples to late subscribers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Durability {
-    /// It does not.
+    /// A late subscriber gets no earlier samples.
     Volatile,
-    /// It gets those that the publisher still has.
+    /// A late subscriber gets the samples that the publisher still has.
     TransientLocal,
 }
 
@@ -224,7 +225,7 @@ pub struct RecordSpec {
     pub max_length: Duration,
 }
 
-/// Where the preroll waits for a trigger.
+/// Storage of the preroll.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Store {
@@ -235,12 +236,12 @@ pub enum Store {
 }
 
 impl Manifest {
-    /// The input of this name.
+    /// Returns the input of this name.
     pub fn input(&self, name: &str) -> Option<&InputSpec> {
         self.inputs.iter().find(|input| input.name == name)
     }
 
-    /// The input whose samples wake the lambda; `None` if the clock does.
+    /// Returns the input whose samples wake the lambda; `None` for a periodic one.
     pub fn event_input(&self) -> Option<&InputSpec> {
         match &self.schedule {
             ScheduleSpec::Event { input, .. } => self.input(input.as_str()),
@@ -248,7 +249,7 @@ impl Manifest {
         }
     }
 
-    /// The manifest as JSON, with the keys of the file and every default filled in.
+    /// Returns the manifest as JSON, with the keys of the file and every default filled in.
     pub fn to_json(&self) -> serde_json::Value {
         serde_json::to_value(self).expect("a manifest has only text keys and finite numbers")
     }

@@ -1,5 +1,4 @@
-//! One value of a TOML document, read as what it should be, with its place for the refusal if it is
-//! not.
+//! Parses one value of a TOML document as the expected type; errors name its location.
 
 use std::ops::RangeInclusive;
 use std::str::FromStr;
@@ -20,7 +19,7 @@ type Result<T> = std::result::Result<T, ManifestError>;
 #[derive(Clone)]
 pub(super) struct TomlValue<'a> {
     pub(super) document: &'a Document<'a>,
-    /// The last part of its path, as it is in the file.
+    /// Its key, the last part of `path`, as it is in the file.
     pub(super) name: &'a str,
     pub(super) path: String,
     pub(super) offset: usize,
@@ -32,7 +31,7 @@ impl<'a> TomlValue<'a> {
         self.document.line(self.offset)
     }
 
-    pub(super) fn place(&self) -> Box<KeyLocation> {
+    pub(super) fn location(&self) -> Box<KeyLocation> {
         Box::new(KeyLocation {
             file: self.document.file.to_owned(),
             line: self.line(),
@@ -44,7 +43,7 @@ impl<'a> TomlValue<'a> {
         self.value
     }
 
-    /// The error for a value of another type; `wanted` is what to give instead.
+    /// Returns the error for a value of another type; `wanted` describes the expected value.
     pub(super) fn wrong_type(&self, wanted: &str) -> ManifestError {
         let found = match self.value {
             DeValue::String(_) => "a text",
@@ -55,38 +54,38 @@ impl<'a> TomlValue<'a> {
             DeValue::Array(_) => "an array",
             DeValue::Table(_) => "a table",
         };
-        ManifestError::WrongType { at: self.place(), found, wanted: wanted.to_owned() }
+        ManifestError::WrongType { at: self.location(), found, wanted: wanted.to_owned() }
     }
 
-    /// The error for a text that should be a `what`; `rule` is what such a text looks like.
+    /// Returns the error for a text that should be a `what`; `rule` describes its form.
     pub(super) fn wrong_form(
         &self,
         text: &str,
         what: &'static str,
         rule: &'static str,
     ) -> ManifestError {
-        ManifestError::WrongForm { at: self.place(), text: excerpt(text), what, rule }
+        ManifestError::WrongForm { at: self.location(), text: excerpt(text), what, rule }
     }
 
-    /// The error for a value that does not fit its surroundings.
+    /// Returns the error for a value that conflicts with other keys.
     pub(super) fn misplaced(
         &self,
         why: impl Into<String>,
-        way_out: impl Into<String>,
+        help: impl Into<String>,
     ) -> ManifestError {
-        ManifestError::Misplaced { at: self.place(), why: why.into(), way_out: way_out.into() }
+        ManifestError::Misplaced { at: self.location(), why: why.into(), help: help.into() }
     }
 
-    /// The table that this is. `title` is how it is written.
+    /// Returns the value as a table with the keys `known`. `title` is its header in the file.
     pub(super) fn table(
         &self,
         title: &str,
         known: &'static [&'static str],
     ) -> Result<TomlTable<'a>> {
-        self.open_table(title)?.knowing(known)
+        self.open_table(title)?.check_keys(known)
     }
 
-    /// A table whose keys the author chooses.
+    /// Returns the value as a table whose keys the author chooses.
     pub(super) fn open_table(&self, title: &str) -> Result<TomlTable<'a>> {
         let DeValue::Table(entries) = self.value else {
             return Err(self.wrong_type("a table"));
@@ -101,7 +100,7 @@ impl<'a> TomlValue<'a> {
         })
     }
 
-    /// The elements of an array, each with its own line.
+    /// Returns the elements of an array, each with its own line.
     pub(super) fn items(&self, wanted: &str) -> Result<Vec<TomlValue<'a>>> {
         let DeValue::Array(items) = self.value else {
             return Err(self.wrong_type(wanted));
@@ -129,20 +128,20 @@ impl<'a> TomlValue<'a> {
         }
     }
 
-    /// A text of a checked form.
+    /// Parses a text of a certain form.
     pub(super) fn parse<T: FromStr<Err = NameError>>(&self) -> Result<T> {
         let text = self.text()?;
         text.parse().map_err(|NameError { what, rule, .. }| self.wrong_form(text, what, rule))
     }
 
-    /// The key itself, where its form matters because the author chose it.
+    /// Parses the key itself, where the author chose it.
     pub(super) fn parse_key<T: FromStr<Err = NameError>>(&self) -> Result<T> {
         self.name
             .parse()
             .map_err(|NameError { what, rule, .. }| self.wrong_form(self.name, what, rule))
     }
 
-    /// One of a few words.
+    /// Parses one of a few words.
     pub(super) fn choice<T: Copy>(&self, choices: &[(&'static str, T)]) -> Result<T> {
         let text = self.text()?;
         if let Some((_, choice)) = choices.iter().find(|(word, _)| *word == text) {
@@ -150,7 +149,12 @@ impl<'a> TomlValue<'a> {
         }
         let words: Vec<_> = choices.iter().map(|(word, _)| *word).collect();
         let near = nearest(text, words.iter().copied());
-        Err(ManifestError::NoChoice { at: self.place(), text: excerpt(text), choices: words, near })
+        Err(ManifestError::NoChoice {
+            at: self.location(),
+            text: excerpt(text),
+            choices: words,
+            near,
+        })
     }
 
     pub(super) fn integer(&self, range: &RangeInclusive<u64>) -> Result<u64> {
@@ -159,7 +163,7 @@ impl<'a> TomlValue<'a> {
         };
         let (min, max) = (i128::from(*range.start()), i128::from(*range.end()));
         self.within(&number, Some(&min), Some(&max), i128::to_string)?;
-        // It lies within a range of 64 bits, so that nothing is replaced here.
+        // It is within a range of 64 bits, so that the default is never used.
         Ok(u64::try_from(number).unwrap_or(*range.end()))
     }
 
@@ -176,7 +180,7 @@ impl<'a> TomlValue<'a> {
                 "a size in quotes, for example \"2 MiB\", or a whole number of bytes",
             ));
         };
-        // As whole numbers, since the one at hand may be negative or beyond 64 bits.
+        // As 128-bit numbers, since the given one may be negative or beyond 64 bits.
         let (min, max) = (i128::from(range.start().bytes()), i128::from(range.end().bytes()));
         let show = |number: &i128| {
             u64::try_from(*number).map_or(number.to_string(), |n| ByteSize::new(n).to_string())
@@ -196,7 +200,7 @@ impl<'a> TomlValue<'a> {
         Ok(duration)
     }
 
-    /// Refuses `value` outside of the limits that there are.
+    /// Refuses `value` if it is below `min` or above `max`.
     pub(super) fn within<T: PartialOrd>(
         &self,
         value: &T,
@@ -206,13 +210,13 @@ impl<'a> TomlValue<'a> {
     ) -> Result<()> {
         match (min, max) {
             (Some(least), _) if value < least => Err(ManifestError::TooSmall {
-                at: self.place(),
+                at: self.location(),
                 value: show(value),
                 min: show(least),
                 max: max.map(show),
             }),
             (_, Some(most)) if value > most => Err(ManifestError::TooLarge {
-                at: self.place(),
+                at: self.location(),
                 value: show(value),
                 min: min.map(&show),
                 max: show(most),
@@ -221,7 +225,7 @@ impl<'a> TomlValue<'a> {
         }
     }
 
-    /// The whole number that this is; one beyond 128 bits is as good as the largest.
+    /// Returns the value as a whole number; one beyond 128 bits is replaced by the largest.
     pub(super) fn whole_number(&self) -> Option<i128> {
         let number = self.value.as_integer()?;
         let huge = if number.as_str().starts_with('-') { i128::MIN } else { i128::MAX };

@@ -1,9 +1,9 @@
-//! Every number has a minimum and a maximum, and every list an end.
+//! Tests that every number has a minimum and a maximum, and every list a maximum length.
 
 use super::super::limit::Limit;
 use super::*;
 
-/// The value in line `line` is refused as out of its bounds.
+/// Asserts that the value in line `line` is refused as out of range.
 #[track_caller]
 fn out_of_bounds(more: &str, line: usize, problem: &str, help: &str) {
     refused_below(more, &format!("lambda.toml, line {line}: {problem}"), help);
@@ -183,12 +183,12 @@ fn numbers_beyond_every_integer_type_are_only_too_large() {
 }
 
 #[test]
-fn inputs_may_not_ask_for_more_memory_than_there_is_for_all_of_them() {
+fn inputs_may_not_exceed_their_total_memory() {
     let text = input("wide", "/wide", "depth = 2\nhold = 1\nmax_size = \"256 MiB\"")
         + &input("deep", "/deep", "depth = 65536\nhold = 1024\nmax_size = \"20 KiB\"");
     refused_below(
         &text,
-        "the inputs in lambda.toml ask for 2325 MiB together, above the maximum of 2 GiB: \
+        "the inputs in lambda.toml need 2325 MiB together, above the maximum of 2 GiB: \
          `wide` (line 8) 1024 MiB, `deep` (line 15) 1301 MiB",
         "lower `depth`, `hold` or `max_size`: an input takes (depth + hold + 1) x max_size, \
          and (hold + 1) x decoded_size for compressed images",

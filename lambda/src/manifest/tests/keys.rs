@@ -1,4 +1,4 @@
-//! Refusals of one key or one value: unknown, missing, of another type or form.
+//! Tests refusals of one key or value: unknown, missing, of another type or form.
 
 use super::*;
 
@@ -39,7 +39,7 @@ fn unknown_keys_are_refused_at_every_level() {
 }
 
 #[test]
-fn what_must_be_there_is_asked_for() {
+fn missing_keys_and_tables_are_refused_with_an_example() {
     refused(
         "",
         "lambda.toml has no [lambda] table",
@@ -65,7 +65,7 @@ fn what_must_be_there_is_asked_for() {
     refused_below(
         "[config]\ngain = { min = 1 }",
         "lambda.toml, line 9: `config.gain` has no `default`",
-        "add default = 1.0, or another value that says what type it is",
+        "add default = 1.0, or another value, whose type is that of the item",
     );
 }
 
@@ -142,53 +142,53 @@ fn names_of_another_form_are_refused() {
     refused_with(
         "name = \"brake-dark\"",
         "name = \"Brake Dark\"",
-        "lambda.toml, line 2: `lambda.name` is `Brake Dark`, which is no lambda name",
+        "lambda.toml, line 2: `lambda.name` is `Brake Dark`, which is not a lambda name",
         "a lambda name has 1 to 63 lower-case letters, digits and hyphens and begins with a letter, for example `brake-dark`",
     );
     refused_with(
         "entry = \"brake_dark.wasm\"",
         "entry = \"../brake_dark.wasm\"",
-        "lambda.toml, line 5: `lambda.entry` is `../brake_dark.wasm`, which is no path inside the lambda's folder",
+        "lambda.toml, line 5: `lambda.entry` is `../brake_dark.wasm`, which is not a path inside the lambda's folder",
         "give a path relative to the lambda's folder, without `..`, for example `models/detector.onnx`",
     );
     refused_with(
         "type = \"sensor_msgs/msg/Imu\"",
         "type = \"sensor_msgs/Imu\"",
-        "lambda.toml, line 20: `input.type` is `sensor_msgs/Imu`, which is no message type",
+        "lambda.toml, line 20: `input.type` is `sensor_msgs/Imu`, which is not a message type",
         "a ROS 2 type has three parts, `package/msg/Type`, for example `sensor_msgs/msg/Imu`",
     );
     refused_with(
         "topic = \"/imu/data\"",
         "topic = \"imu/data\"",
-        "lambda.toml, line 19: `input.topic` is `imu/data`, which is no topic name",
+        "lambda.toml, line 19: `input.topic` is `imu/data`, which is not a topic name",
         "a topic begins with `/` and has parts of letters, digits and `_`, none beginning with a digit, for example `/camera/front`",
     );
     refused_with(
         "version = \"0.1.0\"",
         "version = \"1.0\"",
-        "lambda.toml, line 3: `lambda.version` is `1.0`, which is no version",
+        "lambda.toml, line 3: `lambda.version` is `1.0`, which is not a version",
         "a version is `major.minor.patch`, for example `0.1.0` or `1.0.0-rc.1`",
     );
     refused_below(
         "[[model]]\nname = \"m\"\nfile = \"m.onnx\"\nsha256 = \"abc\"",
-        "lambda.toml, line 11: `model.sha256` is `abc`, which is no sha256",
+        "lambda.toml, line 11: `model.sha256` is `abc`, which is not a sha256",
         "a sha256 has 64 lower-case hexadecimal digits: the first column that `sha256sum FILE` prints",
     );
     refused_below(
         "[config]\n\"a=b\" = 1",
-        "lambda.toml, line 9: `config.a=b` is `a=b`, which is no name",
+        "lambda.toml, line 9: `config.a=b` is `a=b`, which is not a name",
         "a name has 1 to 63 lower-case letters, digits, `_` and `-` and begins with a letter, for example `front_camera`",
     );
     refused_with(
         "preroll = \"5s\"",
         "preroll = \"5 seconds\"",
-        "lambda.toml, line 24: `record.preroll` is `5 seconds`, which is no duration",
+        "lambda.toml, line 24: `record.preroll` is `5 seconds`, which is not a duration",
         "write a number and its unit, us, ms, s, min or h, for example \"50ms\" or \"1.5s\"",
     );
     refused_with(
         "max_size = \"2 MiB\"",
         "max_size = \"2 MB\"",
-        "lambda.toml, line 15: `input.max_size` is `2 MB`, which is no size",
+        "lambda.toml, line 15: `input.max_size` is `2 MB`, which is not a size",
         "write a whole number and its unit, B, KiB, MiB or GiB, for example \"2 MiB\"",
     );
 }

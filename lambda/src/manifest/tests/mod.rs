@@ -1,4 +1,4 @@
-//! The refusals are the user's interface: each is asserted with its whole text.
+//! Tests of the manifest. Refusals are the user's interface: each is asserted with its whole text.
 
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ mod keys;
 mod reference;
 mod relations;
 
-/// The example of the design, line by line.
+/// A complete example.
 const BRAKE_DARK: &str = r#"[lambda]
 name = "brake-dark"
 version = "0.1.0"
@@ -47,7 +47,7 @@ brake_mps2 = { default = -3.0, unit = "m/s^2", description = "mean forward accel
 dark_luma = { default = 50.0, min = 0, max = 255, description = "mean grey below this is dark" }
 "#;
 
-/// A periodic lambda without inputs; what follows it begins in line 8.
+/// A periodic lambda without inputs; appended text begins in line 8.
 const TICKER: &str = r#"[lambda]
 name = "ticker"
 version = "1.2.3"
@@ -65,7 +65,7 @@ fn refused(text: &str, message: &str, help: &str) {
     assert_eq!(error.exit(), Exit::Usage);
 }
 
-/// The example with one line in place of another is refused.
+/// Asserts that the example is refused with `line` replaced by `instead`.
 #[track_caller]
 fn refused_with(line: &str, instead: &str, message: &str, help: &str) {
     assert_eq!(BRAKE_DARK.lines().filter(|known| *known == line).count(), 1, "no line `{line}`");
@@ -74,21 +74,21 @@ fn refused_with(line: &str, instead: &str, message: &str, help: &str) {
     refused(&text.join("\n"), message, help);
 }
 
-/// An `[[input]]` of IMU samples; `more` is its fifth line.
+/// Returns an `[[input]]` of IMU samples; `more` is its fifth line.
 fn input(name: &str, topic: &str, more: &str) -> String {
     format!(
         "[[input]]\nname = \"{name}\"\ntopic = \"{topic}\"\ntype = \"sensor_msgs/msg/Imu\"\n{more}\n"
     )
 }
 
-/// The ticker with more tables is refused.
+/// Asserts that the periodic lambda is refused with more tables appended.
 #[track_caller]
 fn refused_below(more: &str, message: &str, help: &str) {
     refused(&format!("{TICKER}{more}"), message, help);
 }
 
 #[test]
-fn the_example_of_the_design_is_read_whole() {
+fn the_example_is_parsed_completely() {
     let manifest = Manifest::parse(BRAKE_DARK, "lambda.toml").unwrap();
     assert_eq!(manifest.lambda.name, "brake-dark");
     assert_eq!(manifest.lambda.kind, LambdaKind::Wasm);
@@ -188,7 +188,7 @@ fn the_backlog_is_each_for_small_samples_and_latest_for_large_ones() {
 }
 
 #[test]
-fn a_fixed_qos_takes_what_it_leaves_out_from_the_default_profile_of_ros() {
+fn a_fixed_qos_has_missing_keys_of_the_default_profile_of_ros() {
     let text = BRAKE_DARK.replace("qos = \"auto\"", "qos = { reliability = \"best_effort\" }");
     let manifest = Manifest::parse(&text, "lambda.toml").unwrap();
     let qos = Qos::Fixed {
@@ -200,7 +200,7 @@ fn a_fixed_qos_takes_what_it_leaves_out_from_the_default_profile_of_ros() {
 }
 
 #[test]
-fn a_model_is_kept_with_all_it_says() {
+fn a_model_is_parsed_with_all_its_keys() {
     let digest = "0123456789abcdef".repeat(4);
     let more = format!(
         "[[model]]\nname = \"detector\"\nfile = \"models/d.onnx\"\nsha256 = \"{digest}\"\nlayout = \"yolov8\"\n\

@@ -1,9 +1,9 @@
-//! The page on the manifest knows every key, and none that is not one.
+//! Tests that `docs/manifest.md` lists exactly the keys that are parsed.
 
 use super::super::reference::sections;
 use super::*;
 
-/// The keys of a table, as a refusal of an unknown one lists them.
+/// Returns the keys of a table, as the error for an unknown key lists them.
 #[track_caller]
 fn known(manifest: &str) -> Vec<&'static str> {
     match Manifest::parse(manifest, "lambda.toml") {
@@ -13,7 +13,7 @@ fn known(manifest: &str) -> Vec<&'static str> {
 }
 
 #[test]
-fn the_reference_has_exactly_the_keys_that_are_read() {
+fn the_reference_has_exactly_the_keys_that_are_parsed() {
     for section in sections() {
         let manifest = match section.title {
             "[lambda]" => TICKER.replace("[lambda]", "[lambda]\nnone = 1"),
@@ -35,7 +35,7 @@ fn the_reference_has_exactly_the_keys_that_are_read() {
 }
 
 #[test]
-fn the_reference_says_the_defaults_that_a_manifest_gets() {
+fn the_reference_has_the_defaults_of_the_parser() {
     let page = reference();
     let manifest = Manifest::parse(TICKER, "lambda.toml").unwrap();
     for (key, value) in manifest.limits.in_words() {

@@ -1,10 +1,10 @@
-//! Refusals that take more than one key, or a file.
+//! Tests refusals that involve several keys, or a file.
 
 use super::*;
 use crate::test_folder::TestFolder;
 
 #[test]
-fn what_may_come_once_is_refused_with_both_lines() {
+fn a_duplicate_is_refused_with_both_lines() {
     let topics = input("a", "/x", "") + &input("b", "/x", "");
     let help = "keep one [[input]] entry per topic";
     refused_below(&topics, "topic `/x` is listed twice in lambda.toml, lines 10 and 15", help);
@@ -41,7 +41,7 @@ fn a_schedule_is_one_input_or_one_period() {
     refused_with(
         "backlog = \"latest\"",
         "period = \"1s\"",
-        "lambda.toml, line 9: `schedule.period` stands beside the other kind of schedule",
+        "lambda.toml, line 9: `schedule.period` conflicts with the other kind of schedule",
         "keep `event` or `period`: a lambda runs on one input or on the clock",
     );
     refused_with(
@@ -63,18 +63,18 @@ fn an_event_is_an_input() {
     refused_with(
         "event = \"camera\"",
         "event = \"camrea\"",
-        "lambda.toml, line 8: `schedule.event` is `camrea`, which is the name of no input",
+        "lambda.toml, line 8: `schedule.event` is `camrea`, which is not the name of an input",
         "did you mean `camera`? the inputs are `camera` and `imu`",
     );
     refused_with(
         "event = \"camera\"",
         "event = \"lidar\"",
-        "lambda.toml, line 8: `schedule.event` is `lidar`, which is the name of no input",
+        "lambda.toml, line 8: `schedule.event` is `lidar`, which is not the name of an input",
         "the inputs are `camera` and `imu`",
     );
     refused(
         &TICKER.replace("period = \"100ms\"", "event = \"imu\""),
-        "lambda.toml, line 7: `schedule.event` is `imu`, which is the name of no input",
+        "lambda.toml, line 7: `schedule.event` is `imu`, which is not the name of an input",
         "add an [[input]] with name = \"imu\"; there is none yet",
     );
 }
@@ -99,23 +99,23 @@ fn keys_without_meaning_where_they_stand_are_refused() {
 }
 
 #[test]
-fn a_text_that_is_no_toml_is_refused_with_its_line() {
+fn invalid_toml_is_refused_with_its_line() {
     let help = "write `key = value` with texts in quotes, and tables as [name], or as [[name]] where there can be several";
     refused_below(
         "[limits]\nfuel 3",
-        "lambda.toml, line 9: this is no TOML: key with no value, expected `=`",
+        "lambda.toml, line 9: invalid TOML: key with no value, expected `=`",
         help,
     );
     let deep = format!("x = {}", "[".repeat(100_000));
     refused(
         &deep,
-        "lambda.toml, line 1: this is no TOML: cannot recurse further; max recursion depth met",
+        "lambda.toml, line 1: invalid TOML: cannot recurse further; max recursion depth met",
         help,
     );
 }
 
 #[test]
-fn messages_stay_short_and_cannot_act_on_a_terminal() {
+fn messages_are_short_and_have_no_control_characters() {
     let long = format!("{}\\u001B[2J", "x".repeat(70)) + &"y".repeat(100_000);
     let error = Manifest::parse(
         &BRAKE_DARK.replace("\"camera\"\nbacklog", &format!("\"{long}\"\nbacklog")),
@@ -126,7 +126,7 @@ fn messages_stay_short_and_cannot_act_on_a_terminal() {
 }
 
 #[test]
-fn no_cut_of_a_manifest_makes_the_reader_panic() {
+fn no_prefix_of_a_manifest_makes_the_parser_panic() {
     for end in 0..BRAKE_DARK.len() {
         let _ = Manifest::parse(&BRAKE_DARK[..end], "lambda.toml");
         let _ = Manifest::parse(&BRAKE_DARK[end..], "lambda.toml");
@@ -165,6 +165,6 @@ fn a_file_that_cannot_be_a_manifest_is_refused() {
     std::fs::write(&path, " ".repeat((1 << 20) + 1)).unwrap();
     refused(
         format!("`{}` is longer than 1 MiB", path.display()),
-        "check that this is a manifest; data of a lambda belongs into files of its own",
+        "check that this is a manifest; data of a lambda belongs in files of its own",
     );
 }
