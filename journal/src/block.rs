@@ -1,7 +1,7 @@
-//! The blocks of a journal: a head that vouches for itself and its payload, then the payload.
+//! The blocks of a journal: a head with checksums of itself and of the payload, then the payload.
 
-/// First bytes of a journal. Bytes that a transfer as text would change tell such a transfer from
-/// damage.
+/// First bytes of a journal. A transfer as text would change some of them, which distinguishes it
+/// from other damage.
 pub(super) const MAGIC: [u8; 8] = *b"\x89GLJRN\r\n";
 
 /// Magic, version, and six bytes that are 0.
@@ -10,13 +10,13 @@ pub(super) const PREAMBLE_LEN: usize = 16;
 /// Kind, length, checksum of the payload, checksum of the head.
 pub(super) const HEAD_LEN: usize = 13;
 
-/// Longest payload. It holds the header of a build with 10,000 files, and the largest wake that the
+/// Longest payload. The header of a build with 10,000 files fits, and the largest wake that the
 /// host allows.
 pub(super) const PAYLOAD_MAX: usize = 2 << 20;
 
-/// What is in a block. Blocks of other kinds are stepped over: a newer writer may have more to say.
+/// Kinds of blocks. Readers skip blocks of other kinds, which newer writers may add.
 pub(super) mod kind {
-    /// The header, as JSON: the first block and no other.
+    /// The header, as JSON: the first block only.
     pub(crate) const HEADER: u8 = 1;
     /// Wakes.
     pub(crate) const WAKES: u8 = 2;
@@ -24,7 +24,7 @@ pub(super) mod kind {
     pub(crate) const END: u8 = 3;
 }
 
-/// What stands before a payload.
+/// The head of a block, before its payload.
 pub(super) struct Head {
     pub(super) kind: u8,
     pub(super) len: u32,
@@ -32,7 +32,7 @@ pub(super) struct Head {
 }
 
 impl Head {
-    /// The bytes of the head of block number `index`.
+    /// Encodes the head of block number `index`.
     pub(super) fn to_bytes(&self, index: u64) -> [u8; HEAD_LEN] {
         let mut bytes = [0; HEAD_LEN];
         bytes[0] = self.kind;
@@ -43,7 +43,7 @@ impl Head {
         bytes
     }
 
-    /// The head of block number `index`; `None` if its checksum is of another one.
+    /// Decodes the head of block number `index`; `None` if the checksum is wrong.
     pub(super) fn from_bytes(bytes: &[u8; HEAD_LEN], index: u64) -> Option<Head> {
         let word = |at: usize| {
             u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
@@ -56,9 +56,9 @@ impl Head {
     }
 }
 
-/// The head has a checksum of its own, so that a flipped length is damage and does not look like a
-/// file that was cut off. The number of the block is in it, so that a block that is missing or
-/// stands elsewhere is found.
+/// Returns the checksum of a head. The head has its own, so that a flipped length is damage and
+/// does not look like a truncated file. It covers the number of the block, so that a missing or
+/// moved block is found.
 fn head_crc(bytes: &[u8; HEAD_LEN], index: u64) -> u32 {
     let mut crc = crc32fast::Hasher::new();
     crc.update(&index.to_le_bytes());

@@ -3,99 +3,99 @@ use serde_json::{Map, Value};
 use super::entry::{InputView, JournalEntry, LogDigest, WakeSource};
 use super::number::{take, unfold};
 use super::previous::{
-    Before, FAULT_ALLOWED, FAULT_USED, InputBefore, TRIGGER_SCORE, flag, newest, seen,
+    FAULT_ALLOWED, FAULT_USED, PreviousInput, PreviousWake, TRIGGER_SCORE, flag, newest, seen,
 };
 use super::{ATTRIBUTES_MAX, FAULTS, TRIGGERS_MAX};
 use gleaner_lambda::{Fault, Trigger, TriggerKind};
 
-/// Why some bytes are no wake.
+/// The reason why some bytes are not a wake.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Malformed {
     /// They end within a wake.
-    #[error("a wake goes on beyond its block")]
+    #[error("a wake continues beyond the end of its block")]
     Short,
-    /// A number is longer than 64 bits, or than what it counts.
+    /// A number is longer than 64 bits, or out of range.
     #[error("a number in a wake is too large")]
     Number,
-    /// A bit is set, or a kind is used, that has no meaning.
+    /// A bit or a kind has no meaning.
     #[error("a wake has the unknown {what} {value}")]
     Unknown {
-        /// What it should be.
+        /// The field.
         what: &'static str,
-        /// What it is.
+        /// Its value.
         value: u8,
     },
-    /// A text is no UTF-8.
-    #[error("a text in a wake is no UTF-8")]
+    /// A text is not UTF-8.
+    #[error("a text in a wake is not UTF-8")]
     Text,
     /// A score is infinite or not a number.
     #[error("the score of a trigger is not finite")]
     Score,
-    /// A wake has more triggers than any lambda may cause.
+    /// A wake has too many triggers.
     #[error("a wake has {found} triggers, above the maximum of {TRIGGERS_MAX}")]
     Triggers {
-        /// How many.
+        /// Their number.
         found: u64,
     },
-    /// Attributes are longer than any lambda may give.
+    /// Attributes are too long.
     #[error("a trigger has {found} bytes of attributes, above the maximum of {ATTRIBUTES_MAX}")]
     LongAttributes {
-        /// How many bytes.
+        /// Their length.
         found: u64,
     },
-    /// Attributes are no JSON object.
-    #[error("the attributes of a trigger are no JSON object")]
+    /// Attributes are not a JSON object.
+    #[error("the attributes of a trigger are not a JSON object")]
     Attributes,
 }
 
 type Result<T> = std::result::Result<T, Malformed>;
 
-/// Reads what an [`Encoder`](super::Encoder) wrote. Its input may be anything: no memory is taken
-/// for a number before the bytes that it counts were seen.
+/// Decodes the output of an [`Encoder`](super::Encoder). Its input is untrusted: no memory is
+/// allocated for a count before the counted bytes are known to exist.
 pub struct Decoder {
-    before: Before,
+    previous: PreviousWake,
 }
 
 impl Decoder {
-    /// For a lambda with so many inputs.
+    /// Creates a decoder for a lambda with so many inputs.
     pub fn new(inputs: usize) -> Decoder {
-        Decoder { before: Before::nothing(inputs) }
+        Decoder { previous: PreviousWake::none(inputs) }
     }
 
-    /// The next wake was written whole.
+    /// Expects the next wake to be encoded without reference to the previous one.
     pub fn reset(&mut self) {
-        self.before.forget();
+        self.previous.reset();
     }
 
-    /// The wake at the begin of `bytes`, which is taken off.
+    /// Decodes the wake at the start of `bytes`, and removes it.
     ///
     /// # Errors
     ///
-    /// [`Malformed`]; what is left of `bytes` then has no meaning, and neither have wakes that were
-    /// written relative to this one.
+    /// [`Malformed`]; then the rest of `bytes` has no meaning, nor have wakes that were encoded
+    /// relative to this one.
     pub fn decode(&mut self, bytes: &mut &[u8]) -> Result<JournalEntry> {
-        let before = &self.before;
+        let previous = &self.previous;
         let [flags] = array(bytes)?;
         if flags & flag::RESERVED != 0 {
             return Err(Malformed::Unknown { what: "flags", value: flags });
         }
-        let at_ns = difference(bytes, before.expected_at_ns() as u64)? as i64;
-        let cause = cause(flags, before, bytes)?;
+        let at_ns = difference(bytes, previous.expected_at_ns() as u64)? as i64;
+        let cause = cause(flags, previous, bytes)?;
         let fuel = match flags & flag::FUEL != 0 {
-            true => Some(difference(bytes, before.fuel)?),
+            true => Some(difference(bytes, previous.fuel)?),
             false => None,
         };
-        // Each input has a byte at least.
-        if bytes.len() < before.inputs.len() {
+        // Each input has at least one byte.
+        if bytes.len() < previous.inputs.len() {
             return Err(Malformed::Short);
         }
         let seen =
-            before.inputs.iter().map(|before| input(before, bytes)).collect::<Result<_>>()?;
+            previous.inputs.iter().map(|previous| input(previous, bytes)).collect::<Result<_>>()?;
         let triggers = if flags & flag::TRIGGERS != 0 { triggers(bytes)? } else { Vec::new() };
         let fault = if flags & flag::FAULT != 0 { Some(fault(bytes)?) } else { None };
-        let log = if flags & flag::LOG != 0 { said(bytes)? } else { LogDigest::default() };
+        let log = if flags & flag::LOG != 0 { log_digest(bytes)? } else { LogDigest::default() };
         let entry = JournalEntry { at_ns, cause, seen, triggers, fault, fuel, log };
-        self.before.note(&entry);
+        self.previous.update(&entry);
         Ok(entry)
     }
 }
@@ -116,7 +116,7 @@ fn difference(bytes: &mut &[u8], expected: u64) -> Result<u64> {
     number(bytes).map(|folded| expected.wrapping_add(unfold(folded)))
 }
 
-/// So many bytes, if they are there.
+/// Removes and returns `len` bytes.
 fn slice<'b>(bytes: &mut &'b [u8], len: u64) -> Result<&'b [u8]> {
     let len = usize::try_from(len).map_err(|_| Malformed::Short)?;
     let (slice, rest) = bytes.split_at_checked(len).ok_or(Malformed::Short)?;
@@ -130,7 +130,7 @@ fn text(bytes: &mut &[u8]) -> Result<String> {
     Ok(text.to_owned())
 }
 
-fn cause(flags: u8, before: &Before, bytes: &mut &[u8]) -> Result<WakeSource> {
+fn cause(flags: u8, previous: &PreviousWake, bytes: &mut &[u8]) -> Result<WakeSource> {
     let (writer_follows, number_follows) = (flags & flag::WRITER != 0, flags & flag::NUMBER != 0);
     if flags & flag::TICK != 0 {
         if writer_follows {
@@ -138,22 +138,22 @@ fn cause(flags: u8, before: &Before, bytes: &mut &[u8]) -> Result<WakeSource> {
         }
         return Ok(WakeSource::Tick { missed: if number_follows { number(bytes)? } else { 0 } });
     }
-    let writer = if writer_follows { array(bytes)? } else { before.woken_by.0 };
-    let expected = before.expected_seq(!writer_follows);
+    let writer = if writer_follows { array(bytes)? } else { previous.woken_by.0 };
+    let expected = previous.expected_seq(!writer_follows);
     Ok(WakeSource::Sample {
         writer,
         seq: if number_follows { difference(bytes, expected)? } else { expected },
     })
 }
 
-fn input(before: &InputBefore, bytes: &mut &[u8]) -> Result<InputView> {
+fn input(previous: &PreviousInput, bytes: &mut &[u8]) -> Result<InputView> {
     let [set] = array(bytes)?;
     let mut new = u64::from(set & seen::NEW);
     if set & seen::NEW == seen::NEW {
         new = new.checked_add(number(bytes)?).ok_or(Malformed::Number)?;
     }
     let digest = if set & seen::DIGEST != 0 { u32::from_le_bytes(array(bytes)?) } else { 0 };
-    let expected = before.expected_newest(new);
+    let expected = previous.expected_newest(new);
     let newest = match set & seen::NEWEST != 0 {
         false => expected,
         true => match (array(bytes)?, expected) {
@@ -167,7 +167,7 @@ fn input(before: &InputBefore, bytes: &mut &[u8]) -> Result<InputView> {
             }
         },
     };
-    let reach = if set & seen::REACH != 0 { number(bytes)? } else { before.reach };
+    let reach = if set & seen::REACH != 0 { number(bytes)? } else { previous.reach };
     Ok(InputView { new, digest, newest, reach })
 }
 
@@ -218,7 +218,7 @@ fn fault(bytes: &mut &[u8]) -> Result<Fault> {
     Ok(Fault { kind: *kind, message, used, allowed })
 }
 
-fn said(bytes: &mut &[u8]) -> Result<LogDigest> {
+fn log_digest(bytes: &mut &[u8]) -> Result<LogDigest> {
     let lines = u32::try_from(number(bytes)?).map_err(|_| Malformed::Number)?;
     Ok(LogDigest { lines, digest: u32::from_le_bytes(array(bytes)?) })
 }

@@ -2,46 +2,46 @@ use super::entry::{InputView, JournalEntry, WakeSource};
 use super::fault_code;
 use super::number::{fold, put};
 use super::previous::{
-    Before, FAULT_ALLOWED, FAULT_USED, InputBefore, TRIGGER_SCORE, flag, newest, seen,
+    FAULT_ALLOWED, FAULT_USED, PreviousInput, PreviousWake, TRIGGER_SCORE, flag, newest, seen,
 };
 use gleaner_lambda::{Fault, Trigger, TriggerKind};
 
-/// Writes wakes, each relative to the one before. It allocates nothing for a wake without triggers.
+/// Encodes wakes, each relative to the previous one. A wake without triggers needs no allocation.
 pub struct Encoder {
-    before: Before,
-    /// Attributes as JSON: their length comes before them.
+    previous: PreviousWake,
+    /// Buffer for attributes as JSON, whose length precedes them.
     json: Vec<u8>,
 }
 
 impl Encoder {
-    /// For a lambda with so many inputs. The first wake is written whole.
+    /// Creates an encoder for a lambda with so many inputs.
     pub fn new(inputs: usize) -> Encoder {
-        Encoder { before: Before::nothing(inputs), json: Vec::new() }
+        Encoder { previous: PreviousWake::none(inputs), json: Vec::new() }
     }
 
-    /// The next wake is written whole.
+    /// Encodes the next wake without reference to the previous one.
     pub fn reset(&mut self) {
-        self.before.forget();
+        self.previous.reset();
     }
 
     /// Appends `entry` to `out`.
     ///
     /// # Panics
     ///
-    /// If `entry` has not as many inputs as were named in [`new`](Self::new).
+    /// If `entry` does not have the number of inputs given to [`new`](Self::new).
     pub fn encode(&mut self, entry: &JournalEntry, out: &mut Vec<u8>) {
-        assert_eq!(entry.seen.len(), self.before.inputs.len(), "a wake of another lambda");
-        let before = &self.before;
+        assert_eq!(entry.seen.len(), self.previous.inputs.len(), "number of inputs of a wake");
+        let previous = &self.previous;
         let flags = out.len();
         out.push(0);
-        put_difference(entry.at_ns as u64, before.expected_at_ns() as u64, out);
-        let mut set = cause(&entry.cause, before, out);
+        put_difference(entry.at_ns as u64, previous.expected_at_ns() as u64, out);
+        let mut set = cause(&entry.cause, previous, out);
         if let Some(fuel) = entry.fuel {
             set |= flag::FUEL;
-            put_difference(fuel, before.fuel, out);
+            put_difference(fuel, previous.fuel, out);
         }
-        for (now, before) in entry.seen.iter().zip(&before.inputs) {
-            input(now, before, out);
+        for (now, previous) in entry.seen.iter().zip(&previous.inputs) {
+            input(now, previous, out);
         }
         if !entry.triggers.is_empty() {
             set |= flag::TRIGGERS;
@@ -50,9 +50,9 @@ impl Encoder {
                 trigger(one, &mut self.json, out);
             }
         }
-        if let Some(why) = &entry.fault {
+        if let Some(one) = &entry.fault {
             set |= flag::FAULT;
-            fault(why, out);
+            fault(one, out);
         }
         if entry.log.lines > 0 || entry.log.digest != 0 {
             set |= flag::LOG;
@@ -60,7 +60,7 @@ impl Encoder {
             out.extend_from_slice(&entry.log.digest.to_le_bytes());
         }
         out[flags] = set;
-        self.before.note(entry);
+        self.previous.update(entry);
     }
 }
 
@@ -73,7 +73,7 @@ fn put_text(text: &str, out: &mut Vec<u8>) {
     out.extend_from_slice(text.as_bytes());
 }
 
-fn cause(cause: &WakeSource, before: &Before, out: &mut Vec<u8>) -> u8 {
+fn cause(cause: &WakeSource, previous: &PreviousWake, out: &mut Vec<u8>) -> u8 {
     match *cause {
         WakeSource::Tick { missed: 0 } => flag::TICK,
         WakeSource::Tick { missed } => {
@@ -82,12 +82,12 @@ fn cause(cause: &WakeSource, before: &Before, out: &mut Vec<u8>) -> u8 {
         }
         WakeSource::Sample { writer, seq } => {
             let mut set = 0;
-            let same_writer = writer == before.woken_by.0;
+            let same_writer = writer == previous.woken_by.0;
             if !same_writer {
                 set |= flag::WRITER;
                 out.extend_from_slice(&writer);
             }
-            let expected = before.expected_seq(same_writer);
+            let expected = previous.expected_seq(same_writer);
             if seq != expected {
                 set |= flag::NUMBER;
                 put_difference(seq, expected, out);
@@ -97,7 +97,7 @@ fn cause(cause: &WakeSource, before: &Before, out: &mut Vec<u8>) -> u8 {
     }
 }
 
-fn input(now: &InputView, before: &InputBefore, out: &mut Vec<u8>) {
+fn input(now: &InputView, previous: &PreviousInput, out: &mut Vec<u8>) {
     let first = out.len();
     out.push(0);
     let mut set = seen::NEW;
@@ -109,7 +109,7 @@ fn input(now: &InputView, before: &InputBefore, out: &mut Vec<u8>) {
         set |= seen::DIGEST;
         out.extend_from_slice(&now.digest.to_le_bytes());
     }
-    let expected = before.expected_newest(now.new);
+    let expected = previous.expected_newest(now.new);
     if now.newest != expected {
         set |= seen::NEWEST;
         match (now.newest, expected) {
@@ -125,7 +125,7 @@ fn input(now: &InputView, before: &InputBefore, out: &mut Vec<u8>) {
             }
         }
     }
-    if now.reach != before.reach {
+    if now.reach != previous.reach {
         set |= seen::REACH;
         put(now.reach, out);
     }

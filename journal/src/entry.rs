@@ -5,68 +5,69 @@ use super::{FAULTS, fault_code};
 use gleaner_base::text::{excerpt, hex};
 use gleaner_lambda::{Fault, Trigger};
 
-/// One wake: what the lambda saw, and what it decided.
+/// One wake: its inputs and its decision.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JournalEntry {
     /// Stamp of the sample or tick, in ns.
     pub at_ns: i64,
-    /// What woke the lambda.
+    /// The cause of the wake.
     pub cause: WakeSource,
-    /// What had arrived: one for each input, in the order of the header.
+    /// The state of each input, in the order of the header.
     pub seen: Vec<InputView>,
-    /// What the lambda caused, in the order in which it did.
+    /// The triggers of the lambda, in their order.
     pub triggers: Vec<Trigger>,
-    /// Why the wake ended early, if it did.
+    /// The fault that ended the wake early, if any.
     pub fault: Option<Fault>,
     /// Fuel that the wake burnt; `None` for Python, which has none.
     pub fuel: Option<u64>,
-    /// What it wrote to its log.
+    /// Its log lines, as a digest.
     pub log: LogDigest,
 }
 
-/// What woke a lambda.
+/// The cause of a wake.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WakeSource {
     /// A sample of the input that its schedule names.
     Sample {
         /// GUID of the sample's writer.
         writer: [u8; 16],
-        /// Its number among those of its writer.
+        /// Its sequence number among those of its writer.
         seq: u64,
     },
     /// The clock.
     Tick {
-        /// Ticks that passed since the wake before without one of their own.
+        /// Number of ticks without a wake since the previous wake.
         missed: u64,
     },
 }
 
-/// What a lambda could see of one input in a wake, and what of it it looked at.
+/// The state of one input in a wake, and the samples of it that the lambda read.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct InputView {
-    /// Samples that arrived since the wake before, those included that found no room in the ring.
+    /// Number of samples that arrived since the previous wake, including those without room in the
+    /// ring.
     pub new: u64,
-    /// Wrapping sum of the digests of those that entered the ring, see `docs/journal.md`; 0 if
-    /// there are none.
+    /// Wrapping sum of the digests of the new samples in the ring, see `docs/journal.md`; 0 for
+    /// none.
     pub digest: u32,
-    /// Writer and number of the newest sample in the ring.
+    /// Writer and sequence number of the newest sample in the ring.
     pub newest: Option<([u8; 16], u64)>,
-    /// How many samples, the newest included, the lambda looked back; 0 if it did not look.
+    /// Number of samples, counted from the newest, that the lambda looked back; 0 for none.
     pub reach: u64,
 }
 
-/// What a lambda wrote to its log in one wake.
+/// The digest of the log lines of one wake.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct LogDigest {
-    /// How many lines.
+    /// Number of lines.
     pub lines: u32,
-    /// CRC-32 over them; 0 if there are none.
+    /// CRC-32 of the lines; 0 for none.
     pub digest: u32,
 }
 
 impl JournalEntry {
-    /// The first difference between the wake in the journal and the same wake made again `now`;
-    /// `None` if the lambda saw the same and decided the same, bit for bit.
+    /// Returns the first difference between the wake in the journal and its repetition `now`;
+    /// `None` if inputs and decision are equal, bit for bit.
     ///
     /// `inputs` are those of the header. A clip keeps neither all writers nor more than 32 bits of
     /// a number: without `writers`, samples are compared as far as a clip keeps them.
@@ -76,15 +77,15 @@ impl JournalEntry {
         inputs: &[JournalInput],
         writers: bool,
     ) -> Option<Difference> {
-        // The usual case, without a word. Equal scores may still differ in their bits, and equal
-        // maps in their order.
+        // The usual case, without formatting. Equal scores may differ in their bits, and equal maps
+        // in their order.
         if self.triggers.is_empty() && self == now {
             return None;
         }
         Difference::of("stamp of the wake, in ns", self.at_ns, now.at_ns)
             .or_else(|| {
                 Difference::of(
-                    "what woke the lambda",
+                    "cause of the wake",
                     self.cause_in_words(writers),
                     now.cause_in_words(writers),
                 )
@@ -141,7 +142,7 @@ fn seen_differs(
     input: &str,
     writers: bool,
 ) -> Option<Difference> {
-    // In every wake, for every input: nothing is put into words unless it differs.
+    // Called in every wake for every input: values are formatted only if they differ.
     if journal == now {
         return None;
     }
@@ -160,7 +161,7 @@ fn seen_differs(
             )
         })
         .or_else(|| {
-            let what = format!("how many samples of {input} the lambda looked back");
+            let what = format!("number of samples of {input} that the lambda looked back");
             Difference::of(what, journal.reach, now.reach)
         })
 }
@@ -186,9 +187,9 @@ fn fault_in_words(fault: &Option<Fault>) -> String {
     format!("{word}, `{message}`, used {}, allowed {}", number(*used), number(*allowed))
 }
 
-/// As for twins, but bit for bit, and the attributes too: it is the same lambda.
-fn triggers_differ(journal: &Trigger, now: &Trigger, place: usize) -> Option<Difference> {
-    let what = |part: &str| format!("trigger {place}: {part}");
+/// Compares triggers as those of twins, but bit for bit and with attributes: it is the same lambda.
+fn triggers_differ(journal: &Trigger, now: &Trigger, index: usize) -> Option<Difference> {
+    let what = |part: &str| format!("trigger {index}: {part}");
     let score =
         |trigger: &Trigger| trigger.score.map_or("none".to_owned(), |score| score.to_string());
     let label = |trigger: &Trigger| format!("`{}`", trigger.label);

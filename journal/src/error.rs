@@ -4,20 +4,20 @@ use super::block::PAYLOAD_MAX;
 use super::{INPUTS_MAX, Malformed, VERSION};
 use gleaner_base::{Exit, Explain};
 
-/// Why a journal cannot be read, or not further.
+/// The reason why a journal cannot be read, or not to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum JournalError {
-    /// It does not begin as one.
-    #[error("this is no journal of gleaner")]
+    /// The file does not begin as a journal.
+    #[error("the file is not a Gleaner journal")]
     NotAJournal,
-    /// It ends before its header is whole, so that nobody knows what it is of.
-    #[error("the journal ends after {bytes} bytes, before its header is whole")]
+    /// The journal ends within its header.
+    #[error("the journal ends after {bytes} bytes, within its header")]
     NoHeader {
-        /// Its length.
+        /// Its length in bytes.
         bytes: u64,
     },
-    /// It is of another version.
-    #[error("the journal is of version {found}; this is a reader of version {VERSION}")]
+    /// The journal has another version of the format.
+    #[error("the journal has format version {found}; this gleaner reads version {VERSION}")]
     Version {
         /// Its version.
         found: u16,
@@ -25,70 +25,70 @@ pub enum JournalError {
     /// The file or stream cannot be read.
     #[error("cannot read the journal")]
     Read {
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
-    /// Bytes are not those that were written. The wakes before are whole.
-    #[error("the journal is damaged in block {block}, at byte {offset}, after {wake} whole wakes")]
+    /// Bytes were changed. The wakes before them are complete.
+    #[error("the journal is damaged in block {block}, at byte {offset}, after {wake} wakes")]
     Damaged {
-        /// Where the block begins.
+        /// Offset of the block.
         offset: u64,
         /// Its number, from 0; block 0 is the header.
         block: u64,
         /// Index of its first wake, from 0.
         wake: u64,
-        /// What is wrong.
+        /// The damage.
         #[source]
         why: Damage,
     },
 }
 
-/// What is wrong with a block.
+/// The damage of a block.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Damage {
     /// Bytes that must be 0 are not.
-    #[error("bytes that are reserved are not 0")]
+    #[error("reserved bytes are not 0")]
     Reserved,
-    /// The head of the block was changed, or is of another block.
+    /// The head of the block was changed, or belongs to another block.
     #[error("the checksum of the block's head is wrong")]
     Head,
     /// The payload was changed.
     #[error("the checksum of the block is wrong")]
     Payload,
-    /// The block is longer than any that is written.
+    /// The block is too long.
     #[error("the block has {len} bytes, above the maximum of {PAYLOAD_MAX}")]
     TooLong {
-        /// What its head claims.
+        /// The length in its head.
         len: u32,
     },
-    /// The first block is none with a header.
-    #[error("the first block is of kind {kind} and no header")]
+    /// The first block is not a header.
+    #[error("the first block has kind {kind} and is not a header")]
     NotAHeader {
         /// Its kind.
         kind: u8,
     },
-    /// A further header stands in the middle.
-    #[error("a second header stands in the middle")]
+    /// There is a second header.
+    #[error("the block is a second header")]
     SecondHeader,
-    /// The header or the end is no JSON, or not the one that it should be.
-    #[error("its JSON cannot be read: {0}")]
+    /// The header or the end is not the expected JSON.
+    #[error("its JSON cannot be parsed: {0}")]
     Json(String),
     /// The header has more inputs than a lambda may have.
     #[error("it has {found} inputs, above the maximum of {INPUTS_MAX}")]
     Inputs {
-        /// How many.
+        /// Their number.
         found: usize,
     },
-    /// The header says that an input wakes the lambda, and has no such input.
-    #[error("the input that wakes the lambda is not there")]
+    /// The header lacks the input that wakes the lambda.
+    #[error("the input that wakes the lambda is missing")]
     EventInput,
-    /// A wake is none.
-    #[error("one of its wakes cannot be read")]
+    /// A wake cannot be decoded.
+    #[error("one of its wakes cannot be decoded")]
     Wake(#[source] Malformed),
-    /// A block of wakes goes on behind the last of them.
+    /// A block of wakes continues after the last wake.
     #[error("bytes follow the last wake of the block")]
     AfterWakes,
-    /// The file goes on behind its end.
+    /// The file continues after the end of the journal.
     #[error("bytes follow the end of the journal")]
     AfterEnd,
 }
@@ -99,7 +99,7 @@ impl Explain for JournalError {
             JournalError::NotAJournal => {
                 "name the file that `gleaner replay --journal FILE` wrote, or a clip".to_owned()
             }
-            JournalError::NoHeader { .. } => "its writer died at once: write a new one".to_owned(),
+            JournalError::NoHeader { .. } => "its writer died early: write a new one".to_owned(),
             JournalError::Version { found } if *found > VERSION => {
                 "use the gleaner that wrote it".to_owned()
             }

@@ -6,14 +6,14 @@ use serde_json::{Map, Value};
 use gleaner_base::text::{excerpt, visible};
 use gleaner_lambda::manifest::{LambdaKind, Limits};
 
-/// What made the decisions of a journal: its first block, as JSON.
+/// The origin of the decisions of a journal: its first block, as JSON.
 ///
-/// A newer writer may add keys; a reader ignores those that it does not know.
+/// Newer writers may add keys; readers ignore unknown ones.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct JournalHeader {
-    /// Version of gleaner that wrote it.
+    /// Version of Gleaner that wrote it.
     pub gleaner: String,
-    /// What the lambda ran on, for example `wasmtime 48.0.8` or `Python 3.12.3, numpy 2.1.0`.
+    /// The engine of the lambda, for example `wasmtime 48.0.8` or `Python 3.12.3, numpy 2.1.0`.
     pub engine: String,
     /// The machine's architecture, for example `x86_64`.
     pub machine: String,
@@ -21,48 +21,47 @@ pub struct JournalHeader {
     pub lambda: String,
     /// Version of the lambda.
     pub version: String,
-    /// What kind of lambda it is.
+    /// Kind of the lambda.
     pub kind: LambdaKind,
     /// The files of its build folder, by path.
     pub files: Vec<FileDigest>,
     /// Its models.
     pub models: Vec<FileDigest>,
-    /// SHA-256 of what its manifest says that a decision can depend on, in hexadecimal digits: not
-    /// of `[record]`, nor of descriptions, so that a clip stays provable when its preroll is tuned;
-    /// and not of `[limits]`, which are here as they were.
+    /// SHA-256 of the parts of its manifest on which a decision can depend, in hexadecimal digits:
+    /// without `[record]` and descriptions, so that a clip can be verified after its preroll was
+    /// tuned, and without `[limits]`, which are below.
     pub manifest: String,
-    /// What it was allowed: the limits of its manifest, as a vehicle may have tightened them.
+    /// Its effective limits: those of its manifest, as far as the vehicle did not reduce them.
     #[serde(default)]
     pub limits: Limits,
     /// Its inputs, in the order of the manifest.
     pub inputs: Vec<JournalInput>,
-    /// Which of `inputs` wakes it; `None` if the clock does.
+    /// Index of the input that wakes it; `None` for a periodic lambda.
     pub event_input: Option<usize>,
-    /// Its config as it got it, in the order of the manifest.
+    /// Its effective config, in the order of the manifest.
     pub config: Map<String, Value>,
-    /// Other names for topics of the manifest, from and to.
+    /// Remapped topics, from and to.
     pub remaps: Vec<(String, String)>,
-    /// What the times are, for example `log time of the drive`.
+    /// The clock of all times, for example `log time of the drive`.
     pub clock: String,
-    /// What was replayed of the drive.
+    /// The replayed part of the drive.
     #[serde(default, skip_serializing_if = "TimeRange::is_all")]
     pub part: TimeRange,
-    /// Wakes that came before the first in here: 0, unless this is the part of a journal that a
-    /// clip holds.
+    /// Number of wakes before the first one here: 0, except for the part of a journal in a clip.
     pub wakes_before: u64,
 }
 
-/// The samples of a drive between two times, by their log time in ns since 1970.
+/// A range of log times of a drive, in ns since 1970.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TimeRange {
-    /// The first time that belongs to it; `None` for the start of the drive.
+    /// Start, inclusive; `None` for the start of the drive.
     pub from_ns: Option<i64>,
-    /// The first time that does not belong to it any more; `None` for the end of the drive.
+    /// End, exclusive; `None` for the end of the drive.
     pub to_ns: Option<i64>,
 }
 
 impl TimeRange {
-    /// Whether it is the whole drive.
+    /// Returns whether it is the whole drive.
     pub fn is_all(&self) -> bool {
         *self == TimeRange::default()
     }
@@ -74,12 +73,12 @@ impl TimeRange {
     }
 }
 
-/// A file, by its content.
+/// A file and its digest.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct FileDigest {
-    /// Where it lies, relative to what it is a part of.
+    /// Path relative to the build folder.
     pub path: String,
-    /// Its length.
+    /// Length in bytes.
     pub bytes: u64,
     /// Its SHA-256, in hexadecimal digits.
     pub sha256: String,
@@ -88,7 +87,7 @@ pub struct FileDigest {
 /// An input of the lambda.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct JournalInput {
-    /// The lambda's word for it.
+    /// Its name in the lambda's code.
     pub name: String,
     /// The topic, as the manifest names it.
     pub topic: String,
@@ -98,42 +97,42 @@ pub struct JournalInput {
     pub type_name: String,
 }
 
-/// The last block of a journal whose writer came to its end, as JSON.
+/// The last block of a complete journal, as JSON.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JournalEnd {
-    /// How often the lambda ran.
+    /// Number of wakes.
     pub wakes: u64,
-    /// Samples that arrived in all, for each input.
+    /// Number of samples that arrived, for each input.
     pub samples: Vec<u64>,
-    /// The drives that were replayed.
+    /// The replayed drives.
     pub drives: Vec<DriveDigest>,
 }
 
-/// A drive, by its content. A checksum is enough to notice that it is not the file that it was, and
-/// costs a replay of it 1 or 2 %; a SHA-256 would cost 15 %.
+/// A file of a drive and its checksum. A CRC is enough to notice a changed file, and costs a replay
+/// 1 or 2 %; a SHA-256 would cost 15 %.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct DriveDigest {
     /// Name of the file, without its folder.
     pub name: String,
-    /// Its length.
+    /// Length in bytes.
     pub bytes: u64,
     /// CRC-32 of the whole file.
     pub crc32: u32,
 }
 
-/// Something that should be equal, and is not.
+/// A difference between a journal and a repetition of its run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
-    /// What it is, for example ``build file `main.py` ``.
+    /// The compared item, for example ``build file `main.py` ``.
     pub what: String,
-    /// What the journal has.
+    /// Its value in the journal.
     pub journal: String,
-    /// What there is now.
+    /// Its value now.
     pub now: String,
 }
 
 impl Difference {
-    /// `what`, if the two sides are not the same text.
+    /// Returns the difference of `what`, if the two sides are not the same text.
     pub(super) fn of(
         what: impl Into<String>,
         journal: impl ToString,
@@ -149,10 +148,10 @@ impl Difference {
 }
 
 impl JournalHeader {
-    /// The most telling difference between what wrote this journal and what would run `now`; `None`
-    /// if a decision that differs is then the fault of neither build, config nor inputs.
+    /// Returns the most significant difference between the origin of this journal and `now`; `None`
+    /// if build, config and inputs are equal, so that they do not explain a differing decision.
     ///
-    /// `gleaner`, `engine`, `machine` and `wakes_before` are not compared: a decision should not
+    /// `gleaner`, `engine`, `machine` and `wakes_before` are not compared: decisions should not
     /// depend on them.
     pub fn differs_from(&self, now: &JournalHeader) -> Option<Difference> {
         Difference::of("lambda", &self.lambda, &now.lambda)
@@ -170,7 +169,7 @@ impl JournalHeader {
             .or_else(|| files_differ("model", &self.models, &now.models))
             .or_else(|| config_differs(&self.config, &now.config))
             .or_else(|| inputs_differ(&self.inputs, &now.inputs))
-            .or_else(|| Difference::of("what wakes the lambda", self.woken_by(), now.woken_by()))
+            .or_else(|| Difference::of("schedule of the lambda", self.woken_by(), now.woken_by()))
             .or_else(|| {
                 Difference::of("remapped topics", self.remaps_in_words(), now.remaps_in_words())
             })
@@ -197,14 +196,14 @@ impl JournalHeader {
     }
 }
 
-const NOT_THERE: &str = "not there";
+const MISSING: &str = "missing";
 
 fn files_differ(what: &str, journal: &[FileDigest], now: &[FileDigest]) -> Option<Difference> {
     let by_path = |files: &'_ [FileDigest]| -> BTreeMap<String, String> {
         files.iter().map(|file| (file.path.clone(), file.sha256.clone())).collect()
     };
     let (journal, now) = (by_path(journal), by_path(now));
-    // What counts of the manifest has a digest of its own.
+    // The relevant parts of the manifest have a digest of their own.
     let mut paths: Vec<_> =
         journal.keys().chain(now.keys()).filter(|path| *path != "lambda.toml").collect();
     paths.sort();
@@ -213,12 +212,12 @@ fn files_differ(what: &str, journal: &[FileDigest], now: &[FileDigest]) -> Optio
         if journal == now {
             return None;
         }
-        // Sixteen digits are enough to see it, unless somebody made them equal.
+        // Sixteen digits show the difference, unless they were made equal on purpose.
         let start =
             |digest: Option<&String>| digest.and_then(|digest| digest.get(..16)).map(str::to_owned);
         let cut = start(journal) != start(now);
         let side = |digest: Option<&String>| match digest {
-            None => NOT_THERE.to_owned(),
+            None => MISSING.to_owned(),
             Some(digest) if cut && digest.len() > 16 => {
                 format!("sha256 {}…", start(Some(digest)).unwrap_or_else(|| digest.clone()))
             }
@@ -235,9 +234,9 @@ fn limits_differ(journal: &Limits, now: &Limits) -> Option<Difference> {
     })
 }
 
-/// Values are compared as they are written, so that `-0.0` is not `0.0`, and 1 is not 1.0.
+/// Compares config values as text, so that `-0.0` differs from `0.0`, and 1 from 1.0.
 fn config_differs(journal: &Map<String, Value>, now: &Map<String, Value>) -> Option<Difference> {
-    let text = |value: Option<&Value>| value.map_or_else(|| NOT_THERE.to_owned(), Value::to_string);
+    let text = |value: Option<&Value>| value.map_or_else(|| MISSING.to_owned(), Value::to_string);
     let keys = journal.keys().chain(now.keys().filter(|key| !journal.contains_key(*key)));
     let mut differences = keys.filter_map(|key| {
         Difference::of(

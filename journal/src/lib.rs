@@ -1,11 +1,11 @@
-//! Journals: of every wake of a lambda, what it saw and what it decided, so that a replay can make
-//! each decision again and compare it.
+//! Journals: the inputs and the decision of every wake of a lambda, so that a replay can repeat and
+//! compare each decision.
 //!
-//! A journal is compact, is only ever appended to, can be read after a crash, and a flipped byte in
-//! it is found and named. `header` and `entry` are what is kept, and what counts as a difference;
-//! `encode` and `decode` turn a wake into some 15 bytes and back; `block`, `write` and `read` are
-//! the file. `docs/journal.md` describes the bytes for readers in other languages. Nothing here
-//! knows where a journal lies, or runs a lambda.
+//! A journal is compact and append-only; it can be read after a crash, and a flipped byte is found
+//! and located. `header` and `entry` define the content and its comparison; `encode` and `decode`
+//! convert a wake to some 15 bytes and back; `block`, `write` and `read` are the file format, which
+//! `docs/journal.md` describes for readers in other languages. Nothing here chooses the path of a
+//! journal, or runs a lambda.
 
 mod block;
 mod decode;
@@ -32,22 +32,21 @@ pub use write::JournalWriter;
 
 use gleaner_lambda::FaultKind;
 
-/// Version of the format. A reader refuses every other, since it cannot know what else changed.
+/// Version of the format. A reader refuses every other version.
 pub const VERSION: u16 = 1;
 
-/// Most inputs of a journal: as many as a manifest may have.
+/// Maximum number of inputs, that of manifests.
 pub const INPUTS_MAX: usize = gleaner_lambda::manifest::bounds::ITEMS_MAX;
 
-/// Most triggers of one wake. The host allows fewer; a reader of files needs a limit that outlasts
-/// the host's.
+/// Maximum number of triggers of one wake. The host allows fewer; readers need a limit that remains
+/// valid if the host's changes.
 pub const TRIGGERS_MAX: usize = 64;
 
-/// Most bytes of one trigger's attributes as JSON: above what the host allows, with every character
-/// escaped.
+/// Maximum length of one trigger's attributes as JSON, above the limit of the host with every
+/// character escaped.
 pub const ATTRIBUTES_MAX: usize = 128 << 10;
 
-/// The bytes that stand for each kind of fault, which is its place here, and the word of
-/// `decisions.jsonl`.
+/// The kinds of fault, by their code in a journal, with their words in `decisions.jsonl`.
 const FAULTS: [(FaultKind, &str); 8] = [
     (FaultKind::Fuel, "fuel"),
     (FaultKind::Deadline, "deadline"),
@@ -59,7 +58,7 @@ const FAULTS: [(FaultKind, &str); 8] = [
     (FaultKind::Killed, "killed"),
 ];
 
-/// The place of `kind` among the [`FAULTS`].
+/// Returns the index of `kind` in [`FAULTS`].
 fn fault_code(kind: FaultKind) -> usize {
     match kind {
         FaultKind::Fuel => 0,

@@ -1,7 +1,7 @@
-//! Whole numbers in as few bytes as they need: seven bits in each, the lowest first; the eighth bit
-//! says that more follow.
+//! Variable-length encoding of whole numbers (LEB128): seven bits in each byte, the lowest first;
+//! the eighth bit means that more follow.
 
-/// Most bytes that a number takes.
+/// Maximum length of a number, in bytes.
 pub(super) const NUMBER_MAX: usize = 10;
 
 /// Appends `number`.
@@ -13,7 +13,7 @@ pub(super) fn put(mut number: u64, out: &mut Vec<u8>) {
     out.push(number as u8);
 }
 
-/// The number at the begin of `bytes`, which is taken off; `None` if it has no end or more than 64
+/// Removes and returns the number at the start of `bytes`; `None` if it has no end or more than 64
 /// bits.
 pub(super) fn take(bytes: &mut &[u8]) -> Option<u64> {
     let mut number = 0;
@@ -32,13 +32,13 @@ pub(super) fn take(bytes: &mut &[u8]) -> Option<u64> {
     None
 }
 
-/// `difference` of two numbers as one that is small if they are close, whichever is larger: 0, -1,
+/// Maps a signed difference to an unsigned number that is small for close numbers (zigzag): 0, -1,
 /// 1, -2 become 0, 1, 2, 3.
 pub(super) fn fold(difference: u64) -> u64 {
     (difference << 1) ^ (((difference as i64) >> 63) as u64)
 }
 
-/// The reverse of [`fold`].
+/// The inverse of [`fold`].
 pub(super) fn unfold(folded: u64) -> u64 {
     (folded >> 1) ^ (folded & 1).wrapping_neg()
 }
@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_number_reads_back_as_itself() {
+    fn every_number_is_decoded_as_encoded() {
         let powers = (0..64).flat_map(|bit| [(1 << bit) - 1, 1 << bit, (1 << bit) + 1]);
         for number in powers.chain([u64::MAX - 1, u64::MAX]) {
             let mut bytes = Vec::new();

@@ -10,48 +10,48 @@ use super::header::{JournalEnd, JournalHeader};
 use super::number::take;
 use super::{INPUTS_MAX, VERSION};
 
-/// Reads a journal block by block, and never holds more than one.
+/// Reads a journal block by block, with one block in memory at a time.
 pub struct JournalReader<R: Read> {
-    source: Source<R>,
+    source: BlockSource<R>,
     header: JournalHeader,
     decoder: Decoder,
-    /// The payload of the block of wakes at hand.
+    /// The payload of the current block of wakes.
     block: Vec<u8>,
-    /// How much of it was read.
+    /// Number of its bytes that were decoded.
     read: usize,
-    /// Wakes in it that were not.
+    /// Number of its wakes that were not decoded yet.
     left: u64,
     /// Index of the next wake.
     wake: u64,
-    at: Place,
+    at: BlockLocation,
     end: Option<JournalEnd>,
     unknown_blocks: u64,
-    state: State,
+    state: ReadState,
 }
 
-/// A block, for messages.
+/// The location of a block, for messages.
 #[derive(Clone, Copy, Default)]
-struct Place {
+struct BlockLocation {
     offset: u64,
     block: u64,
     wake: u64,
 }
 
-impl Place {
+impl BlockLocation {
     fn damaged(self, why: Damage) -> JournalError {
         JournalError::Damaged { offset: self.offset, block: self.block, wake: self.wake, why }
     }
 }
 
-enum State {
+enum ReadState {
     Reading,
     Ended,
-    /// The bytes end within this journal's last block.
-    CutOff {
+    /// The journal has no end block: its bytes end after or within its last block.
+    Truncated {
         torn_bytes: u64,
     },
-    /// Says the same whenever it is asked again; no place if reading itself failed.
-    Failed(Option<(Place, Damage)>),
+    /// Every further call fails likewise; no location if reading itself failed.
+    Failed(Option<(BlockLocation, Damage)>),
 }
 
 impl<R: Read> JournalReader<R> {
@@ -59,14 +59,15 @@ impl<R: Read> JournalReader<R> {
     ///
     /// # Errors
     ///
-    /// [`JournalError`], if this is none, is of another version, or its header cannot be read.
+    /// [`JournalError`] if this is not a journal, has another version, or its header cannot be
+    /// parsed.
     pub fn open(bytes: R) -> Result<JournalReader<R>, JournalError> {
-        let mut source = Source { bytes, offset: 0, blocks: 0 };
+        let mut source = BlockSource { bytes, offset: 0, blocks: 0 };
         source.preamble()?;
-        let at = Place { offset: source.offset, ..Place::default() };
+        let at = BlockLocation { offset: source.offset, ..BlockLocation::default() };
         let (kind, payload) = match source.block().map_err(|stop| stop.into_error(at))? {
-            Next::Block(kind, payload) => (kind, payload),
-            Next::Nothing | Next::Torn(_) => {
+            NextBlock::Block(kind, payload) => (kind, payload),
+            NextBlock::Nothing | NextBlock::Torn(_) => {
                 return Err(JournalError::NoHeader { bytes: source.offset });
             }
         };
@@ -92,29 +93,29 @@ impl<R: Read> JournalReader<R> {
             at,
             end: None,
             unknown_blocks: 0,
-            state: State::Reading,
+            state: ReadState::Reading,
         })
     }
 
-    /// What made the decisions.
+    /// Returns the header.
     pub fn header(&self) -> &JournalHeader {
         &self.header
     }
 
-    /// The next wake; `None` after the last one that is whole. Then [`end`](Self::end) and
-    /// [`truncated`](Self::truncated) tell whether the writer came to its end.
+    /// Returns the next wake; `None` after the last complete one. Then [`end`](Self::end) and
+    /// [`truncated`](Self::truncated) show whether the journal is complete.
     ///
     /// # Errors
     ///
-    /// [`JournalError::Damaged`] or [`JournalError::Read`]; nothing is read behind either.
+    /// [`JournalError::Damaged`] or [`JournalError::Read`]; nothing is read after either.
     #[allow(clippy::should_implement_trait)]
     pub fn next(&mut self) -> Result<Option<JournalEntry>, JournalError> {
         loop {
             match &self.state {
-                State::Reading => {}
-                State::Ended | State::CutOff { .. } => return Ok(None),
-                State::Failed(Some((at, why))) => return Err(at.damaged(why.clone())),
-                State::Failed(None) => {
+                ReadState::Reading => {}
+                ReadState::Ended | ReadState::Truncated { .. } => return Ok(None),
+                ReadState::Failed(Some((at, why))) => return Err(at.damaged(why.clone())),
+                ReadState::Failed(None) => {
                     return Err(JournalError::Read {
                         source: io::Error::other("an earlier read failed"),
                     });
@@ -128,36 +129,36 @@ impl<R: Read> JournalReader<R> {
             match step {
                 Ok(None) => {}
                 Ok(entry) => return Ok(entry),
-                Err(Stop::Damage(why)) => self.state = State::Failed(Some((self.at, why))),
-                Err(Stop::Read(source)) => {
-                    self.state = State::Failed(None);
+                Err(ReadStop::Damage(why)) => self.state = ReadState::Failed(Some((self.at, why))),
+                Err(ReadStop::Read(source)) => {
+                    self.state = ReadState::Failed(None);
                     return Err(JournalError::Read { source });
                 }
             }
         }
     }
 
-    /// What the writer said at its end; `None` before it was read, or if the journal is cut off.
+    /// Returns the end block; `None` before it was read, or if the journal is truncated.
     pub fn end(&self) -> Option<&JournalEnd> {
         self.end.as_ref()
     }
 
-    /// Whether the journal has no end: its writer died. Known after the last wake.
+    /// Returns whether the journal has no end block, as its writer died. Known after the last wake.
     pub fn truncated(&self) -> bool {
-        matches!(self.state, State::CutOff { .. })
+        matches!(self.state, ReadState::Truncated { .. })
     }
 
-    /// Bytes of a last block that was not written whole; they were not read.
+    /// Returns the number of bytes of an incomplete last block, which were not decoded.
     pub fn torn_bytes(&self) -> u64 {
-        if let State::CutOff { torn_bytes } = self.state { torn_bytes } else { 0 }
+        if let ReadState::Truncated { torn_bytes } = self.state { torn_bytes } else { 0 }
     }
 
-    /// Whole blocks of a kind that only a newer gleaner knows; they were stepped over.
+    /// Returns the number of skipped blocks, whose kind is known to newer versions only.
     pub fn unknown_blocks(&self) -> u64 {
         self.unknown_blocks
     }
 
-    fn decode(&mut self) -> Result<JournalEntry, Stop> {
+    fn decode(&mut self) -> Result<JournalEntry, ReadStop> {
         let mut rest = &self.block[self.read..];
         let entry = self.decoder.decode(&mut rest).map_err(Damage::Wake)?;
         let unread = rest.len();
@@ -165,65 +166,71 @@ impl<R: Read> JournalReader<R> {
         self.left -= 1;
         self.wake += 1;
         if self.left == 0 && unread > 0 {
-            return Err(Stop::Damage(Damage::AfterWakes));
+            return Err(ReadStop::Damage(Damage::AfterWakes));
         }
         Ok(entry)
     }
 
-    fn open_block(&mut self) -> Result<(), Stop> {
-        self.at = Place { offset: self.source.offset, block: self.source.blocks, wake: self.wake };
+    fn open_block(&mut self) -> Result<(), ReadStop> {
+        self.at = BlockLocation {
+            offset: self.source.offset,
+            block: self.source.blocks,
+            wake: self.wake,
+        };
         match self.source.block()? {
-            Next::Nothing => self.state = State::CutOff { torn_bytes: 0 },
-            Next::Torn(torn_bytes) => self.state = State::CutOff { torn_bytes },
-            Next::Block(kind::HEADER, _) => return Err(Stop::Damage(Damage::SecondHeader)),
-            Next::Block(kind::WAKES, payload) => {
+            NextBlock::Nothing => self.state = ReadState::Truncated { torn_bytes: 0 },
+            NextBlock::Torn(torn_bytes) => self.state = ReadState::Truncated { torn_bytes },
+            NextBlock::Block(kind::HEADER, _) => {
+                return Err(ReadStop::Damage(Damage::SecondHeader));
+            }
+            NextBlock::Block(kind::WAKES, payload) => {
                 let mut wakes = payload.as_slice();
                 self.left = take(&mut wakes).ok_or(Damage::Wake(super::Malformed::Short))?;
                 self.read = payload.len() - wakes.len();
                 if self.left == 0 && !wakes.is_empty() {
-                    return Err(Stop::Damage(Damage::AfterWakes));
+                    return Err(ReadStop::Damage(Damage::AfterWakes));
                 }
                 self.block = payload;
                 self.decoder.reset();
             }
-            Next::Block(kind::END, payload) => {
+            NextBlock::Block(kind::END, payload) => {
                 let end = json(&payload)?;
                 if self.source.fill(&mut [0])? > 0 {
-                    return Err(Stop::Damage(Damage::AfterEnd));
+                    return Err(ReadStop::Damage(Damage::AfterEnd));
                 }
                 self.end = Some(end);
-                self.state = State::Ended;
+                self.state = ReadState::Ended;
             }
-            Next::Block(..) => self.unknown_blocks += 1,
+            NextBlock::Block(..) => self.unknown_blocks += 1,
         }
         Ok(())
     }
 }
 
-/// Why reading stops.
-enum Stop {
+/// The reason why reading stops.
+enum ReadStop {
     Damage(Damage),
     Read(io::Error),
 }
 
-impl Stop {
-    fn into_error(self, at: Place) -> JournalError {
+impl ReadStop {
+    fn into_error(self, at: BlockLocation) -> JournalError {
         match self {
-            Stop::Damage(why) => at.damaged(why),
-            Stop::Read(source) => JournalError::Read { source },
+            ReadStop::Damage(why) => at.damaged(why),
+            ReadStop::Read(source) => JournalError::Read { source },
         }
     }
 }
 
-impl From<Damage> for Stop {
+impl From<Damage> for ReadStop {
     fn from(why: Damage) -> Self {
-        Stop::Damage(why)
+        ReadStop::Damage(why)
     }
 }
 
-impl From<io::Error> for Stop {
+impl From<io::Error> for ReadStop {
     fn from(source: io::Error) -> Self {
-        Stop::Read(source)
+        ReadStop::Read(source)
     }
 }
 
@@ -231,26 +238,26 @@ fn json<T: DeserializeOwned>(payload: &[u8]) -> Result<T, Damage> {
     serde_json::from_slice(payload).map_err(|error| Damage::Json(error.to_string()))
 }
 
-/// The bytes of a journal, taken apart into blocks.
-struct Source<R> {
+/// Splits the bytes of a journal into blocks.
+struct BlockSource<R> {
     bytes: R,
-    /// Bytes that were read.
+    /// Number of bytes read.
     offset: u64,
-    /// Blocks that were read.
+    /// Number of blocks read.
     blocks: u64,
 }
 
-enum Next {
+enum NextBlock {
     /// The bytes end here.
     Nothing,
-    /// They end within the next block, after so many bytes of it.
+    /// The bytes end within the next block, after so many bytes of it.
     Torn(u64),
-    /// A whole block: its kind and its payload.
+    /// A complete block: its kind and its payload.
     Block(u8, Vec<u8>),
 }
 
-impl<R: Read> Source<R> {
-    /// As many bytes as there are, up to the length of `buffer`.
+impl<R: Read> BlockSource<R> {
+    /// Reads as many bytes as there are, up to the length of `buffer`; returns their number.
     fn fill(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let mut filled = 0;
         while filled < buffer.len() {
@@ -281,50 +288,54 @@ impl<R: Read> Source<R> {
         }
         match preamble[10..].iter().all(|byte| *byte == 0) {
             true => Ok(()),
-            false => Err(Place::default().damaged(Damage::Reserved)),
+            false => Err(BlockLocation::default().damaged(Damage::Reserved)),
         }
     }
 
-    fn block(&mut self) -> Result<Next, Stop> {
+    fn block(&mut self) -> Result<NextBlock, ReadStop> {
         let mut head = [0; HEAD_LEN];
         let filled = self.fill(&mut head)?;
         if filled < HEAD_LEN {
-            return Ok(if filled == 0 { Next::Nothing } else { Next::Torn(filled as u64) });
+            return Ok(if filled == 0 {
+                NextBlock::Nothing
+            } else {
+                NextBlock::Torn(filled as u64)
+            });
         }
         let Some(Head { kind, len, payload_crc }) = Head::from_bytes(&head, self.blocks) else {
             return self.zeros(&head);
         };
         if len as usize > PAYLOAD_MAX {
-            return Err(Stop::Damage(Damage::TooLong { len }));
+            return Err(ReadStop::Damage(Damage::TooLong { len }));
         }
-        // Grows with what is there, not with what the head claims.
+        // Allocates as bytes arrive, not by the length in the head.
         let mut payload = Vec::new();
         let filled = (&mut self.bytes).take(len.into()).read_to_end(&mut payload)?;
         self.offset += filled as u64;
         if filled < len as usize {
-            return Ok(Next::Torn((HEAD_LEN + filled) as u64));
+            return Ok(NextBlock::Torn((HEAD_LEN + filled) as u64));
         }
         if crc32fast::hash(&payload) != payload_crc {
-            return Err(Stop::Damage(Damage::Payload));
+            return Err(ReadStop::Damage(Damage::Payload));
         }
         self.blocks += 1;
-        Ok(Next::Block(kind, payload))
+        Ok(NextBlock::Block(kind, payload))
     }
 
-    /// After a loss of power, a file may have its new length and zeros for what was not written
-    /// yet: it is torn.
-    fn zeros(&mut self, head: &[u8; HEAD_LEN]) -> Result<Next, Stop> {
+    /// Checks for zeros up to the end: after a loss of power, a file may have its new length, with
+    /// zeros in place of data not yet written. Such a block is torn, not damaged.
+    fn zeros(&mut self, head: &[u8; HEAD_LEN]) -> Result<NextBlock, ReadStop> {
         let mut torn_bytes = HEAD_LEN as u64;
         let mut zeros = head.iter().all(|byte| *byte == 0);
         let mut buffer = [0; 4096];
         while zeros {
             let filled = self.fill(&mut buffer)?;
             if filled == 0 {
-                return Ok(Next::Torn(torn_bytes));
+                return Ok(NextBlock::Torn(torn_bytes));
             }
             torn_bytes += filled as u64;
             zeros = buffer[..filled].iter().all(|byte| *byte == 0);
         }
-        Err(Stop::Damage(Damage::Head))
+        Err(ReadStop::Damage(Damage::Head))
     }
 }

@@ -9,30 +9,30 @@ use super::header::{JournalEnd, JournalHeader};
 use super::number::{NUMBER_MAX, put};
 use super::{ATTRIBUTES_MAX, INPUTS_MAX, TRIGGERS_MAX, VERSION};
 
-/// A block of wakes is written when it is as long: small enough that its checksum names a place.
+/// Length at which a block of wakes is written: small enough that its checksum locates damage.
 const CLOSE_AT: usize = 32 << 10;
 
-/// A block is written when it has as many wakes: a writer that dies loses fewer. Where a block ends
-/// depends on what is in it and on nothing else, so that the journals of equal runs are equal. Of 4
-/// KB, its head and its first wake take some 60 bytes.
+/// Number of wakes at which a block is written, so that a writer that dies loses few. The end of a
+/// block depends on its content only, so that the journals of equal runs are equal. Head and first
+/// wake take some 60 of 4,000 bytes.
 const CLOSE_AT_WAKES: u64 = 256;
 
-/// Room for what comes before the wakes of a block, and is known when it is full.
-const ROOM: usize = HEAD_LEN + NUMBER_MAX;
+/// Space before the wakes of a block, for the head and the count, which are known at its end.
+const RESERVED: usize = HEAD_LEN + NUMBER_MAX;
 
 /// Writes a journal.
 ///
-/// Wakes wait in a block until it is full or [`flush`](Self::flush) is called. A writer that is
-/// dropped without [`finish`](Self::finish) loses those, and leaves a journal that is cut off.
+/// Wakes are buffered in a block until it is full or [`flush`](Self::flush) is called. A writer
+/// that is dropped without [`finish`](Self::finish) loses them, and leaves a truncated journal.
 pub struct JournalWriter<W: Write> {
     out: W,
     encoder: Encoder,
     inputs: usize,
-    /// The block at hand: [`ROOM`], then its wakes.
+    /// The current block: [`RESERVED`], then its wakes.
     block: Vec<u8>,
     wakes: u64,
     blocks: u64,
-    /// A block may be torn: what is written behind it could never be read.
+    /// Set after a failed write: the last block may be torn, and later blocks would be unreadable.
     failed: bool,
 }
 
@@ -41,16 +41,16 @@ impl<W: Write> JournalWriter<W> {
     ///
     /// # Errors
     ///
-    /// Those of `out`, and [`io::ErrorKind::InvalidInput`] for a header that no reader would take.
+    /// Those of `out`, and [`io::ErrorKind::InvalidInput`] for a header that readers refuse.
     pub fn begin(out: W, header: &JournalHeader) -> io::Result<JournalWriter<W>> {
         let inputs = header.inputs.len();
         if inputs > INPUTS_MAX || header.event_input.is_some_and(|event| event >= inputs) {
             return Err(refused(
-                "a header names more inputs than there may be, or one that is not there",
+                "a header has too many inputs, or lacks the one that wakes the lambda",
             ));
         }
-        let mut block = Vec::with_capacity(ROOM + 2 * CLOSE_AT);
-        block.resize(ROOM, 0);
+        let mut block = Vec::with_capacity(RESERVED + 2 * CLOSE_AT);
+        block.resize(RESERVED, 0);
         let encoder = Encoder::new(inputs);
         let mut writer =
             JournalWriter { out, encoder, inputs, block, wakes: 0, blocks: 0, failed: false };
@@ -67,8 +67,8 @@ impl<W: Write> JournalWriter<W> {
     /// # Errors
     ///
     /// Those of `out`; after one, every further call fails, since the last block may be torn.
-    /// [`io::ErrorKind::InvalidInput`] for a wake that no reader would take: it is left out, and
-    /// the next one may follow.
+    /// [`io::ErrorKind::InvalidInput`] for a wake that readers refuse: it is omitted, and further
+    /// wakes may follow.
     pub fn wake(&mut self, entry: &JournalEntry) -> io::Result<()> {
         self.usable()?;
         self.fits(entry)?;
@@ -78,7 +78,7 @@ impl<W: Write> JournalWriter<W> {
         if payload > PAYLOAD_MAX {
             self.block.truncate(before);
             self.write_wakes()?;
-            return Err(refused("a wake is larger than a block of a journal"));
+            return Err(refused("a wake is too large for a block of a journal"));
         }
         self.wakes += 1;
         if payload >= CLOSE_AT || self.wakes >= CLOSE_AT_WAKES {
@@ -88,7 +88,7 @@ impl<W: Write> JournalWriter<W> {
         }
     }
 
-    /// Writes the wakes that wait, and flushes `out`.
+    /// Writes buffered wakes, and flushes `out`.
     ///
     /// # Errors
     ///
@@ -101,7 +101,7 @@ impl<W: Write> JournalWriter<W> {
         flushed
     }
 
-    /// Writes the wakes that wait and the end, flushes, and gives `out` back.
+    /// Writes buffered wakes and the end, flushes, and returns `out`.
     ///
     /// # Errors
     ///
@@ -114,7 +114,7 @@ impl<W: Write> JournalWriter<W> {
         Ok(self.out)
     }
 
-    /// What was written so far.
+    /// Returns the output so far.
     #[cfg(test)]
     pub(super) fn written(&self) -> &W {
         &self.out
@@ -129,10 +129,10 @@ impl<W: Write> JournalWriter<W> {
 
     fn fits(&self, entry: &JournalEntry) -> io::Result<()> {
         if entry.seen.len() != self.inputs {
-            return Err(refused("a wake has not the inputs of the header"));
+            return Err(refused("a wake does not have the inputs of the header"));
         }
         if entry.triggers.len() > TRIGGERS_MAX {
-            return Err(refused("a wake has more triggers than a journal takes"));
+            return Err(refused("a wake has too many triggers for a journal"));
         }
         for trigger in &entry.triggers {
             let long = || {
@@ -140,7 +140,7 @@ impl<W: Write> JournalWriter<W> {
                     .map_or(true, |json| json.len() > ATTRIBUTES_MAX)
             };
             if !trigger.attributes.is_empty() && long() {
-                return Err(refused("a trigger has longer attributes than a journal takes"));
+                return Err(refused("a trigger has attributes that are too long for a journal"));
             }
             if trigger.score.is_some_and(|score| !score.is_finite()) {
                 return Err(refused("a trigger has a score that is not finite"));
@@ -149,7 +149,7 @@ impl<W: Write> JournalWriter<W> {
         Ok(())
     }
 
-    /// Closes the block of wakes, if it has any. The next one can be read without it.
+    /// Writes the block of wakes, if it has any. The next block can be decoded without it.
     fn write_wakes(&mut self) -> io::Result<()> {
         self.encoder.reset();
         if self.wakes == 0 {
@@ -157,17 +157,17 @@ impl<W: Write> JournalWriter<W> {
         }
         let mut count = Vec::with_capacity(NUMBER_MAX);
         put(self.wakes, &mut count);
-        let payload = ROOM - count.len();
-        self.block[payload..ROOM].copy_from_slice(&count);
+        let payload = RESERVED - count.len();
+        self.block[payload..RESERVED].copy_from_slice(&count);
         let head = self.head(kind::WAKES, &self.block[payload..]);
         self.block[payload - HEAD_LEN..payload].copy_from_slice(&head);
         let written = self.out.write_all(&self.block[payload - HEAD_LEN..]);
-        self.block.truncate(ROOM);
+        self.block.truncate(RESERVED);
         self.wakes = 0;
-        self.note(written)
+        self.finish_block(written)
     }
 
-    /// Writes `value` in a block of its own, behind `bytes`, all at once.
+    /// Writes `value` as a block of its own, after `bytes`, in one call.
     fn write_json(
         &mut self,
         kind: u8,
@@ -176,12 +176,12 @@ impl<W: Write> JournalWriter<W> {
     ) -> io::Result<()> {
         let json = serde_json::to_vec(value)?;
         if json.len() > PAYLOAD_MAX {
-            return Err(refused("the header or the end is larger than a block of a journal"));
+            return Err(refused("the header or the end is too large for a block of a journal"));
         }
         bytes.extend_from_slice(&self.head(kind, &json));
         bytes.extend_from_slice(&json);
         let written = self.out.write_all(&bytes);
-        self.note(written)
+        self.finish_block(written)
     }
 
     fn head(&self, kind: u8, payload: &[u8]) -> [u8; HEAD_LEN] {
@@ -189,7 +189,7 @@ impl<W: Write> JournalWriter<W> {
         Head { kind, len, payload_crc: crc32fast::hash(payload) }.to_bytes(self.blocks)
     }
 
-    fn note(&mut self, written: io::Result<()>) -> io::Result<()> {
+    fn finish_block(&mut self, written: io::Result<()>) -> io::Result<()> {
         self.blocks += 1;
         self.failed = written.is_err();
         written

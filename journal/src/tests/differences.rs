@@ -1,9 +1,9 @@
-//! What differs between a journal and now is said, the most telling difference first.
+//! Tests comparisons: the most significant difference is reported.
 
 use super::*;
 
 #[track_caller]
-fn said(difference: Option<Difference>, what: &str, journal: &str, now: &str) {
+fn assert_differs(difference: Option<Difference>, what: &str, journal: &str, now: &str) {
     let sides =
         Difference { what: what.to_owned(), journal: journal.to_owned(), now: now.to_owned() };
     assert_eq!(difference, Some(sides));
@@ -16,7 +16,7 @@ fn with(change: impl FnOnce(&mut JournalHeader)) -> Option<Difference> {
 }
 
 #[test]
-fn what_a_decision_should_not_depend_on_is_no_difference_of_a_header() {
+fn facts_that_decisions_do_not_depend_on_are_not_compared() {
     let difference = with(|now| {
         now.gleaner = "9".to_owned();
         now.engine = "Python".to_owned();
@@ -28,14 +28,14 @@ fn what_a_decision_should_not_depend_on_is_no_difference_of_a_header() {
 }
 
 #[test]
-fn the_most_telling_difference_of_a_header_comes_first() {
+fn the_most_significant_difference_of_a_header_comes_first() {
     type Case = (fn(&mut JournalHeader), [&'static str; 3]);
     let changes: [Case; 10] = [
         (|now| now.clock = "system".to_owned(), ["clock", "log time of the drive", "system"]),
         (|now| now.remaps.clear(), ["remapped topics", "/in0 is /wire0", "none"]),
         (
             |now| now.event_input = None,
-            ["what wakes the lambda", "samples of input `in0`", "the clock"],
+            ["schedule of the lambda", "samples of input `in0`", "the clock"],
         ),
         (
             |now| now.inputs[1].wire_topic = "/in1".to_owned(),
@@ -48,7 +48,7 @@ fn the_most_telling_difference_of_a_header_comes_first() {
         (|now| now.config["brake_mps2"] = json!(-3), ["config `brake_mps2`", "-3.0", "-3"]),
         (
             |now| now.models.clear(),
-            ["model `models/d.onnx`", "sha256 0123456789abcdef…", "not there"],
+            ["model `models/d.onnx`", "sha256 0123456789abcdef…", "missing"],
         ),
         (|now| now.limits.deadline /= 2, ["limit `deadline`", "50ms", "25ms"]),
         (
@@ -68,43 +68,48 @@ fn the_most_telling_difference_of_a_header_comes_first() {
     let mut now = header(2);
     for (change, [what, journal, now_text]) in changes {
         change(&mut now);
-        said(header(2).differs_from(&now), what, journal, now_text);
+        assert_differs(header(2).differs_from(&now), what, journal, now_text);
     }
 }
 
 #[test]
 fn files_and_config_that_only_one_side_has_are_differences() {
     let difference = with(|now| now.files.remove(0).path.clear());
-    said(difference, "build file `brake_dark.wasm`", "sha256 0123456789abcdef…", "not there");
-    // Of the manifest only what a decision can depend on counts.
+    assert_differs(
+        difference,
+        "build file `brake_dark.wasm`",
+        "sha256 0123456789abcdef…",
+        "missing",
+    );
+    // Only the relevant parts of the manifest are compared.
     assert_eq!(with(|now| now.files.remove(1).path.clear()), None);
     let more = FileDigest { path: "a.py".to_owned(), bytes: 1, sha256: "ab".repeat(32) };
-    said(
+    assert_differs(
         with(|now| now.files.push(more)),
         "build file `a.py`",
-        "not there",
+        "missing",
         "sha256 abababababababab…",
     );
     let difference = with(|now| {
         now.config.insert("new".to_owned(), json!(true));
     });
-    said(difference, "config `new`", "not there", "true");
-    said(with(|now| now.inputs.truncate(1)), "number of inputs", "2", "1");
+    assert_differs(difference, "config `new`", "missing", "true");
+    assert_differs(with(|now| now.inputs.truncate(1)), "number of inputs", "2", "1");
 }
 
 #[test]
-fn digests_that_begin_alike_are_shown_whole() {
+fn digests_with_the_same_start_are_shown_completely() {
     let begin = "0123456789abcdef";
     let other = format!("{begin}{}", "0".repeat(48));
     let (journal, now) = (format!("sha256 {}", begin.repeat(4)), format!("sha256 {other}"));
-    said(
+    assert_differs(
         with(|header| header.files[0].sha256 = other),
         "build file `brake_dark.wasm`",
         &journal,
         &now,
     );
-    // A digest of a journal may be any text.
-    said(
+    // A digest in a journal may be any text.
+    assert_differs(
         with(|header| header.files[0].sha256 = "ä".to_owned()),
         "build file `brake_dark.wasm`",
         "sha256 0123456789abcdef…",
@@ -146,20 +151,25 @@ fn equal_wakes_do_not_differ() {
 }
 
 #[test]
-fn what_woke_the_lambda_is_compared_with_the_writer() {
-    said(changed(|now| now.at_ns = 11), "stamp of the wake, in ns", "10", "11");
+fn causes_are_compared_including_the_writer() {
+    assert_differs(changed(|now| now.at_ns = 11), "stamp of the wake, in ns", "10", "11");
     let writer = "ab".repeat(16);
     let journal = format!("sample 4294967303 of writer {writer}");
-    let cause = "what woke the lambda";
-    said(changed(|now| now.cause = WakeSource::Tick { missed: 0 }), cause, &journal, "a tick");
-    said(
+    let cause = "cause of the wake";
+    assert_differs(
+        changed(|now| now.cause = WakeSource::Tick { missed: 0 }),
+        cause,
+        &journal,
+        "a tick",
+    );
+    assert_differs(
         changed(|now| now.cause = WakeSource::Tick { missed: 3 }),
         cause,
         &journal,
         "a tick after 3 missed ones",
     );
     let now = format!("sample 4294967304 of writer {writer}");
-    said(
+    assert_differs(
         changed(|now| now.cause = WakeSource::Sample { writer: [0xab; 16], seq: (1 << 32) + 8 }),
         cause,
         &journal,
@@ -168,78 +178,98 @@ fn what_woke_the_lambda_is_compared_with_the_writer() {
 }
 
 #[test]
-fn samples_of_a_clip_are_compared_without_what_a_clip_does_not_keep() {
+fn samples_of_a_clip_are_compared_as_far_as_a_clip_keeps_them() {
     let mut now = entry();
     now.cause = WakeSource::Sample { writer: [1; 16], seq: 7 };
     now.seen[0].newest = Some(([1; 16], 7 + (5 << 32)));
     assert_eq!(entry().differs_from(&now, &[], false), None);
     assert!(entry().differs_from(&now, &[], true).is_some());
     now.cause = WakeSource::Sample { writer: [1; 16], seq: 8 };
-    said(entry().differs_from(&now, &[], false), "what woke the lambda", "sample 7", "sample 8");
+    assert_differs(
+        entry().differs_from(&now, &[], false),
+        "cause of the wake",
+        "sample 7",
+        "sample 8",
+    );
 }
 
 #[test]
-fn what_the_lambda_saw_is_named_by_its_input() {
+fn differences_of_samples_name_the_input() {
     let input = "input `in0` (/wire0)";
-    said(
+    assert_differs(
         changed(|now| now.seen[0].new = 2),
         &format!("number of new samples of {input}"),
         "1",
         "2",
     );
     let what = format!("newest sample of {input}");
-    said(
+    assert_differs(
         changed(|now| now.seen[0].newest = None),
         &what,
         &format!("7 of writer {}", "ab".repeat(16)),
         "none",
     );
     let what = format!("samples of {input}");
-    said(changed(|now| now.seen[0].digest = 0x1b), &what, "digest 0000001a", "digest 0000001b");
-    let what = "how many samples of input `in1` (/wire1) the lambda looked back";
-    said(changed(|now| now.seen[1].reach = 9), what, "0", "9");
-    said(changed(|now| now.seen.truncate(1)), "number of inputs", "2", "1");
+    assert_differs(
+        changed(|now| now.seen[0].digest = 0x1b),
+        &what,
+        "digest 0000001a",
+        "digest 0000001b",
+    );
+    let what = "number of samples of input `in1` (/wire1) that the lambda looked back";
+    assert_differs(changed(|now| now.seen[1].reach = 9), what, "0", "9");
+    assert_differs(changed(|now| now.seen.truncate(1)), "number of inputs", "2", "1");
     let mut now = entry();
     now.seen[1].new = 1;
-    said(entry().differs_from(&now, &[], true), "number of new samples of input 2", "0", "1");
+    assert_differs(
+        entry().differs_from(&now, &[], true),
+        "number of new samples of input 2",
+        "0",
+        "1",
+    );
 }
 
 #[test]
 fn triggers_are_compared_bit_for_bit() {
-    said(changed(|now| now.triggers.clear()), "number of triggers", "1", "0");
-    said(
+    assert_differs(changed(|now| now.triggers.clear()), "number of triggers", "1", "0");
+    assert_differs(
         changed(|now| now.triggers[0].kind = TriggerKind::Stop),
         "trigger 1: kind",
         "event",
         "stop",
     );
-    said(
+    assert_differs(
         changed(|now| now.triggers[0].label = "x\u{1b}".to_owned()),
         "trigger 1: label",
         "`brake`",
         "`x\\u{1b}`",
     );
-    said(changed(|now| now.triggers[0].score = Some(-0.0)), "trigger 1: score", "0", "-0");
-    said(changed(|now| now.triggers[0].score = None), "trigger 1: score", "0", "none");
+    assert_differs(
+        changed(|now| now.triggers[0].score = Some(-0.0)),
+        "trigger 1: score",
+        "0",
+        "-0",
+    );
+    assert_differs(changed(|now| now.triggers[0].score = None), "trigger 1: score", "0", "none");
     let attribute = |key: &str, value| {
         let key = key.to_owned();
         changed(|now| {
             now.triggers[0].attributes.insert(key, value);
         })
     };
-    said(
+    assert_differs(
         attribute("a", json!(0.500_000_000_000_000_1)),
         "trigger 1: attribute `a`",
         "0.5",
         "0.5000000000000001",
     );
-    said(attribute("b", json!(1.0)), "trigger 1: attribute `b`", "1", "1.0");
-    said(attribute("c", json!("x")), "trigger 1: attribute `c`", "none", "\"x\"");
+    assert_differs(attribute("b", json!(1.0)), "trigger 1: attribute `b`", "1", "1.0");
+    assert_differs(attribute("c", json!("x")), "trigger 1: attribute `c`", "none", "\"x\"");
     let difference = changed(|now| {
         let first = now.triggers[0].attributes.shift_remove("a").unwrap();
         now.triggers[0].attributes.insert("a".to_owned(), first);
     });
-    said(difference, "trigger 1: order of its attributes", "a, b", "b, a");
+    assert_differs(difference, "trigger 1: order of its attributes", "a, b", "b, a");
 }
 
 #[test]
@@ -251,11 +281,11 @@ fn faults_fuel_and_logs_are_compared() {
         allowed: Some(8),
     };
     let now = "host_call, `no\\n`, used none, allowed 8";
-    said(changed(|now| now.fault = Some(fault)), "fault", "none", now);
-    said(changed(|now| now.fuel = Some(6)), "fuel", "5", "6");
-    said(changed(|now| now.fuel = None), "fuel", "5", "none");
-    said(changed(|now| now.log.lines = 2), "number of log lines", "1", "2");
-    said(
+    assert_differs(changed(|now| now.fault = Some(fault)), "fault", "none", now);
+    assert_differs(changed(|now| now.fuel = Some(6)), "fuel", "5", "6");
+    assert_differs(changed(|now| now.fuel = None), "fuel", "5", "none");
+    assert_differs(changed(|now| now.log.lines = 2), "number of log lines", "1", "2");
+    assert_differs(
         changed(|now| now.log.digest = 3),
         "text of the log lines",
         "digest 00000002",
@@ -264,7 +294,7 @@ fn faults_fuel_and_logs_are_compared() {
 }
 
 #[test]
-fn every_kind_of_fault_has_its_place_and_the_word_of_the_decisions() {
+fn every_kind_of_fault_has_its_code_and_its_word_in_decisions() {
     for (place, (kind, word)) in FAULTS.iter().enumerate() {
         assert_eq!(fault_code(*kind), place);
         assert_eq!(serde_json::to_value(kind).unwrap(), json!(word));

@@ -1,12 +1,12 @@
-//! Journals as files: whole, cut off at every byte, and with a writer whose disk is full.
+//! Tests journals as files: complete, truncated at every byte, and on a full disk.
 
 use std::io::{self, Write};
 
 use super::*;
 
 #[test]
-fn a_journal_reads_back_whole_with_its_header_and_end() {
-    let mut random = Random(11);
+fn a_journal_is_read_back_with_its_header_and_end() {
+    let mut random = Xorshift(11);
     let entries: Vec<_> = (0..3000).map(|_| any_entry(&mut random, 2)).collect();
     let header = header(2);
     let bytes = journal(&header, &entries, usize::MAX);
@@ -16,12 +16,12 @@ fn a_journal_reads_back_whole_with_its_header_and_end() {
     assert!(error.is_none() && read == entries);
     assert_eq!(reader.end(), Some(&end(3000)));
     assert_eq!((reader.truncated(), reader.torn_bytes(), reader.unknown_blocks()), (false, 0, 0));
-    // The end stays the end.
+    // Further calls return the end again.
     assert_eq!(reader.next().unwrap(), None);
 }
 
 #[test]
-fn a_reader_takes_bytes_as_they_come() {
+fn a_reader_accepts_reads_of_any_length() {
     struct Drip<'b>(&'b [u8], bool);
     impl io::Read for Drip<'_> {
         fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
@@ -42,12 +42,12 @@ fn a_reader_takes_bytes_as_they_come() {
 }
 
 #[test]
-fn a_journal_cut_off_at_any_byte_gives_its_whole_blocks() {
+fn a_journal_truncated_at_any_byte_has_its_complete_blocks() {
     let entries = usual_entries(2, 12);
     let header = header(2);
     let mut writer = JournalWriter::begin(Vec::new(), &header).unwrap();
     let header_len = writer_len(&mut writer);
-    // The length after each block, and the wakes up to there.
+    // The length after each block, and the number of wakes until then.
     let mut blocks = vec![(header_len, 0)];
     for (index, entry) in entries.iter().enumerate() {
         writer.wake(entry).unwrap();
@@ -75,14 +75,14 @@ fn a_journal_cut_off_at_any_byte_gives_its_whole_blocks() {
     }
 }
 
-/// What a writer has written so far.
+/// Returns the length of the output so far.
 fn writer_len(writer: &mut JournalWriter<Vec<u8>>) -> usize {
     writer.flush().unwrap();
     writer.written().len()
 }
 
 #[test]
-fn zeros_that_a_loss_of_power_left_at_the_end_are_torn_and_no_damage() {
+fn zeros_at_the_end_after_a_loss_of_power_are_a_torn_block() {
     let entries = usual_entries(1, 4);
     let mut writer = JournalWriter::begin(Vec::new(), &header(1)).unwrap();
     entries.iter().for_each(|entry| writer.wake(entry).unwrap());
@@ -123,7 +123,7 @@ fn a_long_journal_is_written_in_blocks_of_256_wakes() {
     assert!(wakes.iter().all(|len| (256..32_000).contains(len)), "{lengths:?}");
 }
 
-/// Takes so many bytes, then fails in the middle of a write.
+/// Accepts so many bytes, then fails in the middle of a write.
 struct FullDisk {
     room: usize,
     bytes: Vec<u8>,
@@ -133,7 +133,7 @@ impl Write for FullDisk {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let n = bytes.len().min(self.room);
         if n == 0 && !bytes.is_empty() {
-            // Later there is room again, which must not tempt the writer.
+            // Later writes would succeed, but the writer must not try.
             self.room = usize::MAX;
             return Err(io::ErrorKind::StorageFull.into());
         }
@@ -148,7 +148,7 @@ impl Write for FullDisk {
 }
 
 #[test]
-fn behind_a_block_that_a_full_disk_tore_nothing_is_written() {
+fn nothing_is_written_after_a_block_torn_by_a_full_disk() {
     let entries = usual_entries(1, 6);
     let begin = journal(&header(1), &[], 1).len();
     for room in [begin, begin + 1, begin + 20, begin + 60] {
@@ -170,11 +170,11 @@ fn behind_a_block_that_a_full_disk_tore_nothing_is_written() {
 }
 
 #[test]
-fn a_wake_that_no_reader_would_take_is_refused_and_the_next_one_is_not() {
+fn a_wake_that_readers_refuse_is_omitted_and_the_next_one_is_written() {
     let entries = usual_entries(1, 3);
     let mut writer = JournalWriter::begin(Vec::new(), &header(1)).unwrap();
     writer.wake(&entries[0]).unwrap();
-    let trigger = any_trigger(&mut Random(5));
+    let trigger = any_trigger(&mut Xorshift(5));
     let long = Map::from_iter([("x".to_owned(), json!("y".repeat(ATTRIBUTES_MAX)))]);
     let triggers: [Vec<Trigger>; 3] = [
         vec![trigger.clone(); TRIGGERS_MAX + 1],
@@ -221,7 +221,7 @@ fn the_largest_wake_that_the_host_allows_fits() {
 }
 
 #[test]
-fn a_header_that_no_reader_would_take_is_not_begun() {
+fn a_header_that_readers_refuse_is_not_written() {
     let begin = |header: &JournalHeader| {
         JournalWriter::begin(Vec::new(), header).err().map(|error| error.kind())
     };

@@ -1,9 +1,8 @@
-//! Journals that somebody changed: each change is found, none makes the reader panic or take
-//! memory.
+//! Tests manipulated journals: each change is found, and none makes the reader panic or allocate.
 
 use super::*;
 
-/// What reading all of `bytes` ends with.
+/// Reads all of `bytes`; returns the wakes, and whether the journal is truncated.
 fn outcome(bytes: &[u8]) -> Result<(Vec<JournalEntry>, bool), JournalError> {
     let mut reader = JournalReader::open(bytes)?;
     match read_all(&mut reader) {
@@ -14,7 +13,7 @@ fn outcome(bytes: &[u8]) -> Result<(Vec<JournalEntry>, bool), JournalError> {
 
 #[test]
 fn any_changed_byte_of_a_finished_journal_is_found() {
-    let mut random = Random(21);
+    let mut random = Xorshift(21);
     let mut entries = usual_entries(2, 5);
     entries.push(any_entry(&mut random, 2));
     let bytes = journal(&header(2), &entries, 3);
@@ -37,7 +36,7 @@ fn any_changed_byte_of_a_finished_journal_is_found() {
 }
 
 #[test]
-fn damage_is_named_by_its_block_and_by_the_wakes_before_it() {
+fn damage_is_located_by_its_block_and_the_wakes_before_it() {
     let entries = usual_entries(1, 9);
     let mut bytes = journal(&header(1), &entries, 3);
     let head = |bytes: &[u8], at: usize| {
@@ -54,7 +53,7 @@ fn damage_is_named_by_its_block_and_by_the_wakes_before_it() {
     let error = error.unwrap();
     assert_eq!(
         error.to_string(),
-        format!("the journal is damaged in block 2, at byte {at}, after 3 whole wakes")
+        format!("the journal is damaged in block 2, at byte {at}, after 3 wakes")
     );
     assert_eq!(
         std::error::Error::source(&error).unwrap().to_string(),
@@ -62,13 +61,13 @@ fn damage_is_named_by_its_block_and_by_the_wakes_before_it() {
     );
     let help = "it was changed after it was written: copy it again, or write a new one";
     assert_eq!((error.help().as_deref(), error.exit()), (Some(help), Exit::Usage));
-    // It stays damaged, and is not taken for one that is cut off.
+    // It stays damaged, and is not truncated.
     assert!(matches!(reader.next(), Err(JournalError::Damaged { block: 2, wake: 3, .. })));
     assert!(!reader.truncated() && reader.end().is_none());
 }
 
 #[test]
-fn a_block_that_is_missing_doubled_or_elsewhere_is_found() {
+fn a_missing_duplicate_or_moved_block_is_found() {
     let entries = usual_entries(1, 9);
     let bytes = journal(&header(1), &entries, 3);
     let mut cuts = vec![PREAMBLE_LEN];
@@ -100,7 +99,7 @@ fn a_block_that_is_missing_doubled_or_elsewhere_is_found() {
 }
 
 #[test]
-fn blocks_that_no_writer_writes_are_refused_though_their_checksums_are_right() {
+fn invalid_blocks_with_correct_checksums_are_refused() {
     let header = header(1);
     let first = header_block(&header);
     let why = |blocks: &[(u8, Vec<u8>)]| match outcome(&journal_of(blocks)) {
@@ -127,7 +126,7 @@ fn blocks_that_no_writer_writes_are_refused_though_their_checksums_are_right() {
 }
 
 #[test]
-fn a_journal_that_goes_on_behind_its_end_has_none() {
+fn a_journal_with_bytes_after_its_end_is_damaged() {
     let end = (kind::END, serde_json::to_vec(&end(0)).unwrap());
     let bytes = journal_of(&[header_block(&header(1)), end.clone(), end]);
     let mut reader = JournalReader::open(bytes.as_slice()).unwrap();
@@ -135,7 +134,7 @@ fn a_journal_that_goes_on_behind_its_end_has_none() {
 }
 
 #[test]
-fn a_block_of_an_unknown_kind_is_stepped_over_and_counted() {
+fn a_block_of_an_unknown_kind_is_skipped_and_counted() {
     let mut payload = vec![1];
     let entry = usual_entries(1, 1).remove(0);
     Encoder::new(1).encode(&entry, &mut payload);
@@ -156,7 +155,7 @@ fn keys_of_a_newer_header_are_ignored() {
 }
 
 #[test]
-fn a_length_that_no_block_has_is_damage_and_takes_no_memory() {
+fn an_impossible_length_is_damage_and_allocates_nothing() {
     let mut bytes = journal_of(&[header_block(&header(1))]);
     let head = Head { kind: kind::WAKES, len: u32::MAX, payload_crc: 0 };
     bytes.extend_from_slice(&head.to_bytes(1));
@@ -167,11 +166,11 @@ fn a_length_that_no_block_has_is_damage_and_takes_no_memory() {
 }
 
 #[test]
-fn other_versions_and_other_files_are_refused_with_a_way_out() {
+fn other_versions_and_other_files_are_refused_with_help() {
     let mut newer = journal(&header(1), &[], 1);
     newer[8] = 2;
     let error = outcome(&newer).unwrap_err();
-    assert_eq!(error.to_string(), "the journal is of version 2; this is a reader of version 1");
+    assert_eq!(error.to_string(), "the journal has format version 2; this gleaner reads version 1");
     assert_eq!(
         (error.help().as_deref(), error.exit()),
         (Some("use the gleaner that wrote it"), Exit::Usage)
@@ -180,11 +179,11 @@ fn other_versions_and_other_files_are_refused_with_a_way_out() {
         assert!(matches!(outcome(other), Err(JournalError::NotAJournal)));
     }
     let error = outcome(b"").unwrap_err();
-    assert_eq!(error.to_string(), "the journal ends after 0 bytes, before its header is whole");
+    assert_eq!(error.to_string(), "the journal ends after 0 bytes, within its header");
 }
 
 #[test]
-fn what_cannot_be_read_stays_unreadable() {
+fn a_failed_read_is_final() {
     struct Broken(Vec<u8>, usize);
     impl std::io::Read for Broken {
         fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
@@ -210,7 +209,7 @@ fn what_cannot_be_read_stays_unreadable() {
 
 #[test]
 fn no_change_of_a_wake_makes_the_decoder_panic() {
-    let mut random = Random(22);
+    let mut random = Xorshift(22);
     for inputs in [0, 1, 3] {
         let (mut encoder, mut bytes) = (Encoder::new(inputs), Vec::new());
         (0..40).for_each(|_| encoder.encode(&any_entry(&mut random, inputs), &mut bytes));
@@ -227,7 +226,7 @@ fn no_change_of_a_wake_makes_the_decoder_panic() {
                     _ => changed[at] = random.next() as u8,
                 }
             }
-            // The checksums are right, so that only the decoder stands in the way.
+            // The checksums are correct, so that the decoder has to find the change.
             let bytes = journal_of(&[header_block(&header(inputs)), (kind::WAKES, changed)]);
             let _ = outcome(&bytes);
         }
@@ -241,7 +240,7 @@ fn no_change_of_a_wake_makes_the_decoder_panic() {
 }
 
 #[test]
-fn what_a_wake_claims_is_checked_before_memory_is_taken() {
+fn counts_in_a_wake_are_checked_before_memory_is_allocated() {
     let decode =
         |inputs: usize, bytes: &[u8]| Decoder::new(inputs).decode(&mut &*bytes).unwrap_err();
     let (tick, triggers, fault, log) = (1_u8, 1 << 4, 1 << 5, 1 << 6);

@@ -1,4 +1,4 @@
-//! What is written reads back, however it was cut or changed; what differs is said.
+//! Tests of journals, with shared headers and wakes.
 
 use serde_json::{Map, json};
 
@@ -13,10 +13,10 @@ mod file;
 mod hostile;
 mod wakes;
 
-/// Numbers that look random and are the same in every run (xorshift64*).
-struct Random(u64);
+/// Pseudo-random numbers, the same in every run (xorshift64*).
+struct Xorshift(u64);
 
-impl Random {
+impl Xorshift {
     fn next(&mut self) -> u64 {
         self.0 ^= self.0 >> 12;
         self.0 ^= self.0 << 25;
@@ -32,7 +32,7 @@ impl Random {
         self.below(n) == 0
     }
 
-    /// Mostly small, sometimes anything.
+    /// Returns a number that is mostly small.
     fn number(&mut self) -> u64 {
         let bits = self.below(64) as u32;
         if self.one_in(3) { self.next() >> bits } else { self.below(40) }
@@ -80,9 +80,9 @@ fn end(wakes: usize) -> JournalEnd {
     JournalEnd { wakes: wakes as u64, samples: vec![5, 6], drives: Vec::new() }
 }
 
-/// Anything that an entry can be.
-fn any_entry(random: &mut Random, inputs: usize) -> JournalEntry {
-    let writer = |random: &mut Random| [random.below(3) as u8; 16];
+/// Returns a random entry.
+fn any_entry(random: &mut Xorshift, inputs: usize) -> JournalEntry {
+    let writer = |random: &mut Xorshift| [random.below(3) as u8; 16];
     let cause = match random.one_in(3) {
         true => WakeSource::Tick { missed: if random.one_in(2) { 0 } else { random.number() } },
         false => WakeSource::Sample { writer: writer(random), seq: random.number() },
@@ -110,13 +110,13 @@ fn any_entry(random: &mut Random, inputs: usize) -> JournalEntry {
     JournalEntry { at_ns: random.number() as i64, cause, seen, triggers, fault, fuel, log }
 }
 
-fn any_trigger(random: &mut Random) -> Trigger {
+fn any_trigger(random: &mut Xorshift) -> Trigger {
     let mut attributes = Map::new();
     for n in 0..random.below(4) {
         let value = match random.below(5) {
             0 => json!(random.number()),
             1 => json!(-(random.below(1 << 60) as i64)),
-            // Of few digits: `a_fraction_keeps_its_last_bit` is about the others.
+            // With few digits: `a_fraction_keeps_its_last_bit` tests the others.
             2 => json!(random.below(1 << 20) as f64 / -1024.0),
             3 => json!({ "x": [null, true, "ü\"\\"] }),
             _ => json!("text"),
@@ -131,10 +131,10 @@ fn any_trigger(random: &mut Random) -> Trigger {
     }
 }
 
-/// Wakes of a lambda with one or two inputs as they are in a drive: a camera at 10 Hz or an IMU at
-/// 100 Hz wakes it.
+/// Returns realistic wakes of a lambda with one or two inputs, woken by a camera at 10 Hz or an IMU
+/// at 100 Hz.
 fn usual_entries(inputs: usize, n: usize) -> Vec<JournalEntry> {
-    let mut random = Random(7);
+    let mut random = Xorshift(7);
     let mut seq = 100;
     let mut imu = 5000;
     let step_ns = if inputs == 1 { 10_000_000 } else { 100_000_000 };
@@ -171,7 +171,7 @@ fn usual_entries(inputs: usize, n: usize) -> Vec<JournalEntry> {
         .collect()
 }
 
-/// A whole journal with a block for every `per_block` wakes.
+/// Returns a complete journal with a block for every `per_block` wakes.
 fn journal(header: &JournalHeader, entries: &[JournalEntry], per_block: usize) -> Vec<u8> {
     let mut writer = JournalWriter::begin(Vec::new(), header).unwrap();
     for (index, entry) in entries.iter().enumerate() {
@@ -183,7 +183,7 @@ fn journal(header: &JournalHeader, entries: &[JournalEntry], per_block: usize) -
     writer.finish(&end(entries.len())).unwrap()
 }
 
-/// All wakes of a journal, and the error that ended it, if one did.
+/// Returns all wakes of a journal, and the error that ended it, if any.
 fn read_all<R: std::io::Read>(
     reader: &mut JournalReader<R>,
 ) -> (Vec<JournalEntry>, Option<JournalError>) {
@@ -197,7 +197,7 @@ fn read_all<R: std::io::Read>(
     }
 }
 
-/// A journal of these blocks, each with the right checksums.
+/// Returns a journal of these blocks, with correct checksums.
 fn journal_of(blocks: &[(u8, Vec<u8>)]) -> Vec<u8> {
     let mut bytes = MAGIC.to_vec();
     bytes.extend_from_slice(&VERSION.to_le_bytes());

@@ -1,10 +1,10 @@
-//! Wakes as bytes: they read back, relative to each other and alone, and are small.
+//! Tests the encoding of wakes: relative to each other and alone, and its size.
 
 use super::*;
 
 #[test]
-fn any_wake_reads_back_as_it_was_written_relative_to_any_other() {
-    let mut random = Random(1);
+fn any_wake_is_decoded_as_encoded_relative_to_any_other() {
+    let mut random = Xorshift(1);
     for inputs in [0, 1, 2, 7] {
         let entries: Vec<_> = (0..2000).map(|_| any_entry(&mut random, inputs)).collect();
         let (mut encoder, mut bytes) = (Encoder::new(inputs), Vec::new());
@@ -20,8 +20,8 @@ fn any_wake_reads_back_as_it_was_written_relative_to_any_other() {
 }
 
 #[test]
-fn after_a_reset_a_wake_stands_alone() {
-    let mut random = Random(2);
+fn after_a_reset_a_wake_is_decoded_alone() {
+    let mut random = Xorshift(2);
     let mut encoder = Encoder::new(2);
     for _ in 0..500 {
         let entry = any_entry(&mut random, 2);
@@ -43,7 +43,7 @@ fn a_usual_wake_takes_few_bytes() {
         for (index, entry) in entries.iter().enumerate() {
             let before = bytes.len();
             encoder.encode(entry, &mut bytes);
-            // The first one is written whole, and the second has no rate to go by.
+            // The first one has no previous wake, and the second no rate.
             longest = if index < 2 { 0 } else { longest.max(bytes.len() - before) };
         }
         assert!(longest <= most, "{longest} bytes for a wake with {inputs} inputs");
@@ -54,7 +54,7 @@ fn a_usual_wake_takes_few_bytes() {
 }
 
 #[test]
-fn a_tick_without_new_samples_takes_a_byte_for_itself_one_for_its_time_and_one_for_each_input() {
+fn a_tick_without_new_samples_takes_two_bytes_and_one_for_each_input() {
     let tick = |at_ns| JournalEntry {
         at_ns,
         cause: WakeSource::Tick { missed: 0 },
@@ -74,7 +74,7 @@ fn a_tick_without_new_samples_takes_a_byte_for_itself_one_for_its_time_and_one_f
 }
 
 #[test]
-fn a_wake_is_laid_out_as_the_documentation_says() {
+fn a_wake_has_the_layout_of_the_documentation() {
     let entry = JournalEntry {
         at_ns: 5,
         cause: WakeSource::Sample { writer: [0xaa; 16], seq: 3 },
@@ -143,7 +143,7 @@ fn numbers_at_the_ends_of_their_range_do_not_overflow() {
 
 #[test]
 fn a_fraction_keeps_its_last_bit() {
-    let mut random = Random(3);
+    let mut random = Xorshift(3);
     for _ in 0..2000 {
         let value = f64::from_bits(random.next());
         if !value.is_finite() {
@@ -157,14 +157,14 @@ fn a_fraction_keeps_its_last_bit() {
         let mut bytes = Vec::new();
         Encoder::new(0).encode(&entry, &mut bytes);
         let read = Decoder::new(0).decode(&mut bytes.as_slice()).unwrap();
-        // Needs the feature `float_roundtrip` of serde_json: without it, a value read may be its
-        // neighbour.
+        // Needs the feature `float_roundtrip` of serde_json: without it, a parsed value may be off
+        // by one bit.
         assert_eq!(read.differs_from(&entry, &[], true), None);
     }
 }
 
 #[test]
-#[should_panic(expected = "a wake of another lambda")]
-fn a_wake_with_other_inputs_is_no_wake_of_this_journal() {
-    Encoder::new(1).encode(&any_entry(&mut Random(4), 2), &mut Vec::new());
+#[should_panic(expected = "number of inputs of a wake")]
+fn a_wake_with_another_number_of_inputs_panics() {
+    Encoder::new(1).encode(&any_entry(&mut Xorshift(4), 2), &mut Vec::new());
 }
