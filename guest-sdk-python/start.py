@@ -1,8 +1,9 @@
-"""Makes this interpreter the host of a Python lambda.
+"""Runs this interpreter as the host of a Python lambda.
 
-`gleaner-runtime` becomes `python3 -I -S start.py LIB_GLEANER ARGUMENTS...`, with its own arguments, its name first. The module
-`_gleaner` is loaded from LIB_GLEANER, so that nothing has to be installed and any virtual environment will do. Nothing of the
-environment is run here: it is the lambda's, and comes when the process is shut, see `gleaner._host`.
+`gleaner-runtime` executes `python3 -I -S start.py LIB_GLEANER ARGUMENTS...`, with its own name and
+arguments as ARGUMENTS. The module `_gleaner` is loaded from LIB_GLEANER, so it need not be
+installed, and any virtual environment can be used. No code of the environment runs here: it is
+untrusted like the lambda, and runs after the process is sandboxed, see `gleaner._host`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ USAGE = 2
 
 
 def main() -> NoReturn:
-    # Ctrl-C ends the process. As an exception it would be a fault of the wake that it happens to meet.
+    # Ctrl-C ends the process. As an exception it would be a fault of the current wake.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
     extension = load(sys.argv[1])
@@ -29,22 +30,25 @@ def main() -> NoReturn:
 
     if gleaner.__version__ != extension.__version__:
         refuse(
-            f"the package gleaner is {gleaner.__version__}, and {sys.argv[1]} is {extension.__version__}",
+            f"the package gleaner has version {gleaner.__version__}, and {sys.argv[1]} has "
+            f"{extension.__version__}",
             "take both from one installation",
         )
-    # Standard output is for reports. What a lambda prints becomes its log, from its import on, and all else comes here.
+    # Standard output is for reports. Text that a lambda prints goes to its log from its import on;
+    # all other output goes to standard error.
     sys.stdout = sys.stderr
     code = INTERNAL
     try:
         code = extension.main(sys.argv[2:], _host)
     finally:
-        # All is written; a thread that the lambda left behind must not keep the process. An exception that comes here was a
-        # panic of ours, which has told its reason.
+        # All results are written; a thread that the lambda started must not keep the process. An
+        # exception here was a panic of the host, which has printed its message.
         os._exit(code)
 
 
 def load(path: str) -> ModuleType:
-    """The extension module in the file `path`, which need not have the name that Python expects."""
+    """Loads the extension module from the file `path`, whose name need not be the one that Python
+    expects."""
     loader = ExtensionFileLoader("_gleaner", path)
     spec = importlib.util.spec_from_file_location("_gleaner", path, loader=loader)
     try:

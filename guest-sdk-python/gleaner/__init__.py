@@ -1,4 +1,4 @@
-"""What a Gleaner lambda in Python sees of the vehicle.
+"""Gleaner's SDK for lambdas in Python.
 
 A lambda is a class, or plain functions, in the file that ``entry`` of its ``lambda.toml`` names::
 
@@ -14,12 +14,15 @@ A lambda is a class, or plain functions, in the file that ``entry`` of its ``lam
 
         # or, with [schedule] period = "100ms":  def on_tick(self, ctx: Context) -> None
 
-    # without a class:  def on_event(ctx, event)  or  def on_tick(ctx), and optionally  def init(ctx)
+    # without a class:  def on_event(ctx, event)  or  def on_tick(ctx),
+    # and optionally  def init(ctx)
 
-An exception that leaves a handler is a fault of that wake. The lambda is then made anew; the globals of its module stay.
+An exception that leaves a handler is a fault of that wake. Before the next wake the host creates a
+fresh instance of the class, or calls ``init`` again; the globals of the module stay.
 
-The classes here describe what the host hands out. Importing them needs no host, so a lambda can be checked at a desk, and
-run there by `gleaner.testing`. The names are those of the WIT package ``gleaner:lambda``, with ``_`` for ``-``.
+The classes here describe the objects that the host passes to a lambda. Importing them needs no
+host, so a lambda can be type-checked locally, and run locally with `gleaner.testing`. The names are
+those of the WIT package ``gleaner:lambda``, with ``_`` for ``-``.
 """
 
 from .context import Context

@@ -1,5 +1,6 @@
-"""The part of hosting that is written in Python: finding a lambda in its file, telling its exceptions, taking down what it
-prints, and keeping the garbage collector out of its wakes. `_gleaner` calls it, and so does `gleaner.testing`; no lambda imports it."""
+"""Hosts a lambda, as far as that is written in Python: loads it from its file, formats its
+exceptions, logs the text that it prints, and keeps the garbage collector out of its wakes.
+`_gleaner` and `gleaner.testing` call it; no lambda imports it."""
 
 from __future__ import annotations
 
@@ -32,28 +33,29 @@ __all__ = [
 
 Handler = Callable[..., object]
 
-# A message has room for about so many entries of a traceback. Without a bound an endless recursion, a thousand entries
-# deep, would take 16 ms to tell.
+# About as many entries of a traceback fit into a message. Without a limit, formatting the traceback
+# of an endless recursion, a thousand entries deep, would take 16 ms.
 TRACE_ENTRIES = 40
 
-# Code of this package, which is not what a lambda's author wants to see.
-OURS = os.path.dirname(__file__) + os.sep
+# Folder of this package, whose code is left out of tracebacks.
+SDK_FOLDER = os.path.dirname(__file__) + os.sep
 
-# What the environment has for its start was run.
+# True once the start-up code of the environment has run.
 _entered = False
 
 HANDLERS: Dict[str, str] = {"on_event": "on_event(ctx, event)", "on_tick": "on_tick(ctx)"}
 
 
 class LambdaError(Exception):
-    """A file in which there is no lambda for its schedule. The text is for its author, who needs no traceback."""
+    """The file has no lambda for its schedule. The text is for the lambda's author, who needs no
+    traceback."""
 
 
 def enter_environment() -> None:
-    """Runs what the environment of this interpreter has for its start, and imports numpy: in the middle of a wake that would cost its
-    deadline. By now the process is shut.
+    """Runs the start-up code of this interpreter's environment and imports numpy, which would
+    exceed the deadline in a wake. The process is sandboxed by now.
 
-    Raises LambdaError, and whatever the environment raises."""
+    Raises LambdaError, and any exception of the environment."""
     global _entered
     if sys.flags.no_site and not _entered:
         site.main()
@@ -68,12 +70,12 @@ def enter_environment() -> None:
 
 
 def numpy_version() -> str:
-    """That of the environment, by the names of what lies there: its code may not run yet."""
+    """Version of the environment's numpy, read from its file names: its code must not run yet."""
     if "numpy" in sys.modules:
         return str(sys.modules["numpy"].__version__)
-    # Without `site` this interpreter does not know that it is one of an environment.
+    # Without `site` this interpreter does not find its virtual environment.
     own = os.path.dirname(os.path.dirname(os.path.abspath(sys.executable)))
-    # Debian's says where the system's packages lie, and not those of an environment.
+    # Debian's `getsitepackages` returns the folders of the system, not those of an environment.
     python = "python{}.{}".format(*sys.version_info)
     folders = [
         os.path.join(own, "lib", python, "site-packages"),
@@ -88,14 +90,16 @@ def numpy_version() -> str:
 
 
 def load(entry: str, handler: str) -> Callable[[Context], Handler]:
-    """Imports the file ``entry``; returns what makes a fresh lambda and gives its ``handler``: ``on_event`` or ``on_tick``.
+    """Imports the file ``entry``. Returns a function that creates a lambda and returns its
+    ``handler``: ``on_event`` or ``on_tick``.
 
-    Raises LambdaError, and whatever the file raises."""
+    Raises LambdaError, and any exception of the file."""
     return maker(_import(entry), handler, os.path.basename(entry))
 
 
 def maker(found: Any, handler: str, where: str) -> Callable[[Context], Handler]:
-    """As `load`, of what is imported already: a module, or the class of a lambda. ``where`` is its name.
+    """Does the same as `load` for an imported module or the class of a lambda. ``where`` is its
+    name.
 
     Raises LambdaError."""
     lambda_class = getattr(found, "Lambda", None) if isinstance(found, ModuleType) else found
@@ -116,23 +120,23 @@ def maker(found: Any, handler: str, where: str) -> Callable[[Context], Handler]:
 
 
 def _nothing(ctx: Context) -> None:
-    """What a module without ``init`` does."""
+    """Replaces a missing ``init``."""
 
 
 def _import(entry: str) -> ModuleType:
     folder = os.path.dirname(entry)
-    # A replay that is repeated begins with fresh globals, those of the lambda's own modules included.
+    # A repeated replay begins with fresh globals, also in the lambda's own modules.
     for name in own_modules(folder):
         del sys.modules[name]
-    # As for any script, what lies beside the file can be imported, and is found before what lies elsewhere.
+    # As for any script, modules in the folder of the file are found first.
     if sys.path[:1] != [folder]:
         sys.path.insert(0, folder)
-    # A build folder is what was built, and nothing else.
+    # The build folder must not get any other files.
     sys.dont_write_bytecode = True
     spec = importlib.util.spec_from_file_location("main", entry)
     if spec is None or spec.loader is None:
         raise LambdaError(
-            f"`{os.path.basename(entry)}` is no Python file: its name must end with `.py`"
+            f"`{os.path.basename(entry)}` is not a Python file: its name must end with `.py`"
         )
     module = importlib.util.module_from_spec(spec)
     sys.modules["main"] = module
@@ -141,9 +145,10 @@ def _import(entry: str) -> ModuleType:
 
 
 def own_modules(folder: str) -> List[str]:
-    """Names of the imported modules that are the lambda's own: that lie below its folder, also by way of links.
+    """Names of the imported modules that belong to the lambda: those below its folder, also through
+    links.
 
-    An environment or an SDK that lies there, or what is hidden, is no part of the lambda."""
+    An environment or an SDK in the folder, and hidden folders, do not belong to the lambda."""
     names: Dict[str, List[str]] = {}
     for name, known in list(sys.modules.items()):
         names.setdefault(_place(known), []).append(name)
@@ -151,7 +156,7 @@ def own_modules(folder: str) -> List[str]:
 
 
 def _place(module: object) -> str:
-    """The folder in which a module lies; of a package without a file, its own."""
+    """Folder of a module; for a package without a file, its own folder."""
     about: Dict[str, Any] = getattr(module, "__dict__", {})
     file = about.get("__file__")
     try:
@@ -159,12 +164,12 @@ def _place(module: object) -> str:
             str(os.path.dirname(file) if file else next(iter(about.get("__path__", ()))))
         )
     except (KeyError, StopIteration, TypeError):
-        # Built in; or a package whose parent is gone.
+        # A built-in module, or a package whose parent is no longer imported.
         return ""
 
 
 def _is_own(folder: str, place: str) -> bool:
-    if not place or os.path.join(place, "").startswith((OURS, os.path.join(sys.prefix, ""))):
+    if not place or os.path.join(place, "").startswith((SDK_FOLDER, os.path.join(sys.prefix, ""))):
         return False
     for form in (os.path.abspath, os.path.realpath):
         root = os.path.join(form(folder), "")
@@ -180,19 +185,22 @@ def _missing(owner: Any, where: str, handler: str) -> str:
         where, wanted = f"`Lambda` of {where}", wanted.replace("(", "(self, ")
     schedule = "event" if handler == "on_event" else "period"
     found = " and ".join(f"`{name}`" for name in HANDLERS if callable(getattr(owner, name, None)))
-    return f"{where} has no `{wanted}`, which `{schedule}` in [schedule] asks for; found {found or 'no handler'}"
+    return (
+        f"{where} has no `{wanted}`, which `{schedule}` in [schedule] requires; "
+        f"found {found or 'no handler'}"
+    )
 
 
 def attempt(
     seconds: float, call: Callable[..., object], *arguments: object
 ) -> Tuple[object, Optional[str], str]:
-    """What ``call`` returns, or the text of what it raises and of which kind that is: even of what asks to leave the process, and
-    of a panic in the host's own code, which comes as an exception, too. After so many seconds it raises DeadlineExceeded; 0 is
-    for ever."""
+    """Returns the result of ``call``, or the text and kind of its exception. Catches every
+    exception, including those that end the process and those of panics in the host. Raises
+    DeadlineExceeded in ``call`` after ``seconds``; 0 is no deadline."""
     try:
         return _attempt(seconds, call, *arguments)
     except DeadlineExceeded as late:
-        # It came once more, on the way out.
+        # It was raised again while the first one was handled.
         _deadline.disarm()
         return None, explain(late), "deadline"
     finally:
@@ -220,27 +228,29 @@ def _kind(error: BaseException) -> str:
 
 
 def explain(error: BaseException) -> str:
-    """The traceback of an exception: the last entries, and none of ours."""
+    """The traceback of an exception: its last entries, without those of this package."""
     if isinstance(error, LambdaError):
         return str(error)
     trace = error.__traceback__
-    while trace is not None and _is_ours(trace):
+    while trace is not None and _is_sdk(trace):
         trace = trace.tb_next
     lines = traceback.format_exception(type(error), error, trace, limit=-TRACE_ENTRIES)
     return "".join(lines).rstrip()
 
 
-def _is_ours(trace: TracebackType) -> bool:
+def _is_sdk(trace: TracebackType) -> bool:
     file = trace.tb_frame.f_code.co_filename
-    return file.startswith((OURS, "<frozen importlib"))
+    return file.startswith((SDK_FOLDER, "<frozen importlib"))
 
 
 def settle() -> None:
-    """Puts all that lives now out of the collector's sight and switches it off; from then on `tidy` calls it.
+    """Excludes all current objects from garbage collection and disables the collector; from then on
+    `tidy` runs it.
 
-    Most of what a process holds are the modules it imported. Looking through them takes tens of milliseconds, and the
-    collector would do that in the middle of a wake. The price: cycles of what lives now are not collected before the next
-    call, so if the first lambda of a process is one and faults, it stays, and its successors do not."""
+    Most objects of a process belong to imported modules. Traversing them takes tens of
+    milliseconds, and the collector would do so in the middle of a wake. The cost: cycles among the
+    current objects are not collected before the next call. If the first lambda of a process is in a
+    cycle and faults, it stays in memory; later ones do not."""
     gc.unfreeze()
     gc.collect()
     gc.freeze()
@@ -248,7 +258,8 @@ def settle() -> None:
 
 
 def tidy(wakes: int) -> None:
-    """Collects between two wakes, the young objects often and all of them seldom: a cycle that holds a frame holds a slot."""
+    """Runs the collector between two wakes, often for young objects and rarely for all: a cycle
+    that holds a frame holds a slot."""
     if wakes % 1000 == 0:
         gc.collect()
     elif wakes % 100 == 0:

@@ -1,5 +1,6 @@
-"""What a lambda prints becomes lines of its log, as in WebAssembly: ``info`` from standard output, ``warn`` from standard
-error. Only ``sys.stdout`` and ``sys.stderr`` lead here: other processes, and code that is not Python, go past it."""
+"""Logs the text that a lambda prints, as in WebAssembly: ``info`` from standard output, ``warn``
+from standard error. Only ``sys.stdout`` and ``sys.stderr`` are redirected: output of other
+processes and of code that is not Python is not logged."""
 
 from __future__ import annotations
 
@@ -13,28 +14,29 @@ from .log import Level
 
 Log = Callable[[Level, str], None]
 
-# A line of the log holds as many. What is longer becomes several lines.
+# Maximum length of a log line. A longer text becomes several lines.
 LINE_BYTES = 4096
 
 STDERR = 2
 
 
-class Lines(io.RawIOBase):
-    """Gives what is written to a log, line by line; while there is none, to standard error, as it comes."""
+class LogWriter(io.RawIOBase):
+    """Writes text to a log, line by line; without a log, to standard error, unchanged."""
 
     def __init__(self, name: str, level: Level) -> None:
         self.name = name
         self._level = level
         self._log: Optional[Log] = None
-        self._begun = b""
-        # Entered twice by one thread if an object that goes away in the midst of it prints its farewell.
+        self._pending = b""
+        # Reentrant: an object that is deleted during a write may print in its `__del__`.
         self._lock = threading.RLock()
 
     def writable(self) -> bool:
         return True
 
     def fileno(self) -> int:
-        """For those who write past Python, such as faulthandler, or processes that inherit the stream."""
+        """File descriptor for writers outside of Python, such as faulthandler and child
+        processes."""
         return STDERR
 
     def write(self, data: Any) -> int:
@@ -42,30 +44,31 @@ class Lines(io.RawIOBase):
         with self._lock:
             if self._log is None:
                 return os.write(STDERR, data)
-            *lines, rest = (self._begun + data).split(b"\n")
+            *lines, rest = (self._pending + data).split(b"\n")
             whole = len(rest) - len(rest) % LINE_BYTES
-            self._begun = rest[whole:]
+            self._pending = rest[whole:]
             for line in [*lines, rest[:whole]]:
-                self._tell(line)
+                self._write_line(line)
         return len(data)
 
     def end_line(self) -> None:
-        """Writes down what did not end with a newline."""
-        if self._begun:
+        """Writes a pending line that has no newline."""
+        if self._pending:
             with self._lock:
-                line, self._begun = self._begun, b""
-                self._tell(line)
+                line, self._pending = self._pending, b""
+                self._write_line(line)
 
-    def lead_to(self, log: Optional[Log]) -> None:
+    def set_log(self, log: Optional[Log]) -> None:
         with self._lock:
             self.end_line()
             self._log = log
 
     def forked(self) -> None:
-        """In the child of a fork: nobody there reads the log, and the lock may be that of a thread which is not there."""
-        self._lock, self._log, self._begun = threading.RLock(), None, b""
+        """Resets the state in the child of a fork: the log has no reader there, and a thread that
+        does not exist there may hold the lock."""
+        self._lock, self._log, self._pending = threading.RLock(), None, b""
 
-    def _tell(self, line: bytes) -> None:
+    def _write_line(self, line: bytes) -> None:
         assert self._log is not None, "a line is begun only where there is a log"
         for at in range(0, len(line), LINE_BYTES):
             text = line[at : at + LINE_BYTES].decode(errors="replace").rstrip()
@@ -74,52 +77,53 @@ class Lines(io.RawIOBase):
 
 
 class Stream:
-    """What ``sys.stdout`` or ``sys.stderr`` is for a lambda, and the lines below it."""
+    """The ``sys.stdout`` or ``sys.stderr`` of a lambda, and the log writer below it."""
 
     def __init__(self, name: str, level: Level) -> None:
         self.name, self.level = name, level
-        self.make()
+        self.open()
 
-    def make(self) -> None:
-        self.lines = Lines(self.name, self.level)
+    def open(self) -> None:
+        self.writer = LogWriter(self.name, self.level)
         self.text = io.TextIOWrapper(
-            self.lines, encoding="utf-8", errors="backslashreplace", line_buffering=True
+            self.writer, encoding="utf-8", errors="backslashreplace", line_buffering=True
         )
 
-    def is_whole(self) -> bool:
-        """Whether no lambda closed it, or put a stream of its own on what is below."""
+    def is_open(self) -> bool:
+        """Returns whether the stream is open: no lambda has closed or detached it."""
         try:
             return not self.text.closed
         except ValueError:
             return False
 
 
-# They outlive a lambda: `logging`, for one, keeps the stream that it was set up with.
+# They are kept across instances of a lambda: `logging`, for example, keeps the stream with which it
+# was configured.
 _streams = (Stream("<stdout>", "info"), Stream("<stderr>", "warn"))
 
 
 def print_to(log: Optional[Log]) -> None:
-    """From now on ``sys.stdout`` and ``sys.stderr`` lead to ``log``; with None to standard error."""
+    """Redirects ``sys.stdout`` and ``sys.stderr`` to ``log``; with None, to standard error."""
     end_call()
     for stream in _streams:
-        if not stream.is_whole():
-            stream.lines.lead_to(None)
-            stream.make()
-        stream.lines.lead_to(log)
+        if not stream.is_open():
+            stream.writer.set_log(None)
+            stream.open()
+        stream.writer.set_log(log)
     sys.stdout, sys.stderr = (stream.text for stream in _streams)
 
 
 def end_call() -> None:
-    """Writes down what has been printed, the beginnings of lines included."""
+    """Writes all printed text to the log, including lines without a newline."""
     for stream in _streams:
-        if stream.is_whole():
+        if stream.is_open():
             stream.text.flush()
-        stream.lines.end_line()
+        stream.writer.end_line()
 
 
 def _forked() -> None:
     for stream in _streams:
-        stream.lines.forked()
+        stream.writer.forked()
 
 
 os.register_at_fork(after_in_child=_forked)

@@ -1,4 +1,4 @@
-"""What a lambda is given at each call."""
+"""The context that a lambda gets at each call."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from .trigger import Trigger
 
 
 class Context(Data, Trigger, Log, Protocol):
-    """The functions of the interfaces ``data``, ``trigger`` and ``log``, and the lambda's configuration.
+    """The functions of the interfaces ``data``, ``trigger`` and ``log``, and the configuration.
 
-    One thread runs a lambda; its own threads may use the context, too, but a trigger belongs to the wake in which it
-    is made.
+    A lambda runs in one thread. Threads that it starts may use the context, too, but a trigger
+    belongs to the wake in which it is called.
     """
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """``[config]`` by key: bool, int, float or str, as the manifest's default has it. The deployment's values lie over
-        the manifest's."""
+        """Values of ``[config]`` by key: the one that the deployment sets, or else the default in
+        the manifest. Each has the type of the default: bool, int, float or str."""
 
     @property
     def scratch(self) -> Scratch:
-        """What the host keeps for the lambda, by name, beyond its faults."""
+        """Named byte strings that the host keeps for the lambda, also across its faults."""
 
     @property
     def missed(self) -> int:
-        """Ticks that were due since the previous wake and did not happen; 0 where samples wake the lambda."""
+        """Number of ticks that were due since the previous wake and did not happen; 0 if samples
+        wake the lambda."""

@@ -1,10 +1,14 @@
-"""Samples, fields and frames: interface ``data`` of the WIT package, and the plain values of ``types``.
+"""Samples, fields and frames: interface ``data`` of the WIT package, and the data types of
+``types``.
 
-The host hands out objects that behave as the protocols here say; plain values are made from the named tuples. What is a
-property never changes and costs nothing; what is a method asks the host.
+The objects of the host implement the protocols here; plain values are named tuples. A property is
+constant and costs nothing; a method calls the host.
 
-A sample that a lambda holds cannot be overwritten, and a lambda that holds too many makes the ring refuse new ones
-(``Counts.no_slot``): let go of what is not needed.
+A handle keeps its sample in the ring until the handle is dropped: a held sample cannot be
+overwritten. If a lambda holds too many, the ring refuses new samples (``Counts.no_slot``).
+
+The maximum numbers of bytes and items below are the defaults of ``call_bytes`` and ``call_items``
+in ``[limits]``. A vehicle may set lower ones.
 """
 
 from __future__ import annotations
@@ -18,8 +22,9 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
 Value = Union[bool, int, float, str, bytes, "npt.NDArray[np.float64]", List[str]]
-"""One field of a message. Arrays of numbers are float64, ``uint8[]`` and ``byte[]`` are bytes; one call hands out at most
-65,536 numbers, 4,096 strings or 1 MiB."""
+"""Value of one field of a message. Arrays of numbers are float64, at most 65,536; arrays of strings
+are lists, at most 4,096; ``uint8[]`` and ``byte[]`` are bytes, like a string at most 1 MiB. A
+longer value is refused, never truncated."""
 
 Encoding = Literal[
     "rgb8",
@@ -39,8 +44,9 @@ Encoding = Literal[
     "bayer_gbrg16",
     "bayer_grbg16",
 ]
-"""Pixel layout, named as in ROS ``sensor_msgs/image_encodings``. ``yuv422`` is U Y V Y, ``yuv422_yuy2`` is Y U Y V. The
-Bayer patterns are raw: the host neither reads nor converts their colours."""
+"""Pixel layout of a frame, named as in ROS ``sensor_msgs/image_encodings``. ``yuv422`` is U Y V Y,
+``yuv422_yuy2`` is Y U Y V, two bytes per pixel. Bayer patterns are raw: the host does not convert
+their colours."""
 
 DataErrorKind = Literal[
     "no-such-input",
@@ -54,20 +60,23 @@ DataErrorKind = Literal[
 
 
 class DataError(Error):
-    """A read of data that failed.
+    """An error in reading data. The message names the object, the cause and the way out.
 
-    ``no-such-input``: no ``[[input]]`` of that name. ``no-such-field``: the type has no such field, or it is not a value.
-    ``wrong-field``: it is no number, or of another topic. ``malformed``: the sample's bytes contradict its type.
-    ``not-a-frame``: no image, or one that the host cannot read. ``no-room``: the image is larger than the input's
-    ``decoded_size``, or every slot is held. ``out-of-range``: a region or size that does not fit.
+    ``no-such-input``: the manifest has no ``[[input]]`` of that name. ``no-such-field``: the
+    message type has no such field, or the path names a whole message. ``wrong-field``: the field is
+    not a number, is too long, or belongs to another topic. ``malformed``: the bytes of the sample
+    contradict its type. ``not-a-frame``: the sample is not an image, or an image that the host
+    cannot read. ``no-room``: the image exceeds ``decoded_size`` of the input, all slots for decoded
+    images are held, or the frames of the lambda reach ``memory`` or ``frames`` in ``[limits]``.
+    ``out-of-range``: a region or size is out of range.
     """
 
     kind: DataErrorKind
 
 
 class Guid(NamedTuple):
-    """Who sent a sample: the 16 bytes of a DDS writer GUID, as two big-endian halves. In replay it is made from the file
-    and the channel, and stays the same in every replay."""
+    """Sender of a sample: the 16 bytes of the DDS writer's GUID, as two big-endian halves. In
+    replay it is derived from the file and the channel, and is the same in every replay."""
 
     high: int
     low: int
@@ -78,69 +87,75 @@ class Guid(NamedTuple):
 
 
 class Identity(NamedTuple):
-    """What makes a sample different from every other one."""
+    """Unique identity of a sample."""
 
     topic: str
-    """ROS topic as the manifest gives it (before ``--remap``), such as ``/imu/data``."""
+    """Name of the ROS topic in the manifest (before ``--remap``), such as ``/imu/data``."""
     writer: Guid
     seq: int
-    """Rises strictly for each writer; gaps are samples that were lost on the way."""
+    """Sequence number, strictly increasing for each writer; a gap means lost samples."""
 
 
 class Stamps(NamedTuple):
-    """When a sample came to be, in nanoseconds. The three clocks may differ: compare like with like."""
+    """Timestamps of a sample in nanoseconds, on three clocks. The clocks may differ, so compare
+    only stamps of the same clock."""
 
     at_ns: int
-    """When the vehicle received it: the clock that orders samples, wakes and clips. In replay: the log time."""
+    """Time of reception on the vehicle; in replay, the log time. Samples, wakes and clips are
+    ordered by this clock."""
     publish_ns: int
-    """When the writer published it, by the writer's clock."""
+    """Time of publication, on the writer's clock."""
     header_ns: Optional[int]
-    """``header.stamp``, where the type starts with a ``std_msgs/msg/Header``."""
+    """``header.stamp`` of the message; None unless its type begins with a ``std_msgs/msg/Header``
+    or a time ``stamp``."""
 
 
 class Counts(NamedTuple):
-    """What became of the samples of one topic since the lambda started."""
+    """Numbers of received and lost samples of one topic since the lambda's process started."""
 
     received: int
-    """Entered the ring."""
+    """Samples that entered the ring."""
     lost: Optional[int]
-    """Known to be lost before they reached this process; None where the transport cannot know."""
+    """Samples that were lost before they reached this process; None if the transport cannot count
+    them."""
     overwritten: int
-    """Left the ring to make room for newer ones."""
+    """Samples that newer ones replaced in the ring."""
     no_slot: int
-    """Refused because every cell was held."""
+    """Samples that the ring refused because the lambda held every cell."""
     too_big: int
-    """Refused because they exceed the input's ``max_size``."""
+    """Samples that the ring refused because they exceed ``max_size`` of the input."""
     skipped: int
-    """Should have woken the lambda and did not, because it was busy or the ring moved on."""
+    """Samples that should have woken the lambda and did not: it was busy, or newer samples had
+    replaced them."""
 
 
 class Column(NamedTuple):
-    """Newest values of one field, oldest first; both arrays have the shape (n,)."""
+    """Values of one field in the newest samples, oldest first. Both arrays have the shape (n,)."""
 
     at_ns: npt.NDArray[np.int64]
     """``Stamps.at_ns`` of each sample."""
     values: npt.NDArray[np.float64]
+    """Value of the field in each sample; true is 1."""
 
 
 class FrameInfo(NamedTuple):
-    """Shape of a frame."""
+    """Size and pixel layout of a frame."""
 
     width: int
-    """Pixels, 1 to 65,535."""
+    """Width in pixels, 1 to 65,535."""
     height: int
-    """Pixels, 1 to 65,535."""
+    """Height in pixels, 1 to 65,535."""
     encoding: Encoding
     step: int
-    """Bytes from one row to the next; at least ``width`` times the bytes of a pixel."""
+    """Bytes from the start of one row to the next; at least ``width`` times the bytes per pixel."""
     big_endian: bool
-    """Byte order of the 16-bit encodings."""
+    """Byte order of 16-bit encodings: true if the high byte comes first."""
     size: int
-    """Bytes of pixel data: ``step * (height - 1)`` plus the last row."""
+    """Bytes of pixel data: ``step * (height - 1)`` plus the bytes of the last row."""
 
 
 class Roi(NamedTuple):
-    """Region of interest in pixels, not empty. What lies outside the frame is left out; all of it must not."""
+    """Region of interest in pixels. It is clipped to the frame, and refused if no pixel is left."""
 
     x: int
     y: int
@@ -152,59 +167,67 @@ class Data(Protocol):
     """Part of :class:`gleaner.Context`."""
 
     def input(self, name: str) -> Topic:
-        """The ``[[input]]`` of that name.
+        """Returns the input ``name`` of the manifest.
 
-        Raises DataError (``no-such-input``), which lists those of the manifest."""
+        Raises DataError: ``no-such-input``, which lists the inputs."""
 
     def inputs(self) -> list[str]:
-        """Names of all inputs, in the manifest's order."""
+        """Names of all inputs, in the order of the manifest."""
 
     def now_ns(self) -> int:
-        """Time of this wake in nanoseconds: ``at_ns`` of the sample or the tick. Virtual in replay."""
+        """Time of the current wake in nanoseconds: ``at_ns`` of its sample or tick. The recorded
+        time in replay; 0 in the first ``init``."""
 
 
 class Topic(Protocol):
-    """The ring of one ``[[input]]``: its newest samples, ``depth`` at most.
+    """The ring of one ``[[input]]``: its newest samples, at most ``depth``.
 
-    Where a field is asked for, its path does as well: it is compiled at its first use and remembered.
+    Methods with a parameter ``field`` accept a path, too: it is compiled at its first use and then
+    cached.
     """
 
     @property
     def name(self) -> str:
-        """The input's ``name``."""
+        """``name`` of the input."""
 
     @property
     def ros_topic(self) -> str:
-        """The ROS topic, such as ``/imu/data``."""
+        """Name of the ROS topic, such as ``/imu/data``."""
 
     @property
     def type_name(self) -> str:
-        """The ROS type, such as ``sensor_msgs/msg/Imu``."""
+        """ROS message type, such as ``sensor_msgs/msg/Imu``."""
 
     def newest(self) -> Sample | None:
-        """Newest sample; None before the first."""
+        """Newest sample; None before the first one."""
 
     def last(self, n: int) -> list[Sample]:
-        """The ``n`` newest samples, oldest first; fewer if the ring holds fewer. ``n`` is clamped to 256."""
+        """The ``n`` newest samples, oldest first; fewer if the ring holds fewer. ``n`` is clamped
+        to 256."""
 
     def since(self, since_ns: int) -> list[Sample]:
-        """Samples with ``at_ns`` later than ``since_ns``, oldest first; the newest 256 at most."""
+        """Samples with ``at_ns`` later than ``since_ns``, oldest first; at most the newest 256."""
 
     def counts(self) -> Counts:
-        """What became of the samples."""
+        """Numbers of received and lost samples of this topic since the lambda's process started."""
 
     def field(self, path: str) -> Field:
-        """Compiles the path of a field, such as ``linear_acceleration.x``, ``cov[3]``, ``fields[2].name``.
+        """Compiles the path of a field, such as ``linear_acceleration.x``, ``cov[3]`` or
+        ``fields[2].name``. Do this once, in ``__init__``: compiling takes microseconds.
 
-        Raises DataError (``no-such-field``), which names the nearest field that exists: do this in ``__init__``."""
+        Raises DataError: ``no-such-field``, which lists the existing fields and the most similar
+        one; ``wrong-field`` for a path of more than 1,024 bytes."""
 
     def column(self, field: Field | str, n: int) -> Column:
-        """``field`` of the ``n`` newest samples. ``n`` is clamped to 65,536.
+        """Values of ``field`` in the ``n`` newest samples, oldest first. ``n`` is clamped to
+        65,536.
 
-        Raises DataError: ``wrong-field`` if it is no number or of another topic; ``malformed``."""
+        Raises DataError: ``wrong-field`` if the field is not a number or belongs to another topic;
+        ``malformed``."""
 
     def column_since(self, field: Field | str, since_ns: int) -> Column:
-        """``field`` of all samples in the ring with ``at_ns`` later than ``since_ns``.
+        """Values of ``field`` in all samples of the ring with ``at_ns`` later than ``since_ns``,
+        oldest first; at most the newest 65,536.
 
         Raises as :meth:`column`."""
 
@@ -214,7 +237,7 @@ class Field(Protocol):
 
     @property
     def path(self) -> str:
-        """The path as it was written."""
+        """The path, as the lambda wrote it."""
 
 
 class Sample(Protocol):
@@ -222,21 +245,24 @@ class Sample(Protocol):
 
     @property
     def identity(self) -> Identity:
-        """What makes it different from every other one."""
+        """Unique identity of the sample: topic, writer and sequence number."""
 
     @property
     def stamps(self) -> Stamps:
-        """When it came to be."""
+        """Timestamps of the sample, on three clocks."""
 
     def get(self, field: Field | str) -> Value:
-        """Any field.
+        """Value of a field, of any type.
 
-        Raises DataError: ``wrong-field`` if it is of another topic or longer than one call hands out; ``malformed``."""
+        Raises DataError: ``wrong-field`` if the field belongs to another topic or exceeds the
+        length that one call can return (see ``Value``; read such a field in pieces with ``cdr``);
+        ``malformed``."""
 
     def number(self, field: Field | str) -> float:
-        """A numeric or boolean field.
+        """Value of a numeric or boolean field, as a 64-bit float; true is 1.
 
-        Raises DataError: ``wrong-field`` if it is no number or of another topic; ``malformed``."""
+        Raises DataError: ``wrong-field`` if the field is not a number or belongs to another topic;
+        ``malformed``."""
 
     @property
     def size(self) -> int:
@@ -244,73 +270,88 @@ class Sample(Protocol):
 
     @property
     def big_endian(self) -> bool:
-        """Whether the message is big-endian CDR."""
+        """True if the message is big-endian CDR."""
 
     def cdr(self, offset: int = 0, len: int | None = None) -> bytes:
-        """Raw CDR bytes from ``offset``, ``len`` at most; clamped to the message and to 1 MiB."""
+        """Raw CDR bytes without the encapsulation header: at most ``len``, from ``offset``. Clamped
+        to the message and to 1 MiB."""
 
     def as_frame(self) -> Frame:
-        """The message as an image: ``sensor_msgs/msg/Image``, or ``sensor_msgs/msg/CompressedImage`` in JPEG or PNG, which
-        is decoded to rgb8 now, once for each sample.
+        """The message as an image. Accepts ``sensor_msgs/msg/Image``, and
+        ``sensor_msgs/msg/CompressedImage`` in JPEG or PNG, which this call decodes to rgb8, once
+        for each sample.
 
-        Raises DataError: ``not-a-frame``; ``no-room``."""
+        Raises DataError: ``not-a-frame``; ``no-room`` if the decoded image exceeds
+        ``decoded_size``, all slots for decoded images are held, or the lambda holds as many frames
+        as ``frames`` in ``[limits]`` allows; ``malformed``."""
 
 
 class Frame(Protocol):
-    """A sample seen as an image. Also an argument of ``numpy.asarray`` and ``torch.from_dlpack``, without a copy.
+    """A sample as an image. ``numpy.asarray`` and ``torch.from_dlpack`` accept it without a copy.
 
-    DLPack says that an array is read-only since its version 1.0, which numpy has since 2.1; older ones refuse.
+    The pixels are read-only, which DLPack can express since version 1.0 and numpy supports since
+    2.1; older versions refuse.
     """
 
     @property
     def info(self) -> FrameInfo:
-        """Its shape."""
+        """Size and pixel layout of the frame."""
 
     @property
     def identity(self) -> Identity:
-        """Identity of the sample behind it."""
+        """Identity of the sample that the frame comes from, also after ``resize`` and
+        ``to_gray``."""
 
     @property
     def stamps(self) -> Stamps:
-        """Stamps of the sample behind it."""
+        """Timestamps of the sample that the frame comes from."""
 
     def mean_luma(self, roi: Roi | tuple[int, int, int, int] | None = None) -> float:
-        """Mean luma (ITU-R BT.601), 0 to 255, of the frame or of ``roi``. Computed in integers, so equal on every CPU.
+        """Mean luma (ITU-R BT.601), 0 to 255, of the whole frame or of ``roi``. Computed with
+        integers, so the result is the same on every CPU.
 
-        Raises DataError: ``out-of-range``; ``not-a-frame`` for Bayer encodings."""
+        Raises DataError: ``out-of-range`` if ``roi`` has no pixel in the frame; ``not-a-frame`` for
+        Bayer encodings."""
 
     def histogram(
         self, roi: Roi | tuple[int, int, int, int] | None = None
     ) -> npt.NDArray[np.uint32]:
-        """256 counts of the pixels' luma.
+        """Number of pixels at each of the 256 luma levels, luma rounded down; the luma of a 16-bit
+        pixel is its high byte.
 
         Raises as :meth:`mean_luma`."""
 
     def resize(self, width: int, height: int) -> Frame:
-        """A new frame of that many pixels, rgb8, or mono8 for grey encodings. Each side 1 to 16,384.
+        """A new frame of ``width`` by ``height`` pixels, each 1 to 16,384: rgb8, or mono8 if the
+        encoding is grey. A new pixel is the mean of the area that it covers where the frame
+        shrinks, and a linear interpolation where it grows.
 
-        Raises DataError: ``out-of-range``; ``no-room``; ``not-a-frame`` for Bayer encodings."""
+        Raises DataError: ``out-of-range``; ``no-room`` if the frames that the lambda created would
+        together exceed ``memory`` in ``[limits]``, or the lambda holds as many frames as ``frames``
+        allows; ``not-a-frame`` for Bayer encodings."""
 
     def to_gray(self) -> Frame:
         """A new mono8 frame of the same size.
 
-        Raises DataError: ``no-room``; ``not-a-frame`` for Bayer encodings."""
+        Raises DataError: ``no-room``, as :meth:`resize`; ``not-a-frame`` for Bayer encodings."""
 
     def read(self, offset: int = 0, len: int | None = None) -> bytes:
-        """A copy of the pixel bytes from ``offset``, ``len`` at most; clamped to the frame and to 1 MiB."""
+        """A copy of pixel bytes: at most ``len``, from ``offset``. Clamped to the frame and to 1
+        MiB. :meth:`array` needs no copy."""
 
     def array(self) -> npt.NDArray[Any]:
-        """The pixels themselves, read-only: no copy is made, whatever their size.
+        """The pixels as a read-only array, without a copy, whatever their size.
 
-        Shape (height, width, 3) or (height, width, 4) for colour, (height, width) for grey and Bayer, (height, width, 2)
-        for yuv422, which has U or V before Y, or after it for yuy2. uint8, or uint16 in the frame's own byte order. The
-        slot is held until the last view of the array is gone: copy what is kept for longer."""
+        Shape (height, width, 3) or (height, width, 4) for colour; (height, width) for grey and
+        Bayer; (height, width, 2) for yuv422, with U or V before Y, and for yuy2, with U or V after
+        Y. uint8, or uint16 in the byte order of the frame. The slot is held until the last view of
+        the array is dropped, so copy pixels that are kept longer."""
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
-        """What ``numpy.asarray`` calls."""
+        """The array of :meth:`array`, for ``numpy.asarray``."""
 
     def __dlpack__(self, **options: Any) -> Any:
-        """What ``from_dlpack`` of numpy and torch calls."""
+        """The array of :meth:`array`, for ``from_dlpack`` of numpy and torch."""
 
     def __dlpack_device__(self) -> tuple[int, int]:
-        """The CPU: (1, 0)."""
+        """Device of the pixels: the CPU, (1, 0)."""

@@ -1,17 +1,19 @@
-"""What the host answers to a call that it refuses."""
+"""Exceptions of the calls that the host refuses, and of a wake that exceeds its deadline."""
 
 from __future__ import annotations
 
 
 class DeadlineExceeded(BaseException):
-    """The wake, or ``init``, has taken longer than ``[limits]`` allows, and is ended. No ``except Exception`` catches it; what
-    does should clean up and let it go on: the wake is a fault anyway, and a process that stays in it is killed."""
+    """The wake, or ``init``, has taken longer than ``[limits]`` allows, and is ended.
+
+    ``except Exception`` does not catch it. Code that catches it should clean up and raise it again:
+    the wake is a fault in any case, and a process that stays in the wake is killed."""
 
 
 class Error(ValueError):
-    """A refused call. The text names the thing, the cause and the way out.
+    """A refused call. The text names the object, the cause and the way out.
 
-    ``kind`` is the case of the WIT variant, such as ``"no-such-field"``: for programs, where the text is for people.
+    ``kind`` is the case of the WIT variant, such as ``"no-such-field"``, for programs to check.
     """
 
     kind: str

@@ -1,6 +1,6 @@
 """Models that run on the host: interface ``inference`` of the WIT package.
 
-This host has no model runtime yet: every call raises InferenceError (``no-runtime``).
+Current hosts have no model runtime: every call raises InferenceError (``no-runtime``).
 """
 
 from __future__ import annotations
@@ -20,84 +20,94 @@ InferenceErrorKind = Literal["no-runtime", "no-such-model", "wrong-input", "fail
 
 
 class InferenceError(Error):
-    """A model that cannot be opened or run.
+    """An error in opening or running a model.
 
-    ``no-runtime``: this host was built without a model runtime. ``no-such-model``: no ``[[model]]`` of that name.
-    ``wrong-input``: shape, type or number of tensors does not fit the model. ``failed``: the model ran and failed.
+    ``no-runtime``: this host was built without a model runtime. ``no-such-model``: the manifest has
+    no ``[[model]]`` of that name. ``wrong-input``: shapes, types or number of the tensors do not
+    fit the model. ``failed``: the model failed to load or to run.
     """
 
     kind: InferenceErrorKind
 
 
 class Preprocess(NamedTuple):
-    """How a frame becomes the input of a model."""
+    """Conversion of a frame to the input tensor of a model."""
 
     width: int
-    """Of the tensor, in pixels, 1 to 8,192."""
+    """Width of the tensor in pixels, 1 to 8,192."""
     height: int
-    """Of the tensor, in pixels, 1 to 8,192."""
+    """Height of the tensor in pixels, 1 to 8,192."""
     letterbox: bool = True
-    """Keep the aspect ratio and fill the rest with ``fill``; otherwise stretch."""
+    """True to keep the aspect ratio and fill the rest with ``fill``; false to stretch."""
     fill: int = 114
-    """Grey level 0 to 255 of the filled border."""
+    """Grey level of the filled border, 0 to 255."""
     bgr: bool = False
-    """Channel order of the tensor: blue first if true, else red first."""
+    """Channel order of the tensor: true for blue first, false for red first."""
     mean: Tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Each channel becomes ``(value - mean) * scale``, with ``value`` from 0 to 255."""
     scale: Tuple[float, float, float] = (1 / 255, 1 / 255, 1 / 255)
 
 
 class Detection(NamedTuple):
-    """What ``detect`` found, in pixels of the frame."""
+    """An object that ``detect`` found, in pixels of the frame."""
 
     class_: int
-    """The WIT's ``class``, which is a keyword of Python."""
+    """Class index of the model: ``class`` of the WIT, which is a keyword of Python."""
     score: float
-    """0 to 1."""
+    """Confidence, 0 to 1."""
     x: float
+    """Left edge."""
     y: float
+    """Upper edge."""
     width: float
+    """Width, above 0."""
     height: float
+    """Height, above 0."""
 
 
 class DetectOptions(NamedTuple):
-    """What ``detect`` looks for."""
+    """Options of ``detect``."""
 
     classes: Sequence[int] = ()
-    """Classes wanted; empty for all."""
+    """Classes to return; empty for all."""
     min_score: float = 0.25
-    """Detections below are dropped, 0 to 1."""
+    """Detections with a lower score are dropped, 0 to 1."""
     max_iou: float = 0.45
-    """Overlap (intersection over union) above which the weaker of two detections is dropped, 0 to 1."""
+    """Overlap (intersection over union), 0 to 1, above which the detection with the lower score is
+    dropped."""
     max_count: int = 100
-    """At most so many, strongest first; clamped to 1,024."""
+    """Maximum number of detections, highest score first; clamped to 1,024."""
 
 
 class Tensor(Protocol):
-    """Numbers in row-major order, on the host."""
+    """An array of numbers in row-major order, kept in the host."""
 
     @staticmethod
     def from_values(
         shape: Sequence[int], values: Sequence[float] | npt.NDArray[np.float32]
     ) -> Tensor:
-        """Makes a tensor of 32-bit floats.
+        """Creates a tensor of 32-bit floats.
 
-        Raises InferenceError: ``wrong-input`` unless the product of ``shape`` is the number of ``values``."""
+        Raises InferenceError: ``wrong-input`` unless the product of ``shape`` is the length of
+        ``values``; ``no-runtime``."""
         tensor: Tensor = _hosted().Tensor.from_values(shape, values)
         return tensor
 
     @staticmethod
     def from_frame(frame: Frame, how: Preprocess) -> Tensor:
-        """Makes a tensor of shape (1, 3, height, width) from a frame."""
+        """Creates a tensor of shape (1, 3, height, width) from a frame.
+
+        Raises InferenceError: ``wrong-input`` for Bayer encodings and sizes out of range;
+        ``no-runtime``."""
         tensor: Tensor = _hosted().Tensor.from_frame(frame, how)
         return tensor
 
     @property
     def shape(self) -> list[int]:
-        """Its dimensions."""
+        """Length of each dimension."""
 
     def read(self, offset: int = 0, len: int | None = None) -> npt.NDArray[np.float32]:
-        """Values from ``offset``, ``len`` at most; clamped to the tensor and to 262,144 values."""
+        """Values: at most ``len``, from ``offset``. Clamped to the tensor and to 262,144 values."""
 
 
 class Model(Protocol):
@@ -105,27 +115,27 @@ class Model(Protocol):
 
     @staticmethod
     def open(name: str) -> Model:
-        """Opens the model of that name. Do this in ``__init__``.
+        """Opens the model ``name`` of the manifest. Do this in ``__init__``.
 
-        Raises InferenceError: ``no-such-model``."""
+        Raises InferenceError: ``no-such-model``; ``failed`` if the model cannot be loaded;
+        ``no-runtime``."""
         model: Model = _hosted().Model.open(name)
         return model
 
     def run(self, inputs: Sequence[Tensor]) -> list[Tensor]:
         """Runs the model once.
 
-        Raises InferenceError: ``wrong-input``; ``failed``."""
+        Raises InferenceError: ``wrong-input`` if the number, shapes or types of ``inputs`` do not
+        fit; ``failed``."""
 
     def detect(self, frame: Frame, options: DetectOptions = DetectOptions()) -> list[Detection]:
-        """Objects in a frame, strongest first.
+        """Finds objects in a frame; returns them by score, highest first.
 
-        Raises InferenceError: ``wrong-input`` if the model is no detector; ``failed``."""
+        Raises InferenceError: ``wrong-input`` if the model is not a detector; ``failed``."""
 
 
 def _hosted() -> Any:
     try:
         return importlib.import_module("_gleaner")
     except ImportError:
-        raise InferenceError(
-            "models run on a Gleaner host, and this is none", "no-runtime"
-        ) from None
+        raise InferenceError("models run only in a Gleaner host", "no-runtime") from None

@@ -1,4 +1,4 @@
-"""What the host keeps for a lambda, by name: interface ``scratch`` of the WIT package."""
+"""Named byte strings that the host keeps for a lambda: interface ``scratch`` of the WIT package."""
 
 from __future__ import annotations
 
@@ -10,52 +10,57 @@ ScratchErrorKind = Literal["no-room", "no-such-entry", "wrong-name"]
 
 
 class ScratchError(Error):
-    """The call is refused and had no effect.
+    """A refused call, which had no effect. The message names the entry, the cause and the way out.
 
-    ``no-room``: it would take more than ``scratch`` of ``[limits]``, or there are 1,024 entries already. ``no-such-entry``:
-    nothing has that name. ``wrong-name``: a name has 1 to 128 bytes and no control characters.
+    ``no-room``: the entries would exceed ``scratch`` in ``[limits]``, or there are 1,024 entries
+    already. ``no-such-entry``: there is no entry of that name. ``wrong-name``: the name is not 1 to
+    128 bytes long, or has control characters.
     """
 
     kind: ScratchErrorKind
 
 
 class Entry(NamedTuple):
-    """Something that is kept."""
+    """Name and length of one entry."""
 
     name: str
     bytes: int
-    """Its length."""
+    """Length of the value."""
 
 
 class Scratch(Protocol):
-    """``ctx.scratch``: bytes that the host keeps by name, beyond a fault of the lambda.
+    """``ctx.scratch``: data that is too large for the lambda's own memory, or that must survive a
+    fault.
 
-    There is room only where ``scratch`` of ``[limits]`` grants some. It is empty when the lambda's process starts; a fault
-    leaves it as it is, and ``init`` may look into it.
+    Its size is ``scratch`` in ``[limits]``, 0 by default. It is empty when the lambda's process
+    starts. A fault of the lambda does not change it, and ``init`` may read it.
     """
 
     def put(self, name: str, bytes: Union[bytes, bytearray, memoryview]) -> None:
-        """Keeps ``bytes`` under a name, in place of what was there. Any object with a buffer of bytes will do.
+        """Stores ``bytes`` under a name; replaces an existing entry. ``bytes`` may be any object
+        with a buffer of bytes.
 
         Raises ScratchError: ``no-room``; ``wrong-name``."""
 
     def append(self, name: str, bytes: Union[bytes, bytearray, memoryview]) -> None:
-        """Keeps ``bytes`` behind what is there already under that name, if anything is.
+        """Appends ``bytes`` to the entry of that name; creates a missing one.
 
         Raises ScratchError: ``no-room``; ``wrong-name``."""
 
     def get(self, name: str, offset: int = 0, len: Optional[int] = None) -> bytes:
-        """Bytes from ``offset``, ``len`` at most; clamped to what is there, and to ``call_bytes`` of ``[limits]``.
+        """Bytes of an entry: at most ``len``, from ``offset``. Clamped to the entry and to
+        ``call_bytes`` in ``[limits]``, 1 MiB by default.
 
         Raises ScratchError: ``no-such-entry``."""
 
     def remove(self, name: str) -> None:
-        """Forgets what is kept under a name.
+        """Deletes an entry.
 
         Raises ScratchError: ``no-such-entry``."""
 
     def entries(self) -> list[Entry]:
-        """Everything that is kept, in the order of the names' bytes."""
+        """All entries, sorted by the bytes of their names."""
 
     def free(self) -> int:
-        """Bytes for which there is room. An entry takes its length, the length of its name and 64 bytes."""
+        """Free space in bytes. An entry takes the length of its value and of its name, and 64
+        bytes."""

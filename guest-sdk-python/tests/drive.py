@@ -1,6 +1,8 @@
-"""Small drives for the tests: MCAP files with `sensor_msgs/msg/Image`, without chunks and without a summary.
+"""Writes small drives for the tests: MCAP files with `sensor_msgs/msg/Image`, without chunks and
+summary.
 
-Source: the MCAP specification, and OMG CDR in its little-endian form (all fields aligned to their size).
+Source: the MCAP specification, and OMG CDR in its little-endian form (all fields aligned to their
+size).
 """
 
 from __future__ import annotations
@@ -73,7 +75,7 @@ class _Cdr:
 
 
 def write(path: Path, images: List[Image], at_ms: Sequence[int]) -> None:
-    """A drive with these images, each at its log time."""
+    """Writes a drive with these images, each at its log time."""
     records = [
         _record(HEADER, _text("ros2") + _text("tests")),
         _record(

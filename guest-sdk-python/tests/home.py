@@ -1,4 +1,4 @@
-"""Where the tests find what they test. Importing this makes `gleaner` and `start` importable."""
+"""Locates the code under test. Importing this module makes `gleaner` and `start` importable."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ sys.path.insert(0, str(SDK))
 
 
 def extension_path() -> str:
-    """The file of `_gleaner`, from GLEANER_EXTENSION; skips the test without."""
+    """Path of the extension `_gleaner`, from GLEANER_EXTENSION; skips the test if it is not set."""
     path = os.environ.get("GLEANER_EXTENSION")
     if not path:
         raise unittest.SkipTest("GLEANER_EXTENSION does not name lib_gleaner.so")
@@ -22,7 +22,7 @@ def extension_path() -> str:
 
 
 def extension() -> ModuleType:
-    """The module `_gleaner`; skips the test where it is not built."""
+    """The module `_gleaner`; skips the test if it is not built."""
     if "_gleaner" not in sys.modules:
         import start
 

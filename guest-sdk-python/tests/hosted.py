@@ -1,6 +1,7 @@
-"""A lambda in the real host: the ground that tests of hosted behaviour stand on.
+"""The base of tests that run a lambda in the real host.
 
-What a lambda asserts and does not find is an exception, so a fault, and fails the test with its traceback.
+A failed assertion in a lambda is an exception, therefore a fault, and fails the test with its
+traceback.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class Hosted(unittest.TestCase):
         depth: int = 4,
         at_ms: Sequence[int] = range(1000, 10_000, 100),
     ) -> "subprocess.CompletedProcess[str]":
-        """Replays a drive with `images`, one each 100 ms unless `at_ms` says otherwise."""
+        """Replays a drive with `images`, one every 100 ms by default."""
         build = self.folder / "build"
         build.mkdir(exist_ok=True)
         (build / "main.py").write_text(textwrap.dedent(source), encoding="utf-8")
@@ -87,8 +88,8 @@ class Hosted(unittest.TestCase):
     def replay(
         self, source: str, images: List[Image], wakes: Optional[int] = None, **how: Any
     ) -> List[Dict[str, Any]]:
-        """The decision of each wake. None may have faulted, and there is one for each image, or there are `wakes`: what a
-        lambda asserts holds only if it was woken."""
+        """The decision of each wake. Checks that none faulted, and that there is one for each
+        image, or that there are `wakes`: assertions of a lambda only run if it is woken."""
         ended = self.start(source, images, **how)
         decisions = self.decisions()
         faults = [decision["fault"]["message"] for decision in decisions if decision["fault"]]
@@ -97,7 +98,8 @@ class Hosted(unittest.TestCase):
         return decisions
 
     def fault(self, source: str, wake: int = 0) -> str:
-        """What the fault of a wake says; there are two wakes, and the replay goes on after the first."""
+        """Message of the fault of a wake. There are two wakes; the replay continues after the
+        first."""
         ended = self.start(source, [GREY, GREY])
         decisions = self.decisions()
         self.assertEqual((ended.returncode, len(decisions)), (6, 2), ended.stderr)

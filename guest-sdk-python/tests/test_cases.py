@@ -1,4 +1,5 @@
-"""The rules of the host, by the calls and answers in `rules/cases`: those that `gleaner-rules` gives, which the host runs."""
+"""Checks the rules of `gleaner.testing` against the calls and results in `rules/cases`, which
+`gleaner-rules` and so the host pass."""
 
 from __future__ import annotations
 
@@ -14,9 +15,9 @@ import home
 from gleaner.data import DataError, Guid
 from gleaner.scratch import ScratchError
 from gleaner.testing import _manifest, _pixels, _replay, _units
-from gleaner.testing._data import Field, Fields, Sample, Source, Topic
+from gleaner.testing._data import Field, FieldCache, Sample, InputState, Topic
 from gleaner.testing._frame import Budget
-from gleaner.testing._path import Missing, NotANumber, Path, _segments
+from gleaner.testing._path import FieldPath, _segments
 from gleaner.testing._ring import Arrival, Ring
 from gleaner.testing._schedule import Event, Periodic, Tick
 from gleaner.testing._session import Scratch, Session, piece
@@ -35,14 +36,15 @@ Calls = Dict[str, Callable[..., Any]]
 
 
 def plain(given: Any) -> Any:
-    """What a case writes shorter, or cannot write: a long text, and numbers that are none."""
+    """Expands values that JSON abbreviates or cannot express: long texts, and NaN and
+    infinities."""
     if isinstance(given, dict) and "times" in given:
         return given["of"] * given["times"]
     return float(given["float"]) if isinstance(given, dict) and "float" in given else given
 
 
 def refusal(call: Callable[[], Any]) -> Any:
-    """What a call answers, or kind and text of its refusal."""
+    """Result of a call, or kind and text of its error."""
     try:
         return call()
     except REFUSALS as error:
@@ -50,7 +52,7 @@ def refusal(call: Callable[[], Any]) -> Any:
 
 
 def refused(call: Callable[[], object]) -> Any:
-    """The text of a refusal, if it is one."""
+    """Text of the error of a call, if there is one."""
     try:
         call()
     except DataError as error:
@@ -103,16 +105,13 @@ class Cases(unittest.TestCase):
         )
 
     def test_faults(self) -> None:
-        notes = {_replay.MADE_ANEW: "made anew", _replay.RESTS: "rests"}
+        notes = {_replay.REINITIALISED: "made anew", _replay.BACKS_OFF: "rests"}
 
         def start(_: Dict[str, Any]) -> Calls:
-            run = _replay._Pass.__new__(_replay._Pass)
-            run._session, run._decisions, run._drive = (
-                Session(LIMITS),
-                [],
-                SimpleNamespace(start_ns=0),
-            )  # type: ignore[assignment]
-            run._in_a_row, run._rest_ns, run._rest = 0, 0, (0, 0)
+            run = _replay._ReplayLoop.__new__(_replay._ReplayLoop)
+            run._session, run._decisions = Session(LIMITS), []
+            run._drive = SimpleNamespace(start_ns=0)  # type: ignore[assignment]
+            run._in_a_row, run._backoff_ns, run._backoff = 0, 0, (0, 0)
 
             def wake(at_ms: int, faults: bool) -> Any:
                 fault = (
@@ -229,7 +228,8 @@ class Cases(unittest.TestCase):
 
             def samples(asked: int) -> int:
                 ring = Mock(newest_while=Mock(return_value=[]))
-                Topic(SimpleNamespace(ring=ring, limits=limits)).last(asked)  # type: ignore[arg-type]
+                source: Any = SimpleNamespace(ring=ring, limits=limits)
+                Topic(source).last(asked)
                 most: int = ring.newest_while.call_args.args[0]
                 return most
 
@@ -245,7 +245,8 @@ class Cases(unittest.TestCase):
                 fields: Any = SimpleNamespace(
                     of=lambda _: SimpleNamespace(text=path, value=lambda _: found)
                 )
-                sample = Sample(source, fields, SimpleNamespace(cell=None))  # type: ignore[arg-type]
+                lease: Any = SimpleNamespace(cell=None)
+                sample = Sample(source, fields, lease)
                 return refused(lambda: sample.get(path))
 
             def elsewhere(path: str, *inputs: str) -> Any:
@@ -253,20 +254,22 @@ class Cases(unittest.TestCase):
                     SimpleNamespace(declared=SimpleNamespace(name=name)) for name in inputs
                 )
                 field = Field(belongs, SimpleNamespace(text=path))  # type: ignore[arg-type]
-                return refused(lambda: Fields(asked).of(field))  # type: ignore[arg-type]
+                return refused(lambda: FieldCache(asked).of(field))  # type: ignore[arg-type]
 
             def no_number(path: str, type_name: str) -> Any:
                 source: Any = SimpleNamespace(
                     declared=SimpleNamespace(type_name=type_name), message=lambda _: None
                 )
-                array = Path(path, (), None, is_array=True)  # type: ignore[arg-type]
-                return refused(lambda: Source.number(source, SimpleNamespace(), array))  # type: ignore[arg-type]
+                array = FieldPath(path, (), None, is_array=True)  # type: ignore[arg-type]
+                cell: Any = SimpleNamespace()
+                return refused(lambda: InputState.number(source, cell, array))
 
             def place(whole: int, offset: int, size: int) -> List[int]:
                 found = piece(bytes(range(whole)), offset, size, given["bytes"])
                 return [found[0] if found else min(offset, whole), len(found)]
 
-            too_long = Fields(SimpleNamespace(types=None, declared=SimpleNamespace(type_name="")))  # type: ignore[arg-type]
+            untyped: Any = SimpleNamespace(types=None, declared=SimpleNamespace(type_name=""))
+            too_long = FieldCache(untyped)
             return {
                 "samples": samples,
                 "value": value,
@@ -332,7 +335,7 @@ def pixels(given: Dict[str, Any]) -> Calls:
     data = np.frombuffer(bytes.fromhex(given["data"]), dtype=np.uint8)
     shape = (given["width"], given["height"], given["encoding"], given["step"], given["big_endian"])
 
-    def told(operation: str, call: Callable[[_pixels.Picture], Any], size: Any = None) -> Any:
+    def outcome(operation: str, call: Callable[[_pixels.Picture], Any], size: Any = None) -> Any:
         try:
             shown = _pixels.picture(*shape, data)
             _pixels.check(shown, operation, size)
@@ -353,10 +356,10 @@ def pixels(given: Dict[str, Any]) -> Calls:
         return [shown.encoding, shown.data.tobytes().hex()]
 
     return {
-        "mean luma": lambda roi: told("mean luma", lambda shown: _pixels.mean_luma(shown, roi)),
-        "histogram": lambda roi: told("histogram", lambda shown: list(histogram(shown, roi))),
-        "to gray": lambda: told("grey image", lambda shown: made(_pixels.to_gray(shown))),
-        "resize": lambda *size: told(
+        "mean luma": lambda roi: outcome("mean luma", lambda shown: _pixels.mean_luma(shown, roi)),
+        "histogram": lambda roi: outcome("histogram", lambda shown: list(histogram(shown, roi))),
+        "to gray": lambda: outcome("grey image", lambda shown: made(_pixels.to_gray(shown))),
+        "resize": lambda *size: outcome(
             "resize", lambda shown: made(_pixels.resize(shown, *size)), size
         ),
     }

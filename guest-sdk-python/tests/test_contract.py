@@ -1,8 +1,10 @@
-"""The WIT package, the classes of `_gleaner` and those of the package `gleaner` have the same names.
+"""Checks that the WIT package, the classes of `_gleaner` and those of the package `gleaner` have
+the same names.
 
-The rules: `-` becomes `_`, types are in CamelCase. The functions of the interfaces `data`, `trigger` and `log` are methods
-of `Context`, those of `scratch` of `ctx.scratch`; resources are classes, records are named tuples, an error's variant is the `kind` of an exception, an enum is a
-set of words. What never changes while a handle lives is a property; what asks the host is a method.
+The rules: `-` becomes `_`, types are in CamelCase. The functions of the interfaces `data`,
+`trigger` and `log` are methods of `Context`, those of `scratch` of `ctx.scratch`. Resources are
+classes, records are named tuples, the case of an error is the `kind` of an exception, an enum is a
+set of strings. A property is constant while a handle exists; a method calls the host.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ from gleaner import data, inference, log, scratch, trigger
 from gleaner.testing import _context, _data, _frame, _session
 
 
-class Desk:
-    """What `gleaner.testing` hands out. There are no models at the desk."""
+class Local:
+    """The classes of `gleaner.testing`. A local run has no models."""
 
     Context, Scratch = _context.Context, _session.Scratch
     Topic, Field, Sample, Frame = _data.Topic, _data.Field, _data.Sample, _frame.Frame
@@ -42,7 +44,8 @@ PROPERTIES: Dict[str, Set[str]] = {
     "Model": set(),
 }
 
-# What Python has and the WIT has not: `config` comes with `init` there, and `missed` with the tick.
+# Names that only Python has: in the WIT, `config` is an argument of `init`, and `missed` a field of
+# the tick.
 ONLY_PYTHON: Dict[str, Set[str]] = {
     "Context": {"config", "missed", "scratch"},
     "Frame": {"array", "__array__", "__dlpack__", "__dlpack_device__"},
@@ -56,9 +59,10 @@ KINDS: Dict[str, Any] = {
 }
 ENUMS: Dict[str, Any] = {"encoding": data.Encoding, "level": log.Level}
 
-# Values of Python say by their type what these say by their case.
+# The type of a Python value replaces the case of these variants.
 PLAIN_VARIANTS = {"value", "attribute-value", "config-value", "wake"}
-# An attribute is a keyword argument; an entry of the configuration is one of `ctx.config`; `tick` is `ctx.missed`.
+# An attribute is a keyword argument; an entry of the configuration is one of `ctx.config`; `tick`
+# is `ctx.missed`.
 PLAIN_RECORDS = {"attribute", "config-entry", "tick"}
 
 
@@ -84,13 +88,13 @@ def wanted() -> Dict[str, Dict[str, wit.Function]]:
 
 
 def members(cls: type) -> Set[str]:
-    """What a class offers beyond any object: public names, and the special ones that are listed above."""
+    """Public names of a class, and the special methods listed above."""
     special = ONLY_PYTHON.get(cls.__name__, set())
     return {name for name in dir(cls) if not name.startswith("_") or name in special}
 
 
 def parameters(cls: type, name: str) -> List[Tuple[str, Any, bool]]:
-    """Name, kind, and whether there is a default, of each parameter but `self`."""
+    """Name and kind of each parameter except `self`, and whether it has a default."""
     given = inspect.signature(getattr(cls, name)).parameters.values()
     return [
         (parameter.name, parameter.kind, parameter.default is not parameter.empty)
@@ -127,14 +131,14 @@ class Surface(unittest.TestCase):
     def test_the_extension_has_the_names_of_the_wit(self) -> None:
         self.holds(home.extension())
 
-    def test_the_desk_has_the_names_of_the_wit(self) -> None:
-        self.holds(Desk)
+    def test_a_local_run_has_the_names_of_the_wit(self) -> None:
+        self.holds(Local)
 
-    def test_the_extension_takes_arguments_as_the_package_says(self) -> None:
+    def test_the_extension_takes_the_arguments_of_the_package(self) -> None:
         self.takes_arguments_as_described(home.extension())
 
-    def test_the_desk_takes_arguments_as_the_package_says(self) -> None:
-        self.takes_arguments_as_described(Desk)
+    def test_a_local_run_takes_the_arguments_of_the_package(self) -> None:
+        self.takes_arguments_as_described(Local)
 
     def takes_arguments_as_described(self, module: Any) -> None:
         for cls, functions in wanted().items():
@@ -143,7 +147,7 @@ class Surface(unittest.TestCase):
                     given, described = getattr(module, cls), getattr(gleaner, cls)
                     self.assertEqual(parameters(given, name), parameters(described, name))
 
-    def test_there_is_something_to_compare(self) -> None:
+    def test_the_wit_was_parsed(self) -> None:
         self.assertEqual(set(wanted()), set(PROPERTIES))
         self.assertEqual(wanted()["Topic"]["column_since"].parameters, ["field", "since-ns"])
         self.assertEqual(wanted()["Context"]["event"].parameters, ["label", "score", "attributes"])
@@ -168,7 +172,7 @@ class Values(unittest.TestCase):
                     self.assertEqual(typing.get_args(KINDS[name]), tuple(cases))
                     self.assertTrue(issubclass(getattr(gleaner, camel(name)), gleaner.Error))
 
-    def test_enums_are_words(self) -> None:
+    def test_enums_are_strings(self) -> None:
         for name, cases in self.all("enums"):
             with self.subTest(enum=name):
                 self.assertEqual(typing.get_args(ENUMS[name]), tuple(map(snake, cases)))

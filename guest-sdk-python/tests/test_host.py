@@ -1,4 +1,4 @@
-"""Finding a lambda in its file and telling its exceptions, without a host."""
+"""Tests loading a lambda from its file and formatting its exceptions, without a host."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Files(unittest.TestCase):
         try:
             _host.load(*load)
         except BaseException as error:
-            # The host calls from Rust, which leaves no entry; this function does.
+            # The host calls from Rust, which adds no entry to the traceback; this function does.
             outermost = error.__traceback__
             return _host.explain(error.with_traceback(outermost and outermost.tb_next))
         raise AssertionError("nothing was raised")
@@ -40,7 +40,7 @@ class Files(unittest.TestCase):
 class Loading(Files):
     ctx: Any = None
 
-    def test_a_class_is_made_and_its_handler_bound(self) -> None:
+    def test_a_class_is_instantiated_and_its_handler_bound(self) -> None:
         source = """
             class Lambda:
                 def __init__(self, ctx):
@@ -54,7 +54,7 @@ class Loading(Files):
         handler = make(self.ctx)
         handler(self.ctx, 1)
         self.assertEqual(handler(self.ctx, 2), [1, 2])
-        self.assertEqual(make(self.ctx)(self.ctx, 3), [3], "a lambda made anew remembers nothing")
+        self.assertEqual(make(self.ctx)(self.ctx, 3), [3], "a fresh instance has no state")
 
     def test_plain_functions_work_and_init_is_optional(self) -> None:
         entry = self.write("def on_tick(ctx): return 'tick'")
@@ -64,38 +64,40 @@ class Loading(Files):
         )
         self.assertEqual(_host.load(entry, "on_tick")(self.ctx)(self.ctx), [self.ctx])
 
-    def test_a_lambda_imports_what_lies_beside_it_and_leaves_nothing_there(self) -> None:
+    def test_a_lambda_imports_modules_of_its_folder_and_writes_no_files_there(self) -> None:
+        self.addCleanup(sys.modules.pop, "beside", None)
         self.write("state = []", "beside.py")
         entry = self.write(
             "import beside\ndef on_tick(ctx): beside.state.append(1); return len(beside.state)"
         )
         for _ in range(2):
             handler = _host.load(entry, "on_tick")(self.ctx)
-            self.assertEqual(handler(self.ctx), 1, "loaded again, it begins with fresh globals")
+            self.assertEqual(handler(self.ctx), 1, "globals are fresh after a second load")
         self.assertEqual(
             sorted(path.name for path in self.folder.iterdir()), ["beside.py", "main.py"]
         )
 
-    def test_a_missing_handler_is_named_with_what_there_is(self) -> None:
+    def test_a_missing_handler_is_named_with_those_that_exist(self) -> None:
         refusals: Dict[str, str] = {
-            "def on_tick(ctx): pass": "`main.py` has no `on_event(ctx, event)`, which `event` in [schedule] asks for; "
-            "found `on_tick`",
-            "class Lambda:\n    def on_tick(self, ctx): pass": "`Lambda` of `main.py` has no `on_event(self, ctx, event)`, "
-            "which `event` in [schedule] asks for; found `on_tick`",
-            "": "`main.py` has no `on_event(ctx, event)`, which `event` in [schedule] asks for; found no handler",
+            "def on_tick(ctx): pass": "`main.py` has no `on_event(ctx, event)`, which `event` in "
+            "[schedule] requires; found `on_tick`",
+            "class Lambda:\n    def on_tick(self, ctx): pass": "`Lambda` of `main.py` has no "
+            "`on_event(self, ctx, event)`, which `event` in [schedule] requires; found `on_tick`",
+            "": "`main.py` has no `on_event(ctx, event)`, which `event` in [schedule] requires; "
+            "found no handler",
         }
         for source, refusal in refusals.items():
             self.assertEqual(self.explained(self.write(source), "on_event"), refusal)
 
-    def test_a_file_that_is_no_python_is_refused(self) -> None:
+    def test_a_file_that_is_not_python_is_refused(self) -> None:
         entry = self.write("", "main.wasm")
         self.assertEqual(
             self.explained(entry, "on_event"),
-            "`main.wasm` is no Python file: its name must end with `.py`",
+            "`main.wasm` is not a Python file: its name must end with `.py`",
         )
 
 
-class Telling(Files):
+class Formatting(Files):
     def test_a_traceback_begins_in_the_file_of_the_lambda(self) -> None:
         entry = self.write("\nraise RuntimeError('no')\n")
         self.assertEqual(
@@ -106,24 +108,27 @@ class Telling(Files):
 
     def test_a_syntax_error_names_file_and_line(self) -> None:
         entry = self.write("x = 1\ndef on_event(:\n")
-        told = self.explained(entry, "on_event")
-        self.assertIn(f'File "{entry}", line 2', told)
-        self.assertNotIn("importlib", told)
+        text = self.explained(entry, "on_event")
+        self.assertIn(f'File "{entry}", line 2', text)
+        self.assertNotIn("importlib", text)
 
-    def test_the_cause_of_an_exception_is_told_too(self) -> None:
-        source = "try:\n    {}['key']\nexcept KeyError as error:\n    raise ValueError('no key') from error\n"
-        told = self.explained(self.write(source), "on_event")
-        self.assertIn("KeyError: 'key'", told)
-        self.assertTrue(told.endswith("ValueError: no key"))
+    def test_the_cause_of_an_exception_is_included(self) -> None:
+        source = (
+            "try:\n    {}['key']\n"
+            "except KeyError as error:\n    raise ValueError('no key') from error\n"
+        )
+        text = self.explained(self.write(source), "on_event")
+        self.assertIn("KeyError: 'key'", text)
+        self.assertTrue(text.endswith("ValueError: no key"))
 
-    def test_an_endless_recursion_is_told_briefly(self) -> None:
-        told = self.explained(self.write("def deeper(): deeper()\ndeeper()"), "on_event")
-        self.assertLess(len(told.splitlines()), 20)
-        self.assertIn("RecursionError", told)
+    def test_the_traceback_of_an_endless_recursion_is_short(self) -> None:
+        text = self.explained(self.write("def deeper(): deeper()\ndeeper()"), "on_event")
+        self.assertLess(len(text.splitlines()), 20)
+        self.assertIn("RecursionError", text)
 
 
-class AtADesk(unittest.TestCase):
-    def test_an_error_says_its_kind_to_programs_and_the_rest_to_people(self) -> None:
+class WithoutHost(unittest.TestCase):
+    def test_an_error_has_a_kind_and_prints_its_message(self) -> None:
         error = DataError("no input `imo`; the manifest has `imu`", "no-such-input")
         self.assertEqual(
             (str(error), error.kind), ("no input `imo`; the manifest has `imu`", "no-such-input")

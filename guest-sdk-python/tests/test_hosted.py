@@ -1,4 +1,5 @@
-"""Lambdas in the real host: each test replays a small drive through `start.py` and looks at what was decided."""
+"""Tests lambdas in the real host: each test replays a small drive through `start.py` and checks the
+decisions."""
 
 from __future__ import annotations
 
@@ -17,8 +18,11 @@ import gleaner
 
 class Arrays(Hosted):
     def array_of(self, image: Image, *checks: str) -> None:
-        """Holds `checks` on `array`, the pixels of `image`."""
-        source = "import numpy as np\ndef on_event(ctx, event):\n    frame = event.as_frame()\n    array = frame.array()\n"
+        """Asserts `checks` on `array`, the pixels of `image`."""
+        source = (
+            "import numpy as np\n"
+            "def on_event(ctx, event):\n    frame = event.as_frame()\n    array = frame.array()\n"
+        )
         lines = [
             f"    assert {check}, (array.dtype, array.shape, array.strides, array.tolist())\n"
             for check in checks
@@ -36,7 +40,7 @@ class Arrays(Hosted):
         image = Image(1, 2, "rgba8", 4, bytes(range(8)))
         self.array_of(image, "array.shape == (2, 1, 4)", "array[1, 0].tolist() == [4, 5, 6, 7]")
 
-    def test_padding_behind_rows_is_stepped_over(self) -> None:
+    def test_padding_of_rows_is_skipped(self) -> None:
         image = Image(2, 2, "rgb8", 8, bytes(range(16)))
         self.array_of(
             image, "array.strides == (8, 3, 1)", "array[1].tolist() == [[8, 9, 10], [11, 12, 13]]"
@@ -46,7 +50,7 @@ class Arrays(Hosted):
         self.array_of(GREY, "array.tolist() == [[7, 9]]", "array.dtype == np.uint8")
         self.array_of(Image(2, 1, "bayer_rggb8", 2, b"\x01\x02"), "array.tolist() == [[1, 2]]")
 
-    def test_sixteen_bits_keep_their_byte_order(self) -> None:
+    def test_sixteen_bit_pixels_keep_their_byte_order(self) -> None:
         self.array_of(Image(2, 1, "mono16", 4, b"\x01\x00\x00\x01"), "array.tolist() == [[1, 256]]")
         image = Image(2, 1, "mono16", 4, b"\x01\x00\x00\x01", big_endian=True)
         self.array_of(
@@ -55,7 +59,7 @@ class Arrays(Hosted):
             "array.dtype == np.dtype('>u2')",
             "(array + 1).sum() == 259",
         )
-        # Behind an odd number of bytes the pixels lie at an odd address.
+        # An odd number of bytes per row puts the pixels at an odd address.
         image = Image(2, 2, "bayer_gbrg16", 5, bytes([1, 0, 2, 0, 9, 3, 0, 4, 0, 9]))
         self.array_of(image, "array.tolist() == [[1, 2], [3, 4]]", "not array.flags.aligned")
 
@@ -64,11 +68,15 @@ class Arrays(Hosted):
             Image(2, 1, "yuv422", 4, b"\x01\x02\x03\x04"), "array.tolist() == [[[1, 2], [3, 4]]]"
         )
 
-    def test_an_array_cannot_be_written_to(self) -> None:
+    def test_an_array_is_read_only(self) -> None:
         source = """
             def on_event(ctx, event):
                 array = event.as_frame().array()
-                for write in (lambda: array.fill(0), lambda: array.setflags(write=True), lambda: array.__setitem__(0, 0)):
+                for write in (
+                    lambda: array.fill(0),
+                    lambda: array.setflags(write=True),
+                    lambda: array.__setitem__(0, 0),
+                ):
                     try:
                         write()
                     except ValueError:
@@ -100,7 +108,7 @@ class Arrays(Hosted):
         """
         self.replay(source, [GREY])
 
-    def test_the_last_view_keeps_the_slot_and_gives_it_back(self) -> None:
+    def test_the_slot_is_released_with_the_last_view(self) -> None:
         source = """
             kept = []
 
@@ -120,18 +128,21 @@ class Data(Hosted):
     # As `drive` writes it, 5 ns before the log time.
     PUBLISHED_NS = 999_999_995
 
-    def test_a_sample_says_what_it_is(self) -> None:
+    def test_a_sample_has_identity_stamps_and_fields(self) -> None:
         source = """
             import gleaner
 
             def on_event(ctx, event):
-                assert event.stamps == gleaner.Stamps(1_000_000_000, PUBLISHED_NS, 7_000_000_500), event.stamps
+                expected = gleaner.Stamps(1_000_000_000, PUBLISHED_NS, 7_000_000_500)
+                assert event.stamps == expected, event.stamps
                 assert event.stamps.at_ns == ctx.now_ns()
                 assert (event.identity.topic, event.identity.seq) == ("/camera", 1), event.identity
                 assert event.get("encoding") == "mono8" and event.get("is_bigendian") == 0
-                assert event.get("data") == b"\\x07\\x09" and event.number("header.stamp.sec") == 7.0
+                assert event.get("data") == b"\\x07\\x09"
+                assert event.number("header.stamp.sec") == 7.0
                 assert event.size == len(event.cdr()) and not event.big_endian
-                assert event.cdr(event.size - 2) == b"\\x07\\x09" and event.cdr(8, 4) == b"\\x04\\x00\\x00\\x00"
+                assert event.cdr(event.size - 2) == b"\\x07\\x09"
+                assert event.cdr(8, 4) == b"\\x04\\x00\\x00\\x00"
                 assert repr(event) == "<Sample /camera seq 1, at 1000000000 ns>", repr(event)
                 frame = event.as_frame()
                 assert frame.info == gleaner.FrameInfo(2, 1, "mono8", 2, False, 2), frame.info
@@ -152,25 +163,35 @@ class Data(Hosted):
             def on_event(ctx, event):
                 camera = ctx.input("camera")
                 assert camera is ctx.input("camera") and ctx.inputs() == ["camera"]
-                assert (camera.name, camera.ros_topic, camera.type_name) == ("camera", "/camera", "sensor_msgs/msg/Image")
-                assert camera.field("step") is camera.field("step") and camera.field("step").path == "step"
+                assert (camera.name, camera.ros_topic) == ("camera", "/camera")
+                assert camera.type_name == "sensor_msgs/msg/Image"
+                assert camera.field("step") is camera.field("step")
+                assert camera.field("step").path == "step"
                 seq = event.identity.seq
                 assert camera.newest().identity == event.identity
-                assert [sample.identity.seq for sample in camera.last(2)] == [s for s in (seq - 1, seq) if s]
+                expected = [s for s in (seq - 1, seq) if s]
+                assert [sample.identity.seq for sample in camera.last(2)] == expected
                 assert [sample.identity.seq for sample in camera.since(ctx.now_ns() - 1)] == [seq]
                 at_ns, values = camera.column("width", 10)
-                assert at_ns.dtype == np.int64 and values.dtype == np.float64 and at_ns[-1] == ctx.now_ns()
-                assert camera.column_since(camera.field("width"), ctx.now_ns() - 1).values.tolist() == [float(seq)]
+                assert at_ns.dtype == np.int64 and values.dtype == np.float64
+                assert at_ns[-1] == ctx.now_ns()
+                column = camera.column_since(camera.field("width"), ctx.now_ns() - 1)
+                assert column.values.tolist() == [float(seq)]
                 assert camera.counts().received == seq and camera.counts().lost is None
         """
         self.replay(source, [Image(n, 1, "mono8", n, bytes(n)) for n in (1, 2, 3)])
 
-    def test_a_number_beyond_its_range_is_an_overflow(self) -> None:
+    def test_a_number_out_of_range_is_an_overflow(self) -> None:
         source = """
             def on_event(ctx, event):
                 camera, frame = ctx.input("camera"), event.as_frame()
                 whole = (camera.last, lambda n: camera.column("width", n), event.cdr, frame.read)
-                half = (lambda n: event.cdr(0, n), lambda n: frame.read(0, n), lambda n: frame.resize(n, 1), lambda n: frame.mean_luma((n, 0, 1, 1)))
+                half = (
+                    lambda n: event.cdr(0, n),
+                    lambda n: frame.read(0, n),
+                    lambda n: frame.resize(n, 1),
+                    lambda n: frame.mean_luma((n, 0, 1, 1)),
+                )
                 signed = (camera.since, lambda n: camera.column_since("width", n))
                 for calls, fitting, others in (
                     (whole, (0, 2**64 - 1), (-1, 2**64)),
@@ -203,7 +224,8 @@ class Data(Hosted):
     def test_configuration_has_the_types_of_the_manifest(self) -> None:
         source = """
             def on_event(ctx, event):
-                assert ctx.config == {"text": "a", "number": 1.5, "whole": 2, "flag": True}, ctx.config
+                expected = {"text": "a", "number": 1.5, "whole": 2, "flag": True}
+                assert ctx.config == expected, ctx.config
                 assert ctx.config["flag"] is True and ctx.missed == 0
         """
         self.replay(source, [GREY])
@@ -249,7 +271,8 @@ class Triggers(Hosted):
             import numpy as np
 
             def on_event(ctx, event):
-                ctx.event("e", np.float32(0.5), label="l", score=-1, whole=np.int64(3), flag=np.bool_(True), **{"a key": 2.5})
+                more = {"whole": np.int64(3), "flag": np.bool_(True), "a key": 2.5}
+                ctx.event("e", np.float32(0.5), label="l", score=-1, **more)
                 ctx.start("s", why="rain")
                 ctx.stop("s")
         """
@@ -273,17 +296,18 @@ class Triggers(Hosted):
             ("numpy.zeros(2)", "ndarray"),
             ("numpy.zeros(0)", "ndarray"),
         ):
-            told = self.fault(
+            message = self.fault(
                 f"import numpy\ndef on_event(ctx, event): ctx.event('e', 1, boxes={boxes})"
             )
             self.assertTrue(
-                told.endswith(
-                    f"TypeError: attribute `boxes` of `e` is of type `{name}`; give bool, int, float or str"
+                message.endswith(
+                    f"TypeError: attribute `boxes` of `e` is of type `{name}`; "
+                    "give bool, int, float or str"
                 ),
-                told,
+                message,
             )
 
-    def test_there_are_none_outside_of_a_wake(self) -> None:
+    def test_triggers_are_refused_outside_of_a_wake(self) -> None:
         source = """
             import gleaner
 
@@ -291,7 +315,11 @@ class Triggers(Hosted):
 
             class Lambda:
                 def __init__(self, ctx):
-                    for call in (lambda: ctx.event("e", 1.0), lambda: ctx.start("s"), lambda: ctx.stop("s")):
+                    for call in (
+                        lambda: ctx.event("e", 1.0),
+                        lambda: ctx.start("s"),
+                        lambda: ctx.stop("s"),
+                    ):
                         try:
                             call()
                         except gleaner.TriggerError as error:
@@ -300,7 +328,7 @@ class Triggers(Hosted):
 
                 def on_event(self, ctx, event):
                     ctx.event(" ".join(refusals), 1.0)
-                    raise RuntimeError("make it anew, in the next wake")
+                    raise RuntimeError("create a fresh instance in the next wake")
         """
         self.fault(source)
         labels = [
@@ -313,14 +341,17 @@ class Triggers(Hosted):
 
 
 class Ticks(Hosted):
-    SOURCE = "class Lambda:\n    def __init__(self, ctx): pass\n    def on_tick(self, ctx): ctx.event('t', ctx.missed)"
+    SOURCE = (
+        "class Lambda:\n    def __init__(self, ctx): pass\n"
+        "    def on_tick(self, ctx): ctx.event('t', ctx.missed)"
+    )
 
     def test_the_clock_wakes_up_to_the_last_instant(self) -> None:
         decisions = self.replay(self.SOURCE, [GREY] * 4, wakes=3, schedule='period = "100ms"')
         self.assertEqual({decision["cause"] for decision in decisions}, {"tick"})
         self.assertEqual([decision["triggers"][0]["score"] for decision in decisions], [0.0] * 3)
 
-    def test_the_ticks_of_a_long_gap_are_told_to_the_next_one(self) -> None:
+    def test_the_next_tick_counts_those_of_a_long_gap_as_missed(self) -> None:
         decisions = self.replay(
             self.SOURCE,
             [GREY] * 3,
@@ -328,14 +359,14 @@ class Ticks(Hosted):
             schedule='period = "1ms"',
             at_ms=[1_000, 200_000, 200_003],
         )
-        # Those at 1,001 ms to 199,999 ms.
+        # The missed ticks are those at 1,001 ms to 199,999 ms.
         self.assertEqual(
             [decision["triggers"][0]["score"] for decision in decisions], [198_999.0, 0.0, 0.0, 0.0]
         )
 
 
 class Faults(Hosted):
-    def test_a_fault_says_where_and_the_lambda_begins_anew(self) -> None:
+    def test_a_fault_has_a_traceback_and_is_followed_by_a_fresh_instance(self) -> None:
         source = """
             made = []
 
@@ -349,16 +380,17 @@ class Faults(Hosted):
                     ctx.event("seen", self.wakes * 10 + len(made))
                     raise RuntimeError("no")
         """
-        told = self.fault(source, wake=1)
+        message = self.fault(source, wake=1)
         self.assertEqual(
-            told,
-            f'Traceback (most recent call last):\n  File "{self.folder}/build/main.py", line 12, in on_event\n'
+            message,
+            "Traceback (most recent call last):\n"
+            f'  File "{self.folder}/build/main.py", line 12, in on_event\n'
             '    raise RuntimeError("no")\nRuntimeError: no',
         )
         scores = [decision["triggers"][0]["score"] for decision in self.decisions()]
-        self.assertEqual(scores, [11, 12], "a new object, and the module as it was")
+        self.assertEqual(scores, [11, 12], "a fresh instance, and the module unchanged")
 
-    def test_leaving_the_process_is_a_fault_too(self) -> None:
+    def test_an_exit_of_the_process_is_a_fault(self) -> None:
         self.assertTrue(
             self.fault("import sys\ndef on_event(ctx, event): sys.exit(3)").endswith(
                 "SystemExit: 3"
@@ -371,22 +403,25 @@ class Faults(Hosted):
         )
 
     def test_a_long_message_keeps_its_end(self) -> None:
-        told = self.fault("def on_event(ctx, event): raise RuntimeError('é' * 9000 + ' at last')")
-        self.assertTrue(told.endswith("é at last"))
-        self.assertIn(len(told.encode()), (4095, 4096))
+        message = self.fault(
+            "def on_event(ctx, event): raise RuntimeError('é' * 9000 + ' at last')"
+        )
+        self.assertTrue(message.endswith("é at last"))
+        self.assertIn(len(message.encode()), (4095, 4096))
 
-    def test_what_fails_before_the_first_wake_ends_the_replay(self) -> None:
+    def test_an_error_before_the_first_wake_ends_the_replay(self) -> None:
         for source, cause in {
             "raise RuntimeError('no')": "in import: Traceback",
-            "def init(ctx): raise RuntimeError('no')\ndef on_event(ctx, event): pass": "in init: Traceback",
+            "def init(ctx): raise RuntimeError('no')\n"
+            "def on_event(ctx, event): pass": "in init: Traceback",
             "def on_tick(ctx): pass": "in import: `main.py` has no `on_event(ctx, event)`",
         }.items():
             ended = self.start(source, [GREY])
             self.assertEqual(ended.returncode, 6, ended.stderr)
             self.assertIn(f"error: cannot start lambda `probe`\n  cause: {cause}", ended.stderr)
 
-    def test_a_panic_of_the_host_is_a_fault_and_not_the_end(self) -> None:
-        # Without it, the bindings of numpy panic where they are used for the first time.
+    def test_a_panic_of_the_host_is_a_fault_and_the_replay_continues(self) -> None:
+        # Without this module, the bindings of numpy panic at their first use.
         source = """
             import sys
 
@@ -394,13 +429,14 @@ class Faults(Hosted):
                 sys.modules["numpy._core.multiarray"] = sys.modules["numpy.core.multiarray"] = None
                 event.as_frame().array()
         """
-        told = self.fault(source, wake=1)
+        message = self.fault(source, wake=1)
         self.assertIn(
-            "line 6, in on_event\n    event.as_frame().array()\npyo3_runtime.PanicException: ", told
+            "line 6, in on_event\n    event.as_frame().array()\npyo3_runtime.PanicException: ",
+            message,
         )
         self.assertEqual([line for line in self.log() if not line[1].startswith("gleaner: ")], [])
 
-    def test_a_thread_left_behind_does_not_keep_the_process(self) -> None:
+    def test_a_running_thread_does_not_keep_the_process(self) -> None:
         source = """
             import threading
             threading.Thread(target=threading.Event().wait).start()
@@ -422,16 +458,17 @@ class Starting(Hosted):
         os.symlink(home.SDK / "start.py", self.folder / "start.py")
         (package / "__init__.py").write_text('__version__ = "9.9.9"')
         (package / "_host.py").write_text("")
-        told = self.refusal(self.extension, home_folder=self.folder)
+        message = self.refusal(self.extension, home_folder=self.folder)
         self.assertIn(
-            f"  cause: the package gleaner is 9.9.9, and {self.extension} is {gleaner.__version__}\n  help:  ",
-            told,
+            f"  cause: the package gleaner has version 9.9.9, and {self.extension} has "
+            f"{gleaner.__version__}\n  help:  ",
+            message,
         )
 
     def test_an_extension_that_cannot_be_loaded_is_refused(self) -> None:
-        told = self.refusal(str(self.folder / "lib_gleaner.so"))
-        self.assertIn("lib_gleaner.so: cannot open shared object file", told)
-        self.assertIn("help:", told)
+        message = self.refusal(str(self.folder / "lib_gleaner.so"))
+        self.assertIn("lib_gleaner.so: cannot open shared object file", message)
+        self.assertIn("help:", message)
 
 
 if __name__ == "__main__":

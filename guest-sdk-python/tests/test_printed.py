@@ -1,4 +1,5 @@
-"""What a lambda prints, in the real host: all that goes through `sys.stdout` and `sys.stderr` is in its log."""
+"""Tests text that a lambda prints in the real host: the log has all output of `sys.stdout` and
+`sys.stderr`."""
 
 from __future__ import annotations
 
@@ -10,11 +11,11 @@ from hosted import GREY, Hosted
 
 class Printing(Hosted):
     def printed(self, statement: str, *lines: str) -> None:
-        """What `statement` prints in a wake are `lines`, all of standard output."""
+        """Asserts that `statement`, in a wake, prints `lines` to standard output."""
         self.replay(f"import sys\ndef on_event(ctx, event): {statement}", [GREY])
         self.assertEqual(self.log(), [("info", line) for line in lines], statement)
 
-    def test_each_line_is_a_line_of_the_log_from_the_import_on(self) -> None:
+    def test_each_printed_line_is_a_log_line_from_the_import_on(self) -> None:
         source = """
             import sys
             print("import")
@@ -29,14 +30,14 @@ class Printing(Hosted):
                     print("wake", 2, file=sys.stderr)
         """
         self.replay(source, [GREY])
-        said = [
+        lines = [
             ("info", "import"),
             ("warn", "init"),
             ("info", "wake 1"),
             ("debug", "between"),
             ("warn", "wake 2"),
         ]
-        self.assertEqual(self.log(), said)
+        self.assertEqual(self.log(), lines)
         self.assertEqual(
             [line["at_ns"] for line in self.lines("log.jsonl")], [0, 0] + [1_000_000_000] * 3
         )
@@ -61,7 +62,7 @@ class Printing(Hosted):
         self.printed("print('é \\ud800')", "é \\ud800")
         self.printed("sys.stdout.buffer.write(b'\\xff\\n'); sys.stdout.write('')", "\ufffd")
 
-    def test_what_is_printed_is_no_report_and_not_said_twice(self) -> None:
+    def test_printed_text_is_not_in_the_report_and_logged_once(self) -> None:
         source = "import os\ndef on_event(ctx, event): print('hello'); os.write(1, b'there\\n')"
         ended = self.start(source, [GREY])
         self.assertEqual(
@@ -70,20 +71,20 @@ class Printing(Hosted):
         )
         self.assertEqual((self.log(), ended.stderr), ([("info", "hello")], "there\n"))
 
-    def test_a_fault_is_told_once_and_what_was_printed_before_it_is_kept(self) -> None:
-        told = self.fault("def on_event(ctx, event): print('so far'); raise RuntimeError('no')")
-        self.assertTrue(told.endswith("RuntimeError: no"), told)
-        said = [line for line in self.log() if not line[1].startswith("gleaner: ")]
-        self.assertEqual(said, [("info", "so far")] * 2)
+    def test_a_fault_is_reported_once_and_text_printed_before_it_is_kept(self) -> None:
+        message = self.fault("def on_event(ctx, event): print('so far'); raise RuntimeError('no')")
+        self.assertTrue(message.endswith("RuntimeError: no"), message)
+        lines = [line for line in self.log() if not line[1].startswith("gleaner: ")]
+        self.assertEqual(lines, [("info", "so far")] * 2)
 
-    def test_a_lambda_that_cannot_start_has_printed_too(self) -> None:
+    def test_text_printed_before_a_failed_start_is_on_standard_error(self) -> None:
         ended = self.start("print('so far')\nraise RuntimeError('no')", [GREY])
         self.assertEqual(ended.returncode, 6)
         self.assertIn("log: so far\n", ended.stderr)
         # The results of an earlier replay stay as they were.
         self.assertFalse((self.folder / "out" / "log.jsonl").exists())
 
-    def test_a_flood_is_dropped_and_counted(self) -> None:
+    def test_lines_over_the_limit_are_dropped_and_counted(self) -> None:
         self.replay("def on_event(ctx, event):\n    for n in range(250): print(n)", [GREY])
         summary = json.loads((self.folder / "out" / "summary.json").read_text())
         self.assertEqual((summary["log_lines"], summary["log_dropped"]), (100, 150))
@@ -96,7 +97,8 @@ class Printing(Hosted):
             logging.basicConfig(level="INFO")
 
             def on_event(ctx, event):
-                threads = [threading.Thread(target=print, args=(f"thread {n} " + "x" * 500,)) for n in range(8)]
+                texts = [f"thread {n} " + "x" * 500 for n in range(8)]
+                threads = [threading.Thread(target=print, args=(text,)) for text in texts]
                 for thread in threads:
                     thread.start()
                 for thread in threads:
@@ -125,7 +127,7 @@ class Printing(Hosted):
         self.assertEqual((ended.returncode, ended.stderr), (0, ""))
         self.assertEqual(self.log(), [("info", "refused")] * 2)
 
-    def test_a_farewell_after_the_last_wake_goes_to_standard_error(self) -> None:
+    def test_text_printed_after_the_last_wake_goes_to_standard_error(self) -> None:
         source = """
             class Lambda:
                 def __init__(self, ctx):
@@ -140,8 +142,8 @@ class Printing(Hosted):
         ended = self.start(source, [GREY])
         self.assertEqual((ended.returncode, ended.stderr, self.log()), (0, "goodbye\n", []))
 
-    def test_a_lambda_may_take_its_streams_apart(self) -> None:
-        for statement, said in {
+    def test_a_lambda_may_close_detach_and_replace_its_streams(self) -> None:
+        for statement, lines in {
             "sys.stdout.close(); sys.stderr.close()": [],
             "sys.stdout = io.TextIOWrapper(sys.stdout.detach(), line_buffering=True); print('a')": [
                 ("info", "a")
@@ -151,7 +153,7 @@ class Printing(Hosted):
             self.replay(
                 f"import io, sys\n{statement}\ndef on_event(ctx, event): pass", [GREY, GREY]
             )
-            self.assertEqual(self.log(), said, statement)
+            self.assertEqual(self.log(), lines, statement)
 
 
 if __name__ == "__main__":

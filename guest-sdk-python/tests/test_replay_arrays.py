@@ -1,4 +1,5 @@
-"""`gleaner.testing.replay` over arrays: what a user gives, and how what cannot be used is refused. Needs no host."""
+"""Tests `gleaner.testing.replay` over arrays: the arguments of a user, and the errors of invalid
+ones. Needs no host."""
 
 from __future__ import annotations
 
@@ -19,12 +20,12 @@ from gleaner.testing import ReplayError, StartError, _manifest, replay
 
 IMU = "/imu/data"
 
-# What is given, and what the refusal says.
+# Invalid values, and the expected part of the error.
 Cases = List[Tuple[Dict[str, Any], str]]
 
 
 def manifest(**tables: Any) -> Dict[str, Any]:
-    """As its file would be read, with these tables in place of others."""
+    """A manifest as a dict, with these tables in place of the defaults."""
     given: Dict[str, Any] = {
         "lambda": {"name": "probe", "version": "0.1.0", "kind": "python", "entry": "main.py"},
         "schedule": {"event": "imu"},
@@ -44,7 +45,7 @@ def encoded(form: str, size: Tuple[int, int], mode: str) -> bytes:
 
 
 def chunk(kind_and_data: bytes) -> bytes:
-    """Of a PNG."""
+    """A chunk of a PNG."""
     return (
         (len(kind_and_data) - 4).to_bytes(4, "big")
         + kind_and_data
@@ -78,7 +79,7 @@ class Arrays(unittest.TestCase):
         times, scores = run.series("above")
         self.assertEqual((times.tolist(), scores.tolist()), ([0.1, 0.4], [2.0, 3.0]))
 
-    def test_config_lies_over_the_manifest(self) -> None:
+    def test_config_overrides_the_manifest(self) -> None:
         items = {"limit": {"default": 1.0, "max": 10, "unit": "m/s^2"}}
         run = replay(
             Above,
@@ -97,18 +98,19 @@ class Arrays(unittest.TestCase):
             with self.assertRaisesRegex(ReplayError, why):
                 replay(Above, imu([0]), manifest=manifest(config=items), config=config)
 
-    def test_headers_have_the_times_and_other_fields_are_empty(self) -> None:
+    def test_headers_have_the_stamps_and_other_fields_are_empty(self) -> None:
         class Lambda(Above):
             def on_event(self, ctx: Context, event: Sample) -> None:
                 assert event.stamps == (2_500_000_000, 2_500_000_000, 2_500_000_000), event.stamps
                 assert event.get("header.frame_id") == "" and event.number("orientation.w") == 0
-                assert event.get("orientation_covariance").tolist() == [0.0] * 8 + [4.5]  # type: ignore[union-attr]
+                covariance: Any = event.get("orientation_covariance")
+                assert covariance.tolist() == [0.0] * 8 + [4.5]
                 assert event.size == len(event.cdr()) > 0 and not event.big_endian
 
         arrays = {IMU: {"t_ns": [2_500_000_000], "orientation_covariance": [[0] * 8 + [4.5]]}}
         self.assertEqual(replay(Lambda, arrays, manifest=manifest()).faults, [])
 
-    def test_pictures_are_arrays_of_numpy(self) -> None:
+    def test_images_are_arrays_of_numpy(self) -> None:
         class Lambda(Above):
             def on_event(self, ctx: Context, event: Sample) -> None:
                 frame = event.as_frame()
@@ -124,21 +126,21 @@ class Arrays(unittest.TestCase):
             [(t.label, t.score, t.attributes["shape"]) for t in run.triggers],
             [("mono8", 7.0, "(2, 3)"), ("rgb8", 9.0, "(4, 5, 3)")],
         )
-        with self.assertRaisesRegex(ReplayError, "give uint8 of shape"):
+        with self.assertRaisesRegex(ReplayError, "use uint8 of shape"):
             replay(
                 Lambda,
                 {"/camera": {"t": [0], "image": [np.zeros((2, 3))]}},
                 manifest=manifest(input=inputs),
             )
 
-    def test_compressed_pictures_are_decoded_within_their_room(self) -> None:
+    def test_compressed_images_are_decoded_within_the_limits(self) -> None:
         kept: List[Any] = []
 
         class Lambda(Above):
             def on_event(self, ctx: Context, event: Sample) -> None:
                 try:
                     frame = event.as_frame()
-                    assert event.as_frame().array() is not frame.array(), "decoded once, seen twice"
+                    assert event.as_frame().array() is not frame.array(), "decoded once, two arrays"
                     ctx.event(frame.info.encoding, frame.mean_luma(), size=frame.info.size)
                     kept.append(frame)
                 except DataError as error:
@@ -182,7 +184,7 @@ class Arrays(unittest.TestCase):
         )
         self.assertIn("every slot for decoded images of `/camera` is held", str(found[-1][1]))
 
-    def test_types_of_ones_own_are_defined_by_their_text(self) -> None:
+    def test_custom_types_are_defined_by_their_text(self) -> None:
         class Lambda(Above):
             def on_event(self, ctx: Context, event: Sample) -> None:
                 ctx.event(
@@ -217,7 +219,7 @@ class Arrays(unittest.TestCase):
         self.assertEqual(
             [t.score for t in replay(Lambda, arrays, manifest=declared).triggers], [-1.0, 5.0, 5.0]
         )
-        # Equal times come in the order in which the topics were given; a topic may be left out.
+        # Messages with equal times are in the order of the topics; a topic may be missing.
         arrays = {"/speed": arrays["/speed"], IMU: arrays[IMU]}
         self.assertEqual(
             [t.score for t in replay(Lambda, arrays, manifest=declared).triggers], [-1.0, 5.0, 6.0]
@@ -226,20 +228,20 @@ class Arrays(unittest.TestCase):
             [t.score for t in replay(Lambda, imu([0]), manifest=declared).triggers], [-1.0]
         )
 
-    def test_arrays_that_contradict_themselves_are_refused(self) -> None:
+    def test_inconsistent_arrays_are_refused(self) -> None:
         refused: Cases = [
             ({"linear_acceleration.z": [1]}, "it needs one of `t` and `t_ns`"),
             ({"t": [0], "t_ns": [0]}, "it needs one of `t` and `t_ns`"),
-            ({"t": [1, 0]}, "times fall"),
+            ({"t": [1, 0]}, "times decrease"),
             ({"t": [float("nan")]}, "a time is not finite"),
             ({"t": [0], "linear_acceleration.zz": [1]}, "has no field `zz`"),
             ({"t": [0], "linear_acceleration": [1]}, "is a whole `geometry_msgs/msg/Vector3`"),
-            ({"t": [0, 1], "linear_acceleration.z": [1]}, "has 1 values, and there are 2 times"),
+            ({"t": [0, 1], "linear_acceleration.z": [1]}, "has 1 values for 2 times"),
             (
                 {"t": [0], "orientation_covariance": [[1, 2]]},
-                "message 0 cannot be made: .* has 9 elements, and 2 were given",
+                "message 0 cannot be encoded: .* has 9 elements, and the array has 2",
             ),
-            ({"t": [0], "header.stamp.sec": [0.5]}, "is a whole number, and 0.5 is none"),
+            ({"t": [0], "header.stamp.sec": [0.5]}, "is a whole number, and 0.5 is not"),
         ]
         for table, why in refused:
             with self.subTest(table=table), self.assertRaisesRegex(ReplayError, why):
@@ -251,7 +253,7 @@ class Arrays(unittest.TestCase):
 
 
 class Manifests(unittest.TestCase):
-    def test_what_no_manifest_has_is_refused_by_its_name(self) -> None:
+    def test_invalid_manifests_are_refused_by_key(self) -> None:
         one = manifest()["input"][0]
         refused: Cases = [
             ({"schedul": {}}, "did you mean `schedule`"),
@@ -276,8 +278,8 @@ class Manifests(unittest.TestCase):
             with self.subTest(why=why), self.assertRaisesRegex(ReplayError, why):
                 replay(Above, imu([0]), manifest=manifest(**tables))
 
-    def test_a_class_without_a_manifest_wants_one(self) -> None:
-        with self.assertRaisesRegex(ReplayError, "no manifest lies beside"):
+    def test_a_class_requires_a_manifest(self) -> None:
+        with self.assertRaisesRegex(ReplayError, "there is no manifest beside"):
             replay(Above, imu([0]))
         with self.assertRaisesRegex(ReplayError, "cannot read manifest `nowhere.toml`"):
             replay(Above, imu([0]), manifest="nowhere.toml")
@@ -308,7 +310,7 @@ class Lambdas(unittest.TestCase):
         with self.assertRaisesRegex(StartError, "has no `on_tick\\(self, ctx\\)`, which `period`"):
             replay(Above, imu([0]), manifest=manifest(schedule={"period": "1s"}))
 
-    def test_what_init_raised_is_the_cause(self) -> None:
+    def test_the_exception_of_init_is_the_cause(self) -> None:
         class Lambda(Above):
             def __init__(self, ctx: Context) -> None:
                 raise KeyError("gone")
@@ -322,20 +324,20 @@ class Lambdas(unittest.TestCase):
         with self.assertRaisesRegex(ReplayError, "is of kind `wasm`"):
             replay(home.CHECKOUT / "examples" / "hello" / "rust", imu([0]))
 
-    def test_prints_can_go_where_a_debugger_is(self) -> None:
+    def test_printed_text_can_go_to_standard_output(self) -> None:
         class Lambda(Above):
             def on_event(self, ctx: Context, event: Sample) -> None:
                 print("seen")
 
-        said = io.StringIO()
-        with contextlib.redirect_stdout(said):
+        output = io.StringIO()
+        with contextlib.redirect_stdout(output):
             run = replay(Lambda, imu([0]), manifest=manifest(), prints_to_log=False)
-        self.assertEqual((said.getvalue(), run.log), ("seen\n", []))
+        self.assertEqual((output.getvalue(), run.log), ("seen\n", []))
         self.assertEqual(
             [line.message for line in replay(Lambda, imu([0]), manifest=manifest()).log], ["seen"]
         )
 
-    def test_scratch_outlives_a_fault(self) -> None:
+    def test_scratch_survives_a_fault(self) -> None:
         class Lambda(Above):
             def on_event(self, ctx: Context, event: Sample) -> None:
                 ctx.scratch.append("seen", b"x")
@@ -352,9 +354,9 @@ class Lambdas(unittest.TestCase):
         self.assertEqual([t.attributes["free"] for t in run.triggers], [1, 0])
         self.assertIn("needs 1 bytes of scratch and 0 are free", str(run.faults[2].fault))
 
-    def test_triggers_beyond_the_minute_are_counted(self) -> None:
+    def test_triggers_over_the_limit_per_minute_are_counted(self) -> None:
         run = replay(Above, imu([2] * 700), manifest=manifest(limits={"events_per_minute": 5}))
-        # 60 seconds begin a new minute: 600 samples, then 100.
+        # The second minute begins at 60 s: 600 samples in the first, then 100.
         self.assertEqual((len(run.triggers), run.triggers_refused), (10, 700 - 10 - run.backed_off))
         self.assertGreater(run.backed_off, 0)
 

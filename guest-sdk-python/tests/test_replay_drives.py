@@ -1,4 +1,5 @@
-"""`gleaner.testing` over recorded drives: MCAP files, rosbag2 directories of both storages, and what cannot be read."""
+"""Tests `gleaner.testing` over recorded drives: MCAP files, rosbag2 directories of both storages,
+and unreadable ones."""
 
 from __future__ import annotations
 
@@ -42,7 +43,7 @@ class Speeds:
 
 
 def bag(path: Path, speeds: List[float], storage: StoragePlugin, **compression: Any) -> None:
-    """A rosbag2 directory with a message each second, from second 1 on."""
+    """Writes a rosbag2 directory with a message every second, from second 1."""
     with_compression = compression.pop("mode", None)
     writer = Writer(path, version=9, storage_plugin=storage)
     if with_compression is not None:
@@ -103,7 +104,7 @@ class Drives(unittest.TestCase):
             ],
         )
 
-    def test_a_drive_is_looked_at_without_a_lambda(self) -> None:
+    def test_a_drive_can_be_read_without_a_lambda(self) -> None:
         sample = Drive(SAMPLE)
         self.assertEqual(sample.topics["/imu/data"], "sensor_msgs/msg/Imu")
         self.assertEqual(repr(sample).split(": ")[1], "40.0 s, 3 topics>")
@@ -116,10 +117,10 @@ class Drives(unittest.TestCase):
             sample.column("/imu/data", "header.frame_id")
         with self.assertRaisesRegex(ReplayError, "did you mean `/imu/data`"):
             sample.column("/imu/dat", "linear_acceleration.z")
-        # A drive that is open already is replayed as well.
+        # An open drive can be replayed, too.
         self.assertEqual(len(replay(HELLO, sample, config={"brake_mps2": -1.4}).triggers), 3)
 
-    def test_topics_are_renamed_as_in_ros(self) -> None:
+    def test_topics_are_remapped_as_in_ros(self) -> None:
         path = self.folder / "bag"
         bag(path, [3.5], StoragePlugin.SQLITE3)
         self.assertEqual(len(replay(Speeds, path, manifest=manifest()).triggers), 1)
@@ -129,7 +130,7 @@ class Drives(unittest.TestCase):
         run = replay(Speeds, path, manifest=other, remap={"/velocity": "/speed"})
         self.assertEqual((run.decisions[0].topic, run.triggers[0].score), ("/velocity", 3.5))
 
-    def test_what_is_renamed_has_to_be_in_the_manifest(self) -> None:
+    def test_a_remapped_topic_must_be_in_the_manifest(self) -> None:
         path = self.folder / "bag"
         bag(path, [3.5], StoragePlugin.SQLITE3)
         with self.assertRaisesRegex(
@@ -155,7 +156,8 @@ class Drives(unittest.TestCase):
             {"name": name, "topic": f"/{name}", "type": SPEED}
             for name in ("first", "speed", "third")
         ]
-        # Each is a delivery of its own: who is woken sees the inputs before its own, and not yet those behind.
+        # Each input gets its own delivery: a woken lambda reads the new sample on inputs before its
+        # own, and not yet on those after it.
         run = replay(
             Both,
             path,
@@ -174,16 +176,17 @@ class Drives(unittest.TestCase):
             {"first": 2, "speed": 2, "third": 2},
         )
 
-    def test_a_record_of_which_the_drive_has_no_topic_is_refused(self) -> None:
+    def test_a_record_without_a_topic_of_the_drive_is_refused(self) -> None:
         path = self.folder / "bag"
         bag(path, [3.5], StoragePlugin.SQLITE3)
         record = {**manifest(), "record": {"topics": ["/imu", "/camera"]}}
         with self.assertRaisesRegex(
             ReplayError,
-            "none of the topics of \\[record\\]\n.*has `/imu`, `/camera`\n.*the drive has `/speed`; pass remap=",
+            "none of the topics of \\[record\\]\n.*has `/imu`, `/camera`\n"
+            ".*the drive has `/speed`; pass remap=",
         ):
             replay(Speeds, path, manifest=record)
-        # Some may be missing, and arrays are a part of a drive.
+        # Some topics may be missing, and arrays need not have all of them.
         self.assertEqual(
             len(replay(Speeds, path, manifest=record, remap={"/imu": "/speed"}).windows), 1
         )
@@ -205,7 +208,7 @@ class Drives(unittest.TestCase):
             (run.decisions, run.counts["speed"].too_big, run.counts["speed"].received), ([], 2, 0)
         )
 
-    def test_what_is_no_whole_drive_is_refused_by_its_name(self) -> None:
+    def test_incomplete_and_missing_drives_are_refused_by_name(self) -> None:
         cut, other = self.folder / "cut.mcap", self.folder / "other.mcap"
         cut.write_bytes(SAMPLE.read_bytes()[:100_000])
         other.write_text("no drive")
@@ -220,7 +223,7 @@ class Drives(unittest.TestCase):
         with self.assertRaisesRegex(ReplayError, "there is no drive `nowhere.mcap`"):
             replay(HELLO, "nowhere.mcap")
 
-    def test_a_message_that_contradicts_its_type_is_a_fault_of_who_reads_it(self) -> None:
+    def test_reading_a_message_that_contradicts_its_type_is_a_fault(self) -> None:
         path = self.folder / "bag"
         with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
             connection = writer.add_connection("/speed", SPEED, typestore=STORE)
@@ -233,11 +236,11 @@ class Drives(unittest.TestCase):
             str(run.faults[0].fault),
         )
 
-    def test_bytes_that_are_no_cdr_end_the_replay(self) -> None:
+    def test_bytes_that_are_not_cdr_end_the_replay(self) -> None:
         path = self.folder / "bag"
         with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
             writer.write(writer.add_connection("/speed", SPEED, typestore=STORE), 1, b"xy")
-        with self.assertRaisesRegex(ReplayError, "a message of `/speed` is no CDR"):
+        with self.assertRaisesRegex(ReplayError, "a message of `/speed` is not CDR"):
             replay(Speeds, path, manifest=manifest())
 
 

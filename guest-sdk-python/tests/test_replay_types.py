@@ -1,4 +1,5 @@
-"""Definitions of messages in `gleaner.testing`: those of a drive, of the lambda, and of ROS 2, in this order."""
+"""Tests message definitions in `gleaner.testing`: those of a drive, of the lambda, and of ROS 2, in
+this order."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ SOURCE = "def on_event(ctx, event): ctx.event('speed', event.number('wheels[0].s
 
 
 def bag(path: Path, speed: float, with_definitions: bool) -> None:
-    """A rosbag2 directory with one message. Before ROS 2 Iron, databases had no definitions."""
+    """Writes a rosbag2 directory with one message. Before ROS 2 Iron, databases had no
+    definitions."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(OF_WHEEL, "car/msg/Wheel"))
     store.register(get_types_from_msg(OF_WHEELS, WHEELS))
@@ -72,7 +74,7 @@ class Definitions(unittest.TestCase):
         self.assertEqual(run.faults, [])
         return [trigger.score for trigger in run.triggers]
 
-    def test_a_drive_that_has_none_takes_those_that_are_given(self) -> None:
+    def test_a_drive_without_definitions_uses_those_that_are_passed(self) -> None:
         bag(self.folder / "bag", 3.5, with_definitions=False)
         with self.assertRaisesRegex(
             ReplayError,
@@ -87,7 +89,7 @@ class Definitions(unittest.TestCase):
         types = {WHEELS: OF_WHEELS, "car/msg/Wheel": OF_WHEEL}
         self.assertEqual(self.scores(self.folder / "bag", types=types), [3.5])
 
-    def test_those_in_the_folder_msg_of_the_lambda_are_taken_too(self) -> None:
+    def test_definitions_in_the_folder_msg_of_the_lambda_are_used(self) -> None:
         bag(self.folder / "bag", 3.5, with_definitions=False)
         for files in (
             {"msg/car/msg/Wheels.msg": OF_WHEELS, "msg/car/Wheel.msg": OF_WHEEL},
@@ -100,19 +102,20 @@ class Definitions(unittest.TestCase):
         self.write({"msg/car/msg/Wheels.msg": "float32 4 ="})
         with self.assertRaisesRegex(
             ReplayError,
-            "(?s)cannot use the definition of `car/msg/Wheels`\n.*correct `.*/msg/car/msg/Wheels.msg`",
+            "(?s)cannot use the definition of `car/msg/Wheels`\n"
+            ".*correct `.*/msg/car/msg/Wheels.msg`",
         ):
             replay(self.lambda_, self.folder / "bag")
         (self.lambda_ / "msg/car/msg/Wheels.msg").write_bytes(b"\xff")
         with self.assertRaisesRegex(ReplayError, "cannot read `.*/msg/car/msg/Wheels.msg`"):
             replay(self.lambda_, self.folder / "bag")
 
-    def test_what_was_recorded_is_right(self) -> None:
+    def test_recorded_definitions_take_precedence(self) -> None:
         bag(self.folder / "bag", 3.5, with_definitions=True)
         self.write({"msg/car/msg/Wheels.msg": "float32 other\n"})
         self.assertEqual(self.scores(self.folder / "bag", types={WHEELS: "string other\n"}), [3.5])
 
-    def test_what_the_lambda_brings_is_before_what_ros_2_has(self) -> None:
+    def test_definitions_of_the_lambda_take_precedence_over_ros_2(self) -> None:
         self.write(
             {
                 "lambda.toml": MANIFEST.replace(WHEELS, "geometry_msgs/msg/Vector3"),
@@ -121,14 +124,14 @@ class Definitions(unittest.TestCase):
             }
         )
         self.assertEqual(self.scores({"/wheels": {"t": [0], "speed": [2]}}), [2.0])
-        # Without its package it stands for no type that ROS 2 has.
+        # Without the package it does not replace a type of ROS 2.
         (self.lambda_ / "msg/geometry_msgs/msg/Vector3.msg").rename(
             self.lambda_ / "msg/Vector3.msg"
         )
         with self.assertRaisesRegex(ReplayError, "has no field `speed`"):
             replay(self.lambda_, {"/wheels": {"t": [0], "speed": [2]}})
 
-    def test_a_class_has_them_beside_its_manifest(self) -> None:
+    def test_a_class_uses_definitions_beside_its_manifest(self) -> None:
         class Speeds:
             def __init__(self, ctx: Context) -> None:
                 try:
@@ -145,7 +148,7 @@ class Definitions(unittest.TestCase):
         self.assertEqual([trigger.score for trigger in run.triggers], [3.5])
         self.assertIn("has no field `speed`", run.log[0].message)
 
-    def test_a_drive_is_looked_at_where_a_definition_is_missing(self) -> None:
+    def test_a_drive_without_a_definition_can_be_opened(self) -> None:
         bag(self.folder / "bag", 3.5, with_definitions=False)
         drive = Drive(self.folder / "bag")
         self.assertEqual(drive.topics, {"/wheels": WHEELS})

@@ -1,4 +1,5 @@
-"""Rules of the host that a lambda can meet, each met by the same lambda in the host and at the desk: decisions and log are equal."""
+"""Compares the rules of a local replay with those of the host: the same lambda has equal decisions
+and log in both."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ import unittest
 from typing import Any, Dict, List, Optional, Tuple
 
 import home
-from at_desk import AtDesk
+from local_run import LocalRun
 from drive import Image
 from hosted import EACH, GREY, Hosted
 
@@ -17,12 +18,13 @@ class Agree(unittest.TestCase):
     clips: List[Tuple[int, int]] = []
 
     def both(self, source: str, images: List[Image], **how: Any) -> Found:
-        """What both decided and logged; of a fault's message the last line, since the desk's own code is in a traceback."""
+        """Decisions and log of both. Of a fault's message only the last line is compared, since a
+        local traceback includes the code of the SDK."""
         home.extension_path()
-        theirs, clips = self.found(Hosted(), source, images, how), self.clips
-        ours = self.found(AtDesk(), source, images, how)
-        self.assertEqual((ours, self.clips), (theirs, clips))
-        return theirs
+        hosted, clips = self.found(Hosted(), source, images, how), self.clips
+        local = self.found(LocalRun(), source, images, how)
+        self.assertEqual((local, self.clips), (hosted, clips))
+        return hosted
 
     def found(self, case: Hosted, source: str, images: List[Image], how: Dict[str, Any]) -> Found:
         case.setUp()
@@ -35,7 +37,7 @@ class Agree(unittest.TestCase):
         for decision in decisions:
             if decision["fault"]:
                 decision["fault"]["message"] = decision["fault"]["message"].splitlines()[-1]
-        # Where one that nobody stopped ends is not said by its window but by the drive.
+        # A recording without a stop ends with the drive, not with its window.
         last_ns = max(decision["at_ns"] for decision in decisions)
         self.clips = [
             (clip["from_ns"], min(clip["to_ns"], last_ns)) for clip in case.lines("clips.jsonl")
@@ -45,8 +47,8 @@ class Agree(unittest.TestCase):
     def scores(self, found: Found) -> List[Optional[float]]:
         return [trigger["score"] for decision in found[0] for trigger in decision["triggers"]]
 
-    def test_a_lambda_that_holds_too_much_makes_the_ring_refuse(self) -> None:
-        # Three are shown, two may be held beyond, and the one that is written needs the last cell.
+    def test_the_ring_refuses_samples_if_a_lambda_holds_too_many(self) -> None:
+        # Three samples are shown, two more may be held, and the last cell is for the next sample.
         source = """
             kept = []
 
@@ -59,10 +61,12 @@ class Agree(unittest.TestCase):
         """
         found = self.both(source, [GREY] * 9, depth=3)
         self.assertEqual(
-            self.scores(found)[::2], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], "three samples woke nobody"
+            self.scores(found)[::2],
+            [0.0, 1.0, 2.0, 3.0, 4.0, 5.0],
+            "three samples did not wake the lambda",
         )
 
-    def test_what_is_let_go_makes_room_again(self) -> None:
+    def test_released_samples_free_their_cells(self) -> None:
         source = """
             kept = []
 
@@ -71,11 +75,12 @@ class Agree(unittest.TestCase):
                 if len(kept) == 7:
                     kept.clear()
                 shown = [sample.identity.seq for sample in ctx.input("camera").last(9)]
-                ctx.event("shown", len(shown), seqs=str(shown), no_slot=ctx.input("camera").counts().no_slot)
+                no_slot = ctx.input("camera").counts().no_slot
+                ctx.event("shown", len(shown), seqs=str(shown), no_slot=no_slot)
         """
         self.assertIn(4.0, self.scores(self.both(source, [GREY] * 30)))
 
-    def test_a_held_sample_leaves_the_ring_and_others_their_place(self) -> None:
+    def test_a_held_sample_leaves_the_ring_and_others_stay(self) -> None:
         source = """
             kept = []
 
@@ -84,11 +89,12 @@ class Agree(unittest.TestCase):
                     kept.append(event.as_frame().array())
                 shown = [sample.identity.seq for sample in ctx.input("camera").last(9)]
                 column = ctx.input("camera").column("header.stamp.sec", 9)
-                ctx.event("shown", len(column.values), seqs=str(shown), at=str(column.at_ns.tolist()))
+                at_ns = str(column.at_ns.tolist())
+                ctx.event("shown", len(column.values), seqs=str(shown), at=at_ns)
         """
         self.both(source, [GREY] * 20)
 
-    def test_after_eight_faults_in_a_row_it_rests_and_then_goes_on(self) -> None:
+    def test_after_eight_faults_in_a_row_it_backs_off_and_then_continues(self) -> None:
         source = """
             def on_event(ctx, event):
                 if event.identity.seq < 40:
@@ -97,10 +103,10 @@ class Agree(unittest.TestCase):
         """
         decisions, log = self.both(source, [GREY] * 60, at_ms=range(1000, 61 * 100 + 1000, 100))
         faults = [decision for decision in decisions if decision["fault"]]
-        self.assertTrue(8 < len(faults) < 39, "it rested")
+        self.assertTrue(8 < len(faults) < 39, "it backed off")
         self.assertTrue(any("8 times in a row" in line["message"] for line in log))
 
-    def test_windows_are_those_of_clips(self) -> None:
+    def test_windows_are_those_of_the_clips(self) -> None:
         source = """
             import random
 
@@ -115,7 +121,10 @@ class Agree(unittest.TestCase):
                 elif kind < 0.3:
                     ctx.stop(chance.choice("ab"))
         """
-        record = '[record]\ntopics = ["/camera"]\npreroll = "150ms"\npostroll = "250ms"\ncooldown = "COOLDOWN"'
+        record = (
+            '[record]\ntopics = ["/camera"]\npreroll = "150ms"\npostroll = "250ms"\n'
+            'cooldown = "COOLDOWN"'
+        )
         windows = 0
         for seed, cooldown in enumerate(["0s", "0s", "300ms", "1s"]):
             schedule = EACH + "\n" + record.replace("COOLDOWN", cooldown)
@@ -124,12 +133,12 @@ class Agree(unittest.TestCase):
             windows += len(self.clips)
         self.assertGreater(windows, 10)
 
-    def test_a_wake_causes_sixteen_triggers_at_most(self) -> None:
+    def test_a_wake_has_at_most_sixteen_triggers(self) -> None:
         source = "def on_event(ctx, event):\n    for n in range(20): ctx.event('e', n)"
         decisions, _ = self.both(source, [GREY, GREY])
         self.assertEqual([len(decision["triggers"]) for decision in decisions], [16, 16])
 
-    def test_refused_triggers_are_told_in_the_same_words(self) -> None:
+    def test_errors_of_triggers_have_the_same_messages(self) -> None:
         source = """
             def on_event(ctx, event):
                 attempts = [
@@ -157,13 +166,14 @@ class Agree(unittest.TestCase):
                     try:
                         attempt()
                     except Exception as error:
-                        ours = hasattr(error, "kind")
-                        ctx.log("info", f"{n}: {type(error).__name__} {getattr(error, 'kind', '')} {error if ours else ''}")
+                        has_kind = hasattr(error, "kind")
+                        shown = (getattr(error, "kind", ""), error if has_kind else "")
+                        ctx.log("info", f"{n}: {type(error).__name__} {shown[0]} {shown[1]}")
         """
         _, log = self.both(source, [GREY])
         self.assertEqual(len(log), 19)
 
-    def test_paths_are_refused_in_the_same_words(self) -> None:
+    def test_errors_of_paths_have_the_same_messages(self) -> None:
         paths = [
             "header",
             "header.stamp",
@@ -177,16 +187,18 @@ class Agree(unittest.TestCase):
         ]
         source = f"""
             def on_event(ctx, event):
-                for path in {paths!r} + ["x" * 2000, "header.frame_id", "header.stamp.nanosec", "data"]:
+                more = ["x" * 2000, "header.frame_id", "header.stamp.nanosec", "data"]
+                for path in {paths!r} + more:
                     try:
-                        ctx.log("info", f"{{path[:20]}}: {{event.get(path)!r}} {{event.number(path)!r}}")
+                        values = (event.get(path), event.number(path))
+                        ctx.log("info", f"{{path[:20]}}: {{values[0]!r}} {{values[1]!r}}")
                     except ValueError as error:
                         ctx.log("info", f"{{path[:20]}}: {{error.kind}} {{error}}")
         """
         _, log = self.both(source, [GREY])
         self.assertEqual(len(log), 13)
 
-    def test_an_element_that_is_not_there_contradicts_the_type(self) -> None:
+    def test_a_missing_element_is_malformed(self) -> None:
         source = """
             def on_event(ctx, event):
                 try:
@@ -197,7 +209,7 @@ class Agree(unittest.TestCase):
         _, log = self.both(source, [GREY])
         self.assertEqual([line["message"] for line in log], ["malformed"])
 
-    def test_what_is_no_picture_is_refused_in_the_same_way(self) -> None:
+    def test_errors_of_images_have_the_same_messages(self) -> None:
         source = """
             def on_event(ctx, event):
                 try:

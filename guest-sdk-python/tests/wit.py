@@ -1,4 +1,4 @@
-"""The WIT package as names: small enough to read, and strict enough to fail on what it does not know."""
+"""Parses the names of the WIT package. Fails on syntax that it does not support."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ONE_LETTER = re.compile(r"borrow<([\w-]+)>")
 
 @dataclass
 class Function:
-    """A function: the names of its parameters, and whether it belongs to the resource and not to a handle."""
+    """A function: the names of its parameters, and whether it is static."""
 
     parameters: List[str]
     static: bool
@@ -30,7 +30,8 @@ class Interface:
 
 
 def read(folder: Path) -> Dict[str, Interface]:
-    """All interfaces of the `.wit` files in `folder`, by name. Names are as in the WIT, with `-`."""
+    """All interfaces of the `.wit` files in `folder`, by name. Names are as in the WIT, with
+    `-`."""
     interfaces = {}
     for path in sorted(folder.glob("*.wit")):
         text = re.sub(r"//.*", "", path.read_text(encoding="utf-8"))
@@ -70,16 +71,18 @@ def _pairs(parameters: str) -> List[Tuple[str, str]]:
 
 
 def _parameter(name: str, kind: str) -> str:
-    """WIT keeps the name of a type for the type, so a handle is passed as `f: borrow<field>`; Python says `field`."""
+    """Name of a parameter. In the WIT a parameter cannot have the name of a type, so a handle is
+    `f: borrow<field>`; in Python it is `field`."""
     handle = ONE_LETTER.fullmatch(kind.strip())
     return handle.group(1) if handle and len(name) == 1 else name
 
 
 def _block(text: str, start: int) -> Tuple[str, int]:
-    """What stands before the brace that closes the one before `start`, and where that ends."""
+    """Text up to the brace that closes the one before `start`, and the position after that
+    brace."""
     depth = 1
     for at in range(start, len(text)):
         depth += {"{": 1, "}": -1}.get(text[at], 0)
         if depth == 0:
             return text[start:at], at + 1
-    raise ValueError("a brace is never closed")
+    raise ValueError("a brace is not closed")

@@ -1,4 +1,5 @@
-"""Runs a lambda without any runtime: over arrays or a recorded drive, in pytest and in a notebook.
+"""Runs a lambda locally, without the runtime: over arrays or a recorded drive, in pytest or a
+notebook.
 
 ::
 
@@ -10,30 +11,32 @@
         assert not run.faults
         assert [round(trigger.at_s, 2) for trigger in run.triggers] == [4.14, 10.81]
 
-Rings with their depth and what a lambda holds, schedules, fields, limits of triggers, log and scratch, faults and what follows
-them are those of a replay by the host. Not here: time and memory, so no deadline and no ``memory`` but for frames that are made;
-the jail; clips, but for their windows; models. ``docs/python.md`` has more. It wants Python 3.10.
+Rings with depth and held samples, schedules, fields, limits of triggers, log and scratch, faults
+and back-off follow the rules of a replay by the host. Not included: deadlines and ``memory``,
+except for frames that the lambda creates; the jail; clips, except for their windows; models. See
+``docs/python.md``. Requires Python 3.10.
 """
 
 import sys
 
 if sys.version_info < (3, 10):
     raise ImportError(
-        "gleaner.testing wants Python 3.10 or newer, as rosbags does; lambdas themselves run on 3.9, too"
+        "gleaner.testing requires Python 3.10 or newer, as rosbags does; lambdas themselves also "
+        "run on 3.9"
     )
 
 from ._drive import Drive
 from ._error import ReplayError, StartError
 from ._replay import replay
 from ._run import Decision, Fault, Run
-from ._session import Line
+from ._session import LogLine
 from ._windows import Moment, Window
 
 __all__ = [
     "Decision",
     "Drive",
     "Fault",
-    "Line",
+    "LogLine",
     "Moment",
     "ReplayError",
     "Run",

@@ -1,4 +1,5 @@
-"""A drive made of arrays: one of times for each topic, and one for each field that matters. All other fields are 0 or empty."""
+"""Drives built from arrays: for each topic an array of times, and one for each field that matters.
+All other fields are 0 or empty."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ import numpy as np
 from ..data import DataError, Guid
 from ._drive import Delivery
 from ._error import ReplayError, quoted
-from ._path import Path, compile_path
+from ._path import FieldPath, compile_path
 from ._ring import Arrival
 from ._types import HEADER, Definitions, Types, dtype, gathered, none
 
@@ -20,18 +21,20 @@ Table = Mapping[str, Any]
 
 
 class Arrays:
-    """``tables`` by topic: ``t`` in seconds or ``t_ns`` in ns, and an array for each field by its path."""
+    """A drive from ``tables`` by topic: ``t`` in seconds or ``t_ns`` in ns, and an array for each
+    field by its path."""
 
     def __init__(
         self, tables: Mapping[str, Table], more: Definitions, type_names: Mapping[str, str]
     ) -> None:
-        """``type_names`` is the type of each topic, as the lambda's inputs have it. Raises ReplayError."""
+        """``type_names`` is the type of each topic, from the lambda's inputs. Raises
+        ReplayError."""
         types = gathered(none(), type_names.values(), more)
         self._types = types
         self.topics = dict(type_names)
         for topic in tables:
             if topic not in type_names:
-                raise _wrong(
+                raise _error(
                     topic,
                     "no input of the lambda has this topic",
                     f"its topics are {quoted(type_names)}",
@@ -45,7 +48,7 @@ class Arrays:
             for messages in self._tables.values()
             for at_ns in messages.at_ns[:1] + messages.at_ns[-1:]
         ]
-        # Times of arrays are as they were given: they count from 0.
+        # Times of arrays are absolute: the drive starts at 0.
         self.start_ns, self.end_ns = 0, max(stamps, default=0)
         self.begins_ns = min(stamps, default=0)
 
@@ -54,14 +57,14 @@ class Arrays:
         return True
 
     def types(self, wanted: Iterable[str], more: Definitions) -> Types:
-        """As it was made with them."""
+        """Types of the drive, which were collected at its creation."""
         return self._types
 
     def type_of(self, topic: str) -> str:
         return self.topics[topic]
 
     def deliveries(self, topics: Iterable[str]) -> Iterator[Delivery]:
-        """By stamp; equal stamps in the order in which the topics were given."""
+        """Messages by stamp; those with equal stamps in the order of the topics in ``tables``."""
         chosen = set(topics)
         numbered = [
             (n, table) for n, (topic, table) in enumerate(self._tables.items()) if topic in chosen
@@ -79,24 +82,24 @@ class _Messages:
     def __init__(self, topic: str, type_name: str, table: Table, types: Types) -> None:
         self._topic, self._type_name, self._types = topic, type_name, types
         self.at_ns = _times(topic, table)
-        # One for all: each message is written over the one before it, in the same fields.
+        # Reused for all messages: each one overwrites the same fields.
         self._message = types.blank(type_name)
-        self._columns: List[Tuple[Path, Any]] = []
+        self._columns: List[Tuple[FieldPath, Any]] = []
         fields = {path: values for path, values in table.items() if path not in ("t", "t_ns")}
-        for path, values in self._pictures(fields).items():
+        for path, values in self._image_fields(fields).items():
             try:
                 self._columns.append((compile_path(types, type_name, path), values))
             except DataError as error:
-                raise _wrong(topic, str(error), "") from None
+                raise _error(topic, str(error), "") from None
             if len(values) != len(self.at_ns):
-                raise _wrong(
+                raise _error(
                     topic,
-                    f"`{path}` has {len(values)} values, and there are {len(self.at_ns)} times",
+                    f"`{path}` has {len(values)} values for {len(self.at_ns)} times",
                     "",
                 )
 
-    def _pictures(self, fields: Dict[str, Any]) -> Dict[str, Any]:
-        """``image`` stands for the fields of raw images."""
+    def _image_fields(self, fields: Dict[str, Any]) -> Dict[str, Any]:
+        """Replaces ``image`` by the fields of raw images."""
         if self._type_name != IMAGE or "image" not in fields:
             return fields
         pictures = [np.asarray(picture) for picture in fields.pop("image")]
@@ -106,10 +109,10 @@ class _Messages:
                 (3, (3,)),
             ):
                 what = f"an `image` of {picture.dtype} and shape {picture.shape}"
-                raise _wrong(
+                raise _error(
                     self._topic,
                     what,
-                    "give uint8 of shape (height, width), or (height, width, 3) in RGB",
+                    "use uint8 of shape (height, width), or (height, width, 3) in RGB",
                 )
         return {
             "height": [picture.shape[0] for picture in pictures],
@@ -121,7 +124,7 @@ class _Messages:
         }
 
     def deliveries(self, number: int) -> Iterator[Tuple[int, Delivery]]:
-        writer = Guid(int.from_bytes(b"desk", "big") << 32, number << 32)
+        writer = Guid(int.from_bytes(b"test", "big") << 32, number << 32)
         for n, at_ns in enumerate(self.at_ns):
             arrival = Arrival(at_ns, at_ns, writer, n + 1, self._cdr(n, at_ns))
             yield number, Delivery(self._topic, arrival)
@@ -137,14 +140,14 @@ class _Messages:
                 _set(message, path, values[n])
             return self._types.encode(message, self._type_name)
         except Exception as error:
-            raise _wrong(
+            raise _error(
                 self._topic,
-                f"message {n} cannot be made: {error}",
-                "see that values fit their fields",
+                f"message {n} cannot be encoded: {error}",
+                "use values that fit their fields",
             ) from None
 
 
-def _set(message: Any, path: Path, value: Any) -> None:
+def _set(message: Any, path: FieldPath, value: Any) -> None:
     owner, last = message, path.steps[-1]
     for step in path.steps[:-1]:
         owner = getattr(owner, step) if isinstance(step, str) else owner[step]
@@ -159,7 +162,7 @@ def _set(message: Any, path: Path, value: Any) -> None:
             plain = bool(plain)
         elif not element.startswith("float"):
             if plain != int(plain):
-                raise ValueError(f"`{path.text}` is a whole number, and {plain} is none")
+                raise ValueError(f"`{path.text}` is a whole number, and {plain} is not")
             plain = int(plain)
     if isinstance(last, str):
         setattr(owner, last, plain)
@@ -167,36 +170,36 @@ def _set(message: Any, path: Path, value: Any) -> None:
         owner[last] = plain
 
 
-def _array(value: Any, path: Path) -> Any:
+def _array(value: Any, path: FieldPath) -> Any:
     wanted = dtype(path.leaf.element)
     if isinstance(value, (bytes, bytearray, memoryview)):
         return np.frombuffer(value, dtype=np.uint8).astype(wanted)
     array = np.asarray(value).astype(wanted)
     if path.leaf.length is not None and 0 <= path.leaf.length != len(array):
         raise ValueError(
-            f"`{path.text}` has {path.leaf.length} elements, and {len(array)} were given"
+            f"`{path.text}` has {path.leaf.length} elements, and the array has {len(array)}"
         )
     return array
 
 
 def _times(topic: str, table: Table) -> List[int]:
     if ("t" in table) == ("t_ns" in table):
-        raise _wrong(
+        raise _error(
             topic,
             "it needs one of `t` and `t_ns`",
-            "give the time of each message, in seconds or in nanoseconds",
+            "set the time of each message, in seconds or in nanoseconds",
         )
     if "t_ns" in table:
         at_ns = [int(time) for time in table["t_ns"]]
     else:
         seconds = np.asarray(table["t"], dtype=np.float64)
         if not np.isfinite(seconds).all():
-            raise _wrong(topic, "a time is not finite", "leave such messages out")
+            raise _error(topic, "a time is not finite", "remove such messages")
         at_ns = [int(time) for time in np.round(seconds * 1e9)]
     if any(later < earlier for earlier, later in zip(at_ns, at_ns[1:])):
-        raise _wrong(topic, "times fall", "sort the messages by time")
+        raise _error(topic, "times decrease", "sort the messages by time")
     return at_ns
 
 
-def _wrong(topic: str, cause: str, help: str) -> ReplayError:
+def _error(topic: str, cause: str, help: str) -> ReplayError:
     return ReplayError(f"cannot use the arrays of topic `{topic}`", cause, help)

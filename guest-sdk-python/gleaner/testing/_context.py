@@ -1,20 +1,25 @@
-"""What a lambda is given at each call."""
+"""The context that a lambda gets at each call."""
 
 from __future__ import annotations
 
 from typing import Any, Dict, List, Mapping
 
 from ..data import DataError
-from ._data import Source, Topic
+from ._data import InputState, Topic
 from ._error import quoted
 from ._session import Scratch, Session
 
 
 class Context:
-    """A lambda that is made anew gets a new one, over the same session."""
+    """The context of one instance of a lambda. A fresh instance gets a new one, over the same
+    session."""
 
     def __init__(
-        self, session: Session, sources: List[Source], config: Mapping[str, Any], scratch: Scratch
+        self,
+        session: Session,
+        sources: List[InputState],
+        config: Mapping[str, Any],
+        scratch: Scratch,
     ) -> None:
         self._session = session
         self._topics = {source.declared.name: Topic(source) for source in sources}
@@ -64,5 +69,5 @@ class Context:
 
 
 def set_missed(context: Context, ticks: int) -> None:
-    """What the lambda will see as ``missed``."""
+    """Sets the ``missed`` of a lambda's context."""
     context._missed = ticks

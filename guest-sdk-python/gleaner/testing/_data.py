@@ -1,4 +1,5 @@
-"""Topics, fields and samples as a lambda reads them, over the rings of a replay. Every number that it passes is clamped here."""
+"""Topics, fields and samples, as a lambda reads them, over the rings of a replay. Clamps every
+number that a lambda passes."""
 
 from __future__ import annotations
 
@@ -7,9 +8,9 @@ from typing import Any, Callable, Dict, List, Mapping, Optional, Union
 import numpy as np
 
 from ..data import Column, Counts, DataError, Identity, Stamps, Value
-from ._frame import Frame, Pictures
+from ._frame import Frame, FramePool
 from ._manifest import Input
-from ._path import Missing, NotANumber, Path, compile_path
+from ._path import MissingElement, NotANumber, FieldPath, compile_path
 from ._ring import Cell, Lease, Ring
 from ._session import cut, i64, piece, u32, u64
 from ._types import Types, stamp_of
@@ -17,19 +18,24 @@ from ._types import Types, stamp_of
 SAMPLES_PER_CALL, TEXTS_PER_FIELD, PATH_BYTES, PATHS = 256, 4096, 1024, 256
 
 
-class Source:
-    """What all of a lambda's objects of one input have together; it lives as long as the replay."""
+class InputState:
+    """State that all objects of one input share, for the whole replay."""
 
     def __init__(
-        self, declared: Input, types: Types, limits: Mapping[str, int], pictures: Pictures
+        self, declared: Input, types: Types, limits: Mapping[str, int], frame_pool: FramePool
     ) -> None:
-        self.declared, self.types, self.limits, self.pictures = declared, types, limits, pictures
+        self.declared, self.types, self.limits, self.frame_pool = (
+            declared,
+            types,
+            limits,
+            frame_pool,
+        )
         self.ring = Ring(declared.depth, declared.hold, declared.max_size)
         self.skipped = 0
         self.is_stamped = types.is_stamped(declared.type_name)
 
     def message(self, cell: Cell) -> Any:
-        """What is in the sample. Raises DataError (``malformed``)."""
+        """The decoded message of a sample. Raises DataError (``malformed``)."""
         if cell.message is None:
             try:
                 cell.message = self.types.decode(cell.arrival.cdr, self.declared.type_name)
@@ -44,14 +50,14 @@ class Source:
             "malformed",
         )
 
-    def number(self, cell: Cell, path: Path) -> float:
+    def number(self, cell: Cell, path: FieldPath) -> float:
         try:
             return path.number(self.message(cell))
         except NotANumber:
             raise DataError(
                 f"field `{path.text}` of `{self.declared.type_name}` is no number", "wrong-field"
             ) from None
-        except Missing as error:
+        except MissingElement as error:
             raise self.malformed(str(error)) from None
 
     def counts(self) -> Counts:
@@ -77,7 +83,7 @@ class Source:
 class Field:
     """A compiled path into the messages of one topic."""
 
-    def __init__(self, source: Source, path: Path) -> None:
+    def __init__(self, source: InputState, path: FieldPath) -> None:
         self._source, self._path = source, path
 
     @property
@@ -88,8 +94,9 @@ class Field:
         return f"<Field `{self.path}`>"
 
 
-def _path(field: Field, source: Source) -> Path:
-    """Raises DataError (``wrong-field``) if it belongs to another input."""
+def _path(field: Field, source: InputState) -> FieldPath:
+    """The path of a field. Raises DataError (``wrong-field``) if the field belongs to another
+    input."""
     if source is not field._source:
         belongs, asked = field._source.declared.name, source.declared.name
         raise DataError(
@@ -98,10 +105,10 @@ def _path(field: Field, source: Source) -> Path:
     return field._path
 
 
-class Fields:
-    """The paths that one input's objects have compiled so far."""
+class FieldCache:
+    """The fields of one input that have been compiled so far."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: InputState) -> None:
         self._source = source
         self._known: Dict[str, Field] = {}
 
@@ -118,24 +125,24 @@ class Fields:
                 self._source,
                 compile_path(self._source.types, self._source.declared.type_name, path),
             )
-            # A lambda that makes up paths as it goes must not fill the memory with them.
+            # Bounds the memory of a lambda that generates paths.
             if len(self._known) < PATHS:
                 self._known[path] = field
         return field
 
-    def of(self, given: Any) -> Path:
-        """A field as it is, or the one at a path."""
+    def of(self, given: Any) -> FieldPath:
+        """Returns the path of a field, or compiles a path."""
         if isinstance(given, Field):
             return _path(given, self._source)
         if not isinstance(given, str):
-            raise TypeError("a field is a Field, or its path as a str")
+            raise TypeError("a field must be a Field, or its path as a str")
         return _path(self.at(given), self._source)
 
 
 class Sample:
-    """One message; holds its cell of the ring."""
+    """One message; keeps its cell of the ring."""
 
-    def __init__(self, source: Source, fields: Fields, lease: Lease) -> None:
+    def __init__(self, source: InputState, fields: FieldCache, lease: Lease) -> None:
         self._source, self._fields, self._lease = source, fields, lease
 
     @property
@@ -154,7 +161,7 @@ class Sample:
         path, source = self._fields.of(field), self._source
         try:
             value: Value = path.value(source.message(self._cell))
-        except Missing as error:
+        except MissingElement as error:
             raise source.malformed(str(error)) from None
         most = self._most(value)
         if most is not None and _length(value) > most:
@@ -192,7 +199,7 @@ class Sample:
     def as_frame(self) -> Frame:
         source, cell = self._source, self._cell
         about = (source.identity(cell), source.stamps(cell))
-        return source.pictures.frame(
+        return source.frame_pool.frame(
             source.declared, lambda: source.message(cell), self._lease, about
         )
 
@@ -207,8 +214,8 @@ def _length(value: Any) -> int:
 class Topic:
     """The ring of one input."""
 
-    def __init__(self, source: Source) -> None:
-        self._source, self._fields = source, Fields(source)
+    def __init__(self, source: InputState) -> None:
+        self._source, self._fields = source, FieldCache(source)
 
     @property
     def name(self) -> str:
@@ -251,7 +258,7 @@ class Topic:
         path, since = self._fields.of(field), i64(since_ns)
         return self._column(path, self._source.ring.depth, lambda arrival: arrival.at_ns > since)
 
-    def _column(self, path: Path, most: int, keep: Callable[[Any], bool]) -> Column:
+    def _column(self, path: FieldPath, most: int, keep: Callable[[Any], bool]) -> Column:
         source = self._source
         cells = source.ring.newest_while(min(most, source.limits["call_items"]), keep)
         values = [source.number(cell, path) for cell in cells]
@@ -263,5 +270,5 @@ class Topic:
 
 
 def sample(topic: Topic, cell: Cell) -> Sample:
-    """A sample of the topic, as the lambda sees it."""
+    """Creates the sample object of a cell for the lambda."""
     return Sample(topic._source, topic._fields, cell.lease())

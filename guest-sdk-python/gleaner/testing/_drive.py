@@ -1,4 +1,5 @@
-"""Recorded drives, message by message in the order of the host's replay. Files are read by `rosbags`."""
+"""Reads recorded drives, message by message in the order of the host's replay. `rosbags` reads the
+files."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from ..data import Column, Guid
 from ._error import ReplayError, nearest, quoted
-from ._path import Missing, NotANumber, compile_path
+from ._path import MissingElement, NotANumber, compile_path
 from ._ring import Arrival
 from ._types import Definitions, Types, gathered, none
 
@@ -19,63 +20,68 @@ Name = Union[str, "os.PathLike[str]"]
 
 
 class Delivery(NamedTuple):
-    """A message and the topic that it came on."""
+    """A message and its topic."""
 
     topic: str
     arrival: Arrival
 
 
 class Drive:
-    """A recorded drive: MCAP files, or rosbag2 directories of either storage; several are read as one.
+    """A recorded drive: MCAP files, or rosbag2 directories of either storage. Several files are
+    read as one drive.
 
-    ``topics`` is the type of each topic. Raises ReplayError for files that cannot be read. ``path`` is one, or a list."""
+    ``path`` is a path or a list of paths. ``topics`` is the type of each topic. Raises ReplayError
+    for files that cannot be read."""
 
     def __init__(self, path: Union[Name, Sequence[Name]]) -> None:
-        single = isinstance(path, (str, os.PathLike))
-        self.paths: List[Path] = [Path(path)] if single else [Path(one) for one in path]  # type: ignore[arg-type, union-attr]
+        self.paths = _paths(path)
         self._shown = ", ".join(map(str, self.paths))
         self.topics: Dict[str, str] = {}
         with _opened(self.paths) as reader:
             for connection in reader.connections:
                 first = self.topics.setdefault(connection.topic, connection.msgtype)
                 if first != connection.msgtype:
-                    cause = f"topic `{connection.topic}` is of type `{first}` and of `{connection.msgtype}`"
+                    topic, second = connection.topic, connection.msgtype
+                    cause = f"topic `{topic}` is of type `{first}` and of `{second}`"
                     raise ReplayError(f"cannot use drive `{self._shown}`", cause)
             self._own = reader.typestore
             spans = [(one.start_time, one.end_time) for one in reader.readers if one.message_count]
         self.start_ns: int = min((start for start, _ in spans), default=0)
-        """Stamp of the first message of any topic, in ns; 0 if there is none."""
+        """Stamp of the first message of all topics, in ns; 0 if there is none."""
         self.begins_ns = self.start_ns
         self.end_ns: int = max((end for _, end in spans), default=1) - 1
-        """Stamp of the last message of any topic."""
+        """Stamp of the last message of all topics, in ns."""
 
     def __repr__(self) -> str:
-        return f"<Drive {self._shown}: {(self.end_ns - self.start_ns) / 1e9:.1f} s, {len(self.topics)} topics>"
+        seconds = (self.end_ns - self.start_ns) / 1e9
+        return f"<Drive {self._shown}: {seconds:.1f} s, {len(self.topics)} topics>"
 
     @property
     def is_partial(self) -> bool:
-        """Whether topics of a lambda may be missing."""
+        """Returns whether topics of a lambda may be missing."""
         return False
 
     def type_of(self, topic: str) -> str:
-        """Raises ReplayError, which names the nearest topic."""
+        """Type of a topic. Raises ReplayError, which names the most similar topic."""
         if topic not in self.topics:
             near = nearest(topic, self.topics)
             help = (
                 f"did you mean `{near}`?"
                 if near
-                else "pass remap={FROM: TO} if the lambda calls it by another name"
+                else "pass remap={FROM: TO} if the lambda uses another name"
             )
             cause = f"it has no topic `{topic}`; it has {quoted(self.topics)}"
             raise ReplayError(f"cannot use drive `{self._shown}`", cause, help)
         return self.topics[topic]
 
     def types(self, wanted: Iterable[str], more: Definitions) -> Types:
-        """Those types: as the files have them, else as ``more`` does. Raises ReplayError for one that is nowhere."""
+        """Collects types: from the files, or else from ``more``. Raises ReplayError for a type in
+        neither."""
         return gathered(self._own, wanted, more)
 
     def deliveries(self, topics: Iterable[str]) -> Iterator[Delivery]:
-        """The messages of these topics by stamp; equal stamps in the order of the files, then of the channels."""
+        """The messages of these topics by stamp; those with equal stamps in the order of the files,
+        then of the channels."""
         wanted = set(topics)
         counted: Dict[Tuple[str, Guid], int] = {}
         with _opened(self.paths) as reader:
@@ -89,7 +95,8 @@ class Drive:
                 self._shown, reader.messages(connections=chosen) if chosen else iter(())
             )
             for at_ns, group in itertools.groupby(messages, key=lambda message: message[1]):
-                # Stable: what one channel has of one instant stays as it lies in the file.
+                # The sort is stable: messages of one channel and instant keep their order in the
+                # file.
                 ordered = sorted(
                     ((files[id(c.owner)], c.id, c, raw) for c, _, raw in group),
                     key=lambda it: it[:2],
@@ -103,9 +110,11 @@ class Drive:
                     yield Delivery(connection.topic, Arrival(at_ns, at_ns, writer, seq, data))
 
     def column(self, topic: str, path: str) -> Column:
-        """A numeric field of all messages of a topic: two arrays, ``at_ns`` and ``values``.
+        """Values of a numeric field in all messages of a topic: two arrays, ``at_ns`` and
+        ``values``.
 
-        Raises ReplayError for a topic that the drive does not have, DataError for a field that is none."""
+        Raises ReplayError for a topic that the drive does not have, DataError for a field that does
+        not exist."""
         type_name = self.type_of(topic)
         types = self.types([type_name], Definitions({}, None))
         field = compile_path(types, type_name, path)
@@ -115,10 +124,16 @@ class Drive:
                 values.append(field.number(types.decode(arrival.cdr, type_name)))
             except NotANumber:
                 raise ReplayError(f"field `{path}` of `{type_name}` is no number") from None
-            except Missing as error:
+            except MissingElement as error:
                 raise ReplayError(f"cannot read `{path}` of `{topic}`", str(error)) from None
             at_ns.append(arrival.at_ns)
         return Column(np.array(at_ns, dtype=np.int64), np.array(values, dtype=np.float64))
+
+
+def _paths(path: Union[Name, Sequence[Name]]) -> List[Path]:
+    if isinstance(path, (str, os.PathLike)):
+        return [Path(path)]
+    return [Path(one) for one in path]
 
 
 def _opened(paths: Sequence[Path]) -> Any:
@@ -129,17 +144,17 @@ def _opened(paths: Sequence[Path]) -> Any:
     if missing or not paths:
         raise ReplayError(
             f"there is no drive `{missing[0] if missing else ''}`",
-            help="give MCAP files or rosbag2 directories",
+            help="pass MCAP files or rosbag2 directories",
         )
     try:
-        # A directory is a bag of its own; only files are read together.
+        # A directory is one bag; only files can be read together.
         return _Reader(AnyReader(paths, default_typestore=none()))
     except Exception as error:
         raise _unreadable(shown, error) from None
 
 
 class _Reader:
-    """An `AnyReader` whose refusals are ours."""
+    """An `AnyReader` that raises ReplayError."""
 
     def __init__(self, inner: Any) -> None:
         self._inner = inner
@@ -166,7 +181,9 @@ def _readable(shown: str, messages: Iterator[Any]) -> Iterator[Any]:
 
 
 def _unreadable(shown: str, error: Exception) -> ReplayError:
-    help = "`gleaner replay` reads a damaged MCAP file up to the damage; rosbags wants a whole one"
+    help = (
+        "`gleaner replay` reads a damaged MCAP file up to the damage; rosbags needs a complete one"
+    )
     return ReplayError(f"cannot read drive `{shown}`", str(error) or type(error).__name__, help)
 
 
@@ -175,11 +192,12 @@ def _checked(shown: str, topic: str, raw: Any) -> bytes:
     if data[:2] not in (b"\0\0", b"\0\1") or len(data) < 4:
         raise ReplayError(
             f"cannot read drive `{shown}`",
-            f"a message of `{topic}` is no CDR: it begins with {data[:4]!r}",
+            f"a message of `{topic}` is not CDR: it begins with {data[:4]!r}",
         )
     return data
 
 
 def _writer(file: int, channel: int) -> Guid:
-    """As the host makes one up for a channel: `mcap`, the file's place in the drive, the channel's id."""
+    """The writer that the host derives for a channel: `mcap`, the index of the file in the drive,
+    the id of the channel."""
     return Guid(int.from_bytes(b"mcap", "big") << 32 | file, (channel & 0xFFFF_FFFF) << 32)

@@ -1,4 +1,4 @@
-"""What cannot be replayed, in words for whoever called :func:`gleaner.testing.replay`."""
+"""The errors of :func:`gleaner.testing.replay`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Iterable, Optional
 
 
 class ReplayError(ValueError):
-    """A lambda, manifest, config value or drive that cannot be used. The text names it, the cause and the way out."""
+    """A lambda, manifest, config value or drive cannot be used. The text names the object, the
+    cause and the way out."""
 
     def __init__(self, what: str, cause: str = "", help: str = "") -> None:
         lines = [what, f"  cause: {cause}" if cause else "", f"  help:  {help}" if help else ""]
@@ -15,21 +16,22 @@ class ReplayError(ValueError):
 
 
 class StartError(ReplayError):
-    """The lambda's file, or its ``init``, raised: nothing was replayed. What it raised is the ``__cause__``."""
+    """The lambda's file or its ``init`` raised an exception, which is the ``__cause__``. Nothing
+    was replayed."""
 
     def __init__(self, what: str, cause: str, kind: str) -> None:
         super().__init__(what, cause)
         self.kind = kind
-        """As of a fault: ``exception`` or ``memory``."""
+        """Kind, as of a fault: ``exception`` or ``memory``."""
 
 
 def nearest(name: str, known: Iterable[str]) -> Optional[str]:
-    """The known name that ``name`` was probably meant to be."""
+    """Returns the known name that is most similar to ``name``, if one is similar enough."""
     found = difflib.get_close_matches(name, list(known), n=1)
     return found[0] if found else None
 
 
 def quoted(names: Iterable[str]) -> str:
-    """A list for a message."""
+    """Formats names as a list for a message."""
     listed = [f"`{name}`" for name in names]
     return ", ".join(listed) if listed else "none"

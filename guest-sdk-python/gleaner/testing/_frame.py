@@ -1,4 +1,5 @@
-"""A sample seen as an image. Raw pixels stay where they are; JPEG and PNG are decoded once, by Pillow, within `decoded_size`."""
+"""A sample as an image. Raw pixels are not copied; Pillow decodes JPEG and PNG, once for each
+sample and up to `decoded_size`."""
 
 from __future__ import annotations
 
@@ -22,15 +23,15 @@ T = TypeVar("T")
 
 
 class Budget:
-    """Frames that a lambda holds at a time, and bytes of those it made."""
+    """Limits the number of frames that a lambda holds, and the bytes of those that it created."""
 
     def __init__(self, limits: Mapping[str, int]) -> None:
         self.frames_allowed = self.frames = limits["frames"]
         self.bytes = limits["memory"]
         self.call_bytes = limits["call_bytes"]
 
-    def take(self, size: int) -> Taken:
-        """Raises DataError (``no-room``)."""
+    def take(self, size: int) -> Reservation:
+        """Takes one frame and ``size`` bytes. Raises DataError (``no-room``)."""
         if self.frames == 0:
             why = "drop frames that are not needed, or raise `frames` in [limits]"
             raise DataError(f"the lambda holds {self.frames_allowed} frames; {why}", "no-room")
@@ -39,11 +40,12 @@ class Budget:
             raise DataError(
                 f"{size} bytes for a new frame, {self.bytes} are left; {why}", "no-room"
             )
-        return Taken(self, size)
+        return Reservation(self, size)
 
 
-class Taken:
-    """Given back when nothing refers to it any more: neither a frame nor an array over its pixels."""
+class Reservation:
+    """A share of the budget, released when neither a frame nor an array over its pixels refers to
+    it."""
 
     def __init__(self, budget: Budget, size: int) -> None:
         self.budget, self._size = budget, size
@@ -55,15 +57,15 @@ class Taken:
         self.budget.bytes += self._size
 
 
-class Decoded:
-    """The pixels of a JPEG or PNG; one slot of the input."""
+class DecodedImage:
+    """The pixels of a JPEG or PNG, in one slot of the input."""
 
     def __init__(self, shown: Picture) -> None:
         self.picture = shown
 
 
-class Pictures:
-    """Room for the images of one input."""
+class FramePool:
+    """Limits and decoded images of one input."""
 
     def __init__(self, declared: Input, budget: Budget) -> None:
         self._slots, self._slot_bytes, self.budget = (
@@ -71,13 +73,13 @@ class Pictures:
             declared.decoded_size,
             budget,
         )
-        self._held: List[weakref.ref[Decoded]] = []
-        self._newest: Optional[Tuple[int, Decoded]] = None
+        self._held: List[weakref.ref[DecodedImage]] = []
+        self._newest: Optional[Tuple[int, DecodedImage]] = None
 
     def frame(
         self, declared: Input, message: Callable[[], Any], lease: Lease, about: About
     ) -> Frame:
-        """Raises DataError."""
+        """Creates the frame of a message. Raises DataError."""
         if declared.type_name not in ("sensor_msgs/msg/Image", COMPRESSED_IMAGE):
             raise DataError(
                 f"a sample of `{declared.topic}` is no image: its type is `{declared.type_name}`",
@@ -100,10 +102,10 @@ class Pictures:
         except ImageError as error:
             raise _not_a_frame(declared.topic, error) from None
 
-    def _decoded(self, declared: Input, position: int, data: bytes) -> Decoded:
+    def _decoded(self, declared: Input, position: int, data: bytes) -> DecodedImage:
         if self._newest is not None and self._newest[0] == position:
             return self._newest[1]
-        # The older image's slot may be the one that is needed now.
+        # Release the previous image first: its slot may be needed now.
         self._newest = None
         opened = _open(declared, data)
         width, height = opened.size
@@ -118,14 +120,14 @@ class Pictures:
             raise DataError(
                 f"every slot for decoded images of `{declared.topic}` is held; {why}", "no-room"
             )
-        decoded = Decoded(_pixels.tight(_rgb(opened), "rgb8"))
+        decoded = DecodedImage(_pixels.tight(_rgb(opened), "rgb8"))
         self._held.append(weakref.ref(decoded))
         self._newest = (position, decoded)
         return decoded
 
 
 def _open(declared: Input, data: bytes) -> Any:
-    """Reads the header. Raises ImageError; DataError for sides that Pillow takes for an attack."""
+    """Reads the header. Raises ImageError; DataError for a size that Pillow treats as an attack."""
     from PIL import Image
 
     if not data.startswith((b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")):
@@ -134,7 +136,7 @@ def _open(declared: Input, data: bytes) -> Any:
         )
     try:
         with warnings.catch_warnings():
-            # Large, but not too large for Pillow: `decoded_size` decides.
+            # Images that Pillow only warns of are limited by `decoded_size`.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             opened = Image.open(io.BytesIO(data), formats=["JPEG", "PNG"])
     except Image.DecompressionBombError as error:
@@ -142,7 +144,7 @@ def _open(declared: Input, data: bytes) -> Any:
     except Exception as error:
         raise ImageError(str(error)) from None
     if opened.mode == "CMYK":
-        raise ImageError("JPEG is of four colours, which is not supported")
+        raise ImageError("JPEG with four colour channels is not supported")
     return opened
 
 
@@ -168,7 +170,8 @@ def _not_a_frame(topic: str, error: ImageError) -> DataError:
 
 
 class View:
-    """What numpy makes an array over. It keeps what the pixels lie in for as long as a view of them lives."""
+    """The object from which numpy creates an array. It keeps the memory of the pixels while a view
+    of them exists."""
 
     def __init__(self, shown: Picture, holds: Tuple[Any, ...]) -> None:
         pixel, channels = LAYOUTS[shown.encoding]
@@ -188,15 +191,16 @@ class View:
 
 
 class Frame:
-    """A sample seen as an image. Holds its pixels."""
+    """A sample as an image. Keeps its pixels."""
 
-    def __init__(self, about: About, shown: Picture, taken: Taken, holds: Any) -> None:
+    def __init__(self, about: About, shown: Picture, taken: Reservation, holds: Any) -> None:
         self._about, self._picture, self._taken, self._holds = about, shown, taken, holds
 
     @property
     def info(self) -> FrameInfo:
         width, height, encoding, step, big_endian, data = self._picture
-        return FrameInfo(width, height, encoding, step, big_endian, len(data))  # type: ignore[arg-type]
+        size = len(data)
+        return FrameInfo(width, height, encoding, step, big_endian, size)  # type: ignore[arg-type]
 
     @property
     def identity(self) -> Identity:
@@ -207,12 +211,12 @@ class Frame:
         return self._about[1]
 
     def mean_luma(self, roi: Optional[Roi | tuple[int, int, int, int]] = None) -> float:
-        return self._ask(lambda: _pixels.mean_luma(self._picture, _roi(roi)))
+        return self._call(lambda: _pixels.mean_luma(self._picture, _roi(roi)))
 
     def histogram(
         self, roi: Optional[Roi | tuple[int, int, int, int]] = None
     ) -> npt.NDArray[np.uint32]:
-        return self._ask(lambda: _pixels.histogram(self._picture, _roi(roi)))
+        return self._call(lambda: _pixels.histogram(self._picture, _roi(roi)))
 
     def resize(self, width: int, height: int) -> Frame:
         width, height = u32(width), u32(height)
@@ -247,7 +251,7 @@ class Frame:
     def __dlpack_device__(self) -> Tuple[int, int]:
         return 1, 0
 
-    def _ask(self, operation: Callable[[], T]) -> T:
+    def _call(self, operation: Callable[[], T]) -> T:
         try:
             return operation()
         except RangeError as error:
@@ -263,12 +267,12 @@ class Frame:
         make: Callable[[], Picture],
     ) -> Frame:
         def made() -> Frame:
-            # What is asked for is checked before room is taken for it, and that before it is made.
+            # Check the arguments first, then take memory from the budget, then create the pixels.
             _pixels.check(self._picture, operation, size)
             taken = self._taken.budget.take(needed)
             return Frame(self._about, make(), taken, None)
 
-        return self._ask(made)
+        return self._call(made)
 
     def __repr__(self) -> str:
         shown = self._picture

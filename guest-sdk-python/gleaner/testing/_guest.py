@@ -1,5 +1,5 @@
-"""The lambda itself: found as it was given, made, called, and made anew after a fault. What it raises is told by the part of
-the SDK that tells it in the host."""
+"""Loads and calls a lambda, and creates a fresh instance after a fault. `gleaner._host` formats its
+exceptions, as in the host."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, Callable, Iterator, List, Optional, Tuple, Union
 
 from .. import _host
 from ._context import Context, set_missed
-from ._data import Source, sample
+from ._data import InputState, sample
 from ._error import ReplayError, StartError
 from ._manifest import Manifest
 from ._ring import Cell
@@ -21,11 +21,11 @@ from ._schedule import Tick
 from ._session import LINE_BYTES, Scratch, Session
 
 Given = Union[type, ModuleType, str, "os.PathLike[str]"]
-Wake = Union[Tick, Tuple[Source, Cell]]
+Wake = Union[Tick, Tuple[InputState, Cell]]
 
 
 class Fault:
-    """Why a wake ended early."""
+    """An error that ended a wake early."""
 
     def __init__(self, kind: str, message: str, allowed: Optional[int]) -> None:
         self.kind, self.message, self.allowed = kind, message, allowed
@@ -35,7 +35,7 @@ class Guest:
     """One lambda over one session."""
 
     def __init__(
-        self, given: Given, manifest: Manifest, session: Session, sources: List[Source]
+        self, given: Given, manifest: Manifest, session: Session, sources: List[InputState]
     ) -> None:
         self._given, self._manifest, self._session, self._sources = (
             given,
@@ -44,12 +44,12 @@ class Guest:
             sources,
         )
         self._scratch = Scratch(session.limits)
-        self._make: Optional[Callable[[Context], Callable[..., object]]] = None
-        self._live: Optional[Tuple[Context, Callable[..., object]]] = None
+        self._create: Optional[Callable[[Context], Callable[..., object]]] = None
+        self._instance: Optional[Tuple[Context, Callable[..., object]]] = None
         self._raised: Optional[BaseException] = None
 
     def init(self) -> None:
-        """Raises StartError if the lambda does."""
+        """Loads and initialises the lambda. Raises StartError if it raises."""
         fault = self._start()
         if fault is not None:
             raised, self._raised = self._raised, None
@@ -58,15 +58,15 @@ class Guest:
             ) from raised
 
     def wake(self, wake: Wake) -> Optional[Fault]:
-        if self._live is None:
+        if self._instance is None:
             caused = self._session.suspend()
             fault = self._start()
             self._session.resume(caused)
             if fault is not None:
                 return fault
-        assert self._live is not None, "it has just been made"
-        # Taken away, so that a lambda that faults is gone.
-        (context, handler), self._live = self._live, None
+        assert self._instance is not None, "it has just been created"
+        # Removed first, so that the instance is dropped if it faults.
+        (context, handler), self._instance = self._instance, None
         if isinstance(wake, Tick):
             set_missed(context, wake.missed)
             _, fault = self._attempt("", handler, context)
@@ -76,19 +76,19 @@ class Guest:
                 "", handler, context, sample(context.input(source.declared.name), cell)
             )
         if fault is None:
-            self._live = context, handler
+            self._instance = context, handler
         return fault
 
     def _start(self) -> Optional[Fault]:
-        if self._make is None:
+        if self._create is None:
             make, fault = self._attempt("in import: ", self._load)
             if fault is not None:
                 return fault
-            self._make = make
+            self._create = make
         context = Context(self._session, self._sources, self._manifest.config, self._scratch)
-        handler, fault = self._attempt("in init: ", self._make, context)
+        handler, fault = self._attempt("in init: ", self._create, context)
         if fault is None:
-            self._live = context, handler
+            self._instance = context, handler
         return fault
 
     def _load(self) -> Any:
@@ -99,7 +99,7 @@ class Guest:
         return _host.maker(self._given, self._manifest.handler, _name(self._given))
 
     def _attempt(self, when: str, call: Any, *arguments: Any) -> Tuple[Any, Optional[Fault]]:
-        """Calls code of the lambda. Ctrl-C ends the replay; everything else that is raised is a fault."""
+        """Calls code of the lambda. Ctrl-C ends the replay; every other exception is a fault."""
         stopped = None
 
         def called(*arguments: Any) -> Any:
@@ -110,41 +110,42 @@ class Guest:
                 stopped = error
                 raise
             except BaseException as error:
-                # A traceback holds the frames of a call, and these the sample: only what ends the replay is kept.
+                # A traceback keeps the frames of a call, and these the sample. Keep only the
+                # exception that ends the replay.
                 self._raised = error if when else None
                 raise
 
-        result, told, kind = _host.attempt(0, called, *arguments)
+        result, text, kind = _host.attempt(0, called, *arguments)
         if stopped is not None:
             raise stopped
-        if told is None:
+        if text is None:
             return result, None
         allowed = self._manifest.limits["memory"] if kind == "memory" else None
-        return None, Fault(kind, when + _ending(told, LINE_BYTES - len(when)), allowed)
+        return None, Fault(kind, when + _ending(text, LINE_BYTES - len(when)), allowed)
 
 
 def _ending(text: str, most: int) -> str:
-    """A traceback says what happened last."""
+    """The end of a text, at most ``most`` bytes: a traceback ends with the exception."""
     return text.encode(errors="replace")[-most:].decode(errors="ignore")
 
 
 def _name(given: Any) -> str:
-    """Where a class or a module comes from."""
+    """Name of the module of a class, or of the module."""
     return str(getattr(given, "__module__", None) or getattr(given, "__name__", "lambda"))
 
 
 def folder(given: Union[str, "os.PathLike[str]"]) -> Path:
-    """Where a lambda lies that was given by its folder, its entry or its manifest."""
+    """Folder of a lambda, from the path of its folder, entry or manifest."""
     path = Path(given)
     if not path.exists():
         raise ReplayError(
-            f"there is no lambda `{path}`", help="give its class, its module, or its folder"
+            f"there is no lambda `{path}`", help="pass its class, its module, or its folder"
         )
     return path if path.is_dir() else path.parent
 
 
 def home(given: Given) -> Optional[Path]:
-    """Where a lambda lies, if it lies anywhere: a class of a notebook does not. Raises ReplayError."""
+    """Folder of a lambda; None if it has no file, as a class in a notebook. Raises ReplayError."""
     if isinstance(given, (str, os.PathLike)):
         return folder(given)
     try:
@@ -154,13 +155,13 @@ def home(given: Given) -> Optional[Path]:
 
 
 def manifest_beside(given: Given) -> Path:
-    """The manifest that lies where the lambda does. Raises ReplayError."""
+    """Path of the manifest in the folder of the lambda. Raises ReplayError."""
     if isinstance(given, (str, os.PathLike)):
         return folder(given) / "lambda.toml"
     beside = home(given)
     if beside is None or not (beside / "lambda.toml").is_file():
         raise ReplayError(
-            f"no manifest lies beside `{_name(given)}`",
+            f"there is no manifest beside `{_name(given)}`",
             help='pass manifest="path/to/lambda.toml", or a dict',
         )
     return beside / "lambda.toml"
@@ -168,8 +169,8 @@ def manifest_beside(given: Given) -> Path:
 
 @contextlib.contextmanager
 def guarded(log: Optional[Callable[[Any, str], None]], given: Given) -> Iterator[None]:
-    """While it lasts, what is printed goes to ``log``, if there is one; afterwards the interpreter is as it was, and knows nothing
-    of what was imported from the folder of the lambda that was ``given``."""
+    """Redirects printed text to ``log``, if there is one. On exit restores the interpreter, and
+    removes the modules that were imported from the folder of the lambda ``given``."""
     streams, path, writes = (sys.stdout, sys.stderr), list(sys.path), sys.dont_write_bytecode
     modules = dict(sys.modules)
     if log is not None:
@@ -184,8 +185,8 @@ def guarded(log: Optional[Callable[[Any, str], None]], given: Given) -> Iterator
         if "main" not in modules:
             sys.modules.pop("main", None)
         if isinstance(given, (str, os.PathLike)):
-            # Another lambda may have modules of the same names.
+            # Another lambda may have modules with the same names.
             for name in _host.own_modules(str(folder(given))):
                 del sys.modules[name]
-        # Fresh globals for a lambda must not mean that a test beside it is gone.
+        # Keep the modules of tests in the same folder.
         sys.modules.update(modules)

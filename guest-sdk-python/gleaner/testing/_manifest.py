@@ -1,4 +1,5 @@
-"""`lambda.toml`, as far as a replay at the desk needs it. `gleaner build` reads all of it, and is stricter in places."""
+"""Parses the parts of `lambda.toml` that a local replay needs. `gleaner build` parses all of it,
+and is stricter in places."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from ._limits import LIMITS
 from ._table import Table
 
 ConfigValue = Union[bool, int, float, str]
-Source = Union[str, "os.PathLike[str]", Mapping[str, Any]]
+ManifestSource = Union[str, "os.PathLike[str]", Mapping[str, Any]]
 
 KIB, MIB, SECOND = 1 << 10, 1 << 20, 1_000_000_000
 
@@ -42,7 +43,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Record:
-    """``[record]``; durations in ns."""
+    """The ``[record]`` table; durations in ns."""
 
     topics: List[str]
     preroll: int
@@ -52,7 +53,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Manifest:
-    """A manifest that was checked."""
+    """A validated manifest."""
 
     name: str
     kind: str
@@ -70,8 +71,9 @@ class Manifest:
         return "on_tick" if self.event is None else "on_event"
 
 
-def read(source: Source, config: Mapping[str, Any]) -> Manifest:
-    """Reads a manifest from its file, or as the ``dict`` that its file would be, and lays ``config`` over its own.
+def read(source: ManifestSource, config: Mapping[str, Any]) -> Manifest:
+    """Reads a manifest from its file or from a ``dict`` with the same content. ``config`` overrides
+    the values of ``[config]``.
 
     Raises ReplayError."""
     if isinstance(source, Mapping):
@@ -185,7 +187,7 @@ def _record(root: Table) -> Optional[Record]:
         return None
     known = ["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"]
     table = Table(root.file, "[record]", root.entries["record"], known)
-    table.need("topics", 'topics = ["/imu/data"]: what a clip holds')
+    table.need("topics", 'topics = ["/imu/data"], the topics of a clip')
     roll = (0, 5 * SECOND, 600 * SECOND)
     return Record(
         topics=[str(topic) for topic in table.list("topics")],
@@ -223,7 +225,9 @@ def _config(root: Table, overrides: Mapping[str, Any]) -> Dict[str, ConfigValue]
 def _item(file: str, name: str, entry: Any, overrides: Mapping[str, Any]) -> ConfigValue:
     entry = entry if isinstance(entry, Mapping) else {"default": entry}
     table = Table(file, f"`config.{name}`", entry, ["default", "min", "max", "unit", "description"])
-    default = table.need("default", "default = 1.0, or another value that says what type it is")
+    default = table.need(
+        "default", "default = 1.0, or another value, whose type is that of the item"
+    )
     if not isinstance(default, (bool, int, float, str)) or not _is_finite(default):
         raise table.refusal(
             "has a `default` of another type", "give a number, a text, or true or false"
@@ -238,7 +242,7 @@ def _item(file: str, name: str, entry: Any, overrides: Mapping[str, Any]) -> Con
 
 
 def _same_type(name: str, default: ConfigValue, given: Any) -> ConfigValue:
-    """``given`` as a value of the type of ``default``; a whole number also serves as a number."""
+    """Converts ``given`` to the type of ``default``; a whole number is accepted for a number."""
     plain = given.item() if hasattr(given, "item") else given
     if type(default) is float and type(plain) is int:
         plain = float(plain)

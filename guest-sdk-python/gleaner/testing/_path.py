@@ -1,4 +1,5 @@
-"""Field paths: ``a.b[3].c``, compiled against a message type, with errors that say what would have been right."""
+"""Compiles field paths, such as ``a.b[3].c``, against a message type. Errors name the valid
+alternatives."""
 
 from __future__ import annotations
 
@@ -19,16 +20,16 @@ BYTES = ("uint8", "byte", "char")
 
 
 class NotANumber(Exception):
-    """A field that is read as a number and is none."""
+    """A field that is read as a number is not one."""
 
 
-class Missing(Exception):
-    """A message without the element that a path names."""
+class MissingElement(Exception):
+    """A message does not have the element that a path names."""
 
 
 @dataclass(frozen=True)
-class Path:
-    """One field of one message type. ``steps`` lead to it; ``leaf`` is what stands there."""
+class FieldPath:
+    """One field of a message type, by the ``steps`` to it; ``leaf`` is the member at the end."""
 
     text: str
     steps: Tuple[Step, ...]
@@ -40,7 +41,7 @@ class Path:
         return not self.is_array and self.leaf.element != "string"
 
     def find(self, message: Any) -> Any:
-        """What stands in ``message``, as `rosbags` has it. Raises Missing."""
+        """The element in ``message``, as `rosbags` decodes it. Raises MissingElement."""
         found = message
         for step in self.steps:
             if isinstance(step, str):
@@ -48,13 +49,13 @@ class Path:
             elif step < len(found):
                 found = found[step]
             else:
-                raise Missing(
+                raise MissingElement(
                     f"it has {len(found)} elements where `{self.text}` wants element {step}"
                 )
         return found
 
     def value(self, message: Any) -> Any:
-        """What a lambda gets of it. Raises Missing."""
+        """The value that a lambda gets. Raises MissingElement."""
         found, element = self.find(message), self.leaf.element
         if not self.is_array:
             return _scalar(element, found)
@@ -65,7 +66,7 @@ class Path:
         return np.asarray(found).astype(np.float64)
 
     def number(self, message: Any) -> float:
-        """Raises NotANumber, and Missing."""
+        """The value as a float. Raises NotANumber and MissingElement."""
         if not self.is_number:
             raise NotANumber
         return float(_scalar(self.leaf.element, self.find(message)))
@@ -81,8 +82,8 @@ def _scalar(element: str, found: Any) -> Any:
     return str(found) if element == "string" else float(found)
 
 
-def compile_path(types: Types, type_name: str, text: str) -> Path:
-    """Raises DataError (``no-such-field``)."""
+def compile_path(types: Types, type_name: str, text: str) -> FieldPath:
+    """Compiles a path. Raises DataError (``no-such-field``)."""
     at, steps, rest = type_name, list[Step](), _segments(text)
     while True:
         name = rest.pop(0)
@@ -90,7 +91,7 @@ def compile_path(types: Types, type_name: str, text: str) -> Path:
         steps.append(str(name))
         if member.length is not None:
             if not rest and member.is_primitive and not member.is_wide:
-                return Path(text, tuple(steps), member, is_array=True)
+                return FieldPath(text, tuple(steps), member, is_array=True)
             if not rest or isinstance(rest[0], str):
                 raise _refused(
                     f"field `{name}` of `{text}` is an array; write `{name}[0]` and so on"
@@ -103,12 +104,13 @@ def compile_path(types: Types, type_name: str, text: str) -> Path:
             steps.append(index)
         if member.is_wide:
             raise _refused(
-                f"`{text}` is or lies behind the wstring `{name}`, whose size on the wire is not defined"
+                f"`{text}` is or lies behind the wstring `{name}`, whose size on the wire is not "
+                "defined"
             )
         if member.is_primitive:
             if rest:
                 raise _refused(f"field `{name}` of `{text}` is a single value with nothing inside")
-            return Path(text, tuple(steps), member, is_array=False)
+            return FieldPath(text, tuple(steps), member, is_array=False)
         at = member.element
         if not rest or isinstance(rest[0], int):
             fields = ", ".join(inner.name for inner in types.members(at))

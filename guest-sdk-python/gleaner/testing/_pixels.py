@@ -1,6 +1,8 @@
-"""What the host computes on frames, in numpy: integers only, so that results are those of the host, bit for bit.
+"""Implements the host's operations on frames in numpy, with integers only, so that results equal
+those of the host bit for bit.
 
-Sources: ITU-R BT.601 for luma; JFIF 1.02 for colours of yuv422. Both as in the crate `gleaner-image`."""
+Sources: ITU-R BT.601 for luma; JFIF 1.02 for colours of yuv422, both as in the crate
+`gleaner-image`."""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ Bytes = npt.NDArray[np.uint8]
 
 MAX_SIDE, MAX_RESIZED_SIDE = 65_535, 16_384
 
-# Bytes of a pixel and numbers in it, by the name of the WIT.
+# Bytes per pixel and numbers per pixel, by the name in the WIT.
 LAYOUTS = {
     "rgb8": (3, 3),
     "bgr8": (3, 3),
@@ -26,9 +28,9 @@ LAYOUTS = {
     **{f"bayer_{pattern}8": (1, 1) for pattern in ("rggb", "bggr", "gbrg", "grbg")},
     **{f"bayer_{pattern}16": (2, 1) for pattern in ("rggb", "bggr", "gbrg", "grbg")},
 }
-# What ROS calls them now, where that is not the name of the WIT.
+# Current names in ROS that differ from those in the WIT.
 IN_ROS = {"yuv422": "uyvy", "yuv422_yuy2": "yuyv"}
-# Other names that ROS has for some.
+# Other names in ROS.
 NAMES = {
     "8UC3": "bgr8",
     "8UC1": "mono8",
@@ -36,22 +38,23 @@ NAMES = {
     "uyvy": "yuv422",
     "yuyv": "yuv422_yuy2",
 }
-# Where red, green and blue are in a pixel.
+# Indices of red, green and blue in a pixel.
 COLOURS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
-# Where U, the left Y, V and the right Y are in a pair of pixels.
+# Indices of U, the left Y, V and the right Y in a pair of pixels.
 PAIRS = {"yuv422": (0, 1, 2, 3), "yuv422_yuy2": (1, 0, 3, 2)}
 
 
 class ImageError(Exception):
-    """An image that contradicts itself, or has no colours yet."""
+    """An image is inconsistent, or has raw Bayer pixels."""
 
 
 class RangeError(Exception):
-    """A region or a size that does not fit."""
+    """A region or a size is out of range."""
 
 
 class Picture(NamedTuple):
-    """Pixels of a checked size: `data` has `step` bytes for each row but the last, which may be shorter."""
+    """Pixels with a validated size: `data` has `step` bytes for each row except the last, which may
+    be shorter."""
 
     width: int
     height: int
@@ -68,13 +71,15 @@ class Picture(NamedTuple):
 def picture(
     width: int, height: int, encoding: str, step: int, big_endian: bool, data: Bytes
 ) -> Picture:
-    """As the fields of `sensor_msgs/msg/Image` say. Raises ImageError with the numbers that do not fit."""
+    """Creates a picture from the fields of a `sensor_msgs/msg/Image`. Raises ImageError with the
+    numbers that do not fit."""
     name = NAMES.get(encoding, encoding)
     if name not in LAYOUTS:
         raise ImageError(
-            f"encoding `{encoding[:40]}` is not supported; supported are {', '.join([*LAYOUTS, *NAMES])}"
+            f"encoding `{encoding[:40]}` is not supported; supported are "
+            f"{', '.join([*LAYOUTS, *NAMES])}"
         )
-    said = IN_ROS.get(name, name)
+    ros_name = IN_ROS.get(name, name)
     for side in (width, height):
         if not 1 <= side <= MAX_SIDE:
             raise ImageError(
@@ -82,42 +87,45 @@ def picture(
             )
     if name in PAIRS and width % 2:
         raise ImageError(
-            f"image of {said} is {width} pixels wide; two pixels share a colour, so the width must be even"
+            f"image of {ros_name} is {width} pixels wide; two pixels share a colour, so the width "
+            "must be even"
         )
     row = width * LAYOUTS[name][0]
     if step < row:
         raise ImageError(
-            f"image of {width}x{height} {said} says a row has {step} bytes; it needs {row}"
+            f"image of {width}x{height} {ros_name} says a row has {step} bytes; it needs {row}"
         )
     needed = step * (height - 1) + row
     if len(data) < needed:
         raise ImageError(
-            f"image of {width}x{height} {said} with {step} bytes per row needs {needed} bytes; it has {len(data)}"
+            f"image of {width}x{height} {ros_name} with {step} bytes per row needs {needed} bytes; "
+            f"it has {len(data)}"
         )
     return Picture(width, height, name, step, big_endian, data[:needed])
 
 
 def rows(shown: Picture) -> Bytes:
-    """All pixels, of shape (height, width, bytes of a pixel), over the same memory."""
+    """All pixels without a copy, of shape (height, width, bytes per pixel)."""
     pixel = LAYOUTS[shown.encoding][0]
     shape, strides = (shown.height, shown.width, pixel), (shown.step, pixel, 1)
     return np.lib.stride_tricks.as_strided(shown.data, shape, strides, writeable=False)
 
 
 def region(shown: Picture, roi: Optional[Tuple[int, int, int, int]]) -> Bytes:
-    """The pixels of a region, or all. Raises RangeError if none is in it."""
+    """The pixels of a region, or all. Raises RangeError if the region has no pixel in the image."""
     if roi is None:
         return rows(shown)
     x, y, width, height = roi
     if x >= shown.width or y >= shown.height or width == 0 or height == 0:
         raise RangeError(
-            f"region {width}x{height} at ({x}, {y}) has no pixel in the image of {shown.width}x{shown.height}"
+            f"region {width}x{height} at ({x}, {y}) has no pixel in the image of "
+            f"{shown.width}x{shown.height}"
         )
     return rows(shown)[y : y + height, x : x + width]
 
 
 def check(shown: Picture, operation: str, size: Optional[Tuple[int, int]] = None) -> None:
-    """Raises ImageError for pixels without a colour, and RangeError for a size that no picture is made in."""
+    """Raises ImageError for raw Bayer pixels, and RangeError for an unsupported size."""
     if shown.encoding.startswith("bayer"):
         why = "its pixels have no colour until it is debayered"
         raise ImageError(f"{operation} of a raw image ({shown.encoding}): {why}")
@@ -143,7 +151,7 @@ def mean_luma(shown: Picture, roi: Optional[Tuple[int, int, int, int]]) -> float
 
 
 def grey(shown: Picture, pixels: Bytes) -> Bytes:
-    """The grey level of each pixel: of shape (height, width)."""
+    """Grey level of each pixel, of shape (height, width)."""
     if shown.encoding in COLOURS:
         red, green, blue = (pixels[..., at].astype(np.uint32) for at in COLOURS[shown.encoding])
         return ((299 * red + 587 * green + 114 * blue) // 1000).astype(np.uint8)
@@ -163,14 +171,14 @@ def to_gray(shown: Picture) -> Picture:
 
 
 def tight(pixels: Bytes, encoding: str) -> Picture:
-    """A picture without padding, of an array of shape (height, width) or (height, width, 3)."""
+    """A picture without padding, from an array of shape (height, width) or (height, width, 3)."""
     height, width = pixels.shape[:2]
     data = np.ascontiguousarray(pixels, dtype=np.uint8).reshape(-1)
     return Picture(width, height, encoding, width * LAYOUTS[encoding][0], False, data)
 
 
 def colours(shown: Picture) -> Bytes:
-    """Red, green and blue of each pixel: of shape (height, width, 3)."""
+    """Red, green and blue of each pixel, of shape (height, width, 3)."""
     pixels = rows(shown)
     if shown.encoding in COLOURS:
         return pixels[..., COLOURS[shown.encoding]]
@@ -182,7 +190,7 @@ def colours(shown: Picture) -> Bytes:
 
 
 def _from_yuv(y: Any, u: Any, v: Any) -> Bytes:
-    """Factors in 1/65536, rounded to nearest."""
+    """Converts to RGB, with factors in 1/65536, rounded to nearest."""
     luma = (y << 16) + (1 << 15)
     channels = [luma + 91_881 * v, luma - 22_554 * u - 46_802 * v, luma + 116_130 * u]
     return np.stack([np.clip(channel >> 16, 0, 255) for channel in channels], axis=-1).astype(
@@ -191,11 +199,13 @@ def _from_yuv(y: Any, u: Any, v: Any) -> Bytes:
 
 
 def resize(shown: Picture, width: int, height: int) -> Picture:
-    """Each axis on its own: the mean of the covered area where the image shrinks, linear where it grows, rounded to nearest."""
+    """Scales each axis by itself: the mean of the covered area where the image shrinks, linear
+    interpolation where it grows, rounded to nearest."""
     pixels = grey(shown, rows(shown))[..., None] if shown.is_grey else colours(shown)
     down, down_total = _weights(shown.height, height)
     across, across_total = _weights(shown.width, width)
-    # Sums stay below 2^40, so products of matrices of f64, which numpy computes fast, are exact in any order.
+    # Sums stay below 2^40, so matrix products of f64, which numpy computes fast, are exact in any
+    # order.
     planes = [
         across @ (down @ pixels[..., channel].astype(np.float64)).T
         for channel in range(pixels.shape[2])
@@ -209,10 +219,11 @@ def resize(shown: Picture, width: int, height: int) -> Picture:
 
 
 def _weights(old: int, new: int) -> Tuple[npt.NDArray[np.float64], int]:
-    """Whole weights of old pixels (columns) in new ones (rows), and the sum of each row."""
+    """Integer weights of old pixels (columns) in new ones (rows), and the sum of each row."""
     at = np.arange(new, dtype=np.int64)
     if new <= old:
-        # The axis is cut into old * new pieces; the weight is how many pieces both have.
+        # The axis is divided into old * new pieces; the weight is the number of pieces that both
+        # share.
         start, source = at[:, None] * old, np.arange(old, dtype=np.int64)[None, :] * new
         shared = np.minimum(start + old, source + new) - np.maximum(start, source)
         return np.maximum(shared, 0).astype(np.float64), old

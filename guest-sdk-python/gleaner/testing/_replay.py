@@ -1,4 +1,5 @@
-"""A replay: every sample delivered, and every wake that the schedule asks for, in the drive's time."""
+"""Replays a drive: delivers every sample and runs every wake of the schedule, in the time of the
+drive."""
 
 from __future__ import annotations
 
@@ -9,10 +10,10 @@ from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple, Union
 
 from . import _manifest
 from ._arrays import Arrays
-from ._data import Source
+from ._data import InputState
 from ._drive import Drive, Name
 from ._error import ReplayError, quoted
-from ._frame import Budget, Pictures
+from ._frame import Budget, FramePool
 from ._guest import Given, Guest, Wake, guarded, home, manifest_beside
 from ._manifest import Manifest
 from ._run import Decision, Fault, Run
@@ -22,15 +23,15 @@ from ._types import Definitions
 from ._windows import Moment, windows
 
 FAULTS_IN_A_ROW = 8
-SHORTEST_REST_NS, LONGEST_REST_NS = 100_000_000, 10_000_000_000
+SHORTEST_BACKOFF_NS, LONGEST_BACKOFF_NS = 100_000_000, 10_000_000_000
 
-MADE_ANEW = (
+REINITIALISED = (
     "gleaner: the lambda was made anew after a fault: what it kept in its variables is gone "
     "(in Python, all but the globals of its module)"
 )
-RESTS = (
-    "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms and twice as "
-    "long after each further fault, 10 s at most, until a wake ends well"
+BACKS_OFF = (
+    "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms "
+    "and twice as long after each further fault, 10 s at most, until a wake ends well"
 )
 
 Tables = Mapping[str, Mapping[str, Any]]
@@ -40,40 +41,43 @@ def replay(
     lambda_: Given,
     drive: Union[Name, Sequence[Name], Drive, Tables],
     *,
-    manifest: Optional[_manifest.Source] = None,
+    manifest: Optional[_manifest.ManifestSource] = None,
     config: Optional[Mapping[str, Any]] = None,
     remap: Optional[Mapping[str, str]] = None,
     types: Optional[Mapping[str, str]] = None,
     prints_to_log: bool = True,
 ) -> Run:
-    """Takes a lambda through a drive, as ``gleaner replay`` does, and returns what it decided.
+    """Runs a lambda over a drive, as ``gleaner replay`` does, and returns its decisions.
 
-    ``lambda_`` is its class, its module, or the folder that it lies in; ``manifest`` the path of its ``lambda.toml``, or a dict
-    of what would stand there, by default what lies beside the lambda. ``drive`` is the path of an MCAP file or a rosbag2
-    directory, a list of them, a :class:`Drive`, or arrays by topic::
+    ``lambda_`` is the class, module or folder of the lambda. ``manifest`` is the path of its
+    ``lambda.toml`` or a dict with the same content; the default is the file in the folder of the
+    lambda. ``drive`` is the path of an MCAP file or a rosbag2 directory, a list of them, a
+    :class:`Drive`, or arrays by topic::
 
         replay(Lambda, {"/imu/data": {"t": seconds, "linear_acceleration.z": az}})
 
-    ``config`` lies over ``[config]``; ``remap`` gives topics of the manifest the names that they have in the drive; ``types``
-    are definitions, the text of a ``.msg`` by its type's name, for types that neither the drive nor ``msg/`` beside the lambda nor
-    ROS 2 has. What the lambda prints is its log, unless ``prints_to_log`` is false, as a debugger wants it.
+    ``config`` overrides values of ``[config]``. ``remap`` maps topics of the manifest to topics of
+    the drive. ``types`` maps type names to texts of ``.msg`` files, for types that are neither in
+    the drive, nor in the folder ``msg/`` of the lambda, nor in ROS 2. Text that the lambda prints
+    goes to its log; with ``prints_to_log=False``, for example in a debugger, it goes to standard
+    output.
 
-    Raises ReplayError if one of these cannot be used, StartError if the lambda's import or ``init`` raises. What a wake raises
-    is a fault of its decision. Ctrl-C ends the replay."""
+    Raises ReplayError if an argument cannot be used, and StartError if the lambda's import or
+    ``init`` raises. An exception in a wake is a fault in its decision. Ctrl-C ends the replay."""
     source = manifest if manifest is not None else manifest_beside(lambda_)
     read = _manifest.read(source, config or {})
     if isinstance(lambda_, (str, os.PathLike)) and read.kind != "python":
         raise ReplayError(
             f"lambda `{lambda_}` is of kind `{read.kind}`",
-            help="only lambdas in Python run here; use gleaner replay",
+            help="only Python lambdas run here; use gleaner replay",
         )
     beside = home(lambda_) if isinstance(source, Mapping) else Path(source).parent
     more = Definitions(types or {}, None if beside is None else beside / "msg")
-    return _Pass(lambda_, read, drive, dict(remap or {}), more).run(prints_to_log)
+    return _ReplayLoop(lambda_, read, drive, dict(remap or {}), more).run(prints_to_log)
 
 
-class _Pass:
-    """One pass of a lambda over its drive."""
+class _ReplayLoop:
+    """The event loop of one replay."""
 
     def __init__(
         self, given: Given, manifest: Manifest, drive: Any, remap: Dict[str, str], more: Definitions
@@ -84,7 +88,7 @@ class _Pass:
         self._drive = _drive(drive, manifest, names, more)
         self._sources = self._inputs(names, more)
         # In the order of the manifest; two inputs may be one topic of the drive.
-        self._by_topic: Dict[str, List[Source]] = {}
+        self._by_topic: Dict[str, List[InputState]] = {}
         for source in self._sources:
             self._by_topic.setdefault(names[source.declared.topic], []).append(source)
         _check_recorded(self._drive, manifest, remap)
@@ -92,10 +96,10 @@ class _Pass:
         woken_by = [source for source in self._sources if source.declared.name == manifest.event]
         self._schedule: Schedule = Event(woken_by[0]) if woken_by else Periodic(manifest.period_ns)
         self._decisions: List[Decision] = []
-        self._in_a_row, self._rest_ns = 0, 0
-        self._rest: Tuple[int, int] = (0, 0)
+        self._in_a_row, self._backoff_ns = 0, 0
+        self._backoff: Tuple[int, int] = (0, 0)
 
-    def _inputs(self, names: Mapping[str, str], more: Definitions) -> List[Source]:
+    def _inputs(self, names: Mapping[str, str], more: Definitions) -> List[InputState]:
         drive, inputs, limits = self._drive, self._manifest.inputs, self._manifest.limits
         for declared in inputs:
             found = drive.type_of(names[declared.topic])
@@ -108,12 +112,14 @@ class _Pass:
             drive.types([declared.type_name for declared in inputs], more),
             Budget(limits),
         )
-        return [Source(declared, types, limits, Pictures(declared, budget)) for declared in inputs]
+        return [
+            InputState(declared, types, limits, FramePool(declared, budget)) for declared in inputs
+        ]
 
     def run(self, prints_to_log: bool) -> Run:
         with guarded(self._session.log if prints_to_log else None, self._given):
             self._guest.init()
-            self._course()
+            self._run_loop()
         session, drive = self._session, self._drive
         triggers = [trigger for decision in self._decisions for trigger in decision.triggers]
         return Run(
@@ -129,7 +135,7 @@ class _Pass:
             windows=windows(self._manifest.record, triggers, drive.start_ns, drive.end_ns),
         )
 
-    def _course(self) -> None:
+    def _run_loop(self) -> None:
         self._schedule.begin(self._drive.begins_ns)
         for topic, arrival in self._drive.deliveries(set(self._by_topic)):
             self._ticks(arrival.at_ns)
@@ -137,7 +143,7 @@ class _Pass:
                 source.ring.push(arrival)
                 for wake in self._schedule.events():
                     self._wake(wake[1].arrival.at_ns, wake)
-        # A tick of the very last instant is still due.
+        # A tick at the last instant is still due.
         self._ticks(self._drive.end_ns + 1)
 
     def _ticks(self, now_ns: int) -> None:
@@ -145,14 +151,14 @@ class _Pass:
             self._wake(tick.at_ns, tick)
 
     def _wake(self, at_ns: int, wake: Wake) -> None:
-        """From cause to decision. What a lambda triggers before it faults still counts."""
+        """Runs one wake and adds its decision. Triggers before a fault still count."""
         session = self._session
-        if self._rest[0] <= at_ns < self._rest[1]:
+        if self._backoff[0] <= at_ns < self._backoff[1]:
             session.backed_off += 1
             return
         session.begin(at_ns)
         if self._in_a_row > 0:
-            session.note(MADE_ANEW)
+            session.note(REINITIALISED)
         started = time.perf_counter_ns()
         fault = self._guest.wake(wake)
         run_ns = time.perf_counter_ns() - started
@@ -160,23 +166,30 @@ class _Pass:
         triggers = [
             Moment(at_s, at_ns, it.kind, it.label, it.score, it.attributes) for it in session.end()
         ]
-        told = None if fault is None else Fault(fault.kind, fault.message, None, fault.allowed)
+        decision_fault = (
+            None if fault is None else Fault(fault.kind, fault.message, None, fault.allowed)
+        )
         self._decisions.append(
-            Decision(at_ns=at_ns, **_cause(wake), triggers=triggers, fault=told, run_ns=run_ns)
+            Decision(
+                at_ns=at_ns, **_cause(wake), triggers=triggers, fault=decision_fault, run_ns=run_ns
+            )
         )
         self._count(at_ns, fault is not None)
 
     def _count(self, at_ns: int, faulted: bool) -> None:
-        """After so many faults in a row the lambda rests, for twice as long after each further one."""
+        """Starts back-off after ``FAULTS_IN_A_ROW`` faults in a row; each further one doubles
+        it."""
         if not faulted:
-            self._in_a_row, self._rest_ns, self._rest = 0, 0, (0, 0)
+            self._in_a_row, self._backoff_ns, self._backoff = 0, 0, (0, 0)
             return
         self._in_a_row += 1
         if self._in_a_row >= FAULTS_IN_A_ROW:
-            self._rest_ns = min(max(2 * self._rest_ns, SHORTEST_REST_NS), LONGEST_REST_NS)
-            self._rest = (at_ns, at_ns + self._rest_ns)
+            self._backoff_ns = min(
+                max(2 * self._backoff_ns, SHORTEST_BACKOFF_NS), LONGEST_BACKOFF_NS
+            )
+            self._backoff = (at_ns, at_ns + self._backoff_ns)
         if self._in_a_row == FAULTS_IN_A_ROW:
-            self._session.note(RESTS)
+            self._session.note(BACKS_OFF)
 
 
 def _cause(wake: Wake) -> Dict[str, Any]:
@@ -202,12 +215,15 @@ def _check_remap(remap: Mapping[str, str], manifest: Manifest) -> None:
 def _check_recorded(
     drive: Union[Drive, Arrays], manifest: Manifest, remap: Mapping[str, str]
 ) -> None:
-    """A drive may lack some of the topics of `[record]`; where it has none, nothing would be kept."""
+    """Raises ReplayError if the drive has no topic of `[record]`. Some of them may be missing."""
     if manifest.record is None or drive.is_partial:
         return
     topics = [remap.get(topic, topic) for topic in manifest.record.topics]
     if not any(topic in drive.topics for topic in topics):
-        help = f"the drive has {quoted(drive.topics)}; pass remap={{FROM: TO}}, or a manifest without [record]"
+        help = (
+            f"the drive has {quoted(drive.topics)}; pass remap={{FROM: TO}}, or a manifest "
+            "without [record]"
+        )
         raise ReplayError(
             "the drive has none of the topics of [record]", f"[record] has {quoted(topics)}", help
         )
@@ -225,6 +241,6 @@ def _drive(
         (names[one.topic] for one in manifest.inputs if one.name == manifest.event), None
     )
     if woken_by is not None and woken_by not in given:
-        cause = f"there are arrays of {quoted(given)}, and the lambda is woken by `{woken_by}`"
-        raise ReplayError("nothing would wake the lambda", cause, "give arrays of that topic")
+        cause = f"there are arrays of {quoted(given)}, and `{woken_by}` wakes the lambda"
+        raise ReplayError("nothing would wake the lambda", cause, "pass arrays of that topic")
     return Arrays(given, more, type_names)

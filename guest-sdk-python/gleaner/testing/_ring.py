@@ -1,4 +1,5 @@
-"""The newest samples of one input, within a number of cells: what is held by the lambda stays, and may cost others their place."""
+"""The ring: the newest samples of one input, in a fixed number of cells. Samples that the lambda
+holds stay, and can displace others."""
 
 from __future__ import annotations
 
@@ -9,18 +10,18 @@ from ..data import Guid
 
 
 class Arrival(NamedTuple):
-    """One message of a drive, on its way into a ring."""
+    """One message of a drive, as it enters a ring."""
 
     at_ns: int
     publish_ns: int
     writer: Guid
     seq: int
     cdr: bytes
-    """With its encapsulation, which is four bytes."""
+    """CDR with its encapsulation header of four bytes."""
 
 
 class Lease:
-    """Held by whatever a lambda was given of a sample. While one lives, the sample's cell is taken."""
+    """Keeps a cell in use. Every object of a sample that a lambda gets refers to its lease."""
 
     __slots__ = ("cell", "__weakref__")
 
@@ -29,7 +30,7 @@ class Lease:
 
 
 class Cell:
-    """One sample. What is read from its bytes is kept with it."""
+    """One sample, with its decoded message once it has been read."""
 
     __slots__ = ("arrival", "position", "message", "_lease")
 
@@ -40,7 +41,7 @@ class Cell:
         self._lease: Optional[weakref.ref[Lease]] = None
 
     def lease(self) -> Lease:
-        """The one that is out, or a new one."""
+        """Returns the existing lease, or a new one."""
         lease = self._lease() if self._lease is not None else None
         if lease is None:
             lease = Lease(self)
@@ -53,7 +54,8 @@ class Cell:
 
 
 class Ring:
-    """Shows ``depth`` samples, over ``depth + hold + 1`` cells of ``max_size`` bytes."""
+    """A ring that shows ``depth`` samples, with ``depth + hold + 1`` cells of ``max_size``
+    bytes."""
 
     def __init__(self, depth: int, hold: int, max_size: int) -> None:
         self.depth, self.cells, self.max_size = depth, depth + hold + 1, max_size
@@ -63,7 +65,7 @@ class Ring:
         self._left: List[Cell] = []
 
     def push(self, arrival: Arrival) -> None:
-        """Takes a sample in, or counts why not."""
+        """Adds a sample, or counts the reason for refusing it."""
         if len(arrival.cdr) - 4 > self.max_size:
             self.too_big += 1
             return
@@ -80,7 +82,7 @@ class Ring:
                 self._left.append(leaving)
 
     def _evict(self) -> bool:
-        """Lets the oldest sample go that nobody holds."""
+        """Removes the oldest sample that the lambda does not hold. Returns whether there is one."""
         for position, cell in self._shown.items():
             if not cell.is_held:
                 del self._shown[position]
@@ -96,9 +98,10 @@ class Ring:
         return cells[0] if cells else None
 
     def newest_while(self, most: int, keep: Callable[[Arrival], bool]) -> List[Cell]:
-        """The newest samples back to the first one that ``keep`` refuses, ``most`` at most; oldest first."""
+        """The newest samples back to the first one that ``keep`` rejects, at most ``most``; oldest
+        first."""
         found: List[Cell] = []
-        # A dict is in the order of its positions: they only ever rise.
+        # The dict is in the order of positions, since they only increase.
         for cell in reversed(self._shown.values()):
             if len(found) >= most or not keep(cell.arrival):
                 break

@@ -1,4 +1,4 @@
-"""What a replay found: plain values, which hold nothing of the drive."""
+"""The result of a replay: plain values, which keep no reference to the drive."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ..data import Counts
-from ._session import Line
+from ._session import LogLine
 from ._windows import Moment, Window
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Why a wake ended early. ``message`` ends with what was raised."""
+    """An error that ended a wake early. ``message`` ends with the exception."""
 
     kind: str
-    """``exception`` or ``memory``; the host knows more kinds."""
+    """``exception`` or ``memory``; the host has more kinds."""
     message: str
     used: Optional[int] = None
     allowed: Optional[int] = None
@@ -35,14 +35,14 @@ class Decision:
     topic: Optional[str]
     writer: Optional[str]
     seq: Optional[int]
-    """Counted from 1 here. In the host it is the recorder's, where it counted."""
+    """Sequence number, counted from 1. In the host it is that of the recording, if it has one."""
     triggers: List[Moment]
     fault: Optional[Fault]
     run_ns: int
-    """Time in the lambda, at this desk."""
+    """Run time of the wake on this machine, in ns."""
 
     def as_json(self) -> Dict[str, Any]:
-        """The object that ``decisions.jsonl`` has."""
+        """The JSON object of this decision in ``decisions.jsonl``."""
         triggers = [
             {"kind": t.kind, "label": t.label, "score": t.score, "attributes": t.attributes}
             for t in self.triggers
@@ -53,31 +53,33 @@ class Decision:
 
 @dataclass(frozen=True)
 class Run:
-    """What a lambda decided, wake by wake."""
+    """The decisions of a lambda, with its log and counts."""
 
     decisions: List[Decision]
     """One for each wake."""
-    log: List[Line]
-    """What the lambda logged and printed, and what the host noted."""
+    log: List[LogLine]
+    """Log lines and printed text of the lambda, and log lines of the host."""
     counts: Dict[str, Counts]
-    """By input: what became of the samples."""
+    """Numbers of received and lost samples, by input."""
     start_ns: int
-    """Stamp of the drive's first message; 0 of arrays."""
+    """Stamp of the drive's first message, in ns; 0 for arrays."""
     end_ns: int
-    """Stamp of its last message."""
+    """Stamp of the drive's last message, in ns."""
     log_dropped: int
-    """Lines beyond the limits of the log."""
+    """Number of log lines dropped by the limits."""
     triggers_refused: int
-    """Triggers beyond ``events_per_minute``."""
+    """Number of triggers refused by ``events_per_minute``."""
     backed_off: int
-    """Wakes that did not happen, because the lambda had faulted again and again."""
+    """Number of wakes skipped during back-off, after repeated faults."""
     missed_ticks: int
+    """Number of ticks that were due and did not happen."""
     windows: List[Window]
-    """What ``[record]`` keeps, by time: windows that overlap as one. Empty without it."""
+    """The windows that ``[record]`` keeps, by time; overlapping ones are merged. Empty without
+    it."""
 
     @property
     def triggers(self) -> List[Moment]:
-        """All triggers, in their order."""
+        """All triggers, in the order of the calls."""
         return [trigger for decision in self.decisions for trigger in decision.triggers]
 
     @property
@@ -86,7 +88,7 @@ class Run:
         return [decision for decision in self.decisions if decision.fault is not None]
 
     def series(self, label: str) -> Tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Times in s and scores of the events with this label: to be plotted or compared."""
+        """Times in s and scores of the events with this label, as arrays."""
         events = [
             trigger
             for trigger in self.triggers

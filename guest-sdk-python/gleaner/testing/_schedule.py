@@ -1,10 +1,10 @@
-"""When a lambda runs: for each new sample of one input, or every so often. As in a replay of the host."""
+"""Schedules wakes as in a replay by the host: for each new sample of one input, or periodically."""
 
 from __future__ import annotations
 
 from typing import Iterator, NamedTuple, Tuple, Union
 
-from ._data import Source
+from ._data import InputState
 from ._ring import Cell
 
 # A longer gap between two samples (a clock that jumped, two drives far apart) is counted as missed.
@@ -19,17 +19,18 @@ class Tick(NamedTuple):
 
 
 class Event:
-    """Wakes on new samples of one input. A drive waits for its lambda, so that `latest` and `each` are the same here."""
+    """Wakes on new samples of one input. The replay waits for the lambda, so the backlogs `latest`
+    and `each` are the same here."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: InputState) -> None:
         self._source = source
         self._next = 0
         self.missed_total = 0
 
     def begin(self, at_ns: int) -> None:
-        """Time begins."""
+        """Sets the start time; it has no effect on events."""
 
-    def events(self) -> Iterator[Tuple[Source, Cell]]:
+    def events(self) -> Iterator[Tuple[InputState, Cell]]:
         """The wakes caused by samples that have arrived."""
         ring = self._source.ring
         while self._next < ring.head:
@@ -54,20 +55,21 @@ class Periodic:
         self.missed_total = 0
 
     def begin(self, at_ns: int) -> None:
-        """Time begins: the first tick comes a period later."""
+        """Sets the start time: the first tick is due a period later."""
         self._due_ns = at_ns + self._period_ns
 
-    def events(self) -> Iterator[Tuple[Source, Cell]]:
+    def events(self) -> Iterator[Tuple[InputState, Cell]]:
         return iter(())
 
     def ticks(self, now_ns: int) -> Iterator[Tick]:
-        """The wakes that are due before ``now_ns``: a tick sees all samples of its own instant."""
+        """The ticks that are due before ``now_ns``: a tick follows all samples of the same
+        instant."""
         while self._due_ns < now_ns:
             behind = (now_ns - self._due_ns - 1) // self._period_ns + 1
             if behind > CATCH_UP_TICKS:
                 self._missed += behind
                 self.missed_total += behind
-                # In step with the ticks before; the next one is due at `now_ns` or later.
+                # Keeps the phase of the earlier ticks; the next one is due at `now_ns` or later.
                 self._due_ns += behind * self._period_ns
                 return
             tick = Tick(self._due_ns, self._missed)

@@ -1,4 +1,5 @@
-"""What one lambda causes: triggers, log lines and what it keeps by name, each within its limits and counted beyond them."""
+"""The session of a replay: triggers, log lines and scratch memory of a lambda, with their limits
+and counters."""
 
 from __future__ import annotations
 
@@ -19,18 +20,18 @@ LEVELS = ("error", "warn", "info", "debug", "trace")
 
 
 @dataclass(frozen=True)
-class Line:
-    """One line of the log: a line of ``log.jsonl``."""
+class LogLine:
+    """One log line: a line of ``log.jsonl``."""
 
     at_ns: int
-    """Time of the wake that wrote it; 0 before the first."""
+    """Time of the wake that wrote it, in ns; 0 before the first wake."""
     level: Level
     message: str
 
 
 @dataclass(frozen=True)
-class Caused:
-    """A trigger, before anybody knows of which wake."""
+class PendingTrigger:
+    """A trigger, without the time of its wake."""
 
     kind: str
     label: str
@@ -39,33 +40,35 @@ class Caused:
 
 
 class Session:
-    """Lives as long as the replay; a lambda that is made anew finds it as it was."""
+    """State for the whole replay. It survives faults: a fresh instance of the lambda finds it
+    unchanged."""
 
     def __init__(self, limits: Mapping[str, int]) -> None:
         self.limits = limits
         self.now_ns = 0
-        self.lines: List[Line] = []
+        self.lines: List[LogLine] = []
         self.log_dropped = self.triggers_refused = self.backed_off = 0
-        self._triggers: Optional[List[Caused]] = None
+        self._triggers: Optional[List[PendingTrigger]] = None
         self._minute, self._caused = 0, 0
-        self._second, self._said, self._said_bytes = 0, 0, 0
+        self._second, self._second_lines, self._second_bytes = 0, 0, 0
         self._notes: Tuple[int, List[str]] = (0, [])
 
     def begin(self, now_ns: int) -> None:
         """Begins a wake."""
         self.now_ns, self._triggers = now_ns, []
 
-    def end(self) -> List[Caused]:
-        """Ends a wake and takes what it caused."""
+    def end(self) -> List[PendingTrigger]:
+        """Ends a wake and returns its triggers."""
         caused, self._triggers = self._triggers or [], None
         return caused
 
-    def suspend(self) -> Optional[List[Caused]]:
-        """An ``init`` begins, which may come in the midst of a wake but is no part of it; gives what `resume` wants."""
+    def suspend(self) -> Optional[List[PendingTrigger]]:
+        """Refuses triggers while ``init`` runs, which may be in the middle of a wake but is not a
+        part of it. Returns the argument of `resume`."""
         caused, self._triggers = self._triggers, None
         return caused
 
-    def resume(self, caused: Optional[List[Caused]]) -> None:
+    def resume(self, caused: Optional[List[PendingTrigger]]) -> None:
         self._triggers = caused
 
     def cause(
@@ -77,7 +80,7 @@ class Session:
             raise _invalid(
                 "triggers belong to a wake: in init, and between two wakes, there are none"
             )
-        # Who has used up the minute may still end what was begun.
+        # A lambda over the limit per minute may still end a recording.
         if kind != "stop":
             self._check_rate()
         if len(self._triggers) >= PER_WAKE:
@@ -86,7 +89,7 @@ class Session:
                 "too-many",
             )
         _check(label, score, plain)
-        self._triggers.append(Caused(kind, label, score, plain))
+        self._triggers.append(PendingTrigger(kind, label, score, plain))
         self._caused += 1
 
     def _check_rate(self) -> None:
@@ -95,42 +98,46 @@ class Session:
             self._minute, self._caused = minute, 0
         if self._caused >= allowed:
             self.triggers_refused += 1
-            why = f"the lambda has caused {allowed} triggers in this minute already, `events_per_minute` in [limits]"
+            why = (
+                f"the lambda has caused {allowed} triggers in this minute already, "
+                "`events_per_minute` in [limits]"
+            )
             raise TriggerError(f"{why}; further ones are refused", "too-many")
 
     def log(self, level: Any, message: Any) -> None:
-        """What a lambda may write in one second of its time is bounded; the rest is counted."""
+        """Writes a line within the limits of a second of the lambda's time; drops and counts
+        further lines."""
         _must_be_text(level)
         _must_be_text(message)
         if level not in LEVELS:
             raise ValueError(
-                "the level of a log line is `error`, `warn`, `info`, `debug` or `trace`"
+                "the level of a log line must be `error`, `warn`, `info`, `debug` or `trace`"
             )
         message = cut(message, LINE_BYTES)
         size, second = len(message.encode()), self.now_ns // SECOND_NS
         if self._second != second:
-            self._second, self._said, self._said_bytes = second, 0, 0
+            self._second, self._second_lines, self._second_bytes = second, 0, 0
         if (
-            self._said >= self.limits["log_lines"]
-            or self._said_bytes + size > self.limits["log_bytes"]
+            self._second_lines >= self.limits["log_lines"]
+            or self._second_bytes + size > self.limits["log_bytes"]
         ):
             self.log_dropped += 1
             return
-        self._said, self._said_bytes = self._said + 1, self._said_bytes + size
-        self.lines.append(Line(self.now_ns, level, message))
+        self._second_lines, self._second_bytes = self._second_lines + 1, self._second_bytes + size
+        self.lines.append(LogLine(self.now_ns, level, message))
 
     def note(self, text: str) -> None:
-        """The host says something: the same thing once in a second."""
+        """Writes a line of the host, the same text at most once a second."""
         second = self.now_ns // SECOND_NS
         if self._notes[0] != second:
             self._notes = (second, [])
         if text not in self._notes[1]:
             self._notes[1].append(text)
-            self.lines.append(Line(self.now_ns, "warn", text))
+            self.lines.append(LogLine(self.now_ns, "warn", text))
 
 
 class Scratch:
-    """``ctx.scratch``, within ``scratch`` of ``[limits]``."""
+    """``ctx.scratch``, within ``scratch`` in ``[limits]``."""
 
     def __init__(self, limits: Mapping[str, int]) -> None:
         self._granted, self._most_given = limits["scratch"], limits["call_bytes"]
@@ -147,13 +154,15 @@ class Scratch:
         _must_be_text(name)
         if not 1 <= len(name.encode()) <= NAME_BYTES or any(map(_is_control, name)):
             raise ScratchError(
-                f"`{_visible(name[:NAME_BYTES])}` is no name for scratch; give 1 to 128 bytes without control characters",
+                f"`{_visible(name[:NAME_BYTES])}` is not a name for scratch; give 1 to 128 bytes "
+                "without control characters",
                 "wrong-name",
             )
         there = self._entries.get(name)
         if there is None and len(self._entries) >= ENTRIES:
             raise ScratchError(
-                f"there is no room for `{name}` beside {ENTRIES} entries; remove some, or append to one of them",
+                f"there is no room for `{name}` beside {ENTRIES} entries; remove some, or append "
+                "to one of them",
                 "no-room",
             )
         given_back = len(there) if there is not None and in_place else 0
@@ -180,7 +189,8 @@ class Scratch:
         _must_be_text(name)
         if name not in self._entries:
             raise ScratchError(
-                f"scratch has no `{_visible(name[:NAME_BYTES])}`; it is empty when the lambda's process starts",
+                f"scratch has no `{_visible(name[:NAME_BYTES])}`; it is empty when the lambda's "
+                "process starts",
                 "no-such-entry",
             )
         return self._entries[name]
@@ -194,14 +204,14 @@ class Scratch:
 
 
 def piece(data: bytes, offset: int, length: Optional[int], most: int) -> bytes:
-    """``length`` bytes from ``offset``, clamped to what is there and to ``most``."""
+    """``length`` bytes from ``offset``, clamped to ``data`` and to ``most``."""
     start = min(u64(offset), len(data))
     wanted = most if length is None else min(length, most)
     return data[start : start + wanted]
 
 
 def u64(number: Any) -> int:
-    """A whole number of 64 bits without a sign, as the host takes it; so are `u32` and `i64`."""
+    """Converts to an unsigned integer of 64 bits, with the errors of the host."""
     whole = operator.index(number)
     if whole < 0:
         raise OverflowError("can't convert negative int to unsigned")
@@ -225,7 +235,7 @@ def i64(number: Any) -> int:
 
 
 def cut(text: str, most: int) -> str:
-    """The longest start of ``text`` that has so many bytes at most."""
+    """The longest prefix of ``text`` with at most ``most`` bytes."""
     return text.encode()[:most].decode(errors="ignore")
 
 
@@ -239,7 +249,7 @@ def _is_control(char: str) -> bool:
 
 
 def _visible(name: str) -> str:
-    """With its control characters written out, as the host does it."""
+    """Escapes control characters, as the host does."""
     short = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
     return "".join(
         short.get(char, f"\\u{{{ord(char):x}}}") if _is_control(char) else char for char in name
@@ -277,7 +287,7 @@ def _check(label: str, score: Optional[float], attributes: Mapping[str, Attribut
 
 
 def _item(value: Any) -> Any:
-    """The plain number that one of numpy stands for. An array of several stands for none."""
+    """Converts a number of numpy to a plain one; None for an array of several elements."""
     try:
         return value.item()
     except Exception:

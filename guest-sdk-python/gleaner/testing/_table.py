@@ -1,4 +1,5 @@
-"""One table of a `lambda.toml`, whose keys are known: each is read as what it should be, or refused by its name."""
+"""Parses one table of a `lambda.toml`: refuses unknown keys, and reads each key with its type and
+bounds."""
 
 from __future__ import annotations
 
@@ -14,12 +15,12 @@ ITEMS_MAX = 256
 
 
 class Table:
-    """``title`` is how it is written, such as ``[schedule]``; ``file`` is where."""
+    """A table; ``title`` is its name, such as ``[schedule]``, in ``file``."""
 
     def __init__(self, file: str, title: str, entries: Any, known: Sequence[str]) -> None:
         self.file, self.title = file, title
         if not isinstance(entries, Mapping):
-            raise self.refusal("is no table", "see the README for what it holds")
+            raise self.refusal("is no table", "see docs/manifest.md for its keys")
         self.entries = entries
         for key in entries:
             if key not in known:
@@ -45,7 +46,7 @@ class Table:
         return value
 
     def form(self, key: str, example: str, rule: "re.Pattern[str]", longest: int) -> str:
-        """A text of one form."""
+        """Reads a text that matches ``rule``."""
         value = self.text(key, example)
         if rule.fullmatch(value) is None or len(value) > longest:
             raise self.refusal(f"has the {key} `{value[:64]}`", f"write it as in {example}")
@@ -58,7 +59,7 @@ class Table:
         return str(value)
 
     def integer(self, key: str, bounds: Tuple[int, int, int]) -> int:
-        """A whole number; ``bounds`` are its minimum, default and maximum."""
+        """Reads a whole number; ``bounds`` are its minimum, default and maximum."""
         value = self.entries.get(key, bounds[1])
         if isinstance(value, bool) or not isinstance(value, int):
             raise self.refusal(
@@ -67,14 +68,14 @@ class Table:
         return self._within(key, value, bounds)
 
     def size(self, key: str, bounds: Tuple[int, int, int]) -> int:
-        """Bytes."""
+        """Reads a size in bytes."""
         value = self.entries.get(key, bounds[1])
         if isinstance(value, int) and not isinstance(value, bool):
             return self._within(key, value, bounds)
         return self._within(key, self._unit(key, value, _units.size), bounds)
 
     def duration(self, key: str, bounds: Tuple[int, int, int]) -> int:
-        """Nanoseconds."""
+        """Reads a duration in nanoseconds."""
         if key not in self.entries:
             return bounds[1]
         return self._within(key, self._unit(key, self.entries[key], _units.duration), bounds)
@@ -97,6 +98,6 @@ class Table:
         if not isinstance(value, list) or len(value) > ITEMS_MAX:
             raise self.refusal(
                 f"has a `{key}` that is no list of at most {ITEMS_MAX}",
-                "see the README for what it holds",
+                "see docs/manifest.md for its keys",
             )
         return value

@@ -1,4 +1,5 @@
-"""Message types: what fields they have, and their messages as CDR and back. Reading them is the work of `rosbags`."""
+"""Message types: their fields, and decoding and encoding of CDR. `rosbags` parses the
+definitions."""
 
 from __future__ import annotations
 
@@ -32,19 +33,19 @@ class Member(NamedTuple):
 
     @property
     def is_wide(self) -> bool:
-        """Whether it is a `wstring`, whose size on the wire is not defined."""
+        """Returns whether this is a `wstring`, whose encoding in CDR is not defined."""
         return self.element == "wstring" or self.element.endswith("/wstring")
 
 
 class Types:
-    """The types that are read of one drive."""
+    """The message types of one drive that a lambda reads."""
 
     def __init__(self, store: Typestore) -> None:
         self._store = store
         self._members: Dict[str, List[Member]] = {}
 
     def members(self, type_name: str) -> List[Member]:
-        """The fields of a type, in the order of the wire."""
+        """The fields of a type, in the order of the message."""
         known = self._members.get(type_name)
         if known is None:
             known = [
@@ -55,22 +56,23 @@ class Types:
         return known
 
     def is_stamped(self, type_name: str) -> bool:
-        """Whether messages begin with a stamp: a header, or a time of the name `stamp`."""
+        """Returns whether messages begin with a stamp: a header, or a time named `stamp`."""
         first = self.members(type_name)[0]
         return first.length is None and (
             first.element == HEADER or (first.name, first.element) == ("stamp", TIME)
         )
 
     def decode(self, cdr: bytes, type_name: str) -> Any:
-        """The message in ``cdr``, which begins with the encapsulation. Raises whatever `rosbags` does for one that is none."""
+        """Decodes ``cdr``, which begins with the encapsulation header. Raises the exceptions of
+        `rosbags` for an invalid message."""
         return self._store.deserialize_cdr(cdr, type_name)
 
     def encode(self, message: Any, type_name: str) -> bytes:
-        """CDR with its encapsulation."""
+        """Encodes a message as CDR with its encapsulation header."""
         return bytes(self._store.serialize_cdr(message, type_name))
 
     def blank(self, type_name: str) -> Any:
-        """A message in which every number is 0, every text and every sequence empty."""
+        """A message with all numbers 0, and all texts and sequences empty."""
         members = self.members(type_name)
         return self._store.types[type_name](
             **{member.name: self._blank(member) for member in members}
@@ -92,14 +94,15 @@ class Types:
 
 
 def dtype(element: str) -> Any:
-    """numpy's type of the elements of an array; `byte` and `char` are as `rosbags` has them."""
+    """numpy type of the elements of an array; `byte` and `char` as in `rosbags`."""
     return np.dtype({"bool": np.bool_, "byte": np.int8, "char": np.uint8}.get(element, element))
 
 
 class Definitions:
-    """What a lambda brings along: the texts that were given, by the names of their types, and the `.msg` files of its folder `msg`.
+    """Message definitions of a lambda: texts by type name, and the `.msg` files of its folder
+    `msg`.
 
-    Raises ReplayError for a text that is no definition; a file is read when its type is looked for."""
+    Raises ReplayError for an invalid text. A file is read when its type is needed."""
 
     def __init__(self, texts: Mapping[str, str], folder: Optional[Path]) -> None:
         self._folder = folder
@@ -108,7 +111,8 @@ class Definitions:
             self._given.update(_parsed(type_name, text, "give the text of its .msg"))
 
     def find(self, type_name: str) -> Any:
-        """What `rosbags` knows of a type, or None: what was given is before what lies in the folder, and all of that before ROS 2.
+        """Returns the definition of a type, or None. Texts come before files of the folder, and
+        both before ROS 2.
 
         Raises ReplayError."""
         package, _, leaf = type_name.partition("/msg/")
@@ -118,7 +122,8 @@ class Definitions:
             found = self._read(type_name, path)
             if found is not None:
                 return found
-        # Last, as it says no package: a `Header.msg` of the lambda's own must not stand for that of all others.
+        # Last, since the path has no package: a `Header.msg` of the lambda must not replace that of
+        # every package.
         return _humble().fielddefs.get(type_name) or self._read(type_name, f"{leaf}.msg")
 
     def _read(self, type_name: str, inside: str) -> Any:
@@ -140,9 +145,9 @@ def _parsed(type_name: str, text: str, help: str) -> Dict[str, Any]:
 
 
 def gathered(own: Typestore, wanted: Iterable[str], more: Definitions) -> Types:
-    """The types that are wanted, with all that they refer to: as the drive has them of its ``own``, else as ``more`` has them.
+    """Collects types with all that they refer to: from the drive's ``own``, or else from ``more``.
 
-    Raises ReplayError for one that is nowhere."""
+    Raises ReplayError for a type in neither."""
     known: Dict[str, Any] = {}
     rest = [(type_name, type_name) for type_name in wanted]
     while rest:
@@ -153,8 +158,8 @@ def gathered(own: Typestore, wanted: Iterable[str], more: Definitions) -> Types:
         if found is None:
             cause = f"`{root}` refers to it" if root != type_name else ""
             help = (
-                'pass types={"%s": "the text of its .msg"}, or put its .msg file into msg/ beside the lambda'
-                % type_name
+                'pass types={"%s": "the text of its .msg"}, or put its .msg file into msg/ beside '
+                "the lambda" % type_name
             )
             raise ReplayError(f"there is no definition of `{type_name}`", cause, help)
         known[type_name] = found
@@ -173,13 +178,13 @@ def gathered(own: Typestore, wanted: Iterable[str], more: Definitions) -> Types:
 
 
 def none() -> Typestore:
-    """What a drive has that says nothing of its types."""
+    """The type store of a drive without definitions."""
     return get_typestore(Stores.EMPTY)
 
 
 @functools.lru_cache(maxsize=None)
 def _humble() -> Typestore:
-    """Made once: it compiles what it reads and writes."""
+    """The types of ROS 2 Humble; cached, since the store compiles its codecs."""
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
@@ -194,7 +199,7 @@ def _member(name: str, description: Any) -> Member:
 
 
 def stamp_of(message: Any, type_name: str, types: Types) -> Tuple[int, int]:
-    """Seconds and nanoseconds of the stamp with which messages of this type begin."""
+    """Seconds and nanoseconds of the stamp at the start of a message."""
     first = getattr(message, types.members(type_name)[0].name)
     stamp = getattr(first, "stamp", first)
     return int(stamp.sec), int(stamp.nanosec)

@@ -1,4 +1,4 @@
-"""Sizes and durations as people write them in `lambda.toml`: ``"2 MiB"``, ``"50ms"``."""
+"""Parses sizes and durations of `lambda.toml`, such as ``"2 MiB"`` and ``"50ms"``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TIME = re.compile(r"\s*([0-9]{1,19}(?:\.[0-9]{1,19})?) ?([a-z]+)\s*", re.ASCII)
 
 
 def size(text: str) -> int:
-    """Bytes. Raises ValueError, which says how a size is written."""
+    """Parses a size in bytes. Raises ValueError with the syntax of a size."""
     found = SIZE.fullmatch(text)
     if found is None or found.group(2) not in SIZES:
         raise ValueError(SIZE_RULE)
@@ -31,7 +31,7 @@ def size(text: str) -> int:
 
 
 def duration(text: str) -> int:
-    """Nanoseconds. Raises ValueError, which says how a duration is written."""
+    """Parses a duration in nanoseconds. Raises ValueError with the syntax of a duration."""
     found = TIME.fullmatch(text)
     if found is None or found.group(2) not in TIMES:
         raise ValueError(TIME_RULE)

@@ -1,4 +1,5 @@
-"""Triggers, and what `[record]` keeps of a drive for their sake: windows, where they overlap as one. `docs/clips.md` has the rules."""
+"""Computes the windows that `[record]` keeps for the triggers of a lambda, by the rules of
+`docs/clips.md`."""
 
 from __future__ import annotations
 
@@ -16,21 +17,21 @@ class Moment:
     """A trigger, with the time of its wake."""
 
     at_s: float
-    """Seconds since the start of the drive; of arrays, the time that they have."""
+    """Seconds since the start of the drive; for arrays, the time in the array."""
     at_ns: int
     kind: str
     """``event``, ``start`` or ``stop``."""
     label: str
     score: Optional[float]
-    """None unless it is an event."""
+    """Strength of an event; None for ``start`` and ``stop``."""
     attributes: Dict[str, AttributeValue] = field(default_factory=dict)
 
 
 class Window(NamedTuple):
-    """A stretch of time that clips would hold, both ends included."""
+    """A time range that clips would cover, both ends included."""
 
     from_s: float
-    """Seconds, as of :class:`Moment`."""
+    """Start in seconds, as in :class:`Moment`."""
     to_s: float
     from_ns: int
     to_ns: int
@@ -39,7 +40,8 @@ class Window(NamedTuple):
 def windows(
     record: Optional[Record], triggers: Iterable[Moment], start_ns: int, end_ns: int
 ) -> List[Window]:
-    """In the order of time. A recording that nobody stops ends with the drive; clips that are too long would be parted."""
+    """The windows by time; overlapping ones are merged. A recording without a ``stop`` ends with
+    the drive. A window is one clip here, also where the recorder would split it by length."""
     if record is None:
         return []
     stretches, started, started_from, opened_at = list[Tuple[int, int]](), set[str](), 0, None
@@ -48,7 +50,7 @@ def windows(
         if trigger.kind == "stop":
             if trigger.label in started:
                 started.discard(trigger.label)
-                # Together they are one window: it lasts until the last stop.
+                # Concurrent recordings are one window, which lasts until the last stop.
                 if not started:
                     stretches.append((started_from, at_ns + record.postroll))
             continue

@@ -1,4 +1,5 @@
-"""The same lambda on the same drive, at the desk and in the real host: every decision is equal, to the last bit of its scores."""
+"""Compares a local replay with the real host: the same lambda decides the same on the same drive,
+to the last bit of its scores."""
 
 from __future__ import annotations
 
@@ -12,9 +13,8 @@ import unittest
 from pathlib import Path
 from typing import Any, Dict, List, Union
 
-import drive
 import home
-from at_desk import AtDesk
+from local_run import LocalRun
 from drive import Image
 from hosted import Hosted
 
@@ -22,7 +22,7 @@ from gleaner.testing import Run, replay
 
 SAMPLE = home.CHECKOUT / "examples" / "data" / "highway_drive.mcap"
 
-# How long it took differs each time.
+# The run time differs each time.
 NOT_COMPARED = ("run_ns",)
 
 
@@ -31,13 +31,13 @@ def comparable(decision: Dict[str, Any]) -> Dict[str, Any]:
 
 
 class Examples(unittest.TestCase):
-    """Examples on the sample drive. What they find there stands in their `expected.txt`."""
+    """Examples on the sample drive. Their `expected.txt` has the results."""
 
     def example(self, name: str, config: Dict[str, Union[int, float]]) -> Run:
         return self.both(home.CHECKOUT / "examples" / name / "python", config)
 
     def both(self, python: Path, config: Dict[str, Union[int, float]]) -> Run:
-        """What the host decides in each of its wakes is what the desk decides."""
+        """Replays in the host and locally, and compares the decisions."""
         extension = home.extension_path()
         with tempfile.TemporaryDirectory() as folder:
             shutil.copytree(
@@ -69,14 +69,14 @@ class Examples(unittest.TestCase):
         run = replay(python, SAMPLE, config=config)
         decided = [decision.as_json() for decision in run.decisions]
         self.assertEqual(len(decided), len(lines))
-        for n, (ours, theirs) in enumerate(zip(decided, map(json.loads, lines))):
-            self.equal(ours, theirs, f"decision {n}")
+        for n, (local, hosted) in enumerate(zip(decided, map(json.loads, lines))):
+            self.equal(local, hosted, f"decision {n}")
         kept = [(clip["from_ns"], clip["to_ns"]) for clip in clips]
         self.assertEqual([(window.from_ns, window.to_ns) for window in run.windows], kept)
         return run
 
-    def equal(self, ours: Dict[str, Any], theirs: Dict[str, Any], which: str) -> None:
-        self.assertEqual(comparable(ours), comparable(theirs), which)
+    def equal(self, local: Dict[str, Any], hosted: Dict[str, Any], which: str) -> None:
+        self.assertEqual(comparable(local), comparable(hosted), which)
 
     def test_hello(self) -> None:
         run = self.example("hello", {"brake_mps2": -1.4})
@@ -89,7 +89,7 @@ class Examples(unittest.TestCase):
         run = self.example("imu-fft", {"rough": 0.02})
         self.assertGreater(len(run.triggers), 50)
 
-    def test_what_is_recorded_moves_no_tick(self) -> None:
+    def test_recorded_topics_do_not_change_the_ticks(self) -> None:
         ticks = []
         with tempfile.TemporaryDirectory() as folder:
             for recorded in (
@@ -125,24 +125,26 @@ preroll = "10ms"
 TICKS = """
 def on_tick(ctx):
     newest = ctx.input("imu").newest()
-    ctx.event("tick", newest.number("linear_acceleration.z"), seq=newest.identity.seq, age=ctx.now_ns() - newest.stamps.at_ns)
+    age = ctx.now_ns() - newest.stamps.at_ns
+    ctx.event("tick", newest.number("linear_acceleration.z"), seq=newest.identity.seq, age=age)
 """
 
 
 class Pictures(Examples):
-    """Another decoder of JPEG makes other pixels, by 3 of 255 at most on this drive."""
+    """The local JPEG decoder is another one; its pixels differ by at most 3 of 255 on this
+    drive."""
 
-    def equal(self, ours: Dict[str, Any], theirs: Dict[str, Any], which: str) -> None:
+    def equal(self, local: Dict[str, Any], hosted: Dict[str, Any], which: str) -> None:
         lumas = [
             [trigger["attributes"].pop("luma") for trigger in it["triggers"]]
-            for it in (ours, theirs)
+            for it in (local, hosted)
         ]
-        super().equal(ours, theirs, which)
+        super().equal(local, hosted, which)
         for luma, expected in zip(*lumas):
             self.assertAlmostEqual(luma, expected, delta=0.01)
 
     test_hello = test_imu_fft = None  # type: ignore[assignment]
-    test_what_is_recorded_moves_no_tick = None  # type: ignore[assignment]
+    test_recorded_topics_do_not_change_the_ticks = None  # type: ignore[assignment]
 
     def test_brake_dark(self) -> None:
         run = self.example("brake-dark", {"brake_mps2": -1.4, "dark_luma": 50})
@@ -152,7 +154,7 @@ class Pictures(Examples):
         )
 
 
-# Sums of pixels of every kind as attributes, and digests of pictures that were made of them.
+# Sums of pixels of every layout as attributes, and checksums of the frames that were created.
 PIXELS = """
 import zlib
 
@@ -162,11 +164,13 @@ SIZES = [(1, 1), (3, 2), (5, 4), (7, 3), (8, 6), (16, 5), (20, 17)]
 def on_event(ctx, event):
     frame = event.as_frame()
     ctx.event("info", 0.0, **frame.info._asdict())
-    ctx.event("array", 0.0, shape=str(frame.array().shape), pixels=zlib.crc32(frame.array().tobytes()))
+    array = frame.array()
+    ctx.event("array", 0.0, shape=str(array.shape), pixels=zlib.crc32(array.tobytes()))
     ctx.event("read", 0.0, pixels=zlib.crc32(frame.read()), piece=zlib.crc32(frame.read(3, 5)))
     try:
         for roi in ROIS:
-            ctx.event("luma", frame.mean_luma(roi), histogram=zlib.crc32(frame.histogram(roi).tobytes()))
+            histogram = zlib.crc32(frame.histogram(roi).tobytes())
+            ctx.event("luma", frame.mean_luma(roi), histogram=histogram)
         ctx.event("gray", 0.0, pixels=zlib.crc32(frame.to_gray().read()))
         for width, height in SIZES:
             made = frame.resize(width, height)
@@ -181,7 +185,7 @@ class Operations(unittest.TestCase):
         home.extension_path()
         images = pictures()
         found = []
-        for how in (Hosted, AtDesk):
+        for how in (Hosted, LocalRun):
             case = how()
             case.setUp()
             self.addCleanup(case.doCleanups)
@@ -189,12 +193,12 @@ class Operations(unittest.TestCase):
             found.append([decision["triggers"] for decision in decisions])
         labels = [trigger["label"] for triggers in found[0] for trigger in triggers]
         self.assertEqual((labels.count("resize"), labels.count("refused")), (7 * 9, 2))
-        for image, theirs, ours in zip(images, *found):
-            self.assertEqual(ours, theirs, image.encoding)
+        for image, hosted, local in zip(images, *found):
+            self.assertEqual(local, hosted, image.encoding)
 
 
 def pictures() -> List[Image]:
-    """One of each layout, of random pixels, with and without padding behind rows."""
+    """An image of each layout, with random pixels, with and without padding of rows."""
     noise = random.Random(6)
     images = []
     for encoding, pixel in [

@@ -1,6 +1,6 @@
-"""What holds of lambdas in the real host, held at the desk: the suites of `test_hosted` and `test_printed`, by inheritance.
+"""Runs the suites of `test_hosted` and `test_printed` locally, by inheritance.
 
-Left out is what only a process of its own can do or refuse."""
+Tests that need a process of its own are left out."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from typing import Dict, List
 import home
 import test_hosted
 import test_printed
-from at_desk import AtDesk
+from local_run import LocalRun
 from hosted import EACH, GREY, MANIFEST
 
 from gleaner.testing import replay
 
 
-class Arrays(AtDesk, test_hosted.Arrays):
+class Arrays(LocalRun, test_hosted.Arrays):
     pass
 
 
-class Data(AtDesk, test_hosted.Data):
-    # `rosbags` hands out log times only.
+class Data(LocalRun, test_hosted.Data):
+    # `rosbags` returns log times only.
     PUBLISHED_NS = 1_000_000_000
 
 
-class Triggers(AtDesk, test_hosted.Triggers):
+class Triggers(LocalRun, test_hosted.Triggers):
     pass
 
 
-class Ticks(AtDesk, test_hosted.Ticks):
+class Ticks(LocalRun, test_hosted.Ticks):
     pass
 
 
-class Faults(AtDesk, test_hosted.Faults):
-    def test_leaving_the_process_is_a_fault_too(self) -> None:
+class Faults(LocalRun, test_hosted.Faults):
+    def test_an_exit_of_the_process_is_a_fault(self) -> None:
         self.assertTrue(
             self.fault("import sys\ndef on_event(ctx, event): sys.exit(3)").endswith(
                 "SystemExit: 3"
@@ -50,29 +50,29 @@ class Faults(AtDesk, test_hosted.Faults):
         )
 
     def test_ctrl_c_ends_the_replay(self) -> None:
-        # In the host it ends the process. Here somebody sits before it.
+        # In the host it ends the process. Here it must reach the user.
         with self.assertRaises(KeyboardInterrupt):
             self.start("def on_event(ctx, event): raise KeyboardInterrupt", [GREY])
 
-    test_a_panic_of_the_host_is_a_fault_and_not_the_end = None  # type: ignore[assignment]
-    test_a_thread_left_behind_does_not_keep_the_process = None  # type: ignore[assignment]
+    test_a_panic_of_the_host_is_a_fault_and_the_replay_continues = None  # type: ignore[assignment]
+    test_a_running_thread_does_not_keep_the_process = None  # type: ignore[assignment]
 
 
-class Printing(AtDesk, test_printed.Printing):
-    test_what_is_printed_is_no_report_and_not_said_twice = None  # type: ignore[assignment]
+class Printing(LocalRun, test_printed.Printing):
+    test_printed_text_is_not_in_the_report_and_logged_once = None  # type: ignore[assignment]
     test_no_other_process_can_be_started = None  # type: ignore[assignment]
-    test_a_farewell_after_the_last_wake_goes_to_standard_error = None  # type: ignore[assignment]
-    test_a_lambda_that_cannot_start_has_printed_too = None  # type: ignore[assignment]
+    test_text_printed_after_the_last_wake_goes_to_standard_error = None  # type: ignore[assignment]
+    test_text_printed_before_a_failed_start_is_on_standard_error = None  # type: ignore[assignment]
 
 
-class Streams(AtDesk):
-    def test_afterwards_the_streams_are_those_of_before(self) -> None:
+class Streams(LocalRun):
+    def test_the_streams_are_restored(self) -> None:
         before = sys.stdout, sys.stderr, list(sys.path), sys.modules.get("main")
         self.replay("def on_event(ctx, event): print('a')", [GREY])
         self.assertEqual((sys.stdout, sys.stderr, list(sys.path), sys.modules.get("main")), before)
         self.assertEqual(self.log(), [("info", "a")])
 
-    def test_modules_beside_a_lambda_are_fresh_in_each_run_and_those_of_a_test_stay(self) -> None:
+    def test_modules_of_a_lambda_are_fresh_in_each_run_and_those_of_a_test_stay(self) -> None:
         beside = self.folder / "build" / "beside.py"
         beside.parent.mkdir()
         beside.write_text("seen = []\n", encoding="utf-8")
@@ -81,7 +81,10 @@ class Streams(AtDesk):
         sys.modules["test_beside"] = mine
         self.addCleanup(sys.modules.pop, "test_beside")
         self.addCleanup(sys.modules.pop, "beside", None)
-        source = "import beside\ndef on_event(ctx, event): beside.seen.append(1); ctx.event('e', len(beside.seen))"
+        source = (
+            "import beside\n"
+            "def on_event(ctx, event): beside.seen.append(1); ctx.event('e', len(beside.seen))"
+        )
         for _ in range(2):
             decisions = self.replay(source, [GREY, GREY])
             self.assertEqual([decision["triggers"][0]["score"] for decision in decisions], [1, 2])
@@ -89,7 +92,7 @@ class Streams(AtDesk):
 
 
 class Folders(unittest.TestCase):
-    """Lambdas that are given by their folder, several in one process."""
+    """Lambdas passed by their folder, several in one process."""
 
     def setUp(self) -> None:
         folder = tempfile.TemporaryDirectory()
@@ -100,7 +103,7 @@ class Folders(unittest.TestCase):
         self.addCleanup(setattr, sys, "path", list(sys.path))
 
     def write(self, name: str, files: Dict[str, str]) -> Path:
-        """The folder of a lambda with its manifest and these files."""
+        """Writes the folder of a lambda with a manifest and these files."""
         folder = self.folder / name
         for inside, text in {
             "lambda.toml": MANIFEST.format(schedule=EACH, depth=4),
@@ -116,8 +119,11 @@ class Folders(unittest.TestCase):
         self.assertEqual(run.faults, [])
         return [trigger.label for trigger in run.triggers]
 
-    def test_each_has_its_own_module_where_two_have_one_of_the_same_name(self) -> None:
-        uses = "from helper import NAME\nimport inner.deep\ndef on_event(ctx, event): ctx.event(NAME + inner.deep.NAME, 0)\n"
+    def test_two_lambdas_with_a_module_of_the_same_name_each_import_their_own(self) -> None:
+        uses = (
+            "from helper import NAME\nimport inner.deep\n"
+            "def on_event(ctx, event): ctx.event(NAME + inner.deep.NAME, 0)\n"
+        )
         for name in ("a", "b"):
             # The folder `inner` has no `__init__.py`.
             self.write(
@@ -140,7 +146,7 @@ class Folders(unittest.TestCase):
                 set(),
             )
 
-    def test_also_where_folders_are_given_by_links_and_from_beside_them(self) -> None:
+    def test_folders_can_be_links_and_relative_paths(self) -> None:
         uses = "from helper import NAME\ndef on_event(ctx, event): ctx.event(NAME, 0)\n"
         for name in ("a", "b"):
             self.write(
@@ -154,17 +160,18 @@ class Folders(unittest.TestCase):
             os.chdir(self.folder / name / "tests")
             self.assertEqual(self.labels(".."), [name])
 
-    def test_what_a_lambda_has_beside_it_is_found_before_what_a_test_put_on_the_path(self) -> None:
+    def test_modules_of_a_lambda_are_found_before_those_that_a_test_put_on_the_path(self) -> None:
         uses = "from helper import NAME\ndef on_event(ctx, event): ctx.event(NAME, 0)\n"
         for name in ("a", "b"):
             self.write(name, {"main.py": uses, "helper.py": f"NAME = '{name}'\n"})
         sys.path[:0] = [str(self.folder / "a"), str(self.folder / "b")]
         self.assertEqual(self.labels(self.folder / "b"), ["b"])
 
-    def test_an_sdk_that_lies_in_the_folder_stays_the_one_that_it_is(self) -> None:
-        # As `gleaner new --kind python` lays it out.
+    def test_an_sdk_in_the_folder_of_the_lambda_is_not_imported_again(self) -> None:
+        # The layout of `gleaner new --kind python`.
         source = "from gleaner import DataError\ndef on_event(ctx, event):\n"
-        source += "    try:\n        ctx.input('gone')\n    except DataError as error:\n        ctx.event(error.kind, 0)\n"
+        source += "    try:\n        ctx.input('gone')\n"
+        source += "    except DataError as error:\n        ctx.event(error.kind, 0)\n"
         folder = self.write("new", {"main.py": source})
         shutil.copytree(
             home.SDK / "gleaner",
@@ -175,12 +182,13 @@ class Folders(unittest.TestCase):
             import sys
             sys.path[:0] = [".", ".gleaner/guest-sdk-python"]
             import gleaner, gleaner.testing
-            known = {name: module for name, module in sys.modules.items() if name.split(".")[0] == "gleaner"}
+            known = {name: sys.modules[name] for name in sys.modules if name.startswith("gleaner")}
             assert "/.gleaner/" in gleaner.__file__, gleaner.__file__
             for _ in range(2):
                 run = gleaner.testing.replay(".", {"/camera": {"t": [0]}})
                 assert not run.faults, run.faults
-                assert [trigger.label for trigger in run.triggers] == ["no-such-input"], run.triggers
+                labels = [trigger.label for trigger in run.triggers]
+                assert labels == ["no-such-input"], run.triggers
             for name, module in known.items():
                 assert sys.modules[name] is module, name
         """

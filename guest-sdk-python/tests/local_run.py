@@ -1,6 +1,8 @@
-"""The same lambda at the desk: `gleaner.testing` in place of the real host, behind the same door as in `hosted`.
+"""Runs a lambda of a test locally: `gleaner.testing` in place of the real host, with the interface
+of `hosted`.
 
-So a test of hosted behaviour, which looks at decisions and log, holds for both by inheriting from `AtDesk` first."""
+A test of hosted behaviour that checks decisions and log can run on both, by inheriting from
+`LocalRun` first."""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ from hosted import EACH, MANIFEST, Hosted
 from gleaner.testing import Run, StartError, replay
 
 
-class AtDesk(Hosted):
+class LocalRun(Hosted):
     def setUp(self) -> None:
         folder = tempfile.TemporaryDirectory()
         self.addCleanup(folder.cleanup)
@@ -33,7 +35,7 @@ class AtDesk(Hosted):
         depth: int = 4,
         at_ms: Sequence[int] = range(1000, 10_000, 100),
     ) -> "subprocess.CompletedProcess[str]":
-        """As in the host, with what it would have written and said."""
+        """Replays as the host does, and writes the same result files."""
         build = self.folder / "build"
         build.mkdir(exist_ok=True)
         (build / "main.py").write_text(textwrap.dedent(source), encoding="utf-8")
