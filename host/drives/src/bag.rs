@@ -1,4 +1,4 @@
-//! The directories that rosbag2 writes: which files belong to them.
+//! Finds the files of the directories that rosbag2 writes.
 
 use std::collections::HashSet;
 use std::ffi::OsString;
@@ -10,11 +10,11 @@ use super::error::ReplayError;
 use super::metadata;
 use super::storage::Bag;
 
-/// What files without metadata are called.
+/// File name suffixes of files without metadata.
 const ENDINGS: [&str; 4] = [".mcap", ".db3", ".mcap.zstd", ".db3.zstd"];
 const PACKED: &str = ".zstd";
 
-/// The files of the directory `folder`.
+/// Returns the files of the directory `folder`.
 pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
     let path = folder.join("metadata.yaml");
     let root = folder
@@ -40,13 +40,14 @@ pub(super) fn list(folder: &Path) -> Result<Bag, ReplayError> {
     let remark = others.first().map(|first| {
         let (count, first) = (others.len(), first.display());
         format!(
-            "metadata.yaml does not name all files beside it: {count} are not read, `{first}` first"
+            "metadata.yaml does not name all files beside it: {count} are skipped, the first is \
+             `{first}`"
         )
     });
     Ok(Bag { files, messages: found.messages, remark })
 }
 
-/// The text of the file `path`, which has to be in the folder `root`.
+/// Reads the text of the file `path`, which must be in the folder `root`.
 fn text_of(path: &Path, root: &Path) -> io::Result<String> {
     let invalid = |what| Err(io::Error::new(io::ErrorKind::InvalidData, what));
     let real = path.canonicalize()?;
@@ -54,7 +55,7 @@ fn text_of(path: &Path, root: &Path) -> io::Result<String> {
         return invalid("it is a link that leads out of its directory");
     }
     if !real.is_file() {
-        return invalid("it is no file");
+        return invalid("it is not a regular file");
     }
     let mut bytes = Vec::new();
     File::open(real)?.take(metadata::MAX_BYTES + 1).read_to_end(&mut bytes)?;
@@ -64,8 +65,8 @@ fn text_of(path: &Path, root: &Path) -> io::Result<String> {
     String::from_utf8(bytes).or_else(|_| invalid("it is not UTF-8"))
 }
 
-/// Where the file is that `metadata` name `file`; it has to be in `folder`, whose own path is
-/// `root`.
+/// Returns the path of the file that `metadata` calls `file`; it must be in `folder`, whose real
+/// path is `root`.
 fn named(
     folder: &Path,
     root: &Path,
@@ -77,10 +78,10 @@ fn named(
     if file.is_empty() || !relative.components().all(is_plain) {
         return Err(ReplayError::Outside { metadata: metadata.to_owned(), file });
     }
-    // Up to version 3, the directory's own name stands in front. It may have another by now.
+    // Up to version 3, names begin with that of the directory, which may have been renamed since.
     let inside: PathBuf = relative.components().skip(1).collect();
     let found = [folder.join(relative), folder.join(inside)].into_iter().find_map(|path| {
-        // A recorder that was killed may not have come to packing, or to noting it.
+        // A killed recorder may not have packed the file, or not have noted that.
         let packed = OsString::from_iter([path.as_os_str(), PACKED.as_ref()]);
         let unpacked = file.strip_suffix(PACKED).map(|_| path.with_extension(""));
         [Some(path), Some(packed.into()), unpacked]
@@ -97,7 +98,7 @@ fn named(
     }
 }
 
-/// All files in `folder`, where nothing says which belong together.
+/// Returns all files in `folder`, which has no metadata.
 fn by_name(folder: &Path) -> Result<Bag, ReplayError> {
     let files = of_a_bag(folder)?;
     if files.is_empty() {
@@ -110,8 +111,8 @@ fn by_name(folder: &Path) -> Result<Bag, ReplayError> {
     Ok(Bag { files, remark, ..Bag::default() })
 }
 
-/// The files in `folder` that are called as those of a bag, in the order of their names; one that
-/// lies there packed and not packed is the latter.
+/// Returns the files in `folder` with names as in a bag, in the order of their names; of a file
+/// that is there packed and unpacked, the unpacked one.
 fn of_a_bag(folder: &Path) -> Result<Vec<PathBuf>, ReplayError> {
     let failed = |source| ReplayError::Open { path: folder.to_owned(), source };
     let mut names = Vec::new();
@@ -120,7 +121,7 @@ fn of_a_bag(folder: &Path) -> Result<Vec<PathBuf>, ReplayError> {
         let name = entry.file_name();
         let is_one =
             name.to_str().is_some_and(|name| ENDINGS.iter().any(|ending| name.ends_with(ending)));
-        // Of the entry itself: no link leads out.
+        // The type of the entry itself: links are not followed.
         if is_one && entry.file_type().map_err(failed)?.is_file() {
             names.push(name);
         }
@@ -133,7 +134,7 @@ fn of_a_bag(folder: &Path) -> Result<Vec<PathBuf>, ReplayError> {
     Ok(names.iter().filter(|name| !is_twin(name)).map(|name| folder.join(name)).collect())
 }
 
-/// The path without the ending of what is packed.
+/// Returns the path without the suffix of packed files.
 fn unpacked(path: &Path) -> PathBuf {
     if path.extension() == Some("zstd".as_ref()) {
         path.with_extension("")

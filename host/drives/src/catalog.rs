@@ -1,4 +1,4 @@
-//! The topics of a drive: the channels of all its files, brought together by name.
+//! The topics of a drive: the channels of all its files, merged by name.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -6,32 +6,32 @@ use std::sync::{Arc, OnceLock};
 
 use super::error::ReplayError;
 use super::file::Contents;
-use gleaner_base::words::nearest;
+use gleaner_base::text::nearest;
 use gleaner_messages::{Definitions, Sources, SourcesError};
 use gleaner_transport::{DiscoveredTopic, TopicSpec, TransportError, same_type};
 
-/// A topic, over all files.
-struct Topic {
+/// A topic of all files.
+struct DriveTopic {
     type_name: String,
-    /// Index of the file that named the type first.
+    /// Index of the first file that names the type.
     named_by: usize,
     text: Option<Arc<str>>,
-    /// `None` if a file does not say.
+    /// `None` if a file does not have the number.
     messages: Option<u64>,
     /// (file, channel id), in that order.
     channels: Vec<(usize, u16)>,
-    /// How messages are encoded that we do not read.
+    /// The unsupported encoding of messages, if there is one.
     foreign: Option<String>,
-    /// How definitions are written that we do not read.
+    /// The unsupported encoding of definitions, if there is one.
     foreign_text: Option<String>,
-    /// Of the first channel that has it.
+    /// That of the first channel that has it.
     offered_qos: Option<String>,
-    /// What was found elsewhere for want of a text.
+    /// Definitions found elsewhere, since the files have none.
     found: OnceLock<Option<Arc<str>>>,
     definitions: OnceLock<Arc<Definitions>>,
 }
 
-/// A topic that may be subscribed.
+/// A topic that can be subscribed.
 pub(super) struct Selected<'a> {
     /// (file, channel id), in that order.
     pub(super) channels: &'a [(usize, u16)],
@@ -40,8 +40,8 @@ pub(super) struct Selected<'a> {
 
 /// All topics.
 pub(super) struct Catalog {
-    by_name: BTreeMap<String, Topic>,
-    /// Where definitions are looked for that the files do not carry.
+    by_name: BTreeMap<String, DriveTopic>,
+    /// The sources of definitions that the files do not carry.
     sources: Option<Sources>,
 }
 
@@ -50,10 +50,10 @@ impl Catalog {
         files: &[(&Path, &Contents)],
         sources: Option<Sources>,
     ) -> Result<Self, ReplayError> {
-        let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
+        let mut topics: BTreeMap<String, DriveTopic> = BTreeMap::new();
         for (file, (path, contents)) in files.iter().enumerate() {
             for (id, channel) in contents.channels.iter() {
-                let topic = topics.entry(channel.topic.clone()).or_insert_with(|| Topic {
+                let topic = topics.entry(channel.topic.clone()).or_insert_with(|| DriveTopic {
                     type_name: channel.type_name.clone(),
                     named_by: file,
                     text: None,
@@ -91,8 +91,8 @@ impl Catalog {
                     Some(text) if channel.schema_encoding == "ros2msg" => {
                         topic.text.get_or_insert_with(|| text.clone());
                     }
-                    // A writer that does not know a type leaves its text out, and how it is written
-                    // with it.
+                    // A writer that does not know a type leaves out its text, and the encoding with
+                    // it.
                     None if !channel.type_name.is_empty() => {}
                     _ => {
                         topic.foreign_text.get_or_insert_with(|| channel.schema_encoding.clone());
@@ -104,10 +104,10 @@ impl Catalog {
     }
 
     pub(super) fn topics(&self) -> Vec<DiscoveredTopic> {
-        let discovered = |(name, topic): (&String, &Topic)| DiscoveredTopic {
+        let discovered = |(name, topic): (&String, &DriveTopic)| DiscoveredTopic {
             topic: name.clone(),
             type_name: topic.type_name.clone(),
-            // What is wrong with it is for who reads fields of it.
+            // Errors of it are reported when fields are read.
             definitions_text: self.text(name, topic).ok().flatten().cloned(),
             messages: topic.messages,
             offered_qos: topic.offered_qos.clone(),
@@ -115,11 +115,12 @@ impl Catalog {
         self.by_name.iter().map(discovered).collect()
     }
 
-    /// The definitions of a topic's type: as its files have them, or else as they were found.
+    /// Returns the definitions of a topic's type: those of its files, otherwise those found
+    /// elsewhere.
     fn text<'a>(
         &'a self,
         name: &str,
-        topic: &'a Topic,
+        topic: &'a DriveTopic,
     ) -> Result<Option<&'a Arc<str>>, TransportError> {
         let Some(sources) = self.sources.as_ref().filter(|_| topic.text.is_none()) else {
             return Ok(topic.text.as_ref());
@@ -132,13 +133,13 @@ impl Catalog {
                     source: Box::new(source),
                 })?,
             };
-            // Nobody else can have come first with another text.
+            // No other thread can have set another text first.
             let _ = topic.found.set(found);
         }
         Ok(topic.found.get().and_then(Option::as_ref))
     }
 
-    /// The channels of a topic, if it is as `spec` wants it.
+    /// Returns the channels of a topic, if it matches `spec`.
     pub(super) fn select(&self, spec: &TopicSpec) -> Result<Selected<'_>, TransportError> {
         let topic = self.get(&spec.topic)?;
         if !same_type(&topic.type_name, &spec.type_name) {
@@ -181,7 +182,7 @@ impl Catalog {
         Ok(topic.definitions.get_or_init(|| Arc::new(parsed)).clone())
     }
 
-    fn get(&self, name: &str) -> Result<&Topic, TransportError> {
+    fn get(&self, name: &str) -> Result<&DriveTopic, TransportError> {
         self.by_name.get(name).ok_or_else(|| TransportError::NoSuchTopic {
             topic: name.to_owned(),
             known: self.by_name.keys().cloned().collect(),

@@ -1,4 +1,4 @@
-//! Chunks in memory: read, decompressed, checked, and sorted by log time.
+//! Chunks in memory: reads, decompresses, checks, and sorts them by log time.
 
 use std::io::{self, Read};
 
@@ -7,15 +7,15 @@ use zstd::stream::raw::{Decoder as ZstdDecoder, Operation};
 use super::damage::Damage;
 use super::error::ReplayError;
 use super::file::Channels;
-use super::options::{Limits, Span};
-use super::records::{ChunkHead, HEAD, MessageHead, Record, Records, op};
-use super::source::Source;
+use super::options::{DriveLimits, Span};
+use super::records::{ChunkHead, HEAD, McapRecord, MessageHead, Records, op};
+use super::source::SourceFile;
 
-/// Where a chunk, or a run of messages outside chunks, lies in a file.
-pub(super) struct Segment {
-    /// Of the first byte of the first record's head.
+/// Position of a chunk, or of a run of messages outside chunks, in a file.
+pub(super) struct FileSegment {
+    /// Offset of the head of the first record.
     pub(super) offset: u64,
-    /// Of all its records, heads included.
+    /// Length of all its records, including their heads.
     pub(super) len: u64,
     pub(super) start_time: u64,
     pub(super) end_time: u64,
@@ -32,28 +32,28 @@ pub(super) enum SegmentKind {
 
 /// One message of an open segment, in the order of delivery.
 #[derive(Copy, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Entry {
+pub(super) struct MessageEntry {
     pub(super) log_time: u64,
-    /// 0 in a segment of a database, in whose order channels have no part.
+    /// 0 in a segment of a database, whose order does not depend on channels.
     pub(super) channel: u16,
-    /// Where the message record's body starts in [`OpenSegment::bytes`]; its length stands before.
+    /// Offset of the message record's body in [`OpenSegment::bytes`]; its length precedes it.
     at: u32,
 }
 
 /// A segment in memory. Its buffers are reused for the next one.
 #[derive(Default)]
 pub(super) struct OpenSegment {
-    /// The records; what lies beyond `len` is left over from an earlier, longer segment.
+    /// The records; bytes beyond `len` are of an earlier, longer segment.
     bytes: Vec<u8>,
     len: usize,
-    entries: Vec<Entry>,
+    entries: Vec<MessageEntry>,
     next: usize,
 }
 
 impl OpenSegment {
-    /// The next message to deliver.
+    /// Returns the next message to deliver.
     #[inline]
-    pub(super) fn head(&self) -> Option<Entry> {
+    pub(super) fn head(&self) -> Option<MessageEntry> {
         self.entries.get(self.next).copied()
     }
 
@@ -62,16 +62,16 @@ impl OpenSegment {
         self.next += 1;
     }
 
-    /// The body of a message record of this segment.
+    /// Returns the body of a message record of this segment.
     #[inline]
-    pub(super) fn body(&self, entry: Entry) -> &[u8] {
+    pub(super) fn body(&self, entry: MessageEntry) -> &[u8] {
         let at = entry.at as usize;
-        // `sort` took `at` from a record that lies within `bytes`, length included.
+        // `sort` took `at` from a record that is within `bytes`, with its length.
         let len = self.bytes[..at].last_chunk().map_or(0, |len| u64::from_le_bytes(*len));
         &self.bytes[at..at + len as usize]
     }
 
-    /// Bytes of records held.
+    /// Returns the size of the records, in bytes.
     pub(super) fn len(&self) -> usize {
         self.len
     }
@@ -80,7 +80,7 @@ impl OpenSegment {
         Records::new(&self.bytes[..self.len])
     }
 
-    /// Forgets everything, for messages that [`OpenSegment::push`] adds.
+    /// Clears the segment, for messages that [`OpenSegment::push`] adds.
     #[cfg(feature = "bags")]
     pub(super) fn clear(&mut self) {
         (self.len, self.next) = (0, 0);
@@ -88,12 +88,12 @@ impl OpenSegment {
         self.entries.clear();
     }
 
-    /// Adds a message behind all others, as a record of MCAP. Of equal times, the one added first
+    /// Adds a message after all others, as an MCAP record. Of equal times, the one added first
     /// comes first.
     #[cfg(feature = "bags")]
     pub(super) fn push(&mut self, head: &MessageHead, data: &[u8]) {
-        // Fits: a database gives no message larger than a segment may be, and fills one with little
-        // more.
+        // It fits: messages of a database are limited to the size of a segment, and fill one with
+        // little more.
         let at = (self.bytes.len() + HEAD as usize) as u32;
         self.bytes.push(op::MESSAGE);
         self.bytes
@@ -101,16 +101,16 @@ impl OpenSegment {
         self.bytes.extend_from_slice(&head.to_bytes());
         self.bytes.extend_from_slice(data);
         self.len = self.bytes.len();
-        self.entries.push(Entry { log_time: head.log_time, channel: 0, at });
+        self.entries.push(MessageEntry { log_time: head.log_time, channel: 0, at });
     }
 
-    /// Collects the messages of the channels that `wanted` accepts, and sorts them. What `segment`
-    /// says of its times, and the file of its `channels`, has to be so.
+    /// Collects the messages of the channels that `wanted` accepts, and sorts them. The times of
+    /// `segment` and the `channels` of the file are checked.
     ///
-    /// `wanted` answers `None` for a channel that does not exist.
+    /// `wanted` returns `None` for an undefined channel.
     fn sort(
         &mut self,
-        segment: &Segment,
+        segment: &FileSegment,
         channels: &Channels,
         span: Span,
         wanted: impl Fn(u16) -> Option<bool>,
@@ -119,7 +119,7 @@ impl OpenSegment {
         entries.clear();
         self.next = 0;
         for record in self.records() {
-            let Record { opcode, at, body } = record?;
+            let McapRecord { opcode, at, body } = record?;
             if opcode != op::MESSAGE {
                 channels.check(opcode, body)?;
                 continue;
@@ -132,8 +132,8 @@ impl OpenSegment {
             if wanted(head.channel).ok_or(Damage::UnknownChannel(head.channel))?
                 && span.holds(head.log_time)
             {
-                // Fits: `Opener::new` clamps the size of a segment.
-                entries.push(Entry {
+                // It fits: `Opener::new` limits the size of a segment.
+                entries.push(MessageEntry {
                     log_time: head.log_time,
                     channel: head.channel,
                     at: at as u32,
@@ -148,8 +148,8 @@ impl OpenSegment {
     }
 }
 
-/// The front of a message record. Times are signed everywhere else: one that does not fit would
-/// become another.
+/// Parses the header of a message record. Times are signed everywhere else: one that does not fit
+/// is damage.
 pub(super) fn message_head(body: &[u8]) -> Result<MessageHead, Damage> {
     let head = MessageHead::parse(body)
         .ok_or(Damage::Malformed("a message record is shorter than its header"))?;
@@ -159,25 +159,25 @@ pub(super) fn message_head(body: &[u8]) -> Result<MessageHead, Damage> {
     Ok(head)
 }
 
-/// Reads segments, with the state that decompression keeps between them.
+/// Reads segments; keeps the decompressor's state between them.
 pub(super) struct Opener {
-    limits: Limits,
+    limits: DriveLimits,
     zstd: Option<ZstdDecoder<'static>>,
     compressed: Vec<u8>,
 }
 
 impl Opener {
-    pub(super) fn new(limits: Limits) -> Self {
-        // Positions in a segment are kept in 32 bits.
-        let limits = Limits { chunk_bytes: limits.chunk_bytes.min(1 << 31), ..limits };
+    pub(super) fn new(limits: DriveLimits) -> Self {
+        // Positions in a segment have 32 bits.
+        let limits = DriveLimits { chunk_bytes: limits.chunk_bytes.min(1 << 31), ..limits };
         Self { limits, zstd: None, compressed: Vec::new() }
     }
 
     /// Reads a segment into `into` and sorts the wanted messages of `span` in it.
     pub(super) fn open(
         &mut self,
-        source: &mut Source,
-        segment: &Segment,
+        source: &mut SourceFile,
+        segment: &FileSegment,
         channels: &Channels,
         span: Span,
         wanted: impl Fn(u16) -> Option<bool>,
@@ -191,7 +191,7 @@ impl Opener {
     /// Reads a segment's records into `into`, unsorted.
     pub(super) fn read(
         &mut self,
-        source: &mut Source,
+        source: &mut SourceFile,
         offset: u64,
         len: u64,
         kind: SegmentKind,
@@ -202,7 +202,7 @@ impl Opener {
         into.len = 0;
         let allowed = self.limits.chunk_bytes;
         let too_large = |claimed| Damage::ChunkTooLarge { claimed, allowed };
-        // `len` was checked against the file's length, so it is no mere claim.
+        // `len` was checked against the file's length, so it is not just a claim.
         let size = usize::try_from(len).ok().filter(|_| len <= allowed.saturating_add(HEAD + 4096));
         let size = size.ok_or_else(|| source.damaged(offset, too_large(len)))?;
         match kind {
@@ -224,24 +224,26 @@ impl Opener {
         }
     }
 
-    /// Decompresses and checks the chunk record in `record`, head included.
+    /// Decompresses and checks the chunk record in `record`, including its head.
     fn unpack(&mut self, record: &[u8], into: &mut OpenSegment) -> Result<(), Damage> {
-        let Some(Ok(Record { opcode: op::CHUNK, body, .. })) = Records::new(record).next() else {
-            return Err(Damage::Malformed("there is no chunk where the index says"));
+        let Some(Ok(McapRecord { opcode: op::CHUNK, body, .. })) = Records::new(record).next()
+        else {
+            return Err(Damage::Malformed("there is no chunk at a position of the index"));
         };
         let head =
-            ChunkHead::parse(body).ok_or(Damage::Malformed("a chunk's header is cut off"))?;
+            ChunkHead::parse(body).ok_or(Damage::Malformed("a chunk's header is truncated"))?;
         let allowed = self.limits.chunk_bytes;
         let size = usize::try_from(head.uncompressed).ok().filter(|size| *size as u64 <= allowed);
         let size = size.ok_or(Damage::ChunkTooLarge { claimed: head.uncompressed, allowed })?;
         let packed = usize::try_from(head.compressed).ok().and_then(|n| body[head.len..].get(..n));
-        let packed = packed.ok_or(Damage::Malformed("a chunk is shorter than its header says"))?;
+        let packed =
+            packed.ok_or(Damage::Malformed("a chunk is shorter than its header claims"))?;
         match head.compression {
             "" if packed.len() == size => {
                 into.bytes.resize(size.max(into.bytes.len()), 0);
                 into.bytes[..size].copy_from_slice(packed);
             }
-            "" => return Err(Damage::Malformed("an uncompressed chunk has two sizes")),
+            "" => return Err(Damage::Malformed("an uncompressed chunk claims two sizes")),
             "zstd" => self.unzstd(packed, size, &mut into.bytes).map_err(Damage::Inflate)?,
             "lz4" => unlz4(packed, size, &mut into.bytes).map_err(Damage::Inflate)?,
             other => return Err(Damage::Compression(other.chars().take(32).collect())),
@@ -266,7 +268,7 @@ impl Opener {
         fill(out, size, packed.len(), |space| {
             let status = decoder.run_on_buffers(packed, space)?;
             packed = &packed[status.bytes_read..];
-            // A frame may end, or its head be read, without output: then input was consumed.
+            // A frame may end, or its header be read, without output: then input was consumed.
             Ok((status.bytes_written, status.bytes_read > 0))
         })
     }
@@ -277,10 +279,10 @@ fn unlz4(packed: &[u8], size: usize, out: &mut Vec<u8>) -> io::Result<()> {
     fill(out, size, packed.len(), |space| decoder.read(space).map(|n| (n, false)))
 }
 
-/// Fills the first `size` bytes of `out` by calling `inflate`, which gives the bytes it wrote and
-/// whether it got on without writing.
+/// Fills the first `size` bytes of `out` by calling `inflate`, which returns the number of bytes
+/// written and whether it consumed input without output.
 ///
-/// `out` grows as data really comes: `size` is a claim until then.
+/// `out` grows with the actual data: until then, `size` is only a claim.
 fn fill(
     out: &mut Vec<u8>,
     size: usize,

@@ -1,8 +1,8 @@
-//! The databases of rosbag2: opened to be read, and not believed.
+//! Opens databases of rosbag2 for reading, without trusting them.
 //!
-//! A database brings its own schema, and a schema can bring views, triggers and columns that
-//! compute. None of that runs here: the three tables that count have to be tables, and their
-//! columns, columns. Nothing is written, not even beside it.
+//! A database contains its own schema, and a schema can contain views, triggers and computed
+//! columns. None of that runs here: the three tables that are read must be plain tables, and their
+//! columns plain columns. Nothing is written, not even beside the database.
 //!
 //! Source: `rosbag2_storage_sqlite3`, schema versions 1 to 4.
 
@@ -22,40 +22,40 @@ use tracing::warn;
 use super::damage::Damage;
 use super::error::ReplayError;
 use super::file::{ChannelInfo, Channels, Contents, offered_qos};
-use super::options::Limits;
-use super::rows::{LATER, Rows, SAME_TIME, is_of_system, select, time};
+use super::options::DriveLimits;
+use super::rows::{LATER, MessageRows, SAME_TIME, is_of_system, select, time};
 use super::storage::journals_of;
 
-type Refused = Box<dyn Error + Send + Sync>;
+type BoxedError = Box<dyn Error + Send + Sync>;
 
-/// The schemas of `rosbag2_storage_sqlite3` that can be read.
+/// The supported schemas of `rosbag2_storage_sqlite3`.
 const VERSIONS: RangeInclusive<i64> = 1..=4;
 
 /// SQLite counts the length of a row in 31 bits.
 const LARGEST_ROW: u64 = 1 << 30;
-/// Statements of ours have at most a list of 65536 topics; those of a schema have no reason to be
-/// longer.
+/// Own statements list at most 65536 topics; those of a schema have no reason to be longer.
 const LONGEST_SQL: i32 = 4 << 20;
 
-/// What a row takes beside its texts, about. A damaged or made-up table has no end to them.
+/// Approximate size of a row, without its texts. A damaged or malicious table may have any number
+/// of rows.
 const ROW_BYTES: usize = 128;
 
-/// Where a database is.
+/// Location of a database.
 #[derive(Copy, Clone)]
-pub(super) struct File<'a> {
-    /// What it is called.
+pub(super) struct DatabaseFile<'a> {
+    /// Its name in messages.
     shown: &'a Path,
     real: &'a Path,
-    /// Whether there may be a journal beside it.
+    /// Set if there may be a journal beside it.
     may_be_open: bool,
 }
 
-impl<'a> File<'a> {
+impl<'a> DatabaseFile<'a> {
     pub(super) fn beside_its_journal(path: &'a Path) -> Self {
         Self { shown: path, real: path, may_be_open: true }
     }
 
-    /// The content of `shown`, which was copied to `real`.
+    /// Describes the content of `shown`, which was copied to `real`.
     pub(super) fn elsewhere(shown: &'a Path, real: &'a Path) -> Self {
         Self { shown, real, may_be_open: false }
     }
@@ -63,15 +63,15 @@ impl<'a> File<'a> {
 
 /// Opens a database of `len` bytes.
 pub(super) fn open(
-    file: File<'_>,
+    file: DatabaseFile<'_>,
     len: u64,
-    limits: Limits,
-) -> Result<(Rows, Contents), ReplayError> {
+    limits: DriveLimits,
+) -> Result<(MessageRows, Contents), ReplayError> {
     if file.may_be_open {
         is_closed(file.real)?;
     }
     let path = file.shown.to_owned();
-    let refused = |source: Refused| {
+    let refused = |source: BoxedError| {
         if is_of_system(&*source) {
             return ReplayError::Open { path: path.clone(), source: io::Error::other(source) };
         }
@@ -88,7 +88,7 @@ pub(super) fn open(
     };
     in_order(&db, &index).map_err(refused)?;
     let first = edge(&db, &index, "ASC");
-    // The newest is lost with the end of the file.
+    // A truncated file has lost its newest messages.
     let last = edge(&db, &index, "DESC").ok().flatten();
     let mut contents =
         Contents { channels: known.channels, uncounted: true, ..Contents::default() };
@@ -99,11 +99,16 @@ pub(super) fn open(
         .flatten()
         .map(|first| (first, last.unwrap_or(first).max(first)));
     if is_cut_off {
-        warn!(path = %path.display(), expected, found = len, "database was cut off, its newest messages are lost");
+        warn!(
+            path = %path.display(),
+            expected,
+            found = len,
+            "database was truncated; its newest messages are lost"
+        );
         contents.is_end_unknown = last.is_none();
-        contents.damage = Some((len, Damage::DatabaseCutOff { expected, found: len }));
+        contents.damage = Some((len, Damage::DatabaseTruncated { expected, found: len }));
     }
-    Ok((Rows::new(file.shown, db, index, known.ids, first), contents))
+    Ok((MessageRows::new(file.shown, db, index, known.ids, first), contents))
 }
 
 /// Refuses a database whose newest messages are still in its journal.
@@ -113,26 +118,27 @@ fn is_closed(path: &Path) -> Result<(), ReplayError> {
             Ok(false) => {}
             Ok(true) => return Err(ReplayError::NotClosed { path: path.to_owned(), beside }),
             Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-            // Nobody knows whether messages are in there.
+            // It is unknown whether it contains messages.
             Err(source) => return Err(ReplayError::Open { path: beside, source }),
         }
     }
     Ok(())
 }
 
-/// Whether the journal `path` was not dealt with: then it is neither empty nor begins with zeros.
+/// Returns whether the journal `path` is still in use: then it is not empty and does not begin with
+/// zeros.
 fn holds_something(path: &Path) -> io::Result<bool> {
     let found = path.metadata()?;
     if !found.is_file() {
-        // Not even opened: of a pipe, that would never end.
-        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no file"));
+        // Not opened: a pipe would block for ever.
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file"));
     }
     let mut start = [0; 1];
     Ok(found.len() > 0 && std::fs::File::open(path)?.read(&mut start)? > 0 && start != [0])
 }
 
-/// The length that the header claims, in bytes; 0 if it claims none. Source: the database file
-/// format, section 1.3.
+/// Returns the length that the header claims, in bytes; 0 if it claims none. Source: the database
+/// file format, section 1.3.
 fn claimed_len(path: &Path) -> std::io::Result<u64> {
     let mut header = Vec::new();
     std::fs::File::open(path)?.take(100).read_to_end(&mut header)?;
@@ -144,12 +150,12 @@ fn claimed_len(path: &Path) -> std::io::Result<u64> {
         Some(&[high, low]) => u64::from(u16::from_be_bytes([high, low])),
         _ => 0,
     };
-    // An old writer does not keep the number of pages.
+    // Old writers do not maintain the number of pages.
     let is_kept = u32_at(24) == u32_at(92);
     Ok(if is_kept { page * u64::from(u32_at(28)) } else { 0 })
 }
 
-fn connect(path: &Path, limits: Limits, is_cut_off: bool) -> rusqlite::Result<Connection> {
+fn connect(path: &Path, limits: DriveLimits, is_cut_off: bool) -> rusqlite::Result<Connection> {
     let mut uri = "file:".to_owned();
     for byte in path.as_os_str().as_bytes() {
         match byte {
@@ -159,7 +165,7 @@ fn connect(path: &Path, limits: Limits, is_cut_off: bool) -> rusqlite::Result<Co
             _ => uri += &format!("%{byte:02X}"),
         }
     }
-    // Nobody else writes to it, so no lock is taken, and nothing is made beside it.
+    // No other process writes to it, so no lock is taken, and no file is created beside it.
     uri += "?immutable=1";
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY
         | OpenFlags::SQLITE_OPEN_URI
@@ -180,7 +186,7 @@ fn connect(path: &Path, limits: Limits, is_cut_off: bool) -> rusqlite::Result<Co
         (DbConfig::SQLITE_DBCONFIG_ENABLE_VIEW, false),
         (DbConfig::SQLITE_DBCONFIG_DQS_DML, false),
         (DbConfig::SQLITE_DBCONFIG_DQS_DDL, false),
-        // Otherwise nothing of a file that is too short is read. Nothing can be written anyway.
+        // Otherwise nothing of a truncated file can be read. Nothing can be written anyway.
         (DbConfig::SQLITE_DBCONFIG_WRITABLE_SCHEMA, is_cut_off),
         (DbConfig::SQLITE_DBCONFIG_DEFENSIVE, !is_cut_off),
     ] {
@@ -189,14 +195,14 @@ fn connect(path: &Path, limits: Limits, is_cut_off: bool) -> rusqlite::Result<Co
     // Pages are read once, in order; a drive may have hundreds of databases, each with a cache (in
     // KiB).
     db.execute_batch(
-        "PRAGMA cell_size_check = ON; PRAGMA temp_store = MEMORY; PRAGMA mmap_size = 0; PRAGMA cache_size = -512;",
+        "PRAGMA cell_size_check = ON; PRAGMA temp_store = MEMORY; \
+         PRAGMA mmap_size = 0; PRAGMA cache_size = -512;",
     )?;
     Ok(db)
 }
 
-/// Refuses a database of a later rosbag2: what it changed cannot be known. Version 1 did not say
-/// which it is.
-fn is_known_version(db: &Connection) -> Result<(), Refused> {
+/// Refuses a database of a later rosbag2, whose changes are unknown. Version 1 has no number.
+fn is_known_version(db: &Connection) -> Result<(), BoxedError> {
     if kind(db, "schema")?.is_none() {
         return Ok(());
     }
@@ -216,13 +222,13 @@ fn is_known_version(db: &Connection) -> Result<(), Refused> {
 }
 
 /// The topics of a database.
-struct Topics {
+struct DatabaseTopics {
     channels: Channels,
-    /// Channels by what the database calls a topic.
+    /// Channel ids by topic number of the database.
     ids: HashMap<i64, u16>,
 }
 
-fn topics(db: &Connection) -> Result<Topics, Refused> {
+fn topics(db: &Connection) -> Result<DatabaseTopics, BoxedError> {
     table(db, "messages", &["topic_id", "timestamp", "data"])?;
     let columns = table(db, "topics", &["id", "name", "type", "serialization_format"])?;
     let has_qos = columns.iter().any(|column| column == "offered_qos_profiles");
@@ -253,7 +259,7 @@ fn topics(db: &Connection) -> Result<Topics, Refused> {
             return Err(format!("two of its topics have the number {number}").into());
         }
     }
-    let mut known = Topics { channels: Channels::default(), ids: HashMap::new() };
+    let mut known = DatabaseTopics { channels: Channels::default(), ids: HashMap::new() };
     for (id, (number, info)) in (0..=u16::MAX).zip(found) {
         known.ids.insert(number, id);
         known.channels.add(id, info)?;
@@ -261,16 +267,18 @@ fn topics(db: &Connection) -> Result<Topics, Refused> {
     Ok(known)
 }
 
-/// The texts of message definitions by type, with how they are written. Databases from before ROS 2
-/// Iron have none.
-fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, Refused> {
+/// Reads the texts of message definitions by type, each with its encoding. Databases from before
+/// ROS 2 Iron have none.
+fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, BoxedError> {
     let name = "message_definitions";
     if kind(db, name)?.is_none() {
         return Ok(HashMap::new());
     }
     table(db, name, &["topic_type", "encoding", "encoded_message_definition"])?;
-    let mut statement =
-        db.prepare("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions NOT INDEXED")?;
+    let mut statement = db.prepare(
+        "SELECT topic_type, encoding, encoded_message_definition FROM \
+                    message_definitions NOT INDEXED",
+    )?;
     let mut rows = statement.query([])?;
     let (mut texts, mut room) = (HashMap::new(), Channels::default());
     while let Some(row) = rows.next()? {
@@ -285,29 +293,33 @@ fn definitions(db: &Connection) -> Result<HashMap<String, (String, Arc<str>)>, R
     Ok(texts)
 }
 
-/// What SQLite made of what the schema calls `name`: the text of a schema can be written in many
-/// ways.
+/// Returns what `name` in the schema is according to SQLite: the text of a schema can be written in
+/// many ways.
 fn kind(db: &Connection, name: &str) -> rusqlite::Result<Option<String>> {
     let sql =
         "SELECT type FROM pragma_table_list WHERE schema = 'main' AND name = ?1 COLLATE NOCASE";
     db.query_row(sql, [name], |row| row.get(0)).optional()
 }
 
-/// The columns of the table `name`, `wanted` among them.
-fn table(db: &Connection, name: &str, wanted: &[&str]) -> Result<Vec<String>, Refused> {
+/// Returns the columns of the table `name`, which must contain `wanted`.
+fn table(db: &Connection, name: &str, wanted: &[&str]) -> Result<Vec<String>, BoxedError> {
     match kind(db, name)?.as_deref() {
         Some("table") => {}
-        Some(_) => return Err(format!("its `{name}` is no plain table").into()),
-        None => return Err(format!("it has no table `{name}`, so it is not of rosbag2").into()),
+        Some(_) => return Err(format!("its `{name}` is not a plain table").into()),
+        None => {
+            return Err(
+                format!("it has no table `{name}`, so it is not a database of rosbag2").into()
+            );
+        }
     }
-    // Columns that compute are hidden ones.
+    // Computed columns are hidden ones.
     let mut statement = db.prepare("SELECT name, hidden FROM pragma_table_xinfo(?1)")?;
     let all: Vec<(String, i64)> = statement
         .query_map([name], |row| Ok((row.get(0)?, row.get(1)?)))?
         .collect::<Result<_, _>>()?;
     if all.iter().any(|(column, _)| column.eq_ignore_ascii_case("rowid")) {
         return Err(format!(
-            "its table `{name}` calls a column `rowid`, which is SQLite's own for the number of a row"
+            "its table `{name}` has a column `rowid`, which is SQLite's own name for row numbers"
         )
         .into());
     }
@@ -319,7 +331,7 @@ fn table(db: &Connection, name: &str, wanted: &[&str]) -> Result<Vec<String>, Re
     }
 }
 
-/// An index by which all messages can be read in the order of their times, quoted for SQL.
+/// Returns an index that orders all messages by time, quoted for SQL.
 fn index_of_times(db: &Connection) -> rusqlite::Result<Option<String>> {
     let mut statement =
         db.prepare("SELECT name FROM pragma_index_list('messages') WHERE partial = 0")?;
@@ -330,7 +342,7 @@ fn index_of_times(db: &Connection) -> rusqlite::Result<Option<String>> {
         let found: Vec<(Option<String>, i64)> = columns
             .query_map([&name], |row| Ok((row.get(0)?, row.get(1)?)))?
             .collect::<Result<_, _>>()?;
-        // The second is the number of the row.
+        // The second column is the row number.
         if let [(Some(column), 0), (None, 0)] = found.as_slice()
             && column == "timestamp"
         {
@@ -340,10 +352,9 @@ fn index_of_times(db: &Connection) -> rusqlite::Result<Option<String>> {
     Ok(None)
 }
 
-/// Refuses a database whose index does not give messages in the order of their times by itself, as
-/// with an order of its own for texts: SQLite would read all of them, and sort them in memory, for
-/// each piece.
-fn in_order(db: &Connection, index: &str) -> Result<(), Refused> {
+/// Refuses a database whose index does not order the messages by time, such as one with another
+/// collation: SQLite would read and sort all messages in memory for each piece.
+fn in_order(db: &Connection, index: &str) -> Result<(), BoxedError> {
     let pieces = [SAME_TIME, LATER].map(|condition| (select(index, "0", condition), false));
     let edges = ["ASC", "DESC"].map(|order| (edge_sql(index, order), true));
     for (sql, may_scan) in pieces.into_iter().chain(edges) {
@@ -366,7 +377,7 @@ fn edge_sql(index: &str, order: &str) -> String {
     format!("SELECT timestamp FROM messages INDEXED BY {index} ORDER BY timestamp {order} LIMIT 1")
 }
 
-/// The first or the last time; `None` if there are no messages.
+/// Returns the first or the last time; `None` if there are no messages.
 fn edge(db: &Connection, index: &str, order: &str) -> Result<Option<u64>, Damage> {
     let unreadable = |error: rusqlite::Error| Damage::Database(error.into());
     let mut statement = db.prepare(&edge_sql(index, order)).map_err(unreadable)?;

@@ -1,4 +1,4 @@
-//! The merge: all files of a drive as one sequence of messages.
+//! Merges all files of a drive into one sequence of messages.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -11,68 +11,69 @@ use super::chunk::{OpenSegment, Opener};
 use super::damage::Damage;
 use super::error::ReplayError;
 use super::inflate::Inflate;
-use super::options::{Limits, Options, Span};
-use super::step::{Progress, Step};
+use super::options::{DriveLimits, DriveOptions, Span};
+use super::step::{Progress, ReplayStep};
 use super::storage;
 use super::track::{Routed, Track, nanoseconds};
 use gleaner_messages::Definitions;
 use gleaner_transport::{
-    DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError, Verdict,
+    Delivery, DiscoveredTopic, Sink, Subscription, TopicSpec, Transport, TransportError,
 };
 
 /// A drive: one or more files and rosbag2 directories, replayed as one.
 ///
 /// Messages come in log-time order; equal times come in the order of the files, then of the channel
-/// ids, then as they lie in the file; in a database, as they are numbered. A message with several
-/// subscriptions is delivered to each in a step of its own.
+/// ids, then of their positions in the file; in a database, of their numbers. A message with
+/// several subscriptions is delivered to each in a step of its own.
 ///
 /// # Damage
 ///
 /// Chunks are delivered whole or not at all: a chunk whose checksum, compression or records are
-/// wrong is damage as a whole. A damaged file ends the drive, for all files, with one
-/// [`ReplayError::Damaged`] from [`Replay::step`] or [`Replay::peek_at_ns`]; from then on there is
+/// wrong is damaged as a whole. A damaged file ends the drive, for all files, with one
+/// [`ReplayError::Damaged`] from [`Replay::step`] or [`Replay::peek_at_ns`]; after it there is
 /// nothing more. Before it:
 ///
-/// - In a finished file with a usable summary, a damaged chunk shows when its turn comes. Every
-///   message of every file whose log time is before that chunk's start time was delivered.
-/// - In a file without (cut off, never finished, summary damaged), opening finds the damage, and
+/// - In a finished file with a usable summary, a damaged chunk is reported when its turn comes.
+///   Every message of every file whose log time is before that chunk's start time was delivered.
+/// - In a file without (truncated, never finished, summary damaged), opening finds the damage, and
 ///   the readable part ends where it begins. Every message in that part was delivered, in log-time
 ///   order, and every message of the other files up to the last log time in it.
-/// - A message that is not CDR is damage where it stands: everything before it in the order of
+/// - A message that is not CDR is damage at its position: every earlier message in the order of
 ///   delivery was delivered.
 ///
-/// A file that is readable to its end but has no footer, or a damaged summary, or another number of
-/// messages of a subscribed topic than the summary counts, is replayed whole and then reported as
-/// damaged; so is one whose index says other times of a chunk than the chunk itself, which is read
-/// as one without. Messages outside chunks have no checksum of their own; if the one of the whole
-/// data section is wrong, that too is reported after them. A writer may leave out any checksum;
-/// then only what contradicts itself is noticed.
+/// A file that is readable to its end is replayed as a whole and then reported as damaged if it has
+/// no footer, a damaged summary, or another number of messages of a subscribed topic than in its
+/// summary; so is one whose index has other times of a chunk than the chunk itself, which is read
+/// as one without an index. Messages outside chunks have no checksum of their own; if the one of
+/// the whole data section is wrong, that too is reported after them. A writer may leave out any
+/// checksum; then only contradictions are noticed.
 ///
-/// A database has no checksums: what its pages contradict is noticed when its turn comes, and every
-/// message before was delivered. So it is with a packed file that cannot be unpacked to its end.
+/// A database has no checksums: a contradiction of its pages is noticed when its turn comes, and
+/// every message before was delivered. The same holds for a packed file that can be unpacked only
+/// in part.
 pub struct Replay {
     tracks: Vec<Track>,
     catalog: Catalog,
     sinks: Vec<Arc<dyn Sink>>,
     opener: Opener,
-    /// What takes apart messages that are packed one by one.
+    /// Unpacks messages that are packed one by one.
     inflate: Inflate,
-    limits: Limits,
-    /// The times that are replayed.
+    limits: DriveLimits,
+    /// The times to replay.
     span: Span,
     /// The next message of every open segment, earliest on top.
     heads: BinaryHeap<Reverse<Head>>,
     open: Vec<OpenSegment>,
-    /// Places in `open` that hold no segment.
+    /// Free indices of `open`.
     free: Vec<usize>,
     open_bytes: u64,
-    /// Which track opens its next segment first, and from which log time on that is due.
+    /// Log time at which the next segment must be open, and the track that has it.
     next_open: Option<(u64, usize)>,
-    /// What ends the drive, and the log time before which all is still delivered.
+    /// The error that ends the drive, and the log time before which everything is still delivered.
     damage: Option<(u64, ReplayError)>,
     started: bool,
     ended: bool,
-    /// How many subscriptions the top message was delivered to already.
+    /// Number of subscriptions that the top message was already delivered to.
     fan: usize,
     last_at_ns: i64,
     out_of_order: u64,
@@ -85,25 +86,25 @@ struct Head {
     log_time: u64,
     track: usize,
     channel: u16,
-    /// Where the segment lies in its file.
+    /// Position of the segment in its file.
     offset: u64,
     slot: usize,
 }
 
 impl Replay {
-    /// Opens the files of a drive and finds out what is in them.
+    /// Opens the files of a drive and finds out their content.
     ///
-    /// A directory is one that rosbag2 wrote: all files that its metadata name, or if it has none,
-    /// those of its name that we read. A file with a summary, and a database, cost a few reads; a
-    /// file without a summary is read through once, and a packed one is unpacked.
+    /// A directory must be one that rosbag2 wrote: its files are those that its metadata name, or
+    /// without metadata, those with known file names. Files with a summary, and databases, cost a
+    /// few reads; a file without a summary is read through once, and a packed one is unpacked.
     ///
     /// # Errors
     ///
-    /// [`ReplayError`] if there is no file, one cannot be opened, is nothing that we read or given
+    /// [`ReplayError`] if there is no file, one cannot be opened, is of an unknown format or given
     /// twice, or if they disagree on a topic's type. Damage further inside is reported by
     /// [`Replay::step`].
     pub fn open(paths: &[PathBuf]) -> Result<Self, ReplayError> {
-        Self::open_as(paths, &Options::default())
+        Self::open_as(paths, &DriveOptions::default())
     }
 
     /// As [`Replay::open`], with other limits.
@@ -111,16 +112,16 @@ impl Replay {
     /// # Errors
     ///
     /// As [`Replay::open`].
-    pub fn open_with(paths: &[PathBuf], limits: Limits) -> Result<Self, ReplayError> {
-        Self::open_as(paths, &Options { limits, ..Options::default() })
+    pub fn open_with(paths: &[PathBuf], limits: DriveLimits) -> Result<Self, ReplayError> {
+        Self::open_as(paths, &DriveOptions { limits, ..DriveOptions::default() })
     }
 
-    /// As [`Replay::open`], in every way that it can be done.
+    /// As [`Replay::open`], with all options.
     ///
     /// # Errors
     ///
     /// As [`Replay::open`].
-    pub fn open_as(paths: &[PathBuf], options: &Options) -> Result<Self, ReplayError> {
+    pub fn open_as(paths: &[PathBuf], options: &DriveOptions) -> Result<Self, ReplayError> {
         if paths.is_empty() {
             return Err(ReplayError::NoFiles);
         }
@@ -151,10 +152,10 @@ impl Replay {
         })
     }
 
-    /// Replays only messages with a log time from `from_ns` on and before `to_ns`; to be called
+    /// Replays only messages with a log time from `from_ns` on and before `to_ns`; must be called
     /// before the first step.
     ///
-    /// Damage that shows behind all of them is not reported: it costs none.
+    /// Later damage is not reported, as it costs none of these messages.
     pub fn restrict(&mut self, from_ns: i64, to_ns: i64) {
         self.span = Span::between(from_ns, to_ns);
         self.progress.total = None;
@@ -166,7 +167,7 @@ impl Replay {
     ///
     /// [`ReplayError::Damaged`] or [`ReplayError::Read`], once; see [`Replay`] for what was
     /// delivered before. Every later call returns `None`.
-    pub fn step(&mut self) -> Result<Option<Step>, ReplayError> {
+    pub fn step(&mut self) -> Result<Option<ReplayStep>, ReplayError> {
         if !self.advance_to_head()? {
             return Ok(None);
         }
@@ -177,7 +178,7 @@ impl Replay {
         let track = &mut self.tracks[head.track];
         let routed = segment
             .head()
-            .ok_or(Damage::Malformed("a chunk lost its place"))
+            .ok_or(Damage::Malformed("a chunk has no current message"))
             .and_then(|entry| track.route(segment.body(entry), self.fan, &mut self.inflate));
         let Routed { subscription, is_last, meta, is_too_big, cdr } = match routed {
             Ok(routed) => routed,
@@ -187,13 +188,13 @@ impl Replay {
             }
         };
         let sink = &self.sinks[subscription.0];
-        let verdict = if is_too_big {
+        let delivery = if is_too_big {
             sink.too_big(&meta, cdr.len());
-            Verdict::TooBig
+            Delivery::TooBig
         } else {
             sink.deliver(&meta, cdr)
         };
-        let step = Step { at_ns: meta.at_ns, subscription, verdict, meta, bytes: cdr.len() };
+        let step = ReplayStep { at_ns: meta.at_ns, subscription, delivery, meta, bytes: cdr.len() };
         if meta.at_ns < self.last_at_ns {
             self.out_of_order += u64::from(self.fan == 0);
         }
@@ -208,7 +209,8 @@ impl Replay {
         Ok(Some(step))
     }
 
-    /// Log time of the message that the next [`Replay::step`] delivers, in ns; `None` at the end.
+    /// Returns the log time of the message that the next [`Replay::step`] delivers, in ns; `None`
+    /// at the end.
     ///
     /// # Errors
     ///
@@ -220,14 +222,14 @@ impl Replay {
         Ok(self.heads.peek().map(|Reverse(head)| nanoseconds(head.log_time)))
     }
 
-    /// Log time of the first message of any topic, in ns; `None` if there is none.
+    /// Returns the log time of the first message of any topic, in ns; `None` if there is none.
     pub fn start_ns(&self) -> Option<i64> {
         let starts = self.tracks.iter().filter_map(|track| track.times().map(|times| times.0));
         starts.min().map(nanoseconds)
     }
 
-    /// Log time of the last message of any topic, in ns; `None` if there is none, or if nobody
-    /// knows: of a database that was cut off.
+    /// Returns the log time of the last message of any topic, in ns; `None` if there is none, or if
+    /// it is unknown, as in a truncated database.
     pub fn end_ns(&self) -> Option<i64> {
         if self.tracks.iter().any(Track::is_end_unknown) {
             return None;
@@ -236,7 +238,7 @@ impl Replay {
         ends.max().map(nanoseconds)
     }
 
-    /// Whether a topic can be subscribed so.
+    /// Checks whether a topic can be subscribed with `spec`.
     ///
     /// # Errors
     ///
@@ -245,23 +247,24 @@ impl Replay {
         self.catalog.select(spec).map(drop)
     }
 
-    /// How far the replay has come.
+    /// Returns the progress of the replay.
     pub fn progress(&self) -> Progress {
         self.progress
     }
 
-    /// Messages delivered after one with a later log time. 0 unless [`Limits::open_bytes`] was
-    /// reached.
+    /// Returns the number of messages delivered after one with a later log time. 0 unless
+    /// [`DriveLimits::open_bytes`] was reached.
     pub fn out_of_order(&self) -> u64 {
         self.out_of_order
     }
 
-    /// Opens what has to be open for the top of `heads` to be the next message; false at the end.
+    /// Opens all segments that must be open for the top of `heads` to be the next message; false at
+    /// the end.
     fn advance_to_head(&mut self) -> Result<bool, ReplayError> {
         if self.ended {
             return Ok(false);
         }
-        // Between two deliveries of one message nothing may take its place.
+        // No other message comes between two deliveries of one message.
         if self.fan > 0 {
             return Ok(true);
         }
@@ -341,7 +344,7 @@ impl Replay {
             starts.filter_map(|(index, track)| Some((track.next_start()?, index))).min();
     }
 
-    /// Moves on from the top message.
+    /// Advances past the top message.
     fn pop(&mut self) {
         let Some(mut top) = self.heads.peek_mut() else {
             return;

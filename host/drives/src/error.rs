@@ -1,12 +1,12 @@
-//! Why a drive cannot be opened, or ends early.
+//! Errors of opening and replaying a drive.
 
 use std::error::Error;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use super::damage::{Damage, Place};
+use super::damage::{Damage, DamageLocation};
 
-/// Why a drive cannot be opened, or ends before its end.
+/// Reasons why a drive cannot be opened, or ends early.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
     /// No file was given.
@@ -17,16 +17,16 @@ pub enum ReplayError {
     Open {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// A directory is given to who reads a file.
+    /// A directory was given in place of a file.
     #[error("`{path}` is a directory, not a file")]
     Directory {
         /// The directory.
         path: PathBuf,
     },
-    /// A directory is no rosbag2 directory.
+    /// A directory is not one of rosbag2.
     #[error("`{path}` has no metadata.yaml, and no .mcap or .db3 file")]
     NoBag {
         /// The directory.
@@ -37,32 +37,33 @@ pub enum ReplayError {
     Metadata {
         /// `metadata.yaml`.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The cause.
         source: Box<dyn Error + Send + Sync>,
     },
-    /// The metadata of a rosbag2 directory name a file that is not there.
-    #[error("`{metadata}` names `{file}`, which is not there")]
+    /// The metadata of a rosbag2 directory name a file that does not exist.
+    #[error("`{metadata}` names `{file}`, which does not exist")]
     NoSuchFile {
         /// `metadata.yaml`.
         metadata: PathBuf,
-        /// The file as it is named there.
+        /// The file, as in the metadata.
         file: String,
     },
-    /// The metadata of a rosbag2 directory name a file elsewhere, by its path or through a link.
+    /// The metadata of a rosbag2 directory name a file outside of it, by its path or through a
+    /// link.
     #[error("`{metadata}` names `{file}`, which is not in its directory")]
     Outside {
         /// `metadata.yaml`.
         metadata: PathBuf,
-        /// The file as it is named there.
+        /// The file, as in the metadata.
         file: String,
     },
-    /// Two of the paths given lead to one file.
+    /// Two of the given paths lead to the same file.
     #[error("drive `{path}` is given twice")]
     Twice {
         /// The file.
         path: PathBuf,
     },
-    /// The file does not begin like anything that we read.
+    /// The file has no known format.
     #[error(
         "`{path}` is not an MCAP file, nor a rosbag2 database, nor one of them packed with zstd"
     )]
@@ -75,39 +76,41 @@ pub enum ReplayError {
     Unpack {
         /// The file.
         path: PathBuf,
-        /// Where its content was to go.
+        /// The folder for its content.
         folder: PathBuf,
-        /// Why it cannot.
+        /// The cause.
         source: io::Error,
     },
-    /// A packed file holds more than we are ready to write.
+    /// The packed files of a drive exceed the limit.
     #[error("with drive `{path}`, the packed files hold more than {allowed} bytes")]
     UnpacksTooLarge {
         /// The file.
         path: PathBuf,
-        /// [`super::Limits::unpacked_bytes`].
+        /// [`super::DriveLimits::unpacked_bytes`].
         allowed: u64,
     },
-    /// A packed file holds far more than it should, for its size.
+    /// The content of a packed file is far too large for its size.
     #[error(
-        "drive `{path}` unpacks to more than {allowed} bytes, which is far more than a recording of its size holds"
+        "drive `{path}` unpacks to more than {allowed} bytes, \
+         far more than a recording of its size"
     )]
     UnpacksManyTimes {
         /// The file.
         path: PathBuf,
-        /// The most that one of its size may hold.
+        /// The limit for its size.
         allowed: u64,
     },
-    /// A packed file holds more than there is room for on the disk.
+    /// The content of a packed file exceeds the free disk space.
     #[error(
-        "drive `{path}` unpacks to more than {allowed} bytes, which is nine tenths of what is free in `{folder}`"
+        "drive `{path}` unpacks to more than {allowed} bytes, \
+         nine tenths of the free space in `{folder}`"
     )]
     NoRoom {
         /// The file.
         path: PathBuf,
-        /// Where its content was to go.
+        /// The folder for its content.
         folder: PathBuf,
-        /// The most that may be taken there.
+        /// The limit for the disk.
         allowed: u64,
     },
     /// A database cannot be read at all.
@@ -115,10 +118,10 @@ pub enum ReplayError {
     Database {
         /// The file.
         path: PathBuf,
-        /// What SQLite said, or what of a rosbag2 database is missing.
+        /// The error of SQLite, or what is missing in the database.
         source: Box<dyn Error + Send + Sync>,
     },
-    /// The newest messages of a database are not in it yet.
+    /// The newest messages of a database are still in its journal.
     #[error("database `{path}` was not closed: its newest messages are in `{beside}`")]
     NotClosed {
         /// The file.
@@ -126,21 +129,21 @@ pub enum ReplayError {
         /// Its journal.
         beside: PathBuf,
     },
-    /// Without an index, each look for the next message would read the whole database.
-    #[error("database `{path}` has no index of the times of its messages")]
+    /// Without an index, each search for the next message would read the whole database.
+    #[error("database `{path}` has no index of message times")]
     NoTimes {
         /// The file.
         path: PathBuf,
     },
-    /// This program was built without what reads rosbag2 directories.
+    /// This program was built without the reader of rosbag2 directories.
     #[error("`{path}` is {what}, which this program does not read")]
     NotBuiltIn {
         /// The file or directory.
         path: PathBuf,
-        /// What it is.
+        /// Its kind.
         what: &'static str,
     },
-    /// Two files, or two channels of one, disagree on the type of a topic.
+    /// Two files, or two channels of a file, disagree on the type of a topic.
     #[error(
         "topic `{topic}` has type `{first_type}` in `{first}` and `{second_type}` in `{second}`"
     )]
@@ -156,52 +159,56 @@ pub enum ReplayError {
         /// Its type there.
         second_type: String,
     },
-    /// The system failed to read the file; the file itself may be sound.
+    /// The system failed to read the file; the file itself may be intact.
     #[error("cannot read drive `{path}` at byte {offset}")]
     Read {
         /// The file.
         path: PathBuf,
-        /// Where.
+        /// The position.
         offset: u64,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// The file is damaged. All that [`super::Replay`] promises to deliver first was delivered.
+    /// The file is damaged. All messages that [`super::Replay`] promises were delivered before.
     #[error("drive `{path}` is damaged at {at}")]
     Damaged {
         /// The file.
         path: PathBuf,
-        /// Where.
-        at: Place,
-        /// What is wrong there.
+        /// The position.
+        at: DamageLocation,
+        /// The damage.
         #[source]
         what: Damage,
     },
 }
 
 impl ReplayError {
-    /// What who gave the drive can do, where there is something.
+    /// Returns what the user can do about it, if anything.
     pub fn help(&self) -> Option<String> {
         Some(match self {
             Self::NoBag { .. } | Self::NoFiles => format!("name {WHAT_IS_ONE}"),
             Self::Open { source, .. } if source.kind() == io::ErrorKind::NotFound => {
-                format!("look at its name; a drive is {WHAT_IS_ONE}")
+                format!("check its name; a drive is {WHAT_IS_ONE}")
             }
             Self::Open { source, .. } if source.kind() == io::ErrorKind::PermissionDenied => {
-                "have its owner let you read it".to_owned()
+                "ask its owner for permission to read it".to_owned()
             }
             Self::NotMcap { .. } => {
                 format!(
-                    "name {WHAT_IS_ONE}; a bag of ROS 1 becomes one by `rosbags-convert`, of the Python package rosbags"
+                    "name {WHAT_IS_ONE}; to convert a bag of ROS 1, use `rosbags-convert` of the \
+                     Python package rosbags"
                 )
             }
             Self::Metadata { path, .. } | Self::NoSuchFile { metadata: path, .. } => {
                 let folder = word(path.parent().unwrap_or(path));
                 format!(
-                    "write it anew with `ros2 bag reindex {folder}`, or name the files in the directory themselves"
+                    "rewrite it with `ros2 bag reindex {folder}`, \
+                     or name the files in the directory themselves"
                 )
             }
-            Self::Outside { .. } => "name that file itself, if you trust who wrote this".to_owned(),
+            Self::Outside { .. } => {
+                "name that file itself, if you trust the author of the metadata".to_owned()
+            }
             Self::Twice { .. } => "its samples would count twice; give each file once".to_owned(),
             Self::Unpack { path, .. } | Self::UnpacksTooLarge { path, .. } => {
                 format!("unpack it yourself: zstd -d {}", word(path))
@@ -210,28 +217,27 @@ impl ReplayError {
                 format!("if you trust it, unpack it yourself: zstd -d {}", word(path))
             }
             Self::NoRoom { path, .. } => {
-                format!(
-                    "make room, or unpack it where there is some: zstd -d {} -o FILE",
-                    word(path)
-                )
+                format!("free disk space, or unpack it elsewhere: zstd -d {} -o FILE", word(path))
             }
             Self::NotClosed { path, .. } => {
                 format!("close it: sqlite3 {} 'PRAGMA wal_checkpoint(TRUNCATE)'", word(path))
             }
             Self::NoTimes { path } => {
                 format!(
-                    "make one: sqlite3 {} 'CREATE INDEX timestamp_idx ON messages (timestamp ASC)'",
+                    "create one: sqlite3 {} 'CREATE INDEX timestamp_idx ON messages (timestamp \
+                     ASC)'",
                     word(path)
                 )
             }
             Self::Damaged {
                 path,
-                what: Damage::Database(_) | Damage::DatabaseCutOff { .. },
+                what: Damage::Database(_) | Damage::DatabaseTruncated { .. },
                 ..
             } => {
                 let path = word(path);
                 format!(
-                    "copy the file again if you can; `sqlite3 {path} .recover | sqlite3 NEW.db3` may find more"
+                    "copy the file again if you can; \
+                     `sqlite3 {path} .recover | sqlite3 NEW.db3` may find more"
                 )
             }
             Self::Damaged { .. } => "copy the file again if you can".to_owned(),
@@ -242,12 +248,11 @@ impl ReplayError {
 
 const WHAT_IS_ONE: &str = "a .mcap or .db3 file, or a directory that `ros2 bag record` wrote";
 
-/// A path as one word of a command to paste into a shell: whoever made the drive chose the names in
-/// it.
+/// Quotes a path as one word of a shell command to paste; the author of the drive chose the names.
 fn word(path: &Path) -> String {
     let text = path.to_string_lossy();
     let is_plain = |c: char| c.is_alphanumeric() || "/._-+=:,@%".contains(c);
-    // Else it would be an option.
+    // Otherwise it would be an option.
     let here = if text.starts_with('-') { "./" } else { "" };
     if !text.is_empty() && text.chars().all(is_plain) {
         return format!("{here}{text}");
@@ -260,7 +265,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_command_to_paste_holds_a_name_as_one_word() {
+    fn a_command_to_paste_quotes_a_name_as_one_word() {
         for (path, shown) in [
             ("/data/drive_0.db3", "/data/drive_0.db3"),
             ("a b.db3", "'a b.db3'"),
@@ -270,7 +275,7 @@ mod tests {
         ] {
             let help = ReplayError::NoTimes { path: path.into() }.help().unwrap();
             assert!(
-                help.starts_with(&format!("make one: sqlite3 {shown} 'CREATE INDEX")),
+                help.starts_with(&format!("create one: sqlite3 {shown} 'CREATE INDEX")),
                 "{help}"
             );
         }

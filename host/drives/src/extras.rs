@@ -1,4 +1,4 @@
-//! What a file holds besides messages: metadata records and attachments.
+//! Reads the content of a file besides messages: metadata records and attachments.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -9,18 +9,18 @@ use super::damage::Damage;
 use super::error::ReplayError;
 use super::indexes::{INDEX_BYTES, Indexes};
 use super::records::{self, HEAD, MAGIC, Statistics, head, op};
-use super::source::Source;
+use super::source::SourceFile;
 use super::summary::footer;
 
-/// What a text, a pair or a list entry takes beside its bytes, about. Without it, a file of tiny
-/// entries would take many times its size.
+/// Approximate size of a text, a pair or a list entry, besides its bytes. Without it, a file of
+/// tiny entries would take many times its size.
 const ENTRY_BYTES: u64 = 128;
 /// Statistics with a count for each of the 65536 channels that a file can have are shorter.
 const MAX_STATISTICS: u64 = 1 << 20;
-/// How much of an attachment's name stands in an error.
+/// Length limit of an attachment's name in an error.
 const NAME_CHARS: usize = 100;
 
-/// What a file holds besides messages.
+/// The content of a file besides messages.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Extras {
     /// The metadata records in the order of the file, each with its name. Names may repeat. They
@@ -28,18 +28,17 @@ pub struct Extras {
     pub metadata: Vec<(String, BTreeMap<String, String>)>,
     /// The attachments in the order of the file. Names may repeat.
     pub attachments: Vec<Attachment>,
-    /// Whether the file was finished and read to its end. If it was cut off, the rest is missing
-    /// here.
+    /// Set if the file was finished and read to its end. Otherwise the rest is missing here.
     pub is_whole: bool,
-    /// Where its indexes and its records do not fit, if so: a reader that goes by index would see
-    /// something else.
+    /// The first difference between its indexes and its records: a reader that relies on the index
+    /// would see other content.
     pub misfit: Option<String>,
 }
 
 /// A file within a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Attachment {
-    /// Its name. Not a path: whoever writes it to a disk has to check it first.
+    /// Its name. It is not a safe path: check it before writing to a disk.
     pub name: String,
     /// Its media type, for example `image/jpeg`; empty if unknown.
     pub media_type: String,
@@ -47,33 +46,31 @@ pub struct Attachment {
     pub data: Vec<u8>,
 }
 
-/// Reads the metadata records and attachments of an MCAP file; chunks are stepped over unread.
+/// Reads the metadata records and attachments of an MCAP file; chunks are skipped unread.
 ///
-/// Names, texts and data may take `limit_bytes` in all, with 128 bytes more for each record and
-/// pair.
+/// Names, texts and data may take `limit_bytes` in all, plus 128 bytes for each record and pair.
 ///
-/// A file without a footer, which was cut off or is still being written, gives what stands before
-/// its end, or before the first damage: with a torn end, it cannot be told which of the two it is.
-/// Attachments without a checksum are not believed there. A finished file gives everything or an
+/// A file without a footer, which was truncated or is still being written, returns the content
+/// before its end, or before the first damage: with a torn end, the two cases look alike.
+/// Attachments without a checksum are not trusted there. A finished file returns everything or an
 /// error.
 ///
 /// # Errors
 ///
-/// [`ReplayError`] if the file cannot be opened or read, is a directory or no MCAP file.
+/// [`ReplayError`] if the file cannot be opened or read, is a directory or not an MCAP file.
 /// [`ReplayError::Damaged`] if there is more than `limit_bytes`, or if a finished file is damaged:
-/// a record that is malformed, an attachment without its checksum (a writer may leave it out),
-/// fewer of either than the summary counts, or any byte of the data section that its checksum does
-/// not allow.
+/// a malformed record, an attachment with a wrong checksum (a writer may leave it out), fewer of
+/// either than in the summary, or a data section that does not match its checksum.
 ///
 /// Source: the MCAP specification, version 0.
 pub fn read_extras(path: &Path, limit_bytes: u64) -> Result<Extras, ReplayError> {
-    let mut source = Source::open(path)?;
+    let mut source = SourceFile::open(path)?;
     if source.peek(0, MAGIC.len())? != MAGIC {
         return Err(ReplayError::NotMcap { path: path.to_owned() });
     }
     let footer_at = footer(&mut source)?.map(|footer| footer.at);
     let len = source.len();
-    let mut walk = Walk {
+    let mut reader = ExtrasReader {
         source,
         end: footer_at.unwrap_or(len),
         is_cut_off: footer_at.is_none(),
@@ -83,34 +80,39 @@ pub fn read_extras(path: &Path, limit_bytes: u64) -> Result<Extras, ReplayError>
         indexes: Indexes::default(),
         claimed: None,
     };
-    match walk.all() {
-        Ok(()) => walk.extras.is_whole = !walk.is_cut_off,
+    match reader.all() {
+        Ok(()) => reader.extras.is_whole = !reader.is_cut_off,
         Err(error @ ReplayError::Damaged { what: Damage::ExtrasTooLarge { .. }, .. }) => {
             return Err(error);
         }
-        Err(ReplayError::Damaged { at, what, .. }) if walk.is_cut_off => {
-            warn!(path = %path.display(), %at, %what, "file is cut off, its further metadata and attachments are lost");
+        Err(ReplayError::Damaged { at, what, .. }) if reader.is_cut_off => {
+            warn!(
+                path = %path.display(),
+                %at,
+                %what,
+                "file is truncated; its further metadata and attachments are lost"
+            );
         }
         Err(error) => return Err(error),
     }
-    walk.extras.misfit = walk.indexes.misfit().filter(|_| walk.extras.is_whole);
-    Ok(walk.extras)
+    reader.extras.misfit = reader.indexes.misfit().filter(|_| reader.extras.is_whole);
+    Ok(reader.extras)
 }
 
-struct Walk {
-    source: Source,
-    /// Where the footer begins, or the file ends without one.
+struct ExtrasReader {
+    source: SourceFile,
+    /// Start of the footer, or end of a file without one.
     end: u64,
     is_cut_off: bool,
     allowed: u64,
     left: u64,
     extras: Extras,
     indexes: Indexes,
-    /// What the summary says of the file.
+    /// Counts from the summary.
     claimed: Option<Statistics>,
 }
 
-impl Walk {
+impl ExtrasReader {
     fn all(&mut self) -> Result<(), ReplayError> {
         let mut at = MAGIC.len() as u64;
         while at != self.end {
@@ -132,8 +134,8 @@ impl Walk {
         Ok(())
     }
 
-    /// Checks everything before `end` against the checksum that stands there: nothing else covers
-    /// metadata, and indexes.
+    /// Checks everything before `end` against the checksum at that position: nothing else covers
+    /// metadata and indexes.
     fn whole_until(&mut self, end: u64, expected: u32) -> Result<(), ReplayError> {
         let found = if expected == 0 { 0 } else { self.source.checksum(end)? };
         if found == expected {
@@ -143,7 +145,7 @@ impl Walk {
         }
     }
 
-    /// Looks at the record at `at`, and returns where the next one is.
+    /// Reads the record at `at`, and returns the position of the next one.
     fn record(&mut self, at: u64) -> Result<u64, ReplayError> {
         let Some((opcode, len)) = head(self.source.peek(at, HEAD as usize)?) else {
             return Err(self.source.damaged(at, Damage::Truncated("the head of a record")));
@@ -161,7 +163,7 @@ impl Walk {
         self.indexes.add(opcode, at, HEAD + len, begins);
         let looked = match opcode {
             0 => Err(Damage::Malformed("a record has kind 0, which does not exist")),
-            op::FOOTER => Err(Damage::Malformed("a footer stands in the middle of the file")),
+            op::FOOTER => Err(Damage::Malformed("a footer is in the middle of the file")),
             op::DATA_END => {
                 let crc = self
                     .source
@@ -197,7 +199,7 @@ impl Walk {
         Ok(next)
     }
 
-    /// The body of the record at `at`, which lies in the file and whose length was found bearable.
+    /// Reads the body of the record at `at`, which is in the file and within the limits.
     fn body(&mut self, at: u64, len: u64) -> Result<Vec<u8>, ReplayError> {
         let mut body = vec![0; len as usize];
         self.source.read(at + HEAD, &mut body)?;
@@ -212,7 +214,7 @@ impl Walk {
 
     fn metadata(&mut self, body: &[u8]) -> Result<(), Damage> {
         let malformed = || Damage::Malformed("a metadata record is malformed");
-        let record = records::Metadata::parse(body).ok_or_else(malformed)?;
+        let record = records::McapMetadata::parse(body).ok_or_else(malformed)?;
         let text = |bytes| str::from_utf8(bytes).map(str::to_owned).map_err(|_| malformed());
         let mut pairs = BTreeMap::new();
         for (key, value) in record.map.pairs() {
@@ -227,11 +229,11 @@ impl Walk {
 
     fn attachment(&mut self, mut body: Vec<u8>) -> Result<(), Damage> {
         let malformed = Damage::Malformed("an attachment record is malformed");
-        let records::Attachment { name, media_type, data, crc, len } =
-            records::Attachment::parse(&body).ok_or(malformed)?;
+        let records::McapAttachment { name, media_type, data, crc, len } =
+            records::McapAttachment::parse(&body).ok_or(malformed)?;
         let found = crc32fast::hash(&body[..len]);
         if crc == 0 && self.is_cut_off {
-            // Pages that never reached the disk read as zeros, this checksum with them.
+            // Pages that never reached the disk read as zeros, including this checksum.
             return Err(Damage::Malformed(
                 "an attachment in a file without a footer has no checksum",
             ));
@@ -241,8 +243,7 @@ impl Walk {
             return Err(Damage::AttachmentCrc { name, expected: crc, found });
         }
         let (name, media_type, start) = (name.to_owned(), media_type.to_owned(), len - data.len());
-        // The data stay where they are read: a second copy of them would double what a caller
-        // allowed.
+        // The data stay in this buffer: a copy would double the memory that the caller allowed.
         body.truncate(len);
         body.drain(..start);
         self.extras.attachments.push(Attachment { name, media_type, data: body });

@@ -1,4 +1,4 @@
-//! What one file contains: its channels, and where its messages lie.
+//! Content of a file: its channels, and the positions of its messages.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -6,9 +6,9 @@ use std::sync::Arc;
 
 use tracing::warn;
 
-use super::chunk::Segment;
+use super::chunk::FileSegment;
 use super::damage::Damage;
-use super::records::{Channel, Schema, op};
+use super::records::{McapChannel, McapSchema, op};
 use gleaner_transport::Guid;
 
 /// A channel of a file.
@@ -20,13 +20,13 @@ pub(super) struct ChannelInfo {
     pub(super) schema_encoding: String,
     pub(super) definitions_text: Option<Arc<str>>,
     pub(super) offered_qos: Option<String>,
-    /// Who wrote its messages, if the file says so. Clips do.
+    /// The writer of its messages, if the file names it. Clips do.
     pub(super) writer: Option<Guid>,
 }
 
 #[cfg(feature = "bags")]
 impl ChannelInfo {
-    /// What its texts take, without the definitions, which channels share.
+    /// Returns the size of its texts, without the definitions, which channels share.
     pub(super) fn bytes(&self) -> usize {
         let texts = [&self.topic, &self.type_name, &self.message_encoding, &self.schema_encoding];
         texts.into_iter().chain(&self.offered_qos).map(|text| text.len()).sum()
@@ -39,21 +39,21 @@ struct SchemaInfo {
     text: Option<Arc<str>>,
 }
 
-/// The channels of a file, as far as they are known.
+/// The channels of a file that are known so far.
 #[derive(Default)]
 pub(super) struct Channels {
     schemas: HashMap<u16, SchemaInfo>,
     by_id: HashMap<u16, ChannelInfo>,
-    /// Bytes of the schemas and channels that were kept.
+    /// Size in bytes of the schemas and channels that were kept.
     bytes: usize,
 }
 
-/// What all schemas and channels of a file may take; a drive with a hundred topics has some 100
+/// Size limit of all schemas and channels of a file; a drive with a hundred topics has some 100
 /// KiB.
 const KNOWN_BYTES: usize = 64 << 20;
-/// The longest description of offered qualities of service that is kept; a usual one has 200 bytes.
+/// Length limit of an offered QoS that is kept; a usual one has 200 bytes.
 const QOS_BYTES: usize = 64 << 10;
-/// How much of a name of the file stands in an error.
+/// Length limit of a name of the file in an error.
 const SHOWN_CHARS: usize = 100;
 const TOO_MUCH: Damage = Damage::Malformed("its schemas and channels take more than 64 MiB");
 
@@ -66,14 +66,14 @@ impl Channels {
         self.by_id.get(&id)
     }
 
-    /// All channels by id, so that everything derived from them has one order.
+    /// Returns all channels by id, so that everything derived from them has one order.
     pub(super) fn iter(&self) -> impl Iterator<Item = (u16, &ChannelInfo)> {
         let mut all: Vec<_> = self.by_id.iter().map(|(id, info)| (*id, info)).collect();
         all.sort_unstable_by_key(|(id, _)| *id);
         all.into_iter()
     }
 
-    /// Adds a channel that a database calls a topic.
+    /// Adds a topic of a database as a channel.
     #[cfg(feature = "bags")]
     pub(super) fn add(&mut self, id: u16, info: ChannelInfo) -> Result<(), Damage> {
         self.make_room(info.bytes() + info.definitions_text.as_ref().map_or(0, |text| text.len()))?;
@@ -86,9 +86,9 @@ impl Channels {
         if self.bytes > KNOWN_BYTES { Err(TOO_MUCH) } else { Ok(()) }
     }
 
-    /// Learns from a record; other records are skipped. Writers repeat schemas and channels, always
-    /// with the same content: a repetition that differs is damage, since messages would change
-    /// their topic or their type.
+    /// Adds a schema or channel record; other records are skipped. Writers repeat schemas and
+    /// channels, always with the same content: a different repetition is damage, since messages
+    /// would change their topic or their type.
     pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
         match opcode {
             op::SCHEMA => {
@@ -126,7 +126,8 @@ impl Channels {
         Ok(())
     }
 
-    /// Compares a record with what is known; other records, and what is not known, are skipped.
+    /// Compares a record with known ones; other records, and unknown schemas and channels, are
+    /// skipped.
     pub(super) fn check(&self, opcode: u8, body: &[u8]) -> Result<(), Damage> {
         match opcode {
             op::SCHEMA => {
@@ -143,7 +144,7 @@ impl Channels {
         }
     }
 
-    fn check_channel(&self, known: &ChannelInfo, again: &Channel<'_>) -> Result<(), Damage> {
+    fn check_channel(&self, known: &ChannelInfo, again: &McapChannel<'_>) -> Result<(), Damage> {
         let redefined =
             |field, first, second| redefined("channel", again.id, field, Some((first, second)));
         if known.topic != again.topic {
@@ -168,8 +169,8 @@ impl Channels {
         }
     }
 
-    /// The schema that a channel names; number 0 stands for none.
-    fn schema_of_channel(&self, channel: &Channel<'_>) -> Result<Option<&SchemaInfo>, Damage> {
+    /// Returns the schema of a channel; id 0 means none.
+    fn schema_of_channel(&self, channel: &McapChannel<'_>) -> Result<Option<&SchemaInfo>, Damage> {
         match self.schemas.get(&channel.schema) {
             None if channel.schema != 0 => {
                 Err(Damage::Malformed("a channel names a schema that is not defined"))
@@ -180,7 +181,7 @@ impl Channels {
 }
 
 impl SchemaInfo {
-    fn of(schema: &Schema<'_>) -> Self {
+    fn of(schema: &McapSchema<'_>) -> Self {
         let text = definitions(schema);
         let (name, encoding) = (schema.name.to_owned(), schema.encoding.to_owned());
         Self {
@@ -190,7 +191,7 @@ impl SchemaInfo {
         }
     }
 
-    fn check(&self, again: &Schema<'_>) -> Result<(), Damage> {
+    fn check(&self, again: &McapSchema<'_>) -> Result<(), Damage> {
         let redefined = |field, values| redefined("schema", again.id, field, values);
         if self.name != again.name {
             return redefined("name", Some((&self.name, again.name)));
@@ -205,17 +206,17 @@ impl SchemaInfo {
     }
 }
 
-/// The text of a schema. Comments in other encodings than UTF-8 are common and harmless.
-fn definitions<'a>(schema: &Schema<'a>) -> Cow<'a, str> {
+/// Returns the text of a schema. Comments in other encodings than UTF-8 are common and harmless.
+fn definitions<'a>(schema: &McapSchema<'a>) -> Cow<'a, str> {
     String::from_utf8_lossy(schema.data)
 }
 
-fn schema_of(body: &[u8]) -> Result<Schema<'_>, Damage> {
-    Schema::parse(body).ok_or(Damage::Malformed("a schema record is malformed"))
+fn schema_of(body: &[u8]) -> Result<McapSchema<'_>, Damage> {
+    McapSchema::parse(body).ok_or(Damage::Malformed("a schema record is malformed"))
 }
 
-fn channel_of(body: &[u8]) -> Result<Channel<'_>, Damage> {
-    Channel::parse(body).ok_or(Damage::Malformed("a channel record is malformed"))
+fn channel_of(body: &[u8]) -> Result<McapChannel<'_>, Damage> {
+    McapChannel::parse(body).ok_or(Damage::Malformed("a channel record is malformed"))
 }
 
 fn redefined(
@@ -233,42 +234,38 @@ fn redefined(
     })
 }
 
-/// What rosbag2 notes of a topic's writers; it is nothing to fail over if it cannot be kept.
+/// Returns the QoS of a topic's writers as rosbag2 wrote it; one that is too long is skipped.
 pub(super) fn offered_qos(topic: &str, found: Option<&str>) -> Option<String> {
     let found = found.filter(|text| !text.is_empty())?;
     if found.len() > QOS_BYTES {
-        warn!(
-            topic,
-            bytes = found.len(),
-            "offered_qos_profiles is longer than 64 KiB, passed over"
-        );
+        warn!(topic, bytes = found.len(), "offered_qos_profiles is longer than 64 KiB; skipped");
         return None;
     }
     Some(found.to_owned())
 }
 
-/// Everything a scan found out about a file.
+/// The result of scanning a file.
 #[derive(Default)]
 pub(super) struct Contents {
     pub(super) channels: Channels,
     /// In file order.
-    pub(super) segments: Vec<Segment>,
-    /// Messages per channel: from the summary, or counted.
+    pub(super) segments: Vec<FileSegment>,
+    /// Number of messages per channel: from the summary, or counted.
     pub(super) messages: HashMap<u16, u64>,
-    /// Whether nobody counted them.
+    /// Set if they are unknown.
     pub(super) uncounted: bool,
-    /// Whether `messages` is a claim of the summary, to be checked against what is delivered.
+    /// Set if `messages` is a claim of the summary, to be checked against the delivered messages.
     pub(super) claimed: bool,
-    /// Where the file is damaged and how; everything in `segments` lies before.
+    /// Damage and its position; all `segments` are before it.
     pub(super) damage: Option<(u64, Damage)>,
-    /// First and last log time, in ns, if they are not those of `segments`.
+    /// First and last log time, in ns, if not those of `segments`.
     pub(super) times: Option<(u64, u64)>,
-    /// Whether the second of `times` is not the last: that is lost.
+    /// Set if the last log time is lost; then the second of `times` is not the last.
     pub(super) is_end_unknown: bool,
 }
 
 impl Contents {
-    /// First and last log time, in ns.
+    /// Returns the first and last log time, in ns.
     pub(super) fn span(&self) -> Option<(u64, u64)> {
         if self.times.is_some() {
             return self.times;

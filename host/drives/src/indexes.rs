@@ -1,19 +1,20 @@
-//! Whether the indexes of an MCAP file name the records that it holds, and no others: a reader that
-//! goes by index sees what they name.
+//! Checks that the indexes of an MCAP file name all of its records and no others, since readers may
+//! rely on an index.
 
 use std::collections::BTreeMap;
 
 use super::records::op;
 
-/// Records that are compared at most: some 60 MB of memory.
+/// Maximum number of records to compare: some 60 MB of memory.
 const RECORDS_MAX: usize = 1 << 20;
-/// Bytes at the beginning of an index record that give a place and a length.
+/// Bytes at the beginning of an index record with a position and a length.
 pub(super) const INDEX_BYTES: usize = 32;
 
-/// Chunks, attachments and metadata records, by place: their kind, and their length with its head.
+/// Chunks, attachments and metadata records by position: their kind, and their length with the
+/// head.
 type Places = BTreeMap<u64, (u8, u64)>;
 
-/// The places of records, as they are and as the indexes name them.
+/// The positions of records in the file and in its indexes.
 #[derive(Default)]
 pub(super) struct Indexes {
     held: Places,
@@ -22,8 +23,8 @@ pub(super) struct Indexes {
 }
 
 impl Indexes {
-    /// Notes the record at `at`, which has `len` bytes with its head. Of an index record, `body`
-    /// begins with [`INDEX_BYTES`], or has all.
+    /// Notes the record at `at`, which has `len` bytes with its head. For an index record, `body`
+    /// has its first [`INDEX_BYTES`] bytes, or all if it is shorter.
     pub(super) fn add(&mut self, opcode: u8, at: u64, len: u64, body: &[u8]) {
         let number =
             |from: usize| body.get(from..from + 8)?.first_chunk().copied().map(u64::from_le_bytes);
@@ -42,9 +43,7 @@ impl Indexes {
         };
         if !is_new {
             self.note(|| {
-                format!(
-                    "an index record at byte {at} that is malformed, or names a record once more"
-                )
+                format!("an index record at byte {at} that is malformed, or names a record again")
             });
         }
         if self.held.len() + self.named.len() > RECORDS_MAX {
@@ -53,8 +52,7 @@ impl Indexes {
         }
     }
 
-    /// Returns what is there and should not be, or the other way round; none in a file as writers
-    /// make it.
+    /// Returns the first difference; `None` in a correct file.
     pub(super) fn misfit(self) -> Option<String> {
         let Self { held, named, misfit } = self;
         let differs = |a: &Places, b: &Places| {
@@ -63,7 +61,7 @@ impl Indexes {
         misfit
             .or_else(|| {
                 differs(&named, &held)
-                    .map(|at| format!("an index names byte {at}, where no such record is"))
+                    .map(|at| format!("an index names byte {at}, which has no such record"))
             })
             .or_else(|| {
                 differs(&held, &named).map(|at| format!("no index names the record at byte {at}"))
@@ -94,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn indexes_name_each_record_once_and_nothing_else() {
+    fn indexes_must_name_each_record_once_and_nothing_else() {
         let record = (op::METADATA, 8, 20, Vec::new());
         let named = |at, len| (op::METADATA_INDEX, 100, 30, index(at, len));
         assert_eq!(misfit(&[record.clone(), named(8, 20)]), None);
@@ -102,7 +100,7 @@ mod tests {
             (vec![record.clone()], "no index names the record at byte 8"),
             (vec![record.clone(), named(9, 20)], "an index names byte 9"),
             (vec![record.clone(), named(8, 21)], "an index names byte 8"),
-            (vec![record.clone(), named(8, 20), named(8, 20)], "names a record once more"),
+            (vec![record.clone(), named(8, 20), named(8, 20)], "names a record again"),
             (
                 vec![record.clone(), (op::ATTACHMENT_INDEX, 100, 30, index(8, 20))],
                 "an index names byte 8",

@@ -1,15 +1,15 @@
-//! Messages that are packed one by one, as rosbag2 does it with `compression_mode: message`.
+//! Unpacks messages that are packed one by one, as rosbag2 does with `compression_mode: message`.
 
 use std::io;
 
 use zstd::stream::raw::{Decoder, Operation};
 
-/// How a frame of zstd begins. No CDR does: its first byte is 0.
+/// First bytes of a zstd frame. No CDR begins so: its first byte is 0.
 pub(super) const ZSTD: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
-/// The memory to begin with, where a message is small.
+/// Initial memory for a small message, in bytes.
 const SMALL: usize = 4 << 10;
 
-/// Unpacks messages, into memory that is used again.
+/// Unpacks messages into memory that is reused.
 pub(super) struct Inflate {
     allowed: u64,
     decoder: Option<Decoder<'static>>,
@@ -18,7 +18,7 @@ pub(super) struct Inflate {
 }
 
 impl Inflate {
-    /// No message may have `allowed` bytes or more.
+    /// Creates an unpacker for messages of fewer than `allowed` bytes.
     pub(super) fn new(allowed: u64) -> Self {
         Self { allowed, decoder: None, bytes: Vec::new(), len: 0 }
     }
@@ -27,17 +27,17 @@ impl Inflate {
         self.allowed
     }
 
-    /// Whether what was unpacked last is larger than allowed.
+    /// Returns whether the last unpacked message is larger than allowed.
     pub(super) fn is_full(&self) -> bool {
         self.len as u64 >= self.allowed
     }
 
-    /// What was unpacked last.
+    /// Returns the last unpacked message.
     pub(super) fn bytes(&self) -> &[u8] {
         &self.bytes[..self.len]
     }
 
-    /// Unpacks the first `most` bytes in `packed`, or all if there are fewer.
+    /// Unpacks the first `most` bytes of `packed`, or all if there are fewer.
     pub(super) fn unpack(&mut self, mut packed: &[u8], most: usize) -> io::Result<()> {
         let most = most.min(usize::try_from(self.allowed).unwrap_or(usize::MAX));
         let decoder = match &mut self.decoder {
@@ -51,7 +51,7 @@ impl Inflate {
         let mut is_whole = false;
         while self.len < most && !(is_whole && packed.is_empty()) {
             if self.len == self.bytes.len() {
-                // Memory grows as data really comes: what a frame claims is not looked at.
+                // Memory grows with the actual data: the size that a frame claims is ignored.
                 let room = (self.len * 2).max(packed.len().saturating_mul(4)).max(SMALL);
                 self.bytes.resize(room.min(most), 0);
             }
@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn messages_come_out_as_they_went_in_one_after_the_other() {
+    fn packed_messages_are_unpacked_one_after_the_other() {
         let mut inflate = Inflate::new(1 << 30);
         for len in [0, 1, 5_000, 3, 200_000, 4_096] {
             let message: Vec<u8> = (0..len).map(|n| (n * 7 % 251) as u8).collect();
@@ -84,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bomb_takes_no_more_memory_than_is_allowed() {
+    fn a_bomb_takes_no_more_memory_than_allowed() {
         let packed = zstd::encode_all(vec![0; 64 << 20].as_slice(), 1).unwrap();
         let mut inflate = Inflate::new(1 << 30);
         inflate.unpack(&packed, 100_000).unwrap();
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_off_or_no_frame_is_an_error() {
+    fn a_truncated_or_invalid_frame_is_an_error() {
         let packed = zstd::encode_all(vec![7; 1000].as_slice(), 1).unwrap();
         let mut inflate = Inflate::new(1 << 30);
         for bad in [&packed[..packed.len() - 1], &packed[..6], &ZSTD, &[1, 2, 3, 4, 5, 6, 7, 8]] {

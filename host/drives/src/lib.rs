@@ -1,18 +1,18 @@
 //! Recorded drives, pulled message by message in log-time order.
 //!
 //! [`Replay`] opens MCAP files, databases of rosbag2 (SQLite, `.db3`) and the directories that
-//! rosbag2 writes, each packed with zstd or not, merges them by log time and gives the next message
-//! of a subscribed topic to its sink each time [`Replay::step`] is called. Nothing runs on its own:
-//! the caller's loop is the clock. Who reads a file is decided by its first bytes; behind that
-//! decision (`storage`) all files are alike. Directories, databases and packed files come with the
+//! rosbag2 writes, each packed with zstd or not, merges them by log time and passes the next
+//! message of a subscribed topic to its sink each time [`Replay::step`] is called. Nothing runs on
+//! its own: the caller's loop is the clock. The first bytes of a file choose its reader
+//! (`storage`); after that all files are alike. Directories, databases and packed files need the
 //! feature `bags`.
 //!
-//! Of a channel's metadata two keys count: `offered_qos_profiles`, which topics are described with,
-//! and `gleaner.writer`, the identity of whoever wrote its messages, which clips keep. What else a
-//! file holds, metadata records and attachments, is for [`read_extras`].
+//! Two keys of a channel's metadata are used: `offered_qos_profiles`, for the description of the
+//! topic, and `gleaner.writer`, the identity of the writer, which clips contain. The other content
+//! of a file, metadata records and attachments, is read by [`read_extras`].
 //!
-//! What never happens here: holding a whole file in memory, delivering a chunk whose checksum is
-//! wrong, losing a message silently, writing to a drive.
+//! No file is held in memory as a whole, no chunk with a wrong checksum is delivered, no message is
+//! lost silently, and nothing is written to a drive.
 
 #[cfg(feature = "bags")]
 mod bag;
@@ -43,12 +43,12 @@ mod track;
 mod unpack;
 mod writers;
 
-pub use damage::{Damage, Place};
+pub use damage::{Damage, DamageLocation};
 pub use drive::Replay;
 pub use error::ReplayError;
 pub use extras::{Attachment, Extras, read_extras};
-pub use options::{Limits, Options};
-pub use step::{Progress, Step};
+pub use options::{DriveLimits, DriveOptions};
+pub use step::{Progress, ReplayStep};
 pub use storage::{files_of, journals_of};
 #[cfg(feature = "bags")]
-pub use unpack::{Name, Unpacked, unpack};
+pub use unpack::{ContentName, Unpacked, unpack};

@@ -1,25 +1,24 @@
-//! `metadata.yaml`, which rosbag2 writes beside the files of a directory.
+//! Parses `metadata.yaml`, which rosbag2 writes beside the files of a directory.
 //!
-//! Its versions 1 to 9 differ in what they add; what is needed here has not changed. So unknown
-//! keys are passed over, and what is needed is looked at closely: whoever wrote the directory wrote
-//! this, too.
+//! Versions 1 to 9 only add keys; those that are needed here have not changed. So unknown keys are
+//! skipped, and the needed ones are checked closely: this file is as untrusted as the directory.
 
 use std::collections::BTreeMap;
 use std::error::Error;
 
 use serde::Deserialize;
 
-/// The largest `metadata.yaml`; one of a thousand topics and files has some 500 KB.
+/// Size limit of `metadata.yaml`; one of a thousand topics and files has some 500 KB.
 pub(super) const MAX_BYTES: u64 = 16 << 20;
-/// More than the storages and compressions of rosbag2 have as names, to be shown.
+/// Length limit for names of storages and compressions in errors; those of rosbag2 are shorter.
 const SHOWN_CHARS: usize = 32;
 
-/// What metadata say of a directory.
+/// The needed content of the metadata.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) struct Metadata {
-    /// The files as they are named, at least one.
+pub(super) struct BagMetadata {
+    /// The file names, at least one.
     pub(super) files: Vec<String>,
-    /// Messages by topic, in all files.
+    /// Number of messages by topic, in all files.
     pub(super) messages: BTreeMap<String, u64>,
 }
 
@@ -34,48 +33,56 @@ struct Information {
     #[serde(default)]
     relative_file_paths: Vec<String>,
     #[serde(default)]
-    files: Vec<File>,
+    files: Vec<FileEntry>,
     #[serde(default)]
     compression_format: Option<String>,
     #[serde(default)]
     compression_mode: Option<String>,
     #[serde(default)]
-    topics_with_message_count: Vec<Counted>,
+    topics_with_message_count: Vec<CountedTopic>,
 }
 
 #[derive(Deserialize)]
-struct File {
+struct FileEntry {
     path: String,
 }
 
 #[derive(Deserialize)]
-struct Counted {
-    topic_metadata: Topic,
+struct CountedTopic {
+    topic_metadata: TopicMetadata,
     message_count: u64,
 }
 
 #[derive(Deserialize)]
-struct Topic {
+struct TopicMetadata {
     name: String,
 }
 
-/// Why metadata cannot be used.
+/// Reasons why metadata cannot be used.
 #[derive(Debug, thiserror::Error)]
-enum Refused {
+enum MetadataError {
     #[error("its storage is `{0}`; only mcap and sqlite3 can be read")]
     Storage(String),
     #[error("its files are compressed with `{0}`; only zstd can be read")]
     Compression(String),
-    #[error("it names no file")]
+    #[error("it does not name any file")]
     NoFiles,
 }
 
-/// Reads the text of a `metadata.yaml`.
-pub(super) fn read(text: &str) -> Result<Metadata, Box<dyn Error + Send + Sync>> {
+/// Parses the text of a `metadata.yaml`.
+pub(super) fn read(text: &str) -> Result<BagMetadata, Box<dyn Error + Send + Sync>> {
     let options = serde_saphyr::options! {
-        // A writer has no use for them; who makes them up wants a small file to become a large one.
-        budget: serde_saphyr::budget! { max_aliases: 1_000, max_recorded_anchor_bytes: 1 << 20, max_documents: 1, max_merge_keys: 0 },
-        alias_limits: serde_saphyr::alias_limits! { max_total_replayed_events: 10_000, max_replay_stack_depth: 4 },
+        // Writers do not use aliases; they could make a small file expand to a large one.
+        budget: serde_saphyr::budget! {
+            max_aliases: 1_000,
+            max_recorded_anchor_bytes: 1 << 20,
+            max_documents: 1,
+            max_merge_keys: 0
+        },
+        alias_limits: serde_saphyr::alias_limits! {
+            max_total_replayed_events: 10_000,
+            max_replay_stack_depth: 4
+        },
         with_snippet: false,
     };
     let document: Document = serde_saphyr::from_str_with_options(text, options)?;
@@ -83,28 +90,29 @@ pub(super) fn read(text: &str) -> Result<Metadata, Box<dyn Error + Send + Sync>>
     let shown =
         |text: &str| text.chars().filter(|c| !c.is_control()).take(SHOWN_CHARS).collect::<String>();
     if !["mcap", "sqlite3"].contains(&found.storage_identifier.as_str()) {
-        return Err(Refused::Storage(shown(&found.storage_identifier)).into());
+        return Err(MetadataError::Storage(shown(&found.storage_identifier)).into());
     }
     let mode = found.compression_mode.unwrap_or_default().to_ascii_lowercase();
     let format = found.compression_format.unwrap_or_default();
-    // Whether files or messages are packed is seen by their first bytes.
+    // The first bytes of files and messages show whether they are packed.
     if !["", "none"].contains(&mode.as_str()) && !["", "zstd"].contains(&format.as_str()) {
-        return Err(Refused::Compression(shown(&format)).into());
+        return Err(MetadataError::Compression(shown(&format)).into());
     }
     let mut files = found.relative_file_paths;
     if files.is_empty() {
         files = found.files.into_iter().map(|file| file.path).collect();
     }
     if files.is_empty() {
-        return Err(Refused::NoFiles.into());
+        return Err(MetadataError::NoFiles.into());
     }
     let mut messages = BTreeMap::<_, u64>::new();
-    for Counted { topic_metadata: Topic { name }, message_count } in found.topics_with_message_count
+    for CountedTopic { topic_metadata: TopicMetadata { name }, message_count } in
+        found.topics_with_message_count
     {
         let known = messages.entry(name).or_default();
         *known = known.saturating_add(message_count);
     }
-    Ok(Metadata { files, messages })
+    Ok(BagMetadata { files, messages })
 }
 
 #[cfg(test)]
@@ -114,12 +122,16 @@ mod tests {
     const START: &str = "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n";
 
     #[test]
-    fn what_is_needed_is_found_among_what_is_not() {
+    fn needed_keys_are_found_among_others() {
         let text = format!(
-            "{START}  duration:\n    nanoseconds: 5\n  relative_file_paths:\n    - a_0.mcap\n    - a_1.mcap\n  message_count: 3\n\
-             \x20 topics_with_message_count:\n    - topic_metadata:\n        name: /a\n        type: std_msgs/msg/String\n\
-             \x20       offered_qos_profiles:\n          - history: keep_last\n            depth: 1\n      message_count: 3\n\
-             \x20 compression_format: \"\"\n  compression_mode: \"\"\n  custom_data: ~\n  ros_distro: rolling\n  invented: [1, 2]\n"
+            "{START}  duration:\n    nanoseconds: 5\n  relative_file_paths:\n    - a_0.mcap\n    \
+             - a_1.mcap\n  message_count: 3\n\
+             \x20 topics_with_message_count:\n    - topic_metadata:\n        name: /a\n        \
+             type: std_msgs/msg/String\n\
+             \x20       offered_qos_profiles:\n          - history: keep_last\n            depth: \
+             1\n      message_count: 3\n\
+             \x20 compression_format: \"\"\n  compression_mode: \"\"\n  custom_data: ~\n  \
+             ros_distro: rolling\n  invented: [1, 2]\n"
         );
         let found = read(&text).unwrap();
         assert_eq!(found.files, ["a_0.mcap", "a_1.mcap"]);
@@ -129,33 +141,34 @@ mod tests {
     #[test]
     fn files_may_be_named_by_their_own_list_only() {
         let text = format!(
-            "{START}  relative_file_paths: []\n  files:\n    - path: a_0.mcap\n      message_count: 3\n"
+            "{START}  relative_file_paths: []\n  files:\n    - path: a_0.mcap\n      \
+             message_count: 3\n"
         );
         assert_eq!(read(&text).unwrap().files, ["a_0.mcap"]);
     }
 
     #[test]
-    fn what_cannot_be_read_is_named() {
+    fn the_error_names_what_cannot_be_read() {
         let file = "  relative_file_paths: [a]\n";
-        for (text, said) in [
+        for (text, expected) in [
             (START.replace("mcap", "rosbag_v2") + file, "its storage is `rosbag_v2`"),
             (
                 format!("{START}{file}  compression_mode: FILE\n  compression_format: lz4\n"),
                 "compressed with `lz4`",
             ),
-            (START.to_owned(), "it names no file"),
+            (START.to_owned(), "it does not name any file"),
             (String::new(), "unexpected end"),
             ("other: 7\n".to_owned(), "rosbag2_bagfile_information"),
             ("rosbag2_bagfile_information: 7\n".to_owned(), "line 1"),
             (format!("{START}  relative_file_paths: [a, [b]]\n"), "line 4"),
         ] {
-            let refused = read(&text).unwrap_err().to_string();
-            assert!(refused.contains(said), "{refused}");
+            let error = read(&text).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
         }
     }
 
     #[test]
-    fn a_small_text_does_not_become_a_large_one() {
+    fn a_small_text_does_not_expand_to_a_large_one() {
         let mut bomb = format!("{START}  a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n");
         for level in 1..10 {
             let before = format!("*a{}, ", level - 1).repeat(10);

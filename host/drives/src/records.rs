@@ -1,21 +1,22 @@
-//! The MCAP records that a replay needs, parsed by hand.
+//! Parses the MCAP records that a replay needs.
 //!
-//! The `mcap` crate's readers are not used: its parser reserves whatever length a string claims,
-//! its indexed reader never checks a chunk's checksum, and neither gives up a chunk's bytes. Ten
-//! record kinds are little enough to read directly. Source: the MCAP specification, version 0.
+//! The readers of the `mcap` crate are not used: its parser reserves any length that a string
+//! claims, its indexed reader never checks a chunk's checksum, and neither returns a chunk's bytes.
+//! Ten kinds of records are few enough to parse directly. Source: the MCAP specification, version
+//! 0.
 
 use super::damage::Damage;
 
-/// What every MCAP file begins and ends with.
+/// First and last bytes of every MCAP file.
 pub(super) const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
-/// Opcode and length in front of every record.
+/// Size of opcode and length, which precede every record.
 pub(super) const HEAD: u64 = 9;
-/// Bytes of a message record in front of the message's data.
+/// Bytes of a message record before the message's data.
 pub(super) const MESSAGE_HEAD: usize = 22;
 /// Footer record and closing magic.
 pub(super) const FOOTER: u64 = HEAD + 20 + 8;
 
-/// Record kinds.
+/// McapRecord kinds.
 pub(super) mod op {
     pub(in super::super) const HEADER: u8 = 0x01;
     pub(in super::super) const FOOTER: u8 = 0x02;
@@ -32,13 +33,13 @@ pub(super) mod op {
     pub(in super::super) const DATA_END: u8 = 0x0f;
 }
 
-/// Opcode and body length of the record whose head is `bytes`.
+/// Parses the opcode and body length of the record whose head is `bytes`.
 pub(super) fn head(bytes: &[u8]) -> Option<(u8, u64)> {
     let (opcode, rest) = bytes.split_first()?;
     Some((*opcode, u64::from_le_bytes(*rest.first_chunk()?)))
 }
 
-/// Walks the records in `bytes`, giving opcode, and the range of the body.
+/// Iterates over the records in `bytes`.
 pub(super) struct Records<'a> {
     bytes: &'a [u8],
     at: usize,
@@ -52,15 +53,15 @@ impl<'a> Records<'a> {
 
 /// One record inside a buffer.
 #[derive(Copy, Clone)]
-pub(super) struct Record<'a> {
+pub(super) struct McapRecord<'a> {
     pub(super) opcode: u8,
-    /// Where the body starts in the buffer.
+    /// Offset of the body in the buffer.
     pub(super) at: usize,
     pub(super) body: &'a [u8],
 }
 
 impl<'a> Iterator for Records<'a> {
-    type Item = Result<Record<'a>, Damage>;
+    type Item = Result<McapRecord<'a>, Damage>;
 
     #[inline]
     fn next(&mut self) -> Option<Self::Item> {
@@ -68,15 +69,15 @@ impl<'a> Iterator for Records<'a> {
         let record = head(rest).and_then(|(opcode, len)| {
             let start = self.at + HEAD as usize;
             let end = start.checked_add(usize::try_from(len).ok()?)?;
-            Some(Record { opcode, at: start, body: self.bytes.get(start..end)? })
+            Some(McapRecord { opcode, at: start, body: self.bytes.get(start..end)? })
         });
-        // After a record that does not fit, nothing can be found any more.
+        // After a record that does not fit, no further one can be found.
         self.at = record.map_or(self.bytes.len(), |record| record.at + record.body.len());
         Some(record.ok_or(Damage::Malformed("a record is longer than the chunk it is in")))
     }
 }
 
-/// The front of a message record.
+/// The header of a message record.
 #[derive(Copy, Clone)]
 pub(super) struct MessageHead {
     pub(super) channel: u16,
@@ -108,20 +109,20 @@ impl MessageHead {
     }
 }
 
-/// The front of a chunk record.
+/// The header of a chunk record.
 pub(super) struct ChunkHead<'a> {
     pub(super) uncompressed: u64,
     pub(super) crc: u32,
     pub(super) compression: &'a str,
     pub(super) compressed: u64,
-    /// Bytes in front of the compressed data.
+    /// Bytes before the compressed data.
     pub(super) len: usize,
 }
 
 impl<'a> ChunkHead<'a> {
     pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
-        // Start and end time: the messages themselves say.
+        // Start and end time: those of the messages are used.
         fields.u64()?;
         fields.u64()?;
         let (uncompressed, crc) = (fields.u64()?, fields.u32()?);
@@ -132,14 +133,14 @@ impl<'a> ChunkHead<'a> {
 }
 
 /// A schema record.
-pub(super) struct Schema<'a> {
+pub(super) struct McapSchema<'a> {
     pub(super) id: u16,
     pub(super) name: &'a str,
     pub(super) encoding: &'a str,
     pub(super) data: &'a [u8],
 }
 
-impl<'a> Schema<'a> {
+impl<'a> McapSchema<'a> {
     pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
         Some(Self {
@@ -152,7 +153,7 @@ impl<'a> Schema<'a> {
 }
 
 /// A channel record.
-pub(super) struct Channel<'a> {
+pub(super) struct McapChannel<'a> {
     pub(super) id: u16,
     pub(super) schema: u16,
     pub(super) topic: &'a str,
@@ -160,29 +161,29 @@ pub(super) struct Channel<'a> {
     pub(super) metadata: Map<'a>,
 }
 
-impl<'a> Channel<'a> {
+impl<'a> McapChannel<'a> {
     pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
         let (id, schema) = (fields.u16()?, fields.u16()?);
         let (topic, encoding) = (fields.text()?, fields.text()?);
-        // A channel that ends here says all that a replay cannot do without.
+        // A channel that ends here has everything that a replay needs.
         let metadata = if fields.0.is_empty() { Map(Fields(&[])) } else { fields.map()? };
         Some(Self { id, schema, topic, encoding, metadata })
     }
 }
 
-/// A map of texts: its pairs are whole, but need not be UTF-8.
+/// A map of texts: its pairs are complete, but may not be UTF-8.
 #[derive(Copy, Clone)]
 pub(super) struct Map<'a>(Fields<'a>);
 
 impl<'a> Map<'a> {
-    /// The value of the first pair with this key, if it is text.
+    /// Returns the value of the first pair with this key, if it is UTF-8.
     pub(super) fn get(&self, key: &str) -> Option<&'a str> {
         let (_, value) = self.pairs().find(|(found, _)| *found == key.as_bytes())?;
         str::from_utf8(value).ok()
     }
 
-    /// Key and value of each pair, in order.
+    /// Returns key and value of each pair, in order.
     pub(super) fn pairs(&self) -> impl Iterator<Item = (&'a [u8], &'a [u8])> + use<'a> {
         let mut rest = self.0;
         std::iter::from_fn(move || Some((rest.bytes()?, rest.bytes()?)))
@@ -190,12 +191,12 @@ impl<'a> Map<'a> {
 }
 
 /// A metadata record.
-pub(super) struct Metadata<'a> {
+pub(super) struct McapMetadata<'a> {
     pub(super) name: &'a str,
     pub(super) map: Map<'a>,
 }
 
-impl<'a> Metadata<'a> {
+impl<'a> McapMetadata<'a> {
     pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
         Some(Self { name: fields.text()?, map: fields.map()? })
@@ -203,17 +204,17 @@ impl<'a> Metadata<'a> {
 }
 
 /// An attachment record.
-pub(super) struct Attachment<'a> {
+pub(super) struct McapAttachment<'a> {
     pub(super) name: &'a str,
     pub(super) media_type: &'a str,
     pub(super) data: &'a [u8],
-    /// Of everything in front of it; 0 if the writer left it out.
+    /// Checksum of everything before it; 0 if the writer left it out.
     pub(super) crc: u32,
-    /// Bytes in front of the checksum; the data are the last of them.
+    /// Bytes before the checksum; the data are the last of them.
     pub(super) len: usize,
 }
 
-impl<'a> Attachment<'a> {
+impl<'a> McapAttachment<'a> {
     pub(super) fn parse(body: &'a [u8]) -> Option<Self> {
         let mut fields = Fields(body);
         let (_log_time, _create_time) = (fields.u64()?, fields.u64()?);
@@ -225,16 +226,16 @@ impl<'a> Attachment<'a> {
     }
 }
 
-/// Where a chunk is and what is in it, from the summary.
+/// Position and content of a chunk, from the summary.
 pub(super) struct ChunkIndex {
     pub(super) start_time: u64,
     pub(super) end_time: u64,
     pub(super) offset: u64,
-    /// Of the chunk record, head included.
+    /// Length of the chunk record, including its head.
     pub(super) len: u64,
-    /// Of the message index records behind it.
+    /// Length of the message index records after it.
     pub(super) index_len: u64,
-    /// The channels with messages in it; empty if the writer did not say.
+    /// The channels with messages in it; empty if the writer left them out.
     pub(super) channels: Vec<u16>,
 }
 
@@ -276,7 +277,7 @@ impl Statistics {
     }
 }
 
-/// What is left of a record's body.
+/// The rest of a record's body.
 #[derive(Copy, Clone)]
 struct Fields<'a>(&'a [u8]);
 
@@ -300,20 +301,20 @@ impl<'a> Fields<'a> {
         self.array().map(u64::from_le_bytes)
     }
 
-    /// The next `len` bytes.
+    /// Takes the next `len` bytes.
     fn take(&mut self, len: usize) -> Option<&'a [u8]> {
         let (found, rest) = self.0.split_at_checked(len)?;
         self.0 = rest;
         Some(found)
     }
 
-    /// Bytes behind their length.
+    /// Takes bytes that are preceded by their length.
     fn bytes(&mut self) -> Option<&'a [u8]> {
         let len = self.u32()? as usize;
         self.take(len)
     }
 
-    /// A map, whose pairs have to fill it.
+    /// Takes a map, whose pairs must fill it.
     fn map(&mut self) -> Option<Map<'a>> {
         let pairs = Fields(self.bytes()?);
         let mut rest = pairs;

@@ -1,8 +1,8 @@
-//! The messages of a database, in the order of their times.
+//! Reads the messages of a database, in the order of their times.
 //!
-//! A piece at a time is read, and put into memory as the messages of a chunk are: so whoever merges
-//! files need not know what they are. The index of times gives one row after the other; that they
-//! really come in order is checked, so that no damaged page leads in circles.
+//! Messages are read piece by piece, and kept in memory like those of a chunk, so the merge need
+//! not know the format. The time index returns one row after the other; their order is checked, so
+//! that a damaged page cannot cause an endless loop.
 
 use std::collections::HashMap;
 use std::error::Error;
@@ -12,19 +12,19 @@ use rusqlite::types::ValueRef;
 use rusqlite::{Connection, ErrorCode, Row, Rows as Cursor};
 
 use super::chunk::OpenSegment;
-use super::damage::{Damage, Place};
+use super::damage::{Damage, DamageLocation};
 use super::error::ReplayError;
 use super::options::Span;
 use super::records::MessageHead;
 
-/// A piece ends behind the message that makes it so long, in bytes.
-const PIECE: usize = 1 << 20;
+/// Size in bytes at which a piece ends, after the message that reaches it.
+const PIECE_BYTES: usize = 1 << 20;
 
-/// Which messages: those of a time behind one of it, and those behind a time.
+/// Conditions: messages of the same time after a given one, and those after a time.
 pub(super) const SAME_TIME: &str = "timestamp = ?1 AND rowid > ?2";
 pub(super) const LATER: &str = "timestamp > ?1";
 
-/// Asks for messages in their order, with the content of those of the topics in `list`.
+/// Returns a query of messages in their order, with the content of those of the topics in `list`.
 pub(super) fn select(index: &str, list: &str, condition: &str) -> String {
     format!(
         "SELECT rowid, timestamp, topic_id, CASE WHEN topic_id IN ({list}) THEN data END \
@@ -35,41 +35,41 @@ pub(super) fn select(index: &str, list: &str, condition: &str) -> String {
 /// `SQLITE_IOERR_SHORT_READ`.
 const SHORT_READ: i32 = 522;
 
-/// A database, being read.
-pub(super) struct Rows {
+/// A database being read.
+pub(super) struct MessageRows {
     path: PathBuf,
-    /// Until all is read: each keeps pages in memory.
+    /// `None` once everything is read: an open database keeps pages in memory.
     db: Option<Connection>,
-    /// The index that the messages are read by, quoted.
+    /// The time index of the messages, quoted.
     index: String,
-    /// Channels by what the database calls a topic.
+    /// Channel ids by topic number of the database.
     channels: HashMap<i64, u16>,
-    /// The first time, if it makes sense.
+    /// The first time, if it is valid.
     first: Result<Option<u64>, Damage>,
-    /// What ends it when all else is read.
+    /// Known damage, reported after all messages.
     last_words: Option<Damage>,
     span: Span,
-    /// The topics whose messages are wanted, sorted.
+    /// The subscribed topics, sorted.
     wanted: Vec<i64>,
     /// Time and number of the row that was read last.
     after: Option<(i64, i64)>,
-    /// The time at which the next piece begins.
+    /// Start time of the next piece.
     next: Option<u64>,
     broken: Option<Damage>,
     pieces: u64,
 }
 
-/// Where a piece ended.
-enum End {
-    /// There is more, from this time on.
+/// The reason why a piece ended.
+enum PieceEnd {
+    /// There are more messages, from this time on.
     Piece(u64),
-    /// There is nothing more that is to be replayed.
+    /// The span to replay has ended.
     Span,
-    /// There is nothing more.
+    /// The table has ended.
     Table,
 }
 
-impl Rows {
+impl MessageRows {
     pub(super) fn new(
         path: &Path,
         db: Connection,
@@ -105,11 +105,11 @@ impl Rows {
             }
             what => what,
         };
-        let at = Place::Message(self.after.map_or(0, |(_, number)| number));
+        let at = DamageLocation::Message(self.after.map_or(0, |(_, number)| number));
         ReplayError::Damaged { path: self.path.clone(), at, what }
     }
 
-    /// Begins with the first message of `span`. `last_words` is the damage that is known already.
+    /// Begins with the first message of `span`. `last_words` is the damage that is already known.
     pub(super) fn start(
         &mut self,
         span: Span,
@@ -128,9 +128,9 @@ impl Rows {
             Ok(Some(first)) => {
                 self.next = Some(first.max(span.from)).filter(|next| !span.ends_before(*next))
             }
-            // No message at all, and perhaps there should be.
+            // No message at all, perhaps because of the damage.
             Ok(None) => self.next = self.last_words.is_some().then_some(span.from),
-            // The first in order makes no sense; from later on all may.
+            // The first time is invalid; later ones may be valid.
             Err(_) if span.from > 0 => self.next = Some(span.from),
             Err(what) => (self.broken, self.next) = (Some(what), Some(0)),
         }
@@ -140,8 +140,8 @@ impl Rows {
         self.next
     }
 
-    /// Reads the next piece, and gives its number. What ends the database ends it in a piece of its
-    /// own, so that all messages before are delivered.
+    /// Reads the next piece, and returns its number. An error is reported in a piece of its own, so
+    /// that all earlier messages are delivered.
     pub(super) fn open_next(&mut self, into: &mut OpenSegment) -> Result<u64, ReplayError> {
         into.clear();
         self.pieces += 1;
@@ -150,13 +150,13 @@ impl Rows {
             return Err(self.damaged(what));
         }
         let what = match self.read(into) {
-            Ok(End::Piece(next)) => {
+            Ok(PieceEnd::Piece(next)) => {
                 self.next = Some(next);
                 return Ok(self.pieces);
             }
-            Ok(End::Span) => None,
-            Ok(End::Table) => self.last_words.take(),
-            // A page that is missing is no riddle where the file is too short.
+            Ok(PieceEnd::Span) => None,
+            Ok(PieceEnd::Table) => self.last_words.take(),
+            // In a truncated file, a missing page is explained by the truncation.
             Err(Damage::Database(error)) if !is_of_system(&*error) => {
                 self.last_words.take().or(Some(Damage::Database(error)))
             }
@@ -170,35 +170,35 @@ impl Rows {
         Ok(self.pieces)
     }
 
-    fn read(&mut self, into: &mut OpenSegment) -> Result<End, Damage> {
+    fn read(&mut self, into: &mut OpenSegment) -> Result<PieceEnd, Damage> {
         let Self { db, index, channels, wanted, span, after, .. } = self;
-        let Some(db) = db else { return Ok(End::Table) };
+        let Some(db) = db else { return Ok(PieceEnd::Table) };
         let list = wanted.iter().map(i64::to_string).collect::<Vec<_>>().join(",");
-        // What nobody wants is not read, but its place in the order is.
+        // The content of other topics is not read, but their rows keep the order.
         let rows =
             |condition: &str| db.prepare(&select(index, &list, condition)).map_err(unreadable);
-        let mut piece = Piece { channels, wanted, span: *span, after, into };
+        let mut piece = PieceFiller { channels, wanted, span: *span, after, into };
         if let Some((at, number)) = *piece.after {
-            // First the rest of those that are of one time.
+            // First the remaining messages of the same time.
             let mut same_time = rows(SAME_TIME)?;
             if let Some(end) = piece.fill(same_time.query((at, number)).map_err(unreadable)?)? {
                 return Ok(end);
             }
         }
-        // Not only numbers may stand there: whatever comes later is looked at.
+        // Times may not be numbers: all later rows are checked.
         let behind = match *piece.after {
             Some((at, _)) => at,
             None => i64::try_from(span.from).unwrap_or(i64::MAX) - 1,
         };
         let mut later = rows(LATER)?;
-        Ok(piece.fill(later.query([behind]).map_err(unreadable)?)?.unwrap_or(End::Table))
+        Ok(piece.fill(later.query([behind]).map_err(unreadable)?)?.unwrap_or(PieceEnd::Table))
     }
 }
 
-/// Whether it is the system that failed, and not the database.
+/// Returns whether the system failed, and not the database.
 pub(super) fn is_of_system(error: &(dyn Error + 'static)) -> bool {
     let Some(error) = error.downcast_ref::<rusqlite::Error>() else { return false };
-    // A file that is too short is no fault of the system.
+    // A file that is too short is not a failure of the system.
     let is_short = error.sqlite_error().is_some_and(|error| error.extended_code == SHORT_READ);
     let codes = [
         ErrorCode::SystemIoFailure,
@@ -213,8 +213,8 @@ fn unreadable(error: rusqlite::Error) -> Damage {
     Damage::Database(error.into())
 }
 
-/// A piece being filled.
-struct Piece<'a> {
+/// A piece while it is filled.
+struct PieceFiller<'a> {
     channels: &'a HashMap<i64, u16>,
     wanted: &'a [i64],
     span: Span,
@@ -222,22 +222,22 @@ struct Piece<'a> {
     into: &'a mut OpenSegment,
 }
 
-impl Piece<'_> {
-    /// Takes `rows` until the piece is full; `None` if it is not.
-    fn fill(&mut self, mut rows: Cursor<'_>) -> Result<Option<End>, Damage> {
+impl PieceFiller<'_> {
+    /// Takes `rows` until the piece is full; `None` if it is not full.
+    fn fill(&mut self, mut rows: Cursor<'_>) -> Result<Option<PieceEnd>, Damage> {
         while let Some(row) = rows.next().map_err(unreadable)? {
             let (number, at) =
                 (row.get(0).map_err(unreadable)?, time(row.get_ref(1).map_err(unreadable)?)?);
-            // `time` gives nothing below 0.
+            // `time` returns no value below 0.
             let log_time = at.unsigned_abs();
             if self.after.is_some_and(|after| after >= (at, number)) {
-                return Err(Damage::Malformed("its index of times is not in order"));
+                return Err(Damage::Malformed("its time index is not in order"));
             }
             if self.span.ends_before(log_time) {
-                return Ok(Some(End::Span));
+                return Ok(Some(PieceEnd::Span));
             }
-            if self.into.len() >= PIECE {
-                return Ok(Some(End::Piece(log_time)));
+            if self.into.len() >= PIECE_BYTES {
+                return Ok(Some(PieceEnd::Piece(log_time)));
             }
             self.take(row, log_time)?;
             *self.after = Some((at, number));
@@ -247,30 +247,28 @@ impl Piece<'_> {
 
     fn take(&mut self, row: &Row<'_>, log_time: u64) -> Result<(), Damage> {
         let ValueRef::Integer(topic) = row.get_ref(2).map_err(unreadable)? else {
-            return Err(Damage::Malformed(
-                "a message names a topic by something that is no number",
-            ));
+            return Err(Damage::Malformed("a message has a topic that is not a number"));
         };
         let channel = *self.channels.get(&topic).ok_or(Damage::UnknownTopic(topic))?;
         match row.get_ref(3).map_err(unreadable)? {
             ValueRef::Blob(data) => {
-                // rosbag2 keeps no numbers of its writers here, and one time.
+                // rosbag2 stores no sequence numbers in databases, and only one time.
                 let head = MessageHead { channel, sequence: 0, log_time, publish_time: log_time };
                 self.into.push(&head, data);
                 Ok(())
             }
             ValueRef::Null if self.wanted.binary_search(&topic).is_err() => Ok(()),
-            _ => Err(Damage::Malformed("a message is something else than bytes")),
+            _ => Err(Damage::Malformed("a message is not a blob")),
         }
     }
 }
 
-/// The time of a message, in ns.
+/// Returns the time of a message, in ns.
 pub(super) fn time(value: ValueRef<'_>) -> Result<i64, Damage> {
     match value {
         ValueRef::Integer(at) if at >= 0 => Ok(at),
         ValueRef::Integer(_) => Err(Damage::Malformed("a message is from before 1970")),
-        _ => Err(Damage::Malformed("a message has a time that is no whole number")),
+        _ => Err(Damage::Malformed("a message has a time that is not an integer")),
     }
 }
 
@@ -281,7 +279,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_disk_that_fails_is_no_damage_of_the_drive() {
+    fn a_disk_failure_is_not_damage_of_the_drive() {
         for (code, is_damage) in [
             (ffi::SQLITE_IOERR, false),
             (ffi::SQLITE_IOERR_READ, false),
@@ -292,8 +290,13 @@ mod tests {
             (ffi::SQLITE_NOTADB, true),
         ] {
             let db = Connection::open_in_memory().unwrap();
-            let rows =
-                Rows::new(Path::new("drive.db3"), db, String::new(), HashMap::new(), Ok(None));
+            let rows = MessageRows::new(
+                Path::new("drive.db3"),
+                db,
+                String::new(),
+                HashMap::new(),
+                Ok(None),
+            );
             let what = unreadable(rusqlite::Error::SqliteFailure(ffi::Error::new(code), None));
             match rows.damaged(what) {
                 ReplayError::Damaged { .. } => assert!(is_damage, "{code}"),

@@ -1,36 +1,36 @@
-//! Finding out what a file contains, without holding it.
+//! Scans a file for its content, without holding it in memory.
 //!
-//! The data section is walked record by record from its start. The summary at the end of a finished
-//! file saves most of that: a chunk that its index lists is stepped over unread. What the index
-//! does not list, for want of a summary or by the writer's choice, is opened and looked into. So
-//! every file is read the same way, whether it is indexed, cut off, or has no chunks at all, and an
-//! index that leaves a chunk out costs time but no messages.
+//! The data section is scanned record by record from its start. The summary at the end of a
+//! finished file saves most of that: a chunk in its index is skipped unread. Chunks that no index
+//! lists, for lack of a summary or by the writer's choice, are opened. So every file is read in the
+//! same way, whether it is indexed, truncated, or has no chunks at all, and an index that omits a
+//! chunk costs time but no messages.
 
 use std::collections::{BTreeSet, HashMap};
 
 use tracing::warn;
 
-use super::chunk::{OpenSegment, Opener, Segment, SegmentKind, message_head};
+use super::chunk::{FileSegment, OpenSegment, Opener, SegmentKind, message_head};
 use super::damage::Damage;
 use super::error::ReplayError;
 use super::file::Contents;
 use super::records::{ChunkIndex, HEAD, MAGIC, MESSAGE_HEAD, MessageHead, head, op};
-use super::source::Source;
+use super::source::SourceFile;
 use super::summary::read_tail;
 
-/// Messages outside chunks are read in runs of about this many bytes.
+/// Approximate size of the runs in which messages outside chunks are read, in bytes.
 const RUN: u64 = 1 << 20;
-/// How many chunks of an index are compared with their own headers when a file is opened. The
-/// headers lie far apart: a disk that turns needs some milliseconds for each.
+/// Number of chunks of an index that are compared with their own headers when a file is opened. The
+/// headers are far apart: a hard disk needs some milliseconds for each.
 const COMPARED: usize = 64;
 /// The head of a chunk record, and its first and last time.
 const TIMES: u64 = HEAD + 16;
-/// The largest schema or channel record outside chunks that is looked at.
+/// Size limit of schema and channel records outside chunks.
 const MAX_RECORD: u64 = 16 << 20;
 
-/// Finds out what `source` contains. Damage is part of the answer; only a file that is no MCAP file
-/// or that the system cannot read is an error.
-pub(super) fn scan(source: &mut Source, opener: &mut Opener) -> Result<Contents, ReplayError> {
+/// Scans `source`. Damage is part of the result; an error is returned only if the file is not MCAP,
+/// or if the system cannot read it.
+pub(super) fn scan(source: &mut SourceFile, opener: &mut Opener) -> Result<Contents, ReplayError> {
     if source.peek(0, MAGIC.len())? != MAGIC {
         return Err(ReplayError::NotMcap { path: source.path().to_owned() });
     }
@@ -38,10 +38,10 @@ pub(super) fn scan(source: &mut Source, opener: &mut Opener) -> Result<Contents,
     if let Some(summary) = &tail.summary
         && let Some(offset) = chunk_of_other_times(source, &summary.chunks)?
     {
-        // No time of the index is to be trusted then, so the file is read through, as one that has
-        // none.
+        // Then no time of the index can be trusted, so the file is read through, like one without
+        // an index.
         tail.damage =
-            Some((offset, Damage::Summary("it gives a chunk other times than the chunk itself")));
+            Some((offset, Damage::Summary("its times of a chunk differ from those in the chunk")));
         tail.summary = None;
     }
     let mut contents = Contents::default();
@@ -52,28 +52,34 @@ pub(super) fn scan(source: &mut Source, opener: &mut Opener) -> Result<Contents,
         contents.claimed = true;
         index = summary.chunks;
     }
-    let mut walk =
-        Walk { source, opener, contents, index, buffer: OpenSegment::default(), data_crc: None };
-    let mut damage = walk.data_section()?;
+    let mut scan = FileScan {
+        source,
+        opener,
+        contents,
+        index,
+        buffer: OpenSegment::default(),
+        data_crc: None,
+    };
+    let mut damage = scan.data_section()?;
     if damage.is_none() && !tail.finished {
-        damage = Some((walk.source.len(), Damage::NoFooter));
+        damage = Some((scan.source.len(), Damage::NoFooter));
     }
     if damage.is_none() {
-        damage = walk.check_runs()?.or(tail.damage);
+        damage = scan.check_runs()?.or(tail.damage);
     }
-    let mut contents = walk.contents;
+    let mut contents = scan.contents;
     if let Some((offset, what)) = &damage {
-        warn!(path = %walk.source.path().display(), offset, %what, "drive is damaged");
+        warn!(path = %scan.source.path().display(), offset, %what, "drive is damaged");
     }
     contents.damage = damage;
     Ok(contents)
 }
 
-/// Looks for a chunk that has other times in `index` than in its own header: among the earliest,
-/// the latest, and some in between. What is read of all others shows later, when they are opened; a
-/// chunk that a part of the drive leaves out is not opened.
+/// Finds a chunk with other times in `index` than in its own header: checks the earliest, the
+/// latest, and some in between. The others are checked when they are opened; chunks outside the
+/// part to replay are not opened.
 fn chunk_of_other_times(
-    source: &mut Source,
+    source: &mut SourceFile,
     index: &HashMap<u64, ChunkIndex>,
 ) -> Result<Option<u64>, ReplayError> {
     let mut chunks: Vec<_> =
@@ -98,46 +104,46 @@ fn chunk_of_other_times(
     Ok(None)
 }
 
-struct Walk<'a> {
-    source: &'a mut Source,
+struct FileScan<'a> {
+    source: &'a mut SourceFile,
     opener: &'a mut Opener,
     contents: Contents,
     /// Chunks that the summary lists, by offset.
     index: HashMap<u64, ChunkIndex>,
     buffer: OpenSegment,
-    /// Where the data section ends, and the checksum that stands there.
+    /// End of the data section, and the checksum at that position.
     data_crc: Option<(u64, u32)>,
 }
 
-/// What to do after a record.
-enum Step {
+/// The next step after a record.
+enum ScanStep {
     GoOn(u64),
     End,
     Damaged(Damage),
 }
 
-impl Walk<'_> {
-    /// Walks to the end of the data section, or to the damage it returns.
+impl FileScan<'_> {
+    /// Scans to the end of the data section, or to the damage that it returns.
     fn data_section(&mut self) -> Result<Option<(u64, Damage)>, ReplayError> {
         let mut at = MAGIC.len() as u64;
         loop {
             let step = match self.indexed_chunk(at) {
-                Some(behind) => Step::GoOn(behind),
+                Some(behind) => ScanStep::GoOn(behind),
                 None => match self.record(at) {
                     Ok(step) => step,
-                    Err(ReplayError::Damaged { what, .. }) => Step::Damaged(what),
+                    Err(ReplayError::Damaged { what, .. }) => ScanStep::Damaged(what),
                     Err(error) => return Err(error),
                 },
             };
             match step {
-                Step::GoOn(behind) => at = behind,
-                Step::End => return Ok(None),
-                Step::Damaged(what) => return Ok(Some((at, what))),
+                ScanStep::GoOn(behind) => at = behind,
+                ScanStep::End => return Ok(None),
+                ScanStep::Damaged(what) => return Ok(Some((at, what))),
             }
         }
     }
 
-    /// Notes the chunk at `at` if the summary lists one there, and returns the position behind it
+    /// Notes the chunk at `at` if the summary lists one there, and returns the position after it
     /// and its message indexes.
     fn indexed_chunk(&mut self, at: u64) -> Option<u64> {
         let chunk = self.index.remove(&at)?;
@@ -145,7 +151,7 @@ impl Walk<'_> {
         if chunk.len < HEAD || behind > self.source.len() {
             return None;
         }
-        self.contents.segments.push(Segment {
+        self.contents.segments.push(FileSegment {
             offset: at,
             len: chunk.len,
             start_time: chunk.start_time,
@@ -156,48 +162,50 @@ impl Walk<'_> {
         Some(behind)
     }
 
-    fn record(&mut self, at: u64) -> Result<Step, ReplayError> {
+    fn record(&mut self, at: u64) -> Result<ScanStep, ReplayError> {
         let file_end = self.source.len();
         if at == file_end {
-            return Ok(Step::Damaged(Damage::NoFooter));
+            return Ok(ScanStep::Damaged(Damage::NoFooter));
         }
         let Some((opcode, len)) = head(self.source.peek(at, HEAD as usize)?) else {
-            return Ok(Step::Damaged(Damage::Truncated("the head of a record")));
+            return Ok(ScanStep::Damaged(Damage::Truncated("the head of a record")));
         };
         let end = at.saturating_add(HEAD).saturating_add(len);
         if end > file_end {
-            return Ok(Step::Damaged(Damage::Truncated("a record")));
+            return Ok(ScanStep::Damaged(Damage::Truncated("a record")));
         }
         match opcode {
-            0 => Ok(Step::Damaged(Damage::Malformed("a record has kind 0, which does not exist"))),
+            0 => Ok(ScanStep::Damaged(Damage::Malformed(
+                "a record has kind 0, which does not exist",
+            ))),
             op::DATA_END => {
                 let body = self.source.peek(at + HEAD, 4)?;
                 let crc = body.first_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));
                 self.data_crc = Some((at, crc));
-                Ok(Step::End)
+                Ok(ScanStep::End)
             }
-            op::FOOTER => Ok(Step::End),
+            op::FOOTER => Ok(ScanStep::End),
             op::SCHEMA | op::CHANNEL if len <= MAX_RECORD => {
                 let mut body = vec![0; len as usize];
                 self.source.read(at + HEAD, &mut body)?;
                 let learned = self.contents.channels.learn(opcode, &body);
-                Ok(learned.map_or_else(Step::Damaged, |()| Step::GoOn(end)))
+                Ok(learned.map_or_else(ScanStep::Damaged, |()| ScanStep::GoOn(end)))
             }
             op::MESSAGE => self.message(at, end),
             op::CHUNK => self.chunk(at, end),
-            _ => Ok(Step::GoOn(end)),
+            _ => Ok(ScanStep::GoOn(end)),
         }
     }
 
-    /// A message outside a chunk: joins the run before it, or begins one.
-    fn message(&mut self, at: u64, end: u64) -> Result<Step, ReplayError> {
+    /// Adds a message outside a chunk to the run before it, or begins a run.
+    fn message(&mut self, at: u64, end: u64) -> Result<ScanStep, ReplayError> {
         let body = self.source.peek(at + HEAD, MESSAGE_HEAD.min((end - at - HEAD) as usize))?;
         let head = match message_head(body) {
             Ok(head) => head,
-            Err(what) => return Ok(Step::Damaged(what)),
+            Err(what) => return Ok(ScanStep::Damaged(what)),
         };
         if self.contents.channels.get(head.channel).is_none() {
-            return Ok(Step::Damaged(Damage::UnknownChannel(head.channel)));
+            return Ok(ScanStep::Damaged(Damage::UnknownChannel(head.channel)));
         }
         let len = end - at;
         match self.contents.segments.last_mut() {
@@ -210,7 +218,7 @@ impl Walk<'_> {
                 run.start_time = run.start_time.min(head.log_time);
                 run.end_time = run.end_time.max(head.log_time);
             }
-            _ => self.contents.segments.push(Segment {
+            _ => self.contents.segments.push(FileSegment {
                 offset: at,
                 len,
                 start_time: head.log_time,
@@ -220,23 +228,23 @@ impl Walk<'_> {
             }),
         }
         self.count([head]);
-        Ok(Step::GoOn(end))
+        Ok(ScanStep::GoOn(end))
     }
 
-    /// A chunk that no index lists: opens it to see which channels and times are in it.
-    fn chunk(&mut self, at: u64, end: u64) -> Result<Step, ReplayError> {
+    /// Opens a chunk that no index lists, for its channels and times.
+    fn chunk(&mut self, at: u64, end: u64) -> Result<ScanStep, ReplayError> {
         let kind = SegmentKind::Chunk;
         self.opener.read(self.source, at, end - at, kind, &mut self.buffer)?;
         let heads = match self.look_into_buffer() {
             Ok(heads) => heads,
-            Err(what) => return Ok(Step::Damaged(what)),
+            Err(what) => return Ok(ScanStep::Damaged(what)),
         };
         if heads.is_empty() {
-            return Ok(Step::GoOn(end));
+            return Ok(ScanStep::GoOn(end));
         }
         let channels: BTreeSet<u16> = heads.iter().map(|head| head.channel).collect();
         let times = || heads.iter().map(|head| head.log_time);
-        self.contents.segments.push(Segment {
+        self.contents.segments.push(FileSegment {
             offset: at,
             len: end - at,
             start_time: times().min().unwrap_or(0),
@@ -245,7 +253,7 @@ impl Walk<'_> {
             channels: Some(channels.into_iter().collect()),
         });
         self.count(heads);
-        Ok(Step::GoOn(end))
+        Ok(ScanStep::GoOn(end))
     }
 
     fn look_into_buffer(&mut self) -> Result<Vec<MessageHead>, Damage> {
@@ -265,7 +273,7 @@ impl Walk<'_> {
         Ok(heads)
     }
 
-    /// Counts messages, unless the summary already did.
+    /// Counts messages, unless the summary did.
     fn count(&mut self, heads: impl IntoIterator<Item = MessageHead>) {
         if !self.contents.claimed {
             for head in heads {
@@ -274,7 +282,7 @@ impl Walk<'_> {
         }
     }
 
-    /// Messages outside chunks are covered by one checksum only, that of the whole data section.
+    /// Checks messages outside chunks: only the checksum of the whole data section covers them.
     fn check_runs(&mut self) -> Result<Option<(u64, Damage)>, ReplayError> {
         let has_runs = self.contents.segments.iter().any(|s| s.kind == SegmentKind::Run);
         let Some((end, expected)) = self.data_crc.filter(|(_, crc)| has_runs && *crc != 0) else {

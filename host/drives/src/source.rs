@@ -1,4 +1,4 @@
-//! One file, read in pieces and never whole.
+//! Reads one file in pieces, never as a whole.
 
 use std::fs::File;
 use std::io;
@@ -6,15 +6,16 @@ use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::damage::{Damage, Place};
+use super::damage::{Damage, DamageLocation};
 use super::error::ReplayError;
 
-/// How much [`Source::peek`] reads at once. Record heads of small messages lie close together.
+/// Bytes that [`SourceFile::peek`] reads at once. Record heads of small messages are close
+/// together.
 const WINDOW: usize = 64 * 1024;
 
 /// An open file of known length.
-pub(super) struct Source {
-    /// Read from where one likes: others may read it, too.
+pub(super) struct SourceFile {
+    /// Read with explicit offsets: others may read it, too.
     file: Arc<File>,
     path: PathBuf,
     len: u64,
@@ -22,21 +23,24 @@ pub(super) struct Source {
     window_at: u64,
 }
 
-impl Source {
+impl SourceFile {
     pub(super) fn open(path: &Path) -> Result<Self, ReplayError> {
         let cannot = |source| ReplayError::Open { path: path.to_owned(), source };
-        // Before it is opened: of a pipe, that would never end.
+        // Checked before it is opened: opening a pipe would block for ever.
         let metadata = path.metadata().map_err(cannot)?;
         if metadata.is_dir() {
             return Err(ReplayError::Directory { path: path.to_owned() });
         }
         if !metadata.is_file() {
-            return Err(cannot(io::Error::new(io::ErrorKind::InvalidInput, "it is no file")));
+            return Err(cannot(io::Error::new(
+                io::ErrorKind::InvalidInput,
+                "it is not a regular file",
+            )));
         }
         Self::over(Arc::new(File::open(path).map_err(cannot)?), path)
     }
 
-    /// What is in `file`, under the name `path`.
+    /// Opens the content of `file`, under the name `path`.
     pub(super) fn over(file: Arc<File>, path: &Path) -> Result<Self, ReplayError> {
         let path = path.to_owned();
         match file.metadata() {
@@ -47,7 +51,7 @@ impl Source {
         }
     }
 
-    /// The file, of which nothing was read from where it is.
+    /// Returns the file, whose own position is still at its start.
     #[cfg(feature = "bags")]
     pub(super) fn into_file(self) -> Arc<File> {
         self.file
@@ -62,15 +66,15 @@ impl Source {
     }
 
     pub(super) fn damaged(&self, offset: u64, what: Damage) -> ReplayError {
-        ReplayError::Damaged { path: self.path.clone(), at: Place::Byte(offset), what }
+        ReplayError::Damaged { path: self.path.clone(), at: DamageLocation::Byte(offset), what }
     }
 
-    /// Fills `into` with the bytes from `offset` on, which the caller knows to lie in the file.
+    /// Fills `into` with the bytes from `offset` on, which the caller knows to be in the file.
     pub(super) fn read(&mut self, offset: u64, into: &mut [u8]) -> Result<(), ReplayError> {
         self.file.read_exact_at(into, offset).map_err(|source| self.failed(offset, source))
     }
 
-    /// The `n` bytes at `offset` (at most [`WINDOW`]), or fewer where the file ends.
+    /// Returns the `n` bytes at `offset` (at most [`WINDOW`]), or fewer at the end of the file.
     pub(super) fn peek(&mut self, offset: u64, n: usize) -> Result<&[u8], ReplayError> {
         let left = self.len.saturating_sub(offset);
         let n = n.min(usize::try_from(left).unwrap_or(usize::MAX)).min(WINDOW);
@@ -93,7 +97,7 @@ impl Source {
         Ok(&self.window[start..start + n])
     }
 
-    /// CRC-32 of the first `end` bytes.
+    /// Returns the CRC-32 of the first `end` bytes.
     pub(super) fn checksum(&mut self, end: u64) -> Result<u32, ReplayError> {
         let mut hasher = crc32fast::Hasher::new();
         let mut piece = vec![0; WINDOW];

@@ -1,29 +1,29 @@
-//! What a replay says of each message, and of how far it is.
+//! Results of replay steps, and the progress of a replay.
 
-use gleaner_transport::{SampleMeta, Subscription, Verdict};
+use gleaner_transport::{Delivery, SampleMeta, Subscription};
 
-/// One delivery.
+/// One delivery of a message.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Step {
+pub struct ReplayStep {
     /// Log time of the message, in ns.
     pub at_ns: i64,
-    /// To whom it was delivered.
+    /// The subscription it was delivered to.
     pub subscription: Subscription,
-    /// What the sink made of it.
-    pub verdict: Verdict,
-    /// What the sink was told besides the bytes.
+    /// Result of the delivery.
+    pub delivery: Delivery,
+    /// Metadata passed to the sink.
     pub meta: SampleMeta,
-    /// Length of the CDR payload, without encapsulation; of one that is packed and too big, as far
-    /// as it was unpacked.
+    /// Length of the CDR payload, without encapsulation; of a packed message that is too big, the
+    /// part that was unpacked.
     pub bytes: usize,
 }
 
-/// How far a replay has come.
+/// Progress of a replay.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Default)]
 pub struct Progress {
-    /// Deliveries made.
+    /// Number of deliveries made.
     pub done: u64,
-    /// Deliveries to expect if the files hold what they claim; `None` if nothing says, as in a
-    /// database without metadata, or where only a part is replayed.
+    /// Expected number of deliveries, if the files are correct; `None` if unknown, as in a database
+    /// without metadata, or if only a part is replayed.
     pub total: Option<u64>,
 }

@@ -1,4 +1,4 @@
-//! What stands behind a path: which files a drive has, and who reads each of them.
+//! Finds the files of a drive, and the reader of each of them.
 
 use std::collections::{BTreeMap, HashSet};
 use std::ffi::OsString;
@@ -11,32 +11,31 @@ use super::chunk::Opener;
 use super::damage::Damage;
 use super::error::ReplayError;
 use super::file::Contents;
-use super::options::Options;
+use super::options::DriveOptions;
 use super::records::MAGIC;
 use super::scan::scan;
-use super::source::Source;
+use super::source::SourceFile;
 use super::track::{Store, Track};
 #[cfg(feature = "bags")]
 use super::unpack::{Unpacked, unpack_one};
 use super::writers::Writers;
 
-/// What the metadata of a directory say of its files.
+/// Content of the metadata of a directory.
 #[derive(Default)]
 pub(super) struct Bag {
     /// In the order of the metadata.
     pub(super) files: Vec<PathBuf>,
-    /// Messages by topic, in all files; empty if nobody counted them.
+    /// Messages by topic, in all files; empty if unknown.
     pub(super) messages: BTreeMap<String, u64>,
-    /// What whoever reads it should know, in a sentence.
+    /// A note for the user, in a sentence.
     pub(super) remark: Option<String>,
 }
 
-/// The files that these paths name: each itself, and of a rosbag2 directory those that it consists
-/// of.
+/// Returns the files that these paths name: each file itself, and those of a rosbag2 directory.
 ///
 /// # Errors
 ///
-/// [`ReplayError`] if a directory is none of rosbag2, or its metadata cannot be used.
+/// [`ReplayError`] if a directory is not one of rosbag2, or its metadata cannot be used.
 pub fn files_of(paths: &[PathBuf]) -> Result<Vec<PathBuf>, ReplayError> {
     paths
         .iter()
@@ -45,14 +44,14 @@ pub fn files_of(paths: &[PathBuf]) -> Result<Vec<PathBuf>, ReplayError> {
         .map(|files| files.concat())
 }
 
-/// Where SQLite keeps what is not yet in the database `path`, if there is something;
-/// [`super::Replay`] looks.
+/// Returns the paths where SQLite keeps changes that are not yet in the database `path`;
+/// [`super::Replay`] checks whether they exist.
 pub fn journals_of(path: &Path) -> [PathBuf; 2] {
     ["-wal", "-journal"]
         .map(|suffix| OsString::from_iter([path.as_os_str(), suffix.as_ref()]).into())
 }
 
-/// A file alone, or a directory of them.
+/// Returns the files of a path: a file alone, or those of a directory.
 fn bag_of(path: &Path) -> Result<Bag, ReplayError> {
     if !path.is_dir() {
         return Ok(Bag { files: vec![path.to_owned()], ..Bag::default() });
@@ -63,10 +62,10 @@ fn bag_of(path: &Path) -> Result<Bag, ReplayError> {
     Err(ReplayError::NotBuiltIn { path: path.to_owned(), what: "a rosbag2 directory" })
 }
 
-/// Opens all files that `paths` name.
+/// Opens all files of `paths`.
 pub(super) fn open(
     paths: &[PathBuf],
-    options: &Options,
+    options: &DriveOptions,
     opener: &mut Opener,
 ) -> Result<Vec<Track>, ReplayError> {
     let mut writers = Writers::default();
@@ -93,8 +92,8 @@ pub(super) fn open(
     Ok(tracks)
 }
 
-/// Has the files that nobody counted hold what the metadata say. Who holds how much of a topic is
-/// not known if there are several: then the first that has it counts for all.
+/// Gives files without counts the number of messages of the metadata. With several files, the share
+/// of each is unknown: then the first that has the topic counts for all.
 fn count(files: &mut [(Store, Contents)], messages: &BTreeMap<String, u64>) {
     if messages.is_empty() || files.iter().any(|(_, contents)| !contents.uncounted) {
         return;
@@ -110,17 +109,17 @@ fn count(files: &mut [(Store, Contents)], messages: &BTreeMap<String, u64>) {
     }
 }
 
-/// What a file is, by its first bytes: names are not to be relied on.
-pub(super) enum Kind {
+/// Format of a file, by its first bytes, as file names are not reliable.
+pub(super) enum FileKind {
     Mcap,
     Database,
     Packed,
 }
 
-/// How many bytes tell it.
+/// Number of bytes that determine the format.
 pub(super) const START: usize = 16;
 
-impl Kind {
+impl FileKind {
     pub(super) fn of(start: &[u8]) -> Option<Self> {
         if start.starts_with(MAGIC) {
             Some(Self::Mcap)
@@ -134,14 +133,14 @@ impl Kind {
     }
 }
 
-fn kind_of(source: &mut Source) -> Result<Kind, ReplayError> {
-    let kind = Kind::of(source.peek(0, START)?);
+fn kind_of(source: &mut SourceFile) -> Result<FileKind, ReplayError> {
+    let kind = FileKind::of(source.peek(0, START)?);
     kind.ok_or_else(|| ReplayError::NotMcap { path: source.path().to_owned() })
 }
 
 fn open_file(
     path: &Path,
-    options: &Options,
+    options: &DriveOptions,
     opener: &mut Opener,
     room: &mut u64,
 ) -> Result<(Store, Contents), ReplayError> {
@@ -149,34 +148,35 @@ fn open_file(
     if let Some(unpacked) = options.unpacked.iter().find(|unpacked| unpacked.path == path) {
         return content(unpacked, options, opener);
     }
-    let mut source = Source::open(path)?;
+    let mut source = SourceFile::open(path)?;
     match kind_of(&mut source)? {
-        Kind::Mcap => mcap(source, opener),
+        FileKind::Mcap => mcap(source, opener),
         #[cfg(feature = "bags")]
-        Kind::Database => {
-            database(super::database::File::beside_its_journal(path), source.len(), options)
+        FileKind::Database => {
+            database(super::database::DatabaseFile::beside_its_journal(path), source.len(), options)
         }
         #[cfg(feature = "bags")]
-        Kind::Packed => content(&unpack_one(source, options, room)?, options, opener),
+        FileKind::Packed => content(&unpack_one(source, options, room)?, options, opener),
         #[cfg(not(feature = "bags"))]
         kind => {
             let _ = (options, room);
-            let what = if matches!(kind, Kind::Packed) { "packed with zstd" } else { "a database" };
+            let what =
+                if matches!(kind, FileKind::Packed) { "packed with zstd" } else { "a database" };
             Err(ReplayError::NotBuiltIn { path: path.to_owned(), what })
         }
     }
 }
 
-fn mcap(mut source: Source, opener: &mut Opener) -> Result<(Store, Contents), ReplayError> {
+fn mcap(mut source: SourceFile, opener: &mut Opener) -> Result<(Store, Contents), ReplayError> {
     let contents = scan(&mut source, opener)?;
     Ok((Store::Mcap(source), contents))
 }
 
 #[cfg(feature = "bags")]
 fn database(
-    file: super::database::File<'_>,
+    file: super::database::DatabaseFile<'_>,
     len: u64,
-    options: &Options,
+    options: &DriveOptions,
 ) -> Result<(Store, Contents), ReplayError> {
     let (rows, contents) = super::database::open(file, len, options.limits)?;
     Ok((Store::Rows(Box::new(rows)), contents))
@@ -186,20 +186,20 @@ fn database(
 #[cfg(feature = "bags")]
 fn content(
     unpacked: &Unpacked,
-    options: &Options,
+    options: &DriveOptions,
     opener: &mut Opener,
 ) -> Result<(Store, Contents), ReplayError> {
     let path = &unpacked.path;
-    let mut source = Source::over(unpacked.content.clone(), path)?;
+    let mut source = SourceFile::over(unpacked.content.clone(), path)?;
     let len = source.len();
     let (store, mut contents) = match kind_of(&mut source)? {
-        Kind::Mcap => mcap(source, opener)?,
-        Kind::Database => database(
-            super::database::File::elsewhere(path, unpacked.name(options)?.as_ref()),
+        FileKind::Mcap => mcap(source, opener)?,
+        FileKind::Database => database(
+            super::database::DatabaseFile::elsewhere(path, unpacked.name(options)?.as_ref()),
             len,
             options,
         )?,
-        Kind::Packed => return Err(ReplayError::NotMcap { path: path.clone() }),
+        FileKind::Packed => return Err(ReplayError::NotMcap { path: path.clone() }),
     };
     if let Some(error) = &unpacked.broken {
         let error = std::io::Error::other(error.clone());

@@ -1,4 +1,4 @@
-//! The end of a file: footer and summary, believed only when they agree with each other.
+//! Reads the end of a file: footer and summary, trusted only if they agree with each other.
 
 use std::collections::HashMap;
 
@@ -6,10 +6,10 @@ use super::damage::Damage;
 use super::error::ReplayError;
 use super::file::Channels;
 use super::records::{ChunkIndex, FOOTER, HEAD, MAGIC, Records, Statistics, head, op};
-use super::source::Source;
+use super::source::SourceFile;
 
-/// The largest summary that is looked at: an index of two million chunks. A file with a larger one
-/// is read without it.
+/// Size limit of a summary: an index of two million chunks. A file with a larger one is read
+/// without it.
 const MAX_SUMMARY: u64 = 256 << 20;
 
 /// A complete summary.
@@ -21,18 +21,18 @@ pub(super) struct Summary {
     pub(super) messages: HashMap<u16, u64>,
 }
 
-/// What stands at the end of a file.
+/// The end of a file.
 #[derive(Default)]
 pub(super) struct Tail {
-    /// Whether footer and closing magic are in place: the file was finished.
+    /// Set if footer and closing magic are present: the file was finished.
     pub(super) finished: bool,
-    /// A summary that names every channel and every chunk. Writers may leave it out.
+    /// A summary that names every channel and every chunk, if the writer added one.
     pub(super) summary: Option<Summary>,
-    /// There is a summary, but it is damaged.
+    /// Damage of the summary, if there is one.
     pub(super) damage: Option<(u64, Damage)>,
 }
 
-pub(super) fn read_tail(source: &mut Source) -> Result<Tail, ReplayError> {
+pub(super) fn read_tail(source: &mut SourceFile) -> Result<Tail, ReplayError> {
     let Some(Footer { at: footer_at, start, crc }) = footer(source)? else {
         return Ok(Tail::default());
     };
@@ -67,14 +67,14 @@ pub(super) fn read_tail(source: &mut Source) -> Result<Tail, ReplayError> {
 /// The last record of a finished file.
 pub(super) struct Footer {
     pub(super) at: u64,
-    /// Where the summary starts; 0 if there is none.
+    /// Start of the summary; 0 if there is none.
     start: u64,
-    /// Of the summary.
+    /// Checksum of the summary.
     crc: u32,
 }
 
-/// The footer of `source`; `None` if the file was cut off or never finished.
-pub(super) fn footer(source: &mut Source) -> Result<Option<Footer>, ReplayError> {
+/// Returns the footer of `source`; `None` if the file is truncated or was never finished.
+pub(super) fn footer(source: &mut SourceFile) -> Result<Option<Footer>, ReplayError> {
     let Some(at) = source.len().checked_sub(FOOTER) else {
         return Ok(None);
     };
@@ -82,7 +82,7 @@ pub(super) fn footer(source: &mut Source) -> Result<Option<Footer>, ReplayError>
     Ok(found.map(|(start, crc)| Footer { at, start, crc }))
 }
 
-/// Start of the summary and its checksum, if `bytes` are a footer and the closing magic.
+/// Parses the footer and the closing magic; returns the start of the summary and its checksum.
 fn parse_footer(bytes: &[u8]) -> Option<(u64, u32)> {
     let (record, magic) = bytes.split_at_checked(bytes.len().checked_sub(MAGIC.len())?)?;
     let body = record.get(HEAD as usize..)?;
@@ -92,7 +92,7 @@ fn parse_footer(bytes: &[u8]) -> Option<(u64, u32)> {
     Some((u64::from_le_bytes(*body.first_chunk()?), u32::from_le_bytes(*body.last_chunk()?)))
 }
 
-/// `None` if the writer left out what would make the summary complete.
+/// Returns `None` if the summary is incomplete.
 fn parse_summary(bytes: &[u8]) -> Result<Option<Summary>, Damage> {
     let malformed = || Damage::Malformed("a summary record is malformed");
     let mut channels = Channels::default();

@@ -1,8 +1,8 @@
-//! One file during a replay: which of its channels go where, and which segment comes next.
+//! One file during a replay: the subscriptions of its channels, and its next segment.
 
 use std::path::Path;
 
-use super::chunk::{OpenSegment, Opener, Segment, message_head};
+use super::chunk::{FileSegment, OpenSegment, Opener, message_head};
 use super::damage::Damage;
 use super::error::ReplayError;
 use super::file::Contents;
@@ -10,22 +10,22 @@ use super::inflate::{Inflate, ZSTD};
 use super::options::Span;
 use super::records::MESSAGE_HEAD;
 #[cfg(feature = "bags")]
-use super::rows::Rows;
-use super::source::Source;
-use super::writers::{Writer, Writers};
+use super::rows::MessageRows;
+use super::source::SourceFile;
+use super::writers::{ChannelWriter, Writers};
 use gleaner_messages::Endian;
 use gleaner_transport::{SampleMeta, Subscription};
 
-/// Bytes in front of the CDR of a message.
+/// Bytes before the CDR of a message.
 const ENCAPSULATION: usize = 4;
 
-/// Where the messages of a file are.
+/// The store of a file's messages.
 pub(super) enum Store {
-    /// In segments that were found when it was opened.
-    Mcap(Source),
-    /// In a database, which makes segments as they are asked for.
+    /// Segments, found when the file was opened.
+    Mcap(SourceFile),
+    /// A database, which makes segments on demand.
     #[cfg(feature = "bags")]
-    Rows(Box<Rows>),
+    Rows(Box<MessageRows>),
 }
 
 impl Store {
@@ -51,41 +51,41 @@ pub(super) struct Track {
     store: Store,
     contents: Contents,
     times: Option<(u64, u64)>,
-    /// What is replayed of it.
+    /// The part to replay.
     span: Span,
     /// By channel id. Most files have a few channels with small ids, so a table beats a map.
-    routes: Vec<Channel>,
-    /// The segments still to open, the next one last.
-    queue: Vec<Segment>,
+    routes: Vec<Route>,
+    /// The segments still to be opened, the next one last.
+    queue: Vec<FileSegment>,
 }
 
-/// What a replay knows of one channel id.
+/// State of one channel id in a replay.
 #[derive(Default)]
-struct Channel {
+struct Route {
     /// `None` if the file does not define the channel.
-    writer: Option<Writer>,
-    subscriptions: Vec<Wanted>,
-    /// The largest message that one of them takes, in bytes of CDR.
+    writer: Option<ChannelWriter>,
+    subscriptions: Vec<ChannelSubscription>,
+    /// The largest message that a subscription takes, in bytes of CDR.
     most: usize,
     seen: u64,
 }
 
-/// Who wants the messages of a channel.
+/// One subscription of a channel.
 #[derive(Copy, Clone)]
-struct Wanted {
+struct ChannelSubscription {
     by: Subscription,
-    /// The largest that is taken, in bytes of CDR.
+    /// The largest message that it takes, in bytes of CDR.
     most: usize,
 }
 
 /// A message on its way to a sink.
 pub(super) struct Routed<'a> {
     pub(super) subscription: Subscription,
-    /// Whether no further subscription wants the message.
+    /// Set if this is the last subscription of the message.
     pub(super) is_last: bool,
     pub(super) meta: SampleMeta,
-    /// Whether it is packed and larger than the subscription takes. Then `cdr` may be its beginning
-    /// only.
+    /// Set if the message is packed and larger than the subscription takes. Then `cdr` may be only
+    /// its beginning.
     pub(super) is_too_big: bool,
     pub(super) cdr: &'a [u8],
 }
@@ -94,8 +94,8 @@ impl Track {
     pub(super) fn new(store: Store, contents: Contents, writers: &mut Writers) -> Self {
         let mut routes = Vec::new();
         for (id, writer) in writers.of_next_file(store.path(), &contents.channels) {
-            // Ids come in order, and are 16 bits wide.
-            routes.resize_with(usize::from(id) + 1, Channel::default);
+            // Ids are sorted, and 16 bits wide.
+            routes.resize_with(usize::from(id) + 1, Route::default);
             routes[usize::from(id)].writer = Some(writer);
         }
         Self { times: contents.span(), span: Span::ALL, store, contents, routes, queue: Vec::new() }
@@ -105,12 +105,12 @@ impl Track {
         (self.store.path(), &self.contents)
     }
 
-    /// First and last log time of any message.
+    /// Returns the first and last log time of any message.
     pub(super) fn times(&self) -> Option<(u64, u64)> {
         self.times
     }
 
-    /// Whether the last of [`Track::times`] is lost.
+    /// Returns whether the last of [`Track::times`] is lost.
     pub(super) fn is_end_unknown(&self) -> bool {
         self.contents.is_end_unknown
     }
@@ -119,22 +119,22 @@ impl Track {
         self.store.damaged(offset, what)
     }
 
-    /// `most` is the largest message that is wanted, in bytes of CDR.
+    /// Subscribes a channel. `most` is the largest message to deliver, in bytes of CDR.
     pub(super) fn subscribe(&mut self, channel: u16, subscription: Subscription, most: usize) {
         if let Some(channel) = self.routes.get_mut(usize::from(channel)) {
-            channel.subscriptions.push(Wanted { by: subscription, most });
+            channel.subscriptions.push(ChannelSubscription { by: subscription, most });
             channel.most = channel.most.max(most);
         }
     }
 
-    /// Lines up the segments that hold subscribed messages of `span`. Returns the damage that the
-    /// scan found, if any, and the log time before which everything still counts.
+    /// Queues the segments with subscribed messages of `span`. Returns the damage that the scan
+    /// found, if any, and the log time before which everything is still delivered.
     pub(super) fn start(&mut self, span: Span) -> Option<(u64, ReplayError)> {
         self.span = span;
         #[cfg(feature = "bags")]
         if let Store::Rows(rows) = &mut self.store {
             let routes = &self.routes;
-            // It reports by itself what ends it.
+            // A database reports by itself the damage that ends it.
             rows.start(span, self.contents.damage.take().map(|(_, what)| what), |id| {
                 wanted(routes, id) == Some(true)
             });
@@ -156,7 +156,7 @@ impl Track {
         Some((before, self.store.damaged(offset, what)))
     }
 
-    /// The log time at which the next segment has to be open.
+    /// Returns the log time at which the next segment must be open.
     pub(super) fn next_start(&self) -> Option<u64> {
         match &self.store {
             Store::Mcap(_) => self.queue.last().map(|segment| segment.start_time),
@@ -165,7 +165,7 @@ impl Track {
         }
     }
 
-    /// Opens the next segment and returns where it lies, or of a database, its number. After an
+    /// Opens the next segment and returns its position, or in a database, its number. After an
     /// error there are no more.
     pub(super) fn open_next(
         &mut self,
@@ -198,8 +198,8 @@ impl Track {
         }
     }
 
-    /// Takes apart the message record in `body`; `fan` says how many subscriptions already have it.
-    /// What is packed goes through `inflate`, where it stays until the next that is.
+    /// Parses the message record in `body`; `fan` is the number of subscriptions that already
+    /// received it. Packed messages are unpacked into `inflate`, and stay there until the next.
     #[inline]
     pub(super) fn route<'a>(
         &mut self,
@@ -262,7 +262,8 @@ impl Track {
         })
     }
 
-    /// At the end: the first subscribed channel that did not hold what the summary claims.
+    /// Returns, at the end, the first subscribed channel whose number of messages differs from the
+    /// summary.
     pub(super) fn missing(&self) -> Option<ReplayError> {
         if !self.contents.claimed {
             return None;
@@ -275,13 +276,21 @@ impl Track {
             }
             let (topic, found) = (info.topic.clone(), channel.seen);
             match &self.store {
-                Store::Mcap(source) => Some(source.damaged(source.len(), Damage::Missing { topic, expected, found })),
-                // rosbag2 also counts what it could not write in time: its recorder lost that, not
-                // this file.
+                Store::Mcap(source) => {
+                    Some(source.damaged(source.len(), Damage::Missing { topic, expected, found }))
+                }
+                // rosbag2 also counts messages that it could not write in time: its recorder lost
+                // these, not this file.
                 #[cfg(feature = "bags")]
                 Store::Rows(rows) => {
                     let path = rows.path().display();
-                    tracing::warn!(%path, topic, expected, found, "metadata.yaml counts another number of messages");
+                    tracing::warn!(
+                        %path,
+                        topic,
+                        expected,
+                        found,
+                        "metadata.yaml has another message count"
+                    );
                     None
                 }
             }
@@ -293,14 +302,14 @@ fn topic_of(contents: &Contents, channel: u16) -> String {
     contents.channels.get(channel).map(|info| info.topic.clone()).unwrap_or_default()
 }
 
-/// A time of a file, where times are unsigned. Log times of messages fit; what an index says, and
-/// when a message was published, may be beyond the year 2262, and then reads as the end of time.
+/// Converts a time of a file, where times are unsigned. Log times of messages fit; index times and
+/// publish times may be beyond the year 2262, and saturate.
 pub(super) fn nanoseconds(log_time: u64) -> i64 {
     i64::try_from(log_time).unwrap_or(i64::MAX)
 }
 
-/// Whether a channel is subscribed; `None` if the file does not define it.
-fn wanted(routes: &[Channel], id: u16) -> Option<bool> {
+/// Returns whether a channel is subscribed; `None` if the file does not define it.
+fn wanted(routes: &[Route], id: u16) -> Option<bool> {
     let channel = routes.get(usize::from(id)).filter(|channel| channel.writer.is_some())?;
     Some(!channel.subscriptions.is_empty())
 }

@@ -1,8 +1,8 @@
-//! Packed files: their content, in a file without a name.
+//! Unpacks packed files, each into a file without a name.
 //!
-//! A packed file cannot be read from where one likes, and messages are not in the order of their
-//! times. So it is unpacked once, to the disk, which has more room than memory. The content has no
-//! name, so nothing of it stays when the process is killed.
+//! A packed file has no random access, and messages are not in the order of their times. So it is
+//! unpacked once, to the disk, which has more space than memory. The content has no name, so it
+//! disappears when the process is killed.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
@@ -20,69 +20,69 @@ use tracing::warn;
 use zstd::stream::read::Decoder;
 
 use super::error::ReplayError;
-use super::options::Options;
-use super::source::Source;
-use super::storage::{Kind, START, files_of};
+use super::options::DriveOptions;
+use super::source::SourceFile;
+use super::storage::{FileKind, START, files_of};
 
-/// Written at once.
+/// Size of a write, in bytes.
 const PIECE: usize = 1 << 20;
-/// How many times its own size a packed file may hold. Sensor data packs to a half or a tenth,
-/// pictures of nothing to a thousandth, and a bomb to less.
+/// Limit of the unpacked size, as a multiple of the packed size. Sensor data packs to a half or a
+/// tenth, blank pictures to a thousandth, and a bomb to less.
 const RATIO: u64 = 200;
-/// The share of all that may be unpacked which one file may take in any case.
+/// The share of the total limit that any file may take.
 const SHARE: u64 = 64;
-/// How the names begin that content has for a moment, and had all the time in earlier versions.
+/// Prefix of the names that content has temporarily, and had permanently in earlier versions.
 const PREFIX: &str = ".unpacked-";
-/// A file of such a name that was not written to for so long belongs to a process that was killed.
+/// Age since the last write from which a file of such a name belongs to a killed process.
 const STALE: Duration = Duration::from_secs(3600);
 
 /// The content of a packed file.
 #[derive(Clone, Debug)]
 pub struct Unpacked {
-    /// The packed file, as it is named among the files of the drive.
+    /// The packed file, named as in the drive.
     pub(super) path: PathBuf,
     pub(super) content: Arc<File>,
-    /// Why there is no more of it, though there should be.
+    /// The reason why the content is incomplete, if it is.
     pub(super) broken: Option<String>,
-    /// The name that it has already.
-    name: Option<Name>,
+    /// Its current name, if it has one.
+    name: Option<ContentName>,
 }
 
 /// A name of the content of a packed file.
 #[derive(Clone, Debug)]
-pub enum Name {
+pub enum ContentName {
     /// Removed with the last clone.
-    Ours(Arc<TempPath>),
-    /// Given by the process that unpacked it, and removed there.
+    Own(Arc<TempPath>),
+    /// Created and removed by the process that unpacked the file.
     Given(PathBuf),
 }
 
-impl AsRef<Path> for Name {
+impl AsRef<Path> for ContentName {
     fn as_ref(&self) -> &Path {
         match self {
-            Self::Ours(name) => name,
+            Self::Own(name) => name,
             Self::Given(name) => name,
         }
     }
 }
 
-/// What bounds the content of a file.
+/// Limits of the content of a file.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-enum Bound {
-    /// All packed files together.
+enum SizeLimit {
+    /// The limit of all packed files together.
     Drive(u64),
-    /// Its own size.
+    /// The limit for its own size.
     Ratio(u64),
-    /// The room on the disk.
+    /// The limit of the disk space.
     Disk(u64),
 }
 
-impl Bound {
-    /// The smallest of a file of `packed` bytes, where all files may take `room` of `most` bytes in
-    /// all, on a disk with `free` bytes.
+impl SizeLimit {
+    /// Returns the smallest limit for a file of `packed` bytes, where all files may take `room` of
+    /// `most` bytes in all, on a disk with `free` bytes.
     fn smallest(packed: u64, room: u64, most: u64, free: u64) -> Self {
         let by_size = packed.saturating_mul(RATIO).max(most / SHARE);
-        // The rest is for the results, and for others.
+        // The rest is for the results, and for other programs.
         let bounds = [Self::Disk(free / 10 * 9), Self::Ratio(by_size), Self::Drive(room)];
         bounds.into_iter().min_by_key(|bound| bound.bytes()).expect("there are three")
     }
@@ -92,7 +92,7 @@ impl Bound {
         bytes
     }
 
-    fn exceeded(self, path: &Path, folder: &Path, options: &Options) -> ReplayError {
+    fn exceeded(self, path: &Path, folder: &Path, options: &DriveOptions) -> ReplayError {
         let path = path.to_owned();
         match self {
             Self::Drive(_) => {
@@ -104,29 +104,28 @@ impl Bound {
     }
 }
 
-/// Unpacks the files of a drive that are packed. A process that may write does it for one that may
-/// not, which opens the drive with [`Options::unpacked`].
+/// Unpacks the packed files of a drive. A process with write access does this for one without,
+/// which opens the drive with [`DriveOptions::unpacked`].
 ///
 /// # Errors
 ///
-/// As [`Replay::open`](super::Replay::open), of what concerns these files.
-pub fn unpack(paths: &[PathBuf], options: &Options) -> Result<Vec<Unpacked>, ReplayError> {
+/// As [`Replay::open`](super::Replay::open), for these files.
+pub fn unpack(paths: &[PathBuf], options: &DriveOptions) -> Result<Vec<Unpacked>, ReplayError> {
     let mut room = options.limits.unpacked_bytes;
     let mut unpacked = Vec::new();
     for path in files_of(paths)? {
-        let mut source = Source::open(&path)?;
-        if matches!(Kind::of(source.peek(0, START)?), Some(Kind::Packed)) {
+        let mut source = SourceFile::open(&path)?;
+        if matches!(FileKind::of(source.peek(0, START)?), Some(FileKind::Packed)) {
             unpacked.push(unpack_one(source, options, &mut room)?);
         }
     }
     Ok(unpacked)
 }
 
-/// Unpacks what is in `source`, if it is something that we read. What that takes is taken from
-/// `room`.
+/// Unpacks `source`, if the content has a supported format, and subtracts its size from `room`.
 pub(super) fn unpack_one(
-    source: Source,
-    options: &Options,
+    source: SourceFile,
+    options: &DriveOptions,
     room: &mut u64,
 ) -> Result<Unpacked, ReplayError> {
     let (path, packed) = (source.path().to_owned(), source.len());
@@ -136,9 +135,9 @@ pub(super) fn unpack_one(
     let mut decoder = Decoder::new(source.into_file()).map_err(failed)?;
     let mut start = Vec::new();
     decoder.by_ref().take(START as u64).read_to_end(&mut start).map_err(failed)?;
-    let is_database = match Kind::of(&start) {
-        Some(Kind::Mcap) => false,
-        Some(Kind::Database) => true,
+    let is_database = match FileKind::of(&start) {
+        Some(FileKind::Mcap) => false,
+        Some(FileKind::Database) => true,
         // The rest is not even unpacked.
         _ => return Err(ReplayError::NotMcap { path }),
     };
@@ -146,7 +145,7 @@ pub(super) fn unpack_one(
     let (mut file, name) = new_file(&folder, is_database).map_err(failed)?;
     let disk = fstatvfs(&file).map_err(|error| failed(error.into()))?;
     let free = disk.f_bavail.saturating_mul(disk.f_frsize);
-    let bound = Bound::smallest(packed, *room, options.limits.unpacked_bytes, free);
+    let bound = SizeLimit::smallest(packed, *room, options.limits.unpacked_bytes, free);
     let mut content = start.as_slice().chain(decoder);
     let (mut piece, mut len) = (vec![0; PIECE], 0);
     let broken = loop {
@@ -161,7 +160,12 @@ pub(super) fn unpack_one(
             }
             Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
             Err(error) => {
-                warn!(path = %path.display(), unpacked = len, %error, "drive can be unpacked only in part");
+                warn!(
+                    path = %path.display(),
+                    unpacked = len,
+                    %error,
+                    "drive can be unpacked only in part"
+                );
                 break Some(error.to_string());
             }
         }
@@ -171,8 +175,8 @@ pub(super) fn unpack_one(
 }
 
 impl Unpacked {
-    /// The content of the packed file `path`, which another process made by [`unpack`] and calls
-    /// `name` for now; of a file that could be unpacked only in part, `broken` says why.
+    /// Opens the content of the packed file `path`, which another process unpacked by [`unpack`]
+    /// and named `name` temporarily; `broken` is the reason if it is incomplete.
     ///
     /// # Errors
     ///
@@ -182,30 +186,30 @@ impl Unpacked {
             path,
             content: Arc::new(File::open(&name)?),
             broken,
-            name: Some(Name::Given(name)),
+            name: Some(ContentName::Given(name)),
         })
     }
 
-    /// The name that another process gave the content, if one did.
+    /// Returns the name that another process gave the content, if one did.
     pub fn given_name(&self) -> Option<&Path> {
         match &self.name {
-            Some(Name::Given(name)) => Some(name),
+            Some(ContentName::Given(name)) => Some(name),
             _ => None,
         }
     }
 
-    /// The packed file, and why its content is not whole, if it is not.
+    /// Returns the packed file, and the reason if its content is incomplete.
     pub fn parts(&self) -> (&Path, Option<&str>) {
         (&self.path, self.broken.as_deref())
     }
 
-    /// Names the content for as long as the result lives: SQLite opens by name only, and follows
-    /// the links in `/proc` to names that are not there.
+    /// Names the content for as long as the result lives: SQLite opens files by name only, and the
+    /// links in `/proc` lead to names that do not exist.
     ///
     /// # Errors
     ///
-    /// [`ReplayError::Unpack`] names the folder in which there can be no such name.
-    pub fn name(&self, options: &Options) -> Result<Name, ReplayError> {
+    /// [`ReplayError::Unpack`] with the folder in which no such name can be created.
+    pub fn name(&self, options: &DriveOptions) -> Result<ContentName, ReplayError> {
         if let Some(name) = &self.name {
             return Ok(name.clone());
         }
@@ -215,50 +219,57 @@ impl Unpacked {
             Ok(linkat(CWD, content, CWD, name, AtFlags::SYMLINK_FOLLOW)?)
         };
         match Builder::new().prefix(PREFIX).make_in(&folder, link) {
-            Ok(named) => Ok(Name::Ours(Arc::new(named.into_temp_path()))),
+            Ok(named) => Ok(ContentName::Own(Arc::new(named.into_temp_path()))),
             Err(source) => Err(ReplayError::Unpack { path: self.path.clone(), folder, source }),
         }
     }
 }
 
-fn folder(options: &Options) -> PathBuf {
+fn folder(options: &DriveOptions) -> PathBuf {
     options.unpack_in.clone().unwrap_or_else(std::env::temp_dir)
 }
 
-/// A new file in `folder`, without a name where that is possible: some file systems, as those of
-/// networks, have none such, and then a database keeps its name until it is open.
-fn new_file(folder: &Path, is_database: bool) -> io::Result<(File, Option<Name>)> {
+/// Creates a file in `folder`, without a name if possible: some file systems, such as network ones,
+/// do not support that, and then a database keeps its name until it is open.
+fn new_file(folder: &Path, is_database: bool) -> io::Result<(File, Option<ContentName>)> {
     let flags = OFlags::TMPFILE | OFlags::RDWR | OFlags::CLOEXEC;
     match open(folder, flags, Mode::RUSR | Mode::WUSR) {
         Ok(file) => Ok((file.into(), None)),
         Err(Errno::OPNOTSUPP | Errno::ISDIR) => {
             let (file, name) = Builder::new().prefix(PREFIX).tempfile_in(folder)?.into_parts();
-            Ok((file, is_database.then(|| Name::Ours(Arc::new(name)))))
+            Ok((file, is_database.then(|| ContentName::Own(Arc::new(name)))))
         }
         Err(error) => Err(error.into()),
     }
 }
 
-/// Removes content that processes left in `folder` that were killed: plain files of this user with
-/// one name, to which nothing has been written for long. Content has a name only until it is
-/// written, or opened.
+/// Removes content of killed processes from `folder`: regular files of this user with a single name
+/// that were not written to for long. Content has a name only until it is written, or opened.
 fn remove_stale(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in
         entries.flatten().filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX))
     {
-        // Of the entry itself: no link is followed.
+        // Metadata of the entry itself: links are not followed.
         let Ok(found) = entry.metadata() else { continue };
-        let is_ours = found.is_file() && found.uid() == geteuid().as_raw() && found.nlink() == 1;
+        let is_own = found.is_file() && found.uid() == geteuid().as_raw() && found.nlink() == 1;
         let is_stale = found.modified().is_ok_and(|at| at.elapsed().is_ok_and(|age| age >= STALE));
-        if is_ours && is_stale {
+        if is_own && is_stale {
             let path = entry.path();
             match fs::remove_file(&path) {
                 Ok(()) => {
-                    warn!(path = %path.display(), bytes = found.len(), "removed what a killed process unpacked")
+                    warn!(
+                        path = %path.display(),
+                        bytes = found.len(),
+                        "removed content that a killed process unpacked"
+                    )
                 }
                 Err(error) => {
-                    warn!(path = %path.display(), %error, "cannot remove what a killed process unpacked")
+                    warn!(
+                        path = %path.display(),
+                        %error,
+                        "cannot remove content that a killed process unpacked"
+                    )
                 }
             }
         }
@@ -270,17 +281,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_is_bounded_by_its_size_by_the_disk_and_by_the_other_files() {
+    fn the_content_of_a_file_is_limited_by_its_size_the_disk_and_other_files() {
         const GIB: u64 = 1 << 30;
         let most = 64 * GIB;
         for (packed, room, free, expected) in [
-            (2_000_000, most, 1000 * GIB, Bound::Ratio(GIB)),
-            (GIB / 10, most, 1000 * GIB, Bound::Ratio(GIB / 10 * RATIO)),
-            (GIB, most, 1000 * GIB, Bound::Drive(most)),
-            (GIB, most, 10 * GIB, Bound::Disk(9 * GIB)),
-            (u64::MAX, 7, u64::MAX, Bound::Drive(7)),
+            (2_000_000, most, 1000 * GIB, SizeLimit::Ratio(GIB)),
+            (GIB / 10, most, 1000 * GIB, SizeLimit::Ratio(GIB / 10 * RATIO)),
+            (GIB, most, 1000 * GIB, SizeLimit::Drive(most)),
+            (GIB, most, 10 * GIB, SizeLimit::Disk(9 * GIB)),
+            (u64::MAX, 7, u64::MAX, SizeLimit::Drive(7)),
         ] {
-            assert_eq!(Bound::smallest(packed, room, most, free), expected);
+            assert_eq!(SizeLimit::smallest(packed, room, most, free), expected);
         }
     }
 }

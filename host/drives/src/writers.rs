@@ -1,4 +1,4 @@
-//! Who wrote the messages of each channel, and how far each writer has counted.
+//! Tracks the writer of each channel, and the last sequence number of each writer.
 
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
@@ -14,19 +14,19 @@ use gleaner_transport::Guid;
 #[derive(Default)]
 pub(super) struct Writers {
     files: u32,
-    /// By topic and writer. Two clips of one drive name the same writer, and it has to count on
-    /// from one to the other.
+    /// By topic and writer. Two clips of one drive name the same writer, whose numbers must
+    /// continue from one to the other.
     counters: HashMap<(String, Guid), Arc<AtomicU64>>,
 }
 
 /// The writer of one channel.
-pub(super) struct Writer {
+pub(super) struct ChannelWriter {
     guid: Guid,
-    /// Shared by all who hold the replay, which is one thread at a time: no order is needed.
+    /// Shared by the tracks of a replay, which one thread uses at a time: no ordering is needed.
     last_seq: Arc<AtomicU64>,
 }
 
-impl Writer {
+impl ChannelWriter {
     pub(super) fn guid(&self) -> Guid {
         self.guid
     }
@@ -35,26 +35,28 @@ impl Writer {
         self.last_seq.load(Relaxed)
     }
 
-    /// Counts a message on which its recorder noted `sequence`.
+    /// Counts a message with the recorded number `sequence`.
     pub(super) fn count(&self, sequence: u32) {
-        // Recorders that do not count write 0; sequence numbers that fall back after a restart
-        // of the writer would make two samples equal.
+        // Recorders that do not count write 0; numbers that fall back after a restart of the writer
+        // would give two samples the same identity.
         self.last_seq.store(u64::from(sequence).max(self.last_seq() + 1), Relaxed);
     }
 }
 
 impl Writers {
-    /// The writers of the channels of one more file, by channel id.
+    /// Returns the writers of the channels of one more file, by channel id.
     ///
     /// A channel has the writer that its metadata claims, unless another channel of its topic in
-    /// this file claimed it first: which of the two a sequence number belongs to could not be told.
-    /// Those without a claim get an identity made of the file's place in the drive and the
-    /// channel's id.
-    pub(super) fn of_next_file(&mut self, path: &Path, channels: &Channels) -> Vec<(u16, Writer)> {
+    /// this file claimed it first: then sequence numbers would be ambiguous. Channels without a
+    /// claim get an identity made of the file's position in the drive and the channel's id.
+    pub(super) fn of_next_file(
+        &mut self,
+        path: &Path,
+        channels: &Channels,
+    ) -> Vec<(u16, ChannelWriter)> {
         let mut taken = HashSet::new();
         let mut ignored = 0_u32;
-        // Claims come first, so that no identity made up for one channel is what a later one
-        // claims.
+        // Claims come first, so that no generated identity equals a later claim.
         let claims: Vec<_> = channels
             .iter()
             .map(|(id, info)| {
@@ -64,7 +66,11 @@ impl Writers {
             })
             .collect();
         if ignored > 0 {
-            warn!(path = %path.display(), ignored, "channels name a writer that another of their topic named first");
+            warn!(
+                path = %path.display(),
+                ignored,
+                "channels claim a writer that another channel of their topic claimed first"
+            );
         }
         let file = self.files;
         self.files = self.files.saturating_add(1);
@@ -75,7 +81,7 @@ impl Writers {
                 free.expect("a file has fewer channels than there are attempts")
             });
             let last_seq = self.counters.entry((topic.to_owned(), guid)).or_default().clone();
-            (id, Writer { guid, last_seq })
+            (id, ChannelWriter { guid, last_seq })
         });
         writers.collect()
     }

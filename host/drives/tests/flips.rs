@@ -1,4 +1,4 @@
-//! Random damage: a program of its own, because it watches the memory of its process.
+//! Tests random damage, in a program of its own, because it checks the memory of its process.
 
 #[path = "suite/support.rs"]
 mod support;
@@ -8,7 +8,7 @@ use gleaner_transport::Transport;
 use mcap::{Compression, WriteOptions};
 use support::{drive, file, listen, run, small_chunks, ticking};
 
-/// The most address space this process ever had, in KiB, where the system tells.
+/// Returns the peak of the address space of this process, in KiB, if known.
 fn peak_kib() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|line| line.starts_with("VmPeak:"))?;
@@ -16,9 +16,9 @@ fn peak_kib() -> Option<u64> {
 }
 
 /// A small generator with a fixed seed (xorshift64, G. Marsaglia 2003): failures repeat.
-struct Random(u64);
+struct XorShift(u64);
 
-impl Random {
+impl XorShift {
     fn below(&mut self, n: usize) -> usize {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;
@@ -29,7 +29,7 @@ impl Random {
 
 #[test]
 fn random_byte_flips_never_panic_hang_or_take_much_memory() {
-    // Without checksums, flips get past the first gate.
+    // Without checksums, flips pass the first check.
     let unchecked = |options: WriteOptions| {
         options
             .calculate_chunk_crcs(false)
@@ -48,7 +48,7 @@ fn random_byte_flips_never_panic_hang_or_take_much_memory() {
     .map(|options| drive(options, &messages))
     .into();
     let before = peak_kib();
-    let mut random = Random(0x9e37_79b9_7f4a_7c15);
+    let mut random = XorShift(0x9e37_79b9_7f4a_7c15);
     for case in 0..2000 {
         let mut bytes = drives[case % drives.len()].clone();
         for _ in 0..1 + random.below(4) {
@@ -63,7 +63,7 @@ fn random_byte_flips_never_panic_hang_or_take_much_memory() {
                 let is_there = topics.iter().any(|name| name == topic);
                 if is_there && replay.definitions(topic).is_ok() {
                     let spec = support::spec(topic);
-                    let _ = replay.subscribe(&spec, std::sync::Arc::new(Count));
+                    let _ = replay.subscribe(&spec, std::sync::Arc::new(CountingSink));
                 }
             }
             let (steps, _) = run(&mut replay);
@@ -75,7 +75,7 @@ fn random_byte_flips_never_panic_hang_or_take_much_memory() {
     if let (Some(before), Some(after)) = (before, peak_kib()) {
         assert!(after - before < 256 * 1024, "grew by {} MiB", (after - before) / 1024);
     }
-    // The drives themselves are sound.
+    // The undamaged drives are still readable.
     for bytes in drives {
         let mut replay = Replay::open(&[file(&bytes)]).unwrap();
         listen(&mut replay, &["/a", "/b"]);
@@ -83,10 +83,10 @@ fn random_byte_flips_never_panic_hang_or_take_much_memory() {
     }
 }
 
-struct Count;
+struct CountingSink;
 
-impl gleaner_transport::Sink for Count {
-    fn deliver(&self, _: &gleaner_transport::SampleMeta, _: &[u8]) -> gleaner_transport::Verdict {
-        gleaner_transport::Verdict::Taken
+impl gleaner_transport::Sink for CountingSink {
+    fn deliver(&self, _: &gleaner_transport::SampleMeta, _: &[u8]) -> gleaner_transport::Delivery {
+        gleaner_transport::Delivery::Taken
     }
 }

@@ -9,7 +9,7 @@ use gleaner_messages::Endian;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Delivery, Guid, SampleMeta, Subscription, Transport, TransportError};
 
-use support::{Memory, TEXT, TYPE, spec};
+use support::{MemorySink, TEXT, TYPE, spec};
 
 fn meta(at_ns: i64) -> SampleMeta {
     SampleMeta {
@@ -27,7 +27,7 @@ fn a_published_sample_reaches_every_subscription() {
     let mut loopback = Loopback::new();
     loopback.add_topic("/a", TYPE, TEXT);
     assert_eq!(loopback.publish("/a", &meta(0), &[0; 8]).unwrap(), None);
-    let memory = Arc::new(Memory::default());
+    let memory = Arc::new(MemorySink::default());
     assert_eq!(loopback.subscribe(&spec("/a"), memory.clone()).unwrap(), Subscription(0));
     assert_eq!(loopback.subscribe(&spec("/a"), memory.clone()).unwrap(), Subscription(1));
     let delivery = loopback.publish("/a", &meta(5), &9i64.to_le_bytes()).unwrap();
@@ -41,7 +41,7 @@ fn a_published_sample_reaches_every_subscription() {
 fn an_error_names_its_cause() {
     let mut loopback = Loopback::new();
     loopback.add_topic("/a", "other/Type", "");
-    let memory = Arc::new(Memory::default());
+    let memory = Arc::new(MemorySink::default());
     let wrong = loopback.subscribe(&spec("/a"), memory.clone()).unwrap_err();
     assert!(matches!(wrong, TransportError::WrongType { .. }));
     let absent = loopback.subscribe(&spec("/b"), memory).unwrap_err();

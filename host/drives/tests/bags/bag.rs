@@ -1,4 +1,4 @@
-//! Writes what rosbag2 writes.
+//! Writes drives as rosbag2 does.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs;
@@ -9,18 +9,21 @@ use tempfile::TempDir;
 
 use crate::support::{TEXT, TYPE, Written, small_chunks};
 
-/// The tables as rosbag2 makes them since ROS 2 Iron.
+/// The tables of rosbag2 since ROS 2 Iron.
 pub const TABLES: &str = "\
-    CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL, \
+    CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, \
+    serialization_format TEXT NOT NULL, \
         offered_qos_profiles TEXT NOT NULL, type_description_hash TEXT NOT NULL);\
-    CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, encoding TEXT NOT NULL, \
+    CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, encoding \
+    TEXT NOT NULL, \
         encoded_message_definition TEXT NOT NULL, type_description_hash TEXT NOT NULL);\
-    CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL);\
+    CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER \
+    NOT NULL, data BLOB NOT NULL);\
     CREATE INDEX timestamp_idx ON messages (timestamp ASC);";
 
-/// How a directory is packed.
+/// The packing of a directory.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub enum Packed {
+pub enum Packing {
     No,
     Files,
     Messages,
@@ -32,33 +35,35 @@ pub enum Storage {
     Sqlite3,
 }
 
-/// A folder that is gone with its test.
+/// Creates a folder that is removed with its test.
 pub fn folder() -> TempDir {
     TempDir::new_in(env!("CARGO_TARGET_TMPDIR")).unwrap()
 }
 
-/// The message as it stands in a file.
+/// Returns the bytes of a message in a file.
 pub fn cdr(message: &Written) -> Vec<u8> {
     [&[0, 1, 0, 0][..], &message.value.to_le_bytes()].concat()
 }
 
-/// A database with the tables, and nothing in them.
+/// Creates a database with empty tables.
 pub fn empty_database(path: &Path) -> Connection {
     let db = Connection::open(path).unwrap();
     db.execute_batch(TABLES).unwrap();
     db
 }
 
-/// Adds a topic, and gives its number.
+/// Adds a topic, and returns its number.
 pub fn add_topic(db: &Connection, topic: &str, type_name: &str) -> i64 {
-    let sql = "INSERT INTO topics (name, type, serialization_format, offered_qos_profiles, type_description_hash) \
+    let sql = "INSERT INTO topics (name, type, serialization_format, offered_qos_profiles, \
+               type_description_hash) \
                VALUES (?1, ?2, 'cdr', '- depth: 5', '')";
     db.execute(sql, (topic, type_name)).unwrap();
     db.last_insert_rowid()
 }
 
 pub fn add_text(db: &Connection, type_name: &str, encoding: &str, text: &str) {
-    let sql = "INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash) \
+    let sql = "INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, \
+               type_description_hash) \
                VALUES (?1, ?2, ?3, '')";
     db.execute(sql, (type_name, encoding, text)).unwrap();
 }
@@ -68,7 +73,7 @@ pub fn add_message(db: &Connection, topic: i64, at: i64, data: &[u8]) {
     db.execute(sql, (topic, at, data)).unwrap();
 }
 
-/// A database with `messages` in this order, each turned into bytes by `bytes`.
+/// Creates a database with `messages` in this order, each converted by `bytes`.
 pub fn database_of(path: &Path, messages: &[Written], bytes: impl Fn(&Written) -> Vec<u8>) {
     let db = empty_database(path);
     db.execute_batch("BEGIN").unwrap();
@@ -86,7 +91,7 @@ pub fn database(path: &Path, messages: &[Written]) {
     database_of(path, messages, cdr);
 }
 
-/// An MCAP file with `messages`, each turned into bytes by `bytes`.
+/// Returns an MCAP file with `messages`, each converted by `bytes`.
 pub fn mcap_of(messages: &[Written], bytes: impl Fn(&Written) -> Vec<u8>) -> Vec<u8> {
     let mut writer = small_chunks().create(std::io::Cursor::new(Vec::new())).unwrap();
     let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
@@ -106,15 +111,15 @@ pub fn packed(bytes: &[u8]) -> Vec<u8> {
     zstd::encode_all(bytes, 1).unwrap()
 }
 
-/// A directory with `parts`, one in each file.
-pub fn bag(storage: Storage, packing: Packed, parts: &[&[Written]]) -> TempDir {
+/// Creates a directory with `parts`, one in each file.
+pub fn bag(storage: Storage, packing: Packing, parts: &[&[Written]]) -> TempDir {
     let folder = folder();
     let mut names = Vec::new();
     for (number, messages) in parts.iter().enumerate() {
         let ending = if storage == Storage::Mcap { "mcap" } else { "db3" };
         let name = format!("bag_{number}.{ending}");
         let bytes = |message: &Written| match packing {
-            Packed::Messages => packed(&cdr(message)),
+            Packing::Messages => packed(&cdr(message)),
             _ => cdr(message),
         };
         let path = folder.path().join(&name);
@@ -122,7 +127,7 @@ pub fn bag(storage: Storage, packing: Packed, parts: &[&[Written]]) -> TempDir {
             Storage::Mcap => fs::write(&path, mcap_of(messages, bytes)).unwrap(),
             Storage::Sqlite3 => database_of(&path, messages, bytes),
         }
-        if packing == Packed::Files {
+        if packing == Packing::Files {
             fs::write(
                 path.with_extension(format!("{ending}.zstd")),
                 packed(&fs::read(&path).unwrap()),
@@ -137,15 +142,15 @@ pub fn bag(storage: Storage, packing: Packed, parts: &[&[Written]]) -> TempDir {
     let names: Vec<_> = names.iter().map(String::as_str).collect();
     let storage = if storage == Storage::Mcap { "mcap" } else { "sqlite3" };
     let mode = match packing {
-        Packed::No => "",
-        Packed::Files => "FILE",
-        Packed::Messages => "MESSAGE",
+        Packing::No => "",
+        Packing::Files => "FILE",
+        Packing::Messages => "MESSAGE",
     };
     write_metadata(folder.path(), &metadata(5, storage, mode, &names, &parts.concat()));
     folder
 }
 
-/// `metadata.yaml` of a version.
+/// Returns a `metadata.yaml` of this version.
 pub fn metadata(
     version: u32,
     storage: &str,
@@ -158,16 +163,21 @@ pub fn metadata(
     let files: String = files.iter().map(|file| format!("    - {file}\n")).collect();
     let topic = |(topic, count): (&&str, &u64)| {
         format!(
-            "    - topic_metadata:\n        name: {topic}\n        type: {TYPE}\n        serialization_format: cdr\n\
-             \x20       offered_qos_profiles: \"- history: 1\\n  depth: 5\"\n      message_count: {count}\n"
+            "    - topic_metadata:\n        name: {topic}\n        type: {TYPE}\n        \
+             serialization_format: cdr\n\
+             \x20       offered_qos_profiles: \"- history: 1\\n  depth: 5\"\n      message_count: \
+             {count}\n"
         )
     };
     let topics: String = counts.iter().map(topic).collect();
     let format = if mode.is_empty() { "" } else { "zstd" };
     format!(
-        "rosbag2_bagfile_information:\n  version: {version}\n  storage_identifier: {storage}\n  relative_file_paths:\n{files}\
-         \x20 duration:\n    nanoseconds: 1\n  starting_time:\n    nanoseconds_since_epoch: 1\n  message_count: {}\n\
-         \x20 topics_with_message_count:\n{topics}  compression_format: \"{format}\"\n  compression_mode: \"{mode}\"\n",
+        "rosbag2_bagfile_information:\n  version: {version}\n  storage_identifier: {storage}\n  \
+         relative_file_paths:\n{files}\
+         \x20 duration:\n    nanoseconds: 1\n  starting_time:\n    nanoseconds_since_epoch: 1\n  \
+         message_count: {}\n\
+         \x20 topics_with_message_count:\n{topics}  compression_format: \"{format}\"\n  \
+         compression_mode: \"{mode}\"\n",
         messages.len()
     )
 }
@@ -176,7 +186,7 @@ pub fn write_metadata(folder: &Path, text: &str) {
     fs::write(folder.join("metadata.yaml"), text).unwrap();
 }
 
-/// The path of a new database in `folder` with `messages`.
+/// Creates a database in `folder` with `messages`, and returns its path.
 pub fn database_in(folder: &TempDir, messages: &[Written]) -> PathBuf {
     let path = folder.path().join("drive.db3");
     database(&path, messages);

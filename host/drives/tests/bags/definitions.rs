@@ -1,10 +1,9 @@
-//! Where the definitions of a recorded topic come from: its file first, then the places that live
-//! topics have.
+//! Tests the sources of definitions of a recorded topic: its file first, then those of live topics.
 
 use std::fs;
 use std::path::PathBuf;
 
-use gleaner_drives::{Options, Replay};
+use gleaner_drives::{DriveOptions, Replay};
 use gleaner_messages::{FieldPath, Sources};
 use gleaner_transport::{Transport, TransportError};
 
@@ -15,10 +14,10 @@ const IMU: &str = "sensor_msgs/msg/Imu";
 
 fn open(path: PathBuf, msg: Option<PathBuf>) -> Replay {
     let sources = Some(Sources::new(&Vec::from_iter(msg), &[]));
-    Replay::open_as(&[path], &Options { sources, ..Options::default() }).unwrap()
+    Replay::open_as(&[path], &DriveOptions { sources, ..DriveOptions::default() }).unwrap()
 }
 
-/// A database with one topic, whose text is written as `text` says, in its encoding.
+/// Creates a database with one topic, whose `text` is an encoding and a definition.
 fn database(type_name: &str, text: Option<(&str, &str)>) -> (tempfile::TempDir, PathBuf) {
     let folder = folder();
     let path = folder.path().join("drive.db3");
@@ -31,7 +30,7 @@ fn database(type_name: &str, text: Option<(&str, &str)>) -> (tempfile::TempDir, 
 }
 
 #[test]
-fn a_type_that_the_file_does_not_carry_is_found_among_those_of_ros_2() {
+fn a_type_that_the_file_does_not_carry_is_found_in_ros_2() {
     let (_folder, path) = database(IMU, None);
     let replay = open(path.clone(), None);
     FieldPath::compile(&replay.definitions("/a").unwrap(), "linear_acceleration.x").unwrap();
@@ -43,7 +42,7 @@ fn a_type_that_the_file_does_not_carry_is_found_among_those_of_ros_2() {
             .unwrap()
             .contains("MSG: geometry_msgs/Vector3")
     );
-    // Who only looks into files finds what is there.
+    // Without sources, only the definitions in the files are used.
     let plain = Replay::open(&[path]).unwrap();
     assert!(matches!(plain.definitions("/a"), Err(TransportError::NoDefinitions { .. })));
     assert_eq!(plain.topics()[0].definitions_text, None);
@@ -68,7 +67,7 @@ fn the_file_comes_before_the_lambda_and_the_lambda_before_ros_2() {
 fn a_text_in_idl_is_refused_unless_there_is_another() {
     let ty = crate::support::TYPE;
     let (_folder, path) = database(ty, Some(("ros2idl", "module test_msgs {};")));
-    let memory = std::sync::Arc::new(crate::support::Memory::default());
+    let memory = std::sync::Arc::new(crate::support::MemorySink::default());
     let refused = open(path.clone(), None).subscribe(&spec("/a"), memory).unwrap_err();
     assert_eq!(
         refused.to_string(),
@@ -83,7 +82,7 @@ fn a_text_in_idl_is_refused_unless_there_is_another() {
 }
 
 #[test]
-fn a_type_that_is_nowhere_can_be_subscribed_but_not_read_by_field() {
+fn a_type_without_definitions_can_be_subscribed_but_not_read_by_field() {
     let (_folder, path) = database(crate::support::TYPE, None);
     let mut replay = open(path, None);
     listen(&mut replay, &["/a"]);
@@ -91,7 +90,7 @@ fn a_type_that_is_nowhere_can_be_subscribed_but_not_read_by_field() {
 }
 
 #[test]
-fn definitions_beside_the_lambda_that_make_no_sense_are_named() {
+fn the_error_names_invalid_definitions_of_the_lambda() {
     let msg = folder();
     fs::create_dir_all(msg.path().join("test_msgs/msg")).unwrap();
     fs::write(msg.path().join("test_msgs/msg/Number.msg"), "int64\n").unwrap();

@@ -1,19 +1,19 @@
-//! Databases that lie, are damaged, or want more than they are given.
+//! Tests databases that are malicious, damaged, or too large.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use gleaner_drives::{Damage, Limits, Place, Replay, ReplayError};
+use gleaner_drives::{Damage, DamageLocation, DriveLimits, Replay, ReplayError};
 use gleaner_transport::Transport;
 use rusqlite::Connection;
 
 use crate::bag::{add_message, add_topic, cdr, database_in, empty_database, folder};
-use crate::support::{Memory, TYPE, expected, file, listen, run, spec, ticking};
+use crate::support::{MemorySink, TYPE, expected, file, listen, run, spec, ticking};
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
 
-pub fn damage(error: Option<ReplayError>) -> (Place, Damage) {
+pub fn damage(error: Option<ReplayError>) -> (DamageLocation, Damage) {
     match error {
         Some(ReplayError::Damaged { at, what, .. }) => (at, what),
         other => panic!("expected damage, got {other:?}"),
@@ -21,10 +21,10 @@ pub fn damage(error: Option<ReplayError>) -> (Place, Damage) {
 }
 
 pub fn refused(path: &Path) -> ReplayError {
-    Replay::open(&[path.to_owned()]).err().expect("it is refused")
+    Replay::open(&[path.to_owned()]).err().expect("an error")
 }
 
-/// What a database of one topic delivers, and how it ends.
+/// Returns the messages that a database of one topic delivers, and the error at its end.
 fn replayed(path: &Path) -> (Vec<(i64, i64)>, Option<ReplayError>) {
     let mut replay = Replay::open(&[path.to_owned()]).unwrap();
     let memory = listen(&mut replay, &["/a"]);
@@ -32,7 +32,7 @@ fn replayed(path: &Path) -> (Vec<(i64, i64)>, Option<ReplayError>) {
     (memory.values(), error)
 }
 
-/// A database with five messages, then changed by `sql`.
+/// Creates a database with five messages, then changes it by `sql`.
 fn changed(sql: &str) -> (tempfile::TempDir, PathBuf) {
     let folder = folder();
     let path = database_in(&folder, &ticking(&["/a"], 5, 10));
@@ -41,7 +41,7 @@ fn changed(sql: &str) -> (tempfile::TempDir, PathBuf) {
 }
 
 #[test]
-fn a_database_cut_anywhere_gives_what_is_readable_and_says_so() {
+fn a_database_truncated_anywhere_delivers_its_readable_part_and_an_error() {
     let messages = ticking(&TOPICS, 6000, 1000);
     let folder = folder();
     let path = database_in(&folder, &messages);
@@ -52,7 +52,7 @@ fn a_database_cut_anywhere_gives_what_is_readable_and_says_so() {
         fs::write(&path, &bytes[..cut]).unwrap();
         let mut replay = match Replay::open(std::slice::from_ref(&path)) {
             Ok(replay) => replay,
-            // The pages that say what is in it are missing.
+            // The pages with its tables are missing.
             Err(ReplayError::Database { .. }) => continue,
             Err(error) => panic!("cut at {cut}: {error}"),
         };
@@ -68,7 +68,7 @@ fn a_database_cut_anywhere_gives_what_is_readable_and_says_so() {
 }
 
 #[test]
-fn flipped_bytes_in_a_database_are_damage_or_other_messages_and_nothing_worse() {
+fn flipped_bytes_in_a_database_cause_only_damage_or_other_messages() {
     let messages = ticking(&TOPICS, 800, 1000);
     let folder = folder();
     let path = database_in(&folder, &messages);
@@ -76,7 +76,7 @@ fn flipped_bytes_in_a_database_are_damage_or_other_messages_and_nothing_worse() 
     let mut damaged = 0;
     for step in 0..400 {
         let mut bytes = bytes.clone();
-        // A prime, so that every part of a page is met.
+        // A prime, so that every part of a page is hit.
         let at = step * 7919 % bytes.len();
         bytes[at] ^= 0xff;
         fs::write(&path, &bytes).unwrap();
@@ -84,7 +84,7 @@ fn flipped_bytes_in_a_database_are_damage_or_other_messages_and_nothing_worse() 
             damaged += 1;
             continue;
         };
-        let memory = Arc::new(Memory::default());
+        let memory = Arc::new(MemorySink::default());
         TOPICS.iter().for_each(|topic| drop(replay.subscribe(&spec(topic), memory.clone())));
         let (steps, error) = run(&mut replay);
         assert!(steps.len() <= 800, "byte {at}: {} messages", steps.len());
@@ -95,26 +95,26 @@ fn flipped_bytes_in_a_database_are_damage_or_other_messages_and_nothing_worse() 
 }
 
 #[test]
-fn messages_that_are_no_cdr_end_the_drive_where_they_stand() {
-    for (value, said) in [
+fn messages_that_are_not_cdr_end_the_drive_at_their_position() {
+    for (value, expected) in [
         ("x''", "begins with []"),
         ("x'00'", "begins with [00]"),
         ("x'000100'", "begins with [00, 01, 00]"),
         ("x'0700000001020304'", "begins with [07, 00, 00, 00]"),
-        ("'text'", "something else than bytes"),
-        ("17", "something else than bytes"),
+        ("'text'", "not a blob"),
+        ("17", "not a blob"),
         ("x'28b52ffd'", "cannot be unpacked"),
     ] {
         let (_folder, path) = changed(&format!("UPDATE messages SET data = {value} WHERE id = 4;"));
         let (all, error) = replayed(&path);
         assert_eq!(all.len(), 3, "{value}");
         let what = damage(error).1.to_string();
-        assert!(what.contains(said), "{value}: {what}");
+        assert!(what.contains(expected), "{value}: {what}");
     }
 }
 
 #[test]
-fn a_message_without_bytes_is_damage_and_not_passed_over() {
+fn a_message_without_bytes_is_damage_and_not_skipped() {
     let folder = folder();
     let path = folder.path().join("drive.db3");
     let db = Connection::open(&path).unwrap();
@@ -125,16 +125,16 @@ fn a_message_without_bytes_is_damage_and_not_passed_over() {
         .unwrap();
     drop(db);
     let what = damage(replayed(&path).1).1.to_string();
-    assert!(what.contains("something else than bytes"), "{what}");
+    assert!(what.contains("not a blob"), "{what}");
 }
 
 #[test]
-fn times_that_are_none_are_damage() {
-    for (time, left, at, said) in [
-        ("-5", 0, Place::Message(0), "is from before 1970"),
-        ("NULL", 0, Place::Message(0), "no whole number"),
-        ("'soon'", 4, Place::Message(5), "no whole number"),
-        ("1e300", 4, Place::Message(5), "no whole number"),
+fn invalid_times_are_damage() {
+    for (time, left, at, expected) in [
+        ("-5", 0, DamageLocation::Message(0), "is from before 1970"),
+        ("NULL", 0, DamageLocation::Message(0), "not an integer"),
+        ("'soon'", 4, DamageLocation::Message(5), "not an integer"),
+        ("1e300", 4, DamageLocation::Message(5), "not an integer"),
     ] {
         let folder = folder();
         let path = folder.path().join("drive.db3");
@@ -150,43 +150,49 @@ fn times_that_are_none_are_damage() {
         db.execute_batch(&format!("UPDATE messages SET timestamp = {time} WHERE id = 3")).unwrap();
         drop(db);
         let (all, error) = replayed(&path);
-        let (place, what) = damage(error);
-        assert_eq!((all.len(), place), (left, at), "{time}");
-        assert!(what.to_string().contains(said), "{time}: {what}");
+        let (location, what) = damage(error);
+        assert_eq!((all.len(), location), (left, at), "{time}");
+        assert!(what.to_string().contains(expected), "{time}: {what}");
     }
 }
 
 #[test]
-fn a_message_of_no_topic_is_damage() {
+fn a_message_of_an_undefined_topic_is_damage() {
     let (_folder, path) = changed("UPDATE messages SET topic_id = 77 WHERE id = 3;");
     let (all, error) = replayed(&path);
     assert_eq!(all.len(), 2);
-    let (place, what) = damage(error);
-    assert_eq!(place, Place::Message(2));
+    let (location, what) = damage(error);
+    assert_eq!(location, DamageLocation::Message(2));
     assert!(matches!(what, Damage::UnknownTopic(77)));
 }
 
 #[test]
-fn what_computes_instead_of_holding_is_refused() {
-    let recursion = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x FROM n) SELECT x AS id, 1 AS topic_id, x AS timestamp, \
+fn views_virtual_tables_and_computed_columns_are_refused() {
+    let recursion = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x FROM n) SELECT x AS id, \
+                     1 AS topic_id, x AS timestamp, \
                      zeroblob(1000000000) AS data FROM n";
-    for (sql, said) in [
-        (format!("DROP TABLE messages; CREATE VIEW messages AS {recursion};"), "no plain table"),
+    for (sql, expected) in [
+        (format!("DROP TABLE messages; CREATE VIEW messages AS {recursion};"), "not a plain table"),
         (
-            "DROP TABLE topics; CREATE VIRTUAL TABLE topics USING fts5(id, name, type, serialization_format);"
+            "DROP TABLE topics; CREATE VIRTUAL TABLE topics USING fts5(id, name, type, \
+             serialization_format);"
                 .to_owned(),
-            "no plain table",
+            "not a plain table",
         ),
         (
-            // As a program writes it that wants it not to be seen.
-            "CREATE VIRTUAL TABLE other USING fts5(id, name, type, serialization_format); DROP TABLE topics; \
-             PRAGMA writable_schema = ON; UPDATE sqlite_schema SET name = 'topics', tbl_name = 'topics', \
-             sql = 'CREATE /**/  VIRTUAL TABLE topics USING fts5(id, name, type, serialization_format)' WHERE name = 'other';"
+            // As a program writes it to hide it.
+            "CREATE VIRTUAL TABLE other USING fts5(id, name, type, serialization_format); DROP \
+             TABLE topics; \
+             PRAGMA writable_schema = ON; UPDATE sqlite_schema SET name = 'topics', tbl_name = \
+             'topics', \
+             sql = 'CREATE /**/  VIRTUAL TABLE topics USING fts5(id, name, type, \
+             serialization_format)' WHERE name = 'other';"
                 .to_owned(),
-            "no plain table",
+            "not a plain table",
         ),
         (
-            "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, \
+            "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, \
+             timestamp INTEGER, \
              data BLOB AS (zeroblob(1000000000)));"
                 .to_owned(),
             "no column `data`",
@@ -196,15 +202,16 @@ fn what_computes_instead_of_holding_is_refused() {
     ] {
         let (_folder, path) = changed(&sql);
         let ReplayError::Database { source, .. } = refused(&path) else { panic!("{sql}") };
-        assert!(source.to_string().contains(said), "{sql}: {source}");
+        assert!(source.to_string().contains(expected), "{sql}: {source}");
     }
 }
 
 #[test]
-fn a_database_without_an_index_of_times_says_how_to_make_one() {
+fn the_error_for_a_missing_time_index_has_the_command_that_creates_it() {
     for sql in [
         "DROP INDEX timestamp_idx;",
-        "DROP INDEX timestamp_idx; CREATE INDEX timestamp_idx ON messages (timestamp) WHERE topic_id = 1;",
+        "DROP INDEX timestamp_idx; CREATE INDEX timestamp_idx ON messages (timestamp) WHERE \
+         topic_id = 1;",
         "DROP INDEX timestamp_idx; CREATE INDEX timestamp_idx ON messages (timestamp + 0);",
         "DROP INDEX timestamp_idx; CREATE INDEX timestamp_idx ON messages (timestamp DESC);",
     ] {
@@ -213,29 +220,30 @@ fn a_database_without_an_index_of_times_says_how_to_make_one() {
         assert!(matches!(error, ReplayError::NoTimes { .. }), "{sql}: {error}");
         assert!(error.help().unwrap().contains("CREATE INDEX timestamp_idx"));
     }
-    // Any name will do.
+    // The name of the index does not matter.
     let (_folder, path) =
         changed("DROP INDEX timestamp_idx; CREATE INDEX \"a \"\" b\" ON messages (timestamp);");
     assert_eq!(replayed(&path).0.len(), 5);
 }
 
 #[test]
-fn what_sqlite_would_have_to_sort_in_memory_is_refused() {
-    let table = "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER";
-    for (columns, index, said) in [
+fn an_index_that_sqlite_would_have_to_sort_in_memory_is_refused() {
+    let table = "DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id \
+                 INTEGER, timestamp INTEGER";
+    for (columns, index, expected) in [
         ("COLLATE NOCASE, data BLOB", "timestamp COLLATE BINARY", "cannot be read in order"),
-        (", data BLOB, RowID INTEGER", "timestamp", "calls a column `rowid`"),
-        (", data BLOB, rowid INTEGER AS (1)", "timestamp", "calls a column `rowid`"),
+        (", data BLOB, RowID INTEGER", "timestamp", "has a column `rowid`"),
+        (", data BLOB, rowid INTEGER AS (1)", "timestamp", "has a column `rowid`"),
     ] {
         let (_folder, path) =
             changed(&format!("{table} {columns}); CREATE INDEX at ON messages ({index});"));
         let ReplayError::Database { source, .. } = refused(&path) else { panic!("{columns}") };
-        assert!(source.to_string().contains(said), "{columns}: {source}");
+        assert!(source.to_string().contains(expected), "{columns}: {source}");
     }
 }
 
 #[test]
-fn a_schema_of_a_version_that_is_not_known_is_refused_by_its_number() {
+fn a_schema_of_an_unknown_version_is_refused() {
     let schema =
         "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);";
     for version in [0, 5, 99, -1] {
@@ -254,37 +262,37 @@ fn a_schema_of_a_version_that_is_not_known_is_refused_by_its_number() {
 }
 
 #[test]
-fn a_number_that_two_topics_have_is_refused() {
+fn two_topics_with_the_same_number_are_refused() {
     let (_folder, path) = changed(
-        "DROP TABLE topics; CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT);
-         INSERT INTO topics VALUES (1, '/a', 'test_msgs/msg/Number', 'cdr'), (1, '/b', 'test_msgs/msg/Number', 'cdr');",
+        "DROP TABLE topics; CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, \
+         serialization_format TEXT);
+         INSERT INTO topics VALUES (1, '/a', 'test_msgs/msg/Number', 'cdr'), (1, '/b', \
+         'test_msgs/msg/Number', 'cdr');",
     );
-    let ReplayError::Database { source, .. } = refused(&path) else {
-        panic!("it is another error")
-    };
+    let ReplayError::Database { source, .. } = refused(&path) else { panic!("another error") };
     assert!(source.to_string().contains("two of its topics have the number 1"), "{source}");
 }
 
 #[test]
-fn more_definitions_than_a_drive_can_need_are_refused_however_short() {
+fn too_many_definitions_are_refused_even_if_they_are_short() {
     let (_folder, path) = changed(
         "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n LIMIT 600000)
-         INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash)
+         INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, \
+         type_description_hash)
          SELECT '', '', '', '' FROM n;",
     );
-    let ReplayError::Database { source, .. } = refused(&path) else {
-        panic!("it is another error")
-    };
+    let ReplayError::Database { source, .. } = refused(&path) else { panic!("another error") };
     assert!(source.to_string().contains("more than 64 MiB"), "{source}");
 }
 
 #[test]
-fn an_index_that_lost_messages_or_their_order_is_noticed_where_it_shows() {
-    // The index says another order than the table: what it gives has to come in order.
+fn an_index_with_missing_or_unordered_messages_is_damage() {
+    // The index has another order than the table: its result must be in order.
     let (_folder, path) = changed(
         "PRAGMA writable_schema = ON;
          CREATE INDEX other ON messages (id);
-         UPDATE sqlite_schema SET rootpage = (SELECT rootpage FROM sqlite_schema WHERE name = 'messages') WHERE name = 'timestamp_idx';",
+         UPDATE sqlite_schema SET rootpage = (SELECT rootpage FROM sqlite_schema WHERE name = \
+         'messages') WHERE name = 'timestamp_idx';",
     );
     match Replay::open(std::slice::from_ref(&path)) {
         Err(ReplayError::Database { .. }) => {}
@@ -297,7 +305,7 @@ fn an_index_that_lost_messages_or_their_order_is_noticed_where_it_shows() {
 }
 
 #[test]
-fn a_database_that_was_not_closed_is_refused_with_the_way_out() {
+fn the_error_for_a_database_that_was_not_closed_has_the_way_out() {
     let folder = folder();
     let path = folder.path().join("drive.db3");
     let db = empty_database(&path);
@@ -307,7 +315,7 @@ fn a_database_that_was_not_closed_is_refused_with_the_way_out() {
     let error = refused(&path);
     assert!(matches!(error, ReplayError::NotClosed { .. }), "{error}");
     assert!(error.help().unwrap().contains("wal_checkpoint"));
-    // Its writer closes it, and takes the journal away.
+    // Its writer closes it, and removes the journal.
     drop(db);
     let (all, error) = replayed(&path);
     assert!(error.is_none(), "{error:?}");
@@ -315,7 +323,7 @@ fn a_database_that_was_not_closed_is_refused_with_the_way_out() {
 }
 
 #[test]
-fn a_journal_that_cannot_be_looked_into_is_not_taken_for_none() {
+fn a_journal_that_cannot_be_read_is_an_error() {
     let folder = folder();
     let path = database_in(&folder, &ticking(&["/a"], 5, 10));
     for suffix in ["-wal", "-journal"] {
@@ -326,14 +334,14 @@ fn a_journal_that_cannot_be_looked_into_is_not_taken_for_none() {
             "{suffix}"
         );
         fs::remove_dir(&beside).unwrap();
-        // As SQLite leaves it.
+        // Content of a journal that SQLite has finished.
         fs::write(&beside, [0; 512]).unwrap();
         assert_eq!(replayed(&path).0.len(), 5);
     }
 }
 
 #[test]
-fn a_pipe_is_refused_and_not_waited_for() {
+fn a_pipe_is_refused_without_blocking() {
     let folder = folder();
     let path = database_in(&folder, &ticking(&["/a"], 5, 10));
     let pipe = |name: &str| {
@@ -350,7 +358,7 @@ fn a_pipe_is_refused_and_not_waited_for() {
 }
 
 #[test]
-fn what_only_begins_like_a_database_is_refused() {
+fn a_file_that_only_begins_like_a_database_is_refused() {
     let start = b"SQLite format 3\0";
     for rest in [&b""[..], &[0; 84], &[0xff; 5000]] {
         let path = file(&[&start[..], rest].concat());
@@ -367,7 +375,7 @@ fn a_message_of_a_database_beyond_the_limit_is_damage() {
     add_message(&db, topic, 5, &cdr(&ticking(&["/a"], 1, 5)[0]));
     add_message(&db, topic, 6, &[&[0, 1, 0, 0][..], &vec![0; 2 << 20]].concat());
     drop(db);
-    let limits = Limits { chunk_bytes: 1 << 20, ..Limits::default() };
+    let limits = DriveLimits { chunk_bytes: 1 << 20, ..DriveLimits::default() };
     let mut replay = Replay::open_with(&[path], limits).unwrap();
     listen(&mut replay, &["/a"]);
     let (steps, error) = run(&mut replay);

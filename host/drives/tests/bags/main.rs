@@ -1,4 +1,4 @@
-//! Directories, databases and packed files of rosbag2, made on the spot as its writers make them.
+//! Tests directories, databases and packed files of rosbag2, created in the form of its writers.
 
 mod bag;
 mod definitions;

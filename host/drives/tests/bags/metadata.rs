@@ -1,4 +1,4 @@
-//! Directories whose metadata cannot be used, or lead elsewhere.
+//! Tests directories whose metadata cannot be used, or lead elsewhere.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -6,22 +6,22 @@ use std::path::PathBuf;
 
 use gleaner_drives::{Replay, ReplayError};
 
-use crate::bag::{Packed, Storage, bag, database, folder, metadata, write_metadata};
+use crate::bag::{Packing, Storage, bag, database, folder, metadata, write_metadata};
 use crate::support::{drive, file, listen, run, small_chunks, ticking};
 
 fn refused(path: &std::path::Path) -> ReplayError {
-    Replay::open(&[path.to_owned()]).err().expect("it is refused")
+    Replay::open(&[path.to_owned()]).err().expect("an error")
 }
 
 #[test]
 fn metadata_that_are_a_link_out_of_the_directory_are_refused() {
-    let (bag, other) = (bag(Storage::Mcap, Packed::No, &[&ticking(&["/a"], 3, 10)]), folder());
+    let (bag, other) = (bag(Storage::Mcap, Packing::No, &[&ticking(&["/a"], 3, 10)]), folder());
     let (path, elsewhere) = (bag.path().join("metadata.yaml"), other.path().join("metadata.yaml"));
     fs::rename(&path, &elsewhere).unwrap();
     std::os::unix::fs::symlink(&elsewhere, &path).unwrap();
     let error = Replay::open(&[bag.path().to_owned()]).err().unwrap();
     assert!(matches!(error, ReplayError::Metadata { .. }), "{error}");
-    // Within, a link is one of the ways to name a file.
+    // A link inside the directory is allowed.
     fs::remove_file(&path).unwrap();
     fs::rename(&elsewhere, bag.path().join("old.yaml")).unwrap();
     std::os::unix::fs::symlink("old.yaml", &path).unwrap();
@@ -46,25 +46,25 @@ fn a_path_that_leaves_the_directory_is_refused() {
         assert!(error.to_string().contains("is not in its directory"), "{error}");
         assert!(error.help().is_some());
     }
-    // Without metadata, a link is no file of the directory.
+    // Without metadata, a link is not a file of the directory.
     fs::remove_file(inside.join("metadata.yaml")).unwrap();
     assert!(matches!(refused(&inside), ReplayError::NoBag { .. }));
 }
 
 #[test]
-fn a_file_that_is_missing_is_named_with_the_way_out() {
+fn the_error_names_a_missing_file_and_the_way_out() {
     let messages = ticking(&["/a"], 5, 10);
-    let bag = bag(Storage::Mcap, Packed::No, &[&messages[..2], &messages[2..]]);
+    let bag = bag(Storage::Mcap, Packing::No, &[&messages[..2], &messages[2..]]);
     fs::remove_file(bag.path().join("bag_1.mcap")).unwrap();
     let error = refused(bag.path());
-    assert!(error.to_string().contains("names `bag_1.mcap`, which is not there"), "{error}");
+    assert!(error.to_string().contains("names `bag_1.mcap`, which does not exist"), "{error}");
     assert!(error.help().unwrap().contains("ros2 bag reindex"));
 }
 
 #[test]
-fn metadata_that_are_none_are_refused_with_their_path() {
+fn invalid_metadata_are_refused_with_their_path() {
     let messages = ticking(&["/a"], 5, 10);
-    let bag = bag(Storage::Mcap, Packed::No, &[&messages]);
+    let bag = bag(Storage::Mcap, Packing::No, &[&messages]);
     let large = format!("# {}\n", "x".repeat(17 << 20));
     for text in ["", "{", "\0", "rosbag2_bagfile_information: []\n", large.as_str()] {
         write_metadata(bag.path(), text);
@@ -78,7 +78,7 @@ fn metadata_that_are_none_are_refused_with_their_path() {
 }
 
 #[test]
-fn an_empty_directory_says_what_is_missing() {
+fn the_error_for_an_empty_directory_names_what_is_missing() {
     let folder = folder();
     let error = refused(folder.path());
     assert!(
@@ -89,15 +89,15 @@ fn an_empty_directory_says_what_is_missing() {
 }
 
 #[test]
-fn a_file_that_is_given_beside_its_directory_is_given_twice() {
+fn a_file_given_together_with_its_directory_is_given_twice() {
     let messages = ticking(&["/a"], 5, 10);
-    let bag = bag(Storage::Mcap, Packed::No, &[&messages]);
+    let bag = bag(Storage::Mcap, Packing::No, &[&messages]);
     let paths: [PathBuf; 2] = [bag.path().to_owned(), bag.path().join("./bag_0.mcap")];
     assert!(matches!(Replay::open(&paths), Err(ReplayError::Twice { .. })));
 }
 
 #[test]
-fn a_recorder_that_counted_more_than_it_wrote_did_not_damage_the_drive() {
+fn a_higher_message_count_in_the_metadata_is_not_damage() {
     let messages = ticking(&["/a"], 50, 10);
     let folder = folder();
     database(&folder.path().join("drive_0.db3"), &messages[..40]);
@@ -111,7 +111,7 @@ fn a_recorder_that_counted_more_than_it_wrote_did_not_damage_the_drive() {
 }
 
 #[test]
-fn a_drive_that_was_cut_off_is_one_in_a_directory_too() {
+fn a_truncated_file_of_a_directory_is_damage() {
     let messages = ticking(&["/a"], 50, 10);
     let bytes = drive(small_chunks(), &messages);
     let folder = folder();

@@ -1,4 +1,4 @@
-//! Packed files and messages that are damaged, or want more than they are given.
+//! Tests packed files and messages that are damaged or too large.
 
 use std::fs;
 use std::path::PathBuf;
@@ -6,30 +6,30 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, SystemTime};
 
-use gleaner_drives::{Damage, Limits, Options, Replay, ReplayError, Unpacked, unpack};
-use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_drives::{Damage, DriveLimits, DriveOptions, Replay, ReplayError, Unpacked, unpack};
+use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
 
-use crate::bag::{Packed, Storage, bag, cdr, folder, mcap_of, packed};
+use crate::bag::{Packing, Storage, bag, cdr, folder, mcap_of, packed};
 use crate::hostile::{damage, refused};
-use crate::support::{Memory, drive, expected, file, listen, run, small_chunks, spec, ticking};
+use crate::support::{MemorySink, drive, expected, file, listen, run, small_chunks, spec, ticking};
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
 
-/// Takes messages up to a size, and notes the largest that it was shown.
-struct UpTo {
+/// Takes messages up to a size, and notes the largest one offered.
+struct LimitedSink {
     most: usize,
     shown: AtomicUsize,
 }
 
-impl Sink for UpTo {
-    fn deliver(&self, _: &SampleMeta, cdr: &[u8]) -> Verdict {
+impl Sink for LimitedSink {
+    fn deliver(&self, _: &SampleMeta, cdr: &[u8]) -> Delivery {
         self.shown.fetch_max(cdr.len(), Ordering::Relaxed);
-        if cdr.len() > self.most { Verdict::TooBig } else { Verdict::Taken }
+        if cdr.len() > self.most { Delivery::TooBig } else { Delivery::Taken }
     }
 }
 
 #[test]
-fn a_message_that_unpacks_to_too_much_is_too_big_and_the_next_is_not() {
+fn a_message_that_unpacks_to_too_much_is_too_big_but_the_next_is_not() {
     let messages = ticking(&["/a"], 3, 10);
     let bytes = mcap_of(&messages, |message| match message.value {
         1 => packed(&[&[0, 1, 0, 0][..], &vec![0; 100 << 20]].concat()),
@@ -38,19 +38,22 @@ fn a_message_that_unpacks_to_too_much_is_too_big_and_the_next_is_not() {
     assert!(bytes.len() < 100_000, "{}", bytes.len());
     let path = file(&bytes);
     let open = |limits| Replay::open_with(std::slice::from_ref(&path), limits).unwrap();
-    let mut replay = open(Limits::default());
-    let sink = Arc::new(UpTo { most: 1000, shown: AtomicUsize::new(0) });
+    let mut replay = open(DriveLimits::default());
+    let sink = Arc::new(LimitedSink { most: 1000, shown: AtomicUsize::new(0) });
     let small = TopicSpec { max_bytes: 1000, ..spec("/a") };
     replay.subscribe(&small, sink.clone()).unwrap();
     let (steps, error) = run(&mut replay);
     assert!(error.is_none(), "{error:?}");
-    let verdicts: Vec<_> = steps.iter().map(|step| step.verdict).collect();
-    assert_eq!(verdicts, [Verdict::Taken, Verdict::TooBig, Verdict::Taken]);
+    let deliveries: Vec<_> = steps.iter().map(|step| step.delivery).collect();
+    assert_eq!(deliveries, [Delivery::Taken, Delivery::TooBig, Delivery::Taken]);
     assert_eq!(sink.shown.load(Ordering::Relaxed), 8);
-    // Whoever takes anything is told where it ends.
-    let mut replay = open(Limits { chunk_bytes: 1 << 20, ..Limits::default() });
+    // A sink without a limit gets an error at the limit of the drive.
+    let mut replay = open(DriveLimits { chunk_bytes: 1 << 20, ..DriveLimits::default() });
     replay
-        .subscribe(&TopicSpec { max_bytes: usize::MAX, ..spec("/a") }, Arc::new(Memory::default()))
+        .subscribe(
+            &TopicSpec { max_bytes: usize::MAX, ..spec("/a") },
+            Arc::new(MemorySink::default()),
+        )
         .unwrap();
     let (steps, error) = run(&mut replay);
     assert_eq!(steps.len(), 1);
@@ -58,7 +61,7 @@ fn a_message_that_unpacks_to_too_much_is_too_big_and_the_next_is_not() {
 }
 
 #[test]
-fn a_packed_message_is_whole_or_too_big_even_for_who_takes_anything() {
+fn a_packed_message_is_delivered_whole_or_is_too_big() {
     let messages = ticking(&["/a"], 3, 10);
     let large = [&[0, 1, 0, 0][..], &vec![7; 5000]].concat();
     let path = file(&mcap_of(&messages, |message| match message.value {
@@ -73,7 +76,7 @@ fn a_packed_message_is_whole_or_too_big_even_for_who_takes_anything() {
         (&[1000, 1 << 30, 2000], &[8, 8, 8, 5000, 8, 8, 8]),
     ] {
         let mut replay = Replay::open(std::slice::from_ref(&path)).unwrap();
-        let memory = Arc::new(Memory::default());
+        let memory = Arc::new(MemorySink::default());
         for &max_bytes in limits {
             replay.subscribe(&TopicSpec { max_bytes, ..spec("/a") }, memory.clone()).unwrap();
         }
@@ -81,12 +84,12 @@ fn a_packed_message_is_whole_or_too_big_even_for_who_takes_anything() {
         assert!(error.is_none(), "{error:?}");
         let taken: Vec<_> = memory.0.lock().unwrap().iter().map(|(_, cdr)| cdr.len()).collect();
         assert_eq!(taken, lens, "{limits:?}");
-        let too_big = steps.iter().filter(|step| step.verdict == Verdict::TooBig).count();
+        let too_big = steps.iter().filter(|step| step.delivery == Delivery::TooBig).count();
         assert_eq!(too_big, 3 * limits.len() - lens.len(), "{limits:?}");
     }
 }
 
-/// Bytes that no compression makes smaller.
+/// Incompressible bytes.
 fn noise(len: u32) -> Vec<u8> {
     let mut state = 1_u32;
     let mut next = || {
@@ -102,14 +105,17 @@ fn noise(len: u32) -> Vec<u8> {
 fn a_file_that_unpacks_to_too_much_is_refused_and_leaves_nothing() {
     let folder = folder();
     let small = drive(small_chunks(), &ticking(&["/a"], 3, 10));
-    let limits = Limits { unpacked_bytes: 1 << 20, ..Limits::default() };
-    let options =
-        Options { limits, unpack_in: Some(folder.path().to_owned()), ..Options::default() };
+    let limits = DriveLimits { unpacked_bytes: 1 << 20, ..DriveLimits::default() };
+    let options = DriveOptions {
+        limits,
+        unpack_in: Some(folder.path().to_owned()),
+        ..DriveOptions::default()
+    };
     let open = |paths: &[PathBuf]| Replay::open_as(paths, &options).map(drop);
     let error = open(&[file(&packed(&[&small[..], &noise(2 << 20)].concat()))]).unwrap_err();
     assert!(matches!(error, ReplayError::UnpacksTooLarge { allowed: 1_048_576, .. }), "{error}");
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
-    // Nor in parts.
+    // The limit holds for all files together.
     let part = [&small[..], &noise(700 << 10)].concat();
     let parts = [file(&packed(&part)), file(&packed(&part))];
     open(&parts[..1]).unwrap();
@@ -127,9 +133,12 @@ fn a_bomb_is_refused_by_its_size_long_before_the_disk_is_full() {
     let bomb = packed(
         &[&drive(small_chunks(), &ticking(&["/a"], 3, 10))[..], &vec![0; 64 << 20]].concat(),
     );
-    let limits = Limits { unpacked_bytes: 64 << 20, ..Limits::default() };
-    let options =
-        Options { limits, unpack_in: Some(folder.path().to_owned()), ..Options::default() };
+    let limits = DriveLimits { unpacked_bytes: 64 << 20, ..DriveLimits::default() };
+    let options = DriveOptions {
+        limits,
+        unpack_in: Some(folder.path().to_owned()),
+        ..DriveOptions::default()
+    };
     let error = Replay::open_as(&[file(&bomb)], &options).err().unwrap();
     let ReplayError::UnpacksManyTimes { allowed, .. } = &error else { panic!("{error}") };
     assert_eq!(*allowed, (200 * bomb.len() as u64).max(1 << 20));
@@ -137,34 +146,37 @@ fn a_bomb_is_refused_by_its_size_long_before_the_disk_is_full() {
 }
 
 #[test]
-fn while_it_is_unpacked_the_content_has_no_name() {
+fn unpacked_content_has_no_name() {
     let folder = folder();
     let messages = ticking(&TOPICS, 60, 1000);
     for storage in [Storage::Mcap, Storage::Sqlite3] {
-        let bag = bag(storage, Packed::Files, &[&messages]);
-        let options = Options { unpack_in: Some(folder.path().to_owned()), ..Options::default() };
+        let bag = bag(storage, Packing::Files, &[&messages]);
+        let options =
+            DriveOptions { unpack_in: Some(folder.path().to_owned()), ..DriveOptions::default() };
         let unpacked = unpack(&[bag.path().to_owned()], &options).unwrap();
         assert_eq!(unpacked.len(), 1);
-        // What a kill leaves from here on.
+        // A kill from here on leaves no file.
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "{storage:?}");
     }
 }
 
 #[test]
-fn content_that_another_process_unpacked_is_read_where_nothing_may_be_written() {
+fn content_unpacked_by_another_process_is_read_without_write_access() {
     let messages = ticking(&TOPICS, 60, 1000);
-    let bag = bag(Storage::Mcap, Packed::Files, &[&messages]);
+    let bag = bag(Storage::Mcap, Packing::Files, &[&messages]);
     let paths = [bag.path().to_owned()];
-    let unpacked = unpack(&paths, &Options::default()).unwrap();
-    let names: Vec<_> = unpacked.iter().map(|one| one.name(&Options::default()).unwrap()).collect();
+    let unpacked = unpack(&paths, &DriveOptions::default()).unwrap();
+    let names: Vec<_> =
+        unpacked.iter().map(|one| one.name(&DriveOptions::default()).unwrap()).collect();
     let handed = unpacked.iter().zip(&names).map(|(one, name)| {
         let (path, broken) = one.parts();
         Unpacked::named(path.to_owned(), name.as_ref().to_owned(), broken.map(str::to_owned))
             .unwrap()
     });
     let nowhere = Some(bag.path().join("nowhere"));
-    let options = Options { unpack_in: nowhere, unpacked: handed.collect(), ..Options::default() };
-    // Each reads the same file.
+    let options =
+        DriveOptions { unpack_in: nowhere, unpacked: handed.collect(), ..DriveOptions::default() };
+    // Both replays read the same file.
     let mut replays = [0; 2].map(|_| Replay::open_as(&paths, &options).unwrap());
     let memories = replays.each_mut().map(|replay| listen(replay, &TOPICS));
     for _ in 0..30 {
@@ -179,7 +191,7 @@ fn content_that_another_process_unpacked_is_read_where_nothing_may_be_written() 
 }
 
 #[test]
-fn what_killed_processes_left_is_removed_and_nothing_else() {
+fn only_files_of_killed_processes_are_removed() {
     let folder = folder();
     let packed = file(&packed(&drive(small_chunks(), &ticking(&["/a"], 3, 10))));
     let old = SystemTime::now() - Duration::from_secs(7200);
@@ -197,7 +209,8 @@ fn what_killed_processes_left_is_removed_and_nothing_else() {
     fs::hard_link(path(".unpacked-twice"), path("second")).unwrap();
     fs::create_dir(path(".unpacked-folder")).unwrap();
     std::os::unix::fs::symlink(path("drive.mcap"), path(".unpacked-link")).unwrap();
-    let options = Options { unpack_in: Some(folder.path().to_owned()), ..Options::default() };
+    let options =
+        DriveOptions { unpack_in: Some(folder.path().to_owned()), ..DriveOptions::default() };
     Replay::open_as(&[packed], &options).unwrap();
     let mut left: Vec<_> =
         fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
@@ -207,23 +220,23 @@ fn what_killed_processes_left_is_removed_and_nothing_else() {
 }
 
 #[test]
-fn what_is_nothing_of_ours_is_not_unpacked() {
+fn content_of_an_unknown_format_is_not_unpacked() {
     let folder = folder();
     let nowhere = folder.path().join("not there");
-    let options = Options { unpack_in: Some(nowhere), ..Options::default() };
+    let options = DriveOptions { unpack_in: Some(nowhere), ..DriveOptions::default() };
     let error = Replay::open_as(&[file(&packed(&vec![7; 8 << 20]))], &options).err().unwrap();
     assert!(matches!(error, ReplayError::NotMcap { .. }), "{error}");
 }
 
 #[test]
-fn a_packed_file_that_was_cut_off_gives_what_is_before_the_cut() {
+fn a_truncated_packed_file_delivers_the_messages_before_the_cut() {
     let messages = ticking(&TOPICS, 3000, 1000);
     for storage in [Storage::Mcap, Storage::Sqlite3] {
-        let bag = bag(storage, Packed::Files, &[&messages]);
+        let bag = bag(storage, Packing::Files, &[&messages]);
         let name = if storage == Storage::Mcap { "bag_0.mcap.zstd" } else { "bag_0.db3.zstd" };
         let path = bag.path().join(name);
         let mut plain = zstd::decode_all(&fs::read(&path).unwrap()[..]).unwrap();
-        // Noise behind it, so that zstd ends a block before the cut.
+        // Noise after it, so that zstd ends a block before the cut.
         plain.extend((0..1_000_000_u32).map(|n| (n.wrapping_mul(2_654_435_761) >> 13) as u8));
         let bytes = packed(&plain);
         fs::write(&path, &bytes[..bytes.len() - 10]).unwrap();
@@ -236,7 +249,7 @@ fn a_packed_file_that_was_cut_off_gives_what_is_before_the_cut() {
 }
 
 #[test]
-fn what_is_packed_twice_or_holds_nothing_of_ours_is_refused() {
+fn files_packed_twice_or_of_an_unknown_format_are_refused() {
     let bytes = drive(small_chunks(), &ticking(&["/a"], 3, 10));
     assert!(matches!(refused(&file(&packed(&packed(&bytes)))), ReplayError::NotMcap { .. }));
     assert!(matches!(refused(&file(&packed(b"notes"))), ReplayError::NotMcap { .. }));

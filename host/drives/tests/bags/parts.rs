@@ -1,4 +1,4 @@
-//! A part of a drive, by time.
+//! Tests replays of a part of a drive, by time.
 
 use std::fs;
 use std::path::PathBuf;
@@ -10,7 +10,7 @@ use crate::support::{drive, expected, file, listen, run, small_chunks, ticking};
 
 const TOPICS: [&str; 2] = ["/a", "/b"];
 
-/// What is delivered of a part, and how it ends.
+/// Returns the messages delivered of a part, and the error at its end.
 fn part(path: &PathBuf, from_ns: i64, to_ns: i64) -> (Vec<(i64, i64)>, Option<ReplayError>) {
     let mut replay = Replay::open(std::slice::from_ref(path)).unwrap();
     replay.restrict(from_ns, to_ns);
@@ -20,7 +20,7 @@ fn part(path: &PathBuf, from_ns: i64, to_ns: i64) -> (Vec<(i64, i64)>, Option<Re
 }
 
 #[test]
-fn a_part_has_its_first_time_and_not_its_last() {
+fn a_part_includes_its_first_time_and_not_its_last() {
     let messages = ticking(&TOPICS, 300, 1000);
     let folder = folder();
     let mcap = small_chunks();
@@ -49,7 +49,7 @@ fn a_part_has_its_first_time_and_not_its_last() {
 }
 
 #[test]
-fn damage_behind_the_part_costs_it_nothing() {
+fn damage_after_the_part_costs_no_message() {
     let messages = ticking(&TOPICS, 300, 1000);
     let bytes = drive(small_chunks(), &messages);
     let path = file(&bytes[..bytes.len() / 2]);
@@ -62,7 +62,7 @@ fn damage_behind_the_part_costs_it_nothing() {
 }
 
 #[test]
-fn a_part_of_a_database_that_was_cut_off_is_whole_if_it_lies_before() {
+fn a_part_of_a_truncated_database_before_the_cut_is_complete() {
     let folder = folder();
     let messages = ticking(&TOPICS, 3000, 1000);
     let path = database_in(&folder, &messages);
@@ -77,7 +77,7 @@ fn a_part_of_a_database_that_was_cut_off_is_whole_if_it_lies_before() {
     assert!(matches!(
         error,
         Some(ReplayError::Damaged {
-            what: Damage::Database(_) | Damage::DatabaseCutOff { .. },
+            what: Damage::Database(_) | Damage::DatabaseTruncated { .. },
             ..
         })
     ));

@@ -1,12 +1,12 @@
-//! Sound directories and files: every message comes, in the order of times.
+//! Tests undamaged directories and files: every message is delivered, in the order of times.
 
 use std::fs;
 
-use gleaner_drives::{Options, Progress, Replay, files_of};
+use gleaner_drives::{DriveOptions, Progress, Replay, files_of};
 use gleaner_transport::Transport;
 
 use crate::bag::{
-    Packed, Storage, add_message, add_topic, bag, cdr, database, database_in, database_of,
+    Packing, Storage, add_message, add_topic, bag, cdr, database, database_in, database_of,
     empty_database, folder, metadata, packed, write_metadata,
 };
 use crate::support::{
@@ -19,7 +19,7 @@ const TOPICS: [&str; 2] = ["/a", "/b"];
 fn every_storage_and_packing_gives_the_same_messages() {
     let messages = ticking(&TOPICS, 600, 1000);
     for storage in [Storage::Mcap, Storage::Sqlite3] {
-        for packing in [Packed::No, Packed::Files, Packed::Messages] {
+        for packing in [Packing::No, Packing::Files, Packing::Messages] {
             let bag = bag(storage, packing, &[&messages[..200], &messages[200..]]);
             let (all, error) = replayed(&[bag.path().to_owned()], &TOPICS);
             assert!(error.is_none(), "{storage:?} {packing:?}: {error:?}");
@@ -48,7 +48,7 @@ fn a_database_is_read_by_time_and_then_by_number() {
 
 #[test]
 fn a_database_of_many_pieces_keeps_its_order_where_times_are_equal() {
-    // Some 8 MB; five thousand messages at a time, so that pieces end between equal times.
+    // Some 8 MB; five thousand messages have the same time, so that pieces end between equal times.
     let messages: Vec<_> = (0..20_000)
         .map(|n| Written {
             topic: TOPICS[n % 2],
@@ -85,7 +85,7 @@ fn databases_and_mcap_files_are_merged_by_time() {
 }
 
 #[test]
-fn a_topic_that_nobody_wants_is_passed_over() {
+fn a_topic_without_subscription_is_skipped() {
     let messages = ticking(&TOPICS, 60, 1000);
     let folder = folder();
     let (all, error) = replayed(&[database_in(&folder, &messages)], &["/b"]);
@@ -95,9 +95,9 @@ fn a_topic_that_nobody_wants_is_passed_over() {
 }
 
 #[test]
-fn topics_are_described_as_the_directory_says() {
+fn topics_are_described_as_in_the_metadata() {
     let messages = ticking(&TOPICS, 30, 1000);
-    let bag = bag(Storage::Sqlite3, Packed::No, &[&messages[..20], &messages[20..]]);
+    let bag = bag(Storage::Sqlite3, Packing::No, &[&messages[..20], &messages[20..]]);
     let mut replay = Replay::open(&[bag.path().to_owned()]).unwrap();
     assert_eq!((replay.start_ns(), replay.end_ns()), (Some(1000), Some(1290)));
     let topics = replay.topics();
@@ -112,7 +112,7 @@ fn topics_are_described_as_the_directory_says() {
 }
 
 #[test]
-fn what_nobody_counted_is_unknown_and_not_zero() {
+fn a_missing_message_count_is_unknown_and_not_zero() {
     let folder = folder();
     let mut replay = Replay::open(&[database_in(&folder, &ticking(&TOPICS, 30, 1000))]).unwrap();
     assert!(replay.topics().iter().all(|topic| topic.messages.is_none()));
@@ -131,13 +131,15 @@ fn a_writer_in_a_database_counts_up_without_numbers_of_its_own() {
 }
 
 #[test]
-fn a_database_of_an_old_distribution_has_less_and_is_read() {
+fn a_database_of_an_old_distribution_is_read() {
     let folder = folder();
     let path = folder.path().join("old.db3");
     let db = rusqlite::Connection::open(&path).unwrap();
     db.execute_batch(
-        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL);
-         CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL);
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, \
+         serialization_format TEXT NOT NULL);
+         CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp \
+         INTEGER NOT NULL, data BLOB NOT NULL);
          CREATE INDEX timestamp_idx ON messages (timestamp ASC);
          INSERT INTO topics VALUES (4, '/a', 'test_msgs/msg/Number', 'cdr');",
     )
@@ -163,10 +165,10 @@ fn an_empty_database_is_an_empty_drive() {
 #[test]
 fn a_directory_without_metadata_is_read_file_by_file() {
     let messages = ticking(&TOPICS, 40, 1000);
-    let bag = bag(Storage::Mcap, Packed::No, &[&messages[..20], &messages[20..]]);
+    let bag = bag(Storage::Mcap, Packing::No, &[&messages[..20], &messages[20..]]);
     fs::remove_file(bag.path().join("metadata.yaml")).unwrap();
     fs::write(bag.path().join("notes.txt"), "no drive").unwrap();
-    // The same once more, as a recorder leaves it that was killed while it packed.
+    // A second copy, as left by a recorder that was killed while it packed.
     fs::write(bag.path().join("bag_1.mcap.zstd"), packed(b"begun")).unwrap();
     let path = [bag.path().to_owned()];
     let names: Vec<_> =
@@ -178,7 +180,7 @@ fn a_directory_without_metadata_is_read_file_by_file() {
 }
 
 #[test]
-fn a_directory_of_version_3_may_have_another_name_by_now() {
+fn a_directory_of_version_3_may_have_been_renamed() {
     let messages = ticking(&TOPICS, 20, 1000);
     let folder = folder();
     database(&folder.path().join("drive_0.db3"), &messages);
@@ -189,7 +191,7 @@ fn a_directory_of_version_3_may_have_another_name_by_now() {
 }
 
 #[test]
-fn files_that_were_packed_or_unpacked_since_are_found() {
+fn files_that_were_packed_or_unpacked_later_are_found() {
     let messages = ticking(&TOPICS, 20, 1000);
     for (there, named) in [("x.mcap", "x.mcap.zstd"), ("x.mcap.zstd", "x.mcap")] {
         let folder = folder();
@@ -206,26 +208,29 @@ fn files_that_were_packed_or_unpacked_since_are_found() {
 }
 
 #[test]
-fn what_is_unpacked_goes_where_it_is_told_and_does_not_stay() {
+fn unpacked_content_is_in_the_given_folder_and_is_removed() {
     let messages = ticking(&TOPICS, 60, 1000);
     for storage in [Storage::Mcap, Storage::Sqlite3] {
-        let (bag, folder) = (bag(storage, Packed::Files, &[&messages]), folder());
-        let options = Options { unpack_in: Some(folder.path().to_owned()), ..Options::default() };
+        let (bag, folder) = (bag(storage, Packing::Files, &[&messages]), folder());
+        let options =
+            DriveOptions { unpack_in: Some(folder.path().to_owned()), ..DriveOptions::default() };
         let mut replay = Replay::open_as(&[bag.path().to_owned()], &options).unwrap();
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
         let memory = listen(&mut replay, &TOPICS);
         assert!(run(&mut replay).1.is_none());
         assert_eq!(memory.values(), expected(&messages));
-        // And not anywhere.
-        let nowhere =
-            Options { unpack_in: Some(folder.path().join("missing")), ..Options::default() };
+        // A folder that does not exist is an error.
+        let nowhere = DriveOptions {
+            unpack_in: Some(folder.path().join("missing")),
+            ..DriveOptions::default()
+        };
         let refused = Replay::open_as(&[bag.path().to_owned()], &nowhere).err().unwrap();
         assert!(refused.help().unwrap().contains("zstd -d"), "{refused}");
     }
 }
 
 #[test]
-fn a_path_may_hold_any_character() {
+fn a_path_may_contain_any_character() {
     let folder = folder();
     let messages = ticking(&TOPICS, 20, 1000);
     let path = folder.path().join("50% of ?a#b& 'ä\".db3");

@@ -1,11 +1,10 @@
-//! What channels say of themselves: who wrote their messages, and the quality of service they
-//! offered.
+//! Tests metadata of channels: the writer of their messages, and the offered QoS.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Cursor;
 use std::path::PathBuf;
 
-use gleaner_drives::{Damage, Replay, ReplayError, Step};
+use gleaner_drives::{Damage, Replay, ReplayError, ReplayStep};
 use gleaner_transport::{Guid, Transport};
 use mcap::records::MessageHeader;
 
@@ -15,17 +14,17 @@ const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 const CLAIM: &str = "00112233445566778899aabbccddeeff";
 
 /// A channel to write: its topic, and one pair of metadata.
-type Channel<'a> = (&'static str, &'a str, &'a str);
+type ChannelSpec<'a> = (&'static str, &'a str, &'a str);
 
-/// A drive with two messages on each of `channels`, in turn, which all number them 1 and 2.
-fn drive_of(channels: &[Channel<'_>], first: u64) -> PathBuf {
+/// Creates a drive with two messages on each of `channels`, in turn, all numbered 1 and 2.
+fn drive_of(channels: &[ChannelSpec<'_>], first: u64) -> PathBuf {
     let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
     let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
     let ids: Vec<u16> = channels
         .iter()
         .enumerate()
         .map(|(n, (topic, key, value))| {
-            // The writer under the tests joins equal channels; ours are to differ.
+            // The MCAP writer merges equal channels; these must differ.
             let metadata =
                 [("n".to_owned(), n.to_string()), (key.to_string(), value.to_string())].into();
             writer.add_channel(schema, topic, "cdr", &metadata).unwrap()
@@ -41,7 +40,7 @@ fn drive_of(channels: &[Channel<'_>], first: u64) -> PathBuf {
     file(&writer.into_inner().into_inner())
 }
 
-fn steps(paths: &[PathBuf], topics: &[&str]) -> Vec<Step> {
+fn steps(paths: &[PathBuf], topics: &[&str]) -> Vec<ReplayStep> {
     let mut replay = Replay::open(paths).unwrap();
     listen(&mut replay, topics);
     let (steps, error) = run(&mut replay);
@@ -49,8 +48,9 @@ fn steps(paths: &[PathBuf], topics: &[&str]) -> Vec<Step> {
     steps
 }
 
-/// The writers in the order of their first message, once it is sure that each of them counts up.
-fn writers(steps: &[Step]) -> Vec<String> {
+/// Returns the writers in the order of their first message, and checks that the numbers of each
+/// increase.
+fn writers(steps: &[ReplayStep]) -> Vec<String> {
     let mut last = BTreeMap::new();
     let mut order = Vec::new();
     for step in steps {
@@ -93,7 +93,7 @@ fn a_channel_names_the_writer_of_its_messages() {
     let steps = steps(&[path], &["/a", "/b"]);
     assert_eq!(writers(&steps), [CLAIM, &other, &made_up(0, 3)]);
     assert_eq!(Guid::from_hex(CLAIM), Some(steps[0].meta.writer));
-    // The writer of two topics counts for each of them.
+    // A writer of two topics counts for each of them.
     assert!(steps.iter().map(|step| step.meta.seq).eq([1, 1, 1, 1, 2, 2, 2, 2]));
 }
 
@@ -109,7 +109,7 @@ fn a_name_that_is_not_32_lower_case_hex_digits_is_ignored() {
 }
 
 #[test]
-fn the_second_channel_of_a_topic_that_claims_a_writer_does_not_get_it() {
+fn a_second_channel_of_a_topic_cannot_claim_the_same_writer() {
     let claim = ("/a", "gleaner.writer", CLAIM);
     let steps = steps(&[drive_of(&[claim, claim, claim], 0)], &["/a"]);
     assert_eq!(writers(&steps), [CLAIM.to_owned(), made_up(0, 2), made_up(0, 3)]);
@@ -117,8 +117,8 @@ fn the_second_channel_of_a_topic_that_claims_a_writer_does_not_get_it() {
 }
 
 #[test]
-fn no_writer_is_made_up_that_another_channel_claims() {
-    // What clips of drives hold that named no writers.
+fn a_generated_writer_differs_from_claimed_ones() {
+    // Content of clips of drives without writers.
     let (one, two) = (made_up(0, 1), made_up(0, 2));
     let key = "gleaner.writer";
     let path =
@@ -130,7 +130,7 @@ fn no_writer_is_made_up_that_another_channel_claims() {
 }
 
 #[test]
-fn a_writer_counts_on_from_one_file_to_the_next() {
+fn a_writer_continues_its_numbers_in_the_next_file() {
     let claim = ("/a", "gleaner.writer", CLAIM);
     let (first, second) = (drive_of(&[claim], 0), drive_of(&[claim], 500));
     // The times of the two are interleaved.
@@ -140,7 +140,7 @@ fn a_writer_counts_on_from_one_file_to_the_next() {
 }
 
 #[test]
-fn a_topic_has_the_quality_of_service_of_its_first_channel_that_names_one() {
+fn a_topic_has_the_qos_of_its_first_channel_that_has_one() {
     let qos = |paths: &[PathBuf]| {
         let topics = Replay::open(paths).unwrap().topics();
         topics.into_iter().map(|topic| topic.offered_qos).collect::<Vec<_>>()
@@ -162,7 +162,8 @@ fn text(text: &str) -> Vec<u8> {
     [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
 }
 
-/// How a file ends that defines one channel whose record has `metadata` at its end.
+/// Returns the damage and the topics of a file that ends after one channel, whose record ends with
+/// `metadata`.
 fn ending(metadata: &[u8]) -> (Damage, Vec<gleaner_transport::DiscoveredTopic>) {
     let schema = [&1u16.to_le_bytes()[..], &text(TYPE), &text("ros2msg"), &text(TEXT)].concat();
     let channel =
@@ -199,7 +200,7 @@ fn a_channel_whose_metadata_is_malformed_is_damage() {
 }
 
 #[test]
-fn metadata_that_nobody_needs_is_passed_over() {
+fn unneeded_metadata_is_skipped() {
     let qos = [text("offered_qos_profiles"), text("- depth: 1")].concat();
     let foreign = [&[2, 0, 0, 0, 0xff, 0xfe][..], &text("value")].concat();
     let map = |bytes: &[u8]| [&(bytes.len() as u32).to_le_bytes()[..], bytes].concat();

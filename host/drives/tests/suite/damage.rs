@@ -1,6 +1,6 @@
-//! Damaged drives: all that is promised comes first, then one error that says where and what.
+//! Tests damaged drives: all promised messages come first, then one error with position and cause.
 
-use gleaner_drives::{Damage, Limits, Place, Replay, ReplayError};
+use gleaner_drives::{Damage, DamageLocation, DriveLimits, Replay, ReplayError};
 use mcap::WriteOptions;
 use mcap::records::ChunkIndex;
 
@@ -14,7 +14,7 @@ fn messages() -> Vec<Written> {
     ticking(&TOPICS, 300, 1000)
 }
 
-/// The chunks of a drive in file order, each with the number of messages in it.
+/// Returns the chunks of a drive in file order, each with its number of messages.
 fn chunks(bytes: &[u8]) -> Vec<(ChunkIndex, usize)> {
     let summary = mcap::Summary::read(bytes).unwrap().unwrap();
     let mut indexes = summary.chunk_indexes.clone();
@@ -25,13 +25,13 @@ fn chunks(bytes: &[u8]) -> Vec<(ChunkIndex, usize)> {
 
 fn damage(error: Option<ReplayError>) -> (u64, Damage) {
     match error {
-        Some(ReplayError::Damaged { at: Place::Byte(offset), what, .. }) => (offset, what),
+        Some(ReplayError::Damaged { at: DamageLocation::Byte(offset), what, .. }) => (offset, what),
         other => panic!("expected damage, got {other:?}"),
     }
 }
 
 #[test]
-fn a_file_cut_anywhere_gives_every_whole_chunk_before_the_cut() {
+fn a_file_truncated_anywhere_delivers_every_whole_chunk_before_the_cut() {
     for options in [small_chunks(), small_chunks().compression(None)] {
         let bytes = drive(options, &messages());
         let chunks = chunks(&bytes);
@@ -53,7 +53,7 @@ fn a_file_cut_anywhere_gives_every_whole_chunk_before_the_cut() {
 }
 
 #[test]
-fn a_file_without_chunks_gives_every_whole_message_before_the_cut() {
+fn a_truncated_file_without_chunks_delivers_every_whole_message() {
     let bytes = drive(small_chunks().use_chunks(false), &messages());
     let mut most = 0;
     for cut in (200..bytes.len()).step_by(97) {
@@ -144,7 +144,7 @@ fn a_damaged_summary_costs_no_message() {
 #[test]
 fn messages_outside_chunks_are_covered_by_the_checksum_of_the_data_section() {
     let mut bytes = drive(small_chunks().use_chunks(false), &messages());
-    // A value: nothing else notices.
+    // A value: only the checksum covers it.
     let needle = 150i64.to_le_bytes();
     let at = bytes.windows(8).position(|window| window == needle).unwrap();
     bytes[at] ^= 1;
@@ -168,7 +168,7 @@ fn fewer_messages_than_the_summary_counts_are_noticed_at_the_end() {
 }
 
 #[test]
-fn messages_that_are_not_cdr_end_the_drive_where_they_stand() {
+fn messages_that_are_not_cdr_end_the_drive_at_their_position() {
     use std::collections::BTreeMap;
     use std::io::Cursor;
     for bad in [&[0u8, 7, 0, 0, 1][..], &[0, 1, 0], &[]] {
@@ -195,7 +195,7 @@ fn messages_that_are_not_cdr_end_the_drive_where_they_stand() {
 #[test]
 fn a_chunk_beyond_the_limit_is_refused() {
     let bytes = drive(WriteOptions::new(), &messages());
-    let limits = Limits { chunk_bytes: 10_000, ..Limits::default() };
+    let limits = DriveLimits { chunk_bytes: 10_000, ..DriveLimits::default() };
     let mut replay = Replay::open_with(&[file(&bytes)], limits).unwrap();
     listen(&mut replay, &TOPICS);
     let (steps, error) = run(&mut replay);

@@ -1,4 +1,4 @@
-//! Metadata records and attachments: all of them, or an error, or what stands before the cut.
+//! Tests metadata records and attachments: all of them, or an error, or those before the cut.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -17,7 +17,7 @@ fn pairs(pairs: &[(&str, &str)]) -> BTreeMap<String, String> {
     pairs.iter().map(|(key, value)| (key.to_string(), value.to_string())).collect()
 }
 
-/// What [`clip`] holds.
+/// Content of [`clip`].
 fn held() -> Extras {
     let attachment = |name: &str, media_type: &str, data: &[u8]| Attachment {
         name: name.to_owned(),
@@ -39,7 +39,7 @@ fn held() -> Extras {
     }
 }
 
-/// A file with messages, and the extras before, between and behind them.
+/// Returns a file with messages, and the extras before, between and after them.
 fn clip(options: WriteOptions) -> Vec<u8> {
     let mut writer = options.create(Cursor::new(Vec::new())).unwrap();
     let held = held();
@@ -83,12 +83,12 @@ fn damage(read: Result<Extras, ReplayError>) -> Damage {
     }
 }
 
-/// Where `needle` begins in `bytes`, for the first time.
+/// Returns the first position of `needle` in `bytes`.
 fn find(bytes: &[u8], needle: &[u8]) -> usize {
     bytes.windows(needle.len()).position(|window| window == needle).unwrap()
 }
 
-/// A file of these records that looks finished.
+/// Returns a file of these records that looks finished.
 fn finished(records: &[Vec<u8>]) -> Vec<u8> {
     [&MAGIC[..], &records.concat(), &record(15, &[0; 4]), &record(2, &[0; 20]), MAGIC].concat()
 }
@@ -117,7 +117,7 @@ fn a_file_without_extras_has_none() {
 }
 
 #[test]
-fn a_file_cut_anywhere_gives_the_extras_before_the_cut() {
+fn a_file_truncated_anywhere_has_the_extras_before_the_cut() {
     let bytes = clip(small_chunks());
     let held = held();
     let mut most = (0, 0);
@@ -137,7 +137,7 @@ fn a_file_cut_anywhere_gives_the_extras_before_the_cut() {
 }
 
 #[test]
-fn what_stands_behind_a_torn_record_of_a_cut_file_is_missing_and_said_to_be() {
+fn extras_after_a_torn_record_are_reported_as_missing() {
     let bytes = clip(small_chunks());
     let torn = find(&bytes, &[0xff, 0xd8, 1, 2, 3]);
     // Pages that never reached the disk read as zeros.
@@ -160,7 +160,7 @@ fn a_flipped_byte_never_gives_attachments_other_than_those_written() {
                     assert_eq!(found.attachments, held.attachments, "byte {at}");
                     assert_eq!(found.metadata.len(), held.metadata.len(), "byte {at}");
                 }
-                // The flip was in the end that tells a finished file.
+                // The flip was in the end that marks a finished file.
                 Ok(found) => assert!(held.attachments.starts_with(&found.attachments), "byte {at}"),
                 Err(ReplayError::Damaged { .. }) => {}
                 Err(other) => panic!("byte {at}: {other:?}"),
@@ -170,7 +170,7 @@ fn a_flipped_byte_never_gives_attachments_other_than_those_written() {
 }
 
 #[test]
-fn an_attachment_without_its_checksum_is_named() {
+fn the_error_names_an_attachment_with_a_wrong_checksum() {
     let mut bytes = clip(small_chunks());
     let at = find(&bytes, &[0xff, 0xd8, 1, 2, 3]);
     bytes[at + 2] = 9;
@@ -179,7 +179,7 @@ fn an_attachment_without_its_checksum_is_named() {
         matches!(&what, Damage::AttachmentCrc { name, .. } if name == "thumbnail.jpg"),
         "{what}"
     );
-    // The checksum covers what stands before the data, too.
+    // The checksum also covers the bytes before the data.
     let mut bytes = clip(small_chunks());
     let at = find(&bytes, b"image/jpeg");
     bytes[at] = b'I';
@@ -187,14 +187,14 @@ fn an_attachment_without_its_checksum_is_named() {
 }
 
 #[test]
-fn a_record_that_is_missing_is_noticed_by_the_count_in_the_summary() {
-    // Without the checksum of the whole, which would notice it first.
+fn a_missing_record_is_noticed_by_the_count_in_the_summary() {
+    // Without the checksum of the data section, which would notice it first.
     let bytes = clip(small_chunks().calculate_data_section_crc(false));
     let heads = [(13, b"gleaner.begin", "metadata records"), (13, b"thumbnail.jpg", "attachments")];
     for (len, name, kind) in heads {
         let mut bytes = bytes.clone();
-        // The kind stands 9 bytes before the body, where a metadata record has its name and an
-        // attachment two stamps.
+        // The kind is 9 bytes before the body, which begins with the name in a metadata record, and
+        // with two stamps in an attachment.
         let before = if kind == "attachments" { 9 + 16 + 4 } else { 9 + 4 };
         let at = find(&bytes, &name[..len]) - before;
         bytes[at] = 0x80;
@@ -213,7 +213,7 @@ fn a_changed_byte_that_no_record_covers_is_noticed_by_the_checksum_of_the_whole(
 }
 
 #[test]
-fn more_than_the_limit_is_refused_before_memory_is_taken_for_it() {
+fn more_than_the_limit_is_refused_before_memory_is_allocated() {
     let bytes = clip(small_chunks());
     let needed = (0..LIMIT).find(|limit| read(&bytes, *limit).is_ok()).unwrap();
     assert_eq!(read(&bytes, needed).unwrap(), held());
@@ -222,7 +222,7 @@ fn more_than_the_limit_is_refused_before_memory_is_taken_for_it() {
         what.to_string(),
         format!("its metadata and attachments take more than {} bytes", needed - 1)
     );
-    // A cut-off file is not excused.
+    // A truncated file has the same limit.
     assert!(matches!(
         damage(read(&bytes[..bytes.len() - 1], 10)),
         Damage::ExtrasTooLarge { allowed: 10 }
@@ -250,8 +250,8 @@ fn hostile_lengths_are_damage() {
         ]
         .concat()
     };
-    let sound = finished(&[record(9, &attachment(4, 4))]);
-    assert_eq!(read(&sound, LIMIT).unwrap().attachments[0].data, [7; 4]);
+    let valid = finished(&[record(9, &attachment(4, 4))]);
+    assert_eq!(read(&valid, LIMIT).unwrap().attachments[0].data, [7; 4]);
     let with_head = |opcode: u8, len: u64| [&[opcode][..], &len.to_le_bytes(), &[0; 50]].concat();
     for bad in [
         record(9, &attachment(4, u64::MAX)),
@@ -265,7 +265,7 @@ fn hostile_lengths_are_damage() {
         record(12, &[1, 0, 0, 0, 0xff, 0, 0, 0, 0]),
         // A key twice.
         record(12, &[&[0, 0, 0, 0, 16, 0, 0, 0][..], &[0; 16]].concat()),
-        // Text that is none.
+        // Text that is not UTF-8.
         record(12, &[&[0, 0, 0, 0, 9, 0, 0, 0][..], &[1, 0, 0, 0, 0xff], &[0; 4]].concat()),
         record(11, &[0; 8]),
         record(0, &[]),
@@ -276,11 +276,11 @@ fn hostile_lengths_are_damage() {
         with_head(11, u64::MAX),
     ] {
         damage(read(&finished(std::slice::from_ref(&bad)), LIMIT));
-        // The same at the end of a file without a footer is where it was cut.
+        // At the end of a file without a footer, the same means that it was truncated.
         let cut = read(&[&MAGIC[..], &bad].concat(), LIMIT).unwrap();
         assert_eq!(cut, Extras::default(), "{bad:?}");
     }
-    // Large, but in the file: more than statistics can have.
+    // Within the file, but larger than statistics can be.
     assert!(matches!(
         damage(read(&finished(&[record(11, &vec![0; 2 << 20])]), LIMIT)),
         Damage::Summary(_)
@@ -288,7 +288,7 @@ fn hostile_lengths_are_damage() {
 }
 
 #[test]
-fn what_is_no_drive_is_refused() {
+fn a_file_that_is_not_a_drive_is_refused() {
     assert!(matches!(read_extras("no/such/file".as_ref(), LIMIT), Err(ReplayError::Open { .. })));
     assert!(matches!(
         read_extras(&std::env::temp_dir(), LIMIT),

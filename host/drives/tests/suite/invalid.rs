@@ -1,7 +1,7 @@
-//! Files that contradict themselves without any byte being lost: each is damage, named with its
-//! place.
+//! Tests files that contradict themselves without a lost byte: each is damage, reported with its
+//! position.
 
-use gleaner_drives::{Damage, Place, Replay, ReplayError};
+use gleaner_drives::{Damage, DamageLocation, Replay, ReplayError};
 use mcap::WriteOptions;
 use mcap::records::ChunkIndex;
 
@@ -15,7 +15,7 @@ const TOPICS: [&str; 2] = ["/a", "/b"];
 
 fn damage(error: Option<ReplayError>) -> (u64, Damage) {
     match error {
-        Some(ReplayError::Damaged { at: Place::Byte(offset), what, .. }) => (offset, what),
+        Some(ReplayError::Damaged { at: DamageLocation::Byte(offset), what, .. }) => (offset, what),
         other => panic!("expected damage, got {other:?}"),
     }
 }
@@ -41,13 +41,13 @@ fn message(channel: u16, at: u64) -> Vec<u8> {
     record(5, &[head, vec![0, 1, 0, 0], (at as i64).to_le_bytes().to_vec()].concat())
 }
 
-/// A finished file of these records, without a summary.
+/// Returns a finished file of these records, without a summary.
 fn finished(records: &[Vec<u8>]) -> Vec<u8> {
     let end = [record(15, &[0; 4]), record(2, &[0; 20]), MAGIC.to_vec()].concat();
     [MAGIC.to_vec(), records.concat(), end].concat()
 }
 
-/// The records in one chunk, which is not packed.
+/// Returns a chunk of the records, not compressed.
 fn chunk(records: &[Vec<u8>], first: u64, last: u64) -> Vec<u8> {
     let bytes = records.concat();
     let len = (bytes.len() as u64).to_le_bytes();
@@ -59,9 +59,9 @@ fn chunk(records: &[Vec<u8>], first: u64, last: u64) -> Vec<u8> {
 }
 
 #[test]
-fn a_channel_or_a_schema_that_is_defined_again_as_another_is_damage() {
+fn a_channel_or_schema_that_is_redefined_is_damage() {
     let (number, a) = (schema(1, TYPE, "ros2msg", TEXT), channel(1, 1, "/a", "cdr"));
-    for (again, said) in [
+    for (again, expected_error) in [
         (
             vec![channel(1, 1, "/b", "cdr")],
             "channel 1 is defined again with another topic: first `/a`, then `/b`",
@@ -71,7 +71,8 @@ fn a_channel_or_a_schema_that_is_defined_again_as_another_is_damage() {
                 schema(2, "std_msgs/msg/String", "ros2msg", "string data"),
                 channel(1, 2, "/a", "cdr"),
             ],
-            "channel 1 is defined again with another type: first `test_msgs/msg/Number`, then `std_msgs/msg/String`",
+            "channel 1 is defined again with another type: first `test_msgs/msg/Number`, then \
+             `std_msgs/msg/String`",
         ),
         (
             vec![channel(1, 1, "/a", "json")],
@@ -84,7 +85,8 @@ fn a_channel_or_a_schema_that_is_defined_again_as_another_is_damage() {
         (vec![channel(1, 7, "/a", "cdr")], "a channel names a schema that is not defined"),
         (
             vec![schema(1, "test_msgs/msg/Other", "ros2msg", TEXT)],
-            "schema 1 is defined again with another name: first `test_msgs/msg/Number`, then `test_msgs/msg/Other`",
+            "schema 1 is defined again with another name: first `test_msgs/msg/Number`, then \
+             `test_msgs/msg/Other`",
         ),
         (
             vec![schema(1, TYPE, "ros2idl", TEXT)],
@@ -104,21 +106,21 @@ fn a_channel_or_a_schema_that_is_defined_again_as_another_is_damage() {
         let second = MAGIC.len() + chunk(&before, 10, 20).len();
         for (bytes, at) in [(runs, at + in_run), (chunks, second)] {
             let (all, error) = replayed(&[file(&bytes)], &["/a"]);
-            assert_eq!(all, [(10, 10), (20, 20)], "{said}");
+            assert_eq!(all, [(10, 10), (20, 20)], "{expected_error}");
             let (offset, what) = damage(error);
-            assert_eq!((offset, what.to_string().as_str()), (at as u64, said));
+            assert_eq!((offset, what.to_string().as_str()), (at as u64, expected_error));
         }
     }
 }
 
 #[test]
-fn a_channel_that_a_chunk_defines_other_than_the_index_is_damage() {
+fn a_channel_that_differs_between_chunk_and_summary_is_damage() {
     let options = small_chunks()
         .compression(None)
         .calculate_chunk_crcs(false)
         .calculate_data_section_crc(false);
     let mut bytes = drive(options, &ticking(&TOPICS, 300, 1000));
-    // The first of the two stands in the first chunk, the second in the summary.
+    // The first occurrence is in the first chunk, the second in the summary.
     let needle = channel(2, 1, "/b", "cdr");
     let at = bytes.windows(needle.len()).position(|window| window == needle).unwrap();
     bytes[at + 9] = 1;
@@ -131,7 +133,7 @@ fn a_channel_that_a_chunk_defines_other_than_the_index_is_damage() {
 }
 
 #[test]
-fn channels_and_schemas_that_are_repeated_are_none() {
+fn repeated_channels_and_schemas_are_not_damage() {
     let definitions = [schema(1, TYPE, "ros2msg", TEXT), channel(1, 1, "/a", "cdr")];
     let one = |at| [definitions.to_vec(), vec![message(1, at)]].concat();
     for bytes in [
@@ -145,7 +147,7 @@ fn channels_and_schemas_that_are_repeated_are_none() {
 }
 
 #[test]
-fn a_stamp_that_no_clock_can_show_is_damage_and_no_other_stamp() {
+fn a_stamp_out_of_range_is_damage() {
     for late in [i64::MAX as u64 + 1, u64::MAX] {
         let mut messages = ticking(&["/a"], 300, 1000);
         messages[200].at = late;
@@ -166,12 +168,12 @@ fn a_stamp_that_no_clock_can_show_is_damage_and_no_other_stamp() {
     assert_eq!(all, [(i64::MAX, 7)]);
 }
 
-/// A drive whose index says other times of some chunks than these have; and where the first of
-/// those lies.
-fn lying(
+/// Returns a drive whose index has wrong times of some chunks, and the position of the first of
+/// these.
+fn with_wrong_times(
     options: WriteOptions,
     messages: &[Written],
-    lies: impl Fn(usize, &ChunkIndex) -> (u64, u64),
+    wrong_times: impl Fn(usize, &ChunkIndex) -> (u64, u64),
 ) -> (Vec<u8>, u64) {
     let mut bytes = drive(options.calculate_summary_section_crc(false), messages);
     let mut chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
@@ -182,11 +184,11 @@ fn lying(
             [start, end, chunk.chunk_start_offset].map(u64::to_le_bytes).concat()
         };
         let needle = words(chunk.message_start_time, chunk.message_end_time);
-        let (start, end) = lies(n, chunk);
-        let lie = words(start, end);
-        if lie != needle {
+        let (start, end) = wrong_times(n, chunk);
+        let wrong = words(start, end);
+        if wrong != needle {
             let at = bytes.windows(needle.len()).rposition(|window| window == needle).unwrap();
-            bytes[at..at + lie.len()].copy_from_slice(&lie);
+            bytes[at..at + wrong.len()].copy_from_slice(&wrong);
             first.get_or_insert(chunk.chunk_start_offset);
         }
     }
@@ -194,10 +196,10 @@ fn lying(
 }
 
 #[test]
-fn an_index_of_wrong_times_is_not_believed_and_costs_no_message() {
+fn an_index_with_wrong_times_is_not_trusted_and_costs_no_message() {
     let messages = ticking(&TOPICS, 300, 1000);
-    type Lie = fn(usize, &ChunkIndex) -> (u64, u64);
-    let lies: [Lie; 4] = [
+    type WrongTimes = fn(usize, &ChunkIndex) -> (u64, u64);
+    let wrong_times: [WrongTimes; 4] = [
         |_, chunk| (chunk.message_start_time + 1_000_000, chunk.message_end_time + 1_000_000),
         |n, chunk| if n == 0 { (7, 7) } else { (chunk.message_start_time, chunk.message_end_time) },
         |n, chunk| {
@@ -207,8 +209,8 @@ fn an_index_of_wrong_times_is_not_believed_and_costs_no_message() {
             if n == 9 { (0, u64::MAX) } else { (chunk.message_start_time, chunk.message_end_time) }
         },
     ];
-    for lie in lies {
-        let (bytes, _) = lying(small_chunks(), &messages, lie);
+    for wrong in wrong_times {
+        let (bytes, _) = with_wrong_times(small_chunks(), &messages, wrong);
         let path = file(&bytes);
         let (all, error) = replayed(std::slice::from_ref(&path), &TOPICS);
         assert_eq!(all, expected(&messages));
@@ -216,7 +218,7 @@ fn an_index_of_wrong_times_is_not_believed_and_costs_no_message() {
             damage(error)
                 .1
                 .to_string()
-                .contains("it gives a chunk other times than the chunk itself")
+                .contains("its times of a chunk differ from those in the chunk")
         );
         let mut part = Replay::open(&[path]).unwrap();
         assert_eq!((part.start_ns(), part.end_ns()), (Some(1000), Some(3990)));
@@ -229,9 +231,9 @@ fn an_index_of_wrong_times_is_not_believed_and_costs_no_message() {
 
 #[test]
 fn a_message_outside_of_the_times_of_its_chunk_is_damage() {
-    // So many chunks that not all are compared with the index before they are read.
+    // Enough chunks that not all are compared with the index in advance.
     let messages = ticking(&TOPICS, 3000, 1000);
-    let (bytes, at) = lying(small_chunks(), &messages, |n, chunk| {
+    let (bytes, at) = with_wrong_times(small_chunks(), &messages, |n, chunk| {
         (chunk.message_start_time + 20 * u64::from(n == 101), chunk.message_end_time)
     });
     let (all, error) = replayed(&[file(&bytes)], &TOPICS);

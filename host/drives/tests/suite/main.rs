@@ -1,4 +1,4 @@
-//! The crate through its public interface: replay, channels, damage, extras.
+//! Tests the crate through its public interface: replay, channels, damage, extras.
 
 mod channels;
 mod damage;

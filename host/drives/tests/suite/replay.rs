@@ -1,17 +1,17 @@
-//! Sound drives: every message once, in order, whatever the file looks like inside.
+//! Tests undamaged drives: every message once, in order, for every layout of the file.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::sync::Arc;
 
-use gleaner_drives::{Limits, Progress, Replay, ReplayError};
+use gleaner_drives::{DriveLimits, Progress, Replay, ReplayError};
 use gleaner_messages::{CompressedView, Endian, FieldPath, header_stamp};
 use gleaner_transport::{Subscription, TopicSpec, Transport, TransportError};
 use mcap::records::MessageHeader;
 use mcap::{Compression, WriteOptions};
 
 use crate::support::{
-    Memory, TYPE, Written, drive, expected, file, listen, replayed, run, sample_drive,
+    MemorySink, TYPE, Written, drive, expected, file, listen, replayed, run, sample_drive,
     small_chunks, spec, ticking, write,
 };
 
@@ -22,10 +22,10 @@ const SAMPLE: [(&str, &str, u64); 3] = [
 ];
 
 #[test]
-fn the_sample_drive_holds_what_its_description_says() {
+fn the_sample_drive_matches_its_description() {
     let mut replay = Replay::open(&[sample_drive()]).unwrap();
     let memories = SAMPLE.map(|(topic, type_name, _)| {
-        let memory = Arc::new(Memory::default());
+        let memory = Arc::new(MemorySink::default());
         let (topic, type_name) = (topic.to_owned(), type_name.to_owned());
         let spec = TopicSpec { topic, type_name, queue: 0, max_bytes: 0, qos: Default::default() };
         replay.subscribe(&spec, memory.clone()).unwrap();
@@ -41,7 +41,7 @@ fn the_sample_drive_holds_what_its_description_says() {
         let samples = memory.0.lock().unwrap();
         assert_eq!(samples.len() as u64, *count, "{topic}");
         assert!(samples.is_sorted_by(|a, b| a.0.at_ns < b.0.at_ns && a.0.seq < b.0.seq));
-        // The description says: log time = header.stamp.
+        // According to the description, log time = header.stamp.
         let stamp = header_stamp(&replay.definitions(topic).unwrap()).unwrap();
         for (meta, cdr) in samples.iter() {
             assert_eq!(stamp.read(cdr, meta.endian), Ok(meta.at_ns));
@@ -71,7 +71,7 @@ fn topics_are_described_before_anything_is_read() {
     }
 }
 
-/// Every way in which a writer may lay out the same messages.
+/// All layouts that a writer can choose for the same messages.
 fn layouts() -> Vec<(&'static str, WriteOptions)> {
     vec![
         ("zstd", small_chunks().compression(Some(Compression::Zstd))),
@@ -127,7 +127,7 @@ fn past_the_memory_limit_order_is_lost_and_counted_but_no_message_is() {
     let messages = ticking(&["/a"], 400, 1000);
     let shuffled: Vec<_> = (0..400).map(|n| messages[n * 7 % 400].clone()).collect();
     let path = file(&drive(small_chunks(), &shuffled));
-    let limits = Limits { open_bytes: 1000, ..Limits::default() };
+    let limits = DriveLimits { open_bytes: 1000, ..DriveLimits::default() };
     let mut replay = Replay::open_with(&[path], limits).unwrap();
     let memory = listen(&mut replay, &["/a"]);
     let (_, error) = run(&mut replay);
@@ -249,7 +249,7 @@ fn foreign_encodings_matter_only_on_subscribed_topics() {
     writer.finish().unwrap();
     let path = file(&writer.into_inner().into_inner());
     let mut replay = Replay::open(&[path]).unwrap();
-    let memory = Arc::new(Memory::default());
+    let memory = Arc::new(MemorySink::default());
     for (topic, text) in [
         ("/json", "topic `/json` has message encoding `json`; only `cdr` can be read"),
         ("/idl", "topic `/idl` has schema encoding `ros2idl`; only `ros2msg` can be read"),
@@ -264,10 +264,10 @@ fn foreign_encodings_matter_only_on_subscribed_topics() {
 }
 
 #[test]
-fn refusals_name_the_topic_and_the_alternatives() {
+fn errors_name_the_topic_and_the_alternatives() {
     let path = file(&drive(small_chunks(), &ticking(&["/camera", "/imu"], 10, 100)));
     let mut replay = Replay::open(&[path]).unwrap();
-    let memory = Arc::new(Memory::default());
+    let memory = Arc::new(MemorySink::default());
     let absent = replay.subscribe(&spec("/camra"), memory.clone()).unwrap_err();
     assert_eq!(
         absent.to_string(),
@@ -283,7 +283,7 @@ fn refusals_name_the_topic_and_the_alternatives() {
 }
 
 #[test]
-fn files_that_disagree_on_a_type_are_refused_together() {
+fn files_that_disagree_on_a_type_are_refused() {
     let good = drive(small_chunks(), &ticking(&["/a"], 10, 100));
     let mut writer = small_chunks().create(Cursor::new(Vec::new())).unwrap();
     let schema = writer.add_schema("test_msgs/msg/Other", "ros2msg", b"int8 x").unwrap();
@@ -297,12 +297,12 @@ fn files_that_disagree_on_a_type_are_refused_together() {
 }
 
 #[test]
-fn what_is_no_drive_is_refused_at_once() {
+fn a_file_that_is_not_a_drive_is_refused_on_open() {
     let refuse = |path| Replay::open(&[path]).err().unwrap();
     assert!(matches!(Replay::open(&[]).err().unwrap(), ReplayError::NoFiles));
     assert!(matches!(refuse("no/such/file".into()), ReplayError::Open { .. }));
     assert!(matches!(refuse(file(b"")), ReplayError::NotMcap { .. }));
-    // With the feature `bags` and without it.
+    // With and without the feature `bags`.
     let database = refuse(file(b"SQLite format 3\0"));
     assert!(
         matches!(database, ReplayError::Database { .. } | ReplayError::NotBuiltIn { .. }),

@@ -1,5 +1,5 @@
-//! What the tests share: a CDR writer, drives made on the spot, and a sink that remembers.
-// Each test program uses its own part.
+//! Shared by the tests: a CDR writer, generated drives, and a sink that keeps its samples.
+// Each test program uses only a part of it.
 #![allow(dead_code)]
 
 use std::collections::BTreeMap;
@@ -8,19 +8,19 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
-use gleaner_drives::{Replay, ReplayError, Step};
+use gleaner_drives::{Replay, ReplayError, ReplayStep};
 use gleaner_messages::Endian;
-use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
 use mcap::records::MessageHeader;
 use mcap::{WriteOptions, Writer};
 
-/// Writes CDR the way a ROS 2 node does, worked out apart from the reader under test.
-pub struct Cdr {
+/// Writes CDR as a ROS 2 node does, implemented independently of the parser under test.
+pub struct CdrBytes {
     pub bytes: Vec<u8>,
     endian: Endian,
 }
 
-impl Cdr {
+impl CdrBytes {
     pub fn new(endian: Endian) -> Self {
         Self { bytes: Vec::new(), endian }
     }
@@ -82,12 +82,12 @@ impl Cdr {
     }
 }
 
-/// The sample drive that comes with the project.
+/// Path of the sample drive of the project.
 pub fn sample_drive() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/highway_drive.mcap")
 }
 
-/// A message to write into a drive.
+/// A message of a generated drive.
 #[derive(Clone, Debug)]
 pub struct Written {
     pub topic: &'static str,
@@ -99,7 +99,7 @@ pub struct Written {
 pub const TYPE: &str = "test_msgs/msg/Number";
 pub const TEXT: &str = "int64 value\n";
 
-/// Messages on `topics` in turn, one per 10 ns from `first` on.
+/// Returns messages on `topics` in turn, one per 10 ns from `first` on.
 pub fn ticking(topics: &[&'static str], count: usize, first: u64) -> Vec<Written> {
     (0..count)
         .map(|n| Written {
@@ -116,7 +116,7 @@ pub fn small_chunks() -> WriteOptions {
     WriteOptions::new().profile("ros2").chunk_size(Some(450))
 }
 
-/// The bytes of a drive with `messages` in file order.
+/// Returns the bytes of a drive with `messages` in file order.
 pub fn drive(options: WriteOptions, messages: &[Written]) -> Vec<u8> {
     let mut writer = options.create(Cursor::new(Vec::new())).unwrap();
     let schema = writer.add_schema(TYPE, "ros2msg", TEXT.as_bytes()).unwrap();
@@ -143,7 +143,7 @@ pub fn write(writer: &mut Writer<Cursor<Vec<u8>>>, channel_id: u16, message: &Wr
     writer.write_to_known_channel(&header, &data).unwrap();
 }
 
-/// A record as it stands in a file, for those that no sound writer writes.
+/// Encodes a record, for those that no correct writer writes.
 pub fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
     [&[opcode][..], &(body.len() as u64).to_le_bytes(), body].concat()
 }
@@ -157,19 +157,19 @@ pub fn file(bytes: &[u8]) -> PathBuf {
     path
 }
 
-/// Remembers what it was given.
+/// A sink that keeps its samples.
 #[derive(Default)]
-pub struct Memory(pub Mutex<Vec<(SampleMeta, Vec<u8>)>>);
+pub struct MemorySink(pub Mutex<Vec<(SampleMeta, Vec<u8>)>>);
 
-impl Sink for Memory {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+impl Sink for MemorySink {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
         self.0.lock().unwrap().push((*meta, cdr.to_vec()));
-        Verdict::Taken
+        Delivery::Taken
     }
 }
 
-impl Memory {
-    /// (log time, value) of each message, as drives of [`drive`] hold them.
+impl MemorySink {
+    /// Returns (log time, value) of each message, for drives of [`drive`].
     pub fn values(&self) -> Vec<(i64, i64)> {
         let taken = self.0.lock().unwrap();
         let value = |cdr: &[u8]| i64::from_le_bytes(cdr.try_into().unwrap());
@@ -182,9 +182,9 @@ pub fn spec(topic: &str) -> TopicSpec {
     TopicSpec { topic, type_name, queue: 1, max_bytes: 1 << 20, qos: Default::default() }
 }
 
-/// Subscribes one memory to `topics`, in that order.
-pub fn listen(replay: &mut Replay, topics: &[&str]) -> Arc<Memory> {
-    let memory = Arc::new(Memory::default());
+/// Subscribes one sink to `topics`, in that order.
+pub fn listen(replay: &mut Replay, topics: &[&str]) -> Arc<MemorySink> {
+    let memory = Arc::new(MemorySink::default());
     for topic in topics {
         replay.subscribe(&spec(topic), memory.clone()).unwrap();
     }
@@ -192,7 +192,7 @@ pub fn listen(replay: &mut Replay, topics: &[&str]) -> Arc<Memory> {
 }
 
 /// Steps to the end, or to the error.
-pub fn run(replay: &mut Replay) -> (Vec<Step>, Option<ReplayError>) {
+pub fn run(replay: &mut Replay) -> (Vec<ReplayStep>, Option<ReplayError>) {
     let mut steps = Vec::new();
     loop {
         match replay.step() {
@@ -203,7 +203,7 @@ pub fn run(replay: &mut Replay) -> (Vec<Step>, Option<ReplayError>) {
     }
 }
 
-/// Replays drives made by [`drive`]: the (log time, value) pairs delivered, and how it ended.
+/// Replays drives of [`drive`]: returns the delivered (log time, value) pairs, and the error.
 pub fn replayed(paths: &[PathBuf], topics: &[&str]) -> (Vec<(i64, i64)>, Option<ReplayError>) {
     let mut replay = Replay::open(paths).unwrap();
     let memory = listen(&mut replay, topics);
@@ -212,7 +212,7 @@ pub fn replayed(paths: &[PathBuf], topics: &[&str]) -> (Vec<(i64, i64)>, Option<
     (memory.values(), error)
 }
 
-/// What a faithful replay of `messages` delivers.
+/// Returns the messages that a correct replay of `messages` delivers.
 pub fn expected(messages: &[Written]) -> Vec<(i64, i64)> {
     let mut all: Vec<_> = messages.iter().map(|m| (m.at as i64, m.value)).collect();
     all.sort_by_key(|(at, _)| *at);

@@ -9,7 +9,7 @@ use gleaner_messages::{
 };
 use gleaner_transport::Transport;
 
-use crate::support::{Cdr, sample_drive};
+use crate::support::{CdrBytes, sample_drive};
 
 const MIXED: &str = "\
 bool flag
@@ -43,14 +43,14 @@ int32 NO_FIELDS=7
 
 /// Encodes a message of the type above; `pad` shifts everything after its name.
 fn mixed(endian: Endian, pad: usize, items: usize) -> Vec<u8> {
-    let item = |cdr: Cdr, n: usize| {
+    let item = |cdr: CdrBytes, n: usize| {
         let mut cdr = cdr.u8(n as u8).text(&"t".repeat(n)).f64(n as f64 + 0.5).u32(n as u32);
         for code in 0..n {
             cdr = cdr.u16(code as u16 + 100);
         }
         cdr
     };
-    let mut cdr = Cdr::new(endian).u8(1).text(&"p".repeat(pad)).u32(items as u32);
+    let mut cdr = CdrBytes::new(endian).u8(1).text(&"p".repeat(pad)).u32(items as u32);
     for n in 0..items {
         cdr = item(cdr, n);
     }
@@ -240,7 +240,7 @@ fn the_image_view_agrees_with_the_field_paths() {
     let definitions = Definitions::parse("sensor_msgs/msg/Image", IMAGE).unwrap();
     for endian in [Endian::Little, Endian::Big] {
         for frame in ["", "c", "camera", "camera_front"] {
-            let cdr = Cdr::new(endian).i32(5).u32(7).text(frame).u32(2).u32(3).text("bgr8");
+            let cdr = CdrBytes::new(endian).i32(5).u32(7).text(frame).u32(2).u32(3).text("bgr8");
             let bytes = cdr.u8(0).u32(9).blob(&[1; 18]).bytes;
             let view = ImageView::read(&bytes, endian).unwrap();
             assert_eq!((view.width, view.height, view.step), (3, 2, 9));
