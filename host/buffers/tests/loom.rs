@@ -2,7 +2,7 @@
 //!
 //! Run with `RUSTFLAGS="--cfg loom" LOOM_MAX_PREEMPTIONS=3 cargo test --release --test loom`.
 //!
-//! Loom runs the first thread as far as possible, and explores the steps of the others from there.
+//! Loom runs the first thread as far as possible, and explores the steps of the second from there.
 //! It can miss that a load comes after another thread's load and store, so the writer is always the
 //! first thread.
 #![cfg(loom)]
@@ -161,17 +161,17 @@ fn a_slot_is_released_once_and_has_one_draft() {
 fn a_reader_never_returns_a_sample_of_another_ring() {
     loom::model(|| {
         let pool = pool(1);
-        let (mut ours, reader) = ring(pool.clone(), 1).unwrap();
-        let (mut others, _) = ring(pool, 1).unwrap();
-        publish(&mut ours, 7);
+        let (mut first, reader) = ring(pool.clone(), 1).unwrap();
+        let (mut second, _) = ring(pool, 1).unwrap();
+        publish(&mut first, 7);
         let reading = thread::spawn(move || {
             let seen = reader.get(0).map(|lease| value(&lease));
             assert!(seen.is_none_or(|value| value == 7));
         });
         // Evicts the sample of this ring at position 0, frees the slot, and publishes in it at
         // position 0 of the other ring.
-        drop(ours.draft(8));
-        publish(&mut others, 8);
+        drop(first.draft(8));
+        publish(&mut second, 8);
         reading.join().unwrap();
     });
 }

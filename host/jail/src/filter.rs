@@ -84,8 +84,8 @@ impl DeniedCalls {
 
     /// Returns the filter, which answers refused calls with `errno`.
     pub(crate) fn filter(mut self, errno: i32) -> Result<BpfProgram, JailError> {
-        let machine = std::env::consts::ARCH;
-        let target: TargetArch = machine.try_into().map_err(|_| JailError::Machine(machine))?;
+        let arch = std::env::consts::ARCH;
+        let target: TargetArch = arch.try_into().map_err(|_| JailError::Architecture(arch))?;
         self.refuse_other_numbers();
         let answer = SeccompAction::Errno(errno.unsigned_abs());
         let filter = SeccompFilter::new(self.0, SeccompAction::Allow, answer, target)

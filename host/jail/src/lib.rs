@@ -41,7 +41,7 @@ pub enum JailError {
     #[error("cannot apply the seccomp filter to an existing thread")]
     ExistingThread(#[source] seccompiler::Error),
     #[error("no seccomp filter exists for the architecture {0}")]
-    Machine(&'static str),
+    Architecture(&'static str),
     #[error("cannot restrict the files")]
     Files(#[from] landlock::RulesetError),
     #[error("cannot limit {what}")]

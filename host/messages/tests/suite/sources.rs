@@ -97,9 +97,9 @@ fn the_text_is_that_of_recordings() {
     let topics = replay.topics();
     assert!(topics.len() >= 3);
     for topic in topics {
-        let ours = bundled().find(&topic.type_name).unwrap().unwrap();
+        let found = bundled().find(&topic.type_name).unwrap().unwrap();
         assert_eq!(
-            ours.trim_end(),
+            found.trim_end(),
             topic.definitions_text.unwrap().trim_end(),
             "{}",
             topic.type_name
@@ -121,8 +121,9 @@ fn a_type_is_found_in_each_of_the_three_places_in_a_folder() {
 #[test]
 fn folders_precede_bundled_definitions_and_these_installed_ones() {
     let (folder, installed) = (DefinitionsFolder::new(), DefinitionsFolder::new());
-    folder.write("std_msgs/msg/Bool.msg", "bool ours");
-    for (name, text) in [("std_msgs/msg/Bool", "bool theirs"), ("std_msgs/msg/Int8", "int8 theirs")]
+    folder.write("std_msgs/msg/Bool.msg", "bool from_folder");
+    for (name, text) in
+        [("std_msgs/msg/Bool", "bool installed"), ("std_msgs/msg/Int8", "int8 installed")]
     {
         installed.write(&format!("share/{name}.msg"), text);
     }
@@ -130,7 +131,7 @@ fn folders_precede_bundled_definitions_and_these_installed_ones() {
     installed.write("share/maker/msg/Part.msg", "int8 x\n");
     let sources = Sources::new(slice::from_ref(&folder.0), slice::from_ref(&installed.0));
     let text = |name| sources.find(name).unwrap().unwrap();
-    assert_eq!(&*text("std_msgs/msg/Bool"), "bool ours\n");
+    assert_eq!(&*text("std_msgs/msg/Bool"), "bool from_folder\n");
     assert_eq!(&*text("std_msgs/msg/Int8"), "int8 data\n");
     assert_eq!(
         *text("maker/msg/Odd"),
