@@ -7,7 +7,7 @@
 //! - `file`: atomic clip files in MCAP, the clip index, and crash recovery.
 //! - `thumbnail`: a small picture of a moment.
 //! - `program`: the process that records live, for all lambdas of a vehicle; with the feature
-//! `program`.
+//!   `program`.
 //!
 //! A recorder of a replay is synchronous and without threads: the recording depends on the stamps
 //! of samples and wakes only. A live recorder is the same, except that a thread writes the files.

@@ -127,7 +127,7 @@ pub(crate) struct ClipTrailer {
     /// These triggers, or as many as were kept.
     pub moments: Vec<Moment>,
     /// Counts of its topics. The number of written messages is counted by the file.
-    pub topics: Vec<TopicCounts>,
+    pub topics: Vec<ClipTopicCounts>,
     /// Reasons why it contains less than was requested.
     pub incomplete: Vec<String>,
     /// A JPEG.
@@ -138,7 +138,7 @@ pub(crate) struct ClipTrailer {
 
 /// Counts of a topic besides its messages in the clip; `None` is unknown.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) struct TopicCounts {
+pub(crate) struct ClipTopicCounts {
     /// Absolute topic name.
     pub topic: String,
     /// Message type; `None` if it never appeared.

@@ -1,8 +1,9 @@
-//! A preroll on disk: chunk files that are written once and deleted whole, with an index in memory.
+//! A preroll on disk: chunk files that are written once and deleted as a whole, with an index in
+//! memory.
 //!
-//! The bound holds for files and index together. Room is made by the chunk, so that up to a
-//! sixteenth of the bound more goes than in memory would. Where the disk has less room than the
-//! bound, the oldest chunks go as well.
+//! The bound covers files and index together. Room is made by the chunk, so up to a sixteenth of
+//! the bound more is dropped than in memory. If the disk has less room than the bound, the oldest
+//! chunks are dropped as well.
 
 use std::collections::VecDeque;
 use std::fs::{self, File};
@@ -16,7 +17,7 @@ use tracing::warn;
 use super::{EntryId, EntryMeta};
 use crate::RecordError;
 
-/// What an entry costs in the index.
+/// Cost of an entry in the index.
 const INDEXED: u64 = size_of::<Indexed>() as u64;
 
 /// Most entries in the index, so that small samples in a large store do not fill the memory: 72
@@ -27,7 +28,7 @@ const INDEX_MAX: usize = 1 << 20;
 const CHUNK_MIN: u64 = 1 << 20;
 const CHUNK_MAX: u64 = 64 << 20;
 
-/// Bytes that wait for the next write.
+/// Bytes that are collected for a write.
 const PENDING: usize = 256 << 10;
 
 pub(super) struct Disk {
@@ -36,19 +37,19 @@ pub(super) struct Disk {
     chunk_bytes: u64,
     chunks: VecDeque<Chunk>,
     next_chunk: u64,
-    /// The file of the newest chunk, and its bytes that are not yet written.
+    /// The file of the newest chunk, and its unwritten bytes.
     newest: Option<File>,
     pending: Vec<u8>,
     index: VecDeque<Indexed>,
-    /// The number, counted from the first of all, of the oldest entry in the index.
+    /// The number of the oldest entry in the index, counted from the first of all.
     first: u64,
     bytes: u64,
-    /// The chunk that was read last, and room for what is read.
+    /// The chunk that was read last, and the buffer for reads.
     reader: Option<(u64, File)>,
     buffer: Vec<u8>,
-    /// Whether more chunks go than come, as the disk has too little room for others.
+    /// True if more chunks are dropped than added, because the disk has too little room.
     shrinks: bool,
-    /// Whether a full disk was said.
+    /// True if a full disk was logged.
     was_full: bool,
 }
 
@@ -92,7 +93,8 @@ impl Disk {
         Ok(disk)
     }
 
-    /// On a full disk the oldest go for it as well; where that does not help, it goes itself.
+    /// On a full disk, drops the oldest entries for it as well; if that does not help, drops the
+    /// new one.
     pub(super) fn push(
         &mut self,
         held: &EntryMeta,
@@ -104,7 +106,7 @@ impl Disk {
                 Err(error) if error.is_full_disk() => {
                     if !std::mem::replace(&mut self.was_full, true) {
                         let folder = self.folder.display();
-                        warn!(%folder, "the disk is full: the preroll holds less than it may");
+                        warn!(%folder, "the disk is full: the preroll is smaller than its bound");
                     }
                     let is_alone = self.bytes == 0;
                     self.drop_oldest(gone)?;
@@ -179,7 +181,7 @@ impl Disk {
         Ok(())
     }
 
-    /// Deletes the oldest chunk; what is left of its entries goes with it.
+    /// Deletes the oldest chunk with its remaining entries.
     fn drop_oldest(&mut self, gone: &mut dyn FnMut(&EntryMeta)) -> Result<(), RecordError> {
         let Some(chunk) = self.chunks.pop_front() else { return Ok(()) };
         let end = match self.chunks.front() {
@@ -267,8 +269,8 @@ impl Disk {
             chunk.bytes
         };
         if let Some(begin) = offset.checked_sub(written) {
-            // Nothing follows the last entry of a chunk, so one of no bytes ends where the written
-            // ones do.
+            // The last entry of a chunk is not followed by another, so an empty one ends at the end
+            // of the written bytes.
             return Ok(&self.pending[begin as usize..][..len]);
         }
         let (number, path) = (chunk.number, path_of(&self.folder, chunk.number));
@@ -301,19 +303,19 @@ impl Disk {
 }
 
 impl Drop for Disk {
-    /// The preroll is of no use to a later process, which would delete it.
+    /// A later process would delete the preroll.
     fn drop(&mut self) {
         for chunk in &self.chunks {
             let _ = fs::remove_file(self.path(chunk.number));
         }
-        // It stays if somebody else's files are in it.
+        // The folder stays if it has other files.
         let _ = fs::remove_dir(&self.folder);
     }
 }
 
-/// Begins the chunk `path`.
+/// Creates the chunk `path`.
 fn begin(path: &Path) -> io::Result<File> {
-    // A test has links to a full disk.
+    // A test uses links to a full disk.
     #[cfg(test)]
     if fs::read_link(path).is_ok_and(|full| full == Path::new("/dev/full")) {
         return File::create(path);
@@ -325,7 +327,7 @@ fn path_of(folder: &Path, number: u64) -> PathBuf {
     folder.join(format!("{number}.chunk"))
 }
 
-/// Whether a file is named as chunks are.
+/// Returns whether a file has the name of a chunk.
 fn is_chunk(path: &Path) -> bool {
     let name = path.file_name().and_then(|name| name.to_str());
     let number = name.and_then(|name| name.strip_suffix(".chunk"));

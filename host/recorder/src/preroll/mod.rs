@@ -1,8 +1,8 @@
-//! What came lately, in order of arrival, within a bound of bytes and of time: where clips begin
-//! before their trigger.
+//! The preroll buffer: recent entries in arrival order, within a bound of bytes and of time. Clips
+//! begin there before their trigger.
 //!
-//! One store for everything. It knows nothing of windows; who reads it walks from the oldest to the
-//! newest and marks what was written to a clip, so that nothing is written to it twice.
+//! One store has all entries, and does not depend on windows. Its reader goes from the oldest to
+//! the newest and marks the entries that it has written to a clip, so that none is written twice.
 
 mod disk;
 mod losses;
@@ -20,14 +20,14 @@ use crate::RecordError;
 use disk::Disk;
 use ram::Ram;
 
-/// What every entry costs beside its bytes.
+/// Overhead of every entry beside its bytes.
 pub const OVERHEAD: usize = 64;
 
-/// Where an entry comes from: a topic, or the wakes of a lambda.
+/// The source of an entry: a topic, or the wakes of a lambda.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct EntrySource(u32);
 
-/// The bit that tells wakes from topics.
+/// The bit that distinguishes wakes from topics.
 const WAKES: u32 = 1 << 31;
 
 impl EntrySource {
@@ -53,22 +53,22 @@ impl EntrySource {
     }
 }
 
-/// What is known of an entry besides its bytes.
+/// The metadata of an entry.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct EntryMeta {
-    /// Where it comes from.
+    /// Its source.
     pub source: EntrySource,
     /// Length of its bytes.
     pub len: u32,
-    /// The stamp that windows go by.
+    /// The stamp that windows are compared with.
     pub at_ns: i64,
-    /// When the writer published it; for a wake 0.
+    /// Publication time; for a wake 0.
     pub publish_ns: i64,
     /// Sequence number, or the number of the wake.
     pub seq: u64,
-    /// The group of windows in whose clips it is, 0 for none.
+    /// The group of windows whose clips have it, 0 for none.
     pub group: u64,
-    /// Who wrote it; for a wake zeros.
+    /// The GUID of the writer; for a wake zeros.
     pub writer: [u8; 16],
     /// Options of the encapsulation.
     pub options: [u8; 2],
@@ -107,7 +107,7 @@ impl EntryMeta {
         }
     }
 
-    /// As the transport said it.
+    /// The metadata of the sample.
     pub fn meta(&self) -> SampleMeta {
         SampleMeta {
             at_ns: self.at_ns,
@@ -120,31 +120,31 @@ impl EntryMeta {
     }
 }
 
-/// Names an entry until the store changes.
+/// Identifies an entry until the store changes.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct EntryId(u64);
 
-/// An entry that a walk from the oldest on has come to. Unlike a [`EntryId`] it may be kept while the
-/// store changes.
+/// An entry that a reader has come to. Unlike an [`EntryId`] it may be kept while the store
+/// changes.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Walked {
     place: EntryId,
-    /// How many entries ever came before it.
+    /// Number of all entries before it, including dropped ones.
     number: u64,
 }
 
 impl Walked {
-    /// Where it is, until the store changes.
+    /// Its ID, until the store changes.
     pub fn place(self) -> EntryId {
         self.place
     }
 }
 
-/// The store.
+/// The preroll buffer.
 pub struct Preroll {
     kind: PrerollStore,
     highest: u64,
-    /// Entries that have gone: the number of the oldest one that is held.
+    /// Number of dropped entries: the number of the oldest one that is kept.
     gone: u64,
 }
 
@@ -154,13 +154,13 @@ enum PrerollStore {
 }
 
 impl Preroll {
-    /// An empty store of at most `bytes`. On disk it is in `folder`, where what an earlier process
-    /// left is deleted. In memory, `prefault` takes it from the system at once.
+    /// An empty store of at most `bytes`. On disk it is in `folder`, where files of an earlier
+    /// process are deleted. In memory, `prefault` allocates it at once.
     ///
     /// # Errors
     ///
-    /// [`RecordError::Preroll`] if the folder cannot be made or emptied,
-    /// [`RecordError::PrerollMemory`] if the system does not have as much memory.
+    /// [`RecordError::Preroll`] if the folder cannot be created or emptied,
+    /// [`RecordError::PrerollMemory`] if the memory cannot be allocated.
     pub fn open(
         store: Store,
         bytes: u64,
@@ -179,8 +179,8 @@ impl Preroll {
         Ok(Preroll { kind, highest: 0, gone: 0 })
     }
 
-    /// Lets it hold `bytes`, on disk if `store` is that. What it holds stays, but may lie
-    /// elsewhere: `true` says that no [`Walked`] is of use any more.
+    /// Raises the bound to `bytes`, and moves to disk if `store` is the disk. Entries are kept, but
+    /// may move: `true` means that every [`Walked`] is invalid.
     ///
     /// # Errors
     ///
@@ -203,7 +203,7 @@ impl Preroll {
             let bytes = self.bytes(walked.place())?;
             match &mut new.kind {
                 PrerollStore::Ram(_) => new.push(held, bytes, &mut |_| {})?,
-                // On a full disk it stays where it is.
+                // On a full disk the old store stays in use.
                 PrerollStore::Disk(disk) => disk.add(&held, bytes, &mut |_| {})?,
             };
             next = self.next(next);
@@ -212,8 +212,8 @@ impl Preroll {
         Ok(true)
     }
 
-    /// Adds an entry; the oldest go to make room for it, and are told to `gone`: on a full disk it
-    /// may be told itself. `false` if it is larger than the store.
+    /// Adds an entry; the oldest are dropped to make room and passed to `gone`. On a full disk the
+    /// new entry itself may be. Returns `false` if it is larger than the store.
     ///
     /// # Errors
     ///
@@ -239,15 +239,15 @@ impl Preroll {
         Ok(taken)
     }
 
-    /// Whether it gets smaller with what comes, as its disk has too little room. In memory that
-    /// changes nothing.
+    /// Sets whether it shrinks as entries come, because its disk has too little room. No effect in
+    /// memory.
     pub fn shrink(&mut self, shrinks: bool) {
         if let PrerollStore::Disk(disk) = &mut self.kind {
             disk.shrink(shrinks);
         }
     }
 
-    /// Gives up what is older than `before`, from the oldest on, and tells it to `aged`.
+    /// Drops entries older than `before`, from the oldest on, and passes them to `aged`.
     ///
     /// # Errors
     ///
@@ -271,7 +271,7 @@ impl Preroll {
         }
     }
 
-    /// The entry that came after `last`, or the oldest if `last` has gone or is none.
+    /// The entry after `last`, or the oldest if `last` was dropped or is `None`.
     pub fn next(&self, last: Option<Walked>) -> Option<Walked> {
         match last {
             Some(Walked { place, number }) if number >= self.gone => {
@@ -281,7 +281,7 @@ impl Preroll {
         }
     }
 
-    /// The entry that came last.
+    /// The newest entry.
     pub fn newest(&self) -> Option<Walked> {
         let (place, entries) = match &self.kind {
             PrerollStore::Ram(ram) => (ram.newest()?, ram.entries()),
@@ -290,12 +290,12 @@ impl Preroll {
         Some(Walked { place, number: (self.gone + entries).saturating_sub(1) })
     }
 
-    /// Where an entry is, unless it has gone.
+    /// The ID of an entry, unless it was dropped.
     pub fn find(&self, walked: Walked) -> Option<EntryId> {
         (walked.number >= self.gone).then_some(walked.place)
     }
 
-    /// Whether an entry of `len` bytes has room here, once others have gone for it.
+    /// Returns whether an entry of `len` bytes fits, once others are dropped.
     pub fn fits(&self, len: usize) -> bool {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.fits(len),
@@ -311,7 +311,7 @@ impl Preroll {
         }
     }
 
-    /// The entry that came after this one.
+    /// The entry after this one.
     fn after(&self, place: EntryId) -> Option<EntryId> {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.after(place),
@@ -319,7 +319,7 @@ impl Preroll {
         }
     }
 
-    /// What is known of an entry.
+    /// The metadata of an entry.
     pub fn held(&self, place: EntryId) -> EntryMeta {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.held(place),
@@ -339,7 +339,7 @@ impl Preroll {
         }
     }
 
-    /// Remembers that an entry is in the clips of a group of windows.
+    /// Marks an entry as written to the clips of a group of windows.
     pub fn mark(&mut self, place: EntryId, group: u64) {
         match &mut self.kind {
             PrerollStore::Ram(ram) => ram.mark(place, group),
@@ -347,7 +347,7 @@ impl Preroll {
         }
     }
 
-    /// Bytes held now, the overhead of entries included.
+    /// Bytes in use, including the overhead of entries.
     pub fn bytes_held(&self) -> u64 {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.bytes_held(),
@@ -355,7 +355,7 @@ impl Preroll {
         }
     }
 
-    /// The most bytes held so far.
+    /// Peak of the bytes in use.
     pub fn bytes_highest(&self) -> u64 {
         self.highest
     }

@@ -1,5 +1,4 @@
-//! A preroll in memory: one block, in which entries follow each other, each behind a head of
-//! [`OVERHEAD`] bytes.
+//! A preroll in memory: one block of consecutive entries, each after a head of [`OVERHEAD`] bytes.
 
 use std::collections::TryReserveError;
 use std::hint::black_box;
@@ -9,18 +8,18 @@ use super::{EntryId, EntryMeta, EntrySource, OVERHEAD};
 /// Entries begin at multiples of this.
 const ALIGN: usize = 8;
 
-/// Distance at which memory is touched, so that the system gives it; no page is smaller.
+/// Distance at which memory is touched, so that the system allocates it; no page is smaller.
 const PAGE: usize = 4096;
 
 pub(super) struct Ram {
     arena: Vec<u8>,
-    /// Where the oldest entry begins.
+    /// Offset of the oldest entry.
     head: usize,
-    /// Where the next one will.
+    /// Offset of the next entry.
     tail: usize,
-    /// Where the newest one begins, if there is one.
+    /// Offset of the newest entry, if there is one.
     newest: usize,
-    /// Where the entries before the end of the block end, if those after them are at its beginning.
+    /// End of the entries before the end of the block, if later ones are at its beginning.
     wrapped: Option<usize>,
     entries: usize,
     bytes: u64,
@@ -29,12 +28,12 @@ pub(super) struct Ram {
 impl Ram {
     /// # Errors
     ///
-    /// If the system does not have as much memory.
+    /// If the memory cannot be allocated.
     pub(super) fn new(bytes: usize, prefault: bool) -> Result<Ram, TryReserveError> {
-        // Asked for first: what follows would end the process.
+        // Reserved first, as a failure below would end the process.
         Vec::<u8>::new().try_reserve_exact(bytes)?;
-        // Zeroed memory comes from the system untouched, so that a large block costs nothing before
-        // it is filled.
+        // Zeroed memory is not touched by the allocation, so that a large block costs nothing
+        // before it is filled.
         let mut arena = vec![0; bytes];
         if prefault {
             arena.iter_mut().step_by(PAGE).for_each(|byte| *black_box(byte) = 0);
@@ -68,7 +67,7 @@ impl Ram {
         true
     }
 
-    /// Where `need` bytes fit without giving up anything.
+    /// Offset of `need` free bytes, if no entry has to be dropped.
     fn room(&mut self, need: usize) -> Option<usize> {
         if self.entries == 0 {
             (self.head, self.tail, self.wrapped) = (0, 0, None);
@@ -87,8 +86,7 @@ impl Ram {
         Some(0)
     }
 
-    /// Takes out the oldest entry, of which there is one: a store without entries has room for all
-    /// that fits into it.
+    /// Removes the oldest entry, which exists: an empty store has room for every entry that fits.
     fn pop(&mut self) -> EntryMeta {
         let held = self.held(EntryId(self.head as u64));
         let size = size(held.len as usize);
@@ -154,12 +152,12 @@ impl Ram {
     }
 }
 
-/// What an entry of `len` bytes takes.
+/// Bytes that an entry of `len` bytes takes.
 fn size(len: usize) -> usize {
     OVERHEAD + len.next_multiple_of(ALIGN)
 }
 
-// Places within the head of an entry.
+// Offsets within the head of an entry.
 const AT: usize = 0;
 const PUBLISH: usize = 8;
 const SEQ: usize = 16;

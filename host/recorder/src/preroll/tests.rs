@@ -1,3 +1,5 @@
+//! Tests of both stores.
+
 use std::fs;
 
 use super::*;
@@ -14,7 +16,7 @@ fn held(topic: usize, at: i64) -> EntryMeta {
     EntryMeta::sample(topic, &meta, 0)
 }
 
-/// Bytes that can be told apart, of a length that differs from sample to sample.
+/// Distinct bytes, of a length that differs from sample to sample.
 fn payload(at: i64, most: u64) -> Vec<u8> {
     let len = (at as u64).wrapping_mul(2_654_435_761) % (most + 1);
     (0..len).map(|n| (n as i64 * 7 + at) as u8).collect()
@@ -44,7 +46,7 @@ fn stores(name: &str, bytes: u64) -> [Preroll; 2] {
 }
 
 #[test]
-fn what_goes_in_comes_out_in_order_and_the_bound_is_never_passed() {
+fn entries_come_out_in_order_and_the_bound_holds() {
     for (bound, most) in [(4_096, 300), (1_000, 900), (100_000, 4_000), (2 << 20, 300_000)] {
         for mut preroll in stores("bound", bound) {
             let mut first = 0;
@@ -74,7 +76,7 @@ fn what_goes_in_comes_out_in_order_and_the_bound_is_never_passed() {
 }
 
 #[test]
-fn what_is_larger_than_the_store_is_refused_and_harms_nothing() {
+fn an_entry_larger_than_the_store_is_refused() {
     for mut preroll in stores("large", 1 << 10) {
         assert!(preroll.push(held(0, 1), &[1; 100], &mut |_| panic!()).unwrap());
         assert!(!preroll.push(held(0, 2), &[2; 1 << 10], &mut |_| panic!()).unwrap());
@@ -86,7 +88,7 @@ fn what_is_larger_than_the_store_is_refused_and_harms_nothing() {
 }
 
 #[test]
-fn the_old_are_trimmed_and_marks_stay() {
+fn old_entries_are_dropped_and_marks_stay() {
     for mut preroll in stores("trim", 3 << 20) {
         for at in 0..1_000 {
             preroll.push(held(1, at), &payload(at, 9_000), &mut |_| {}).unwrap();
@@ -112,12 +114,12 @@ fn the_old_are_trimmed_and_marks_stay() {
 }
 
 #[test]
-fn a_walk_goes_on_where_it_ended_whatever_came_and_went_meanwhile() {
+fn a_reader_continues_whatever_was_added_and_dropped_meanwhile() {
     for mut preroll in stores("walk", 4_096) {
         let (mut last, mut seen) = (None, Vec::new());
         for at in 0..2_000 {
             preroll.push(held(1, at), &payload(at, 300), &mut |_| {}).unwrap();
-            // At times so many come between two walks that what was walked is gone.
+            // At times more entries come between two reads than the store keeps.
             if at % 5 == 0 && at % 400 < 300 {
                 while let Some(walked) = preroll.next(last) {
                     seen.push(preroll.held(walked.place()).at_ns);
@@ -135,7 +137,7 @@ fn a_walk_goes_on_where_it_ended_whatever_came_and_went_meanwhile() {
 }
 
 #[test]
-fn the_disk_holds_no_more_files_than_are_needed_and_none_at_the_end() {
+fn the_disk_has_only_the_needed_files_and_none_at_the_end() {
     let folder = scratch("files");
     fs::create_dir_all(&folder).unwrap();
     for name in ["7.chunk", "x.chunk", "notes.txt"] {
@@ -153,7 +155,7 @@ fn the_disk_holds_no_more_files_than_are_needed_and_none_at_the_end() {
     assert_eq!(
         names(),
         ["notes.txt", "x.chunk"],
-        "chunks of an earlier process go, other files stay"
+        "chunks of an earlier process are deleted, other files stay"
     );
     for at in 0..1_000 {
         preroll.push(held(1, at), &[at as u8; 100_000], &mut |_| {}).unwrap();
@@ -170,7 +172,7 @@ fn the_disk_holds_no_more_files_than_are_needed_and_none_at_the_end() {
 }
 
 #[test]
-fn a_disk_that_fails_is_named() {
+fn a_failing_disk_is_reported_with_its_path() {
     let folder = scratch("fails");
     let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
     fs::remove_dir_all(&folder).unwrap();
@@ -189,11 +191,11 @@ fn a_disk_that_fails_is_named() {
 }
 
 #[test]
-fn on_a_full_disk_the_oldest_go_and_nothing_fails() {
+fn on_a_full_disk_the_oldest_entries_are_dropped_without_error() {
     let folder = scratch("full");
     let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
     let mut gone = Vec::new();
-    // Larger than what waits to be written together, and smaller.
+    // Larger than the write buffer, and smaller.
     for bytes in [300_000, 100_000] {
         gone.clear();
         for at in 0..50 {
@@ -236,14 +238,14 @@ fn on_a_full_disk_the_oldest_go_and_nothing_fails() {
         assert_eq!(
             stamps.collect::<Vec<_>>(),
             (0..=last).collect::<Vec<_>>(),
-            "each is held, or was told"
+            "each is kept or was reported"
         );
         preroll.trim(last + 1, &mut |_| {}).unwrap();
     }
 }
 
 #[test]
-fn a_disk_with_too_little_room_for_others_holds_less_and_less() {
+fn a_preroll_on_a_nearly_full_disk_shrinks() {
     let folder = scratch("shrink");
     let mut preroll = Preroll::open(Store::Disk, 16 << 20, folder.clone(), false).unwrap();
     let files = || fs::read_dir(&folder).unwrap().count();

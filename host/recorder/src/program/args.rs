@@ -1,4 +1,4 @@
-//! The command line.
+//! Parses the command line.
 
 use std::path::PathBuf;
 
@@ -11,45 +11,44 @@ use gleaner_transport::{Clock, LiveSource};
 
 use super::RecorderOptions;
 
-/// Records for lambdas from live topics of ROS 2. Lambdas come over standard input, which is a
-/// socket of the starter; reports, a JSON object a line, go to standard output.
+/// Records for lambdas from live ROS 2 topics. Lambdas connect over standard input, a socket of the
+/// starter; reports, one JSON object per line, go to standard output.
 #[derive(Parser)]
 #[command(name = "gleaner-recorder", version)]
 pub(super) struct Args {
-    /// Folder of the clips: `clips.jsonl`, `clips/`.
+    /// Output folder: `clips.jsonl`, `clips/`.
     #[arg(long, value_name = "FOLDER")]
     out: PathBuf,
     #[command(flatten)]
     network: NetworkArgs,
-    /// How far the clock of samples is ahead of CLOCK_MONOTONIC, in ns; without it, it shows the
-    /// time of day.
+    /// Offset of the sample clock from CLOCK_MONOTONIC, in ns; default: the time of day.
     #[arg(long, value_name = "NS", allow_negative_numbers = true)]
     clock_offset: Option<i64>,
-    /// Folder with message definitions, looked through first.
+    /// Folder with message definitions, searched first.
     #[arg(long, value_name = "FOLDER")]
     messages: Vec<PathBuf>,
-    /// Bytes of the largest sample, by which socket buffers are sized.
+    /// Bytes of the largest sample, which sets the size of socket buffers.
     #[arg(long, value_name = "BYTES")]
     largest: Option<usize>,
-    /// Bytes of the preroll; without it, as many as the lambdas ask for together.
+    /// Bytes of the preroll; default: the sum of what the lambdas request.
     #[arg(long, value_name = "BYTES")]
     preroll_memory: Option<u64>,
-    /// Bytes of the disk that stay free: below, no clip is begun, and an open one ends.
+    /// Bytes of the disk to keep free: below, no clip is begun, and an open one ends.
     #[arg(long, value_name = "BYTES", default_value_t = 1 << 30)]
     disk_floor: u64,
-    /// Most clips that are kept; of more, the oldest that nobody fetched are deleted.
+    /// Most clips to keep; beyond it, the oldest that were not fetched are deleted.
     #[arg(long, value_name = "N")]
     clips_max: Option<u64>,
-    /// Most bytes of clips that are kept; of more, the oldest that nobody fetched are deleted.
+    /// Most bytes of clips to keep; beyond it, the oldest that were not fetched are deleted.
     #[arg(long, value_name = "BYTES")]
     bytes_max: Option<u64>,
-    /// Topic of commands, of type `std_msgs/msg/String`: whoever writes it can have something
-    /// recorded. Without it, nobody can.
+    /// Topic of commands, of type `std_msgs/msg/String`: any of its writers can request recordings.
+    /// Default: none.
     #[arg(long, value_name = "TOPIC")]
     commands: Option<TopicName>,
 }
 
-/// How the network is joined.
+/// The options of the network.
 pub(super) struct NetworkOptions(dds::DdsOptions);
 
 impl Args {

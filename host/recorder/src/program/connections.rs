@@ -1,5 +1,5 @@
-//! What the starter and the lambdas say, on its way to the loop. A thread each: their frames may
-//! come in pieces, or not at all.
+//! Receives the messages of the starter and of lambdas, with one thread for each: frames may arrive
+//! in pieces, or not at all.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -17,23 +17,23 @@ use tracing::warn;
 
 use super::topic_watch::WatchEvent;
 
-/// What one lambda said waits for the loop, up to this; then its socket waits, and then the
+/// Most messages of one lambda that are queued for the loop; then its socket fills, and then the
 /// lambda's own queue.
 const INBOX: usize = 64;
 
-/// What the loop hears beside samples and lambdas.
+/// An event for the loop, other than samples and messages of lambdas.
 pub(super) enum LoopEvent {
-    /// A lambda will come.
+    /// A lambda was announced.
     Registered(Box<Registration>),
-    /// One was announced, and refused; it was said why.
+    /// A lambda was announced and refused; the reason was sent to it.
     Refused,
-    /// It is to end: the starter said so, or has ended, or speaks nonsense.
+    /// The loop has to end: the starter sent stop, has ended, or made a protocol error.
     Stop,
-    /// From the watch.
+    /// An event of the watch thread.
     Watch(WatchEvent),
 }
 
-/// A lambda that will come, and how it is heard.
+/// An announced lambda, and its connection.
 pub(super) struct Registration {
     pub(super) manifest: Manifest,
     pub(super) remaps: Vec<(String, String)>,
@@ -41,11 +41,11 @@ pub(super) struct Registration {
     pub(super) replies: LambdaReplies,
 }
 
-/// What a lambda said.
+/// A message of a lambda.
 pub(super) enum LambdaEvent {
-    /// What it is: what was announced.
+    /// Its header matches the announcement.
     Hello(Box<JournalHeader>),
-    /// It is something else.
+    /// Its header differs from the announcement in this way.
     Mismatch(String),
     Wake {
         entry: Box<JournalEntry>,
@@ -53,11 +53,11 @@ pub(super) enum LambdaEvent {
         missing: u32,
         bytes: usize,
     },
-    /// Nothing more comes.
+    /// The connection is closed.
     Closed(Option<LinkError>),
 }
 
-/// Hears the starter until it ends.
+/// Receives messages of the starter until it ends.
 pub(super) fn starter(
     control: OwnedFd,
     events: SyncSender<LoopEvent>,
@@ -75,7 +75,7 @@ pub(super) fn starter(
                 Err(error) => {
                     warn!(
                         error = &error as &dyn std::error::Error,
-                        "the starter cannot be understood"
+                        "protocol error on the control connection"
                     );
                     LoopEvent::Stop
                 }
@@ -95,14 +95,14 @@ fn register(add: AddLambda, socket: OwnedFd, reader: &Thread) -> Option<Registra
     let (link, mut replies) = match LambdaLink::new(socket) {
         Ok(both) => both,
         Err(error) => {
-            warn!(%lambda, %error, "a lambda's socket cannot be used");
+            warn!(%lambda, %error, "cannot use the socket of a lambda");
             return None;
         }
     };
     let (manifest, digest) = match load(&add) {
         Ok(loaded) => loaded,
         Err(failure) => {
-            warn!(%lambda, %failure, "a lambda cannot be recorded for");
+            warn!(%lambda, %failure, "cannot record for a lambda");
             replies.refused(&failure.message);
             return None;
         }
@@ -111,12 +111,12 @@ fn register(add: AddLambda, socket: OwnedFd, reader: &Thread) -> Option<Registra
         ExpectedLambda { manifest: manifest.clone(), digest, remaps: add.remaps.clone() };
     let (sender, inbox) = sync_channel(INBOX);
     let reader = reader.clone();
-    let name = format!("hear {}", manifest.lambda.name);
+    let name = format!("link {}", manifest.lambda.name);
     let started =
         Builder::new().name(name).spawn(move || read_link(link, &expected, &sender, &reader));
     if let Err(error) = started {
-        warn!(%lambda, %error, "a lambda cannot be heard");
-        replies.refused("the recorder has no thread for it");
+        warn!(%lambda, %error, "cannot start the thread of a lambda");
+        replies.refused("the recorder cannot start a thread for it");
         return None;
     }
     Some(Registration { manifest, remaps: add.remaps, inbox, replies })
@@ -148,21 +148,21 @@ fn read_link(
     }
 }
 
-/// What the starter said that a lambda is.
+/// A lambda as the starter announced it.
 struct ExpectedLambda {
     manifest: Manifest,
-    /// Of its `lambda.toml`, in hexadecimal digits.
+    /// SHA-256 of its `lambda.toml`, in hexadecimal digits.
     digest: String,
     remaps: Vec<(String, String)>,
 }
 
 impl ExpectedLambda {
-    /// In which way `header` is of another lambda.
+    /// Returns how `header` differs, if it is of another lambda.
     fn differs(&self, header: &JournalHeader) -> Option<String> {
         let lambda = &self.manifest.lambda;
         let text = |what: &str, wanted: &str, found: &str| {
             (wanted != found)
-                .then(|| format!("its {what} is `{found}`; the recorder was told of `{wanted}`"))
+                .then(|| format!("its {what} is `{found}`; the starter announced `{wanted}`"))
         };
         let manifest = header.files.iter().find(|file| file.path == "lambda.toml");
         text("name", lambda.name.as_str(), &header.lambda)
@@ -174,9 +174,7 @@ impl ExpectedLambda {
             })
             .or_else(|| {
                 let is_other = header.remaps != self.remaps;
-                is_other.then(|| {
-                    "its topics are remapped in another way than the recorder was told".to_owned()
-                })
+                is_other.then(|| "its topics are not remapped as the starter announced".to_owned())
             })
             .or_else(|| {
                 let limits =
@@ -188,8 +186,7 @@ impl ExpectedLambda {
     }
 }
 
-/// The manifest of a build with the limits that it gets on this vehicle, and its digest: of the
-/// same bytes.
+/// The manifest of a build with the limits of this vehicle, and the digest of its bytes.
 fn load(add: &AddLambda) -> Result<(Manifest, String), Failure> {
     let build = BuildDir::of(&add.lambda);
     let text = Manifest::read(build.path())?;

@@ -1,5 +1,5 @@
-//! The loop: it owns the recorder. It takes its turns in small pieces, so that a trigger is heard
-//! within a fraction of a millisecond, whatever else there is to do.
+//! The event loop, which owns the recorder. It works in small steps, so that a trigger is handled
+//! within a fraction of a millisecond.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -29,32 +29,32 @@ use super::topic_watch::{RequestKind, SystemHealth, TopicRequest, TopicWatch, Wa
 use crate::recorder::counted;
 use crate::{Recorder, RecordingFolder, Settings, TopicId, Work};
 
-/// Events that wait for the loop.
+/// Most events that are queued for the loop.
 const EVENTS: usize = 256;
-/// Samples and bytes that are taken before triggers are looked for again.
+/// Most samples and bytes that are taken before the loop checks for triggers again.
 const SAMPLES_TURN: usize = 64;
 const BYTES_TURN: usize = 256 << 10;
-/// How long nobody looks for samples, if nothing else happens.
+/// Longest wait before samples are checked, if nothing else happens.
 const IDLE_WAIT: Duration = Duration::from_millis(5);
-/// And for the thread that writes, if that is behind.
+/// The same while the thread that writes clips is behind.
 const WRITER_WAIT: Duration = Duration::from_millis(1);
-/// A sample is stamped before it is staged: time passes for the recorder only when all up to then
-/// must have come.
+/// A sample is stamped before it is staged: the recorder's time advances only when all samples up
+/// to then must have arrived.
 const MARGIN_NS: i64 = 100_000_000;
-/// How long the last words of lambdas may take, and the last sample.
+/// Time that the last messages of lambdas may take, and the last sample.
 const FINISH_TIMEOUT: Duration = Duration::from_secs(1);
 const FINISH_POLL: Duration = Duration::from_millis(2);
-/// Room for staged samples: twice as much is taken.
+/// Room for staged samples: twice this is allocated.
 pub(super) const STAGING: std::ops::RangeInclusive<usize> = 8 << 20..=256 << 20;
-/// Room on the disk above the floor from which on clips are begun again.
+/// Free space above the floor from which on clips are begun again.
 const SLACK: u64 = 64 << 20;
 
-/// Records until the starter says stop, or ends, or `stop` is set; then open clips are completed.
+/// Records until the starter sends stop, or ends, or `stop` is set; then open clips are completed.
 ///
 /// # Errors
 ///
-/// [`Failure`] if the folder cannot be used, if the preroll fails, or if the network is dead:
-/// whoever started this starts it again.
+/// [`Failure`] if the folder cannot be used, if the preroll fails, or if the network is dead: the
+/// starter then restarts the process.
 pub fn run(
     options: RecorderOptions,
     source: impl FnOnce() -> Result<Box<dyn LiveSource>, Failure>,
@@ -66,7 +66,7 @@ pub fn run(
         |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
     let mut folder = RecordingFolder::hold(&options.out)?;
     let mut reports = ReportWriter::start(reports, folder.losses()).map_err(internal)?;
-    // Before anything is recovered, which takes room.
+    // Before recovery, which takes disk space.
     let mut deleted = Vec::new();
     if options.clips_max.is_some() || options.bytes_max.is_some() {
         deleted = folder.keep_at_most(options.clips_max, options.bytes_max)?;
@@ -135,22 +135,22 @@ pub fn run(
     deleted.into_iter().for_each(|loss| recorder_loop.reports.send(RecorderReport::Loss(loss)));
     let ended = recorder_loop.run();
     let last = recorder_loop.final_status();
-    // A watch that waits for room in the inbox would never end.
+    // A watch thread that waits for room in the inbox would never end.
     drop((recorder_loop.requests, recorder_loop.inbox));
     recorder_loop.reports.end(RecorderReport::Ended(Box::new(last)));
-    // It ends by itself, and with it the network.
+    // The watch thread ends by itself, and with it the network.
     let _ = watch.join();
     ended
 }
 
-/// What came of samples.
+/// The result of a turn for samples.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 enum SampleTurn {
-    /// There may be more.
+    /// There may be more samples.
     More,
-    /// Nothing.
+    /// There are no samples.
     Nothing,
-    /// One is just being copied: nobody knows what came before that is accepted.
+    /// A sample is being copied: it is unknown what came before it is accepted.
     Copying,
 }
 
@@ -165,23 +165,23 @@ pub(super) struct RecorderLoop {
     pub(super) recorder: Recorder,
     pub(super) clock: Clock,
     pub(super) staging: Arc<Staging>,
-    /// Samples that are being taken, and up to which they are.
+    /// The samples that are being taken, and the index of the next one.
     block: Block,
     at: usize,
-    /// How much room there is to be.
+    /// Room that a block of staged samples has to have.
     pub(super) room: usize,
     inbox: Receiver<LoopEvent>,
     pub(super) requests: SyncSender<TopicRequest>,
     pub(super) commands: Option<Commands>,
     pub(super) lambdas: Vec<ConnectedLambda>,
     pub(super) topics: BTreeMap<TopicId, TopicEntry>,
-    /// By lambda: what it asks of the preroll, and bytes that it expects in a second.
+    /// By lambda: the requested kind and bytes of preroll, and its expected bytes per second.
     pub(super) shares: BTreeMap<String, (Store, u64, usize)>,
     pub(super) reported: LastReported,
     pub(super) health: SystemHealth,
     pub(super) spreads: IntervalDurations,
-    /// What is counted here: lambdas and wakes that are refused, and clips that were deleted before
-    /// anything was recorded. The recorder counts the rest.
+    /// The counts of the loop: lambdas and wakes that were refused, and clips that were deleted
+    /// before anything was recorded. The recorder counts the rest.
     pub(super) counted: RecordingCounts,
     is_ending: bool,
     pub(super) options: RecorderOptions,
@@ -216,7 +216,7 @@ impl RecorderLoop {
         }
     }
 
-    /// Hears the starter and the watch.
+    /// Handles the events of the starter and of the watch thread.
     fn events(&mut self) -> Result<bool, Failure> {
         let mut is_busy = false;
         while let Ok(event) = self.inbox.try_recv() {
@@ -233,7 +233,7 @@ impl RecorderLoop {
                         (Err(error), _) => {
                             error!(
                                 error = &error as &dyn std::error::Error,
-                                "a topic is not recorded"
+                                "cannot record a topic"
                             );
                         }
                     }
@@ -247,21 +247,21 @@ impl RecorderLoop {
         Ok(is_busy)
     }
 
-    /// Below the floor no clip is begun, and the open one ends.
+    /// Suspends recording while the free disk space is below the floor.
     fn check_disk(&mut self) -> Result<(), Failure> {
         let (Some(free), floor) = (self.health.disk_free, self.options.disk_floor) else {
             return Ok(());
         };
         let is_held = self.recorder.is_held();
         if free < floor && !is_held {
-            let why = format!("less than {} MiB of the disk were free", floor >> 20);
-            warn!(free, floor, "the disk has too little room: nothing is recorded");
+            let why = format!("less than {} MiB of disk space were free", floor >> 20);
+            warn!(free, floor, "too little free disk space: recording is suspended");
             self.recorder.hold(Some(&why))?;
             if let Some(commands) = &mut self.commands {
                 commands.forget_running();
             }
         } else if is_held && free >= floor.saturating_add(SLACK) {
-            warn!(free, floor, "the disk has room again");
+            warn!(free, floor, "enough free disk space again: recording resumes");
             self.recorder.hold(None)?;
         }
         Ok(())
@@ -290,7 +290,7 @@ impl RecorderLoop {
         Ok(is_busy)
     }
 
-    /// Takes some of the samples that came.
+    /// Takes some of the staged samples.
     fn samples(&mut self, most: usize) -> Result<SampleTurn, Failure> {
         let (mut samples, mut bytes) = (0, 0);
         while let Some((staged, cdr)) = self.block.get(self.at) {
@@ -313,7 +313,7 @@ impl RecorderLoop {
         match self.staging.exchange(empty) {
             Ok(block) => self.block = block,
             Err(empty) => {
-                // Time passes only once it is known what came.
+                // Time advances only once all earlier samples are known.
                 self.block = empty;
                 return Ok(SampleTurn::Copying);
             }
@@ -322,14 +322,14 @@ impl RecorderLoop {
             self.recorder.advance(now.saturating_sub(MARGIN_NS))?;
             return Ok(SampleTurn::Nothing);
         }
-        // A topic is told before its first sample.
+        // A topic is announced before its first sample.
         self.events()?;
         Ok(SampleTurn::More)
     }
 
-    /// Takes what has come, and completes what is open.
+    /// Takes the remaining samples and wakes, and completes open clips.
     fn finish(&mut self) -> Result<(), Failure> {
-        // Their processes have ended, or will: what they said before is still on its way.
+        // The processes of lambdas have ended, or will: their last messages are still in transit.
         let until = Instant::now() + FINISH_TIMEOUT;
         while !self.lambdas.is_empty() && Instant::now() < until {
             if !self.poll_lambdas()? {
@@ -338,12 +338,12 @@ impl RecorderLoop {
         }
         let end = self.clock.now();
         let until = Instant::now() + FINISH_TIMEOUT;
-        // Three blocks at most: what comes in another is later than the end.
+        // Three blocks at most: samples in a later one are later than the end.
         let mut blocks = 0;
         while blocks < 4 {
             match self.samples(usize::MAX)? {
                 SampleTurn::More => blocks += u32::from(self.at == 0),
-                // No sample takes as long to copy.
+                // No sample takes that long to copy.
                 SampleTurn::Copying if Instant::now() < until => thread::park_timeout(FINISH_POLL),
                 SampleTurn::Copying | SampleTurn::Nothing => break,
             }

@@ -1,4 +1,4 @@
-//! Who is heard, and how much each may ask for.
+//! The connected lambdas, and their rate limits.
 
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::Instant;
@@ -14,45 +14,46 @@ use super::connections::LambdaEvent;
 use super::rate_limit::RateLimit;
 use crate::{LambdaId, LambdaSpec, RecordError, Recorder, TopicId, lambda_digest};
 
-/// What of one lambda is heard before it is the next one's turn.
+/// Most messages of one lambda before the next one's turn.
 const MOST_PER_TURN: usize = 16;
 
-/// Triggers per second that a lambda may cause, and at once.
+/// Triggers of a lambda per second, and in a burst.
 const TRIGGERS: RateLimit = RateLimit::of(200.0, 1000.0);
-/// Bytes of wakes per second that a lambda may fill the preroll with, and at once.
+/// Bytes of wakes of a lambda per second, and in a burst: they take room in the preroll.
 const BYTES: RateLimit = RateLimit::of(1048576.0, 4194304.0);
 
-/// How far a wake's stamp may lie behind the clock, and ahead of it: it is the stamp of a sample or
-/// of a tick.
+/// Greatest lag and lead of a wake's stamp relative to the clock: it is the stamp of a sample or of
+/// a tick.
 const BEHIND_NS: i64 = 60_000_000_000;
 const AHEAD_NS: i64 = 1_000_000_000;
 
-/// A lambda that is heard, or will be.
+/// A lambda that is connected, or will be.
 pub(super) struct ConnectedLambda {
     pub(super) name: String,
     rules: RecordSpec,
     topics: Vec<TopicId>,
     inbox: Receiver<LambdaEvent>,
     replies: LambdaReplies,
-    /// Once it has said what it is.
+    /// Set once its header was received.
     id: Option<LambdaId>,
     triggers: RateLimit,
     bytes: RateLimit,
-    /// What was refused is said once.
+    /// Set once a refused wake was logged.
     is_warned: bool,
 }
 
-/// What came of listening.
+/// The result of [`ConnectedLambda::poll`].
 #[derive(Copy, Clone, Debug, Default)]
 pub(super) struct PollResult {
+    /// True if there was a message.
     pub(super) is_busy: bool,
-    /// It has said what it is.
+    /// Set if its header was received and it was added.
     pub(super) is_new: Option<LambdaId>,
-    /// It is not recorded for: that was said, to it and in the log.
+    /// True if it is refused, which it was sent and is logged.
     pub(super) is_refused: bool,
-    /// Nothing more is heard of it.
+    /// True if its connection is closed.
     pub(super) is_gone: bool,
-    /// Wakes that are not recorded, and triggers of such.
+    /// Counts of wakes that are not recorded, and their triggers.
     pub(super) counted: RecordingCounts,
 }
 
@@ -77,7 +78,7 @@ impl ConnectedLambda {
         }
     }
 
-    /// Hears what it has said, up to its turn.
+    /// Handles its queued messages, up to its turn.
     pub(super) fn poll(
         &mut self,
         recorder: &mut Recorder,
@@ -110,14 +111,14 @@ impl ConnectedLambda {
                         }
                         Err(why) => {
                             let error = &why as &dyn std::error::Error;
-                            warn!(lambda = %self.name, error, "a lambda cannot be recorded for");
+                            warn!(lambda = %self.name, error, "cannot record for a lambda");
                             self.replies.refused(&why.to_string());
                             (polled.is_refused, polled.is_gone) = (true, true);
                         }
                     }
                 }
                 LambdaEvent::Mismatch(why) => {
-                    warn!(lambda = %self.name, %why, "a lambda is not what the starter said");
+                    warn!(lambda = %self.name, %why, "a lambda differs from its announcement");
                     self.replies.refused(&why);
                     (polled.is_refused, polled.is_gone) = (true, true);
                 }
@@ -142,7 +143,7 @@ impl ConnectedLambda {
                 LambdaEvent::Closed(why) => {
                     if let Some(why) = why {
                         let error = &why as &dyn std::error::Error;
-                        warn!(lambda = %self.name, error, "a lambda is not heard any more");
+                        warn!(lambda = %self.name, error, "lost the connection to a lambda");
                     }
                     polled.is_gone = true;
                 }
@@ -158,8 +159,9 @@ impl ConnectedLambda {
         Ok(polled)
     }
 
-    /// Counts a wake that an honest host would not send, and its triggers: a lambda cannot fill
-    /// what all share.
+    /// Checks a wake against the rate limits and the clock; returns its counts if it is refused. A
+    /// well-behaved host sends no such wakes, and a lambda must not exhaust resources that all
+    /// share.
     fn refused(
         &mut self,
         entry: &JournalEntry,
@@ -179,7 +181,7 @@ impl ConnectedLambda {
             warn!(
                 lambda = %self.name,
                 is_now,
-                "wakes of a lambda are not recorded: too many, or of another time"
+                "wakes of a lambda are not recorded: over the rate limit, or misstamped"
             );
         }
         Some(match is_now {

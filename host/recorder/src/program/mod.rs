@@ -1,22 +1,19 @@
-//! The program `gleaner-recorder`: one process records for all lambdas, from live topics.
+//! The program `gleaner-recorder`: one process records live topics for all lambdas.
 //!
 //! - `args`: the command line.
-//! - `hear`: a thread for the starter, and one for each lambda: what they say, on its way to the
-//!   loop.
-//! - `staging`: samples on their way from the transport's thread to the loop; all memory of it is
-//!   there before they come.
-//! - `watch`: a thread that finds topics, subscribes them, and looks after the network and the
-//!   disk.
-//! - `announce`: a lambda will come: what it records is wanted, and room for it made.
-//! - `lambdas`: who is heard, and how much each may ask for: `allowance`.
-//! - `commands`: what somebody outside may ask for, over a topic.
-//! - `course`: the loop: it owns the recorder, and nothing in it waits for a disk, a lambda or the
-//!   network.
-//! - `telling`, `say`: what the starter is told, and a thread that writes reports, for a starter
-//!   that may be slow to read them.
+//! - `connections`: a thread for the starter, and one for each lambda, which receive their
+//!   messages.
+//! - `staging`: samples in transit from the transport's thread to the loop, in memory that is
+//!   allocated before.
+//! - `topic_watch`: a thread that finds and subscribes topics, and checks the network and the disk.
+//! - `register`: requests the topics of an announced lambda, and makes room for it.
+//! - `lambdas`: the connected lambdas and their rate limits: `rate_limit`.
+//! - `commands`: recordings requested over a topic.
+//! - `event_loop`: owns the recorder, and never blocks on a disk, a lambda or the network.
+//! - `status`, `report_writer`: reports to the starter, and the thread that writes them, as the
+//!   starter may be slow to read.
 //!
-//! What never happens here: a lambda's code; a lambda that speaks for another; a sample that is
-//! kept waiting for a file.
+//! Never here: code of a lambda; a lambda that acts as another; a sample that waits for a file.
 
 mod args;
 mod commands;
@@ -45,22 +42,22 @@ use rustix::process::{Signal, set_parent_process_death_signal};
 use args::Args;
 pub use event_loop::run;
 
-/// How the process records.
+/// Options of the process.
 #[derive(Clone, Debug)]
 pub struct RecorderOptions {
     /// The folder of clips and their list.
     pub out: PathBuf,
     /// The clock of samples and wakes.
     pub clock: Clock,
-    /// Bytes of the preroll; `None`: as many as the lambdas ask for together.
+    /// Bytes of the preroll; `None`: the sum of what the lambdas request.
     pub preroll_bytes: Option<u64>,
-    /// Bytes of the disk that stay free.
+    /// Bytes of the disk to keep free.
     pub disk_floor: u64,
-    /// Most clips that are kept.
+    /// Most clips to keep.
     pub clips_max: Option<u64>,
-    /// Most bytes of clips that are kept.
+    /// Most bytes of clips to keep.
     pub bytes_max: Option<u64>,
-    /// The topic of commands; `None`: none are heard.
+    /// The topic of commands; `None`: commands are off.
     pub commands: Option<String>,
 }
 
@@ -80,13 +77,12 @@ fn start(args: Args) -> Result<(), Failure> {
     let internal = |what: &'static str| {
         move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
     };
-    // A starter that dies closes our standard input as well. Whatever comes first, open clips are
-    // completed.
+    // A starter that dies also closes our standard input. In either case, open clips are completed.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)
-        .map_err(internal("cannot be told of the starter's death"))?;
+        .map_err(internal("cannot watch for the starter's death"))?;
     let stop = stop_flag().map_err(internal("cannot handle SIGTERM"))?;
-    // Ctrl-C in a terminal reaches all processes; the starter says when this one ends.
+    // Ctrl-C in a terminal reaches all processes; the starter decides when this one ends.
     signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::default())
         .map_err(internal("cannot handle SIGINT"))?;
     let control = control()?;

@@ -1,25 +1,25 @@
-//! How much somebody may ask for.
+//! Limits the rate of requests: a token bucket.
 
 use std::time::Instant;
 
-/// So much per second, and some at once.
+/// A token bucket: a rate per second, and a burst.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct RateLimit {
     per_s: f64,
-    most: f64,
+    burst: f64,
     left: f64,
     since: Option<Instant>,
 }
 
 impl RateLimit {
-    pub(super) const fn of(per_s: f64, most: f64) -> RateLimit {
-        RateLimit { per_s, most, left: most, since: None }
+    pub(super) const fn of(per_s: f64, burst: f64) -> RateLimit {
+        RateLimit { per_s, burst, left: burst, since: None }
     }
 
-    /// Takes `amount`, if that much is left.
+    /// Takes `amount` and returns true, if that much is left.
     pub(super) fn take(&mut self, amount: f64, now: Instant) -> bool {
         let passed = self.since.map_or(0.0, |since| now.duration_since(since).as_secs_f64());
-        self.left = (self.left + passed * self.per_s).min(self.most);
+        self.left = (self.left + passed * self.per_s).min(self.burst);
         self.since = Some(now);
         let fits = amount <= self.left;
         self.left -= if fits { amount } else { 0.0 };
@@ -40,6 +40,6 @@ mod tests {
         assert!(!limit.take(5.0, start + Duration::from_millis(400)));
         assert!(limit.take(5.0, start + Duration::from_millis(600)));
         assert!(limit.take(100.0, start + Duration::from_secs(3600)));
-        assert!(!limit.take(1.0, start + Duration::from_secs(3600)), "not more than at once");
+        assert!(!limit.take(1.0, start + Duration::from_secs(3600)), "not more than a burst");
     }
 }

@@ -1,4 +1,4 @@
-//! A lambda is announced: its topics are wanted from then on, and it has its share of the preroll.
+//! Registers a lambda: requests its topics, and sizes the preroll and staging for it.
 
 use std::sync::Arc;
 
@@ -13,22 +13,21 @@ use super::staging::TopicSink;
 use super::topic_watch::{LargestSample, RequestKind, TopicRequest};
 use crate::{RecordError, TopicId};
 
-/// Lambdas that are heard at a time. Each has a thread.
+/// Most lambdas at a time. Each has a thread.
 const LAMBDAS: usize = 256;
-/// Bytes of the largest sample of a topic of which no manifest says more, as far as room for it
-/// goes.
+/// Bytes of the largest sample of a topic whose size no manifest states, for the size of the
+/// staging area.
 const USUAL_BYTES: usize = 8 << 20;
 
 impl RecorderLoop {
-    /// A lambda will come: its topics are wanted from now on, so that there is a preroll when it
-    /// does.
+    /// Registers a lambda before it connects, so that there is a preroll when it does.
     pub(super) fn register(&mut self, registration: Registration) -> Result<(), Failure> {
         let Registration { manifest, remaps, inbox, mut replies } = registration;
         let Some(rules) = manifest.record.clone() else { return Ok(()) };
         let name = manifest.lambda.name.to_string();
         if self.lambdas.len() == LAMBDAS {
-            warn!(lambda = %name, most = LAMBDAS, "too many lambdas at a time: not recorded for");
-            replies.refused(&format!("it hears at most {LAMBDAS} lambdas at a time"));
+            warn!(lambda = %name, most = LAMBDAS, "too many lambdas: one is not recorded for");
+            replies.refused(&format!("it records for at most {LAMBDAS} lambdas at a time"));
             self.counted.lambdas_refused += 1;
             return Ok(());
         }
@@ -50,7 +49,7 @@ impl RecorderLoop {
                 Ok(_) => {}
                 Err(error) => {
                     let why = error.to_string();
-                    warn!(lambda = %name, topic = %wanted, %why, "a lambda cannot be recorded for");
+                    warn!(lambda = %name, topic = %wanted, %why, "cannot record for a lambda");
                     replies.refused(&why);
                     self.counted.lambdas_refused += 1;
                     return Ok(());
@@ -65,10 +64,10 @@ impl RecorderLoop {
         let wanted = largest.saturating_add(per_s).clamp(*STAGING.start(), *STAGING.end());
         self.room = self.room.max(wanted);
         if let Err(error) = self.grow_preroll() {
-            // The others go on with what they have.
+            // The other lambdas keep what they have.
             self.shares.remove(&name);
             let why = Failure::from(error).to_string();
-            warn!(lambda = %name, %why, "a lambda cannot be recorded for");
+            warn!(lambda = %name, %why, "cannot record for a lambda");
             replies.refused(&why);
             self.counted.lambdas_refused += 1;
             return Ok(());
@@ -78,7 +77,7 @@ impl RecorderLoop {
         Ok(())
     }
 
-    /// As much preroll as all lambdas ask for.
+    /// Grows the preroll to the sum of all requests.
     fn grow_preroll(&mut self) -> Result<(), RecordError> {
         let store = if self.shares.values().any(|shares| shares.0 == Store::Disk) {
             Store::Disk
@@ -87,12 +86,12 @@ impl RecorderLoop {
         };
         let bytes = self.shares.values().map(|shares| shares.1).fold(0, u64::saturating_add);
         match self.options.preroll_bytes {
-            // What is given is memory.
+            // The given size is memory.
             Some(given) if store == Store::Ram => {
                 if given < bytes {
                     warn!(
-                        shares = bytes,
-                        given, "lambdas ask for more preroll than the recorder was given"
+                        requested = bytes,
+                        given, "lambdas request more preroll than --preroll-memory allows"
                     );
                 }
                 Ok(())
@@ -113,7 +112,7 @@ impl RecorderLoop {
                 TopicSink { topic, staging: Arc::clone(&self.staging), arrivals: Arc::default() };
             TopicEntry { name: name.to_owned(), type_name: None, sink: Arc::new(sink) }
         });
-        // The watch takes them as they come.
+        // The watch thread takes requests as they come.
         let what = RequestKind::Recorded { topic, largest };
         let _ = self.requests.send(TopicRequest {
             what,

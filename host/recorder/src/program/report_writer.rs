@@ -1,5 +1,5 @@
-//! Reports to the starter, and losses to their list, by a thread each: a starter that is slow to
-//! read keeps no loss from being noted, and a slow disk no report from being said.
+//! Writes reports to the starter, and losses to their list, with one thread each: a slow starter
+//! does not delay a loss, and a slow disk does not delay a report.
 
 use std::fs::File;
 use std::io::Write;
@@ -13,20 +13,20 @@ use tracing::{error, warn};
 
 use crate::LossList;
 
-/// Reports that wait, and losses. Those of clips are few; of status, one more or less does not
+/// Most reports and losses in a queue. Those of clips are few, and a status more or less does not
 /// matter.
 const WAITING: usize = 1024;
 
-/// How long a starter is waited for that does not read, and a disk that does not write.
-const PATIENCE: Duration = Duration::from_secs(2);
+/// Time to wait for a starter that does not read, and a disk that does not write.
+const END_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Says things without waiting.
+/// Queues reports without blocking.
 pub(super) struct ReportWriter {
     reports: SyncSender<RecorderReport>,
     losses: SyncSender<Loss>,
-    /// Nothing comes over it; it closes when both threads have ended.
+    /// Nothing is sent over it; it closes when both threads have ended.
     ended: Receiver<()>,
-    /// Reports for which there was no room. Clips and losses stand in their lists all the same.
+    /// Number of reports dropped for lack of room. Clips and losses are still in their lists.
     dropped: u64,
 }
 
@@ -49,32 +49,31 @@ impl ReportWriter {
 
     pub(super) fn send(&mut self, report: RecorderReport) {
         if let RecorderReport::Loss(loss) = &report
-            // Noted already, by whoever deletes: before.
+            // Noted already, before the deletion.
             && !matches!(loss, Loss::Deleted { .. } | Loss::NotDeleted { .. })
             && self.losses.try_send(loss.clone()).is_err()
         {
-            error!(?loss, "the disk is too slow to note a loss");
+            error!(?loss, "the disk is too slow to write losses.jsonl");
         }
         match self.reports.try_send(report) {
             Ok(()) | Err(TrySendError::Disconnected(_)) => {}
             Err(TrySendError::Full(_)) => {
                 self.dropped += 1;
                 if self.dropped == 1 {
-                    warn!("the starter does not read reports: some are left out");
+                    warn!("the starter does not read reports: some are dropped");
                 }
             }
         }
     }
 
-    /// Says the last thing, and waits until all is said and noted; not for a starter that does not
-    /// read.
+    /// Sends the last report, and waits until all is written; not for a starter that does not read.
     pub(super) fn end(mut self, report: RecorderReport) {
         self.send(report);
         let ReportWriter { reports, losses, ended, dropped } = self;
         drop((reports, losses));
-        let _ = ended.recv_timeout(PATIENCE);
+        let _ = ended.recv_timeout(END_TIMEOUT);
         if dropped > 0 {
-            warn!(dropped, "reports were left out, as the starter did not read them");
+            warn!(dropped, "reports dropped: the starter did not read them");
         }
     }
 }
@@ -84,7 +83,7 @@ fn write(mut to: File, reports: &Receiver<RecorderReport>) {
         let mut line = serde_json::to_vec(&report).expect("a report is plain data");
         line.push(b'\n');
         if to.write_all(&line).is_err() {
-            // Nobody reads any more.
+            // There is no reader any more.
             return;
         }
     }
@@ -93,7 +92,7 @@ fn write(mut to: File, reports: &Receiver<RecorderReport>) {
 fn note(list: &LossList, losses: &Receiver<Loss>) {
     for loss in losses {
         if let Err(error) = list.note(&loss) {
-            error!(?loss, error = &error as &dyn std::error::Error, "cannot note a loss");
+            error!(?loss, error = &error as &dyn std::error::Error, "cannot write losses.jsonl");
         }
     }
 }
@@ -109,7 +108,7 @@ mod tests {
     use crate::support::TestDir;
 
     #[test]
-    fn a_loss_is_noted_though_the_starter_reads_nothing() {
+    fn a_loss_is_noted_even_if_the_starter_reads_nothing() {
         let scratch = TestDir::new();
         let (folder, _) = RecordingFolder::open(&scratch.0).unwrap();
         let (reader, writer) = std::io::pipe().unwrap();
@@ -127,9 +126,9 @@ mod tests {
             std::thread::yield_now();
         }
         assert_eq!(noted(), "{\"loss\":\"failed\",\"at_ns\":7,\"why\":\"x\"}\n");
-        // The loss itself may have found a place that was just made.
+        // The loss itself may have found room that had just become free.
         assert!(reports.dropped >= 1);
-        // A starter that reads again has every report that waited.
+        // A starter that reads again gets every queued report.
         let reading = std::thread::spawn(move || {
             BufReader::new(reader).lines().map_while(Result::ok).count()
         });

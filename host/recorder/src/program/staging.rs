@@ -1,13 +1,13 @@
-//! Samples on their way from the transport to the loop.
+//! Stages samples between the transport and the loop.
 //!
-//! Two blocks of memory: into one the transport's thread writes, the other is read by the loop, and
-//! they change places when that one is empty. Nothing is allocated while samples come. A sample is
-//! copied here once, from the transport's own memory, before it is known whose it is: it counts
-//! when that is accepted.
+//! There are two blocks of memory: the transport's thread writes one, the loop reads the other, and
+//! they are swapped when that one is empty. Nothing is allocated per sample. A sample is copied
+//! here once, from the transport's memory, before its metadata is known: it counts when it is
+//! accepted.
 //!
-//! The loop never waits for the transport's copying: meanwhile that has the block, and the loop
-//! comes back later. The transport's thread waits for the loop only if that moves a copy which is
-//! not accepted yet behind samples that are, once for each such copy.
+//! The loop never waits for a copy: during a copy the transport has the block, and the loop tries
+//! again later. The transport's thread waits for the loop only if a copy that is not accepted yet
+//! has to be moved behind accepted samples, once for each such copy.
 
 use std::hint::black_box;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -18,22 +18,22 @@ use gleaner_transport::{Delivery, SampleMeta, Sink};
 
 use crate::TopicId;
 
-/// Samples in a block.
+/// Most samples in a block.
 const SAMPLES: usize = 64 << 10;
 
-/// Distance at which memory is touched, so that the system gives it; no page is smaller.
+/// Distance at which memory is touched, so that the system allocates it; no page is smaller.
 const PAGE: usize = 4096;
 
-/// A sample that waits.
+/// A staged sample.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Staged {
     pub(super) topic: TopicId,
     pub(super) meta: SampleMeta,
-    /// Where its bytes are; `None`: there was no room for them.
+    /// Position and length of its bytes; `None`: there was no room for them.
     pub(super) bytes: Option<(usize, usize)>,
 }
 
-/// Samples in the order in which they came.
+/// Staged samples in order of arrival.
 #[derive(Default)]
 pub(super) struct Block {
     bytes: Vec<u8>,
@@ -41,7 +41,7 @@ pub(super) struct Block {
 }
 
 impl Block {
-    /// One for as many bytes, all of which is there at once.
+    /// A block for this many bytes, all of them allocated at once.
     pub(super) fn new(bytes: usize) -> Block {
         let mut memory = vec![0_u8; bytes];
         memory.iter_mut().step_by(PAGE).for_each(|byte| *black_box(byte) = 0);
@@ -65,18 +65,18 @@ impl Block {
     }
 }
 
-/// Where the sinks of all topics put samples. They are all called by one thread, the transport's.
+/// The staging area of the sinks of all topics. They are all called by one thread, the transport's.
 pub(super) struct Staging {
     filling: Mutex<Filling>,
-    /// The loop, which looks by itself every few ms; it is woken only when half of the room is
-    /// taken.
+    /// The thread of the loop, which checks by itself every few ms; it is unparked only when half
+    /// of the room is taken.
     reader: Thread,
 }
 
 struct Filling {
     /// `None` while a sample is being copied into it.
     block: Option<Block>,
-    /// What was copied last, until it is known whose sample it is.
+    /// The last copy, until it is accepted.
     copied: Option<Copied>,
 }
 
@@ -84,9 +84,9 @@ struct Filling {
 struct Copied {
     topic: TopicId,
     delivery: Delivery,
-    /// Where its bytes begin; they go to the end of the block.
+    /// Start of its bytes, which reach to the end of the block.
     at: usize,
-    /// Whether the loop has come for the block once since.
+    /// True if the loop has requested the block once since.
     is_awaited: bool,
 }
 
@@ -96,9 +96,8 @@ impl Staging {
         Arc::new(Staging { filling: Mutex::new(filling), reader })
     }
 
-    /// Takes what came, for `empty`, which has as much room as the one before at least. `empty`
-    /// comes back if a sample is just being copied or about to be accepted: whoever asks is to come
-    /// again.
+    /// Swaps the filled block for `empty`, which has at least as much room. Returns `empty` as the
+    /// error while a sample is being copied or about to be accepted: the caller tries again later.
     pub(super) fn exchange(&self, mut empty: Block) -> Result<Block, Block> {
         let mut filling = self.filling();
         let Filling { block: Some(block), copied } = &mut *filling else { return Err(empty) };
@@ -107,9 +106,8 @@ impl Staging {
                 copied.is_awaited = true;
                 return Err(empty);
             }
-            // It may be nobody's, and never be accepted; or its thread was interrupted. What came
-            // before is not kept waiting for it: it goes along to the next block. Alone it stays
-            // where it is.
+            // It may never be accepted, or its thread was interrupted. Earlier samples do not wait
+            // for it: it moves to the next block. Alone it stays where it is.
             if block.samples.is_empty() {
                 return Ok(empty);
             }
@@ -124,10 +122,10 @@ impl Staging {
     fn fill(&self, topic: TopicId, cdr: &[u8]) -> Delivery {
         let mut filling = self.filling();
         let unaccepted = filling.copied.take();
-        // All samples come from one thread, so nobody else is copying.
+        // All samples come from one thread, so there is no other copy in progress.
         let Some(mut block) = filling.block.take() else { return Delivery::NoSlot };
         drop(filling);
-        // One that was never accepted was nobody's.
+        // A copy that was never accepted is dropped.
         if let Some(copied) = unaccepted {
             block.bytes.truncate(copied.at);
         }
@@ -146,13 +144,13 @@ impl Staging {
         delivery
     }
 
-    /// What was copied last is this sample of `topic`; what became of it.
+    /// Accepts the last copy as this sample of `topic`; returns whether it was taken.
     fn accept(&self, topic: TopicId, meta: &SampleMeta) -> Option<Delivery> {
         let mut filling = self.filling();
         let copied = filling.copied.take_if(|copied| copied.topic == topic)?;
         let block = filling.block.as_mut()?;
-        // A sample without room is still known to have been there. If there is no room even for
-        // that, its number will be missing.
+        // A sample without room is still recorded as present. If there is no room even for that,
+        // its number will be missing.
         if block.samples.len() < SAMPLES {
             let bytes = (copied.delivery == Delivery::Taken)
                 .then(|| (copied.at, block.bytes.len() - copied.at));
@@ -171,7 +169,7 @@ impl Staging {
     }
 }
 
-/// What came of one topic.
+/// Counts of one topic.
 #[derive(Debug, Default)]
 pub(super) struct Arrivals {
     pub(super) received: AtomicU64,
@@ -179,7 +177,7 @@ pub(super) struct Arrivals {
     pub(super) too_big: AtomicU64,
 }
 
-/// Takes the samples of one topic.
+/// The sink of one topic.
 pub(super) struct TopicSink {
     pub(super) topic: TopicId,
     pub(super) staging: Arc<Staging>,
@@ -214,35 +212,35 @@ mod tests {
     use crate::support::{TestDir, meta, topic};
 
     /// Room for 100 bytes, and the sinks of two topics.
-    fn lanes() -> (Arc<Staging>, [TopicSink; 2]) {
+    fn sinks() -> (Arc<Staging>, [TopicSink; 2]) {
         let scratch = TestDir::new();
         let mut recorder = scratch.recorder(|_| {});
         let staging = Staging::new(100, std::thread::current());
-        let lanes = ["/a", "/b"].map(|name| TopicSink {
+        let sinks = ["/a", "/b"].map(|name| TopicSink {
             topic: recorder.add_topic(topic(name)).unwrap(),
             staging: Arc::clone(&staging),
             arrivals: Arc::default(),
         });
-        (staging, lanes)
+        (staging, sinks)
     }
 
-    /// Topic, number and bytes of what waits; `None` for what found no room.
+    /// Topic, number and bytes of a staged sample; `None` for one without room.
     type StagedEntry = (TopicId, u64, Option<Vec<u8>>);
 
-    fn came(block: &Block) -> Vec<StagedEntry> {
-        let came = |(staged, cdr): (Staged, &[u8])| {
+    fn staged(block: &Block) -> Vec<StagedEntry> {
+        let entry = |(staged, cdr): (Staged, &[u8])| {
             (staged.topic, staged.meta.seq, staged.bytes.map(|_| cdr.to_vec()))
         };
-        (0..).map_while(|index| block.get(index).map(came)).collect()
+        (0..).map_while(|index| block.get(index).map(entry)).collect()
     }
 
     fn take(staging: &Staging) -> Vec<StagedEntry> {
-        came(&staging.exchange(Block::new(100)).ok().expect("nothing is being copied"))
+        staged(&staging.exchange(Block::new(100)).ok().expect("nothing is being copied"))
     }
 
     #[test]
-    fn what_is_copied_comes_once_it_is_accepted() {
-        let (staging, [a, b]) = lanes();
+    fn a_copy_is_staged_once_it_is_accepted() {
+        let (staging, [a, b]) = sinks();
         assert_eq!(a.copy(b"first"), Some(Delivery::Taken));
         a.accept(&meta(1, 1));
         assert_eq!(b.deliver(&meta(2, 2), b"second"), Delivery::Taken);
@@ -250,13 +248,13 @@ mod tests {
         b.accept(&meta(3, 3));
         let expected =
             [(a.topic, 1, Some(b"first".to_vec())), (b.topic, 2, Some(b"second".to_vec()))];
-        assert_eq!(take(&staging), expected, "there was nothing else to accept");
+        assert_eq!(take(&staging), expected, "nothing else was accepted");
         assert_eq!(a.arrivals.received.load(Ordering::Relaxed), 1);
     }
 
     #[test]
-    fn copies_that_are_never_accepted_leave_nothing_behind_and_keep_nobody_waiting() {
-        let (staging, [a, b]) = lanes();
+    fn copies_that_are_never_accepted_take_no_room_and_delay_no_sample() {
+        let (staging, [a, b]) = sinks();
         b.deliver(&meta(1, 1), b"before");
         for _ in 0..10 {
             assert_eq!(a.copy(&[7; 60]), Some(Delivery::Taken));
@@ -264,7 +262,7 @@ mod tests {
         let empty =
             staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
         let block = staging.exchange(empty).ok().expect("or never");
-        assert_eq!(came(&block), [(b.topic, 1, Some(b"before".to_vec()))]);
+        assert_eq!(staged(&block), [(b.topic, 1, Some(b"before".to_vec()))]);
         assert_eq!(b.deliver(&meta(2, 2), &[8; 100]), Delivery::Taken, "its room is free again");
         a.accept(&meta(3, 3));
         assert_eq!(take(&staging), [(b.topic, 2, Some(vec![8; 100]))]);
@@ -272,7 +270,7 @@ mod tests {
 
     #[test]
     fn a_copy_that_waits_alone_is_not_moved() {
-        let (staging, [a, _]) = lanes();
+        let (staging, [a, _]) = sinks();
         a.copy(b"late");
         let mut empty =
             staging.exchange(Block::new(100)).err().expect("it may be accepted at any time");
@@ -285,8 +283,8 @@ mod tests {
     }
 
     #[test]
-    fn a_copy_that_is_accepted_late_comes_with_the_next_block() {
-        let (staging, [a, b]) = lanes();
+    fn a_copy_that_is_accepted_late_is_in_the_next_block() {
+        let (staging, [a, b]) = sinks();
         b.deliver(&meta(1, 1), b"before");
         a.copy(b"late");
         let empty =
@@ -301,8 +299,8 @@ mod tests {
     }
 
     #[test]
-    fn what_finds_no_room_is_counted_and_known_to_have_been_there() {
-        let (staging, [a, b]) = lanes();
+    fn a_sample_without_room_is_counted_and_recorded_as_present() {
+        let (staging, [a, b]) = sinks();
         assert_eq!(a.copy(&[0; 101]), Some(Delivery::TooBig));
         a.accept(&meta(1, 1));
         assert_eq!(a.copy(&[1; 60]), Some(Delivery::Taken));

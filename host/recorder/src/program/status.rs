@@ -1,4 +1,4 @@
-//! What the loop tells the starter.
+//! Reports of the loop to the starter.
 
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -10,7 +10,7 @@ use tracing::{error, warn};
 use super::event_loop::{RecorderLoop, TopicEntry};
 use crate::{RecorderCounts, TopicId};
 
-/// What was told of the counts.
+/// The last reported counts.
 #[derive(Default)]
 pub(super) struct LastReported {
     clips: u64,
@@ -19,7 +19,7 @@ pub(super) struct LastReported {
 }
 
 impl RecorderLoop {
-    /// Tells what is new.
+    /// Reports new clips, losses and, once a second, the status.
     pub(super) fn report(&mut self, is_last: bool) -> Result<(), Failure> {
         let counts = self.recorder.counts();
         let new =
@@ -32,14 +32,14 @@ impl RecorderLoop {
         for clip in self.recorder.take_recovered() {
             warn!(
                 clip = %clip.file.display(),
-                "recovered a clip of an earlier recorder, which did not end well"
+                "recovered a clip of an earlier recorder that died"
             );
             self.reports.send(RecorderReport::Recovered(Box::new(clip)));
         }
         let at_ns = self.clock.now();
         for error in self.recorder.take_failures() {
             let failure = Failure::from(error);
-            error!(%failure, "a clip could not be written");
+            error!(%failure, "cannot write a clip");
             let reason = std::iter::once(failure.message)
                 .chain(failure.causes)
                 .collect::<Vec<_>>()
@@ -56,7 +56,7 @@ impl RecorderLoop {
         let disk_suppressed = counts.recording.disk_suppressed - self.reported.disk_suppressed;
         if disk_suppressed > 0 {
             self.reported.disk_suppressed = counts.recording.disk_suppressed;
-            let reason = "the disk had too little room".to_owned();
+            let reason = "too little free disk space".to_owned();
             self.reports.send(RecorderReport::Loss(Loss::DiskSuppressed {
                 at_ns,
                 triggers: disk_suppressed,

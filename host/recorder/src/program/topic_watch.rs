@@ -1,5 +1,4 @@
-//! Finds the topics that are wanted and subscribes them; looks after the network and the disk once
-//! a second.
+//! Finds and subscribes the requested topics; checks the network and the disk once a second.
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -20,57 +19,56 @@ use super::commands;
 use super::connections::LoopEvent;
 use crate::{TopicId, TopicSchema};
 
-/// How often topics are looked for.
+/// Interval of the search for topics.
 const SEARCH_INTERVAL: Duration = Duration::from_millis(100);
-/// How often network and disk are looked after.
+/// Interval of the checks of network and disk.
 const HEALTH_INTERVAL: Duration = Duration::from_secs(1);
-/// Looks until a topic that could not be subscribed is tried again.
+/// Searches until a failed subscription is retried.
 const RETRY_AFTER: u32 = 100;
 
-/// A topic that is to be heard.
+/// A request for a topic.
 pub(super) struct TopicRequest {
     pub(super) what: RequestKind,
     pub(super) name: String,
-    /// Its type, where a manifest says it; else the one that most write.
+    /// Its type, if a manifest states it; else the one with most writers.
     pub(super) type_name: Option<String>,
     pub(super) sink: Arc<dyn Sink>,
 }
 
-/// How long a topic may wait for somebody to say what it is; others are asked about others
+/// Time that a topic may wait for its definitions; other nodes are queried for other topics
 /// meanwhile.
 const DEFINITIONS_TIMEOUT: Duration = Duration::from_secs(6);
 
-/// What a topic is wanted for.
+/// The purpose of a request.
 #[derive(Copy, Clone, Debug)]
 pub(super) enum RequestKind {
-    /// To be recorded, once it is there and its type known.
+    /// Record it, once it is found and its type known.
     Recorded {
         topic: TopicId,
-        /// How large its samples are. Of several wants of a topic, the largest counts.
+        /// The size of its samples. Of several requests for a topic, the largest counts.
         largest: LargestSample,
     },
-    /// Commands come over it. It is heard before anybody writes, where the network can do that: a
-    /// command is written once.
+    /// Receive commands. It is subscribed before there is a writer, where the network can do that:
+    /// a command is written once.
     Commands,
 }
 
-/// How large the samples of a topic may be, as far as manifests say.
+/// The largest sample of a topic, as far as manifests state it.
 #[derive(Copy, Clone, Debug, Default)]
 pub(super) struct LargestSample {
-    /// The most that a manifest says, in bytes.
+    /// The largest size that a manifest states, in bytes.
     largest_bytes: usize,
-    /// Whether somebody wants it whose manifest does not say: the usual size of its type counts as
-    /// well.
+    /// True if a manifest does not state it: then the usual size of its type counts as well.
     is_usual: bool,
 }
 
 impl LargestSample {
-    /// What one manifest says.
+    /// The size in one manifest.
     pub(super) fn of(max_bytes: Option<usize>) -> LargestSample {
         LargestSample { largest_bytes: max_bytes.unwrap_or(0), is_usual: max_bytes.is_none() }
     }
 
-    /// What two of them say.
+    /// The larger of two.
     fn and(self, other: LargestSample) -> LargestSample {
         LargestSample {
             largest_bytes: self.largest_bytes.max(other.largest_bytes),
@@ -83,15 +81,15 @@ impl LargestSample {
     }
 }
 
-/// What was seen.
+/// An event of the watch thread.
 pub(super) enum WatchEvent {
-    /// A topic is there, and will be heard.
+    /// A topic was found, and will be subscribed.
     Found { topic: TopicId, of: TopicSchema },
-    /// Once a second.
+    /// The checks of each second.
     Health(Box<SystemHealth>),
 }
 
-/// How everything outside is.
+/// The health of the network, the disk and this process.
 #[derive(Default)]
 pub(super) struct SystemHealth {
     pub(super) source: Health,
@@ -102,16 +100,16 @@ pub(super) struct SystemHealth {
     pub(super) cpu_s: f64,
 }
 
-/// A topic that is heard.
+/// A subscribed topic.
 struct SubscribedTopic {
     topic: TopicId,
     subscription: Subscription,
     type_name: String,
-    /// What it was subscribed for.
+    /// The largest sample of the subscription, in bytes.
     max_bytes: usize,
 }
 
-/// Adds a want; several for one topic are one.
+/// Adds a request; several for one topic are merged.
 fn add(
     requested: &mut Vec<(TopicRequest, u32)>,
     subscribed: &[SubscribedTopic],
@@ -129,7 +127,7 @@ fn add(
                 %topic,
                 %requested,
                 recorded = %visible(known),
-                "a topic is wanted as two types, and recorded as one"
+                "a topic is requested with two types; one is recorded"
             );
         }
     };
@@ -142,7 +140,7 @@ fn add(
                 %topic,
                 requested,
                 max_bytes,
-                "a topic is heard already, with room for smaller samples: more of them may be lost"
+                "already subscribed for smaller samples; larger ones may be lost"
             );
         }
         return;
@@ -163,7 +161,7 @@ fn add(
     requested.push((request, 0));
 }
 
-/// The thread's own.
+/// The watch thread.
 pub(super) struct TopicWatch {
     pub(super) source: Box<dyn LiveSource>,
     pub(super) requests: Receiver<TopicRequest>,
@@ -173,19 +171,19 @@ pub(super) struct TopicWatch {
 }
 
 impl TopicWatch {
-    /// Until nobody wants anything more.
+    /// Runs until the loop drops the request channel.
     pub(super) fn run(mut self) {
         let mut requested: Vec<(TopicRequest, u32)> = Vec::new();
         let (mut subscribed, mut commands) = (Vec::<SubscribedTopic>::new(), None);
         let mut health_at = Instant::now();
-        // Since when each topic waits for its definitions.
+        // The start of each topic's wait for its definitions.
         let mut waiting_since: HashMap<String, Instant> = HashMap::new();
-        // Topics that were found as several types, or as another than is wanted; what they are was
-        // said.
-        let mut odd: HashSet<String> = HashSet::new();
+        // Topics with writers of several types, or of another type than requested, that were
+        // logged.
+        let mut mismatched: HashSet<String> = HashSet::new();
         loop {
             match self.requests.recv_timeout(SEARCH_INTERVAL) {
-                // All that wait at once: to look for topics takes longer.
+                // All queued requests at once: a search for topics takes longer.
                 Ok(request) => std::iter::once(request)
                     .chain(std::iter::from_fn(|| self.requests.try_recv().ok()))
                     .for_each(|request| add(&mut requested, &subscribed, request)),
@@ -196,11 +194,11 @@ impl TopicWatch {
                 let topics = self.source.topics();
                 requested.retain_mut(|(request, wait)| {
                     *wait = wait.saturating_sub(1);
-                    let found = choose(&topics, request, &mut odd);
+                    let found = choose(&topics, request, &mut mismatched);
                     match (request.what, found) {
                         _ if *wait > 0 => return true,
-                        // Whoever writes it is asked what it is. Until then it is not recorded, so
-                        // it is not waited for longer.
+                        // A node that writes it is queried for the definitions. The topic is not
+                        // recorded meanwhile, so the wait is bounded.
                         (RequestKind::Recorded { .. }, Some(found))
                             if found.definitions_text.is_none()
                                 && waiting_since
@@ -266,7 +264,7 @@ impl TopicWatch {
             warn!(
                 %topic,
                 %type_name,
-                "no definitions of this type: its messages are recorded without"
+                "no definitions of this type; recording its messages without"
             );
         }
         let of = TopicSchema {
@@ -300,14 +298,15 @@ impl TopicWatch {
         }
     }
 
-    /// Or after how many looks to try again.
+    /// Subscribes the topic of commands; the error is the number of searches until the next
+    /// attempt.
     fn subscribe_commands(&mut self, request: &TopicRequest) -> Result<Subscription, u32> {
         let spec = TopicSpec {
             topic: request.name.clone(),
             type_name: commands::TYPE.to_owned(),
             queue: commands::QUEUE,
             max_bytes: commands::MESSAGE_MAX,
-            // Not those from before: they are obeyed already, or nobody wants them any more.
+            // Not earlier commands: they were executed already, or are outdated.
             qos: Qos::Fixed { reliable: true, transient_local: false, depth: commands::QUEUE },
         };
         self.source.subscribe(&spec, Arc::clone(&request.sink)).map_err(|why| match why {
@@ -316,7 +315,7 @@ impl TopicWatch {
                 error!(
                     topic = %visible(&request.name),
                     error = &why as &dyn std::error::Error,
-                    "cannot hear commands"
+                    "cannot subscribe the topic of commands"
                 );
                 RETRY_AFTER
             }
@@ -324,23 +323,23 @@ impl TopicWatch {
     }
 }
 
-/// Of what is there, the topic that is wanted: of the type that a manifest says, else of the one
-/// that most write.
+/// Chooses the requested topic: with the type that a manifest states, else with the type with most
+/// writers.
 fn choose<'a>(
     topics: &'a [DiscoveredTopic],
     request: &TopicRequest,
-    odd: &mut HashSet<String>,
+    mismatched: &mut HashSet<String>,
 ) -> Option<&'a DiscoveredTopic> {
     let mut named = topics.iter().filter(|topic| topic.topic == request.name);
     let is_wanted = |found: &&DiscoveredTopic| {
         request.type_name.as_ref().is_none_or(|requested| found.type_name == *requested)
     };
-    // The transport names first what most write.
+    // The transport lists the type with most writers first.
     let found = named.clone().find(is_wanted);
     let chosen = found.map(|found| &found.type_name);
     if let Some(other) = named.find(|topic| Some(&topic.type_name) != chosen)
         && matches!(request.what, RequestKind::Recorded { .. })
-        && odd.insert(request.name.clone())
+        && mismatched.insert(request.name.clone())
     {
         let (topic, other) = (visible(&request.name), visible(&other.type_name));
         match (chosen, &request.type_name) {
@@ -349,7 +348,7 @@ fn choose<'a>(
                     %topic,
                     recorded = %visible(chosen),
                     %other,
-                    "a topic is written as several types, one is recorded"
+                    "a topic has writers of several types; one type is recorded"
                 );
             }
             (None, requested) => {
@@ -358,7 +357,7 @@ fn choose<'a>(
                     %topic,
                     %requested,
                     %other,
-                    "a topic is written as another type than the input says, not recorded so far"
+                    "no writer of a topic has the type of the input; not recorded yet"
                 );
             }
         }
@@ -366,9 +365,9 @@ fn choose<'a>(
     found
 }
 
-/// Bytes of the largest sample of a topic of which no manifest says more. What is larger may be
-/// dropped before anybody can count it, so this is generous; the staging area, which counts what it
-/// has no room for, is not.
+/// Bytes of the largest sample of a topic whose size no manifest states. Larger samples may be
+/// dropped before they can be counted, so this is generous; the staging area, which counts samples
+/// without room, is not.
 fn usual_bytes(type_name: &str) -> usize {
     match type_name.rsplit('/').next() {
         Some("Image" | "PointCloud2") => 32 << 20,
@@ -376,7 +375,7 @@ fn usual_bytes(type_name: &str) -> usize {
     }
 }
 
-/// Bytes that are free on the disk of `folder`.
+/// Free bytes on the disk of `folder`.
 fn free(folder: &Path) -> Option<u64> {
     rustix::fs::statvfs(folder).ok().map(|disk| disk.f_bavail.saturating_mul(disk.f_frsize))
 }
@@ -386,7 +385,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn of_several_who_want_a_topic_the_largest_sample_counts() {
+    fn of_several_requests_for_a_topic_the_largest_sample_counts() {
         let image = "sensor_msgs/msg/Image";
         let largest_bytes = |bytes| LargestSample::of(Some(bytes));
         assert_eq!(
@@ -396,7 +395,7 @@ mod tests {
         assert_eq!(
             largest_bytes(100).and(LargestSample::of(None)).bytes(image),
             32 << 20,
-            "somebody does not know"
+            "one manifest does not state it"
         );
         assert_eq!(LargestSample::of(None).and(largest_bytes(64 << 20)).bytes(image), 64 << 20);
     }

@@ -1,5 +1,5 @@
-//! Bringing into a clip what is held already: a way through the preroll from the oldest to the
-//! newest, in steps, so that whoever records live is never busy with it for long.
+//! Writes entries of the preroll to a clip, from the oldest to the newest, in steps, so that a live
+//! recorder is never busy with it for long.
 
 use super::open_clip::OpenClip;
 use super::state::{RecorderState, Settled};
@@ -7,7 +7,7 @@ use crate::RecordError;
 use crate::preroll::{EntrySource, Walked};
 use crate::window::{Group, Window};
 
-/// How much of a walk is done at once.
+/// The amount of work of one step.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Budget {
     bytes: usize,
@@ -15,11 +15,11 @@ pub(super) struct Budget {
 }
 
 impl Budget {
-    /// All of it.
+    /// No limit.
     pub(super) const ALL: Budget = Budget { bytes: usize::MAX, entries: usize::MAX };
-    /// Nothing.
+    /// No work.
     pub(super) const NONE: Budget = Budget { bytes: 0, entries: 0 };
-    /// A tenth of a millisecond or two, unless a single message takes longer.
+    /// 0.1 to 0.2 ms, unless a single message takes longer.
     pub(super) const STEP: Budget = Budget { bytes: 256 << 10, entries: 1024 };
 
     fn is_spent(&self) -> bool {
@@ -27,17 +27,17 @@ impl Budget {
     }
 }
 
-/// A walk that is under way.
+/// A backfill in progress.
 #[derive(Debug)]
 pub(super) struct Backfill {
-    /// Those for which it is made.
+    /// The windows for which it is made.
     windows: Vec<Window>,
-    /// Nothing later is wanted.
+    /// Later entries are not needed.
     limit: i64,
-    /// Up to which stamp all is settled behind it, if that is known.
+    /// The stamp up to which all is settled after it, if known.
     settles: Option<i64>,
     last: Option<Walked>,
-    /// Comes first.
+    /// The search for an image, which comes first.
     thumbnail_search: Option<ThumbnailSearch>,
 }
 
@@ -51,12 +51,13 @@ struct ThumbnailSearch {
 }
 
 impl Backfill {
-    /// From behind `last` on, for messages that could not be written when they came.
+    /// A backfill of the entries after `last`, for messages that could not be written when they
+    /// came.
     pub(super) fn from(last: Option<Walked>, limit: i64) -> Backfill {
         Backfill { windows: Vec::new(), limit, settles: None, last, thumbnail_search: None }
     }
 
-    /// Starts again: the preroll lies elsewhere now.
+    /// Restarts, as the preroll has moved.
     pub(super) fn restart(&mut self) {
         (self.last, self.settles) = (None, None);
         if let Some(thumbnail_search) = &mut self.thumbnail_search {
@@ -66,9 +67,8 @@ impl Backfill {
 }
 
 impl RecorderState {
-    /// Begins to bring a clip up to what its group covers and what is held, not after `limit`.
-    /// `windows` are those that have just joined the group; what is before `fresh_from` it has
-    /// covered already.
+    /// Starts a backfill of the entries that a clip's group covers, not after `limit`. `windows`
+    /// have just joined the group; entries before `fresh_from` were covered already.
     pub(super) fn settle(
         &mut self,
         open_clip: &mut OpenClip,
@@ -91,8 +91,8 @@ impl RecorderState {
         Ok(Backfill { windows, limit, settles: Some(settles), last, thumbnail_search })
     }
 
-    /// The picture is made when a clip first has a topic with images. A clip that continues another
-    /// takes its own first one.
+    /// Starts the search for a thumbnail when a clip first has a topic with images. A clip that
+    /// continues another takes its own first image.
     fn thumbnail_search(
         &mut self,
         open_clip: &mut OpenClip,
@@ -115,7 +115,7 @@ impl RecorderState {
         Ok((!open_clip.continues).then_some(thumbnail_search))
     }
 
-    /// Goes on as far as `budget` reaches and the pen has room; `true` once all is done.
+    /// Continues as far as `budget` and the writer allow; `true` once it is done.
     pub(super) fn backfill(
         &mut self,
         backfill: &mut Backfill,
@@ -165,14 +165,14 @@ impl RecorderState {
             }
             backfill.last = Some(walked);
         }
-        // What had to go meanwhile.
+        // Entries that were evicted meanwhile.
         backfill.windows.iter().for_each(|window| self.reach_back(open_clip, window));
         self.count_losses(open_clip, group, backfill.limit);
         self.gather(open_clip, group, backfill.limit);
         Ok(true)
     }
 
-    /// Goes on searching; `true` once all was seen.
+    /// Continues the search; `true` once it is done.
     fn search(
         &self,
         thumbnail_search: &mut ThumbnailSearch,

@@ -1,8 +1,8 @@
-//! How a clip is called: `hello-20180802T083451.136Z`.
+//! Names clips: `hello-20180802T083451.136Z`.
 
 const DAY_S: i64 = 86_400;
 
-/// The lambda that triggered, and when, in UTC to the millisecond.
+/// The lambda that triggered, and the time in UTC with milliseconds.
 pub(super) fn clip_name(lambda: &str, at_ns: i64) -> String {
     let (seconds, nanoseconds) = (at_ns.div_euclid(1_000_000_000), at_ns.rem_euclid(1_000_000_000));
     let (year, month, day) = date(seconds.div_euclid(DAY_S));
@@ -37,14 +37,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_clip_is_called_after_its_lambda_and_moment() {
+    fn a_clip_is_named_by_its_lambda_and_moment() {
         assert_eq!(clip_name("hello", 1_533_198_891_136_999_999), "hello-20180802T083451.136Z");
         assert_eq!(clip_name("x", 0), "x-19700101T000000.000Z");
         assert_eq!(clip_name("x", i64::MAX), "x-22620411T234716.854Z");
     }
 
     #[test]
-    fn dates_follow_each_other_as_the_calendar_says() {
+    fn dates_follow_the_calendar() {
         let is_leap = |year: i64| year % 4 == 0 && (year % 100 != 0 || year % 400 == 0);
         let mut expected = (1970, 1, 1);
         for days in 0..120_000 {

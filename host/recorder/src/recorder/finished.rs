@@ -1,31 +1,31 @@
-//! Clips that are finished. Their list is on disk: of many, only the newest are remembered.
+//! Finished clips. Their list is on disk: only the newest are kept in memory.
 
 use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
 
 use crate::RecordError;
 
-/// As many are remembered, and at times twice as many.
+/// Number of clips kept, and at times twice as many.
 pub(super) const KEPT: usize = 256;
 
-/// Failures that wait to be asked for; of more, the first are told.
+/// Most failures kept until they are taken; of more, the first.
 const FAILURES: usize = 16;
 
 #[derive(Debug, Default)]
 pub(super) struct Finished {
     newest: Vec<Clip>,
-    /// How many there were.
+    /// Number of finished clips.
     pub(super) count: u64,
-    /// Why others could not be finished.
+    /// Errors of clips that could not be finished.
     pub(super) failures: Vec<RecordError>,
-    /// What had to go for them, and was not yet asked for.
+    /// Losses from making room, until they are taken.
     pub(super) deleted: Vec<Loss>,
-    /// Clips of an earlier process, which were not yet asked for.
+    /// Recovered clips of an earlier process, until they are taken.
     pub(super) recovered: Vec<Clip>,
 }
 
 impl Finished {
-    /// Adds a clip, if it is known already.
+    /// Adds a clip, if it is finished already.
     pub(super) fn add(&mut self, clip: Option<Clip>) {
         let Some(clip) = clip else { return };
         if self.newest.len() >= 2 * KEPT {

@@ -1,8 +1,8 @@
-//! How much of each kind there may be, in memory and in a file.
+//! Limits of a recorder, in memory and in a file.
 
 use crate::file::MESSAGE_MAX;
 
-/// Bounds that only tests change.
+/// Limits that only tests change.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct RecorderLimits {
     /// The longest message.

@@ -1,4 +1,4 @@
-//! A recorder that is fed live: nothing that it is told waits for a disk.
+//! The live part of a recorder: no call waits for a disk.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -17,11 +17,11 @@ use crate::RecordError;
 use crate::file::{RecordingFolder, TopicSchema};
 use crate::window::TriggerOutcome;
 
-/// How much later than its stamp a wake may come: a lambda's process sends them together, see
+/// Greatest delay of a wake after its stamp: a lambda's process sends wakes in batches, see
 /// [`gleaner_protocol::link::RecorderLink::wake`]. Clips wait for them.
 const GRACE: Duration = Duration::from_millis(200);
 
-/// How many clips were deleted to make room, and how many could not be.
+/// Counts the clips that were deleted to make room, and those that could not be.
 pub(crate) fn counted(losses: &[Loss]) -> (u64, u64) {
     let count = |is_it: fn(&Loss) -> bool| losses.iter().filter(|loss| is_it(loss)).count() as u64;
     (
@@ -31,10 +31,10 @@ pub(crate) fn counted(losses: &[Loss]) -> (u64, u64) {
 }
 
 impl Recorder {
-    /// A recorder without topics and lambdas, that is fed while it happens. A thread writes its
-    /// clips; at most 16 MiB and one message are on their way to it, and the preroll holds what has
-    /// to wait. Gaps in the numbers of samples are losses. What an earlier process left in a folder
-    /// of [`RecordingFolder::hold`] is recovered by that thread, between what it has to write.
+    /// A live recorder without topics and lambdas. A thread writes its clips; at most 16 MiB and
+    /// one message are queued for it, and the preroll holds the rest. Gaps in sequence numbers are
+    /// losses. Unfinished clips of an earlier process in a folder of [`RecordingFolder::hold`] are
+    /// recovered by that thread, between its jobs.
     ///
     /// # Errors
     ///
@@ -45,14 +45,14 @@ impl Recorder {
         Ok(recorder)
     }
 
-    /// Does a piece of what is to be done, which takes a tenth of a millisecond or two unless a
-    /// single message takes longer. To be called after every few samples and wakes, and again while
-    /// it says so.
+    /// Does a piece of the pending work, which takes 0.1 to 0.2 ms unless a single message takes
+    /// longer. To be called after every few samples and wakes, and again while it returns
+    /// [`Work::More`].
     ///
     /// # Errors
     ///
-    /// [`RecordError`] if the preroll is on disk and that fails, or the thread that writes is gone.
-    /// That a clip could not be written is no such error: see [`Recorder::take_failures`].
+    /// [`RecordError`] if the preroll is on disk and that fails, or if the writer thread has ended.
+    /// A clip that could not be written is no such error: see [`Recorder::take_failures`].
     pub fn work(&mut self) -> Result<Work, RecordError> {
         let mut outcomes = Vec::new();
         self.state.context.writer.poll(&mut outcomes)?;
@@ -64,40 +64,39 @@ impl Recorder {
         Ok(if self.state.context.writer.has_room() { Work::More } else { Work::Wait })
     }
 
-    /// Why clips could not be written since this was asked last; the first of them, 16 at most.
+    /// Takes the errors of clips that could not be written since the last call; the first 16.
     pub fn take_failures(&mut self) -> Vec<RecordError> {
         std::mem::take(&mut self.finished.failures)
     }
 
-    /// Clips that an earlier process had left unfinished, and that are whole now, since this was
-    /// asked last. One that cannot be recovered is among the failures.
+    /// Takes the clips of an earlier process that were recovered since the last call. One that
+    /// cannot be recovered is among the failures.
     pub fn take_recovered(&mut self) -> Vec<Clip> {
         std::mem::take(&mut self.finished.recovered)
     }
 
-    /// Clips that had to go for others, or could not be deleted, since this was asked last; the
-    /// first of them.
+    /// Takes the clips that were deleted to make room, or could not be deleted, since the last
+    /// call; the first of them.
     pub fn take_deleted(&mut self) -> Vec<Loss> {
         std::mem::take(&mut self.finished.deleted)
     }
 
-    /// Whether a clip is open.
+    /// Returns whether a clip is open.
     pub fn is_recording(&self) -> bool {
         self.open_clip.is_some()
     }
 
-    /// A topic that was missing is there.
+    /// Adds the description of a topic that was missing until now.
     ///
     /// # Errors
     ///
-    /// [`RecordError::LongTopic`] if a clip has no room for what it says of itself: it stays
-    /// missing.
+    /// [`RecordError::LongTopic`] if a clip has no room for its description: it stays missing.
     pub fn found_topic(&mut self, id: TopicId, topic: TopicSchema) -> Result<(), RecordError> {
         topic.check()?;
         let now = self.now;
         let topic_state = &mut self.state.context.topics[id.0];
         if topic_state.is_missing {
-            // Messages and windows know it by the name under which it was wanted.
+            // Messages and windows use the name with which it was requested.
             topic_state.topic =
                 Arc::new(TopicSchema { name: topic_state.topic.name.clone(), ..topic });
             (topic_state.is_missing, topic_state.found_at) = (false, now);
@@ -105,22 +104,22 @@ impl Recorder {
         Ok(())
     }
 
-    /// So many wakes of a lambda were lost before they came here; the next one to come is of this
-    /// stamp.
+    /// Counts wakes of a lambda that did not arrive; `at_ns` is the stamp of the next one that
+    /// does.
     pub fn lost_wakes(&mut self, lambda: LambdaId, at_ns: i64, count: u64) {
         self.state.context.lambdas[lambda.0].wakes += count;
         self.state.wake_losses[lambda.0].lost.add_some(at_ns, 0, count);
     }
 
-    /// A sample came as far as here, and there was no room for it.
+    /// Counts a sample that arrived without room for it.
     pub fn lost_sample(&mut self, topic: TopicId, meta: &SampleMeta) {
         self.state.note_gap(topic.0, meta);
         self.state.losses[topic.0].lost.add(meta.at_ns, 0);
     }
 
-    /// Somebody commands what `lambda` could trigger; `source` says who, in words. It is no wake:
-    /// no journal has it, and it has no part in the lambda's cooldown. A stop ends what a command
-    /// started with this label.
+    /// Executes a command in the name of `lambda`; `source` describes who gave it. It is not a
+    /// wake: it is in no journal, and has no effect on the lambda's cooldown. A stop ends only a
+    /// recording that a command started with this label.
     ///
     /// # Errors
     ///
@@ -156,7 +155,7 @@ impl Recorder {
         Ok(commanded)
     }
 
-    /// A lambda has ended: what it started and did not stop ends now.
+    /// Ends a lambda, and the recordings that it started and did not stop.
     ///
     /// # Errors
     ///
@@ -171,8 +170,8 @@ impl Recorder {
         self.run()
     }
 
-    /// From now on no clip is begun, and the one that is open ends: `why` says it. A preroll on
-    /// disk gets smaller. `None`: goes on.
+    /// Suspends recording: no clip is begun, and the open one ends with the reason `why`. A preroll
+    /// on disk shrinks. `None` resumes.
     ///
     /// # Errors
     ///
@@ -180,22 +179,22 @@ impl Recorder {
     pub fn hold(&mut self, why: Option<&str>) -> Result<(), RecordError> {
         self.held = why.map(Arc::from);
         self.state.preroll.shrink(why.is_some());
-        // What is open ends at once.
+        // The open clip ends at once.
         self.windows.set_grace(if why.is_some() { 0 } else { nanoseconds(GRACE) });
         self.run()
     }
 
-    /// Whether nothing is to be recorded for now.
+    /// Returns whether recording is suspended.
     pub fn is_held(&self) -> bool {
         self.held.is_some()
     }
 
-    /// The preroll may take more from now on: `bytes`, and a disk if it was in memory. It is never
-    /// made smaller.
+    /// Raises the bound of the preroll to `bytes`, and moves it to disk if `store` is the disk. It
+    /// never shrinks.
     ///
     /// # Errors
     ///
-    /// [`RecordError::Preroll`] if it has no place on the disk.
+    /// [`RecordError::Preroll`] if there is no room on the disk.
     pub fn grow_preroll(&mut self, store: Store, bytes: u64) -> Result<(), RecordError> {
         let Settings { folder, prefault, .. } = &self.settings;
         if bytes <= self.counts.preroll_bound && store != Store::Disk {
@@ -217,13 +216,13 @@ impl Recorder {
         Ok(())
     }
 
-    /// The longest clip is as long from now on, if that is longer than before.
+    /// Raises the length of the longest clip.
     pub fn grow_length(&mut self, most: Duration) {
         self.max_length_ns = self.max_length_ns.max(nanoseconds(most));
         self.windows.grow_length(self.max_length_ns);
     }
 
-    /// Does everything that can be decided, however long it takes.
+    /// Does all pending work, however long it takes.
     pub(super) fn settle_all(&mut self) -> Result<(), RecordError> {
         loop {
             self.run_within(Budget::ALL)?;

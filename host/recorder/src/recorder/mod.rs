@@ -1,4 +1,4 @@
-//! The recorder: samples and wakes go in, clips come out.
+//! The recorder: turns samples and wakes into clips.
 
 mod backfill;
 mod clip_name;
@@ -40,23 +40,22 @@ pub(crate) use live::counted;
 pub use settings::{Commanded, LambdaId, RecorderCounts, Settings, TopicId, Work};
 pub use state::LambdaSpec;
 
-/// Most topics of one recorder. A vehicle has some hundreds. Of each, the stamps of some thousand
+/// Most topics of one recorder. A vehicle has some hundreds. For each, the stamps of some thousand
 /// lost samples are kept: 100 KiB.
 pub const TOPICS_MAX: usize = 1024;
 
-/// Most bytes of the names of all topics of one recorder, and of their types: they stand in a line
-/// of the list of clips, up to seven times and with six bytes for one, and a line has at most 16
-/// MiB.
+/// Most bytes of the names of all topics of one recorder, and of their types: they are in a line of
+/// the list of clips, up to seven times and with six bytes for one, and a line has at most 16 MiB.
 const NAMES_MAX: usize = 256 << 10;
 
-/// Cuts clips out of what passes by. Time is what stamps and [`Recorder::advance`] say, and never
-/// goes back.
+/// Cuts clips out of the stream of samples. Time is given by stamps and [`Recorder::advance`], and
+/// never goes back.
 ///
-/// One made by [`new`](Self::new) does everything within each call; what it records depends on
-/// stamps only. One made by [`live`](Self::live) leaves what takes long to a thread, and to
-/// [`work`](Self::work), which is to be called in between.
+/// A recorder of [`new`](Self::new) does everything within each call; the recording depends on
+/// stamps only. A recorder of [`live`](Self::live) leaves long work to a thread, and to
+/// [`work`](Self::work), which has to be called in between.
 ///
-/// After an error a recorder is of no use: drop it. What it has written is recovered by the next
+/// After an error, drop the recorder. Its written data is recovered by the next
 /// [`RecordingFolder::open`].
 pub struct Recorder {
     windows: Windows,
@@ -64,30 +63,29 @@ pub struct Recorder {
     open_clip: Option<OpenClip>,
     /// A clip of windows before those of `open_clip`.
     late_clip: Option<LateClip>,
-    /// What brings `late_clip`, or else `open_clip`, up to what is held. Nothing is decided while it is
-    /// under way.
+    /// The backfill of `late_clip`, or else of `open_clip`. Nothing is decided while it runs.
     backfill: Option<Backfill>,
-    /// Messages after this one came while they could not be written to `open_clip`.
+    /// The last entry before the messages that could not be written to `open_clip` when they came.
     behind: Option<Option<Walked>>,
-    /// Why nothing is to be recorded for now.
+    /// The reason why recording is suspended.
     held: Option<Arc<str>>,
-    /// Groups of windows so far; each has its number.
+    /// Number of groups of windows so far.
     groups: u64,
     now: Option<i64>,
     max_length_ns: i64,
     finished: Finished,
     counts: RecorderCounts,
-    /// Where a wake is encoded.
+    /// Buffer for an encoded wake.
     encoded: Vec<u8>,
     settings: Settings,
 }
 
 impl Recorder {
-    /// A recorder without topics and lambdas, for a drive that waits.
+    /// A recorder without topics and lambdas, for a replay.
     ///
     /// # Errors
     ///
-    /// [`RecordError::Preroll`] if the preroll is on disk and has no place there.
+    /// [`RecordError::Preroll`] if the preroll is on disk and there is no room.
     pub fn new(folder: RecordingFolder, settings: Settings) -> Result<Recorder, RecordError> {
         Recorder::with(ClipWriter::inline(folder), settings, false)
     }
@@ -134,18 +132,19 @@ impl Recorder {
         })
     }
 
-    /// Adds a topic; one of the same name that is there already stays as it is.
+    /// Adds a topic; an existing one of the same name is unchanged.
     ///
     /// # Errors
     ///
     /// [`RecordError::TooManyTopics`] beyond [`TOPICS_MAX`]; [`RecordError::LongTopic`] and
-    /// [`RecordError::LongNames`] if a clip has no room for what it says of itself, or all
+    /// [`RecordError::LongNames`] if a clip has no room for its description, or for all names
     /// together.
     pub fn add_topic(&mut self, topic: TopicSchema) -> Result<TopicId, RecordError> {
         self.add_topic_state(topic, false)
     }
 
-    /// Adds a topic that is wanted but not there: clips list it with no messages and no type.
+    /// Adds a topic that is requested but does not exist yet: clips list it without messages and
+    /// type.
     ///
     /// # Errors
     ///
@@ -191,7 +190,8 @@ impl Recorder {
     ///
     /// # Panics
     ///
-    /// Beyond 1024 lambdas, which a replay never has; [`Recorder::try_add_lambda`] says so instead.
+    /// Beyond 1024 lambdas, which a replay never has; [`Recorder::try_add_lambda`] returns an error
+    /// instead.
     pub fn add_lambda(&mut self, member: LambdaSpec) -> LambdaId {
         self.try_add_lambda(member).expect("few lambdas are added without asking")
     }
@@ -229,7 +229,7 @@ impl Recorder {
         Ok(LambdaId(lambda))
     }
 
-    /// A sample came.
+    /// Takes a sample.
     ///
     /// # Errors
     ///
@@ -260,8 +260,8 @@ impl Recorder {
         self.state.keep(EntryMeta::sample(topic.0, &meta, in_group), cdr, evicted_early, too_big)
     }
 
-    /// Writes a sample to the open clip, if it belongs there. Returns the group in whose clip it is
-    /// then.
+    /// Writes a sample to the open clip, if it belongs there. Returns the group whose clip then has
+    /// it, or 0.
     fn write(&mut self, topic: usize, meta: &SampleMeta, cdr: &[u8]) -> Result<u64, RecordError> {
         let is_prompt = self.is_prompt(meta.at_ns);
         let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open()) else {
@@ -276,7 +276,7 @@ impl Recorder {
         } else if is_prompt || !preroll.fits(cdr.len()) && context.writer.has_room() {
             open_clip.message(context, group, topic, meta, cdr)?;
         } else {
-            // It is counted as too big if it cannot be kept; else a walk comes by.
+            // It is counted as too big if it cannot be kept; else a backfill writes it later.
             if self.backfill.is_none() || self.late_clip.is_some() {
                 self.behind.get_or_insert_with(|| preroll.newest());
             }
@@ -285,10 +285,10 @@ impl Recorder {
         Ok(open_clip.group)
     }
 
-    /// A lambda was woken: keeps the wake for its journal, and does what its triggers ask for.
+    /// Takes a wake of a lambda for its journal, and applies its triggers.
     ///
-    /// Live, its stamp lets no time pass: samples from before it may still be on their way, and it
-    /// may itself be up to 200 ms late.
+    /// Live, its stamp does not advance time: earlier samples may still be in transit, and the wake
+    /// may be up to 200 ms late.
     ///
     /// # Errors
     ///
@@ -348,13 +348,13 @@ impl Recorder {
         &self.state.context.lambdas[lambda.0].header.lambda
     }
 
-    /// A moment waits for the clip that it belongs to.
+    /// Queues a moment for the clip that it belongs to.
     fn await_clip(&mut self, lambda: LambdaId, moment: Moment) {
         let most = self.state.context.limits.waiting;
         self.state.waiting.push(lambda.0, moment, &self.windows, most);
     }
 
-    /// Does what triggers ask for.
+    /// Applies the effects of triggers.
     fn act(&mut self) -> Result<(), RecordError> {
         self.run()?;
         if let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open()) {
@@ -363,7 +363,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Time passes without samples.
+    /// Advances time without samples.
     ///
     /// # Errors
     ///
@@ -372,13 +372,12 @@ impl Recorder {
         self.pass(now_ns.max(0))
     }
 
-    /// The newest of the clips that are finished, in the order in which they were; `clips.jsonl`
-    /// has all.
+    /// The newest finished clips, in order; `clips.jsonl` has all.
     pub fn clips(&self) -> &[Clip] {
         self.finished.newest()
     }
 
-    /// What was done so far.
+    /// The counts so far.
     pub fn counts(&self) -> RecorderCounts {
         let preroll = &self.state.preroll;
         RecorderCounts {

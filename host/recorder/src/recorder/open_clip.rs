@@ -1,4 +1,4 @@
-//! A clip that is being written: what is counted of it, and what it says of itself in the end.
+//! A clip that is being written: its counts, and its trailer at the end.
 
 use std::sync::Arc;
 
@@ -11,21 +11,21 @@ use super::clip_writer::journal_part::JournalPart;
 use super::limits::RecorderLimits;
 use super::state::{ClipContext, Settled};
 use crate::RecordError;
-use crate::file::{CONTINUES, ClipHeader, ClipTrailer, TopicCounts, names};
+use crate::file::{CONTINUES, ClipHeader, ClipTopicCounts, ClipTrailer, names};
 use crate::window::Group;
 
-/// What one topic has in a clip, and what it has not.
+/// The counts of one topic in a clip.
 #[derive(Clone, Debug)]
 pub(super) struct TopicTally {
     pub(super) messages: u64,
-    /// `None` if nobody knows.
+    /// `None` if unknown.
     pub(super) overwritten: Option<u64>,
     pub(super) too_big: Option<u64>,
-    /// Before they came here.
+    /// Lost before they reached the recorder.
     pub(super) lost: Option<u64>,
-    /// Of those that are too big, the ones that no clip can hold.
+    /// Those of `too_big` that no clip can hold.
     pub(super) huge: u64,
-    /// Whether a window reaches further back than anything is held.
+    /// True if a window reaches further back than the preroll.
     pub(super) is_aged: bool,
 }
 
@@ -42,34 +42,34 @@ impl Default for TopicTally {
     }
 }
 
-/// How a clip comes to its end.
+/// The reason for the end of a clip.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum CloseReason {
     /// No window is open any more.
     Complete,
-    /// It is full: the next one goes on after this instant.
+    /// It is full: the next clip continues after this instant.
     Full(i64),
-    /// The drive ends, at this instant.
+    /// The drive ends at this instant.
     EndOfDrive(i64),
-    /// Somebody ends it at this instant, and says why.
+    /// It is ended early, at this instant, for this reason.
     Early(i64, Arc<str>),
 }
 
 /// A clip that is being written.
 pub(super) struct OpenClip {
-    /// The group of windows that it belongs to. What is in one of its clips bears this number.
+    /// The number of its group of windows. Entries in one of the group's clips are marked with it.
     pub(super) group: u64,
     /// Its own number.
     pub(super) clip: u64,
-    /// Whether it goes on where another clip was full.
+    /// True if it continues a full clip.
     pub(super) continues: bool,
     pub(super) begins_late_ns: i64,
     pub(super) triggers: u64,
-    /// Whether it has a topic that its picture is made from.
+    /// True if it has a topic from which its thumbnail is made.
     pub(super) has_images: bool,
-    /// What of the preroll need not be looked through again.
+    /// The part of the preroll that need not be searched again.
     pub(super) settled: Option<Settled>,
-    /// Lambdas with more triggers than were counted.
+    /// Lambdas with more triggers than counted.
     pub(super) uncertain: Vec<usize>,
     /// Lambdas that ended while they recorded.
     pub(super) ended: Vec<usize>,
@@ -77,21 +77,21 @@ pub(super) struct OpenClip {
     /// The trigger that names it.
     opening: Moment,
     from: i64,
-    /// Whether it has a file.
+    /// True if its file is begun.
     is_begun: bool,
     messages: u64,
     /// By topic.
     tallies: Vec<TopicTally>,
     moments: Vec<Moment>,
-    /// By lambda; those without windows in the clip are thrown away at its end.
+    /// By lambda; those without windows in the clip are dropped at its end.
     parts: Vec<JournalPart>,
-    /// What they take together, about.
+    /// Their approximate size together.
     parts_bytes: usize,
     /// Lambdas whose part is short because there was no room for all together.
     crowded: Vec<usize>,
-    /// Pushed out of the preroll.
+    /// By lambda: wakes that the preroll evicted.
     wakes_lost: Vec<u64>,
-    /// Lost on their way to the recorder.
+    /// By lambda: wakes that did not reach the recorder.
     wakes_undelivered: Vec<u64>,
 }
 
@@ -128,7 +128,7 @@ impl OpenClip {
         }
     }
 
-    /// The clip that goes on after this one.
+    /// The clip that continues this one.
     pub(super) fn next(&self, group: &Group, context: &mut ClipContext) -> OpenClip {
         OpenClip {
             continues: true,
@@ -136,12 +136,12 @@ impl OpenClip {
         }
     }
 
-    /// Where it begins.
+    /// Its begin.
     pub(super) fn from(&self, group: &Group) -> i64 {
         self.from.min(group.from)
     }
 
-    /// Whether no message is in it.
+    /// Returns whether it has no message.
     pub(super) fn is_empty(&self) -> bool {
         self.messages == 0
     }
@@ -150,7 +150,7 @@ impl OpenClip {
         at(&mut self.tallies, topic)
     }
 
-    /// Counts a message that no clip can hold, and that would be in this one.
+    /// Counts a message of this clip that no clip can hold.
     pub(super) fn refuse(&mut self, topic: usize) {
         let tally = self.tally(topic);
         tally.too_big = tally.too_big.map(|count| count + 1);
@@ -175,7 +175,7 @@ impl OpenClip {
         Ok(())
     }
 
-    /// What its file begins with, which is made when it is first needed.
+    /// Returns the name and header for its file, once.
     fn begin(&mut self, context: &ClipContext, group: &Group) -> Option<(String, ClipHeader)> {
         if self.is_begun {
             return None;
@@ -203,18 +203,18 @@ impl OpenClip {
         }
     }
 
-    /// What it keeps of journals in memory, about.
+    /// Approximate memory for the parts of journals.
     #[cfg(test)]
     pub(super) fn journal_bytes(&self) -> usize {
         self.parts.iter().map(JournalPart::bytes).sum()
     }
 
-    /// Counts wakes that the preroll does not have any more.
+    /// Counts wakes that the preroll has evicted.
     pub(super) fn lose_wakes(&mut self, lambda: usize, count: u64) {
         *at(&mut self.wakes_lost, lambda) += count;
     }
 
-    /// Counts wakes that were lost before they came here.
+    /// Counts wakes that did not reach the recorder.
     pub(super) fn wakes_undelivered(&mut self, lambda: usize, count: u64) {
         *at(&mut self.wakes_undelivered, lambda) += count;
     }
@@ -261,13 +261,13 @@ impl OpenClip {
         self.note_ends(group, close, &mut trailer.incomplete);
         let name = |lambda: &usize| &context.lambdas[*lambda].header.lambda;
         trailer.incomplete.extend(
-            self.ended.iter().map(|lambda| format!("{} ended before it said stop", name(lambda))),
+            self.ended
+                .iter()
+                .map(|lambda| format!("{} ended before its stop trigger", name(lambda))),
         );
         trailer.incomplete.extend(self.uncertain.iter().map(|lambda| {
             let name = name(lambda);
-            format!(
-                "there are more triggers of {name} than are counted: too many waited for their clip"
-            )
+            format!("more triggers of {name} than counted: too many waited for their clip")
         }));
         for topic in topics {
             trailer.topics.push(self.counts(context, topic, group, &mut trailer.incomplete));
@@ -277,7 +277,7 @@ impl OpenClip {
             let header = &context.lambdas[*lambda].header;
             trailer.headers.push(Arc::clone(header));
             let part = self.part(*lambda, &header.lambda, &mut trailer.incomplete);
-            // A lambda that was started again is another one of the same name.
+            // A restarted lambda is another one of the same name.
             let mut names = names(&header.lambda);
             let name = names.find(|name| !journals.iter().any(|(taken, ..)| taken == name));
             journals.push((name.unwrap_or_default(), Arc::clone(header), part));
@@ -292,8 +292,8 @@ impl OpenClip {
         })
     }
 
-    /// The topics of its lambdas; and those of which it holds late messages, for a lambda whose
-    /// windows ended before it.
+    /// The topics of its lambdas, and those of which it has late messages, for a lambda whose
+    /// windows ended earlier.
     fn topics(&self, context: &ClipContext, group: &Group) -> Vec<usize> {
         let mut topics = context.topics_of(group);
         let written = self
@@ -310,7 +310,7 @@ impl OpenClip {
         topics
     }
 
-    /// Why the clip does not begin and end where its windows do.
+    /// Notes why the clip does not begin and end with its windows.
     fn note_ends(&self, group: &Group, close: &CloseReason, short: &mut Vec<String>) {
         if self.continues {
             short.push(CONTINUES.to_owned());
@@ -321,10 +321,10 @@ impl OpenClip {
         }
         match close {
             CloseReason::Full(_) => {
-                short.push("continues in the next clip, if anything more came".to_owned())
+                short.push("continues in the next clip, if there was more".to_owned())
             }
             CloseReason::EndOfDrive(_) if group.waits_for_stop() => {
-                short.push("the drive ended before the lambda said stop".to_owned());
+                short.push("the drive ended before the lambda's stop trigger".to_owned());
             }
             CloseReason::EndOfDrive(end) if *end < group.to => {
                 let early = seconds(group.to.saturating_sub(*end));
@@ -341,7 +341,7 @@ impl OpenClip {
         topic: usize,
         group: &Group,
         short: &mut Vec<String>,
-    ) -> TopicCounts {
+    ) -> ClipTopicCounts {
         let TopicTally { messages, overwritten, too_big, lost, huge, is_aged } =
             self.tally(topic).clone();
         let topic_state = &context.topics[topic];
@@ -350,16 +350,19 @@ impl OpenClip {
             Some(0) => {}
             Some(count) => {
                 let samples = plural(count, "sample");
-                short.push(format!("the preroll was cut by preroll_size: {samples} of {name} pushed out"));
+                short.push(format!(
+                    "preroll_size is too small: {samples} of {name} evicted from the preroll"
+                ));
             }
             None => short.push(format!(
-                "the preroll was cut by preroll_size: samples of {name} pushed out, more than were counted"
+                "preroll_size is too small: samples of {name} evicted from the preroll, more than \
+                 counted"
             )),
         }
         if huge > 0 {
             let most = self.limits.message_bytes >> 20;
             short.push(format!(
-                "{} of {name} larger than {most} MiB: no clip holds such",
+                "{} of {name} larger than {most} MiB, too large for a clip",
                 plural(huge, "sample")
             ));
         }
@@ -373,7 +376,8 @@ impl OpenClip {
             }
             None => {
                 short.push(format!(
-                    "samples of {name} did not fit into the preroll, more than were counted: preroll_size"
+                    "samples of {name} did not fit into the preroll, more than counted: \
+                     preroll_size"
                 ));
             }
         }
@@ -391,7 +395,7 @@ impl OpenClip {
             short.push(format!("{} of {name} did not reach the recorder", plural(count, "sample")));
         }
         let received = || Some(messages + overwritten? + too_big?);
-        TopicCounts {
+        ClipTopicCounts {
             topic: name.clone(),
             type_name: (!topic_state.is_missing).then(|| topic_state.topic.type_name.clone()),
             received: if is_aged { None } else { received() },
@@ -401,14 +405,14 @@ impl OpenClip {
         }
     }
 
-    /// The wakes of a lambda, and what is missing of them.
+    /// Takes the wakes of a lambda, and notes which are missing.
     fn part(&mut self, lambda: usize, name: &str, short: &mut Vec<String>) -> JournalPart {
         let mut part = std::mem::take(at(&mut self.parts, lambda));
         let undelivered = *at(&mut self.wakes_undelivered, lambda);
         if undelivered > 0 {
             let wakes = plural(undelivered, "wake");
             short.push(format!(
-                "the journal of {name} lacks {wakes}: lost on the way to the recorder"
+                "the journal of {name} lacks {wakes}: lost in transit to the recorder"
             ));
             let apart = part.keep_run();
             if apart > 0 {
@@ -419,7 +423,7 @@ impl OpenClip {
         let lost = *at(&mut self.wakes_lost, lambda);
         if lost > 0 {
             short.push(format!(
-                "the journal of {name} lacks {}: pushed out of the preroll",
+                "the journal of {name} lacks {}: evicted from the preroll",
                 plural(lost, "wake")
             ));
         }
@@ -428,7 +432,7 @@ impl OpenClip {
             let why = match self.crowded.contains(&lambda) {
                 false => format!("longer than {} MiB", self.limits.part_bytes >> 20),
                 true => format!(
-                    "the journals of all are longer than {} MiB",
+                    "all journals together are longer than {} MiB",
                     self.limits.parts_bytes >> 20
                 ),
             };
@@ -438,8 +442,7 @@ impl OpenClip {
     }
 }
 
-/// The item at `index` of a list that grows as far as it is asked for. Topics and lambdas are
-/// numbered from 0.
+/// The item at `index` of a list that grows on demand. Topics and lambdas are numbered from 0.
 fn at<T: Default>(list: &mut Vec<T>, index: usize) -> &mut T {
     if list.len() <= index {
         list.resize_with(index + 1, T::default);
@@ -452,6 +455,6 @@ fn plural(count: u64, what: &str) -> String {
 }
 
 fn seconds(ns: i64) -> String {
-    // What is shorter than a tenth of a second is not shown as none.
+    // A time below a tenth of a second is not shown as 0.
     format!("{:.1} s", (ns as f64 / 1e9).max(0.1))
 }

@@ -1,4 +1,4 @@
-//! How a recorder works, and what it has done.
+//! Settings and counts of a recorder.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -6,20 +6,20 @@ use std::time::Duration;
 use gleaner_lambda::manifest::Store;
 use gleaner_protocol::RecordingCounts;
 
-/// How a recorder works.
+/// Settings of a recorder.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// Where the preroll waits.
+    /// The store of the preroll.
     pub store: Store,
     /// Most bytes of the preroll, with 64 bytes or a little more for each sample.
     pub preroll_bytes: u64,
-    /// The longest clip; what is longer goes on in a next one.
+    /// The longest clip; a longer recording continues in the next clip.
     pub max_length: Duration,
-    /// The folder that clips go to. A preroll on disk is in `preroll` there.
+    /// The output folder. A preroll on disk is in `preroll` there.
     pub folder: PathBuf,
-    /// What stamps are, for example "log time of the drive".
+    /// The clock of stamps, for example "log time of the drive".
     pub clock: String,
-    /// Whether memory for the preroll is taken from the system at once.
+    /// True if memory for the preroll is allocated at once.
     pub prefault: bool,
 }
 
@@ -31,12 +31,12 @@ pub struct TopicId(pub(super) usize);
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct LambdaId(pub(super) usize);
 
-/// What a recorder has done so far.
+/// Counts of a recorder.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub struct RecorderCounts {
-    /// What is reported.
+    /// The reported counts.
     pub recording: RecordingCounts,
-    /// Samples older than one that came before them. They are recorded where windows cover them.
+    /// Samples older than an earlier one. They are recorded if windows cover them.
     pub out_of_order: u64,
     /// Bytes that the preroll holds.
     pub preroll_bytes: u64,
@@ -44,30 +44,30 @@ pub struct RecorderCounts {
     pub preroll_highest: u64,
     /// The most that it may hold.
     pub preroll_bound: u64,
-    /// Bytes that are on their way to the thread that writes; 0 where there is none.
+    /// Bytes queued for the writer thread; 0 if there is none.
     pub in_flight: u64,
 }
 
-/// What became of a command.
+/// The result of a command.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Commanded {
     /// It opened a window.
     Opened,
     /// It ended a window.
     Stopped,
-    /// What it was to start is running, or what it was to stop is not, or too much is.
+    /// Ignored: the recording to start is running, or the one to stop is not, or too many are.
     Ignored,
-    /// Nothing is recorded at present.
+    /// Recording is suspended.
     DiskSuppressed,
 }
 
-/// What is left to do for a recorder that is fed live.
+/// The pending work of a live recorder.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Work {
     /// Nothing.
     Done,
-    /// Some, at once.
+    /// Some, now.
     More,
-    /// Some, once the thread that writes has come further.
+    /// Some, once the writer thread has made progress.
     Wait,
 }

@@ -1,5 +1,5 @@
-//! What is held and known while no clip is written: the preroll and its losses, topics, lambdas,
-//! triggers that wait.
+//! The state of a recorder besides its open clip: the preroll and its losses, topics, lambdas,
+//! waiting triggers.
 
 use std::sync::Arc;
 
@@ -19,28 +19,28 @@ use crate::preroll::{EntryMeta, Losses, Preroll, Walked};
 use crate::thumbnail::is_image;
 use crate::window::{Group, Window};
 
-/// A lambda that records.
+/// A lambda to record for.
 #[derive(Clone, Debug)]
 pub struct LambdaSpec {
-    /// What it is, as its journal says it.
+    /// Its description, the header of its journal.
     pub header: JournalHeader,
     /// Its `[record]`.
     pub rules: RecordSpec,
     /// SHA-256 over the digests of its files, in hexadecimal digits.
     pub digest: String,
-    /// What its clips hold, in the order of `[record]`.
+    /// The topics of its clips, in the order of `[record]`.
     pub topics: Vec<super::TopicId>,
 }
 
-/// A topic, and who records it.
+/// The state of a recorded topic.
 #[derive(Debug)]
 pub(super) struct TopicState {
     pub(super) topic: Arc<TopicSchema>,
     pub(super) is_missing: bool,
-    /// When it was found, if that was later than it was wanted.
+    /// The time when it was found, if later than requested.
     pub(super) found_at: Option<i64>,
     pub(super) lambdas: Vec<usize>,
-    /// What numbers tell of losses.
+    /// Losses, from gaps in sequence numbers.
     pub(super) gaps: Gaps,
 }
 
@@ -50,7 +50,7 @@ impl TopicState {
     }
 }
 
-/// One lambda, its windows aside.
+/// The state of one lambda, without its windows.
 pub(super) struct RecordedLambda {
     /// Clips share it.
     pub(super) header: Arc<JournalHeader>,
@@ -61,14 +61,14 @@ pub(super) struct RecordedLambda {
     pub(super) wakes: u64,
 }
 
-/// What every clip is written with.
+/// The context of all clips: writer, limits, topics and lambdas.
 pub(super) struct ClipContext {
     pub(super) writer: ClipWriter,
-    /// Clips so far; each has its number.
+    /// Number of clips so far.
     pub(super) clips: u64,
     pub(super) clock: String,
     pub(super) limits: RecorderLimits,
-    /// Whether samples come as they are made, so that gaps in their numbers are losses.
+    /// True if live, so that gaps in sequence numbers are losses.
     pub(super) is_live: bool,
     pub(super) topics: Vec<TopicState>,
     pub(super) lambdas: Vec<RecordedLambda>,
@@ -81,7 +81,7 @@ impl ClipContext {
         self.clips
     }
 
-    /// Whether a window of a lambda that records this topic contains `at`.
+    /// Returns whether a window of a lambda that records this topic contains `at`.
     pub(super) fn covers(&self, group: &Group, topic: usize, at: i64) -> bool {
         self.topics[topic].lambdas.iter().any(|lambda| group.covers(*lambda, at))
     }
@@ -113,16 +113,16 @@ impl ClipContext {
     }
 }
 
-/// How far a clip has been settled: what came up to an entry will not be wanted by windows that
-/// cover nothing new before its newest stamp. So a lambda that triggers in every wake does not have
-/// the whole preroll looked through each time.
+/// The extent to which a clip has been settled: entries up to `last` are not needed by windows that
+/// cover nothing new before `newest`. So a lambda that triggers in every wake does not cause a
+/// search of the whole preroll each time.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Settled {
     pub(super) last: Walked,
     pub(super) newest: i64,
 }
 
-/// Everything that clips are made from.
+/// The state that clips are made from.
 pub(super) struct RecorderState {
     pub(super) preroll: Preroll,
     /// By topic.
@@ -131,13 +131,13 @@ pub(super) struct RecorderState {
     pub(super) wake_losses: Vec<Losses>,
     pub(super) waiting: WaitingTriggers,
     pub(super) context: ClipContext,
-    /// When the recorder first heard of anything.
+    /// The first stamp or time of the recorder.
     pub(super) began_at: i64,
 }
 
 impl RecorderState {
-    /// Keeps an entry. `evicted_early` counts samples that have to go for it, `too_big` is raised if
-    /// it cannot be kept.
+    /// Adds an entry to the preroll. `evicted_early` counts samples evicted for it, `too_big` is
+    /// raised if it cannot be kept.
     pub(super) fn keep(
         &mut self,
         held: EntryMeta,
@@ -153,7 +153,7 @@ impl RecorderState {
                 losses.overwritten.add(gone.at_ns, gone.group);
             }
         };
-        // What no clip can hold need not wait for one.
+        // A message that is too large for any clip is not kept.
         let fits = !is_sample || bytes.len() <= context.limits.message_bytes;
         if fits && preroll.push(held, bytes, &mut gone)? {
             return Ok(());
@@ -165,7 +165,7 @@ impl RecorderState {
         Ok(())
     }
 
-    /// Counts what the number of a sample tells of samples before it.
+    /// Counts losses before a sample, from its sequence number.
     pub(super) fn note_gap(&mut self, topic: usize, meta: &SampleMeta) {
         let gaps = &mut self.context.topics[topic].gaps;
         let before = gaps.lost();
@@ -178,7 +178,7 @@ impl RecorderState {
         }
     }
 
-    /// Gives up what is older than `before`.
+    /// Drops entries older than `before`.
     pub(super) fn trim(&mut self, before: i64) -> Result<(), RecordError> {
         let RecorderState { preroll, losses, wake_losses, .. } = self;
         preroll.trim(before, &mut |held| {
@@ -188,7 +188,8 @@ impl RecorderState {
         })
     }
 
-    /// Whether an entry belongs into a clip that ends at `limit` at the latest, and is not in it.
+    /// Returns whether an entry belongs into a clip that ends at `limit` at the latest, and is not
+    /// in it yet.
     pub(super) fn wants(
         &self,
         open_clip: &OpenClip,
@@ -205,7 +206,7 @@ impl RecorderState {
         }
     }
 
-    /// The stamp of the earliest sample that is covered, but in none of the clips of the group.
+    /// The stamp of the earliest sample that is covered, but in no clip of the group.
     pub(super) fn earliest(&self, open_clip: &OpenClip, group: &Group) -> Option<i64> {
         let mut earliest = None;
         let mut next = self.preroll.next(None);
@@ -219,13 +220,13 @@ impl RecorderState {
         earliest
     }
 
-    /// The triggers within the clip.
+    /// Collects the triggers within the clip.
     pub(super) fn gather(&mut self, open_clip: &mut OpenClip, group: &Group, limit: i64) {
         let counted = self.waiting.take(group, limit, |moment| open_clip.moment(moment));
         open_clip.triggers += counted;
     }
 
-    /// Completes a clip, which is returned if it is written already.
+    /// Completes a clip; returns it if it is written already.
     pub(super) fn finish(
         &mut self,
         mut open_clip: OpenClip,
@@ -240,7 +241,7 @@ impl RecorderState {
         open_clip.finish(&mut self.context, group, &close)
     }
 
-    /// What did not even come here.
+    /// Counts samples and wakes that did not reach the recorder.
     fn count_lost(&mut self, open_clip: &mut OpenClip, group: &Group, limit: i64) {
         let (number, from) = (open_clip.group, open_clip.from(group));
         for topic in self.context.topics_of(group) {
@@ -272,7 +273,7 @@ impl RecorderState {
         })
     }
 
-    /// What a window asks for and nobody can give.
+    /// Counts data that a window covers but that is no longer available.
     pub(super) fn reach_back(&mut self, open_clip: &mut OpenClip, window: &Window) {
         open_clip.begins_late_ns =
             open_clip.begins_late_ns.max(self.began_at.saturating_sub(window.from));

@@ -1,4 +1,4 @@
-//! What a recorder does when time passes or a trigger comes.
+//! Steps of the recorder when time advances or a trigger comes.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use super::open_clip::{CloseReason, OpenClip};
 use crate::RecordError;
 use crate::window::{Group, Window, WindowStep};
 
-/// A clip of windows that lie before the one that is open. All of it is in the past.
+/// A clip of windows before the open one. All of it is in the past.
 pub(super) struct LateClip {
     open_clip: OpenClip,
     group: Group,
@@ -16,7 +16,7 @@ pub(super) struct LateClip {
 }
 
 impl Recorder {
-    /// Lets time pass. What is due is done before anything is given up for its age: it may need it.
+    /// Advances time. Pending steps come before old entries are dropped, as they may need them.
     pub(super) fn pass(&mut self, now: i64) -> Result<(), RecordError> {
         if self.now.is_none() {
             self.state.began_at = now;
@@ -27,14 +27,14 @@ impl Recorder {
         if self.is_settled() { self.state.trim(self.windows.horizon()) } else { Ok(()) }
     }
 
-    /// Does all that is to be done; live, what takes long is left to [`Recorder::work`].
+    /// Does all pending work; live, long work is left to [`Recorder::work`].
     pub(super) fn run(&mut self) -> Result<(), RecordError> {
         self.run_within(if self.state.context.is_live { Budget::NONE } else { Budget::ALL })
     }
 
-    /// Whether a sample of this stamp may be written to the open clip when it comes. While the clip
-    /// is being brought up to what is held, or is full, it waits its turn in the preroll, so that a
-    /// file is in the order in which things came.
+    /// Returns whether a sample of this stamp may be written to the open clip when it comes. During
+    /// a backfill, or while the clip is full, it waits in the preroll, so that the file is in order
+    /// of arrival.
     pub(super) fn is_prompt(&self, at_ns: i64) -> bool {
         !self.state.context.is_live
             || self.behind.is_none()
@@ -43,12 +43,12 @@ impl Recorder {
                 && self.state.context.writer.has_room()
     }
 
-    /// Whether all is decided that can be.
+    /// Returns whether there is nothing left to decide.
     pub(super) fn is_settled(&self) -> bool {
         self.backfill.is_none() && self.behind.is_none() && self.state.context.writer.has_room()
     }
 
-    /// Does what is to be done, with walks as far as `budget` reaches.
+    /// Does the pending work, with backfills as far as `budget` allows.
     pub(super) fn run_within(&mut self, mut budget: Budget) -> Result<(), RecordError> {
         while self.continue_backfill(&mut budget)? && self.state.context.writer.has_room() {
             let held = self.held.clone();
@@ -56,7 +56,7 @@ impl Recorder {
                 self.counts.recording.disk_suppressed += self.windows.forget_waiting();
             }
             let Some(step) = self.windows.step() else {
-                // What a full clip has kept for its next one is in that by now.
+                // The part that a full clip left for the next one is in it by now.
                 if let Some(why) = held
                     && let Some(group) = self.windows.close()
                 {
@@ -70,7 +70,8 @@ impl Recorder {
                 WindowStep::Join { windows, fresh_from: Some(from) } => {
                     self.settle(windows, from)?
                 }
-                // It covers nothing new so far, and its trigger is gathered by whoever brought it.
+                // It covers nothing new so far, and its trigger is collected by the caller that
+                // added it.
                 WindowStep::Join { .. } => {}
                 WindowStep::Roll { boundary, before } => self.roll(boundary, &before)?,
                 WindowStep::Finish(group) => self.complete(&group, CloseReason::Complete)?,
@@ -80,7 +81,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Goes on with what is under way; `true` once nothing is.
+    /// Continues the backfill; `true` once there is none.
     fn continue_backfill(&mut self, budget: &mut Budget) -> Result<bool, RecordError> {
         loop {
             let Some(mut backfill) = self.backfill.take() else {
@@ -131,7 +132,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Goes on in a next clip.
+    /// Continues in a next clip.
     fn roll(&mut self, boundary: i64, before: &Group) -> Result<(), RecordError> {
         let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open()) else {
             return Ok(());
@@ -141,7 +142,7 @@ impl Recorder {
             let full = std::mem::replace(open_clip, next);
             self.finished.add(self.state.finish(full, before, CloseReason::Full(boundary))?);
         }
-        // Where nothing came for longer than a clip may be, no clips are made of it.
+        // A gap longer than a clip becomes no clips.
         if self.now.is_none_or(|now| now > self.windows.limit()) {
             let until = self.state.earliest(open_clip, group).or(self.now).unwrap_or(boundary);
             if until > self.windows.limit() {
@@ -157,8 +158,8 @@ impl Recorder {
         close: CloseReason,
     ) -> Result<(), RecordError> {
         if let Some(open_clip) = self.open_clip.take() {
-            // The clip before promised that more would come; where nothing did, there is no clip of
-            // nothing.
+            // The previous clip announced a continuation; if nothing followed, there is no empty
+            // clip.
             if open_clip.continues && open_clip.is_empty() && open_clip.triggers == 0 {
                 return self.state.context.writer.forget(open_clip.clip);
             }
@@ -178,7 +179,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// A stray clip has what is held of it: completes it, or goes on in a next one.
+    /// A late clip is backfilled: completes it, or continues in a next one.
     fn end_late_clip(&mut self, late_clip: LateClip) -> Result<(), RecordError> {
         let LateClip { mut open_clip, mut group, limit: boundary } = late_clip;
         if group.to <= boundary {
@@ -199,8 +200,8 @@ impl Recorder {
         Ok(())
     }
 
-    /// The drive ends: completes what is open. A clip whose window had not ended says so. Live,
-    /// this waits for the disk.
+    /// Ends the recording: completes open clips. A clip whose window had not ended notes that.
+    /// Live, this waits for the disk.
     ///
     /// # Errors
     ///

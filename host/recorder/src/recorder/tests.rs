@@ -1,4 +1,4 @@
-//! Bounds, which here are lowered, and what is remembered from wake to wake.
+//! Tests with lowered limits, and of the state between wakes.
 
 use gleaner_lambda::TriggerKind::{Event, Start};
 
@@ -23,7 +23,7 @@ fn wake(recorder: &mut Recorder, lambda: LambdaId, ms: i64) {
 }
 
 #[test]
-fn a_journal_that_is_too_long_has_no_hole_and_says_what_is_missing() {
+fn a_journal_that_is_too_long_has_no_gap_and_states_what_is_missing() {
     let scratch = TestDir::new();
     let (mut recorder, a, lambda) = recorder(
         &scratch,
@@ -45,7 +45,7 @@ fn a_journal_that_is_too_long_has_no_hole_and_says_what_is_missing() {
 }
 
 #[test]
-fn the_journals_of_a_clip_are_bounded_together_and_each_says_what_it_lacks() {
+fn the_journals_of_a_clip_are_bounded_together_and_each_states_what_is_missing() {
     let scratch = TestDir::new();
     let limits =
         RecorderLimits { part_bytes: 2 << 10, parts_bytes: 3 << 10, ..RecorderLimits::default() };
@@ -67,7 +67,8 @@ fn the_journals_of_a_clip_are_bounded_together_and_each_says_what_it_lacks() {
         assert_eq!(wakes, (0..kept).map(|n| T0 + (100 + n) * MS).collect::<Vec<_>>());
         lacking += 40 - kept;
         let short = format!(
-            "the journal of {name} lacks the last {} wakes: the journals of all are longer than 0 MiB",
+            "the journal of {name} lacks the last {} wakes: \
+             all journals together are longer than 0 MiB",
             40 - kept
         );
         assert!(clip.incomplete.contains(&short), "{:?}", clip.incomplete);
@@ -92,14 +93,14 @@ fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
     assert_eq!(records.iter().filter(|(name, _)| name == "gleaner.decision").count(), 150);
     let lambda =
         records.iter().find(|(name, _)| name == "gleaner.lambda").map(|(_, of)| of).unwrap();
-    let said = ["name", "engine", "gleaner", "config", "models", "digest", "windows"]
+    let stated = ["name", "engine", "gleaner", "config", "models", "digest", "windows"]
         .map(|key| lambda[key].as_str());
-    assert_eq!(said, ["hello", "Python", "0.1.0", "{}", "", "d1e5", "200"]);
+    assert_eq!(stated, ["hello", "Python", "0.1.0", "{}", "", "d1e5", "200"]);
     assert_eq!(RecorderLimits::default().moments, 10_000);
 }
 
 #[test]
-fn triggers_that_wait_in_too_great_numbers_are_counted_in_the_clip_that_they_are_in() {
+fn triggers_beyond_the_waiting_limit_are_counted_in_their_clip() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     recorder.state.context.limits.waiting = 20;
@@ -112,19 +113,19 @@ fn triggers_that_wait_in_too_great_numbers_are_counted_in_the_clip_that_they_are
     wakes.push((900, slow, &[Event]));
     drive(&mut recorder, &[a], (0, 2000, 1), &wakes);
     recorder.finish(T0 + 2000 * MS).unwrap();
-    let told: Vec<_> = recorder
+    let counts: Vec<_> = recorder
         .clips()
         .iter()
         .map(|clip| (clip.triggers, clip.moments.len(), clip.incomplete.len()))
         .collect();
-    let [first, second, third] = told[..] else { panic!("{told:?}") };
+    let [first, second, third] = counts[..] else { panic!("{counts:?}") };
     assert_eq!((first.0, third.0), (1, 1));
     assert_eq!((second.0, second.2), (200, 0), "{:?}", recorder.clips()[1].incomplete);
     assert!(second.1 >= 20);
 }
 
 #[test]
-fn a_clip_says_so_if_nobody_knows_how_many_triggers_are_in_it() {
+fn a_clip_states_that_its_number_of_triggers_is_unknown() {
     let scratch = TestDir::new();
     // In the cooldown, triggers open no window; the next window reaches back over some of them.
     let (mut recorder, a, lambda) = recorder(
@@ -136,14 +137,14 @@ fn a_clip_says_so_if_nobody_knows_how_many_triggers_are_in_it() {
     (100..=300).for_each(|ms| wake(&mut recorder, lambda, ms));
     recorder.finish(T0 + S).unwrap();
     let [first, second] = recorder.clips() else { panic!("{:?}", recorder.clips()) };
-    let said = "there are more triggers of hello than are counted: too many waited for their clip";
-    assert_eq!((first.triggers, first.incomplete.iter().any(|short| short == said)), (1, false));
+    let stated = "more triggers of hello than counted: too many waited for their clip";
+    assert_eq!((first.triggers, first.incomplete.iter().any(|short| short == stated)), (1, false));
     assert!((10..51).contains(&second.triggers), "{}", second.triggers);
-    assert!(second.incomplete.iter().any(|short| short == said), "{:?}", second.incomplete);
+    assert!(second.incomplete.iter().any(|short| short == stated), "{:?}", second.incomplete);
 }
 
 #[test]
-fn a_message_that_no_clip_can_hold_is_counted_by_the_clip_that_wants_it() {
+fn a_message_that_is_too_large_for_a_clip_is_counted_by_the_clip_that_covers_it() {
     let scratch = TestDir::new();
     let (mut recorder, a, lambda) = recorder(
         &scratch,
@@ -162,13 +163,13 @@ fn a_message_that_no_clip_can_hold_is_counted_by_the_clip_that_wants_it() {
     let topic = &clip.topics[0];
     assert_eq!((topic.messages, topic.received, topic.too_big), (2, Some(4), Some(2)));
     assert_eq!(recorder.counts().recording.too_big, 3);
-    let said = "1 sample of /a larger than 0 MiB: no clip holds such";
-    assert!(clip.incomplete.iter().any(|short| short == said), "{:?}", clip.incomplete);
+    let stated = "1 sample of /a larger than 0 MiB, too large for a clip";
+    assert!(clip.incomplete.iter().any(|short| short == stated), "{:?}", clip.incomplete);
 }
 
-/// Each sample and each wake is looked at once or a few times, not as often as there are triggers.
+/// Each sample and each wake is visited a few times, not once for each trigger.
 #[test]
-fn a_lambda_that_triggers_in_every_wake_looks_only_at_what_is_new() {
+fn a_lambda_that_triggers_in_every_wake_visits_only_new_entries() {
     for late_ms in [0, 7] {
         let scratch = TestDir::new();
         let (mut recorder, a, lambda) = recorder(&scratch, (1000, 0, 0), RecorderLimits::default());
@@ -176,7 +177,7 @@ fn a_lambda_that_triggers_in_every_wake_looks_only_at_what_is_new() {
         for ms in 1000..1500 {
             recorder.sample(a, &meta(T0 + ms * MS, ms as u64), &ms.to_le_bytes()).unwrap();
             wake(&mut recorder, lambda, ms - late_ms);
-            // Were it looked at again, it would be written again.
+            // If it were visited again, it would be written again.
             let oldest = recorder.state.preroll.next(None).unwrap().place();
             recorder.state.preroll.mark(oldest, 0);
             let settled = recorder.open_clip.as_ref().unwrap().settled.unwrap();
@@ -187,7 +188,7 @@ fn a_lambda_that_triggers_in_every_wake_looks_only_at_what_is_new() {
                 left += 1;
                 next = recorder.state.preroll.next(Some(walked));
             }
-            assert!(left <= 3 * late_ms, "{left} entries are looked at again");
+            assert!(left <= 3 * late_ms, "{left} entries are visited again");
         }
         recorder.finish(T0 + 1500 * MS).unwrap();
         let clip = &recorder.clips()[0];
@@ -196,8 +197,8 @@ fn a_lambda_that_triggers_in_every_wake_looks_only_at_what_is_new() {
     }
 }
 
-/// What the clips of a random drive hold: late triggers, samples out of order, windows that reach
-/// back by different lengths. With `forgets`, everything is looked at in every wake.
+/// The contents of the clips of a random drive: late triggers, samples out of order, windows with
+/// different prerolls. With `forgets`, all entries are visited in every wake.
 fn random_drive(seed: u64, forgets: bool) -> Vec<Vec<(String, i64, u32)>> {
     let mut random = SeededRandom(seed);
     let scratch = TestDir::new();
@@ -223,7 +224,7 @@ fn random_drive(seed: u64, forgets: bool) -> Vec<Vec<(String, i64, u32)>> {
 }
 
 #[test]
-fn looking_only_at_what_is_new_misses_nothing() {
+fn visiting_only_new_entries_misses_nothing() {
     for seed in 0..60 {
         let clips = random_drive(seed, false);
         assert_eq!(clips, random_drive(seed, true), "seed {seed}");
@@ -237,7 +238,7 @@ fn looking_only_at_what_is_new_misses_nothing() {
 }
 
 #[test]
-fn a_topic_that_says_too_much_of_itself_is_refused() {
+fn a_topic_with_a_long_description_is_refused() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let long = "x".repeat(64 << 10);
@@ -259,7 +260,7 @@ fn a_topic_that_says_too_much_of_itself_is_refused() {
 }
 
 #[test]
-fn a_start_that_lasts_keeps_being_settled() {
+fn a_long_recording_stays_settled() {
     let scratch = TestDir::new();
     let (mut recorder, a, lambda) = recorder(&scratch, (50, 0, 0), RecorderLimits::default());
     let second = recorder.add_lambda(member("second", (90, 0, 0), &[a]));

@@ -1,4 +1,4 @@
-//! Triggers that are in no clip yet: the window that they opened waits, or they came in a cooldown.
+//! Triggers that are in no clip yet: their window waits, or they came in a cooldown.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::RangeInclusive;
@@ -11,7 +11,7 @@ use crate::window::{Group, Windows};
 #[derive(Debug, Default)]
 pub(super) struct WaitingTriggers {
     moments: VecDeque<(usize, Moment)>,
-    /// By lambda: those that there was no room for. Of them, only this is known.
+    /// By lambda: triggers without room, which are only counted.
     counted: BTreeMap<usize, CountedTriggers>,
 }
 
@@ -24,8 +24,8 @@ struct CountedTriggers {
 }
 
 impl WaitingTriggers {
-    /// A trigger came. At most `most` wait: of more, the oldest that no window wants yet goes, or
-    /// else the new one.
+    /// Adds a trigger. At most `most` wait: beyond it, the oldest that no window covers is dropped,
+    /// or else the new one.
     pub(super) fn push(&mut self, lambda: usize, moment: Moment, windows: &Windows, most: usize) {
         let horizon = windows.horizon();
         while self.moments.front().is_some_and(|(_, moment)| moment.at_ns < horizon) {
@@ -68,7 +68,8 @@ impl WaitingTriggers {
             .map(|(_, moment)| moment)
     }
 
-    /// Takes those out that are within `group` and not after `limit`, and how many more there were.
+    /// Takes the triggers within `group` and not after `limit`; returns the number of further ones
+    /// that were only counted.
     pub(super) fn take(&mut self, group: &Group, limit: i64, mut each: impl FnMut(Moment)) -> u64 {
         let inside = inside(group, limit);
         for _ in 0..self.moments.len() {
@@ -90,7 +91,7 @@ impl WaitingTriggers {
         count
     }
 
-    /// The lambdas of which more triggers may be within `group` and not after `limit` than were
+    /// The lambdas with possibly more triggers within `group` and not after `limit` than were
     /// taken: they were only counted, and some of them lie outside.
     pub(super) fn uncertain(&self, group: &Group, limit: i64) -> Vec<usize> {
         let inside = inside(group, limit);

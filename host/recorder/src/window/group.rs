@@ -1,10 +1,10 @@
-//! Windows that overlap, and so share a clip.
+//! Groups of windows that overlap, and so share a clip.
 
 use super::Window;
 use super::intervals::Intervals;
 
-/// Windows of which each touches another: what one clip holds, or several in turn if it grows too
-/// long for one.
+/// Windows connected by overlaps: the content of one clip, or of several in turn if it is too long
+/// for one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Group {
     /// Begin of the earliest window.
@@ -14,12 +14,12 @@ pub struct Group {
     pub from: i64,
     /// End of the latest window, inclusive; [`i64::MAX`] while one waits for its stop.
     pub to: i64,
-    /// The lambda and the anchor that stand first: they name the clip.
+    /// The lambda and the anchor that come first: they name the clip.
     pub first: (usize, i64),
     /// Lambdas with windows here, in the order in which they came.
     pub lambdas: Vec<usize>,
-    /// What the windows of each lambda cover; by lambda, shorter than the list of lambdas if the
-    /// last have none.
+    /// The intervals of each lambda's windows; by lambda, shorter than the list of lambdas if the
+    /// last ones have none.
     shares: Vec<Share>,
 }
 
@@ -39,8 +39,7 @@ impl Share {
 }
 
 impl Group {
-    /// A group of windows, of which there is at least one. Nobody will ask for instants before
-    /// `horizon`.
+    /// A group of at least one window. Instants before `horizon` will not be queried.
     pub(super) fn new(windows: &[Window], horizon: i64) -> Option<Group> {
         let first = windows.iter().min_by_key(|window| (window.anchor, window.lambda))?;
         let from = windows.iter().map(|window| window.from).min()?;
@@ -69,7 +68,7 @@ impl Group {
         if !self.lambdas.contains(&window.lambda) {
             self.lambdas.push(window.lambda);
         }
-        // The clip that is being written reaches back as well: its predecessors are finished.
+        // The clip that is being written reaches back as well: the previous ones are finished.
         if window.from < self.begin {
             self.begin = window.from;
             self.from = window.from;
@@ -77,7 +76,7 @@ impl Group {
         self.to = self.to.max(window.to.unwrap_or(i64::MAX));
     }
 
-    /// Ends the window of `lambda` that waits for it; `false` if none does.
+    /// Ends the window of `lambda` that waits for its stop; `false` if there is none.
     pub(super) fn stop(&mut self, lambda: usize, to: i64, horizon: i64) -> bool {
         let Some(share) = self.shares.get_mut(lambda) else { return false };
         let Some(from) = share.started.take() else { return false };
@@ -89,7 +88,7 @@ impl Group {
         true
     }
 
-    /// Goes on in a next clip, after `boundary`.
+    /// Continues in a next clip, after `boundary`.
     pub fn roll(&mut self, boundary: i64) {
         self.from = boundary.saturating_add(1);
         for share in &mut self.shares {
@@ -99,12 +98,12 @@ impl Group {
         self.lambdas.retain(|lambda| shares[*lambda].windows > 0);
     }
 
-    /// Whether a window shares an instant with this group.
+    /// Returns whether a window shares an instant with this group.
     pub(super) fn touches(&self, window: &Window) -> bool {
         window.from <= self.to && window.to.is_none_or(|to| self.begin <= to)
     }
 
-    /// Whether a window of `lambda` contains `at`.
+    /// Returns whether a window of `lambda` contains `at`.
     pub fn covers(&self, lambda: usize, at: i64) -> bool {
         self.shares.get(lambda).is_some_and(|share| share.covers(at))
     }
@@ -121,13 +120,13 @@ impl Group {
         }
     }
 
-    /// How many windows of `lambda` the present clip has. In a clip that continues another, windows
-    /// that overlap count as one.
+    /// Number of windows of `lambda` in the current clip. In a clip that continues another,
+    /// overlapping windows count as one.
     pub fn windows(&self, lambda: usize) -> u64 {
         self.shares.get(lambda).map_or(0, |share| share.windows)
     }
 
-    /// Whether a window waits for its stop.
+    /// Returns whether a window waits for its stop.
     pub fn waits_for_stop(&self) -> bool {
         self.to == i64::MAX
     }

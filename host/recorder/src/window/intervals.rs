@@ -1,15 +1,15 @@
-//! Sorted stretches of time that do not touch each other, both ends inclusive.
+//! Sets of instants, as sorted, disjoint intervals with both ends inclusive.
 
-/// A set of instants, as stretches of time.
+/// A set of instants.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Intervals(Vec<(i64, i64)>);
 
-/// With more stretches than this, those that nobody can ask for any more are forgotten.
+/// Beyond this number of intervals, those before the horizon are dropped.
 const MANY: usize = 4096;
 
 impl Intervals {
-    /// Adds `from..=to`; what it touches becomes one with it. Nobody will ask for instants before
-    /// `horizon`.
+    /// Adds `from..=to`, merged with the intervals that it touches. Instants before `horizon` will
+    /// not be queried.
     pub fn insert(&mut self, from: i64, to: i64, horizon: i64) {
         if self.0.len() >= MANY {
             let old = self.0.partition_point(|(_, end)| *end < horizon);
@@ -23,14 +23,14 @@ impl Intervals {
         self.0.splice(first..last, [merged]);
     }
 
-    /// Whether `at` is one of the instants.
+    /// Returns whether `at` is in the set.
     pub fn contains(&self, at: i64) -> bool {
         self.0
             .get(self.0.partition_point(|(_, end)| *end < at))
             .is_some_and(|(begin, _)| *begin <= at)
     }
 
-    /// The first instant of `from..=to` that is none of them.
+    /// The first instant of `from..=to` that is not in the set.
     pub fn first_outside(&self, from: i64, to: i64) -> Option<i64> {
         match self.0.get(self.0.partition_point(|(_, end)| *end < from)) {
             Some((begin, end)) if *begin <= from => (*end < to).then(|| end.saturating_add(1)),
@@ -43,7 +43,7 @@ impl Intervals {
         self.0.last().map(|(_, end)| *end)
     }
 
-    /// How many stretches end after `at`.
+    /// Number of intervals that end after `at`.
     pub fn beyond(&self, at: i64) -> u64 {
         (self.0.len() - self.0.partition_point(|(_, end)| *end <= at)) as u64
     }
@@ -54,7 +54,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn stretches_that_share_an_instant_become_one() {
+    fn intervals_that_share_an_instant_are_merged() {
         let mut intervals = Intervals::default();
         intervals.insert(10, 20, 0);
         intervals.insert(30, 40, 0);
@@ -68,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn both_ends_belong_to_a_stretch() {
+    fn both_ends_belong_to_an_interval() {
         let mut intervals = Intervals::default();
         intervals.insert(10, 20, 0);
         intervals.insert(30, 30, 0);
@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn many_stretches_are_forgotten_once_nobody_can_ask_for_them() {
+    fn old_intervals_are_dropped_once_they_are_many() {
         let mut intervals = Intervals::default();
         for at in 0..100_000 {
             intervals.insert(at * 10, at * 10, at * 10 - 1000);

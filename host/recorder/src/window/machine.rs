@@ -1,4 +1,4 @@
-//! The state of all windows, and what is to be done next.
+//! The state machine of all windows, and its next step.
 
 use std::collections::BTreeSet;
 
@@ -6,7 +6,7 @@ use gleaner_lambda::TriggerKind;
 
 use super::{Group, Window, WindowRules};
 
-/// What became of a trigger.
+/// The outcome of a trigger.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum TriggerOutcome {
     /// It opened a window.
@@ -23,15 +23,15 @@ pub enum TriggerOutcome {
     TooManyWaiting,
 }
 
-/// Who triggers in the name of a lambda.
+/// The origin of a trigger.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum TriggeredBy {
     Lambda,
-    /// Somebody outside, who has nothing to do with what the lambda started, nor with its cooldown.
+    /// A command, which is independent of recordings that the lambda started, and of its cooldown.
     Command,
 }
 
-/// What is to be done next.
+/// A step of the recorder.
 #[derive(Debug, PartialEq, Eq)]
 pub enum WindowStep {
     /// A clip begins, with these windows; [`Windows::open`] has their group.
@@ -40,12 +40,12 @@ pub enum WindowStep {
     Join {
         /// The windows.
         windows: Vec<Window>,
-        /// The first instant up to now that they cover and the clip did not: only what is held from
-        /// there on has to be looked through.
+        /// The first instant up to now that they cover and the clip did not: only later entries
+        /// have to be searched.
         fresh_from: Option<i64>,
     },
-    /// The clip is full: it ends at `boundary`, and a next one goes on after it. The open group is
-    /// already that of the next; `before` is the one that ends.
+    /// The clip is full: it ends at `boundary`, and the next one continues after it. The open group
+    /// is already that of the next; `before` is the one that ends.
     Roll {
         /// Last instant of the full clip.
         boundary: i64,
@@ -54,8 +54,8 @@ pub enum WindowStep {
     },
     /// No window can touch the open clip any more: it is complete.
     Finish(Box<Group>),
-    /// A trigger came so late that its windows lie before the open clip: a clip that is made at
-    /// once.
+    /// A trigger came so late that its windows lie before the open clip: they become a separate
+    /// clip now.
     Late(Vec<Window>, Box<Group>),
 }
 
@@ -65,11 +65,11 @@ pub struct Windows {
     lambdas: Vec<WindowLambda>,
     longest_preroll_ns: i64,
     max_length_ns: i64,
-    /// How long nothing is ended for good, as wakes may come late.
+    /// Time that steps are delayed, as wakes may come late.
     grace_ns: i64,
     pub(super) now: i64,
     open: Option<Group>,
-    /// Windows that touch nothing that is open. They wait at most for the longest preroll, unless
+    /// Windows that do not touch the open group. They wait at most for the longest preroll, unless
     /// they came late.
     pending: Vec<Window>,
 }
@@ -79,24 +79,23 @@ struct WindowLambda {
     rules: WindowRules,
     /// Anchor of the last trigger that opened a window.
     opened_at: Option<i64>,
-    /// Recordings that were started and not stopped, by their labels. Together they are one window:
-    /// it lasts until the last stop.
+    /// Recordings that were started and not stopped, by their labels. Together they are one window,
+    /// which lasts until the last stop.
     started: BTreeSet<(TriggeredBy, String)>,
 }
 
-/// Recordings of one lambda that may run at once, by their labels; and as many that commands
-/// started.
+/// Most recordings of one lambda at a time; and as many that commands started.
 pub const STARTED_MAX: usize = 64;
 
-/// Windows that may wait for an open clip to end. A lambda with windows that do not touch could
-/// fill the memory otherwise, while a disk is slow.
+/// Most windows that wait for an open clip to end. Otherwise a lambda with windows that do not
+/// touch could fill the memory while a disk is slow.
 const WAITING_MAX: usize = 4096;
 
-/// What a late trigger may lag behind the samples even if no window has a preroll.
+/// Greatest lag of a late trigger behind the samples even if no window has a preroll.
 const LATE_NS: i64 = 1_000_000_000;
 
 impl Windows {
-    /// No lambda, no window. A clip covers `max_length_ns` at most.
+    /// A state without lambdas and windows. A clip covers `max_length_ns` at most.
     pub fn new(max_length_ns: i64) -> Windows {
         Windows {
             lambdas: Vec::new(),
@@ -116,7 +115,7 @@ impl Windows {
         self.lambdas.len() - 1
     }
 
-    /// How far back from now samples have to be held.
+    /// Time from now back to which samples have to be kept.
     ///
     /// Let P be the longest preroll. A trigger whose anchor is now covers nothing before `now - P`.
     /// A window that waits, because it lies behind the end `to` of the open clip, begins after
@@ -131,7 +130,7 @@ impl Windows {
             .saturating_add(self.grace_ns)
     }
 
-    /// Nobody will ask for instants before this one.
+    /// Earlier instants will not be queried.
     pub fn horizon(&self) -> i64 {
         self.now.saturating_sub(self.retention_ns())
     }
@@ -141,7 +140,7 @@ impl Windows {
         self.open.as_ref()
     }
 
-    /// Whether a window of `lambda`, open or waiting, contains `at`.
+    /// Returns whether a window of `lambda`, open or waiting, contains `at`.
     pub fn covers(&self, lambda: usize, at: i64) -> bool {
         let waits = |window: &Window| {
             window.lambda == lambda && window.from <= at && window.to.is_none_or(|to| at <= to)
@@ -155,13 +154,13 @@ impl Windows {
         self.open.as_ref().map_or(i64::MAX, |open| open.from.saturating_add(self.max_length_ns))
     }
 
-    /// Time passes; it never goes back.
+    /// Advances time; it never goes back.
     pub fn pass(&mut self, now: i64) {
         self.now = self.now.max(now);
     }
 
-    /// Lambda `lambda` triggered in a wake at `anchor`. A stop ends the recording that was started
-    /// with the same label.
+    /// Applies a trigger of `lambda` in a wake at `anchor`. A stop ends the recording that was
+    /// started with the same label.
     pub fn trigger(
         &mut self,
         lambda: usize,
@@ -172,8 +171,8 @@ impl Windows {
         self.apply(lambda, TriggeredBy::Lambda, kind, label, anchor)
     }
 
-    /// Somebody commands at `anchor` what `lambda` could trigger. A stop ends only what a command
-    /// started.
+    /// Applies a command in the name of `lambda` at `anchor`. A stop ends only a recording that a
+    /// command started.
     pub fn command(
         &mut self,
         lambda: usize,
@@ -271,7 +270,7 @@ impl Windows {
         }
     }
 
-    /// What is to be done next; `None` until time passes or a trigger comes.
+    /// Returns the next step; `None` until time advances or a trigger comes.
     pub fn step(&mut self) -> Option<WindowStep> {
         let (horizon, due) = (self.horizon(), self.now.saturating_sub(self.grace_ns));
         let Some(open) = &mut self.open else {
@@ -318,16 +317,16 @@ impl Windows {
         None
     }
 
-    /// Lets the open clip begin later, at `from`: there is nothing to write before. Without this, a
-    /// jump in time would cost a step for each clip that could have been in between.
+    /// Moves the begin of the open clip to `from`, as there is nothing to write before. Without
+    /// this, a jump in time would cost a step for each clip that could have been in between.
     pub fn slide(&mut self, from: i64) {
         if let Some(open) = &mut self.open {
             open.from = open.from.max(from.min(open.to));
         }
     }
 
-    /// A lambda has ended, at `at`: so does what it started, but not what commands did. `false` if
-    /// that was nothing.
+    /// Ends a lambda at `at`, and the recordings that it started, but not those of commands.
+    /// Returns `false` if there were none.
     pub fn end(&mut self, lambda: usize, at: i64) -> bool {
         let Some(state) =
             self.lambdas.get_mut(lambda).filter(|state| state.started_by(TriggeredBy::Lambda) > 0)
@@ -342,22 +341,22 @@ impl Windows {
         true
     }
 
-    /// From now on clips end so much later than time says, for what comes late.
+    /// Delays the end of clips by `grace_ns`, for late wakes.
     pub fn set_grace(&mut self, grace_ns: i64) {
         self.grace_ns = grace_ns;
     }
 
-    /// Clips may be as long from now on.
+    /// Raises the length of clips.
     pub fn grow_length(&mut self, max_length_ns: i64) {
         self.max_length_ns = max_length_ns;
     }
 
-    /// Gives up the windows that wait, and says how many they were.
+    /// Drops the waiting windows, and returns their number.
     pub fn forget_waiting(&mut self) -> u64 {
         self.pending.drain(..).map(|window| window.windows).sum()
     }
 
-    /// At the end: closes the open group, whatever may come. Starts are over.
+    /// Closes the open group at the end of the recording. All starts are ended.
     pub fn close(&mut self) -> Option<Group> {
         self.lambdas.iter_mut().for_each(|lambda| lambda.started.clear());
         self.open.take()
@@ -370,7 +369,7 @@ impl WindowLambda {
     }
 }
 
-/// Takes out the window at `index` and all that hang together with it.
+/// Removes the window at `index` and all that are connected with it.
 fn take_group(pending: &mut Vec<Window>, index: usize) -> Vec<Window> {
     let mut group = vec![pending.swap_remove(index)];
     while let Some(index) =

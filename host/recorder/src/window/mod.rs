@@ -1,14 +1,14 @@
-//! Which stretches of time are kept: from triggers to windows, from windows to clips.
+//! Computes the intervals to keep: from triggers to windows, from windows to clips.
 //!
 //! - An `event` trigger at anchor `a` opens the window `[a - preroll, a + postroll]`, both ends
 //!   inclusive. `start` opens one at `a - preroll`, `stop` ends it at its own anchor `+ postroll`.
-//! - Windows that share an instant are of one [`Group`], whichever lambdas they are of. A group is
-//!   one clip, or several in turn if it grows longer than a clip may be.
+//! - Windows that share an instant belong to one [`Group`], of any lambdas. A group is one clip, or
+//!   several in turn if it is longer than a clip may be.
 //! - One group is open at a time. It stays open until no trigger can come whose window would touch
 //!   it; a window that does not touch it waits meanwhile. So the groups do not depend on how soon a
 //!   trigger comes after its anchor, as long as it comes before the next sample.
 //!
-//! Pure bookkeeping: nothing here knows of samples or files, and time is what the caller says.
+//! Pure bookkeeping: samples and files are unknown here, and time is given by the caller.
 
 mod group;
 mod intervals;
@@ -19,21 +19,21 @@ pub use group::Group;
 use machine::STARTED_MAX;
 pub use machine::{TriggerOutcome, WindowStep, Windows};
 
-/// What one lambda's `[record]` says of its windows, in ns.
+/// The windows of one lambda's `[record]`, in ns.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct WindowRules {
-    /// How far a window reaches back from its anchor.
+    /// Time from the begin of a window to its anchor.
     pub preroll_ns: i64,
-    /// How far it reaches beyond.
+    /// Time from the anchor to the end of a window.
     pub postroll_ns: i64,
-    /// How long after a trigger that opened a window the next ones open none.
+    /// Time after a trigger that opened a window in which further ones open none.
     pub cooldown_ns: i64,
 }
 
-/// A stretch of time that one lambda wants to keep.
+/// An interval that one lambda wants to keep.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Window {
-    /// Whose it is.
+    /// The lambda.
     pub lambda: usize,
     /// Stamp of the trigger.
     pub anchor: i64,
@@ -41,7 +41,7 @@ pub struct Window {
     pub from: i64,
     /// Its last instant; `None` until the stop.
     pub to: Option<i64>,
-    /// How many windows this one is made of: overlapping ones of one lambda wait as one.
+    /// Number of merged windows: overlapping ones of one lambda wait as one.
     pub windows: u64,
 }
 

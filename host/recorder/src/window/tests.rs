@@ -1,8 +1,10 @@
+//! Tests of the windows, also against a naive model.
+
 use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
 
 use super::*;
 
-/// Numbers that look random and are the same in each run (SplitMix64).
+/// Pseudo-random numbers, the same in each run (SplitMix64).
 struct SeededRandom(u64);
 
 impl SeededRandom {
@@ -29,7 +31,7 @@ fn machine(max_length_ns: i64, rules: &[WindowRules]) -> Windows {
     windows
 }
 
-/// Does all that is to be done; the groups that are finished.
+/// Does all pending steps; returns the finished groups.
 fn drain(windows: &mut Windows) -> Vec<Group> {
     let mut finished = Vec::new();
     while let Some(step) = windows.step() {
@@ -41,7 +43,7 @@ fn drain(windows: &mut Windows) -> Vec<Group> {
     finished
 }
 
-/// The begins and ends of the groups that come of triggers of lambda 0, each at its anchor.
+/// The begins and ends of the groups of triggers of lambda 0, each at its anchor.
 fn groups(windows: &mut Windows, triggers: &[(i64, TriggerKind)]) -> Vec<(i64, i64)> {
     let mut finished = Vec::new();
     for (at, kind) in triggers {
@@ -56,7 +58,7 @@ fn groups(windows: &mut Windows, triggers: &[(i64, TriggerKind)]) -> Vec<(i64, i
 }
 
 #[test]
-fn windows_that_overlap_share_a_clip_and_others_do_not() {
+fn overlapping_windows_share_a_clip_and_others_do_not() {
     let cases = [
         (vec![8, 12], vec![(3, 17)]),
         (vec![8, 16], vec![(3, 21)]),
@@ -80,9 +82,9 @@ fn a_start_lasts_until_its_stop_and_others_are_ignored() {
     let triggers = [(3, Stop), (10, Start), (11, Start), (12, Event), (500, Stop), (501, Stop)];
     assert_eq!(groups(&mut windows, &triggers), [(5, 502)]);
     let mut windows = machine(LONG, &[rules(5, 2, 0)]);
-    let heard = triggers.map(|(at, kind)| windows.trigger(0, kind, "x", at));
+    let outcomes = triggers.map(|(at, kind)| windows.trigger(0, kind, "x", at));
     use TriggerOutcome::{Ignored, Opened, Stopped};
-    assert_eq!(heard, [Ignored, Opened, Ignored, Opened, Stopped, Ignored]);
+    assert_eq!(outcomes, [Ignored, Opened, Ignored, Opened, Stopped, Ignored]);
 }
 
 #[test]
@@ -92,11 +94,11 @@ fn the_end_of_an_event_may_be_later_than_the_stop() {
 }
 
 #[test]
-fn a_cooldown_keeps_windows_shut_for_as_long_as_it_says() {
+fn a_cooldown_opens_no_window_until_it_ends() {
     let mut windows = machine(LONG, &[rules(1, 1, 10)]);
-    let heard = [0, 9, 10, 19, 25].map(|at| windows.trigger(0, Event, "x", at));
+    let outcomes = [0, 9, 10, 19, 25].map(|at| windows.trigger(0, Event, "x", at));
     use TriggerOutcome::{InCooldown, Opened};
-    assert_eq!(heard, [Opened, InCooldown, Opened, InCooldown, Opened]);
+    assert_eq!(outcomes, [Opened, InCooldown, Opened, InCooldown, Opened]);
     assert_eq!(windows.trigger(0, Start, "x", 30), InCooldown);
     assert_eq!(windows.trigger(0, Stop, "x", 31), TriggerOutcome::Ignored);
 }
@@ -108,7 +110,7 @@ fn a_late_trigger_without_a_cooldown_opens_its_window() {
 }
 
 #[test]
-fn a_window_that_touches_neither_clip_may_still_join_two() {
+fn a_late_window_may_join_two_others() {
     // Lambda 1 reaches back over the gap between the windows of lambda 0 only later.
     let mut windows = machine(LONG, &[rules(1, 1, 0), rules(50, 1, 0)]);
     for (at, lambda) in [(100, 0), (120, 0), (140, 1)] {
@@ -127,19 +129,19 @@ fn a_window_that_touches_neither_clip_may_still_join_two() {
     assert_eq!(
         covered,
         [99, 100, 101, 119, 120, 121],
-        "what lambda 0 does not want is not in it for its sake"
+        "only the windows of lambda 0 are covered for it"
     );
 }
 
 #[test]
-fn a_late_trigger_before_the_open_clip_makes_a_clip_of_its_own() {
+fn a_late_trigger_before_the_open_clip_makes_a_separate_clip() {
     let mut windows = machine(LONG, &[rules(5, 5, 0), rules(2, 2, 0)]);
     windows.pass(100);
     windows.trigger(0, Start, "x", 100);
     assert_eq!(drain(&mut windows), []);
     windows.trigger(1, Event, "x", 60);
-    let stray = drain(&mut windows);
-    assert_eq!(stray.iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(), [(58, 62)]);
+    let late = drain(&mut windows);
+    assert_eq!(late.iter().map(|group| (group.begin, group.to)).collect::<Vec<_>>(), [(58, 62)]);
     windows.trigger(1, Event, "x", 93);
     assert_eq!(drain(&mut windows), []);
     assert_eq!(windows.open().map(|group| (group.begin, group.from)), Some((91, 91)));
@@ -157,7 +159,7 @@ fn a_late_stop_ends_its_window_now() {
 }
 
 #[test]
-fn a_long_clip_is_cut_without_a_gap() {
+fn a_long_clip_is_split_without_a_gap() {
     let mut windows = machine(100, &[rules(5, 0, 0)]);
     windows.pass(50);
     windows.trigger(0, Start, "x", 50);
@@ -191,10 +193,10 @@ fn extreme_times_do_not_overflow() {
     assert!(windows.close().is_some());
 }
 
-/// A window as the model sees it: lambda, first and last instant.
+/// A window of the model: lambda, first and last instant.
 type Plain = (usize, i64, i64);
 
-/// The model: all windows at once, then those that hang together. No state, no order of arrival.
+/// The model: all windows at once, then the connected ones. No state, no order of arrival.
 fn model(rules: &[WindowRules], triggers: &[(i64, usize, TriggerKind)]) -> Vec<Vec<Plain>> {
     let mut windows: Vec<Plain> = Vec::new();
     for (lambda, rules) in rules.iter().enumerate() {
@@ -234,7 +236,7 @@ fn model(rules: &[WindowRules], triggers: &[(i64, usize, TriggerKind)]) -> Vec<V
 }
 
 #[test]
-fn random_triggers_make_the_groups_of_the_model() {
+fn random_triggers_give_the_groups_of_the_model() {
     for seed in 0..3_000 {
         let mut random = SeededRandom(seed);
         let lambdas = 1 + random.below(3) as usize;
@@ -250,13 +252,13 @@ fn random_triggers_make_the_groups_of_the_model() {
                     WindowStep::Begin(new) | WindowStep::Join { windows: new, .. } => {
                         assert!(
                             new.iter().all(|window| window.from >= trimmed),
-                            "what it needs is gone: {seed}"
+                            "a needed entry was dropped: {seed}"
                         );
                     }
                     step => panic!("{step:?}"),
                 }
             }
-            // Tighter than the recorder is: one preroll, and no second for the late.
+            // Tighter than the recorder: one preroll, and no second for late triggers.
             let longest = rules.iter().map(|rules| rules.preroll_ns).max().unwrap_or(0);
             trimmed = windows.now - longest;
         };
@@ -322,38 +324,41 @@ fn a_stop_ends_the_recording_of_its_label_and_the_clip_lasts_until_the_last() {
 }
 
 #[test]
-fn a_lambda_that_starts_ever_new_recordings_is_heard_up_to_a_bound() {
+fn the_number_of_recordings_that_a_lambda_starts_is_bounded() {
     let mut windows = Windows::new(1_000_000);
     windows.add(WindowRules { preroll_ns: 5, postroll_ns: 5, cooldown_ns: 0 });
-    let heard = (0..STARTED_MAX + 1)
+    let outcomes = (0..STARTED_MAX + 1)
         .map(|n| windows.trigger(0, Start, &n.to_string(), 100))
         .collect::<Vec<_>>();
-    assert_eq!(heard.iter().filter(|heard| **heard == TriggerOutcome::Opened).count(), STARTED_MAX);
-    assert_eq!(heard.last(), Some(&TriggerOutcome::TooManyStarted));
+    assert_eq!(
+        outcomes.iter().filter(|outcome| **outcome == TriggerOutcome::Opened).count(),
+        STARTED_MAX
+    );
+    assert_eq!(outcomes.last(), Some(&TriggerOutcome::TooManyStarted));
 }
 
 #[test]
-fn more_windows_than_may_wait_are_refused_as_that() {
+fn windows_beyond_the_waiting_limit_are_refused() {
     let mut windows = machine(LONG, &[rules(0, 0, 0)]);
-    let heard: Vec<_> = (0..4097).map(|n| windows.trigger(0, Event, "x", 10 * n)).collect();
-    assert!(heard[..4096].iter().all(|heard| *heard == TriggerOutcome::Opened));
+    let outcomes: Vec<_> = (0..4097).map(|n| windows.trigger(0, Event, "x", 10 * n)).collect();
+    assert!(outcomes[..4096].iter().all(|outcome| *outcome == TriggerOutcome::Opened));
     assert_eq!(
-        (heard[4096], windows.trigger(0, Start, "y", 100_000)),
+        (outcomes[4096], windows.trigger(0, Start, "y", 100_000)),
         (TriggerOutcome::TooManyWaiting, TriggerOutcome::TooManyWaiting)
     );
     assert_eq!(windows.forget_waiting(), 4096);
 }
 
 #[test]
-fn what_comes_late_is_waited_for_before_anything_is_ended() {
+fn clips_wait_for_late_wakes_before_they_end() {
     let mut windows = machine(100, &[rules(10, 20, 0), rules(0, 0, 0)]);
     windows.set_grace(30);
     windows.pass(1000);
     windows.trigger(0, Event, "x", 1000);
-    // An end and a preroll later it would be finished.
+    // It would be finished one preroll after its end.
     windows.pass(1030 + 30);
     assert!(drain(&mut windows).is_empty());
-    // One that lies behind it waits as long.
+    // A window behind it waits as long.
     windows.trigger(1, Event, "x", 1060);
     windows.pass(1031 + 30);
     assert_eq!(drain(&mut windows).len(), 1);
@@ -367,7 +372,7 @@ fn what_comes_late_is_waited_for_before_anything_is_ended() {
     );
     windows.pass(2091 + 30);
     assert!(matches!(windows.step(), Some(WindowStep::Roll { boundary: 2090, .. })));
-    // A stray is one that nothing can join any more.
+    // A late clip is one that nothing can join any more.
     windows.trigger(1, Event, "x", 2091 - 102);
     assert!(windows.step().is_some_and(|step| matches!(step, WindowStep::Late(..))));
     windows.set_grace(i64::MAX / 2);
@@ -380,8 +385,8 @@ fn commands_and_triggers_end_only_what_is_their_own() {
     let mut windows = machine(1_000_000, &[rules(10, 10, 1000)]);
     windows.pass(100);
     assert_eq!(windows.trigger(0, Event, "x", 100), TriggerOutcome::Opened);
-    let heard = [0, 1, 2].map(|at| windows.command(0, Event, "x", 100 + at));
-    assert_eq!(heard, [TriggerOutcome::Opened; 3], "a cooldown is the lambda's");
+    let outcomes = [0, 1, 2].map(|at| windows.command(0, Event, "x", 100 + at));
+    assert_eq!(outcomes, [TriggerOutcome::Opened; 3], "a cooldown is the lambda's");
     assert_eq!(windows.trigger(0, Event, "x", 103), TriggerOutcome::InCooldown);
     assert_eq!(windows.command(0, Start, "a", 105), TriggerOutcome::Opened);
     assert_eq!(windows.command(0, Start, "a", 106), TriggerOutcome::Ignored);
@@ -404,13 +409,16 @@ fn commands_and_triggers_end_only_what_is_their_own() {
 }
 
 #[test]
-fn a_lambda_that_starts_too_much_keeps_no_command_from_starting() {
+fn a_lambda_at_its_limit_does_not_block_commands() {
     let mut windows = machine(1_000_000, &[rules(10, 10, 0)]);
     for n in 0..2 * STARTED_MAX {
         windows.trigger(0, Start, &n.to_string(), 100);
     }
-    let heard = (0..STARTED_MAX + 1)
+    let outcomes = (0..STARTED_MAX + 1)
         .map(|n| windows.command(0, Start, &n.to_string(), 100))
         .collect::<Vec<_>>();
-    assert_eq!(heard.iter().filter(|heard| **heard == TriggerOutcome::Opened).count(), STARTED_MAX);
+    assert_eq!(
+        outcomes.iter().filter(|outcome| **outcome == TriggerOutcome::Opened).count(),
+        STARTED_MAX
+    );
 }

@@ -1,4 +1,4 @@
-//! Commands over a topic: what they record, and what is refused.
+//! Tests of commands over a topic.
 #![cfg(feature = "program")]
 
 use std::time::Instant;
@@ -15,7 +15,7 @@ const TOPIC: &str = "/gleaner/commands";
 /// The writer that `meta` names, in hexadecimal digits.
 const SOURCE: &str = "command on /gleaner/commands by 07070707070707070707070707070707";
 
-/// A process that hears commands, with a sensor on `/a`.
+/// A process that receives commands, with a sensor on `/a`.
 struct CommandedRun {
     running: Running,
     network: FakeNetwork,
@@ -40,27 +40,28 @@ impl CommandedRun {
         link
     }
 
-    /// Says something; once somebody listens.
-    fn say(&self, text: impl AsRef<[u8]>) -> (i64, Delivery) {
+    /// Publishes a command once there is a reader.
+    fn publish(&self, text: impl AsRef<[u8]>) -> (i64, Delivery) {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let at = self.running.clock.now();
             match self.network.publish_text(TOPIC, at, text.as_ref()) {
-                Some(verdict) => return (at, verdict),
-                None => assert!(Instant::now() < deadline, "nobody listens"),
+                Some(delivery) => return (at, delivery),
+                None => assert!(Instant::now() < deadline, "there is no reader"),
             }
             std::thread::yield_now();
         }
     }
 
-    fn told(&mut self, wanted: impl Fn(&CommandStatus) -> bool) -> CommandStatus {
+    fn command_status(&mut self, wanted: impl Fn(&CommandStatus) -> bool) -> CommandStatus {
         let status = self.running.status(|status| status.commands.as_ref().is_some_and(&wanted));
         status.commands.unwrap()
     }
 
     fn accepted_and_refused(&mut self, accepted: u64, refused: u64) {
-        let told = self.told(|told| told.accepted + told.refused >= accepted + refused);
-        assert_eq!((told.accepted, told.refused), (accepted, refused));
+        let status =
+            self.command_status(|status| status.accepted + status.refused >= accepted + refused);
+        assert_eq!((status.accepted, status.refused), (accepted, refused));
     }
 
     fn end(mut self) {
@@ -72,12 +73,12 @@ impl CommandedRun {
 fn moments(clip: &Clip) -> Vec<(&str, TriggerKind, &str, Option<&str>)> {
     let moment = |moment: &gleaner_lambda::Moment| moment.source.is_some();
     assert!(clip.moments.iter().any(moment));
-    let told = clip.moments.iter();
-    told.map(|m| (m.lambda.as_str(), m.kind, m.label.as_str(), m.source.as_deref())).collect()
+    let moments = clip.moments.iter();
+    moments.map(|m| (m.lambda.as_str(), m.kind, m.label.as_str(), m.source.as_deref())).collect()
 }
 
 #[test]
-fn an_event_by_command_records_as_the_lambda_would_and_stands_in_no_journal() {
+fn an_event_by_command_records_like_the_lambda_and_is_in_no_journal() {
     let scratch = TestDir::new();
     let mut commanded = CommandedRun::start(&scratch);
     let mut link = commanded.join(&scratch, "first", (5000, 100));
@@ -86,7 +87,7 @@ fn an_event_by_command_records_as_the_lambda_would_and_stands_in_no_journal() {
     let at_wake = commanded.running.clock.now();
     link.wake(&entry(at_wake, &[]), 0).unwrap();
     link.poll().unwrap();
-    let (at, _) = commanded.say(r#"{"command": "event", "label": "odd noise", "score": 0.25}"#);
+    let (at, _) = commanded.publish(r#"{"command": "event", "label": "odd noise", "score": 0.25}"#);
     let clip = commanded.running.clip();
     assert_eq!((clip.from_ns, clip.to_ns, clip.triggers), (at - 5 * S, at + 100 * MS, 1));
     assert_eq!(moments(&clip), [("first", Event, "odd noise", Some(SOURCE))]);
@@ -98,8 +99,9 @@ fn an_event_by_command_records_as_the_lambda_would_and_stands_in_no_journal() {
         "{numbers:?}"
     );
     assert_eq!(scratch.journal(&clip, "first").1, [at_wake], "wakes, and nothing else");
-    let told = scratch.metadata(&clip);
-    let decisions: Vec<_> = told.iter().filter(|(name, _)| name == "gleaner.decision").collect();
+    let metadata = scratch.metadata(&clip);
+    let decisions: Vec<_> =
+        metadata.iter().filter(|(name, _)| name == "gleaner.decision").collect();
     assert_eq!(decisions.len(), 1);
     assert_eq!(decisions[0].1["source"], SOURCE);
     commanded.accepted_and_refused(1, 0);
@@ -115,19 +117,20 @@ fn a_stop_ends_what_a_command_started_and_nothing_else() {
     received(&mut commanded.running, 50);
     first.wake(&entry(commanded.running.clock.now(), &[Start]), 0).unwrap();
     commanded.running.status(|status| status.recording.windows == 1);
-    // The lambda's own is not ended, whoever asks.
-    commanded.say(r#"{"command": "stop", "label": "here", "lambda": "first"}"#);
+    // The lambda's own recording is not ended by a command.
+    commanded.publish(r#"{"command": "stop", "label": "here", "lambda": "first"}"#);
     commanded.accepted_and_refused(0, 1);
-    commanded.say(r#"{"command": "start", "label": "here", "lambda": "second"}"#);
+    commanded.publish(r#"{"command": "start", "label": "here", "lambda": "second"}"#);
     commanded.accepted_and_refused(1, 1);
-    // Nor does the lambda's end end what was commanded in its name.
+    // Nor does the end of the lambda end what was commanded in its name.
     second.bye(PATIENCE);
     first.bye(PATIENCE);
     let status = commanded.running.status(|status| status.lambdas == 0);
     assert!(status.is_recording);
-    commanded.say(r#"{"command": "stop", "label": "here"}"#);
+    commanded.publish(r#"{"command": "stop", "label": "here"}"#);
     commanded.accepted_and_refused(1, 2);
-    let (stopped, _) = commanded.say(r#"{"command": "stop", "label": "here", "lambda": "second"}"#);
+    let (stopped, _) =
+        commanded.publish(r#"{"command": "stop", "label": "here", "lambda": "second"}"#);
     let clip = commanded.running.clip();
     assert!(clip.to_ns >= stopped, "{clip:?}");
     let source = Some(SOURCE);
@@ -139,29 +142,29 @@ fn a_stop_ends_what_a_command_started_and_nothing_else() {
             ("second", TriggerKind::Stop, "here", source)
         ]
     );
-    assert_eq!(clip.incomplete, ["first ended before it said stop"]);
+    assert_eq!(clip.incomplete, ["first ended before its stop trigger"]);
     commanded.accepted_and_refused(2, 2);
     commanded.end();
 }
 
 #[test]
-fn too_many_too_long_and_senseless_commands_are_counted_and_do_nothing() {
+fn too_many_too_long_and_invalid_commands_are_counted_and_do_nothing() {
     let scratch = TestDir::new();
     let mut commanded = CommandedRun::start(&scratch);
     let long = format!(r#"{{"command": "event", "label": "x"}}{}"#, " ".repeat(4096));
-    assert_eq!(commanded.say(&long).1, Delivery::TooBig);
+    assert_eq!(commanded.publish(&long).1, Delivery::TooBig);
     for text in [
         "",
         "{\"command\": \"event\", \"label\": \"\u{1b}[2J\", \"lambda\": \"\u{7}\"}",
         "{\"command\":\"x\"}",
     ] {
-        assert_eq!(commanded.say(text).1, Delivery::Taken);
+        assert_eq!(commanded.publish(text).1, Delivery::Taken);
     }
-    commanded.say([0xff; 100]);
+    commanded.publish([0xff; 100]);
     commanded.accepted_and_refused(0, 5);
-    let verdicts: Vec<_> =
-        (0..10_000).map(|_| commanded.say(r#"{"command":"event","label":"x"}"#).1).collect();
-    let taken = verdicts.iter().filter(|verdict| **verdict == Delivery::Taken).count();
+    let deliveries: Vec<_> =
+        (0..10_000).map(|_| commanded.publish(r#"{"command":"event","label":"x"}"#).1).collect();
+    let taken = deliveries.iter().filter(|delivery| **delivery == Delivery::Taken).count();
     assert!(taken < 100, "at most five at once, and one each second: {taken}");
     commanded.accepted_and_refused(0, 5 + 10_000);
     let last = {
@@ -172,7 +175,7 @@ fn too_many_too_long_and_senseless_commands_are_counted_and_do_nothing() {
 }
 
 #[test]
-fn nobody_commands_where_nobody_asked_for_it() {
+fn without_the_option_there_are_no_commands() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();
     network.add("/a");

@@ -1,5 +1,5 @@
-//! What others have put where a recorder's files belong: nothing is written to where it leads, and
-//! nobody waits for it.
+//! Tests with other files under the names of a recorder's files: nothing is written through them,
+//! and nothing blocks on them.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -20,7 +20,7 @@ fn pipe(path: &Path) {
     assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
 }
 
-/// A file that nobody may touch.
+/// A file that must not be changed.
 fn precious(scratch: &TestDir) -> PathBuf {
     let path = scratch.0.join("precious");
     fs::write(&path, PRECIOUS).unwrap();
@@ -31,7 +31,7 @@ fn is_untouched(path: &Path) -> bool {
     fs::read_to_string(path).unwrap() == PRECIOUS
 }
 
-/// What puts something at the second path, the first being the precious file, and how it is called.
+/// Creates something at the second path, the first being the precious file; and the expected error.
 type Put = (fn(&Path, &Path), &'static str);
 
 const IN_THE_WAY: [Put; 4] = [
@@ -41,7 +41,7 @@ const IN_THE_WAY: [Put; 4] = [
     (|_, path| pipe(path), "it is not a regular file"),
 ];
 
-/// Asserts that it is refused in words: which file, why, and what to do.
+/// Asserts that the error names the file, the reason, and the way out.
 fn assert_refused(error: RecordError, path: &Path, why: &str) {
     let failure = Failure::from(error);
     let text = failure.to_string();
@@ -65,7 +65,7 @@ fn one_clip(scratch: &TestDir, store: Store) -> Result<Vec<Clip>, RecordError> {
 }
 
 #[test]
-fn a_list_or_a_lock_that_is_no_file_of_ours_is_refused() {
+fn a_list_or_a_lock_that_is_not_a_regular_file_is_refused() {
     for name in ["clips.jsonl", "clips/.lock"] {
         for (put, why) in IN_THE_WAY {
             let scratch = TestDir::new();
@@ -94,7 +94,7 @@ fn a_list_that_is_replaced_while_the_recorder_runs_is_not_written_to() {
 }
 
 #[test]
-fn losses_are_noted_in_a_file_of_ours_only() {
+fn losses_are_written_to_a_regular_file_only() {
     for (put, why) in IN_THE_WAY {
         let scratch = TestDir::new();
         let precious = precious(&scratch);
@@ -139,12 +139,12 @@ fn a_folder_of_clips_or_of_the_preroll_that_is_a_link_is_refused() {
             .unwrap();
     assert_refused(refused, &preroll, "it is a link");
     assert!(is_untouched(&elsewhere.0.join("0.chunk")));
-    assert_eq!(fs::read_dir(&elsewhere.0).unwrap().count(), 1, "nothing was made there");
+    assert_eq!(fs::read_dir(&elsewhere.0).unwrap().count(), 1, "nothing was created there");
 }
 
 #[test]
-fn what_has_the_names_of_unfinished_files_loses_them_and_nothing_else() {
-    // A clip begins by a name that nobody has, and a list and the preroll by new files.
+fn links_with_names_of_unfinished_files_are_replaced() {
+    // A clip begins with a free name, and a list and the preroll with new files.
     for (put, why) in IN_THE_WAY {
         let scratch = TestDir::new();
         let precious = precious(&scratch);
@@ -166,14 +166,14 @@ fn what_has_the_names_of_unfinished_files_loses_them_and_nothing_else() {
 }
 
 #[test]
-fn a_pipe_that_is_named_like_a_clip_is_not_waited_for() {
+fn a_pipe_with_the_name_of_a_clip_does_not_block() {
     let scratch = TestDir::new();
     {
         let mut recorder = scratch.recorder(|_| {});
         let topics = [recorder.add_topic(topic("/a")).unwrap()];
         let lambda = recorder.add_lambda(member("hello", (500, 500, 0), &topics));
         drive(&mut recorder, &topics, (0, 3000, 10), &[(2000, lambda, &[Start])]);
-        // It dies: nothing is finished.
+        // It dies before anything is finished.
     }
     let parts =
         || fs::read_dir(scratch.0.join("clips")).unwrap().map(|entry| entry.unwrap().path());

@@ -1,5 +1,5 @@
-//! The process is killed while it records, at any moment: what it has reported is there, and what
-//! it was writing is saved.
+//! Tests that kill the recording process at any time: reported clips are there, and open ones are
+//! recovered.
 #![cfg(feature = "program")]
 
 use std::fs::{self, File};
@@ -18,24 +18,24 @@ use gleaner_recorder::RecordingFolder;
 use gleaner_recorder::program::run;
 use gleaner_transport::{Clock, LiveSource};
 
-/// Kills if `GLEANER_KILLS` does not say how many, each after a second and a half; twenty times as
-/// many with `GLEANER_LONG=1`.
+/// Number of kills without `GLEANER_KILLS`, each after a second and a half on average; twenty times
+/// as many with `GLEANER_LONG=1`.
 const KILLS: u64 = 10;
 
-/// Not a test by itself: the process that the next one kills.
+/// Not a test: the process that the next test kills.
 #[test]
-#[ignore = "started by what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill"]
+#[ignore = "started by reported_clips_are_complete_and_open_ones_are_recovered_after_any_kill"]
 fn child() {
     let Some(out) = std::env::var_os("GLEANER_TEST_OUT") else { return };
     let scratch = std::mem::ManuallyDrop::new(TestDir(out.into()));
     let (network, clock) = (FakeNetwork::default(), Clock::from_time_of_day());
     network.add("/a");
     let (mut control, stdin) = ControlClient::pair().unwrap();
-    let (feed, options) = (network.clone(), options(&scratch.0, clock));
-    // What is in a file was written, whenever the kill comes.
+    let (source, options) = (network.clone(), options(&scratch.0, clock));
+    // Reports in a file are written, whenever the kill comes.
     let reports = File::create(scratch.0.join("reports.jsonl")).unwrap();
     thread::spawn(move || {
-        run(options, || Ok(Box::new(feed) as Box<dyn LiveSource>), stdin, reports, Arc::default())
+        run(options, || Ok(Box::new(source) as Box<dyn LiveSource>), stdin, reports, Arc::default())
     });
     let (folder, header) = lambda(&scratch, "first", (300, 1500));
     let mut link = RecorderLink::new(control.add(&add(&folder)).unwrap());
@@ -55,15 +55,14 @@ fn child() {
     }
 }
 
-/// Reports that were written whole.
+/// Reports with complete lines.
 fn reports(out: &Path) -> Vec<RecorderReport> {
     let text = fs::read_to_string(out.join("reports.jsonl")).unwrap_or_default();
     let whole = text.split_inclusive('\n').filter(|line| line.ends_with('\n'));
     whole.map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
-/// Numbers of the messages in the whole chunks of a file that has no end, as the crate `mcap` reads
-/// them.
+/// Numbers of the messages in the complete chunks of an unfinished file, read by the crate `mcap`.
 fn in_whole_chunks(part: &Path) -> Vec<u32> {
     let bytes = fs::read(part).unwrap();
     let options = mcap::read::Options::IgnoreEndMagic.into();
@@ -82,8 +81,8 @@ fn follow_each_other(numbers: &[u32]) -> bool {
 }
 
 #[test]
-fn what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill() {
-    let usual = if std::env::var("GLEANER_LONG").is_ok_and(|said| said == "1") {
+fn reported_clips_are_complete_and_open_ones_are_recovered_after_any_kill() {
+    let usual = if std::env::var("GLEANER_LONG").is_ok_and(|value| value == "1") {
         20 * KILLS
     } else {
         KILLS
@@ -139,7 +138,7 @@ fn what_was_reported_is_whole_and_what_was_open_is_saved_after_any_kill() {
                 assert!(journals.sum::<usize>() > 0, "kill {kill}");
             }
         }
-        // Whatever had come to the disk whole is saved.
+        // All complete chunks on the disk are recovered.
         let mut wanted: Vec<_> = parts.into_iter().filter(|numbers| !numbers.is_empty()).collect();
         wanted.sort();
         let mut found: Vec<_> = recovered

@@ -1,4 +1,4 @@
-//! A recorder that is fed live, and hears of wakes later than of samples.
+//! Tests of a live recorder whose wakes arrive later than samples.
 
 use std::time::Duration;
 
@@ -7,8 +7,8 @@ use gleaner_lambda::TriggerKind::{self, Event, Start, Stop};
 use gleaner_lambda::manifest::Store;
 use gleaner_recorder::{LambdaId, Recorder, RecordingFolder, Settings, TopicId};
 
-/// With one topic and a lambda that keeps nothing from before a trigger, so that nothing waits for
-/// longer than it must.
+/// A recorder with one topic and a lambda without preroll, so that nothing waits longer than it
+/// must.
 fn recorder(
     scratch: &TestDir,
     postroll_ms: i64,
@@ -29,7 +29,7 @@ fn recorder(
     (recorder, a, lambda)
 }
 
-/// A sample and a wake each ms from 0 to before `to_ms`. Wakes are told together every 100 ms, or
+/// A sample and a wake each ms from 0 to before `to_ms`. Wakes are sent together every 100 ms, or
 /// with the next one that triggers.
 fn late_drive(
     recorder: &mut Recorder,
@@ -49,7 +49,7 @@ fn late_drive(
         }
         recorder.work().unwrap();
     }
-    // The last ones come with a good-bye.
+    // The last ones are sent at the end.
     wait.drain(..).for_each(|entry| recorder.wake(lambda, &entry).unwrap());
 }
 
@@ -73,7 +73,7 @@ fn wakes_that_come_late_are_in_the_journals_of_their_clips() {
 }
 
 #[test]
-fn clips_that_go_on_share_out_wakes_that_come_late() {
+fn late_wakes_are_in_the_right_clip_of_a_long_recording() {
     let scratch = TestDir::new();
     let (mut recorder, a, lambda) = recorder(&scratch, 0, 300);
     late_drive(&mut recorder, a, lambda, 2000, &[(250, Start), (1490, Stop)]);
@@ -94,7 +94,7 @@ fn clips_that_go_on_share_out_wakes_that_come_late() {
 }
 
 #[test]
-fn a_full_clip_that_waits_for_wakes_loses_nothing_when_everything_ends() {
+fn a_full_clip_that_waits_for_wakes_loses_nothing_at_the_end() {
     for is_held in [true, false] {
         let scratch = TestDir::new();
         let (mut recorder, a, lambda) = recorder(&scratch, 0, 300);

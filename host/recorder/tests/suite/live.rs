@@ -1,4 +1,4 @@
-//! A recorder that is fed live makes the clips that one makes which is told the same of a drive.
+//! Tests that a live recorder makes the same clips as a replay of the same drive.
 
 use std::time::Duration;
 
@@ -23,8 +23,8 @@ fn live(scratch: &TestDir, change: impl FnOnce(&mut Settings)) -> Recorder {
     Recorder::live(RecordingFolder::open(&scratch.0).unwrap().0, settings).unwrap()
 }
 
-/// What the clips of a random drive hold, each by itself. Triggers come at once; `work` is done as
-/// often as chance has it.
+/// The contents of each clip of a random drive. Triggers come at once; `work` is called at random
+/// intervals.
 fn random_drive(seed: u64, is_live: bool) -> Vec<Vec<(String, i64, u32)>> {
     let (mut random, mut pace) = (SeededRandom(seed), SeededRandom(seed + 1000));
     let scratch = TestDir::new();
@@ -70,7 +70,7 @@ fn random_drive(seed: u64, is_live: bool) -> Vec<Vec<(String, i64, u32)>> {
 }
 
 #[test]
-fn clips_are_those_of_a_drive_whenever_the_work_is_done() {
+fn clips_are_those_of_a_replay_whenever_the_work_is_done() {
     let mut clips = 0;
     for seed in 0..60 {
         let expected = random_drive(seed, false);
@@ -81,7 +81,7 @@ fn clips_are_those_of_a_drive_whenever_the_work_is_done() {
 }
 
 #[test]
-fn clips_that_go_on_hold_everything_once_whenever_the_work_is_done() {
+fn consecutive_clips_contain_everything_once_whenever_the_work_is_done() {
     for every in [1, 7, 60] {
         let scratch = TestDir::new();
         let mut recorder =
@@ -108,7 +108,7 @@ fn clips_that_go_on_hold_everything_once_whenever_the_work_is_done() {
 }
 
 #[test]
-fn little_is_on_its_way_to_the_disk_however_fast_samples_come() {
+fn the_queue_to_the_disk_is_bounded_however_fast_samples_come() {
     let scratch = TestDir::new();
     let mut recorder = live(&scratch, |settings| settings.preroll_bytes = 256 << 20);
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -141,7 +141,7 @@ fn little_is_on_its_way_to_the_disk_however_fast_samples_come() {
 }
 
 #[test]
-fn what_has_to_go_before_it_is_written_is_counted() {
+fn samples_evicted_before_they_are_written_are_counted() {
     let scratch = TestDir::new();
     let mut recorder = live(&scratch, |settings| settings.preroll_bytes = 50_000);
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -149,7 +149,7 @@ fn what_has_to_go_before_it_is_written_is_counted() {
     for ms in 0..2000 {
         recorder.sample(a, &meta(T0 + ms * MS, ms as u64), &[1; 100]).unwrap();
         if ms == 500 {
-            // Nobody finds the time to work.
+            // No time to work.
             recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap();
         }
     }
@@ -162,7 +162,7 @@ fn what_has_to_go_before_it_is_written_is_counted() {
 }
 
 #[test]
-fn gaps_in_numbers_are_losses_of_the_clip_that_they_are_in() {
+fn gaps_in_sequence_numbers_are_losses_of_their_clip() {
     let scratch = TestDir::new();
     let mut recorder = live(&scratch, |_| {});
     let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
@@ -181,7 +181,7 @@ fn gaps_in_numbers_are_losses_of_the_clip_that_they_are_in() {
                 .sum::<u64>();
         recorder.sample(topics[0], &meta(at, seq), b"x").unwrap();
         if ms % 2 == 0 {
-            // One comes late, and is no loss; another had no room here.
+            // One comes late, and is not lost; another had no room here.
             let swapped = match ms {
                 540 => 542,
                 542 => 540,
@@ -206,21 +206,21 @@ fn gaps_in_numbers_are_losses_of_the_clip_that_they_are_in() {
     }
     recorder.finish(T0 + S).unwrap();
     let [clip] = recorder.clips() else { panic!() };
-    let told: Vec<_> = clip.topics.iter().map(|topic| (topic.messages, topic.lost)).collect();
-    assert_eq!(told, [(201, Some(7)), (100, Some(1)), (91, None)]);
+    let counts: Vec<_> = clip.topics.iter().map(|topic| (topic.messages, topic.lost)).collect();
+    assert_eq!(counts, [(201, Some(7)), (100, Some(1)), (91, None)]);
     assert_eq!(clip.topics[2].type_name.as_deref(), Some("test_msgs/msg/Number"));
     let expected = [
         "7 samples of /a did not reach the recorder",
         "1 sample of /b did not reach the recorder",
         "/late was found 0.1 s after the clip begins",
-        "the journal of hello lacks 3 wakes: lost on the way to the recorder",
+        "the journal of hello lacks 3 wakes: lost in transit to the recorder",
     ];
     assert_eq!(clip.incomplete, expected);
     assert_eq!(scratch.journal(clip, "hello").0.wakes_before, 3);
 }
 
 #[test]
-fn while_nothing_may_be_recorded_triggers_are_counted_and_the_open_clip_ends() {
+fn while_recording_is_suspended_triggers_are_counted_and_the_open_clip_ends() {
     let scratch = TestDir::new();
     let mut recorder = live(&scratch, |_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -246,7 +246,7 @@ fn while_nothing_may_be_recorded_triggers_are_counted_and_the_open_clip_ends() {
 }
 
 #[test]
-fn a_lambda_that_ends_stops_what_it_started() {
+fn the_end_of_a_lambda_stops_its_recordings() {
     let scratch = TestDir::new();
     let mut recorder = live(&scratch, |_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -263,11 +263,11 @@ fn a_lambda_that_ends_stops_what_it_started() {
     recorder.finish(T0 + S).unwrap();
     let clip = &recorder.clips()[0];
     assert_eq!(stamps(&scratch, clip, "/a"), every(100, 350, 1));
-    assert_eq!(clip.incomplete, ["hello ended before it said stop"]);
+    assert_eq!(clip.incomplete, ["hello ended before its stop trigger"]);
 }
 
 #[test]
-fn a_clip_that_cannot_be_written_is_told_and_the_next_one_can() {
+fn a_clip_that_cannot_be_written_is_reported_and_the_next_one_is_written() {
     let scratch = TestDir::new();
     let mut recorder = live(&scratch, |_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -296,7 +296,7 @@ fn a_clip_that_cannot_be_written_is_told_and_the_next_one_can() {
 }
 
 #[test]
-fn a_preroll_that_grows_keeps_what_it_holds() {
+fn a_growing_preroll_keeps_its_entries() {
     for store in [Store::Ram, Store::Disk] {
         let scratch = TestDir::new();
         let mut recorder = live(&scratch, |settings| settings.preroll_bytes = 30_000);
@@ -307,7 +307,7 @@ fn a_preroll_that_grows_keeps_what_it_holds() {
             match ms {
                 300 => recorder.grow_preroll(store, 64 << 20).unwrap(),
                 1000 => recorder.wake(lambda, &entry(T0 + ms * MS, EVENT)).unwrap(),
-                // In the middle of the way through it.
+                // In the middle of the backfill.
                 1003 => recorder.grow_preroll(store, 65 << 20).unwrap(),
                 _ => {}
             }
@@ -321,7 +321,7 @@ fn a_preroll_that_grows_keeps_what_it_holds() {
 }
 
 #[test]
-fn the_oldest_clips_make_room_and_each_is_named() {
+fn the_oldest_clips_are_deleted_and_each_is_noted() {
     let scratch = TestDir::new();
     let (mut folder, _) = RecordingFolder::open(&scratch.0).unwrap();
     assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
@@ -356,7 +356,7 @@ fn the_oldest_clips_make_room_and_each_is_named() {
 }
 
 #[test]
-fn a_clip_that_was_fetched_leaves_its_room_to_others() {
+fn a_fetched_clip_does_not_count() {
     let scratch = TestDir::new();
     let (folder, _) = RecordingFolder::open(&scratch.0).unwrap();
     let settings = Settings {
@@ -381,7 +381,7 @@ fn a_clip_that_was_fetched_leaves_its_room_to_others() {
     drop(recorder);
     let [oldest, second, third] = &files[..] else { panic!("{files:?}") };
     std::fs::remove_file(second).unwrap();
-    // Two are left, and two there may be.
+    // Two are left, and two are allowed.
     let (mut folder, _) = RecordingFolder::open(&scratch.0).unwrap();
     assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
     std::fs::remove_file(third).unwrap();

@@ -1,5 +1,5 @@
-//! The recorder through its public interface, and its process within a test, as one program: each
-//! file is a subject.
+//! Tests of the recorder through its public interface, and of its process within a test: one
+//! program, with one file for each subject.
 
 mod commands;
 mod in_the_way;

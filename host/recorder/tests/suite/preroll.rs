@@ -1,5 +1,5 @@
-//! The preroll, seen from clips: what did not fit is counted, in the clip whose window reaches over
-//! it.
+//! Tests of the preroll by its clips: evicted entries are counted in the clip whose window covers
+//! them.
 
 use std::fs;
 
@@ -41,7 +41,7 @@ fn within_bound(recorder: &Recorder) {
 }
 
 #[test]
-fn what_was_pushed_out_is_counted_in_the_clip_that_misses_it() {
+fn evicted_samples_are_counted_in_the_clip_that_lacks_them() {
     for store in [Store::Ram, Store::Disk] {
         let (scratch, clip, evicted_early) = cut(store, 50_000);
         let topic = &clip.topics[0];
@@ -52,7 +52,7 @@ fn what_was_pushed_out_is_counted_in_the_clip_that_misses_it() {
         assert_eq!(
             clip.incomplete,
             [format!(
-                "the preroll was cut by preroll_size: {overwritten} samples of /a pushed out"
+                "preroll_size is too small: {overwritten} samples of /a evicted from the preroll"
             )]
         );
         assert!(evicted_early > overwritten);
@@ -65,7 +65,7 @@ fn what_was_pushed_out_is_counted_in_the_clip_that_misses_it() {
 }
 
 #[test]
-fn what_nobody_can_count_is_said_to_be_unknown() {
+fn losses_that_cannot_be_counted_are_unknown() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.preroll_bytes = 10_000);
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -78,14 +78,14 @@ fn what_nobody_can_count_is_said_to_be_unknown() {
         (None, None, Some(0))
     );
     assert!(
-        clip.incomplete.iter().any(|short| short.ends_with("more than were counted")),
+        clip.incomplete.iter().any(|short| short.ends_with("more than counted")),
         "{:?}",
         clip.incomplete
     );
 }
 
 #[test]
-fn what_is_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
+fn a_sample_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
     for store in [Store::Ram, Store::Disk] {
         let scratch = TestDir::new();
         let mut recorder =
@@ -98,7 +98,7 @@ fn what_is_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
         }
         recorder.wake(lambda, &entry(T0 + 200 * MS, EVENT)).unwrap();
         recorder.sample(a, &meta(T0 + 300 * MS, 3), &[2; 10_000]).unwrap();
-        // A second window over the same time counts nothing a second time.
+        // A second window over the same time counts nothing twice.
         recorder.wake(lambda, &entry(T0 + 400 * MS, EVENT)).unwrap();
         recorder.finish(T0 + 3 * S).unwrap();
         let clip = &recorder.clips()[0];
@@ -110,7 +110,7 @@ fn what_is_larger_than_the_store_is_in_an_open_clip_and_counted_before_one() {
 }
 
 #[test]
-fn wakes_that_were_pushed_out_are_missing_from_the_journal_and_said() {
+fn evicted_wakes_are_missing_from_the_journal_and_reported() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.preroll_bytes = 3_000);
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -126,15 +126,15 @@ fn wakes_that_were_pushed_out_are_missing_from_the_journal_and_said() {
         (header.wakes_before + wakes.len() as u64, wakes.last()),
         (100, Some(&(T0 + 99 * MS)))
     );
-    let said = format!(
-        "the journal of hello lacks {} wakes: pushed out of the preroll",
+    let stated = format!(
+        "the journal of hello lacks {} wakes: evicted from the preroll",
         header.wakes_before
     );
-    assert!(clip.incomplete.contains(&said), "{:?}", clip.incomplete);
+    assert!(clip.incomplete.contains(&stated), "{:?}", clip.incomplete);
 }
 
 #[test]
-fn a_preroll_on_disk_is_deleted_in_the_end_and_its_failure_is_named() {
+fn a_preroll_on_disk_is_deleted_at_the_end_and_its_failure_is_reported() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.store = Store::Disk);
     let a = recorder.add_topic(topic("/a")).unwrap();

@@ -1,4 +1,4 @@
-//! The process, fed by the loopback transport: from sockets and samples to clips and reports.
+//! Tests of the process with the loopback transport: from sockets and samples to clips and reports.
 #![cfg(feature = "program")]
 
 use std::fs::{self, File};
@@ -18,7 +18,7 @@ use gleaner_recorder::program::{RecorderOptions, run};
 use gleaner_transport::{Clock, LiveSource};
 
 #[test]
-fn two_lambdas_record_and_neither_speaks_for_the_other() {
+fn two_lambdas_record_and_neither_can_act_as_the_other() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();
     network.add("/a");
@@ -29,7 +29,7 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
     let sockets =
         [running.control.add(&add(&first)).unwrap(), running.control.add(&add(&second)).unwrap()];
     let [mut one, mut two] = sockets.map(RecorderLink::new);
-    // Each is only what its own socket was made for.
+    // Each link can only act as the lambda of its own socket.
     let refused = RecorderLink::new(running.control.add(&add(&first)).unwrap())
         .hello(&second_header, PATIENCE);
     assert!(
@@ -58,23 +58,23 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
         (clip.from_ns, clip.to_ns, clip.triggers),
         (anchor - 200 * MS, anchor + 100 * MS, 1)
     );
-    // Every number from the first to the last, once, and all that there are of that time.
+    // Every number from the first to the last, once, and all of that time.
     let numbers: Vec<_> = scratch.messages(&clip).into_iter().map(|(_, _, seq, _)| seq).collect();
     assert!(
         numbers.len() > 1 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1),
         "{numbers:?}"
     );
     assert_eq!(numbers, sensor.numbers(clip.from_ns, clip.to_ns));
-    let told: Vec<_> = clip
+    let counts: Vec<_> = clip
         .topics
         .iter()
         .map(|topic| (topic.topic.as_str(), topic.lost, topic.type_name.is_some()))
         .collect();
-    assert_eq!((told[0].0, told[0].1, told[0].2), ("/a", Some(0), true));
-    assert_eq!((told[1].0, told[1].2), ("/b", false), "one that is not there");
+    assert_eq!((counts[0].0, counts[0].1, counts[0].2), ("/a", Some(0), true));
+    assert_eq!((counts[1].0, counts[1].2), ("/b", false), "a topic without a writer");
     assert_eq!(scratch.journal(&clip, "first").1, [anchor]);
     assert_eq!(two.bye(PATIENCE), one.bye(PATIENCE));
-    // One that was never built.
+    // A lambda that was never built.
     let _unbuilt = running.control.add(&add(&scratch.0.join("third"))).unwrap();
     running.status(|status| status.lambdas == 0 && status.recording.lambdas_refused == 2);
     running.control.stop().unwrap();
@@ -88,7 +88,7 @@ fn two_lambdas_record_and_neither_speaks_for_the_other() {
 }
 
 #[test]
-fn a_recording_that_is_stopped_keeps_what_it_has() {
+fn a_stopped_recording_keeps_its_clips() {
     for how in ["stop", "the starter's end", "SIGTERM"] {
         let scratch = TestDir::new();
         let network = FakeNetwork::default();
@@ -96,7 +96,7 @@ fn a_recording_that_is_stopped_keeps_what_it_has() {
         let (folder, header) = lambda(&scratch, "first", (100, 60_000));
         let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
         link.hello(&header, PATIENCE).unwrap();
-        // A topic that comes later is found.
+        // A topic that appears later is found.
         network.add("/a");
         let _sensor = Sensor::start(&network, running.clock);
         received(&mut running, 10);
@@ -120,7 +120,7 @@ fn a_recording_that_is_stopped_keeps_what_it_has() {
 }
 
 #[test]
-fn what_a_hostile_lambda_says_costs_nobody_else() {
+fn messages_of_a_hostile_lambda_do_not_affect_others() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();
     network.add("/a");
@@ -136,7 +136,7 @@ fn what_a_hostile_lambda_says_costs_nobody_else() {
     rustix::net::send(nonsense.as_fd(), &[255; 4096], rustix::net::SendFlags::NOSIGNAL).unwrap();
     let _sensor = Sensor::start(&network, clock);
     received(&mut running, 200);
-    // Of other times, and far too often.
+    // At other times, and far too often.
     for at in [i64::MAX, i64::MIN + 1, 0, clock.now() + 3600 * S] {
         noisy.wake(&entry(at, &[Start, Event]), 0).unwrap();
     }
@@ -165,7 +165,7 @@ fn what_a_hostile_lambda_says_costs_nobody_else() {
 }
 
 #[test]
-fn the_limits_of_a_vehicle_hold_for_what_the_recorder_reads_of_a_manifest() {
+fn the_limits_of_a_vehicle_apply_to_the_manifest_in_the_recorder() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();
     let mut running = Running::start(&scratch, &network, |_| {});
@@ -174,10 +174,10 @@ fn the_limits_of_a_vehicle_hold_for_what_the_recorder_reads_of_a_manifest() {
     on_vehicle.limits.fuel = 10_000;
     let mut announced = add(&folder);
     announced.most.fuel = 10_000;
-    // A process with more than the vehicle gives is not the one that was announced.
+    // A process with higher limits than the vehicle's is not the one that was announced.
     let refused = RecorderLink::new(running.control.add(&announced).unwrap())
         .hello(&as_in_manifest, PATIENCE);
-    let limit = "its limit `fuel` is `50000000`; the recorder was told of `10000`";
+    let limit = "its limit `fuel` is `50000000`; the starter announced `10000`";
     assert!(
         matches!(&refused, Err(LinkError::Refused { why }) if why.contains(limit)),
         "{refused:?}"
@@ -190,7 +190,7 @@ fn the_limits_of_a_vehicle_hold_for_what_the_recorder_reads_of_a_manifest() {
 }
 
 #[test]
-fn a_full_disk_is_said_and_no_clip_is_begun() {
+fn a_full_disk_is_reported_and_no_clip_is_begun() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();
     network.add("/a");
@@ -225,7 +225,7 @@ fn unfinished(scratch: &TestDir) {
 }
 
 #[test]
-fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and_stays() {
+fn a_recorder_is_ready_before_it_recovers_and_reports_what_it_cannot_recover() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();
     network.add("/a");
@@ -236,7 +236,7 @@ fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and
     };
     let [part] = &find(".mcap.part")[..] else { panic!("no clip was left") };
     let left = fs::read(part).unwrap();
-    // Where the copy is to be, there is something that cannot be removed.
+    // In the place of the copy is something that cannot be removed.
     let in_the_way = part.with_extension("part2");
     fs::create_dir(&in_the_way).unwrap();
     let mut running = Running::start(&scratch, &network, |_| {});
@@ -260,7 +260,8 @@ fn a_recorder_is_ready_before_it_recovers_and_what_it_cannot_recover_is_said_and
     assert_eq!((last.recording.clips, last.recording.failed, ended), (1, 1, Ok(())));
     assert!(fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap().contains("cannot recover"));
     assert_eq!(fs::read(part).unwrap(), left);
-    // The way is free; and a recorder that is stopped at once has some seconds for it.
+    // The obstacle is gone; and a recorder that is stopped at once still has some seconds for
+    // recovery.
     fs::remove_dir(&in_the_way).unwrap();
     let mut running = Running::start(&scratch, &network, |options| options.clips_max = Some(1));
     running.control.stop().unwrap();
@@ -300,7 +301,7 @@ fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
 }
 
 #[test]
-fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_that_one_of_them_expects() {
+fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_of_all() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();
     let mut running = Running::start(&scratch, &network, |_| {});
@@ -316,7 +317,7 @@ fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_that_one_of_them_e
         link.hello(&with_manifest(header, &text), PATIENCE).unwrap();
         links.push(link);
     }
-    // All have said what they want before it is there.
+    // All have announced their topics before there is a writer.
     network.add("/a");
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 1);
@@ -328,7 +329,7 @@ fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_that_one_of_them_e
 }
 
 #[test]
-fn a_topic_is_recorded_as_the_type_that_the_input_says_whoever_came_first() {
+fn a_topic_is_recorded_with_the_type_of_the_input_whichever_writer_came_first() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();
     network.add_other("/a", "aaa/msg/X");
@@ -337,7 +338,7 @@ fn a_topic_is_recorded_as_the_type_that_the_input_says_whoever_came_first() {
     let (folder, header) = lambda(&scratch, "first", (10, 10));
     let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
     link.hello(&header, PATIENCE).unwrap();
-    // `/b` is no input, so that any type will do: once it is found, `/a` was looked for as well.
+    // `/b` is no input, so any type is accepted: once it is found, `/a` was searched as well.
     let type_of = |status: &RecorderStatus, name: &str| {
         status
             .topics
@@ -358,7 +359,7 @@ fn a_topic_is_recorded_as_the_type_that_the_input_says_whoever_came_first() {
 }
 
 #[test]
-fn one_lambda_too_many_is_refused_in_words_and_the_others_are_heard() {
+fn one_lambda_too_many_is_refused_with_a_reason_and_the_others_work() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();
     let mut running =
@@ -369,12 +370,12 @@ fn one_lambda_too_many_is_refused_in_words_and_the_others_are_heard() {
     let refused = last.hello(&header, PATIENCE).unwrap_err();
     assert_eq!(
         refused.to_string(),
-        "the recorder refuses the lambda: it hears at most 256 lambdas at a time"
+        "the recorder refuses the lambda: it records for at most 256 lambdas at a time"
     );
     running.status(|status| (status.lambdas, status.recording.lambdas_refused) == (256, 1));
     let mut links = sockets.into_iter().map(RecorderLink::new);
     links.next_back().unwrap().hello(&header, PATIENCE).unwrap();
-    // Where one goes, there is room for another.
+    // When one leaves, there is room for another.
     drop(links.next());
     running.status(|status| status.lambdas < 256);
     RecorderLink::new(running.control.add(&add(&folder)).unwrap())
@@ -383,7 +384,7 @@ fn one_lambda_too_many_is_refused_in_words_and_the_others_are_heard() {
 }
 
 #[test]
-fn a_preroll_that_no_memory_holds_is_an_error_in_words() {
+fn a_preroll_that_cannot_be_allocated_is_an_error_with_help() {
     for bytes in [u64::MAX, 1 << 60] {
         let scratch = TestDir::new();
         let options = RecorderOptions {
@@ -397,11 +398,7 @@ fn a_preroll_that_no_memory_holds_is_an_error_in_words() {
         let failure = run(options, never, stdin, File::from(OwnedFd::from(writer)), Arc::default())
             .unwrap_err();
         assert_eq!(failure.exit, Exit::Usage);
-        let said = failure.to_string();
-        assert!(
-            said.contains("there is no memory for a preroll of")
-                && said.contains("--preroll-memory"),
-            "{said}"
-        );
+        let text = failure.to_string();
+        assert!(text.contains("cannot allocate") && text.contains("--preroll-memory"), "{text}");
     }
 }

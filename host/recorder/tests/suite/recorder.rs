@@ -1,4 +1,4 @@
-//! A recorder, clip by clip: what is in it, and what it says of itself.
+//! Tests of a recorder, clip by clip: contents and description.
 
 use std::time::Duration;
 
@@ -11,7 +11,7 @@ use gleaner_recorder::{RecordError, RecordingFolder, TOPICS_MAX};
 const EVENT: &[gleaner_lambda::TriggerKind] = &[Event];
 
 #[test]
-fn a_clip_holds_exactly_its_window_and_says_what_it_is() {
+fn a_clip_contains_exactly_its_window_and_describes_itself() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
@@ -107,7 +107,7 @@ fn lambdas_share_a_clip_each_with_its_own_topics() {
 }
 
 #[test]
-fn a_late_trigger_makes_the_clip_that_a_prompt_one_would_have_made() {
+fn a_late_trigger_makes_the_same_clip_as_a_prompt_one() {
     let made = |late_ms: i64| {
         let scratch = TestDir::new();
         let mut recorder = scratch.recorder(|_| {});
@@ -128,11 +128,11 @@ fn a_late_trigger_makes_the_clip_that_a_prompt_one_would_have_made() {
     let (contents, clip) = made(1700);
     assert!(contents.len() < prompt.len());
     assert_eq!(clip.incomplete, ["a trigger came late: samples of /a had left the preroll"]);
-    assert_eq!(clip.topics[0].received, None, "nobody knows what was there");
+    assert_eq!(clip.topics[0].received, None, "the number is unknown");
 }
 
 #[test]
-fn a_long_clip_goes_on_in_the_next_without_loss_or_doubles() {
+fn a_long_clip_continues_in_the_next_without_loss_or_duplicates() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.max_length = Duration::from_secs(1));
     let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
@@ -157,8 +157,7 @@ fn a_long_clip_goes_on_in_the_next_without_loss_or_doubles() {
             "{index}"
         );
         assert_eq!(
-            clip.incomplete
-                .contains(&"continues in the next clip, if anything more came".to_owned()),
+            clip.incomplete.contains(&"continues in the next clip, if there was more".to_owned()),
             !last,
             "{index}"
         );
@@ -172,7 +171,7 @@ fn a_long_clip_goes_on_in_the_next_without_loss_or_doubles() {
 }
 
 #[test]
-fn a_jump_in_time_makes_no_clips_of_nothing() {
+fn a_jump_in_time_makes_no_empty_clips() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|settings| settings.max_length = Duration::from_secs(1));
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -189,7 +188,7 @@ fn a_jump_in_time_makes_no_clips_of_nothing() {
 }
 
 #[test]
-fn what_is_open_at_the_end_of_the_drive_says_so() {
+fn a_clip_that_is_open_at_the_end_of_the_drive_states_that() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -213,12 +212,12 @@ fn what_is_open_at_the_end_of_the_drive_says_so() {
     drive(&mut recorder, &[a], (0, 1000, 10), &[(500, start, &[Start])]);
     recorder.finish(T0 + 1500 * MS).unwrap();
     let [clip] = recorder.clips() else { panic!() };
-    assert_eq!(clip.incomplete, ["the drive ended before the lambda said stop"]);
+    assert_eq!(clip.incomplete, ["the drive ended before the lambda's stop trigger"]);
     assert_eq!((clip.to_ns, clip.topics[0].messages), (T0 + 1500 * MS, 60));
 }
 
 #[test]
-fn what_is_before_1970_or_out_of_order_is_counted() {
+fn samples_before_1970_or_out_of_order_are_counted() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -241,19 +240,19 @@ fn what_is_before_1970_or_out_of_order_is_counted() {
 }
 
 #[test]
-fn a_recorder_has_an_end_of_topics() {
+fn the_number_of_topics_is_bounded() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     for index in 0..TOPICS_MAX {
         recorder.add_topic(topic(&format!("/t{index}"))).unwrap();
     }
-    assert!(recorder.add_topic(topic("/t7")).is_ok(), "one that it has");
+    assert!(recorder.add_topic(topic("/t7")).is_ok(), "an existing one");
     let refused = recorder.add_topic(topic("/more")).unwrap_err();
     assert!(matches!(refused, RecordError::TooManyTopics { most: TOPICS_MAX }));
 }
 
 #[test]
-fn the_names_of_all_topics_have_an_end_before_a_line_of_the_list_has() {
+fn the_names_of_all_topics_fit_into_a_line_of_the_list() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let name = |index: usize| format!("/t{index:03}{}", "x".repeat(1000));
@@ -265,7 +264,7 @@ fn the_names_of_all_topics_have_an_end_before_a_line_of_the_list_has() {
 
 /// A grey image of 4x4 pixels.
 fn image(grey: u8) -> Vec<u8> {
-    // Stamp, and an empty frame id of one byte.
+    // Stamp, and an empty frame ID of one byte.
     let mut cdr = vec![0; 16];
     cdr[8] = 1;
     for number in [4_u32, 4, 6] {
@@ -280,7 +279,7 @@ fn image(grey: u8) -> Vec<u8> {
 }
 
 #[test]
-fn the_picture_is_that_of_the_trigger() {
+fn the_thumbnail_is_the_image_at_the_trigger() {
     let picture = |anchor_ms: i64| {
         let scratch = TestDir::new();
         let mut recorder = scratch.recorder(|_| {});
@@ -307,7 +306,7 @@ fn the_picture_is_that_of_the_trigger() {
 }
 
 #[test]
-fn the_picture_is_in_the_clip() {
+fn the_thumbnail_is_from_the_clip() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let topics = ["/a", "/camera"].map(|name| recorder.add_topic(topic(name)).unwrap());
@@ -324,7 +323,7 @@ fn the_picture_is_in_the_clip() {
 }
 
 #[test]
-fn a_topic_that_was_silent_has_a_channel_and_a_missing_one_has_none() {
+fn a_silent_topic_has_a_channel_and_a_missing_one_has_none() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let topics = ["/a", "/silent", "/other"].map(|name| recorder.add_topic(topic(name)).unwrap());
@@ -340,7 +339,7 @@ fn a_topic_that_was_silent_has_a_channel_and_a_missing_one_has_none() {
 }
 
 #[test]
-fn a_recorder_that_dies_leaves_what_it_has_written() {
+fn the_written_data_of_a_recorder_that_dies_is_recovered() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();
@@ -353,7 +352,7 @@ fn a_recorder_that_dies_leaves_what_it_has_written() {
 }
 
 #[test]
-fn a_lambda_that_was_started_again_within_a_clip_is_told_from_itself() {
+fn a_lambda_that_is_restarted_within_a_clip_is_listed_twice() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
     let a = recorder.add_topic(topic("/a")).unwrap();

@@ -1,4 +1,5 @@
-//! Random drives: each clip holds exactly what a look at all windows at once says.
+//! Tests with random drives: each clip contains exactly what a brute-force computation of all
+//! windows gives.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -61,7 +62,7 @@ fn plan(seed: u64) -> Plan {
 /// Topic, stamp and number of each message of a clip, sorted.
 type Contents = Vec<(String, i64, u32)>;
 
-/// What each clip holds, by brute force.
+/// The contents of each clip, by brute force.
 fn expected(plan: &Plan) -> Vec<Contents> {
     let mut windows: Vec<(usize, i64, i64)> = Vec::new();
     for (lambda, ((preroll, postroll, cooldown), _)) in plan.lambdas.iter().enumerate() {
@@ -113,7 +114,7 @@ fn expected(plan: &Plan) -> Vec<Contents> {
     groups.iter().map(contents).collect()
 }
 
-/// What the recorder's clips hold, and why each is short.
+/// The contents of the recorder's clips, and why each is incomplete.
 fn recorded(plan: &Plan, store: Store, max_length: Duration) -> Vec<(Contents, Vec<String>)> {
     let scratch = TestDir::new();
     let mut recorder =
@@ -157,7 +158,7 @@ fn recorded(plan: &Plan, store: Store, max_length: Duration) -> Vec<(Contents, V
 }
 
 #[test]
-fn random_drives_are_cut_as_brute_force_says() {
+fn clips_of_random_drives_equal_those_by_brute_force() {
     let mut made = 0;
     for seed in 0..60 {
         let plan = plan(seed);
@@ -170,7 +171,7 @@ fn random_drives_are_cut_as_brute_force_says() {
 }
 
 #[test]
-fn random_drives_are_cut_alike_from_memory_and_from_disk() {
+fn clips_from_memory_and_from_disk_are_equal() {
     for seed in 100..120 {
         let (plan, max_length) = (plan(seed), Duration::from_millis(700));
         assert_eq!(
@@ -182,7 +183,7 @@ fn random_drives_are_cut_alike_from_memory_and_from_disk() {
 }
 
 #[test]
-fn clips_that_go_on_hold_together_what_one_would_have_held() {
+fn consecutive_clips_contain_together_what_one_would() {
     for seed in 200..240 {
         let plan = plan(seed);
         let mut groups = Vec::<Vec<_>>::new();
@@ -196,7 +197,7 @@ fn clips_that_go_on_hold_together_what_one_would_have_held() {
                 _ => groups.push(contents),
             }
         }
-        // Equal lists: nothing is lost, and nothing twice.
+        // Equal lists: nothing is lost or duplicated.
         groups.iter_mut().for_each(|group| group.sort());
         assert_eq!(groups, expected(&plan), "seed {seed}");
     }

@@ -233,8 +233,11 @@ fn the_longest_possible_line_can_be_read_again() {
         offered_qos: None,
     };
     assert!(topic(1).check().is_ok());
-    let counts =
-        |n| TopicCounts { topic: name(n), type_name: Some(name(n)), ..TopicCounts::default() };
+    let counts = |n| ClipTopicCounts {
+        topic: name(n),
+        type_name: Some(name(n)),
+        ..ClipTopicCounts::default()
+    };
     let attributes =
         || Some(serde_json::Map::from_iter([("text".to_owned(), "y".repeat(2000).into())]));
     let long = ClipTrailer {

@@ -13,7 +13,9 @@ use gleaner_lambda::{Clip, ClipLambda, Moment, Recovered, TriggerKind};
 use gleaner_messages::Endian;
 use gleaner_transport::{Guid, SampleMeta};
 
-use super::{ClipHeader, ClipTrailer, RecordingFolder, TopicCounts, TopicSchema, UnfinishedClip};
+use super::{
+    ClipHeader, ClipTopicCounts, ClipTrailer, RecordingFolder, TopicSchema, UnfinishedClip,
+};
 
 /// A folder for one test, removed when the test ends.
 struct TestDir(PathBuf);
@@ -125,7 +127,7 @@ fn trailer() -> ClipTrailer {
         triggers: 2,
         moments: vec![moment(12 * SECOND), Moment { score: None, ..moment(13 * SECOND) }],
         topics: vec![
-            TopicCounts {
+            ClipTopicCounts {
                 topic: "/imu/data".to_owned(),
                 type_name: Some("sensor_msgs/msg/Imu".to_owned()),
                 received: Some(9),
@@ -133,7 +135,11 @@ fn trailer() -> ClipTrailer {
                 overwritten: Some(1),
                 too_big: Some(0),
             },
-            TopicCounts { topic: "/gone".to_owned(), received: Some(0), ..TopicCounts::default() },
+            ClipTopicCounts {
+                topic: "/gone".to_owned(),
+                received: Some(0),
+                ..ClipTopicCounts::default()
+            },
         ],
         incomplete: vec!["the drive ended 2.1 s before the window did".to_owned()],
         thumbnail: Some(b"a picture".to_vec()),

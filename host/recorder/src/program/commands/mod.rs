@@ -1,12 +1,10 @@
-//! Commands of people and other programs, over a topic of ROS 2: whoever writes it can have
-//! something recorded.
+//! Handles commands over a ROS 2 topic, by which users and programs request recordings.
 //!
-//! A command asks for what a lambda could trigger, in the lambda's name. Who writes the topic is
-//! not known here, so nothing of a message is looked at before it is known to be short and not one
-//! of too many. What a command can cost others: the disk, within what the recorder may take, and
-//! the commands of others, which come too often with it.
+//! A command requests what a lambda could trigger, in the lambda's name. The writers of the topic
+//! are unknown, so a message is read only if it is short and within the rate limit. A command can
+//! cost others only disk space, within the recorder's limits, and commands beyond the rate limit.
 //!
-//! - `order`: what one message says.
+//! - `request`: parses one message.
 
 mod request;
 
@@ -30,24 +28,24 @@ use request::{CommandError, CommandRequest};
 
 /// The type of the topic.
 pub(super) const TYPE: &str = "std_msgs/msg/String";
-/// Messages per second that are read, and at once.
+/// Messages that are read per second, and in a burst.
 const ALLOWED: RateLimit = RateLimit::of(1.0, 5.0);
-/// Messages that wait for the loop: more than may come at once.
+/// Most messages that are queued for the loop: more than a burst.
 const WAITING: usize = 8;
 /// Messages that the network keeps until they are taken.
 pub(super) const QUEUE: usize = 16;
-/// How often it is said how many were not read.
+/// Interval of the log line on unread messages.
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
-/// Characters of what is said of a refusal: a message may say what it likes, but not as much.
+/// Most characters of a logged refusal: a message may contain any text.
 const WHY_MAX: usize = 200;
 
-/// A message that is to be read.
+/// A message to be read.
 struct CommandMessage {
     meta: SampleMeta,
     cdr: Vec<u8>,
 }
 
-/// Messages that nobody reads.
+/// Counts of messages that are not read.
 #[derive(Debug, Default)]
 struct Unread {
     too_many: AtomicU64,
@@ -60,7 +58,7 @@ impl Unread {
     }
 }
 
-/// Takes the messages of the topic.
+/// The sink of the topic.
 struct CommandSink {
     allowed: Mutex<RateLimit>,
     messages: SyncSender<CommandMessage>,
@@ -74,7 +72,7 @@ impl Sink for CommandSink {
             self.unread.too_long.fetch_add(1, Ordering::Relaxed);
             return Delivery::TooBig;
         }
-        // Only the transport's thread is here.
+        // Only the transport's thread calls this.
         let may =
             self.allowed.lock().unwrap_or_else(PoisonError::into_inner).take(1.0, Instant::now());
         if !may
@@ -88,25 +86,25 @@ impl Sink for CommandSink {
     }
 }
 
-/// Obeys commands.
+/// Executes commands.
 pub(super) struct Commands {
     topic: String,
     messages: Receiver<CommandMessage>,
     unread: Arc<Unread>,
-    /// The newest of each name, also after its end: an operator need not wait for a lambda that is
-    /// being started again.
+    /// The newest lambda of each name, also after its end: an operator need not wait for a lambda
+    /// that is being restarted.
     lambdas: BTreeMap<String, LambdaId>,
-    /// What runs, by lambda and label: with the lambda that it was started with, which may have
-    /// ended since.
+    /// Running recordings, by lambda and label, with the lambda that each was started with, which
+    /// may have ended since.
     running: BTreeMap<(String, String), LambdaId>,
     accepted: u64,
     refused: u64,
-    /// What was said of messages that nobody read, and when.
+    /// The last logged counts of unread messages, and the time.
     reported: ((u64, u64), Option<Instant>),
 }
 
 impl Commands {
-    /// Commands over `topic`, and who hears them there.
+    /// Returns the commands over `topic`, and their sink.
     pub(super) fn new(topic: String, reader: Thread) -> (Commands, Arc<dyn Sink>) {
         let (sender, messages) = sync_channel(WAITING);
         let unread = Arc::<Unread>::default();
@@ -129,34 +127,34 @@ impl Commands {
         (commands, Arc::new(sink))
     }
 
-    /// A lambda is there.
+    /// Adds a lambda.
     pub(super) fn add(&mut self, name: &str, lambda: LambdaId) {
         self.lambdas.insert(name.to_owned(), lambda);
     }
 
-    /// All that ran was ended.
+    /// Forgets the running recordings, as all were ended.
     pub(super) fn forget_running(&mut self) {
         self.running.clear();
     }
 
-    /// Obeys those that came; `true` if there were any.
+    /// Executes the queued commands; returns whether there were any.
     pub(super) fn handle(&mut self, recorder: &mut Recorder) -> Result<bool, RecordError> {
         let mut any = false;
-        // Those that come meanwhile are for the next time.
+        // Later messages are for the next turn.
         for _ in 0..WAITING {
             let Ok(CommandMessage { meta, cdr }) = self.messages.try_recv() else { break };
             any = true;
             let source = format!("command on {} by {}", self.topic, meta.writer);
             let refused = match CommandRequest::read(&cdr, meta.endian) {
-                Ok(order) => self.execute(order, meta.at_ns, source.clone(), recorder)?,
+                Ok(request) => self.execute(request, meta.at_ns, source.clone(), recorder)?,
                 Err(why) => Some(why),
             };
             match refused {
                 None => self.accepted += 1,
                 Some(why) => {
                     self.refused += 1;
-                    // There are no more of them than messages are read.
-                    warn!(%source, why = describe(&why), "a command is refused");
+                    // Not more log lines than messages are read.
+                    warn!(%source, why = describe(&why), "command refused");
                 }
             }
         }
@@ -164,7 +162,7 @@ impl Commands {
         Ok(any)
     }
 
-    /// Why not, if it is refused.
+    /// Executes a command; returns the reason if it is refused.
     fn execute(
         &mut self,
         CommandRequest { lambda, trigger }: CommandRequest,
@@ -230,10 +228,10 @@ impl Commands {
         }
         self.reported = (unread, Some(Instant::now()));
         let (too_many, too_long) = (unread.0 - reported.0.0, unread.1 - reported.0.1);
-        warn!(topic = %self.topic, too_many, too_long, "commands are refused unread");
+        warn!(topic = %self.topic, too_many, too_long, "commands refused unread");
     }
 
-    /// What came of them.
+    /// The counts of commands.
     pub(super) fn status(&self, network: Option<&ReceptionStatus>) -> CommandStatus {
         let (too_many, too_long) = self.unread.counts();
         CommandStatus {
@@ -246,7 +244,7 @@ impl Commands {
     }
 }
 
-/// An error with its cause, fit for a log.
+/// Formats an error with its cause for a log.
 fn describe(error: &CommandError) -> String {
     let cause =
         std::error::Error::source(error).map(|cause| format!(": {cause}")).unwrap_or_default();

@@ -1,47 +1,47 @@
-//! One command, as it is written: a `std_msgs/msg/String` whose text is a JSON object.
+//! Parses a command: a `std_msgs/msg/String` whose text is a JSON object.
 
 use gleaner_lambda::{Trigger, TriggerKind};
 use gleaner_messages::Endian;
 use serde::Deserialize;
 
-/// Longest text.
+/// Longest text, in bytes.
 const TEXT_MAX: usize = 4 << 10;
-/// Longest message: its length, the text, a zero, and what fills up the last four bytes.
+/// Longest message: the length, the text, a zero, and padding of the last four bytes.
 pub(in crate::program) const MESSAGE_MAX: usize = 4 + TEXT_MAX + 4;
 /// Longest label, in bytes: that of a lambda's trigger.
 const LABEL_MAX: usize = 128;
 
-/// Why a command is refused.
+/// The reason why a command is refused.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum CommandError {
-    #[error("the message holds no text")]
+    #[error("the message has no text")]
     NoText,
-    #[error("the text is no command")]
+    #[error("the text is not a command")]
     NoCommand { source: serde_json::Error },
     #[error("its label is empty")]
     NoLabel,
     #[error("its label has {bytes} bytes; at most {LABEL_MAX} are allowed")]
     LongLabel { bytes: usize },
-    #[error("no lambda that records has come yet")]
+    #[error("no recording lambda is connected yet")]
     NoLambdas,
-    #[error("it has to say which of {known} lambdas it is for: `lambda`")]
+    #[error("`lambda` has to name one of the {known} recording lambdas")]
     WhichLambda { known: usize },
-    #[error("there is no lambda `{name}` that records")]
+    #[error("no recording lambda is named `{name}`")]
     NoSuchLambda { name: String },
     #[error("a recording `{label}` is running already, or too many are")]
     Running { label: String },
-    #[error("no command has started a recording `{label}` that is running")]
+    #[error("no command started a running recording `{label}`")]
     NotRunning { label: String },
     #[error("too many windows wait for their clip")]
     TooMuch,
-    #[error("the disk has too little room: nothing is recorded")]
+    #[error("too little free disk space: recording is suspended")]
     DiskSuppressed,
 }
 
-/// What is commanded.
+/// A parsed command.
 #[derive(Debug, PartialEq)]
 pub(super) struct CommandRequest {
-    /// In whose name.
+    /// The lambda in whose name it is given.
     pub(super) lambda: Option<String>,
     pub(super) trigger: Trigger,
 }
@@ -57,7 +57,7 @@ struct CommandText {
 }
 
 impl CommandRequest {
-    /// What a message says, of [`MESSAGE_MAX`] bytes at most.
+    /// Parses a message of [`MESSAGE_MAX`] bytes at most.
     pub(super) fn read(cdr: &[u8], endian: Endian) -> Result<CommandRequest, CommandError> {
         let CommandText { command: kind, label, lambda, score } =
             serde_json::from_str(text(cdr, endian)?)
@@ -101,7 +101,7 @@ mod tests {
         CommandRequest::read(&message(text), Endian::Little)
     }
 
-    /// Why a text is refused, with what JSON says of it.
+    /// The error of a text, with the error of the JSON parser.
     fn refused(text: &str) -> String {
         let error = read(text).unwrap_err();
         match &error {
@@ -112,19 +112,19 @@ mod tests {
 
     #[test]
     fn a_command_is_what_a_lambda_could_trigger() {
-        let order = read(
+        let request = read(
             r#" {"command": "start", "label": "test \u001b[2J", "lambda": "brake", "score": 1e2} "#,
         )
         .unwrap();
-        assert_eq!(order.lambda.as_deref(), Some("brake"));
-        let Trigger { kind, label, score, attributes } = order.trigger;
+        assert_eq!(request.lambda.as_deref(), Some("brake"));
+        let Trigger { kind, label, score, attributes } = request.trigger;
         assert_eq!(
             (kind, label.as_str(), score),
             (TriggerKind::Start, "test \u{1b}[2J", Some(100.0))
         );
         assert!(attributes.is_empty());
-        let order = read(r#"{"label":"x","command":"event","lambda":null}"#).unwrap();
-        assert_eq!((order.lambda, order.trigger.score), (None, None));
+        let request = read(r#"{"label":"x","command":"event","lambda":null}"#).unwrap();
+        assert_eq!((request.lambda, request.trigger.score), (None, None));
         let mut big = message(r#"{"label":"x","command":"stop"}"#);
         big[..4].reverse();
         assert_eq!(
@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn broken_messages_hold_no_text() {
+    fn broken_messages_have_no_text() {
         let good = message(r#"{"command":"event","label":"x"}"#);
         for len in 0..good.len() {
             assert!(

@@ -1,4 +1,4 @@
-//! Who writes clips: their files, their pictures, their journals. All that takes long is here.
+//! The open clip files: messages, thumbnails, journals. All slow work is here.
 
 use std::sync::Arc;
 
@@ -14,18 +14,18 @@ use crate::file::{
 };
 use crate::thumbnail::thumbnail;
 
-/// Images that are tried until one can be read. Each costs some milliseconds.
+/// Images that are tried until one can be decoded. Each costs some milliseconds.
 const TRIES: u32 = 8;
 
-/// A clip that comes to its end.
+/// The data that completes a clip.
 pub(in crate::recorder) struct ClipCompletion {
     pub(in crate::recorder) clip: u64,
-    /// Where its file begins, if no message of it came.
+    /// The name and header of its file, if it has no message.
     pub(in crate::recorder) begin: Option<(String, ClipHeader)>,
     pub(in crate::recorder) trailer: ClipTrailer,
     /// Topics that have a channel even if no message came.
     pub(in crate::recorder) topics: Vec<Arc<TopicSchema>>,
-    /// Of each lambda: the name of its journal, and what is in it.
+    /// For each lambda: the name of its journal, and its part.
     pub(in crate::recorder) journals: Vec<(String, Arc<JournalHeader>, JournalPart)>,
 }
 
@@ -35,12 +35,12 @@ pub(in crate::recorder) struct ClipFiles {
     open: Vec<OpenFile>,
 }
 
-/// A clip that is open.
+/// An open clip.
 #[derive(Default)]
 struct OpenFile {
     clip: u64,
     file: Option<UnfinishedClip>,
-    /// The topic that its picture is made from, once it has one with images.
+    /// The topic of its thumbnail, once it has one with images.
     images: Option<usize>,
     jpeg: Option<Vec<u8>>,
     tried: u32,
@@ -64,7 +64,7 @@ impl ClipFiles {
         ClipFiles { folder, open: Vec::new() }
     }
 
-    /// What an earlier process left in the folder.
+    /// Takes the unfinished clips of an earlier process.
     pub(super) fn take_unfinished(&mut self) -> Recovery {
         self.folder.take_unfinished()
     }
@@ -78,7 +78,7 @@ impl ClipFiles {
         &mut self.open[index]
     }
 
-    /// Makes the file of a clip.
+    /// Creates the file of a clip.
     pub(super) fn begin(
         &mut self,
         clip: u64,
@@ -90,12 +90,12 @@ impl ClipFiles {
         Ok(())
     }
 
-    /// From now on the picture is made from the messages of this topic.
+    /// Makes the thumbnail from the messages of this topic from now on.
     pub(super) fn images(&mut self, clip: u64, topic: usize) {
         self.open_file(clip).images = Some(topic);
     }
 
-    /// Makes the picture from this message, if it can be.
+    /// Makes the thumbnail from this message, if possible.
     pub(super) fn image(&mut self, clip: u64, of: &TopicSchema, meta: &SampleMeta, cdr: &[u8]) {
         self.open_file(clip).try_image(of, meta, cdr);
     }
@@ -116,7 +116,7 @@ impl ClipFiles {
         open_file.file().message(of, meta, cdr)
     }
 
-    /// Forgets a clip. If it has a file, that stays for recovery.
+    /// Drops a clip. Its file, if any, stays for recovery.
     pub(super) fn forget(&mut self, clip: u64) {
         self.open.retain(|open_file| open_file.clip != clip);
     }
@@ -138,7 +138,7 @@ impl ClipFiles {
                     tracing::error!(
                         lambda = %name,
                         %error,
-                        "the journal of a clip cannot be written"
+                        "cannot write the journal of a clip"
                     );
                     trailer
                         .incomplete
@@ -153,8 +153,8 @@ impl ClipFiles {
         open_file.file.expect("it was begun").finish(trailer)
     }
 
-    /// Makes room for a clip that was finished, if there is a bound. What cannot be deleted stays,
-    /// and is tried again with the next.
+    /// Makes room for a finished clip, if there is a limit. A clip that cannot be deleted stays,
+    /// and is retried with the next one.
     pub(super) fn make_room(&mut self, clip: &Clip) -> Vec<Loss> {
         self.folder.added(clip)
     }

@@ -5,13 +5,13 @@ use std::io;
 
 use gleaner_journal::{Decoder, JournalEnd, JournalHeader, JournalWriter};
 
-/// What a wake takes beside its bytes, about.
+/// Approximate overhead of a wake in memory.
 const OVERHEAD: usize = 64;
 
-/// Wakes of one lambda, each encoded by itself; they come in any order.
+/// Wakes of one lambda, each encoded independently, added in any order.
 ///
-/// If there is no room for all, the last ones go: what a journal holds follows each other, so that
-/// it can be made again wake by wake.
+/// If there is no room for all, the last ones are dropped: the wakes of a journal are consecutive,
+/// so that it can be replayed wake by wake.
 #[derive(Debug, Default)]
 pub(in crate::recorder) struct JournalPart {
     /// By their numbers.
@@ -41,18 +41,18 @@ impl JournalPart {
         }
     }
 
-    /// How many wakes found no room.
+    /// Number of wakes without room.
     pub(in crate::recorder) fn cut(&self) -> u64 {
         self.cut
     }
 
-    /// What it takes in memory, about.
+    /// Approximate size in memory.
     pub(in crate::recorder) fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Keeps the longest run of wakes that follow each other, and returns how many others there
-    /// were: some in between were lost before they came here.
+    /// Keeps the longest run of consecutive wakes, and returns the number of others: some in
+    /// between did not reach the recorder.
     pub(in crate::recorder) fn keep_run(&mut self) -> u64 {
         let (mut longest, mut run) = (0..0, 0..0);
         for number in self.wakes.keys() {
@@ -96,12 +96,12 @@ impl JournalPart {
 mod tests {
     use super::*;
 
-    /// The numbers that a part of at most `most` bytes keeps of wakes of 36 bytes, and how many it
-    /// cuts off.
+    /// The numbers that a part of at most `most` bytes keeps of wakes of 36 bytes, and the number
+    /// it drops.
     fn kept(numbers: impl IntoIterator<Item = u64>, most: usize) -> (Vec<u64>, u64) {
         let mut part = JournalPart::default();
         for number in numbers {
-            // One is longer than the room that is left, while those after it would fit again.
+            // One is longer than the room that is left, while the ones after it would fit again.
             let len = if number == 7 { 400 } else { 36 };
             part.push(number, &vec![number as u8; len], most);
         }
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_after_the_first_wake_without_room_is_cut_off_too() {
+    fn wakes_after_the_first_one_without_room_are_dropped_too() {
         assert_eq!(kept(0..5, 1000), ((0..5).collect(), 0));
         assert_eq!(kept(0..12, 1000), ((0..7).collect(), 5), "without a hole at 7");
         assert_eq!(kept([3], 99), (vec![], 1));
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn earlier_wakes_that_come_later_push_out_the_last_ones() {
+    fn earlier_wakes_that_arrive_late_displace_the_last_ones() {
         assert_eq!(kept((20..30).chain(8..13), 1000), ((8..13).chain(20..25).collect(), 5));
         assert_eq!(kept([10, 11, 12, 0, 13, 1, 12], 300), (vec![0, 1, 10], 4));
     }

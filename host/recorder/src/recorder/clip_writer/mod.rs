@@ -1,8 +1,7 @@
-//! How clips are written: here and now, as a replay does, or by a thread of its own, so that nobody
-//! who records waits for a disk.
+//! Writes clips: inline, in a replay, or on a background thread, so that a live recorder does not
+//! wait for a disk.
 //!
-//! Both are the same [`ClipFiles`]. What is said to it is in one order, so that the files are the
-//! same.
+//! Both use [`ClipFiles`], with the same calls in the same order, so the files are the same.
 
 mod clip_files;
 pub(super) mod journal_part;
@@ -20,24 +19,24 @@ pub(super) use clip_files::ClipCompletion;
 use clip_files::ClipFiles;
 use thread::WriterThread;
 
-/// Bytes on their way to the disk at most, but for one message that goes beyond.
+/// Most bytes queued for the disk, except for one message that exceeds it.
 const IN_FLIGHT: usize = 16 << 20;
 
 /// Writes clips.
 pub(super) enum ClipWriter {
     /// Each call returns when its work is done.
     Inline(Box<ClipFiles>),
-    /// Each call hands the work over.
+    /// Each call queues the work.
     Background(WriterThread),
 }
 
-/// What became of a clip.
+/// The outcome of a clip.
 pub(super) enum ClipOutcome {
-    /// It is whole, and listed; others had to go for it, or could not.
+    /// It is complete and listed; with the losses from making room for it.
     Finished(Box<Clip>, Vec<Loss>),
-    /// It is of an earlier process that left it unfinished, or unlisted; as above.
+    /// It was left unfinished or unlisted by an earlier process; as above.
     Recovered(Box<Clip>, Vec<Loss>),
-    /// It is not; what was written is recovered when the folder is opened again.
+    /// It failed; its written data is recovered when the folder is opened again.
     Failed(RecordError),
 }
 
@@ -47,12 +46,12 @@ impl ClipWriter {
         ClipWriter::Inline(Box::new(ClipFiles::new(folder)))
     }
 
-    /// Writes in a thread of its own.
+    /// Writes on a background thread.
     pub(super) fn background(folder: RecordingFolder) -> Result<ClipWriter, RecordError> {
         Ok(ClipWriter::Background(WriterThread::start(ClipFiles::new(folder))?))
     }
 
-    /// Makes the file of a clip.
+    /// Creates the file of a clip.
     pub(super) fn begin(
         &mut self,
         clip: u64,
@@ -65,7 +64,7 @@ impl ClipWriter {
         }
     }
 
-    /// The picture of a clip is made from the messages of this topic.
+    /// Makes the thumbnail of a clip from the messages of this topic.
     pub(super) fn images(&mut self, clip: u64, topic: usize) -> Result<(), RecordError> {
         match self {
             ClipWriter::Inline(files) => {
@@ -76,7 +75,7 @@ impl ClipWriter {
         }
     }
 
-    /// And best from this one.
+    /// Makes the thumbnail preferably from this message.
     pub(super) fn image(
         &mut self,
         clip: u64,
@@ -108,7 +107,7 @@ impl ClipWriter {
         }
     }
 
-    /// Forgets a clip in which is nothing.
+    /// Drops an empty clip.
     pub(super) fn forget(&mut self, clip: u64) -> Result<(), RecordError> {
         match self {
             ClipWriter::Inline(files) => {
@@ -119,7 +118,7 @@ impl ClipWriter {
         }
     }
 
-    /// Completes a clip, which is returned if that is done already.
+    /// Completes a clip; returns it if that is done already.
     pub(super) fn finish(
         &mut self,
         completion: ClipCompletion,
@@ -134,14 +133,12 @@ impl ClipWriter {
         }
     }
 
-    /// Whether more may be handed over. Whoever does it all the same makes the queue longer than it
-    /// may be.
+    /// Returns whether the queue has room. A caller that adds more anyway exceeds the limit.
     pub(super) fn has_room(&self) -> bool {
         self.in_flight() < IN_FLIGHT
     }
 
-    /// Hands over what was collected, if the thread has nothing else to do; and tells what became
-    /// of clips.
+    /// Sends collected messages, if the thread is idle; collects the outcomes of clips.
     pub(super) fn poll(&mut self, outcomes: &mut Vec<ClipOutcome>) -> Result<(), RecordError> {
         match self {
             ClipWriter::Inline(_) => Ok(()),
@@ -149,7 +146,7 @@ impl ClipWriter {
         }
     }
 
-    /// As [`poll`](Self::poll), and waits until something was done.
+    /// As [`poll`](Self::poll), but waits until a job is done.
     pub(super) fn wait(&mut self, outcomes: &mut Vec<ClipOutcome>) -> Result<(), RecordError> {
         match self {
             ClipWriter::Inline(_) => Ok(()),
@@ -157,14 +154,14 @@ impl ClipWriter {
         }
     }
 
-    /// The recording ends: what an earlier process left has some seconds to be recovered.
+    /// Ends the recording: the recovery of an earlier process's clips gets some more seconds.
     pub(super) fn end_recovery(&self) {
         if let ClipWriter::Background(thread) = self {
             thread.end_recovery();
         }
     }
 
-    /// Whether nothing is under way.
+    /// Returns whether no work is queued or in progress.
     pub(super) fn is_idle(&self) -> bool {
         match self {
             ClipWriter::Inline(_) => true,
@@ -172,7 +169,7 @@ impl ClipWriter {
         }
     }
 
-    /// Bytes that were handed over and are not yet written.
+    /// Bytes that are queued and not yet written.
     pub(super) fn in_flight(&self) -> usize {
         match self {
             ClipWriter::Inline(_) => 0,

@@ -1,5 +1,5 @@
-//! The thread that writes clips, and what is on its way to it. It also recovers what an earlier
-//! process left, between its jobs.
+//! The thread that writes clips, and its queues. Between its jobs it recovers unfinished clips of
+//! an earlier process.
 
 use std::io;
 use std::sync::mpsc::{Receiver, Sender, TryRecvError, channel};
@@ -14,19 +14,19 @@ use super::clip_files::{ClipCompletion, ClipFiles};
 use crate::RecordError;
 use crate::file::{ClipHeader, TopicSchema};
 
-/// Messages are handed over when they have so many bytes together.
+/// Messages are sent in batches of this many bytes.
 const BATCH: usize = 1 << 20;
-/// What a message costs on its way beside its bytes, about.
+/// Approximate overhead of a queued message.
 const OVERHEAD: usize = 128;
-/// What any other job costs, about.
+/// Approximate cost of any other job.
 const JOB: usize = 4 << 10;
-/// Batches that were written and are kept for the next messages.
+/// Empty batches that are kept for reuse.
 const SPARE: usize = 16;
-/// How long a recovery may still take once the recording ends; what it does not reach is left for
-/// the next start.
+/// Time that a recovery may still take once the recording ends; the rest is left for the next
+/// start.
 const RECOVERY: Duration = Duration::from_secs(5);
 
-/// What the thread is to do.
+/// A job of the thread.
 enum WriterJob {
     Begin(u64, String, Box<ClipHeader>),
     Images(u64, usize),
@@ -37,7 +37,7 @@ enum WriterJob {
 }
 
 impl WriterJob {
-    /// Whose job it is.
+    /// The clip of the job.
     fn clip(&self) -> u64 {
         match self {
             WriterJob::Begin(clip, ..) | WriterJob::Images(clip, _) | WriterJob::Forget(clip) => {
@@ -49,13 +49,13 @@ impl WriterJob {
     }
 }
 
-/// What came of a job.
+/// The result of a job.
 enum JobResult {
     Nothing,
-    /// This is empty now, and may be used again.
+    /// An empty batch for reuse.
     Messages(Batch),
     Clip(ClipOutcome),
-    /// Nothing is left to recover, or it is left for another process.
+    /// The recovery is done or aborted.
     Recovery,
 }
 
@@ -102,25 +102,25 @@ impl Batch {
     }
 }
 
-/// The thread, seen from those who record.
+/// The handle of the thread.
 pub(in crate::recorder) struct WriterThread {
     /// `None` once it is to end.
     jobs: Option<Sender<(usize, WriterJob)>>,
-    /// Of each job what it was counted as, and what came of it.
+    /// Cost and result of each job.
     done: Receiver<(usize, JobResult)>,
     handle: Option<JoinHandle<()>>,
     batch: Batch,
     in_flight: usize,
     spare: Vec<Batch>,
     is_recovering: bool,
-    /// When a recovery gives up, once that is known.
+    /// The deadline of the recovery, once it is set.
     until: Arc<OnceLock<Instant>>,
 }
 
 impl WriterThread {
     pub(super) fn start(files: ClipFiles) -> Result<WriterThread, RecordError> {
-        // Neither queue has a bound of its own: what is in them is counted, and nothing is added
-        // beyond what a pen has room for.
+        // Neither queue has a bound of its own: its content is counted, and nothing is added when
+        // the writer has no room.
         let ((jobs, inbox), (outbox, done)) = (channel(), channel());
         let until = Arc::<OnceLock<_>>::default();
         let given_up = Arc::clone(&until);
@@ -143,7 +143,7 @@ impl WriterThread {
         })
     }
 
-    /// The recording ends: a recovery has some seconds left.
+    /// Gives the recovery some more seconds.
     pub(super) fn end_recovery(&self) {
         self.until.get_or_init(|| Instant::now() + RECOVERY);
     }
@@ -215,7 +215,7 @@ impl WriterThread {
                 Err(TryRecvError::Disconnected) => return Err(gone()),
             }
         }
-        // Small messages wait for each other only while the thread has other work.
+        // Small messages are collected only while the thread has other work.
         if self.in_flight == 0 { self.hand_over() } else { Ok(()) }
     }
 
@@ -231,7 +231,7 @@ impl WriterThread {
     fn note(&mut self, (cost, done): (usize, JobResult), outcomes: &mut Vec<ClipOutcome>) {
         self.in_flight -= cost;
         match done {
-            // One that held a large message would keep its memory for nothing.
+            // A batch that held a large message would keep its memory.
             JobResult::Messages(batch)
                 if self.spare.len() < SPARE && batch.bytes.capacity() <= 2 * BATCH =>
             {
@@ -243,7 +243,7 @@ impl WriterThread {
         }
     }
 
-    /// Hands over the messages that were collected.
+    /// Sends the collected messages.
     fn hand_over(&mut self) -> Result<(), RecordError> {
         if self.batch.messages.is_empty() {
             return Ok(());
@@ -253,7 +253,7 @@ impl WriterThread {
         self.give(batch.cost(), WriterJob::Messages(batch))
     }
 
-    /// Hands over a job, behind the messages that came before it.
+    /// Sends a job, after the collected messages.
     fn send(&mut self, job: WriterJob, cost: usize) -> Result<(), RecordError> {
         self.hand_over()?;
         self.give(cost, job)
@@ -267,7 +267,7 @@ impl WriterThread {
 }
 
 impl Drop for WriterThread {
-    /// Waits for what is under way; a clip that is not finished stays for recovery.
+    /// Waits for queued jobs; an unfinished clip stays for recovery.
     fn drop(&mut self) {
         self.jobs = None;
         let _ = self.until.set(Instant::now());
@@ -281,16 +281,16 @@ fn gone() -> RecordError {
     RecordError::Thread { source: io::Error::other("the thread that writes clips has ended") }
 }
 
-/// What the thread has in hand.
+/// The state of the thread.
 struct WriterLoop {
     files: ClipFiles,
-    /// Clips that failed: what else is said of them is left out. Each goes with its end.
+    /// Clips that failed: their further jobs are skipped. Each is removed with its last job.
     failed: Vec<u64>,
     done: Sender<(usize, JobResult)>,
 }
 
 impl WriterLoop {
-    /// What the thread does until it is told nothing more. Jobs do not wait for what is recovered.
+    /// Runs until the job queue is closed. Jobs do not wait for the recovery.
     fn run(mut self, jobs: &Receiver<(usize, WriterJob)>, until: &OnceLock<Instant>) {
         let mut recovery = self.files.take_unfinished();
         while let Some(came) = recovery.next(&mut || {
@@ -317,7 +317,7 @@ impl WriterLoop {
         }
     }
 
-    /// Does a job; `false` if nobody wants to know any more.
+    /// Does a job; `false` if the handle is gone.
     fn job(&mut self, cost: usize, job: WriterJob) -> bool {
         let clip = job.clip();
         let came = match job {
@@ -374,7 +374,7 @@ fn act(files: &mut ClipFiles, job: WriterJob) -> Result<JobResult, RecordError> 
             batch.clear();
             return Ok(JobResult::Messages(batch));
         }
-        // Their outcome is not that of a step.
+        // Handled by the caller.
         WriterJob::Forget(_) | WriterJob::Finish(_) => {}
     }
     Ok(JobResult::Nothing)

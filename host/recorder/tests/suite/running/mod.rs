@@ -1,4 +1,4 @@
-//! The process within a test: a network that the test feeds, lambdas, and what is reported.
+//! Runs the recorder process within a test: a network that the test feeds, lambdas, and reports.
 // Each test program uses its own part.
 #![allow(dead_code)]
 
@@ -33,9 +33,9 @@ pub const PATIENCE: Duration = Duration::from_secs(60);
 #[derive(Clone, Default)]
 pub struct FakeNetwork {
     pub loopback: Loopback,
-    /// What was subscribed.
+    /// The subscriptions.
     pub specs: Arc<Mutex<Vec<TopicSpec>>>,
-    /// Types under which a topic is written as well, by others.
+    /// Other types of a topic, by other writers.
     others: Arc<Mutex<Vec<DiscoveredTopic>>>,
 }
 
@@ -44,7 +44,7 @@ impl FakeNetwork {
         self.loopback.add_topic(topic, "test_msgs/msg/Number", "int64 value\n");
     }
 
-    /// Somebody else writes the topic as another type, and is named first.
+    /// Adds another writer of the topic with another type, listed first.
     pub fn add_other(&self, topic: &str, type_name: &str) {
         let (topic, type_name) = (topic.to_owned(), type_name.to_owned());
         let definitions_text = Some("string other\n".into());
@@ -62,7 +62,7 @@ impl FakeNetwork {
         self.loopback.add_topic(topic, "std_msgs/msg/String", "string data\n");
     }
 
-    /// Whether anybody takes what is published.
+    /// Publishes a text; returns the delivery, or `None` without a subscription.
     pub fn publish_text(&self, topic: &str, at_ns: i64, text: &[u8]) -> Option<Delivery> {
         self.loopback.publish(topic, &meta(at_ns, 1), &cdr(text)).unwrap()
     }
@@ -108,7 +108,7 @@ impl LiveSource for FakeNetwork {
     }
 }
 
-/// A process, but for the process.
+/// The recorder's main loop on a thread.
 pub struct Running {
     pub control: ControlClient,
     reports: BufReader<PipeReader>,
@@ -157,12 +157,12 @@ impl Running {
         running
     }
 
-    /// Reads reports until one is what is looked for.
-    pub fn until<T>(&mut self, mut looked_for: impl FnMut(RecorderReport) -> Option<T>) -> T {
+    /// Reads reports until one matches.
+    pub fn until<T>(&mut self, mut matches: impl FnMut(RecorderReport) -> Option<T>) -> T {
         loop {
             let mut line = String::new();
             assert!(self.reports.read_line(&mut line).unwrap() > 0, "the reports end");
-            if let Some(found) = looked_for(serde_json::from_str(&line).unwrap()) {
+            if let Some(found) = matches(serde_json::from_str(&line).unwrap()) {
                 return found;
             }
         }
@@ -193,9 +193,11 @@ impl Running {
 /// A built lambda that records `/a`, and the header of its journal.
 pub fn lambda(scratch: &TestDir, name: &str, rolls_ms: (u32, u32)) -> (PathBuf, JournalHeader) {
     let text = format!(
-        "[lambda]\nname = \"{name}\"\nversion = \"1.2.3\"\nkind = \"python\"\nentry = \"main.py\"\n[schedule]\nevent = \"numbers\"\n\
+        "[lambda]\nname = \"{name}\"\nversion = \"1.2.3\"\nkind = \"python\"\n\
+         entry = \"main.py\"\n[schedule]\nevent = \"numbers\"\n\
          [[input]]\nname = \"numbers\"\ntopic = \"/a\"\ntype = \"test_msgs/msg/Number\"\n\
-         [record]\ntopics = [\"/a\", \"/b\"]\npreroll = \"{}ms\"\npostroll = \"{}ms\"\npreroll_size = \"2 MiB\"\n",
+         [record]\ntopics = [\"/a\", \"/b\"]\npreroll = \"{}ms\"\n\
+         postroll = \"{}ms\"\npreroll_size = \"2 MiB\"\n",
         rolls_ms.0, rolls_ms.1
     );
     let folder = scratch.0.join(name);

@@ -1,4 +1,4 @@
-//! What the tests share: a folder, lambdas, a drive of samples and wakes, and a look into clips.
+//! Shared test support: a folder, lambdas, a drive of samples and wakes, and access to clips.
 // Each test program uses its own part.
 #![allow(dead_code)]
 
@@ -249,7 +249,7 @@ pub fn every(from: i64, to: i64, every: i64) -> Vec<i64> {
     (from..=to).filter(|ms| ms % every == 0).collect()
 }
 
-/// Numbers that look random and are the same in each run (SplitMix64).
+/// Pseudo-random numbers, the same in each run (SplitMix64).
 pub struct SeededRandom(pub u64);
 
 impl SeededRandom {
