@@ -1,9 +1,7 @@
-//! An entry of the cache: native code below a digest, which binds the code to all that it was made
-//! from.
+//! A cache entry: native code behind a digest that binds it to everything it was made from.
 //!
-//! Whoever changes a bit of an entry, cuts it, or copies another over it has code that is never
-//! run. An attacker who can write into the cache can make the digest as well; that is why owners
-//! and modes are checked first.
+//! Code that was changed, truncated or copied from another entry is never run. An attacker who can
+//! write into the cache can also write the digest, so owners and modes are checked first.
 
 use std::fs::{self, File, Metadata};
 use std::io::{self, Read};
@@ -11,35 +9,36 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 use gleaner_base::hex;
-use gleaner_base::own_file::{self, InTheWay};
+use gleaner_base::safe_file::{self, UnsafePath};
 use sha2::{Digest, Sha256};
 
 use super::prune::note_use;
 use super::{CODE_BYTES, CompileError, Nans};
 
-/// First bytes of an entry. They are part of its key: entries of another layout have other names.
+/// First bytes of an entry. They are part of its key, so that entries of another layout have other
+/// names.
 const MAGIC: [u8; 16] = *b"gleaner native 2";
 const DIGEST_BYTES: usize = 32;
 const HEAD_BYTES: usize = MAGIC.len() + DIGEST_BYTES;
 
-/// The place of a component's native code in the cache of this machine.
-pub struct Entry {
+/// The location of a component's native code in the cache.
+pub struct CacheEntry {
     path: PathBuf,
     key: [u8; DIGEST_BYTES],
 }
 
-/// Content of the place of an [`Entry`].
+/// Content of a [`CacheEntry`].
 #[derive(Debug, PartialEq, Eq)]
-pub enum Found {
+pub enum CacheLookup {
     /// The code as it was compiled.
     Code(Vec<u8>),
     /// No file.
     Nothing,
-    /// Anything else, with the difference. It is to be replaced.
+    /// Damaged code, with the reason. It has to be replaced.
     Damaged(String),
 }
 
-impl Entry {
+impl CacheEntry {
     /// The entry of `component`, compiled with `nans`, in the folder `cache`:
     /// `<cache>/<key>.cwasm`.
     pub fn of(cache: &Path, component: &[u8], nans: Nans) -> Self {
@@ -53,46 +52,48 @@ impl Entry {
         Self { path: cache.join(hex(&key) + ".cwasm"), key }
     }
 
-    /// Where it is.
+    /// Path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Reads the code into memory and compares it with its digest there: nothing that another
-    /// process does to the file afterwards changes what is loaded. The code counts as used.
+    /// Reads the code into memory and checks its digest there, so that later changes to the file do
+    /// not affect the loaded code. Notes the use for pruning.
     ///
     /// # Errors
     ///
     /// [`CompileError::Untrusted`] if another user could have written it: file and folders above it
-    /// must belong to this user or to root, and only they may write to them. The same if it is no
-    /// file, such as a link, a pipe or a folder. [`CompileError::ReadCode`] if it cannot be opened.
-    pub fn read(&self) -> Result<Found, CompileError> {
+    /// must belong to this user or to root, and only they may write to them. Also if it is not a
+    /// regular file. [`CompileError::ReadCode`] if it cannot be opened.
+    pub fn read(&self) -> Result<CacheLookup, CompileError> {
         check_folder(self.path.parent().unwrap_or(&self.path))?;
         let untrusted = |why: String| CompileError::Untrusted { path: self.path.clone(), why };
-        let cannot = |error: io::Error| match InTheWay::of(&error) {
+        let cannot = |error: io::Error| match UnsafePath::of(&error) {
             Some(other) => untrusted(other.to_string()),
             None => CompileError::ReadCode { path: self.path.clone(), source: error },
         };
-        let file = match own_file::read(&self.path) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Found::Nothing),
+        let file = match safe_file::read(&self.path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                return Ok(CacheLookup::Nothing);
+            }
             opened => opened.map_err(cannot)?,
         };
         let meta = file.metadata().map_err(cannot)?;
         if let Some(why) = foreign(&meta) {
             return Err(untrusted(why.to_owned()));
         }
-        // A disk that cannot give the bytes back is one more way of damage.
+        // A read error counts as damage.
         let found = self
             .compared(&file, meta.len())
-            .unwrap_or_else(|error| Found::Damaged(error.to_string()));
-        if matches!(found, Found::Code(_)) {
+            .unwrap_or_else(|error| CacheLookup::Damaged(error.to_string()));
+        if matches!(found, CacheLookup::Code(_)) {
             note_use(&file);
         }
         Ok(found)
     }
 
-    fn compared(&self, mut file: &File, len: u64) -> io::Result<Found> {
-        let damaged = |why: &str| Ok(Found::Damaged(why.to_owned()));
+    fn compared(&self, mut file: &File, len: u64) -> io::Result<CacheLookup> {
+        let damaged = |why: &str| Ok(CacheLookup::Damaged(why.to_owned()));
         let Some(code_len) = usize::try_from(len).ok().and_then(|len| len.checked_sub(HEAD_BYTES))
         else {
             return damaged("it is too short");
@@ -105,13 +106,13 @@ impl Entry {
         let mut code = Vec::with_capacity(code_len);
         file.take(CODE_BYTES as u64).read_to_end(&mut code)?;
         if head == self.head(&code) {
-            Ok(Found::Code(code))
+            Ok(CacheLookup::Code(code))
         } else {
-            damaged("its digest is not that of its content")
+            damaged("its digest does not match its content")
         }
     }
 
-    /// What stands before `code` in the file.
+    /// The header before `code` in the file.
     pub(super) fn head(&self, code: &[u8]) -> [u8; HEAD_BYTES] {
         let digest = Sha256::new().chain_update(self.key).chain_update(code).finalize();
         let mut head = [0; HEAD_BYTES];
@@ -121,9 +122,8 @@ impl Entry {
     }
 }
 
-/// Features of this machine's CPU, as the kernel names them: a cache in a home folder may be shared
-/// by several machines. Wasmtime checks the same again when it loads code, and refuses what does
-/// not fit.
+/// CPU features of this machine, as the kernel names them, since a cache in a home folder may be
+/// shared by several machines. Wasmtime checks them again when it loads code.
 fn cpu_features() -> String {
     let cpus = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let features =
@@ -142,9 +142,9 @@ fn check_folder(folder: &Path) -> Result<(), CompileError> {
         let meta = fs::symlink_metadata(path).map_err(read)?;
         let root_owns = meta.uid() == 0;
         let wrong = match foreign(&meta) {
-            // Folders above may be root's; in one that all may write to, like /tmp, the sticky bit
-            // protects what is ours.
-            Some(NOT_OURS) if above > 0 && root_owns && meta.mode() & 0o022 == 0 => None,
+            // Parent folders may belong to root. In a world-writable one such as /tmp, the sticky
+            // bit protects this user's files.
+            Some(OTHER_OWNER) if above > 0 && root_owns && meta.mode() & 0o022 == 0 => None,
             Some(_) if above > 0 && root_owns && meta.mode() & 0o1000 != 0 => None,
             wrong => wrong,
         };
@@ -155,11 +155,11 @@ fn check_folder(folder: &Path) -> Result<(), CompileError> {
     Ok(())
 }
 
-const NOT_OURS: &str = "it belongs to another user";
+const OTHER_OWNER: &str = "it belongs to another user";
 
 fn foreign(meta: &Metadata) -> Option<&'static str> {
     if meta.uid() != rustix::process::geteuid().as_raw() {
-        Some(NOT_OURS)
+        Some(OTHER_OWNER)
     } else if meta.mode() & 0o022 != 0 {
         Some("others may write to it")
     } else {
@@ -167,7 +167,7 @@ fn foreign(meta: &Metadata) -> Option<&'static str> {
     }
 }
 
-/// Makes the cache folder, for this user alone.
+/// Creates the cache folder, accessible to this user only.
 ///
 /// # Errors
 ///
@@ -193,38 +193,38 @@ mod tests {
 
     const CODE: &[u8] = b"native code";
 
-    /// A cache of this test's own with an entry in it, and the bytes of that.
-    fn cache(name: &str) -> (PathBuf, Entry, Vec<u8>) {
+    /// A new cache with an entry, and the bytes of the entry.
+    fn cache(name: &str) -> (PathBuf, CacheEntry, Vec<u8>) {
         let cache =
             std::env::temp_dir().join(format!("gleaner-entry-{name}-{}", std::process::id()));
         make_cache(&cache).unwrap();
-        let entry = Entry::of(&cache, b"component", Nans::AsMade);
+        let entry = CacheEntry::of(&cache, b"component", Nans::Native);
         let bytes = [&entry.head(CODE), CODE].concat();
         put(&entry, &bytes);
         (cache, entry, bytes)
     }
 
-    fn put(entry: &Entry, bytes: &[u8]) {
+    fn put(entry: &CacheEntry, bytes: &[u8]) {
         fs::write(&entry.path, bytes).unwrap();
         fs::set_permissions(&entry.path, PermissionsExt::from_mode(0o600)).unwrap();
     }
 
     #[test]
     fn another_component_has_another_entry() {
-        let of = |component: &[u8], nans| Entry::of(Path::new("/c"), component, nans).path;
-        assert_eq!(of(b"a", Nans::AsMade), of(b"a", Nans::AsMade));
-        assert_ne!(of(b"a", Nans::AsMade), of(b"b", Nans::AsMade));
-        assert_ne!(of(b"a", Nans::AsMade), of(b"a", Nans::Canonical));
-        assert_eq!(of(b"a", Nans::AsMade).file_name().unwrap().len(), 64 + ".cwasm".len());
+        let of = |component: &[u8], nans| CacheEntry::of(Path::new("/c"), component, nans).path;
+        assert_eq!(of(b"a", Nans::Native), of(b"a", Nans::Native));
+        assert_ne!(of(b"a", Nans::Native), of(b"b", Nans::Native));
+        assert_ne!(of(b"a", Nans::Native), of(b"a", Nans::Canonical));
+        assert_eq!(of(b"a", Nans::Native).file_name().unwrap().len(), 64 + ".cwasm".len());
     }
 
     #[test]
-    fn code_is_read_back_only_as_it_was_written() {
+    fn changed_code_is_not_read_back() {
         let (cache, entry, bytes) = cache("bits");
-        assert_eq!(entry.read().unwrap(), Found::Code(CODE.to_vec()));
+        assert_eq!(entry.read().unwrap(), CacheLookup::Code(CODE.to_vec()));
         let damaged = |bytes: &[u8]| {
             put(&entry, bytes);
-            matches!(entry.read().unwrap(), Found::Damaged(_))
+            matches!(entry.read().unwrap(), CacheLookup::Damaged(_))
         };
         for bit in 0..8 * bytes.len() {
             let mut flipped = bytes.clone();
@@ -235,12 +235,12 @@ mod tests {
             assert!(damaged(&bytes[..len]), "{len} bytes");
         }
         assert!(damaged(&[&bytes[..], b"x"].concat()) && damaged(CODE) && damaged(b"\x7fELF"));
-        let other = Entry::of(&cache, b"another component", Nans::AsMade);
+        let other = CacheEntry::of(&cache, b"another component", Nans::Native);
         assert!(damaged(&[&other.head(CODE), CODE].concat()));
         File::options().write(true).open(&entry.path).unwrap().set_len(1 << 40).unwrap();
-        assert_eq!(entry.read().unwrap(), Found::Damaged("it is too long".to_owned()));
+        assert_eq!(entry.read().unwrap(), CacheLookup::Damaged("it is too long".to_owned()));
         fs::remove_file(&entry.path).unwrap();
-        assert_eq!(entry.read().unwrap(), Found::Nothing);
+        assert_eq!(entry.read().unwrap(), CacheLookup::Nothing);
         fs::remove_dir_all(&cache).unwrap();
     }
 
@@ -251,15 +251,18 @@ mod tests {
             fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
             entry.read().unwrap_err().to_string()
         };
-        let said = refused(&entry.path, 0o620);
-        assert!(said.ends_with(".cwasm` is not loaded: others may write to it"), "{said}");
-        let said = refused(&cache, 0o770);
-        assert!(said.ends_with("others may write to it") && !said.contains(".cwasm"), "{said}");
+        let message = refused(&entry.path, 0o620);
+        assert!(message.ends_with(".cwasm` is not loaded: others may write to it"), "{message}");
+        let message = refused(&cache, 0o770);
+        assert!(
+            message.ends_with("others may write to it") && !message.contains(".cwasm"),
+            "{message}"
+        );
         fs::remove_dir_all(&cache).unwrap();
     }
 
     #[test]
-    fn an_entry_that_is_no_file_is_refused_and_not_waited_for() {
+    fn an_entry_that_is_not_a_regular_file_is_refused_without_blocking() {
         let (cache, entry, bytes) = cache("kinds");
         let place = &entry.path;
         let why = || {
@@ -271,15 +274,15 @@ mod tests {
         symlink(cache.join("elsewhere"), place).unwrap();
         assert_eq!(why(), "it is a link");
         mknodat(CWD, place, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
-        assert_eq!(why(), "it is no file");
+        assert_eq!(why(), "it is not a regular file");
         mknodat(CWD, place, FileType::Socket, Mode::RUSR | Mode::WUSR, 0).unwrap();
-        assert_eq!(why(), "it is no file");
+        assert_eq!(why(), "it is not a regular file");
         fs::create_dir(place).unwrap();
-        assert_eq!(why(), "it is no file");
+        assert_eq!(why(), "it is not a regular file");
         symlink("/dev/zero", place).unwrap();
         assert_eq!(why(), "it is a link");
         put(&entry, &bytes);
-        assert_eq!(entry.read().unwrap(), Found::Code(CODE.to_vec()));
+        assert_eq!(entry.read().unwrap(), CacheLookup::Code(CODE.to_vec()));
         fs::remove_dir_all(&cache).unwrap();
     }
 }

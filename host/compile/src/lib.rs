@@ -1,11 +1,10 @@
-//! The engine that all lambdas run on, and the cache of their native code.
+//! The WebAssembly engine of all lambdas, and the cache of their native code.
 //!
-//! Compiling takes a second and 40 MB, loading 0.3 ms and 11 MB, and comparing it before 0.2 ms; so
-//! a component is compiled once, in a process of its own (`gleaner-compile`), and every runtime
-//! loads what that left. Loading native code means trusting it: an entry of the cache must belong
-//! to this user alone, and has a digest of its code that is bound to the component, to wasmtime's
-//! version, to the settings below and to the CPU. A component is hostile until proven otherwise, so
-//! compiling has a limit of memory and of time.
+//! Compiling takes a second and 40 MB; loading takes 0.3 ms and 11 MB, with a check of 0.2 ms. So a
+//! component is compiled once, in a separate process (`gleaner-compile`), and every runtime loads
+//! the result. Loading native code means trusting it: a cache entry must belong to this user alone,
+//! and has a digest that binds the code to the component, wasmtime's version, the settings below
+//! and the CPU. Components are untrusted, so compiling has a memory and a time limit.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -14,52 +13,56 @@ use gleaner_base::{Exit, Explain, NotPlain, PlainFile, chain};
 use gleaner_lambda::layout::COMPONENT_MAX;
 use wasmtime::{Config, Engine};
 
-/// Largest native code that is kept, in bytes.
+/// Maximum size of native code, in bytes.
 pub const CODE_BYTES: usize = 256 << 20;
 
-/// Memory that compiling may take, in bytes; an ordinary lambda takes some 50 MB. A small component
-/// can be made to take any.
+/// Maximum memory for compiling, in bytes. An ordinary lambda takes some 50 MB, but even a small
+/// hostile component can take any amount.
 pub const COMPILE_MEMORY_BYTES: u64 = 2 << 30;
 
-/// Seconds of CPU time that compiling may take; an ordinary lambda takes one.
+/// Maximum CPU time for compiling, in seconds. An ordinary lambda takes one.
 pub const COMPILE_CPU_SECONDS: u64 = 120;
 
-/// Most stack of a guest, in bytes. The thread that runs it needs some more.
+/// Maximum stack of a guest, in bytes. Its thread needs some more.
 pub const GUEST_STACK_BYTES: usize = 512 << 10;
 
-/// Which bits a NaN has that a component computes.
+/// The bits of NaNs that a component computes.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub enum Nans {
-    /// Those that the CPU gives it, as WebAssembly allows. Only who looks at the bits can tell.
+    /// The bits that the CPU produces, as WebAssembly allows. Only code that reads the bits can see
+    /// a difference.
     #[default]
-    AsMade,
-    /// The same on every CPU. On spectra this costs twice the time and more, see `bench/README.md`.
+    Native,
+    /// The same bits on every CPU. Spectra take more than twice the time, see `bench/README.md`.
     Canonical,
 }
 
 impl Nans {
-    /// Wasmtime's version and the settings of [`engine`]; a change of either makes new entries.
+    /// Wasmtime's version and the settings of [`engine`]. A change of either invalidates the cache.
     pub const fn settings(self) -> &'static str {
         match self {
-            Self::AsMade => "wasmtime 48.0.8, fuel, epochs, speed, 1",
+            Self::Native => "wasmtime 48.0.8, fuel, epochs, speed, 1",
             Self::Canonical => "wasmtime 48.0.8, fuel, epochs, speed, canonical NaNs, 1",
         }
     }
 }
 
-/// Why native code could not be made or found.
+/// Errors of compiling and of reading the cache.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum CompileError {
     #[error("cannot read component `{}`", path.display())]
     Read { path: PathBuf, source: io::Error },
-    #[error("component `{}` has {bytes} bytes; at most {COMPONENT_MAX} are compiled", path.display())]
+    #[error("component `{}` has {bytes} bytes; the maximum is {COMPONENT_MAX}", path.display())]
     TooLarge { path: PathBuf, bytes: u64 },
-    #[error("`{}` is no WebAssembly component: {}", path.display(), why.what())]
+    #[error("`{}` is not a WebAssembly component: {}", path.display(), why.reason())]
     NoComponent { path: PathBuf, why: NoComponent },
     #[error("cannot compile component `{}`", path.display())]
     Compile { path: PathBuf, source: Box<dyn std::error::Error + Send + Sync> },
-    #[error("component `{}` becomes {bytes} bytes of native code; at most {CODE_BYTES} are kept", path.display())]
+    #[error(
+        "component `{}` compiles to {bytes} bytes of native code; the maximum is {CODE_BYTES}",
+        path.display()
+    )]
     CodeTooLarge { path: PathBuf, bytes: usize },
     #[error("cannot set up the engine")]
     Engine { source: Box<dyn std::error::Error + Send + Sync> },
@@ -71,7 +74,7 @@ pub enum CompileError {
     Untrusted { path: PathBuf, why: String },
 }
 
-/// Contents of a file that is no component, by its first bytes.
+/// Content of a file that is not a component, by its first bytes.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum NoComponent {
     /// Other bytes than those of WebAssembly.
@@ -81,7 +84,7 @@ pub enum NoComponent {
 }
 
 impl NoComponent {
-    /// Why `bytes` cannot be a component, if their beginning says so.
+    /// Checks the first bytes of a component; `None` if they can be those of one.
     #[cfg(feature = "compiler")]
     pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
         match bytes.get(..8) {
@@ -91,7 +94,7 @@ impl NoComponent {
         }
     }
 
-    fn what(self) -> &'static str {
+    fn reason(self) -> &'static str {
         match self {
             Self::Foreign => "its first bytes are not those of WebAssembly",
             Self::Module => "it is a core module, without the types of a component",
@@ -101,17 +104,17 @@ impl NoComponent {
     fn help(self) -> &'static str {
         match self {
             Self::Foreign => {
-                "name the component as `entry` in lambda.toml, and build the lambda: gleaner build DIR"
+                "set `entry` in lambda.toml to the component, and build the lambda: gleaner build DIR"
             }
             Self::Module => {
-                "build the lambda with `gleaner build DIR`, which makes a component (target wasm32-wasip2)"
+                "build the lambda with `gleaner build DIR`, which makes a component (wasm32-wasip2)"
             }
         }
     }
 }
 
-/// Whether the compiler refused something of WebAssembly that [`settings`] do not have.
-fn asks_for_a_proposal(error: &(dyn std::error::Error + 'static)) -> bool {
+/// Returns whether the compiler refused a WebAssembly proposal that [`settings`] do not enable.
+fn needs_a_proposal(error: &(dyn std::error::Error + 'static)) -> bool {
     let text = chain(error);
     text.contains("must be enabled") || text.contains("not enabled")
 }
@@ -120,20 +123,24 @@ impl Explain for CompileError {
     fn help(&self) -> Option<String> {
         match self {
             Self::NoComponent { why, .. } => Some(why.help().to_owned()),
-            Self::Compile { source, .. } if asks_for_a_proposal(source.as_ref()) => Some(
-                "build it without that proposal of WebAssembly: leave out flags such as `-C target-feature`, as `gleaner build DIR` does"
+            Self::Compile { source, .. } if needs_a_proposal(source.as_ref()) => Some(
+                "build it without that WebAssembly proposal: leave out flags such as \
+                 `-C target-feature`, as `gleaner build DIR` does"
                     .to_owned(),
             ),
-            Self::Compile { .. } => {
-                Some("the file may be cut off or damaged; build the lambda again: gleaner build DIR".to_owned())
-            }
+            Self::Compile { .. } => Some(
+                "the file may be truncated or damaged; build the lambda again: gleaner build DIR"
+                    .to_owned(),
+            ),
             Self::Read { .. } => Some("build the lambda again: gleaner build DIR".to_owned()),
-            Self::TooLarge { .. } | Self::CodeTooLarge { .. } => {
-                Some("leave out what the lambda does not need, or move data to files of a model".to_owned())
+            Self::TooLarge { .. } | Self::CodeTooLarge { .. } => Some(
+                "remove code that the lambda does not need, or move data to model files".to_owned(),
+            ),
+            Self::Write { .. } => {
+                Some("make the folder writable, or set XDG_CACHE_HOME to one that is".to_owned())
             }
-            Self::Write { .. } => Some("make the folder writable, or set XDG_CACHE_HOME to one that is".to_owned()),
             Self::ReadCode { path, .. } | Self::Untrusted { path, .. } => {
-                Some(format!("delete it, it will be made again: rm -r '{}'", path.display()))
+                Some(format!("delete it, it will be compiled again: rm -r '{}'", path.display()))
             }
             Self::Engine { .. } => None,
         }
@@ -152,8 +159,8 @@ impl Explain for CompileError {
     }
 }
 
-/// The engine for which all lambdas are compiled and on which they run, with a stack of so many
-/// bytes, at most [`GUEST_STACK_BYTES`]. Native code does not depend on that, but on `nans`.
+/// Returns the engine that compiles and runs all lambdas, with a stack of `stack_bytes`, at most
+/// [`GUEST_STACK_BYTES`]. Native code depends on `nans`, but not on the stack.
 ///
 /// # Errors
 ///
@@ -164,13 +171,12 @@ pub fn engine(stack_bytes: usize, nans: Nans) -> Result<Engine, CompileError> {
     Engine::new(&settings).map_err(|source| CompileError::Engine { source: source.into() })
 }
 
-/// What [`engine`] is set to, named by [`Nans::settings`]; benches change a part of it to tell its
-/// price.
+/// Settings of [`engine`], named by [`Nans::settings`]. Benches change some of them to measure
+/// their cost.
 pub fn settings(nans: Nans) -> Config {
     let mut config = Config::new();
     config
-        // Instructions are counted and the clock can interrupt, always: the same code serves replay
-        // and vehicle.
+        // Fuel and interrupts are always compiled in: replay and vehicle use the same code.
         .consume_fuel(true)
         .epoch_interruption(true)
         // A call into a guest costs 0.15 µs without it and 2.7 µs with it.
@@ -204,12 +210,12 @@ pub fn read_component(path: &Path) -> Result<Vec<u8>, CompileError> {
 }
 
 mod entry;
-pub use entry::{Entry, Found, make_cache};
+pub use entry::{CacheEntry, CacheLookup, make_cache};
 #[cfg(feature = "compiler")]
 mod compiler;
 #[cfg(feature = "compiler")]
 pub use compiler::compile;
-#[cfg_attr(not(feature = "compiler"), allow(dead_code, reason = "who compiles cleans up"))]
+#[cfg_attr(not(feature = "compiler"), allow(dead_code, reason = "only the compiler prunes"))]
 mod prune;
 pub use prune::CACHE_BYTES;
 
@@ -220,16 +226,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_settings_name_the_version_that_is_pinned() {
+    fn the_settings_name_the_pinned_version() {
         let workspace = include_str!("../../../Cargo.toml");
-        for nans in [Nans::AsMade, Nans::Canonical] {
+        for nans in [Nans::Native, Nans::Canonical] {
             assert!(nans.settings().starts_with("wasmtime 48.0.8,"));
         }
         assert!(workspace.contains("wasmtime = { version = \"=48.0.8\""));
     }
 
     #[test]
-    fn only_a_file_of_a_bounded_size_is_read_as_a_component() {
+    fn only_a_regular_file_of_bounded_size_is_read_as_a_component() {
         let folder =
             std::env::temp_dir().join(format!("gleaner-compile-read-{}", std::process::id()));
         fs::create_dir_all(&folder).unwrap();
@@ -253,7 +259,10 @@ mod tests {
         for none in [&pipe, &device, &folder] {
             let error = read_component(none).unwrap_err();
             let why = std::error::Error::source(&error).unwrap().to_string();
-            assert!(matches!(error, CompileError::Read { .. }) && why == "it is no file", "{why}");
+            assert!(
+                matches!(error, CompileError::Read { .. }) && why == "it is not a regular file",
+                "{why}"
+            );
         }
         File::create(&large).unwrap().set_len(COMPONENT_MAX.bytes() + 1).unwrap();
         assert!(

@@ -1,21 +1,21 @@
-//! The cache does not grow without end: what nobody has loaded for long goes first.
+//! Bounds the size of the cache: removes the least recently used entries.
 
 use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-use gleaner_base::own_file;
+use gleaner_base::safe_file;
 
-/// Most bytes of native code that are kept; an ordinary lambda takes half a megabyte. It goes by
-/// when code was loaded last, so it is that of components that were built anew, of earlier versions
-/// and of other settings that goes.
+/// Maximum size of the cache, in bytes; an ordinary lambda takes half a megabyte. Code of old
+/// builds, versions and settings is no longer loaded, and so removed first.
 pub const CACHE_BYTES: u64 = 1 << 30;
 
-/// When code was loaded is noted once in this time, so that a start does not write to the disk.
+/// Interval in which the use of an entry is noted at most once, so that few starts write to the
+/// disk.
 const DAY: Duration = Duration::from_secs(24 * 3600);
 
-/// Notes that the code in `entry` is in use. What cannot be noted goes earlier, and is made again.
+/// Notes the use of `entry` in its modification time. If that fails, it is only removed earlier.
 pub(crate) fn note_use(entry: &File) {
     let _ = (|| {
         let used = entry.metadata()?.modified()?;
@@ -28,14 +28,14 @@ pub(crate) fn note_use(entry: &File) {
     })();
 }
 
-/// Removes from `cache` what was not in use for longest, until at most `most` bytes are left, and
-/// what a killed process did not complete. `keep` stays. What a process has loaded stays for that.
-/// Another process may do the same meanwhile.
+/// Removes the least recently used entries of `cache`, except `keep`, until at most `max` bytes are
+/// left, and the partial files of killed processes. Processes keep the code that they have loaded.
+/// Several processes may prune at the same time.
 ///
 /// # Errors
 ///
-/// Those of reading the folder; what cannot be removed stays.
-pub(crate) fn prune(cache: &Path, keep: &Path, most: u64) -> io::Result<()> {
+/// Errors of reading the folder; files that cannot be removed stay.
+pub(crate) fn prune(cache: &Path, keep: &Path, max: u64) -> io::Result<()> {
     let mut bytes = 0_u64;
     let mut entries: Vec<(SystemTime, PathBuf, u64)> = Vec::new();
     for entry in fs::read_dir(cache)? {
@@ -53,7 +53,7 @@ pub(crate) fn prune(cache: &Path, keep: &Path, most: u64) -> io::Result<()> {
     }
     entries.sort();
     for (_, path, len) in entries {
-        if bytes <= most {
+        if bytes <= max {
             break;
         }
         if fs::remove_file(path).is_ok() {
@@ -63,11 +63,11 @@ pub(crate) fn prune(cache: &Path, keep: &Path, most: u64) -> io::Result<()> {
     Ok(())
 }
 
-/// Removes what no process locks, as those do that write it.
+/// Removes a partial file that no process has locked; its writer would hold a lock.
 fn remove_abandoned(part: &Path) {
-    let Ok(file) = own_file::edit(part) else { return };
+    let Ok(file) = safe_file::edit(part) else { return };
     if file.try_lock().is_ok() {
-        // Still locked, so that a process that began it meanwhile sees that it is gone.
+        // Removed under the lock, so that a process that has just created it sees that it is gone.
         let _ = fs::remove_file(part);
     }
 }
@@ -76,7 +76,7 @@ fn remove_abandoned(part: &Path) {
 mod tests {
     use super::*;
 
-    /// A file of so many bytes that was last in use so long ago.
+    /// Creates a file of `bytes` bytes that was last used `ago`.
     fn file(path: &Path, bytes: u64, ago: Duration) {
         let file = File::create(path).unwrap();
         file.set_len(bytes).unwrap();
@@ -84,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_used_for_longest_goes_first() {
+    fn the_least_recently_used_entries_are_removed_first() {
         let cache = std::env::temp_dir().join(format!("gleaner-prune-{}", std::process::id()));
         fs::create_dir_all(&cache).unwrap();
         for (day, name) in
@@ -94,11 +94,11 @@ mod tests {
         }
         file(&cache.join("x.17.part"), 10, DAY * 2);
         file(&cache.join("y.18.part"), 10, DAY * 2);
-        let writer = own_file::edit(&cache.join("y.18.part")).unwrap();
+        let writer = safe_file::edit(&cache.join("y.18.part")).unwrap();
         writer.lock().unwrap();
         file(&cache.join("foreign.txt"), 10_000, DAY * 9);
-        let left = |most| {
-            prune(&cache, &cache.join("kept.cwasm"), most).unwrap();
+        let left = |max| {
+            prune(&cache, &cache.join("kept.cwasm"), max).unwrap();
             let mut names: Vec<_> = fs::read_dir(&cache)
                 .unwrap()
                 .map(|entry| entry.unwrap().file_name().into_string().unwrap())
@@ -114,7 +114,7 @@ mod tests {
         note_use(&File::open(cache.join("older.cwasm")).unwrap());
         assert_eq!(left(2000), "foreign.txt kept.cwasm older.cwasm y.18.part");
         assert_eq!(left(0), "foreign.txt kept.cwasm y.18.part");
-        // Its writer was killed.
+        // As if its writer had been killed.
         drop(writer);
         assert_eq!(left(0), "foreign.txt kept.cwasm");
         fs::remove_dir_all(&cache).unwrap();

@@ -3,67 +3,72 @@ use std::path::PathBuf;
 
 use gleaner_base::{Exit, Explain, NotPlain};
 
-/// A place or program that was tried, and why it would not do.
+/// A Python interpreter that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Looked {
-    /// What was tried.
-    pub at: PathBuf,
-    /// Why it would not do.
-    pub why: String,
+pub struct RejectedPython {
+    /// Its path.
+    pub path: PathBuf,
+    /// The reason.
+    pub reason: String,
 }
 
-/// Why a part of the installation is not found.
+/// Errors of finding a part of the installation.
 #[derive(Debug, thiserror::Error)]
 pub enum PartsError {
-    /// The system does not say where the running program lies.
-    #[error("cannot find out where this program lies")]
+    /// The path of the running program is unknown.
+    #[error("cannot find the path of this program")]
     NoExecutable {
-        /// Why not.
+        /// The cause.
         source: io::Error,
     },
-    /// The folder that the user wants is no installation.
-    #[error("GLEANER_HOME is `{}`, where nothing of Gleaner lies", home.display())]
+    /// `GLEANER_HOME` is not an installation.
+    #[error("GLEANER_HOME is `{}`, which is not an installation of Gleaner", home.display())]
     Home {
         /// The folder.
         home: PathBuf,
     },
-    /// The interpreter that the user wants will not do.
-    #[error("GLEANER_PYTHON is `{}`, which cannot be used: {}", wanted.at.display(), wanted.why)]
+    /// `GLEANER_PYTHON` cannot be used.
+    #[error(
+        "GLEANER_PYTHON is `{}`, which cannot be used: {}",
+        wanted.path.display(),
+        wanted.reason
+    )]
     WantedPython {
-        /// The interpreter, and why not.
-        wanted: Looked,
+        /// The interpreter and the reason.
+        wanted: RejectedPython,
     },
-    /// The environment of a lambda is one that was tampered with.
+    /// `pyvenv.cfg` of a lambda's environment is not a regular file.
     #[error("cannot read `{}`", config.display())]
     Environment {
         /// Its `pyvenv.cfg`.
         config: PathBuf,
-        /// Why not.
+        /// The cause.
         source: io::Error,
     },
-    /// A part is in none of its places.
-    #[error("cannot find {part}; looked in{}", lines(folders.iter().map(|folder| folder.display().to_string())))]
+    /// A part was not found.
+    #[error(
+        "cannot find {part}; searched in{}",
+        lines(folders.iter().map(|folder| folder.display().to_string()))
+    )]
     Missing {
         /// The part, for example `gleaner-runtime`.
         part: String,
-        /// The folders that were looked at, in order.
+        /// The searched folders, in order.
         folders: Vec<PathBuf>,
         /// The command that makes the part in a checkout.
         made_by: &'static str,
     },
-    /// No Python interpreter will do.
+    /// No Python interpreter can be used.
     #[error(
-        "found no Python 3.9 or newer that runs; tried{}",
-        lines(tried.iter().map(|tried| format!("{}: {}", tried.at.display(), tried.why)))
+        "cannot find a working Python 3.9 or newer; tried{}",
+        lines(tried.iter().map(|tried| format!("{}: {}", tried.path.display(), tried.reason)))
     )]
     NoPython {
         /// The candidates, in order.
-        tried: Vec<Looked>,
+        tried: Vec<RejectedPython>,
     },
-    /// There is no home to keep a cache in.
-    #[error(
-        "there is no folder for the cache: neither XDG_CACHE_HOME nor HOME is set to an absolute path"
-    )]
+    /// There is no folder for the cache.
+    #[error("no folder for the cache: neither XDG_CACHE_HOME nor HOME is an absolute path")]
     NoCache,
 }
 
@@ -73,15 +78,20 @@ impl Explain for PartsError {
             PartsError::NoExecutable { .. } => None,
             PartsError::Home { .. } => Some("set GLEANER_HOME to the folder of the installation, or unset it".to_owned()),
             PartsError::WantedPython { .. } => Some(
-                "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip, or unset it".to_owned(),
+                "set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip, or unset it"
+                    .to_owned(),
             ),
             PartsError::Environment { source, .. } => NotPlain::of(source)
                 .map(|why| format!("{}: `python3 -m venv` writes a new one", why.help())),
             PartsError::Missing { made_by, .. } => {
-                Some(format!("in a checkout run `{made_by}`, else set GLEANER_HOME to the folder of the installation"))
+                Some(format!(
+                    "in a checkout run `{made_by}`, else set GLEANER_HOME to the folder of the \
+                     installation"
+                ))
             }
             PartsError::NoPython { .. } => Some(
-                "in a checkout run `cargo xtask demo`, or set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip"
+                "in a checkout run `cargo xtask demo`, or set GLEANER_PYTHON to a Python 3.9 or newer \
+                 with venv and ensurepip"
                     .to_owned(),
             ),
             PartsError::NoCache => Some("set XDG_CACHE_HOME".to_owned()),

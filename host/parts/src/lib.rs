@@ -1,9 +1,8 @@
-//! Where the parts of an installation are: programs, the Python side, the interpreter, the cache.
+//! Finds the parts of an installation: programs, Python files, the interpreter, the cache.
 //!
-//! Looked for in this order: `$GLEANER_HOME`, `<exe>/../lib/gleaner`, and, for a program in a cargo
-//! target folder, beside it and in `guest-sdk-python/` of the checkout around that folder. Nothing
-//! is built, copied or remembered here, and no environment variable but those named in the docs is
-//! read.
+//! It searches in this order: `$GLEANER_HOME`, `<exe>/../lib/gleaner`, and, for a program in a
+//! cargo target folder, the folder of the program and `guest-sdk-python/` of the checkout. Nothing
+//! is built, copied or remembered, and only the documented environment variables are read.
 
 mod error;
 mod places;
@@ -15,31 +14,31 @@ mod test_folder;
 use std::env;
 use std::path::{self, Path, PathBuf};
 
-pub use error::{Looked, PartsError};
+pub use error::{PartsError, RejectedPython};
 use places::Places;
 
 /// The parts of the installation that a program belongs to.
 #[derive(Debug, Clone)]
 pub struct Parts {
     places: Places,
-    /// `GLEANER_PYTHON`: the interpreter that the user wants.
+    /// `GLEANER_PYTHON`, the interpreter that the user has chosen.
     wanted_python: Option<PathBuf>,
 }
 
 impl Parts {
-    /// The parts of the installation that the running program belongs to. Reads `GLEANER_HOME` and
+    /// Finds the installation that the running program belongs to. Reads `GLEANER_HOME` and
     /// `GLEANER_PYTHON`.
     ///
     /// # Errors
     ///
-    /// [`PartsError::NoExecutable`] if the system does not tell where the running program lies,
-    /// [`PartsError::Home`] if there is no part at all in `GLEANER_HOME`.
+    /// [`PartsError::NoExecutable`] if the path of the running program is unknown,
+    /// [`PartsError::Home`] if `GLEANER_HOME` has no part of an installation.
     pub fn find() -> Result<Parts, PartsError> {
         let exe = env::current_exe().map_err(|source| PartsError::NoExecutable { source })?;
-        // Absolute, since what is found may be used by a program with another working folder.
+        // Absolute, since a program with another working folder may use the paths.
         let home = variable("GLEANER_HOME").map(|home| path::absolute(&home).unwrap_or(home));
         match home {
-            // Else other parts than the wanted ones would be taken, and nobody told.
+            // Otherwise parts of another installation would be used silently.
             Some(home) if !places::has_parts(&home) => Err(PartsError::Home { home }),
             home => Ok(Parts::around(&exe, home, variable("GLEANER_PYTHON"))),
         }
@@ -49,13 +48,13 @@ impl Parts {
         Parts { places: Places::around(exe, home), wanted_python }
     }
 
-    /// The program `name`, for example `gleaner-runtime`.
+    /// Finds the program `name`, for example `gleaner-runtime`.
     ///
     /// # Errors
     ///
-    /// [`PartsError::Missing`] with every place that was looked at.
+    /// [`PartsError::Missing`] with the searched folders.
     pub fn program(&self, name: &str) -> Result<PathBuf, PartsError> {
-        // It is not built with the rest: see its docs.
+        // The player is not built with the other programs: see its docs.
         let how =
             if name == "gleaner-player" { "cargo xtask player" } else { "cargo build --release" };
         self.places.first(name, how, |folder| {
@@ -64,11 +63,11 @@ impl Parts {
         })
     }
 
-    /// The folder with Python's side: `start.py` and the package `gleaner`.
+    /// Finds the folder with `start.py` and the Python package `gleaner`.
     ///
     /// # Errors
     ///
-    /// [`PartsError::Missing`] with every place that was looked at.
+    /// [`PartsError::Missing`] with the searched folders.
     pub fn python_home(&self) -> Result<PathBuf, PartsError> {
         self.places.first("start.py with the package gleaner", "cargo xtask demo", |folder| {
             let complete =
@@ -77,11 +76,11 @@ impl Parts {
         })
     }
 
-    /// The extension module `_gleaner`, loaded by path from `lib_gleaner.so`.
+    /// Finds `lib_gleaner.so`, the extension module `_gleaner`, which is loaded by path.
     ///
     /// # Errors
     ///
-    /// [`PartsError::Missing`] with every place that was looked at.
+    /// [`PartsError::Missing`] with the searched folders.
     pub fn extension(&self) -> Result<PathBuf, PartsError> {
         self.places.first("lib_gleaner.so", "cargo build --release", |folder| {
             let module = folder.join("lib_gleaner.so");
@@ -89,32 +88,32 @@ impl Parts {
         })
     }
 
-    /// The Python interpreter for the lambda in `lambda_dir`, as an absolute path: it runs, is 3.9
-    /// or newer and has `venv` and `ensurepip`. That is `GLEANER_PYTHON` if it is set, else the
-    /// first such of `lambda_dir/.venv`, the checkout's `.venv`, and `python3`, `python3.13` …
-    /// `python3.9` of `PATH`.
+    /// Finds the Python interpreter for the lambda in `lambda_dir`, as an absolute path. It is 3.9
+    /// or newer and has `venv` and `ensurepip`. `GLEANER_PYTHON` is used if it is set, else the
+    /// first working one of `lambda_dir/.venv`, the checkout's `.venv`, and `python3`, `python3.13`
+    /// … `python3.9` in `PATH`.
     ///
-    /// Each candidate is started once: a program that can be found may still not run.
+    /// Each candidate is started once to check that it works.
     ///
     /// # Errors
     ///
-    /// [`PartsError::WantedPython`] if `GLEANER_PYTHON` will not do, [`PartsError::Environment`] if
-    /// `pyvenv.cfg` of the lambda is no file, [`PartsError::NoPython`] with every candidate and why
-    /// it was refused.
+    /// [`PartsError::WantedPython`] if `GLEANER_PYTHON` cannot be used, [`PartsError::Environment`]
+    /// if `pyvenv.cfg` of the lambda is not a regular file, [`PartsError::NoPython`] with all
+    /// candidates and reasons.
     pub fn python(&self, lambda_dir: Option<&Path>) -> Result<PathBuf, PartsError> {
-        self.python_or_why(lambda_dir).map(|(python, _)| python)
+        self.python_and_unused_venv(lambda_dir).map(|(python, _)| python)
     }
 
-    /// As [`Parts::python`], and the environment that `lambda_dir` has though another interpreter
-    /// was chosen, with why it is not used.
+    /// As [`Parts::python`]; also returns the environment in `lambda_dir`, with the reason, if it
+    /// exists but is not used.
     ///
     /// # Errors
     ///
     /// As [`Parts::python`].
-    pub fn python_or_why(
+    pub fn python_and_unused_venv(
         &self,
         lambda_dir: Option<&Path>,
-    ) -> Result<(PathBuf, Option<Looked>), PartsError> {
+    ) -> Result<(PathBuf, Option<RejectedPython>), PartsError> {
         if let Some(wanted) = &self.wanted_python {
             return Ok((python::wanted(wanted)?, None));
         }
@@ -122,13 +121,13 @@ impl Parts {
         let (python, tried) = python::first_that_runs(candidates, lambda_dir)?;
         let environment =
             lambda_dir.map(|dir| dir.join(".venv")).filter(|it| it.symlink_metadata().is_ok());
-        let unused =
-            environment.and_then(|it| tried.into_iter().find(|looked| looked.at.starts_with(&it)));
+        let unused = environment
+            .and_then(|it| tried.into_iter().find(|rejected| rejected.path.starts_with(&it)));
         Ok((python, unused))
     }
 }
 
-/// The folder for what can be made again, such as native code: `$XDG_CACHE_HOME/gleaner`, else
+/// Folder of the cache, for example for native code: `$XDG_CACHE_HOME/gleaner`, else
 /// `~/.cache/gleaner`. It need not exist.
 ///
 /// # Errors
@@ -147,7 +146,7 @@ fn cache_below(xdg: Option<PathBuf>, home: Option<PathBuf>) -> Result<PathBuf, P
     cache.map(|cache| cache.join("gleaner")).ok_or(PartsError::NoCache)
 }
 
-/// An environment variable as a path; set to nothing it counts as unset.
+/// An environment variable as a path; `None` if unset or empty.
 fn variable(name: &str) -> Option<PathBuf> {
     env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from)
 }

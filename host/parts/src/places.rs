@@ -2,17 +2,17 @@ use std::path::{Path, PathBuf};
 
 use super::PartsError;
 
-/// The folders in which parts may lie.
+/// The folders that may contain parts.
 #[derive(Debug, Clone)]
 pub(super) struct Places {
-    /// In the order in which they are looked at.
+    /// In search order.
     folders: Vec<PathBuf>,
-    /// The checkout around the cargo target folder with the program, if it is in one.
+    /// The checkout, if the program is in its cargo target folder.
     checkout: Option<PathBuf>,
 }
 
 impl Places {
-    /// The places of the program `exe`, of which `home` comes first if the user set it.
+    /// The folders for the program `exe`, with `home` first if it is set.
     pub(super) fn around(exe: &Path, home: Option<PathBuf>) -> Places {
         let mut folders = Vec::new();
         if let Some(home) = home {
@@ -20,8 +20,7 @@ impl Places {
             folders.push(home);
         }
         let beside = exe.parent().unwrap_or(Path::new(""));
-        // A program that lies in `lib/gleaner` itself was started by one in `bin`: its parts are
-        // beside it.
+        // A program in `lib/gleaner` was started by one in `bin`; its parts are beside it.
         if beside.ends_with("lib/gleaner") {
             folders.push(beside.to_owned());
         }
@@ -31,7 +30,7 @@ impl Places {
         let mut checkout = None;
         if let Some(target) = cargo_target(beside) {
             folders.push(beside.to_owned());
-            // Cargo puts test programs into `deps`, one below the programs they test.
+            // Cargo puts test programs into `deps`, below the folder of the programs under test.
             if beside.ends_with("deps") {
                 folders.extend(beside.parent().map(Path::to_owned));
             }
@@ -46,7 +45,7 @@ impl Places {
         self.checkout.as_deref()
     }
 
-    /// What `part` finds in the first folder where it finds something.
+    /// Returns the first match of `part` in the folders.
     pub(super) fn first(
         &self,
         name: &str,
@@ -62,7 +61,7 @@ impl Places {
     }
 }
 
-/// There is something of Gleaner in `home`, or in `lib/gleaner` of it.
+/// Returns whether `home` or its `lib/gleaner` has a part of an installation.
 pub(super) fn has_parts(home: &Path) -> bool {
     let parts = ["gleaner-runtime", "lib_gleaner.so", "start.py"];
     [home.join("lib/gleaner"), home.to_owned()]
@@ -70,8 +69,8 @@ pub(super) fn has_parts(home: &Path) -> bool {
         .any(|folder| parts.iter().any(|part| folder.join(part).is_file()))
 }
 
-/// The cargo target folder around `folder`, known by the tag that cargo leaves in it. Programs are
-/// at most `target/<triple>/<profile>/deps` deep.
+/// Finds the cargo target folder around `folder` by cargo's tag file. Programs are at most
+/// `target/<triple>/<profile>/deps` deep.
 fn cargo_target(folder: &Path) -> Option<&Path> {
     folder.ancestors().take(4).find(|folder| folder.join("CACHEDIR.TAG").is_file())
 }

@@ -4,11 +4,11 @@ use super::*;
 use crate::test_folder::TestFolder;
 use gleaner_base::{Exit, Explain};
 
-/// Linux refuses to start a file that is open for writing anywhere, be it in the child that another
-/// test is about to start. Tests that write programs and start them take turns.
-static TURN: Mutex<()> = Mutex::new(());
+/// Linux refuses to start a file that is open for writing anywhere, such as in a child that another
+/// test is about to start. The lock serialises tests that write and start programs.
+static EXEC_LOCK: Mutex<()> = Mutex::new(());
 
-/// A program that answers the probe as Python of this version would.
+/// A program that answers the probe like Python of this version.
 fn python(dir: &TestFolder, relative: &str, version: &str) -> PathBuf {
     let path = dir.path(relative);
     dir.write_program(
@@ -86,17 +86,17 @@ fn outside_of_a_target_folder_nothing_beside_the_program_is_taken() {
 }
 
 #[test]
-fn a_missing_program_is_reported_with_every_place_and_the_way_out() {
+fn a_missing_program_is_reported_with_all_folders_and_help() {
     let dir = checkout();
     let root = dir.root().display();
-    // There, but nothing that could be started.
+    // A file that is not executable.
     dir.write("target/release/gleaner-shim", "");
     let parts = Parts::around(&dir.path("target/release/deps/x"), Some(dir.path("home")), None);
     let error = parts.program("gleaner-shim").unwrap_err();
     assert_eq!(
         error.to_string(),
         format!(
-            "cannot find gleaner-shim; looked in\n{root}/home/lib/gleaner\n{root}/home\n{root}/target/release/lib/gleaner\n\
+            "cannot find gleaner-shim; searched in\n{root}/home/lib/gleaner\n{root}/home\n{root}/target/release/lib/gleaner\n\
              {root}/target/release/deps\n{root}/target/release\n{root}/guest-sdk-python"
         )
     );
@@ -106,22 +106,22 @@ fn a_missing_program_is_reported_with_every_place_and_the_way_out() {
 }
 
 #[test]
-fn a_missing_python_side_is_reported_with_the_command_that_makes_it() {
+fn missing_python_files_are_reported_with_the_command_that_makes_them() {
     let dir = installation();
     std::fs::remove_file(dir.path("lib/gleaner/gleaner/__init__.py")).unwrap();
     let error = Parts::around(&dir.path("bin/gleaner"), None, None).python_home().unwrap_err();
     let lib = dir.path("lib/gleaner");
     assert_eq!(
         error.to_string(),
-        format!("cannot find start.py with the package gleaner; looked in\n{}", lib.display())
+        format!("cannot find start.py with the package gleaner; searched in\n{}", lib.display())
     );
     let help = "in a checkout run `cargo xtask demo`, else set GLEANER_HOME to the folder of the installation";
     assert_eq!(error.help().as_deref(), Some(help));
 }
 
 #[test]
-fn the_python_that_the_user_wants_comes_before_those_of_lambda_and_checkout() {
-    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+fn the_chosen_python_comes_before_those_of_lambda_and_checkout() {
+    let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     let dir = checkout();
     let exe = dir.path("target/release/gleaner");
     let wanted = python(&dir, "wanted/python", "3 9");
@@ -149,8 +149,8 @@ fn environment(dir: &TestFolder, program: &std::path::Path) {
 }
 
 #[test]
-fn nothing_that_came_with_a_lambda_is_run_to_find_its_python() {
-    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+fn no_program_of_a_lambda_is_run_to_find_its_python() {
+    let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     let dir = checkout();
     let lambda = dir.path("lambda");
     let shared = python(&dir, ".venv/bin/python3", "3 12");
@@ -158,21 +158,21 @@ fn nothing_that_came_with_a_lambda_is_run_to_find_its_python() {
     let ran = dir.path("ran");
     let script = format!("#!/bin/sh\ntouch '{}'\n", ran.display());
     assert_eq!(
-        parts.python_or_why(Some(&lambda)).unwrap(),
+        parts.python_and_unused_venv(Some(&lambda)).unwrap(),
         (shared.clone(), None),
         "it has no environment"
     );
-    // A program of its own, as `python3 -m venv --copies` makes it, and one behind a link within
-    // the folder.
+    // A copied program, as `python3 -m venv --copies` makes it, and one behind a link within the
+    // folder.
     let own = dir.write_program("lambda/.venv/bin/python3", &script);
-    let (chosen, unused) = parts.python_or_why(Some(&lambda)).unwrap();
+    let (chosen, unused) = parts.python_and_unused_venv(Some(&lambda)).unwrap();
     assert_eq!(chosen, shared);
-    let why = "is a program in the lambda's folder; make the environment with `python3 -m venv`, which links";
-    assert_eq!(unused.unwrap(), Looked { at: own.clone(), why: why.to_owned() });
+    let why = "is a program in the lambda's folder; create the environment with `python3 -m venv`, which uses links";
+    assert_eq!(unused.unwrap(), RejectedPython { path: own.clone(), reason: why.to_owned() });
     std::fs::rename(own, dir.path("lambda/python3")).unwrap();
     environment(&dir, &dir.path("lambda/python3"));
     assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
-    // A good program, with libraries of the lambda's choice.
+    // A valid program, but with libraries that the lambda chooses.
     environment(&dir, &python(&dir, "elsewhere/bin/python3", "3 12"));
     dir.write("lambda/.venv/pyvenv.cfg", &format!("home = {}\n", lambda.display()));
     assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
@@ -180,25 +180,25 @@ fn nothing_that_came_with_a_lambda_is_run_to_find_its_python() {
 }
 
 #[test]
-fn an_environment_of_a_lambda_is_not_asked_by_way_of_its_own_files() {
-    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+fn the_program_behind_an_environments_link_is_started_by_its_own_path() {
+    let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     let dir = checkout();
     let lambda = dir.path("lambda");
     let shared = python(&dir, ".venv/bin/python3", "3 12");
     let parts = Parts::around(&dir.path("target/release/gleaner"), None, None);
-    // Says by which name it was started, and takes what lies beside that for its own.
-    let asked = dir.path("asked");
+    // Records the name by which it was started.
+    let started = dir.path("started");
     let home = dir.path("elsewhere/bin");
     let script = format!(
         "#!/bin/sh\necho \"$0\" >> '{}'\necho '3 12'\necho '{}/python3'\n",
-        asked.display(),
+        started.display(),
         home.display()
     );
     let own = dir.write_program("elsewhere/bin/python3", &script);
     environment(&dir, &own);
     assert_eq!(parts.python(Some(&lambda)).unwrap(), lambda.join(".venv/bin/python3"));
-    assert_eq!(std::fs::read_to_string(&asked).unwrap().trim_end(), own.to_str().unwrap());
-    // Libraries that only the interpreter would see.
+    assert_eq!(std::fs::read_to_string(&started).unwrap().trim_end(), own.to_str().unwrap());
+    // Library paths that only the interpreter would read.
     for name in ["python3._pth", "PYTHON._PTH"] {
         let names = dir.write(&format!("lambda/.venv/bin/{name}"), "../evil\n");
         assert_eq!(parts.python(Some(&lambda)).unwrap(), shared, "{name}");
@@ -216,17 +216,17 @@ fn an_environment_of_a_lambda_is_not_asked_by_way_of_its_own_files() {
     }
     dir.write("lambda/.venv/pyvenv.cfg", &home);
     assert_eq!(parts.python(Some(&lambda)).unwrap(), lambda.join(".venv/bin/python3"));
-    // A program that is no interpreter, and one that starts another.
+    // A program that is not an interpreter, and one that starts another.
     environment(&dir, &dir.write_program("elsewhere/bin/shutdown", &script));
     assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
     environment(&dir, &dir.write_program("elsewhere/bin/python3.12", &script));
     assert_eq!(parts.python(Some(&lambda)).unwrap(), shared);
-    assert_eq!(std::fs::read_to_string(&asked).unwrap().lines().count(), 3);
+    assert_eq!(std::fs::read_to_string(&started).unwrap().lines().count(), 3);
 }
 
 #[test]
-fn a_wanted_python_that_will_not_do_is_refused_and_no_other_taken() {
-    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+fn an_unusable_chosen_python_is_refused_and_no_other_is_used() {
+    let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     let dir = checkout();
     python(&dir, ".venv/bin/python3", "3 12");
     let old = python(&dir, "old", "3 8");
@@ -241,7 +241,7 @@ fn a_wanted_python_that_will_not_do_is_refused_and_no_other_taken() {
 }
 
 #[test]
-fn a_folder_with_any_part_will_do_as_home_and_another_will_not() {
+fn gleaner_home_must_have_a_part() {
     let (installed, dir) = (installation(), checkout());
     for home in [installed.root(), &installed.path("lib/gleaner"), &dir.path("guest-sdk-python")] {
         assert!(places::has_parts(home), "{}", home.display());
@@ -250,7 +250,10 @@ fn a_folder_with_any_part_will_do_as_home_and_another_will_not() {
         assert!(!places::has_parts(home), "{}", home.display());
     }
     let error = PartsError::Home { home: "/nope".into() };
-    assert_eq!(error.to_string(), "GLEANER_HOME is `/nope`, where nothing of Gleaner lies");
+    assert_eq!(
+        error.to_string(),
+        "GLEANER_HOME is `/nope`, which is not an installation of Gleaner"
+    );
     assert_eq!(error.exit(), Exit::Usage);
 }
 
@@ -262,8 +265,8 @@ fn the_pythons_of_path_are_tried_last_and_newest_first() {
 }
 
 #[test]
-fn without_a_python_that_runs_each_candidate_is_named_with_its_fault() {
-    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+fn without_a_working_python_each_candidate_is_named_with_its_error() {
+    let _lock = EXEC_LOCK.lock().unwrap_or_else(PoisonError::into_inner);
     let dir = TestFolder::new();
     let old = python(&dir, "old", "3 8");
     let silent = dir.write_program("silent", "#!/bin/sh\nexit 3\n");
@@ -280,16 +283,16 @@ fn without_a_python_that_runs_each_candidate_is_named_with_its_fault() {
     assert_eq!(
         error.to_string(),
         format!(
-            "found no Python 3.9 or newer that runs; tried\n\
+            "cannot find a working Python 3.9 or newer; tried\n\
              {root}/old: is Python 3.8\n\
              {root}/silent: ends with exit status: 3\n\
              {root}/split: ModuleNotFoundError: No module named 'ensurepip'\n\
-             {root}/other: does not answer as Python does\n\
+             {root}/other: does not behave like Python\n\
              {root}/locked: Permission denied (os error 13)\n\
              {root}/missing: not found"
         )
     );
-    let help = "in a checkout run `cargo xtask demo`, or set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip";
+    let help = "in a checkout run `cargo xtask demo`, or set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip";
     assert_eq!(error.help().as_deref(), Some(help));
 }
 
@@ -305,7 +308,7 @@ fn the_cache_follows_xdg_and_ignores_relative_paths() {
     let error = cache_below(None, path("u")).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "there is no folder for the cache: neither XDG_CACHE_HOME nor HOME is set to an absolute path"
+        "no folder for the cache: neither XDG_CACHE_HOME nor HOME is an absolute path"
     );
     assert_eq!(error.help().as_deref(), Some("set XDG_CACHE_HOME"));
 }

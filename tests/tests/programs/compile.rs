@@ -1,5 +1,5 @@
-//! Compiling a component has a bound of memory and of CPU time, and what would go beyond is refused
-//! in words. Native code in the cache runs only as it was written there.
+//! Compiling a component has limits of memory and CPU time; a component that exceeds them is
+//! refused with a message. Native code in the cache runs only if it is unchanged.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use gleaner_base::Exit;
-use gleaner_tests::{Copy, Folder, program, replay, root, sample_drive};
+use gleaner_tests::{LambdaCopy, TempFolder, program, replay, root, sample_drive};
 
-/// A component of so many functions, each of which takes a quarter of a second to be compiled, and
-/// not much memory: thousands of values live until its end, and blocks keep the compiler from
-/// putting them together.
+/// A component of `functions` functions. Each takes a quarter of a second to compile, and little
+/// memory: thousands of values live until its end, and blocks prevent the compiler from merging
+/// them.
 fn slow(functions: usize) -> Vec<u8> {
     const VALUES: usize = 4000;
     let block =
@@ -23,16 +23,17 @@ fn slow(functions: usize) -> Vec<u8> {
     wat::parse_str(text).expect("the test's own component")
 }
 
-/// `gleaner check` of a lambda that is this component, where compiling has so many seconds.
+/// Runs `gleaner check` on a lambda with this component and a limit of CPU time for compiling.
 fn check(component: &[u8], seconds: u64) -> Output {
-    let (lambda, home) = (Copy::of("examples/hello/rust", |manifest| manifest), Folder::new());
+    let (lambda, home) =
+        (LambdaCopy::of("examples/hello/rust", |manifest| manifest), TempFolder::new());
     lambda.replace("hello.wasm", component);
     let compile = program("gleaner-compile");
     let script =
         format!("#!/bin/sh\nexec '{}' --cpu-seconds {seconds} \"$@\"\n", compile.display());
     let script = home.write("gleaner-compile", script);
     fs::set_permissions(script, PermissionsExt::from_mode(0o755)).unwrap();
-    // Without it this would be no installation.
+    // The folder must look like an installation.
     std::os::unix::fs::symlink(program("gleaner-runtime"), home.path().join("gleaner-runtime"))
         .unwrap();
     let mut check = Command::new(program("gleaner"));
@@ -43,27 +44,27 @@ fn check(component: &[u8], seconds: u64) -> Output {
 #[test]
 fn a_component_that_is_compiled_for_too_long_is_refused() {
     let output = check(&slow(60), 1);
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(i32::from(Exit::Usage.code())), "{said}");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(i32::from(Exit::Usage.code())), "{stderr}");
     let expected = [
         "cannot compile component `",
         "hello.wasm`",
-        "takes more than 120 s of CPU time to compile",
+        "takes more than 120 s of CPU time",
         "help:",
-        "leave out",
+        "remove code",
     ];
-    let mut rest = said.as_ref();
+    let mut rest = stderr.as_ref();
     for words in expected {
-        let at = rest.find(words).unwrap_or_else(|| panic!("no `{words}` in:\n{said}"));
+        let at = rest.find(words).unwrap_or_else(|| panic!("no `{words}` in:\n{stderr}"));
         rest = &rest[at + words.len()..];
     }
 }
 
 #[test]
-fn the_bound_of_cpu_time_can_only_be_made_tighter() {
-    let folder = Folder::new();
+fn the_limit_of_cpu_time_can_only_be_lowered() {
+    let folder = TempFolder::new();
     let component = folder.write("few.wasm", slow(1));
-    for (seconds, ends_well) in
+    for (seconds, succeeds) in
         [("120", true), ("121", false), ("0", false), ("-1", false), ("x", false)]
     {
         let mut compile = Command::new(program("gleaner-compile"));
@@ -75,7 +76,7 @@ fn the_bound_of_cpu_time_can_only_be_made_tighter() {
         let output = compile.output().expect("gleaner-compile starts");
         assert_eq!(
             output.status.success(),
-            ends_well,
+            succeeds,
             "{seconds}: {}",
             String::from_utf8_lossy(&output.stderr)
         );
@@ -83,52 +84,52 @@ fn the_bound_of_cpu_time_can_only_be_made_tighter() {
 }
 
 #[test]
-fn bytes_that_are_no_component_are_refused_once_with_a_help_that_fits() {
+fn invalid_components_are_refused_once_with_specific_help() {
     let whole = fs::read(root().join("examples/hello/rust/build/hello.wasm")).unwrap();
     let threads = wat::parse_str("(component (core module (memory 1 1 shared)))").unwrap();
     let cases: [(&[u8], &str, &str); 4] = [
         (
             b"not a component",
-            "is no WebAssembly component: its first bytes are not",
-            "name the component as `entry`",
+            "is not a WebAssembly component: its first bytes are not",
+            "set `entry` in lambda.toml to the component",
         ),
         (
             b"\0asm\x01\0\0\0",
-            "is no WebAssembly component: it is a core module",
+            "is not a WebAssembly component: it is a core module",
             "`gleaner build DIR`, which makes",
         ),
         (
             &whole[..whole.len() / 2],
             "cannot compile component",
-            "may be cut off or damaged; build the lambda again",
+            "may be truncated or damaged; build the lambda again",
         ),
-        (&threads, "threads must be enabled", "without that proposal of WebAssembly"),
+        (&threads, "threads must be enabled", "without that WebAssembly proposal"),
     ];
     for (component, cause, help) in cases {
-        let copy = Copy::of("examples/hello/rust", |manifest| manifest);
+        let copy = LambdaCopy::of("examples/hello/rust", |manifest| manifest);
         copy.replace("hello.wasm", component);
         let run = replay(copy.path(), &[sample_drive()], &[]);
-        let said = &run.must_exit(Exit::Usage.code()).stderr;
-        assert!(said.starts_with("error: cannot load lambda `hello`\n  cause: "), "{said}");
-        assert!(said.contains(cause) && said.contains(help), "{said}");
+        let stderr = &run.must_exit(Exit::Usage.code()).stderr;
+        assert!(stderr.starts_with("error: cannot load lambda `hello`\n  cause: "), "{stderr}");
+        assert!(stderr.contains(cause) && stderr.contains(help), "{stderr}");
         assert_eq!(
-            [said.matches("hello.wasm").count(), said.matches("help:").count()],
+            [stderr.matches("hello.wasm").count(), stderr.matches("help:").count()],
             [1, 1],
-            "{said}"
+            "{stderr}"
         );
     }
 }
 
-/// A cache of this test's own, with native code of `hello` in it.
-struct Cache {
-    home: Folder,
+/// A cache for one test, with native code of `hello` in it.
+struct CodeCache {
+    home: TempFolder,
     entry: PathBuf,
     healthy: Vec<u8>,
 }
 
-impl Cache {
+impl CodeCache {
     fn new() -> Self {
-        let home = Folder::new();
+        let home = TempFolder::new();
         fs::set_permissions(home.path(), PermissionsExt::from_mode(0o700)).unwrap();
         let mut cache = Self { home, entry: PathBuf::new(), healthy: Vec::new() };
         cache.replay("first");
@@ -153,21 +154,21 @@ impl Cache {
         replay
     }
 
-    /// Replays `hello`, which has to go well, and returns its decisions and what was printed.
+    /// Replays `hello`, which must succeed; returns its decisions and its standard error.
     fn replay(&self, out: &str) -> (String, String) {
         let output = self.command(out).output().expect("gleaner-runtime starts");
-        self.ended_well(out, &output)
+        self.must_succeed(out, &output)
     }
 
-    fn ended_well(&self, out: &str, output: &Output) -> (String, String) {
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert_eq!(output.status.code(), Some(0), "{said}");
+    fn must_succeed(&self, out: &str, output: &Output) -> (String, String) {
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(0), "{stderr}");
         let decisions =
             fs::read_to_string(self.home.path().join(out).join("decisions.jsonl")).unwrap();
-        (decisions.lines().map(without_time).collect(), said)
+        (decisions.lines().map(without_time).collect(), stderr)
     }
 
-    /// Has other bytes where the code is.
+    /// Replaces the native code by other bytes.
     fn put(&self, bytes: &[u8]) {
         fs::write(&self.entry, bytes).unwrap();
     }
@@ -175,12 +176,13 @@ impl Cache {
     fn warning(&self) -> String {
         let file = self.entry.display();
         format!(
-            "warning: native code in the cache is damaged: the component is compiled again file={file} why="
+            "warning: native code in the cache is damaged; compiling the component again \
+             file={file} why="
         )
     }
 }
 
-/// A line of `decisions.jsonl` but for times of this machine.
+/// A line of `decisions.jsonl` without durations.
 fn without_time(line: &str) -> String {
     let mut decision: serde_json::Map<String, serde_json::Value> =
         serde_json::from_str(line).unwrap();
@@ -189,27 +191,30 @@ fn without_time(line: &str) -> String {
 }
 
 #[test]
-fn native_code_that_was_changed_is_never_run_and_is_made_again() {
-    let cache = Cache::new();
-    let (expected, said) = cache.replay("healthy");
-    assert_eq!(said, "", "healthy code was not taken");
+fn changed_native_code_is_never_run_and_is_compiled_again() {
+    let cache = CodeCache::new();
+    let (expected, stderr) = cache.replay("healthy");
+    assert_eq!(stderr, "", "healthy code was not used");
     assert_eq!(expected.matches("hard-brake").count(), 3);
     let flipped = |at: usize, bits: u8| {
         let mut bytes = cache.healthy.clone();
         bytes[at] ^= bits;
         bytes
     };
-    // A number of the lambda's: 3 s, within which it does not trigger again.
+    // A constant of the lambda: 3 s, within which it does not trigger again.
     let refractory = 3_000_000_000_u64.to_le_bytes();
-    let constant =
-        cache.healthy.windows(8).position(|bytes| bytes == refractory).expect("it is in the code");
+    let constant = cache
+        .healthy
+        .windows(8)
+        .position(|bytes| bytes == refractory)
+        .expect("the constant is in the code");
     let mut damaged = vec![
         flipped(constant + 3, 0x80),
         cache.healthy[..cache.healthy.len() / 2].to_vec(),
         Vec::new(),
         vec![0; cache.healthy.len()],
         fs::read(program("gleaner-compile")).unwrap(),
-        // As it was before there were digests.
+        // The format before there were digests.
         cache.healthy[48..].to_vec(),
     ];
     let mut state = 1_u64;
@@ -220,23 +225,23 @@ fn native_code_that_was_changed_is_never_run_and_is_made_again() {
     }));
     for (case, bytes) in damaged.iter().enumerate() {
         cache.put(bytes);
-        let (decisions, said) = cache.replay("damaged");
+        let (decisions, stderr) = cache.replay("damaged");
         assert_eq!(decisions, expected, "case {case}");
         assert!(
-            said.starts_with(&cache.warning()) && said.lines().count() == 1,
-            "case {case}: {said}"
+            stderr.starts_with(&cache.warning()) && stderr.lines().count() == 1,
+            "case {case}: {stderr}"
         );
         assert_eq!(
             cache.replay("again"),
             (expected.clone(), String::new()),
-            "case {case}: it was not made again"
+            "case {case}: it was not compiled again"
         );
     }
 }
 
 #[test]
 fn native_code_of_another_component_is_not_run() {
-    let cache = Cache::new();
+    let cache = CodeCache::new();
     let mut compile = Command::new(program("gleaner-compile"));
     let other = root().join("tests/lambdas/misbehave/rust/build/misbehave.wasm");
     let output =
@@ -244,23 +249,23 @@ fn native_code_of_another_component_is_not_run() {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let (expected, _) = cache.replay("healthy");
     cache.put(&fs::read(String::from_utf8_lossy(&output.stdout).trim_end()).unwrap());
-    let (decisions, said) = cache.replay("other");
+    let (decisions, stderr) = cache.replay("other");
     assert_eq!(decisions, expected);
-    assert!(said.starts_with(&cache.warning()), "{said}");
+    assert!(stderr.starts_with(&cache.warning()), "{stderr}");
 }
 
 #[test]
-fn processes_that_meet_damaged_code_at_the_same_time_all_go_on() {
-    let cache = Cache::new();
+fn processes_that_find_damaged_code_at_the_same_time_all_succeed() {
+    let cache = CodeCache::new();
     let (expected, _) = cache.replay("healthy");
     cache.put(&cache.healthy[..1000]);
-    let outs: Vec<_> = (0..8).map(|number| format!("at-once-{number}")).collect();
+    let outs: Vec<_> = (0..8).map(|number| format!("concurrent-{number}")).collect();
     let replays: Vec<_> = outs
         .iter()
         .map(|out| cache.command(out).spawn().expect("gleaner-runtime starts"))
         .collect();
     for (out, replay) in outs.iter().zip(replays) {
-        let (decisions, _) = cache.ended_well(out, &replay.wait_with_output().unwrap());
+        let (decisions, _) = cache.must_succeed(out, &replay.wait_with_output().unwrap());
         assert_eq!(decisions, expected, "{out}");
     }
     assert_eq!(
@@ -276,31 +281,31 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn what_is_no_file_in_the_place_of_native_code_is_refused_and_not_waited_for() {
-    let cache = Cache::new();
+fn a_pipe_link_or_folder_in_place_of_native_code_is_refused() {
+    let cache = CodeCache::new();
     fs::remove_file(&cache.entry).unwrap();
     let refused = |why: &str| {
         let output = cache.command("refused").output().expect("gleaner-runtime starts");
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(i32::from(Exit::Denied.code())), "{said}");
-        assert!(said.contains(why) && said.contains("rm -r"), "{said}");
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(i32::from(Exit::Denied.code())), "{stderr}");
+        assert!(stderr.contains(why) && stderr.contains("rm -r"), "{stderr}");
     };
     assert!(Command::new("mkfifo").arg(&cache.entry).status().unwrap().success());
-    refused("it is no file");
+    refused("it is not a regular file");
     fs::remove_file(&cache.entry).unwrap();
     std::os::unix::fs::symlink("/dev/zero", &cache.entry).unwrap();
     refused("it is a link");
     fs::remove_file(&cache.entry).unwrap();
     fs::create_dir(&cache.entry).unwrap();
-    refused("it is no file");
+    refused("it is not a regular file");
     fs::remove_dir(&cache.entry).unwrap();
     cache.replay("without");
     assert!(cache.entry.is_file());
 }
 
 #[test]
-fn what_a_killed_process_began_in_the_cache_goes_with_the_next_that_compiles() {
-    let (folder, cache) = (Folder::new(), Folder::new());
+fn partial_files_of_killed_processes_are_deleted_by_the_next_that_compiles() {
+    let (folder, cache) = (TempFolder::new(), TempFolder::new());
     let component = folder.write("few.wasm", slow(1));
     let compile = || {
         let mut compile = Command::new(program("gleaner-compile"));
@@ -308,10 +313,10 @@ fn what_a_killed_process_began_in_the_cache_goes_with_the_next_that_compiles() {
         compile
     };
     fs::set_permissions(cache.path(), PermissionsExt::from_mode(0o700)).unwrap();
-    let left = cache.write("killed.part", [0; 1000]);
-    let theirs = cache.write("theirs.part", [0; 1000]);
-    let writer = fs::File::options().write(true).open(&theirs).unwrap();
+    let orphan = cache.write("killed.part", [0; 1000]);
+    let in_use = cache.write("in-use.part", [0; 1000]);
+    let writer = fs::File::options().write(true).open(&in_use).unwrap();
     writer.lock().unwrap();
     assert!(compile().status().unwrap().success());
-    assert!(!left.exists() && theirs.exists(), "{:?}", names(cache.path()));
+    assert!(!orphan.exists() && in_use.exists(), "{:?}", names(cache.path()));
 }

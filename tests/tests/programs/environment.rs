@@ -1,13 +1,13 @@
-//! What a Python lambda's own environment starts before the lambda, which it brings along as it
-//! likes, is shut in as the lambda is.
+//! Start-up code of a Python lambda's own environment, which runs before the lambda and is
+//! untrusted, is sandboxed like the lambda.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_parts::Parts;
-use gleaner_tests::{Folder, copy_lambda, program, root, runtime, sample_drive};
+use gleaner_tests::{TempFolder, copy_lambda, program, root, runtime, sample_drive};
 
-/// What `sitecustomize.py` tries, each with the name under which it says what came of it.
+/// Actions that `sitecustomize.py` attempts; it prints the name of each and the outcome.
 const TRIES: &str = r#"
 import fcntl, os, resource, socket, sys
 
@@ -37,11 +37,11 @@ for name, attempt in TRIES.items():
 "#;
 
 /// A lambda with an environment that runs [`TRIES`] when its interpreter starts. It has no numpy,
-/// so that is all that comes of it.
-fn hostile(folder: &Folder) -> PathBuf {
+/// so the start fails afterwards.
+fn hostile(folder: &TempFolder) -> PathBuf {
     copy_lambda("tests/lambdas/misbehave/python", folder, "lambda", |manifest| manifest);
     let lambda = folder.path().join("lambda");
-    let python = Parts::find().and_then(|parts| parts.python(None)).expect("there is a Python");
+    let python = Parts::find().and_then(|parts| parts.python(None)).expect("Python is installed");
     let made = Command::new(python)
         .args(["-m", "venv", "--without-pip", ".venv"])
         .current_dir(&lambda)
@@ -64,7 +64,7 @@ fn start(lambda: &Path, out: &Path, with_shim: bool) -> String {
     } else {
         runtime()
     };
-    // Or it would be taken instead of the lambda's own.
+    // The variable would replace the lambda's own environment.
     command
         .env_remove("GLEANER_PYTHON")
         .arg("replay")
@@ -72,14 +72,14 @@ fn start(lambda: &Path, out: &Path, with_shim: bool) -> String {
         .arg(sample_drive())
         .arg("--out")
         .arg(out);
-    let output = command.output().expect("it starts");
-    assert_ne!(output.status.code(), Some(0), "an environment without numpy will not do");
+    let output = command.output().expect("the program starts");
+    assert_ne!(output.status.code(), Some(0), "an environment without numpy is not usable");
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 #[test]
-fn start_up_code_of_an_environment_is_shut_in_before_it_runs() {
-    let folder = Folder::new();
+fn start_up_code_of_an_environment_runs_in_the_sandbox() {
+    let folder = TempFolder::new();
     let lambda = hostile(&folder);
     let tries = TRIES
         .lines()
@@ -88,27 +88,27 @@ fn start_up_code_of_an_environment_is_shut_in_before_it_runs() {
     let tries: Vec<_> = tries.collect();
     assert_eq!(tries.len(), 16);
     for with_shim in [true, false] {
-        let said = start(&lambda, &folder.path().join("out"), with_shim);
+        let stderr = start(&lambda, &folder.path().join("out"), with_shim);
         for name in &tries {
-            assert!(said.contains(&format!("<{name}> refused")), "{name}: {said}");
+            assert!(stderr.contains(&format!("<{name}> refused")), "{name}: {stderr}");
         }
         assert!(
-            said.contains("at the start of its environment: No module named 'numpy'; "),
-            "{said}"
+            stderr.contains("at the start of its environment: No module named 'numpy'; "),
+            "{stderr}"
         );
         assert!(
-            said.contains("pip install numpy, or name another interpreter: GLEANER_PYTHON"),
-            "{said}"
+            stderr.contains("pip install numpy, or name another interpreter: GLEANER_PYTHON"),
+            "{stderr}"
         );
     }
 }
 
 #[test]
 fn an_environment_that_is_not_used_is_named_with_the_way_out() {
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     copy_lambda("tests/lambdas/misbehave/python", &folder, "lambda", |manifest| manifest);
     let lambda = folder.path().join("lambda");
-    let python = Parts::find().and_then(|parts| parts.python(None)).expect("there is a Python");
+    let python = Parts::find().and_then(|parts| parts.python(None)).expect("Python is installed");
     let environment = ["-m", "venv", "--copies", "--without-pip", ".venv"];
     assert!(
         Command::new(python)
@@ -123,25 +123,33 @@ fn an_environment_that_is_not_used_is_named_with_the_way_out() {
         .arg("check")
         .arg(&lambda)
         .output()
-        .expect("it starts");
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains("warning: the lambda's environment is not used"), "{said}");
-    assert!(said.contains("make the environment with `python3 -m venv`, which links"), "{said}");
+        .expect("the program starts");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(stderr.contains("warning: the lambda's environment is not used"), "{stderr}");
+    assert!(
+        stderr.contains("create the environment with `python3 -m venv`, which uses links"),
+        "{stderr}"
+    );
 }
 
 #[test]
-fn a_lambda_whose_file_is_a_pipe_is_refused_and_not_waited_for() {
-    let folder = Folder::new();
+fn a_lambda_whose_file_is_a_pipe_is_refused_without_waiting() {
+    let folder = TempFolder::new();
     copy_lambda("tests/lambdas/misbehave/python", &folder, "lambda", |manifest| manifest);
     let entry = folder.path().join("lambda/build/main.py");
     std::fs::remove_file(&entry).unwrap();
-    assert!(Command::new("mkfifo").arg(&entry).status().expect("there is a `mkfifo`").success());
-    let output =
-        runtime().arg("check").arg(folder.path().join("lambda")).output().expect("it starts");
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(Command::new("mkfifo").arg(&entry).status().expect("`mkfifo` exists").success());
+    let output = runtime()
+        .arg("check")
+        .arg(folder.path().join("lambda"))
+        .output()
+        .expect("the program starts");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{stderr}");
     assert!(
-        said.contains("main.py`\n  cause: it is no file\n  help:  put a file in its place"),
-        "{said}"
+        stderr.contains(
+            "main.py`\n  cause: it is not a regular file\n  help:  put a file in its place"
+        ),
+        "{stderr}"
     );
 }

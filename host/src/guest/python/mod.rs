@@ -11,7 +11,7 @@ use std::process::Command;
 
 use gleaner_base::{Exit, Explain};
 use gleaner_jail::cgroup::CGROUP_ENV;
-use gleaner_parts::{Looked, Parts, PartsError};
+use gleaner_parts::{Parts, PartsError, RejectedPython};
 use gleaner_protocol::LAYERS_ENV;
 
 use crate::isolation::{self, SandboxPermissions};
@@ -69,10 +69,10 @@ fn interpreter(
     mut permissions: SandboxPermissions,
 ) -> Result<(PathBuf, Command), PartsError> {
     let parts = Parts::find()?;
-    let (python, unused) = parts.python_or_why(Some(lambda_dir))?;
-    if let Some(Looked { at, why }) = unused {
-        let instead = python.display();
-        tracing::warn!(environment = %at.display(), %why, %instead, "the lambda's environment is not used");
+    let (python, unused) = parts.python_and_unused_venv(Some(lambda_dir))?;
+    if let Some(RejectedPython { path, reason }) = unused {
+        let (environment, instead) = (path.display(), python.display());
+        tracing::warn!(%environment, %reason, %instead, "the lambda's environment is not used");
     }
     let mut command = Command::new(&python);
     // Isolated: neither PYTHONPATH nor the current folder decides what a lambda imports.

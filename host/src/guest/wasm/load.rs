@@ -8,8 +8,8 @@ use std::process::Command;
 
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_compile::{
-    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Entry, Found, Nans, make_cache,
-    read_component,
+    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CacheEntry, CacheLookup, CompileError, Nans,
+    make_cache, read_component,
 };
 use gleaner_parts::{Parts, PartsError};
 use sha2::{Digest, Sha256};
@@ -60,16 +60,19 @@ impl Explain for WasmError {
             Self::Compile(error) => error.help(),
             Self::Parts(error) => error.help(),
             Self::World { .. } => Some(
-                "build it against this version's SDK: implement `Lambda` and export it with `gleaner_sdk::lambda!`; \
+                "build it against this version's SDK: implement `Lambda` and export it with \
+                 `gleaner_sdk::lambda!`; \
                  a component may import `gleaner:lambda` and WASI 0.2, nothing else"
                     .to_owned(),
             ),
             Self::Compiler { help, .. } => help.clone(),
-            Self::Limit { .. } => {
-                Some("remove code that the lambda does not need, or move data to files of a model".to_owned())
-            }
+            Self::Limit { .. } => Some(
+                "remove code that the lambda does not need, or move data to files of a model"
+                    .to_owned(),
+            ),
             Self::Load { path, .. } => Some(format!(
-                "start again; if that does not help, delete the file, which will be created again: rm '{}'",
+                "start again; if that does not help, delete the file, which will be created again: \
+                 rm '{}'",
                 path.display()
             )),
             Self::Start { .. } => None,
@@ -111,11 +114,11 @@ impl Loaded {
     ) -> Result<Self, WasmError> {
         let component = read_component(path)?;
         let engine = gleaner_compile::engine(stack_bytes, nans)?;
-        let entry = Entry::of(cache, &component, nans);
+        let entry = CacheEntry::of(cache, &component, nans);
         let code = native_code(&entry, path, cache, nans)?;
-        // SAFETY: these bytes are in this process's memory. `Entry::read` found that their digest
-        // is the one that `gleaner-compile` wrote for this component, engine and CPU, in a file and
-        // below folders to which only this user or root may write.
+        // SAFETY: these bytes are in this process's memory. `CacheEntry::read` found that their
+        // digest is the one that `gleaner-compile` wrote for this component, engine and CPU, in a
+        // file and below folders to which only this user or root may write.
         let code = unsafe { Component::deserialize(&engine, &code) }.map_err(|source| {
             WasmError::Load { path: entry.path().to_owned(), source: source.into() }
         })?;
@@ -160,23 +163,32 @@ impl Loaded {
 }
 
 /// Returns the code in `entry`, and compiles it first if it is missing or damaged.
-fn native_code(entry: &Entry, path: &Path, cache: &Path, nans: Nans) -> Result<Vec<u8>, WasmError> {
+fn native_code(
+    entry: &CacheEntry,
+    path: &Path,
+    cache: &Path,
+    nans: Nans,
+) -> Result<Vec<u8>, WasmError> {
     make_cache(cache)?;
     match entry.read()? {
-        Found::Code(code) => return Ok(code),
-        Found::Nothing => {}
-        Found::Damaged(why) => {
+        CacheLookup::Code(code) => return Ok(code),
+        CacheLookup::Nothing => {}
+        CacheLookup::Damaged(why) => {
             let file = entry.path().display();
-            tracing::warn!(%file, %why, "native code in the cache is damaged; compiling the component again");
+            tracing::warn!(
+                %file,
+                %why,
+                "native code in the cache is damaged; compiling the component again"
+            );
         }
     }
     compile(path, cache, nans)?;
     let why = match entry.read()? {
-        Found::Code(code) => return Ok(code),
-        Found::Nothing => {
+        CacheLookup::Code(code) => return Ok(code),
+        CacheLookup::Nothing => {
             "the code is missing: the component or the cache was changed meanwhile".to_owned()
         }
-        Found::Damaged(why) => format!("the code was just written, and {why}"),
+        CacheLookup::Damaged(why) => format!("the code was just written, and {why}"),
     };
     Err(WasmError::Load { path: entry.path().to_owned(), source: why.into() })
 }
@@ -205,7 +217,7 @@ fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
     if let Some(signal) = output.status.signal() {
         // Ended by a signal: it ran into its limits.
         let memory = COMPILE_MEMORY_BYTES >> 20;
-        let said = match signal {
+        let text = match signal {
             libc::SIGXCPU => {
                 format!("compiling takes more than {COMPILE_CPU_SECONDS} s of CPU time")
             }
@@ -216,13 +228,13 @@ fn compile(path: &Path, cache: &Path, nans: Nans) -> Result<(), WasmError> {
         };
         return Err(WasmError::Limit {
             path: path.to_owned(),
-            source: CompilerMessage { text: said, source: None },
+            source: CompilerMessage { text, source: None },
         });
     }
-    let said = String::from_utf8_lossy(&output.stderr);
+    let stderr = String::from_utf8_lossy(&output.stderr);
     let exit = output.status.code().and_then(Exit::from_code).unwrap_or(Exit::Internal);
-    let Failure { exit, message, causes, help } = Failure::parse(&said, exit)
-        .unwrap_or_else(|| Failure::new(exit, format!("gleaner-compile: {}", said.trim())));
+    let Failure { exit, message, causes, help } = Failure::parse(&stderr, exit)
+        .unwrap_or_else(|| Failure::new(exit, format!("gleaner-compile: {}", stderr.trim())));
     let chain = |source, text| Some(Box::new(CompilerMessage { text, source }));
     Err(WasmError::Compiler {
         message,
