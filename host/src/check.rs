@@ -134,8 +134,9 @@ fn topics(
         })?;
         if text.is_none() {
             notes.push(format!(
-                "no definition of `{type_name}`, of input `{}`, is on this machine: `init` was not run. Its .msg files may lie in msg/ beside \
-                 lambda.toml; a drive or the node that writes the topic brings its own",
+                "no definition of `{type_name}`, of input `{}`, is on this machine: `init` was not \
+                 run. Put its .msg files into msg/ beside lambda.toml; a drive or the node that \
+                 writes the topic brings its own",
                 input.name
             ));
         }

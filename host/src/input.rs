@@ -106,7 +106,7 @@ pub fn open_inputs(
     let limits = &manifest.limits;
     let frames = usize::try_from(limits.frames).unwrap_or(usize::MAX);
     let shared = SharedLimits {
-        made: Budget::new(frames, limits.memory.as_usize()),
+        budget: Budget::new(frames, limits.memory.as_usize()),
         per_call: PerCall::new(limits),
         query_until: Instant::now() + QUERY_TIMEOUT,
     };
@@ -121,7 +121,7 @@ pub fn open_inputs(
 struct SharedLimits {
     /// Deadline of type queries to other nodes.
     query_until: Instant,
-    made: Budget,
+    budget: Budget,
     per_call: PerCall,
 }
 
@@ -153,7 +153,7 @@ fn open_input(
         Some(bytes) => Some(pool(input, input.decoded_slots(), bytes.as_usize())?),
         None => None,
     };
-    let images = (Images::new(decoded, shared.made.clone()), shared.per_call.clone());
+    let images = (Images::new(decoded, shared.budget.clone()), shared.per_call.clone());
     let arrivals = Arc::new(Arrivals::new(input.depth + spare));
     let ingest = Arc::new(Ingest {
         fill: Mutex::new(RingFill { ring: writer, copied: None }),
@@ -181,7 +181,8 @@ fn open_input(
     let definitions = match found {
         Ok(definitions) => Some(definitions),
         Err(TransportError::NoDefinitions { type_name, .. }) => {
-            warn!(input = %input.name, r#type = %type_name, "no message definitions: fields of this input cannot be read");
+            let input = &input.name;
+            warn!(%input, r#type = %type_name, "no message definitions: fields cannot be read");
             None
         }
         Err(error) => return Err(subscribe(error)),
@@ -332,13 +333,21 @@ impl Ingest {
         let Some(samples) = refusals.lock().unwrap_or_else(PoisonError::into_inner).due() else {
             return;
         };
+        let (input, topic) = (&self.input, &self.topic);
         match refusal {
             DraftError::NoSlot => {
-                warn!(input = %self.input, topic = %self.topic, samples, "samples dropped: the lambda holds all slots");
+                warn!(%input, %topic, samples, "samples dropped: the lambda holds all slots");
             }
             DraftError::TooBig { len, max } => {
-                let topic = &self.topic;
-                warn!(input = %self.input, %topic, samples, bytes = len, max_size = max, "samples dropped: larger than max_size");
+                let (bytes, max_size) = (len, max);
+                warn!(
+                    %input,
+                    %topic,
+                    samples,
+                    bytes,
+                    max_size,
+                    "samples dropped: larger than max_size"
+                );
             }
         }
     }

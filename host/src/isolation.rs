@@ -55,7 +55,7 @@ impl Isolation {
         let pulse =
             Pulse::inherited().map_err(|error| failed("cannot use the shim's page", &error))?;
         let has_shim = std::env::var_os(PULSE_ENV).is_some();
-        end_with_starter(if has_shim { Signal::KILL } else { Signal::TERM })?;
+        die_with_parent(if has_shim { Signal::KILL } else { Signal::TERM })?;
         Ok(Self {
             permissions,
             pulse,
@@ -142,7 +142,7 @@ impl Isolation {
 /// # Errors
 ///
 /// A failure if the system refuses it.
-pub fn end_with_starter(signal: Signal) -> Result<(), Failure> {
+pub fn die_with_parent(signal: Signal) -> Result<(), Failure> {
     set_parent_process_death_signal(Some(signal)).map_err(|error| {
         let error = std::io::Error::from(error);
         Failure::caused_by(Exit::Internal, "cannot make this process end with its parent", &error)

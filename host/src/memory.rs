@@ -15,7 +15,7 @@ use rustix::mm::{MapFlags, ProtFlags, mmap_anonymous, munmap};
 
 /// Makes the allocator map each large block and unmap it when it is freed, which is also its
 /// initial behaviour. Call it once, at the start of a program.
-pub fn give_large_blocks_back() {
+pub fn map_large_blocks() {
     #[cfg(target_env = "gnu")]
     // SAFETY: `mallopt` takes two numbers by value and locks what it changes. It fails only for an
     // unknown parameter, and then nothing has changed.
@@ -25,7 +25,7 @@ pub fn give_large_blocks_back() {
 }
 
 /// Returns freed memory that the allocator keeps to the system.
-pub fn give_freed_back() {
+pub fn trim_heap() {
     #[cfg(target_env = "gnu")]
     // SAFETY: `malloc_trim` takes a number by value, and locks what it releases, which is unused.
     unsafe {

@@ -56,11 +56,11 @@ struct Cli {
 enum RuntimeCommand {
     /// Runs a built lambda over recorded drives.
     Replay(ReplayArgs),
-    /// Makes the decisions in a clip again and compares.
+    /// Reproduces the decisions in a clip and compares.
     Verify(VerifyArgs),
     /// Runs the `init` of a built lambda, and reports what it will need.
     Check(CheckArgs),
-    /// MessageSender what is in recorded drives.
+    /// Reports the content of recorded drives.
     Inspect(InspectArgs),
     /// Runs a built lambda on live topics, until SIGTERM.
     #[cfg(feature = "dds")]
@@ -243,7 +243,7 @@ fn run_any(job: RuntimeJob, is_worker: bool) -> Result<Exit, Failure> {
     #[allow(unused_variables, reason = "used only with the feature `python`")]
     let (lambda, manifest) = job.lambda();
     #[allow(unused_variables, reason = "the same")]
-    let around = job.start_permissions(is_worker)?;
+    let permissions = job.start_permissions(is_worker)?;
     match manifest.lambda.kind {
         #[cfg(feature = "wasm")]
         LambdaKind::Wasm => run(job, &mut wasm::load),
@@ -252,7 +252,8 @@ fn run_any(job: RuntimeJob, is_worker: bool) -> Result<Exit, Failure> {
         #[cfg(feature = "python")]
         LambdaKind::Python => {
             let args = std::env::args_os().collect::<Vec<_>>();
-            let error = crate::guest::python::become_interpreter(&lambda.folder, &args, around);
+            let error =
+                crate::guest::python::become_interpreter(&lambda.folder, &args, permissions);
             Err(Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error))
         }
         #[allow(unreachable_patterns)]
@@ -266,7 +267,7 @@ fn run_any(job: RuntimeJob, is_worker: bool) -> Result<Exit, Failure> {
 /// Runs `job` except for the part that its worker runs.
 #[cfg(feature = "python")]
 fn run_with_worker(job: RuntimeJob) -> Result<Exit, Failure> {
-    isolation::end_with_starter(Signal::TERM)?;
+    isolation::die_with_parent(Signal::TERM)?;
     // The worker is in the control group of this process.
     let group = cgroup::limit_memory(job.permissions(false).all);
     let packed = if let RuntimeJob::Replay(job) = &job { Some(job.packed()) } else { None };
@@ -313,12 +314,14 @@ fn work(job: RuntimeJob, load: Load<'_>) -> Result<Exit, Failure> {
     if reports.is_ready() { Ok(ended.unwrap_or(Exit::Ok)) } else { ended }
 }
 
-/// Has the guests that `load` makes entered only once this process is sandboxed.
+/// A loaded guest, or the reason why there is none.
+type GuestResult = Result<Box<dyn Guest>, Failure>;
+
+/// Wraps the guests that `load` creates: the process is sandboxed before the first call.
 fn sandboxed<'a>(
     load: Load<'a>,
     isolation: &'a Arc<Isolation>,
-) -> impl FnMut(&ConfiguredLambda, &Manifest, Session, RunMode) -> Result<Box<dyn Guest>, Failure> + 'a
-{
+) -> impl FnMut(&ConfiguredLambda, &Manifest, Session, RunMode) -> GuestResult + 'a {
     move |lambda, manifest, session, mode| {
         let limits = &manifest.limits;
         let timeouts = match mode {
@@ -361,7 +364,7 @@ mod wasm {
         };
         let cache = gleaner_parts::cache_dir().map_err(|error| cannot(&error.into()))?;
         let limits = &manifest.limits;
-        let nans = if manifest.lambda.deterministic { Nans::Canonical } else { Nans::AsMade };
+        let nans = if manifest.lambda.deterministic { Nans::Canonical } else { Nans::Native };
         let loaded =
             Loaded::open(&lambda.build.entry_path(manifest), &cache, limits.stack.as_usize(), nans)
                 .map_err(|error| cannot(&error))?;
@@ -381,7 +384,7 @@ mod wasm {
 }
 
 fn prepare() {
-    crate::memory::give_large_blocks_back();
+    crate::memory::map_large_blocks();
     gleaner_vitals::log::init();
 }
 

@@ -127,7 +127,7 @@ impl Topic {
             n.min(self.per_call.clamps().samples()).min(self.depth),
             &mut leases,
         );
-        self.hand_out(leases)
+        self.samples_of(leases)
     }
 
     /// Returns the samples received later than `since_ns`, oldest first; at most as many of the
@@ -145,10 +145,10 @@ impl Topic {
             |meta| meta.at_ns > since_ns,
             &mut leases,
         );
-        self.hand_out(leases)
+        self.samples_of(leases)
     }
 
-    fn hand_out(
+    fn samples_of(
         self: &Arc<Self>,
         leases: Vec<Lease<SampleMeta>>,
     ) -> Result<Vec<Sample>, OutOfFuel> {

@@ -105,7 +105,7 @@ impl Frame {
             stamps: sample.stamps(),
         };
         let picture = sample.picture()?;
-        let taken = source.topic.images.made.take(0)?;
+        let taken = source.topic.images.budget.take(0)?;
         match picture {
             ImageMessage::Raw(raw) => Self::raw(source, sample, &raw, taken),
             ImageMessage::Compressed(compressed) => {
@@ -199,7 +199,7 @@ impl Frame {
                 PixelOperation::ToGray => ops::work(&view, None).map(|bytes| GRAY * bytes),
                 PixelOperation::Resize(width, height) => ops::resized(&view, width, height)
                     .and_then(|(_, bytes)| {
-                        let has_room = self.source.topic.images.made.has(bytes);
+                        let has_room = self.source.topic.images.budget.has(bytes);
                         if has_room { ops::resize_work(&view, width, height) } else { Ok(0) }
                     }),
             };
@@ -305,10 +305,10 @@ impl Paid<'_> {
     ) -> Result<Frame, DataError> {
         let source = self.0.source.clone();
         let len = info.step as usize * info.height as usize;
-        let taken = source.topic.images.made.take(len)?;
+        let taken = source.topic.images.budget.take(len)?;
         let mut bytes = vec![0; len].into_boxed_slice();
         self.work(|view| fill(view, &mut bytes))?;
-        Ok(Frame { source, info, pixels: SharedBytes::made(bytes), _taken: taken })
+        Ok(Frame { source, info, pixels: SharedBytes::owned(bytes), _taken: taken })
     }
 }
 

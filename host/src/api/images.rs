@@ -16,7 +16,7 @@ const DECODE: usize = 40;
 /// created ones.
 pub struct Images {
     pub(super) decoded: Option<Pool<Info>>,
-    pub(super) made: Budget,
+    pub(super) budget: Budget,
     /// The newest decoded image, so that each is decoded once.
     pub(super) newest: Mutex<Option<(u64, Lease<Info>)>>,
     pub(super) decode_ns: AtomicU64,
@@ -24,9 +24,9 @@ pub struct Images {
 
 impl Images {
     /// `decoded` holds decoded JPEG and PNG (`None` for raw images). All inputs of a lambda share
-    /// `made`.
-    pub fn new(decoded: Option<Pool<Info>>, made: Budget) -> Self {
-        Self { decoded, made, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
+    /// `budget`.
+    pub fn new(decoded: Option<Pool<Info>>, budget: Budget) -> Self {
+        Self { decoded, budget, newest: Mutex::new(None), decode_ns: AtomicU64::new(0) }
     }
 
     /// Work of decoding `data` in bytes, estimated by its header; 0 if it is the newest decoded

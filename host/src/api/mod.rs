@@ -173,7 +173,7 @@ impl Session {
     }
 
     fn lock(&self) -> MutexGuard<'_, SessionState> {
-        // No call leaves the state half changed, so after a panic at worst a list is shorter.
+        // No call leaves the state half changed: after a panic, a list may be shorter at worst.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -24,7 +24,7 @@ enum BytesOwner {
     /// A slot for decoded pictures.
     Decoded(Lease<Info>),
     /// Own memory. Boxed twice, since an `Arc<[u8]>` would need a copy.
-    Made(Arc<Box<[u8]>>),
+    Owned(Arc<Box<[u8]>>),
 }
 
 impl SharedBytes {
@@ -39,8 +39,8 @@ impl SharedBytes {
     }
 
     /// All of `bytes`.
-    pub(super) fn made(bytes: Box<[u8]>) -> Self {
-        Self { len: bytes.len(), start: 0, owner: BytesOwner::Made(Arc::new(bytes)) }
+    pub(super) fn owned(bytes: Box<[u8]>) -> Self {
+        Self { len: bytes.len(), start: 0, owner: BytesOwner::Owned(Arc::new(bytes)) }
     }
 
     /// Returns `len` bytes from `offset`, clamped to its length.
@@ -57,7 +57,7 @@ impl Deref for SharedBytes {
         let whole: &[u8] = match &self.owner {
             BytesOwner::Message(lease) => lease,
             BytesOwner::Decoded(lease) => lease,
-            BytesOwner::Made(bytes) => bytes,
+            BytesOwner::Owned(bytes) => bytes,
         };
         &whole[self.start..self.start + self.len]
     }
@@ -75,7 +75,7 @@ mod tests {
 
     #[test]
     fn a_part_is_clamped_to_the_length() {
-        let whole = SharedBytes::made((0..10).collect());
+        let whole = SharedBytes::owned((0..10).collect());
         for (offset, len, expected) in [
             (0, 10, &[0, 1, 2, 3, 4, 5, 6, 7, 8, 9][..]),
             (8, 5, &[8, 9]),
@@ -89,7 +89,7 @@ mod tests {
 
     #[test]
     fn a_part_of_a_part_is_relative_to_it_and_outlives_the_whole() {
-        let whole = SharedBytes::made((0..10).collect());
+        let whole = SharedBytes::owned((0..10).collect());
         let part = whole.part(4, 4);
         drop(whole);
         let last = part.part(2, 100);

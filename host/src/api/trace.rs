@@ -40,7 +40,7 @@ struct Sums {
 }
 
 impl Arrivals {
-    /// Sums of a ring of `depth`, which is still empty.
+    /// Creates the sums of a ring of `depth`, which must still be empty.
     pub fn new(depth: usize) -> Self {
         Self {
             is_enabled: AtomicBool::new(false),

@@ -105,7 +105,7 @@ impl Session {
         let state = &mut *self.lock();
         let caused = state.triggers.cause(
             state.now_ns,
-            as_asked(kind),
+            rule_kind(kind),
             (label, score),
             attributes,
             |attributes| {
@@ -120,7 +120,7 @@ impl Session {
     }
 }
 
-fn as_asked(kind: TriggerKind) -> Kind {
+fn rule_kind(kind: TriggerKind) -> Kind {
     match kind {
         TriggerKind::Event => Kind::Event,
         TriggerKind::Start => Kind::Start,

@@ -49,7 +49,8 @@ impl Meter {
             let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
             let (has, may) = (mib(used), mib(self.share.most));
             let message = format!(
-                "the lambda has {has:.1} MiB more than before its init; `memory` in [limits] allows {may:.1} MiB"
+                "the lambda has {has:.1} MiB more than before its init; `memory` in [limits] \
+                 allows {may:.1} MiB"
             );
             let (used, allowed) = (Some(used), Some(self.share.most));
             Fault { kind: FaultKind::Memory, message, used, allowed }

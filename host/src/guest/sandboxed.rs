@@ -49,7 +49,7 @@ pub struct SandboxedGuest {
     meter: Option<Meter>,
     is_prepared: bool,
     /// Set if the next wake begins with an `init`.
-    is_new: bool,
+    needs_init: bool,
 }
 
 impl SandboxedGuest {
@@ -61,12 +61,20 @@ impl SandboxedGuest {
         timeouts: KillTimeouts,
         memory: Option<u64>,
     ) -> Self {
-        Self { guest, isolation, timeouts, memory, meter: None, is_prepared: false, is_new: false }
+        Self {
+            guest,
+            isolation,
+            timeouts,
+            memory,
+            meter: None,
+            is_prepared: false,
+            needs_init: false,
+        }
     }
 }
 
 /// The fault of a guest that returned without one but uses too much memory. It is discarded.
-fn excess(guest: &mut dyn Guest, meter: &mut Option<Meter>) -> Option<Fault> {
+fn memory_fault(guest: &mut dyn Guest, meter: &mut Option<Meter>) -> Option<Fault> {
     let fault = meter.as_mut()?.fault();
     if fault.is_some() {
         guest.discard();
@@ -102,7 +110,7 @@ impl Guest for SandboxedGuest {
         }
         let _busy = self.isolation.pulse().busy(Phase::Init, self.timeouts.init, 0);
         self.guest.init()?;
-        match excess(&mut *self.guest, &mut self.meter) {
+        match memory_fault(&mut *self.guest, &mut self.meter) {
             Some(fault) => Err(Fault { message: format!("in init: {}", fault.message), ..fault }),
             None => Ok(()),
         }
@@ -110,16 +118,16 @@ impl Guest for SandboxedGuest {
 
     fn wake(&mut self, wake: Wake) -> WakeOutcome {
         let KillTimeouts { init, wake: timeouts } = self.timeouts;
-        let timeouts = if self.is_new { timeouts.saturating_add(init) } else { timeouts };
+        let timeouts = if self.needs_init { timeouts.saturating_add(init) } else { timeouts };
         let busy = self.isolation.pulse().busy(Phase::Wake, timeouts, wake.at_ns());
         let mut outcome = self.guest.wake(wake);
         if outcome.result.is_ok()
-            && let Some(fault) = excess(&mut *self.guest, &mut self.meter)
+            && let Some(fault) = memory_fault(&mut *self.guest, &mut self.meter)
         {
             outcome.result = Err(fault);
         }
         drop(busy);
-        self.is_new = outcome.result.is_err();
+        self.needs_init = outcome.result.is_err();
         outcome
     }
 

@@ -58,7 +58,7 @@ pub struct LambdaIdentity<'a> {
 }
 
 impl LambdaIdentity<'_> {
-    /// The first block of a journal.
+    /// Builds the header of a journal.
     ///
     /// # Errors
     ///

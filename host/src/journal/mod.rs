@@ -1,4 +1,4 @@
-//! Builds the journal entry of each wake, from which the decision can be made again and compared.
+//! Builds the journal entry of each wake, from which the decision can be reproduced.
 //! The format is `gleaner_journal`.
 
 mod identity;

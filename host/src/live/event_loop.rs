@@ -46,11 +46,11 @@ pub(super) struct LiveEventLoop {
 impl LiveEventLoop {
     /// Runs until `stop` is set.
     pub(super) fn run(&mut self, stop: &AtomicBool) -> Result<(), Failure> {
-        let mut looked = self.clock.now();
+        let mut last_round = self.clock.now();
         loop {
             let now = self.clock.now();
-            if now.saturating_sub(looked) >= nanoseconds(ROUND) {
-                looked = now;
+            if now.saturating_sub(last_round) >= nanoseconds(ROUND) {
+                last_round = now;
                 if stop.load(Ordering::Relaxed) {
                     return Ok(());
                 }
@@ -67,7 +67,7 @@ impl LiveEventLoop {
                 .schedule
                 .next_due()
                 .unwrap_or(i64::MAX)
-                .min(looked.saturating_add(nanoseconds(ROUND)));
+                .min(last_round.saturating_add(nanoseconds(ROUND)));
             // If this thread was unparked meanwhile, this returns at once.
             thread::park_timeout(Duration::from_nanos(
                 u64::try_from(due.saturating_sub(now)).unwrap_or(0),

@@ -144,8 +144,8 @@ impl LiveRun<'_> {
         results.page(&ResultItem::Woken(WokenBy::schedule_of(&manifest)));
         results.report(Report::Isolation { layers: close()? });
         let initialised = guest.init();
-        let (said, _) = session.take_log();
-        results.log(said);
+        let (init_log, _) = session.take_log();
+        results.log(init_log);
         if let Err(fault) = initialised {
             // Its log may explain the fault.
             results.finish(None)?;

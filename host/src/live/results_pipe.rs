@@ -44,8 +44,10 @@ impl ResultsPipe {
         let cannot =
             |error: &io::Error| Failure::caused_by(Exit::Internal, "cannot send results", error);
         let pipe = inherited(RESULTS_ENV).map_err(|error| cannot(&error))?.ok_or_else(|| {
-            Failure::new(Exit::Usage, "no process writes the results of this process")
-                .with_help("start it with `gleaner run`, or with `gleaner-shim --results DIR -- gleaner-runtime run`")
+            Failure::new(Exit::Usage, "no process writes the results of this process").with_help(
+                "start it with `gleaner run`, or with `gleaner-shim --results DIR -- \
+                     gleaner-runtime run`",
+            )
         })?;
         let found = fstat(&pipe).map_err(|error| cannot(&error.into()))?;
         if FileType::from_raw_mode(found.st_mode) != FileType::Fifo {
@@ -95,7 +97,10 @@ impl ResultsPipe {
                 Err(error) => {
                     let lines = self.waiting.iter().filter(|byte| **byte == b'\n').count() as u64;
                     if self.unwritten == 0 {
-                        tracing::error!(%error, "cannot send results to gleaner-shim; they are counted as not written");
+                        tracing::error!(
+                            %error,
+                            "cannot send results to gleaner-shim; counted as not written"
+                        );
                     }
                     self.unwritten += lines;
                     self.waiting.clear();
@@ -131,12 +136,12 @@ impl ResultsPipe {
         }
     }
 
-    /// ResultsPipe that did not fit, here, and those that the shim could not write.
+    /// Number of items that did not fit here, or that the shim could not write.
     pub(super) fn unwritten(&self) -> u64 {
         self.unwritten.saturating_add(self.pulse.unwritten())
     }
 
-    /// ResultsPipe that did not fit.
+    /// Number of items that did not fit here.
     pub(super) fn unsent(&self) -> u64 {
         self.unwritten
     }

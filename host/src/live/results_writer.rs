@@ -25,11 +25,11 @@ pub(super) struct ResultsWriter {
     /// Set if decisions without trigger and fault are results, too.
     all: bool,
     reports: SyncSender<Report>,
-    speaker: JoinHandle<()>,
+    report_thread: JoinHandle<()>,
 }
 
 impl ResultsWriter {
-    /// Hands results to `pages`, and writes reports to `reports`. With `all`, decisions without
+    /// Sends results to `pages`, and writes reports to `reports`. With `all`, decisions without
     /// trigger and fault are results, too.
     pub(super) fn start(
         pages: ResultsPipe,
@@ -37,10 +37,11 @@ impl ResultsWriter {
         reports: impl Write + Send + 'static,
     ) -> Result<Self, Failure> {
         let cannot = |error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
-        let (say, said) = mpsc::sync_channel(REPORTS);
-        let speaker = thread::Builder::new().name("gleaner-report".to_owned());
-        let speaker = speaker.spawn(move || speak(&said, reports)).map_err(cannot)?;
-        Ok(Self { pages, all, reports: say, speaker })
+        let (sender, receiver) = mpsc::sync_channel(REPORTS);
+        let report_thread = thread::Builder::new().name("gleaner-report".to_owned());
+        let report_thread =
+            report_thread.spawn(move || write_reports(&receiver, reports)).map_err(cannot)?;
+        Ok(Self { pages, all, reports: sender, report_thread })
     }
 
     /// Adds a decision. One with a trigger or a fault is reported, too, after it was sent to the
@@ -67,7 +68,7 @@ impl ResultsWriter {
         for line in lines {
             self.pages.add(&ResultItem::Log(line));
         }
-        // They may say why this process ends in the next wake.
+        // They may explain a crash of this process in the next wake.
         self.pages.send();
     }
 
@@ -82,7 +83,7 @@ impl ResultsWriter {
         self.pages.send();
     }
 
-    /// Sends a report, unless the starter does not read.
+    /// Sends a report, unless the parent does not read.
     pub(super) fn report(&mut self, report: Report) {
         let _ = self.reports.try_send(report);
     }
@@ -98,7 +99,7 @@ impl ResultsWriter {
     ///
     /// A failure if results do not reach the shim.
     pub(super) fn finish(self, last: Option<LiveStatus>) -> Result<(), Failure> {
-        let Self { mut pages, reports, speaker, .. } = self;
+        let Self { mut pages, reports, report_thread, .. } = self;
         if let Some(last) = &last {
             // The shim adds its own count.
             pages.add(&ResultItem::Last(Box::new(LiveStatus {
@@ -106,7 +107,7 @@ impl ResultsWriter {
                 ..last.clone()
             })));
         }
-        // Here it may take its time: nothing runs any more.
+        // The lambda no longer runs, so this may block.
         let finished = pages.finish(Instant::now() + LAST_RESULTS);
         let deadline = Instant::now() + LAST_REPORT;
         if let Some(last) = last {
@@ -121,18 +122,18 @@ impl ResultsWriter {
             }
         }
         drop(reports);
-        while !speaker.is_finished() && Instant::now() < deadline {
+        while !report_thread.is_finished() && Instant::now() < deadline {
             thread::sleep(Duration::from_millis(5));
         }
         finished
     }
 }
 
-fn speak(said: &Receiver<Report>, mut reports: impl Write) {
-    while let Ok(report) = said.recv() {
+fn write_reports(receiver: &Receiver<Report>, mut reports: impl Write) {
+    while let Ok(report) = receiver.recv() {
         let Ok(mut line) = serde_json::to_string(&report) else { continue };
         line.push('\n');
-        // The parent may have gone; the results are in files.
+        // The parent may have ended; the results are in files.
         let _ = reports.write_all(line.as_bytes());
     }
 }

@@ -2,10 +2,10 @@
 //! to a decision.
 //!
 //! `sensor_msgs/msg/TimeReference`, a type that every ROS 2 has: `header.stamp` is that of the
-//! waking message (its receive stamp where it has none; for a tick, when it was due), `time_ref` is
-//! when the decision was out, `source` is `LAMBDA:WAKE:TRIGGERS` with the labels of the triggers in
-//! between commas. Both stamps are of CLOCK_MONOTONIC if the message's is, as with `gleaner play
-//! --stamp monotonic`.
+//! waking message (its receive stamp where it has none; for a tick, its due time), `time_ref` is
+//! the time at which the decision was sent, `source` is `LAMBDA:WAKE:TRIGGERS` with the labels of
+//! the triggers in between commas. Both stamps are of CLOCK_MONOTONIC if the message's is, as with
+//! `gleaner play --stamp monotonic`.
 
 use gleaner_base::Failure;
 use gleaner_lambda::Decision;

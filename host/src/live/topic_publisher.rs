@@ -36,7 +36,8 @@ impl TopicPublisher {
         if let Err(error) = self.publisher.publish(self.message.bytes()) {
             self.unsent += 1;
             if self.unsent.is_power_of_two() {
-                tracing::warn!(topic = %self.topic, unsent = self.unsent, %error, "message not sent");
+                let (topic, unsent) = (&self.topic, self.unsent);
+                tracing::warn!(%topic, unsent, %error, "message not sent");
             }
         }
     }

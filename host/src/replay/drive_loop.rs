@@ -23,12 +23,12 @@ pub(super) trait DriveHandler {
 /// First and last stamp of a drive in ns, both inclusive, over all its topics: ticks must not
 /// depend on the topics that are recorded. `None` if unknown.
 #[derive(Copy, Clone, Debug, Default)]
-pub(super) struct Span {
+pub(super) struct DriveSpan {
     pub(super) start_ns: Option<i64>,
     pub(super) end_ns: Option<i64>,
 }
 
-impl Span {
+impl DriveSpan {
     /// The span of this range of `drive`.
     pub(super) fn of(drive: &Replay, part: TimeRange) -> Self {
         let start_ns = drive
@@ -42,7 +42,7 @@ impl Span {
 }
 
 /// The end of a loop over a drive.
-pub(super) struct Reached {
+pub(super) struct LoopEnd {
     /// Stamp of the last sample; 0 if there was none.
     pub(super) at_ns: i64,
     /// The error that ended it before the end of the drive.
@@ -55,10 +55,10 @@ pub(super) struct Reached {
 /// run before the first later sample, and up to the end of the drive.
 pub(super) fn run(
     drive: &mut Replay,
-    span: Span,
+    span: DriveSpan,
     handler: &mut impl DriveHandler,
-) -> Result<Reached, Failure> {
-    let mut reached = Reached { at_ns: 0, broken: None, stopped: false };
+) -> Result<LoopEnd, Failure> {
+    let mut reached = LoopEnd { at_ns: 0, broken: None, stopped: false };
     if let Some(start_ns) = span.start_ns {
         handler.schedule().begin(start_ns);
     }

@@ -75,7 +75,7 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
         out_of_order += drive.out_of_order();
         damaged = damaged.or(broken);
     }
-    let mut topics: Vec<_> = topics.into_iter().map(TopicInspection::seen).collect();
+    let mut topics: Vec<_> = topics.into_iter().map(TopicInspection::into_info).collect();
     // A writer that numbers the messages of all topics together leaves gaps in each topic, one for
     // each message of the others.
     let (read, missing) = topics.iter().fold((0, 0), |(read, missing), topic| {
@@ -84,8 +84,8 @@ pub fn inspect(args: &InspectArgs, reports: &mut dyn Write) -> Result<Exit, Fail
     if missing > read / 2 {
         topics.iter_mut().for_each(|topic| topic.missing = None);
     }
-    let seen = DriveInfo { start_ns, end_ns, parts, out_of_order, damaged, topics, skipped };
-    super::report(reports, &Report::Drive(seen));
+    let info = DriveInfo { start_ns, end_ns, parts, out_of_order, damaged, topics, skipped };
+    super::report(reports, &Report::Drive(info));
     Ok(Exit::Ok)
 }
 
@@ -131,7 +131,7 @@ fn read(
         topic.begin();
         match drive.subscribe(&topic.spec(), topic.first.clone()) {
             Ok(subscription) => drop(subscribed.insert(subscription, index)),
-            Err(error) => topic.seen.unreadable = Some(error.to_string()),
+            Err(error) => topic.info.unreadable = Some(error.to_string()),
         }
     }
     let mut bytes = 0;
@@ -154,7 +154,7 @@ fn read(
 
 /// Statistics of one topic so far.
 struct TopicInspection {
-    seen: DriveTopicInfo,
+    info: DriveTopicInfo,
     first: Arc<FirstMessage>,
     /// Set from the second message on: most topics of a file may have none.
     intervals: Option<Durations>,
@@ -167,7 +167,7 @@ struct TopicInspection {
 impl TopicInspection {
     fn new(found: DiscoveredTopic) -> Self {
         let first = FirstMessage { type_name: found.type_name.clone(), picture: Mutex::new(None) };
-        let seen = DriveTopicInfo {
+        let info = DriveTopicInfo {
             topic: found.topic,
             type_name: found.type_name,
             messages: found.messages,
@@ -182,11 +182,11 @@ impl TopicInspection {
             picture: None,
         };
         let (first, gaps) = (Arc::new(first), Gaps::default());
-        Self { seen, first, intervals: None, longest_ns: -1, last_ns: None, gaps }
+        Self { info, first, intervals: None, longest_ns: -1, last_ns: None, gaps }
     }
 
     fn spec(&self) -> TopicSpec {
-        let DriveTopicInfo { topic, type_name, .. } = &self.seen;
+        let DriveTopicInfo { topic, type_name, .. } = &self.info;
         let (topic, type_name) = (topic.clone(), type_name.clone());
         TopicSpec { topic, type_name, queue: 1, max_bytes: LARGEST, qos: Qos::Auto }
     }
@@ -194,29 +194,29 @@ impl TopicInspection {
     /// Begins another part: the time between two parts is no gap.
     fn begin(&mut self) {
         self.last_ns = None;
-        self.seen.missing = self
-            .seen
+        self.info.missing = self
+            .info
             .missing
             .map(|missing| missing.saturating_add(std::mem::take(&mut self.gaps).lost()));
     }
 
     fn add(&mut self, step: &ReplayStep) {
-        self.seen.messages_read += 1;
-        self.seen.bytes += step.bytes as u64;
-        self.seen.largest_bytes = self.seen.largest_bytes.max(step.bytes as u64);
+        self.info.messages_read += 1;
+        self.info.bytes += step.bytes as u64;
+        self.info.largest_bytes = self.info.largest_bytes.max(step.bytes as u64);
         self.gaps.note(step.meta.writer, step.meta.seq);
         if let Some(last) = self.last_ns {
             let interval = step.at_ns.saturating_sub(last);
             self.intervals.get_or_insert_default().add(interval);
             if interval > self.longest_ns {
                 self.longest_ns = interval;
-                self.seen.longest_gap_at_ns = Some(last);
+                self.info.longest_gap_at_ns = Some(last);
             }
         }
         self.last_ns = Some(step.at_ns);
     }
 
-    fn seen(mut self) -> DriveTopicInfo {
+    fn into_info(mut self) -> DriveTopicInfo {
         self.begin();
         let picture = self.first.picture.lock().unwrap_or_else(PoisonError::into_inner).take();
         // The histogram keeps two digits, and no more than a day.
@@ -226,7 +226,7 @@ impl TopicInspection {
             .as_ref()
             .and_then(Durations::all)
             .map(|kept| DurationStats { max_ns, ..kept });
-        DriveTopicInfo { interval, picture: picture.flatten(), ..self.seen }
+        DriveTopicInfo { interval, picture: picture.flatten(), ..self.info }
     }
 }
 

@@ -25,10 +25,10 @@ pub struct ReplayArgs {
     /// MCAP files, databases and directories of rosbag2; several are merged by time.
     #[arg(required = true)]
     pub drives: Vec<PathBuf>,
-    /// Replay from this time on: seconds after the drive's start, or since 1970 behind an `@`.
+    /// Replay from this time on: seconds after the drive's start, or since 1970 after an `@`.
     #[arg(long, value_name = "TIME")]
     pub from: Option<DriveTime>,
-    /// Replay until before this time, given likewise.
+    /// Replay until before this time, in the same format.
     #[arg(long, value_name = "TIME")]
     pub to: Option<DriveTime>,
     /// Folder of the results; `DIR/out` if not given.
@@ -37,7 +37,7 @@ pub struct ReplayArgs {
     /// Write every decision, not only those with a trigger or a fault.
     #[arg(long)]
     pub all: bool,
-    /// Leave out the clips that the table `record` of the manifest asks for.
+    /// Write no clips, even if the manifest has a table `record`.
     #[arg(long)]
     pub no_record: bool,
     /// Record these topics of the drive in clips, instead of those of the manifest; a `*` stands
@@ -47,10 +47,11 @@ pub struct ReplayArgs {
     /// Write a journal of every wake.
     #[arg(long, value_name = "FILE")]
     pub journal: Option<PathBuf>,
-    /// Make every decision of this journal again and compare, instead of writing results.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["from", "to", "out", "all", "no_record", "journal", "repeat"])]
+    /// Reproduce every decision of this journal and compare, instead of writing results.
+    #[arg(long, value_name = "FILE", 
+        conflicts_with_all = ["from", "to", "out", "all", "no_record", "journal", "repeat"])]
     pub verify: Option<PathBuf>,
-    /// Replay so many times in this process, each time from the start.
+    /// Number of replays in this process, each from the start.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     pub repeat: u32,
 }
@@ -58,7 +59,7 @@ pub struct ReplayArgs {
 /// Arguments of `verify`.
 #[derive(Args, Clone, Debug)]
 pub struct VerifyArgs {
-    /// A clip, with the part of the journal that made it.
+    /// A clip, which contains its part of the journal.
     pub clip: PathBuf,
     /// The lambda's folder, built by `gleaner build`.
     #[arg(long, value_name = "DIR")]

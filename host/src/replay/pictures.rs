@@ -54,10 +54,10 @@ pub(super) struct TriggerPictures {
     wakes: u64,
     /// One of so many such wakes has a picture.
     every: u64,
-    made: Vec<Made>,
+    pictures: Vec<PendingPicture>,
 }
 
-struct Made {
+struct PendingPicture {
     wake: u64,
     at_ns: i64,
     topic: String,
@@ -69,7 +69,7 @@ impl TriggerPictures {
     /// Pictures of the first of `inputs` that has images, or else of `camera`.
     pub(super) fn new(inputs: &[Arc<Topic>], camera: Option<Arc<RecordedCamera>>) -> Self {
         let inputs = inputs.iter().filter(|topic| is_image(topic.type_name())).cloned().collect();
-        Self { inputs, camera, wakes: 0, every: 1, made: Vec::new() }
+        Self { inputs, camera, wakes: 0, every: 1, pictures: Vec::new() }
     }
 
     /// Number of wakes with a trigger so far.
@@ -84,19 +84,19 @@ impl TriggerPictures {
         }
         let wake = self.wakes;
         self.wakes += 1;
-        if self.made.len() >= Signals::PICTURES_MAX {
+        if self.pictures.len() >= Signals::PICTURES_MAX {
             self.every *= 2;
-            self.made.retain(|made| made.wake.is_multiple_of(self.every));
+            self.pictures.retain(|picture| picture.wake.is_multiple_of(self.every));
         }
         if wake.is_multiple_of(self.every)
-            && let Some(made) = self.make(wake, decision.at_ns)
+            && let Some(picture) = self.make(wake, decision.at_ns)
         {
-            self.made.push(made);
+            self.pictures.push(picture);
         }
     }
 
-    fn make(&self, wake: u64, at_ns: i64) -> Option<Made> {
-        let made = |topic: &str, image_ns, jpeg| Made {
+    fn make(&self, wake: u64, at_ns: i64) -> Option<PendingPicture> {
+        let picture = |topic: &str, image_ns, jpeg| PendingPicture {
             wake,
             at_ns,
             topic: topic.to_owned(),
@@ -110,19 +110,22 @@ impl TriggerPictures {
             let jpeg = self
                 .as_before(meta.at_ns)
                 .or_else(|| thumbnail(topic.type_name(), &lease, meta.endian));
-            return jpeg.map(|jpeg| made(topic.ros_topic(), meta.at_ns, jpeg));
+            return jpeg.map(|jpeg| picture(topic.ros_topic(), meta.at_ns, jpeg));
         }
         let camera = self.camera.as_ref()?;
         let newest = camera.newest.lock().unwrap_or_else(PoisonError::into_inner);
         let (meta, cdr) = newest.as_ref()?;
         let jpeg =
             self.as_before(meta.at_ns).or_else(|| thumbnail(&camera.type_name, cdr, meta.endian));
-        jpeg.map(|jpeg| made(&camera.topic, meta.at_ns, jpeg))
+        jpeg.map(|jpeg| picture(&camera.topic, meta.at_ns, jpeg))
     }
 
     /// The previous picture, if it is of the same image.
     fn as_before(&self, image_ns: i64) -> Option<Vec<u8>> {
-        self.made.last().filter(|made| made.image_ns == image_ns).map(|made| made.jpeg.clone())
+        self.pictures
+            .last()
+            .filter(|picture| picture.image_ns == image_ns)
+            .map(|picture| picture.jpeg.clone())
     }
 
     /// Writes the pictures below `out` and removes those of an earlier replay; also returns the
@@ -130,19 +133,21 @@ impl TriggerPictures {
     pub(super) fn write(self, out: &Path) -> Result<(Vec<TriggerPicture>, u64), OutputError> {
         let folder = out.join(FOLDER);
         remove(&folder)?;
-        let omitted = self.wakes - self.made.len() as u64;
-        if self.made.is_empty() {
+        let omitted = self.wakes - self.pictures.len() as u64;
+        if self.pictures.is_empty() {
             return Ok((Vec::new(), omitted));
         }
         safe_file::folder(&folder).map_err(|source| OutputError { path: folder, source })?;
-        let written = self.made.into_iter().map(|Made { at_ns, topic, image_ns, jpeg, wake }| {
-            let file = Path::new(FOLDER).join(format!("{PREFIX}{wake:06}.jpg"));
-            let path = out.join(&file);
-            // Always a new file: an existing one may be a link to another place.
-            let written = File::create_new(&path).and_then(|mut file| file.write_all(&jpeg));
-            written.map_err(|source| OutputError { path, source })?;
-            Ok(TriggerPicture { at_ns, topic, image_ns, file })
-        });
+        let written = self.pictures.into_iter().map(
+            |PendingPicture { at_ns, topic, image_ns, jpeg, wake }| {
+                let file = Path::new(FOLDER).join(format!("{PREFIX}{wake:06}.jpg"));
+                let path = out.join(&file);
+                // Always a new file: an existing one may be a link to another place.
+                let written = File::create_new(&path).and_then(|mut file| file.write_all(&jpeg));
+                written.map_err(|source| OutputError { path, source })?;
+                Ok(TriggerPicture { at_ns, topic, image_ns, file })
+            },
+        );
         Ok((written.collect::<Result<_, _>>()?, omitted))
     }
 }

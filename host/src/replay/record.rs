@@ -117,7 +117,10 @@ impl ReplayRecorder {
                 .ok()
                 .map(|at| &known[at]);
             if found.is_none() {
-                tracing::warn!(topic = %name, "clips are made without this topic of [record]: the drive does not have it");
+                tracing::warn!(
+                    topic = %name,
+                    "clips are made without this topic of [record]: the drive lacks it"
+                );
             }
             let camera = found.filter(|found| !is_seen && is_image(&found.type_name));
             is_seen |= camera.is_some();
@@ -170,7 +173,8 @@ impl ReplayRecorder {
     pub(super) fn start(&mut self, out: &Path, header: &JournalHeader) -> Result<(), Failure> {
         let (folder, recovered) = RecordingFolder::open(out)?;
         for clip in &recovered {
-            tracing::warn!(clip = %clip.file.display(), "recovered an unfinished clip of an earlier replay");
+            let clip = clip.file.display();
+            tracing::warn!(%clip, "recovered an unfinished clip of an earlier replay");
         }
         self.earlier = Some((folder.earlier(), recovered));
         let settings = Settings {

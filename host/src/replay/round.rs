@@ -14,7 +14,7 @@ use gleaner_protocol::{ReplaySummary, Report, Round, TopicReport, WokenBy};
 use gleaner_vitals::usage;
 
 use super::digests::Digests;
-use super::drive_loop::{self, DriveHandler, Reached, Span};
+use super::drive_loop::{self, DriveHandler, DriveSpan, LoopEnd};
 use super::journal_file::JournalFile;
 use super::open::{DriveError, open_drives};
 use super::options::Results;
@@ -36,7 +36,7 @@ use crate::session_setup::{
 /// Interval of progress reports; a shorter one is not visible to a user.
 const PROGRESS: Duration = Duration::from_millis(100);
 /// Number of samples between two readings of the clock.
-const SAMPLES_PER_LOOK: u64 = 256;
+const SAMPLES_PER_CLOCK_READ: u64 = 256;
 
 struct ReplayLoop<'a> {
     invoker: Invoker,
@@ -57,7 +57,7 @@ struct ReplayLoop<'a> {
     stopped: Option<String>,
     log_lines: u64,
     samples: u64,
-    looked: Instant,
+    progress_sent: Instant,
 }
 
 impl DriveHandler for ReplayLoop<'_> {
@@ -107,8 +107,10 @@ impl DriveHandler for ReplayLoop<'_> {
             recording.check()?;
         }
         self.samples += 1;
-        if self.samples.is_multiple_of(SAMPLES_PER_LOOK) && self.looked.elapsed() >= PROGRESS {
-            self.looked = Instant::now();
+        if self.samples.is_multiple_of(SAMPLES_PER_CLOCK_READ)
+            && self.progress_sent.elapsed() >= PROGRESS
+        {
+            self.progress_sent = Instant::now();
             self.output.flush()?;
             let progress = drive.progress();
             let report =
@@ -148,8 +150,8 @@ impl ReplayLoop<'_> {
     fn run(
         &mut self,
         drive: &mut Replay,
-    ) -> Result<(Reached, gleaner_protocol::RecordingCounts), Failure> {
-        let span = Span::of(drive, self.part);
+    ) -> Result<(LoopEnd, gleaner_protocol::RecordingCounts), Failure> {
+        let span = DriveSpan::of(drive, self.part);
         let reached = drive_loop::run(drive, span, self)?;
         // The end of a damaged drive is unknown: its last sample counts.
         let is_whole = reached.broken.is_none() && !reached.stopped;
@@ -244,7 +246,7 @@ pub(super) fn replay(
         stopped: None,
         log_lines: 0,
         samples: 0,
-        looked: Instant::now(),
+        progress_sent: Instant::now(),
     };
     replay_loop.write_log(&init_log)?;
 
@@ -272,8 +274,8 @@ pub(super) fn replay(
         lambda: name.to_owned(),
         version: manifest.lambda.version.to_string(),
         kind: manifest.lambda.kind,
-        drive: options.drives.named.iter().map(|drive| shown(drive)).collect(),
-        out: shown(&results.out),
+        drive: options.drives.named.iter().map(|drive| lossy_path(drive)).collect(),
+        out: lossy_path(&results.out),
         wakes: replay_loop.wakes,
         triggers: replay_loop.triggers,
         faults: replay_loop.faults,
@@ -355,6 +357,6 @@ fn topic_report((topic, counts): (&Arc<Topic>, &Counts)) -> TopicReport {
 }
 
 /// A path as JSON can hold it: invalid UTF-8 is replaced.
-fn shown(path: &Path) -> PathBuf {
+fn lossy_path(path: &Path) -> PathBuf {
     PathBuf::from(path.to_string_lossy().into_owned())
 }

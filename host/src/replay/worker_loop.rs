@@ -5,7 +5,7 @@ use gleaner_drives::{Replay, ReplayStep};
 use gleaner_lambda::manifest::Manifest;
 
 use super::ReplayOptions;
-use super::drive_loop::{self, DriveHandler, Span};
+use super::drive_loop::{self, DriveHandler, DriveSpan};
 use super::open::open_drives;
 use super::record::ReplayRecorder;
 use crate::api::Session;
@@ -42,7 +42,7 @@ pub(super) fn run(
     let invoker = Invoker::new(session.clone(), guest);
     let mut worker_loop =
         WorkerLoop { schedule: WakeSchedule::new(manifest, &inputs), session, invoker };
-    let span = Span::of(&drive, part);
+    let span = DriveSpan::of(&drive, part);
     drive_loop::run(&mut drive, span, &mut worker_loop)?;
     reports.done(Totals::of(&inputs, &curves));
     Ok(())

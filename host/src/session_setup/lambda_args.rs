@@ -71,7 +71,8 @@ pub fn tighten(manifest: &mut Manifest, file: &Path) -> Result<(), Failure> {
     manifest.limits = limits;
     if !tightened.is_empty() {
         let limits = tightened.iter().map(Tightened::to_string).collect::<Vec<_>>().join(", ");
-        tracing::warn!(lambda = %manifest.lambda.name, by = %file.display(), %limits, "limits lowered by the vehicle's configuration");
+        let (lambda, by) = (&manifest.lambda.name, file.display());
+        tracing::warn!(%lambda, %by, %limits, "limits lowered by the vehicle's configuration");
     }
     Ok(())
 }

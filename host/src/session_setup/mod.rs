@@ -85,12 +85,16 @@ impl Explain for InputError {
             return Some("lower depth, hold or max_size of this [[input]]".to_owned());
         };
         Some(match source {
-            TransportError::NoSuchTopic { .. } => "correct `topic` in lambda.toml, or pass --remap FROM:=TO".to_owned(),
+            TransportError::NoSuchTopic { .. } => {
+                "correct `topic` in lambda.toml, or pass --remap FROM:=TO".to_owned()
+            }
             TransportError::WrongType { found, .. } => {
                 format!("write type = \"{found}\" in lambda.toml, or choose another topic")
             }
             TransportError::Encoding { what: "schema encoding", .. } => {
-                "put the .msg files of the type, and of those it refers to, into DIR/msg, and build again".to_owned()
+                "put the .msg files of the type, and of those it refers to, into DIR/msg, and \
+                 build again"
+                    .to_owned()
             }
             _ => return None,
         })

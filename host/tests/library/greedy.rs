@@ -110,7 +110,7 @@ impl TestGuest {
         let (transport, topic) = subscribed(&manifest, IMAGE);
         let session = Session::new(vec![Arc::clone(&topic)], config, limits);
         let cache = root().join("target/test-cache/gleaner");
-        let loaded = Loaded::open(component, &cache, limits.stack.as_usize(), Nans::AsMade)
+        let loaded = Loaded::open(component, &cache, limits.stack.as_usize(), Nans::Native)
             .expect("a component of this world");
         let shortest = limits.deadline.min(limits.init_deadline);
         let deadline = timed

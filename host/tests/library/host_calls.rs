@@ -103,7 +103,7 @@ impl DriverGuest {
             &lambda.join("driver.wasm"),
             &cache,
             limits.stack.as_usize(),
-            Nans::AsMade,
+            Nans::Native,
         )
         .unwrap();
         let deadline = timed.then(|| Deadline::new(loaded.engine(), limits.deadline).unwrap());

@@ -53,7 +53,7 @@ impl MisbehavingGuest {
             &lambda.join("misbehave.wasm"),
             &cache,
             limits.stack.as_usize(),
-            Nans::AsMade,
+            Nans::Native,
         )
         .unwrap();
         let deadline = deadline.map(|allowed| Deadline::new(loaded.engine(), allowed).unwrap());

@@ -24,7 +24,7 @@ impl types::Host for Hosted {}
 impl Host for Hosted {
     fn input(&mut self, name: String) -> DataResult<Resource<Topic>> {
         let input = self.session.input(&name);
-        self.hand_out(input)
+        self.push_result(input)
     }
 
     fn inputs(&mut self) -> wasmtime::Result<Vec<String>> {
@@ -39,25 +39,25 @@ impl Host for Hosted {
 
 impl HostTopic for Hosted {
     fn name(&mut self, topic: Resource<Topic>) -> wasmtime::Result<String> {
-        Ok(self.look(&topic)?.name().to_owned())
+        Ok(self.resolve(&topic)?.name().to_owned())
     }
 
     fn ros_topic(&mut self, topic: Resource<Topic>) -> wasmtime::Result<String> {
-        Ok(self.look(&topic)?.ros_topic().to_owned())
+        Ok(self.resolve(&topic)?.ros_topic().to_owned())
     }
 
     fn type_name(&mut self, topic: Resource<Topic>) -> wasmtime::Result<String> {
-        Ok(self.look(&topic)?.type_name().to_owned())
+        Ok(self.resolve(&topic)?.type_name().to_owned())
     }
 
     fn newest(&mut self, topic: Resource<Topic>) -> wasmtime::Result<Option<Resource<Sample>>> {
-        let newest = self.look(&topic)?.newest();
+        let newest = self.resolve(&topic)?.newest();
         newest.map(|sample| Ok(self.handles.push(sample)?)).transpose()
     }
 
     fn last(&mut self, topic: Resource<Topic>, n: u32) -> wasmtime::Result<Vec<Resource<Sample>>> {
         let samples = self.handles.get(&topic)?.last(n as usize)?;
-        self.hand_out_all(samples)
+        self.push_all(samples)
     }
 
     fn since(
@@ -66,18 +66,18 @@ impl HostTopic for Hosted {
         since_ns: i64,
     ) -> wasmtime::Result<Vec<Resource<Sample>>> {
         let samples = self.handles.get(&topic)?.since(since_ns)?;
-        self.hand_out_all(samples)
+        self.push_all(samples)
     }
 
     fn counts(&mut self, topic: Resource<Topic>) -> wasmtime::Result<Counts> {
         let data::Counts { received, lost, overwritten, no_slot, too_big, skipped } =
-            self.look(&topic)?.counts();
+            self.resolve(&topic)?.counts();
         Ok(Counts { received, lost, overwritten, no_slot, too_big, skipped })
     }
 
     fn field(&mut self, topic: Resource<Topic>, path: String) -> DataResult<Resource<Field>> {
         let field = self.handles.get(&topic)?.field(&path);
-        self.hand_out(field)
+        self.push_result(field)
     }
 
     fn column(
@@ -87,7 +87,7 @@ impl HostTopic for Hosted {
         n: u32,
     ) -> DataResult<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
-        answer(topic.column(field, n as usize).map(column_out))
+        wit_result(topic.column(field, n as usize).map(column_out))
     }
 
     fn column_since(
@@ -97,7 +97,7 @@ impl HostTopic for Hosted {
         since_ns: i64,
     ) -> DataResult<Column> {
         let (topic, field) = (self.handles.get(&topic)?, self.handles.get(&field)?);
-        answer(topic.column_since(field, since_ns).map(column_out))
+        wit_result(topic.column_since(field, since_ns).map(column_out))
     }
 
     fn drop(&mut self, topic: Resource<Topic>) -> wasmtime::Result<()> {
@@ -108,7 +108,7 @@ impl HostTopic for Hosted {
 
 impl HostField for Hosted {
     fn path(&mut self, field: Resource<Field>) -> wasmtime::Result<String> {
-        Ok(self.look(&field)?.path().to_owned())
+        Ok(self.resolve(&field)?.path().to_owned())
     }
 
     fn drop(&mut self, field: Resource<Field>) -> wasmtime::Result<()> {
@@ -119,29 +119,29 @@ impl HostField for Hosted {
 
 impl HostSample for Hosted {
     fn identity(&mut self, sample: Resource<Sample>) -> wasmtime::Result<Identity> {
-        Ok(identity(&self.look(&sample)?.identity()))
+        Ok(identity(&self.resolve(&sample)?.identity()))
     }
 
     fn stamps(&mut self, sample: Resource<Sample>) -> wasmtime::Result<Stamps> {
-        Ok(stamps(self.look(&sample)?.stamps()))
+        Ok(stamps(self.resolve(&sample)?.stamps()))
     }
 
     fn get(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> DataResult<Value> {
         let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
-        answer(sample.get(field).map(value))
+        wit_result(sample.get(field).map(value))
     }
 
     fn number(&mut self, sample: Resource<Sample>, field: Resource<Field>) -> DataResult<f64> {
         let (sample, field) = (self.handles.get(&sample)?, self.handles.get(&field)?);
-        answer(sample.number(field))
+        wit_result(sample.number(field))
     }
 
     fn size(&mut self, sample: Resource<Sample>) -> wasmtime::Result<u64> {
-        Ok(self.look(&sample)?.bytes().len() as u64)
+        Ok(self.resolve(&sample)?.bytes().len() as u64)
     }
 
     fn big_endian(&mut self, sample: Resource<Sample>) -> wasmtime::Result<bool> {
-        Ok(self.look(&sample)?.big_endian())
+        Ok(self.resolve(&sample)?.big_endian())
     }
 
     /// Never called: see [`add_reads_to_linker`].
@@ -156,7 +156,7 @@ impl HostSample for Hosted {
 
     fn as_frame(&mut self, sample: Resource<Sample>) -> DataResult<Resource<Frame>> {
         let frame = self.handles.get(&sample)?.as_frame();
-        self.hand_out(frame)
+        self.push_result(frame)
     }
 
     fn drop(&mut self, sample: Resource<Sample>) -> wasmtime::Result<()> {
@@ -167,26 +167,26 @@ impl HostSample for Hosted {
 
 impl HostFrame for Hosted {
     fn info(&mut self, frame: Resource<Frame>) -> wasmtime::Result<FrameInfo> {
-        let frame = self.look(&frame)?;
+        let frame = self.resolve(&frame)?;
         let frame::Info { width, height, encoding, step, big_endian } = frame.info();
         let size = frame.bytes().len() as u64;
         Ok(FrameInfo { width, height, encoding: encoding_out(encoding), step, big_endian, size })
     }
 
     fn identity(&mut self, frame: Resource<Frame>) -> wasmtime::Result<Identity> {
-        Ok(identity(self.look(&frame)?.identity()))
+        Ok(identity(self.resolve(&frame)?.identity()))
     }
 
     fn stamps(&mut self, frame: Resource<Frame>) -> wasmtime::Result<Stamps> {
-        Ok(stamps(self.look(&frame)?.stamps()))
+        Ok(stamps(self.resolve(&frame)?.stamps()))
     }
 
     fn mean_luma(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> DataResult<f64> {
-        answer(self.handles.get(&frame)?.mean_luma(roi.map(roi_in)))
+        wit_result(self.handles.get(&frame)?.mean_luma(roi.map(roi_in)))
     }
 
     fn histogram(&mut self, frame: Resource<Frame>, roi: Option<Roi>) -> DataResult<Vec<u32>> {
-        answer(self.handles.get(&frame)?.histogram(roi.map(roi_in)).map(Vec::from))
+        wit_result(self.handles.get(&frame)?.histogram(roi.map(roi_in)).map(Vec::from))
     }
 
     fn resize(
@@ -196,12 +196,12 @@ impl HostFrame for Hosted {
         height: u32,
     ) -> DataResult<Resource<Frame>> {
         let resized = self.handles.get(&frame)?.resize(width, height);
-        self.hand_out(resized)
+        self.push_result(resized)
     }
 
     fn to_gray(&mut self, frame: Resource<Frame>) -> DataResult<Resource<Frame>> {
         let gray = self.handles.get(&frame)?.to_gray();
-        self.hand_out(gray)
+        self.push_result(gray)
     }
 
     /// Never called: see [`add_reads_to_linker`].
@@ -255,31 +255,31 @@ impl Hosted {
         Ok(Bytes::from_owner(self.handles.get(frame)?.read(offset, len)?))
     }
 
-    fn hand_out<T: Send + 'static>(
+    fn push_result<T: Send + 'static>(
         &mut self,
-        made: Result<T, data::DataError>,
+        result: Result<T, data::DataError>,
     ) -> DataResult<Resource<T>> {
-        Ok(match answer(made)? {
+        Ok(match wit_result(result)? {
             Ok(value) => Ok(self.handles.push(value)?),
             Err(refused) => Err(refused),
         })
     }
 
-    fn hand_out_all(&mut self, samples: Vec<Sample>) -> wasmtime::Result<Vec<Resource<Sample>>> {
+    fn push_all(&mut self, samples: Vec<Sample>) -> wasmtime::Result<Vec<Resource<Sample>>> {
         samples.into_iter().map(|sample| Ok(self.handles.push(sample)?)).collect()
     }
 
     /// Resolves a handle for a call that only reads a value, and charges the call, which is charged
     /// nowhere else.
-    fn look<T: 'static>(&self, handle: &Resource<T>) -> wasmtime::Result<&T> {
+    fn resolve<T: 'static>(&self, handle: &Resource<T>) -> wasmtime::Result<&T> {
         self.session.fuel().charge_call()?;
         Ok(self.handles.get(handle)?)
     }
 }
 
 /// Converts a result for the guest. Errors for lack of fuel or time end the guest.
-fn answer<T>(made: Result<T, data::DataError>) -> DataResult<T> {
-    match made {
+fn wit_result<T>(result: Result<T, data::DataError>) -> DataResult<T> {
+    match result {
         Ok(value) => Ok(Ok(value)),
         Err(data::DataError::OutOfFuel(error)) => Err(error.into()),
         Err(error @ data::DataError::OutOfTime) => Err(error.into()),

@@ -91,14 +91,14 @@ pub(super) fn from_error(
     let aborted = starting || trap == Some(&Trap::UnreachableCodeReached);
     let for_memory =
         printed.as_ref().is_none_or(|printed| printed.contains("memory allocation of"));
-    if let Some(RefusedGrowth { what, asked, allowed }) =
+    if let Some(RefusedGrowth { what, requested, allowed }) =
         hosted.caps.refused().filter(|_| aborted && for_memory)
     {
-        let message = format!("asked for {asked} {what}; {allowed} are allowed");
+        let message = format!("asked for {requested} {what}; {allowed} are allowed");
         return Fault {
             kind: FaultKind::Memory,
             message,
-            used: Some(asked),
+            used: Some(requested),
             allowed: Some(allowed),
         };
     }

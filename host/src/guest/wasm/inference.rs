@@ -19,9 +19,9 @@ impl HostTensor for Hosted {
         shape: Vec<u32>,
         values: Vec<f32>,
     ) -> InferenceResult<Resource<Tensor>> {
-        let made =
+        let result =
             Tensor::from_values(size_of_val(&*shape) + size_of_val(&*values), self.session.fuel());
-        self.answer(made)
+        self.push_model_result(result)
     }
 
     fn from_frame(
@@ -29,8 +29,8 @@ impl HostTensor for Hosted {
         _frame: Resource<Frame>,
         _how: Preprocess,
     ) -> InferenceResult<Resource<Tensor>> {
-        let made = Tensor::from_frame(self.session.fuel());
-        self.answer(made)
+        let result = Tensor::from_frame(self.session.fuel());
+        self.push_model_result(result)
     }
 
     fn shape(&mut self, tensor: Resource<Tensor>) -> wasmtime::Result<Vec<u32>> {
@@ -54,7 +54,7 @@ impl HostTensor for Hosted {
 impl HostModel for Hosted {
     fn open(&mut self, name: String) -> InferenceResult<Resource<Model>> {
         let opened = Model::open(&name, self.session.fuel());
-        self.answer(opened)
+        self.push_model_result(opened)
     }
 
     fn run(
@@ -80,11 +80,11 @@ impl HostModel for Hosted {
 }
 
 impl Hosted {
-    fn answer<T: Send + 'static>(
+    fn push_model_result<T: Send + 'static>(
         &mut self,
-        made: Result<T, inference::InferenceError>,
+        result: Result<T, inference::InferenceError>,
     ) -> InferenceResult<Resource<T>> {
-        let error = match made {
+        let error = match result {
             Ok(value) => return Ok(Ok(self.handles.push(value)?)),
             Err(inference::InferenceError::OutOfFuel(error)) => return Err(error.into()),
             Err(error) => error,

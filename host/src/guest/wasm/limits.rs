@@ -25,7 +25,7 @@ pub(super) struct Caps {
 pub(super) struct RefusedGrowth {
     /// `bytes of memory` or `elements of tables`.
     pub(super) what: &'static str,
-    pub(super) asked: u64,
+    pub(super) requested: u64,
     pub(super) allowed: u64,
 }
 
@@ -72,8 +72,8 @@ impl ResourceLimiter for Caps {
             self.fuel.charge(|| if grows { more } else { PAGE })?;
         }
         if !fits {
-            let (asked, allowed) = (total as u64, self.memory_allowed as u64);
-            self.refused = Some(RefusedGrowth { what: "bytes of memory", asked, allowed });
+            let (requested, allowed) = (total as u64, self.memory_allowed as u64);
+            self.refused = Some(RefusedGrowth { what: "bytes of memory", requested, allowed });
             return Ok(false);
         }
         if grows {
@@ -90,8 +90,8 @@ impl ResourceLimiter for Caps {
     ) -> wasmtime::Result<bool> {
         let total = self.table_elements.saturating_add(desired.saturating_sub(now));
         if total > self.tables_allowed {
-            let (asked, allowed) = (total as u64, self.tables_allowed as u64);
-            self.refused = Some(RefusedGrowth { what: "elements of tables", asked, allowed });
+            let (requested, allowed) = (total as u64, self.tables_allowed as u64);
+            self.refused = Some(RefusedGrowth { what: "elements of tables", requested, allowed });
             return Ok(false);
         }
         let grows = max.is_none_or(|max| desired <= max);
@@ -125,16 +125,16 @@ mod tests {
         assert!(caps.memory_growing(0, MIB, None).unwrap());
         assert_eq!(caps.refused(), None);
         assert!(!caps.memory_growing(MIB, MIB + 1, None).unwrap());
-        let asked = MIB as u64 + 1;
+        let requested = MIB as u64 + 1;
         assert_eq!(
             caps.refused(),
-            Some(RefusedGrowth { what: "bytes of memory", asked, allowed: asked - 1 })
+            Some(RefusedGrowth { what: "bytes of memory", requested, allowed: requested - 1 })
         );
         caps.forget_refusal();
         assert!(!caps.table_growing(0, 101, None).unwrap());
         assert_eq!(
             caps.refused(),
-            Some(RefusedGrowth { what: "elements of tables", asked: 101, allowed: 100 })
+            Some(RefusedGrowth { what: "elements of tables", requested: 101, allowed: 100 })
         );
     }
 

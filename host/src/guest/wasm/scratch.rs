@@ -8,19 +8,19 @@ type ScratchResult<T> = wasmtime::Result<Result<T, ScratchError>>;
 
 impl Host for Hosted {
     fn put(&mut self, name: String, bytes: Vec<u8>) -> ScratchResult<()> {
-        answer(self.session.put(&name, &bytes))
+        wit_result(self.session.put(&name, &bytes))
     }
 
     fn append(&mut self, name: String, bytes: Vec<u8>) -> ScratchResult<()> {
-        answer(self.session.append(&name, &bytes))
+        wit_result(self.session.append(&name, &bytes))
     }
 
     fn get(&mut self, name: String, offset: u64, len: u32) -> ScratchResult<Vec<u8>> {
-        answer(self.session.get(&name, offset, u64::from(len)))
+        wit_result(self.session.get(&name, offset, u64::from(len)))
     }
 
     fn remove(&mut self, name: String) -> ScratchResult<()> {
-        answer(self.session.remove(&name))
+        wit_result(self.session.remove(&name))
     }
 
     fn entries(&mut self) -> wasmtime::Result<Vec<Entry>> {
@@ -37,8 +37,8 @@ impl Host for Hosted {
     }
 }
 
-fn answer<T>(made: Result<T, scratch::ScratchError>) -> ScratchResult<T> {
-    let error = match made {
+fn wit_result<T>(result: Result<T, scratch::ScratchError>) -> ScratchResult<T> {
+    let error = match result {
         Ok(value) => return Ok(Ok(value)),
         Err(scratch::ScratchError::OutOfFuel(error)) => return Err(error.into()),
         Err(error) => error,

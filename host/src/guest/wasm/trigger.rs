@@ -8,15 +8,19 @@ type TriggerResult = wasmtime::Result<Result<(), TriggerError>>;
 
 impl Host for Hosted {
     fn event(&mut self, label: String, score: f64, attributes: Vec<Attribute>) -> TriggerResult {
-        answer(self.session.event(&label, score, attributes.into_iter().map(attribute).collect()))
+        wit_result(self.session.event(
+            &label,
+            score,
+            attributes.into_iter().map(attribute).collect(),
+        ))
     }
 
     fn start(&mut self, label: String, attributes: Vec<Attribute>) -> TriggerResult {
-        answer(self.session.start(&label, attributes.into_iter().map(attribute).collect()))
+        wit_result(self.session.start(&label, attributes.into_iter().map(attribute).collect()))
     }
 
     fn stop(&mut self, label: String) -> TriggerResult {
-        answer(self.session.stop(&label))
+        wit_result(self.session.stop(&label))
     }
 }
 
@@ -30,8 +34,8 @@ fn attribute(Attribute { key, value }: Attribute) -> trigger::Attribute {
     trigger::Attribute { key, value }
 }
 
-fn answer(made: Result<(), trigger::TriggerError>) -> TriggerResult {
-    let Err(error) = made else { return Ok(Ok(())) };
+fn wit_result(result: Result<(), trigger::TriggerError>) -> TriggerResult {
+    let Err(error) = result else { return Ok(Ok(())) };
     if let trigger::TriggerError::OutOfFuel(error) = error {
         return Err(error.into());
     }

@@ -39,7 +39,7 @@ pub struct RemoteGuest {
     most_resident_bytes: u64,
 }
 
-/// The message that ends a call, and what the lambda logged in it.
+/// The message that ends a call, and the log lines of the call.
 struct CallMessages {
     log: Vec<(Level, String)>,
     message: WorkerMessage,
@@ -181,7 +181,7 @@ impl RemoteGuest {
     }
 
     /// Waits for the end of a worker that has sent everything.
-    fn ended_well(&mut self) -> Result<(), Fault> {
+    fn check_exit(&mut self) -> Result<(), Fault> {
         let Some(ended) = self.end(SHUTDOWN_TIMEOUT) else { return Ok(()) };
         if ended.was_forced {
             tracing::warn!("the lambda's process did not end after its last wake, and was killed");
@@ -344,7 +344,7 @@ impl Guest for RemoteGuest {
         {
             return Err(self.killed(Some("invalid counts of samples")));
         }
-        self.ended_well()?;
+        self.check_exit()?;
         Ok(Some(Totals { counts, decode_ns, curves, curves_omitted }))
     }
 }

@@ -11,7 +11,7 @@ use gleaner_recorder::{ClipStatements, RecordError};
 use gleaner_transport::{SampleMeta, Transport};
 
 use super::lockstep::{LockstepDrive, LockstepError};
-use super::reference::{unreadable_clip, untrue};
+use super::reference::{contradiction, unreadable_clip};
 use super::triggers::JournalTriggers;
 use super::{ReferenceJournal, Rerun, VerifyOutcome, counts_differ, different, seconds};
 use crate::api::data::{Tick, Topic, Wake};
@@ -32,9 +32,9 @@ pub(super) fn verify(
 ) -> Result<VerifyOutcome, Failure> {
     let clip = open(options).map_err(unreadable_clip)?;
     let header = reference.header().clone();
-    holds_all_inputs(&clip, &header)?;
+    check_inputs(&clip, &header)?;
     let stated = reference.clip.take().expect("a part of a journal is in a clip");
-    holds_what_it_states(reference.path(), &stated)?;
+    check_statements(reference.path(), &stated)?;
     let (rerun, clip, inputs) = Rerun::start(LockstepDrive::new(clip), options, manifest, load)?;
     let engine = rerun.engine.clone();
     let mut verify_loop = ClipVerifyLoop {
@@ -73,7 +73,8 @@ pub(super) fn verify(
             "in each wake that could prove one, the lambda had read samples from before the clip";
         failure.causes = vec![format!("{what} ({uncovered} of {wakes} wakes)")];
         return Err(failure.with_help(
-            "make `preroll` longer than the lambda looks back; this clip can be verified against its drive: \
+            "make `preroll` longer than the lambda looks back; this clip can be verified against \
+             its drive: \
              gleaner replay DIR DRIVE --verify JOURNAL",
         ));
     }
@@ -83,7 +84,7 @@ pub(super) fn verify(
 const CHANGED: &str = "the clip, or its journal, was changed after it was written";
 
 /// Refuses a clip that lacks the topic of an input.
-fn holds_all_inputs(clip: &Replay, header: &JournalHeader) -> Result<(), Failure> {
+fn check_inputs(clip: &Replay, header: &JournalHeader) -> Result<(), Failure> {
     let topics = clip.topics();
     let missing = header
         .inputs
@@ -94,16 +95,17 @@ fn holds_all_inputs(clip: &Replay, header: &JournalHeader) -> Result<(), Failure
         "the clip holds no `{}`, which input `{}` of the lambda reads",
         input.wire_topic, input.name
     );
-    let help = "add the topic to [record] for further clips; this one can be verified against its drive only: \
+    let help = "add the topic to [record] for further clips; this one can be verified against its \
+                drive only: \
                 gleaner replay DIR DRIVE --verify JOURNAL";
     Err(Failure::new(Exit::Usage, message).with_help(help))
 }
 
 /// Refuses a clip whose messages contradict its records.
-fn holds_what_it_states(path: &Path, stated: &ClipStatements) -> Result<(), Failure> {
+fn check_statements(path: &Path, stated: &ClipStatements) -> Result<(), Failure> {
     match stated.contradicted(path) {
         Ok(None) => Ok(()),
-        Ok(Some(error)) => Err(untrue(path, &error)),
+        Ok(Some(error)) => Err(contradiction(path, &error)),
         Err(RecordError::Unreadable { source, .. }) => Err(unreadable_clip(*source)),
         Err(error) => Err(Failure { exit: Exit::Usage, ..error.into() }),
     }
@@ -218,7 +220,7 @@ impl ClipVerifyLoop<'_> {
             }
             (WakeSource::Tick { .. }, Some(_)) => {
                 let (journal, now) = ("a tick".to_owned(), "samples, by its manifest".to_owned());
-                let what = "what woke the lambda".to_owned();
+                let what = "cause of the wake".to_owned();
                 return Err(self.differs(entry, &Difference { what, journal, now }));
             }
             (WakeSource::Sample { writer, seq }, _) => (writer, seq),
@@ -254,11 +256,11 @@ impl ClipVerifyLoop<'_> {
 
     fn differs(&self, entry: &JournalEntry, difference: &Difference) -> Failure {
         match &self.losses {
-            None => different(format!("{} differs", self.wake_in_words(entry)), difference)
+            None => different(format!("{} differs", self.describe_wake(entry)), difference)
                 .with_help(CHANGED),
             Some(losses) => {
                 let message =
-                    format!("the clip alone does not settle {}", self.wake_in_words(entry));
+                    format!("the clip alone does not settle {}", self.describe_wake(entry));
                 let failure = Failure { exit: Exit::Usage, ..different(message, difference) };
                 failure.with_help(format!(
                     "the clip states that it lacks messages ({losses}): raise `preroll_size`; \
@@ -271,16 +273,17 @@ impl ClipVerifyLoop<'_> {
     /// The failure of a wake with the same inputs and another decision, which may depend on state
     /// from before the clip.
     fn unsettled(&self, entry: &JournalEntry, difference: &Difference) -> Failure {
-        let message = format!("the clip alone does not settle {}", self.wake_in_words(entry));
+        let message = format!("the clip alone does not settle {}", self.describe_wake(entry));
         let failure = Failure { exit: Exit::Usage, ..different(message, difference) };
         failure.with_help(format!(
-            "the lambda had run {} times before the clip begins, and its variables from then are not in the clip: \
+            "the lambda had run {} times before the clip begins, and its variables from then are \
+             not in the clip: \
              gleaner replay DIR DRIVE --verify JOURNAL settles it",
             self.header.wakes_before
         ))
     }
 
-    fn wake_in_words(&self, entry: &JournalEntry) -> String {
+    fn describe_wake(&self, entry: &JournalEntry) -> String {
         let number = self.header.wakes_before.saturating_add(self.wakes).saturating_add(1);
         let at = seconds(entry.at_ns, self.start_ns);
         format!("wake {number} of lambda `{}`, at {at:.6} s of the clip,", self.header.lambda)

@@ -13,7 +13,7 @@ use crate::api::data::{Topic, Wake};
 use crate::api::trace::offered;
 use crate::replay::ReplayOptions;
 use crate::replay::digests::Digests;
-use crate::replay::drive_loop::{self, DriveHandler, Span};
+use crate::replay::drive_loop::{self, DriveHandler, DriveSpan};
 use crate::replay::open::{DriveError, open_drives};
 use crate::schedule::WakeSchedule;
 use crate::session_setup::Load;
@@ -34,7 +34,7 @@ pub(super) fn verify(
     }
     let digests = Digests::start(options.drives.files.clone());
     let (drive, part) = open_drives(options)?;
-    let span = Span::of(&drive, part);
+    let span = DriveSpan::of(&drive, part);
     let start_ns = drive.start_ns().unwrap_or(0);
     let (rerun, mut drive, inputs) = Rerun::start(drive, options, manifest, load)?;
     let schedule = WakeSchedule::new(manifest, &inputs);
@@ -90,7 +90,7 @@ impl DriveHandler for VerifyLoop<'_> {
             if self.reference.reader().end().is_none() {
                 return Ok(false);
             }
-            let (what, now) = ("wake".to_owned(), in_words(at_ns, self.start_ns));
+            let (what, now) = ("wake".to_owned(), at_seconds(at_ns, self.start_ns));
             return Err(self
                 .differs(at_ns, &Difference { what, journal: "no further wake".to_owned(), now }));
         };
@@ -113,7 +113,7 @@ impl VerifyLoop<'_> {
     fn end(&mut self, inputs: &[Arc<Topic>]) -> Result<(), Failure> {
         if let Some(JournalEntry { at_ns, cause, .. }) = self.reference.next()? {
             let kind = if matches!(cause, WakeSource::Tick { .. }) { "a tick" } else { "a sample" };
-            let journal = format!("{kind}, {}", in_words(at_ns, self.start_ns));
+            let journal = format!("{kind}, {}", at_seconds(at_ns, self.start_ns));
             let difference =
                 Difference { what: "wake".to_owned(), journal, now: "no further wake".to_owned() };
             return Err(self.differs(at_ns, &difference));
@@ -149,7 +149,7 @@ impl VerifyLoop<'_> {
     }
 }
 
-fn in_words(at_ns: i64, start_ns: i64) -> String {
+fn at_seconds(at_ns: i64, start_ns: i64) -> String {
     format!("at {:.6} s", seconds(at_ns, start_ns))
 }
 

@@ -1,4 +1,4 @@
-//! Makes every decision of a journal again, up to the first difference.
+//! Reproduces every decision of a journal, up to the first difference.
 //!
 //! Over a drive, the schedule decides on the wakes, as in the replay that wrote the journal: each
 //! wake must be the next in the journal. Over a clip, which begins in the middle, the journal

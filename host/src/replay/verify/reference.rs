@@ -83,7 +83,7 @@ impl ReferenceJournal {
         let part = std::mem::take(&mut part.data);
         let mut reference = Self::open(path, Box::new(Cursor::new(part)))?;
         let stated = ClipStatements::read(&extras, reference.header())
-            .map_err(|error| untrue(path, &error))?;
+            .map_err(|error| contradiction(path, &error))?;
         reference.clip = Some(stated);
         Ok(reference)
     }
@@ -95,7 +95,8 @@ impl ReferenceJournal {
                 format!("`{}` was recorded live, which cannot be verified yet", path.display());
             let mut failure = Failure::new(Exit::Usage, message);
             failure.causes = vec![
-                "lambda and recorder received the samples independently, and the clip has the recorder's stamps"
+                "lambda and recorder received the samples independently, and the clip has the \
+                 recorder's stamps"
                     .to_owned(),
             ];
             return Err(
@@ -145,7 +146,8 @@ impl ReferenceJournal {
                 manifest.limits = limits;
                 let note = |Tightened { key, from, to }| {
                     format!(
-                        "limit `{key}`: {to} in the journal, which is used, {from} in lambda.toml; --vehicle FILE compares it"
+                        "limit `{key}`: {to} in the journal, which is used, {from} in lambda.toml; \
+                         --vehicle FILE compares it"
                     )
                 };
                 self.limits = tightened.into_iter().map(note).collect();
@@ -204,8 +206,13 @@ fn compare(
     let now = LambdaIdentity { manifest, build, config, remaps, engine, clock, part }.header()?;
     match header.differs_from(&now) {
         None => Ok(()),
-        Some(difference) => Err(different("this is not the lambda that wrote the journal", &difference).with_help(
-            "name the folder of the lambda that wrote it, with the same build, --set, --remap and --vehicle",
+        Some(difference) => Err(different(
+            "this is not the lambda that wrote the journal",
+            &difference,
+        )
+        .with_help(
+            "name the folder of the lambda that wrote it, with the same build, --set, --remap and \
+                 --vehicle",
         )),
     }
 }
@@ -219,7 +226,7 @@ pub(super) fn different(message: impl Into<String>, difference: &Difference) -> 
 }
 
 /// The failure of a clip whose metadata contradicts its messages or its journal.
-pub(super) fn untrue(
+pub(super) fn contradiction(
     path: &Path,
     FalseStatement { what, stated, found }: &FalseStatement,
 ) -> Failure {
@@ -227,7 +234,8 @@ pub(super) fn untrue(
         Failure::new(Exit::Differs, format!("clip `{}` contradicts itself", path.display()));
     failure.causes = vec![format!("{what}\nstated:    {stated}\nexpected:  {found}")];
     failure.with_help(
-        "the clip was changed after it was written, or an older gleaner wrote it: replay the lambda over its drive again",
+        "the clip was changed after it was written, or an older gleaner wrote it: replay the \
+         lambda over its drive again",
     )
 }
 

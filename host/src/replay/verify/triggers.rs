@@ -48,13 +48,14 @@ impl JournalTriggers {
             !is_short || self.span.is_some_and(|(first, last)| (first..=last).contains(&at_ns))
         };
         // A command is no trigger of the lambda, and not in its journal.
-        let ours = |moment: &&Moment| moment.lambda == self.lambda && moment.source.is_none();
-        let mut named = stated.moments().iter().filter(ours).filter(|moment| is_here(moment.at_ns));
-        let mut made = self.moments.iter();
+        let is_own = |moment: &&Moment| moment.lambda == self.lambda && moment.source.is_none();
+        let mut listed =
+            stated.moments().iter().filter(is_own).filter(|moment| is_here(moment.at_ns));
+        let mut reproduced = self.moments.iter();
         // All lambdas of a clip share its limit.
         let is_full = stated.moments().len() >= KEPT;
         for number in 1.. {
-            let (journal, now) = (made.next(), named.next());
+            let (journal, now) = (reproduced.next(), listed.next());
             if now.is_none() && (journal.is_none() || is_full) {
                 break;
             }
@@ -83,7 +84,7 @@ impl JournalTriggers {
             };
             return Some(Difference { what, journal, now });
         }
-        let others = stated.moments().iter().filter(|moment| !ours(moment)).count() as u64;
+        let others = stated.moments().iter().filter(|moment| !is_own(moment)).count() as u64;
         match is_short || is_full && others > 0 {
             true => None,
             false => counts_differ(
