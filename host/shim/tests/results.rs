@@ -20,7 +20,12 @@ log() { item '{"log":{"at_ns":'$1',"level":"info","message":"m"}}'; }
 tick() { item '{"decision":{"at_ns":'$1',"cause":"tick","triggers":[],"run_ns":1}}'; }
 woken() { item '{"woken":{"cause":"event","input":"camera","topic":"/camera"}}'; }
 asked() { local is=; trap 'is=1' TERM; kill -TERM $PPID; until [ "$is" ]; do sleep 0.01; done; }
-last() { item '{"last":{"lambda":"l","version":"1.0.0","kind":"wasm","out":"o","restarts":0,"up_s":1.0,"wakes":2,"triggers":0,"faults":0,"skipped":0,"missed_ticks":0,"log_lines":0,"log_dropped":0,"triggers_refused":0,"backed_off":0,"unwritten":5,"topics":[],"network":{"domain":0,"participants":0,"buffer_requested":0,"buffer_granted":0,"socket_drops":0,"filtered":0},"rss_bytes":0,"cpu_s":0.0}}'; }
+last() { item '{"last":{"lambda":"l","version":"1.0.0","kind":"wasm","out":"o","restarts":0,'\
+'"up_s":1.0,"wakes":2,"triggers":0,"faults":0,"skipped":0,"missed_ticks":0,'\
+'"log_lines":0,"log_dropped":0,"triggers_refused":0,"backed_off":0,'\
+'"unwritten":5,"topics":[],"network":{"domain":0,"participants":0,'\
+'"buffer_requested":0,"buffer_granted":0,"socket_drops":0,"filtered":0},'\
+'"rss_bytes":0,"cpu_s":0.0}}'; }
 "#;
 
 /// A folder for one test, removed when dropped.
