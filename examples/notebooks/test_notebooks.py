@@ -1,4 +1,4 @@
-"""The notebooks run from their first cell to their last, and are kept without their outputs."""
+"""Tests that the notebooks run from the first cell to the last, and are stored without outputs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 NOTEBOOKS = sorted(Path(__file__).parent.glob("*.ipynb"))
 
-# Generous: a kernel starts in a second, on a machine that has nothing else to do.
+# Generous: on an idle machine, a kernel starts in a second.
 SECONDS_PER_CELL = 300
 
 
@@ -18,7 +18,7 @@ def test_a_notebook_runs(path: Path) -> None:
     nbformat = pytest.importorskip("nbformat")
     notebook = nbformat.read(path, as_version=4)
     kept = [cell for cell in notebook.cells if cell.get("outputs") or cell.get("execution_count")]
-    assert kept == [], "clear all outputs before you save it"
+    assert kept == [], "clear all outputs before saving"
     client = nbclient.NotebookClient(
         notebook, timeout=SECONDS_PER_CELL, resources={"metadata": {"path": str(path.parent)}}
     )

@@ -1,6 +1,7 @@
-"""Novelty: a picture unlike all kinds of picture seen so far, by the distance of their histograms of brightness.
+"""Novelty: an image unlike all kinds of image seen so far, by the distance of brightness
+histograms.
 
-What was seen is kept as at most 16 histograms, in `scratch`, so that a fault does not make the whole world new again.
+At most 16 known histograms are kept, in `scratch`, so that they survive a fault.
 """
 
 from __future__ import annotations
@@ -21,13 +22,12 @@ class Lambda:
         self.distance: float = ctx.config["distance"]
         self.next_ns = 0
         kept = any(entry.name == NAME for entry in ctx.scratch.entries())
-        # Shape (n, BINS), the one that was seen last at the end.
-        self.known = np.frombuffer(ctx.scratch.get(NAME) if kept else b"", np.float64).reshape(
-            -1, BINS
-        )
+        # Shape (n, BINS), the most recently seen kind last.
+        known = ctx.scratch.get(NAME) if kept else b""
+        self.known = np.frombuffer(known, np.float64).reshape(-1, BINS)
 
     def on_event(self, ctx: Context, event: Sample) -> None:
-        # Decoding is what costs; the world does not change ten times a second.
+        # Decoding is expensive, and the scene does not change ten times a second.
         if ctx.now_ns() < self.next_ns:
             return
         self.next_ns = ctx.now_ns() + self.every_ns
@@ -36,7 +36,7 @@ class Lambda:
         distances = hellinger(self.known, seen)
         nearest = int(distances.argmin()) if len(distances) else None
         if nearest is not None and distances[nearest] < self.distance:
-            # Known. It goes to the end, for whoever is at the front is forgotten first.
+            # Known: move it to the end, since the first one is forgotten first.
             self.known = np.vstack([np.delete(self.known, nearest, axis=0), self.known[nearest]])
             return
         if nearest is not None:
@@ -46,5 +46,6 @@ class Lambda:
 
 
 def hellinger(known: Any, seen: Any) -> Any:
-    """Distance of `seen`, shape (BINS,), to each row of `known`: 0 for the same, 1 for nothing in common."""
+    """Hellinger distance of `seen`, shape (BINS,), to each row of `known`: 0 if equal, 1 if
+    disjoint."""
     return np.sqrt(np.clip(1.0 - np.sqrt(known * seen).sum(axis=1), 0.0, 1.0))

@@ -1,6 +1,8 @@
-"""Sensor silent: no sample of an input for too long. It says so once, and once more in the log when the sensor is back.
+"""Sensor silent: no sample of an input for too long. Reports it once, and logs when the sensor is
+back.
 
-Samples cannot wake a lambda that waits for their absence: the clock does, and looks at the newest of each.
+Missing samples cannot wake a lambda, so a period does, and the lambda checks the newest sample of
+each input.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ class Lambda:
         self.first_ns = int(ctx.config["first_s"] * 1e9)
         self.inputs = [ctx.input(name) for name in ctx.inputs()]
         self.began_ns: int | None = None
-        # The inputs that are silent, and since when.
+        # The silent inputs, by name, with the time of the last sample.
         self.silent: dict[str, int] = {}
 
     def on_tick(self, ctx: Context) -> None:
@@ -23,11 +25,12 @@ class Lambda:
             self.began_ns = now
         for topic in self.inputs:
             newest = topic.newest()
-            # Who never spoke is silent since the beginning, but may take longer: on a vehicle a sensor has to be found first.
-            heard_ns, limit_ns = self.began_ns, self.first_ns
+            # An input without a sample counts from the start, with a longer limit: on a vehicle,
+            # discovery of the sensor takes time.
+            last_ns, limit_ns = self.began_ns, self.first_ns
             if newest is not None:
-                heard_ns, limit_ns = newest.stamps.at_ns, self.silent_ns
-            quiet_ns = now - heard_ns
+                last_ns, limit_ns = newest.stamps.at_ns, self.silent_ns
+            quiet_ns = now - last_ns
             if quiet_ns < limit_ns:
                 since_ns = self.silent.pop(topic.name, None)
                 if since_ns is not None:
@@ -35,7 +38,7 @@ class Lambda:
                         "info", f"{topic.ros_topic} is back after {(now - since_ns) / 1e9:.1f} s"
                     )
             elif topic.name not in self.silent:
-                self.silent[topic.name] = heard_ns
+                self.silent[topic.name] = last_ns
                 ctx.event(
                     "sensor-silent",
                     quiet_ns / 1e9,

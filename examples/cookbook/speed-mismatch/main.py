@@ -1,7 +1,8 @@
-"""Speed mismatch: the speed on the bus changes otherwise than the accelerometer says. Wheels slip, or a sensor lies.
+"""Speed mismatch: wheel speed and accelerometer disagree, because wheels slip or a sensor is wrong.
 
-Two sensors that measure the same in different ways judge each other. What differs all the time, as an IMU that is
-not mounted level, is learnt slowly and taken out; what differs suddenly is the event.
+Two sensors that measure the same in different ways check each other. A constant difference, for
+example of an IMU that is not mounted level, is learnt slowly and removed; a sudden difference is an
+event.
 """
 
 from __future__ import annotations
@@ -10,10 +11,11 @@ import numpy as np
 from gleaner import Column, Context
 
 SECOND_NS = 1_000_000_000
-# So far from its ends a window may begin and end: a sensor may send ten times a second only.
+# Maximum distance of the first and last sample from the ends of a window: a sensor may send only
+# ten times a second.
 EDGE_NS = 200_000_000
 REST_NS = 3_000_000_000
-# The offset is the mean of the first 100 ticks, and then follows within as many.
+# The offset is the mean of the first 100 ticks; then it follows with a time constant of 100 ticks.
 TICKS = 100
 
 
@@ -33,7 +35,8 @@ class Lambda:
         wheels = self.speed.column_since(self.wheels, now - SECOND_NS)
         if not (full(imu, now) and full(wheels, now)):
             return
-        # For one second: the wheels' speed at the end less that at the beginning, by the time between; and the mean acceleration.
+        # Change of speed in one second: by the wheels, from the start and end of the window; by the
+        # IMU, the mean acceleration.
         span = max(len(wheels.values) // 10, 1)
         gained = float(np.median(wheels.values[-span:]) - np.median(wheels.values[:span]))
         by_wheels = gained * SECOND_NS / float(wheels.at_ns[-1] - wheels.at_ns[0])
@@ -44,7 +47,8 @@ class Lambda:
         if self.ticks == 1:
             self.offset_mps = by_wheels - by_imu
         sudden = by_wheels - by_imu - self.offset_mps
-        # Clipped: what is sudden moves the offset a little, so that what stays for good becomes usual.
+        # Clipped, so that a sudden difference moves the offset only a little, and a lasting one is
+        # learnt.
         self.offset_mps += max(-self.mismatch_mps, min(self.mismatch_mps, sudden)) / self.ticks
         if abs(sudden) >= self.mismatch_mps and now >= self.rest_until_ns:
             self.rest_until_ns = now + REST_NS
@@ -58,7 +62,7 @@ class Lambda:
 
 
 def full(window: Column, now: int) -> bool:
-    """Whether a window reaches over the second: no sensor began, or broke off, in it."""
+    """Returns whether samples cover the whole second: the sensor did not start or stop in it."""
     at_ns = window.at_ns
     return len(at_ns) > 1 and bool(
         at_ns[0] <= now - SECOND_NS + EDGE_NS and at_ns[-1] >= now - EDGE_NS

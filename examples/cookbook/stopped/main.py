@@ -1,7 +1,8 @@
-"""Stopped in traffic: records from when the car has stood for a while until it moves again.
+"""Stopped in traffic: records from the time when the car has stood for a while until it moves
+again.
 
-`start` and `stop` keep what is between, however long that is. Two limits, one to stand and one to go: a car that creeps
-at the limit would else begin a new recording with each metre.
+`start` and `stop` record a period of any length. There are two thresholds, one to stand and one to
+go: with one, a creeping car would start a new recording every metre.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from gleaner import Context, Sample
 
 LABEL = "stopped"
-# In `scratch` while it records: after a fault the new object must know, or nobody would end the recording.
+# Entry in `scratch` during a recording, so that a fresh instance after a fault ends it.
 NAME = "recording"
 
 
@@ -21,7 +22,8 @@ class Lambda:
         self.after_ns = int(ctx.config["after_s"] * 1e9)
         if self.going_mps <= self.stopped_mps:
             raise ValueError(
-                f"going_mps is {self.going_mps}; it has to be above stopped_mps, which is {self.stopped_mps}"
+                f"going_mps is {self.going_mps}; it must be above stopped_mps, which is "
+                f"{self.stopped_mps}"
             )
         self.slow_since_ns: int | None = None
         self.recording = any(entry.name == NAME for entry in ctx.scratch.entries())
@@ -34,7 +36,7 @@ class Lambda:
                 ctx.scratch.remove(NAME)
                 self.recording, self.slow_since_ns = False, None
             return
-        # Written this way round, so that what is no number is no standing either.
+        # Not `speed > ...`, so that NaN does not count as standing.
         if not speed <= self.stopped_mps:
             self.slow_since_ns = None
             return

@@ -1,6 +1,8 @@
-"""Swerve: the car is pushed to one side and then to the other within seconds, as when it evades something.
+"""Swerve: lateral acceleration to one side and then to the other within seconds, as in an evasive
+manoeuvre.
 
-One lobe alone is a bend, and a bend is nothing to keep. Both sides must pass the limit, close together; after that it rests.
+One side alone is a bend. Both sides must exceed the limit, close together; after an event there is
+a pause.
 """
 
 from __future__ import annotations
@@ -8,7 +10,8 @@ from __future__ import annotations
 from gleaner import Context, Sample
 
 WINDOW_NS = 500_000_000
-# A window counts if its oldest sample is within 0.2 s of its start: an IMU may send ten times a second only.
+# A window is full if its oldest sample is within 0.2 s of its start: an IMU may send only ten times
+# a second.
 FULL_NS = 300_000_000
 REST_NS = 2_000_000_000
 
@@ -19,7 +22,7 @@ class Lambda:
         self.lateral = self.imu.field("linear_acceleration.y")
         self.limit: float = ctx.config["swerve_mps2"]
         self.within_ns = int(ctx.config["within_s"] * 1e9)
-        # When each side was last pushed beyond the limit, and by how much at most since the last swerve.
+        # By side: the last time above the limit, and the largest value since the last swerve.
         self.seen_ns: dict[str, int] = {}
         self.peak: dict[str, float] = {}
         self.rest_until_ns = 0
@@ -28,12 +31,12 @@ class Lambda:
         now = ctx.now_ns()
         if now < self.rest_until_ns:
             return
-        # A mean over half a second: what the road does to the wheels is faster, what a driver does is slower.
+        # A mean over half a second: bumps of the road are faster, the driver is slower.
         window = self.imu.column_since(self.lateral, now - WINDOW_NS)
         if now - window.at_ns[0] < FULL_NS:
             return
         mean = float(window.values.mean())
-        # Written this way round, so that what is no number is no push either.
+        # Not `abs(mean) < ...`, so that NaN is ignored.
         if not abs(mean) >= self.limit:
             return
         side, other = ("left", "right") if mean > 0 else ("right", "left")

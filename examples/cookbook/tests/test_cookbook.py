@@ -1,4 +1,5 @@
-"""The recipes in Python at the desk, without any runtime. `pip install ./guest-sdk-python pytest`, then `pytest examples/cookbook`.
+"""Tests the Python recipes locally, without the runtime. `pip install ./guest-sdk-python pytest`,
+then `pytest examples/cookbook`.
 
 `tests/tests/programs/cookbook.rs` runs all ten recipes in the real host."""
 
@@ -35,7 +36,7 @@ def hundredths(seconds: float) -> Any:
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_a_recipe_finds_at_the_desk_what_expected_txt_says(name: str) -> None:
+def test_a_local_run_of_a_recipe_agrees_with_expected_txt(name: str) -> None:
     command, *rows = (COOKBOOK / name / "expected.txt").read_text(encoding="utf-8").splitlines()
     settings = [word.split("=") for word in command.split() if "=" in word]
     done = run(name, SAMPLE, **{key: float(value) for key, value in settings})
@@ -44,23 +45,23 @@ def test_a_recipe_finds_at_the_desk_what_expected_txt_says(name: str) -> None:
 
 
 def test_four_lane_changes_are_four_swerves() -> None:
-    # People who watched the drive labelled two of them, the hard ones to the right, at 16.1 to 18.5 s and 25.1 to 27.6 s.
+    # The two hard ones to the right are labelled in the data set, at 16.1 to 18.5 s and 25.1 to
+    # 27.6 s.
     drive = SHARED / "rec_brake_imu_trip17.mcap"
     if not drive.exists():
-        pytest.skip(f"{drive.name} does not come with the project; it would lie in ../shared/data")
+        pytest.skip(f"{drive.name} is not distributed with the project; put it into ../shared/data")
     assert times(run("swerve", drive)) == pytest.approx([13.13, 17.12, 22.2, 26.25], abs=0.02)
 
 
-def test_pushes_that_are_too_far_apart_are_no_swerve() -> None:
+def test_sides_too_far_apart_are_not_a_swerve() -> None:
     t = hundredths(12)
     y = np.where((t > 2) & (t < 3), 4.0, 0.0) - np.where((t > 7) & (t < 8), 4.0, 0.0)
     assert times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}})) == []
-    assert (
-        len(times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}}, within_s=10.0))) == 1
-    )
+    drive = {IMU: {"t": t, "linear_acceleration.y": y}}
+    assert len(times(run("swerve", drive, within_s=10.0))) == 1
 
 
-def test_what_is_no_number_makes_no_swerve_of_a_bend() -> None:
+def test_nan_in_a_bend_is_not_a_swerve() -> None:
     t = hundredths(12)
     y = np.where((t > 2) & (t < 6), 4.0, 0.0)
     y[400] = np.nan
@@ -73,7 +74,7 @@ def test_a_swerve_is_found_at_nine_samples_a_second() -> None:
     assert len(times(run("swerve", {IMU: {"t": t, "linear_acceleration.y": y}}))) == 1
 
 
-def test_a_car_that_creeps_between_the_limits_stays_stopped() -> None:
+def test_a_car_that_creeps_between_the_thresholds_stays_stopped() -> None:
     t = hundredths(30)
     v = np.select([t < 5, t < 10, t < 20], [10.0, 0.0, 1.5], 10.0)
     done = run("stopped", {SPEED: {"t": t, "twist.linear.x": v}})
@@ -83,12 +84,12 @@ def test_a_car_that_creeps_between_the_limits_stays_stopped() -> None:
     ]
 
 
-def test_what_is_no_number_is_no_standing() -> None:
+def test_nan_is_not_standing() -> None:
     t = hundredths(10)
     assert run("stopped", {SPEED: {"t": t, "twist.linear.x": np.nan * t}}).triggers == []
 
 
-def test_a_recording_ends_even_after_a_fault_in_it(tmp_path: Path) -> None:
+def test_a_recording_ends_also_after_a_fault_in_it(tmp_path: Path) -> None:
     for name in ("lambda.toml", "main.py"):
         (tmp_path / name).write_text(
             (COOKBOOK / "stopped" / name).read_text(encoding="utf-8"), encoding="utf-8"
@@ -105,7 +106,7 @@ def test_a_recording_ends_even_after_a_fault_in_it(tmp_path: Path) -> None:
     ]
 
 
-# Behind a recipe: a fault where the speed is 0.25 m/s.
+# Appended to a recipe: a fault at a speed of 0.25 m/s.
 FAULT_AT_A_QUARTER = """
 class Lambda(Lambda):
     def on_event(self, ctx, event):
@@ -115,13 +116,13 @@ class Lambda(Lambda):
 """
 
 
-def test_limits_the_wrong_way_round_are_refused() -> None:
+def test_thresholds_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(StartError) as refused:
         run("stopped", SAMPLE, stopped_mps=5.0)
-    assert "going_mps is 2.0; it has to be above stopped_mps" in str(refused.value.__cause__)
+    assert "going_mps is 2.0; it must be above stopped_mps" in str(refused.value.__cause__)
 
 
-def test_an_imu_that_is_not_level_is_no_mismatch() -> None:
+def test_an_imu_that_is_not_level_is_not_a_mismatch() -> None:
     t = hundredths(30)
     v = 10 + 0.5 * t
     level = {
@@ -137,7 +138,7 @@ def test_an_imu_that_is_not_level_is_no_mismatch() -> None:
     assert times(run("speed-mismatch", slips))[0] == pytest.approx(20.1, abs=0.15)
 
 
-def test_a_mismatch_is_found_at_ten_samples_a_second_and_after_what_is_no_number() -> None:
+def test_a_mismatch_is_found_at_ten_samples_a_second_and_after_nan() -> None:
     t = np.arange(300) / 10 + 0.03 * (np.arange(300) % 2)
     x = 1.6 + 0 * t
     x[:3] = np.nan
@@ -153,7 +154,7 @@ def test_a_mismatch_is_found_at_ten_samples_a_second_and_after_what_is_no_number
     assert times(run("speed-mismatch", slips))[0] == pytest.approx(20.1, abs=0.15)
 
 
-def test_a_sensor_that_never_spoke_is_silent() -> None:
+def test_a_sensor_that_never_sent_is_silent() -> None:
     t = hundredths(12)
     done = run("sensor-silent", {IMU: {"t": t}, SPEED: {"t": t}})
     assert [trigger.attributes["topic"] for trigger in done.triggers] == [
@@ -162,12 +163,12 @@ def test_a_sensor_that_never_spoke_is_silent() -> None:
     assert times(done) == pytest.approx([10.0], abs=0.2)
 
 
-def test_a_sensor_that_is_found_late_was_not_silent() -> None:
+def test_a_sensor_that_is_discovered_late_is_not_silent() -> None:
     t = hundredths(12)
     assert times(run("sensor-silent", {IMU: {"t": t}, SPEED: {"t": t[500:]}}, first_s=20.0)) == []
 
 
-def test_a_picture_is_new_once_and_the_oldest_kind_is_forgotten(tmp_path: Path) -> None:
+def test_an_image_is_new_once_and_the_oldest_kind_is_forgotten(tmp_path: Path) -> None:
     manifest = tmp_path / "lambda.toml"
     text = (COOKBOOK / "novelty" / "lambda.toml").read_text(encoding="utf-8")
     manifest.write_text(text.replace("CompressedImage", "Image"), encoding="utf-8")
@@ -180,6 +181,6 @@ def test_a_picture_is_new_once_and_the_oldest_kind_is_forgotten(tmp_path: Path) 
         )
 
     assert new([10, 200, 10, 200, 10]) == [1]
-    # 17 kinds are one more than it knows: the first is forgotten.
+    # 17 kinds are one more than it keeps: the first is forgotten.
     kinds = [8 * index for index in range(17)]
     assert new(kinds + kinds[1:] + kinds[:1]) == [*range(1, 17), 33]

@@ -1,29 +1,41 @@
-"""Road roughness: how much of the vertical acceleration lies at frequencies at which a road shakes a car.
+"""Road roughness: the power of the vertical acceleration at the frequencies at which a road shakes
+a car.
 
-The rules, which every twin keeps to the letter. All arithmetic is in 64-bit floats.
+The rules, which every twin follows exactly. All arithmetic is in 64-bit floats.
 
-1. *Stamps* are ``at_ns``, by which the host orders samples. Every sample of the input wakes the lambda.
-2. *The period* is learnt once, from the first 33 stamps: of their 32 intervals, sorted, the one at index 16. A stamp that is not later
-   than the one before it, while the period is being learnt, makes the learning begin anew, with that sample as the first.
-3. *A window* has ``n`` samples: the power of two nearest to ``window_s * 1e9 / period``, the larger one if two are as near, and within
-   16 and 4096. It stays so for as long as the lambda lives.
-4. *A run* is a row of samples without a gap: no interval in it is below 1 ns or above 2.5 periods. A sample behind a gap is the
-   first of a new run; no window reaches across a gap. The 33 samples of rule 2 count as well.
-5. A window is *complete* with the sample that is number ``n``, ``n + n/4``, ``n + 2n/4`` and so on in its run; it holds the newest ``n``
-   samples of the ring, and is left out if there are fewer, as where the host had to drop some. Windows that would have been complete
-   before the period was known are left out, too.
-6. *The rate* of a window follows from its own stamps: ``(n - 1) * 1e9 / (last - first)`` Hz. Bin ``k`` lies at ``k * (rate / n)`` Hz.
-7. Gravity is taken out, since it would fill the lowest bins: the first sample of the window is subtracted from all, then the mean of
-   what remains. So a constant leaves exactly 0, in whatever order a mean is summed. Then the one-sided power spectral density is
-   taken, with the periodic Hann window ``w[j] = (1 - cos(2 pi j / n)) / 2``, as in ``docs/kernels.md``::
+1. *Stamps* are ``at_ns``, by which the host orders samples. Every sample of the input wakes the
+   lambda.
+2. *The period* is learnt once, from the first 33 stamps: of their 32 intervals, sorted, the one at
+   index 16. If a stamp during learning is not later than the previous one, learning restarts with
+   that sample as the first.
+3. *A window* has ``n`` samples: the power of two nearest to ``window_s * 1e9 / period``, the larger
+   one if two are equally near, at least 16 and at most 4096. It stays the same for the life of the
+   lambda.
+4. *A run* is a sequence of samples without a gap: no interval in it is below 1 ns or above 2.5
+   periods. A sample after a gap is the first of a new run; no window includes a gap. The 33 samples
+   of rule 2 count as well.
+5. A window is *complete* with the sample that is number ``n``, ``n + n/4``, ``n + 2n/4`` and so on
+   in its run. It has the newest ``n`` samples of the ring, and is skipped if there are fewer, for
+   example because the host had to drop some. Windows that were complete before the period was known
+   are skipped, too.
+6. *The rate* of a window follows from its own stamps: ``(n - 1) * 1e9 / (last - first)`` Hz. Bin
+   ``k`` is at ``k * (rate / n)`` Hz.
+7. Gravity is removed, since it would fill the lowest bins: the first sample of the window is
+   subtracted from all, then the mean of the differences. So a constant leaves exactly 0, in any
+   order of summation. Then the one-sided power spectral density is computed, with the periodic Hann
+   window ``w[j] = (1 - cos(2 pi j / n)) / 2``, as in ``docs/kernels.md``::
 
-       density[k] = c[k] |sum over j of w[j] x[j] exp(-2 pi i j k / n)|^2 / (rate * sum over j of w[j]^2)
+       density[k] = c[k] |sum over j of w[j] x[j] exp(-2 pi i j k / n)|^2
+                    / (rate * sum over j of w[j]^2)
 
-   for ``k`` of 0 to ``n/2``, where ``c`` is 1 for the first and the last bin and 2 for those between.
-8. *The power* in a band is the sum of its bins, from its lower edge on and below its upper one, times ``rate / n``, in (m/s^2)^2. *The score*
-   is 0.2 of that from 0.5 to 2 Hz, 0.5 of that from 2 to 8 Hz, and all of that from 8 to 20 Hz.
-9. ``peak_hz`` is where the largest bin from 1 to 6 Hz lies, both included; the lowest of equal ones; 0 if there is none.
-10. A score above ``rough`` is an event ``rough-road`` of that score, at the window's last sample. Anything that is no number is not above.
+   for ``k`` of 0 to ``n/2``, where ``c`` is 1 for the first and the last bin and 2 for the others.
+8. *The power* in a band is the sum of its bins, from its lower edge (inclusive) to its upper one
+   (exclusive), times ``rate / n``, in (m/s^2)^2. *The score* is the sum of 0.2 times the power from
+   0.5 to 2 Hz, 0.5 times that from 2 to 8 Hz, and all of that from 8 to 20 Hz.
+9. ``peak_hz`` is the frequency of the largest bin from 1 to 6 Hz, both inclusive; the lowest of
+   equal ones; 0 if there is none.
+10. A score above ``rough`` is an event ``rough-road`` with that score, at the last sample of the
+    window. NaN is not above.
 """
 
 from __future__ import annotations
@@ -74,7 +86,7 @@ class Lambda:
             ctx.event("rough-road", score, peak_hz=peak_hz)
 
     def learn(self, now: int) -> None:
-        """Rules 2 to 4, for the first samples."""
+        """Applies rules 2 to 4 to the first samples."""
         if self.learning and now <= self.learning[-1]:
             self.learning.clear()
         self.learning.append(now)
@@ -91,12 +103,12 @@ class Lambda:
 
 
 def follows(interval_ns: int, period_ns: int) -> bool:
-    """Whether a sample goes on with the run of the one before it."""
+    """Returns whether a sample continues the run of the previous one."""
     return 0 < interval_ns <= GAP_PERIODS * period_ns
 
 
 def samples(wanted: float) -> int:
-    """The power of two nearest to `wanted`."""
+    """The power of two nearest to `wanted`; the larger one if two are equally near."""
     n = SMALLEST
     while n < LARGEST and wanted >= 1.5 * n:
         n *= 2
@@ -104,7 +116,8 @@ def samples(wanted: float) -> int:
 
 
 def roughness(signal: Floats, rate: float, weights: Floats) -> tuple[float, float]:
-    """Score in (m/s^2)^2 and peak in Hz of one window; `signal` is in m/s^2, shape (n,), oldest first."""
+    """Score in (m/s^2)^2 and peak in Hz of one window. `signal` is in m/s^2, shape (n,), oldest
+    first."""
     n = len(signal)
     bin_hz = rate / n
     risen = signal - signal[0]

@@ -1,6 +1,8 @@
-"""The lambda at the desk, without any runtime. `pip install ./guest-sdk-python pytest`, then `pytest examples/imu-fft`.
+"""Tests the lambda locally, without the runtime. `pip install ./guest-sdk-python pytest`, then
+`pytest examples/imu-fft`.
 
-Drives that cannot come with the project lie in `../shared/data`, beside the checkout; without them their tests are skipped."""
+Drives that cannot be distributed with the project are expected in `../shared/data`, beside the
+checkout; tests that need a missing one are skipped."""
 
 from __future__ import annotations
 
@@ -25,12 +27,12 @@ ALL = {"rough": 0.0}
 def shared(name: str) -> Path:
     path = SHARED / name
     if not path.exists():
-        pytest.skip(f"{name} does not come with the project; it would lie in ../shared/data")
+        pytest.skip(f"{name} is not distributed with the project; put it into ../shared/data")
     return path
 
 
 def shaken(signal: Any, rate_hz: float = 50.0, keep: Any = None, **config: Any) -> Run:
-    """A replay of vertical accelerations, of which only those at the indices `keep` arrive."""
+    """Replays vertical accelerations, of which only those at the indices `keep` arrive."""
     keep = np.arange(len(signal)) if keep is None else np.asarray(keep)
     table = {"t": keep / rate_hz, "linear_acceleration.z": np.asarray(signal)[keep]}
     run = replay(PYTHON, {"/imu/data": table}, config={**ALL, **config})
@@ -47,12 +49,13 @@ def ends(run: Run, rate_hz: float = 50.0) -> list[int]:
     return [round(trigger.at_s * rate_hz) for trigger in run.triggers]
 
 
-# Bins of 256 samples at 50 Hz are 0.1953125 Hz apart; each of these is in one, and so are both neighbours in its band.
+# Bins of 256 samples at 50 Hz are 0.1953125 Hz apart; each frequency is at a bin, whose neighbours
+# are in the same band.
 @pytest.mark.parametrize(
     ("hz", "weight"), [(1.171875, 0.2), (4.6875, 0.5), (12.5, 1.0), (23.4375, 0.0)]
 )
 def test_a_sine_scores_its_mean_square_by_the_weight_of_its_band(hz: float, weight: float) -> None:
-    # Of the second sine there is only enough for a score above 0.
+    # The second sine only keeps the score above 0.
     run = shaken(sine(hz, amplitude=3.0, n=600) + sine(12.5, amplitude=1e-3, n=600), window_s=5.0)
     assert ends(run) == [255, 319, 383, 447, 511, 575]
     assert [trigger.score for trigger in run.triggers] == pytest.approx(
@@ -69,22 +72,22 @@ def test_a_window_is_complete_every_quarter_of_its_length() -> None:
     assert ends(run) == [63, 79, 95, 111, 127]
 
 
-def test_no_window_reaches_across_a_gap() -> None:
+def test_no_window_includes_a_gap() -> None:
     # Two samples are missing: 3 periods. The next run begins with sample 102.
     whole = np.arange(300)
     run = shaken(sine(5.0, 1.0, n=300), keep=np.delete(whole, [100, 101]))
     assert ends(run) == [63, 79, 95, *range(102 + 63, 300, 16)]
-    # One sample is no gap, and time goes on: samples are counted, not instants.
+    # One missing sample is not a gap: samples are counted, not time.
     run = shaken(sine(5.0, 1.0, n=300), keep=np.delete(whole, [100]))
     assert ends(run) == [63, 79, 95, *range(112, 300, 16)]
 
 
-def test_a_gap_while_the_period_is_learnt_begins_a_run_as_well() -> None:
+def test_a_gap_while_the_period_is_learnt_starts_a_new_run() -> None:
     run = shaken(sine(5.0, 1.0, n=200), keep=np.delete(np.arange(200), range(10, 20)))
     assert ends(run) == list(range(20 + 63, 200, 16))
 
 
-def test_a_stamp_that_does_not_rise_begins_anew() -> None:
+def test_a_stamp_that_does_not_increase_starts_again() -> None:
     for at in (5, 100):
         twice = np.sort(np.append(np.arange(200), at))
         run = shaken(sine(5.0, 1.0, n=200), keep=twice)
@@ -100,24 +103,18 @@ def test_the_length_of_a_window_is_a_power_of_two(rate_hz: float, window_s: floa
     assert ends(run, rate_hz) == [n - 1 + hop * n // 4 for hop in range(5)]
 
 
-def test_of_two_lengths_that_are_as_near_the_larger_one_is_taken() -> None:
+def test_of_two_equally_near_lengths_the_larger_one_is_used() -> None:
     samples = lambda_file().samples
-    assert [samples(wanted) for wanted in (0.0, 23.9, 24.0, 47.9, 48.0, 1e9)] == [
-        16,
-        16,
-        32,
-        32,
-        64,
-        4096,
-    ]
+    lengths = [samples(wanted) for wanted in (0.0, 23.9, 24.0, 47.9, 48.0, 1e9)]
+    assert lengths == [16, 16, 32, 32, 64, 4096]
 
 
-def test_what_is_no_number_is_not_rough() -> None:
+def test_nan_is_not_rough() -> None:
     assert shaken(np.full(200, np.nan)).triggers == []
 
 
 @pytest.mark.parametrize("constant", [9.81, 9.7])
-def test_a_constant_scores_exactly_nothing(constant: float) -> None:
+def test_a_constant_scores_exactly_zero(constant: float) -> None:
     run = shaken(np.full(200, constant))
     assert (run.counts["imu"].received, run.triggers) == (200, [])
 
@@ -142,18 +139,17 @@ def test_regular_roads_score_lower_than_others() -> None:
     assert area >= 0.80
 
 
-def test_scores_rise_with_the_noise_of_the_wheels() -> None:
+def test_scores_correlate_with_the_noise_of_the_wheels() -> None:
     run = replay(PYTHON, shared("rec_highway_imu_can_00_30s.mcap"), config=ALL)
-    truth = json.loads(shared("rec_highway_imu_can_00_30s.truth.json").read_text(encoding="utf-8"))[
-        "windows"
-    ]
+    text = shared("rec_highway_imu_can_00_30s.truth.json").read_text(encoding="utf-8")
+    truth = json.loads(text)["windows"]
     wheels = [window["wheel_speed_rms_hp5hz"] for window in truth]
     scores = [nearest(run.triggers, window["end_s"]).score for window in truth]
     assert len(truth) > 50
     assert np.corrcoef(ranks(scores), ranks(wheels))[0, 1] >= 0.7
 
 
-def test_a_walk_has_the_frequency_of_its_steps() -> None:
+def test_the_peak_of_a_walk_is_the_frequency_of_its_steps() -> None:
     run = replay(PYTHON, shared("rec_sync_gopro_walk.mcap"), config={**ALL, "window_s": 5.2})
     assert [trigger.attributes["peak_hz"] for trigger in run.triggers] == pytest.approx(
         [1.74] * len(run.triggers), abs=0.1

@@ -6,7 +6,7 @@ const WINDOW_NS: i64 = 500_000_000;
 const FULL_NS: i64 = 450_000_000;
 const REFRACTORY_NS: i64 = 3_000_000_000;
 
-/// The lambda, and what it keeps between wakes.
+/// The lambda and its state between wakes.
 pub struct BrakeDark {
     imu: Topic,
     forward: Field,
@@ -30,7 +30,7 @@ impl Lambda for BrakeDark {
         let Some(mean) = braking(&window, now, self.brake_mps2).filter(|_| rested) else {
             return Ok(());
         };
-        // Only now is the image decoded: most frames cost nothing.
+        // The image is decoded only here, so most frames cost nothing.
         let luma = camera.as_frame()?.mean_luma(None)?;
         if luma < self.dark_luma {
             self.last_ns = Some(now);
@@ -40,7 +40,7 @@ impl Lambda for BrakeDark {
     }
 }
 
-/// Mean of the window in m/s², if the window is full and its mean is below `brake_mps2`.
+/// Mean of the window in m/s²; none unless the window is full and its mean is below `brake_mps2`.
 fn braking(window: &Column, now: i64, brake_mps2: f64) -> Option<f64> {
     let full = window.at_ns.first().is_some_and(|oldest| now - oldest >= FULL_NS);
     window.mean().filter(|mean| full && *mean < brake_mps2)
@@ -55,7 +55,7 @@ mod tests {
 
     use super::*;
 
-    /// A second of braking at 5 m/s², with a picture of that grey at its end.
+    /// Runs one second of braking at 5 m/s², with an image of one grey level at its end.
     fn brake(grey: u8) -> Run<BrakeDark> {
         let mut run =
             Host::from_manifest(include_str!("../lambda.toml")).load::<BrakeDark>().unwrap();
@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn braking_counts_in_the_dark_only() {
+    fn braking_is_reported_in_the_dark_only() {
         let dark = brake(20);
         let found = dark.triggers().collect::<Vec<_>>();
         assert_eq!(
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn the_threshold_of_darkness_is_a_setting() {
+    fn the_threshold_of_darkness_has_a_range() {
         let refused = Host::from_manifest(include_str!("../lambda.toml"))
             .set("dark_luma", 256)
             .load::<BrakeDark>();
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn no_sample_is_no_braking() {
+    fn an_empty_window_is_not_braking() {
         assert_eq!(braking(&Column::default(), 0, -3.0), None);
     }
 

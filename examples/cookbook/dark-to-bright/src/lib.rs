@@ -1,8 +1,9 @@
-//! Dark to bright: the picture turns bright within seconds, as at the end of a tunnel. There
-//! cameras are blind for a moment.
+//! Dark to bright: the image turns bright within seconds, as at the end of a tunnel, where cameras
+//! are overexposed for a moment.
 //!
-//! Two limits, one for dark and one for bright: what lies between changes nothing, so that lamps in
-//! a tunnel are no daylight. And one dark picture is no tunnel: it must have been dark for a time.
+//! There are two thresholds, one for dark and one for bright. Values between them change nothing,
+//! so lamps in a tunnel do not count as daylight. It must have been dark for some time, so one dark
+//! image does not count as a tunnel.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, event, now_ns};
 
@@ -17,7 +18,7 @@ impl Lambda for DarkToBright {
         let (dark, bright) = (config.real("dark_luma")?, config.real("bright_luma")?);
         if bright <= dark {
             let why =
-                format!("bright_luma is {bright}; it has to be above dark_luma, which is {dark}");
+                format!("bright_luma is {bright}; it must be above dark_luma, which is {dark}");
             return Err(Error::new(why));
         }
         Ok(Self { light: Light { dark, bright, dark_ns, within_ns, seen: None } })
@@ -40,11 +41,11 @@ struct Light {
     bright: f64,
     dark_ns: i64,
     within_ns: i64,
-    /// None once it was bright.
+    /// The current dark period; none after a bright image.
     seen: Option<Dark>,
 }
 
-/// When the first and the last dark picture were, and the mean grey of the last.
+/// Times of the first and the last dark image, and the mean grey level of the last.
 struct Dark {
     first_ns: i64,
     last_ns: i64,
@@ -58,7 +59,7 @@ struct Change {
 }
 
 impl Light {
-    /// The change that a picture of this mean grey, 0 to 255, completes.
+    /// Adds an image with this mean grey level, 0 to 255. Returns the change that it completes.
     fn note(&mut self, at_ns: i64, luma: f64) -> Option<Change> {
         if luma < self.dark {
             let first_ns = self.seen.as_ref().map_or(at_ns, |seen| seen.first_ns);
@@ -66,7 +67,7 @@ impl Light {
         }
         let Dark { first_ns, last_ns, luma: from } = self.seen.take_if(|_| luma > self.bright)?;
         let (lasted_ns, took_ns) = (last_ns - first_ns, at_ns - last_ns);
-        // A dark picture alone is no tunnel, and a dawn is no event.
+        // Ignores single dark images, and slow changes such as dawn.
         (lasted_ns >= self.dark_ns && took_ns <= self.within_ns).then_some(Change { from, took_ns })
     }
 }
@@ -79,7 +80,7 @@ mod tests {
 
     const SECOND: i64 = 1_000_000_000;
 
-    /// The changes in pictures of these mean greys, one a second.
+    /// The changes in images with these mean grey levels, one per second.
     fn changes(lumas: &[f64]) -> Vec<Change> {
         let mut light =
             Light { dark: 50.0, bright: 80.0, dark_ns: SECOND, within_ns: 3 * SECOND, seen: None };
@@ -87,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_of_a_tunnel_is_told_once() {
+    fn the_end_of_a_tunnel_is_reported_once() {
         assert_eq!(
             changes(&[120.0, 20.0, 30.0, 60.0, 90.0, 130.0]),
             [Change { from: 30.0, took_ns: 2 * SECOND }]
@@ -95,17 +96,13 @@ mod tests {
     }
 
     #[test]
-    fn a_dark_picture_alone_is_no_tunnel() {
+    fn a_single_dark_image_is_ignored() {
         assert_eq!(changes(&[120.0, 20.0, 120.0]), []);
-        assert_eq!(
-            changes(&[120.0, 20.0, 120.0, 20.0, 120.0]),
-            [],
-            "nor are two with light between them"
-        );
+        assert_eq!(changes(&[120.0, 20.0, 120.0, 20.0, 120.0]), [], "two single ones");
     }
 
     #[test]
-    fn lamps_and_a_dawn_are_no_change() {
+    fn lamps_and_slow_changes_are_ignored() {
         assert_eq!(changes(&[20.0, 70.0, 20.0, 79.0, 30.0]), []);
         assert_eq!(changes(&[40.0, 55.0, 65.0, 75.0, 85.0]), []);
         assert_eq!(changes(&[120.0, 90.0, 60.0, 100.0]), [], "it was never dark");

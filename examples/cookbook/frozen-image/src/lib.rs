@@ -1,7 +1,7 @@
-//! Frozen image: the camera goes on sending, but always the same picture, while the car moves.
+//! Frozen image: the camera keeps sending the same image while the car moves.
 //!
-//! Pictures are compared small and grey, so that the noise of a sensor and of JPEG does not hide
-//! it. The host makes them small; what comes into the lambda is 2,304 bytes.
+//! Images are compared small and grey, so that the noise of the sensor and of JPEG does not hide a
+//! repetition. The host scales them down; only 2,304 bytes are copied into the lambda.
 
 use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input};
 
@@ -13,7 +13,7 @@ struct FrozenImage {
     speed: Topic,
     forward: Field,
     moving_mps: f64,
-    camera: Camera,
+    detector: FreezeDetector,
 }
 
 impl Lambda for FrozenImage {
@@ -21,7 +21,7 @@ impl Lambda for FrozenImage {
         let speed = input("speed")?;
         let forward = speed.field("twist.linear.x")?;
         let (limit, frames) = (config.real("same_luma")?, config.integer("frames")?);
-        let camera = Camera {
+        let detector = FreezeDetector {
             limit,
             frames,
             before: vec![0; PIXELS],
@@ -29,26 +29,26 @@ impl Lambda for FrozenImage {
             same: 0,
             seen: false,
         };
-        Ok(Self { speed, forward, moving_mps: config.real("moving_mps")?, camera })
+        Ok(Self { speed, forward, moving_mps: config.real("moving_mps")?, detector })
     }
 
-    fn on_event(&mut self, picture: Sample) -> Result<()> {
-        // Who stands sees the same, and rightly so.
+    fn on_event(&mut self, camera: Sample) -> Result<()> {
+        // A standing car gets equal images from a working camera.
         let Some(speed) = self.speed.newest() else { return Ok(()) };
         let speed = speed.number(&self.forward)?;
         let moves = speed.abs() >= self.moving_mps;
-        picture.as_frame()?.resize(WIDTH, HEIGHT)?.to_gray()?.copy_to(&mut self.camera.now)?;
-        if self.camera.freezes(moves) {
-            event("frozen-image", self.camera.same as f64).with("speed_mps", speed).send()?;
+        camera.as_frame()?.resize(WIDTH, HEIGHT)?.to_gray()?.copy_to(&mut self.detector.now)?;
+        if self.detector.freezes(moves) {
+            event("frozen-image", self.detector.same as f64).with("speed_mps", speed).send()?;
         }
         Ok(())
     }
 }
 
-struct Camera {
-    /// Mean difference of two pictures, in grey levels of 255, below which they are the same.
+struct FreezeDetector {
+    /// Mean difference of two images, in grey levels of 255, below which they are equal.
     limit: f64,
-    /// So many pictures in a row that are the same as the one before are a frozen camera.
+    /// Number of consecutive images equal to the previous one after which the camera is frozen.
     frames: i64,
     before: Vec<u8>,
     now: Vec<u8>,
@@ -56,9 +56,9 @@ struct Camera {
     seen: bool,
 }
 
-impl Camera {
-    /// Whether the picture in `now` is the one that makes it sure; once for each time that it
-    /// freezes.
+impl FreezeDetector {
+    /// Adds the image in `now`. Returns whether it shows that the camera is frozen, once per
+    /// freeze.
     fn freezes(&mut self, moves: bool) -> bool {
         let is_same = self.seen && difference(&self.before, &self.now) < self.limit;
         self.seen = true;
@@ -68,7 +68,7 @@ impl Camera {
     }
 }
 
-/// Mean absolute difference of two grey pictures of the same size.
+/// Mean absolute difference of two grey images of the same size.
 fn difference(a: &[u8], b: &[u8]) -> f64 {
     let sum: u64 = a.iter().zip(b).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
     sum as f64 / a.len() as f64
@@ -80,9 +80,9 @@ gleaner_sdk::lambda!(FrozenImage);
 mod tests {
     use super::*;
 
-    /// Which pictures, each of one grey, make it sure that the camera is frozen.
+    /// Indices of the images, each of one grey level, at which the camera is reported as frozen.
     fn frozen(greys: &[u8], moves: bool) -> Vec<usize> {
-        let mut camera = Camera {
+        let mut detector = FreezeDetector {
             limit: 0.1,
             frames: 3,
             before: vec![0; 9],
@@ -91,8 +91,8 @@ mod tests {
             seen: false,
         };
         let mut freezes = |grey: u8| {
-            camera.now.fill(grey);
-            camera.freezes(moves)
+            detector.now.fill(grey);
+            detector.freezes(moves)
         };
         greys
             .iter()
@@ -102,13 +102,13 @@ mod tests {
     }
 
     #[test]
-    fn the_same_picture_again_and_again_is_told_once_each_time() {
+    fn a_repeated_image_is_reported_once_per_freeze() {
         assert_eq!(frozen(&[0, 0, 0, 0, 0, 0, 9, 9, 9, 9, 9], true), [3, 9]);
         assert_eq!(frozen(&[1, 2, 3, 3, 3, 4, 4, 4, 5], true), []);
     }
 
     #[test]
-    fn a_car_that_stands_sees_the_same() {
+    fn a_standing_car_is_ignored() {
         assert_eq!(frozen(&[0; 10], false), []);
     }
 }

@@ -1,7 +1,7 @@
-//! Pothole: one hard jolt in the vertical acceleration, far above how rough the road is anyway.
+//! Pothole: one hard jolt in the vertical acceleration, far above the usual roughness of the road.
 //!
-//! Most samples are answered by the span of a seventh of a second. Only when a jolt has ended is
-//! the road around it looked at.
+//! Most wakes only compute the span of a seventh of a second. The roughness of the road is computed
+//! only when a jolt has ended.
 
 use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input, now_ns};
 
@@ -35,15 +35,15 @@ impl Lambda for Pothole {
     }
 }
 
-/// A jolt begins above the limit and ends below half of it, so that one jolt is one event, with its
-/// largest value.
+/// Detects jolts. A jolt begins at the limit and ends below half of it, so that one jolt is one
+/// event, with its largest span.
 struct Jolts {
     limit: f64,
     largest: Option<f64>,
 }
 
 impl Jolts {
-    /// The largest span of the jolt that ends now, if one does.
+    /// Adds a span. Returns the largest span of the jolt that it ends; none if it ends none.
     fn note(&mut self, span: f64) -> Option<f64> {
         match self.largest {
             Some(_) if span < self.limit / 2.0 => self.largest.take(),
@@ -59,7 +59,7 @@ impl Jolts {
     }
 }
 
-/// Largest less smallest value, in their unit; minus infinity for none.
+/// Largest minus smallest value, in their unit; minus infinity if there are none.
 fn span(values: &[f64]) -> f64 {
     let (low, high) = values
         .iter()
@@ -67,8 +67,8 @@ fn span(values: &[f64]) -> f64 {
     high - low
 }
 
-/// Median distance from the median: a jolt of a few samples hardly changes it, as it would a
-/// standard deviation.
+/// Median absolute deviation from the median. Unlike a standard deviation, it hardly changes with a
+/// jolt of a few samples.
 fn spread(values: Vec<f64>) -> f64 {
     let centre = median(values.clone());
     median(values.into_iter().map(|value| (value - centre).abs()).collect())
@@ -86,16 +86,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_jolt_is_told_once_when_it_has_ended_with_its_largest_value() {
+    fn a_jolt_is_reported_once_at_its_end_with_its_largest_value() {
         let mut jolts = Jolts { limit: 8.0, largest: None };
-        let told = [1.0, 7.9, 8.0, 11.0, 9.0, 4.0, 3.9, 1.0, 8.5, 1.0].map(|span| jolts.note(span));
+        let reported =
+            [1.0, 7.9, 8.0, 11.0, 9.0, 4.0, 3.9, 1.0, 8.5, 1.0].map(|span| jolts.note(span));
         let mut expected = [None; 10];
         (expected[6], expected[9]) = (Some(11.0), Some(8.5));
-        assert_eq!(told, expected);
+        assert_eq!(reported, expected);
     }
 
     #[test]
-    fn the_spread_of_a_road_does_not_mind_a_jolt() {
+    fn the_spread_of_a_road_hardly_changes_with_a_jolt() {
         let road: Vec<f64> =
             (0..100).map(|i| 9.7 + if i % 2 == 0 { 0.25 } else { -0.25 }).collect();
         let mut jolted = road.clone();

@@ -6,7 +6,7 @@ const WINDOW_NS: i64 = 500_000_000;
 const FULL_NS: i64 = 450_000_000;
 const REFRACTORY_NS: i64 = 3_000_000_000;
 
-/// The lambda, and what it keeps between wakes.
+/// The lambda and its state between wakes.
 pub struct Hello {
     imu: Topic,
     forward: Field,
@@ -33,7 +33,7 @@ impl Lambda for Hello {
     }
 }
 
-/// Mean of the window in m/s², if the window is full and its mean is below `brake_mps2`.
+/// Mean of the window in m/s²; none unless the window is full and its mean is below `brake_mps2`.
 fn braking(window: &Column, now: i64, brake_mps2: f64) -> Option<f64> {
     let full = window.at_ns.first().is_some_and(|oldest| now - oldest >= FULL_NS);
     window.mean().filter(|mean| full && *mean < brake_mps2)
@@ -47,7 +47,7 @@ mod tests {
 
     use super::*;
 
-    /// What the lambda makes of forward accelerations at 100 Hz, in m/s².
+    /// Runs the lambda over forward accelerations at 100 Hz, in m/s².
     fn drive(forward: &[f64]) -> Run<Hello> {
         let mut run = Host::from_manifest(include_str!("../lambda.toml")).load::<Hello>().unwrap();
         for (n, forward) in (0..).zip(forward) {
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tap_on_the_brake_is_none() {
+    fn a_tap_on_the_brake_is_not_reported() {
         let run = drive(&[[0.0; 100].as_slice(), &[-5.0; 10], &[0.0; 100]].concat());
         assert_eq!(run.triggers().next(), None);
     }
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn a_window_that_is_not_full_is_not_judged() {
+    fn a_window_that_is_not_full_is_ignored() {
         assert_eq!(braking(&window(&[-9.0, -9.0]), 200_000_000, -3.0), None);
     }
 

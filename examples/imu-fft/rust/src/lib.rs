@@ -1,8 +1,8 @@
-//! Road roughness: how much of the vertical acceleration lies at frequencies at which a road shakes
+//! Road roughness: the power of the vertical acceleration at the frequencies at which a road shakes
 //! a car.
 //!
-//! The rules stand at the top of its twin, `../python/main.py`, with their numbers. `road` keeps
-//! them; here it meets the host.
+//! The numbered rules are at the top of the Python twin, `../python/main.py`. `road` implements
+//! them; this file calls the host.
 
 mod road;
 
@@ -10,7 +10,7 @@ use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input};
 
 use road::{Road, Roughness};
 
-/// The lambda, and what it keeps between wakes.
+/// The lambda and its state between wakes.
 pub struct ImuFft {
     imu: Topic,
     vertical: Field,
@@ -52,7 +52,7 @@ mod tests {
 
     use super::*;
 
-    /// Ten seconds at 100 Hz on a road that shakes the car by a sine of 4 Hz, in m/s².
+    /// Runs ten seconds at 100 Hz on a road that shakes the car with a sine of 4 Hz, in m/s².
     fn shake(amplitude: f64) -> Run<ImuFft> {
         let mut run = Host::from_manifest(include_str!("../lambda.toml")).load::<ImuFft>().unwrap();
         for n in 0..1000 {
@@ -65,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn a_road_is_rough_that_shakes_the_car() {
+    fn a_road_that_shakes_the_car_is_rough() {
         let run = shake(3.0);
         let rough = run.triggers().next().expect("a trigger");
         assert_eq!(rough.label, "rough-road");

@@ -1,4 +1,4 @@
-//! When a window is complete, and how rough it is. Nothing here knows of the host.
+//! Determines complete windows and computes their roughness. Does not call the host.
 
 use gleaner_sdk::kernels::fft::{Spectrum, SpectrumError, band_power};
 
@@ -14,31 +14,31 @@ const BANDS: [(f64, f64, f64); 3] = [(0.5, 2.0, 0.2), (2.0, 8.0, 0.5), (8.0, 20.
 /// Rule 9.
 const PEAK_HZ: (f64, f64) = (1.0, 6.0);
 
-/// What was learnt of the samples so far.
+/// State of the rules after the samples so far.
 pub(crate) struct Road {
     window_s: f64,
     learning: Vec<i64>,
     period_ns: i64,
     last_ns: i64,
-    /// Samples without a gap, up to the last one.
+    /// Number of samples without a gap, up to the last one.
     run: usize,
     plan: Option<Plan>,
 }
 
-/// Made once the length of windows is known.
+/// Buffers and spectrum, created once the length of windows is known.
 struct Plan {
-    /// At 1 Hz: the rate is read off each window.
+    /// Planned for 1 Hz: the rate follows from each window.
     spectrum: Spectrum<f64>,
     density: Vec<f64>,
     centred: Vec<f64>,
 }
 
-/// Of one window.
+/// Roughness of one window.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Roughness {
-    /// In (m/s²)².
+    /// Score in (m/s²)².
     pub(crate) score: f64,
-    /// In Hz; 0 if there is no bin.
+    /// Frequency of the largest bin in Hz; 0 if there is no bin.
     pub(crate) peak_hz: f64,
 }
 
@@ -54,7 +54,8 @@ impl Road {
         }
     }
 
-    /// Takes note of a sample; of how many samples the window is that it completes, if it does.
+    /// Adds a sample. Returns the length of the window that it completes, in samples; none if it
+    /// completes none.
     pub(crate) fn note(&mut self, at_ns: i64) -> Result<Option<usize>, SpectrumError> {
         if self.plan.is_none() {
             self.learn(at_ns)?;
@@ -68,7 +69,7 @@ impl Road {
         Ok(is_complete.then_some(samples))
     }
 
-    /// Rules 2 to 4, for the first samples.
+    /// Applies rules 2 to 4 to the first samples.
     fn learn(&mut self, at_ns: i64) -> Result<(), SpectrumError> {
         if self.learning.last().is_some_and(|last| at_ns <= *last) {
             self.learning.clear();
@@ -100,8 +101,8 @@ impl Road {
         self.run = if follows { self.run + 1 } else { 1 };
     }
 
-    /// Of the window that was just completed: stamps, and vertical accelerations in m/s², oldest
-    /// first.
+    /// Computes the roughness of the window that was just completed, from its stamps in nanoseconds
+    /// and its vertical accelerations in m/s², oldest first.
     pub(crate) fn roughness(
         &mut self,
         at_ns: &[i64],
@@ -130,7 +131,7 @@ impl Road {
     }
 }
 
-/// Where the largest bin within [`PEAK_HZ`] lies, the lowest of equal ones.
+/// Frequency of the largest bin within [`PEAK_HZ`], the lowest of equal ones.
 fn peak(density: &[f64], bin_hz: f64) -> f64 {
     let bins = density.iter().enumerate().map(|(bin, power)| (bin as f64 * bin_hz, *power));
     let within = bins.filter(|(at_hz, _)| (PEAK_HZ.0..=PEAK_HZ.1).contains(at_hz));
@@ -139,7 +140,7 @@ fn peak(density: &[f64], bin_hz: f64) -> f64 {
         .map_or(0.0, |(at_hz, _)| at_hz)
 }
 
-/// Of two that are as near, the larger one.
+/// Returns the power of two nearest to `wanted`; the larger one if two are equally near.
 fn nearest_power_of_two(wanted: f64) -> usize {
     let mut samples = SMALLEST;
     while samples < LARGEST && wanted >= 1.5 * samples as f64 {
@@ -156,7 +157,7 @@ mod tests {
 
     use super::*;
 
-    /// The sample with which each window ends, and its roughness; sample `i` is at `i / rate_hz`.
+    /// Index of the last sample of each window, and its roughness; sample `i` is at `i / rate_hz`.
     fn windows(road: &mut Road, rate_hz: f64, signal: &[f64]) -> Vec<(usize, Roughness)> {
         let at_ns: Vec<i64> =
             (0..signal.len()).map(|i| (i as f64 / rate_hz * 1e9).round() as i64).collect();
@@ -197,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn a_constant_scores_exactly_nothing() {
+    fn a_constant_scores_exactly_zero() {
         for constant in [9.81, 9.7] {
             let found = windows(&mut Road::new(1.25), 50.0, &[constant; 200]);
             let scores: Vec<f64> = found.iter().map(|(_, found)| found.score).collect();
@@ -206,13 +207,13 @@ mod tests {
     }
 
     #[test]
-    fn of_two_lengths_that_are_as_near_the_larger_one_is_taken() {
+    fn of_two_equally_near_lengths_the_larger_one_is_used() {
         let lengths = [0.0, 23.9, 24.0, 47.9, 48.0, 1e9].map(nearest_power_of_two);
         assert_eq!(lengths, [16, 16, 32, 32, 64, 4096]);
     }
 
     #[test]
-    fn what_is_no_number_is_not_above_anything() {
+    fn the_score_of_nan_is_nan() {
         let found = windows(&mut Road::new(1.25), 50.0, &[f64::NAN; 100]);
         assert!(
             !found.is_empty() && found.iter().all(|(_, found)| found.score.is_nan()),
@@ -220,15 +221,15 @@ mod tests {
         );
     }
 
-    /// 300 series of the vertical acceleration at 50 Hz, regular road and four kinds of bad road.
-    /// The data cannot come with the project.
+    /// Uses 300 series of the vertical acceleration at 50 Hz: regular road and four kinds of bad
+    /// road. The data cannot be distributed with the project.
     #[test]
     fn regular_roads_score_lower_than_others() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR"))
             .join("../../../../shared/data/road_surface/accz_50hz_labelled.csv");
         let Ok(text) = fs::read_to_string(&path) else {
             return println!(
-                "skipped: no {}, which does not come with the project",
+                "skipped: no {}, which is not distributed with the project",
                 path.display()
             );
         };
