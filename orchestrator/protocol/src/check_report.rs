@@ -2,44 +2,44 @@ use serde::{Deserialize, Serialize};
 
 use gleaner_lambda::manifest::LambdaKind;
 
-/// What was found out about a built lambda without any sample: it could be loaded, it fits the
-/// interface, and its `init` returned.
+/// The result of checking a built lambda without samples: it was loaded, fits the interface, and
+/// its `init` returned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CheckReport {
     /// Name of the lambda.
     pub lambda: String,
     /// Version of the lambda.
     pub version: String,
-    /// What kind of lambda it is.
+    /// Kind of the lambda.
     pub kind: LambdaKind,
-    /// What runs it, with its version.
+    /// Its engine, with the version.
     pub engine: String,
-    /// How long `init` took, in ms; `None` if it was not run.
+    /// Duration of `init`, in ms; `None` if it was not run.
     pub init_ms: Option<f64>,
-    /// Resident memory of its process after that, all its rings included, in bytes.
+    /// Resident memory of its process afterwards, including all rings, in bytes.
     pub resident_bytes: u64,
-    /// What it will take on a vehicle: what is there from the start, and what it may take at most.
+    /// Resources that it needs on a vehicle: preallocated ones, and maxima.
     pub needs: Vec<Need>,
-    /// What it logged and printed on the way.
+    /// Lines that it logged and printed.
     pub log: Vec<String>,
-    /// What a user should know, and is no error.
+    /// Notes for the user, which are not errors.
     pub notes: Vec<String>,
 }
 
 /// Memory or disk for one purpose.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Need {
-    /// What it is for, for example ``input `imu`, 1,025 slots``.
+    /// Its purpose, for example ``input `imu`, 1,025 slots``.
     pub purpose: String,
-    /// Bytes; `None` where nothing of the lambda's own bounds it.
+    /// Bytes; `None` if the lambda's manifest sets no limit.
     pub bytes: Option<u64>,
-    /// Where.
+    /// Memory or disk.
     pub place: NeedPlace,
-    /// Taken from the start; else as much as this at most.
+    /// True if it is allocated at the start; otherwise `bytes` is a maximum.
     pub preallocated: bool,
 }
 
-/// Where something is kept.
+/// The resource that a [`Need`] refers to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[allow(missing_docs)]

@@ -2,23 +2,23 @@ use serde::{Deserialize, Serialize};
 
 use crate::DurationStats;
 
-/// What is in a recorded drive.
+/// The content of a recorded drive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DriveInfo {
     /// Log time of its first message, in ns since the epoch; `None` if there is none.
     pub start_ns: Option<i64>,
     /// Log time of its last message, in ns since the epoch.
     pub end_ns: Option<i64>,
-    /// What of it was read: log times in ns, the second no longer of the part. All of it if there
-    /// are none.
+    /// The parts of it that were read, as log times in ns, the second exclusive. Empty if all of it
+    /// was read.
     pub parts: Vec<[i64; 2]>,
-    /// Messages that came after one with a later log time.
+    /// Number of messages after one with a later log time.
     pub out_of_order: u64,
-    /// Why it was not read to its end, if it is damaged.
+    /// The damage that ended reading, if any.
     pub damaged: Option<String>,
-    /// By name.
+    /// Its topics, sorted by name.
     pub topics: Vec<DriveTopicInfo>,
-    /// Topics beyond those, which were not looked at.
+    /// Number of further topics, which were not read.
     #[serde(default)]
     pub skipped: u64,
 }
@@ -26,42 +26,43 @@ pub struct DriveInfo {
 /// A topic of a drive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DriveTopicInfo {
-    /// Its absolute name.
+    /// Absolute name.
     pub topic: String,
-    /// Its type, for example `sensor_msgs/msg/Imu`.
+    /// Message type, for example `sensor_msgs/msg/Imu`.
     pub type_name: String,
-    /// How many messages there are; `None` if nothing says.
+    /// Number of messages; `None` if the drive does not state it.
     pub messages: Option<u64>,
-    /// Whether the drive carries the definitions of the type, or they are known here.
+    /// True if the drive contains the definition of the type, or it is bundled.
     pub is_defined: bool,
-    /// Why it cannot be read, if it cannot.
+    /// The reason why it cannot be read, if any.
     pub unreadable: Option<String>,
-    /// Messages in what was read of the drive.
+    /// Number of messages in the parts that were read.
     pub messages_read: u64,
-    /// Time between neighbours there, by log time.
+    /// Time between consecutive messages there, by log time.
     pub interval: Option<DurationStats>,
-    /// Log time of the message before the longest of these times, in ns since the epoch.
+    /// Log time of the message before the longest interval, in ns since the epoch.
     pub longest_gap_at_ns: Option<i64>,
-    /// Numbers that are missing between those of its messages; `None` where the recorder did not
-    /// number them one by one.
+    /// Number of gaps in the sequence numbers; `None` if the recorder did not number messages one
+    /// by one.
     pub missing: Option<u64>,
-    /// Bytes of the largest message there, as CDR.
+    /// Size of the largest message there, as CDR, in bytes.
     pub largest_bytes: u64,
-    /// Bytes of all messages there.
+    /// Size of all messages there, in bytes.
     pub bytes: u64,
-    /// Of a topic with pictures: the first one, for example `jpeg 1280x720` or `bgr8 320x180`.
+    /// Format of the first image, for example `jpeg 1280x720` or `bgr8 320x180`; `None` for other
+    /// types.
     pub picture: Option<PictureInfo>,
 }
 
-/// The shape of a picture.
+/// The format of an image.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PictureInfo {
-    /// Its encoding in words.
+    /// Name of its encoding.
     pub encoding: String,
-    /// Pixels.
+    /// Width in pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height in pixels.
     pub height: u32,
-    /// Whether it has to be decoded.
+    /// True if it has to be decoded.
     pub is_compressed: bool,
 }

@@ -3,26 +3,28 @@ use std::time::Duration;
 
 use gleaner_base::parse_duration;
 
-/// A time in a drive, as people give it.
+/// A time in a drive, as given by a user.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DriveTime {
-    /// So long after its first message.
+    /// Time since its first message.
     After(Duration),
-    /// On the clock of its log times, in ns since 1970.
+    /// Log time, in ns since 1970.
     At(i64),
 }
 
-/// A text that is no [`DriveTime`].
+/// The text is not a [`DriveTime`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "write seconds after the drive's start, as in 12.5 or 2min, or a time since 1970, as in @1700000000.5"
+    "write seconds after the drive's start, as in 12.5 or 2min, \
+     or a time since 1970, as in @1700000000.5"
 )]
 pub struct DriveTimeError;
 
 impl FromStr for DriveTime {
     type Err = DriveTimeError;
 
-    /// Seconds, or a duration as in a manifest; behind an `@`, since 1970. Exact to the nanosecond.
+    /// Parses seconds, or a duration as in a manifest; after an `@`, since 1970. Exact to the
+    /// nanosecond.
     fn from_str(text: &str) -> Result<DriveTime, DriveTimeError> {
         let (since_1970, time) = text.strip_prefix('@').map_or((false, text), |time| (true, time));
         let has_unit = time.ends_with(|c: char| c.is_ascii_alphabetic());
@@ -42,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn seconds_need_no_unit_and_others_have_theirs() {
+    fn seconds_need_no_unit_and_other_durations_do() {
         let after = |ns| Ok(DriveTime::After(Duration::from_nanos(ns)));
         for (text, ns) in [
             ("0", 0),
@@ -63,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_time_is_refused_with_examples() {
+    fn invalid_times_are_refused_with_examples() {
         for text in
             ["", "@", "-1", "1m", "12:30", "1e3", "@-5", "@99999999999", "@@1", "1.0000000001", "s"]
         {

@@ -6,52 +6,52 @@ use serde::{Deserialize, Serialize};
 
 use gleaner_base::{Exit, safe_file, write_atomically};
 
-/// How long a runtime may take for its end once it was asked for it; then `gleaner-shim` kills it.
-/// Who started both waits longer.
+/// Time for a runtime to end after a request; then `gleaner-shim` kills it. The program that
+/// started both waits longer.
 pub const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// How a runtime ended, as `gleaner-shim` wrote it down: for whoever supervises runtimes, even if
-/// it was not there at that time.
+/// The end of a runtime, written by `gleaner-shim` for the supervisor, even if that was not running
+/// at the time.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ExitRecord {
-    /// Process id that it had.
+    /// Its process id.
     pub pid: u32,
-    /// When it was started, in ns of CLOCK_REALTIME.
+    /// Start time, in ns of `CLOCK_REALTIME`.
     pub started_ns: i64,
-    /// When it ended, likewise.
+    /// End time, likewise.
     pub ended_ns: i64,
     /// Its exit code; `None` if a signal ended it.
     pub code: Option<i32>,
     /// The signal that ended it.
     pub signal: Option<i32>,
-    /// Why `gleaner-shim` killed it, if it did.
+    /// Set if `gleaner-shim` killed it.
     pub killed: Option<Killed>,
-    /// There was no memory left for it: the kernel killed some of it, for its control group had
-    /// none; or, ended by SIGABRT, it was refused more by its own limit.
+    /// True if it ran out of memory: the kernel killed a process of its control group, or, for an
+    /// end by SIGABRT, an allocation exceeded its own limit.
     pub out_of_memory: bool,
-    /// The most memory that it had resident, in bytes.
+    /// Peak resident memory, in bytes.
     pub max_rss_bytes: u64,
-    /// CPU time that it and what it started used, in ns.
+    /// CPU time of it and its children, in ns.
     pub cpu_ns: u64,
-    /// Processes that it left behind, which were killed.
+    /// Number of processes that outlived it and were killed.
     pub orphans: u32,
-    /// `gleaner-shim` had been asked to end it. A lambda can ask its own process only, and not the
+    /// True if the shim was requested to end it. A lambda can signal its own process only, not the
     /// shim.
     #[serde(default)]
     pub end_requested: bool,
-    /// What it was doing when it ended, if it reported that.
+    /// Its phase at the end, if it reported one.
     #[serde(default)]
     pub phase: Option<Phase>,
 }
 
-/// What a runtime was doing when `gleaner-shim` killed it, and why.
+/// The reason why `gleaner-shim` killed a runtime, and its phase.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Killed {
-    /// What it did.
+    /// Its phase.
     pub phase: Phase,
-    /// How long it had been at it, or had been stopped, in ns.
+    /// Time in that phase, or time stopped, in ns.
     pub ran_ns: u64,
-    /// How long that may take before it is killed, in ns.
+    /// Allowed time, in ns.
     pub allowed_ns: u64,
     /// Time of the wake, in ns of the lambda's clock; 0 if there was none.
     pub at_ns: i64,
@@ -64,33 +64,33 @@ pub struct Killed {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum KillReason {
-    /// It did not come back in time.
+    /// A call into the lambda, or the runtime, did not return in time.
     #[default]
     Overdue,
-    /// A signal had stopped it.
+    /// A signal stopped it.
     Stopped,
-    /// It kept more memory than it may, in bytes.
+    /// It used more memory than allowed, in bytes.
     Memory {
-        /// Memory that it had.
+        /// Used memory.
         used: u64,
-        /// Memory that it may have.
+        /// Allowed memory.
         allowed: u64,
     },
-    /// It had more threads than it may.
+    /// It had more threads than allowed.
     Threads {
-        /// Threads that it had.
+        /// Number of threads.
         used: u64,
-        /// Threads that it may have.
+        /// Allowed number of threads.
         allowed: u64,
     },
 }
 
-/// What a runtime is doing.
+/// The phase of a runtime.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u32)]
 pub enum Phase {
-    /// It looks after itself between two wakes.
+    /// Between two calls into the lambda.
     Housekeeping = 0,
     /// The lambda's `init` runs.
     Init = 1,
@@ -99,7 +99,7 @@ pub enum Phase {
 }
 
 impl Phase {
-    /// From its number; what is unknown counts as `Rounds`.
+    /// Parses its number; unknown numbers count as `Housekeeping`.
     pub fn from_number(number: u32) -> Self {
         match number {
             1 => Self::Init,
@@ -110,11 +110,11 @@ impl Phase {
 }
 
 impl Killed {
-    /// A sentence for people, without what was killed.
+    /// Returns a sentence for the user, without its subject.
     pub fn sentence(&self) -> String {
         let (ran, allowed) = (self.ran_ns as f64 / 1e9, self.allowed_ns as f64 / 1e9);
         let what = match (self.reason, self.phase) {
-            (KillReason::Overdue, Phase::Housekeeping) => "gave no sign of life",
+            (KillReason::Overdue, Phase::Housekeeping) => "did not respond",
             (KillReason::Overdue, Phase::Init) => "was in its init",
             (KillReason::Overdue, Phase::Wake) => "was in one wake",
             (KillReason::Stopped, _) => "was stopped by a signal",
@@ -122,43 +122,48 @@ impl Killed {
                 let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
                 let (used, allowed) = (mib(used), mib(allowed));
                 return format!(
-                    "needed more memory than it may have: {used:.1} MiB, of {allowed:.1} MiB"
+                    "needed more memory than allowed: {used:.1} MiB of {allowed:.1} MiB"
                 );
             }
             (KillReason::Threads { used, allowed }, _) => {
-                return format!("had {used} threads, and may have {allowed}");
+                return format!("had {used} threads; the limit is {allowed}");
             }
         };
-        format!("{what} for {ran:.2} s; after {allowed:.2} s it is killed")
+        format!("{what} for {ran:.2} s; the limit is {allowed:.2} s")
     }
 
-    /// The way out.
+    /// Returns help for the user.
     pub fn help(&self) -> &'static str {
         match (self.reason, self.phase) {
             (KillReason::Overdue, Phase::Wake) => {
-                "do less in one wake, or raise `deadline` in [limits]: a process is killed after twice that and 0.35 s; \
-                 in a replay, after 100 times that, or a minute if that is longer"
+                "do less in one wake, or raise `deadline` in [limits]: a process is killed after \
+                 twice that and 0.35 s; in a replay, after 100 times that, or a minute if that is \
+                 longer"
             }
             (KillReason::Overdue, Phase::Init) => {
-                "do less in `init`, or raise `init_deadline` in [limits]: a process is killed after twice that and \
-                 0.35 s; in a replay, after 10 times that, or a minute if that is longer"
+                "do less in `init`, or raise `init_deadline` in [limits]: a process is killed after \
+                 twice that and 0.35 s; in a replay, after 10 times that, or a minute if that is \
+                 longer"
             }
             (KillReason::Overdue, Phase::Housekeeping) => {
-                "no wake ran, so no deadline is too short: look for threads or native code of the lambda that keep its \
-                 process busy, and for a disk that does not answer"
+                "no wake ran, so no deadline is too short: look for threads or native code of the \
+                 lambda that keep its process busy, and for a disk that does not respond"
             }
             (KillReason::Stopped, _) => {
-                "a lambda must not stop its own process, as SIGSTOP does; if it was stopped by hand, go on"
+                "a lambda must not stop its own process, for example with SIGSTOP; nothing is wrong \
+                 if a user stopped it"
             }
             (KillReason::Memory { .. }, _) => {
-                "keep less, or raise `memory` in [limits]; what native code has taken and not freed stays taken when \
-                 the lambda is made again"
+                "keep less, or raise `memory` in [limits]; memory that native code does not free stays \
+                 allocated when the lambda is re-initialised"
             }
-            (KillReason::Threads { .. }, _) => "start fewer threads, and join those that are done",
+            (KillReason::Threads { .. }, _) => {
+                "start fewer threads, and join those that have ended"
+            }
         }
     }
 
-    /// What was used and what is allowed, in the unit of the limit: bytes, threads, or ns.
+    /// Returns the used and the allowed amount, in the unit of the limit: bytes, threads, or ns.
     pub fn used_and_allowed(&self) -> (u64, u64) {
         match self.reason {
             KillReason::Overdue | KillReason::Stopped => (self.ran_ns, self.allowed_ns),
@@ -169,43 +174,43 @@ impl Killed {
     }
 }
 
-/// The signal by which a process ends itself, on all of Linux.
+/// The signal of `abort`, on all Linux platforms.
 const SIGABRT: i32 = 6;
 
-/// Longest record that is read. One has some 300 bytes.
+/// Longest accepted record. One has some 300 bytes.
 const RECORD_MAX: u64 = 16 << 10;
 
 impl ExitRecord {
-    /// Its name in the folder of a run's results.
+    /// Name of its file in the folder of results.
     pub const FILE: &'static str = "exit.json";
 
     /// Returns whether the lambda caused the end. Without a request, an end within a call into the
     /// lambda counts as caused by it, and so does an exit code of success: our own failures come
     /// between two calls and have their own exit codes.
     pub fn is_caused_by_lambda(&self) -> bool {
-        let is_ours = |code| {
+        let is_internal = |code| {
             Exit::from_code(code)
                 .is_some_and(|exit| !matches!(exit, Exit::Ok | Exit::LambdaFaulted))
         };
         let is_within = matches!(self.phase, Some(Phase::Init | Phase::Wake));
         self.killed.is_some()
             || self.out_of_memory
-            || !self.end_requested && (is_within || !self.code.is_some_and(is_ours))
+            || !self.end_requested && (is_within || !self.code.is_some_and(is_internal))
     }
 
-    /// Whether it ended by itself with an exit code of a run that was completed.
-    pub fn is_in_order(&self) -> bool {
+    /// Returns whether it exited by itself with the exit code of a complete run.
+    pub fn is_complete(&self) -> bool {
         let exit = self.code.and_then(Exit::from_code);
         self.killed.is_none() && matches!(exit, Some(Exit::Ok | Exit::LambdaFaulted))
     }
 
-    /// Why it did not end well, as the end of a sentence about the process; `None` if it did.
+    /// Returns the cause of an abnormal end, as a sentence without its subject, the process; `None`
+    /// for a normal end.
     pub fn sentence(&self) -> Option<String> {
         match (self.killed, self.out_of_memory, self.signal, self.code) {
             (Some(killed), ..) => Some(killed.sentence()),
             (None, true, Some(SIGABRT), _) => Some(
-                "ended itself: it needed more memory than `memory` in [limits] leaves it"
-                    .to_owned(),
+                "ended itself: it needed more memory than `memory` in [limits] allows".to_owned(),
             ),
             (None, true, ..) => {
                 Some("was killed by the kernel: its control group had no memory left".to_owned())
@@ -218,7 +223,7 @@ impl ExitRecord {
         }
     }
 
-    /// Writes it so that `path` holds the former record or this one, whole.
+    /// Writes it to `path`, atomically.
     ///
     /// # Errors
     ///
@@ -229,8 +234,8 @@ impl ExitRecord {
         write_atomically(path, &text)
     }
 
-    /// Prints it as the last line of standard output, where its process may have left a part of a
-    /// line.
+    /// Prints it as the last line of standard output, after a line break: its process may have left
+    /// a partial line.
     ///
     /// # Errors
     ///
@@ -244,7 +249,7 @@ impl ExitRecord {
     ///
     /// # Errors
     ///
-    /// Those of the file system; [`io::ErrorKind::InvalidData`] if it is no record.
+    /// Those of the file system; [`io::ErrorKind::InvalidData`] if it is not a record.
     pub fn read(path: &Path) -> io::Result<Self> {
         let mut text = Vec::new();
         safe_file::read(path)?.take(RECORD_MAX).read_to_end(&mut text)?;
@@ -284,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn a_record_of_an_earlier_version_is_read_as_one_of_a_late_process_that_was_not_asked() {
+    fn missing_keys_of_a_record_mean_overdue_and_no_request() {
         let mut json = serde_json::to_value(record()).unwrap();
         json.as_object_mut().unwrap().remove("end_requested");
         json["killed"].as_object_mut().unwrap().remove("reason");
@@ -292,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn a_process_that_ends_unasked_as_if_asked_was_ended_by_its_lambda() {
+    fn a_process_that_exits_with_success_without_a_request_was_ended_by_its_lambda() {
         let ended = ExitRecord { killed: None, signal: None, code: Some(0), ..record() };
         assert!(ended.is_caused_by_lambda());
         assert!(
@@ -302,7 +307,7 @@ mod tests {
         assert!(!ExitRecord { end_requested: true, ..ended.clone() }.is_caused_by_lambda());
         assert!(
             !ExitRecord { code: Some(5), ..ended.clone() }.is_caused_by_lambda(),
-            "our programs have said why"
+            "an error of the runtime"
         );
         assert!(
             ExitRecord { end_requested: true, killed: record().killed, ..ended }
@@ -314,7 +319,7 @@ mod tests {
     fn help_fits_the_limit_that_was_exceeded() {
         let killed = |reason, phase| Killed { reason, phase, ..record().killed.unwrap() };
         let memory = killed(KillReason::Memory { used: 96 << 20, allowed: 64 << 20 }, Phase::Wake);
-        assert_eq!(memory.sentence(), "needed more memory than it may have: 96.0 MiB, of 64.0 MiB");
+        assert_eq!(memory.sentence(), "needed more memory than allowed: 96.0 MiB of 64.0 MiB");
         assert_eq!(memory.used_and_allowed(), (96 << 20, 64 << 20));
         for (reason, phase, word) in [
             (KillReason::Overdue, Phase::Wake, "raise `deadline`"),
@@ -329,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_written_is_read_again_and_replaces_what_was_there() {
+    fn a_record_is_read_back_and_replaces_an_earlier_one() {
         let folder = TestFolder::new();
         let path = folder.path("exit.json");
         record().write(&path).unwrap();
@@ -340,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_record_is_refused() {
+    fn an_invalid_record_is_refused() {
         let folder = TestFolder::new();
         let path = folder.path("exit.json");
         fs::write(&path, "{\"pid\": -1}").unwrap();
@@ -348,11 +353,8 @@ mod tests {
     }
 
     #[test]
-    fn a_person_reads_why_it_was_killed() {
-        assert_eq!(
-            record().sentence().unwrap(),
-            "was in one wake for 0.35 s; after 0.35 s it is killed"
-        );
+    fn the_sentence_states_the_cause_of_the_end() {
+        assert_eq!(record().sentence().unwrap(), "was in one wake for 0.35 s; the limit is 0.35 s");
         let crashed = ExitRecord { killed: None, signal: Some(11), ..record() };
         assert_eq!(crashed.sentence().unwrap(), "was ended by signal 11");
         let full = |signal| {
@@ -360,10 +362,7 @@ mod tests {
                 .sentence()
                 .unwrap()
         };
-        assert_eq!(
-            full(6),
-            "ended itself: it needed more memory than `memory` in [limits] leaves it"
-        );
+        assert_eq!(full(6), "ended itself: it needed more memory than `memory` in [limits] allows");
         assert_eq!(full(9), "was killed by the kernel: its control group had no memory left");
         assert_eq!(ExitRecord { code: Some(0), signal: None, ..crashed }.sentence(), None);
     }

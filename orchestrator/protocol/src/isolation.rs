@@ -2,45 +2,45 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// The environment variable in which `gleaner-shim` tells its runtime the layers that it has set
-/// up: a JSON list of [`Layer`].
+/// The environment variable in which `gleaner-shim` passes the layers that it has set up to its
+/// runtime: a JSON list of [`Layer`].
 pub const LAYERS_ENV: &str = "GLEANER_LAYERS";
 
-/// A layer of isolation around a lambda's process, as it was found to hold on this machine.
+/// A layer of isolation around a lambda's process, as tested on this machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Layer {
-    /// What it keeps a lambda from, in a word or two: `files`, `processes`.
+    /// The protected resource, in a word or two: `files`, `processes`.
     pub name: String,
-    /// Whether it holds.
+    /// The result of the test.
     pub holds: Holds,
-    /// By what, or why not, for people.
+    /// The mechanism, or the reason why it does not hold.
     pub note: String,
 }
 
-/// Whether a layer of isolation holds.
+/// The result of testing a layer of isolation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Holds {
-    /// It was tried, and held.
+    /// It was tested, and holds.
     Yes,
-    /// Some of it is missing on this system.
+    /// A part of it is missing on this system.
     Partly,
-    /// It is not there.
+    /// It is missing.
     No,
 }
 
 impl Layer {
-    /// A layer that holds.
+    /// Creates a layer that holds.
     pub fn yes(name: &str, note: impl Into<String>) -> Self {
         Self { name: name.to_owned(), holds: Holds::Yes, note: note.into() }
     }
 
-    /// A layer of which something is missing.
+    /// Creates a layer of which a part is missing.
     pub fn partly(name: &str, note: impl Into<String>) -> Self {
         Self { name: name.to_owned(), holds: Holds::Partly, note: note.into() }
     }
 
-    /// A layer that is not there.
+    /// Creates a layer that is missing.
     pub fn no(name: &str, note: impl Into<String>) -> Self {
         Self { name: name.to_owned(), holds: Holds::No, note: note.into() }
     }
@@ -51,7 +51,7 @@ impl fmt::Display for Holds {
         f.pad(match self {
             Holds::Yes => "holds",
             Holds::Partly => "partly",
-            Holds::No => "not here",
+            Holds::No => "missing",
         })
     }
 }

@@ -1,13 +1,14 @@
-//! Messages between Gleaner's programs: reports of a runtime, pages of results, exit records,
-//! frames to and from the recorder.
+//! Messages between Gleaner programs: reports of a runtime, result items, exit records, frames to
+//! and from the recorder.
 //!
-//! Nothing here runs a lambda or listens on a socket. Programs talk to each other through these
-//! types; they never link each other.
+//! Nothing here runs a lambda or listens on a socket. Programs share these types; they never link
+//! each other.
 
 mod check_report;
 mod drive_info;
 mod drive_time;
 mod exit_record;
+mod interrupted_wake;
 mod isolation;
 pub mod link;
 mod live_status;
@@ -17,7 +18,6 @@ mod result_item;
 #[cfg(test)]
 #[path = "../../../base/src/test_folder.rs"]
 mod test_folder;
-mod undecided;
 
 pub use check_report::{CheckReport, Need, NeedPlace};
 pub use drive_info::{DriveInfo, DriveTopicInfo, PictureInfo};

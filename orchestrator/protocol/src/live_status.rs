@@ -5,61 +5,63 @@ use serde::{Deserialize, Serialize};
 use crate::link::RecorderStatus;
 use gleaner_lambda::manifest::LambdaKind;
 
-/// How a lambda is doing on live topics. Counts are since its start; spreads are since the report
-/// before, and in the last report since the start.
+/// The status of a live lambda. Counts are since its start; durations are since the previous
+/// report, and in the last report since the start.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LiveStatus {
     /// Name of the lambda.
     pub lambda: String,
     /// Version of the lambda.
     pub version: String,
-    /// What kind of lambda it is.
+    /// Kind of the lambda.
     pub kind: LambdaKind,
-    /// Where its results are written.
+    /// The folder of its results.
     pub out: PathBuf,
-    /// How often its process was started again before.
+    /// Number of restarts of its process so far.
     pub restarts: u32,
     /// Time since its `init`, in s.
     pub up_s: f64,
-    /// How often it ran.
+    /// Number of wakes.
     pub wakes: u64,
     /// Triggers of all kinds.
     pub triggers: u64,
     /// Wakes that ended in a fault.
     pub faults: u64,
-    /// Event samples that woke nobody, by `backlog = "latest"` or because the ring was full.
+    /// Number of event samples that did not wake the lambda, by `backlog = "latest"` or because the
+    /// ring was full.
     pub skipped: u64,
-    /// Ticks that passed while the lambda was still running.
+    /// Number of ticks during a wake.
     pub missed_ticks: u64,
-    /// Log lines that the lambda wrote and that were kept.
+    /// Number of log lines of the lambda that were kept.
     pub log_lines: u64,
-    /// Log lines over the rate limit, thrown away.
+    /// Number of log lines over the rate limit, which were dropped.
     pub log_dropped: u64,
-    /// Triggers over `events_per_minute` of `[limits]`, refused.
+    /// Number of triggers over `events_per_minute` of `[limits]`, which were refused.
     pub triggers_refused: u64,
-    /// Wakes that did not happen, since the lambda had faulted again and again.
+    /// Number of wakes skipped by the back-off after repeated faults.
     pub backed_off: u64,
-    /// Decisions and log lines that could not be written: the disk failed, or was too slow; and
-    /// what native code of the lambda handed on in their place, which is none.
+    /// Number of decisions and log lines that could not be written, as the disk failed or was too
+    /// slow; and of invalid items that native code of the lambda sent in their place.
     pub unwritten: u64,
-    /// Messages on the topics of `--rtt` and `--decisions` that were not sent, since a reader does
-    /// not keep up.
+    /// Number of messages on the topics of `--rtt` and `--decisions` that were dropped, as a reader
+    /// was too slow.
     #[serde(default)]
     pub unsent: u64,
-    /// Sample received, or tick due, until the lambda is entered. `None` without wakes.
+    /// Time from reception of a sample, or from a due tick, until the lambda is entered. `None`
+    /// without wakes.
     pub wake_latency: Option<DurationStats>,
-    /// Time in the lambda.
+    /// Time in the lambda's code.
     pub run_time: Option<DurationStats>,
-    /// Lambda left until its decision is out.
+    /// Time from the return of the lambda until its decision is sent.
     pub decision_latency: Option<DurationStats>,
     /// One entry per input, in the manifest's order.
     pub topics: Vec<LiveTopic>,
-    /// The network.
+    /// Status of the network.
     pub network: NetworkStatus,
-    /// What became of the wakes on their way to the recorder; `None` without one.
+    /// Losses on the link to the recorder; `None` without a recorder.
     pub recorder_link: Option<LinkLosses>,
-    /// What the recorders of the run counted, in `summary.json` only: whoever starts them adds it.
-    /// `None` without one.
+    /// Counts of the recorders of the run, in `summary.json` only: added by the program that starts
+    /// them. `None` without a recorder.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recording: Option<Box<RecorderStatus>>,
     /// Resident memory, in bytes.
@@ -69,8 +71,8 @@ pub struct LiveStatus {
 }
 
 impl LiveStatus {
-    /// With what was counted of `before`, an earlier process of the same lambda. Spreads, rates,
-    /// and what is true of an instant stay those of this one.
+    /// Adds the counts of `before`, an earlier process of the same lambda. Durations, rates and
+    /// instantaneous values stay those of this process.
     #[must_use]
     pub fn after(mut self, before: &LiveStatus) -> LiveStatus {
         self.up_s += before.up_s;
@@ -95,7 +97,7 @@ impl LiveStatus {
             let Some(before) = before.topics.iter().find(|before| before.name == topic.name) else {
                 continue;
             };
-            // Unknown in one of them is unknown in both.
+            // Unknown in one of them means unknown in the sum.
             topic.lost =
                 topic.lost.zip(before.lost).map(|(now, before)| now.saturating_add(before));
             add([
@@ -121,84 +123,84 @@ pub(crate) fn add<const N: usize>(counts: [(&mut u64, u64); N]) {
     counts.into_iter().for_each(|(count, before)| *count = count.saturating_add(before));
 }
 
-/// How long something took.
+/// Statistics of durations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DurationStats {
-    /// How often.
+    /// Number of durations.
     pub n: u64,
     /// Median, in ns.
     pub p50_ns: u64,
-    /// What 99 of 100 do not exceed, in ns.
+    /// 99th percentile, in ns.
     pub p99_ns: u64,
-    /// The longest, in ns.
+    /// Maximum, in ns.
     pub max_ns: u64,
 }
 
-/// What arrives on one input, and what is lost on the way.
+/// The samples of one input: received and lost.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LiveTopic {
     /// Name of the input.
     pub name: String,
     /// Its topic, after remapping.
     pub topic: String,
-    /// Its type, for example `sensor_msgs/msg/Imu`.
+    /// Message type, for example `sensor_msgs/msg/Imu`.
     pub type_name: String,
-    /// Writers that are connected now.
+    /// Number of connected writers.
     pub writers: Option<usize>,
-    /// Samples received per second, since the report before.
+    /// Samples received per second, since the previous report.
     pub rate_hz: f64,
-    /// Samples that reached the ring.
+    /// Number of samples that reached the ring.
     pub received: u64,
-    /// Samples that were lost before they reached us, as far as gaps in their numbers tell; `None`
-    /// if nothing tells.
+    /// Number of samples lost before they reached this process, by gaps in their numbers; `None` if
+    /// unknown.
     pub lost: Option<u64>,
-    /// Samples that could not be read at all.
+    /// Number of samples that could not be parsed.
     pub malformed: u64,
-    /// Samples that a newer one pushed out of the ring.
+    /// Number of samples that newer ones replaced in the ring.
     pub overwritten: u64,
-    /// Samples that found no free slot, since the lambda held too many.
+    /// Number of samples without a free slot, as the lambda held too many.
     pub no_slot: u64,
-    /// Samples larger than the input's `max_size`.
+    /// Number of samples larger than the input's `max_size`.
     pub too_big: u64,
-    /// Samples that should have woken the lambda and did not.
+    /// Number of samples that should have woken the lambda and did not.
     pub skipped: u64,
     /// Age of the newest sample, in ns; `None` before the first.
     pub age_ns: Option<i64>,
-    /// What is asked of the writers, in words.
+    /// The requested QoS, as text.
     pub qos: Option<String>,
-    /// What keeps writers from being heard, in whole sentences.
+    /// Reasons why writers do not match, in whole sentences.
     pub qos_warnings: Vec<String>,
 }
 
-/// The network, as a process of ours sees it.
+/// The network status of one process.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct NetworkStatus {
-    /// The domain of DDS.
+    /// DDS domain.
     pub domain: u16,
-    /// Other participants that are known.
+    /// Number of other known participants.
     pub participants: usize,
-    /// Bytes of socket buffer that were asked for.
+    /// Requested size of the socket buffer, in bytes.
     pub buffer_requested: usize,
-    /// Bytes that the system granted.
+    /// Granted size, in bytes.
     pub buffer_granted: usize,
-    /// Datagrams that the system dropped because a buffer was full.
+    /// Number of datagrams that the system dropped because a buffer was full.
     pub socket_drops: u64,
-    /// Datagrams that nobody should send, with fragments that claim too much or with too many
-    /// numbers, dropped before they could do harm: see `docs/dds-limits.md`.
+    /// Number of harmful datagrams that the packet filter dropped, with excessive fragments or too
+    /// many numbers: see `docs/dds-limits.md`.
     #[serde(default)]
     pub filtered: u64,
-    /// Why such datagrams are let pass, if they are.
+    /// The reason why such datagrams are not filtered, if any.
     #[serde(default)]
     pub unfiltered: Option<String>,
 }
 
-/// What became of wakes on their way to the recorder.
+/// Losses on the link from a lambda to the recorder.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LinkLosses {
-    /// Wakes without a trigger that were left out because the recorder was too slow: clips say how
-    /// many they lack.
+    /// Number of wakes without a trigger that were dropped because the recorder was too slow: clips
+    /// state how many they lack.
     pub wakes_dropped: u64,
-    /// Triggers that could not be handed over.
+    /// Number of triggers that could not be sent.
     pub triggers_lost: u64,
 }
 
@@ -265,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_are_those_of_both_processes_and_all_else_is_of_the_later_one() {
+    fn counts_are_added_and_other_values_are_those_of_the_later_process() {
         let both = live(2, Some(3)).after(&live(40, Some(50)));
         let mut expected = live(42, Some(53));
         (expected.restarts, expected.rss_bytes, expected.topics[0].rate_hz) = (2, 2, 2.0);

@@ -2,16 +2,15 @@ use serde::{Deserialize, Serialize};
 
 use gleaner_base::grouped;
 
-/// Makes all of the table: the counts, their sum, and how each is shown.
+/// Generates the code of the table: the counts, their sum, and their text.
 ///
-/// A count of what is missing has after `=>` what it is shown as: one of it, several, and the
-/// cause.
+/// A count of missing data has its text after `=>`: singular, plural, and the cause.
 macro_rules! recording {
     ($($(#[doc = $meaning:literal])+ $key:ident $(=> $outcome:ident $one:literal, $many:literal, $why:literal)?;)+) => {
-        /// What a recorder counted since its start: each count has one cause.
+        /// Counts of a recorder since its start; each count has one cause.
         ///
-        /// It is a part of a replay's summary, and of what a recorder reports live. Of an older
-        /// file, missing counts are 0.
+        /// They are part of a replay's summary, and of the reports of a live recorder. Counts that
+        /// an older file lacks are 0.
         #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
         #[serde(default)]
         pub struct RecordingCounts {
@@ -19,12 +18,12 @@ macro_rules! recording {
         }
 
         impl RecordingCounts {
-            /// Adds what another recorder counted.
+            /// Adds the counts of another recorder.
             pub fn add(&mut self, other: &RecordingCounts) {
                 $(self.$key = self.$key.saturating_add(other.$key);)+
             }
 
-            /// Each count of something that is missing, by its cause; also those that are 0.
+            /// Returns each count of missing data, with its cause; also those that are 0.
             pub fn by_cause(&self) -> Vec<LossCount> {
                 let mut all = Vec::new();
                 $($(all.push(LossCount {
@@ -41,98 +40,101 @@ macro_rules! recording {
 }
 
 recording! {
-    /// Clips that are finished.
+    /// Finished clips.
     clips;
 
     /// Windows that triggers and commands opened.
     windows;
 
-    /// Triggers that opened no window, as they came within the cooldown of another.
+    /// Triggers within the cooldown of another, which opened no window.
     in_cooldown => NoWindow "trigger", "triggers", "within the cooldown of another";
 
-    /// Starts of a recording that was running, and stops of none.
-    ignored => NoWindow "start or stop", "starts or stops", "of a recording that ran already or did not run";
+    /// Starts of a running recording, and stops of none.
+    ignored => NoWindow "start or stop", "starts or stops",
+        "of a recording that was already running, or not running";
 
-    /// Starts while as many recordings of the lambda were running as may.
-    too_many_started => Lost "start", "starts", "while as many recordings of the lambda ran as may";
+    /// Starts beyond the maximum of running recordings of the lambda.
+    too_many_started => Lost "start", "starts", "over the maximum of recordings of a lambda";
 
-    /// Triggers while as many windows waited for their clip as may.
-    too_many_waiting => Lost "trigger", "triggers", "while as many windows waited for their clip as may";
+    /// Triggers beyond the maximum of windows that wait for their clip.
+    too_many_waiting => Lost "trigger", "triggers",
+        "over the maximum of windows that wait for their clip";
 
-    /// Triggers but for stops, and commands, that opened no window, as the disk had too little
-    /// room.
+    /// Triggers except stops, and commands, that opened no window, as the disk had too little
+    /// space.
     disk_suppressed => Lost "trigger", "triggers", "without a window: the disk was too full";
 
-    /// Triggers of wakes that were refused, as the lambda causes more of them, or more bytes, than
-    /// the recorder takes of one.
-    triggers_over_rate => Lost "trigger", "triggers", "beyond what the recorder takes of one lambda";
+    /// Triggers of wakes that were refused, as the lambda exceeded the recorder's rate limit of
+    /// triggers or bytes.
+    triggers_over_rate => Lost "trigger", "triggers", "over the recorder's rate limit of a lambda";
 
-    /// Triggers of wakes that were refused, as their stamps were of another time.
-    triggers_misstamped => Lost "trigger", "triggers", "of another time than the recorder's";
+    /// Triggers of wakes that were refused for stamps too far in the past or future.
+    triggers_misstamped => Lost "trigger", "triggers", "with a wrong time";
 
     /// Wakes that did not reach the recorder: the journals of clips lack them, and the ones below.
     wakes_lost => Lost "wake", "wakes", "not in any journal: they did not reach the recorder";
 
-    /// Wakes that were refused, as the lambda causes more triggers or bytes than the recorder takes
-    /// of one.
-    wakes_over_rate => Lost "wake", "wakes", "not in any journal: beyond what the recorder takes of one lambda";
+    /// Wakes that were refused, as the lambda exceeded the recorder's rate limit of triggers or
+    /// bytes.
+    wakes_over_rate => Lost "wake", "wakes",
+        "not in any journal: over the recorder's rate limit of a lambda";
 
-    /// Wakes that were refused, as their stamps were of another time.
-    wakes_misstamped => Lost "wake", "wakes", "not in any journal: of another time than the recorder's";
+    /// Wakes that were refused for stamps too far in the past or future.
+    wakes_misstamped => Lost "wake", "wakes", "not in any journal: with a wrong time";
 
-    /// Clips that could not be written, or recovered. What there is of them is recovered when the
-    /// folder is opened again.
+    /// Clips that could not be written or recovered. Their remains are recovered when the folder is
+    /// opened again.
     failed => Lost "clip", "clips", "not written";
 
-    /// Clips that were deleted to make room, and that nobody had fetched.
+    /// Clips that were deleted to make room before they were fetched.
     deleted => Lost "clip", "clips", "deleted before being fetched";
 
     /// Clips that should have been deleted to make room, and could not be.
-    not_deleted => Kept "clip", "clips", "not deleted to make room: losses.jsonl says why";
+    not_deleted => Kept "clip", "clips", "not deleted to make room: see losses.jsonl";
 
-    /// Samples that left the preroll for want of bytes before they were too old for any window.
-    evicted_early => Lost "sample", "samples", "pushed out of the preroll too early: preroll_size";
+    /// Samples that left the full preroll before they were too old for any window.
+    evicted_early => Lost "sample", "samples", "evicted from the preroll too early: preroll_size";
 
-    /// Samples that are larger than the preroll. While a clip is open, they are in it nevertheless,
-    /// unless they are larger than any message of a clip, which is somewhat below 1 GiB.
+    /// Samples larger than the preroll. They are in a clip only if it is open when they arrive, and
+    /// if they are below the maximum for a message, somewhat below 1 GiB.
     too_big => Lost "sample", "samples", "larger than the preroll: preroll_size";
 
-    /// Samples and wakes with a stamp before 1970: they are not recorded.
+    /// Samples and wakes with a stamp before 1970, which are not recorded.
     before_1970 => Lost "sample or wake", "samples or wakes", "stamped before 1970";
 
-    /// Samples of a topic that was not known yet: they are not recorded.
+    /// Samples of a topic that was not known yet, which are not recorded.
     topic_unknown => Lost "sample", "samples", "of a topic not yet known";
 
-    /// Lambdas that the recorder was told of and does not record for; the log says why.
-    lambdas_refused => Lost "lambda", "lambdas", "not recorded for: the recorder has said why";
+    /// Lambdas that the recorder refused; its log has the reasons.
+    lambdas_refused => Lost "lambda", "lambdas", "refused: see the recorder's log";
 }
 
-/// What came of something that is counted.
+/// The outcome of counted data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LossOutcome {
-    /// It opened no window, as the manifest wants it.
+    /// It opened no window, as the manifest requires.
     NoWindow,
     /// It is lost.
     Lost,
-    /// It is there, and should not be.
+    /// It was kept, and should not be.
     Kept,
 }
 
-/// A count of something that is missing, and why.
+/// A count of missing data, with its cause.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LossCount {
-    /// What came of it.
+    /// The outcome.
     pub outcome: LossOutcome,
-    /// How many.
+    /// The count.
     pub count: u64,
-    /// What is counted, with its cause: for a table.
+    /// The counted data with the cause, for a table.
     pub label: &'static str,
     thing: &'static str,
     why: &'static str,
 }
 
 impl LossCount {
-    /// Returns the count in words, for example `no window: 2 triggers, within the cooldown of
+    /// Returns the count as text, for example `no window: 2 triggers, within the cooldown of
     /// another`.
     pub fn in_words(&self) -> String {
         let LossCount { outcome, count, thing, why, .. } = self;
@@ -180,8 +182,8 @@ mod tests {
             shown.map(|counted| counted.in_words()).collect::<Vec<_>>(),
             [
                 "no window: 1 trigger, within the cooldown of another",
-                "kept: 1 clip, not deleted to make room: losses.jsonl says why",
-                "lost: 3,000 samples, pushed out of the preroll too early: preroll_size",
+                "kept: 1 clip, not deleted to make room: see losses.jsonl",
+                "lost: 3,000 samples, evicted from the preroll too early: preroll_size",
             ]
         );
     }

@@ -10,15 +10,15 @@ use gleaner_lambda::manifest::LambdaKind;
 /// One line of JSON that `gleaner-runtime` writes on its standard output for the program that
 /// started it.
 ///
-/// The key `report` says which it is. Every floating-point value is finite: JSON has no other.
+/// The key `report` has the kind. Every floating-point value is finite, as in JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "report", rename_all = "snake_case")]
 pub enum Report {
     /// Sent a few times per second during a replay.
     Progress {
-        /// Messages of the drive that were handled so far.
+        /// Number of messages of the drive handled so far.
         done: u64,
-        /// Messages of the drive, if its index tells.
+        /// Number of messages of the drive, if its index has it.
         total: Option<u64>,
         /// Log time reached, in ns since the epoch.
         at_ns: i64,
@@ -29,26 +29,26 @@ pub enum Report {
     Summary(Box<ReplaySummary>),
     /// Sent once, before the lambda is entered for the first time.
     Isolation {
-        /// The layers around its process, and whether they hold here.
+        /// The layers around its process, as tested.
         layers: Vec<Layer>,
     },
     /// Live: the lambda is ready for its first wake.
     Ready,
-    /// Live: a wake with a trigger or a fault. Where nobody reads fast enough, some are left out
-    /// here; all are in the file.
+    /// Live: a wake with a trigger or a fault. If the reader is too slow, some are dropped here;
+    /// all are in the file.
     Decision(Box<Decision>),
     /// Live: sent once a second.
     Live(Box<LiveStatus>),
     /// Live: sent once, last.
     Ended(Box<LiveStatus>),
-    /// Sent once, last: the topics that are there.
+    /// Sent once, last: the topics of the network.
     Topics {
-        /// By name.
+        /// Sorted by name.
         topics: Vec<TopicInfo>,
     },
-    /// Sent once, last: a lambda was checked.
+    /// Sent once, last: the result of a check.
     Checked(Box<CheckReport>),
-    /// Sent once, last: what is in a recorded drive.
+    /// Sent once, last: the content of a recorded drive.
     Drive(DriveInfo),
     /// Sent once, last, instead of a summary: a journal was compared, and every decision was the
     /// same.
@@ -58,19 +58,19 @@ pub enum Report {
 /// A topic of the network.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TopicInfo {
-    /// Its absolute name.
+    /// Absolute name.
     pub topic: String,
-    /// Its type, for example `sensor_msgs/msg/Imu`.
+    /// Message type, for example `sensor_msgs/msg/Imu`.
     pub type_name: String,
-    /// How many write it.
+    /// Number of writers.
     pub writers: usize,
-    /// How many read it.
+    /// Number of readers.
     pub readers: usize,
-    /// What the writers offer, in words, each once.
+    /// QoS profiles that the writers offer, as text, each once.
     pub qos: Vec<String>,
 }
 
-/// How far a journal was proved.
+/// The result of verifying a journal.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Verified {
     /// Name of the lambda.
@@ -79,21 +79,20 @@ pub struct Verified {
     pub wakes: u64,
     /// Triggers in them.
     pub triggers: u64,
-    /// Those of the wakes that were not compared: the lambda had looked at samples from before the
-    /// clip.
+    /// Wakes that were not compared, as the lambda had read samples from before the clip.
     pub uncovered: u64,
-    /// Triggers in these.
+    /// Triggers in those.
     pub uncovered_triggers: u64,
-    /// The journal has no end: its writer died, or its drive was damaged. What it holds was
-    /// compared.
+    /// True if the journal has no end, as its writer died or its drive was damaged. All of its
+    /// wakes were compared.
     pub truncated: bool,
     /// Duration, in s.
     pub wall_s: f64,
-    /// What was not the same around the lambda, such as another version of its engine.
+    /// Differences in the environment, such as another version of the engine.
     pub notes: Vec<String>,
 }
 
-/// One pass over a drive, of several: what shows a leak or a slowdown.
+/// One pass over a drive, of several; comparing passes shows a leak or a slowdown.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Round {
     /// The pass, from 1.
@@ -110,50 +109,51 @@ pub struct Round {
     pub rss_bytes: u64,
 }
 
-/// What a replay did, as a whole.
+/// The summary of a replay.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ReplaySummary {
     /// Name of the lambda.
     pub lambda: String,
     /// Version of the lambda.
     pub version: String,
-    /// What kind of lambda it is.
+    /// Kind of the lambda.
     pub kind: LambdaKind,
-    /// The drive: MCAP files and rosbag2 directories, as they were named.
+    /// The drive: MCAP files and rosbag2 directories, as given.
     pub drive: Vec<PathBuf>,
-    /// Where the results were written.
+    /// The folder of the results.
     pub out: PathBuf,
-    /// How often the lambda ran.
+    /// Number of wakes.
     pub wakes: u64,
     /// Triggers of all kinds.
     pub triggers: u64,
     /// Wakes that ended in a fault.
     pub faults: u64,
-    /// Event samples that woke nobody, by `backlog = "latest"` or because the ring was full.
+    /// Number of event samples that did not wake the lambda, by `backlog = "latest"` or because the
+    /// ring was full.
     pub skipped: u64,
-    /// Ticks of a periodic lambda that passed while it was still running.
+    /// Number of ticks of a periodic lambda during a wake.
     pub missed_ticks: u64,
-    /// Messages of the drive that came after one with a later log time: the index of a file lied,
-    /// or was not there.
+    /// Number of messages after one with a later log time, as the index of a file is wrong or
+    /// missing.
     pub out_of_order: u64,
-    /// Log lines that the lambda wrote and that were kept.
+    /// Number of log lines of the lambda that were kept.
     pub log_lines: u64,
-    /// Log lines over the rate limit, thrown away.
+    /// Number of log lines over the rate limit, which were dropped.
     pub log_dropped: u64,
-    /// Triggers over `events_per_minute` of `[limits]`, refused.
+    /// Number of triggers over `events_per_minute` of `[limits]`, which were refused.
     pub triggers_refused: u64,
-    /// Wakes that did not happen, since the lambda had faulted again and again.
+    /// Number of wakes skipped by the back-off after repeated faults.
     pub backed_off: u64,
     /// Log time of the drive's first message, in ns since the epoch.
     pub start_ns: i64,
     /// Log time of the drive's last message, in ns since the epoch.
     pub end_ns: i64,
-    /// What was replayed of it.
+    /// The replayed part of it.
     #[serde(default, skip_serializing_if = "TimeRange::is_all")]
     pub part: TimeRange,
     /// Duration of the replay, in s.
     pub wall_s: f64,
-    /// Time in the lambda, in s.
+    /// Time in the lambda's code, in s.
     pub run_s: f64,
     /// Time spent decoding images, in s; part of `run_s`, as it happens on the lambda's thread.
     pub decode_s: f64,
@@ -163,38 +163,38 @@ pub struct ReplaySummary {
     pub peak_rss_bytes: u64,
     /// One entry per input, in the manifest's order.
     pub topics: Vec<TopicReport>,
-    /// What was recorded, and what was not; `clips.jsonl` has a line for each clip, and for those
-    /// that were recovered.
+    /// Counts of the recorder; `clips.jsonl` has a line for each clip, including recovered ones.
     #[serde(flatten)]
     pub recording: RecordingCounts,
-    /// Clips of an earlier replay that were deleted from the same folder.
+    /// Number of clips of an earlier replay that were deleted from the same folder.
     pub clips_replaced: u64,
-    /// What is wrong with the drive, if it is damaged; the results end there.
+    /// The damage of the drive, if any; the results end there.
     pub damaged: Option<String>,
-    /// Why the lambda's process could not go on to the end of the drive; the results end there.
+    /// The reason why the lambda's process stopped before the end of the drive, if it did; the
+    /// results end there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stopped: Option<String>,
 }
 
-/// What arrived on one input, and what was lost on the way.
+/// The samples of one input: received and lost.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TopicReport {
     /// Name of the input.
     pub name: String,
     /// Its topic, after remapping.
     pub topic: String,
-    /// Its type, for example `sensor_msgs/msg/Imu`.
+    /// Message type, for example `sensor_msgs/msg/Imu`.
     pub type_name: String,
-    /// Samples that reached the ring.
+    /// Number of samples that reached the ring.
     pub received: u64,
-    /// Samples that were lost before they reached us; `None` where sequence numbers do not tell.
+    /// Number of samples lost before they reached this process; `None` without sequence numbers.
     /// Unknown is never 0.
     pub lost: Option<u64>,
-    /// Samples that a newer one pushed out of the ring.
+    /// Number of samples that newer ones replaced in the ring.
     pub overwritten: u64,
-    /// Samples that found no free slot, since the lambda held too many.
+    /// Number of samples without a free slot, as the lambda held too many.
     pub no_slot: u64,
-    /// Samples larger than the input's `max_size`.
+    /// Number of samples larger than the input's `max_size`.
     pub too_big: u64,
 }
 
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_summary_says_null_for_what_nobody_knows() {
+    fn a_summary_has_null_for_unknown_values() {
         let topic = TopicReport {
             name: "imu".to_owned(),
             topic: "/imu/data".to_owned(),
@@ -262,7 +262,7 @@ mod tests {
             damaged: None,
             stopped: None,
         };
-        // Flat, whatever a recorder counts.
+        // The counts of the recorder are at the top level.
         let counts = serde_json::to_string(&summary.recording).unwrap();
         assert!(
             counts.starts_with(r#"{"clips":2,"windows":0,"in_cooldown":3,"ignored":0,"#),

@@ -4,26 +4,26 @@ use crate::LiveStatus;
 use gleaner_lambda::manifest::{Manifest, ScheduleSpec};
 use gleaner_lambda::{Cause, Decision, LogLine};
 
-/// The environment variable with the number of the pipe by which a live lambda's process hands
-/// pages to `gleaner-shim`.
+/// The environment variable with the file descriptor of the pipe on which a live lambda's process
+/// sends result items to `gleaner-shim`.
 pub const RESULTS_ENV: &str = "GLEANER_RESULTS";
 
-/// What a live lambda's process hands to `gleaner-shim`, which writes the files of its results: one
+/// A message from a live lambda's process to `gleaner-shim`, which writes the result files: one
 /// line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ResultItem {
     /// Sent once, first, before the lambda is entered.
     Woken(WokenBy),
-    /// A decision, to be kept.
+    /// A decision.
     Decision(Box<Decision>),
-    /// A line of the log.
+    /// A log line.
     Log(LogLine),
-    /// Sent once, last: the summary. Its `unwritten` lacks what the shim could not write.
+    /// Sent once, last: the summary. Its `unwritten` lacks the losses of the shim.
     Last(Box<LiveStatus>),
 }
 
-/// What wakes a lambda: of a wake that ended with its process, more is not known.
+/// The schedule of a lambda: all that is known of a wake that ended with its process.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WokenBy {
     /// A sample or the clock.
@@ -35,7 +35,7 @@ pub struct WokenBy {
 }
 
 impl WokenBy {
-    /// By the schedule of `manifest`.
+    /// Returns the schedule of `manifest`.
     pub fn schedule_of(manifest: &Manifest) -> Self {
         let ScheduleSpec::Event { input: name, .. } = &manifest.schedule else {
             return Self { cause: Cause::Tick, input: None, topic: None };

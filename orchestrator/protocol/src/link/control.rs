@@ -1,4 +1,4 @@
-//! From whoever starts the recorder to the recorder.
+//! The control connection, from the program that starts the recorder to the recorder.
 
 use std::collections::VecDeque;
 use std::io::{self, BufReader, IoSlice, IoSliceMut, Read};
@@ -21,58 +21,58 @@ use gleaner_lambda::manifest::Limits;
 const STARTER: &str = "the starter";
 const RECORDER: &str = "the recorder";
 
-/// Sockets that were received and not yet asked for. There is one in each frame.
+/// Maximum number of received sockets that wait for their frame. Each frame has one.
 const SOCKETS: usize = 16;
 
-/// A lambda that the recorder is to hear.
+/// Adds a lambda to the recorder.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AddLambda {
-    /// Its folder. The manifest in its `build/` says its name and what it records, not the lambda's
-    /// process.
+    /// Its folder. Its name and `[record]` are those of the manifest in its `build/`; the lambda's
+    /// process cannot change them.
     pub lambda: PathBuf,
-    /// Other names for topics of the manifest, from and to.
+    /// Remapped topics, from and to.
     pub remaps: Vec<(String, String)>,
-    /// The most that a lambda gets on this vehicle: the limits of its manifest count as far as they
-    /// are smaller.
+    /// The limits of this vehicle: of each limit, the smaller value of this and the manifest's
+    /// counts.
     pub most: Limits,
 }
 
-/// The starter's end.
+/// The starter's end of the control connection.
 #[derive(Debug)]
 pub struct ControlClient {
     socket: UnixStream,
 }
 
 impl ControlClient {
-    /// A new connection, and what becomes the recorder's standard input.
+    /// Creates a connection; also returns the standard input of the recorder.
     ///
     /// # Errors
     ///
-    /// What the system says: too many open files.
+    /// Those of the system: too many open files.
     pub fn pair() -> io::Result<(ControlClient, OwnedFd)> {
         let (ours, theirs) = UnixStream::pair()?;
         Ok((ControlClient { socket: ours }, theirs.into()))
     }
 
-    /// Has the recorder hear a lambda; returns the socket that the lambda's process is to be given.
+    /// Adds a lambda to the recorder; returns the socket for the lambda's process.
     ///
     /// # Errors
     ///
     /// [`LinkError::Gone`] if the recorder has ended, [`LinkError::Socket`] if there are too many
     /// open files.
     pub fn add(&mut self, add: &AddLambda) -> Result<OwnedFd, LinkError> {
-        let failed = |source| LinkError::Socket { who: RECORDER, source };
+        let failed = |source| LinkError::Socket { peer: RECORDER, source };
         let (ours, theirs) = UnixStream::pair().map_err(failed)?;
         let payload = serde_json::to_vec(add).map_err(|error| failed(error.into()))?;
-        let bytes = frame::whole(tag::ADD, &payload);
+        let bytes = frame::encode(tag::ADD, &payload);
         if payload.len() > super::FRAME_MAX {
             return Err(LinkError::TooLong {
-                who: STARTER,
+                peer: STARTER,
                 frame: "add",
                 bytes: payload.len() as u64,
             });
         }
-        // With the first of its bytes, so that it is there when the frame is.
+        // The socket is sent with the first bytes, so that it arrives before the frame is complete.
         let fds = [theirs.as_fd()];
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
         let mut with = SendAncillaryBuffer::new(&mut space);
@@ -88,16 +88,16 @@ impl ControlClient {
         Ok(ours.into())
     }
 
-    /// Has the recorder complete what is open, and end.
+    /// Requests the recorder to complete open clips and exit.
     ///
     /// # Errors
     ///
-    /// [`LinkError::Gone`] if it has ended already.
+    /// [`LinkError::Gone`] if it has ended.
     pub fn stop(&mut self) -> Result<(), LinkError> {
-        self.send(&frame::whole(tag::STOP, &[]))
+        self.send(&frame::encode(tag::STOP, &[]))
     }
 
-    /// All of `bytes`. A recorder that ended is an error, not a signal.
+    /// Sends all of `bytes`. A recorder that has ended is an error, not a signal.
     fn send(&self, mut bytes: &[u8]) -> Result<(), LinkError> {
         while !bytes.is_empty() {
             match send(&self.socket, bytes, SendFlags::NOSIGNAL) {
@@ -110,16 +110,16 @@ impl ControlClient {
     }
 }
 
-/// What the starter wants.
+/// A request of the starter.
 #[derive(Debug)]
 pub enum ControlMessage {
-    /// A lambda, and its socket.
+    /// Add a lambda, with its socket.
     Add(AddLambda, OwnedFd),
-    /// Complete what is open, and end.
+    /// Complete open clips and exit.
     Stop,
 }
 
-/// The recorder's end.
+/// The recorder's end of the control connection.
 #[derive(Debug)]
 pub struct ControlServer {
     from: BufReader<Receiver>,
@@ -127,29 +127,29 @@ pub struct ControlServer {
 }
 
 impl ControlServer {
-    /// Over this socket, which is the recorder's standard input.
+    /// Creates it from the socket that is the recorder's standard input.
     pub fn new(socket: OwnedFd) -> ControlServer {
         let receiver = Receiver { socket, received: VecDeque::new() };
         ControlServer { from: BufReader::new(receiver), payload: Vec::new() }
     }
 
-    /// The next order; waits for it. `None` when the starter has ended.
+    /// Waits for the next request. `None` when the starter has ended.
     ///
     /// # Errors
     ///
-    /// [`LinkError`] names the frame that makes no sense; nothing can be read after it.
-    pub fn order(&mut self) -> Result<Option<ControlMessage>, LinkError> {
+    /// [`LinkError`] names the invalid frame; nothing can be read after it.
+    pub fn receive(&mut self) -> Result<Option<ControlMessage>, LinkError> {
         match frame::read(&mut self.from, &mut self.payload, STARTER)? {
             None => Ok(None),
             Some(tag::STOP) => Ok(Some(ControlMessage::Stop)),
             Some(tag::ADD) => {
                 let add = serde_json::from_slice(&self.payload).map_err(|error| {
-                    LinkError::Malformed { who: STARTER, frame: "add", why: error.to_string() }
+                    LinkError::Malformed { peer: STARTER, frame: "add", reason: error.to_string() }
                 })?;
                 let socket = self.from.get_mut().received.pop_front().ok_or(LinkError::NoSocket)?;
                 Ok(Some(ControlMessage::Add(add, socket)))
             }
-            Some(tag) => Err(LinkError::Unknown { who: STARTER, tag }),
+            Some(tag) => Err(LinkError::Unknown { peer: STARTER, tag }),
         }
     }
 }
@@ -169,7 +169,7 @@ impl Read for Receiver {
         let bytes = recvmsg(&self.socket, &mut [IoSliceMut::new(buffer)], &mut with, flags)?.bytes;
         for message in with.drain() {
             if let RecvAncillaryMessage::ScmRights(sockets) = message {
-                // Those that nobody wants are closed.
+                // Excess sockets are closed.
                 let room = SOCKETS.saturating_sub(self.received.len());
                 self.received.extend(sockets.take(room));
             }

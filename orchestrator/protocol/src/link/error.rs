@@ -6,93 +6,92 @@ use super::FRAME_MAX;
 use gleaner_base::{Exit, Explain};
 use gleaner_journal::Malformed;
 
-/// Why two programs do not understand each other.
+/// An error of a connection between two programs.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
-    /// The other side has closed the connection: it has ended, or does not want to be connected any
-    /// more.
-    #[error("{who} has ended, or closed the connection")]
+    /// The other side has ended, or closed the connection.
+    #[error("{peer} has ended, or closed the connection")]
     Gone {
-        /// Who: "the recorder", "the lambda" or "the starter".
-        who: &'static str,
+        /// "the recorder", "the lambda" or "the starter".
+        peer: &'static str,
     },
-    /// The recorder does not take a lambda.
-    #[error("the recorder refuses the lambda: {why}")]
+    /// The recorder refuses the lambda.
+    #[error("the recorder refuses the lambda: {reason}")]
     Refused {
-        /// Why, in its words.
-        why: String,
+        /// The reason, from the recorder.
+        reason: String,
     },
-    /// The recorder does not answer.
-    #[error("the recorder has not answered for {seconds} s")]
+    /// The recorder does not respond.
+    #[error("the recorder has not responded for {seconds} s")]
     Silent {
-        /// How long it was waited for.
+        /// The timeout.
         seconds: u64,
     },
-    /// A frame is longer than any may be.
-    #[error("frame `{frame}` from {who} has {bytes} bytes, above the maximum of {FRAME_MAX}")]
+    /// A frame is too long.
+    #[error("frame `{frame}` from {peer} has {bytes} bytes, above the maximum of {FRAME_MAX}")]
     TooLong {
-        /// Whose frame it is.
-        who: &'static str,
+        /// Its sender.
+        peer: &'static str,
         /// Its name.
         frame: &'static str,
-        /// What its head claims.
+        /// The length in its head.
         bytes: u64,
     },
-    /// A frame that there is none of, or not here.
-    #[error("frame {tag} from {who} is not known here")]
+    /// A frame has an unknown tag, or one for another connection.
+    #[error("frame {tag} from {peer} is unknown")]
     Unknown {
-        /// Whose frame it is.
-        who: &'static str,
+        /// Its sender.
+        peer: &'static str,
         /// Its tag.
         tag: u8,
     },
-    /// A frame comes where another one is due.
-    #[error("frame `{frame}` from {who} comes where `{due}` is due")]
+    /// A frame is out of order.
+    #[error("received frame `{frame}` from {peer} instead of `{expected}`")]
     Unexpected {
-        /// Whose frame it is.
-        who: &'static str,
+        /// Its sender.
+        peer: &'static str,
         /// Its name.
         frame: &'static str,
-        /// What should have come.
-        due: &'static str,
+        /// The expected frame.
+        expected: &'static str,
     },
-    /// The payload of a frame is not what it should be.
-    #[error("frame `{frame}` from {who} cannot be read: {why}")]
+    /// The payload of a frame is invalid.
+    #[error("frame `{frame}` from {peer} is invalid: {reason}")]
     Malformed {
-        /// Whose frame it is.
-        who: &'static str,
+        /// Its sender.
+        peer: &'static str,
         /// Its name.
         frame: &'static str,
-        /// What is wrong with it.
-        why: String,
+        /// The reason.
+        reason: String,
     },
-    /// A wake in a frame is none.
-    #[error("frame `wake` from {who} is none")]
+    /// The wake in a frame cannot be decoded.
+    #[error("frame `wake` from {peer} cannot be decoded")]
     Wake {
-        /// Whose frame it is.
-        who: &'static str,
-        /// What is wrong with it.
+        /// Its sender.
+        peer: &'static str,
+        /// The cause.
         source: Malformed,
     },
-    /// A lambda was announced without its socket.
+    /// A lambda was added without its socket.
     #[error("frame `add` came without a socket")]
     NoSocket,
-    /// The socket fails.
-    #[error("cannot talk to {who}")]
+    /// The socket failed.
+    #[error("the connection to {peer} failed")]
     Socket {
-        /// Who is at the other end.
-        who: &'static str,
-        /// What the system said.
+        /// The other end.
+        peer: &'static str,
+        /// The error of the system.
         source: io::Error,
     },
 }
 
 impl LinkError {
-    /// What the system says of a socket to `who`.
-    pub(super) fn of(who: &'static str, error: Errno) -> LinkError {
+    /// Converts the error of a socket to `peer`.
+    pub(super) fn of(peer: &'static str, error: Errno) -> LinkError {
         match error {
-            Errno::PIPE | Errno::CONNRESET => LinkError::Gone { who },
-            error => LinkError::Socket { who, source: error.into() },
+            Errno::PIPE | Errno::CONNRESET => LinkError::Gone { peer },
+            error => LinkError::Socket { peer, source: error.into() },
         }
     }
 }
@@ -101,9 +100,11 @@ impl Explain for LinkError {
     fn help(&self) -> Option<String> {
         match self {
             LinkError::Refused { .. } => {
-                Some("build the lambda again, and start recorder and lambda anew".to_owned())
+                Some("build the lambda again, and restart recorder and lambda".to_owned())
             }
-            LinkError::Unknown { .. } => Some("use recorder and runtime of one version".to_owned()),
+            LinkError::Unknown { .. } => {
+                Some("use recorder and runtime of the same version".to_owned())
+            }
             _ => None,
         }
     }

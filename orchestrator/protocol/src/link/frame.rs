@@ -4,35 +4,35 @@ use std::io::{self, Read};
 
 use super::LinkError;
 
-/// Longest payload: as long as the longest block of a journal, which holds the header of a build
-/// with thousands of files, and the largest wake that a host allows.
+/// Longest payload, that of the longest block of a journal: the header of a build with thousands of
+/// files fits, and the largest wake that a host allows.
 pub const FRAME_MAX: usize = 2 << 20;
 
-/// Bytes before a payload.
+/// Length of the head, before the payload.
 pub(super) const HEAD: usize = 5;
 
-/// What a frame is.
+/// Tags of frames.
 pub(super) mod tag {
-    /// Starter to recorder: a lambda, as JSON; its socket comes with it.
+    /// Starter to recorder: a lambda, as JSON, with its socket.
     pub(crate) const ADD: u8 = 1;
-    /// Starter to recorder: complete what is open, and end.
+    /// Starter to recorder: complete open clips and exit.
     pub(crate) const STOP: u8 = 2;
-    /// Lambda to recorder: the header of its journal, as JSON. First, once.
+    /// Lambda to recorder: the header of its journal, as JSON. Sent once, first.
     pub(crate) const HELLO: u8 = 16;
-    /// Lambda to recorder: `i64` time of the decision, `u32` wakes that are missing before it, and
+    /// Lambda to recorder: `i64` time of the decision, `u32` number of missing wakes before it, and
     /// the wake as in a journal.
     pub(crate) const WAKE: u8 = 17;
-    /// Lambda to recorder: nothing more comes.
+    /// Lambda to recorder: the end of the connection.
     pub(crate) const BYE: u8 = 18;
-    /// Recorder to lambda: it is heard from now on.
+    /// Recorder to lambda: it is accepted.
     pub(crate) const READY: u8 = 32;
-    /// Recorder to lambda: it is not, and why, as text.
+    /// Recorder to lambda: it is refused; the reason as text.
     pub(crate) const REFUSED: u8 = 33;
     /// Recorder to lambda: `u64` ns from a decision with triggers to the opening of its windows.
     pub(crate) const OPENED: u8 = 34;
 }
 
-/// The name of a tag in messages.
+/// Returns the name of a tag for messages.
 pub(super) fn name(tag: u8) -> &'static str {
     match tag {
         tag::ADD => "add",
@@ -53,7 +53,7 @@ pub(super) fn open(tag: u8, out: &mut Vec<u8>) {
     out.extend_from_slice(&[0, 0, 0, 0, tag]);
 }
 
-/// Completes the frame in `out`: its length is known now. `false` if it is longer than any may be.
+/// Completes the frame in `out` with its length. Returns `false` if it is too long.
 pub(super) fn close(out: &mut [u8]) -> bool {
     let len = out.len() - HEAD;
     if let (true, Ok(len)) = (len <= FRAME_MAX, u32::try_from(len)) {
@@ -63,8 +63,8 @@ pub(super) fn close(out: &mut [u8]) -> bool {
     false
 }
 
-/// A whole frame.
-pub(super) fn whole(tag: u8, payload: &[u8]) -> Vec<u8> {
+/// Returns a complete frame.
+pub(super) fn encode(tag: u8, payload: &[u8]) -> Vec<u8> {
     let mut out = Vec::with_capacity(HEAD + payload.len());
     open(tag, &mut out);
     out.extend_from_slice(payload);
@@ -72,34 +72,34 @@ pub(super) fn whole(tag: u8, payload: &[u8]) -> Vec<u8> {
     out
 }
 
-/// What a head says: tag and length.
-pub(super) fn head(bytes: [u8; HEAD], who: &'static str) -> Result<(u8, usize), LinkError> {
+/// Parses a head: tag and length.
+pub(super) fn head(bytes: [u8; HEAD], peer: &'static str) -> Result<(u8, usize), LinkError> {
     let [a, b, c, d, tag] = bytes;
     let len = u32::from_le_bytes([a, b, c, d]);
     match usize::try_from(len) {
         Ok(len) if len <= FRAME_MAX => Ok((tag, len)),
-        _ => Err(LinkError::TooLong { who, frame: name(tag), bytes: len.into() }),
+        _ => Err(LinkError::TooLong { peer, frame: name(tag), bytes: len.into() }),
     }
 }
 
-/// The next frame from `who`, into `payload`; `None` at the end. Memory is taken as bytes come, not
-/// as a head claims.
+/// Reads the next frame from `peer` into `payload`; returns its tag, `None` at the end. Memory is
+/// allocated as bytes arrive, not by the length in the head.
 pub(super) fn read(
     from: &mut impl Read,
     payload: &mut Vec<u8>,
-    who: &'static str,
+    peer: &'static str,
 ) -> Result<Option<u8>, LinkError> {
     let failed = |source: io::Error| match source.kind() {
-        io::ErrorKind::ConnectionReset | io::ErrorKind::BrokenPipe => LinkError::Gone { who },
-        _ => LinkError::Socket { who, source },
+        io::ErrorKind::ConnectionReset | io::ErrorKind::BrokenPipe => LinkError::Gone { peer },
+        _ => LinkError::Socket { peer, source },
     };
     payload.clear();
     from.by_ref().take(HEAD as u64).read_to_end(payload).map_err(failed)?;
     let Ok(bytes) = <[u8; HEAD]>::try_from(payload.as_slice()) else {
-        return if payload.is_empty() { Ok(None) } else { Err(LinkError::Gone { who }) };
+        return if payload.is_empty() { Ok(None) } else { Err(LinkError::Gone { peer }) };
     };
-    let (tag, len) = head(bytes, who)?;
+    let (tag, len) = head(bytes, peer)?;
     payload.clear();
     from.by_ref().take(len as u64).read_to_end(payload).map_err(failed)?;
-    if payload.len() < len { Err(LinkError::Gone { who }) } else { Ok(Some(tag)) }
+    if payload.len() < len { Err(LinkError::Gone { peer }) } else { Ok(Some(tag)) }
 }

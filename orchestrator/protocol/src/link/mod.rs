@@ -1,16 +1,15 @@
-//! How a lambda's process tells the recorder what it decided, and how both come to be connected.
+//! The link between a lambda's process and the recorder: it carries the wakes of the lambda.
 //!
-//! Whoever starts them makes a pair of sockets for each lambda, and hands one end to the recorder,
-//! over its standard input, and the other to the lambda's process. So nobody listens anywhere, and
-//! a socket is all that says who somebody is: no frame carries a lambda's name, and a lambda can
-//! say nothing for another.
+//! The program that starts both creates a pair of sockets for each lambda. It passes one end to the
+//! recorder, over its standard input, and the other to the lambda's process. So no process listens
+//! on a socket, and the socket itself identifies the lambda: no frame carries a lambda's name, and
+//! a lambda cannot send for another.
 //!
 //! - `frame`: a length, a tag, a payload; never longer than [`FRAME_MAX`].
 //! - `control`: from the starter to the recorder: [`ControlClient`] and [`ControlServer`].
-//! - `client`: from a lambda's process to the recorder, without ever waiting for it:
-//!   [`RecorderLink`].
+//! - `client`: from a lambda's process to the recorder, without blocking: [`RecorderLink`].
 //! - `server`: the recorder's end of that: [`LambdaLink`].
-//! - `report`: what the recorder says to its starter, as lines of JSON on its standard output.
+//! - `report`: from the recorder to its starter, as lines of JSON on its standard output.
 
 mod client;
 mod control;

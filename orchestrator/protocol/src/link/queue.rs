@@ -1,33 +1,33 @@
-//! Frames that wait for the recorder.
+//! The queue of frames for the recorder.
 
 use std::collections::VecDeque;
 
 use super::frame::HEAD;
 
-/// Where in a frame stands how many wakes are missing before it: behind the time of the decision.
+/// Position in a frame of the number of missing wakes before it: after the time of the decision.
 const MISSING: std::ops::Range<usize> = HEAD + 8..HEAD + 12;
 
-/// Frames that are sent together.
-const TOGETHER: usize = 64;
+/// Maximum number of frames sent together.
+const BATCH: usize = 64;
 
-/// Wakes that wait, oldest first, in at most so many bytes.
+/// Queued wakes, oldest first, up to a maximum number of bytes.
 #[derive(Debug)]
 pub(super) struct Queue {
-    frames: VecDeque<Frame>,
+    frames: VecDeque<QueuedFrame>,
     bytes: usize,
     most: usize,
-    /// How much of the first one is sent.
+    /// Number of bytes of the first frame that are sent.
     sent: usize,
-    /// Wakes that were left out since the last frame.
+    /// Number of wakes dropped since the last frame.
     missing: u32,
-    /// Wakes without a trigger that were left out in all.
+    /// Total number of dropped wakes without a trigger.
     pub(super) wakes_dropped: u64,
-    /// Triggers for which there was no room.
+    /// Total number of dropped triggers.
     pub(super) triggers_lost: u64,
 }
 
 #[derive(Debug)]
-struct Frame {
+struct QueuedFrame {
     bytes: Vec<u8>,
     triggers: usize,
 }
@@ -45,12 +45,13 @@ impl Queue {
         }
     }
 
-    /// Adds a wake as a frame. If there is no room, wakes without triggers go for one with
-    /// triggers, the oldest first; else it goes itself. `false` if triggers are lost by that.
+    /// Adds a wake as a frame. If the queue is full, older wakes without triggers are dropped for
+    /// one with triggers, the oldest first; otherwise the new wake is dropped. Returns `false` if
+    /// triggers are lost.
     pub(super) fn push(&mut self, bytes: &[u8], triggers: usize) -> bool {
         while self.bytes + bytes.len() > self.most {
-            if triggers == 0 || !self.drop_one() {
-                self.leave_out(triggers);
+            if triggers == 0 || !self.drop_oldest() {
+                self.count_dropped(triggers);
                 return triggers == 0;
             }
         }
@@ -58,59 +59,60 @@ impl Queue {
         add_missing(&mut bytes, self.missing);
         self.missing = 0;
         self.bytes += bytes.len();
-        self.frames.push_back(Frame { bytes, triggers });
+        self.frames.push_back(QueuedFrame { bytes, triggers });
         true
     }
 
-    /// A wake is left out that is not even a frame.
-    pub(super) fn leave_out(&mut self, triggers: usize) {
+    /// Counts a dropped wake.
+    pub(super) fn count_dropped(&mut self, triggers: usize) {
         self.missing = self.missing.saturating_add(1);
         self.wakes_dropped += u64::from(triggers == 0);
         self.triggers_lost += triggers as u64;
     }
 
-    /// Leaves out the oldest wake without triggers of which nothing is sent.
-    fn drop_one(&mut self) -> bool {
-        let begun = usize::from(self.sent > 0);
-        let Some(index) = self.frames.iter().skip(begun).position(|frame| frame.triggers == 0)
+    /// Drops the oldest wake without triggers of which nothing is sent. Returns `false` if there is
+    /// none.
+    fn drop_oldest(&mut self) -> bool {
+        let started = usize::from(self.sent > 0);
+        let Some(index) = self.frames.iter().skip(started).position(|frame| frame.triggers == 0)
         else {
             return false;
         };
-        let Some(gone) = self.frames.remove(begun + index) else { return false };
-        self.bytes -= gone.bytes.len();
+        let Some(dropped) = self.frames.remove(started + index) else { return false };
+        self.bytes -= dropped.bytes.len();
         self.wakes_dropped += 1;
-        let missing = missing(&gone.bytes).saturating_add(1);
-        match self.frames.get_mut(begun + index) {
+        let missing = missing(&dropped.bytes).saturating_add(1);
+        match self.frames.get_mut(started + index) {
             Some(next) => add_missing(&mut next.bytes, missing),
             None => self.missing = self.missing.saturating_add(missing),
         }
         true
     }
 
-    /// Leaves out all that waits.
-    pub(super) fn give_up(&mut self) {
+    /// Drops all frames.
+    pub(super) fn drop_all(&mut self) {
         for frame in std::mem::take(&mut self.frames) {
-            self.leave_out(frame.triggers);
+            self.count_dropped(frame.triggers);
         }
         (self.bytes, self.sent) = (0, 0);
     }
 
-    /// What is to be sent next.
+    /// Returns the bytes to send next.
     pub(super) fn next(&self) -> Option<&[u8]> {
         self.frames.front().map(|frame| &frame.bytes[self.sent..])
     }
 
-    /// What is to be sent next, and what follows it, instead of what is in `bytes`.
-    pub(super) fn together(&self, bytes: &mut Vec<u8>) {
+    /// Replaces `bytes` by the next frames to send.
+    pub(super) fn next_batch(&self, bytes: &mut Vec<u8>) {
         bytes.clear();
         let mut from = self.sent;
-        for frame in self.frames.iter().take(TOGETHER) {
+        for frame in self.frames.iter().take(BATCH) {
             bytes.extend_from_slice(&frame.bytes[from..]);
             from = 0;
         }
     }
 
-    /// So much of that was sent.
+    /// Removes so many bytes, which were sent.
     pub(super) fn sent(&mut self, bytes: usize) {
         self.sent += bytes;
         while let Some(frame) = self.frames.pop_front_if(|frame| frame.bytes.len() <= self.sent) {
@@ -119,7 +121,7 @@ impl Queue {
         }
     }
 
-    /// Bytes that wait.
+    /// Returns the number of queued bytes.
     pub(super) fn bytes(&self) -> usize {
         self.bytes
     }
@@ -141,7 +143,7 @@ mod tests {
     use super::*;
     use crate::link::frame::{close, open, tag};
 
-    /// A wake that is told from others by its first byte.
+    /// Returns a wake with `number` as its content.
     fn wake(number: u8) -> Vec<u8> {
         let mut bytes = Vec::new();
         open(tag::WAKE, &mut bytes);
@@ -151,7 +153,7 @@ mod tests {
         bytes
     }
 
-    /// Of each frame that is left its number, and how many are missing before it.
+    /// Returns the number of each remaining frame, and the number of missing wakes before it.
     fn left(mut queue: Queue) -> Vec<(u8, u32)> {
         let mut left = Vec::new();
         while let Some(next) = queue.next() {
@@ -164,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_room_is_counted_in_the_frame_that_follows() {
+    fn dropped_wakes_are_counted_in_the_next_frame() {
         let mut queue = Queue::new(3 * wake(0).len());
         for number in 0..5 {
             assert!(queue.push(&wake(number), 0));
@@ -176,13 +178,13 @@ mod tests {
     }
 
     #[test]
-    fn frames_go_together_and_are_cut_anywhere() {
+    fn frames_are_sent_in_batches_and_cut_anywhere() {
         let mut queue = Queue::new(1 << 20);
         let all: Vec<u8> = (0..100).flat_map(wake).collect();
         (0..100).for_each(|number| assert!(queue.push(&wake(number), 0)));
         let (mut sent, mut bytes) = (Vec::new(), Vec::new());
         for step in (1..).map(|n| n * 37 % 500) {
-            queue.together(&mut bytes);
+            queue.next_batch(&mut bytes);
             let step = step.min(bytes.len());
             sent.extend_from_slice(&bytes[..step]);
             queue.sent(step);
@@ -194,16 +196,16 @@ mod tests {
     }
 
     #[test]
-    fn wakes_without_triggers_go_for_one_with_triggers() {
+    fn wakes_without_triggers_are_dropped_for_one_with_triggers() {
         let mut queue = Queue::new(3 * wake(0).len());
         for (number, triggers) in [(0, 0), (1, 1), (2, 0), (3, 2)] {
             assert!(queue.push(&wake(number), triggers));
         }
         assert_eq!(queue.wakes_dropped, 1);
-        // One that is partly sent cannot be taken back.
+        // A partly sent frame cannot be dropped.
         queue.sent(1);
-        assert!(queue.push(&wake(4), 1), "2 goes");
-        assert!(!queue.push(&wake(5), 3), "nothing is left that could");
+        assert!(queue.push(&wake(4), 1), "2 is dropped");
+        assert!(!queue.push(&wake(5), 3), "no other can be dropped");
         assert_eq!((queue.wakes_dropped, queue.triggers_lost), (2, 3));
         queue.sent(wake(0).len() - 1);
         assert!(queue.push(&wake(6), 0));

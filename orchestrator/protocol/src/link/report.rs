@@ -9,17 +9,17 @@ use gleaner_lambda::Clip;
 /// One line of JSON that `gleaner-recorder` writes on its standard output for the program that
 /// started it.
 ///
-/// The key `recorder` says which it is.
+/// The key `recorder` has the kind.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "recorder", rename_all = "snake_case")]
 pub enum RecorderReport {
-    /// It hears lambdas from now on.
+    /// It accepts lambdas from now on.
     Ready,
-    /// A clip of an earlier recorder, which did not end well, was saved.
+    /// A clip of an earlier recorder, which died, was recovered.
     Recovered(Box<Clip>),
-    /// A clip is whole.
+    /// A clip is complete.
     Clip(Box<Clip>),
-    /// Something that was wanted is not there, or will not be.
+    /// Data was lost.
     Loss(Loss),
     /// Sent once a second.
     Status(Box<RecorderStatus>),
@@ -27,79 +27,80 @@ pub enum RecorderReport {
     Ended(Box<RecorderStatus>),
 }
 
-/// Something that was wanted and is not there: one line of `losses.jsonl`.
+/// A loss of data: one line of `losses.jsonl`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "loss", rename_all = "snake_case")]
 pub enum Loss {
-    /// A clip was deleted that nobody had fetched.
+    /// A clip was deleted before it was fetched.
     Deleted {
-        /// When, in ns since 1970.
+        /// Time, in ns since 1970.
         at_ns: i64,
         /// The clip, as in `clips.jsonl`.
         file: PathBuf,
-        /// Its length.
+        /// Length in bytes.
         bytes: u64,
-        /// Why, in words.
+        /// The reason.
         reason: String,
     },
-    /// A clip that should have been deleted to make room, and could not be: it is still there,
-    /// whole or without its thumbnail, though a line before may say that it was deleted.
+    /// A clip that should have been deleted to make room, and could not be: it still exists,
+    /// complete or without its thumbnail, although an earlier line may report its deletion.
     NotDeleted {
-        /// When, in ns since 1970.
+        /// Time, in ns since 1970.
         at_ns: i64,
         /// The clip, as in `clips.jsonl`.
         file: PathBuf,
-        /// Its length.
+        /// Length in bytes.
         bytes: u64,
-        /// Why, in words.
+        /// The reason.
         reason: String,
     },
-    /// A clip could not be written. What there is of it is recovered by the next recorder.
+    /// A clip could not be written. The next recorder recovers its remains.
     Failed {
-        /// When, in ns on the clock of the clips.
+        /// Time, in ns on the clock of the clips.
         at_ns: i64,
-        /// Why, in words.
+        /// The reason.
         reason: String,
     },
-    /// Triggers that opened no window, as nothing was recorded.
+    /// Triggers that opened no window, as recording was suspended.
     DiskSuppressed {
-        /// When, in ns on the clock of the clips.
+        /// Time, in ns on the clock of the clips.
         at_ns: i64,
-        /// How many.
+        /// Number of triggers.
         triggers: u64,
-        /// Why, in words.
+        /// The reason.
         reason: String,
     },
 }
 
-/// How the recorder is doing. Counts are since its start; the spread is since the report before,
+/// The status of the recorder. Counts are since its start; durations are since the previous report,
 /// and in the last report since the start.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecorderStatus {
-    /// Lambdas that it hears.
+    /// Number of connected lambdas.
     pub lambdas: usize,
-    /// What it counted.
+    /// Its counts.
     #[serde(flatten)]
     pub recording: RecordingCounts,
-    /// Whether a clip is open.
+    /// True if a clip is open.
     #[serde(rename = "recording")]
     pub is_recording: bool,
-    /// Bytes that the preroll holds.
+    /// Size of the preroll, in bytes.
     pub preroll_bytes: u64,
-    /// The most that it may hold.
+    /// Maximum size of the preroll, in bytes.
     pub preroll_bound: u64,
-    /// Bytes on their way to the disk.
+    /// Number of bytes being written to disk.
     pub in_flight: u64,
-    /// From a decision with triggers to the opening of its windows. `None` without such.
+    /// Time from a decision with triggers to the opening of its windows. `None` without such
+    /// decisions.
     pub trigger_to_open: Option<DurationStats>,
-    /// Commands; `None` where none are heard.
+    /// Commands; `None` if they are off.
     #[serde(default)]
     pub commands: Option<CommandStatus>,
-    /// Topics that are recorded.
+    /// Recorded topics.
     pub topics: Vec<RecordedTopic>,
-    /// The network; `None` where there is none.
+    /// Status of the network; `None` without one.
     pub network: Option<NetworkStatus>,
-    /// Bytes that are free on the disk of the clips.
+    /// Free bytes on the disk of the clips.
     pub disk_free: Option<u64>,
     /// Resident memory, in bytes.
     pub rss_bytes: u64,
@@ -108,8 +109,8 @@ pub struct RecorderStatus {
 }
 
 impl RecorderStatus {
-    /// With what was counted of `before`, an earlier recorder of the same run. Spreads, and what is
-    /// true of an instant, stay those of this one.
+    /// Adds the counts of `before`, an earlier recorder of the same run. Durations and
+    /// instantaneous values stay those of this recorder.
     #[must_use]
     pub fn after(mut self, before: &RecorderStatus) -> RecorderStatus {
         self.recording.add(&before.recording);
@@ -122,7 +123,7 @@ impl RecorderStatus {
             else {
                 continue;
             };
-            // Unknown in one of them is unknown in both.
+            // Unknown in one of them means unknown in the sum.
             topic.lost =
                 topic.lost.zip(before.lost).map(|(now, before)| now.saturating_add(before));
             add([
@@ -145,43 +146,43 @@ impl RecorderStatus {
     }
 }
 
-/// What came of commands.
+/// Counts of commands.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CommandStatus {
-    /// The topic over which they come.
+    /// Their topic.
     pub topic: String,
-    /// Those that did something.
+    /// Number of accepted commands.
     pub accepted: u64,
-    /// Those that make no sense, came too often, or were too long.
+    /// Number of commands that were invalid, too frequent or too long.
     pub refused: u64,
-    /// Writers that are connected now.
+    /// Number of connected writers.
     pub writers: Option<usize>,
-    /// What keeps writers from being heard, in whole sentences.
+    /// Reasons why writers do not match, in whole sentences.
     pub qos_warnings: Vec<String>,
 }
 
-/// A topic that is recorded. `None` is unknown.
+/// A recorded topic. `None` means unknown.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RecordedTopic {
     /// The topic.
     pub topic: String,
-    /// Its type; `None` until it is found.
+    /// Message type; `None` until it is found.
     pub type_name: Option<String>,
-    /// Writers that are connected now.
+    /// Number of connected writers.
     pub writers: Option<usize>,
-    /// Samples that reached the recorder.
+    /// Number of samples that reached the recorder.
     pub received: u64,
-    /// Samples that were lost before they reached it.
+    /// Number of samples lost before they reached it.
     pub lost: Option<u64>,
-    /// Samples that it had no room for, as it was busy.
+    /// Number of samples without a free slot, as the recorder was busy.
     pub no_slot: u64,
-    /// Samples that are larger than it can take.
+    /// Number of samples that were too large.
     pub too_big: u64,
-    /// Samples that could not be read at all.
+    /// Number of samples that could not be parsed.
     pub malformed: u64,
-    /// What is asked of the writers, in words.
+    /// The requested QoS, as text.
     pub qos: Option<String>,
-    /// What keeps writers from being heard, in whole sentences.
+    /// Reasons why writers do not match, in whole sentences.
     pub qos_warnings: Vec<String>,
 }
 
@@ -221,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_are_those_of_both_recorders() {
+    fn counts_of_both_recorders_are_added() {
         let both = status(2, &["/a"], Some(3)).after(&status(40, &["/a", "/b"], Some(50)));
         let mut expected = status(42, &["/a"], Some(53));
         expected.topics.extend(status(40, &["/b"], Some(50)).topics);
@@ -234,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn a_status_reads_back_and_is_flat() {
+    fn a_status_is_flat_and_is_parsed_back() {
         let status = RecorderStatus { is_recording: true, ..status(2, &["/a"], None) };
         let json = serde_json::to_value(&status).unwrap();
         assert_eq!((&json["disk_suppressed"], &json["recording"]), (&2.into(), &true.into()));

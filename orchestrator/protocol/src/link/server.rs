@@ -13,70 +13,70 @@ use gleaner_journal::{Decoder, INPUTS_MAX, JournalEntry, JournalHeader};
 
 const LAMBDA: &str = "the lambda";
 
-/// Most bytes of a refusal.
-const WHY_MAX: usize = 2 << 10;
+/// Longest reason for a refusal, in bytes.
+const REASON_MAX: usize = 2 << 10;
 
-/// What a lambda's process says.
+/// A message from a lambda's process.
 #[derive(Debug)]
 pub enum LambdaMessage {
-    /// What it is. First, once.
+    /// Its identity. Sent once, first.
     Hello(Box<JournalHeader>),
-    /// It was woken.
+    /// A wake.
     Wake {
         /// The wake.
         entry: Box<JournalEntry>,
-        /// When it was decided, in ns of `CLOCK_MONOTONIC`.
+        /// Time of the decision, in ns of `CLOCK_MONOTONIC`.
         decided_ns: i64,
-        /// Wakes that are missing before it.
+        /// Number of missing wakes before it.
         missing: u32,
-        /// How long the frame was.
+        /// Length of the frame.
         bytes: usize,
     },
-    /// Nothing more comes.
+    /// The end of the connection.
     Bye,
 }
 
-/// Reads what one lambda's process says; nothing of it is believed.
+/// Parses untrusted messages from one lambda's process.
 pub struct LambdaLink {
     from: BufReader<UnixStream>,
     payload: Vec<u8>,
-    /// Once it has said what it is.
+    /// Set after `Hello`.
     decoder: Option<Decoder>,
 }
 
-/// Answers to one lambda's process, without ever waiting for it.
+/// Sends replies to one lambda's process, without blocking.
 #[derive(Debug)]
 pub struct LambdaReplies {
     socket: UnixStream,
-    /// The rest of a frame that is partly sent.
+    /// The rest of a partly sent frame.
     rest: Vec<u8>,
 }
 
 impl LambdaLink {
-    /// Over this socket, which the starter gave.
+    /// Creates both ends from the socket that the starter sent.
     ///
     /// # Errors
     ///
-    /// What the system says: too many open files.
+    /// Those of the system: too many open files.
     pub fn new(socket: OwnedFd) -> io::Result<(LambdaLink, LambdaReplies)> {
         let socket = UnixStream::from(socket);
-        let answers = LambdaReplies { socket: socket.try_clone()?, rest: Vec::new() };
+        let replies = LambdaReplies { socket: socket.try_clone()?, rest: Vec::new() };
         Ok((
             LambdaLink { from: BufReader::new(socket), payload: Vec::new(), decoder: None },
-            answers,
+            replies,
         ))
     }
 
-    /// What it says next; waits for it. `None` when its process has ended.
+    /// Waits for the next message. `None` when the lambda's process has ended.
     ///
     /// # Errors
     ///
-    /// [`LinkError`] names the frame that makes no sense; nothing can be read after it.
-    pub fn hear(&mut self) -> Result<Option<LambdaMessage>, LinkError> {
+    /// [`LinkError`] names the invalid frame; nothing can be read after it.
+    pub fn receive(&mut self) -> Result<Option<LambdaMessage>, LinkError> {
         let Some(tag) = frame::read(&mut self.from, &mut self.payload, LAMBDA)? else {
             return Ok(None);
         };
-        let malformed = |frame, why| LinkError::Malformed { who: LAMBDA, frame, why };
+        let malformed = |frame, reason| LinkError::Malformed { peer: LAMBDA, frame, reason };
         match (tag, &mut self.decoder) {
             (tag::HELLO, None) => {
                 let header: JournalHeader = serde_json::from_slice(&self.payload)
@@ -85,7 +85,7 @@ impl LambdaLink {
                 if inputs > INPUTS_MAX || header.event_input.is_some_and(|event| event >= inputs) {
                     return Err(malformed(
                         "hello",
-                        "its inputs are more than there may be, or not there".to_owned(),
+                        "it has too many inputs, or lacks the one that wakes the lambda".to_owned(),
                     ));
                 }
                 self.decoder = Some(Decoder::new(inputs));
@@ -102,7 +102,7 @@ impl LambdaLink {
                 decoder.reset();
                 let entry = decoder
                     .decode(&mut rest)
-                    .map_err(|source| LinkError::Wake { who: LAMBDA, source })?;
+                    .map_err(|source| LinkError::Wake { peer: LAMBDA, source })?;
                 if !rest.is_empty() {
                     return Err(malformed("wake", format!("{} bytes follow the wake", rest.len())));
                 }
@@ -115,58 +115,62 @@ impl LambdaLink {
             }
             (tag::BYE, Some(_)) => Ok(Some(LambdaMessage::Bye)),
             (tag::HELLO, Some(_)) => {
-                Err(LinkError::Unexpected { who: LAMBDA, frame: "hello", due: "wake" })
+                Err(LinkError::Unexpected { peer: LAMBDA, frame: "hello", expected: "wake" })
             }
-            (tag::WAKE | tag::BYE, None) => {
-                Err(LinkError::Unexpected { who: LAMBDA, frame: frame::name(tag), due: "hello" })
-            }
-            (tag, _) => Err(LinkError::Unknown { who: LAMBDA, tag }),
+            (tag::WAKE | tag::BYE, None) => Err(LinkError::Unexpected {
+                peer: LAMBDA,
+                frame: frame::name(tag),
+                expected: "hello",
+            }),
+            (tag, _) => Err(LinkError::Unknown { peer: LAMBDA, tag }),
         }
     }
 }
 
 impl LambdaReplies {
-    /// The lambda is heard from now on.
+    /// Accepts the lambda.
     pub fn ready(&mut self) {
         self.send(tag::READY, &[]);
     }
 
-    /// The lambda is not heard. Whoever reads it needs not wait for its end.
-    pub fn refused(&mut self, why: &str) {
-        let end =
-            (0..=WHY_MAX.min(why.len())).rev().find(|end| why.is_char_boundary(*end)).unwrap_or(0);
-        self.send(tag::REFUSED, &why.as_bytes()[..end]);
+    /// Refuses the lambda for this `reason`, which is cut if it is too long.
+    pub fn refused(&mut self, reason: &str) {
+        let end = (0..=REASON_MAX.min(reason.len()))
+            .rev()
+            .find(|end| reason.is_char_boundary(*end))
+            .unwrap_or(0);
+        self.send(tag::REFUSED, &reason.as_bytes()[..end]);
     }
 
-    /// The windows of a decision are open, so long after it.
+    /// Reports that the windows of a decision are open, `wait_ns` after it.
     pub fn opened(&mut self, wait_ns: u64) {
         self.send(tag::OPENED, &wait_ns.to_le_bytes());
     }
 
-    /// Closes the connection from this side, so that its reader comes to the end.
+    /// Closes the connection, so that its reader reaches the end.
     pub fn close(&self) {
-        // It fails only where the other side was faster.
+        // It fails only if the other side closed it first.
         let _ = self.socket.shutdown(std::net::Shutdown::Both);
     }
 
-    /// Sends a frame, unless the other side does not read: then it is left out. Nothing but times
-    /// is lost by that, as the first answers fit in any case.
+    /// Sends a frame, or drops it if the other side does not read. Only times can be lost, as the
+    /// first replies always fit.
     fn send(&mut self, tag: u8, payload: &[u8]) {
         let pending = std::mem::take(&mut self.rest);
         self.rest = self.try_send(pending);
         if self.rest.is_empty() {
-            self.rest = self.try_send(frame::whole(tag, payload));
+            self.rest = self.try_send(frame::encode(tag, payload));
         }
     }
 
-    /// What of `bytes` could not be sent.
+    /// Sends `bytes`; returns the rest that could not be sent.
     fn try_send(&self, mut bytes: Vec<u8>) -> Vec<u8> {
         while !bytes.is_empty() {
             match send(&self.socket, &bytes, SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
                 Ok(sent) => drop(bytes.drain(..sent)),
                 Err(Errno::INTR) => {}
                 Err(Errno::AGAIN) => break,
-                // Its reader will notice.
+                // The reader of the connection will notice.
                 Err(_) => bytes.clear(),
             }
         }

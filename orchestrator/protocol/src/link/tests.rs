@@ -62,11 +62,11 @@ fn entry(at_ns: i64, label: Option<&str>) -> JournalEntry {
     }
 }
 
-/// A lambda's end, and the recorder's.
+/// Returns a lambda's end of a connection, and the recorder's.
 fn connected() -> (RecorderLink, LambdaLink, LambdaReplies) {
     let (ours, theirs) = UnixStream::pair().unwrap();
-    let (link, answers) = LambdaLink::new(theirs.into()).unwrap();
-    (RecorderLink::new(ours.into()), link, answers)
+    let (link, replies) = LambdaLink::new(theirs.into()).unwrap();
+    (RecorderLink::new(ours.into()), link, replies)
 }
 
 fn add(lambda: &str) -> AddLambda {
@@ -78,87 +78,87 @@ fn add(lambda: &str) -> AddLambda {
 }
 
 #[test]
-fn each_lambda_is_announced_with_a_socket_of_its_own() {
-    let (mut control, stdin) = ControlClient::pair().unwrap();
-    let mut controlled = ControlServer::new(stdin);
-    let lambdas = ["first", "second", "third"].map(|name| (name, control.add(&add(name)).unwrap()));
-    control.stop().unwrap();
-    drop(control);
+fn each_lambda_is_added_with_a_socket_of_its_own() {
+    let (mut client, stdin) = ControlClient::pair().unwrap();
+    let mut server = ControlServer::new(stdin);
+    let lambdas = ["first", "second", "third"].map(|name| (name, client.add(&add(name)).unwrap()));
+    client.stop().unwrap();
+    drop(client);
     for (name, theirs) in lambdas {
-        let Some(ControlMessage::Add(order, ours)) = controlled.order().unwrap() else { panic!() };
-        assert_eq!(order, add(name));
-        // What is written at one end comes out at the other, and not elsewhere.
+        let Some(ControlMessage::Add(added, ours)) = server.receive().unwrap() else { panic!() };
+        assert_eq!(added, add(name));
+        // Bytes written at one end arrive at its other end.
         UnixStream::from(theirs).write_all(name.as_bytes()).unwrap();
         let mut read = String::new();
         UnixStream::from(ours).read_to_string(&mut read).unwrap();
         assert_eq!(read, name);
     }
-    assert!(matches!(controlled.order(), Ok(Some(ControlMessage::Stop))));
-    assert!(matches!(controlled.order(), Ok(None)), "the starter has ended");
+    assert!(matches!(server.receive(), Ok(Some(ControlMessage::Stop))));
+    assert!(matches!(server.receive(), Ok(None)), "the starter has ended");
 }
 
 #[test]
-fn a_recorder_that_has_ended_is_an_error_and_no_signal() {
-    let (mut control, stdin) = ControlClient::pair().unwrap();
+fn a_recorder_that_has_ended_is_an_error_not_a_signal() {
+    let (mut client, stdin) = ControlClient::pair().unwrap();
     drop(stdin);
-    assert!(matches!(control.add(&add("x")), Err(LinkError::Gone { who: "the recorder" })));
-    assert!(matches!(control.stop(), Err(LinkError::Gone { .. })));
-    let (mut lambda, link, answers) = connected();
-    drop((link, answers));
+    assert!(matches!(client.add(&add("x")), Err(LinkError::Gone { peer: "the recorder" })));
+    assert!(matches!(client.stop(), Err(LinkError::Gone { .. })));
+    let (mut lambda, link, replies) = connected();
+    drop((link, replies));
     assert!(matches!(lambda.hello(&header("x"), PATIENCE), Err(LinkError::Gone { .. })));
     assert!(matches!(lambda.poll(), Err(LinkError::Gone { .. })));
 }
 
 #[test]
 fn wakes_arrive_as_they_were_sent() {
-    let (mut lambda, mut link, mut answers) = connected();
+    let (mut lambda, mut link, mut replies) = connected();
     let recorder = thread::spawn(move || {
-        let Some(LambdaMessage::Hello(said)) = link.hear().unwrap() else { panic!() };
-        assert_eq!(*said, header("hello"));
-        answers.ready();
-        let mut heard = Vec::new();
+        let Some(LambdaMessage::Hello(hello)) = link.receive().unwrap() else { panic!() };
+        assert_eq!(*hello, header("hello"));
+        replies.ready();
+        let mut received = Vec::new();
         while let Some(LambdaMessage::Wake { entry, decided_ns, missing: 0, .. }) =
-            link.hear().unwrap()
+            link.receive().unwrap()
         {
             if !entry.triggers.is_empty() {
-                answers.opened(decided_ns as u64 + 1);
+                replies.opened(decided_ns as u64 + 1);
             }
-            heard.push((*entry, decided_ns));
+            received.push((*entry, decided_ns));
         }
-        assert!(matches!(link.hear(), Ok(None)));
-        heard
+        assert!(matches!(link.receive(), Ok(None)));
+        received
     });
     lambda.hello(&header("hello"), PATIENCE).unwrap();
     let sent: Vec<_> =
         (0..1000).map(|at| (entry(at, (at % 10 == 0).then_some("here")), at * 3)).collect();
-    let mut said = Vec::new();
+    let mut messages = Vec::new();
     for (entry, decided) in &sent {
         lambda.wake(entry, *decided).unwrap();
-        said.extend(lambda.poll().unwrap());
+        messages.extend(lambda.poll().unwrap());
     }
-    while said.len() < 100 {
-        said.extend(lambda.poll().unwrap());
+    while messages.len() < 100 {
+        messages.extend(lambda.poll().unwrap());
         thread::yield_now();
     }
-    assert_eq!(said[3], RecorderMessage::Opened { wait_ns: 91 });
+    assert_eq!(messages[3], RecorderMessage::Opened { wait_ns: 91 });
     assert_eq!(lambda.bye(PATIENCE), crate::LinkLosses::default());
     assert_eq!(recorder.join().unwrap(), sent);
 }
 
 #[test]
-fn only_what_is_urgent_goes_at_once_and_the_order_stays() {
+fn only_urgent_wakes_are_sent_at_once_and_in_order() {
     let (ours, theirs) = UnixStream::pair().unwrap();
     let (mut lambda, mut theirs) = (RecorderLink::new(ours.into()), theirs);
-    theirs.write_all(&frame::whole(tag::READY, &[])).unwrap();
+    theirs.write_all(&frame::encode(tag::READY, &[])).unwrap();
     lambda.hello(&header("hello"), PATIENCE).unwrap();
     theirs.set_nonblocking(true).unwrap();
-    let mut came = Vec::new();
-    let mut bytes_come = || {
-        let before = came.len();
-        let _ = theirs.read_to_end(&mut came);
-        came.len() - before
+    let mut received = Vec::new();
+    let mut new_bytes = || {
+        let before = received.len();
+        let _ = theirs.read_to_end(&mut received);
+        received.len() - before
     };
-    assert!(bytes_come() > 0, "hello");
+    assert!(new_bytes() > 0, "hello");
     let mut at = 0;
     let mut next = |label: Option<&str>| {
         at += 1;
@@ -168,46 +168,49 @@ fn only_what_is_urgent_goes_at_once_and_the_order_stays() {
     for _ in 0..3 {
         wake(&mut lambda, next(None));
     }
-    assert_eq!(bytes_come(), 0, "they wait");
+    assert_eq!(new_bytes(), 0, "they are queued");
     lambda.poll().unwrap();
-    assert!(bytes_come() > 0, "for this");
+    assert!(new_bytes() > 0, "`poll` sends them");
     wake(&mut lambda, next(None));
     wake(&mut lambda, next(Some("here")));
-    assert!(bytes_come() > 0, "a trigger goes at once");
+    assert!(new_bytes() > 0, "a trigger is sent at once");
     wake(&mut lambda, next(None));
     let fault = Fault { kind: FaultKind::Trap, message: "x".to_owned(), used: None, allowed: None };
     wake(&mut lambda, JournalEntry { fault: Some(fault), ..next(None) });
-    assert!(bytes_come() > 0, "and so does a fault");
+    assert!(new_bytes() > 0, "and so is a fault");
     let mut waited = 0;
-    while bytes_come() == 0 {
+    while new_bytes() == 0 {
         wake(&mut lambda, next(None));
         waited += 1;
     }
-    assert!((100..1000).contains(&waited), "16 KiB go together: {waited}");
+    assert!((100..1000).contains(&waited), "16 KiB are sent together: {waited}");
     wake(&mut lambda, next(None));
-    assert_eq!(bytes_come(), 0);
+    assert_eq!(new_bytes(), 0);
     assert_eq!(lambda.bye(PATIENCE), crate::LinkLosses::default());
-    assert!(bytes_come() > 0);
-    // All of them, in their order, and then the end.
+    assert!(new_bytes() > 0);
+    // All wakes in order, and then the end.
     let (mut writer, reader) = UnixStream::pair().unwrap();
-    let (mut link, _answers) = LambdaLink::new(reader.into()).unwrap();
-    let writer = thread::spawn(move || writer.write_all(&came).unwrap());
-    assert!(matches!(link.hear(), Ok(Some(LambdaMessage::Hello(_)))));
-    for due in 1..=at {
-        let heard = link.hear().unwrap();
+    let (mut link, _replies) = LambdaLink::new(reader.into()).unwrap();
+    let writer = thread::spawn(move || writer.write_all(&received).unwrap());
+    assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
+    for expected in 1..=at {
+        let message = link.receive().unwrap();
         assert!(
-            matches!(&heard, Some(LambdaMessage::Wake { entry, missing: 0, .. }) if entry.at_ns == due),
-            "{due}: {heard:?}"
+            matches!(
+                &message,
+                Some(LambdaMessage::Wake { entry, missing: 0, .. }) if entry.at_ns == expected
+            ),
+            "{expected}: {message:?}"
         );
     }
-    assert!(matches!(link.hear(), Ok(Some(LambdaMessage::Bye))));
+    assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Bye))));
     writer.join().unwrap();
 }
 
 #[test]
-fn a_recorder_that_does_not_read_costs_wakes_and_no_time() {
-    let (mut lambda, mut link, mut answers) = connected();
-    answers.ready();
+fn a_recorder_that_does_not_read_costs_wakes_but_no_time() {
+    let (mut lambda, mut link, mut replies) = connected();
+    replies.ready();
     lambda.hello(&header("hello"), PATIENCE).unwrap();
     let all = 200_000_i64;
     for at in 0..all {
@@ -216,12 +219,12 @@ fn a_recorder_that_does_not_read_costs_wakes_and_no_time() {
     let dropped = lambda.dropped();
     assert!(dropped.wakes_dropped > 0 && dropped.triggers_lost == 0, "{dropped:?}");
     let lambda = thread::spawn(move || lambda.bye(PATIENCE));
-    assert!(matches!(link.hear(), Ok(Some(LambdaMessage::Hello(_)))));
+    assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
     let (mut next, mut triggers, mut lost) = (0, 0, 0);
-    while let Some(LambdaMessage::Wake { entry, missing, .. }) = link.hear().unwrap() {
+    while let Some(LambdaMessage::Wake { entry, missing, .. }) = link.receive().unwrap() {
         next += i64::from(missing);
         lost += u64::from(missing);
-        assert_eq!(entry.at_ns, next, "what is missing is said where it is");
+        assert_eq!(entry.at_ns, next, "the number of missing wakes");
         next += 1;
         triggers += entry.triggers.len() as i64;
     }
@@ -230,78 +233,87 @@ fn a_recorder_that_does_not_read_costs_wakes_and_no_time() {
 }
 
 #[test]
-fn a_refusal_is_told_and_silence_has_an_end() {
-    let (mut lambda, _link, mut answers) = connected();
-    answers.refused("it is another \u{1b}[2J");
+fn a_refusal_has_its_reason_and_silence_a_timeout() {
+    let (mut lambda, _link, mut replies) = connected();
+    replies.refused("it is another \u{1b}[2J");
     let refused = lambda.hello(&header("x"), PATIENCE).unwrap_err();
     assert!(
-        matches!(&refused, LinkError::Refused { why } if why == "it is another \\u{1b}[2J"),
+        matches!(&refused, LinkError::Refused { reason } if reason == "it is another \\u{1b}[2J"),
         "{refused}"
     );
-    let (mut lambda, _link, _answers) = connected();
+    let (mut lambda, _link, _replies) = connected();
     assert!(matches!(
         lambda.hello(&header("x"), Duration::from_millis(20)),
         Err(LinkError::Silent { .. })
     ));
-    let (mut lambda, _link, mut answers) = connected();
-    answers.refused(&"é".repeat(5000));
+    let (mut lambda, _link, mut replies) = connected();
+    replies.refused(&"é".repeat(5000));
     assert!(matches!(lambda.hello(&header("x"), PATIENCE), Err(LinkError::Refused { .. })));
 }
 
-/// What the recorder makes of these bytes of a lambda.
-fn heard(frames: &[Vec<u8>]) -> Result<usize, LinkError> {
+/// Receives `frames` as the recorder; returns the number of messages.
+fn receive_all(frames: &[Vec<u8>]) -> Result<usize, LinkError> {
     let (mut ours, theirs) = UnixStream::pair().unwrap();
     let bytes = frames.concat();
     let writer = thread::spawn(move || {
         let _ = ours.write_all(&bytes);
     });
-    let (mut link, _answers) = LambdaLink::new(theirs.into()).unwrap();
+    let (mut link, _replies) = LambdaLink::new(theirs.into()).unwrap();
     let mut count = 0;
-    let heard = loop {
-        match link.hear() {
+    let result = loop {
+        match link.receive() {
             Ok(Some(_)) => count += 1,
             Ok(None) => break Ok(count),
             Err(error) => break Err(error),
         }
     };
-    drop((link, _answers));
+    drop((link, _replies));
     writer.join().unwrap();
-    heard
+    result
 }
 
 #[test]
-fn nonsense_is_refused_by_name() {
-    let hello = || frame::whole(tag::HELLO, &serde_json::to_vec(&header("x")).unwrap());
-    let wake = |payload: &[u8]| frame::whole(tag::WAKE, payload);
-    let said = |frames: &[Vec<u8>]| heard(frames).unwrap_err().to_string();
-    assert_eq!(heard(&[hello()]).unwrap(), 1);
-    assert_eq!(said(&[wake(&[0; 30])]), "frame `wake` from the lambda comes where `hello` is due");
+fn invalid_frames_of_a_lambda_are_refused_by_name() {
+    let hello = || frame::encode(tag::HELLO, &serde_json::to_vec(&header("x")).unwrap());
+    let wake = |payload: &[u8]| frame::encode(tag::WAKE, payload);
+    let refusal = |frames: &[Vec<u8>]| receive_all(frames).unwrap_err().to_string();
+    assert_eq!(receive_all(&[hello()]).unwrap(), 1);
     assert_eq!(
-        said(&[hello(), hello()]),
-        "frame `hello` from the lambda comes where `wake` is due"
+        refusal(&[wake(&[0; 30])]),
+        "received frame `wake` from the lambda instead of `hello`"
     );
     assert_eq!(
-        said(&[hello(), wake(&[0; 11])]),
-        "frame `wake` from the lambda cannot be read: it has 11 bytes"
+        refusal(&[hello(), hello()]),
+        "received frame `hello` from the lambda instead of `wake`"
     );
-    assert_eq!(said(&[hello(), wake(&[255; 40])]), "frame `wake` from the lambda is none");
-    assert_eq!(said(&[frame::whole(99, &[])]), "frame 99 from the lambda is not known here");
-    assert_eq!(said(&[frame::whole(tag::ADD, b"{}")]), "frame 1 from the lambda is not known here");
+    assert_eq!(
+        refusal(&[hello(), wake(&[0; 11])]),
+        "frame `wake` from the lambda is invalid: it has 11 bytes"
+    );
+    assert_eq!(
+        refusal(&[hello(), wake(&[255; 40])]),
+        "frame `wake` from the lambda cannot be decoded"
+    );
+    assert_eq!(refusal(&[frame::encode(99, &[])]), "frame 99 from the lambda is unknown");
+    assert_eq!(refusal(&[frame::encode(tag::ADD, b"{}")]), "frame 1 from the lambda is unknown");
     assert!(
-        said(&[frame::whole(tag::HELLO, b"{}")])
-            .starts_with("frame `hello` from the lambda cannot be read")
+        refusal(&[frame::encode(tag::HELLO, b"{}")])
+            .starts_with("frame `hello` from the lambda is invalid")
     );
     let claims = [&u32::MAX.to_le_bytes()[..], &[tag::HELLO]].concat();
-    assert!(said(&[claims]).contains("has 4294967295 bytes, above the maximum of 2097152"));
-    assert_eq!(said(&[hello()[..20].to_vec()]), "the lambda has ended, or closed the connection");
+    assert!(refusal(&[claims]).contains("has 4294967295 bytes, above the maximum of 2097152"));
+    assert_eq!(
+        refusal(&[hello()[..20].to_vec()]),
+        "the lambda has ended, or closed the connection"
+    );
     let outside = JournalHeader { event_input: Some(1), ..header("x") };
-    let outside = frame::whole(tag::HELLO, &serde_json::to_vec(&outside).unwrap());
-    assert!(said(&[outside]).contains("inputs"));
+    let outside = frame::encode(tag::HELLO, &serde_json::to_vec(&outside).unwrap());
+    assert!(refusal(&[outside]).contains("inputs"));
 }
 
 #[test]
 fn random_bytes_are_an_error_or_an_end() {
-    let hello = frame::whole(tag::HELLO, &serde_json::to_vec(&header("x")).unwrap());
+    let hello = frame::encode(tag::HELLO, &serde_json::to_vec(&header("x")).unwrap());
     let mut random = 0x2545_f491_4f6c_dd1d_u64;
     for len in 0..200 {
         let payload: Vec<u8> = std::iter::repeat_with(|| {
@@ -312,32 +324,32 @@ fn random_bytes_are_an_error_or_an_end() {
         })
         .take(12 + len % 100)
         .collect();
-        // Whatever it is, it comes back.
-        let _ = heard(&[hello.clone(), frame::whole(tag::WAKE, &payload)]);
-        let _ = heard(&[payload]);
+        // It must return, whatever the result.
+        let _ = receive_all(&[hello.clone(), frame::encode(tag::WAKE, &payload)]);
+        let _ = receive_all(&[payload]);
     }
 }
 
 #[test]
-fn a_starter_that_talks_nonsense_is_refused_by_name() {
-    let said = |bytes: &[u8]| {
+fn invalid_frames_of_a_starter_are_refused_by_name() {
+    let refusal = |bytes: &[u8]| {
         let (mut ours, theirs) = UnixStream::pair().unwrap();
         ours.write_all(bytes).unwrap();
         drop(ours);
-        ControlServer::new(OwnedFd::from(theirs)).order().unwrap_err().to_string()
+        ControlServer::new(OwnedFd::from(theirs)).receive().unwrap_err().to_string()
     };
     let add = serde_json::to_vec(&add("x")).unwrap();
-    assert_eq!(said(&frame::whole(tag::ADD, &add)), "frame `add` came without a socket");
+    assert_eq!(refusal(&frame::encode(tag::ADD, &add)), "frame `add` came without a socket");
     assert!(
-        said(&frame::whole(tag::ADD, b"[]"))
-            .starts_with("frame `add` from the starter cannot be read")
+        refusal(&frame::encode(tag::ADD, b"[]"))
+            .starts_with("frame `add` from the starter is invalid")
     );
-    assert_eq!(said(&frame::whole(tag::HELLO, &[])), "frame 16 from the starter is not known here");
-    assert_eq!(said(&[1, 0, 0]), "the starter has ended, or closed the connection");
+    assert_eq!(refusal(&frame::encode(tag::HELLO, &[])), "frame 16 from the starter is unknown");
+    assert_eq!(refusal(&[1, 0, 0]), "the starter has ended, or closed the connection");
 }
 
 #[test]
-fn reports_are_lines_that_name_themselves() {
+fn reports_are_lines_with_their_kind() {
     let loss = RecorderReport::Loss(Loss::Deleted {
         at_ns: 5,
         file: "clips/a.mcap".into(),
@@ -347,7 +359,10 @@ fn reports_are_lines_that_name_themselves() {
     let line = serde_json::to_string(&loss).unwrap();
     assert_eq!(
         line,
-        r#"{"recorder":"loss","loss":"deleted","at_ns":5,"file":"clips/a.mcap","bytes":9,"reason":"--clips-max 3"}"#
+        concat!(
+            r#"{"recorder":"loss","loss":"deleted","at_ns":5,"file":"clips/a.mcap","bytes":9,"#,
+            r#""reason":"--clips-max 3"}"#
+        )
     );
     assert_eq!(serde_json::from_str::<RecorderReport>(&line).unwrap(), loss);
     let status = RecorderReport::Status(Box::default());
@@ -358,42 +373,47 @@ fn reports_are_lines_that_name_themselves() {
 }
 
 #[test]
-fn a_recorder_that_talks_nonsense_is_refused_by_name() {
-    let said = |bytes: &[u8]| {
+fn invalid_frames_of_a_recorder_are_refused_by_name() {
+    let refusal = |bytes: &[u8]| {
         let (mut ours, theirs) = UnixStream::pair().unwrap();
         ours.write_all(bytes).unwrap();
         RecorderLink::new(theirs.into()).poll().unwrap_err().to_string()
     };
-    assert_eq!(said(&frame::whole(99, &[])), "frame 99 from the recorder is not known here");
+    assert_eq!(refusal(&frame::encode(99, &[])), "frame 99 from the recorder is unknown");
     assert_eq!(
-        said(&frame::whole(tag::WAKE, &[0; 20])),
-        "frame 17 from the recorder is not known here"
+        refusal(&frame::encode(tag::WAKE, &[0; 20])),
+        "frame 17 from the recorder is unknown"
     );
-    let short = frame::whole(tag::OPENED, &[0; 7]);
+    let short = frame::encode(tag::OPENED, &[0; 7]);
     assert_eq!(
-        said(&short),
-        "frame `opened` from the recorder cannot be read: it has 7 bytes instead of 8"
+        refusal(&short),
+        "frame `opened` from the recorder is invalid: it has 7 bytes instead of 8"
     );
     let claims = [&5000_u32.to_le_bytes()[..], &[tag::REFUSED]].concat();
     assert_eq!(
-        said(&claims),
-        "frame `refused` from the recorder cannot be read: it has 5000 bytes, above the maximum of 4096"
+        refusal(&claims),
+        "frame `refused` from the recorder is invalid: \
+         it has 5000 bytes, above the maximum of 4096"
     );
     let claims = [&u32::MAX.to_le_bytes()[..], &[tag::READY]].concat();
-    assert!(said(&claims).contains("has 4294967295 bytes, above the maximum of 2097152"));
+    assert!(refusal(&claims).contains("has 4294967295 bytes, above the maximum of 2097152"));
 }
 
 #[test]
-fn an_order_that_no_frame_holds_is_not_sent() {
-    let (mut control, stdin) = ControlClient::pair().unwrap();
+fn a_request_that_is_too_long_is_not_sent() {
+    let (mut client, stdin) = ControlClient::pair().unwrap();
     let long =
         AddLambda { lambda: "x".repeat(FRAME_MAX).into(), remaps: Vec::new(), most: Limits::MAX };
-    let refused = control.add(&long).unwrap_err();
+    let refused = client.add(&long).unwrap_err();
     assert!(
-        matches!(refused, LinkError::TooLong { who: "the starter", frame: "add", bytes } if bytes > FRAME_MAX as u64),
+        matches!(
+            refused,
+            LinkError::TooLong { peer: "the starter", frame: "add", bytes }
+                if bytes > FRAME_MAX as u64
+        ),
         "{refused}"
     );
-    // Nothing of it went over, so that what follows is understood.
-    control.stop().unwrap();
-    assert!(matches!(ControlServer::new(stdin).order(), Ok(Some(ControlMessage::Stop))));
+    // Nothing of it was sent, so that the next request is valid.
+    client.stop().unwrap();
+    assert!(matches!(ControlServer::new(stdin).receive(), Ok(Some(ControlMessage::Stop))));
 }

@@ -4,30 +4,30 @@ use gleaner_lambda::{Decision, Fault, FaultKind};
 impl ExitRecord {
     /// Returns the decision of the wake in which the process of a lambda ended: a fault of kind
     /// `killed`. None if the end was requested, or if something around the lambda failed.
-    pub fn undecided(&self, woken_by: WokenBy) -> Option<Decision> {
+    pub fn interrupted_wake(&self, woken_by: WokenBy) -> Option<Decision> {
         if !self.is_caused_by_lambda() {
             return None;
         }
-        let why = self
+        let cause = self
             .sentence()
             .unwrap_or_else(|| "ended by itself without a request, with exit code 0".to_owned());
         let amounts = self.killed.map(|killed| killed.used_and_allowed());
         let wake = self.killed.filter(|killed| killed.phase == Phase::Wake);
         let fault = Fault {
             kind: FaultKind::Killed,
-            message: format!("the lambda's process {why}"),
+            message: format!("the lambda's process {cause}"),
             used: amounts.map(|(used, _)| used),
             allowed: amounts.map(|(_, allowed)| allowed),
         };
-        // Of a process that was not killed by the shim the wake is not known; the clocks agree but
-        // for what the time of day was set.
+        // The wake is known only if the shim killed the process. The clocks agree unless the time
+        // of day was set.
         let at_ns = wake.map_or(self.ended_ns, |killed| killed.at_ns);
         Some(woken_by.faulted(at_ns, wake.map_or(0, |killed| killed.ran_ns), fault))
     }
 }
 
 impl WokenBy {
-    /// The decision of a wake of which only the fault is known.
+    /// Returns the decision of a wake of which only the fault is known.
     pub fn faulted(self, at_ns: i64, run_ns: u64, fault: Fault) -> Decision {
         let Self { cause, input, topic } = self;
         let (writer, seq, triggers, fuel) = (None, None, Vec::new(), None);
