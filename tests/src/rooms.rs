@@ -1,5 +1,5 @@
-//! The order of the house: which room may name which, and where unsafe code has its address. See
-//! ARCHITECTURE.md.
+//! The rules of the repository's structure: which room may use which, and which files may contain
+//! unsafe code. See ARCHITECTURE.md.
 
 use std::collections::BTreeSet;
 use std::process::Command;
@@ -7,14 +7,18 @@ use std::process::Command;
 use crate::root;
 use crate::tree::File;
 
-/// The files that may hold unsafe code. Each says so below its `//!` lines, and states the fact
-/// that makes each block sound.
+/// The files that may contain unsafe code. Each declares it below its `//!` lines, and states for
+/// each block why it is sound.
 pub const UNSAFE_FILES: &[&str] = &[
     "guest-sdk-rust/src/bindings.rs",
     "host/buffers/src/lease.rs",
     "host/buffers/src/pool.rs",
     "host/buffers/src/region.rs",
     "host/buffers/src/ring.rs",
+    "host/buffers/src/shared/control.rs",
+    "host/buffers/src/shared/layout.rs",
+    "host/buffers/src/shared/reader.rs",
+    "host/buffers/src/shared/writer.rs",
     "host/dds/src/joins.rs",
     "host/jail/src/cgroup_join.rs",
     "host/python/src/array.rs",
@@ -26,8 +30,8 @@ pub const UNSAFE_FILES: &[&str] = &[
     "player/src/cyclone.rs",
 ];
 
-/// The crates of ours that a crate may depend on. A crate that is not listed may depend on what it
-/// likes: tests, benches and lambdas stand outside of the house.
+/// The workspace crates that a crate may depend on. A crate that is not listed may depend on
+/// anything: tests, benches and lambdas are outside of the rules.
 pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-base", &["gleaner-rules"]),
     ("gleaner-buffers", &[]),
@@ -121,19 +125,19 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-vitals", &["gleaner-protocol"]),
 ];
 
-/// Crates that are not linked into a crate of ours, whatever its features.
+/// Crates that must not be linked into a crate, with any of its features.
 pub const WITHOUT: &[(&str, &[&str])] = &[
     ("gleaner-cli", &["wasmtime", "pyo3", "rustdds"]),
     ("gleaner-dds", &["mcap", "rusqlite"]),
     ("gleaner-drives", &["pyo3", "rustdds"]),
-    // Native code is loaded by the runtime and made by `gleaner-compile` alone.
+    // The runtime loads native code; only `gleaner-compile` generates it.
     ("gleaner-host", &["cranelift-codegen", "pyo3"]),
     ("gleaner-player", &["pyo3", "rustdds"]),
-    // The cloud's page can use it.
+    // A web page may use it.
     ("gleaner-report", &["clap", "indicatif"]),
 ];
 
-/// Inside of `host/src`: a room, and the rooms that it must not name.
+/// For each room of `host/src`, the rooms that it must not use.
 pub const ROOMS: &[(&str, &[&str])] = &[
     (
         "memory",
@@ -206,7 +210,7 @@ pub const ROOMS: &[(&str, &[&str])] = &[
     ),
 ];
 
-/// Whether `file` declares that it holds unsafe code.
+/// Returns whether `file` declares unsafe code.
 pub fn allows_unsafe(file: &File) -> bool {
     file.text
         .lines()
@@ -214,9 +218,9 @@ pub fn allows_unsafe(file: &File) -> bool {
         .any(|line| line.starts_with('#') && line.contains("allow(unsafe_code"))
 }
 
-/// The lines of a Rust file that hold unsafe code, from 1.
+/// The lines of a Rust file with unsafe code, from 1.
 pub fn unsafe_lines(file: &File) -> Vec<usize> {
-    // Put together here, so that this file does not hold what it looks for.
+    // Joined here, so that this file does not contain the patterns.
     let signs = ["{", "impl", "fn", "extern"].map(|what| ["unsafe", what].join(" "));
     let lines = code(&file.text).enumerate();
     lines
@@ -225,20 +229,20 @@ pub fn unsafe_lines(file: &File) -> Vec<usize> {
         .collect()
 }
 
-/// The lines of a Rust file without what follows `//`; good enough to tell code from comments.
+/// The lines of a Rust file without the text after `//`; a good approximation of its code.
 pub fn code(text: &str) -> impl Iterator<Item = &str> {
     text.lines().map(|line| line.split_once("//").map_or(line, |(code, _)| code))
 }
 
-/// The room in `host/src` that a file belongs to: `guest` of `host/src/guest/mod.rs`.
+/// The room of `host/src` that a file belongs to: `guest` for `host/src/guest/mod.rs`.
 pub fn room_of(path: &str) -> Option<&str> {
     let inside = path.strip_prefix("host/src/")?;
     let room = inside.split('/').next()?;
     Some(room.strip_suffix(".rs").unwrap_or(room))
 }
 
-/// The rooms of its crate that a Rust file names, as in `crate::api::Session` or `use crate::{api,
-/// input::Remap}`.
+/// The rooms of its crate that a Rust file uses, as in `crate::api::Session` or
+/// `use crate::{api, input::Remap}`.
 pub fn rooms_named(text: &str) -> BTreeSet<String> {
     let code: String = code(text).flat_map(|line| [line, "\n"]).collect();
     let mut named = BTreeSet::new();
@@ -252,7 +256,7 @@ pub fn rooms_named(text: &str) -> BTreeSet<String> {
     named
 }
 
-/// The first word of a path, or those of each path in a group in braces.
+/// The first word of a path, or of each path in a group in braces.
 fn first_words(path: &str) -> Vec<String> {
     let word = |text: &str| {
         let text = text.trim_start();
@@ -281,8 +285,7 @@ fn first_words(path: &str) -> Vec<String> {
     words
 }
 
-/// The packages that a `Cargo.toml` depends on for what it makes, on any platform; not those of its
-/// own tests.
+/// The packages that a `Cargo.toml` depends on, on any platform, without those for tests.
 pub fn dependencies(manifest: &toml::Table) -> BTreeSet<String> {
     let platforms = manifest
         .get("target")
@@ -293,18 +296,18 @@ pub fn dependencies(manifest: &toml::Table) -> BTreeSet<String> {
     let tables = sections
         .flat_map(|section| ["dependencies", "build-dependencies"].map(|key| section.get(key)));
     let entries = tables.flatten().filter_map(toml::Value::as_table).flatten();
-    // An entry may give the package another name; then the package is what counts.
+    // An entry may rename the package; the package counts.
     let package = |(name, entry): (&String, &toml::Value)| {
         entry.get("package").and_then(toml::Value::as_str).unwrap_or(name).to_owned()
     };
     entries.map(package).collect()
 }
 
-/// The crates that are linked into `package` with all its features, those of its tests left out.
+/// The crates that are linked into `package` with all its features, without those for tests.
 ///
 /// # Panics
 ///
-/// If cargo does not know the package.
+/// If cargo does not find the package.
 pub fn contents(package: &str) -> BTreeSet<String> {
     let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     cargo.args([

@@ -50,6 +50,7 @@ mod lease;
 mod pool;
 mod region;
 mod ring;
+pub mod shared;
 mod sync;
 
 pub use error::{DraftError, PoolError};

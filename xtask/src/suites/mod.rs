@@ -1,10 +1,9 @@
-//! `cargo xtask test`: every suite of the project, one after the other, and one count at the end.
+//! `cargo xtask test`: runs all test suites one after the other, and prints the total counts.
 //!
-//! A suite that fails does not keep the next from running. `tally` counts from what a suite prints;
-//! nothing else knows how the different test runners speak.
+//! All suites run even if one fails. `counts` parses the output of the different test runners.
 
+mod counts;
 mod memory;
-mod tally;
 
 use std::env;
 use std::io::{self, BufRead, BufReader, Write};
@@ -20,44 +19,44 @@ use crate::player;
 use crate::setup;
 use crate::steps::{Steps, succeeds};
 use crate::venv;
-use tally::{Speech, Tally};
+use counts::{OutputFormat, TestCounts};
 
 struct Suite {
     name: String,
-    how: How,
+    action: SuiteAction,
 }
 
-enum How {
-    Run(Command, Speech),
-    /// What is missing. It counts as one skipped test.
+enum SuiteAction {
+    Run(Command, OutputFormat),
+    /// Skips the suite for this reason. It counts as one skipped test.
     Skip(&'static str),
 }
 
-/// Sets up and runs all tests. The last line says `N passed, M failed, K skipped`.
+/// Sets up and runs all tests. The last line is `N passed, M failed, K skipped`.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut suites = suites(checkout);
     suites.extend(player_suites(checkout)?);
     let mut steps = Steps::of(setup::STEPS + 1 + suites.len());
     setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
     fuzz::driver(checkout)?;
-    steps.begin("mypy, pytest, readers of drives, and what runs notebooks");
+    steps.begin("mypy, pytest, drive readers and notebook tools");
     venv::set_up_for_tests(checkout)?;
-    let mut total = Tally::new(Speech::None);
+    let mut total = TestCounts::new(OutputFormat::None);
     let mut table =
         format!("\n{:<44} {:>7} {:>7} {:>7} {:>7}\n", "suite", "passed", "failed", "skipped", "s");
     let folder = memory::Folder::new();
     for mut suite in suites {
         steps.begin(&suite.name);
-        if let (Some(folder), How::Run(command, _)) = (&folder, &mut suite.how) {
+        if let (Some(folder), SuiteAction::Run(command, _)) = (&folder, &mut suite.action) {
             command.env("TMPDIR", folder.path());
         }
         let started = Instant::now();
-        let tally = suite.how.run();
+        let counts = suite.action.run();
         let seconds = started.elapsed().as_secs_f64();
-        let Tally { passed, failed, skipped, .. } = &tally;
+        let TestCounts { passed, failed, skipped, .. } = &tally;
         table +=
             &format!("{:<44} {passed:>7} {failed:>7} {skipped:>7} {seconds:>7.1}\n", suite.name);
-        total.add(tally, &suite.name);
+        total.add(counts, &suite.name);
     }
     print!("{table}");
     for name in &total.names {
@@ -68,16 +67,16 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
 }
 
 fn suites(checkout: &Checkout) -> Vec<Suite> {
-    let suite = |name: &str, command, speech| Suite {
+    let suite = |name: &str, command, format| Suite {
         name: name.to_owned(),
-        how: How::Run(command, speech),
+        action: SuiteAction::Run(command, format),
     };
 
     let mut tests = checkout.cargo();
     tests.args(["test", "--release", "--no-fail-fast"]);
 
-    // Of the fuzz targets, with the features of all that is built by default, so that nothing is
-    // built twice.
+    // Seeds of the fuzz targets, with the features of the default build, so that nothing is built
+    // twice.
     let mut seeds = checkout.cargo();
     seeds.args([
         "test",
@@ -90,12 +89,21 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
     ]);
     seeds.args(["--test", "seeds"]);
 
-    // In target folders of their own: their flags would have everything else compiled anew.
+    // In a separate target folder, since its flags would recompile everything else.
     let mut loom = checkout.cargo();
-    loom.args(["test", "--release", "-p", "gleaner-buffers", "--test", "loom"])
-        .env("CARGO_TARGET_DIR", checkout.target().join("loom"))
-        .env("RUSTFLAGS", "--cfg loom")
-        .env("LOOM_MAX_PREEMPTIONS", "3");
+    loom.args([
+        "test",
+        "--release",
+        "-p",
+        "gleaner-buffers",
+        "--test",
+        "loom",
+        "--test",
+        "loom_shared",
+    ])
+    .env("CARGO_TARGET_DIR", checkout.target().join("loom"))
+    .env("RUSTFLAGS", "--cfg loom")
+    .env("LOOM_MAX_PREEMPTIONS", "3");
 
     let mut unittest = checkout.command(checkout.python());
     unittest
@@ -110,12 +118,12 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
         .env("PYTHONDONTWRITEBYTECODE", "1");
 
     let mut suites = vec![
-        suite("cargo test", tests, Speech::Libtest),
-        suite("cargo test: seeds of the fuzz targets", seeds, Speech::Libtest),
-        suite("loom: orders of threads in gleaner-buffers", loom, Speech::Libtest),
-        Suite { name: "miri: memory in gleaner-buffers".to_owned(), how: miri(checkout) },
-        suite("unittest: Python SDK", unittest, Speech::Unittest),
-        suite("pytest: examples and notebooks", pytest, Speech::Pytest),
+        suite("cargo test", tests, OutputFormat::Libtest),
+        suite("cargo test: seeds of the fuzz targets", seeds, OutputFormat::Libtest),
+        suite("loom: orders of threads in gleaner-buffers", loom, OutputFormat::Libtest),
+        Suite { name: "miri: memory in gleaner-buffers".to_owned(), action: miri(checkout) },
+        suite("unittest: Python SDK", unittest, OutputFormat::Unittest),
+        suite("pytest: examples and notebooks", pytest, OutputFormat::Pytest),
     ];
     suites.extend(typed(checkout).into_iter().map(|file| {
         let mut mypy = checkout.command(checkout.python());
@@ -123,18 +131,18 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
             .arg(checkout.target().join("mypy"))
             .arg(&file)
             .env("MYPYPATH", checkout.path("guest-sdk-python"));
-        suite(&format!("mypy: {}", file.display()), mypy, Speech::None)
+        suite(&format!("mypy: {}", file.display()), mypy, OutputFormat::None)
     }));
     suites
 }
 
-/// What has to hold of the player, where it was built: it is no default member.
+/// Suites of the player, if it was built: it is not a default member.
 fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
-    let suite = |name: &str, how| Suite { name: name.to_owned(), how };
+    let suite = |name: &str, action| Suite { name: name.to_owned(), action };
     if !checkout.program("gleaner-player").is_file() {
         return Ok(vec![suite(
             "cargo test: player",
-            How::Skip("no gleaner-player; run: cargo xtask player"),
+            SuiteAction::Skip("no gleaner-player; run: cargo xtask player"),
         )]);
     }
     let mut lints = player::cargo(checkout)?;
@@ -159,13 +167,13 @@ fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
         "program",
     ]);
     Ok(vec![
-        suite("lints: player", How::Run(lints, Speech::None)),
-        suite("cargo test: player", How::Run(tests, Speech::Libtest)),
+        suite("lints: player", SuiteAction::Run(lints, OutputFormat::None)),
+        suite("cargo test: player", SuiteAction::Run(tests, OutputFormat::Libtest)),
     ])
 }
 
-/// What mypy checks, relative to the checkout: the SDK and its tests, and each lambda by itself, as
-/// all are called `main`.
+/// Paths that mypy checks, relative to the checkout: the SDK, its tests, and each lambda
+/// separately, since all are named `main`.
 fn typed(checkout: &Checkout) -> Vec<PathBuf> {
     let mains = checkout.lambdas(&FAMILIES).into_iter().map(|lambda| lambda.join("main.py"));
     let mains = mains.filter(|main| checkout.path(main).is_file());
@@ -176,65 +184,64 @@ fn typed(checkout: &Checkout) -> Vec<PathBuf> {
         .collect()
 }
 
-fn miri(checkout: &Checkout) -> How {
-    // Only rustup's cargo understands `+nightly`; ours is the cargo of one toolchain, and names it
-    // to its children.
+fn miri(checkout: &Checkout) -> SuiteAction {
+    // Only rustup's cargo understands `+nightly`. The current cargo belongs to one toolchain, which
+    // it passes to its children.
     let cargo = || {
         let mut cargo = checkout.command("cargo");
         cargo.arg("+nightly").arg("miri").env_remove("CARGO").env_remove("RUSTUP_TOOLCHAIN");
         cargo
     };
     if !succeeds(cargo().arg("--version")) {
-        return How::Skip("needs miri: `rustup +nightly component add miri rust-src`");
+        return SuiteAction::Skip("needs miri: `rustup +nightly component add miri rust-src`");
     }
     let mut tests = cargo();
     tests
         .args(["test", "-p", "gleaner-buffers", "--no-fail-fast"])
         .env("CARGO_TARGET_DIR", checkout.target().join("miri"));
-    // No pointer may be made up from a number; unless the user wants other checks.
+    // Forbids pointers made from integers, unless the user has set other flags.
     if env::var_os("MIRIFLAGS").is_none() {
         tests.env("MIRIFLAGS", "-Zmiri-strict-provenance");
     }
-    How::Run(tests, Speech::Libtest)
+    SuiteAction::Run(tests, OutputFormat::Libtest)
 }
 
-impl How {
-    fn run(self) -> Tally {
+impl SuiteAction {
+    fn run(self) -> TestCounts {
         match self {
-            How::Skip(why) => {
+            SuiteAction::Skip(why) => {
                 println!("skipped: {why}");
-                let mut tally = Tally::new(Speech::None);
-                tally.skipped = 1;
-                tally
+                let mut counts = TestCounts::new(OutputFormat::None);
+                counts.skipped = 1;
+                counts
             }
-            How::Run(command, speech) => {
+            SuiteAction::Run(command, format) => {
                 let program = command.get_program().display().to_string();
-                let mut tally = Tally::new(speech);
-                match listen(command, &mut tally) {
-                    Ok(status) => tally.end(status.success(), &format!("ended with {status}")),
-                    Err(error) => tally.end(false, &format!("cannot run `{program}`: {error}")),
+                let mut counts = TestCounts::new(format);
+                match run_and_count(command, &mut counts) {
+                    Ok(status) => counts.end(status.success(), &format!("ended with {status}")),
+                    Err(error) => counts.end(false, &format!("cannot run `{program}`: {error}")),
                 }
-                tally
+                counts
             }
         }
     }
 }
 
-/// Runs a suite and shows what it says, on both streams in the order in which it does, while
-/// `tally` listens.
-fn listen(mut command: Command, tally: &mut Tally) -> io::Result<ExitStatus> {
-    let (said, speak) = io::pipe()?;
+/// Runs a suite, shows the output of both streams in order, and counts the tests in it.
+fn run_and_count(mut command: Command, counts: &mut TestCounts) -> io::Result<ExitStatus> {
+    let (reader, writer) = io::pipe()?;
     let mut child =
-        command.stdin(Stdio::null()).stdout(speak.try_clone()?).stderr(speak).spawn()?;
-    // It holds our ends for writing: with them open, reading would never come to an end.
+        command.stdin(Stdio::null()).stdout(writer.try_clone()?).stderr(writer).spawn()?;
+    // The command holds write ends of the pipe: with them open, reading would never end.
     drop(command);
-    let mut said = BufReader::new(said);
+    let mut reader = BufReader::new(reader);
     let mut line = Vec::new();
-    while said.read_until(b'\n', &mut line)? > 0 {
+    while reader.read_until(b'\n', &mut line)? > 0 {
         let mut out = io::stdout().lock();
         out.write_all(&line)?;
         out.flush()?;
-        tally.hear(String::from_utf8_lossy(&line).trim_end());
+        counts.parse_line(String::from_utf8_lossy(&line).trim_end());
         line.clear();
     }
     child.wait()

@@ -1,0 +1,121 @@
+//! The control page of a reader: its hazards and its bell.
+#![allow(unsafe_code)]
+
+use std::ops::Range;
+use std::ptr::NonNull;
+
+use crate::sync::{AtomicU32, AtomicU64, Ordering};
+
+/// Bytes of a control page.
+const CONTROL_BYTES: usize = 4096;
+
+/// Hazard words of a control page.
+pub const HAZARDS: usize = (CONTROL_BYTES - 64) / 8;
+
+/// Positions that one hazard names at most.
+pub(super) const WINDOW_MAX: u32 = u16::MAX as u32;
+
+/// The words of a control page.
+///
+/// Its reader and the writer map it; the writer trusts none of it.
+#[repr(C, align(64))]
+pub struct ControlPage {
+    /// Raised for each sample that wakes the reader.
+    pub(super) bell: AtomicU32,
+    /// Set while the reader waits for the bell.
+    pub(super) waiting: AtomicU32,
+    _padding: [u64; 7],
+    /// First position in the upper 48 bits, number of positions in the lower 16; 0 names none.
+    pub(super) hazards: [AtomicU64; HAZARDS],
+}
+
+/// The hazard words of a control page that belong to one topic.
+pub type HazardRange = Range<u16>;
+
+impl ControlPage {
+    /// A page without hazards.
+    pub fn new() -> Self {
+        Self {
+            bell: AtomicU32::new(0),
+            waiting: AtomicU32::new(0),
+            _padding: [0; 7],
+            hazards: std::array::from_fn(|_| AtomicU64::new(0)),
+        }
+    }
+
+    /// Stores `value` in a hazard word, as every process that maps the page can.
+    ///
+    /// # Panics
+    ///
+    /// If the page has no such word.
+    pub fn overwrite(&self, word: usize, value: u64) {
+        self.hazards[word].store(value, Ordering::Relaxed);
+    }
+}
+
+impl Default for ControlPage {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// A mapped control page.
+///
+/// # Safety
+///
+/// For as long as the value lives, `page` points to 4,096 mapped bytes, aligned to a
+/// cache line, that are valid for atomic reads and writes from any thread. Other processes may
+/// write them.
+pub unsafe trait ControlMemory: Send + Sync + 'static {
+    /// The first byte of the page.
+    fn page(&self) -> NonNull<ControlPage>;
+}
+
+// SAFETY: a boxed page stays where it is.
+unsafe impl ControlMemory for crate::sync::Arc<ControlPage> {
+    fn page(&self) -> NonNull<ControlPage> {
+        NonNull::from(&**self)
+    }
+}
+
+/// A control page that is mapped.
+pub(super) struct MappedControl(Box<dyn ControlMemory>);
+
+impl MappedControl {
+    pub(super) fn new(memory: impl ControlMemory) -> Self {
+        Self(Box::new(memory))
+    }
+
+    pub(super) fn control(&self) -> &ControlPage {
+        // SAFETY: the promise of `ControlMemory`; all fields that change are atomics.
+        unsafe { self.0.page().as_ref() }
+    }
+}
+
+/// A hazard word: positions from `first`, `count` of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct HazardWindow {
+    pub(super) first: u64,
+    pub(super) count: u32,
+}
+
+impl HazardWindow {
+    pub(super) fn word(self) -> u64 {
+        debug_assert!(self.count <= WINDOW_MAX);
+        self.first << 16 | u64::from(self.count)
+    }
+
+    pub(super) fn of(word: u64) -> Self {
+        Self { first: word >> 16, count: (word & 0xffff) as u32 }
+    }
+}
+
+/// Stores a hazard. Release: it may replace another one, whose sample was read before.
+pub(super) fn set(hazard: &AtomicU64, window: HazardWindow) {
+    hazard.store(window.word(), Ordering::Release);
+}
+
+/// Clears a hazard. Release: the sample was read before.
+pub(super) fn clear(hazard: &AtomicU64) {
+    hazard.store(0, Ordering::Release);
+}

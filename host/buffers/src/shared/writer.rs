@@ -1,0 +1,262 @@
+//! The writing end of a topic: fills slots that no reader holds, and shows the newest samples.
+#![allow(unsafe_code)]
+
+use std::collections::VecDeque;
+use std::ops::{Deref, DerefMut};
+use std::slice;
+
+use super::control::{ControlMemory, HAZARDS, HazardRange, HazardWindow, MappedControl};
+use super::layout::{COUNTER_WORDS, META_WORDS, SharedMemory};
+use super::writer_fence;
+use crate::HEADROOM;
+use crate::sync::Ordering;
+
+/// A sample or a reader that the topic has no room for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WriteError {
+    /// The sample is larger than a slot.
+    TooBig {
+        /// Length of the sample in bytes.
+        len: usize,
+        /// Bytes of a slot.
+        max: usize,
+    },
+    /// The quotas of all readers would exceed the slots of the region.
+    Quota {
+        /// Positions that the reader asks to hold.
+        asked: u32,
+        /// Positions that are left.
+        left: u32,
+    },
+    /// The words are not on the control page.
+    Hazards,
+}
+
+/// Identifies a reader of one topic.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ReaderId(u64);
+
+/// The writing end of a topic.
+pub struct SharedWriter {
+    memory: SharedMemory,
+    head: u64,
+    /// Position in each slot that has one, in order of positions.
+    filled: VecDeque<(u64, u32)>,
+    /// Slots that no sample is in.
+    empty: Vec<u32>,
+    pending: Option<Pending>,
+    /// Set for each slot that a reader holds; computed for each draft.
+    held: Box<[bool]>,
+    readers: Vec<AttachedReader>,
+    next_reader: u64,
+}
+
+struct AttachedReader {
+    id: ReaderId,
+    page: MappedControl,
+    hazards: HazardRange,
+    quota: u32,
+}
+
+/// The slot of the next sample, until it is published.
+#[derive(Debug, Clone, Copy)]
+struct Pending {
+    slot: u32,
+    len: usize,
+}
+
+/// The bytes of the next sample.
+///
+/// They are those of an earlier one: write all of them, or [`truncate`](Self::truncate).
+pub struct SharedDraft<'a>(&'a mut SharedWriter);
+
+impl SharedWriter {
+    /// A writer of an empty topic.
+    pub fn new(memory: SharedMemory) -> Self {
+        let slots = memory.layout().slots;
+        Self {
+            head: 0,
+            filled: VecDeque::with_capacity(slots as usize),
+            // The lowest slot is taken first, so that few slots stay in the caches.
+            empty: (0..slots).rev().collect(),
+            held: vec![false; slots as usize].into(),
+            pending: None,
+            readers: Vec::new(),
+            next_reader: 0,
+            memory,
+        }
+    }
+
+    /// Lets a reader hold up to `quota` positions through `hazards` of its control page.
+    ///
+    /// # Errors
+    ///
+    /// [`WriteError::Quota`] and [`WriteError::Hazards`].
+    pub fn attach(
+        &mut self,
+        control: impl ControlMemory,
+        hazards: HazardRange,
+        quota: u32,
+    ) -> Result<ReaderId, WriteError> {
+        if hazards.end as usize > HAZARDS || hazards.is_empty() {
+            return Err(WriteError::Hazards);
+        }
+        let layout = self.memory.layout();
+        let given: u32 = self.readers.iter().map(|reader| reader.quota).sum();
+        // One slot is drafted while all others are shown or held.
+        let left = (layout.slots - layout.depth - 1).saturating_sub(given);
+        if quota > left {
+            return Err(WriteError::Quota { asked: quota, left });
+        }
+        let id = ReaderId(self.next_reader);
+        self.next_reader += 1;
+        self.readers.push(AttachedReader { id, page: MappedControl::new(control), hazards, quota });
+        Ok(id)
+    }
+
+    /// Forgets a reader: what it held may be written again.
+    pub fn detach(&mut self, id: ReaderId) {
+        self.readers.retain(|reader| reader.id != id);
+    }
+
+    /// Returns the bytes of the next sample, `len` of them. A draft that was not published is
+    /// discarded.
+    ///
+    /// # Errors
+    ///
+    /// [`WriteError::TooBig`]. There is always a free slot.
+    pub fn draft(&mut self, len: usize) -> Result<SharedDraft<'_>, WriteError> {
+        self.discard();
+        let max = self.memory.layout().slot_bytes as usize;
+        if len > max {
+            return Err(WriteError::TooBig { len, max });
+        }
+        let slot = self.take();
+        self.memory.writes(slot);
+        self.pending = Some(Pending { slot, len });
+        let mut draft = SharedDraft(self);
+        draft.headroom_mut().fill(0);
+        Ok(draft)
+    }
+
+    /// Takes a slot that is neither shown nor held.
+    fn take(&mut self) -> u32 {
+        writer_fence();
+        self.held.fill(false);
+        for reader in &self.readers {
+            let control = reader.page.control();
+            let mut left = reader.quota;
+            let words =
+                &control.hazards[reader.hazards.start as usize..reader.hazards.end as usize];
+            for word in words {
+                // Once: a second load could see another value.
+                let window = HazardWindow::of(word.load(Ordering::Acquire));
+                let count = window.count.min(left);
+                left -= count;
+                let from = self.filled.partition_point(|(position, _)| *position < window.first);
+                let end = window.first + u64::from(count);
+                for (position, slot) in self.filled.range(from..) {
+                    if *position >= end {
+                        break;
+                    }
+                    self.held[*slot as usize] = true;
+                }
+            }
+        }
+        if let Some(slot) = self.empty.pop() {
+            return slot;
+        }
+        let shown_from = self.head.saturating_sub(u64::from(self.memory.layout().depth));
+        let free = self
+            .filled
+            .iter()
+            .position(|(position, slot)| *position < shown_from && !self.held[*slot as usize]);
+        let index = free.expect("there are more slots than are shown and held");
+        self.filled.remove(index).expect("the index was just found").1
+    }
+
+    /// Gives up a draft that was not published.
+    pub fn discard(&mut self) {
+        self.empty.extend(self.pending.take().map(|pending| pending.slot));
+    }
+
+    /// Shows the drafted sample to the readers, and returns its position: 0, 1, 2, ...
+    ///
+    /// Returns `None` if there is no draft.
+    pub fn publish(&mut self, meta: &[u64; META_WORDS]) -> Option<u64> {
+        let draft = self.pending.take()?;
+        let position = self.head;
+        let place = self.memory.place(position);
+        let slot = u64::from(draft.slot) << 32 | draft.len as u64;
+        place.slot.store(slot, Ordering::Relaxed);
+        for (word, value) in place.meta.iter().zip(meta) {
+            word.store(*value, Ordering::Relaxed);
+        }
+        place.seq.store(position + 1, Ordering::Release);
+        self.filled.push_back((position, draft.slot));
+        self.head = position + 1;
+        let header = self.memory.header();
+        header.head.store(self.head, Ordering::Release);
+        if let Some(leaving) = position.checked_sub(u64::from(self.memory.layout().depth)) {
+            // The next draft's fence comes after it.
+            self.memory.place(leaving).seq.store(0, Ordering::Relaxed);
+        }
+        Some(position)
+    }
+
+    /// Stores counters for the readers to show.
+    pub fn set_counters(&self, counters: &[u64; COUNTER_WORDS]) {
+        for (word, value) in self.memory.header().counters.iter().zip(counters) {
+            word.store(*value, Ordering::Relaxed);
+        }
+    }
+
+    /// Number of samples published.
+    pub fn head(&self) -> u64 {
+        self.head
+    }
+}
+
+impl SharedDraft<'_> {
+    /// Keeps the first `len` bytes; does nothing if there are no more.
+    pub fn truncate(&mut self, len: usize) {
+        let pending = self.pending_mut();
+        pending.len = pending.len.min(len);
+    }
+
+    /// Returns the bytes in front of the sample; 0 in a new draft.
+    pub fn headroom_mut(&mut self) -> &mut [u8; HEADROOM] {
+        let payload = self.0.memory.payload(self.pending().slot);
+        // SAFETY: the headroom lies in front of each payload and belongs to its slot, which no
+        // reader holds, and the writer is borrowed mutably.
+        unsafe { payload.sub(HEADROOM).cast().as_mut() }
+    }
+
+    fn pending(&self) -> Pending {
+        self.0.pending.expect("a draft borrows a writer that has one")
+    }
+
+    fn pending_mut(&mut self) -> &mut Pending {
+        self.0.pending.as_mut().expect("a draft borrows a writer that has one")
+    }
+}
+
+impl Deref for SharedDraft<'_> {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        let Pending { slot, len } = self.pending();
+        let payload = self.0.memory.payload(slot);
+        // SAFETY: a slot has `slot_bytes >= len` bytes, and only the borrowed writer writes to it.
+        unsafe { slice::from_raw_parts(payload.as_ptr(), len) }
+    }
+}
+
+impl DerefMut for SharedDraft<'_> {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        let Pending { slot, len } = self.pending();
+        let payload = self.0.memory.payload(slot);
+        // SAFETY: as in `deref`, and the draft is borrowed mutably.
+        unsafe { slice::from_raw_parts_mut(payload.as_ptr(), len) }
+    }
+}

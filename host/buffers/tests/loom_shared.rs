@@ -1,0 +1,175 @@
+//! Orders of a writer and readers in shared memory, with up to three preemptions.
+//!
+//! `tests/loom.rs` has the command, with `--test loom_shared`.
+#![cfg(loom)]
+
+use std::time::Duration;
+
+use gleaner_buffers::shared::{
+    Bell, ControlPage, Futex, HeldSample, META_WORDS, SharedLayout, SharedMemory, SharedReader,
+    SharedWriter, fences,
+};
+use loom::sync::Arc;
+use loom::sync::atomic::{AtomicU32, Ordering};
+use loom::thread;
+
+fn topic(depth: u32, slots: u32, quota: u32) -> (SharedWriter, SharedReader) {
+    let layout = SharedLayout { depth, slots, slot_bytes: 8 };
+    let (memory, seen) = SharedMemory::in_process(layout).unwrap();
+    let control = Arc::new(ControlPage::new());
+    let mut writer = SharedWriter::new(memory);
+    writer.attach(control.clone(), 0..2, quota).unwrap();
+    (writer, SharedReader::new(Arc::new(seen), control, 0..2, quota).unwrap())
+}
+
+fn publish(writer: &mut SharedWriter, value: u64) {
+    let mut draft = writer.draft(8).unwrap();
+    draft.copy_from_slice(&value.to_le_bytes());
+    let mut meta = [0; META_WORDS];
+    meta[0] = value;
+    writer.publish(&meta).unwrap();
+}
+
+fn check(hold: &HeldSample) {
+    assert_eq!(**hold, hold.position().to_le_bytes());
+    assert_eq!(hold.meta()[0], hold.position());
+}
+
+/// Held by each model: one of them leaves out a fence for all threads of the process.
+static MODEL: std::sync::Mutex<()> = std::sync::Mutex::new(());
+
+/// One sample under a hazard, while the writer takes slots.
+fn one() {
+    loom::model(|| {
+        let (mut writer, reader) = topic(1, 3, 1);
+        publish(&mut writer, 0);
+        let reading = thread::spawn(move || {
+            if let Some(hold) = reader.get(0).unwrap() {
+                check(&hold);
+                check(&hold);
+            }
+            if let Some(hold) = reader.get(1).unwrap() {
+                check(&hold);
+            }
+        });
+        for value in 1..4 {
+            publish(&mut writer, value);
+        }
+        reading.join().unwrap();
+    });
+}
+
+#[test]
+fn a_held_sample_does_not_change() {
+    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    one();
+}
+
+#[test]
+fn a_held_window_does_not_change() {
+    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    loom::model(|| {
+        let (mut writer, reader) = topic(2, 5, 2);
+        publish(&mut writer, 0);
+        publish(&mut writer, 1);
+        let reading = thread::spawn(move || {
+            if let Some(window) = reader.window(0, 2).unwrap() {
+                window.iter().for_each(check);
+            }
+        });
+        for value in 2..5 {
+            publish(&mut writer, value);
+        }
+        reading.join().unwrap();
+    });
+}
+
+/// Runs `model` without a fence, and expects that it fails.
+fn fails(without: &std::sync::atomic::AtomicBool, model: fn()) {
+    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    without.store(true, std::sync::atomic::Ordering::Relaxed);
+    let found = std::panic::catch_unwind(model);
+    without.store(false, std::sync::atomic::Ordering::Relaxed);
+    assert!(found.is_err(), "the model does not see the missing fence");
+}
+
+#[test]
+fn without_the_readers_fence_the_model_finds_a_torn_sample() {
+    fails(&fences::NO_READER_FENCE, one);
+}
+
+#[test]
+fn without_the_writers_fence_the_model_finds_a_torn_sample() {
+    fails(&fences::NO_WRITER_FENCE, one);
+}
+
+/// A futex as the kernel has it, which compares and sleeps under one lock.
+struct Sleeper {
+    state: loom::sync::Mutex<Sleep>,
+    change: loom::sync::Condvar,
+}
+
+#[derive(Default)]
+struct Sleep {
+    sleeps: bool,
+    woken: bool,
+    /// The ring is over: the timeout of the sleep.
+    over: bool,
+}
+
+struct Kernel(Arc<Sleeper>);
+
+impl Futex for Kernel {
+    fn wait(&self, word: &AtomicU32, seen: u32, _: Duration) {
+        let mut state = self.0.state.lock().unwrap();
+        if word.load(Ordering::Relaxed) != seen {
+            return;
+        }
+        state.sleeps = true;
+        while !state.woken && !state.over {
+            state = self.0.change.wait(state).unwrap();
+        }
+        assert!(state.woken, "the reader sleeps beside a sample");
+    }
+
+    fn wake(&self, _: &AtomicU32) {
+        let mut state = self.0.state.lock().unwrap();
+        state.woken = state.sleeps;
+        self.0.change.notify_all();
+    }
+}
+
+#[test]
+fn no_ring_is_missed() {
+    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    rings();
+}
+
+/// A ring between the reader's look at its topics and its sleep.
+fn rings() {
+    loom::model(|| {
+        let control = Arc::new(ControlPage::new());
+        let state = loom::sync::Mutex::new(Sleep::default());
+        let sleeper = Arc::new(Sleeper { state, change: loom::sync::Condvar::new() });
+        let published = Arc::new(AtomicU32::new(0));
+        let bell = Bell::of(control.clone());
+        let (seen_by_reader, kernel) = (published.clone(), Kernel(sleeper.clone()));
+        let waiting = thread::spawn(move || {
+            let bell = Bell::of(control);
+            let seen = bell.value();
+            if seen_by_reader.load(Ordering::Acquire) == 0 {
+                bell.wait(seen, Duration::from_secs(1), &kernel);
+            }
+        });
+        published.store(1, Ordering::Release);
+        bell.ring(&Kernel(sleeper.clone()));
+        sleeper.state.lock().unwrap().over = true;
+        sleeper.change.notify_all();
+        waiting.join().unwrap();
+    });
+}
+
+#[test]
+fn without_the_bells_fences_the_model_finds_a_missed_ring() {
+    fails(&fences::NO_BELL_FENCE, rings);
+}
