@@ -1,5 +1,5 @@
-//! `cargo xtask bless`: what the examples decide today becomes what they are expected to decide,
-//! and pages that are made of the source become what it says.
+//! `cargo xtask bless`: writes the current decisions of the examples as the expected ones, and the
+//! generated files.
 
 use std::fs;
 use std::path::Path;
@@ -9,18 +9,17 @@ use gleaner_lambda::manifest::GENERATED;
 use gleaner_report::format::trigger_lines;
 
 use crate::checkout::Checkout;
-use crate::examples::{DRIVE, EXAMPLES, Recipe, Replayed, difference};
+use crate::examples::{DRIVE, EXAMPLES, Recipe, TwinReplay, difference};
 use crate::setup;
 use crate::steps::Steps;
 
-/// Writes `examples/*/expected.txt`, a line per trigger of the Rust twin, and
-/// `examples/cookbook/*/expected.txt`, where the first line is the command; before these, what is
-/// made of the manifest's types: a page, and the numbers of the limits in three other files. Of
-/// twins that differ nothing is written.
+/// Writes the files that are generated from the manifest's types, then `examples/*/expected.txt`
+/// with a line per trigger of the Rust twin, and `examples/cookbook/*/expected.txt`, whose first
+/// line is the command. Fails if the twins of an example differ.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     for file in GENERATED {
         let path = checkout.path(Path::new(file.path));
-        // One that is not there yet is made whole.
+        // A missing file is generated completely.
         let now = fs::read_to_string(&path).unwrap_or_default();
         let text = file.text(&now).map_err(|why| Failure::new(Exit::Usage, why))?;
         write(checkout, Path::new(file.path), text)?;
@@ -55,13 +54,13 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
 }
 
 /// A line for each trigger.
-fn rows(run: &Replayed) -> String {
+fn rows(run: &TwinReplay) -> String {
     let lines =
         run.decisions.iter().flat_map(|decision| trigger_lines(decision, run.summary.start_ns));
     lines.map(|line| line + "\n").collect()
 }
 
-/// Writes and shows a file of the checkout.
+/// Writes and prints a file of the checkout.
 fn write(checkout: &Checkout, file: &Path, text: String) -> Result<(), Failure> {
     let file_name = file.display();
     fs::write(checkout.path(file), &text).map_err(|error| {

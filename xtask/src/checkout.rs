@@ -1,4 +1,4 @@
-//! Where things are: the checkout, its target folder, and the cargo that started us.
+//! Finds the checkout, its target folder, and the cargo that started this program.
 
 use std::env;
 use std::ffi::{OsStr, OsString};
@@ -8,7 +8,7 @@ use std::process::Command;
 
 use gleaner_base::{Exit, Failure};
 
-/// The folders with a folder for each lambda, which holds one for each of its twins.
+/// Folders of lambdas; each lambda has a folder with one for each of its twins.
 pub(crate) const FAMILIES: [&str; 3] = ["bench/lambdas", "examples", "tests/lambdas"];
 
 pub(crate) struct Checkout {
@@ -24,19 +24,19 @@ impl Checkout {
             Failure::new(Exit::Usage, what)
                 .with_help("start it as `cargo xtask`, inside of the checkout")
         };
-        // Cargo tells a program that it runs where its package is and which cargo it is.
-        let package = env::var_os("CARGO_MANIFEST_DIR")
-            .ok_or_else(|| lost("cannot tell where the checkout is"))?;
+        // Cargo sets these variables for the programs that it runs.
+        let package =
+            env::var_os("CARGO_MANIFEST_DIR").ok_or_else(|| lost("cannot find the checkout"))?;
         let root = Path::new(&package)
             .parent()
-            .ok_or_else(|| lost("cannot tell where the checkout is"))?
+            .ok_or_else(|| lost("cannot find the checkout"))?
             .to_owned();
         let cargo = env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        // TARGET/xtask/xtask: so every other cargo builds where this one did, whatever the user
-        // configured.
+        // This program is TARGET/xtask/xtask. Every other cargo builds there, too, whatever the
+        // user has configured.
         let exe = env::current_exe().ok().filter(|exe| exe.is_absolute());
         let target = exe.as_deref().and_then(|exe| exe.ancestors().nth(2));
-        let target = target.ok_or_else(|| lost("cannot tell where cargo builds"))?.to_owned();
+        let target = target.ok_or_else(|| lost("cannot find the target folder"))?.to_owned();
         Ok(Checkout { root, target, cargo })
     }
 
@@ -58,8 +58,8 @@ impl Checkout {
         self.target.join("release").join(name)
     }
 
-    /// `program`, to be run in the checkout; it and what it starts use our cargo, target folder and
-    /// Python, and the checkout's parts even if the target folder lies elsewhere or another Gleaner
+    /// A command that runs `program` in the checkout. It uses the same cargo, target folder and
+    /// Python, and the checkout's parts even if the target folder is elsewhere or another Gleaner
     /// is installed.
     pub(crate) fn command(&self, program: impl AsRef<OsStr>) -> Command {
         let mut command = Command::new(program);
@@ -72,7 +72,7 @@ impl Checkout {
         command
     }
 
-    /// Cargo, as [`command`](Self::command).
+    /// Cargo as a [`command`](Self::command).
     pub(crate) fn cargo(&self) -> Command {
         self.command(&self.cargo)
     }

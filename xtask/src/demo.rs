@@ -1,4 +1,4 @@
-//! `cargo xtask demo`: the main job, end to end.
+//! `cargo xtask demo`: shows Gleaner's main functions end to end.
 
 use std::collections::BTreeMap;
 
@@ -7,12 +7,12 @@ use gleaner_lambda::Decision;
 use gleaner_report::format::{clip_contents, clip_span, grouped, seconds};
 
 use crate::checkout::Checkout;
-use crate::examples::{DRIVE, EXAMPLES, Example, Replayed, difference};
+use crate::examples::{DRIVE, EXAMPLES, Example, TwinReplay, difference};
 use crate::setup;
 use crate::steps::Steps;
 
-/// Replays the sample drive through both twins of every example, compares them, and makes every
-/// decision a second time: from the journal, and from the clips alone.
+/// Replays the sample drive with both twins of every example, compares them, and repeats every
+/// decision from the journal and from the clips alone.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 1);
     setup::run(
@@ -23,13 +23,13 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     steps.begin(&format!("replay of {DRIVE}"));
     let mut rows =
         vec![["example", "kind", "wakes", "wakes/s", "peak MiB", "triggers"].map(str::to_owned)];
-    let (mut verdicts, mut proofs, mut clips) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut verdicts, mut verifications, mut clips) = (Vec::new(), Vec::new(), Vec::new());
     let mut agree = true;
     for example in &EXAMPLES {
         let twins = example.replay(checkout)?;
         rows.extend(twins.iter().map(|twin| row(example.name, twin)));
         for twin in &twins {
-            proofs.push(prove(checkout, example, twin)?);
+            verifications.push(verify(checkout, example, twin)?);
         }
         clips.extend(twins.first().into_iter().flat_map(clip_lines));
         let difference = difference(&twins);
@@ -39,7 +39,8 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         verdicts.push(match difference {
             None => {
                 format!(
-                    "{}{with}{settings}: the Rust and the Python lambda decide and keep the same",
+                    "{}{with}{settings}: the Rust and the Python lambda have the same decisions \
+                     and clips",
                     example.name
                 )
             }
@@ -57,27 +58,29 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     for line in clips {
         println!("{line}");
     }
-    println!("\ndecisions made a second time:");
-    for proof in proofs {
-        println!("{proof}");
+    println!("\nrepeated decisions:");
+    for verification in verifications {
+        println!("{verification}");
     }
     println!(
-        "\nfiles: out/demo/EXAMPLE-KIND/ with clips/, clips.jsonl, decisions.jsonl, log.jsonl, summary.json, wakes.journal, and report.html to look at"
+        "\nfiles: out/demo/EXAMPLE-KIND/ with clips/, clips.jsonl, decisions.jsonl, log.jsonl, \
+         summary.json, wakes.journal, and report.html"
     );
     let gleaner = checkout.program("gleaner");
     let gleaner = gleaner.strip_prefix(checkout.path("")).unwrap_or(&gleaner).display();
     println!(
-        "try next, with another limit: {gleaner} replay examples/hello/rust {DRIVE} --set brake_mps2=-1.2"
+        "try next, with another threshold: {gleaner} replay examples/hello/rust {DRIVE} \
+         --set brake_mps2=-1.2"
     );
     Ok(if agree { Exit::Ok } else { Exit::Differs })
 }
 
-/// Two lines for each clip: where it is, what is in it, and its thumbnail.
-fn clip_lines(twin: &Replayed) -> Vec<String> {
+/// Formats each clip: file, contents and thumbnail.
+fn clip_lines(twin: &TwinReplay) -> Vec<String> {
     let lines = twin.clips.iter().map(|clip| {
         let [from, to] = clip_span(clip).map(|at_ns| seconds(at_ns, twin.summary.start_ns));
         let thumbnail =
-            clip.thumbnail.as_ref().map_or("no camera in it".to_owned(), |path| twin.path(path));
+            clip.thumbnail.as_ref().map_or("no camera".to_owned(), |path| twin.path(path));
         let short = clip
             .incomplete
             .iter()
@@ -92,15 +95,15 @@ fn clip_lines(twin: &Replayed) -> Vec<String> {
     lines.collect()
 }
 
-/// Verifies the journal, and every clip that can be alone, and says how many decisions were the
-/// same.
-fn prove(checkout: &Checkout, example: &Example, twin: &Replayed) -> Result<String, Failure> {
+/// Verifies the journal, and every clip if the lambda allows that; returns a line with the number
+/// of identical decisions.
+fn verify(checkout: &Checkout, example: &Example, twin: &TwinReplay) -> Result<String, Failure> {
     let (name, kind) = (example.name, twin.summary.kind.as_str());
     let whole = twin.verify(checkout)?;
     let all =
         format!("  {name}, {kind}: all {} from the journal and the drive", grouped(whole.wakes));
-    if !example.forgets {
-        return Ok(format!("{all}; not from clips alone, since it remembers what was before them"));
+    if !example.is_stateless {
+        return Ok(format!("{all}; not from clips alone, since it keeps state from before them"));
     }
     let parts = twin
         .clips
@@ -113,12 +116,12 @@ fn prove(checkout: &Checkout, example: &Example, twin: &Replayed) -> Result<Stri
         if parts.len() == 1 { "one clip".to_owned() } else { format!("{} clips", parts.len()) };
     let further = match uncovered {
         0 => String::new(),
-        _ => format!(" (in {} the lambda had looked at samples from before)", grouped(uncovered)),
+        _ => format!(" (in {} the lambda had read samples from before)", grouped(uncovered)),
     };
     Ok(format!("{all}; {} from {clips} alone{further}", grouped(wakes.saturating_sub(uncovered))))
 }
 
-fn row(name: &str, Replayed { summary, decisions, .. }: &Replayed) -> [String; 6] {
+fn row(name: &str, TwinReplay { summary, decisions, .. }: &TwinReplay) -> [String; 6] {
     [
         name.to_owned(),
         summary.kind.as_str().to_owned(),
@@ -129,7 +132,7 @@ fn row(name: &str, Replayed { summary, decisions, .. }: &Replayed) -> [String; 6
     ]
 }
 
-/// Each label once, with the times of its triggers in s: `hard-brake at 4.14, 10.80 s`.
+/// Formats each label with the times of its triggers: `hard-brake at 4.14, 10.80 s`.
 fn triggers(decisions: &[Decision], start_ns: i64) -> String {
     let mut times: BTreeMap<&str, Vec<String>> = BTreeMap::new();
     for decision in decisions {
@@ -143,7 +146,8 @@ fn triggers(decisions: &[Decision], start_ns: i64) -> String {
     if times.is_empty() { "none".to_owned() } else { labels.collect::<Vec<_>>().join("; ") }
 }
 
-/// Columns as wide as their widest cell: words to the left, numbers to the right.
+/// Formats a table with columns as wide as their widest cell: text left-aligned, numbers
+/// right-aligned.
 fn table(rows: &[[String; 6]]) -> String {
     let width =
         |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
@@ -162,7 +166,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_table_has_words_to_the_left_and_numbers_to_the_right() {
+    fn a_table_aligns_text_left_and_numbers_right() {
         let rows = [
             ["example", "kind", "wakes", "w/s", "MiB", "at"],
             ["a", "python", "10", "9999", "1.0", "none"],
@@ -176,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn each_label_stands_once_before_its_times() {
+    fn triggers_are_grouped_by_label() {
         let decision = |at_ns: i64, label: &str| -> Decision {
             let trigger =
                 format!(r#"{{"kind":"event","label":"{label}","score":null,"attributes":{{}}}}"#);

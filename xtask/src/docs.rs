@@ -1,9 +1,7 @@
-//! `cargo xtask docs`: the pages as a book, in `target/book`. Tests do without it: they read the
-//! pages themselves.
+//! `cargo xtask docs`: builds the pages as a book in `target/book`. Tests read the pages directly.
 //!
-//! Pages link to files all over the checkout, and mdBook knows those of one folder only. So it gets
-//! a folder with the text files of the checkout at their places, beside which `SUMMARY.md` of
-//! `docs` lies, its links as seen from there.
+//! Pages link to files all over the checkout, but mdBook reads only one folder. So the text files
+//! of the checkout are copied to a folder, beside `SUMMARY.md` of `docs` with adapted links.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,14 +11,14 @@ use gleaner_base::{Exit, Failure};
 use crate::checkout::Checkout;
 use crate::steps::{self, Steps};
 
-/// The version that the book was looked at with.
+/// The version that the book was checked with.
 const MDBOOK: &str = "0.5.4";
 
-/// What pages link to, by the ends of the names.
+/// Names and extensions of files that pages link to.
 const LINKED: [&str; 9] = ["md", "rs", "py", "toml", "txt", "wit", "ipynb", "LICENSE", "json"];
 
-/// What is not of the book: what tools make, and what has no page.
-const LEFT_OUT: [&str; 5] = ["target", "out", "build", "fuzz", "__pycache__"];
+/// Folders without pages, and those that tools make.
+const SKIPPED: [&str; 5] = ["target", "out", "build", "fuzz", "__pycache__"];
 
 /// Fetches mdBook if it is not there, and builds the book.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
@@ -32,14 +30,15 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     if !has.is_ok_and(|output| String::from_utf8_lossy(&output.stdout).trim().ends_with(MDBOOK)) {
         let mut install = checkout.cargo();
         install.args(["install", "mdbook", "--locked", "--version", MDBOOK, "--root"]).arg(&home);
-        let help = "see that the network is there; the pages can be read without a book, too";
+        let help = "check the network; the pages can also be read without a book";
         steps::run(&mut install, help)
             .map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
     }
     steps.begin("the book");
     let source = checkout.target().join("book-source");
-    stage(checkout, &source)
-        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot lay out the book", &error))?;
+    copy_pages(checkout, &source).map_err(|error| {
+        Failure::caused_by(Exit::Internal, "cannot copy the pages of the book", &error)
+    })?;
     let mut build = checkout.command(&mdbook);
     let book = checkout.target().join("book");
     build.arg("build").arg(&source).arg("--dest-dir").arg(&book);
@@ -51,8 +50,8 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     Ok(Exit::Ok)
 }
 
-/// Lays out what mdBook reads in `to`.
-fn stage(checkout: &Checkout, to: &Path) -> std::io::Result<()> {
+/// Copies the pages and linked files to `to`, for mdBook.
+fn copy_pages(checkout: &Checkout, to: &Path) -> std::io::Result<()> {
     if to.exists() {
         fs::remove_dir_all(to)?;
     }
@@ -64,7 +63,7 @@ fn stage(checkout: &Checkout, to: &Path) -> std::io::Result<()> {
             let path = folder.join(&name);
             let kind = entry.file_type()?;
             if kind.is_dir() {
-                if !name.starts_with('.') && !LEFT_OUT.contains(&&*name) {
+                if !name.starts_with('.') && !SKIPPED.contains(&&*name) {
                     folders.push(path);
                 }
             } else if kind.is_file()
@@ -73,8 +72,7 @@ fn stage(checkout: &Checkout, to: &Path) -> std::io::Result<()> {
                 let copy = to.join("src").join(path);
                 fs::create_dir_all(copy.parent().unwrap_or(to))?;
                 if name.ends_with(".md") {
-                    // mdBook calls the page of a README `index.html`, but leaves links to it as
-                    // they are.
+                    // mdBook renames the page of a README to `index.html`, but not links to it.
                     let page = fs::read_to_string(entry.path())?;
                     fs::write(
                         copy,
@@ -91,7 +89,7 @@ fn stage(checkout: &Checkout, to: &Path) -> std::io::Result<()> {
     fs::copy(checkout.path("docs/book.toml"), to.join("book.toml")).map(drop)
 }
 
-/// The links of `docs/SUMMARY.md` as seen from the root of the checkout.
+/// Adapts the links of `docs/SUMMARY.md` to the root of the checkout.
 fn from_the_root(summary: &str) -> String {
     summary.replace("](", "](docs/").replace("](docs/../", "](")
 }
@@ -101,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn chapters_are_named_from_the_root() {
+    fn links_are_relative_to_the_root() {
         let summary = "[Gleaner](../README.md)\n\n- [Clips](clips.md)\n    - [X](../examples/hello/README.md)";
         let moved =
             "[Gleaner](README.md)\n\n- [Clips](docs/clips.md)\n    - [X](examples/hello/README.md)";

@@ -1,5 +1,5 @@
-//! The examples and the recipes of the cookbook on the sample drive: what `demo` shows and `bless`
-//! writes down.
+//! Replays the sample drive with the examples and the recipes of the cookbook, for `demo` and
+//! `bless`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -17,31 +17,30 @@ pub(crate) const DRIVE: &str = "examples/data/highway_drive.mcap";
 
 const JOURNAL: &str = "wakes.journal";
 
-/// Where the recipes are, relative to the checkout.
+/// Folder of the recipes, relative to the checkout.
 const COOKBOOK: &str = "examples/cookbook";
 
-/// An example, with the values that suit the sample drive: its braking is gentle.
+/// An example with settings for the gentle braking in the sample drive.
 pub(crate) struct Example {
     pub(crate) name: &'static str,
     pub(crate) set: &'static [&'static str],
-    /// Whether it decides by what it looks at in a wake and shortly before, so that a clip alone
-    /// tells what it decided.
-    pub(crate) forgets: bool,
+    /// True if its decisions depend only on recent samples, so that a clip alone reproduces them.
+    pub(crate) is_stateless: bool,
 }
 
 pub(crate) const EXAMPLES: [Example; 3] = [
-    Example { name: "hello", set: &["brake_mps2=-1.4"], forgets: true },
-    Example { name: "brake-dark", set: &["brake_mps2=-1.4", "dark_luma=50"], forgets: true },
-    // Its windows follow each other from the first sample of the drive on.
-    Example { name: "imu-fft", set: &[], forgets: false },
+    Example { name: "hello", set: &["brake_mps2=-1.4"], is_stateless: true },
+    Example { name: "brake-dark", set: &["brake_mps2=-1.4", "dark_luma=50"], is_stateless: true },
+    // Its consecutive windows depend on the first sample of the drive.
+    Example { name: "imu-fft", set: &[], is_stateless: false },
 ];
 
-/// What one twin did.
-pub(crate) struct Replayed {
+/// Results of a replay with one twin.
+pub(crate) struct TwinReplay {
     pub(crate) summary: ReplaySummary,
-    /// Those with a trigger or a fault.
+    /// Decisions with a trigger or a fault.
     pub(crate) decisions: Vec<Decision>,
-    /// Made around its triggers.
+    /// Clips around its triggers.
     pub(crate) clips: Vec<Clip>,
     lambda: PathBuf,
     out: PathBuf,
@@ -50,11 +49,11 @@ pub(crate) struct Replayed {
 impl Example {
     /// Replays the Rust and the Python twin, in this order. Results go to
     /// `out/demo/<example>-<kind>/`.
-    pub(crate) fn replay(&self, checkout: &Checkout) -> Result<[Replayed; 2], Failure> {
+    pub(crate) fn replay(&self, checkout: &Checkout) -> Result<[TwinReplay; 2], Failure> {
         Ok([self.replay_twin(checkout, "rust")?, self.replay_twin(checkout, "python")?])
     }
 
-    /// The folders of both, relative to the checkout.
+    /// The folders of both twins, relative to the checkout.
     pub(crate) fn lambdas(&self) -> [PathBuf; 2] {
         ["rust", "python"].map(|language| self.lambda(language))
     }
@@ -63,7 +62,7 @@ impl Example {
         Path::new("examples").join(self.name).join(language)
     }
 
-    fn replay_twin(&self, checkout: &Checkout, language: &str) -> Result<Replayed, Failure> {
+    fn replay_twin(&self, checkout: &Checkout, language: &str) -> Result<TwinReplay, Failure> {
         let kind = if language == "rust" { "wasm" } else { language };
         let lambda = self.lambda(language);
         let settings = self.set.iter().flat_map(|set| ["--set".to_owned(), (*set).to_owned()]);
@@ -71,16 +70,16 @@ impl Example {
     }
 }
 
-/// A lambda of the cookbook: in one language, with an `expected.txt` whose first line is the
-/// command that finds the others.
+/// A lambda of the cookbook in one language. The first line of its `expected.txt` is the command
+/// that produces the other lines.
 pub(crate) struct Recipe {
     name: String,
-    /// That first line.
+    /// The first line of `expected.txt`.
     pub(crate) command: String,
 }
 
 impl Recipe {
-    /// All of them.
+    /// Finds all recipes.
     pub(crate) fn all(checkout: &Checkout) -> Result<Vec<Recipe>, Failure> {
         let folders = checkout
             .lambdas(&["examples"])
@@ -106,14 +105,14 @@ impl Recipe {
         }
     }
 
-    /// The file that says what it finds, relative to the checkout.
+    /// Path of `expected.txt`, relative to the checkout.
     pub(crate) fn expected(&self) -> PathBuf {
         Path::new(COOKBOOK).join(&self.name).join("expected.txt")
     }
 
-    /// Does what the command says. Results go to `out/demo/cookbook-<name>/`.
-    pub(crate) fn replay(&self, checkout: &Checkout) -> Result<Replayed, Failure> {
-        // Behind `gleaner replay DIR DRIVE`.
+    /// Runs the command. Results go to `out/demo/cookbook-<name>/`.
+    pub(crate) fn replay(&self, checkout: &Checkout) -> Result<TwinReplay, Failure> {
+        // The arguments after `gleaner replay DIR DRIVE`.
         let settings = self.command.split_whitespace().skip(4).map(str::to_owned).collect();
         replay(
             checkout,
@@ -130,7 +129,7 @@ fn replay(
     name: &str,
     lambda: PathBuf,
     settings: Vec<String>,
-) -> Result<Replayed, Failure> {
+) -> Result<TwinReplay, Failure> {
     let out = Path::new("out/demo").join(name);
     let mut replay = checkout.command(checkout.program("gleaner"));
     replay
@@ -141,18 +140,18 @@ fn replay(
         .arg("--out")
         .arg(&out)
         .arg("--json");
-    // The folder may not be there yet, and a journal of an earlier demo is replaced.
+    // The folder may be missing, and a journal of an earlier demo is replaced.
     fs::create_dir_all(checkout.path(&out))
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot make `out/demo`", &error))?;
     replay.arg("--journal").arg(out.join(JOURNAL));
     let summary: ReplaySummary = report(&mut replay)?;
     let folder = checkout.path(&out);
     let clips = if summary.recording.clips > 0 { clips(&folder)? } else { Vec::new() };
-    Ok(Replayed { decisions: decisions(&folder)?, clips, summary, lambda, out })
+    Ok(TwinReplay { decisions: decisions(&folder)?, clips, summary, lambda, out })
 }
 
-impl Replayed {
-    /// Makes every decision of the journal again, from the drive.
+impl TwinReplay {
+    /// Repeats every decision of the journal, from the drive.
     pub(crate) fn verify(&self, checkout: &Checkout) -> Result<Verified, Failure> {
         let mut verify = checkout.command(checkout.program("gleaner"));
         verify
@@ -165,7 +164,7 @@ impl Replayed {
         report(&mut verify)
     }
 
-    /// Makes the decisions in a clip again, from the clip alone.
+    /// Repeats the decisions of a clip, from the clip alone.
     pub(crate) fn verify_clip(
         &self,
         checkout: &Checkout,
@@ -181,18 +180,17 @@ impl Replayed {
         report(&mut verify)
     }
 
-    /// A file of its results, as a person would name it.
+    /// Path of a result file, relative to the checkout.
     pub(crate) fn path(&self, file: &Path) -> String {
         self.out.join(file).display().to_string()
     }
 }
 
-/// What `gleaner --json` reports.
+/// Runs `gleaner --json` and parses its report.
 fn report<T: serde::de::DeserializeOwned>(
     gleaner: &mut std::process::Command,
 ) -> Result<T, Failure> {
-    let json =
-        steps::output(gleaner, "see the error above; what was decided until then is in out/demo")?;
+    let json = steps::output(gleaner, "see the error above; the results up to it are in out/demo")?;
     serde_json::from_str(&json).map_err(|error| {
         Failure::caused_by(Exit::Internal, "`gleaner --json` gave no report", &error)
     })
@@ -202,19 +200,19 @@ fn decisions(out: &Path) -> Result<Vec<Decision>, ResultsError> {
     Decisions::open(out)?.collect()
 }
 
-/// What differs first between twins, for a person; `None` if they agree.
-pub(crate) fn difference([a, b]: &[Replayed; 2]) -> Option<String> {
+/// The first difference between twins, as text; `None` if they agree.
+pub(crate) fn difference([a, b]: &[TwinReplay; 2]) -> Option<String> {
     if a.summary.wakes != b.summary.wakes {
         return Some(format!("the number of wakes is {} and {}", a.summary.wakes, b.summary.wakes));
     }
-    let held = |twin: &Replayed| {
+    let held = |twin: &TwinReplay| {
         twin.clips
             .iter()
             .map(|clip| (clip.from_ns, clip.to_ns, clip.topics.clone()))
             .collect::<Vec<_>>()
     };
     if held(a) != held(b) {
-        return Some("the clips do not hold the same".to_owned());
+        return Some("the contents of the clips".to_owned());
     }
     let (a, b) = (&a.decisions, &b.decisions);
     let differ =

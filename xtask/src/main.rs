@@ -1,9 +1,8 @@
-//! `cargo xtask`: everything a fresh machine needs beyond cargo, a C compiler and Python is fetched
-//! and built here.
+//! `cargo xtask`: fetches and builds everything beyond cargo, a C compiler and Python, and runs the
+//! project's tasks.
 //!
-//! `checkout` knows where things are, `setup` makes what is missing, `examples` replays the sample
-//! drive, and each command is a file that says what it does after that. Nothing here is part of
-//! what is installed.
+//! `checkout` finds paths, `setup` builds what is missing, `examples` replays the sample drive, and
+//! each command has a file. Nothing here is installed.
 
 mod aarch64;
 mod bless;
@@ -29,16 +28,16 @@ use checkout::{Checkout, FAMILIES};
 use steps::Steps;
 
 const USAGE: &str = "usage: cargo xtask COMMAND
-  demo   run both twins of every example over the sample drive, and show what they decided
-  test   run all tests; the last line is `N passed, M failed, K skipped`
-  bless  write what the examples decide on the sample drive to expected.txt, and what is made of the manifest's types
-  docs   fetch mdBook and build the pages as a book, in target/book
-  bench  measure what is promised; what follows goes to gleaner-bench
-  peers  build programs on other DDS for the tests of live topics; --install fetches their packages first
-  player build gleaner-player, which plays drives with Cyclone DDS, and fetch what that takes
-  fuzz   feed what reads foreign bytes with made-up ones; [TARGET...] [--seconds N] [--seed N]
-  aarch64  build for vehicles with an ARM processor, and compare what lambdas decide there, emulated
-  build  only set up: wasm target, Python environment, programs, lambdas";
+  demo     replay the sample drive with both twins of every example, and show their decisions
+  test     run all tests; the last line is `N passed, M failed, K skipped`
+  bless    write the examples' decisions to expected.txt, and the generated files
+  docs     fetch mdBook and build the pages as a book in target/book
+  bench    run the benchmarks; further arguments are passed to gleaner-bench
+  peers    build test programs on other DDS implementations; --install fetches their packages first
+  player   fetch the tools for gleaner-player, which plays drives with Cyclone DDS, and build it
+  fuzz     fuzz parsers of untrusted input; [TARGET...] [--seconds N] [--seed N]
+  aarch64  build for ARM vehicles, and compare the decisions of lambdas there, emulated
+  build    only set up: wasm target, Python environment, programs, lambdas";
 
 fn main() -> ExitCode {
     match run(env::args_os().skip(1).collect()) {
@@ -84,12 +83,12 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
 fn bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 3);
     setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
-    steps.begin("readers of drives, to compare with");
+    steps.begin("readers of drives for comparison");
     venv::set_up_for_tests(checkout)?;
     steps.begin("gleaner-bench");
     let mut build = checkout.cargo();
-    // By its name alone: cargo chooses features by the packages that are named, and none of it is
-    // to compile twice.
+    // Only the binary is named: cargo selects features by the named packages, and other features
+    // would compile dependencies twice.
     steps::run(
         build.args(["build", "--release", "--bin", "gleaner-bench"]),
         "see the first error above",
@@ -97,5 +96,5 @@ fn bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     steps.begin("measurements");
     let mut bench = checkout.command(checkout.program("gleaner-bench"));
     bench.args(arguments);
-    steps::run(&mut bench, "look at what it says above").map(|()| Exit::Ok)
+    steps::run(&mut bench, "see the messages above").map(|()| Exit::Ok)
 }

@@ -1,6 +1,6 @@
-//! `cargo xtask peers`: programs on other people's DDS, which the suite `dds` lets us talk to.
-//! Those whose packages are there are built into `peers/` of the target folder; for the others it
-//! is said how to get them.
+//! `cargo xtask peers`: builds test programs on other DDS implementations, for the suite `dds`.
+//! Programs whose packages are installed are built into `peers/` of the target folder; for the
+//! others the missing packages are named.
 
 use std::ffi::OsString;
 use std::fs;
@@ -13,10 +13,11 @@ use crate::checkout::Checkout;
 use crate::steps::{Steps, run, succeeds};
 use crate::venv;
 
-/// Debian's and Ubuntu's packages: of the two DDS, and of what private networks for tests are made
-/// with.
+/// Debian and Ubuntu packages of Cyclone DDS.
 const CYCLONE: [&str; 2] = ["cyclonedds-dev", "cyclonedds-tools"];
+/// Packages of Fast DDS.
 const FAST: [&str; 4] = ["libfastrtps-dev", "libfastcdr-dev", "fastddsgen", "default-jre-headless"];
+/// Packages for the private networks of tests.
 const NETWORK: [&str; 2] = ["iproute2", "nftables"];
 
 /// A Gid has 24 bytes up to ROS 2 Humble and 16 since Iron.
@@ -48,14 +49,14 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     if cyclone {
         peers.cyclone()?;
     } else {
-        println!("left out: {} are missing", CYCLONE.join(" and "));
+        println!("skipped: {} are missing", CYCLONE.join(" and "));
     }
     steps.begin("Fast DDS in C++");
     let fast = peers.has_fast();
     if fast {
         peers.fast()?;
     } else {
-        println!("left out: {} are missing", FAST.join(", "));
+        println!("skipped: {} are missing", FAST.join(", "));
     }
     steps.begin("Cyclone DDS in Python");
     peers.python()?;
@@ -69,7 +70,7 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     Err(Failure::new(Exit::Unreachable, "packages are missing").with_help(help))
 }
 
-/// What could not be fetched.
+/// Marks a failed download.
 fn unreachable(failure: Failure) -> Failure {
     Failure { exit: Exit::Unreachable, ..failure }
 }
@@ -84,7 +85,7 @@ impl Peers<'_> {
         succeeds(self.checkout.command(program).arg(argument))
     }
 
-    /// Whether a compiler finds a header.
+    /// Returns whether a compiler finds a header.
     fn has_header(&self, compiler: &str, language: &str, header: &str) -> bool {
         let mut compile = self.checkout.command(compiler);
         succeeds(compile.args(["-fsyntax-only", "-x", language, "-include", header, "/dev/null"]))
@@ -116,13 +117,14 @@ impl Peers<'_> {
     }
 
     fn install(&self, packages: &[&str]) -> Result<(), Failure> {
-        let help = "packages of Debian and Ubuntu are installed by root, after `apt-get update`; elsewhere, install what they stand for";
+        let help = "install packages as root after `apt-get update`; on other systems than Debian \
+                    and Ubuntu, install their equivalents";
         let mut install = self.checkout.command("apt-get");
         install.args(["install", "-y", "--no-install-recommends"]).args(packages);
         run(install.env("DEBIAN_FRONTEND", "noninteractive"), help)
     }
 
-    /// A folder below `peers/` for what a tool generates.
+    /// A folder below `peers/` for generated files.
     fn generated(&self, name: &str) -> Result<PathBuf, Failure> {
         let folder = self.folder.join(name);
         fs::create_dir_all(&folder).map_err(|error| {
@@ -194,8 +196,8 @@ impl Peers<'_> {
         }
         let mut make = self.checkout.command(Parts::find()?.python(None)?);
         make.args(["-m", "venv", "--clear"]).arg(&venv);
-        run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip")?;
-        let help = "see that the network is there, or configure pip for a mirror";
+        run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip")?;
+        let help = "check the network, or configure a mirror for pip";
         venv::pip(self.checkout.command(&python), &["cyclonedds"], help).map_err(unreachable)
     }
 }

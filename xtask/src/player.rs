@@ -1,6 +1,5 @@
-//! `cargo xtask player`: builds `gleaner-player`. It holds Cyclone DDS, which is C: that takes
-//! cmake, and libclang to read its headers. What the system lacks of them is put into `.venv`,
-//! which needs no root.
+//! `cargo xtask player`: builds `gleaner-player`. It contains Cyclone DDS, which is C and needs
+//! cmake, and libclang for its headers. Missing tools are installed into `.venv`, without root.
 
 use std::env;
 use std::ffi::OsString;
@@ -20,7 +19,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     steps.begin("cmake and libclang");
     let mut build = cargo(checkout)?;
     steps.begin("gleaner-player with Cyclone DDS (the first time this takes minutes)");
-    // With the features of the whole workspace, so that what it shares is built once.
+    // With the features of the whole workspace, so that shared dependencies are built once.
     build.args(["build", "--release", "--workspace", "--bin", "gleaner-player"]);
     let help = "if a C compiler is missing, install one (`cc`); else see the first error above";
     steps::run(&mut build, help)?;
@@ -28,13 +27,12 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     Ok(Exit::Ok)
 }
 
-/// Cargo that can build the player: with the tools that it takes, which are fetched if the system
-/// lacks them.
+/// Cargo with the tools for the player, which are fetched if the system lacks them.
 pub(crate) fn cargo(checkout: &Checkout) -> Result<Command, Failure> {
     let lacks_cmake = !steps::succeeds(checkout.command("cmake").arg("--version"));
     let lacks_libclang = env::var_os("LIBCLANG_PATH").is_none() && !has_libclang();
     if lacks_cmake || lacks_libclang {
-        // Who cannot fetch them may do without a player; what does not compile is another matter.
+        // A failed download is reported as unreachable, unlike a compile error.
         fetch(checkout).map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
     }
     let mut cargo = checkout.cargo();
@@ -44,19 +42,18 @@ pub(crate) fn cargo(checkout: &Checkout) -> Result<Command, Failure> {
     if lacks_libclang {
         cargo.env("LIBCLANG_PATH", fetched_libclang(checkout)?);
     }
-    // libclang alone has no stddef.h and the like, and finds those of the C compiler only if told
-    // where.
+    // libclang has no stddef.h and the like, and needs the path of those of the C compiler.
     if env::var_os("BINDGEN_EXTRA_CLANG_ARGS").is_none() {
         cargo.env("BINDGEN_EXTRA_CLANG_ARGS", format!("-I{}", headers(checkout)?));
     }
     Ok(cargo)
 }
 
-/// Whether libclang lies where the crate `clang-sys` looks for it.
+/// Returns whether libclang is in a folder that the crate `clang-sys` searches.
 fn has_libclang() -> bool {
     let folders =
         ["/usr/lib", "/usr/lib64", "/usr/local/lib", "/usr/local/lib64"].map(PathBuf::from);
-    // Below each, distributions have one for their architecture, and one for each version of LLVM.
+    // Distributions have subfolders for the architecture and for each version of LLVM.
     let deeper =
         folders.iter().flat_map(|folder| entries(folder)).flat_map(|path| [path.join("lib"), path]);
     deeper
@@ -66,7 +63,7 @@ fn has_libclang() -> bool {
 
 fn is_libclang(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    // Another library has the begin of its name: libclang-cpp.
+    // Not libclang-cpp, another library.
     let has_version = name
         .strip_prefix("libclang-")
         .is_some_and(|rest| rest.starts_with(|c: char| c.is_ascii_digit()));
@@ -81,17 +78,21 @@ fn entries(folder: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Puts both into `.venv`; pip does nothing where they are there.
+/// Installs both into `.venv`; pip skips installed packages.
 fn fetch(checkout: &Checkout) -> Result<(), Failure> {
     venv::set_up(checkout)?;
-    let help = "see that the network is there, or install both with the system";
+    let help = "check the network, or install both packages of the system";
     venv::pip(checkout.command(checkout.python()), &["cmake", "libclang"], help)
 }
 
 fn path_with(folder: PathBuf) -> Result<OsString, Failure> {
     let path = env::var_os("PATH").unwrap_or_default();
     env::join_paths(env::split_paths(&path).chain([folder])).map_err(|error| {
-        Failure::caused_by(Exit::Internal, "the checkout's path cannot stand in PATH", &error)
+        Failure::caused_by(
+            Exit::Internal,
+            "the path of the checkout cannot be part of PATH",
+            &error,
+        )
     })
 }
 

@@ -1,5 +1,4 @@
-//! What every command needs first. Each step looks first, and does nothing where nothing is
-//! missing.
+//! Sets up what every command needs. Each step does nothing if nothing is missing.
 
 use std::path::{Path, PathBuf};
 
@@ -12,11 +11,10 @@ use crate::venv;
 /// The number of steps that [`run`] takes.
 pub(crate) const STEPS: usize = 4;
 
-/// What lambdas in Rust are compiled for.
+/// Compilation target of Rust lambdas.
 pub(crate) const TARGET: &str = "wasm32-wasip2";
 
-/// The packages with what is installed, and nothing else: no benches, no tests, no lambda for this
-/// machine.
+/// The packages with installed programs: no benches, no tests, no lambdas.
 const PROGRAMS: [&str; 6] = [
     "gleaner-cli",
     "gleaner-compile",
@@ -26,7 +24,7 @@ const PROGRAMS: [&str; 6] = [
     "gleaner-shim",
 ];
 
-/// Sets up: the wasm target, `.venv`, the programs, and these lambdas.
+/// Sets up the wasm target, `.venv`, the programs, and these lambdas.
 pub(crate) fn run(
     checkout: &Checkout,
     steps: &mut Steps,
@@ -42,9 +40,9 @@ pub(crate) fn run(
     build_lambdas(checkout, lambdas)
 }
 
-/// Adds the libraries of Rust for `target`.
+/// Installs Rust's libraries for `target`.
 pub(crate) fn target(checkout: &Checkout, target: &str) -> Result<(), Failure> {
-    // Asked of the compiler: it need not come from rustup.
+    // The compiler is queried, since it need not come from rustup.
     let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
     let mut rustc = checkout.command(rustc);
     rustc.args(["--print", "target-libdir", "--target", target]);
@@ -55,13 +53,14 @@ pub(crate) fn target(checkout: &Checkout, target: &str) -> Result<(), Failure> {
     let mut add = checkout.command("rustup");
     add.args(["target", "add", target]);
     let help = format!(
-        "install the standard library for {target}: `rustup target add {target}`, or your system's package"
+        "install the standard library for {target}: `rustup target add {target}`, or your system's \
+         package"
     );
     steps::run(&mut add, &help)
 }
 
-/// All in one call, those too that a command needs not: features of shared crates are then those of
-/// `cargo test`, and nothing heavy compiles twice.
+/// Builds all programs in one call, even those that a command does not need: shared crates then
+/// have the features of `cargo test`, and nothing heavy compiles twice.
 pub(crate) fn programs(checkout: &Checkout) -> Result<(), Failure> {
     let mut build = checkout.cargo();
     build
@@ -69,7 +68,8 @@ pub(crate) fn programs(checkout: &Checkout) -> Result<(), Failure> {
         .args(PROGRAMS.iter().flat_map(|package| ["--package", package]));
     steps::run(
         &mut build,
-        "if a linker or a C compiler is missing, install one (`cc`); else see the first error above",
+        "if a linker or a C compiler is missing, install one (`cc`); else see the first error \
+         above",
     )
 }
 
@@ -108,12 +108,12 @@ mod tests {
     }
 
     #[test]
-    fn what_is_built_of_programs_is_not_built_again_for_tests() {
+    fn tests_reuse_the_build_of_the_programs() {
         let (programs, all) =
             (packages("normal,build", &PROGRAMS), packages("normal,build,dev", &[]));
         assert!(programs.len() > 100, "{}", programs.len());
-        // As cargo chooses features by what it builds, a feature that only a test enables is one
-        // more build of all that uses it.
+        // Cargo selects features by what it builds: a feature that only a test enables rebuilds
+        // everything that uses it.
         let again: Vec<_> = programs.difference(&all).collect();
         assert!(again.is_empty(), "with other features in `cargo test`: {again:#?}");
     }

@@ -1,31 +1,32 @@
-//! A step: said before it begins, with the tool's own progress below, and a way out if it fails.
+//! Runs the steps of a command: prints each one before it begins, shows the output of its tool, and
+//! gives help if it fails.
 
 use std::io::{self, Write};
 use std::process::{Command, Output, Stdio};
 
 use gleaner_base::{Exit, Failure};
 
-/// Counts the steps of a command, so that a person sees how many are left.
+/// Numbers the steps of a command.
 pub(crate) struct Steps {
-    begun: usize,
+    started: usize,
     total: usize,
 }
 
 impl Steps {
     pub(crate) fn of(total: usize) -> Steps {
-        Steps { begun: 0, total }
+        Steps { started: 0, total }
     }
 
-    /// Says what comes next.
+    /// Prints the next step.
     pub(crate) fn begin(&mut self, what: &str) {
-        self.begun += 1;
-        println!("[{}/{}] {what}", self.begun, self.total);
-        // What the tool itself says, on either stream, has to come after it.
+        self.started += 1;
+        println!("[{}/{}] {what}", self.started, self.total);
+        // Flushed, so that output of the tool comes after it.
         let _ = io::stdout().flush();
     }
 }
 
-/// Runs `command` to its end, with its output shown. `help` is what to do if it fails.
+/// Runs `command` with its output shown. `help` is for the error message if it fails.
 pub(crate) fn run(command: &mut Command, help: &str) -> Result<(), Failure> {
     let status = command
         .stdin(Stdio::null())
@@ -34,7 +35,7 @@ pub(crate) fn run(command: &mut Command, help: &str) -> Result<(), Failure> {
     if status.success() { Ok(()) } else { Err(ended(command, &status.to_string(), help)) }
 }
 
-/// Runs `command` to its end and keeps what it writes to standard output; the rest is shown.
+/// Runs `command` and returns its standard output; standard error is shown.
 pub(crate) fn output(command: &mut Command, help: &str) -> Result<String, Failure> {
     let command = command.stdin(Stdio::null()).stderr(Stdio::inherit());
     let Output { status, stdout, .. } =
@@ -46,8 +47,7 @@ pub(crate) fn output(command: &mut Command, help: &str) -> Result<String, Failur
     }
 }
 
-/// Runs `command` silently. Whether it succeeded is the answer; a program that is not there did
-/// not.
+/// Runs `command` silently; returns whether it succeeded. False if the program is missing.
 pub(crate) fn succeeds(command: &mut Command) -> bool {
     let command = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     command.status().is_ok_and(|status| status.success())

@@ -1,7 +1,7 @@
-//! `.venv`: Python with numpy, for Python lambdas; and for tests and benches mypy, which checks the
-//! SDK's types, and the readers of others, by which tests read our clips. No version is pinned: the
-//! newest that this Python takes, so that a user's environment is the one that is tested. But for
-//! mypy, of which the newest may find new faults in old code: it has an upper bound.
+//! Sets up `.venv`: Python with numpy for Python lambdas, and for tests and benches mypy, which
+//! checks the SDK's types, and other readers of clips. Versions are not pinned: the newest ones for
+//! this Python are tested, as users have them. Only mypy has an upper bound, since a newer one may
+//! report new errors in old code.
 
 use std::fs;
 use std::process::Command;
@@ -12,11 +12,11 @@ use gleaner_parts::Parts;
 use crate::checkout::Checkout;
 use crate::steps::{run, succeeds};
 
-/// What lambdas need: what pip calls it, and what Python does.
+/// Packages for lambdas: name in pip, and name of the module.
 const PACKAGES: [(&str, &str); 1] = [("numpy", "numpy")];
 
-/// What tests and benches need, too: types, readers, `gleaner.testing` on pictures, tests of
-/// lambdas, and notebooks.
+/// Packages for tests and benches: types, readers, pictures in `gleaner.testing`, tests of lambdas,
+/// and notebooks.
 const FOR_TESTS: [(&str, &str); 9] = [
     ("mypy<2.5", "mypy"),
     ("mcap", "mcap"),
@@ -29,8 +29,8 @@ const FOR_TESTS: [(&str, &str); 9] = [
     ("matplotlib", "matplotlib"),
 ];
 
-/// Makes the environment, or completes it. One whose Python does not run, since the system's Python
-/// went, is made anew.
+/// Creates or completes the environment. It is created again if its Python does not run, because
+/// the system's Python was removed.
 pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
     if has(checkout, &PACKAGES) {
         return Ok(());
@@ -38,7 +38,7 @@ pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
     if !succeeds(&mut python(checkout, "import pip")) {
         let folder = checkout.path(".venv");
         if folder.exists() {
-            println!("making it anew: its Python does not run");
+            println!("creating it again: its Python does not run");
             fs::remove_dir_all(&folder).map_err(|error| {
                 Failure::caused_by(
                     Exit::Internal,
@@ -47,23 +47,22 @@ pub(crate) fn set_up(checkout: &Checkout) -> Result<(), Failure> {
                 )
             })?;
         }
-        // By the rule by which Python is found for a lambda; what is in `.venv` comes first, and
-        // there is nothing.
+        // Found as for a lambda. `.venv` would come first, but does not exist here.
         let interpreter = Parts::find()?.python(None)?;
-        println!("made by {}", interpreter.display());
+        println!("created by {}", interpreter.display());
         let mut make = checkout.command(interpreter);
         make.args(["-m", "venv"]).arg(folder);
-        run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer that has venv and ensurepip")?;
+        run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip")?;
     }
     fetch(checkout, &PACKAGES)
 }
 
-/// Adds what tests and benches need to the environment.
+/// Adds the packages for tests and benches to the environment.
 pub(crate) fn set_up_for_tests(checkout: &Checkout) -> Result<(), Failure> {
     if has(checkout, &FOR_TESTS) { Ok(()) } else { fetch(checkout, &FOR_TESTS) }
 }
 
-/// The environment's Python, which is to run `code`.
+/// A command that runs `code` with the environment's Python.
 fn python(checkout: &Checkout, code: &str) -> Command {
     let mut python = checkout.command(checkout.python());
     python.args(["-I", "-c", code]);
@@ -80,11 +79,11 @@ fn fetch(checkout: &Checkout, packages: &[(&str, &str)]) -> Result<(), Failure> 
     pip(
         checkout.command(checkout.python()),
         &packages,
-        "see that the network is there, or configure pip for a mirror",
+        "check the network, or configure a mirror for pip",
     )
 }
 
-/// Has the pip of a `python` fetch packages. `help` is what else can be done.
+/// Installs packages with the pip of `python`. `help` is for the error message.
 pub(crate) fn pip(mut python: Command, packages: &[&str], help: &str) -> Result<(), Failure> {
     python.args(["-m", "pip", "install", "--disable-pip-version-check", "-q"]).args(packages);
     run(&mut python, &format!("pip fetches {}: {help}", packages.join(", ")))

@@ -1,4 +1,4 @@
-//! What is replayed, and on what machine: this one, or the emulated one.
+//! Defines the replays, and runs them on this machine and on the emulated one.
 
 use std::fs;
 use std::os::unix::fs::DirBuilderExt;
@@ -9,32 +9,32 @@ use std::time::Instant;
 use gleaner_base::{Exit, Failure};
 use gleaner_protocol::{ReplaySummary, Verified};
 
-use super::compare::{Replayed, read};
+use super::compare::{ReplayResults, read};
 use crate::checkout::Checkout;
 use crate::examples::DRIVE;
 
-/// Where results go, in the checkout.
+/// Result folder in the checkout.
 pub(super) const OUT: &str = "out/aarch64";
 
 /// A lambda with settings.
-pub(super) struct Case {
+pub(super) struct ReplayCase {
     lambda: &'static str,
     set: &'static [&'static str],
-    /// A limit that a vehicle makes smaller.
+    /// A limit of the vehicle that is smaller than that of the manifest.
     limit: Option<&'static str>,
-    /// Whether its manifest says so, instead of what it says there.
+    /// True to set `deterministic` in its manifest.
     deterministic: bool,
-    /// Why its decisions are known to differ, which also shows that a difference would be seen.
-    pub(super) known: Option<&'static str>,
+    /// Reason why its decisions must differ, which also proves that differences are found.
+    pub(super) known_difference: Option<&'static str>,
 }
 
-const fn case(lambda: &'static str, set: &'static [&'static str]) -> Case {
-    Case { lambda, set, limit: None, deterministic: false, known: None }
+const fn case(lambda: &'static str, set: &'static [&'static str]) -> ReplayCase {
+    ReplayCase { lambda, set, limit: None, deterministic: false, known_difference: None }
 }
 
-/// Triggers, all pixels of all pictures, floating point, and every way to fault that a processor
-/// has a part in.
-pub(super) const CASES: [Case; 13] = [
+/// Replays with triggers, all pixels of all pictures, floating point, and every kind of fault that
+/// depends on the processor.
+pub(super) const CASES: [ReplayCase; 13] = [
     case("examples/hello/rust", &["brake_mps2=-1.4"]),
     case("examples/brake-dark/rust", &["brake_mps2=-1.4", "dark_luma=50"]),
     // Every picture is bright enough, and the car always brakes.
@@ -46,15 +46,18 @@ pub(super) const CASES: [Case; 13] = [
     case("tests/lambdas/misbehave/rust", &["behaviour=panic"]),
     case("tests/lambdas/misbehave/rust", &["behaviour=memory"]),
     case("tests/lambdas/misbehave/rust", &["behaviour=host_calls"]),
-    Case {
+    ReplayCase {
         limit: Some("stack = \"16 KiB\""),
         ..case("tests/lambdas/misbehave/rust", &["behaviour=recurse"])
     },
-    Case {
-        known: Some("a NaN that arithmetic makes has a sign here and none there"),
+    ReplayCase {
+        known_difference: Some("the NaN of an arithmetic operation has a sign here and none there"),
         ..case("tests/lambdas/misbehave/rust", &["behaviour=nan_bits"])
     },
-    Case { deterministic: true, ..case("tests/lambdas/misbehave/rust", &["behaviour=nan_bits"]) },
+    ReplayCase {
+        deterministic: true,
+        ..case("tests/lambdas/misbehave/rust", &["behaviour=nan_bits"])
+    },
 ];
 
 /// The folders of the lambdas in [`CASES`], each once, relative to the checkout.
@@ -76,14 +79,14 @@ impl<'c> Machine<'c> {
         Self { checkout, name: std::env::consts::ARCH, programs: checkout.target().join("release") }
     }
 
-    /// `programs` holds a script for each.
+    /// The emulated machine; `programs` holds a script for each program.
     pub(super) fn emulated(checkout: &'c Checkout, programs: PathBuf) -> Self {
         Self { checkout, name: "aarch64", programs }
     }
 
     fn program(&self, name: &str) -> Command {
         let mut program = self.checkout.command(self.programs.join(name));
-        // Else they would start the programs beside what the emulator runs.
+        // Otherwise they would start the programs beside the emulator.
         program.env("GLEANER_HOME", &self.programs).stdin(Stdio::null());
         program
     }
@@ -99,24 +102,24 @@ impl<'c> Machine<'c> {
         })
     }
 
-    /// What `gleaner --json` reports, however it exits.
+    /// Runs `gleaner --json` and parses its report, whatever its exit code.
     fn report<T: serde::de::DeserializeOwned>(&self, command: Command) -> Result<T, Failure> {
         let output = self.run(command)?;
         serde_json::from_slice(&output.stdout).map_err(|_| {
-            let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+            let stderr = String::from_utf8_lossy(&output.stderr).trim().to_owned();
             let mut failure = Failure::new(
                 Exit::Internal,
                 format!("no result on {} ({})", self.name, output.status),
             );
             failure.causes =
-                vec![if said.is_empty() { "it said nothing".to_owned() } else { said }];
+                vec![if stderr.is_empty() { "it printed no error".to_owned() } else { stderr }];
             failure
         })
     }
 }
 
-impl Case {
-    /// As a person would type it.
+impl ReplayCase {
+    /// Name of the case: lambda and settings.
     pub(super) fn name(&self) -> String {
         let set: String = self.set.iter().map(|set| format!(" {set}")).collect();
         let limit: String = self.limit.iter().map(|limit| format!(" with {limit}")).collect();
@@ -124,7 +127,7 @@ impl Case {
         format!("{}{set}{limit}{deterministic}", self.lambda.trim_end_matches("/rust"))
     }
 
-    /// The lambda's folder, relative to the checkout; if it is to be deterministic, a copy that is.
+    /// The lambda's folder, relative to the checkout; a copy if the case sets `deterministic`.
     fn lambda(&self, checkout: &Checkout) -> Result<PathBuf, Failure> {
         if !self.deterministic {
             return Ok(PathBuf::from(self.lambda));
@@ -150,7 +153,7 @@ impl Case {
     }
 
     /// Replays the sample drive, with a journal.
-    pub(super) fn replay(&self, machine: &Machine<'_>) -> Result<Replayed, Failure> {
+    pub(super) fn replay(&self, machine: &Machine<'_>) -> Result<ReplayResults, Failure> {
         let out = self.out(machine);
         let folder = machine.checkout.path(&out);
         let failed = |error: std::io::Error| {
@@ -176,7 +179,8 @@ impl Case {
         read(&folder, summary.wakes, started.elapsed().as_secs_f64())
     }
 
-    /// Makes every decision of `writer`'s journal again on `reader`; says how many there were.
+    /// Repeats every decision of `writer`'s journal on `reader`; returns a sentence with their
+    /// number.
     pub(super) fn verify(
         &self,
         writer: &Machine<'_>,
@@ -187,7 +191,7 @@ impl Case {
         verify.arg("--verify").arg(journal(&self.out(writer))).arg("--json");
         let verified: Verified = reader.report(verify)?;
         Ok(format!(
-            "and {} decisions of the journal of {} made again on {}",
+            "and {} decisions of the journal of {} repeated on {}",
             verified.wakes, writer.name, reader.name
         ))
     }
@@ -204,7 +208,7 @@ fn copy_deterministic(lambda: &Path, copy: &Path) -> std::io::Result<()> {
     }
     let manifest = fs::read_to_string(lambda.join("build/lambda.toml"))?;
     let manifest = manifest.replace("[lambda]\n", "[lambda]\ndeterministic = true\n");
-    // The build's last: it must not be older than its source.
+    // The manifest of the build is written last, since a build must not be older than its source.
     fs::write(copy.join("lambda.toml"), &manifest)?;
     fs::write(build.join("lambda.toml"), &manifest)
 }
@@ -213,11 +217,11 @@ fn journal(out: &Path) -> PathBuf {
     out.join("wakes.journal")
 }
 
-/// Puts code that was compiled here to where the emulated machine expects its own, and sees that it
-/// is not loaded, but compiled again. Returns the warning.
+/// Puts code compiled here into the cache of the emulated machine, and checks that it is compiled
+/// again instead of loaded. Returns the warning.
 pub(super) fn foreign_code(here: &Machine<'_>, there: &Machine<'_>) -> Result<String, Failure> {
     let lambda = CASES[0].lambda;
-    let cache = Cache::make()?;
+    let cache = TempCache::make()?;
     let compile = |machine: &Machine<'_>, folder: &str| -> Result<PathBuf, Failure> {
         let mut compile = machine.program("gleaner-compile");
         let component = machine.checkout.path(lambda).join("build/hello.wasm");
@@ -233,7 +237,7 @@ pub(super) fn foreign_code(here: &Machine<'_>, there: &Machine<'_>) -> Result<St
             ))
         }
     };
-    // A program finds its cache in the folder `gleaner` of the one that it is told.
+    // A program uses the folder `gleaner` in `XDG_CACHE_HOME`.
     let (foreign, own) = (compile(here, "here")?, compile(there, "gleaner")?);
     if foreign.file_name() == own.file_name() {
         return Err(Failure::new(
@@ -252,24 +256,24 @@ pub(super) fn foreign_code(here: &Machine<'_>, there: &Machine<'_>) -> Result<St
         .arg("--out")
         .arg(cache.0.join("out"));
     let output = there.run(replay)?;
-    let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-    if !output.status.success() || !said.contains("native code in the cache is damaged") {
+    let stderr = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+    if !output.status.success() || !stderr.contains("native code in the cache is damaged") {
         let mut failure = Failure::new(
             Exit::Differs,
             format!("code of {} was not replaced on {}", here.name, there.name),
         );
-        failure.causes = vec![format!("it ended with {}: {said}", output.status)];
+        failure.causes = vec![format!("it ended with {}: {stderr}", output.status)];
         return Err(failure);
     }
-    Ok(said)
+    Ok(stderr)
 }
 
-/// A cache of our own, below a folder where only we may write; else code in it would not be looked
-/// at. It goes in the end.
-struct Cache(PathBuf);
+/// A cache in a folder that only this user may write, as loading code requires. It is removed in
+/// the end.
+struct TempCache(PathBuf);
 
-impl Cache {
-    fn make() -> Result<Cache, Failure> {
+impl TempCache {
+    fn make() -> Result<TempCache, Failure> {
         let folder = std::env::temp_dir().join(format!("gleaner-aarch64-{}", std::process::id()));
         fs::DirBuilder::new().mode(0o700).create(&folder).map_err(|error| {
             Failure::caused_by(
@@ -278,13 +282,13 @@ impl Cache {
                 &error,
             )
         })?;
-        Ok(Cache(folder))
+        Ok(TempCache(folder))
     }
 }
 
-impl Drop for Cache {
+impl Drop for TempCache {
     fn drop(&mut self) {
-        // What stays in a temporary folder disturbs nobody.
+        // Remains in a temporary folder do no harm.
         let _ = fs::remove_dir_all(&self.0);
     }
 }

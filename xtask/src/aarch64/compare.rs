@@ -1,4 +1,4 @@
-//! Two replays of one lambda, bit for bit: all decisions, the log, and the thumbnails of its clips.
+//! Compares two replays of one lambda bit for bit: decisions, log, and thumbnails of clips.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,17 +8,17 @@ use std::path::{Path, PathBuf};
 use gleaner_base::{Exit, Failure};
 use serde_json::{Map, Value};
 
-/// What a replay left, less how long it took.
-pub(super) struct Replayed {
-    /// One for each wake.
+/// The results of a replay, without run times.
+pub(super) struct ReplayResults {
+    /// One decision for each wake.
     pub(super) decisions: Vec<Map<String, Value>>,
     pub(super) seconds: f64,
-    /// By name: what else has to be equal.
+    /// Other files that have to be equal, by name.
     files: BTreeMap<PathBuf, Vec<u8>>,
 }
 
-/// Reads the results in `folder`, of so many wakes.
-pub(super) fn read(folder: &Path, wakes: u64, seconds: f64) -> Result<Replayed, Failure> {
+/// Reads the results in `folder`, which must have `wakes` decisions.
+pub(super) fn read(folder: &Path, wakes: u64, seconds: f64) -> Result<ReplayResults, Failure> {
     let cannot = |what: &Path, error: &dyn std::error::Error| {
         Failure::caused_by(Exit::Internal, format!("cannot read `{}`", what.display()), error)
     };
@@ -35,7 +35,7 @@ pub(super) fn read(folder: &Path, wakes: u64, seconds: f64) -> Result<Replayed, 
         return Err(Failure::new(Exit::Internal, message));
     }
     let files = others(folder).map_err(|error| cannot(folder, &error))?;
-    Ok(Replayed { decisions, seconds, files })
+    Ok(ReplayResults { decisions, seconds, files })
 }
 
 fn decision(line: &str) -> Result<Map<String, Value>, serde_json::Error> {
@@ -62,8 +62,8 @@ fn others(folder: &Path) -> io::Result<BTreeMap<PathBuf, Vec<u8>>> {
     Ok(files)
 }
 
-/// How many wakes, triggers and faults there were, and how much fuel was used.
-pub(super) fn counted(decisions: &[Map<String, Value>]) -> String {
+/// Formats the numbers of wakes, triggers and faults, and the used fuel.
+pub(super) fn counts(decisions: &[Map<String, Value>]) -> String {
     let triggers = decisions
         .iter()
         .filter_map(|decision| decision["triggers"].as_array())
@@ -74,8 +74,8 @@ pub(super) fn counted(decisions: &[Map<String, Value>]) -> String {
     format!("{} wakes, {triggers} triggers, {faults} faults, {fuel} fuel", decisions.len())
 }
 
-/// What differs first, for a person; `None` if nothing does.
-pub(super) fn difference(a: &Replayed, b: &Replayed) -> Option<String> {
+/// The first difference, as text; `None` if the results are equal.
+pub(super) fn difference(a: &ReplayResults, b: &ReplayResults) -> Option<String> {
     let pairs = a.decisions.iter().zip(&b.decisions).enumerate();
     let decision =
         |(index, (a, b))| Some(format!("decision {}: {}", index + 1, key_that_differs(a, b)?));
@@ -90,7 +90,7 @@ pub(super) fn difference(a: &Replayed, b: &Replayed) -> Option<String> {
         .or_else(|| file_that_differs(&a.files, &b.files))
 }
 
-/// Compared as it is written, by which two zeros and any last bits differ.
+/// Compares the texts of the values, so that signed zeros and last bits differ.
 fn key_that_differs(a: &Map<String, Value>, b: &Map<String, Value>) -> Option<String> {
     let written = |of: &Map<String, Value>, key: &str| {
         of.get(key).map_or("nothing".to_owned(), Value::to_string)
@@ -113,14 +113,14 @@ fn file_that_differs(
 mod tests {
     use super::*;
 
-    fn replayed(lines: &[&str], thumbnail: &[u8]) -> Replayed {
+    fn replayed(lines: &[&str], thumbnail: &[u8]) -> ReplayResults {
         let decisions = lines.iter().map(|line| decision(line).unwrap()).collect();
         let files = BTreeMap::from([(PathBuf::from("clips/1.jpg"), thumbnail.to_vec())]);
-        Replayed { decisions, seconds: 0.0, files }
+        ReplayResults { decisions, seconds: 0.0, files }
     }
 
     #[test]
-    fn how_long_it_took_is_no_difference() {
+    fn run_time_is_no_difference() {
         let [a, b] = [r#"{"at_ns":1,"fuel":7,"run_ns":5}"#, r#"{"at_ns":1,"fuel":7,"run_ns":50}"#];
         assert_eq!(difference(&replayed(&[a], b"x"), &replayed(&[b], b"x")), None);
     }
@@ -134,11 +134,11 @@ mod tests {
             difference(&replayed(&[&same, &of(a)], b""), &replayed(&[&same, &of(b)], b""))
         };
         assert_eq!(found("0.1", "0.1"), None);
-        // Its last bit; and the sign of a zero.
+        // The last bit, and the sign of a zero.
         for (a, b) in [("0.3", "0.30000000000000004"), ("0.0", "-0.0")] {
-            let said =
+            let expected =
                 format!(r#"decision 2: triggers is [{{"score":{a}}}] and [{{"score":{b}}}]"#);
-            assert_eq!(found(a, b), Some(said));
+            assert_eq!(found(a, b), Some(expected));
         }
         let [one, none] = [replayed(&["{}"], b""), replayed(&[], b"")];
         assert_eq!(difference(&one, &none).unwrap(), "the number of decisions: 1 and 0");

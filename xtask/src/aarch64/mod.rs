@@ -1,12 +1,11 @@
-//! `cargo xtask aarch64`: builds what goes into a vehicle with an ARM processor, and finds out
-//! whether lambdas decide there what they decide here: every decision of the same replays, bit for
-//! bit, and the fuel that it took.
+//! `cargo xtask aarch64`: builds the programs of an ARM vehicle, and checks that lambdas decide
+//! there as they do here: every decision of the same replays, bit for bit, and its fuel.
 //!
-//! The programs for ARM run in qemu's user mode, which emulates the processor; the kernel remains
-//! this machine's. So nothing is said about speed, and nothing about isolation: qemu knows neither
-//! Landlock nor seccomp, and the programs say that these do not hold. It lacks a call without which
-//! `gleaner-shim` does not start, so that one is built but not run: its place is taken by this
-//! machine's.
+//! The ARM programs run in qemu's user mode, which emulates the processor but uses this machine's
+//! kernel. So this tests neither speed nor isolation: qemu supports neither Landlock nor seccomp,
+//! and the programs report these layers as missing. qemu also lacks a system call that
+//! `gleaner-shim` needs to start, so that program is built but not run: this machine's shim is used
+//! instead.
 
 mod cases;
 mod compare;
@@ -22,10 +21,10 @@ use gleaner_base::{Exit, Failure};
 use crate::checkout::Checkout;
 use crate::setup;
 use crate::steps::{self, Steps};
-use cases::{CASES, Case, Machine};
+use cases::{CASES, Machine, ReplayCase};
 use tools::{TARGET, Tools};
 
-/// Packages with what goes into a vehicle.
+/// Packages with the programs of a vehicle.
 const PACKAGES: [&str; 6] = [
     "gleaner-cli",
     "gleaner-compile",
@@ -34,14 +33,14 @@ const PACKAGES: [&str; 6] = [
     "gleaner-recorder",
     "gleaner-shim",
 ];
-/// The programs in them that are run.
+/// The programs that are run.
 const PROGRAMS: [&str; 3] = ["gleaner", "gleaner-compile", "gleaner-runtime"];
 const SHIM: &str = "gleaner-shim";
 
 /// Builds, replays here and there, and compares.
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     if env::consts::ARCH == "aarch64" {
-        return Err(Failure::new(Exit::Usage, "this machine is an aarch64 itself")
+        return Err(Failure::new(Exit::Usage, "this machine is itself an aarch64")
             .with_help("run `cargo xtask demo`"));
     }
     let mut steps = Steps::of(5);
@@ -60,13 +59,13 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     steps.begin(&format!("{} replays, each on both processors", CASES.len()));
     let unexpected =
         CASES.iter().map(|case| compare(case, &here, &there)).sum::<Result<usize, Failure>>()?;
-    println!("{} of {} replays went as they must", CASES.len() - unexpected, CASES.len());
+    println!("{} of {} replays as expected", CASES.len() - unexpected, CASES.len());
     println!("files: {}/", cases::OUT);
     Ok(if unexpected == 0 { Exit::Ok } else { Exit::Differs })
 }
 
-/// Builds, and puts a script for each program into a folder, by which programs start each other
-/// emulated. Gives the folder.
+/// Builds the programs, and writes a script for each one that starts it emulated. Returns the
+/// folder of the scripts.
 fn build(checkout: &Checkout, tools: &Tools) -> Result<PathBuf, Failure> {
     let mut build = tools.cargo(checkout);
     build.args(["build", "--release", "--target", TARGET]);
@@ -98,17 +97,17 @@ fn write_program(folder: &Path, name: &str, script: &str) -> std::io::Result<()>
     fs::set_permissions(path, fs::Permissions::from_mode(0o755))
 }
 
-/// Says how one case went, in a line. 1 if that was not expected.
-fn compare(case: &Case, here: &Machine<'_>, there: &Machine<'_>) -> Result<usize, Failure> {
+/// Compares one case and prints the result. Returns 1 if it is unexpected, else 0.
+fn compare(case: &ReplayCase, here: &Machine<'_>, there: &Machine<'_>) -> Result<usize, Failure> {
     let [a, b] = [case.replay(here)?, case.replay(there)?];
     let difference = compare::difference(&a, &b);
-    let verdict = match (&difference, case.known) {
+    let verdict = match (&difference, case.known_difference) {
         (None, None) => format!("equal, {}", case.verify(here, there)?),
         (Some(what), None) => format!("DIFFERS in {what}"),
-        (Some(what), Some(why)) => format!("differs as it must, {why}: {what}"),
-        (None, Some(why)) => format!("EQUAL, but it should not be: {why}"),
+        (Some(what), Some(why)) => format!("differs as expected, {why}: {what}"),
+        (None, Some(why)) => format!("EQUAL, but must differ: {why}"),
     };
     let times = format!("{:.1} s here, {:.1} s emulated", a.seconds, b.seconds);
-    println!("{}\n  {}; {times}\n  {verdict}", case.name(), compare::counted(&a.decisions));
-    Ok(usize::from(difference.is_some() != case.known.is_some()))
+    println!("{}\n  {}; {times}\n  {verdict}", case.name(), compare::counts(&a.decisions));
+    Ok(usize::from(difference.is_some() != case.known_difference.is_some()))
 }

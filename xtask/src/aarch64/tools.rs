@@ -1,5 +1,5 @@
-//! What it takes to build for the other processor and to run what was built: a C compiler for it,
-//! its C library, and an emulator.
+//! Finds the tools to build for the other processor and to run the programs: a C compiler, a C
+//! library and an emulator.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -10,11 +10,11 @@ use crate::checkout::Checkout;
 use crate::setup;
 use crate::steps;
 
-/// What rustup and cargo call it.
+/// Its target name in rustup and cargo.
 pub(super) const TARGET: &str = "aarch64-unknown-linux-gnu";
 
 const COMPILER: &str = "aarch64-linux-gnu-gcc";
-/// Either will do; packages of distributions have one or both.
+/// Names of the emulator; packages of distributions have one or both.
 const EMULATORS: [&str; 2] = ["qemu-aarch64-static", "qemu-aarch64"];
 const LOADER: &str = "ld-linux-aarch64.so.1";
 
@@ -26,7 +26,7 @@ pub(super) struct Tools {
 }
 
 impl Tools {
-    /// Finds the tools; fetches Rust's own libraries.
+    /// Finds the tools, and fetches Rust's libraries for the target.
     pub(super) fn find(checkout: &Checkout) -> Result<Tools, Failure> {
         let has = |program: &str| steps::succeeds(checkout.command(program).arg("--version"));
         let emulator = EMULATORS.into_iter().find(|program| has(program));
@@ -47,26 +47,26 @@ impl Tools {
                 format!("as root, on Debian and Ubuntu: apt-get install {}", missing.join(" "));
             return Err(Failure::new(Exit::Unreachable, "packages are missing").with_help(help));
         };
-        // Who cannot fetch it may do without; what does not compile is another matter.
+        // A failed download is reported as unreachable, unlike a compile error.
         setup::target(checkout, TARGET)
             .map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
         Ok(Tools { emulator, libraries })
     }
 
-    /// A cargo that builds for the other processor, if it is told [`TARGET`].
+    /// The command cargo, set up for builds with [`TARGET`].
     pub(super) fn cargo(&self, checkout: &Checkout) -> Command {
         let name = TARGET.replace('-', "_");
         let mut cargo = checkout.cargo();
         cargo
             .env(format!("CARGO_TARGET_{}_LINKER", name.to_uppercase()), COMPILER)
             .env(format!("CC_{name}"), COMPILER);
-        // The extension module takes its symbols from whatever interpreter loads it, and keeps to
-        // what 3.9 had: no Python of the other processor is asked for anything.
+        // The extension module uses the stable ABI of 3.9, with symbols of the interpreter that
+        // loads it, so no Python of the other processor is needed to build it.
         cargo.env("PYO3_NO_PYTHON", "1");
         cargo
     }
 
-    /// A script for `sh` that is `program`, emulated.
+    /// A shell script that runs `program` emulated.
     pub(super) fn script(&self, program: &Path) -> String {
         format!(
             "#!/bin/sh\nexec {} -L {} {} \"$@\"\n",
@@ -76,24 +76,24 @@ impl Tools {
         )
     }
 
-    /// A script for `sh` that is `program` of this machine.
+    /// A shell script that runs `program` of this machine.
     pub(super) fn script_here(program: &Path) -> String {
         format!("#!/bin/sh\nexec {} \"$@\"\n", quoted(program))
     }
 }
 
-/// The C compiler knows where the C library is.
+/// Finds the C library by the C compiler.
 fn libraries(checkout: &Checkout) -> Result<Option<PathBuf>, Failure> {
-    let mut ask = checkout.command(COMPILER);
+    let mut compiler = checkout.command(COMPILER);
     let loader =
-        steps::output(ask.arg(format!("-print-file-name={LOADER}")), "see the error above")?;
-    // Its bare name, if it does not. Else it lies in FOLDER/lib, by way of the compiler's own
-    // folder.
+        steps::output(compiler.arg(format!("-print-file-name={LOADER}")), "see the error above")?;
+    // The compiler prints the bare name if it does not find the loader, else FOLDER/lib/LOADER
+    // relative to its own folder.
     let loader = Path::new(loader.trim()).canonicalize().ok().filter(|loader| loader.is_file());
     Ok(loader.and_then(|loader| Some(loader.parent()?.parent()?.to_owned())))
 }
 
-/// `path` as one word of `sh`.
+/// Quotes `path` for a shell.
 fn quoted(path: &Path) -> String {
     format!("'{}'", path.display().to_string().replace('\'', r"'\''"))
 }
@@ -103,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_script_takes_any_path_as_one_word() {
+    fn scripts_quote_paths() {
         let tools = Tools { emulator: "emulator", libraries: "/usr/arm".into() };
         let script = tools.script(Path::new("/it's a/program"));
         assert_eq!(script, "#!/bin/sh\nexec emulator -L '/usr/arm' '/it'\\''s a/program' \"$@\"\n");

@@ -44,7 +44,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let mut total = TestCounts::new(OutputFormat::None);
     let mut table =
         format!("\n{:<44} {:>7} {:>7} {:>7} {:>7}\n", "suite", "passed", "failed", "skipped", "s");
-    let folder = memory::Folder::new();
+    let folder = memory::MemoryFolder::new();
     for mut suite in suites {
         steps.begin(&suite.name);
         if let (Some(folder), SuiteAction::Run(command, _)) = (&folder, &mut suite.action) {
@@ -53,7 +53,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
         let started = Instant::now();
         let counts = suite.action.run();
         let seconds = started.elapsed().as_secs_f64();
-        let TestCounts { passed, failed, skipped, .. } = &tally;
+        let TestCounts { passed, failed, skipped, .. } = &counts;
         table +=
             &format!("{:<44} {passed:>7} {failed:>7} {skipped:>7} {seconds:>7.1}\n", suite.name);
         total.add(counts, &suite.name);

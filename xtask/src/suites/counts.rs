@@ -1,83 +1,84 @@
+//! Counts tests in the output of test runners.
+
 use std::path::Path;
 
-/// How a suite says what became of its tests.
+/// Output format of a test suite.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Speech {
-    /// As Rust's test programs do, several after each other, and cargo between them.
+pub(super) enum OutputFormat {
+    /// Several Rust test programs, started by cargo.
     Libtest,
-    /// As Python's unittest does with `-v`.
+    /// Python's unittest with `-v`.
     Unittest,
-    /// As pytest does with `-q`.
+    /// pytest with `-q`.
     Pytest,
-    /// Not at all: the exit status stands for one test.
+    /// No counts: the exit status stands for one test.
     None,
 }
 
-/// What became of the tests of a suite.
+/// Counts of the tests in a suite.
 #[derive(Debug)]
-pub(super) struct Tally {
+pub(super) struct TestCounts {
     pub(super) passed: u64,
     pub(super) failed: u64,
     pub(super) skipped: u64,
-    /// The tests that failed.
+    /// Names of the failed tests.
     pub(super) names: Vec<String>,
-    speech: Speech,
+    format: OutputFormat,
     /// The test program that cargo started last.
     program: String,
-    /// Whether that program began with tests and has not given its result yet.
+    /// True while that program runs tests and has not printed its result.
     open: bool,
-    /// The tests that unittest ran.
+    /// Number of tests that unittest ran.
     ran: u64,
 }
 
-impl Tally {
-    pub(super) fn new(speech: Speech) -> Tally {
-        Tally {
+impl TestCounts {
+    pub(super) fn new(format: OutputFormat) -> TestCounts {
+        TestCounts {
             passed: 0,
             failed: 0,
             skipped: 0,
             names: Vec::new(),
-            speech,
+            format,
             program: String::new(),
             open: false,
             ran: 0,
         }
     }
 
-    /// Counts what this line tells.
-    pub(super) fn hear(&mut self, line: &str) {
-        match self.speech {
-            Speech::Libtest => self.hear_libtest(line),
-            Speech::Unittest => self.hear_unittest(line),
-            Speech::Pytest => self.hear_pytest(line),
-            Speech::None => {}
+    /// Parses one line of output.
+    pub(super) fn parse_line(&mut self, line: &str) {
+        match self.format {
+            OutputFormat::Libtest => self.parse_libtest(line),
+            OutputFormat::Unittest => self.parse_unittest(line),
+            OutputFormat::Pytest => self.parse_pytest(line),
+            OutputFormat::None => {}
         }
     }
 
-    /// Ends the suite. One that does not succeed has at least one failed test, named by
-    /// `how_it_ended` if it did not tell one; one that counts its tests and had none is blind,
-    /// which is a failure too.
-    pub(super) fn end(&mut self, success: bool, how_it_ended: &str) {
+    /// Ends the suite. If it did not succeed, it has at least one failed test, named `status` if
+    /// its output names none. A suite without tests is a failure, too.
+    pub(super) fn end(&mut self, success: bool, status: &str) {
         self.close();
-        if self.speech == Speech::None && success {
+        if self.format == OutputFormat::None && success {
             self.passed = 1;
         }
         if !success && self.failed == 0 {
-            self.fail(how_it_ended);
+            self.fail(status);
         } else if self.passed + self.failed + self.skipped == 0 {
             self.fail("there are no tests");
         }
     }
 
-    /// Adds what became of the tests of `suite`.
-    pub(super) fn add(&mut self, tally: Tally, suite: &str) {
-        self.passed += tally.passed;
-        self.failed += tally.failed;
-        self.skipped += tally.skipped;
-        self.names.extend(tally.names.into_iter().map(|name| format!("{suite}: {name}")));
+    /// Adds the counts of `suite`.
+    pub(super) fn add(&mut self, counts: TestCounts, suite: &str) {
+        self.passed += counts.passed;
+        self.failed += counts.failed;
+        self.skipped += counts.skipped;
+        self.names.extend(counts.names.into_iter().map(|name| format!("{suite}: {name}")));
     }
 
-    fn hear_libtest(&mut self, line: &str) {
+    fn parse_libtest(&mut self, line: &str) {
         let line = line.trim_start();
         if let Some((_, program)) =
             line.strip_prefix("Running ").and_then(|rest| rest.rsplit_once(" ("))
@@ -105,7 +106,7 @@ impl Tally {
         }
     }
 
-    fn hear_unittest(&mut self, line: &str) {
+    fn parse_unittest(&mut self, line: &str) {
         if let Some(name) = line.strip_prefix("FAIL: ").or_else(|| line.strip_prefix("ERROR: ")) {
             self.names.push(name.to_owned());
         } else if let Some(ran) = line.strip_prefix("Ran ") {
@@ -114,12 +115,12 @@ impl Tally {
             let count = |what| count_after(line, what);
             self.failed = count("failures=") + count("errors=") + count("unexpected successes=");
             self.skipped = count("skipped=");
-            // An error in a fixture counts as an error, but its tests were not run.
+            // An error in a fixture counts as an error, although its tests did not run.
             self.passed = self.ran.saturating_sub(self.failed + self.skipped);
         }
     }
 
-    fn hear_pytest(&mut self, line: &str) {
+    fn parse_pytest(&mut self, line: &str) {
         if let Some(name) = line.strip_prefix("FAILED ").or_else(|| line.strip_prefix("ERROR ")) {
             self.names.push(name.split(" - ").next().unwrap_or(name).to_owned());
         } else if let Some((counts, _)) =
@@ -132,10 +133,11 @@ impl Tally {
         }
     }
 
-    /// A test program that began and gave no result was killed, or ended itself.
+    /// Counts a failure if a test program began but printed no result, since it was killed or
+    /// aborted.
     fn close(&mut self) {
         if std::mem::take(&mut self.open) {
-            let name = format!("{}: ended in the midst of its tests", self.program);
+            let name = format!("{}: ended during its tests", self.program);
             self.fail(&name);
         }
     }
@@ -152,14 +154,14 @@ fn program_name(path: &str) -> String {
     file.rsplit_once('-').map_or(file.to_string(), |(name, _)| name.to_owned())
 }
 
-/// The number in front of `what`; 0 if it is not there.
+/// The number before `what`; 0 if there is none.
 fn count_before(text: &str, what: &str) -> u64 {
     let before = text.find(what).map_or("", |at| &text[..at]);
     let digits = before.trim_end_matches(|c: char| c.is_ascii_digit()).len();
     before[digits..].parse().unwrap_or(0)
 }
 
-/// The number behind `what`; 0 if it is not there.
+/// The number after `what`; 0 if there is none.
 fn count_after(text: &str, what: &str) -> u64 {
     let after = text.find(what).map_or("", |at| &text[at + what.len()..]);
     let digits = after.find(|c: char| !c.is_ascii_digit()).unwrap_or(after.len());
@@ -170,15 +172,15 @@ fn count_after(text: &str, what: &str) -> u64 {
 mod tests {
     use super::*;
 
-    fn heard(speech: Speech, success: bool, text: &str) -> Tally {
-        let mut tally = Tally::new(speech);
-        text.lines().for_each(|line| tally.hear(line));
-        tally.end(success, "ended with exit status: 1");
-        tally
+    fn counted(format: OutputFormat, success: bool, text: &str) -> TestCounts {
+        let mut counts = TestCounts::new(format);
+        text.lines().for_each(|line| counts.parse_line(line));
+        counts.end(success, "ended with exit status: 1");
+        counts
     }
 
-    fn counts(tally: &Tally) -> [u64; 3] {
-        [tally.passed, tally.failed, tally.skipped]
+    fn totals(counts: &TestCounts) -> [u64; 3] {
+        [counts.passed, counts.failed, counts.skipped]
     }
 
     #[test]
@@ -190,9 +192,9 @@ mod tests {
                     test result: FAILED. 3 passed; 1 failed; 2 ignored; 0 measured; 0 filtered out\n\
                     \x20  Doc-tests gleaner_sdk\n\nrunning 0 tests\n\n\
                     test result: ok. 0 passed; 0 failed; 0 ignored; 0 measured; 0 filtered out\n";
-        let tally = heard(Speech::Libtest, false, text);
-        assert_eq!(counts(&tally), [15, 1, 3]);
-        assert_eq!(tally.names, ["rooms: the_house"]);
+        let counts = counted(OutputFormat::Libtest, false, text);
+        assert_eq!(totals(&counts), [15, 1, 3]);
+        assert_eq!(counts.names, ["rooms: the_house"]);
     }
 
     #[test]
@@ -200,59 +202,69 @@ mod tests {
         let text = "     Running tests/a.rs (target/release/deps/a-1)\nrunning 2 tests\ntest x ... ok\n\
                     \x20    Running tests/b.rs (target/release/deps/b-2)\nrunning 1 test\n\
                     test result: ok. 1 passed; 0 failed\n";
-        let tally = heard(Speech::Libtest, false, text);
-        assert_eq!(counts(&tally), [1, 1, 0]);
-        assert_eq!(tally.names, ["a: ended in the midst of its tests"]);
+        let counts = counted(OutputFormat::Libtest, false, text);
+        assert_eq!(totals(&counts), [1, 1, 0]);
+        assert_eq!(counts.names, ["a: ended during its tests"]);
     }
 
     #[test]
     fn a_suite_that_does_not_compile_counts_as_a_failure() {
-        let tally = heard(Speech::Libtest, false, "error: could not compile `x`");
-        assert_eq!(counts(&tally), [0, 1, 0]);
-        assert_eq!(tally.names, ["ended with exit status: 1"]);
+        let counts = counted(OutputFormat::Libtest, false, "error: could not compile `x`");
+        assert_eq!(totals(&counts), [0, 1, 0]);
+        assert_eq!(counts.names, ["ended with exit status: 1"]);
     }
 
     #[test]
     fn unittest_counts_its_skipped_and_failed_tests_among_those_it_ran() {
         let text = "FAIL: test_a (m.C)\nERROR: test_b (m.C)\nRan 9 tests in 0.1s\n\nFAILED (failures=1, errors=1, skipped=2)";
-        let tally = heard(Speech::Unittest, false, text);
-        assert_eq!(counts(&tally), [5, 2, 2]);
-        assert_eq!(tally.names, ["test_a (m.C)", "test_b (m.C)"]);
-        assert_eq!(counts(&heard(Speech::Unittest, true, "Ran 1 test in 0.1s\n\nOK")), [1, 0, 0]);
+        let counts = counted(OutputFormat::Unittest, false, text);
+        assert_eq!(totals(&counts), [5, 2, 2]);
+        assert_eq!(counts.names, ["test_a (m.C)", "test_b (m.C)"]);
         assert_eq!(
-            counts(&heard(Speech::Unittest, true, "Ran 3 tests in 0.1s\n\nOK (skipped=1)")),
+            totals(&counted(OutputFormat::Unittest, true, "Ran 1 test in 0.1s\n\nOK")),
+            [1, 0, 0]
+        );
+        assert_eq!(
+            totals(&counted(OutputFormat::Unittest, true, "Ran 3 tests in 0.1s\n\nOK (skipped=1)")),
             [2, 0, 1]
         );
     }
 
     #[test]
-    fn pytest_says_its_counts_in_its_last_line() {
+    fn pytest_prints_its_counts_in_its_last_line() {
         let text = "..F.s  [100%]\nFAILED examples/a/tests/test_a.py::test_x[1] - assert 1 in [2]\nERROR b/test_b.py\n\
                     1 failed, 12 passed, 3 skipped, 2 errors in 4.52s";
-        let tally = heard(Speech::Pytest, false, text);
-        assert_eq!(counts(&tally), [12, 3, 3]);
-        assert_eq!(tally.names, ["examples/a/tests/test_a.py::test_x[1]", "b/test_b.py"]);
+        let counts = counted(OutputFormat::Pytest, false, text);
+        assert_eq!(totals(&counts), [12, 3, 3]);
+        assert_eq!(counts.names, ["examples/a/tests/test_a.py::test_x[1]", "b/test_b.py"]);
         assert_eq!(
-            counts(&heard(Speech::Pytest, true, "17 passed in 62.21s (0:01:02)")),
+            totals(&counted(OutputFormat::Pytest, true, "17 passed in 62.21s (0:01:02)")),
             [17, 0, 0]
         );
-        assert_eq!(counts(&heard(Speech::Pytest, false, "no tests ran in 0.01s")), [0, 1, 0]);
+        assert_eq!(
+            totals(&counted(OutputFormat::Pytest, false, "no tests ran in 0.01s")),
+            [0, 1, 0]
+        );
     }
 
     #[test]
     fn a_suite_without_any_test_is_a_failure() {
-        // Up to Python 3.11 it calls that a success.
+        // Up to Python 3.11, unittest reports success.
         assert_eq!(
-            counts(&heard(Speech::Unittest, true, "Ran 0 tests in 0.000s\n\nOK")),
+            totals(&counted(OutputFormat::Unittest, true, "Ran 0 tests in 0.000s\n\nOK")),
             [0, 1, 0]
         );
         assert_eq!(
-            counts(&heard(Speech::Unittest, false, "Ran 0 tests in 0.000s\n\nNO TESTS RAN")),
+            totals(&counted(
+                OutputFormat::Unittest,
+                false,
+                "Ran 0 tests in 0.000s\n\nNO TESTS RAN"
+            )),
             [0, 1, 0]
         );
         assert_eq!(
-            counts(&heard(
-                Speech::Libtest,
+            totals(&counted(
+                OutputFormat::Libtest,
                 true,
                 "running 0 tests\n\ntest result: ok. 0 passed; 0 failed"
             )),
@@ -261,11 +273,15 @@ mod tests {
     }
 
     #[test]
-    fn a_suite_that_says_nothing_is_one_test() {
+    fn a_suite_without_counts_is_one_test() {
         assert_eq!(
-            counts(&heard(Speech::None, true, "Success: no issues found in 5 source files")),
+            totals(&counted(
+                OutputFormat::None,
+                true,
+                "Success: no issues found in 5 source files"
+            )),
             [1, 0, 0]
         );
-        assert_eq!(counts(&heard(Speech::None, false, "Found 1 error")), [0, 1, 0]);
+        assert_eq!(totals(&counted(OutputFormat::None, false, "Found 1 error")), [0, 1, 0]);
     }
 }
