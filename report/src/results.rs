@@ -199,12 +199,12 @@ mod tests {
         std::fs::write(folder.path().join("other"), "").unwrap();
         std::os::unix::fs::symlink("other", &clips_list).unwrap();
         let errors = [Decisions::open(folder.path()).err(), clips(folder.path()).err()];
-        for (error, said) in errors.into_iter().zip([
+        for (error, message) in errors.into_iter().zip([
             "decisions.jsonl`\n  cause: it is not a regular file",
             "clips.jsonl`\n  cause: it is a link",
         ]) {
             let text = gleaner_base::Failure::from(error.unwrap()).to_string();
-            assert!(text.contains(said), "{text}");
+            assert!(text.contains(message), "{text}");
         }
     }
 }

@@ -298,8 +298,8 @@ fn starts_and_stops_are_named_and_triggers_without_a_clip_are_counted() {
         "  turn, start  1.46\n",
         "  turn, stop  1.46\n",
         "  no window: 2 triggers, within the cooldown of another\n",
-        "  no window: 1 start or stop, of a recording that ran already or did not run\n",
-        "  lost: 3 samples, pushed out of the preroll too early: preroll_size\n",
+        "  no window: 1 start or stop, of a recording that was already running, or not running\n",
+        "  lost: 3 samples, evicted from the preroll too early: preroll_size\n",
         "  replaced: 5 clips of an earlier replay\n",
     ] {
         assert!(text.contains(line), "no `{line}` in {text}");

@@ -58,7 +58,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
         let left = args
             .last
             .map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
-        let begun = Instant::now();
+        let started_at = Instant::now();
         // The runtime reads the same file at each start and reports if it cannot be used. That does
         // not end the run.
         most = allowed().unwrap_or(most);
@@ -82,7 +82,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
         }
         earlier.add(group.last_status(), group.recorder_status(), group.has_lost_wake());
         restarts += 1;
-        delay = if begun.elapsed() >= HEALTHY { DELAY } else { delay };
+        delay = if started_at.elapsed() >= HEALTHY { DELAY } else { delay };
         let reason = failures.reason.as_deref().unwrap_or_default();
         screen.warn(&format!("{reason}; restarting in {} s (restart {restarts})", delay.as_secs()));
         let until = Instant::now() + delay;

@@ -104,7 +104,8 @@ impl NoComponent {
     fn help(self) -> &'static str {
         match self {
             Self::Foreign => {
-                "set `entry` in lambda.toml to the component, and build the lambda: gleaner build DIR"
+                "set `entry` in lambda.toml to the component, and build the lambda: \
+                 gleaner build DIR"
             }
             Self::Module => {
                 "build the lambda with `gleaner build DIR`, which makes a component (wasm32-wasip2)"

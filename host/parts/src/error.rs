@@ -76,22 +76,22 @@ impl Explain for PartsError {
     fn help(&self) -> Option<String> {
         match self {
             PartsError::NoExecutable { .. } => None,
-            PartsError::Home { .. } => Some("set GLEANER_HOME to the folder of the installation, or unset it".to_owned()),
+            PartsError::Home { .. } => {
+                Some("set GLEANER_HOME to the folder of the installation, or unset it".to_owned())
+            }
             PartsError::WantedPython { .. } => Some(
                 "set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip, or unset it"
                     .to_owned(),
             ),
             PartsError::Environment { source, .. } => NotPlain::of(source)
                 .map(|why| format!("{}: `python3 -m venv` writes a new one", why.help())),
-            PartsError::Missing { made_by, .. } => {
-                Some(format!(
-                    "in a checkout run `{made_by}`, else set GLEANER_HOME to the folder of the \
+            PartsError::Missing { made_by, .. } => Some(format!(
+                "in a checkout run `{made_by}`, else set GLEANER_HOME to the folder of the \
                      installation"
-                ))
-            }
+            )),
             PartsError::NoPython { .. } => Some(
-                "in a checkout run `cargo xtask demo`, or set GLEANER_PYTHON to a Python 3.9 or newer \
-                 with venv and ensurepip"
+                "in a checkout run `cargo xtask demo`, or set GLEANER_PYTHON to a Python 3.9 or \
+                 newer with venv and ensurepip"
                     .to_owned(),
             ),
             PartsError::NoCache => Some("set XDG_CACHE_HOME".to_owned()),

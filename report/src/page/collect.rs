@@ -30,7 +30,7 @@ const TEXT_BYTES: usize = 2 << 20;
 
 /// A line of `log.jsonl`.
 #[derive(Deserialize)]
-struct LogLine {
+struct UntrustedLogLine {
     at_ns: i64,
     level: String,
     message: String,
@@ -61,7 +61,7 @@ pub(crate) fn collect(
     })?;
 
     let (mut log, mut log_seen, mut log_budget) = (Vec::new(), 0, TextBudget(budget / 2));
-    each(out, "log.jsonl", true, &mut notes, |line: LogLine| {
+    each(out, "log.jsonl", true, &mut notes, |line: UntrustedLogLine| {
         last_ns = last_ns.max(line.at_ns);
         log_seen += 1;
         let (t, level) = (seconds(line.at_ns, start_ns), cut(&line.level, 12));

@@ -112,7 +112,7 @@ mod tests {
 
     #[test]
     fn the_page_fetches_nothing_and_sets_no_text_as_html() {
-        let ours = [PAGE, STYLE[1]].iter().chain(SCRIPTS).copied().collect::<String>();
+        let sources = [PAGE, STYLE[1]].iter().chain(SCRIPTS).copied().collect::<String>();
         for word in [
             "http://",
             "https://",
@@ -122,7 +122,7 @@ mod tests {
             "document.write",
             "eval(",
         ] {
-            assert!(!ours.contains(word), "{word}");
+            assert!(!sources.contains(word), "{word}");
         }
         assert!(PAGE.find("{{policy}}").unwrap() < PAGE.find("{{style}}").unwrap());
     }
