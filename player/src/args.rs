@@ -1,4 +1,4 @@
-//! The command line, checked as far as it can be without looking at a file.
+//! Parses the command line; checks all that needs no file.
 
 use std::fmt;
 use std::net::IpAddr;
@@ -10,43 +10,46 @@ use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::TopicName;
 
 use crate::pace::Rate;
-use crate::stamp::Stamp;
+use crate::stamp::StampMode;
 
 /// Play recorded drives as live topics of ROS 2, through Cyclone DDS
 ///
-/// Topics keep their names, types and offered quality of service, so that nodes cannot tell a drive
-/// from a vehicle. Plays in the domain of --domain, else of ROS_DOMAIN_ID, else 0. Ctrl-C ends it
-/// in order, with a summary.
+/// Topics keep their names, types and offered quality of service, so that nodes cannot distinguish
+/// a drive from a vehicle. The DDS domain is --domain, else ROS_DOMAIN_ID, else 0. Ctrl-C stops
+/// playing and prints the summary.
 #[derive(Parser, Debug)]
 #[command(name = "gleaner-player", bin_name = "gleaner play", version)]
-#[command(group = ArgGroup::new("what").required(true).multiple(true).args(["drives", "synthetic", "imu"]))]
+#[command(group = ArgGroup::new("what")
+    .required(true)
+    .multiple(true)
+    .args(["drives", "synthetic", "imu"]))]
 pub(crate) struct Args {
     /// MCAP files; several are merged by time
     #[arg(value_name = "DRIVE")]
     pub(crate) drives: Vec<PathBuf>,
-    /// How fast: 1 is as recorded, 2 twice as fast, max as fast as writing goes
+    /// Speed: 1 is as recorded, 2 twice as fast, max as fast as writers accept
     #[arg(long, value_name = "R", default_value = "1")]
     pub(crate) rate: Rate,
-    /// Begin again at the end, until ctrl-C
+    /// Start again at the end, until ctrl-C
     #[arg(long = "loop")]
     pub(crate) looped: bool,
-    /// What header.stamp becomes: the wall clock at sending, what was recorded, or the monotonic
-    /// clock at sending
+    /// Value of header.stamp: the wall clock when sent, as recorded, or the monotonic clock when
+    /// sent
     #[arg(long, value_enum, default_value = "now")]
-    pub(crate) stamp: Stamp,
+    pub(crate) stamp: StampMode,
     /// Play only these topics of the drive
     #[arg(long, value_name = "TOPIC,TOPIC", value_delimiter = ',')]
     pub(crate) topics: Vec<String>,
-    /// Another name for a topic that is played, as in /imu/data:=/car/imu
+    /// New name for a played topic, as in /imu/data:=/car/imu
     #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
     pub(crate) remap: Vec<(String, String)>,
-    /// Begin so many seconds into the drive
+    /// Start this many seconds into the drive
     #[arg(long, value_name = "S", value_parser = seconds, default_value = "0")]
     pub(crate) start: i64,
-    /// Play only so many seconds of the drive
+    /// Play only this many seconds of the drive
     #[arg(long, value_name = "S", value_parser = some_seconds)]
     pub(crate) duration: Option<i64>,
-    /// Decode topics of CompressedImage, and send them as bgr8 images under .../image_raw
+    /// Decode CompressedImage topics and send them as bgr8 images under .../image_raw
     #[arg(long)]
     pub(crate) raw_images: bool,
     /// Scale the images of --raw-images, at most to 3848x2168
@@ -55,20 +58,33 @@ pub(crate) struct Args {
     /// Wait until each topic has N readers
     #[arg(long, value_name = "N", default_value = "0")]
     pub(crate) wait: usize,
-    /// The domain of DDS, 0 to 232
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=i64::from(LAST_DOMAIN)))]
+    /// DDS domain, 0 to 232
+    #[arg(
+        long,
+        value_name = "N",
+        value_parser = clap::value_parser!(u32).range(0..=i64::from(LAST_DOMAIN))
+    )]
     pub(crate) domain: Option<u32>,
-    /// Use only the network interface that has this address
+    /// Use only the network interface with this address
     #[arg(long, value_name = "IP")]
     pub(crate) interface: Option<IpAddr>,
     /// Print the summary as one JSON object
     #[arg(long)]
     pub(crate) json: bool,
     /// Without a drive: noise as bgr8 images on /camera/synthetic/image_raw, as in 1920x1080@30
-    #[arg(long, value_name = "WxH@HZ", conflicts_with_all = ["drives", "looped", "topics", "start", "raw_images"])]
-    pub(crate) synthetic: Option<Camera>,
+    #[arg(
+        long,
+        value_name = "WxH@HZ",
+        conflicts_with_all = ["drives", "looped", "topics", "start", "raw_images"]
+    )]
+    pub(crate) synthetic: Option<SyntheticCamera>,
     /// Without a drive: an IMU at rest on /imu/synthetic
-    #[arg(long, value_name = "HZ", value_parser = hertz, conflicts_with_all = ["drives", "looped", "topics", "start", "raw_images"])]
+    #[arg(
+        long,
+        value_name = "HZ",
+        value_parser = hertz,
+        conflicts_with_all = ["drives", "looped", "topics", "start", "raw_images"]
+    )]
     pub(crate) imu: Option<f64>,
 }
 
@@ -83,10 +99,10 @@ pub(crate) struct Size {
 }
 
 impl Size {
-    /// What the largest camera of the Zenseact Open Dataset delivers; 25 MB in bgr8.
+    /// Resolution of the largest camera of the Zenseact Open Dataset; 25 MB in bgr8.
     const LARGEST: Size = Size { width: 3848, height: 2168 };
 
-    /// Bytes of such an image in bgr8.
+    /// Bytes of an image of this size in bgr8.
     pub(crate) fn bytes(self) -> usize {
         3 * self.width as usize * self.height as usize
     }
@@ -117,26 +133,26 @@ impl FromStr for Size {
     }
 }
 
-/// A made-up camera.
+/// A synthetic camera.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub(crate) struct Camera {
+pub(crate) struct SyntheticCamera {
     pub(crate) size: Size,
     pub(crate) hertz: f64,
 }
 
-impl FromStr for Camera {
+impl FromStr for SyntheticCamera {
     type Err = String;
 
-    fn from_str(text: &str) -> Result<Camera, String> {
+    fn from_str(text: &str) -> Result<SyntheticCamera, String> {
         let (size, rate) =
             text.split_once('@').ok_or("write WIDTHxHEIGHT@HZ, as in 1920x1080@30")?;
-        Ok(Camera { size: size.parse()?, hertz: hertz(rate)? })
+        Ok(SyntheticCamera { size: size.parse()?, hertz: hertz(rate)? })
     }
 }
 
 impl Args {
-    /// The domain to play in: what was asked for, else what `environment`, the content of
-    /// `ROS_DOMAIN_ID`, says.
+    /// The domain to play in: `--domain`, else `environment`, the content of `ROS_DOMAIN_ID`, else
+    /// 0.
     pub(crate) fn domain(&self, environment: Option<&str>) -> Result<u32, Failure> {
         match (self.domain, environment.map(str::trim)) {
             (Some(domain), _) => Ok(domain),
@@ -145,7 +161,7 @@ impl Args {
                 text.parse().ok().filter(|domain| *domain <= LAST_DOMAIN).ok_or_else(|| {
                     Failure::new(
                         Exit::Usage,
-                        format!("ROS_DOMAIN_ID is `{text}`, which is no domain"),
+                        format!("ROS_DOMAIN_ID is `{text}`, which is not a domain"),
                     )
                     .with_help(format!(
                         "set it to a number from 0 to {LAST_DOMAIN}, or give --domain"
@@ -156,7 +172,7 @@ impl Args {
     }
 }
 
-/// A drive may call its topics as it likes; what they are played as, ROS 2 has to take.
+/// Parses FROM:=TO. A drive may use any topic name; the new name must be valid in ROS 2.
 fn remap(text: &str) -> Result<(String, String), String> {
     match text.split_once(":=").map(|(from, to)| (from.trim(), to.trim())) {
         Some((from, to)) if !from.is_empty() && !to.is_empty() => match to.parse::<TopicName>() {
@@ -167,7 +183,7 @@ fn remap(text: &str) -> Result<(String, String), String> {
     }
 }
 
-/// Seconds as nanoseconds; a year at most, so that no sum of them overflows.
+/// Parses seconds into nanoseconds; at most a year, so that sums of them do not overflow.
 fn seconds(text: &str) -> Result<i64, String> {
     let seconds = text.parse::<f64>().ok().filter(|seconds| (0.0..=31_536_000.0).contains(seconds));
     seconds
@@ -195,28 +211,31 @@ mod tests {
     }
 
     #[test]
-    fn the_definition_of_the_command_line_is_sound() {
+    fn the_definition_of_the_command_line_is_valid() {
         use clap::CommandFactory;
         Args::command().debug_assert();
     }
 
     #[test]
-    fn a_drive_is_played_as_recorded_with_stamps_of_now_unless_told_otherwise() {
+    fn a_drive_is_played_as_recorded_with_stamps_of_now_by_default() {
         let args = parse(&["a.mcap", "b.mcap"]).unwrap();
         assert_eq!(args.drives.len(), 2);
         assert_eq!(
             (args.rate, args.stamp, args.start, args.wait),
-            (Rate::Times(1.0), Stamp::Now, 0, 0)
+            (Rate::Times(1.0), StampMode::Now, 0, 0)
         );
         assert!(args.duration.is_none() && !args.looped && !args.raw_images && !args.json);
     }
 
     #[test]
-    fn made_up_sensors_need_no_drive_and_exclude_one() {
+    fn synthetic_sensors_need_no_drive_and_exclude_one() {
         let args =
             parse(&["--synthetic", "1920x1080@30", "--imu", "100", "--duration", "2.5"]).unwrap();
         let size = Size { width: 1920, height: 1080 };
-        assert_eq!((args.synthetic, args.imu), (Some(Camera { size, hertz: 30.0 }), Some(100.0)));
+        assert_eq!(
+            (args.synthetic, args.imu),
+            (Some(SyntheticCamera { size, hertz: 30.0 }), Some(100.0))
+        );
         assert_eq!(args.duration, Some(2_500_000_000));
         assert!(parse(&[]).unwrap_err().contains("<DRIVE"));
         assert!(parse(&["a.mcap", "--imu", "100"]).is_err());
@@ -224,14 +243,14 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_is_refused_with_an_example() {
-        for (arguments, said) in [
+    fn invalid_arguments_are_refused_with_an_example() {
+        for (arguments, expected) in [
             (["--rate", "0"], "greater than 0"),
             (["--rate", "-1"], "greater than 0"),
             (["--rate", "inf"], "greater than 0"),
             (["--remap", "/a=/b"], "FROM:=TO"),
             (["--remap", ":=/b"], "FROM:=TO"),
-            (["--remap", "/a:=no name"], "`no name` is no topic name"),
+            (["--remap", "/a:=no name"], "`no name` is not a topic name"),
             (["--domain", "233"], "233"),
             (["--interface", "eth0"], "eth0"),
             (["--start", "-1"], "seconds"),
@@ -241,7 +260,7 @@ mod tests {
             (["--stamp", "later"], "monotonic"),
         ] {
             let error = parse(&["a.mcap", &arguments.join("=")]).unwrap_err();
-            assert!(error.contains(said), "{arguments:?}: {error}");
+            assert!(error.contains(expected), "{arguments:?}: {error}");
         }
         for camera in
             ["1920x1080", "0x10@1", "3849x10@1", "10x2169@1", "10x10@0", "10x10@inf", "x@"]
@@ -257,15 +276,15 @@ mod tests {
         assert_eq!(of(&["a"], Some(" 42 ")), Ok(42));
         assert_eq!(of(&["a"], Some("")), Ok(0));
         assert_eq!(of(&["a"], None), Ok(0));
-        // The page by which all programs of ours are tested.
+        // All programs are tested with this table.
         for line in
             include_str!("../../tests/domains.txt").lines().filter(|line| line.starts_with('|'))
         {
             let (content, domain) = line[1..].split_once('|').unwrap();
             assert_eq!(of(&["a"], Some(content)).ok(), domain.trim().parse().ok(), "{line}");
         }
-        for nonsense in ["233", "-1", "a", "4.0"] {
-            assert_eq!(of(&["a"], Some(nonsense)).unwrap_err().exit, Exit::Usage);
+        for invalid in ["233", "-1", "a", "4.0"] {
+            assert_eq!(of(&["a"], Some(invalid)).unwrap_err().exit, Exit::Usage);
         }
     }
 }

@@ -1,23 +1,23 @@
-//! Memory for messages: handed on without copying, and used again once DDS has let go of it.
+//! Message buffers: passed on without copying, and reused when DDS releases them.
 
 use std::mem;
 use std::ops::{Deref, DerefMut};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Bytes that a pool keeps for later at most. A frame of 25 MB is mapped and cleared by the kernel
-/// each time it is allocated; with a depth of ten, this much comes back at once.
+/// Maximum bytes that a pool keeps for reuse. The kernel maps and clears a 25 MB frame on each
+/// allocation; with a depth of ten, this much is released at once.
 const KEPT_BYTES: usize = 256 << 20;
 
-/// The bytes of one message. They return to their pool when dropped, on whatever thread that is.
+/// The bytes of one message. On drop, in any thread, they return to their pool.
 #[derive(Debug, Default)]
 pub(crate) struct Buffer {
     bytes: Vec<u8>,
-    home: Option<Pool>,
+    pool: Option<Pool>,
 }
 
 impl From<Vec<u8>> for Buffer {
     fn from(bytes: Vec<u8>) -> Buffer {
-        Buffer { bytes, home: None }
+        Buffer { bytes, pool: None }
     }
 }
 
@@ -37,30 +37,30 @@ impl DerefMut for Buffer {
 
 impl Drop for Buffer {
     fn drop(&mut self) {
-        if let Some(home) = self.home.take() {
-            home.put(mem::take(&mut self.bytes));
+        if let Some(pool) = self.pool.take() {
+            pool.put(mem::take(&mut self.bytes));
         }
     }
 }
 
-/// Buffers of about one size.
+/// A pool of buffers of similar size.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Pool(Arc<Mutex<Vec<Vec<u8>>>>);
 
 impl Pool {
-    /// A buffer with room for `len` bytes: one that was used before, with its old content, or an
-    /// empty one.
+    /// Returns a buffer with room for `len` bytes: a used one, with its old content, or an empty
+    /// one.
     pub(crate) fn take(&self, len: usize) -> Buffer {
         let mut kept = self.kept();
         let fits = |bytes: &Vec<u8>| bytes.capacity() >= len && bytes.capacity() / 2 <= len;
         let found = kept.iter().rposition(fits).map(|index| kept.swap_remove(index));
         drop(kept);
-        Buffer { bytes: found.unwrap_or_else(|| Vec::with_capacity(len)), home: Some(self.clone()) }
+        Buffer { bytes: found.unwrap_or_else(|| Vec::with_capacity(len)), pool: Some(self.clone()) }
     }
 
     fn put(&self, bytes: Vec<u8>) {
         let mut kept = self.kept();
-        // Those of another size, of which no more come, make room for this one.
+        // Buffers of another size are no longer needed and make room for this one.
         while kept.iter().map(Vec::capacity).sum::<usize>() + bytes.capacity() > KEPT_BYTES
             && !kept.is_empty()
         {
@@ -71,7 +71,7 @@ impl Pool {
         }
     }
 
-    /// A list of vectors is whole even if a thread died holding it.
+    /// A list of vectors stays valid even if a thread panicked while it held the lock.
     fn kept(&self) -> MutexGuard<'_, Vec<Vec<u8>>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -91,7 +91,7 @@ mod tests {
         drop(first);
         let second = pool.take(90);
         assert_eq!((second.as_ptr(), second.as_slice()), (at, &[7; 100][..]));
-        assert!(pool.take(90).is_empty(), "it is not given out twice");
+        assert!(pool.take(90).is_empty(), "a buffer is lent only once");
     }
 
     #[test]

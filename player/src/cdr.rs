@@ -1,9 +1,9 @@
-//! Messages as they go over the wire: four bytes of encapsulation, then CDR, then zeros up to a
+//! Builds messages in wire format: four bytes of encapsulation, then CDR, then zeros up to a
 //! multiple of four.
 
 use gleaner_messages::{CdrWriter, Endian};
 
-/// Bytes in front of the CDR, from which its alignment does not count.
+/// Size of the encapsulation before the CDR; CDR alignment does not count it.
 pub(crate) const ENCAPSULATION: usize = 4;
 
 /// The encapsulation of plain CDR; `options` are its last two bytes.
@@ -11,33 +11,31 @@ pub(crate) fn encapsulation(endian: Endian, options: [u8; 2]) -> [u8; ENCAPSULAT
     let [a, b] = options;
     [0, u8::from(endian == Endian::Little), a, b]
 }
-
-/// Fills `bytes` up to a multiple of four, which is how DDS sends them: Cyclone DDS may read that
+/// Pads `bytes` with zeros to a multiple of four, as DDS sends them: Cyclone DDS may read that far.
 /// far.
 pub(crate) fn pad(bytes: &mut Vec<u8>) {
     bytes.resize(bytes.len().next_multiple_of(4), 0);
 }
 
-/// The begin of a little-endian message: a `std_msgs/msg/Header`.
+/// Begins a little-endian message with a `std_msgs/msg/Header`.
 pub(crate) fn with_header(stamp_ns: i64, frame_id: &str) -> CdrWriter {
     let mut cdr = CdrWriter::new();
     cdr.time(stamp_ns).string(frame_id);
     cdr
 }
 
-/// A little-endian message as it goes over the wire.
+/// A little-endian message in wire format.
 pub(crate) fn sealed(cdr: &CdrWriter) -> Vec<u8> {
     let mut message = [&encapsulation(Endian::Little, [0, 0]), cdr.bytes()].concat();
     pad(&mut message);
     message
 }
 
-/// All of a `sensor_msgs/msg/Image` in bgr8 that comes before its pixels, of which there are `3 *
-/// width * height`.
+/// The bytes of a `sensor_msgs/msg/Image` in bgr8 before its `3 * width * height` bytes of pixels.
 pub(crate) fn image_head(stamp_ns: i64, frame_id: &str, width: u32, height: u32) -> Vec<u8> {
     let mut cdr = with_header(stamp_ns, frame_id);
     cdr.u32(height).u32(width).string("bgr8").u8(0).u32(3 * width).u32(3 * width * height);
-    // The length was aligned to four, and so is what ends with it.
+    // The length field is aligned to four, and so is its end.
     sealed(&cdr)
 }
 
@@ -48,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_image_is_read_back_as_it_was_written() {
+    fn an_image_is_read_back_unchanged() {
         for frame_id in ["", "a", "ab", "camera"] {
             let mut message = image_head(-1, frame_id, 5, 3);
             message.extend(1..=45);

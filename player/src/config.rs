@@ -1,14 +1,14 @@
-//! How Cyclone DDS is set up, unless the user did.
+//! The configuration of Cyclone DDS, unless the user sets one.
 
 use std::net::IpAddr;
 
 /// The configuration of Cyclone DDS as its own XML.
 ///
-/// With its defaults a frame of 25 MB is 18,600 fragments of 1344 bytes, of which a reader with an
-/// ordinary socket buffer loses many; with these, 400. A writer waits when more than `WhcHigh` was
-/// not acknowledged: ten frames of 25 MB are below it. A sample that is larger than
-/// `MaxQueuedRexmitBytes` could never be repaired, and one that is larger than `MaxRexmit` is
-/// repaired in several rounds, each as long as the reader waits before it asks.
+/// With the defaults of Cyclone DDS a frame of 25 MB is 18,600 fragments of 1344 bytes, of which a
+/// reader with an ordinary socket buffer loses many; with these settings it is 400. A writer blocks
+/// while more than `WhcHigh` is not acknowledged: ten frames of 25 MB are below it. A sample larger
+/// than `MaxQueuedRexmitBytes` could never be retransmitted; one larger than `MaxRexmit` is
+/// retransmitted in several rounds, each as long as the reader's NACK delay.
 pub(crate) fn xml(interface: Option<IpAddr>) -> String {
     let interfaces = match interface {
         Some(address) => {
@@ -38,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_interface_is_named_only_if_asked_for() {
+    fn an_interface_is_configured_only_on_request() {
         assert!(!xml(None).contains("Interface"));
         assert!(
             xml(Some("127.0.0.1".parse().unwrap()))
@@ -48,10 +48,10 @@ mod tests {
     }
 
     #[test]
-    fn people_who_configure_cyclone_dds_themselves_are_told_the_same() {
+    fn the_documented_configuration_is_the_one_in_use() {
         let page = include_str!("../../docs/play.md");
-        let told =
+        let documented =
             page.split_once("```xml\n").and_then(|(_, rest)| rest.split_once("```")).unwrap().0;
-        assert_eq!(told.lines().map(str::trim).collect::<String>(), xml(None));
+        assert_eq!(documented.lines().map(str::trim).collect::<String>(), xml(None));
     }
 }

@@ -1,26 +1,27 @@
-//! What became of the messages of one topic.
+//! TopicCounts the messages of one topic: sent, lost, late.
 
-/// Counts of one topic.
+/// Message counts of one topic.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Counts {
+pub(crate) struct TopicCounts {
     pub(crate) sent: u64,
-    /// With their encapsulation.
+    /// Bytes sent, encapsulation included.
     pub(crate) bytes: u64,
-    /// Not sent, since readers did not take older ones in time, or since Cyclone DDS refused them.
+    /// Not sent: readers did not acknowledge earlier messages in time, or Cyclone DDS refused them.
     pub(crate) refused: u64,
     /// Sent more than [`LATE_NS`] after they were due.
     pub(crate) late: u64,
     pub(crate) latest_ns: i64,
-    /// Messages too short for the stamp that their type has, sent as they were.
+    /// Sent unchanged: too short for the stamp that their type has.
     pub(crate) unstamped: u64,
     pub(crate) writes: Durations,
 }
 
-/// From which delay on a message counts as late. Waking up takes a tenth of a millisecond on a
-/// machine that has time, and several on one that has not.
+/// Delay from which a message counts as late. A wake-up takes a tenth of a millisecond on an idle
+/// machine and several milliseconds on a busy one.
 pub(crate) const LATE_NS: i64 = 5_000_000;
 
-/// Durations in buckets that are an eighth of a power of two wide: 12 % of a value, in 4 KiB.
+/// A histogram of durations. Buckets are an eighth of a power of two wide: 12 % of a value, in 4
+/// KiB.
 #[derive(Clone, Debug)]
 pub(crate) struct Durations {
     buckets: Vec<u64>,
@@ -28,7 +29,7 @@ pub(crate) struct Durations {
     longest_ns: u64,
 }
 
-/// Of each power of two.
+/// Buckets per power of two.
 const STEPS: u64 = 8;
 
 impl Default for Durations {
@@ -46,8 +47,8 @@ impl Durations {
         self.longest_ns = self.longest_ns.max(ns);
     }
 
-    /// The median, rounded up to the end of its bucket, but not beyond the longest. 0 if there is
-    /// none.
+    /// The median, rounded up to the end of its bucket, at most the maximum. 0 if there are no
+    /// durations.
     pub(crate) fn median_ns(&self) -> u64 {
         let mut before = 0;
         let at = self.buckets.iter().position(|bucket| {
@@ -70,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_median_is_within_an_eighth_of_the_true_one() {
+    fn the_median_is_at_most_an_eighth_too_high() {
         for scale in [1, 17, 1_000, 123_456_789] {
             let mut durations = Durations::default();
             (1..=1001).for_each(|n| durations.add(n * scale));
@@ -84,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn none_few_and_absurd_durations_have_a_median() {
+    fn the_median_of_zero_or_one_duration_is_exact() {
         assert_eq!(Durations::default().median_ns(), 0);
         for ns in [0, 1, 9, u64::MAX] {
             let mut durations = Durations::default();

@@ -1,10 +1,11 @@
-//! Cyclone DDS: a participant, and writers of any type, that are handed whole CDR messages without
-//! copying them.
+//! Cyclone DDS: a participant, and writers of any type that send whole CDR messages without
+//! copying.
 //!
-//! A topic of Cyclone DDS is usually made from a C type. `cyclors` also makes one from names alone,
-//! whose samples are opaque bytes; for those we bring our own operations on samples, so that
-//! Cyclone DDS refers to our buffers, and drops them when the last reader has acknowledged them.
-//! There are no readers here, so nothing is ever made from received bytes.
+//! A topic of Cyclone DDS is usually created from a C type. `cyclors` also creates one from names
+//! alone, whose samples are opaque bytes. For those this module provides its own operations on
+//! samples: Cyclone DDS refers to the buffers of the player, and drops them when the last reader
+//! has acknowledged them. There are no readers here, so no sample is ever created from received
+//! bytes.
 #![allow(unsafe_code)]
 
 use std::ffi::{CStr, CString, c_char, c_void};
@@ -21,24 +22,25 @@ use gleaner_base::{Exit, Explain};
 use crate::buffer::Buffer;
 use crate::offer::Offer;
 
-/// Why Cyclone DDS does not do what we want.
+/// Error of Cyclone DDS.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum CycloneError {
-    /// A participant or a writer cannot be made.
-    #[error("Cyclone DDS cannot make {what}: {said}")]
-    Create { what: String, said: String },
-    /// A message was not sent: readers did not acknowledge older ones in time.
-    #[error("readers did not take what was sent before within {} s", MAX_BLOCKING.as_secs())]
+    /// A participant or a writer cannot be created.
+    #[error("Cyclone DDS cannot create {what}: {reason}")]
+    Create { what: String, reason: String },
+    /// A message was not sent: readers did not acknowledge earlier ones in time.
+    #[error("readers did not acknowledge earlier messages within {} s", MAX_BLOCKING.as_secs())]
     Blocked,
     /// A message was not sent for another reason.
-    #[error("Cyclone DDS cannot send a message of {len} bytes: {said}")]
-    Write { len: usize, said: String },
+    #[error("Cyclone DDS cannot send a message of {len} bytes: {reason}")]
+    Write { len: usize, reason: String },
 }
 
 impl Explain for CycloneError {
     fn help(&self) -> Option<String> {
         matches!(self, CycloneError::Create { .. }).then(|| {
-            "see what Cyclone DDS said above; is there a network interface that is up, and is --interface an address of it?"
+            "see the output of Cyclone DDS above; check that a network interface is up and that \
+             --interface is one of its addresses"
                 .to_owned()
         })
     }
@@ -48,20 +50,20 @@ impl Explain for CycloneError {
     }
 }
 
-/// How long a write waits for readers that lag behind. ROS 2 waits forever; then a stopped reader
-/// stops the player.
+/// Maximum time that a write waits for slow readers. ROS 2 waits forever; then a stopped reader
+/// would stop the player.
 const MAX_BLOCKING: Duration = Duration::from_secs(1);
 
-/// More than any message of ROS 2, and what Cyclone DDS sends at most.
+/// Larger than any message of ROS 2; the maximum that Cyclone DDS sends.
 const MAX_MESSAGE: usize = i32::MAX as usize - 8;
 
-/// Our presence in a domain.
+/// A participant in a domain.
 pub(crate) struct Participant {
     participant: dds_entity_t,
 }
 
 impl Participant {
-    /// Joins a domain, with this configuration (XML), or with what the environment says.
+    /// Joins a domain, with this configuration (XML), or with that of the environment.
     pub(crate) fn join(domain: u32, config: Option<&str>) -> Result<Participant, CycloneError> {
         let what = || format!("a participant in domain {domain}");
         if let Some(config) = config {
@@ -75,13 +77,13 @@ impl Participant {
         created(participant, what).map(|participant| Participant { participant })
     }
 
-    /// Offers a topic by the names that DDS has for it and for its type.
+    /// Creates a writer for a topic, by the DDS names of the topic and its type.
     pub(crate) fn writer(
         &self,
         topic: &str,
         type_name: &str,
         offer: Offer,
-    ) -> Result<Writer<'_>, CycloneError> {
+    ) -> Result<CycloneWriter<'_>, CycloneError> {
         let what = || format!("a writer of `{topic}` with type `{type_name}`");
         let (topic_name, type_name) = (c_string(topic), c_string(type_name));
         // SAFETY: both texts are terminated and outlive the call, which copies them and does not
@@ -96,11 +98,11 @@ impl Participant {
         };
         created(topic, what)?;
         let mut sertype: *const ddsi_sertype = ptr::null();
-        // SAFETY: the topic is ours, and the place for the answer is valid.
+        // SAFETY: `topic` was created above, and the pointer for the result is valid.
         let answer = unsafe { cyclors::dds_get_entity_sertype(topic, &mut sertype) };
         created(answer, what)?;
-        // SAFETY: a fresh set of policies, filled by the calls below, copied by dds_create_writer,
-        // deleted once; the array of representations is as long as it says.
+        // SAFETY: `qos` is new, set by the calls below, copied by dds_create_writer and deleted
+        // once; the array of representations has the given length.
         let writer = unsafe {
             let qos = cyclors::dds_create_qos();
             let (reliability, durability) = kinds(offer);
@@ -110,7 +112,7 @@ impl Participant {
             let depth = offer.depth as i32;
             let keep_last = cyclors::dds_history_kind_DDS_HISTORY_KEEP_LAST;
             cyclors::dds_qset_history(qos, keep_last, depth);
-            // How many of a topic that is transient local are kept for late readers.
+            // Number of samples of a transient-local topic that are kept for late readers.
             cyclors::dds_qset_durability_service(qos, 0, keep_last, depth, -1, -1, -1);
             let xcdr1 = DDS_DATA_REPRESENTATION_XCDR1 as i16;
             cyclors::dds_qset_data_representation(qos, 1, &xcdr1);
@@ -118,46 +120,43 @@ impl Participant {
             cyclors::dds_delete_qos(qos);
             writer
         };
-        created(writer, what).map(|writer| Writer { writer, sertype, _participant: self })
+        created(writer, what).map(|writer| CycloneWriter { writer, sertype, _participant: self })
     }
 }
 
 impl Drop for Participant {
     fn drop(&mut self) {
-        // Also ends its writers and topics. What it returns says only that it is gone already.
-        // SAFETY: a handle that is not valid any more is refused.
+        // Also deletes its writers and topics. An error can only mean that it no longer exists.
+        // SAFETY: an invalid handle is refused.
         unsafe { cyclors::dds_delete(self.participant) };
     }
 }
 
-/// Writes messages of one topic.
-pub(crate) struct Writer<'p> {
+/// CycloneWriter of one topic.
+pub(crate) struct CycloneWriter<'p> {
     writer: dds_entity_t,
     /// The topic's type, which lives as long as the topic, and so as the participant.
     sertype: *const ddsi_sertype,
     _participant: &'p Participant,
 }
 
-// SAFETY: Cyclone DDS locks its entities itself, and never changes a type after the topic was made.
-unsafe impl Send for Writer<'_> {}
+// SAFETY: Cyclone DDS locks its entities itself, and never changes a type after creation.
+unsafe impl Send for CycloneWriter<'_> {}
 // SAFETY: as above.
-unsafe impl Sync for Writer<'_> {}
+unsafe impl Sync for CycloneWriter<'_> {}
 
-impl Writer<'_> {
+impl CycloneWriter<'_> {
     /// Sends `message`: encapsulation, CDR, and zeros up to a multiple of four. Returns when the
-    /// kernel has it; waits at most [`MAX_BLOCKING`] for readers that lag behind.
+    /// kernel has it; waits at most [`MAX_BLOCKING`] for slow readers.
     pub(crate) fn write(&self, message: Buffer) -> Result<(), CycloneError> {
         let len = message.len();
         if len > MAX_MESSAGE || !len.is_multiple_of(4) || len < 4 {
-            return Err(CycloneError::Write {
-                len,
-                said: "it has no length that a message can have".to_owned(),
-            });
+            return Err(CycloneError::Write { len, reason: "invalid length".to_owned() });
         }
         // SAFETY: all of `ddsi_serdata` is numbers and pointers, for which zeros are valid;
         // `ddsi_serdata_init` fills it with one reference, which dds_writecdr takes over.
         let code = unsafe {
-            let mut sample = Box::new(Sample { base: std::mem::zeroed(), message });
+            let mut sample = Box::new(CycloneSample { base: std::mem::zeroed(), message });
             cyclors::ddsi_serdata_init(
                 &mut sample.base,
                 self.sertype,
@@ -169,21 +168,21 @@ impl Writer<'_> {
         match code {
             0.. => Ok(()),
             DDS_RETCODE_TIMEOUT => Err(CycloneError::Blocked),
-            code => Err(CycloneError::Write { len, said: said(code) }),
+            code => Err(CycloneError::Write { len, reason: reason(code) }),
         }
     }
 
-    /// Readers that match now.
+    /// Number of readers that match now.
     pub(crate) fn readers(&self) -> usize {
-        // SAFETY: with room for no handle, none is written, and the answer is their number.
+        // SAFETY: with room for no handle, none is written; the result is their number.
         let count =
             unsafe { cyclors::dds_get_matched_subscriptions(self.writer, ptr::null_mut(), 0) };
         usize::try_from(count).unwrap_or(0)
     }
 
-    /// Waits until all readers have acknowledged everything; false if that took too long.
+    /// Waits until all readers have acknowledged everything. Returns false on timeout.
     pub(crate) fn flush(&self, at_most: Duration) -> bool {
-        // SAFETY: only the handle is passed, and one that is not valid is refused.
+        // SAFETY: only the handle is passed, and an invalid one is refused.
         unsafe { cyclors::dds_wait_for_acks(self.writer, at_most.as_nanos() as i64) >= 0 }
     }
 }
@@ -208,23 +207,23 @@ fn created(answer: i32, what: impl FnOnce() -> String) -> Result<dds_entity_t, C
     if answer >= 0 {
         Ok(answer)
     } else {
-        Err(CycloneError::Create { what: what(), said: said(answer) })
+        Err(CycloneError::Create { what: what(), reason: reason(answer) })
     }
 }
 
-fn said(code: i32) -> String {
-    // SAFETY: the answer is a terminated text that is never freed, for any number.
+fn reason(code: i32) -> String {
+    // SAFETY: for any number, the result is a terminated text that is never freed.
     unsafe { CStr::from_ptr(cyclors::dds_strretcode(code)) }.to_string_lossy().into_owned()
 }
 
-/// A message as Cyclone DDS holds it. It only knows the first field, and frees it through [`free`].
+/// A message as Cyclone DDS holds it: it accesses only the first field, and frees it by [`free`].
 #[repr(C)]
-struct Sample {
+struct CycloneSample {
     base: ddsi_serdata,
     message: Buffer,
 }
 
-/// What Cyclone DDS asks of a sample that is written. The rest is for samples that are received.
+/// Operations of a sample that is written. The rest is for received samples.
 static OPERATIONS: ddsi_serdata_ops = ddsi_serdata_ops {
     eqkey: Some(eqkey),
     get_size: Some(get_size),
@@ -253,7 +252,7 @@ unsafe extern "C" fn eqkey(_: *const ddsi_serdata, _: *const ddsi_serdata) -> bo
 unsafe extern "C" fn get_size(sample: *const ddsi_serdata) -> u32 {
     // SAFETY: Cyclone DDS calls these operations only with samples that `write` or `to_untyped`
     // made, and that live.
-    let message = unsafe { &(*sample.cast::<Sample>()).message };
+    let message = unsafe { &(*sample.cast::<CycloneSample>()).message };
     // At most MAX_MESSAGE.
     message.len() as u32
 }
@@ -264,15 +263,15 @@ unsafe extern "C" fn to_ser(
     len: usize,
     into: *mut c_void,
 ) {
-    // SAFETY: as in `get_size`; `into` has room for `len` bytes, and is not ours.
+    // SAFETY: as in `get_size`; `into` has room for `len` bytes, and does not overlap the message.
     unsafe {
-        let message = &(*sample.cast::<Sample>()).message;
+        let message = &(*sample.cast::<CycloneSample>()).message;
         ptr::copy_nonoverlapping(message[from..from + len].as_ptr(), into.cast::<u8>(), len);
     }
 }
 
-/// Lends a part of the message. It counts as a reference, so that the part stays where it is until
-/// [`to_ser_unref`].
+/// Lends a part of the message. The loan counts as a reference, so that the part stays in place
+/// until [`to_ser_unref`].
 unsafe extern "C" fn to_ser_ref(
     sample: *const ddsi_serdata,
     from: usize,
@@ -282,7 +281,7 @@ unsafe extern "C" fn to_ser_ref(
     // SAFETY: as in `get_size`; `part` is valid. The count is only ever changed atomically, by
     // Cyclone DDS and here. What is lent is only read.
     unsafe {
-        let lent = &(&(*sample.cast::<Sample>()).message)[from..from + len];
+        let lent = &(&(*sample.cast::<CycloneSample>()).message)[from..from + len];
         (*part).iov_base = lent.as_ptr().cast_mut().cast();
         (*part).iov_len = len;
         let sample = sample.cast_mut();
@@ -292,16 +291,17 @@ unsafe extern "C" fn to_ser_ref(
 }
 
 unsafe extern "C" fn to_ser_unref(sample: *mut ddsi_serdata, _: *const ddsrt_iovec_t) {
-    // SAFETY: gives back the reference that `to_ser_ref` took.
+    // SAFETY: releases the reference that `to_ser_ref` took.
     unsafe { cyclors::ddsi_serdata_unref(sample) };
 }
 
-/// The key of a sample, which is nothing.
+/// The key of a sample, which is empty.
 unsafe extern "C" fn to_untyped(sample: *const ddsi_serdata) -> *mut ddsi_serdata {
-    // SAFETY: as in `write`; the type is that of a live sample, and a key is not to refer to it
+    // SAFETY: as in `write`; the type is that of a live sample, and a key must not refer to it
     // afterwards.
     unsafe {
-        let mut key = Box::new(Sample { base: std::mem::zeroed(), message: Buffer::default() });
+        let mut key =
+            Box::new(CycloneSample { base: std::mem::zeroed(), message: Buffer::default() });
         cyclors::ddsi_serdata_init(
             &mut key.base,
             (*sample).type_,
@@ -314,12 +314,12 @@ unsafe extern "C" fn to_untyped(sample: *const ddsi_serdata) -> *mut ddsi_serdat
 }
 
 unsafe extern "C" fn free(sample: *mut ddsi_serdata) {
-    // SAFETY: as in `get_size`; this was the last reference, and the box was given away when the
-    // first was.
-    drop(unsafe { Box::from_raw(sample.cast::<Sample>()) });
+    // SAFETY: as in `get_size`; this was the last reference, and the box was released when the
+    // first was created.
+    drop(unsafe { Box::from_raw(sample.cast::<CycloneSample>()) });
 }
 
-/// What a trace of Cyclone DDS shows of a sample: nothing.
+/// Prints a sample in a trace of Cyclone DDS: as nothing.
 unsafe extern "C" fn print(
     _: *const ddsi_sertype,
     _: *const ddsi_serdata,
@@ -338,6 +338,6 @@ unsafe extern "C" fn get_keyhash(
     into: *mut ddsi_keyhash,
     _force_md5: bool,
 ) {
-    // SAFETY: Cyclone DDS brings the place for the answer.
+    // SAFETY: Cyclone DDS passes a valid pointer for the result.
     unsafe { (*into).value = [0; 16] };
 }

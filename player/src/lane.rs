@@ -1,39 +1,39 @@
-//! A lane: one thread that sends the messages of some topics when they are due.
+//! A lane: a thread that sends the messages of some topics when they are due.
 
 use std::sync::atomic::AtomicBool;
 
 use rustix::time::ClockId;
 
-use crate::counts::{Counts, LATE_NS};
-use crate::cyclone::Writer;
+use crate::counts::{LATE_NS, TopicCounts};
+use crate::cyclone::CycloneWriter;
 use crate::pace::Pace;
 use crate::queue::Queue;
-use crate::say::warn;
-use crate::stamp::{self, Stamp};
+use crate::stamp::{self, StampMode};
+use crate::stderr::warn;
 
 /// A topic that is played.
 pub(crate) struct Outlet<'p> {
-    /// As ROS 2 calls it.
+    /// Its ROS 2 name.
     pub(crate) topic: String,
-    pub(crate) writer: Writer<'p>,
-    /// Whether its messages begin with a stamp that we write.
+    pub(crate) writer: CycloneWriter<'p>,
+    /// Set if its messages begin with a stamp that the player writes.
     pub(crate) is_stamped: bool,
 }
 
-/// From which delay on people are told at once that the player falls behind.
+/// Delay from which a warning is printed at once.
 const BEHIND_NS: i64 = 100_000_000;
 
-/// Sends what comes through `lane` of `queue`, until the queue is closed and empty or the player
+/// Sends the messages of lane `lane` of `queue` until the queue is closed and empty, or the player
 /// stops. Returns the counts of all topics; those of other lanes are zero.
 pub(crate) fn run(
     queue: &Queue<'_>,
     lane: usize,
     outlets: &[Outlet<'_>],
     pace: &Pace,
-    stamp: Stamp,
+    stamp: StampMode,
     stop: &AtomicBool,
-) -> Vec<Counts> {
-    let mut counts = vec![Counts::default(); outlets.len()];
+) -> Vec<TopicCounts> {
+    let mut counts = vec![TopicCounts::default(); outlets.len()];
     while let Some(mut message) = queue.pop(lane) {
         let Some(late_ns) = pace.wait(message.at_ns, stop) else { break };
         let (outlet, counts) = (&outlets[message.topic], &mut counts[message.topic]);
@@ -43,7 +43,8 @@ pub(crate) fn run(
         if late_ns > BEHIND_NS && counts.latest_ns <= BEHIND_NS {
             let late_s = late_ns as f64 / 1e9;
             warn(&format!(
-                "the player is behind: a message of `{}` was {late_s:.1} s late; the summary counts them",
+                "the player is behind: a message of `{}` was {late_s:.1} s late; \
+                 the summary has the count",
                 outlet.topic
             ));
         }
@@ -65,7 +66,7 @@ pub(crate) fn run(
             Err(error) => {
                 if counts.refused == 0 {
                     warn(&format!(
-                        "a message of `{}` was not sent: {error}; the summary counts them",
+                        "cannot send a message of `{}`: {error}; the summary has the count",
                         outlet.topic
                     ));
                 }

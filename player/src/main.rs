@@ -1,10 +1,10 @@
-//! `gleaner-player`: plays drives as live topics of ROS 2. `gleaner play` starts it; see `gleaner
-//! play --help`.
+//! `gleaner-player`: plays drives as live topics of ROS 2. Started by `gleaner play`; see
+//! `gleaner play --help`.
 //!
-//! A `source` (a drive, or made-up sensors) is read ahead by one thread into a bounded `queue`;
-//! lanes, which are threads, take messages from it, wait until each is due by the `pace`, and write
-//! it through `cyclone`, the one room that knows Cyclone DDS. No message is copied after it was put
-//! into the queue, until the kernel sends it.
+//! One thread reads a `source` (a drive, or synthetic sensors) ahead into a bounded `queue`. Lanes,
+//! which are threads, take messages from it, wait until each is due by the `pace`, and write it
+//! through `cyclone`, the only module that uses Cyclone DDS. No message is copied between the queue
+//! and the kernel.
 
 mod args;
 mod buffer;
@@ -18,9 +18,9 @@ mod offer;
 mod pace;
 mod play;
 mod queue;
-mod say;
 mod source;
 mod stamp;
+mod stderr;
 mod summary;
 
 use std::process::ExitCode;
@@ -31,7 +31,7 @@ fn main() -> ExitCode {
     match play::run(&args::Args::parse()) {
         Ok(exit) => exit.into(),
         Err(failure) => {
-            say::line(&failure.to_string());
+            stderr::line(&failure.to_string());
             failure.exit.into()
         }
     }

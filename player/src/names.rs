@@ -1,14 +1,14 @@
-//! Names of ROS 2, and what DDS calls them.
+//! Names of topics and types in ROS 2 and in DDS.
 
 use gleaner_lambda::manifest::TopicName;
 
-/// The DDS name of a topic: `rt/imu/data` of `/imu/data`; `None` if ROS 2 takes no such name.
+/// The DDS name of a topic: `rt/imu/data` for `/imu/data`; `None` if the name is invalid in ROS 2.
 pub(crate) fn dds_topic(topic: &str) -> Option<String> {
     topic.parse::<TopicName>().ok().map(|topic| format!("rt{topic}"))
 }
 
-/// The DDS name of a type: `sensor_msgs::msg::dds_::Imu_` of `sensor_msgs/msg/Imu`; `None` if it is
-/// no type of ROS 2.
+/// The DDS name of a type: `sensor_msgs::msg::dds_::Imu_` for `sensor_msgs/msg/Imu`; `None` if it
+/// is not a ROS 2 type.
 pub(crate) fn dds_type(type_name: &str) -> Option<String> {
     let parts: Vec<&str> = type_name.split('/').collect();
     let (package, kind, name) = match parts[..] {
@@ -16,11 +16,11 @@ pub(crate) fn dds_type(type_name: &str) -> Option<String> {
         [package, kind, name] => (package, kind, name),
         _ => return None,
     };
-    let is_whole = [package, kind, name].into_iter().all(is_identifier) && type_name.len() <= 247;
-    is_whole.then(|| format!("{package}::{kind}::dds_::{name}_"))
+    let is_valid = [package, kind, name].into_iter().all(is_identifier) && type_name.len() <= 247;
+    is_valid.then(|| format!("{package}::{kind}::dds_::{name}_"))
 }
 
-/// The name under which the decoded images of a topic of compressed images are sent.
+/// The topic on which the decoded images of a compressed topic are sent.
 pub(crate) fn image_raw(topic: &str) -> String {
     format!("{}/image_raw", topic.strip_suffix("/compressed").unwrap_or(topic))
 }
@@ -36,7 +36,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn topics_and_types_are_spelt_as_the_middleware_of_ros_2_does() {
+    fn topics_and_types_have_the_dds_names_of_ros_2() {
         assert_eq!(dds_topic("/imu/data").unwrap(), "rt/imu/data");
         assert_eq!(dds_type("sensor_msgs/msg/Imu").unwrap(), "sensor_msgs::msg::dds_::Imu_");
         assert_eq!(dds_type("sensor_msgs/Imu").unwrap(), "sensor_msgs::msg::dds_::Imu_");
@@ -44,7 +44,7 @@ mod tests {
     }
 
     #[test]
-    fn what_ros_2_does_not_take_has_no_name() {
+    fn names_that_are_invalid_in_ros_2_have_no_dds_name() {
         for topic in [
             "imu",
             "",
@@ -65,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn decoded_images_stand_beside_the_compressed_ones() {
+    fn decoded_images_are_sent_in_the_namespace_of_the_compressed_ones() {
         assert_eq!(image_raw("/camera/front/compressed"), "/camera/front/image_raw");
         assert_eq!(image_raw("/camera/front"), "/camera/front/image_raw");
     }

@@ -1,39 +1,39 @@
-//! The quality of service that a topic is offered with: what its writers offered when the drive was
+//! The quality of service that a topic is offered with: that of its writers when the drive was
 //! recorded.
 
-/// What a writer offers.
+/// Offered quality of service.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Offer {
     pub(crate) reliable: bool,
     pub(crate) transient_local: bool,
-    /// Samples kept for readers that lag behind or come late.
+    /// Samples kept for slow or late readers.
     pub(crate) depth: u32,
 }
 
-/// Samples that a writer keeps at most. Those that offered to keep all get this many: what a drive
-/// claims is not to decide how much memory we take.
+/// Maximum samples that a writer keeps, also for `keep_all`: a drive must not control the memory of
+/// the player.
 const MAX_DEPTH: u32 = 1000;
 
-/// The same for types whose messages may be frames of 25 MB.
+/// [`MAX_DEPTH`] for types whose messages may be frames of 25 MB.
 const MAX_LARGE_DEPTH: u32 = 16;
 
 impl Default for Offer {
-    /// What ROS 2 offers by default.
+    /// The default profile of ROS 2.
     fn default() -> Offer {
         Offer { reliable: true, transient_local: false, depth: 10 }
     }
 }
 
 impl Offer {
-    /// What satisfies every reader that any of the recorded writers did. `yaml` is the list that
-    /// rosbag2 notes: with words since Jazzy, with the numbers of `rmw` before.
+    /// The offer that satisfies every reader that any recorded writer satisfied. `yaml` is the list
+    /// that rosbag2 records: with names since Jazzy, with the numbers of `rmw` before.
     pub(crate) fn recorded(yaml: Option<&str>) -> Offer {
         let (mut reliable, mut transient_local, mut depth) = (None, false, None);
         for line in yaml.unwrap_or_default().lines() {
             let line = line.trim().trim_start_matches("- ").trim();
             let Some((key, value)) = line.split_once(':') else { continue };
             match (key.trim(), value.trim().trim_matches(['"', '\''])) {
-                // What a writer left to the middleware is reliable.
+                // A reliability left to the middleware is reliable.
                 ("reliability", kind) => {
                     reliable = Some(reliable == Some(true) || !matches!(kind, "best_effort" | "2"));
                 }
@@ -54,14 +54,14 @@ impl Offer {
         }
     }
 
-    /// The same, for a type whose messages are large or not.
-    pub(crate) fn of_large(self, is_large: bool) -> Offer {
+    /// Limits the depth for large or small messages.
+    pub(crate) fn capped(self, is_large: bool) -> Offer {
         Offer { depth: self.depth.min(if is_large { MAX_LARGE_DEPTH } else { MAX_DEPTH }), ..self }
     }
 }
 
-/// Whether messages of a type are usually large: then one of them takes milliseconds to write, and
-/// others should not wait.
+/// Returns whether messages of a type are usually large: writing one then takes milliseconds, and
+/// other topics should not wait for it.
 pub(crate) fn is_large(type_name: &str) -> bool {
     let large = ["Image", "CompressedImage", "PointCloud2"];
     let name = type_name
@@ -74,12 +74,14 @@ pub(crate) fn is_large(type_name: &str) -> bool {
 mod tests {
     use super::*;
 
-    const JAZZY: &str = "- history: keep_last\n  depth: 5\n  reliability: best_effort\n  durability: volatile\n  \
-        deadline:\n    sec: 9223372036\n    nsec: 854775807\n  liveliness: automatic\n  avoid_ros_namespace_conventions: false\n";
-    const HUMBLE: &str = "- history: 1\n  depth: 7\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 1\n    nsec: 1\n";
+    const JAZZY: &str = "- history: keep_last\n  depth: 5\n  reliability: best_effort\n  \
+        durability: volatile\n  deadline:\n    sec: 9223372036\n    nsec: 854775807\n  \
+        liveliness: automatic\n  avoid_ros_namespace_conventions: false\n";
+    const HUMBLE: &str = "- history: 1\n  depth: 7\n  reliability: 1\n  durability: 1\n  \
+        deadline:\n    sec: 1\n    nsec: 1\n";
 
     #[test]
-    fn words_and_numbers_are_read() {
+    fn names_and_numbers_are_parsed() {
         let jazzy = Offer { reliable: false, transient_local: false, depth: 5 };
         assert_eq!(Offer::recorded(Some(JAZZY)), jazzy);
         let humble = Offer { reliable: true, transient_local: true, depth: 7 };
@@ -94,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn of_several_writers_the_strongest_promise_counts() {
+    fn the_strongest_offer_of_several_writers_counts() {
         let both = format!("{JAZZY}{HUMBLE}");
         assert_eq!(
             Offer::recorded(Some(&both)),
@@ -103,17 +105,17 @@ mod tests {
     }
 
     #[test]
-    fn without_a_usable_profile_it_is_what_ros_2_offers() {
-        for nothing in [None, Some(""), Some("[]"), Some("garbage")] {
+    fn without_a_usable_profile_the_offer_is_the_default_of_ros_2() {
+        for profile in [None, Some(""), Some("[]"), Some("garbage")] {
             assert_eq!(
-                Offer::recorded(nothing),
+                Offer::recorded(profile),
                 Offer { reliable: true, transient_local: false, depth: 10 }
             );
         }
     }
 
     #[test]
-    fn a_drive_does_not_decide_how_much_is_kept() {
+    fn the_depth_in_a_drive_is_capped() {
         let absurd = HUMBLE.replace("depth: 7", "depth: 4000000000");
         assert_eq!(Offer::recorded(Some(&absurd)).depth, MAX_DEPTH);
         assert_eq!(
@@ -122,7 +124,7 @@ mod tests {
         );
         assert_eq!(Offer::recorded(Some("- depth: -3\n")), Offer::default());
         assert_eq!(Offer::recorded(Some("- depth: 0\n")).depth, 1);
-        assert_eq!(Offer::recorded(Some(&absurd)).of_large(true).depth, MAX_LARGE_DEPTH);
+        assert_eq!(Offer::recorded(Some(&absurd)).capped(true).depth, MAX_LARGE_DEPTH);
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! When a message is due: an absolute schedule, so that small delays never add up.
+//! Computes when a message is due: an absolute schedule, so that delays do not add up.
 
 use std::str::FromStr;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -8,10 +8,10 @@ use rustix::time::{ClockId, Timespec};
 
 use crate::stamp::now;
 
-/// How fast a drive is played.
+/// Playback speed.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) enum Rate {
-    /// So many times as fast as recorded.
+    /// Multiple of the recorded speed.
     Times(f64),
     /// As fast as writers accept.
     Max,
@@ -31,30 +31,29 @@ impl FromStr for Rate {
     }
 }
 
-/// The schedule: which time of the drive is which time of the monotonic clock.
+/// The schedule: maps time in the drive to the monotonic clock.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Pace {
     pub(crate) rate: Rate,
-    /// The time of the monotonic clock at which the drive begins, in ns.
+    /// Monotonic time at which the drive begins, in ns.
     pub(crate) begin_ns: i64,
 }
 
-/// How long a wait goes on before it looks whether the player is to stop.
+/// Interval at which a wait checks whether the player stops.
 const SLICE_NS: i64 = 100_000_000;
 
 impl Pace {
-    /// When a message `at_ns` after the begin of the drive is due, by the monotonic clock; `None`
-    /// if at once.
+    /// Monotonic time at which a message `at_ns` after the begin of the drive is due; `None` if it
+    /// is due at once.
     pub(crate) fn due_ns(&self, at_ns: i64) -> Option<i64> {
         match self.rate {
-            // A double holds the nanoseconds of a hundred days.
+            // A double is exact for the nanoseconds of a hundred days.
             Rate::Times(times) => Some(self.begin_ns.saturating_add((at_ns as f64 / times) as i64)),
             Rate::Max => None,
         }
     }
 
-    /// Waits until a message is due. Returns by how many ns it is late, or `None` if the player is
-    /// to stop.
+    /// Waits until a message is due. Returns its delay in ns, or `None` if the player stops.
     pub(crate) fn wait(&self, at_ns: i64, stop: &AtomicBool) -> Option<i64> {
         loop {
             if stop.load(Ordering::Relaxed) {
@@ -70,7 +69,7 @@ impl Pace {
                 tv_sec: until_ns.div_euclid(1_000_000_000),
                 tv_nsec: until_ns.rem_euclid(1_000_000_000),
             };
-            // A signal ends it early; the loop looks again.
+            // A signal ends the sleep early; the loop checks again.
             let _ = clock_nanosleep_absolute(ClockId::Monotonic, &until);
         }
     }
@@ -81,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn due_times_are_worked_out_from_the_begin_and_never_from_the_last_message() {
+    fn due_times_are_computed_from_the_begin_not_from_the_last_message() {
         let pace = Pace { rate: Rate::Times(1.0), begin_ns: 1_000 };
         assert_eq!(pace.due_ns(0), Some(1_000));
         assert_eq!(pace.due_ns(86_400_000_000_007), Some(86_400_000_001_007));
@@ -91,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn a_drive_that_claims_absurd_times_does_not_overflow() {
+    fn extreme_times_in_a_drive_do_not_overflow() {
         let slow = Pace { rate: Rate::Times(0.000_1), begin_ns: i64::MAX - 1 };
         assert_eq!(slow.due_ns(i64::MAX), Some(i64::MAX));
     }
@@ -110,7 +109,7 @@ mod tests {
         let stop = AtomicBool::new(false);
         std::thread::scope(|scope| {
             let waiting = scope.spawn(|| pace.wait(i64::MAX, &stop));
-            // It is to find the flag raised only after it has begun to wait.
+            // The wait should have begun before the flag is set.
             std::thread::sleep(std::time::Duration::from_millis(20));
             assert!(!waiting.is_finished());
             stop.store(true, Ordering::Relaxed);

@@ -1,4 +1,4 @@
-//! The course of events: open, offer, wait for readers, play, say what became of it.
+//! Runs the player: opens the source, offers topics, waits for readers, plays, prints the summary.
 
 use std::env;
 use std::io::{self, Write};
@@ -19,21 +19,21 @@ use crate::names;
 use crate::offer::is_large;
 use crate::pace::{Pace, Rate};
 use crate::queue::Queue;
-use crate::say::{line, warn};
-use crate::source::{self, Source, Topic};
-use crate::stamp::{Stamp, now};
-use crate::summary::{self, Line};
+use crate::source::{self, MessageSource, PlayedTopic};
+use crate::stamp::{StampMode, now};
+use crate::stderr::{line, warn};
+use crate::summary::{self, TopicSummary};
 
-/// Lanes for topics with large messages; the others share one.
+/// Number of lanes for topics with large messages; all others share one.
 const LARGE_LANES: usize = 8;
 
-/// After which time without any reader people are told.
-const LONELY: Duration = Duration::from_secs(3);
+/// Time without readers after which a notice is printed.
+const NO_READERS: Duration = Duration::from_secs(3);
 
-/// How long the end waits for readers to acknowledge what was sent.
+/// Maximum wait at the end for readers to acknowledge all messages.
 const FLUSH: Duration = Duration::from_secs(5);
 
-/// Plays what the arguments ask for.
+/// Plays as the arguments request.
 pub(crate) fn run(args: &Args) -> Result<Exit, Failure> {
     let domain = args.domain(env::var("ROS_DOMAIN_ID").ok().as_deref())?;
     let stop = stop_on_signals()?;
@@ -65,7 +65,7 @@ pub(crate) fn run(args: &Args) -> Result<Exit, Failure> {
             |index| scope.spawn(move || lane::run(queue, index, outlets, &pace, args.stamp, stop));
         let senders: Vec<_> = (0..queue.lanes()).map(work).collect();
         let mut readers = vec![0; outlets.len()];
-        watch(outlets, &mut readers, || senders.iter().all(|sender| sender.is_finished()));
+        track_readers(outlets, &mut readers, || senders.iter().all(|sender| sender.is_finished()));
         let counts =
             senders.into_iter().map(|sender| sender.join().expect("a lane does not panic"));
         let counts: Vec<_> = counts.collect();
@@ -73,18 +73,23 @@ pub(crate) fn run(args: &Args) -> Result<Exit, Failure> {
         (reader.join().expect("reading ahead does not panic"), counts, readers, seconds)
     });
     flush(&outlets);
-    let lines: Vec<_> = (topics.iter().enumerate())
+    let summaries: Vec<_> = (topics.iter().enumerate())
         .map(|(index, topic)| {
             let own_lane = &counts[lanes[index]];
             let undecodable = source.undecodable(index);
-            Line { topic, counts: own_lane[index].clone(), undecodable, readers: readers[index] }
+            TopicSummary {
+                topic,
+                counts: own_lane[index].clone(),
+                undecodable,
+                readers: readers[index],
+            }
         })
         .collect();
-    show(&lines, seconds, args.json)?;
+    print_summary(&summaries, seconds, args.json)?;
     ended.map(|()| Exit::Ok)
 }
 
-/// A flag that ctrl-C and SIGTERM set; a second one ends the process at once.
+/// Returns a flag that ctrl-C and SIGTERM set; a second signal ends the process at once.
 fn stop_on_signals() -> Result<Arc<AtomicBool>, Failure> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {
@@ -94,18 +99,21 @@ fn stop_on_signals() -> Result<Arc<AtomicBool>, Failure> {
             stop.clone(),
         )
         .and_then(|_| signal_hook::flag::register(signal, stop.clone()))
-        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot listen to signals", &error))?;
+        .map_err(|error| {
+            Failure::caused_by(Exit::Internal, "cannot install signal handlers", &error)
+        })?;
     }
     Ok(stop)
 }
 
-/// Our configuration of Cyclone DDS, or `None` if the user has one.
+/// The player's configuration of Cyclone DDS, or `None` if the user set one.
 fn configuration(args: &Args) -> Option<String> {
     if env::var_os("CYCLONEDDS_URI").is_none_or(|uri| uri.is_empty()) {
         return Some(config::xml(args.interface));
     }
     line(
-        "CYCLONEDDS_URI is set: Cyclone DDS is configured by it alone, see docs/play.md for what images of 25 MB need",
+        "CYCLONEDDS_URI is set and replaces the player's configuration of Cyclone DDS; \
+         see docs/play.md for the settings that images of 25 MB need",
     );
     if args.interface.is_some() {
         warn("--interface has no effect while CYCLONEDDS_URI is set");
@@ -115,29 +123,30 @@ fn configuration(args: &Args) -> Option<String> {
 
 fn offer<'p>(
     participant: &'p Participant,
-    topic: &Topic,
-    stamp: Stamp,
+    topic: &PlayedTopic,
+    stamp: StampMode,
 ) -> Result<Outlet<'p>, Failure> {
-    let Topic { topic: name, type_name, offer, is_stamped } = topic;
+    let PlayedTopic { topic: name, type_name, offer, is_stamped } = topic;
     let unusable = || {
-        Failure::new(Exit::Usage, format!("ROS 2 takes no topic `{name}` of type `{type_name}`"))
+        Failure::new(
+            Exit::Usage,
+            format!("topic `{name}` of type `{type_name}` is not valid in ROS 2"),
+        )
     };
     let dds_topic = names::dds_topic(name).ok_or_else(unusable)?;
     let dds_type = names::dds_type(type_name).ok_or_else(unusable)?;
     let writer = participant.writer(&dds_topic, &dds_type, *offer)?;
-    if !is_stamped && stamp != Stamp::Recorded {
-        line(&format!(
-            "`{name}` is sent as recorded: its type does not begin with a stamp, as far as the drive tells"
-        ));
+    if !is_stamped && stamp != StampMode::Recorded {
+        line(&format!("`{name}` is sent as recorded: its type has no known stamp at its begin"));
     }
     Ok(Outlet { topic: name.clone(), writer, is_stamped: *is_stamped })
 }
 
-/// The lane of each topic. As fast as possible there is one, since nothing else keeps the order of
-/// the drive.
-fn lanes(topics: &[Topic], rate: Rate) -> Vec<usize> {
+/// The lane of each topic. At maximum rate there is only one lane, because nothing else keeps the
+/// order of the drive.
+fn lanes(topics: &[PlayedTopic], rate: Rate) -> Vec<usize> {
     let mut large = 0;
-    let lane = |topic: &Topic| {
+    let lane = |topic: &PlayedTopic| {
         if rate == Rate::Max || !is_large(&topic.type_name) {
             return 0;
         }
@@ -147,7 +156,11 @@ fn lanes(topics: &[Topic], rate: Rate) -> Vec<usize> {
     topics.iter().map(lane).collect()
 }
 
-fn read_ahead(source: &mut dyn Source, lanes: &[usize], queue: &Queue<'_>) -> Result<(), Failure> {
+fn read_ahead(
+    source: &mut dyn MessageSource,
+    lanes: &[usize],
+    queue: &Queue<'_>,
+) -> Result<(), Failure> {
     while let Some(message) = source.next()? {
         if !queue.push(lanes[message.topic], message) {
             break;
@@ -157,34 +170,35 @@ fn read_ahead(source: &mut dyn Source, lanes: &[usize], queue: &Queue<'_>) -> Re
 }
 
 fn wait_for_readers(outlets: &[Outlet<'_>], wanted: usize, stop: &AtomicBool) {
-    let mut said = Instant::now();
+    let mut printed = Instant::now();
     while let Some(outlet) = outlets.iter().find(|outlet| outlet.writer.readers() < wanted) {
         if stop.load(Ordering::Relaxed) {
             return;
         }
-        if said.elapsed() >= LONELY {
+        if printed.elapsed() >= NO_READERS {
             let readers = outlet.writer.readers();
-            line(&format!("waiting: `{}` has {readers} readers of {wanted}", outlet.topic));
-            said = Instant::now();
+            line(&format!("waiting for readers: `{}` has {readers} of {wanted}", outlet.topic));
+            printed = Instant::now();
         }
         thread::sleep(Duration::from_millis(10));
     }
 }
 
-/// Notes the readers of each topic until playing is over, and says once if there are none at all.
-fn watch(outlets: &[Outlet<'_>], readers: &mut [usize], is_over: impl Fn() -> bool) {
+/// Records the maximum readers of each topic until playing is over. Warns once if there are none.
+fn track_readers(outlets: &[Outlet<'_>], readers: &mut [usize], is_over: impl Fn() -> bool) {
     let begin = Instant::now();
-    let mut is_told = false;
+    let mut is_checked = false;
     loop {
         let is_last = is_over();
         for (most, outlet) in readers.iter_mut().zip(outlets) {
             *most = outlet.writer.readers().max(*most);
         }
-        if !is_told && (begin.elapsed() >= LONELY || is_last) {
-            is_told = true;
+        if !is_checked && (begin.elapsed() >= NO_READERS || is_last) {
+            is_checked = true;
             if readers.iter().all(|readers| *readers == 0) {
                 warn(
-                    "no reader was found; is it in the same domain, and does it ask for no more than is offered?",
+                    "no readers found; check that they are in the same domain and that their QoS \
+                     requests no more than is offered",
                 );
             }
         }
@@ -195,8 +209,8 @@ fn watch(outlets: &[Outlet<'_>], readers: &mut [usize], is_over: impl Fn() -> bo
     }
 }
 
-/// Waits until readers have what was sent, so that the end of the process does not take it away
-/// from them.
+/// Waits until readers have acknowledged all messages: the end of the process would discard the
+/// rest.
 fn flush(outlets: &[Outlet<'_>]) {
     let until = Instant::now() + FLUSH;
     for outlet in outlets {
@@ -206,11 +220,15 @@ fn flush(outlets: &[Outlet<'_>]) {
     }
 }
 
-fn show(lines: &[Line<'_>], seconds: f64, as_json: bool) -> Result<(), Failure> {
+fn print_summary(
+    summaries: &[TopicSummary<'_>],
+    seconds: f64,
+    as_json: bool,
+) -> Result<(), Failure> {
     let text = if as_json {
-        format!("{}\n", summary::json(lines, seconds))
+        format!("{}\n", summary::json(summaries, seconds))
     } else {
-        summary::text(lines, seconds)
+        summary::text(summaries, seconds)
     };
     let mut out = io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
@@ -227,8 +245,8 @@ mod tests {
     use crate::offer::Offer;
 
     #[test]
-    fn large_topics_have_lanes_of_their_own_unless_nothing_else_keeps_the_order() {
-        let topic = |type_name: &str| Topic {
+    fn large_topics_have_separate_lanes_except_at_maximum_rate() {
+        let topic = |type_name: &str| PlayedTopic {
             topic: "/a".to_owned(),
             type_name: type_name.to_owned(),
             offer: Offer::default(),

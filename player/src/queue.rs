@@ -1,5 +1,5 @@
-//! What was read ahead: messages in the order of the drive, sorted into lanes, within one bound of
-//! bytes for all.
+//! The queue of messages that were read ahead: lanes in the order of the drive, with one limit on
+//! the bytes of all.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,30 +10,30 @@ use gleaner_messages::Endian;
 
 use crate::buffer::Buffer;
 
-/// A message that waits for its time.
+/// A message that waits until it is due.
 #[derive(Debug)]
-pub(crate) struct Message {
+pub(crate) struct QueuedMessage {
     /// Index of its topic.
     pub(crate) topic: usize,
-    /// When it is due, in ns of the drive since the begin, all rounds counted.
+    /// Time at which it is due, in ns since the begin of the drive, earlier rounds included.
     pub(crate) at_ns: i64,
-    /// How much of that are the rounds before, in ns.
+    /// Duration of the earlier rounds, in ns.
     pub(crate) rounds_ns: i64,
     pub(crate) endian: Endian,
     /// Encapsulation, CDR, and zeros up to a multiple of four.
     pub(crate) bytes: Buffer,
 }
 
-/// What a message takes besides its bytes, so that small ones are bounded too.
+/// Memory of a message besides its bytes, so that small messages are bounded too.
 const OVERHEAD: usize = 256;
 
-impl Message {
+impl QueuedMessage {
     fn cost(&self) -> usize {
         self.bytes.len() + OVERHEAD
     }
 }
 
-/// One reader in front, one thread for each lane behind.
+/// A bounded queue with one producer and one consumer per lane.
 pub(crate) struct Queue<'s> {
     inner: Mutex<Inner>,
     changed: Condvar,
@@ -42,31 +42,30 @@ pub(crate) struct Queue<'s> {
 }
 
 struct Inner {
-    lanes: Vec<VecDeque<Message>>,
-    /// The cost of all messages that wait or are being sent.
+    lanes: Vec<VecDeque<QueuedMessage>>,
+    /// Cost of all messages that are queued or being sent.
     held: usize,
     is_closed: bool,
 }
 
-/// How long a thread sleeps before it looks whether the player is to stop.
-const LOOK: Duration = Duration::from_millis(100);
+/// Interval at which a waiting thread checks whether the player stops.
+const CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
 impl<'s> Queue<'s> {
-    /// A queue of `lanes` lanes, which holds `budget` bytes, or one message if that is larger.
+    /// Creates a queue of `lanes` lanes that holds `budget` bytes, or one larger message.
     pub(crate) fn new(lanes: usize, budget: usize, stop: &'s AtomicBool) -> Queue<'s> {
         let lanes = std::iter::repeat_with(VecDeque::new).take(lanes).collect();
         let inner = Mutex::new(Inner { lanes, held: 0, is_closed: false });
         Queue { inner, changed: Condvar::new(), budget, stop }
     }
 
-    /// How many lanes there are.
+    /// Number of lanes.
     pub(crate) fn lanes(&self) -> usize {
         self.lock().lanes.len()
     }
 
-    /// Puts a message behind the others of its lane, as soon as there is room. False if the player
-    /// is to stop.
-    pub(crate) fn push(&self, lane: usize, message: Message) -> bool {
+    /// Appends a message to its lane when there is room. Returns false if the player stops.
+    pub(crate) fn push(&self, lane: usize, message: QueuedMessage) -> bool {
         let mut inner = self.lock();
         while inner.held > 0 && inner.held + message.cost() > self.budget {
             if self.is_stopping() {
@@ -80,9 +79,9 @@ impl<'s> Queue<'s> {
         !self.is_stopping()
     }
 
-    /// The next message of a lane; `None` if there will be none, or if the player is to stop. It
-    /// counts until [`Self::sent`] is told its length.
-    pub(crate) fn pop(&self, lane: usize) -> Option<Message> {
+    /// Takes the next message of a lane; `None` after the last one, or if the player stops. Its
+    /// cost counts until [`Self::sent`] is called with its length.
+    pub(crate) fn pop(&self, lane: usize) -> Option<QueuedMessage> {
         let mut inner = self.lock();
         loop {
             if self.is_stopping() {
@@ -96,31 +95,34 @@ impl<'s> Queue<'s> {
         }
     }
 
-    /// A message of so many bytes left the player: there is room again.
+    /// Releases the cost of a sent message of `bytes` bytes.
     pub(crate) fn sent(&self, bytes: usize) {
         let mut inner = self.lock();
         inner.held = inner.held.saturating_sub(bytes + OVERHEAD);
         self.changed.notify_all();
     }
 
-    /// No more messages come.
+    /// Marks the end: no more messages follow.
     pub(crate) fn close(&self) {
         self.lock().is_closed = true;
         self.changed.notify_all();
     }
 
-    /// Waits until so much was read ahead that playing can begin: half of the budget, everything,
-    /// or what came within a second after the first message.
+    /// Waits until enough was read ahead to begin: half of the budget, everything, or as much as
+    /// came within a second of the first message.
     pub(crate) fn wait_until_filled(&self) {
         let mut inner = self.lock();
-        let mut looks = 0;
-        while !inner.is_closed && inner.held <= self.budget / 2 && looks < 10 && !self.is_stopping()
+        let mut checks = 0;
+        while !inner.is_closed
+            && inner.held <= self.budget / 2
+            && checks < 10
+            && !self.is_stopping()
         {
-            looks += u32::from(inner.held > 0);
+            checks += u32::from(inner.held > 0);
             let is_filling = |inner: &mut Inner| !inner.is_closed && inner.held <= self.budget / 2;
             inner = self
                 .changed
-                .wait_timeout_while(inner, LOOK, is_filling)
+                .wait_timeout_while(inner, CHECK_INTERVAL, is_filling)
                 .unwrap_or_else(PoisonError::into_inner)
                 .0;
         }
@@ -131,11 +133,11 @@ impl<'s> Queue<'s> {
     }
 
     fn sleep<'g>(&self, inner: MutexGuard<'g, Inner>) -> MutexGuard<'g, Inner> {
-        self.changed.wait_timeout(inner, LOOK).unwrap_or_else(PoisonError::into_inner).0
+        self.changed.wait_timeout(inner, CHECK_INTERVAL).unwrap_or_else(PoisonError::into_inner).0
     }
 
-    /// Each change of what is inside is a single step, so it is whole even if a thread died holding
-    /// it.
+    /// Each change of the state is a single step, so it stays valid even if a thread panicked while
+    /// it held the lock.
     fn lock(&self) -> MutexGuard<'_, Inner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -145,8 +147,8 @@ impl<'s> Queue<'s> {
 mod tests {
     use super::*;
 
-    fn message(topic: usize, len: usize) -> Message {
-        Message {
+    fn message(topic: usize, len: usize) -> QueuedMessage {
+        QueuedMessage {
             topic,
             at_ns: 0,
             rounds_ns: 0,
@@ -187,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn a_message_larger_than_the_budget_passes_alone() {
+    fn a_message_larger_than_the_budget_is_accepted_alone() {
         let stop = AtomicBool::new(false);
         let queue = Queue::new(1, 10, &stop);
         assert!(queue.push(0, message(0, 5000)));
@@ -195,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stop_ends_both_who_waits_for_room_and_who_waits_for_a_message() {
+    fn a_stop_wakes_the_producer_and_the_consumer() {
         let stop = AtomicBool::new(false);
         let queue = Queue::new(2, 10, &stop);
         assert!(queue.push(0, message(0, 10)));

@@ -1,4 +1,4 @@
-//! `header.stamp`: what it becomes when a message is sent.
+//! Writes `header.stamp` when a message is sent.
 
 use clap::ValueEnum;
 use gleaner_messages::{Definitions, Endian, header_stamp};
@@ -6,36 +6,36 @@ use rustix::time::{ClockId, clock_gettime};
 
 use crate::cdr::ENCAPSULATION;
 
-/// What `header.stamp` becomes.
+/// Source of the value of `header.stamp`.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Stamp {
-    /// The wall clock at sending
+pub(crate) enum StampMode {
+    /// The wall clock when sent
     Now,
-    /// As recorded; in later rounds of --loop, later by the rounds before
+    /// As recorded; with --loop, shifted by the duration of the earlier rounds
     Recorded,
-    /// The monotonic clock at sending, to measure delays on one machine
+    /// The monotonic clock when sent, to measure delays on one machine
     Monotonic,
 }
 
-/// Whether messages of a type have a stamp that [`write`] reaches: then it stands in their first
-/// eight bytes.
+/// Returns whether messages of a type have a stamp that [`write`] can set: in their first eight
+/// bytes.
 pub(crate) fn has_stamp(definitions: &Definitions) -> bool {
     header_stamp(definitions).is_some()
 }
 
-/// Puts the stamp that `stamp` asks for into `message`, which [`has_stamp`]. `later_ns` is how long
-/// the rounds before took.
+/// Writes the stamp into `message`, whose type [`has_stamp`]. `later_ns` is the duration of the
+/// earlier rounds.
 ///
-/// Returns false for a message that is too short to have a stamp.
-pub(crate) fn write(message: &mut [u8], endian: Endian, stamp: Stamp, later_ns: i64) -> bool {
+/// Returns false if the message is too short for a stamp.
+pub(crate) fn write(message: &mut [u8], endian: Endian, stamp: StampMode, later_ns: i64) -> bool {
     let Some(field) = message.get_mut(ENCAPSULATION..ENCAPSULATION + 8) else {
         return false;
     };
     let (sec, nanosec) = match stamp {
-        Stamp::Now => split(now(ClockId::Realtime)),
-        Stamp::Monotonic => split(now(ClockId::Monotonic)),
-        Stamp::Recorded if later_ns == 0 => return true,
-        Stamp::Recorded => split(read(field, endian).saturating_add(later_ns)),
+        StampMode::Now => split(now(ClockId::Realtime)),
+        StampMode::Monotonic => split(now(ClockId::Monotonic)),
+        StampMode::Recorded if later_ns == 0 => return true,
+        StampMode::Recorded => split(read(field, endian).saturating_add(later_ns)),
     };
     let (sec, nanosec) = match endian {
         Endian::Little => (sec.to_le_bytes(), nanosec.to_le_bytes()),
@@ -52,7 +52,7 @@ pub(crate) fn now(clock: ClockId) -> i64 {
     time.tv_sec.saturating_mul(1_000_000_000).saturating_add(time.tv_nsec)
 }
 
-/// Nanoseconds as ROS 2 writes them, within what its seconds can hold.
+/// Splits nanoseconds into seconds and nanoseconds of ROS 2, clamped to the range of its seconds.
 pub(crate) fn split(ns: i64) -> (i32, u32) {
     let sec = ns.div_euclid(1_000_000_000).clamp(i64::from(i32::MIN), i64::from(i32::MAX));
     // Both fit: one was clamped, the other is below 10^9.
@@ -80,16 +80,16 @@ mod tests {
     fn a_recorded_stamp_is_untouched_in_the_first_round() {
         // Not even one whose nanoseconds are out of range.
         let mut bytes = message(1, [0xff; 8]);
-        assert!(write(&mut bytes, Endian::Little, Stamp::Recorded, 0));
+        assert!(write(&mut bytes, Endian::Little, StampMode::Recorded, 0));
         assert_eq!(bytes, message(1, [0xff; 8]));
     }
 
     #[test]
-    fn a_recorded_stamp_goes_on_in_later_rounds_in_both_byte_orders() {
+    fn a_recorded_stamp_is_shifted_in_later_rounds_in_both_byte_orders() {
         let mut little = message(1, [2, 0, 0, 0, 0, 0xca, 0x9a, 0x3b - 1]);
         let mut big = message(0, [0, 0, 0, 2, 0x3b - 1, 0x9a, 0xca, 0]);
-        assert!(write(&mut little, Endian::Little, Stamp::Recorded, 3_000_000_000));
-        assert!(write(&mut big, Endian::Big, Stamp::Recorded, 3_000_000_000));
+        assert!(write(&mut little, Endian::Little, StampMode::Recorded, 3_000_000_000));
+        assert!(write(&mut big, Endian::Big, StampMode::Recorded, 3_000_000_000));
         assert_eq!(little, message(1, [5, 0, 0, 0, 0, 0xca, 0x9a, 0x3a]));
         assert_eq!(big, message(0, [0, 0, 0, 5, 0x3a, 0x9a, 0xca, 0]));
     }
@@ -97,7 +97,7 @@ mod tests {
     #[test]
     fn the_clocks_at_sending_replace_the_stamp_and_nothing_else() {
         for (stamp, clock) in
-            [(Stamp::Now, ClockId::Realtime), (Stamp::Monotonic, ClockId::Monotonic)]
+            [(StampMode::Now, ClockId::Realtime), (StampMode::Monotonic, ClockId::Monotonic)]
         {
             let mut bytes = message(0, [0; 8]);
             let before = now(clock);
@@ -109,9 +109,9 @@ mod tests {
     }
 
     #[test]
-    fn a_message_too_short_for_a_stamp_is_left_alone() {
+    fn a_message_too_short_for_a_stamp_is_unchanged() {
         let mut bytes = vec![0, 1, 0, 0, 1, 2, 3];
-        assert!(!write(&mut bytes, Endian::Little, Stamp::Now, 0));
+        assert!(!write(&mut bytes, Endian::Little, StampMode::Now, 0));
         assert_eq!(bytes, [0, 1, 0, 0, 1, 2, 3]);
     }
 

@@ -1,25 +1,26 @@
-//! What was played, for people and for programs.
+//! Formats the summary, as text and as JSON.
 
 use serde_json::{Value, json};
 
-use crate::counts::Counts;
-use crate::source::Topic;
+use crate::counts::TopicCounts;
+use crate::source::PlayedTopic;
 
-/// One topic's line.
-pub(crate) struct Line<'t> {
-    pub(crate) topic: &'t Topic,
-    pub(crate) counts: Counts,
+/// Summary of one topic.
+pub(crate) struct TopicSummary<'t> {
+    pub(crate) topic: &'t PlayedTopic,
+    pub(crate) counts: TopicCounts,
     pub(crate) undecodable: u64,
-    /// The most readers that were seen at once.
+    /// Maximum number of readers at the same time.
     pub(crate) readers: usize,
 }
 
-/// The summary as one JSON object, all times in ns.
-pub(crate) fn json(lines: &[Line<'_>], seconds: f64) -> Value {
+/// The summary as a JSON object, all times in ns.
+pub(crate) fn json(lines: &[TopicSummary<'_>], seconds: f64) -> Value {
     let topics: Vec<Value> = lines
         .iter()
         .map(|line| {
-            let Counts { sent, bytes, refused, late, latest_ns, unstamped, writes } = &line.counts;
+            let TopicCounts { sent, bytes, refused, late, latest_ns, unstamped, writes } =
+                &line.counts;
             json!({
                 "topic": line.topic.topic,
                 "type": line.topic.type_name,
@@ -42,8 +43,8 @@ pub(crate) fn json(lines: &[Line<'_>], seconds: f64) -> Value {
     json!({ "seconds": seconds, "topics": topics })
 }
 
-/// The summary as a table, and below it what was lost.
-pub(crate) fn text(lines: &[Line<'_>], seconds: f64) -> String {
+/// The summary as a table, followed by the losses.
+pub(crate) fn text(lines: &[TopicSummary<'_>], seconds: f64) -> String {
     let sent: u64 = lines.iter().map(|line| line.counts.sent).sum();
     let bytes: u64 = lines.iter().map(|line| line.counts.bytes).sum();
     let rate = bytes as f64 / 1e6 / seconds.max(1e-9);
@@ -73,8 +74,8 @@ pub(crate) fn text(lines: &[Line<'_>], seconds: f64) -> String {
         let (topic, counts) = (&line.topic.topic, &line.counts);
         let losses = [
             (counts.refused, "were not sent: readers were too slow".to_owned()),
-            (line.undecodable, "were left out: their pictures cannot be decoded".to_owned()),
-            (counts.unstamped, "kept their stamp: they are too short for one".to_owned()),
+            (line.undecodable, "were skipped: their images cannot be decoded".to_owned()),
+            (counts.unstamped, "were sent unchanged: they are too short for a stamp".to_owned()),
             (
                 counts.late,
                 format!("were late, by up to {}", duration(counts.latest_ns.unsigned_abs())),
@@ -101,34 +102,34 @@ mod tests {
     use crate::offer::Offer;
 
     #[test]
-    fn every_loss_is_in_the_table_and_in_the_object() {
-        let topic = Topic {
+    fn every_loss_is_in_the_text_and_in_the_json() {
+        let topic = PlayedTopic {
             topic: "/camera/front".to_owned(),
             type_name: "sensor_msgs/msg/Image".to_owned(),
             offer: Offer::default(),
             is_stamped: true,
         };
-        let mut counts = Counts {
+        let mut counts = TopicCounts {
             sent: 7,
             bytes: 7_000_000,
             refused: 3,
             late: 2,
             latest_ns: 12_000_000,
             unstamped: 1,
-            ..Counts::default()
+            ..TopicCounts::default()
         };
         counts.writes.add(1_500_000);
-        let lines = [Line { topic: &topic, counts, undecodable: 4, readers: 1 }];
+        let lines = [TopicSummary { topic: &topic, counts, undecodable: 4, readers: 1 }];
         let text = text(&lines, 2.0);
-        for said in [
+        for expected in [
             "3.5 MB/s",
             "1.5 ms",
             "3 messages were not sent",
-            "4 messages were left out",
+            "4 messages were skipped",
             "by up to 12.0 ms",
-            "1 messages kept",
+            "1 messages were sent unchanged",
         ] {
-            assert!(text.contains(said), "{said}: {text}");
+            assert!(text.contains(expected), "{expected}: {text}");
         }
         let object = json(&lines, 2.0);
         let line = &object["topics"][0];

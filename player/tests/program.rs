@@ -1,4 +1,4 @@
-//! The program as people start it, as far as it refuses: nothing here reaches a network.
+//! Starts the program with invalid arguments; no test here uses a network.
 
 use std::process::{Command, Output};
 
@@ -9,8 +9,8 @@ fn play(arguments: &[&str], ros_domain: &str) -> Output {
 }
 
 #[test]
-fn what_cannot_be_played_is_refused_with_the_exit_code_that_scripts_expect() {
-    for (arguments, ros_domain, code, said) in [
+fn invalid_arguments_are_refused_with_their_documented_exit_codes() {
+    for (arguments, ros_domain, code, expected) in [
         (&["no-such-drive.mcap"][..], "", 2, "cannot open drive `no-such-drive.mcap`"),
         (&["--imu", "10"], "seven", 2, "ROS_DOMAIN_ID is `seven`"),
         (&["--imu", "10", "--rate", "0"], "", 2, "greater than 0"),
@@ -20,13 +20,13 @@ fn what_cannot_be_played_is_refused_with_the_exit_code_that_scripts_expect() {
             2,
             "`/imu/data`, which is not played",
         ),
-        // An address for documentation (RFC 5737), which no interface has.
+        // A documentation address (RFC 5737), which no interface has.
         (&["--imu", "10", "--interface", "203.0.113.1"], "", 5, "--interface"),
     ] {
         let output = play(arguments, ros_domain);
         let shown = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(code), "{shown}");
-        assert!(shown.contains(said), "{shown}");
+        assert!(shown.contains(expected), "{shown}");
         assert!(output.stdout.is_empty());
     }
 }

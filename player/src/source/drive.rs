@@ -1,4 +1,4 @@
-//! A drive: its topics as they are to be played, and its messages, round after round.
+//! The source that reads drives: its topics, and its messages, round after round.
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -6,24 +6,24 @@ use std::sync::{Arc, Mutex, PoisonError};
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_drives::{Replay, ReplayError};
 use gleaner_messages::Endian;
-use gleaner_transport::{DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::{Delivery, DiscoveredTopic, Qos, SampleMeta, Sink, TopicSpec, Transport};
 
 use super::images::Decoder;
-use super::{Renamed, Source, Topic};
+use super::{MessageSource, PlayedTopic, Remaps};
 use crate::args::Args;
 use crate::buffer::{Buffer, Pool};
 use crate::offer::{Offer, is_large};
-use crate::queue::Message;
-use crate::say::warn;
+use crate::queue::QueuedMessage;
+use crate::stderr::warn;
 use crate::{cdr, names, stamp};
 
-/// Between the last message of a round and the first of the next.
+/// Time between the last message of a round and the first of the next.
 const GAP_NS: i64 = 10_000_000;
 
-/// From which size on a message is put into memory that was used before.
+/// Size from which on messages are put into pooled buffers.
 const LARGE: usize = 256 << 10;
 
-/// A drive that cannot be read.
+/// Error of reading a drive.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
 struct DriveError(ReplayError);
@@ -48,26 +48,26 @@ impl Explain for DriveError {
     }
 }
 
-/// The files of a drive, being read.
+/// The files of a drive, and the position in them.
 pub(crate) struct Drive {
     paths: Vec<PathBuf>,
-    topics: Vec<Topic>,
-    /// How each topic is named and typed in the drive, and whether its images are decoded.
+    topics: Vec<PlayedTopic>,
+    /// Name and type of each topic in the drive, and whether its images are decoded.
     recorded: Vec<(TopicSpec, bool)>,
     replay: Replay,
     inbox: Arc<Inbox>,
     decoder: Decoder,
     undecodable: Vec<u64>,
-    /// Log times: from the first on, up to the second, without it.
+    /// Log times to play: from the first, up to but not including the second.
     window: (i64, i64),
-    /// How long a round takes, if there is more than one.
+    /// Duration of a round with `--loop`.
     round_ns: Option<i64>,
     rounds: i64,
-    /// Whether the current round had a message.
+    /// Set if the current round had a message.
     is_alive: bool,
 }
 
-/// Takes what the replay delivers, one message at a time.
+/// Receives the messages of the replay, one at a time.
 struct Inbox {
     from_ns: i64,
     pool: Pool,
@@ -75,10 +75,10 @@ struct Inbox {
 }
 
 impl Sink for Inbox {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
-        // Not even copied: `--start` reads through what is before it.
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
+        // Skipped without a copy: `--start` reads through all earlier messages.
         if meta.at_ns < self.from_ns {
-            return Verdict::Taken;
+            return Delivery::Taken;
         }
         let len = cdr.len() + cdr::ENCAPSULATION;
         let mut bytes = if len < LARGE {
@@ -91,7 +91,7 @@ impl Sink for Inbox {
         bytes.extend_from_slice(cdr);
         cdr::pad(&mut bytes);
         *self.taken.lock().unwrap_or_else(PoisonError::into_inner) = Some((meta.endian, bytes));
-        Verdict::Taken
+        Delivery::Taken
     }
 }
 
@@ -99,15 +99,15 @@ impl Drive {
     pub(crate) fn open(args: &Args) -> Result<Drive, Failure> {
         let mut replay = Replay::open(&args.drives).map_err(DriveError)?;
         let start_ns = replay.start_ns().unwrap_or(0);
-        // Of a database that was cut off, nobody knows it.
+        // A truncated database does not have it.
         let known_end_ns = replay.end_ns();
         let end_ns = known_end_ns.unwrap_or(start_ns);
         let from_ns = start_ns.saturating_add(args.start);
         let to_ns = args.duration.map_or(i64::MAX, |duration| from_ns.saturating_add(duration));
         if known_end_ns.is_some() && from_ns > end_ns {
             let seconds = end_ns.saturating_sub(start_ns) as f64 / 1e9;
-            let what = format!("the drive is only {seconds:.1} s long");
-            return Err(Failure::new(Exit::Usage, what).with_help("give a smaller --start"));
+            let message = format!("the drive is only {seconds:.1} s long");
+            return Err(Failure::new(Exit::Usage, message).with_help("give a smaller --start"));
         }
         let round_ns = if to_ns <= end_ns {
             to_ns - from_ns
@@ -115,12 +115,12 @@ impl Drive {
             end_ns.saturating_sub(from_ns).saturating_add(GAP_NS)
         };
         let inbox = Arc::new(Inbox { from_ns, pool: Pool::default(), taken: Mutex::new(None) });
-        let mut renamed = Renamed::by(args);
-        let (mut topics, mut recorded) = (Vec::<Topic>::new(), Vec::new());
+        let mut remaps = Remaps::of(args);
+        let (mut topics, mut recorded) = (Vec::<PlayedTopic>::new(), Vec::new());
         for found in wanted(&replay, &args.topics)? {
             let decoded =
                 args.raw_images && names::dds_type(&found.type_name).as_deref() == Some(COMPRESSED);
-            let to = renamed.take(&found.topic);
+            let to = remaps.take(&found.topic);
             let topic = play_as(&replay, &found, decoded, to);
             let spec = TopicSpec {
                 topic: found.topic.clone(),
@@ -138,14 +138,14 @@ impl Drive {
                     topics.push(topic);
                     recorded.push((spec, decoded));
                 }
-                // A topic that was asked for by its name is not left out.
+                // A topic that was requested by name is never skipped.
                 Err(why) if args.topics.contains(&found.topic) => {
                     return Err(Failure::new(Exit::Usage, why));
                 }
-                Err(why) => warn(&format!("{why}; it is not played")),
+                Err(why) => warn(&format!("{why}; the topic is skipped")),
             }
         }
-        renamed.check(&topics)?;
+        remaps.check(&topics)?;
         if topics.is_empty() {
             return Err(Failure::new(Exit::Usage, "the drive has no topic that can be played"));
         }
@@ -164,7 +164,7 @@ impl Drive {
         })
     }
 
-    /// Begins the next round; false if there is none.
+    /// Begins the next round; returns false if there is none.
     fn begin_again(&mut self) -> Result<bool, Failure> {
         if self.round_ns.is_none() || !self.is_alive {
             return Ok(false);
@@ -182,16 +182,16 @@ impl Drive {
     }
 }
 
-/// The type of compressed images, as DDS calls it.
+/// The DDS name of the type of compressed images.
 const COMPRESSED: &str = "sensor_msgs::msg::dds_::CompressedImage_";
 
-/// The topics of `replay` that are asked for, or all.
+/// The requested topics of `replay`, or all.
 fn wanted(replay: &Replay, names: &[String]) -> Result<Vec<DiscoveredTopic>, Failure> {
     let topics = replay.topics();
     if let Some(unknown) =
         names.iter().find(|name| topics.iter().all(|topic| topic.topic != **name))
     {
-        // Its error says which topics there are.
+        // The error lists the topics that exist.
         let error = replay.definitions(unknown).err().map(|error| error.to_string());
         return Err(Failure::new(
             Exit::Usage,
@@ -204,40 +204,40 @@ fn wanted(replay: &Replay, names: &[String]) -> Result<Vec<DiscoveredTopic>, Fai
         .collect())
 }
 
-/// How a topic is played, under the name `to` if it is given; or why it cannot be.
+/// Returns how a topic is played, named `to` if given; or the reason why it cannot be played.
 fn play_as(
     replay: &Replay,
     found: &DiscoveredTopic,
     decoded: bool,
     to: Option<&str>,
-) -> Result<Topic, String> {
+) -> Result<PlayedTopic, String> {
     let topic = match to {
         Some(to) => to.to_owned(),
         None if decoded => names::image_raw(&found.topic),
         None => found.topic.clone(),
     };
     if names::dds_topic(&topic).is_none() {
-        return Err(format!("ROS 2 takes no topic of the name `{topic}`"));
+        return Err(format!("topic name `{topic}` is not valid in ROS 2"));
     }
     let type_name = if decoded { "sensor_msgs/msg/Image" } else { &found.type_name };
     if names::dds_type(type_name).is_none() {
         return Err(format!(
-            "topic `{}` has type `{type_name}`, which is none of ROS 2",
+            "topic `{}` has type `{type_name}`, which is not a ROS 2 type",
             found.topic
         ));
     }
     let is_stamped = decoded
         || replay.definitions(&found.topic).is_ok_and(|definitions| stamp::has_stamp(&definitions));
-    let offer = Offer::recorded(found.offered_qos.as_deref()).of_large(is_large(type_name));
-    Ok(Topic { topic, type_name: type_name.to_owned(), offer, is_stamped })
+    let offer = Offer::recorded(found.offered_qos.as_deref()).capped(is_large(type_name));
+    Ok(PlayedTopic { topic, type_name: type_name.to_owned(), offer, is_stamped })
 }
 
-impl Source for Drive {
-    fn topics(&self) -> &[Topic] {
+impl MessageSource for Drive {
+    fn topics(&self) -> &[PlayedTopic] {
         &self.topics
     }
 
-    fn next(&mut self) -> Result<Option<Message>, Failure> {
+    fn next(&mut self) -> Result<Option<QueuedMessage>, Failure> {
         loop {
             let step = match self.replay.step().map_err(DriveError)? {
                 Some(step) if step.at_ns < self.window.1 => step,
@@ -246,7 +246,7 @@ impl Source for Drive {
             };
             let taken = self.inbox.taken.lock().unwrap_or_else(PoisonError::into_inner).take();
             let Some((mut endian, mut bytes)) = taken else { continue };
-            // Subscribed in the order of the topics.
+            // Subscription ids follow the order of the topics.
             let topic = step.subscription.0;
             if self.recorded[topic].1 {
                 match self.decoder.convert(&bytes[cdr::ENCAPSULATION..], endian) {
@@ -255,7 +255,8 @@ impl Source for Drive {
                         if self.undecodable[topic] == 0 {
                             let topic = &self.recorded[topic].0.topic;
                             warn(&format!(
-                                "an image of `{topic}` is left out: {error}; the summary counts them"
+                                "cannot decode an image of `{topic}`, skipped: {error}; \
+                                 the summary has the count"
                             ));
                         }
                         self.undecodable[topic] += 1;
@@ -266,7 +267,7 @@ impl Source for Drive {
             self.is_alive = true;
             let rounds_ns = self.round_ns.unwrap_or(0).saturating_mul(self.rounds);
             let at_ns = step.at_ns.saturating_sub(self.window.0).saturating_add(rounds_ns);
-            return Ok(Some(Message { topic, at_ns, rounds_ns, endian, bytes }));
+            return Ok(Some(QueuedMessage { topic, at_ns, rounds_ns, endian, bytes }));
         }
     }
 
@@ -286,7 +287,7 @@ mod tests {
 
     use super::*;
 
-    /// 40 s of a camera at 10 Hz, an IMU at 100 Hz, and a speed.
+    /// 40 s of a camera at 10 Hz, an IMU at 100 Hz, and a speed topic.
     const SAMPLE: &str =
         concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/data/highway_drive.mcap");
 
@@ -300,11 +301,11 @@ mod tests {
     }
 
     fn refused(arguments: &[&str]) -> Failure {
-        open(arguments).err().expect("it is refused")
+        open(arguments).err().expect("the arguments are refused")
     }
 
     #[test]
-    fn a_drive_is_played_whole_and_in_order_from_time_0() {
+    fn all_messages_of_a_drive_are_played_in_order_from_time_0() {
         let mut drive = open(&[]).unwrap();
         assert_eq!(names(&drive), ["/camera/front/compressed", "/imu/data", "/vehicle/speed"]);
         assert!(drive.topics().iter().all(|topic| topic.is_stamped));
@@ -333,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_follow_each_other_without_an_end_and_without_a_step_back() {
+    fn rounds_repeat_without_end_and_time_never_goes_back() {
         let mut drive = open(&["--topics", "/imu/data", "--start", "39", "--loop"]).unwrap();
         let messages: Vec<_> = std::iter::from_fn(|| drive.next().unwrap()).take(1000).collect();
         assert_eq!(messages.len(), 1000);
@@ -361,11 +362,11 @@ mod tests {
     }
 
     #[test]
-    fn topics_are_renamed_and_nonsense_is_refused_with_a_way_out() {
+    fn topics_are_renamed_and_invalid_arguments_are_refused() {
         assert!(names(&open(&["--remap", "/imu/data:=/car/imu"]).unwrap()).contains(&"/car/imu"));
-        let renamed = ["--raw-images", "--remap", "/camera/front/compressed:=/front"];
-        assert!(names(&open(&renamed).unwrap()).contains(&"/front"));
-        for (arguments, said) in [
+        let remaps = ["--raw-images", "--remap", "/camera/front/compressed:=/front"];
+        assert!(names(&open(&remaps).unwrap()).contains(&"/front"));
+        for (arguments, expected) in [
             (&["--topics", "/imu/dat"][..], "/imu/data"),
             (&["--remap", "/nothing:=/x"], "which is not played"),
             (&["--remap", "/imu/data:=/vehicle/speed"], "two topics"),
@@ -373,7 +374,7 @@ mod tests {
         ] {
             let failure = refused(arguments);
             assert_eq!(failure.exit, Exit::Usage);
-            assert!(failure.message.contains(said), "{failure}");
+            assert!(failure.message.contains(expected), "{failure}");
         }
     }
 }

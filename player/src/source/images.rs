@@ -1,8 +1,8 @@
-//! Compressed images become raw ones, in another size if asked for.
+//! Converts compressed images into raw ones, and resizes them on request.
 
 use gleaner_image::{ImageError, decode_rgb8, probe};
 use gleaner_messages::{
-    CdrError, CompressedView, Definitions, Endian, FieldPath, HeaderStamp, Sources, Value,
+    CdrError, CompressedView, Definitions, Endian, FieldPath, HeaderStamp, MessageValue, Sources,
     header_stamp,
 };
 
@@ -10,18 +10,18 @@ use crate::args::Size;
 use crate::buffer::{Buffer, Pool};
 use crate::cdr;
 
-/// Why an image cannot be sent.
+/// Error of a conversion.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ConvertError {
-    /// The message is no `CompressedImage`.
-    #[error("it is no sensor_msgs/msg/CompressedImage")]
+    /// The message is not a `CompressedImage`.
+    #[error("not a sensor_msgs/msg/CompressedImage")]
     Message(#[from] CdrError),
-    /// What it holds is no picture.
-    #[error("its picture cannot be decoded: {0}")]
-    Picture(#[from] ImageError),
+    /// The image data is invalid.
+    #[error("invalid image data: {0}")]
+    Image(#[from] ImageError),
 }
 
-/// Bytes that an image may have as rgb8: 21 million pixels.
+/// Maximum bytes of an image in rgb8: 21 million pixels.
 const MAX_BYTES: usize = 64 << 20;
 
 /// Decodes the images of one drive.
@@ -33,33 +33,33 @@ pub(crate) struct Decoder {
     pool: Pool,
 }
 
-/// A drive need not define it.
+/// The type of compressed images; a drive need not define it.
 const TYPE: &str = "sensor_msgs/msg/CompressedImage";
 
 impl Decoder {
-    /// Makes images of `size`, or as large as they are.
+    /// Creates a decoder for images of `size`, or of their own size.
     pub(crate) fn new(size: Option<Size>) -> Decoder {
         let text = Sources::default()
             .find(TYPE)
-            .expect("bundled definitions are sound")
-            .expect("it is bundled");
-        let definitions = Definitions::parse(TYPE, &text).expect("bundled definitions are sound");
-        let stamp = header_stamp(&definitions).expect("it begins with a header");
+            .expect("bundled definitions are valid")
+            .expect("the type is bundled");
+        let definitions = Definitions::parse(TYPE, &text).expect("bundled definitions are valid");
+        let stamp = header_stamp(&definitions).expect("the type begins with a header");
         let frame_id =
-            FieldPath::compile(&definitions, "header.frame_id").expect("a header has it");
+            FieldPath::compile(&definitions, "header.frame_id").expect("a header has this field");
         Decoder { size, stamp, frame_id, rgb: Vec::new(), pool: Pool::default() }
     }
 
-    /// The `sensor_msgs/msg/Image` in bgr8, little-endian, of a `CompressedImage`.
+    /// Converts a `CompressedImage` into a `sensor_msgs/msg/Image` in bgr8, little-endian.
     pub(crate) fn convert(&mut self, cdr: &[u8], endian: Endian) -> Result<Buffer, ConvertError> {
         let view = CompressedView::read(cdr, endian)?;
         let stamp_ns = self.stamp.read(cdr, endian)?;
         let frame_id = match self.frame_id.read(cdr, endian)? {
-            Value::Text(text) => text,
+            MessageValue::Text(text) => text,
             _ => "",
         };
         let header = probe(view.data)?;
-        // Too large is refused below, before any memory is taken.
+        // Too large an image is refused below, before memory is allocated.
         let len = header.rgb8_len().filter(|len| *len <= MAX_BYTES).unwrap_or(0);
         self.rgb.resize(len, 0);
         decode_rgb8(view.data, &header, MAX_BYTES, &mut self.rgb)?;
@@ -75,7 +75,7 @@ impl Decoder {
     }
 }
 
-/// Takes for each pixel the nearest one of `rgb`, and turns red, green, blue around.
+/// Scales `rgb` by nearest neighbour and swaps red and blue.
 fn scale_to_bgr(rgb: &[u8], from: Size, bgr: &mut [u8], to: Size) {
     let nearest =
         |at: u32, to: u32, from: u32| (u64::from(at) * u64::from(from) / u64::from(to)) as usize;
@@ -99,7 +99,7 @@ mod tests {
     use super::*;
     use crate::cdr::{sealed, with_header};
 
-    /// A picture whose left half is red and whose right half is blue.
+    /// A message with an image whose left half is red and whose right half is blue.
     fn message() -> Vec<u8> {
         let pixels = [[255, 0, 0], [0, 0, 255]].map(|pixel| pixel.repeat(16)).concat().repeat(16);
         let mut jpeg = Vec::new();
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_becomes_bgr8_with_its_stamp_and_frame() {
+    fn an_image_becomes_bgr8_and_keeps_its_stamp_and_frame_id() {
         for (size, side) in [(None, (32, 16)), (Some("64x48"), (64, 48)), (Some("7x5"), (7, 5))] {
             let mut decoder = Decoder::new(size.map(|text| text.parse().unwrap()));
             let image = decoder.convert(&message(), Endian::Little).unwrap();
@@ -131,20 +131,17 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_picture_is_refused_and_the_next_one_decoded() {
+    fn an_invalid_image_is_refused_and_the_next_one_decoded() {
         let mut decoder = Decoder::new(None);
         assert!(matches!(decoder.convert(&[0; 3], Endian::Little), Err(ConvertError::Message(_))));
         let mut broken = message();
         let at = broken.len() / 2;
         broken.truncate(at);
         assert!(decoder.convert(&broken, Endian::Little).is_err());
-        let mut no_picture = with_header(0, "");
-        no_picture.string("jpeg").u32(0);
-        let cdr = sealed(&no_picture);
-        assert!(matches!(
-            decoder.convert(&cdr[4..], Endian::Little),
-            Err(ConvertError::Picture(_))
-        ));
+        let mut no_image = with_header(0, "");
+        no_image.string("jpeg").u32(0);
+        let cdr = sealed(&no_image);
+        assert!(matches!(decoder.convert(&cdr[4..], Endian::Little), Err(ConvertError::Image(_))));
         assert!(decoder.convert(&message(), Endian::Little).is_ok());
     }
 }

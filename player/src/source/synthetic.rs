@@ -1,18 +1,18 @@
-//! Sensors that are made up: a camera that sees noise, and an IMU at rest. For measurements and for
+//! Synthetic sensors: a camera that sends noise, and an IMU at rest. For measurements, and for
 //! tests of losses.
 //!
-//! The pixels of all frames are equal, and equal in every run. Each message has its number, from 0,
-//! in `header.frame_id`, ten digits long, so that a reader can tell what was lost.
+//! The pixels of all frames are equal, in every run. `header.frame_id` of each message holds its
+//! number, from 0, in ten digits, so that a reader can find gaps.
 
 use gleaner_base::Failure;
 use gleaner_messages::Endian;
 
-use super::{Renamed, Source, Topic};
-use crate::args::{Args, Camera, Size};
+use super::{MessageSource, PlayedTopic, Remaps};
+use crate::args::{Args, Size, SyntheticCamera};
 use crate::buffer::{Buffer, Pool};
 use crate::cdr;
 use crate::offer::Offer;
-use crate::queue::Message;
+use crate::queue::QueuedMessage;
 
 const IMAGES: &str = "/camera/synthetic/image_raw";
 const IMU: &str = "/imu/synthetic";
@@ -22,22 +22,22 @@ const SEED: u64 = 0x676c_6561_6e65_7221;
 
 /// The sensors, merged by time.
 pub(crate) struct Synthetic {
-    topics: Vec<Topic>,
-    streams: Vec<Stream>,
+    topics: Vec<PlayedTopic>,
+    sensors: Vec<SyntheticSensor>,
     until_ns: Option<i64>,
     pool: Pool,
 }
 
 /// One sensor.
-struct Stream {
-    /// The size of its frames; `None` for the IMU.
+struct SyntheticSensor {
+    /// Size of its frames; `None` for the IMU.
     size: Option<Size>,
     hertz: f64,
-    /// The number of its next message.
+    /// Number of its next message.
     next: u64,
 }
 
-impl Stream {
+impl SyntheticSensor {
     fn at_ns(&self) -> i64 {
         (self.next as f64 * 1e9 / self.hertz) as i64
     }
@@ -45,31 +45,31 @@ impl Stream {
 
 impl Synthetic {
     pub(crate) fn open(args: &Args) -> Result<Synthetic, Failure> {
-        let mut renamed = Renamed::by(args);
-        let mut topic = |topic: &'static str, type_name: &str| Topic {
-            topic: renamed.take(topic).unwrap_or(topic).to_owned(),
+        let mut remaps = Remaps::of(args);
+        let mut topic = |topic: &'static str, type_name: &str| PlayedTopic {
+            topic: remaps.take(topic).unwrap_or(topic).to_owned(),
             type_name: type_name.to_owned(),
             offer: Offer::default(),
             is_stamped: true,
         };
-        let (mut topics, mut streams) = (Vec::new(), Vec::new());
-        if let Some(Camera { size, hertz }) = args.synthetic {
+        let (mut topics, mut sensors) = (Vec::new(), Vec::new());
+        if let Some(SyntheticCamera { size, hertz }) = args.synthetic {
             topics.push(topic(IMAGES, "sensor_msgs/msg/Image"));
-            streams.push(Stream { size: Some(size), hertz, next: 0 });
+            sensors.push(SyntheticSensor { size: Some(size), hertz, next: 0 });
         }
         if let Some(hertz) = args.imu {
             topics.push(topic(IMU, "sensor_msgs/msg/Imu"));
-            streams.push(Stream { size: None, hertz, next: 0 });
+            sensors.push(SyntheticSensor { size: None, hertz, next: 0 });
         }
-        renamed.check(&topics)?;
-        Ok(Synthetic { topics, streams, until_ns: args.duration, pool: Pool::default() })
+        remaps.check(&topics)?;
+        Ok(Synthetic { topics, sensors, until_ns: args.duration, pool: Pool::default() })
     }
 
     fn frame(&self, number: u64, size: Size) -> Buffer {
         let head = cdr::image_head(0, &frame_id(number), size.width, size.height);
         let len = (head.len() + size.bytes()).next_multiple_of(4);
         let mut frame = self.pool.take(len);
-        // One that was used before has its noise already.
+        // A reused buffer already contains the noise.
         if frame.len() != len {
             frame.resize(len, 0);
             noise(&mut frame[head.len()..head.len() + size.bytes()]);
@@ -79,29 +79,29 @@ impl Synthetic {
     }
 }
 
-impl Source for Synthetic {
-    fn topics(&self) -> &[Topic] {
+impl MessageSource for Synthetic {
+    fn topics(&self) -> &[PlayedTopic] {
         &self.topics
     }
 
-    fn next(&mut self) -> Result<Option<Message>, Failure> {
-        let Some(topic) = (0..self.streams.len()).min_by_key(|index| self.streams[*index].at_ns())
+    fn next(&mut self) -> Result<Option<QueuedMessage>, Failure> {
+        let Some(topic) = (0..self.sensors.len()).min_by_key(|index| self.sensors[*index].at_ns())
         else {
             return Ok(None);
         };
-        let &Stream { size, next, .. } = &self.streams[topic];
-        let at_ns = self.streams[topic].at_ns();
+        let &SyntheticSensor { size, next, .. } = &self.sensors[topic];
+        let at_ns = self.sensors[topic].at_ns();
         if self.until_ns.is_some_and(|until_ns| at_ns >= until_ns) {
             return Ok(None);
         }
         let bytes = size.map_or_else(|| imu(next).into(), |size| self.frame(next, size));
-        self.streams[topic].next += 1;
-        Ok(Some(Message { topic, at_ns, rounds_ns: 0, endian: Endian::Little, bytes }))
+        self.sensors[topic].next += 1;
+        Ok(Some(QueuedMessage { topic, at_ns, rounds_ns: 0, endian: Endian::Little, bytes }))
     }
 
-    /// A few frames: they cost next to nothing to make.
+    /// A few frames: making one is cheap.
     fn read_ahead(&self) -> usize {
-        self.streams
+        self.sensors
             .iter()
             .filter_map(|stream| stream.size)
             .map(|size| 4 * size.bytes())
@@ -114,12 +114,13 @@ impl Source for Synthetic {
     }
 }
 
-/// Always of one length, so that a frame that is used again has its pixels in the same place.
+/// Returns `header.frame_id`. Its length is constant, so that the pixels of a reused frame stay in
+/// place.
 fn frame_id(number: u64) -> String {
     format!("{:010}", number % 10_000_000_000)
 }
 
-/// Fills `pixels` with the same noise each time: a sequence after Marsaglia, "Xorshift RNGs", 2003.
+/// Fills `pixels` with the same noise each time: Marsaglia, "Xorshift RNGs", 2003.
 fn noise(pixels: &mut [u8]) {
     let mut state = SEED;
     for chunk in pixels.chunks_mut(8) {
@@ -130,7 +131,7 @@ fn noise(pixels: &mut [u8]) {
     }
 }
 
-/// A `sensor_msgs/msg/Imu` that lies still, with its z axis up.
+/// A `sensor_msgs/msg/Imu` at rest, with its z axis up.
 fn imu(number: u64) -> Vec<u8> {
     let mut imu = cdr::with_header(0, &frame_id(number));
     let diagonal = |variance: f64| [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance];
@@ -144,7 +145,7 @@ fn imu(number: u64) -> Vec<u8> {
 mod tests {
     use clap::Parser;
     use gleaner_base::Exit;
-    use gleaner_messages::{Definitions, FieldPath, ImageView, Sources, Value};
+    use gleaner_messages::{Definitions, FieldPath, ImageView, MessageValue, Sources};
 
     use super::*;
 
@@ -152,7 +153,7 @@ mod tests {
         Synthetic::open(&Args::try_parse_from(["gleaner-player"].iter().chain(arguments)).unwrap())
     }
 
-    fn all(mut source: Synthetic) -> Vec<Message> {
+    fn all(mut source: Synthetic) -> Vec<QueuedMessage> {
         std::iter::from_fn(|| source.next().unwrap()).collect()
     }
 
@@ -170,16 +171,16 @@ mod tests {
         assert_eq!(number("angular_velocity.x"), 0.0);
         assert_eq!(number("linear_acceleration_covariance[8]"), 1e-4);
         let path = FieldPath::compile(&definitions, "header.frame_id").unwrap();
-        assert_eq!(path.read(cdr, Endian::Little).unwrap(), Value::Text("0000000042"));
+        assert_eq!(path.read(cdr, Endian::Little).unwrap(), MessageValue::Text("0000000042"));
         assert_eq!(messages[42].at_ns, 420_000_000);
     }
 
     #[test]
-    fn frames_are_images_with_equal_noise_and_a_number_each_even_in_memory_that_is_used_again() {
+    fn frames_have_equal_noise_and_a_number_each_also_in_reused_buffers() {
         let mut source = open(&["--synthetic", "33x7@30"]).unwrap();
         let mut first = None;
         for number in 0..20 {
-            // Dropped at once, so that the next frame is made in its memory.
+            // Dropped at once, so that the next frame reuses its buffer.
             let message = source.next().unwrap().unwrap();
             let image = ImageView::read(&message.bytes[4..], Endian::Little).unwrap();
             assert_eq!(
@@ -204,19 +205,19 @@ mod tests {
     }
 
     #[test]
-    fn sensors_can_have_other_names_and_a_name_that_no_sensor_has_is_refused() {
+    fn sensors_can_be_renamed_and_an_unknown_name_is_refused() {
         let both = ["--imu", "1", "--synthetic", "4x4@10", "--remap"];
         let remapped = |remap| open(&[&both[..], &[remap]].concat());
         let source = remapped("/camera/synthetic/image_raw:=/camera/rear/image_raw").unwrap();
         let names: Vec<_> = source.topics().iter().map(|topic| topic.topic.as_str()).collect();
         assert_eq!(names, ["/camera/rear/image_raw", "/imu/synthetic"]);
-        for (remap, said) in [
+        for (remap, expected) in [
             ("/imu:=/car/imu", "`/imu`, which is not played"),
             ("/imu/synthetic:=/camera/synthetic/image_raw", "two topics"),
         ] {
-            let failure = remapped(remap).err().expect("it is refused");
+            let failure = remapped(remap).err().expect("the name is refused");
             assert_eq!(failure.exit, Exit::Usage);
-            assert!(failure.message.contains(said), "{failure}");
+            assert!(failure.message.contains(expected), "{failure}");
         }
     }
 }
