@@ -1,8 +1,8 @@
-//! Binds calls of the extension module to its own functions, where it has one of the name.
+//! Links calls in the extension module to its own functions, if it defines one of that name.
 //!
-//! Python loads it with RTLD_LOCAL, so that other libraries come first: the module's `setsockopt`
-//! (`gleaner_transport`, room `dds`), which keeps a multicast address from being announced, would
-//! never be called.
+//! Python loads the module with RTLD_LOCAL, so other libraries take precedence: without this flag
+//! the module's `setsockopt` (`gleaner_transport`, room `dds`), which keeps a multicast address
+//! from being announced, would never be called.
 
 fn main() {
     println!("cargo:rerun-if-changed=build.rs");

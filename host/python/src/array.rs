@@ -1,4 +1,4 @@
-//! The pixels of a frame as a numpy array that copies nothing and cannot be written to.
+//! Exposes the pixels of a frame as a read-only numpy array without copying.
 #![allow(unsafe_code)]
 
 use std::ptr;
@@ -11,7 +11,7 @@ use pyo3::prelude::*;
 
 use crate::frame::Frame;
 
-/// Where the elements of an array over a frame lie.
+/// Memory layout of an array over a frame.
 struct Layout {
     dims: [npy_intp; 3],
     /// In bytes, one for each dimension.
@@ -25,13 +25,13 @@ struct Layout {
 }
 
 impl Layout {
-    /// Shape (height, width, channels), or (height, width) for one channel; padding behind rows is
-    /// stepped over.
+    /// Shape (height, width, channels), or (height, width) for one channel; strides skip the
+    /// padding after each row.
     fn of(info: &Info) -> Self {
         let (width, height, step) = (info.width as usize, info.height as usize, info.step as usize);
         let (pixel, channels) = (info.encoding.bytes_per_pixel(), info.encoding.channels());
         let item = pixel / channels;
-        // Sides have at most 16 bits and a step has 32: every product below fits into 64 bits.
+        // Sides have at most 16 bits and a step has 32, so every product below fits into 64 bits.
         Self {
             dims: [height, width, channels].map(|n| n as npy_intp),
             strides: [step, pixel, item].map(|n| n as npy_intp),
@@ -42,8 +42,8 @@ impl Layout {
     }
 }
 
-/// A read-only array over the pixels of `frame`, which keeps the frame, and with it the slot, as
-/// long as any view lives.
+/// A read-only array over the pixels of `frame`. It holds the frame, and with it the slot, until
+/// the last view is dropped.
 pub(crate) fn over<'py>(frame: &Bound<'py, Frame>) -> PyResult<Bound<'py, PyAny>> {
     let py = frame.py();
     let host = frame.get().host();
@@ -58,7 +58,7 @@ pub(crate) fn over<'py>(frame: &Bound<'py, Frame>) -> PyResult<Bound<'py, PyAny>
     };
     // SAFETY: `enter_environment` imported numpy. `dims` and `strides` have `count` entries or more
     // and are copied. All elements lie within `bytes`, as checked above, and flags of 0 forbid
-    // writing. The reference to `descr` is given away.
+    // writing. The call takes over the reference to `descr`.
     let array = unsafe {
         let array = PY_ARRAY_API.PyArray_NewFromDescr(
             py,
@@ -73,9 +73,8 @@ pub(crate) fn over<'py>(frame: &Bound<'py, Frame>) -> PyResult<Bound<'py, PyAny>
         );
         Bound::from_owned_ptr_or_err(py, array)?
     };
-    // SAFETY: `array` is an array without a base, and a reference to `frame` is given away. From
-    // now on every view keeps `frame`, which is frozen; its lease keeps `bytes` where they are, and
-    // writers away from them.
+    // SAFETY: `array` has no base yet, and the call takes over a reference to `frame`. From now on
+    // every view holds `frame`, which is frozen; its lease keeps `bytes` in place and writers away.
     let status = unsafe {
         PY_ARRAY_API.PyArray_SetBaseObject(
             py,

@@ -1,5 +1,5 @@
-//! What a lambda is given at each call: the functions of the WIT interfaces `data`, `trigger` and
-//! `log`.
+//! The context that a lambda receives in each call: the functions of the WIT interfaces `data`,
+//! `trigger` and `log`.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use crate::data::{Sample, Topic, refused};
 use crate::scratch::Scratch;
 use crate::{log, trigger};
 
-/// The session of one lambda. A lambda that starts afresh after a fault gets a new one.
+/// The session of one lambda. A lambda that is re-initialised after a fault gets a new one.
 #[pyclass(frozen, module = "_gleaner")]
 pub(crate) struct Context {
     session: Session,
@@ -41,18 +41,18 @@ impl Context {
         Ok(Self { session, topics, config: config.unbind(), scratch, missed: AtomicU64::new(0) })
     }
 
-    /// What the lambda will see as `missed`.
+    /// Sets the value that the lambda reads as `missed`.
     pub(crate) fn set_missed(&self, ticks: u64) {
         self.missed.store(ticks, Ordering::Relaxed);
     }
 
-    /// A sample of one of the inputs, as the lambda sees it.
+    /// Wraps a sample of one of the inputs for the lambda.
     pub(crate) fn sample(&self, py: Python<'_>, sample: data::Sample) -> PyResult<Sample> {
         let topic = self.topic(py, sample.topic())?;
         Ok(topic.get().sample(py, sample))
     }
 
-    /// The same object for every call, so that it compiles each path once.
+    /// Returns the same object in every call, so that each path is compiled once.
     fn topic<'py>(
         &self,
         py: Python<'py>,
@@ -66,13 +66,13 @@ impl Context {
 
 #[pymethods]
 impl Context {
-    /// Values of `[config]` by key, after the deployment's were laid over the manifest's.
+    /// Values of `[config]` by key: the manifest's, overridden by the deployment's.
     #[getter]
     fn config<'py>(&self, py: Python<'py>) -> &Bound<'py, PyDict> {
         self.config.bind(py)
     }
 
-    /// What the host keeps for the lambda, by name.
+    /// The lambda's scratch memory.
     #[getter]
     fn scratch<'py>(&self, py: Python<'py>) -> &Bound<'py, Scratch> {
         self.scratch.bind(py)

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use gleaner_host::api::data::{self, DataError, OutOfFuel};
-use gleaner_messages::Value;
+use gleaner_messages::MessageValue;
 use numpy::PyArray1;
 use pyo3::IntoPyObjectExt;
 use pyo3::exceptions::PyTypeError;
@@ -20,8 +20,8 @@ static IDENTITY: SdkClass = SdkClass::new("gleaner.data", "Identity");
 static STAMPS: SdkClass = SdkClass::new("gleaner.data", "Stamps");
 static COLUMN: SdkClass = SdkClass::new("gleaner.data", "Column");
 
-/// Paths that a topic remembers. A lambda that makes up paths as it goes must not fill the memory
-/// with them.
+/// Maximum number of paths that a topic caches, so that a lambda that generates paths cannot fill
+/// the memory.
 const PATHS: usize = 256;
 
 /// The ring of one input.
@@ -39,7 +39,7 @@ pub(crate) struct Field(data::Field);
 #[pyclass(frozen, module = "_gleaner")]
 pub(crate) struct Sample {
     inner: data::Sample,
-    /// Those of its topic.
+    /// Cached fields of its topic.
     fields: Py<PyDict>,
 }
 
@@ -52,7 +52,7 @@ impl Topic {
         &self.inner
     }
 
-    /// A sample of this topic, as the lambda sees it.
+    /// Wraps a sample of this topic for the lambda.
     pub(crate) fn sample(&self, py: Python<'_>, inner: data::Sample) -> Sample {
         Sample { inner, fields: self.fields.clone_ref(py) }
     }
@@ -190,7 +190,7 @@ impl Sample {
     }
 
     fn as_frame(&self, py: Python<'_>) -> PyResult<Frame> {
-        // Decoding takes milliseconds, in which other threads of the lambda may go on.
+        // Decoding takes milliseconds, in which other threads of the lambda may run.
         py.detach(|| self.inner.as_frame()).map(Frame::new).map_err(|error| refused(py, error))
     }
 
@@ -200,7 +200,7 @@ impl Sample {
     }
 }
 
-/// A field as it is, or the one at a path.
+/// Returns a given field, or the field at a given path.
 fn field_of<'py>(
     given: &Bound<'py, PyAny>,
     topic: &Arc<data::Topic>,
@@ -211,11 +211,11 @@ fn field_of<'py>(
     }
     match given.cast::<PyString>() {
         Ok(path) => field_at(path, topic, fields),
-        Err(_) => Err(PyTypeError::new_err("a field is a Field, or its path as a str")),
+        Err(_) => Err(PyTypeError::new_err("a field must be a Field, or its path as a str")),
     }
 }
 
-/// The field at `path`, compiled at the first call and remembered in `fields`.
+/// The field at `path`, compiled in the first call and cached in `fields`.
 fn field_at<'py>(
     path: &Bound<'py, PyString>,
     topic: &Arc<data::Topic>,
@@ -239,16 +239,16 @@ fn column(py: Python<'_>, column: Result<data::Column, DataError>) -> PyResult<B
     COLUMN.make(py, (PyArray1::from_vec(py, at_ns), PyArray1::from_vec(py, values)))
 }
 
-fn value<'py>(py: Python<'py>, value: Value<'_>) -> PyResult<Bound<'py, PyAny>> {
+fn value<'py>(py: Python<'py>, value: MessageValue<'_>) -> PyResult<Bound<'py, PyAny>> {
     match value {
-        Value::Bool(value) => value.into_bound_py_any(py),
-        Value::Signed(value) => value.into_bound_py_any(py),
-        Value::Unsigned(value) => value.into_bound_py_any(py),
-        Value::Real(value) => value.into_bound_py_any(py),
-        Value::Text(value) => value.into_bound_py_any(py),
-        Value::Bytes(value) => Ok(PyBytes::new(py, value).into_any()),
-        Value::Numbers(values) => Ok(PyArray1::from_vec(py, values).into_any()),
-        Value::Texts(values) => values.into_bound_py_any(py),
+        MessageValue::Bool(value) => value.into_bound_py_any(py),
+        MessageValue::Signed(value) => value.into_bound_py_any(py),
+        MessageValue::Unsigned(value) => value.into_bound_py_any(py),
+        MessageValue::Real(value) => value.into_bound_py_any(py),
+        MessageValue::Text(value) => value.into_bound_py_any(py),
+        MessageValue::Bytes(value) => Ok(PyBytes::new(py, value).into_any()),
+        MessageValue::Numbers(values) => Ok(PyArray1::from_vec(py, values).into_any()),
+        MessageValue::Texts(values) => values.into_bound_py_any(py),
     }
 }
 

@@ -12,8 +12,8 @@ use crate::sdk::SdkClass;
 
 static FRAME_INFO: SdkClass = SdkClass::new("gleaner.data", "FrameInfo");
 
-/// A sample seen as an image. Nothing can replace what is inside while the object lives: arrays
-/// over its pixels rely on it.
+/// A sample seen as an image. Its content is never replaced while the object lives: arrays over its
+/// pixels rely on that.
 #[pyclass(frozen, module = "_gleaner")]
 pub(crate) struct Frame(frame::Frame);
 
@@ -30,7 +30,7 @@ impl Frame {
     }
 }
 
-// The operations on pixels take up to milliseconds, in which other threads of the lambda may go on.
+// Operations on pixels take up to milliseconds, in which other threads of the lambda may run.
 #[pymethods]
 impl Frame {
     #[getter]
@@ -124,7 +124,7 @@ fn region((x, y, width, height): RoiFields) -> Roi {
     Roi { x, y, width, height }
 }
 
-/// The name of an encoding in the WIT, with `_` for `-`.
+/// The WIT name of an encoding, with `_` for `-`.
 fn name(encoding: Encoding) -> &'static str {
     match encoding {
         Encoding::Rgb8 => "rgb8",

@@ -1,7 +1,7 @@
 //! `gleaner:lambda/inference` over `gleaner_host::api::inference`.
 //!
-//! This build has no model runtime: nothing can be opened or made, and what would work on it is
-//! never reached.
+//! This build has no model runtime: no model or tensor can be created, so their methods are never
+//! called.
 
 use std::borrow::Cow;
 
@@ -13,7 +13,7 @@ use crate::sdk::SdkClass;
 
 static INFERENCE_ERROR: SdkClass = SdkClass::new("gleaner.inference", "InferenceError");
 
-/// Numbers on the host.
+/// A tensor in host memory.
 #[pyclass(frozen, module = "_gleaner")]
 pub(crate) struct Tensor(inference::Tensor);
 

@@ -1,13 +1,13 @@
 //! The extension module `_gleaner`: the runtime's library, hosted by a Python interpreter.
 //!
-//! `data`, `frame`, `trigger`, `inference`, `log` and `scratch` are thin skins over the files of
-//! the same names in `gleaner_host::api`: they convert arguments and errors, and decide nothing.
-//! `guest` wakes the lambda. Plain values and exceptions are classes of the Python package
-//! `gleaner`, defined once, there; `sdk` finds them.
+//! `data`, `frame`, `trigger`, `inference`, `log` and `scratch` are thin wrappers around the
+//! modules of the same names in `gleaner_host::api`: they convert arguments and errors, and decide
+//! nothing. `guest` calls the lambda. Plain values and exceptions are classes of the Python package
+//! `gleaner`; `sdk` looks them up.
 //!
-//! One thread runs all of it. No thread that receives samples ever attaches to the interpreter, and
-//! nothing here is `unsafe` but `array`, which lends the pixels of a frame to numpy, and `memory`,
-//! which notices where there is none left.
+//! Everything runs in one thread. Threads that receive samples never attach to the interpreter.
+//! `unsafe` code is only in `array`, which lends the pixels of a frame to numpy, and in `memory`,
+//! which counts allocations.
 
 mod array;
 mod context;
@@ -23,8 +23,8 @@ mod trigger;
 
 use pyo3::prelude::*;
 
-/// What `start.py` loads, before anything of the lambda's environment: `gleaner._host` imports
-/// numpy, once the process is shut.
+/// The module that `start.py` loads before the lambda's environment. `gleaner._host` imports numpy
+/// later, in the sandboxed process.
 #[pymodule]
 mod _gleaner {
     use super::*;

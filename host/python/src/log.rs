@@ -4,7 +4,7 @@ use gleaner_host::api::log::Level;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
-/// The level of that name in the WIT.
+/// Parses the WIT name of a level.
 pub(crate) fn level(name: &str) -> PyResult<Level> {
     Ok(match name {
         "error" => Level::Error,
@@ -13,7 +13,8 @@ pub(crate) fn level(name: &str) -> PyResult<Level> {
         "debug" => Level::Debug,
         "trace" => Level::Trace,
         _ => {
-            let message = "the level of a log line is `error`, `warn`, `info`, `debug` or `trace`";
+            let message =
+                "the level of a log line must be `error`, `warn`, `info`, `debug` or `trace`";
             return Err(PyValueError::new_err(message));
         }
     })

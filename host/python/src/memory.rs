@@ -1,21 +1,21 @@
-//! Memory of our part of an interpreter: it is counted, since the rest is the lambda's. Rust ends a
-//! process to which it is refused; then the shim can say why.
+//! Counts the memory that Rust code allocates in the interpreter, because the rest is the lambda's.
+//! Rust aborts the process when an allocation fails; the shim can then report the reason.
 #![allow(unsafe_code)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
 
 use gleaner_vitals::{Pulse, own};
 
-struct Counted;
+struct CountingAllocator;
 
 #[global_allocator]
-static ALLOCATOR: Counted = Counted;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
-// SAFETY: all is left to the system's allocator, with the same arguments, and what it gives is
-// given on; counting takes no memory.
-unsafe impl GlobalAlloc for Counted {
+// SAFETY: every call is passed to the system's allocator with the same arguments, and its result is
+// returned; counting allocates nothing.
+unsafe impl GlobalAlloc for CountingAllocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        // SAFETY: whoever called us has kept what `System` asks for, which is the same.
+        // SAFETY: the caller has kept the contract of `System`, which is the same.
         counted(unsafe { System.alloc(layout) }, layout.size())
     }
 
@@ -40,10 +40,10 @@ unsafe impl GlobalAlloc for Counted {
     }
 }
 
-/// `memory`, after it was counted, or the shim was told that there is none.
+/// Counts `memory`, or reports to the shim that none is left; returns `memory`.
 fn counted(memory: *mut u8, bytes: usize) -> *mut u8 {
     if memory.is_null() {
-        Pulse::say_full();
+        Pulse::report_full();
     } else {
         own::allocated(bytes);
     }

@@ -16,7 +16,7 @@ fn refused(py: Python<'_>, error: &ScratchError) -> PyErr {
     SCRATCH_ERROR.error(py, error.to_string(), error.kind().name())
 }
 
-/// What the host keeps for the lambda, by name.
+/// The lambda's scratch memory.
 #[pyclass(frozen, module = "_gleaner")]
 pub(crate) struct Scratch(Session);
 
@@ -29,11 +29,11 @@ impl Scratch {
 #[pymethods]
 impl Scratch {
     fn put(&self, py: Python<'_>, name: Cow<'_, str>, bytes: &Bound<'_, PyAny>) -> PyResult<()> {
-        self.0.put(&name, taken(bytes)?.as_bytes()).map_err(|error| refused(py, &error))
+        self.0.put(&name, to_bytes(bytes)?.as_bytes()).map_err(|error| refused(py, &error))
     }
 
     fn append(&self, py: Python<'_>, name: Cow<'_, str>, bytes: &Bound<'_, PyAny>) -> PyResult<()> {
-        self.0.append(&name, taken(bytes)?.as_bytes()).map_err(|error| refused(py, &error))
+        self.0.append(&name, to_bytes(bytes)?.as_bytes()).map_err(|error| refused(py, &error))
     }
 
     #[pyo3(signature = (name, offset = 0, len = None))]
@@ -65,11 +65,11 @@ impl Scratch {
     }
 }
 
-/// The bytes of anything that has some: `bytes`, `bytearray`, an array of numpy.
-fn taken<'py>(bytes: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyBytes>> {
+/// The bytes of an object with a buffer: `bytes`, `bytearray`, a numpy array.
+fn to_bytes<'py>(bytes: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyBytes>> {
     if let Ok(bytes) = bytes.cast::<PyBytes>() {
         return Ok(bytes.clone());
     }
-    // What may be written to meanwhile is copied first.
+    // A mutable buffer is copied first.
     Ok(PyMemoryView::from(bytes)?.call_method0("tobytes")?.cast_into()?)
 }

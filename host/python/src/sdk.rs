@@ -1,4 +1,4 @@
-//! Plain values and exceptions of the Python package `gleaner`, each looked up once.
+//! Looks up plain values and exceptions of the Python package `gleaner`, each once.
 
 use pyo3::call::PyCallArgs;
 use pyo3::prelude::*;
@@ -17,7 +17,7 @@ impl SdkClass {
         Self { module, name, class: PyOnceLock::new() }
     }
 
-    /// A value of the class, from its fields in their order.
+    /// Creates a value of the class from its fields, in their order.
     pub(crate) fn make<'py>(
         &self,
         py: Python<'py>,
@@ -26,8 +26,8 @@ impl SdkClass {
         self.class.import(py, self.module, self.name)?.call1(fields)
     }
 
-    /// An exception of the class, with the message of the host's error and the name of its case in
-    /// the WIT.
+    /// Creates an exception of the class from the message of the host's error and the WIT name of
+    /// its case.
     pub(crate) fn error(&self, py: Python<'_>, message: String, kind: &'static str) -> PyErr {
         match self.class.import(py, self.module, self.name) {
             Ok(class) => PyErr::from_type(class.clone(), (message, kind)),

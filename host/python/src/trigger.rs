@@ -13,7 +13,7 @@ pub(crate) fn refused(py: Python<'_>, error: &TriggerError) -> PyErr {
     TRIGGER_ERROR.error(py, error.to_string(), error.kind().name())
 }
 
-/// Keyword arguments as attributes of `label`, in the order in which they were written.
+/// Converts keyword arguments into attributes of `label`, in the order of the call.
 pub(crate) fn attributes(
     label: &str,
     named: Option<&Bound<'_, PyDict>>,
@@ -31,7 +31,7 @@ fn attribute_value(label: &str, key: &str, value: &Bound<'_, PyAny>) -> PyResult
     if let Some(plain) = plain(value)? {
         return Ok(plain);
     }
-    // A number of numpy knows the plain one that it stands for.
+    // A numpy scalar converts itself with `item`.
     if let Ok(item) = value.call_method0("item")
         && let Some(plain) = plain(&item)?
     {
@@ -45,7 +45,7 @@ fn attribute_value(label: &str, key: &str, value: &Bound<'_, PyAny>) -> PyResult
 }
 
 fn plain(value: &Bound<'_, PyAny>) -> PyResult<Option<AttributeValue>> {
-    // A bool is an int, too, so it has to be asked first.
+    // A bool is an int too, so it is checked first.
     Ok(Some(if let Ok(value) = value.cast::<PyBool>() {
         AttributeValue::Boolean(value.is_true())
     } else if value.is_instance_of::<PyInt>() {
