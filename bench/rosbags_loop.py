@@ -1,8 +1,9 @@
-"""What people do without us: a drive read by rosbags, each IMU message taken apart, the example's judgement on the last half second.
+"""Baseline without Gleaner: reads a drive with rosbags, parses each IMU message, and calls the
+example's function on the last half second.
 
-Prints one JSON object: messages, hits and seconds from the first message to the last. The judgement is that of
-`examples/hello/python/main.py`, imported; around it is what a careful script would do: one topic read, a ring in numpy."""
-
+Prints one JSON object: messages, hits, and seconds from the first message to the last. The function
+is imported from `examples/hello/python/main.py`; the loop is what a careful script would do: one
+topic, a ring in numpy."""
 from __future__ import annotations
 
 import json

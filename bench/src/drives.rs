@@ -1,21 +1,21 @@
-//! Long drives: how long it takes to see what is in one, and what replaying it takes.
+//! Measures long drives: the time of `gleaner inspect` and of a replay.
 
 use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
-use gleaner_protocol::{DriveSeen, Summary};
-use gleaner_tests::{Folder, bag, program, replay, root, sample_drive};
+use gleaner_protocol::{DriveInfo, ReplaySummary};
+use gleaner_tests::{TempFolder, bag, program, replay, root, sample_drive};
 
 use crate::measure::Figure;
 
-/// The sample drive so often is 2 GB.
+/// Copies of the sample drive that make 2 GB.
 const ROUNDS: u64 = 265;
 
-/// What is measured of a drive of 2 GB in each storage; a tenth of that if `quick`.
+/// Measures a drive of 2 GB in each storage; a tenth of that if `quick`.
 pub fn figures(quick: bool) -> Vec<Figure> {
     let rounds = if quick { ROUNDS / 10 } else { ROUNDS };
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let mcap = folder.path().join("drive.mcap");
     bag::mcap(&mcap, rounds);
     let directory = bag::directory(&folder, rounds);
@@ -25,16 +25,16 @@ pub fn figures(quick: bool) -> Vec<Figure> {
         [("MCAP", &mcap, &mcap), ("sqlite3", &directory, &directory.join("drive_0.db3"))]
     {
         let bytes = std::fs::metadata(file).expect("it was written").len();
-        let mut tell = |what: &str, unit, value: f64| {
-            figures.push(Figure::told(&format!("{name}: {what}"), unit, &[value]))
+        let mut add = |what: &str, unit, value: f64| {
+            figures.push(Figure::without_goal(&format!("{name}: {what}"), unit, &[value]))
         };
-        tell("size", "GB", bytes as f64 / 1e9);
+        add("size", "GB", bytes as f64 / 1e9);
         let summary = hello(drive, "rust");
         assert_eq!(summary.wakes, rounds * 4170, "every IMU sample wakes");
-        tell("replay by hello", "s", summary.wall_s);
-        tell("replay by hello", "wakes/s", summary.wakes_per_s);
+        add("replay by hello", "s", summary.wall_s);
+        add("replay by hello", "wakes/s", summary.wakes_per_s);
         let growth = summary.peak_rss_bytes as f64 - short as f64;
-        let what = format!("{name}: memory of that beyond a replay of the sample drive");
+        let what = format!("{name}: additional memory against a replay of the sample drive");
         figures.push(Figure::at_most(&what, "MiB", 16.0, &[growth / 1024.0 / 1024.0]));
         let opened: Vec<_> = (0..if quick { 2 } else { 9 }).map(|_| inspect_ms(drive)).collect();
         figures.push(Figure::at_most(&format!("{name}: gleaner inspect"), "ms", 1000.0, &opened));
@@ -42,10 +42,10 @@ pub fn figures(quick: bool) -> Vec<Figure> {
     figures
 }
 
-/// The same judgement over the same drive of 200 MB, by lambdas and in a script on rosbags, in
-/// turns: wakes for each second from the first message to the last.
+/// Runs the same function over a drive of 200 MB in lambdas and in a script on rosbags,
+/// alternating. The unit is wakes per second from the first message to the last.
 fn against_rosbags(quick: bool) -> Vec<Figure> {
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let drive = folder.path().join("drive.mcap");
     let rounds = ROUNDS / 10;
     bag::mcap(&drive, rounds);
@@ -53,20 +53,25 @@ fn against_rosbags(quick: bool) -> Vec<Figure> {
     for _ in 0..if quick { 1 } else { 5 } {
         let (wasm, python) = (hello(&drive, "rust"), hello(&drive, "python"));
         let (messages, hits, seconds) = rosbags(&drive);
-        assert_eq!((messages, hits), (rounds * 4170, python.triggers), "all judge alike");
+        assert_eq!(
+            (messages, hits),
+            (rounds * 4170, python.triggers),
+            "all make the same decisions"
+        );
         assert_eq!(wasm.triggers, python.triggers);
         rates[0].push(wasm.wakes_per_s);
         rates[1].push(python.wakes_per_s);
         rates[2].push(messages as f64 / seconds);
     }
     let names = ["hello in wasm", "hello in Python", "the same function in a script on rosbags"];
-    let told = names
-        .iter()
-        .zip(&rates)
-        .map(|(name, rates)| Figure::told(&format!("MCAP, 0.2 GB: {name}"), "wakes/s", rates));
+    let figures = names.iter().zip(&rates).map(|(name, rates)| {
+        Figure::without_goal(&format!("MCAP, 0.2 GB: {name}"), "wakes/s", rates)
+    });
     let factor =
-        rates[1].iter().zip(&rates[2]).map(|(ours, theirs)| ours / theirs).collect::<Vec<_>>();
-    told.chain([Figure::told("replay in Python against rosbags", "x", &factor)]).collect()
+        rates[1].iter().zip(&rates[2]).map(|(lambda, script)| lambda / script).collect::<Vec<_>>();
+    figures
+        .chain([Figure::without_goal("replay in Python against rosbags", "x", &factor)])
+        .collect()
 }
 
 /// Messages, triggers and seconds of the script.
@@ -79,15 +84,16 @@ fn rosbags(drive: &Path) -> (u64, u64, f64) {
         .output()
         .expect("python starts");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let told: serde_json::Value = serde_json::from_slice(&output.stdout).expect("one JSON object");
-    let count = |key: &str| told[key].as_u64().expect("a count");
-    (count("messages"), count("hits"), told["seconds"].as_f64().expect("seconds"))
+    let result: serde_json::Value =
+        serde_json::from_slice(&output.stdout).expect("one JSON object");
+    let count = |key: &str| result[key].as_u64().expect("a count");
+    (count("messages"), count("hits"), result["seconds"].as_f64().expect("seconds"))
 }
 
-/// Brings `hello` to trigger on the sample drive.
+/// A threshold at which `hello` triggers on the sample drive.
 const BRAKE_MPS2: &str = "-1.4";
 
-fn hello(drive: &Path, kind: &str) -> Summary {
+fn hello(drive: &Path, kind: &str) -> ReplaySummary {
     let threshold = format!("brake_mps2={BRAKE_MPS2}");
     let args = ["--set", threshold.as_str(), "--no-record"];
     let run = replay(&root().join("examples/hello").join(kind), &[drive.to_owned()], &args);
@@ -95,7 +101,7 @@ fn hello(drive: &Path, kind: &str) -> Summary {
     run.summary.expect("a replay ends with a summary")
 }
 
-/// How long `gleaner inspect` takes, the start of its two programs included.
+/// Time of `gleaner inspect` in ms, including the start of its two programs.
 fn inspect_ms(drive: &Path) -> f64 {
     let started = Instant::now();
     let output = Command::new(program("gleaner"))
@@ -104,7 +110,7 @@ fn inspect_ms(drive: &Path) -> f64 {
         .output()
         .expect("gleaner starts");
     let ms = started.elapsed().as_secs_f64() * 1e3;
-    let seen: DriveSeen = serde_json::from_slice(&output.stdout).expect("topics of a drive");
+    let seen: DriveInfo = serde_json::from_slice(&output.stdout).expect("topics of a drive");
     assert_eq!(seen.topics.len(), 3);
     ms
 }

@@ -1,8 +1,8 @@
-//! Measures what Gleaner promises, with the programs that users run. `cargo xtask bench` builds
-//! what it needs first.
+//! Measures Gleaner against its performance goals, with the programs that users run.
+//! `cargo xtask bench` builds what it needs first.
 //!
-//! Kinds of lambda are measured in alternating runs on one core; each row gives the median and the
-//! spread of its runs.
+//! Variants are measured in alternating runs on one core; each row gives the median and the spread
+//! of its runs.
 
 mod answers;
 mod drives;
@@ -16,26 +16,26 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use gleaner_lambda::manifest::Store;
-use measure::{Figure, Kind, Setting, quantile};
+use measure::{Figure, ReplayBench, Twin, quantile};
 
-/// Prints a table of promises with what was measured, in Markdown.
+/// Measures Gleaner against its performance goals and prints a table in Markdown.
 #[derive(Parser)]
 struct Args {
-    /// Fewer rounds: shows that the benches run, not what they say.
+    /// Fewer rounds: shows that the benches run; the values are not meaningful.
     #[arg(long)]
     quick: bool,
     /// Live topics instead of drives, in a private network; needs gleaner-player.
     #[arg(long)]
     live: bool,
-    /// Arithmetic in lambdas against the same natively, and calls between lambda and host, instead
-    /// of drives.
+    /// Arithmetic in lambdas against the same code natively, and calls between lambda and host,
+    /// instead of drives.
     #[arg(long, conflicts_with = "live")]
     kernels: bool,
     /// Drives of 2 GB in each storage, instead of short ones; takes 5 GB of disk.
     #[arg(long, conflicts_with_all = ["live", "kernels", "isolation"])]
     drives: bool,
-    /// What a lambda feels of another one that misbehaves, in a private network, and what a process
-    /// costs, instead of drives; needs gleaner-player.
+    /// Effect of a misbehaving lambda on others, in a private network, and costs of a process,
+    /// instead of drives; needs gleaner-player.
     #[arg(long, conflicts_with_all = ["live", "kernels"])]
     isolation: bool,
 }
@@ -43,7 +43,7 @@ struct Args {
 fn main() -> ExitCode {
     let Args { quick, live, kernels, drives, isolation } = Args::parse();
     if live || isolation {
-        let figures = match live::elsewhere() {
+        let figures = match live::in_private_network() {
             Some(Ok(true)) => return ExitCode::SUCCESS,
             Some(Ok(false)) => return ExitCode::FAILURE,
             Some(Err(why)) => Err(why),
@@ -51,7 +51,7 @@ fn main() -> ExitCode {
             None => Ok(live::figures(quick)),
         };
         return match figures {
-            Ok(figures) => tell(&figures, quick),
+            Ok(figures) => report(&figures, quick),
             Err(why) => {
                 println!("skipped: {why}");
                 ExitCode::SUCCESS
@@ -59,52 +59,52 @@ fn main() -> ExitCode {
         };
     }
     let rounds = if quick { 1 } else { 9 };
-    if let Err(error) = measure::stay_on_one_core() {
-        eprintln!("cannot stay on one core, figures are of all: {error}");
+    if let Err(error) = measure::bind_to_one_core() {
+        eprintln!("cannot bind to one core, measuring on all cores: {error}");
     }
     if kernels {
-        return tell(&kernels::figures(quick), quick);
+        return report(&kernels::figures(quick), quick);
     }
     if drives {
-        return tell(&drives::figures(quick), quick);
+        return report(&drives::figures(quick), quick);
     }
-    let setting = Setting::new();
+    let bench = ReplayBench::new();
     let mut figures = Vec::new();
 
-    let imu = [Kind::Rust, Kind::Python].map(|kind| (kind, Vec::new()));
-    let imu = alternate(rounds, imu, |kind| setting.hello(kind).wakes_per_s);
+    let imu = [Twin::Rust, Twin::Python].map(|kind| (kind, Vec::new()));
+    let imu = alternate(rounds, imu, |kind| bench.hello(kind).wakes_per_s);
     figures.push(Figure::at_least("replay, IMU only, wasm", "wakes/s", 25_000.0, &imu[0].1));
     figures.push(Figure::at_least("replay, IMU only, Python", "wakes/s", 5_000.0, &imu[1].1));
 
-    let camera = [Kind::Rust, Kind::Python].map(|kind| (kind, Vec::new()));
+    let camera = [Twin::Rust, Twin::Python].map(|kind| (kind, Vec::new()));
     let mut shares = Vec::new();
     let camera = alternate(rounds, camera, |kind| {
-        let summary = setting.every_frame_decoded(kind);
+        let summary = bench.every_frame_decoded(kind);
         shares.push(100.0 * summary.decode_s / summary.wall_s);
         summary.wakes_per_s
     });
-    figures.push(Figure::told(
+    figures.push(Figure::without_goal(
         "replay, 640x360 JPEG, every frame decoded, wasm",
         "frames/s",
         &camera[0].1,
     ));
-    figures.push(Figure::told(
+    figures.push(Figure::without_goal(
         "replay, 640x360 JPEG, every frame decoded, Python",
         "frames/s",
         &camera[1].1,
     ));
-    figures.push(Figure::told("share of JPEG decoding in these", "%", &shares));
+    figures.push(Figure::without_goal("share of JPEG decoding in these", "%", &shares));
 
     for example in ["hello", "brake-dark"] {
-        for kind in [Kind::Rust, Kind::Python] {
-            let growth = (0..rounds.min(3)).map(|_| setting.growth_from_2nd_to_10th(example, kind));
+        for kind in [Twin::Rust, Twin::Python] {
+            let growth = (0..rounds.min(3)).map(|_| bench.growth_from_2nd_to_10th(example, kind));
             let name = format!(
-                "memory after the 10th replay of {example} in one process against the 2nd, {kind}"
+                "memory growth from the 2nd to the 10th replay of {example} in one process, {kind}"
             );
             figures.push(Figure::at_most(&name, "%", 2.0, &growth.collect::<Vec<_>>()));
         }
     }
-    let arrays = (0..rounds.min(5)).flat_map(|_| setting.array_ns()).collect::<Vec<_>>();
+    let arrays = (0..rounds.min(5)).flat_map(|_| bench.array_ns()).collect::<Vec<_>>();
     figures.push(Figure::at_most(
         "slot to ndarray, 1920x1080 bgr8 (6.2 MB)",
         "ns",
@@ -114,26 +114,26 @@ fn main() -> ExitCode {
 
     let what = || [("", Vec::new()), ("journal", Vec::new()), ("clips", Vec::new())];
     let [imu, sample] = [
-        alternate(rounds, what(), |what| setting.imu_rounds(what)),
-        alternate(rounds, what(), |what| setting.sample_rounds(what)),
+        alternate(rounds, what(), |what| bench.imu_rounds(what)),
+        alternate(rounds, what(), |what| bench.sample_rounds(what)),
     ];
     let slower = |replays: &[(&str, Vec<f64>); 3], with: usize| {
         let pairs = replays[0].1.iter().zip(&replays[with].1);
         pairs.map(|(a, b)| 100.0 * (a / b - 1.0)).collect::<Vec<_>>()
     };
     figures.push(Figure::at_most(
-        "replay slower by a journal, 200 s of IMU, wasm",
+        "replay slowdown by a journal, 200 s of IMU, wasm",
         "%",
         5.0,
         &slower(&imu, 1),
     ));
-    figures.push(Figure::told(
-        "replay slower by a journal, sample drive with camera, wasm",
+    figures.push(Figure::without_goal(
+        "replay slowdown by a journal, sample drive with camera, wasm",
         "%",
         &slower(&sample, 1),
     ));
-    figures.push(Figure::told(
-        "replay slower by clips, sample drive with camera, wasm",
+    figures.push(Figure::without_goal(
+        "replay slowdown by clips, sample drive with camera, wasm",
         "%",
         &slower(&sample, 2),
     ));
@@ -144,75 +144,79 @@ fn main() -> ExitCode {
             &name,
             "bytes/wake",
             goal,
-            &[setting.journal_bytes_per_wake(example)],
+            &[bench.journal_bytes_per_wake(example)],
         ));
     }
 
     for (name, store) in [("memory", Store::Ram), ("disk", Store::Disk)] {
         let load = record::record(if quick { 2 } else { 60 }, store);
-        let mut tell = |what: &str, unit, value| {
-            figures.push(Figure::told(
+        let mut add = |what: &str, unit, value| {
+            figures.push(Figure::without_goal(
                 &format!("recorder at 20 MB/s, preroll in {name}: {what}"),
                 unit,
                 &[value],
             ));
         };
-        tell("arrived", "MB/s", load.megabytes_per_s);
-        tell("part of the time in clips", "%", load.recorded_percent);
-        tell("share of a core", "%", load.cpu_percent);
-        // Beyond the preroll, a chunk and its compression.
+        add("arrived", "MB/s", load.megabytes_per_s);
+        add("share of time in clips", "%", load.recorded_percent);
+        add("share of a core", "%", load.cpu_percent);
+        // On top of the preroll: a chunk and its compression.
         let bound = if store == Store::Ram { 64.0 + 16.0 } else { 16.0 };
         let memory = format!("recorder at 20 MB/s, preroll in {name}: memory");
         figures.push(Figure::at_most(&memory, "MiB", bound, &[load.memory_mib]));
-        let name = format!("recorder at 20 MB/s, preroll in {name}: preroll against its bound");
+        let name = format!("recorder at 20 MB/s, preroll in {name}: preroll against its limit");
         figures.push(Figure::at_most(&name, "%", 100.0, &[load.preroll_percent]));
     }
 
     let live = record::record_live(if quick { 4 } else { 60 });
     let opened = |share| quantile(&live.opened_ms, share);
-    figures.push(Figure::told("trigger to window open, at 20 MB/s: median", "ms", &[opened(0.5)]));
+    figures.push(Figure::without_goal(
+        "trigger to window open, at 20 MB/s: p50",
+        "ms",
+        &[opened(0.5)],
+    ));
     figures.push(Figure::at_most(
-        "trigger to window open, at 20 MB/s: 99 %",
+        "trigger to window open, at 20 MB/s: p99",
         "ms",
         1.0,
         &[opened(0.99)],
     ));
-    figures.push(Figure::told(
-        "trigger to window open, at 20 MB/s: longest",
+    figures.push(Figure::without_goal(
+        "trigger to window open, at 20 MB/s: max",
         "ms",
         &live.opened_ms[live.opened_ms.len().max(1) - 1..],
     ));
-    figures.push(Figure::told(
-        "live recorder at 20 MB/s: longest time to take a sample",
+    figures.push(Figure::without_goal(
+        "live recorder at 20 MB/s: max time to accept a sample",
         "ms",
         &[live.longest_ms],
     ));
-    figures.push(Figure::told(
-        "live recorder: time to tell it of a wake",
+    figures.push(Figure::without_goal(
+        "live recorder: time to send a wake, p50",
         "us",
-        &[quantile(&live.told_us, 0.5)],
+        &[quantile(&live.sent_us, 0.5)],
     ));
     figures.push(Figure::at_most(
-        "live recorder at 20 MB/s: samples lost",
+        "live recorder at 20 MB/s: lost samples",
         "samples",
         0.0,
         &[live.lost as f64],
     ));
 
-    tell(&figures, quick)
+    report(&figures, quick)
 }
 
-fn tell(figures: &[Figure], quick: bool) -> ExitCode {
-    println!("| promise | goal | median | spread | runs | |\n|---|---|---|---|---|---|");
+fn report(figures: &[Figure], quick: bool) -> ExitCode {
+    println!("| measurement | goal | median | spread | runs | |\n|---|---|---|---|---|---|");
     for figure in figures {
         println!("{figure}");
     }
-    // Two rounds on a busy machine say nothing about a promise.
+    // Two rounds on a busy machine are not significant.
     if quick || figures.iter().all(Figure::is_met) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// Runs `measure` for each of `series` in turn, `rounds` times, so that a change of the machine's
-/// mood meets all alike.
+/// Runs `measure` for each of `series` in turn, `rounds` times, so that drift of the machine
+/// affects all of them alike.
 fn alternate<K: Copy, const N: usize>(
     rounds: usize,
     mut series: [(K, Vec<f64>); N],

@@ -1,21 +1,21 @@
-//! Single measurements, and how a series of them is shown.
+//! Runs single measurements, and formats a series of them as a row.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use gleaner_protocol::{Report, Round, Summary};
+use gleaner_protocol::{ReplaySummary, Report, Round};
 use gleaner_tests::drive::{IMAGE, image, imu_only, one_topic};
-use gleaner_tests::{Folder, program, replay, root, sample_drive};
+use gleaner_tests::{TempFolder, program, replay, root, sample_drive};
 
-/// Which of two twins.
+/// The two versions of a lambda.
 #[derive(Clone, Copy)]
-pub enum Kind {
+pub enum Twin {
     Rust,
     Python,
 }
 
-impl fmt::Display for Kind {
+impl fmt::Display for Twin {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Rust => "wasm",
@@ -24,8 +24,8 @@ impl fmt::Display for Kind {
     }
 }
 
-impl Kind {
-    /// The folder of this kind's twin.
+impl Twin {
+    /// The folder of this version.
     pub fn folder(self) -> &'static str {
         match self {
             Self::Rust => "rust",
@@ -39,8 +39,8 @@ impl Kind {
 }
 
 /// Binds this process and its children to the first core that it may use.
-pub fn stay_on_one_core() -> std::io::Result<()> {
-    stay_on(cores()?.first().copied().unwrap_or(0))
+pub fn bind_to_one_core() -> std::io::Result<()> {
+    bind_to(cores()?.first().copied().unwrap_or(0))
 }
 
 /// The cores that this thread may use.
@@ -50,48 +50,48 @@ pub fn cores() -> std::io::Result<Vec<usize>> {
 }
 
 /// Binds this thread, and the threads and processes that it will start, to one core.
-pub fn stay_on(core: usize) -> std::io::Result<()> {
+pub fn bind_to(core: usize) -> std::io::Result<()> {
     let mut one = rustix::thread::CpuSet::new();
     one.set(core);
     Ok(rustix::thread::sched_setaffinity(None, &one)?)
 }
 
-/// The drives that are measured on.
-pub struct Setting {
+/// Drives for the replay benchmarks.
+pub struct ReplayBench {
     sample: PathBuf,
     frames: PathBuf,
     imu: PathBuf,
-    _folders: [Folder; 2],
+    _folders: [TempFolder; 2],
 }
 
-impl Setting {
+impl ReplayBench {
     pub fn new() -> Self {
-        let folder = Folder::new();
+        let folder = TempFolder::new();
         let pixels = vec![99; 1920 * 1080 * 3];
         let frames = (0..4)
             .map(|i| (i * 100_000_000, image(1920, 1080, "bgr8", 5760, &pixels)))
             .collect::<Vec<_>>();
         let frames =
             one_topic(&folder, "/camera/front/image_raw", "sensor_msgs/msg/Image", IMAGE, &frames);
-        let imu_folder = Folder::new();
+        let imu_folder = TempFolder::new();
         let imu = imu_only(&imu_folder, 5);
         Self { sample: sample_drive(), frames, imu, _folders: [folder, imu_folder] }
     }
 
     /// `hello` over the sample drive: a wake for each of 4,170 IMU samples.
-    pub fn hello(&self, kind: Kind) -> Summary {
+    pub fn hello(&self, kind: Twin) -> ReplaySummary {
         self.run(&kind.example("hello"), &["--set", "brake_mps2=-1.4", "--no-record"])
     }
 
-    /// `brake-dark` over the sample drive, brought to look at each of its 400 pictures.
-    pub fn every_frame_decoded(&self, kind: Kind) -> Summary {
+    /// `brake-dark` over the sample drive, configured to inspect each of its 400 images.
+    pub fn every_frame_decoded(&self, kind: Twin) -> ReplaySummary {
         self.run(
             &kind.example("brake-dark"),
             &["--set", "brake_mps2=1000", "--set", "dark_luma=0", "--no-record"],
         )
     }
 
-    fn run(&self, lambda: &Path, args: &[&str]) -> Summary {
+    fn run(&self, lambda: &Path, args: &[&str]) -> ReplaySummary {
         replay(lambda, std::slice::from_ref(&self.sample), args)
             .must_exit(0)
             .summary
@@ -99,19 +99,18 @@ impl Setting {
             .expect("a summary")
     }
 
-    /// By how many per cent memory after the 10th replay of `example` in one process exceeds that
-    /// after the 2nd.
-    pub fn growth_from_2nd_to_10th(&self, example: &str, kind: Kind) -> f64 {
+    /// Growth of memory from the 2nd to the 10th replay of `example` in one process, in %.
+    pub fn growth_from_2nd_to_10th(&self, example: &str, kind: Twin) -> f64 {
         let args = ["--set", "brake_mps2=-1.4", "--repeat", "10"];
         let rounds = self.rounds(&kind.example(example), &self.sample, &args);
         100.0 * (rounds[9].rss_bytes as f64 / rounds[1].rss_bytes as f64 - 1.0)
     }
 
-    /// Wakes per second of `hello` in wasm over `drive` that judges alone, or writes a `journal`,
-    /// or makes `clips`: the median of so many passes in one process that a pass of 20 ms is no
-    /// matter of luck.
+    /// Median wakes per second of 20 passes of `hello` in wasm over `drive`, in one process:
+    /// decisions only, with a `journal`, or with `clips`. A single pass of 20 ms would be too
+    /// noisy.
     fn hello_rounds(&self, drive: &Path, what: &str) -> f64 {
-        let folder = Folder::new();
+        let folder = TempFolder::new();
         let journal = folder.path().join("wakes.journal");
         let mut args = vec!["--set", "brake_mps2=-1.4", "--repeat", "20"];
         match what {
@@ -121,26 +120,26 @@ impl Setting {
             "clips" => {}
             _ => args.push("--no-record"),
         }
-        let rounds = self.rounds(&Kind::Rust.example("hello"), drive, &args);
+        let rounds = self.rounds(&Twin::Rust.example("hello"), drive, &args);
         let mut rates = rounds.iter().map(|round| round.wakes_per_s).collect::<Vec<_>>();
         rates.sort_by(f64::total_cmp);
         rates[rates.len() / 2]
     }
 
-    /// As [`Setting::hello_rounds`] over the sample drive, most of which is pictures that the
-    /// lambda does not read.
+    /// [`ReplayBench::hello_rounds`] over the sample drive, most of which is images that the lambda
+    /// does not read.
     pub fn sample_rounds(&self, what: &str) -> f64 {
         self.hello_rounds(&self.sample, what)
     }
 
-    /// As [`Setting::hello_rounds`] over 200 s of IMU alone.
+    /// [`ReplayBench::hello_rounds`] over 200 s of IMU alone.
     pub fn imu_rounds(&self, what: &str) -> f64 {
         self.hello_rounds(&self.imu, what)
     }
 
-    /// Bytes of the journal of `example` in wasm, for each wake.
+    /// Bytes per wake of the journal of `example` in wasm.
     pub fn journal_bytes_per_wake(&self, example: &str) -> f64 {
-        let folder = Folder::new();
+        let folder = TempFolder::new();
         let journal = folder.path().join("wakes.journal");
         let args = [
             "--set",
@@ -149,12 +148,12 @@ impl Setting {
             "--journal",
             journal.to_str().expect("a plain name"),
         ];
-        let summary = self.run(&Kind::Rust.example(example), &args);
+        let summary = self.run(&Twin::Rust.example(example), &args);
         std::fs::metadata(&journal).expect("a journal").len() as f64 / summary.wakes as f64
     }
 
     fn rounds(&self, lambda: &Path, drive: &Path, args: &[&str]) -> Vec<Round> {
-        let out = Folder::new();
+        let out = TempFolder::new();
         let output = Command::new(program("gleaner-runtime"))
             .arg("replay")
             .arg(lambda)
@@ -175,8 +174,8 @@ impl Setting {
         rounds
     }
 
-    /// Nanoseconds for one array over a frame of 6.2 MB, one figure for each frame, as the lambda
-    /// measures it.
+    /// Nanoseconds to create an array over a frame of 6.2 MB, one value for each frame, measured by
+    /// the lambda.
     pub fn array_ns(&self) -> Vec<f64> {
         let lambda = root().join("bench/lambdas/ndarray/python");
         let run = replay(&lambda, std::slice::from_ref(&self.frames), &[]);
@@ -185,7 +184,7 @@ impl Setting {
     }
 }
 
-/// The value that a share of `values` is below; no number if there are none.
+/// The `share` quantile of `values`; NaN if there are none.
 pub fn quantile(values: &[f64], share: f64) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -204,15 +203,15 @@ pub struct Figure {
 
 impl Figure {
     pub fn at_least(name: &str, unit: &'static str, goal: f64, values: &[f64]) -> Self {
-        Self { goal: Some((goal, true)), ..Self::told(name, unit, values) }
+        Self { goal: Some((goal, true)), ..Self::without_goal(name, unit, values) }
     }
 
     pub fn at_most(name: &str, unit: &'static str, goal: f64, values: &[f64]) -> Self {
-        Self { goal: Some((goal, false)), ..Self::told(name, unit, values) }
+        Self { goal: Some((goal, false)), ..Self::without_goal(name, unit, values) }
     }
 
     /// A figure without a goal.
-    pub fn told(name: &str, unit: &'static str, values: &[f64]) -> Self {
+    pub fn without_goal(name: &str, unit: &'static str, values: &[f64]) -> Self {
         let mut sorted = values.to_vec();
         sorted.sort_by(f64::total_cmp);
         let at = |index: usize| sorted.get(index).copied().unwrap_or(f64::NAN);
@@ -244,7 +243,7 @@ impl fmt::Display for Figure {
             Some((goal, false)) => format!("<= {goal} {unit}"),
             None => "-".to_owned(),
         };
-        let verdict = match (self.goal.is_some(), self.is_met()) {
+        let result = match (self.goal.is_some(), self.is_met()) {
             (false, _) => "",
             (true, true) => "met",
             (true, false) => "not met",
@@ -252,7 +251,8 @@ impl fmt::Display for Figure {
         let digits = if median.abs() < 100.0 { 2 } else { 0 };
         write!(
             f,
-            "| {name} | {goal} | {median:.digits$} {unit} | {low:.digits$} to {high:.digits$} | {runs} | {verdict} |"
+            "| {name} | {goal} | {median:.digits$} {unit} \
+             | {low:.digits$} to {high:.digits$} | {runs} | {result} |"
         )
     }
 }

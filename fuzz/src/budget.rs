@@ -1,6 +1,5 @@
-//! Memory that a reading may take. Every allocation of these programs is counted; one beyond the
-//! budget fails, which ends the program, and so is a finding, however short the memory would have
-//! been used.
+//! Memory budget of a parser. Every allocation of the fuzz programs is counted. An allocation
+//! beyond the budget fails and ends the program, so that even a short peak is a finding.
 
 use std::alloc::System;
 use std::panic;
@@ -11,28 +10,26 @@ use cap::Cap;
 #[global_allocator]
 static ALLOCATOR: Cap<System> = Cap::new(System, usize::MAX);
 
-/// What `read` returns. It may hold `bytes` more than before, at any time.
-///
-/// Where several threads allocate, it is all of them together.
+/// Calls `read` and returns its result. Allocations may exceed those at the start by `bytes`, at
+/// any time, counted over all threads.
 pub fn within<T>(bytes: usize, read: impl FnOnce() -> T) -> T {
-    static TELLS: Once = Once::new();
-    TELLS.call_once(no_limit_for_panics);
+    static HOOK: Once = Once::new();
+    HOOK.call_once(lift_limit_on_panic);
     limit(ALLOCATOR.allocated().saturating_add(bytes));
     let value = read();
     limit(usize::MAX);
     value
 }
 
-/// Saying where a panic comes from takes memory, too; without it the program would wait for itself
-/// instead.
-fn no_limit_for_panics() {
-    let tell = panic::take_hook();
-    panic::set_hook(Box::new(move |what| {
+/// Lifts the limit in a panic: printing the message allocates, and would deadlock at the limit.
+fn lift_limit_on_panic() {
+    let hook = panic::take_hook();
+    panic::set_hook(Box::new(move |info| {
         limit(usize::MAX);
-        tell(what);
+        hook(info);
     }));
 }
 
 fn limit(bytes: usize) {
-    ALLOCATOR.set_limit(bytes).expect("a limit is set above what is allocated");
+    ALLOCATOR.set_limit(bytes).expect("the limit is above the current allocation");
 }

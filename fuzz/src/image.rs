@@ -1,4 +1,4 @@
-//! Images: files to be decoded, and raw pixels to be worked on.
+//! Fuzzes images: compressed files that are decoded, and raw pixels that are processed.
 //!
 //! An input is a byte for the mode, and then either a JPEG or PNG file, or the fields of an image
 //! and its pixels.
@@ -8,7 +8,7 @@ use gleaner_image::{
 };
 
 use crate::budget;
-use crate::input::Input;
+use crate::input::FuzzInput;
 
 /// Modes of an input.
 pub mod mode {
@@ -18,7 +18,7 @@ pub mod mode {
     pub const RAW: u8 = 1;
 }
 
-/// A limit as an input of a lambda has one.
+/// Limit on decoded bytes, as an input of a lambda has one.
 const DECODED_MAX: usize = 1 << 20;
 
 /// The names of all encodings.
@@ -41,9 +41,10 @@ pub const ENCODINGS: [&str; 16] = [
     "bayer_grbg16",
 ];
 
-/// Decodes a file, or works on pixels. Whether it could be decoded, or is an image.
+/// Decodes a file, or processes pixels. Returns whether the file could be decoded, or the pixels
+/// are an image.
 pub fn check(data: &[u8]) -> bool {
-    let mut input = Input(data);
+    let mut input = FuzzInput(data);
     match input.u8() {
         mode::RAW => raw(&mut input),
         _ => file(input.0),
@@ -61,17 +62,17 @@ fn file(data: &[u8]) -> bool {
         assert!(matches!(refused, Err(ImageError::Bomb { .. })), "{refused:?}");
         return false;
     }
-    // As promised; and what is small beside that.
+    // The documented bound, plus small allocations.
     let memory = (4 << 20) + 4 * DECODED_MAX + 2 * data.len() + (256 << 10);
     let decode = |before: u8| {
         let mut out = vec![before; len];
         budget::within(memory, || decode_rgb8(data, &header, DECODED_MAX, &mut out)).map(|()| out)
     };
     let (first, second) = (decode(0xaa), decode(0x55));
-    let sound = first.is_ok();
+    let valid = first.is_ok();
     match (first, second) {
         (Ok(first), Ok(second)) => {
-            assert!(first == second, "{header}: pixels of an earlier image are left")
+            assert!(first == second, "{header}: pixels of an earlier image remain")
         }
         (Err(_), Err(_)) => {}
         (first, second) => panic!("{header}: {:?}, then {:?}", first.err(), second.err()),
@@ -81,12 +82,12 @@ fn file(data: &[u8]) -> bool {
         decode_rgb8(data, &header, DECODED_MAX, &mut short),
         Err(ImageError::Pixels(PixelError::Output { .. }))
     ));
-    sound
+    valid
 }
 
-fn raw(input: &mut Input) -> bool {
+fn raw(input: &mut FuzzInput) -> bool {
     let encoding = ENCODINGS[usize::from(input.u8()) % ENCODINGS.len()];
-    let encoding = Encoding::from_ros(encoding).expect("these are its names");
+    let encoding = Encoding::from_ros(encoding).expect("these are names of ROS");
     let (width, height, step) = (input.u16(), input.u16(), input.u16());
     let big_endian = input.u8() & 1 == 1;
     let [x, y, wide, high] = std::array::from_fn(|_| u32::from(input.u16()));
@@ -113,7 +114,7 @@ fn raw(input: &mut Input) -> bool {
     true
 }
 
-/// What is said of the grey of a region agrees with its pixels.
+/// Checks histogram and mean luma of a region against its grey pixels.
 fn grey(view: &View, roi: Option<Roi>) {
     let Ok(inside) = view.clip(roi) else {
         assert!(ops::histogram(view, roi).is_err() && ops::mean_luma(view, roi).is_err());
@@ -122,7 +123,7 @@ fn grey(view: &View, roi: Option<Roi>) {
     assert!(inside.x + inside.width <= view.width() && inside.y + inside.height <= view.height());
     let counts = ops::histogram(view, roi).expect("the region has pixels");
     let mut grey = vec![0; view.width() as usize * view.height() as usize];
-    ops::to_gray(view, &mut grey).expect("the place is as large as the image");
+    ops::to_gray(view, &mut grey).expect("the buffer is as large as the image");
     let mut expected = [0_u32; 256];
     let rows = grey
         .chunks_exact(view.width() as usize)
@@ -149,7 +150,7 @@ fn resize(view: &View, (width, height): (u32, u32)) {
     assert_eq!(len, width as usize * height as usize * encoding.bytes_per_pixel());
     let mut out = vec![0; len];
     assert_eq!(
-        ops::resize(view, width, height, &mut out).expect("size and place are right"),
+        ops::resize(view, width, height, &mut out).expect("size and buffer are right"),
         encoding
     );
     let unchanged = view.encoding() == encoding && (width, height) == (view.width(), view.height());

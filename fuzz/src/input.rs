@@ -1,8 +1,8 @@
-//! An input, taken apart from its begin. What is missing at its end is 0.
+//! Splits an input into numbers and byte strings, front to back. Bytes beyond its end are 0.
 
-pub(crate) struct Input<'a>(pub(crate) &'a [u8]);
+pub(crate) struct FuzzInput<'a>(pub(crate) &'a [u8]);
 
-impl<'a> Input<'a> {
+impl<'a> FuzzInput<'a> {
     pub(crate) fn u8(&mut self) -> u8 {
         self.bytes(1).first().copied().unwrap_or(0)
     }
@@ -18,7 +18,7 @@ impl<'a> Input<'a> {
         bytes
     }
 
-    /// Up to the next byte 0, which is taken too.
+    /// The bytes up to the next 0, which is consumed.
     pub(crate) fn until_zero(&mut self) -> &'a [u8] {
         let end = self.0.iter().position(|byte| *byte == 0).unwrap_or(self.0.len());
         let bytes = self.bytes(end);

@@ -1,31 +1,33 @@
-//! Journals: as files, and as the wakes in them.
+//! Fuzzes journals: whole files, and encoded wakes.
 //!
-//! An input is a byte for the mode, and what that says. Checksums would keep a fuzzer from all that
-//! lies behind them, so that in one mode they are made right.
+//! An input is a byte for the mode, then data that depends on the mode. Checksums would stop a
+//! fuzzer early, so one mode computes them.
 
 use gleaner_journal::{
-    ATTRIBUTES_MAX, Decoder, Encoder, End, Entry, Reader, TRIGGERS_MAX, VERSION, Writer,
+    ATTRIBUTES_MAX, Decoder, Encoder, JournalEnd, JournalEntry, JournalReader, JournalWriter,
+    TRIGGERS_MAX, VERSION,
 };
 
 use crate::budget;
-use crate::input::Input;
+use crate::input::FuzzInput;
 
 /// Modes of an input.
 pub mod mode {
     /// A file follows.
     pub const FILE: u8 = 0;
-    /// Blocks follow: kind, length in two bytes, payload. They get the right checksums.
+    /// Blocks follow: kind, length in two bytes, payload. Their checksums are computed.
     pub const BLOCKS: u8 = 1;
-    /// The number of inputs follows, and wakes as a block has them.
+    /// The number of inputs follows, then wakes encoded as in a block.
     pub const WAKES: u8 = 2;
 }
 
-/// A journal holds one block at a time, and JSON takes many times its text.
+/// A reader holds one block at a time, and JSON takes a multiple of its text.
 const MEMORY: usize = 8 << 20;
 
-/// Reads it, writes what was read, and reads that. Whether it has wakes, and is not damaged.
+/// Reads the input, writes the result and reads it again. Returns whether it has wakes and is
+/// undamaged.
 pub fn check(data: &[u8]) -> bool {
-    let mut input = Input(data);
+    let mut input = FuzzInput(data);
     match input.u8() {
         mode::WAKES => {
             let inputs = usize::from(input.u8());
@@ -36,8 +38,8 @@ pub fn check(data: &[u8]) -> bool {
     }
 }
 
-/// A file of the blocks that `input` names; `docs/journal.md` says what it consists of.
-pub(crate) fn sealed(mut input: Input) -> Vec<u8> {
+/// A file of the blocks in `input`; `docs/journal.md` describes the format.
+pub(crate) fn sealed(mut input: FuzzInput) -> Vec<u8> {
     let mut file = b"\x89GLJRN\r\n".to_vec();
     file.extend(VERSION.to_le_bytes());
     file.resize(16, 0);
@@ -58,7 +60,9 @@ pub(crate) fn sealed(mut input: Input) -> Vec<u8> {
 }
 
 fn file(bytes: &[u8]) -> bool {
-    let Ok(mut reader) = budget::within(MEMORY, || Reader::open(bytes)) else { return false };
+    let Ok(mut reader) = budget::within(MEMORY, || JournalReader::open(bytes)) else {
+        return false;
+    };
     let header = reader.header().clone();
     let mut entries = Vec::new();
     let failed = loop {
@@ -70,22 +74,24 @@ fn file(bytes: &[u8]) -> bool {
         assert!(entries.len() <= bytes.len(), "more wakes than bytes");
     };
     match &failed {
-        None => assert!(reader.next().is_ok_and(|entry| entry.is_none()), "a wake behind the end"),
+        None => assert!(reader.next().is_ok_and(|entry| entry.is_none()), "a wake after the end"),
         Some(first) => {
-            let again = reader.next().expect_err("what is damaged stays damaged").to_string();
+            let again = reader.next().expect_err("a damaged journal stays damaged").to_string();
             assert_eq!(*first, again);
         }
     }
     assert!(failed.is_none() || !reader.truncated() && reader.end().is_none());
     assert!(failed.is_some() || reader.truncated() != reader.end().is_some());
     assert!(reader.torn_bytes() <= bytes.len() as u64);
-    let end =
-        reader.end().cloned().unwrap_or(End { wakes: entries.len() as u64, ..End::default() });
-    let mut writer = Writer::begin(Vec::new(), &header).expect("the header was read");
+    let end = reader
+        .end()
+        .cloned()
+        .unwrap_or(JournalEnd { wakes: entries.len() as u64, ..JournalEnd::default() });
+    let mut writer = JournalWriter::begin(Vec::new(), &header).expect("the header was read");
     entries.retain(fits);
     entries.iter().for_each(|entry| writer.wake(entry).expect("the wake was read"));
     let written = writer.finish(&end).expect("the end was read");
-    let mut reader = Reader::open(written.as_slice()).expect("it was written");
+    let mut reader = JournalReader::open(written.as_slice()).expect("it was written");
     assert_eq!(*reader.header(), header);
     for entry in &entries {
         assert_eq!(reader.next().expect("it was written").as_ref(), Some(entry));
@@ -95,24 +101,24 @@ fn file(bytes: &[u8]) -> bool {
     failed.is_none() && !entries.is_empty()
 }
 
-/// Numbers in attributes may be longer when they are written again: `1e15` is 1000000000000000.0
-/// then.
-fn fits(entry: &Entry) -> bool {
+/// Returns whether the attributes fit when they are written again: numbers may become longer, such
+/// as `1e15`, which becomes 1000000000000000.0.
+fn fits(entry: &JournalEntry) -> bool {
     let long = |attributes| {
         serde_json::to_string(attributes).is_ok_and(|json| json.len() > ATTRIBUTES_MAX)
     };
     !entry.triggers.iter().any(|trigger| long(&trigger.attributes))
 }
 
-/// What is decoded, encoded again, and decoded again is the same, to the last bit.
+/// Decodes, encodes and decodes again: both results are equal to the last bit.
 fn wakes(inputs: usize, bytes: &[u8]) -> bool {
     let mut decoder = Decoder::new(inputs);
     let mut rest = bytes;
-    let (mut entries, mut sound) = (Vec::new(), true);
+    let (mut entries, mut valid) = (Vec::new(), true);
     while !rest.is_empty() {
         let before = rest.len();
         let Ok(entry) = budget::within(MEMORY, || decoder.decode(&mut rest)) else {
-            sound = false;
+            valid = false;
             break;
         };
         assert!(rest.len() < before, "a wake of no bytes");
@@ -121,13 +127,13 @@ fn wakes(inputs: usize, bytes: &[u8]) -> bool {
         entries.push(entry);
     }
     entries.retain(fits);
-    again(inputs, &entries);
-    sound && !entries.is_empty()
+    round_trip(inputs, &entries);
+    valid && !entries.is_empty()
 }
 
-/// Encodes `entries`, decodes that, and compares.
-pub(crate) fn again(inputs: usize, entries: &[Entry]) {
-    let encode = |entries: &[Entry]| {
+/// Encodes `entries`, decodes the result, and compares.
+pub(crate) fn round_trip(inputs: usize, entries: &[JournalEntry]) {
+    let encode = |entries: &[JournalEntry]| {
         let (mut encoder, mut bytes) = (Encoder::new(inputs), Vec::new());
         entries.iter().for_each(|entry| encoder.encode(entry, &mut bytes));
         bytes
@@ -139,6 +145,6 @@ pub(crate) fn again(inputs: usize, entries: &[Entry]) {
         assert_eq!(entry.differs_from(&now, &[], true), None);
         read.push(now);
     }
-    assert!(rest.is_empty(), "bytes behind the last wake");
-    assert!(encode(&read) == bytes, "the same wakes as other bytes");
+    assert!(rest.is_empty(), "bytes after the last wake");
+    assert!(encode(&read) == bytes, "the same wakes encode to different bytes");
 }

@@ -1,13 +1,13 @@
-//! What reads foreign bytes, fed with bytes that a fuzzer makes up; and the calls of a lambda.
-//! `docs/fuzzing.md` says how.
+//! Fuzz targets for every parser of untrusted input, and for the calls of a lambda. See
+//! `docs/fuzzing.md`.
 //!
-//! Each module is a target: its `check` reads bytes in every way that we offer, panics if what
-//! comes out contradicts what is promised, and returns whether the input was sound, so that there
-//! was something to check. Most promises are such that two readings must agree. `budget` bounds the
-//! memory of a reading, `seeds` are the sound inputs that a fuzzer begins with. In `targets/` is a
-//! program for each.
+//! Each module is a target. Its `check` parses an input in every way that the library offers,
+//! panics if a result contradicts a documented guarantee, and returns whether the input was valid,
+//! so that there was something to check. Most guarantees are checked by parsing twice and
+//! comparing. `budget` bounds the memory of a parser, `seeds` are valid inputs that a fuzzer starts
+//! from, and `targets/` holds a program for each target.
 //!
-//! What never happens here: a promise that only holds for what our own writers write.
+//! A check never relies on properties that only files written by Gleaner have.
 
 pub mod bag;
 pub mod budget;
@@ -21,18 +21,18 @@ pub mod manifest;
 pub mod message;
 pub mod seeds;
 
-/// A target: its name, what it does with an input, and the inputs and words to begin with.
+/// A fuzz target: its name, its check, its seeds and its dictionary.
 pub struct Target {
     /// Its name; its program is `fuzz-<name>`.
     pub name: &'static str,
-    /// Panics if a promise is broken. Returns whether the input was sound, as seeds are. None where
-    /// this was built without it.
+    /// Panics if a guarantee is broken. Returns whether the input was valid, as every seed is.
+    /// `None` if the crate was built without the feature of this target.
     pub check: Option<fn(&[u8]) -> bool>,
-    /// Length up to which inputs make sense, in bytes: a longer one is cut off there.
+    /// Maximum useful length of an input in bytes; longer inputs are truncated.
     pub longest: usize,
-    /// Sound inputs, none longer.
+    /// Valid inputs, none longer than `longest`.
     pub seeds: fn() -> Vec<Vec<u8>>,
-    /// What a fuzzer is unlikely to find by itself.
+    /// Dictionary entries: tokens that a fuzzer is unlikely to find by itself.
     pub words: &'static [&'static str],
 }
 

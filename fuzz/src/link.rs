@@ -1,10 +1,10 @@
-//! What a lambda's process and a starter say to the recorder, and the recorder to a lambda's
-//! process, over sockets.
+//! Fuzzes the sockets of the recorder: messages from a lambda's process and from a starter to the
+//! recorder, and from the recorder to a lambda's process.
 //!
 //! A starter sends one socket, with the first byte.
 //!
-//! An input is a byte for the mode, and then either bytes as they go over the socket, or frames:
-//! tag, length in two bytes, payload.
+//! An input is a byte for the mode, then either the raw bytes of the stream, or frames: tag, length
+//! in two bytes, payload.
 
 use std::io::{IoSlice, Write};
 use std::mem::MaybeUninit;
@@ -12,68 +12,70 @@ use std::net::Shutdown;
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
 
-use gleaner_protocol::link::{Controlled, Heard, LambdaLink, Order, RecorderLink};
+use gleaner_protocol::link::{
+    ControlMessage, ControlServer, LambdaLink, LambdaMessage, RecorderLink,
+};
 
 use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
 
 use crate::budget;
-use crate::input::Input;
+use crate::input::FuzzInput;
 use crate::journal;
 
 /// Bits of the mode.
 pub mod mode {
-    /// To whom it is said; these two bits.
-    pub const WHO: u8 = 3;
-    /// By a lambda's process to the recorder.
+    /// Mask of the two bits that select sender and receiver.
+    pub const PEERS: u8 = 3;
+    /// From a lambda's process to the recorder.
     pub const LAMBDA: u8 = 0;
-    /// By a starter to the recorder.
+    /// From a starter to the recorder.
     pub const STARTER: u8 = 1;
-    /// By the recorder to a lambda's process.
+    /// From the recorder to a lambda's process.
     pub const RECORDER: u8 = 2;
     /// Frames follow.
     pub const FRAMES: u8 = 4;
 }
 
-/// The longest that is said, so that a socket takes it at once.
+/// Longest stream that is sent: a socket buffer takes it in one write.
 const BYTES_MAX: usize = 64 << 10;
 
-/// What one frame may take. JSON takes many times its text.
+/// Memory budget of one frame. JSON takes a multiple of its text.
 const MEMORY: usize = 8 << 20;
 
-/// Has it said, and listens to the end. Whether anything of it made sense.
+/// Sends the input and receives it to the end. Returns whether any message was valid.
 pub fn check(data: &[u8]) -> bool {
-    let mut input = Input(data);
+    let mut input = FuzzInput(data);
     let mode = input.u8();
     let mut bytes = if mode & mode::FRAMES == 0 { input.0.to_vec() } else { framed(input) };
     if bytes.len() > BYTES_MAX {
         return false;
     }
-    let (mut theirs, ours) = UnixStream::pair().expect("the system has sockets");
-    if mode & mode::WHO == mode::STARTER && !bytes.is_empty() {
+    let (mut remote, local) = UnixStream::pair().expect("the system has sockets");
+    if mode & mode::PEERS == mode::STARTER && !bytes.is_empty() {
         let (first, rest) = bytes.split_at(1);
-        with_socket(&theirs, first);
+        with_socket(&remote, first);
         bytes = rest.to_vec();
     }
-    theirs.write_all(&bytes).expect("a socket takes this much at once");
-    theirs.shutdown(Shutdown::Write).expect("the socket is open");
-    match mode & mode::WHO {
-        mode::STARTER => orders(ours, bytes.len()),
-        mode::RECORDER => answers(ours, bytes.len()),
-        _ => wakes(ours, bytes.len()),
+    remote.write_all(&bytes).expect("a socket buffer takes this much in one write");
+    remote.shutdown(Shutdown::Write).expect("the socket is open");
+    match mode & mode::PEERS {
+        mode::STARTER => orders(local, bytes.len()),
+        mode::RECORDER => answers(local, bytes.len()),
+        _ => wakes(local, bytes.len()),
     }
 }
 
-/// Sends `bytes` and a socket, as a starter does with the first bytes of an order.
+/// Sends `bytes` and a socket, as a starter does with the first bytes of a command.
 fn with_socket(to: &UnixStream, bytes: &[u8]) {
     let fds = [to.as_fd()];
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
     let mut with = SendAncillaryBuffer::new(&mut space);
     with.push(SendAncillaryMessage::ScmRights(&fds));
     sendmsg(to, &[IoSlice::new(bytes)], &mut with, SendFlags::NOSIGNAL)
-        .expect("a socket takes this much at once");
+        .expect("a socket buffer takes this much in one write");
 }
 
-fn framed(mut input: Input) -> Vec<u8> {
+fn framed(mut input: FuzzInput) -> Vec<u8> {
     let mut bytes = Vec::new();
     while !input.0.is_empty() {
         let (tag, len) = (input.u8(), input.u16());
@@ -88,19 +90,19 @@ fn framed(mut input: Input) -> Vec<u8> {
 fn wakes(socket: UnixStream, bytes: usize) -> bool {
     let (mut link, answers) = LambdaLink::new(socket.into()).expect("the system has sockets");
     let mut inputs = None;
-    for heard in 0.. {
-        assert!(heard <= bytes, "more frames than bytes");
-        match budget::within(MEMORY, || link.hear()) {
-            Ok(Some(Heard::Hello(header))) => {
+    for frames in 0.. {
+        assert!(frames <= bytes, "more frames than bytes");
+        match budget::within(MEMORY, || link.receive()) {
+            Ok(Some(LambdaMessage::Hello(header))) => {
                 assert!(inputs.is_none(), "a second hello");
                 inputs = Some(header.inputs.len());
             }
-            Ok(Some(Heard::Wake { entry, .. })) => {
+            Ok(Some(LambdaMessage::Wake { entry, .. })) => {
                 let inputs = inputs.expect("a wake before hello");
                 assert_eq!(entry.seen.len(), inputs);
-                journal::again(inputs, &[*entry]);
+                journal::round_trip(inputs, &[*entry]);
             }
-            Ok(Some(Heard::Bye)) => {}
+            Ok(Some(LambdaMessage::Bye)) => {}
             Ok(None) | Err(_) => break,
         }
     }
@@ -109,11 +111,11 @@ fn wakes(socket: UnixStream, bytes: usize) -> bool {
 }
 
 fn orders(socket: UnixStream, bytes: usize) -> bool {
-    let mut controlled = Controlled::new(socket.into());
+    let mut controlled = ControlServer::new(socket.into());
     let (mut orders, mut sockets) = (0, 0);
-    while let Ok(Some(order)) = budget::within(MEMORY, || controlled.order()) {
-        sockets += usize::from(matches!(order, Order::Add(..)));
-        assert!(sockets <= 1, "a lambda without a socket");
+    while let Ok(Some(order)) = budget::within(MEMORY, || controlled.receive()) {
+        sockets += usize::from(matches!(order, ControlMessage::Add(..)));
+        assert!(sockets <= 1, "a lambda without its own socket");
         orders += 1;
         assert!(orders <= bytes, "more orders than bytes");
     }
@@ -122,17 +124,17 @@ fn orders(socket: UnixStream, bytes: usize) -> bool {
 
 fn answers(socket: UnixStream, bytes: usize) -> bool {
     let mut link = RecorderLink::new(socket.into());
-    let mut sound = false;
-    // Until it finds that the other side has closed, or that it makes no sense.
+    let mut valid = false;
+    // Until the link reports a closed connection or a protocol error.
     for polls in 0.. {
-        assert!(polls <= bytes + 1, "a closed connection is not found to be closed");
+        assert!(polls <= bytes + 1, "a closed connection is not reported");
         match budget::within(MEMORY, || link.poll()) {
-            Ok(said) => {
-                assert!(said.len() <= bytes, "more answers than bytes");
-                sound |= !said.is_empty();
+            Ok(answers) => {
+                assert!(answers.len() <= bytes, "more answers than bytes");
+                valid |= !answers.is_empty();
             }
             Err(_) => break,
         }
     }
-    sound
+    valid
 }

@@ -1,18 +1,18 @@
-//! Manifests. An input is the text of one.
+//! Fuzzes manifests. An input is the text of a manifest.
 
 use gleaner_base::{ByteSize, Explain, Failure, format_duration, parse_duration};
-use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Limits, Manifest, Schedule, bounds};
+use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Limits, Manifest, ScheduleSpec, bounds};
 
 use crate::budget;
 
-/// TOML takes many times its text.
+/// Memory budget: parsed TOML takes a multiple of its text.
 const MEMORY: usize = 32 << 20;
 
-/// The longest message about a manifest: a few lists of names, each name cut to 80 characters.
+/// Longest error message about a manifest: a few lists of names, each name cut to 80 characters.
 const MESSAGE_MAX: usize = 64 << 10;
 
-/// Parses it. What is accepted is within all bounds, and what is refused is refused in words that
-/// can be shown.
+/// Parses the text. An accepted manifest is within all bounds; the error of a rejected one can be
+/// printed safely.
 pub fn check(data: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(data) else { return false };
     match budget::within(MEMORY, || Manifest::parse(text, "lambda.toml")) {
@@ -25,8 +25,8 @@ pub fn check(data: &[u8]) -> bool {
             let _ = error.exit();
             let shown = budget::within(MEMORY, || Failure::from(error).to_string());
             assert!(shown.len() <= MESSAGE_MAX, "a message of {} bytes", shown.len());
-            let acts = |character: char| character.is_control() && character != '\n';
-            assert!(!shown.contains(acts), "a message acts on the terminal: {shown:?}");
+            let is_escape = |character: char| character.is_control() && character != '\n';
+            assert!(!shown.contains(is_escape), "a message with control characters: {shown:?}");
             false
         }
     }
@@ -40,15 +40,15 @@ fn accepted(manifest: &Manifest) {
     let memory = manifest.inputs.iter().map(|input| input.memory().bytes()).sum::<u64>();
     assert!(memory <= bounds::INPUTS_MEMORY_MAX.bytes(), "{memory} bytes of inputs");
     match &manifest.schedule {
-        Schedule::Event { .. } => {
-            assert!(manifest.event_input().is_some(), "woken by an input that is not there")
+        ScheduleSpec::Event { .. } => {
+            assert!(manifest.event_input().is_some(), "woken by an input that does not exist")
         }
-        Schedule::Periodic { period } => {
+        ScheduleSpec::Periodic { period } => {
             assert!(bounds::PERIOD.contains(period) && reads_back(*period))
         }
     }
     for input in &manifest.inputs {
-        assert!(manifest.input(input.name.as_str()) == Some(input), "two inputs of one name");
+        assert!(manifest.input(input.name.as_str()) == Some(input), "two inputs with one name");
         assert!(input.depth >= 1 && input.slots() > input.depth);
         assert_eq!(input.max_size.to_string().parse::<ByteSize>().ok(), Some(input.max_size));
         assert_eq!(input.decoded_size.is_some(), input.type_name.is_compressed_image());
@@ -62,7 +62,7 @@ fn accepted(manifest: &Manifest) {
         );
     }
     assert!(
-        (Limits::LEAST.fuel..=Limits::MOST.fuel).contains(&manifest.limits.fuel)
+        (Limits::MIN.fuel..=Limits::MAX.fuel).contains(&manifest.limits.fuel)
             && reads_back(manifest.limits.deadline)
     );
     config(manifest);
@@ -74,7 +74,7 @@ fn reads_back(duration: std::time::Duration) -> bool {
     parse_duration(&format_duration(duration)) == Ok(duration)
 }
 
-/// A default is a value that the item takes, also as the text that is shown for it.
+/// Checks that a default is a valid value of its item, also when it is parsed from its own text.
 fn config(manifest: &Manifest) {
     let set = ConfigSet::resolve(manifest, &[]).expect("nothing is set");
     assert_eq!(set.len(), manifest.config.len());

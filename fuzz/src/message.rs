@@ -1,19 +1,19 @@
-//! Messages as CDR, of the bundled types and of types that the input defines.
+//! Fuzzes CDR messages, of the bundled types and of types that the input defines.
 //!
-//! An input is a byte for the mode, one for the order of bytes, the type (its place in [`TYPES`],
-//! or its definition, up to a byte 0), a path up to a byte 0, and the message. Besides that path,
-//! all fields of the type are read.
+//! An input is a byte for the mode, one for the byte order, the type (its index in [`TYPES`], or
+//! its definition up to a byte 0), a path up to a byte 0, and the message. All fields of the type
+//! are read, and the path.
 
 use std::collections::VecDeque;
 use std::sync::OnceLock;
 
 use gleaner_messages::{
-    CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, Kind, PathError, Sources,
-    Value, header_stamp,
+    CdrError, CompressedView, Definitions, Endian, FieldPath, ImageView, MessageValue, PathError,
+    Sources, ValueKind, header_stamp,
 };
 
 use crate::budget;
-use crate::input::Input;
+use crate::input::FuzzInput;
 
 /// Modes of an input.
 pub mod mode {
@@ -23,7 +23,7 @@ pub mod mode {
     pub const DEFINED: u8 = 1;
 }
 
-/// Types of every shape: flat, nested, with arrays of structs, texts and arrays of texts.
+/// Types of every shape: flat, nested, with arrays of structs, strings and arrays of strings.
 pub const TYPES: [&str; 16] = [
     "sensor_msgs/msg/Image",
     "sensor_msgs/msg/CompressedImage",
@@ -43,15 +43,15 @@ pub const TYPES: [&str; 16] = [
     "rcl_interfaces/msg/ParameterEvent",
 ];
 
-/// Fields that are read of one type.
+/// Maximum number of fields that are read of one type.
 const PATHS_MAX: usize = 64;
 
-/// Memory for a type and a path of it. A page of text may define 20,000 fields.
+/// Memory budget of a type and one path. A page of text may define 20,000 fields.
 const DEFINITIONS_MEMORY: usize = 64 << 20;
 
-/// Reads one message in every way that there is. Whether any of its fields could be read.
+/// Reads a message with every accessor. Returns whether any field could be read.
 pub fn check(data: &[u8]) -> bool {
-    let mut input = Input(data);
+    let mut input = FuzzInput(data);
     let (mode, order) = (input.u8(), input.u8());
     let endian = if order & 1 == 0 { Endian::Little } else { Endian::Big };
     if mode == mode::DEFINED {
@@ -68,13 +68,13 @@ pub fn check(data: &[u8]) -> bool {
     let place = usize::from(input.u8()) % bundled.len();
     let (definitions, paths) = &bundled[place];
     let path = input.until_zero();
-    let sound = of_type(definitions, paths, path, input.0, endian);
+    let valid = of_type(definitions, paths, path, input.0, endian);
     match place {
         0 => image_agrees(paths, input.0, endian),
         1 => compressed_agrees(paths, input.0, endian),
         _ => {}
     }
-    sound
+    valid
 }
 
 fn bundled() -> &'static [(Definitions, Vec<FieldPath>)] {
@@ -83,7 +83,7 @@ fn bundled() -> &'static [(Definitions, Vec<FieldPath>)] {
         let definitions = TYPES.map(|name| {
             let text = Sources::default()
                 .find(name)
-                .expect("a bundled type is whole")
+                .expect("bundled types are complete")
                 .expect("the type is bundled");
             Definitions::parse(name, &text).expect("a bundled type parses")
         });
@@ -97,8 +97,8 @@ fn bundled() -> &'static [(Definitions, Vec<FieldPath>)] {
     })
 }
 
-/// The first [`PATHS_MAX`] fields of a type. Of an array of structs, the first and the third
-/// element.
+/// The first [`PATHS_MAX`] fields of a type; of an array of structs, those of the first and the
+/// third element.
 fn all_paths(definitions: &Definitions) -> Vec<FieldPath> {
     let mut open: VecDeque<String> = definitions.fields().map(str::to_owned).collect();
     let mut paths = Vec::new();
@@ -121,7 +121,7 @@ fn all_paths(definitions: &Definitions) -> Vec<FieldPath> {
             Err(PathError::WideText { .. } | PathError::OutOfRange { .. }) => {}
             Err(error) => panic!("`{path}` is a field: {error}"),
         }
-        // Where structs nest, there are more paths than anybody reads.
+        // Nested structs have exponentially many paths.
         open.truncate(4 * PATHS_MAX);
     }
     paths
@@ -144,52 +144,52 @@ fn of_type(
     read.count() > 0
 }
 
-/// One field is the same whichever way it is read, and does not depend on what stands behind it.
-/// Whether it could be read.
+/// Checks that all accessors read the same value of a field, and that bytes after the message do
+/// not change it. Returns whether the field could be read.
 fn field(path: &FieldPath, cdr: &[u8], longer: &[u8], endian: Endian) -> bool {
-    // A number takes at least a byte there and eight here, a text four and sixteen; a vector grows
-    // by doubling.
+    // A number takes at least one byte in the message and eight in memory, a string four and
+    // sixteen; a vector grows by doubling.
     let memory = (64 << 10) + 32 * cdr.len();
     let read = budget::within(memory, || path.read(cdr, endian));
     let number = budget::within(4096, || path.number(cdr, endian));
     let again = path.read(longer, endian);
     let Ok(value) = read else {
-        assert!(number.is_err(), "{}: a number where nothing can be read", path.path());
+        assert!(number.is_err(), "{}: a number of an unreadable field", path.path());
         return false;
     };
     assert!(
         again.is_ok_and(|again| same(&value, &again)),
-        "{}: more bytes behind the message change it",
+        "{}: bytes after the message change it",
         path.path()
     );
     let inside = |bytes: &[u8]| {
         let (all, part) = (cdr.as_ptr_range(), bytes.as_ptr_range());
         assert!(
             bytes.is_empty() || all.start <= part.start && part.end <= all.end,
-            "bytes from elsewhere"
+            "bytes outside the message"
         );
     };
     let (kind, expected) = match &value {
-        Value::Bool(truth) => (Kind::Bool, Some(f64::from(u8::from(*truth)))),
-        Value::Signed(number) => (Kind::Signed, Some(*number as f64)),
-        Value::Unsigned(number) => (Kind::Unsigned, Some(*number as f64)),
-        Value::Real(number) => (Kind::Real, Some(*number)),
-        Value::Text(text) => {
+        MessageValue::Bool(truth) => (ValueKind::Bool, Some(f64::from(u8::from(*truth)))),
+        MessageValue::Signed(number) => (ValueKind::Signed, Some(*number as f64)),
+        MessageValue::Unsigned(number) => (ValueKind::Unsigned, Some(*number as f64)),
+        MessageValue::Real(number) => (ValueKind::Real, Some(*number)),
+        MessageValue::Text(text) => {
             inside(text.as_bytes());
-            (Kind::Text, None)
+            (ValueKind::Text, None)
         }
-        Value::Bytes(bytes) => {
+        MessageValue::Bytes(bytes) => {
             inside(bytes);
-            (Kind::Bytes, None)
+            (ValueKind::Bytes, None)
         }
-        Value::Numbers(numbers) => {
+        MessageValue::Numbers(numbers) => {
             assert!(numbers.len() <= cdr.len());
-            (Kind::Numbers, None)
+            (ValueKind::Numbers, None)
         }
-        Value::Texts(texts) => {
+        MessageValue::Texts(texts) => {
             assert!(texts.len() <= cdr.len() / 4);
             texts.iter().for_each(|text| inside(text.as_bytes()));
-            (Kind::Texts, None)
+            (ValueKind::Texts, None)
         }
     };
     assert_eq!(
@@ -208,18 +208,18 @@ fn field(path: &FieldPath, cdr: &[u8], longer: &[u8], endian: Endian) -> bool {
     true
 }
 
-/// As `==`, but for numbers that are none.
-fn same(a: &Value, b: &Value) -> bool {
+/// As `==`, but NaN equals itself.
+fn same(a: &MessageValue, b: &MessageValue) -> bool {
     match (a, b) {
-        (Value::Real(a), Value::Real(b)) => a.to_bits() == b.to_bits(),
-        (Value::Numbers(a), Value::Numbers(b)) => {
+        (MessageValue::Real(a), MessageValue::Real(b)) => a.to_bits() == b.to_bits(),
+        (MessageValue::Numbers(a), MessageValue::Numbers(b)) => {
             a.iter().map(|number| number.to_bits()).eq(b.iter().map(|number| number.to_bits()))
         }
         _ => a == b,
     }
 }
 
-/// The quick way to the stamp finds what its path finds.
+/// Checks that the fast accessor of the header's stamp agrees with the field paths.
 fn stamp(definitions: &Definitions, cdr: &[u8], endian: Endian) {
     let Some(quick) = header_stamp(definitions) else { return };
     let first = definitions.fields().next().expect("a type has fields");
@@ -228,8 +228,8 @@ fn stamp(definitions: &Definitions, cdr: &[u8], endian: Endian) {
         let inside = [format!("{first}.stamp.{name}"), format!("{first}.{name}")];
         let path = inside.iter().find_map(|path| FieldPath::compile(definitions, path).ok());
         path.and_then(|path| match path.read(cdr, endian) {
-            Ok(Value::Signed(number)) => Some(number),
-            Ok(Value::Unsigned(number)) => i64::try_from(number).ok(),
+            Ok(MessageValue::Signed(number)) => Some(number),
+            Ok(MessageValue::Unsigned(number)) => i64::try_from(number).ok(),
             _ => None,
         })
     };
@@ -247,11 +247,11 @@ fn stamp(definitions: &Definitions, cdr: &[u8], endian: Endian) {
 fn image_agrees(paths: &[FieldPath], cdr: &[u8], endian: Endian) {
     let Ok(view) = budget::within(4096, || ImageView::read(cdr, endian)) else { return };
     let expected = [
-        ("width", Value::Unsigned(view.width.into())),
-        ("height", Value::Unsigned(view.height.into())),
-        ("encoding", Value::Text(view.encoding)),
-        ("step", Value::Unsigned(view.step.into())),
-        ("data", Value::Bytes(view.data)),
+        ("width", MessageValue::Unsigned(view.width.into())),
+        ("height", MessageValue::Unsigned(view.height.into())),
+        ("encoding", MessageValue::Text(view.encoding)),
+        ("step", MessageValue::Unsigned(view.step.into())),
+        ("data", MessageValue::Bytes(view.data)),
     ];
     paths_agree(paths, cdr, endian, &expected);
 }
@@ -262,11 +262,11 @@ fn compressed_agrees(paths: &[FieldPath], cdr: &[u8], endian: Endian) {
         paths,
         cdr,
         endian,
-        &[("format", Value::Text(view.format)), ("data", Value::Bytes(view.data))],
+        &[("format", MessageValue::Text(view.format)), ("data", MessageValue::Bytes(view.data))],
     );
 }
 
-fn paths_agree(paths: &[FieldPath], cdr: &[u8], endian: Endian, expected: &[(&str, Value)]) {
+fn paths_agree(paths: &[FieldPath], cdr: &[u8], endian: Endian, expected: &[(&str, MessageValue)]) {
     for (name, value) in expected {
         let path = paths.iter().find(|path| path.path() == *name).expect("an image has this field");
         assert_eq!(path.read(cdr, endian).as_ref(), Ok(value), "{name}");

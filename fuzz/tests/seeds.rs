@@ -1,10 +1,10 @@
-//! Seeds are sound and keep the promises of their targets, also when they are changed by chance. In
-//! one test, as memory is counted for the whole program.
+//! Checks all seeds, unchanged and with random changes. One test only, because memory is counted
+//! for the whole process.
 
 use gleaner_fuzz::{TARGETS, Target};
 
-/// Inputs made from the seeds of a target: as many as take a second or two. Twenty times as many
-/// with `GLEANER_LONG=1`.
+/// Number of inputs made from the seeds of a target: one or two seconds' worth. Twenty times as
+/// many with `GLEANER_LONG=1`.
 fn inputs(target: &Target) -> u32 {
     match target.name {
         "bag" => 1_000,
@@ -14,10 +14,10 @@ fn inputs(target: &Target) -> u32 {
     }
 }
 
-/// xorshift64: the same inputs each time.
-struct Random(u64);
+/// Changes seeds with xorshift64: the same inputs in each run.
+struct SeedMutator(u64);
 
-impl Random {
+impl SeedMutator {
     fn below(&mut self, n: usize) -> usize {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;
@@ -25,8 +25,8 @@ impl Random {
         (self.0 % n as u64) as usize
     }
 
-    /// One of the seeds, with some bytes changed, moved, left out or taken from another one.
-    fn changed(&mut self, seeds: &[Vec<u8>], longest: usize) -> Vec<u8> {
+    /// One of the seeds, with some bytes changed, removed, or replaced from another seed.
+    fn mutate(&mut self, seeds: &[Vec<u8>], longest: usize) -> Vec<u8> {
         let mut bytes = seeds[self.below(seeds.len())].clone();
         for _ in 0..=self.below(4) {
             let (at, to) = (self.below(bytes.len() + 1), self.below(bytes.len() + 1));
@@ -46,41 +46,41 @@ impl Random {
 }
 
 #[test]
-fn all_seeds_keep_all_promises_also_when_they_are_cut_off_or_changed() {
-    let times = if std::env::var("GLEANER_LONG").is_ok_and(|said| said == "1") { 20 } else { 1 };
+fn all_seeds_pass_their_checks_whole_truncated_and_changed() {
+    let times = if std::env::var("GLEANER_LONG").is_ok_and(|value| value == "1") { 20 } else { 1 };
     for target in TARGETS {
         let seeds = (target.seeds)();
         let Some(check) = target.check else {
-            println!("{}: skipped, since this is built without its feature", target.name);
+            println!("{}: skipped, built without its feature", target.name);
             continue;
         };
         assert!(seeds.len() >= 3, "{}", target.name);
         for (number, seed) in seeds.iter().enumerate() {
-            // libFuzzer would cut it off.
+            // libFuzzer would truncate it.
             assert!(
                 seed.len() <= target.longest,
                 "seed {number} for {} has {} bytes",
                 target.name,
                 seed.len()
             );
-            assert!(check(seed), "seed {number} for {} is not sound", target.name);
+            assert!(check(seed), "seed {number} for {} is not valid", target.name);
             for part in 0..8 {
                 check(&seed[..seed.len() * part / 8]);
             }
         }
-        changed(&target, check, &seeds, times);
+        check_mutations(&target, check, &seeds, times);
     }
 }
 
-fn changed(target: &Target, check: fn(&[u8]) -> bool, seeds: &[Vec<u8>], times: u32) {
+fn check_mutations(target: &Target, check: fn(&[u8]) -> bool, seeds: &[Vec<u8>], times: u32) {
     let inputs = times * inputs(target);
-    let mut random = Random(0x9e37_79b9_7f4a_7c15);
+    let mut mutator = SeedMutator(0x9e37_79b9_7f4a_7c15);
     let started = std::time::Instant::now();
-    let sound = (0..inputs).filter(|_| check(&random.changed(seeds, target.longest))).count();
+    let valid = (0..inputs).filter(|_| check(&mutator.mutate(seeds, target.longest))).count();
     println!(
-        "{}: {sound} of {inputs} changed seeds are sound, in {:?}",
+        "{}: {valid} of {inputs} changed seeds are valid, in {:?}",
         target.name,
         started.elapsed()
     );
-    assert!(sound > 0, "{}: nothing was checked", target.name);
+    assert!(valid > 0, "{}: nothing was checked", target.name);
 }

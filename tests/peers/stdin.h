@@ -1,11 +1,11 @@
-// Peers end when whoever started them does, or wants them to: then their standard input ends.
+// Peers end when their standard input ends: when the program that started them ends or closes it.
 #ifndef GLEANER_PEERS_STDIN_H
 #define GLEANER_PEERS_STDIN_H
 
 #include <poll.h>
 #include <unistd.h>
 
-// Waits for at most `ms`; whether standard input has ended by then.
+// Waits for at most `ms`; returns whether standard input has ended.
 static inline int stdin_ended(int ms)
 {
   struct pollfd in = {.fd = 0, .events = POLLIN, .revents = 0};

@@ -1,5 +1,6 @@
-// The sum that both ends print of a message: CRC-32 of its fields in wire order, little-endian, without padding; a string
-// is its length with the zero, its characters and the zero, a sequence its length and its elements.
+// The checksum of a message that both ends print: CRC-32 of its fields in wire order, little-endian,
+// without padding; a string is its length with the zero, its characters and the zero, a sequence its
+// length and its elements.
 #ifndef GLEANER_PEERS_SUM_H
 #define GLEANER_PEERS_SUM_H
 
@@ -25,7 +26,7 @@ static inline uint32_t sum_bytes(uint32_t sum, const void *data, size_t length)
   return sum;
 }
 
-// Peers run on little-endian machines: what is in memory is what the sum is over.
+// Peers run on little-endian machines: memory and wire format are the same.
 static inline uint32_t sum_u8(uint32_t sum, uint8_t value) { return sum_bytes(sum, &value, 1); }
 static inline uint32_t sum_u32(uint32_t sum, uint32_t value) { return sum_bytes(sum, &value, 4); }
 static inline uint32_t sum_f64(uint32_t sum, double value) { return sum_bytes(sum, &value, 8); }
@@ -38,7 +39,7 @@ static inline uint32_t sum_text(uint32_t sum, const char *text)
 
 static inline uint32_t sum_end(uint32_t sum) { return ~sum; }
 
-// What is in a message follows from its number: see tests/src/peers/message.rs.
+// The content of a message follows from its number: see tests/src/peers/message.rs.
 static inline int32_t content_sec(uint32_t n) { return (int32_t)(1000 + n); }
 static inline uint32_t content_nanosec(uint32_t n) { return 7 * n + 3; }
 static inline uint8_t content_byte(uint32_t n, size_t at) { return (uint8_t)(31 * at + 7 * n); }

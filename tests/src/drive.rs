@@ -1,4 +1,4 @@
-//! Drives made by a test: MCAP files with chosen messages, and their CDR.
+//! Builds drives for tests: MCAP files with given messages, and the CDR of messages.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -6,11 +6,11 @@ use std::path::PathBuf;
 
 use mcap::records::MessageHeader;
 
-use crate::{Folder, sample_drive};
+use crate::{TempFolder, sample_drive};
 
 /// `sensor_msgs/msg/Image` as ROS 2 defines it.
-pub const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n\
-uint32 step\nuint8[] data\n\
+pub const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\n\
+uint8 is_bigendian\nuint32 step\nuint8[] data\n\
 ================================================================================\n\
 MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
 ================================================================================\n\
@@ -23,10 +23,10 @@ MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
 ================================================================================\n\
 MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
 
-/// Writes a drive of one topic; each message is its log time in nanoseconds and its CDR without
+/// Writes a drive with one topic; a message is its log time in nanoseconds and its CDR without
 /// encapsulation.
 pub fn one_topic(
-    folder: &Folder,
+    folder: &TempFolder,
     topic: &str,
     type_name: &str,
     schema: &str,
@@ -50,17 +50,17 @@ pub fn one_topic(
         let data = [&[0, 1, 0, 0], cdr.as_slice()].concat();
         writer.write_to_known_channel(&header, &data).expect("a message");
     }
-    writer.finish().expect("a whole drive");
+    writer.finish().expect("a complete drive");
     drop(writer);
     folder.write("made.mcap", file.into_inner())
 }
 
-/// The IMU of the sample drive alone, so many times in a row, 40 s each.
-pub fn imu_only(folder: &Folder, times: u64) -> PathBuf {
-    let bytes = std::fs::read(sample_drive()).expect("the sample drive is there");
+/// Writes a drive with only the IMU of the sample drive, `times` times in a row, 40 s each.
+pub fn imu_only(folder: &TempFolder, times: u64) -> PathBuf {
+    let bytes = std::fs::read(sample_drive()).expect("the sample drive exists");
     let messages = mcap::MessageStream::new(&bytes)
         .expect("a drive")
-        .map(|message| message.expect("a whole drive"));
+        .map(|message| message.expect("a complete drive"));
     let imu = messages.filter(|message| message.channel.topic == "/imu/data").collect::<Vec<_>>();
     let schema = imu[0].channel.schema.clone().expect("a schema");
     let schema = String::from_utf8_lossy(&schema.data).into_owned();
@@ -72,28 +72,28 @@ pub fn imu_only(folder: &Folder, times: u64) -> PathBuf {
     one_topic(folder, "/imu/data", "sensor_msgs/msg/Imu", &schema, &rounds.collect::<Vec<_>>())
 }
 
-/// The IMU of the sample drive, with so many topics beside it: `/many/0` and on, each with ten of
-/// its messages.
-pub fn with_topics(folder: &Folder, topics: u16) -> PathBuf {
-    let bytes = std::fs::read(sample_drive()).expect("the sample drive is there");
+/// Writes a drive with the IMU of the sample drive and `topics` further topics: `/many/0` and so
+/// on, each with ten of its messages.
+pub fn with_topics(folder: &TempFolder, topics: u16) -> PathBuf {
+    let bytes = std::fs::read(sample_drive()).expect("the sample drive exists");
     let mut file = Cursor::new(Vec::new());
     let mut writer =
         mcap::WriteOptions::new().profile("ros2").create(&mut file).expect("a drive in memory");
     let messages = mcap::MessageStream::new(&bytes)
         .expect("a drive")
-        .map(|message| message.expect("a whole drive"));
+        .map(|message| message.expect("a complete drive"));
     let imu = messages.filter(|message| message.channel.topic == "/imu/data").collect::<Vec<_>>();
     let schema = imu[0].channel.schema.clone().expect("a schema");
     let schema = writer.add_schema(&schema.name, &schema.encoding, &schema.data).expect("a schema");
     let mut add = |topic: &str| {
         writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).expect("a channel")
     };
-    let ours = add("/imu/data");
+    let imu_channel = add("/imu/data");
     let others = (0..topics).map(|n| add(&format!("/many/{n}"))).collect::<Vec<_>>();
-    let apart = imu.len() / 10;
+    let interval = imu.len() / 10;
     for (n, message) in imu.iter().enumerate() {
-        let others = if n % apart == 0 { others.as_slice() } else { &[] };
-        for channel_id in [ours].iter().chain(others) {
+        let others = if n % interval == 0 { others.as_slice() } else { &[] };
+        for channel_id in [imu_channel].iter().chain(others) {
             let (log_time, publish_time) = (message.log_time, message.publish_time);
             let header = MessageHeader {
                 channel_id: *channel_id,
@@ -104,51 +104,51 @@ pub fn with_topics(folder: &Folder, topics: u16) -> PathBuf {
             writer.write_to_known_channel(&header, &message.data).expect("a message");
         }
     }
-    writer.finish().expect("a whole drive");
+    writer.finish().expect("a complete drive");
     drop(writer);
     folder.write("many.mcap", file.into_inner())
 }
 
-/// A message of the sample drive, to be changed by a test.
+/// A message of the sample drive that a test may change.
 #[derive(Clone, Debug)]
-pub struct Changed {
+pub struct DriveMessage {
     /// Its topic.
     pub topic: String,
     /// Seconds after the drive's first message.
     pub at_s: f64,
-    /// When it is received, in nanoseconds.
+    /// Its log time in nanoseconds.
     pub log_time: u64,
     /// Its CDR, with the encapsulation header.
     pub data: Vec<u8>,
 }
 
-impl Changed {
-    /// Where the first field behind its header lies, for types of 64-bit floats: behind a stamp and
-    /// the text of `frame_id`.
+impl DriveMessage {
+    /// Offset of the first field after its header, for types of 64-bit floats: after the stamp and
+    /// `frame_id`.
     fn body(&self) -> usize {
         let length =
             u32::from_le_bytes(self.data[12..16].try_into().expect("a header has a frame_id"));
-        // Alignment counts from behind the 4 bytes of encapsulation.
+        // Alignment does not count the 4 bytes of encapsulation.
         (12 + length as usize).next_multiple_of(8) + 4
     }
 
-    /// Replaces the float number `index`, from 0, behind its header.
+    /// Replaces the float with the given index, from 0, after its header.
     pub fn set(&mut self, index: usize, value: f64) {
         let at = self.body() + 8 * index;
         self.data[at..at + 8].copy_from_slice(&value.to_le_bytes());
     }
 
-    /// Adds so many seconds to `header.stamp`.
+    /// Adds seconds to `header.stamp`.
     pub fn shift_stamp(&mut self, seconds: i32) {
         let stamp = i32::from_le_bytes(self.data[4..8].try_into().expect("a stamp")) + seconds;
         self.data[4..8].copy_from_slice(&stamp.to_le_bytes());
     }
 }
 
-/// The sample drive with each message as `change` leaves it, and without those of which it says
-/// `false`.
-pub fn changed(folder: &Folder, mut change: impl FnMut(&mut Changed) -> bool) -> PathBuf {
-    let bytes = std::fs::read(sample_drive()).expect("the sample drive is there");
+/// Writes the sample drive with each message changed by `change`, without those for which it
+/// returns `false`.
+pub fn changed(folder: &TempFolder, mut change: impl FnMut(&mut DriveMessage) -> bool) -> PathBuf {
+    let bytes = std::fs::read(sample_drive()).expect("the sample drive exists");
     let mut file = Cursor::new(Vec::new());
     let mut writer = mcap::WriteOptions::new()
         .profile("ros2")
@@ -158,12 +158,12 @@ pub fn changed(folder: &Folder, mut change: impl FnMut(&mut Changed) -> bool) ->
     let mut start = None;
     for message in mcap::MessageStream::new(&bytes)
         .expect("a drive")
-        .map(|message| message.expect("a whole drive"))
+        .map(|message| message.expect("a complete drive"))
     {
         let (topic, log_time, data) =
             (message.channel.topic.clone(), message.log_time, message.data.to_vec());
         let at_s = (log_time - *start.get_or_insert(log_time)) as f64 / 1e9;
-        let mut changed = Changed { topic, at_s, log_time, data };
+        let mut changed = DriveMessage { topic, at_s, log_time, data };
         if change(&mut changed) {
             let (publish_time, data) = (message.publish_time, changed.data.into());
             let message =
@@ -171,16 +171,16 @@ pub fn changed(folder: &Folder, mut change: impl FnMut(&mut Changed) -> bool) ->
             writer.write(&message).expect("a message");
         }
     }
-    writer.finish().expect("a whole drive");
+    writer.finish().expect("a complete drive");
     drop(writer);
     folder.write("changed.mcap", file.into_inner())
 }
 
 /// Little-endian CDR, field by field.
 #[derive(Default)]
-pub struct Cdr(Vec<u8>);
+pub struct CdrBuilder(Vec<u8>);
 
-impl Cdr {
+impl CdrBuilder {
     /// A `std_msgs/msg/Header` with stamp 0 and no frame.
     pub fn header() -> Self {
         Self::default().u32(0).u32(0).text("")
@@ -219,26 +219,26 @@ impl Cdr {
     }
 }
 
-/// An image message with whatever numbers a test wants it to claim.
+/// An image message with the given fields, consistent or not.
 pub fn image(width: u32, height: u32, encoding: &str, step: u32, data: &[u8]) -> Vec<u8> {
-    Cdr::header().u32(height).u32(width).text(encoding).u8(0).u32(step).bytes(data).done()
+    CdrBuilder::header().u32(height).u32(width).text(encoding).u8(0).u32(step).bytes(data).done()
 }
 
 /// A compressed image message.
 pub fn compressed(data: &[u8]) -> Vec<u8> {
-    Cdr::header().text("jpeg").bytes(data).done()
+    CdrBuilder::header().text("jpeg").bytes(data).done()
 }
 
-/// The sample drive cut after `part` of its bytes.
-pub fn truncated(folder: &Folder, part: f64) -> PathBuf {
-    let whole = std::fs::read(sample_drive()).expect("the sample drive is there");
+/// The sample drive, truncated to the share `part` of its bytes.
+pub fn truncated(folder: &TempFolder, part: f64) -> PathBuf {
+    let whole = std::fs::read(sample_drive()).expect("the sample drive exists");
     let len = (whole.len() as f64 * part) as usize;
     folder.write("truncated.mcap", &whole[..len])
 }
 
 /// The sample drive with one byte changed in the middle of its data.
-pub fn corrupted(folder: &Folder) -> PathBuf {
-    let mut whole = std::fs::read(sample_drive()).expect("the sample drive is there");
+pub fn corrupted(folder: &TempFolder) -> PathBuf {
+    let mut whole = std::fs::read(sample_drive()).expect("the sample drive exists");
     let middle = whole.len() / 2;
     whole[middle] ^= 0x55;
     folder.write("corrupted.mcap", whole)

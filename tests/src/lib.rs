@@ -1,8 +1,8 @@
-//! What the suites share: where things are, running a replay, and drives made by a test.
+//! Shared by the suites: paths of the checkout, replays, and drives made for tests.
 
 pub mod bag;
 pub mod drive;
-pub mod given;
+pub mod fake_messages;
 pub mod live;
 pub mod markdown;
 pub mod namespace;
@@ -19,8 +19,8 @@ use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use gleaner_lambda::{Clip, Decision};
-use gleaner_protocol::{Report, Summary, Verified};
-use gleaner_report::words::{seconds, trigger_lines};
+use gleaner_protocol::{ReplaySummary, Report, Verified};
+use gleaner_report::format::{seconds, trigger_lines};
 
 /// The checkout.
 pub fn root() -> PathBuf {
@@ -32,14 +32,13 @@ pub fn sample_drive() -> PathBuf {
     root().join("examples/data/highway_drive.mcap")
 }
 
-/// Drives that may not come with the project, in the folder beside the checkout; the reason where
-/// there are none.
+/// A drive in the folder beside the checkout, which may be missing; then the reason.
 pub fn shared_drive(name: &str) -> Result<PathBuf, String> {
     let path = root().join("../shared/data").join(name);
     if path.is_file() { Ok(path) } else { Err(format!("no `{name}` in ../shared/data")) }
 }
 
-/// A program of ours, beside this one.
+/// A program of the workspace, built into the same folder as this one.
 ///
 /// # Panics
 ///
@@ -54,29 +53,27 @@ pub fn program(name: &str) -> PathBuf {
     path
 }
 
-/// How often a test is to do what it does: what the variable `name` says, else `usual`, which is
-/// short, or twenty times that with `GLEANER_LONG=1`. ARCHITECTURE.md ("Tests") lists the
-/// variables.
+/// Number of repetitions of a test: the variable `name`, else `usual`, which is short, or twenty
+/// times that with `GLEANER_LONG=1`. CONTRIBUTING.md ("Tests") lists the variables.
 ///
 /// # Panics
 ///
-/// If the variable is set to anything but a whole number above 0: a test that does nothing would
-/// pass.
+/// If the variable is not a whole number above 0: a test without repetitions would pass.
 pub fn times(name: &str, usual: u32) -> u32 {
-    let is_long = std::env::var_os("GLEANER_LONG").is_some_and(|said| said == "1");
-    let Some(said) = std::env::var_os(name) else {
+    let is_long = std::env::var_os("GLEANER_LONG").is_some_and(|value| value == "1");
+    let Some(value) = std::env::var_os(name) else {
         return if is_long { 20 * usual } else { usual };
     };
-    let times = said.to_str().and_then(|said| said.parse().ok()).filter(|times| *times > 0);
+    let times = value.to_str().and_then(|text| text.parse().ok()).filter(|times| *times > 0);
     times.unwrap_or_else(|| {
-        panic!("{name} is {said:?}; set it to a whole number above 0, or not at all")
+        panic!("{name} is {value:?}; set it to a whole number above 0, or not at all")
     })
 }
 
-/// A folder of this test's own, removed with it.
-pub struct Folder(PathBuf);
+/// A temporary folder, deleted on drop.
+pub struct TempFolder(PathBuf);
 
-impl Folder {
+impl TempFolder {
     /// A new empty folder.
     #[allow(clippy::new_without_default)]
     pub fn new() -> Self {
@@ -91,7 +88,7 @@ impl Folder {
         Self(path)
     }
 
-    /// Where it is.
+    /// Its path.
     pub fn path(&self) -> &Path {
         &self.0
     }
@@ -106,17 +103,17 @@ impl Folder {
     }
 }
 
-impl Drop for Folder {
+impl Drop for TempFolder {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.0);
     }
 }
 
-/// What a replay left.
-pub struct Run {
+/// Results of a replay.
+pub struct ReplayRun {
     /// Exit code; 128 and more for a signal.
     pub exit: i32,
-    /// What it said to people.
+    /// Its standard error.
     pub stderr: String,
     /// `decisions.jsonl`.
     pub decisions: Vec<Decision>,
@@ -124,12 +121,12 @@ pub struct Run {
     pub log: Vec<serde_json::Value>,
     /// `clips.jsonl`.
     pub clips: Vec<Clip>,
-    /// The last report; none if it did not come so far.
-    pub summary: Option<Summary>,
+    /// The final report; `None` if there was none.
+    pub summary: Option<ReplaySummary>,
 }
 
-/// `gleaner-runtime`, which compiles into the tests' own cache: nothing that a user compiled before
-/// is trusted or touched.
+/// `gleaner-runtime` with the tests' own cache of compiled code: the user's cache is neither used
+/// nor changed.
 pub fn runtime() -> Command {
     let mut runtime = Command::new(program("gleaner-runtime"));
     runtime.env("XDG_CACHE_HOME", root().join("target/test-cache"));
@@ -137,17 +134,17 @@ pub fn runtime() -> Command {
 }
 
 /// Replays the built lambda in `lambda` over `drives`.
-pub fn replay(lambda: &Path, drives: &[PathBuf], args: &[&str]) -> Run {
-    replay_to(Folder::new().path(), lambda, drives, args)
+pub fn replay(lambda: &Path, drives: &[PathBuf], args: &[&str]) -> ReplayRun {
+    replay_to(TempFolder::new().path(), lambda, drives, args)
 }
 
-/// As [`replay`], with results that stay in `out`.
-pub fn replay_to(out: &Path, lambda: &Path, drives: &[PathBuf], args: &[&str]) -> Run {
+/// As [`replay`], with results in `out`.
+pub fn replay_to(out: &Path, lambda: &Path, drives: &[PathBuf], args: &[&str]) -> ReplayRun {
     let mut replay = runtime();
     replay.arg("replay").arg(lambda).args(drives).args(args).arg("--out").arg(out);
     let output = replay.output().expect("gleaner-runtime starts");
     let read = |name: &str| std::fs::read_to_string(out.join(name)).unwrap_or_default();
-    Run {
+    ReplayRun {
         exit: output.status.code().unwrap_or(128),
         stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
         decisions: read("decisions.jsonl").lines().map(parsed).collect(),
@@ -160,17 +157,17 @@ pub fn replay_to(out: &Path, lambda: &Path, drives: &[PathBuf], args: &[&str]) -
     }
 }
 
-/// What came of a comparison.
+/// Result of a comparison.
 pub struct Verification {
     /// Exit code; 128 and more for a signal.
     pub exit: i32,
-    /// What it said to people: the first difference, both sides.
+    /// Its standard error: the first difference, both sides.
     pub stderr: String,
-    /// The result; none if something differs.
+    /// The result; `None` if there is a difference.
     pub verified: Option<Verified>,
 }
 
-/// Runs `gleaner-runtime` with `args`, which ask for a comparison.
+/// Runs `gleaner-runtime` with `args`, which request a comparison.
 pub fn verify(args: &[&OsStr]) -> Verification {
     let output = runtime().args(args).output().expect("gleaner-runtime starts");
     Verification {
@@ -191,7 +188,7 @@ fn parsed<T: serde::de::DeserializeOwned>(line: &str) -> T {
     serde_json::from_str(line).unwrap_or_else(|error| panic!("{error} in {line}"))
 }
 
-impl Run {
+impl ReplayRun {
     /// A line for each trigger, as in `expected.txt`.
     pub fn rows(&self) -> String {
         let lines =
@@ -199,7 +196,7 @@ impl Run {
         lines.map(|line| line + "\n").collect()
     }
 
-    /// Seconds from the start of the drive of each trigger.
+    /// Time of each trigger in seconds from the start of the drive.
     pub fn seconds(&self) -> Vec<f64> {
         let causing = self
             .decisions
@@ -224,23 +221,23 @@ impl Run {
         Some((fault.kind, fault.message.clone()))
     }
 
-    /// Asserts the exit code, showing what was said if it differs.
+    /// Asserts the exit code; shows standard error if it differs.
     pub fn must_exit(&self, code: u8) -> &Self {
         assert_eq!(self.exit, i32::from(code), "{}", self.stderr);
         self
     }
 }
 
-/// A copy of a built lambda whose manifest a test may change.
-pub struct Copy {
-    folder: Folder,
+/// A copy of a built lambda, with a changed manifest.
+pub struct LambdaCopy {
+    folder: TempFolder,
 }
 
-impl Copy {
+impl LambdaCopy {
     /// Copies the lambda in `lambda`, a folder of the checkout, with `change` applied to its
     /// manifest.
     pub fn of(lambda: &str, change: impl Fn(String) -> String) -> Self {
-        let folder = Folder::new();
+        let folder = TempFolder::new();
         copy_lambda(lambda, &folder, ".", change);
         Self { folder }
     }
@@ -258,7 +255,12 @@ impl Copy {
 
 /// Copies the built lambda in `lambda`, a folder of the checkout, to `name` in `folder`, with
 /// `change` applied to its manifest.
-pub fn copy_lambda(lambda: &str, folder: &Folder, name: &str, change: impl Fn(String) -> String) {
+pub fn copy_lambda(
+    lambda: &str,
+    folder: &TempFolder,
+    name: &str,
+    change: impl Fn(String) -> String,
+) {
     let source = root().join(lambda).join("build");
     let files = std::fs::read_dir(&source)
         .unwrap_or_else(|error| panic!("{}: {error}; run: cargo xtask test", source.display()));
@@ -271,7 +273,7 @@ pub fn copy_lambda(lambda: &str, folder: &Folder, name: &str, change: impl Fn(St
     }
     let manifest =
         std::fs::read_to_string(source.join("lambda.toml")).expect("a build has a manifest");
-    // The build's manifest is written last: it must not be older than any source.
+    // The build's manifest is written last, because it must not be older than any source.
     folder.write(&format!("{name}/lambda.toml"), change(manifest.clone()));
     folder.write(&format!("{name}/build/lambda.toml"), change(manifest));
 }

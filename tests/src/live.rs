@@ -1,5 +1,4 @@
-//! `gleaner run` as a process that a test starts, hears out, and ends; and the player that gives it
-//! something to hear.
+//! Starts `gleaner run` and `gleaner play` as processes, reads their reports, and stops them.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -10,30 +9,30 @@ use std::time::{Duration, Instant};
 
 use gleaner_lambda::Decision;
 use gleaner_protocol::link::RecorderReport;
-use gleaner_protocol::{Live, Report};
+use gleaner_protocol::{LiveStatus, Report};
 
 use crate::{program, root};
 
-/// How long anything may take: far longer than it does, so that only what hangs is caught.
+/// Maximum wait for anything: far longer than needed, so that only a hang reaches it.
 pub const PATIENCE: Duration = Duration::from_secs(90);
 
 /// A line that `gleaner run --json` prints.
 #[derive(Debug)]
-pub enum Line {
-    /// Of the lambda.
+pub enum JsonReport {
+    /// A report of the lambda.
     Lambda(Report),
-    /// Of the recorder.
+    /// A report of the recorder.
     Recorder(RecorderReport),
 }
 
-/// A program that was started, and is ended with this.
-pub struct Started {
+/// A running program, stopped on drop.
+pub struct RunningProgram {
     child: Child,
     lines: Receiver<String>,
     errors: Receiver<String>,
 }
 
-/// Why there is no player here; `None` if there is one.
+/// The reason why there is no player; `None` if there is one.
 pub fn no_player() -> Option<&'static str> {
     player().is_none().then_some("no gleaner-player; run: cargo xtask player")
 }
@@ -43,22 +42,22 @@ fn player() -> Option<PathBuf> {
     player.is_file().then_some(player)
 }
 
-/// `gleaner run` of a built lambda, reporting as JSON.
-pub fn run(lambda: &Path, out: &Path, args: &[&str]) -> Started {
+/// Starts `gleaner run` with a built lambda, reporting as JSON.
+pub fn run(lambda: &Path, out: &Path, args: &[&str]) -> RunningProgram {
     let mut gleaner = Command::new(program("gleaner"));
     gleaner.env("XDG_CACHE_HOME", root().join("target/test-cache"));
     gleaner.arg("run").arg(lambda).arg("--json").arg("--out").arg(out).args(args);
-    Started::start(gleaner)
+    RunningProgram::start(gleaner)
 }
 
-/// `gleaner play`, with a summary as JSON.
-pub fn play(args: &[&str]) -> Started {
-    let mut player = Command::new(player().expect("asked before whether there is a player"));
+/// Starts `gleaner play`, with its summary as JSON.
+pub fn play(args: &[&str]) -> RunningProgram {
+    let mut player = Command::new(player().expect("the caller has checked `no_player`"));
     player.arg("--json").args(args);
-    Started::start(player)
+    RunningProgram::start(player)
 }
 
-impl Started {
+impl RunningProgram {
     /// Starts `command`.
     ///
     /// # Panics
@@ -66,28 +65,28 @@ impl Started {
     /// If it cannot be started.
     pub fn start(mut command: Command) -> Self {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        let mut child = command.spawn().expect("a program of ours starts");
-        let lines = heard(child.stdout.take().expect("it was asked for"));
-        let errors = heard(child.stderr.take().expect("it was asked for"));
+        let mut child = command.spawn().expect("the program starts");
+        let lines = lines_of(child.stdout.take().expect("stdout is a pipe"));
+        let errors = lines_of(child.stderr.take().expect("stderr is a pipe"));
         Self { child, lines, errors }
     }
 
-    /// Its process.
+    /// Its process id.
     pub fn pid(&self) -> u32 {
         self.child.id()
     }
 
-    /// Sends it a signal, by name.
+    /// Sends it the signal `name`.
     pub fn signal(&self, name: &str) {
         signal(self.pid(), name);
     }
 
-    /// The first line of its reports, from now on, of which `wanted` makes something.
+    /// Waits for the first further report for which `wanted` returns a value.
     ///
     /// # Panics
     ///
-    /// If it ends before, or takes longer than [`PATIENCE`].
-    pub fn until<T>(&self, what: &str, mut wanted: impl FnMut(Line) -> Option<T>) -> T {
+    /// If it ends earlier, or takes longer than [`PATIENCE`].
+    pub fn until<T>(&self, what: &str, mut wanted: impl FnMut(JsonReport) -> Option<T>) -> T {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
@@ -97,32 +96,36 @@ impl Started {
                         return found;
                     }
                 }
-                Err(error) => panic!("waiting for {what}: {error}; it said\n{}", self.said()),
+                Err(error) => panic!("waiting for {what}: {error}; stderr:\n{}", self.stderr()),
             }
         }
     }
 
-    /// Waits until the lambda has had its `init`.
+    /// Waits until the `init` of the lambda has returned.
     pub fn until_ready(&self) {
         self.until("the lambda to be ready", |line| {
-            matches!(line, Line::Lambda(Report::Ready)).then_some(())
+            matches!(line, JsonReport::Lambda(Report::Ready)).then_some(())
         });
     }
 
-    /// Waits for a status of the lambda that is as `wanted`.
-    pub fn until_live(&self, what: &str, mut wanted: impl FnMut(&Live) -> bool) -> Live {
+    /// Waits for a status of the lambda for which `wanted` holds.
+    pub fn until_live(
+        &self,
+        what: &str,
+        mut wanted: impl FnMut(&LiveStatus) -> bool,
+    ) -> LiveStatus {
         self.until(what, |line| match line {
-            Line::Lambda(Report::Live(live)) if wanted(&live) => Some(*live),
+            JsonReport::Lambda(Report::Live(live)) if wanted(&live) => Some(*live),
             _ => None,
         })
     }
 
-    /// What it has said to people since the last call.
-    pub fn said(&self) -> String {
+    /// Its standard error since the last call.
+    pub fn stderr(&self) -> String {
         self.errors.try_iter().collect::<Vec<_>>().join("\n")
     }
 
-    /// The rest of its reports, once it has ended by itself.
+    /// Waits until it ends by itself; returns the rest of its reports.
     ///
     /// # Panics
     ///
@@ -136,22 +139,22 @@ impl Started {
             lines.push(line);
         }
         let status = loop {
-            match self.child.try_wait().expect("a child of ours can be waited for") {
+            match self.child.try_wait().expect("a child can be waited for") {
                 Some(status) => break status,
                 None if Instant::now() > deadline => {
-                    panic!("it does not end; it said\n{}", self.said())
+                    panic!("it does not end; stderr:\n{}", self.stderr())
                 }
                 None => thread::sleep(Duration::from_millis(10)),
             }
         };
-        Finished { status, lines, said: self.said() }
+        Finished { status, lines, stderr: self.stderr() }
     }
 }
 
-impl Drop for Started {
+impl Drop for RunningProgram {
     fn drop(&mut self) {
         if let Ok(None) = self.child.try_wait() {
-            // In order; its own children end with it in any case.
+            // Gracefully; its own children end with it in any case.
             self.signal("TERM");
             let deadline = Instant::now() + Duration::from_secs(5);
             while Instant::now() < deadline && matches!(self.child.try_wait(), Ok(None)) {
@@ -163,28 +166,29 @@ impl Drop for Started {
     }
 }
 
-/// How a program ended, and what it reported since it was last listened to.
+/// Exit status and remaining output of a program.
 pub struct Finished {
     /// Its exit status.
     pub status: ExitStatus,
     /// Its reports.
     pub lines: Vec<String>,
-    /// What it said to people.
-    pub said: String,
+    /// Its standard error.
+    pub stderr: String,
 }
 
 impl Finished {
-    /// How the lambda was, at the end.
+    /// The final status of the lambda.
     ///
     /// # Panics
     ///
-    /// If it did not say.
-    pub fn ended(&self) -> Live {
+    /// If there is none.
+    pub fn ended(&self) -> LiveStatus {
         let ended = self.lines.iter().filter_map(|line| parsed(line)).find_map(|line| match line {
-            Line::Lambda(Report::Ended(live)) => Some(*live),
+            JsonReport::Lambda(Report::Ended(live)) => Some(*live),
             _ => None,
         });
-        ended.unwrap_or_else(|| panic!("no last report; {}, it said\n{}", self.status, self.said))
+        ended
+            .unwrap_or_else(|| panic!("no final report; {}, stderr:\n{}", self.status, self.stderr))
     }
 }
 
@@ -194,7 +198,7 @@ impl Finished {
 ///
 /// If `kill` cannot be run.
 pub fn signal(pid: u32, name: &str) {
-    // It may have ended just now.
+    // It may have just ended.
     let _ = Command::new("kill")
         .arg(format!("-{name}"))
         .arg(pid.to_string())
@@ -202,18 +206,18 @@ pub fn signal(pid: u32, name: &str) {
         .status();
 }
 
-/// The processes below `of` whose command line contains `name`.
-pub fn below(of: u32, name: &str) -> Vec<u32> {
+/// The descendants of process `of` whose command line contains `name`.
+pub fn descendants(of: u32, name: &str) -> Vec<u32> {
     let text =
         std::fs::read_to_string(format!("/proc/{of}/task/{of}/children")).unwrap_or_default();
     let is_called = |pid: u32| {
         let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
-        // Python, too, has our program's name in its arguments no more; it has `start.py`.
+        // Python does not have the program's name in its arguments, but `start.py`.
         String::from_utf8_lossy(&line).contains(name)
     };
     let children = text.split_whitespace().filter_map(|pid| pid.parse().ok());
     children
-        .flat_map(|pid| is_called(pid).then_some(pid).into_iter().chain(below(pid, name)))
+        .flat_map(|pid| is_called(pid).then_some(pid).into_iter().chain(descendants(pid, name)))
         .collect()
 }
 
@@ -223,19 +227,19 @@ pub fn decisions(out: &Path) -> Vec<Decision> {
     text.lines().map(|line| serde_json::from_str(line).expect("a line is a decision")).collect()
 }
 
-fn parsed(line: &str) -> Option<Line> {
-    let lambda = serde_json::from_str(line).map(Line::Lambda);
-    lambda.or_else(|_| serde_json::from_str(line).map(Line::Recorder)).ok()
+fn parsed(line: &str) -> Option<JsonReport> {
+    let lambda = serde_json::from_str(line).map(JsonReport::Lambda);
+    lambda.or_else(|_| serde_json::from_str(line).map(JsonReport::Recorder)).ok()
 }
 
-fn heard(stream: impl std::io::Read + Send + 'static) -> Receiver<String> {
-    let (say, heard) = mpsc::channel();
+fn lines_of(stream: impl std::io::Read + Send + 'static) -> Receiver<String> {
+    let (sender, receiver) = mpsc::channel();
     thread::spawn(move || {
         for line in BufReader::new(stream).lines().map_while(Result::ok) {
-            if say.send(line).is_err() {
+            if sender.send(line).is_err() {
                 return;
             }
         }
     });
-    heard
+    receiver
 }

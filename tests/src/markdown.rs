@@ -1,15 +1,15 @@
-//! Pages of Markdown, as far as tests look at them: fenced blocks, links, headings.
+//! Parses Markdown pages as far as tests need: fenced blocks, links, headings.
 
 /// A block between fences.
 #[derive(Debug)]
 pub struct Block {
-    /// The line of its first fence, from 1.
+    /// Line of its opening fence, from 1.
     pub line: usize,
-    /// What follows the fence, such as `rust`.
+    /// Text after the fence, such as `rust`.
     pub language: String,
-    /// The path in a comment `<!-- file: PATH -->` right above it: what it is an excerpt of.
+    /// The path in a comment `<!-- file: PATH -->` directly above it: the file that it quotes.
     pub file: Option<String>,
-    /// Its lines, without the indent of the fence.
+    /// Its lines, without the indentation of the fence.
     pub lines: Vec<String>,
 }
 
@@ -48,7 +48,7 @@ pub fn blocks(page: &str) -> Vec<Block> {
     blocks
 }
 
-/// The targets of all links of a page, with their lines, from 1; not those within code.
+/// The targets of all links of a page with their lines, from 1; links in code are ignored.
 pub fn links(page: &str) -> Vec<(usize, String)> {
     let mut links = Vec::new();
     let mut inside = false;
@@ -60,7 +60,7 @@ pub fn links(page: &str) -> Vec<(usize, String)> {
             continue;
         }
         for (at, _) in line.match_indices("](") {
-            // Within code there is an odd number of backticks before it.
+            // Inside of code there is an odd number of backticks before it.
             let in_code = line[..at].matches('`').count() % 2 == 1;
             if let Some((target, _)) = line[at + 2..].split_once(')').filter(|_| !in_code) {
                 links.push((index + 1, target.to_owned()));
@@ -70,7 +70,7 @@ pub fn links(page: &str) -> Vec<(usize, String)> {
     links
 }
 
-/// What may stand behind `#` in a link to a page, as GitHub and mdBook make it of headings.
+/// The anchors of a page for links with `#`, as GitHub and mdBook derive them from headings.
 pub fn anchors(page: &str) -> Vec<String> {
     let mut inside = false;
     let headings = page.lines().filter(|line| {

@@ -1,7 +1,7 @@
-//! A private network for one test: only `lo`, with multicast, and nobody else on it.
+//! A private network for a test: only `lo`, with multicast, and no other processes.
 //!
-//! Linux gives a process a network of its own, with which what it starts is alone. A DDS peer that
-//! is started any other way could talk to whatever runs on this machine or next to it.
+//! Linux gives a process and its children a network namespace of their own. Without it a DDS peer
+//! could talk to other programs on this machine or its network.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -9,32 +9,33 @@ use std::sync::OnceLock;
 
 use libtest_mimic::Failed;
 
-/// What makes a network usable for DDS, then the program in `$0` with its arguments.
-const SET_UP: &str = "ip link set lo up && ip link set lo multicast on && ip route add 224.0.0.0/4 dev lo && exec \"$0\" \"$@\"";
+/// Prepares a network for DDS, then runs the program in `$0` with its arguments.
+const SET_UP: &str = "ip link set lo up && ip link set lo multicast on && \
+                      ip route add 224.0.0.0/4 dev lo && exec \"$0\" \"$@\"";
 
-/// Why there can be no private network here; `None` where there can.
+/// The reason why there is no private network; `None` if there is.
 pub fn unavailable() -> Option<&'static str> {
-    if way().is_some() {
+    if unshare_options().is_some() {
         None
     } else {
-        Some("no private network can be made here: unshare -n and ip are needed")
+        Some("cannot create a private network: unshare -n and ip are needed")
     }
 }
 
-/// `program`, to be run in a private network that ends with it.
+/// A command that runs `program` in a private network, which ends with it.
 ///
 /// # Panics
 ///
-/// If there can be none; see [`unavailable`].
+/// If there is none; see [`unavailable`].
 pub fn command(program: &Path) -> Command {
     let mut command =
-        shell(way().expect("asked before whether there can be a private network"), SET_UP);
+        shell(unshare_options().expect("the caller has checked `unavailable`"), SET_UP);
     command.arg(program);
     command
 }
 
-/// This program once more, in a private network, with the variable `name` set to `value`, so that
-/// it knows what it is to do.
+/// A command that runs this program again in a private network, with the variable `name` set to
+/// `value` to select its work.
 ///
 /// # Panics
 ///
@@ -45,12 +46,12 @@ pub fn again(name: &str, value: &str) -> Command {
     command
 }
 
-/// Runs one case of a suite in a private network: this program once more, with the variable `name`
-/// set to the `case`. What it prints is shown.
+/// Runs a case of a suite in a private network: this program again, with the variable `name` set to
+/// `case`. Prints its output.
 ///
 /// # Errors
 ///
-/// How it ended, and what it said, if it did not succeed.
+/// Its exit status and its standard error, if it failed.
 ///
 /// # Panics
 ///
@@ -61,17 +62,17 @@ pub fn case(name: &str, case: &str) -> Result<(), Failed> {
     if output.status.success() {
         return Ok(());
     }
-    Err(format!("{}; it said:\n{}", output.status, String::from_utf8_lossy(&output.stderr)).into())
+    Err(format!("{}; stderr:\n{}", output.status, String::from_utf8_lossy(&output.stderr)).into())
 }
 
-/// The options of `unshare` that work here: root needs no more than `-n`, others become root of a
-/// user namespace, where that is allowed.
-fn way() -> Option<&'static [&'static str]> {
-    static WAY: OnceLock<Option<&[&str]>> = OnceLock::new();
-    *WAY.get_or_init(|| {
-        let ways: [&[&str]; 2] = [&["-n"], &["-r", "-n"]];
-        ways.into_iter().find(|way| {
-            let mut probe = shell(way, SET_UP);
+/// The options of `unshare` that work here: root needs only `-n`; other users become root of a user
+/// namespace, where that is permitted.
+fn unshare_options() -> Option<&'static [&'static str]> {
+    static OPTIONS: OnceLock<Option<&[&str]>> = OnceLock::new();
+    *OPTIONS.get_or_init(|| {
+        let candidates: [&[&str]; 2] = [&["-n"], &["-r", "-n"]];
+        candidates.into_iter().find(|options| {
+            let mut probe = shell(options, SET_UP);
             let probe =
                 probe.arg("true").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
             probe.status().is_ok_and(|status| status.success())
@@ -79,8 +80,8 @@ fn way() -> Option<&'static [&'static str]> {
     })
 }
 
-fn shell(way: &[&str], script: &str) -> Command {
+fn shell(options: &[&str], script: &str) -> Command {
     let mut command = Command::new("unshare");
-    command.args(way).args(["--", "sh", "-c", script]);
+    command.args(options).args(["--", "sh", "-c", script]);
     command
 }

@@ -1,4 +1,4 @@
-//! Clips taken apart and put together again, so that a test can change any of it.
+//! Takes clips apart and reassembles them, so that a test can change any part.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -12,7 +12,7 @@ use mcap::{Attachment, Channel};
 
 /// An attachment.
 #[derive(Clone)]
-pub struct Attached {
+pub struct ClipAttachment {
     /// Its name.
     pub name: String,
     /// Its media type.
@@ -24,22 +24,22 @@ pub struct Attached {
 }
 
 /// A message, with the index of its channel.
-pub type Message = (usize, MessageHeader, Vec<u8>);
+pub type ClipMessage = (usize, MessageHeader, Vec<u8>);
 
-/// A clip, taken apart.
+/// The parts of a clip.
 #[derive(Clone)]
-pub struct Parts {
+pub struct ClipParts {
     /// Its metadata records.
     pub metadata: Vec<Metadata>,
     /// Its channels.
     pub channels: Vec<Arc<Channel<'static>>>,
     /// Its messages, each with the index of its channel.
-    pub messages: Vec<Message>,
+    pub messages: Vec<ClipMessage>,
     /// Its attachments.
-    pub attachments: Vec<Attached>,
+    pub attachments: Vec<ClipAttachment>,
 }
 
-impl Parts {
+impl ClipParts {
     /// Takes the clip `path` apart.
     pub fn of(path: &Path) -> Self {
         let bytes = std::fs::read(path).unwrap();
@@ -58,7 +58,7 @@ impl Parts {
                     };
                     schemas.insert(header.id, Arc::new(schema));
                 }
-                // The summary has them again.
+                // The summary repeats the channels.
                 Record::Channel(channel) if !indexes.contains_key(&channel.id) => {
                     indexes.insert(channel.id, parts.channels.len());
                     parts.channels.push(Arc::new(Channel {
@@ -73,7 +73,7 @@ impl Parts {
                     parts.messages.push((indexes[&header.channel_id], header, data.into_owned()));
                 }
                 Record::Metadata(metadata) => parts.metadata.push(metadata),
-                Record::Attachment { header, data, .. } => parts.attachments.push(Attached {
+                Record::Attachment { header, data, .. } => parts.attachments.push(ClipAttachment {
                     name: header.name,
                     media_type: header.media_type,
                     log_time: header.log_time,
@@ -85,7 +85,7 @@ impl Parts {
         parts
     }
 
-    /// The clip, put together again with right checksums.
+    /// Reassembles the clip with correct checksums.
     pub fn bytes(&self) -> Vec<u8> {
         let mut file = Cursor::new(Vec::new());
         let mut writer = mcap::WriteOptions::new().profile("ros2").create(&mut file).unwrap();
@@ -109,7 +109,7 @@ impl Parts {
             let header = MessageHeader { channel_id: ids[*channel], ..*header };
             writer.write_to_known_channel(&header, data).unwrap();
         }
-        for Attached { name, media_type, log_time, data } in &self.attachments {
+        for ClipAttachment { name, media_type, log_time, data } in &self.attachments {
             let (name, media_type, data) =
                 (name.clone(), media_type.clone(), Cow::Borrowed(&data[..]));
             let attachment =
@@ -123,9 +123,9 @@ impl Parts {
 
     /// The first record `gleaner.NAME`.
     pub fn record(&mut self, name: &str) -> &mut BTreeMap<String, String> {
-        let found =
+        let record =
             self.metadata.iter_mut().find(|metadata| metadata.name == format!("gleaner.{name}"));
-        &mut found.unwrap_or_else(|| panic!("there is no gleaner.{name}")).metadata
+        &mut record.unwrap_or_else(|| panic!("no record gleaner.{name}")).metadata
     }
 
     /// The record of a topic.
@@ -149,7 +149,7 @@ impl Parts {
     }
 
     /// The messages of a topic.
-    pub fn messages_of(&mut self, topic: &str) -> Vec<&mut Message> {
+    pub fn messages_of(&mut self, topic: &str) -> Vec<&mut ClipMessage> {
         let channels: Vec<_> = self.channels.iter().map(|channel| channel.topic == topic).collect();
         self.messages.iter_mut().filter(|(channel, ..)| channels[*channel]).collect()
     }
@@ -160,8 +160,8 @@ impl Parts {
         self.messages.retain(|(channel, ..)| !channels[*channel]);
     }
 
-    /// The part of a journal in it.
-    pub fn journal(&mut self) -> &mut Attached {
+    /// The journal excerpt in it.
+    pub fn journal(&mut self) -> &mut ClipAttachment {
         self.attachments
             .iter_mut()
             .find(|attachment| attachment.name.starts_with("journal/"))

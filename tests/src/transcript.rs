@@ -1,5 +1,5 @@
-//! Pages that show what commands print: each `text` block that begins with `$ ` is a transcript,
-//! which a test does again.
+//! Checks pages that show output of commands: each `text` block that begins with `$ ` is a
+//! transcript, which a test repeats.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -9,27 +9,28 @@ use gleaner_parts::Parts;
 use crate::markdown::{Block, blocks};
 use crate::{program, root};
 
-/// A command of a page, and what the page says that it prints.
+/// A command of a page with its documented output.
 #[derive(Debug)]
-pub struct Step {
-    /// The line of the block's fence, from 1.
+pub struct TranscriptStep {
+    /// Line of the block's fence, from 1.
     pub line: usize,
-    /// For a shell.
+    /// The command, for a shell.
     pub command: String,
-    /// Its lines; `[..]` stands for anything within a line, and a line `...` for any lines.
+    /// Lines of the output; `[..]` stands for any text within a line, and a line `...` for any
+    /// lines.
     pub shown: Vec<String>,
 }
 
 /// The commands of a page, in its order.
-pub fn steps(page: &str) -> Vec<Step> {
+pub fn steps(page: &str) -> Vec<TranscriptStep> {
     let is_transcript = |block: &Block| {
         block.language == "text" && block.lines.first().is_some_and(|line| line.starts_with("$ "))
     };
-    let mut steps: Vec<Step> = Vec::new();
+    let mut steps: Vec<TranscriptStep> = Vec::new();
     for block in blocks(page).into_iter().filter(is_transcript) {
         for text in block.lines {
             match text.strip_prefix("$ ") {
-                Some(command) => steps.push(Step {
+                Some(command) => steps.push(TranscriptStep {
                     line: block.line,
                     command: command.to_owned(),
                     shown: Vec::new(),
@@ -43,12 +44,12 @@ pub fn steps(page: &str) -> Vec<Step> {
     steps
 }
 
-/// Does what a step says in `folder`: what it printed, on both streams, and its exit code, if that
-/// is not 0. Paths within the folder are shown as those relative to it.
+/// Runs `command` in `folder`; returns its output on both streams, and its exit code unless it is
+/// 0. Paths within the folder become relative to it.
 ///
 /// # Panics
 ///
-/// If there is no shell, or no Python.
+/// If there is no shell or no Python.
 pub fn perform(folder: &Path, command: &str) -> Vec<String> {
     let gleaner = program("gleaner");
     let programs = gleaner.parent().expect("a program lies in a folder");
@@ -62,7 +63,7 @@ pub fn perform(folder: &Path, command: &str) -> Vec<String> {
     shell
         .env("PATH", path.expect("folders of programs"))
         .env("XDG_CACHE_HOME", root().join("target/test-cache"));
-    // What is compiled is that of this workspace, of which all is here.
+    // Cargo compiles crates of this workspace, so all dependencies are available offline.
     shell.env("CARGO_NET_OFFLINE", "true").env("CARGO_TARGET_DIR", root().join("target/test-new"));
     let output = shell.output().expect("there is a shell");
     let text =
@@ -77,7 +78,7 @@ pub fn perform(folder: &Path, command: &str) -> Vec<String> {
     lines
 }
 
-/// Whether `lines` are those that `shown` says.
+/// Returns whether `lines` match `shown`.
 pub fn fits(shown: &[String], lines: &[String]) -> bool {
     match (shown, lines) {
         ([], lines) => lines.is_empty(),
@@ -106,9 +107,8 @@ fn line_fits(shown: &str, line: &str) -> bool {
     rest.is_empty()
 }
 
-/// The page with what each command printed now, where it does not fit: for whoever changed a
-/// message.
-pub fn rewritten(page: &str, printed: &[(Step, Vec<String>)]) -> String {
+/// The page with the new output of each command whose output does not match.
+pub fn rewritten(page: &str, printed: &[(TranscriptStep, Vec<String>)]) -> String {
     let mut page = page.to_owned();
     for (step, lines) in printed.iter().filter(|(step, lines)| !fits(&step.shown, lines)) {
         let block = |lines: &[String]| {

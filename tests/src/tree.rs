@@ -1,4 +1,4 @@
-//! The files of the checkout that people write.
+//! The source files of the checkout.
 
 use std::fs;
 use std::path::Path;
@@ -10,12 +10,12 @@ use crate::root;
 pub struct File {
     /// Its path from the root of the checkout, with `/` between its parts.
     pub path: String,
-    /// What it says.
+    /// Its content.
     pub text: String,
 }
 
 impl File {
-    /// Whether the name ends with one of `extensions`, given without their dots.
+    /// Returns whether the name ends with one of `extensions`, given without dots.
     pub fn is_one_of(&self, extensions: &[&str]) -> bool {
         Path::new(&self.path)
             .extension()
@@ -23,8 +23,8 @@ impl File {
     }
 }
 
-/// Every text file of the checkout, in the order of the paths. What tools make is left out: target
-/// folders, results, build folders of lambdas, and hidden folders but those that are ours.
+/// All text files of the checkout, sorted by path. Generated ones are omitted: target folders,
+/// results, build folders of lambdas, and hidden folders except the project's own.
 ///
 /// # Panics
 ///
@@ -42,11 +42,11 @@ pub fn files() -> Vec<File> {
             let path = if folder.is_empty() { name.clone() } else { format!("{folder}/{name}") };
             let kind = entry.file_type().expect("a file of the checkout has a type");
             if kind.is_dir() {
-                if is_written_by_people(&root, &folder, &name) {
+                if is_source_folder(&root, &folder, &name) {
                     folders.push(path);
                 }
             } else if kind.is_file() {
-                // What is no text is a recording or a picture.
+                // A file that is not text is a recording or an image.
                 files.extend(fs::read_to_string(entry.path()).ok().map(|text| File { path, text }));
             }
         }
@@ -55,7 +55,7 @@ pub fn files() -> Vec<File> {
     files
 }
 
-fn is_written_by_people(root: &Path, folder: &str, name: &str) -> bool {
+fn is_source_folder(root: &Path, folder: &str, name: &str) -> bool {
     match name {
         ".ci" | ".cargo" => true,
         "out" => !(folder.is_empty() || is_lambda(root, folder)),

@@ -1,5 +1,5 @@
-//! Lambdas that attack whatever is around them, live, below `gleaner-shim`: what becomes of each
-//! attack is a row of the table in `docs/security.md`, and has to be as it says there.
+//! Runs lambdas that attack their environment live, under `gleaner-shim`. The outcome of each
+//! attack is a row of the table in `docs/security.md`, and must be as documented there.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -7,49 +7,49 @@ use std::process::{Child, Command, ExitCode, Stdio};
 
 use gleaner_base::Exit;
 use gleaner_lambda::{Decision, FaultKind};
-use gleaner_protocol::{Live, Report};
-use gleaner_tests::live::{Line, Started, decisions, run};
-use gleaner_tests::{Folder, namespace, root};
+use gleaner_protocol::{LiveStatus, Report};
+use gleaner_tests::live::{JsonReport, RunningProgram, decisions, run};
+use gleaner_tests::{TempFolder, namespace, root};
 use libtest_mimic::{Arguments, Trial};
 
-/// Names the case that this process is to run in the network that it was started in.
+/// Environment variable with the case that this process runs in its private network.
 const CASE: &str = "GLEANER_ATTACK_CASE";
 
-/// What becomes of an attack.
+/// Documented outcome of an attack.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-enum Fate {
+enum AttackOutcome {
     /// The wake ends with this fault; the process goes on.
     Fault(FaultKind),
-    /// The call is refused, with these words in the error, and the lambda may go on.
+    /// The call is refused, with this text in the error, and the lambda may continue.
     Refused(&'static str),
-    /// It may go on, and what is too much is thrown away and counted.
-    Cut,
-    /// It may go on, and what it wrote in place of results is counted, and changes no others.
+    /// It may continue; output over the limits is dropped and counted.
+    RateLimited,
+    /// It may continue; what it wrote in place of results is counted, and changes no other result.
     Garbled,
-    /// The shim kills the process, or it ends itself; a new one is started, and the wake is a fault
-    /// of kind `killed`, with these words.
+    /// The shim kills the process, or the process ends itself. A new one is started, and the wake
+    /// is a fault of kind `killed`, with this text.
     Killed(&'static str),
-    /// The process cannot go on, says why and ends, each time that it is started. Nobody killed it,
-    /// and the run has not gone well.
+    /// The process cannot continue, reports why and ends, each time it is started. It was not
+    /// killed, and the run fails.
     Broken,
 }
 
-use Fate::{Broken, Cut, Fault, Garbled, Killed, Refused};
+use AttackOutcome::{Broken, Fault, Garbled, Killed, RateLimited, Refused};
 use FaultKind::{Deadline, Exception, Fuel, HostCall, Memory, Trap};
 
-/// An attack, and its fate in WebAssembly and in Python; none where the language has no words for
-/// it.
-const ATTACKS: &[(&str, Option<Fate>, Option<Fate>)] = &[
+/// An attack, and its outcome in WebAssembly and in Python; `None` where the language cannot
+/// express it.
+const ATTACKS: &[(&str, Option<AttackOutcome>, Option<AttackOutcome>)] = &[
     ("endless", Some(Fault(Fuel)), Some(Fault(Deadline))),
     ("host_calls", Some(Fault(Fuel)), Some(Fault(Deadline))),
     ("recurse", Some(Fault(Trap)), Some(Fault(Exception))),
     ("memory", Some(Fault(Memory)), Some(Fault(Memory))),
     ("read_only_memory", None, Some(Killed("needed more memory"))),
     ("page_tables", None, Some(Killed("needed more memory"))),
-    ("threads", None, Some(Killed("threads, and may have 512"))),
+    ("threads", None, Some(Killed("threads; the limit is 512"))),
     ("full", None, Some(Killed("needed more memory"))),
-    ("log_flood", Some(Cut), Some(Cut)),
-    // Even the event that says so is refused then.
+    ("log_flood", Some(RateLimited), Some(RateLimited)),
+    // Even the event that would report the outcome is refused.
     ("event_flood", Some(Fault(Exception)), Some(Fault(Exception))),
     ("handles", Some(Fault(HostCall)), None),
     ("fork", Some(Refused("not supported")), Some(Refused("Operation not permitted"))),
@@ -100,9 +100,9 @@ fn main() -> ExitCode {
     if let Ok(case) = std::env::var(CASE) {
         let (attack, language) = case.split_once('/').expect("a case of this suite");
         let (_, wasm, python) =
-            ATTACKS.iter().find(|(known, ..)| *known == attack).expect("a case of this suite");
-        let fate = if language == "rust" { wasm } else { python };
-        attacked(attack, language, fate.expect("a case of this suite"));
+            ATTACKS.iter().find(|(name, ..)| *name == attack).expect("a case of this suite");
+        let outcome = if language == "rust" { wasm } else { python };
+        run_attack(attack, language, outcome.expect("a case of this suite"));
         return ExitCode::SUCCESS;
     }
     let missing = namespace::unavailable();
@@ -110,7 +110,7 @@ fn main() -> ExitCode {
         let languages = [("rust", wasm), ("python", python)];
         languages
             .into_iter()
-            .filter(|(_, fate)| fate.is_some())
+            .filter(|(_, outcome)| outcome.is_some())
             .map(move |(language, _)| format!("{attack}/{language}"))
     });
     let trial = |case: String| {
@@ -121,22 +121,19 @@ fn main() -> ExitCode {
         Trial::test(name, move || namespace::case(CASE, &case)).with_ignored_flag(missing.is_some())
     };
     let mut arguments = Arguments::from_args();
-    // They wait for most of their time: for a start, a deadline, a status each half a second.
+    // They mostly wait: for a start, a deadline, a status each half a second.
     arguments.test_threads.get_or_insert(4);
     let trials = cases.map(trial).collect();
     libtest_mimic::run(&arguments, trials).exit_code()
 }
 
-/// A process of somebody else, for attacks.
+/// An unrelated process, as a target of attacks.
 struct Bystander(Child);
 
 impl Bystander {
     fn new() -> Self {
-        let child = Command::new("sleep")
-            .arg("1000")
-            .stdin(Stdio::null())
-            .spawn()
-            .expect("there is a `sleep`");
+        let child =
+            Command::new("sleep").arg("1000").stdin(Stdio::null()).spawn().expect("`sleep` exists");
         Self(child)
     }
 
@@ -152,30 +149,30 @@ impl Drop for Bystander {
     }
 }
 
-fn attacked(attack: &str, language: &str, fate: Fate) {
+fn run_attack(attack: &str, language: &str, outcome: AttackOutcome) {
     let mut bystander = Bystander::new();
-    let out = Folder::new();
+    let out = TempFolder::new();
     let lambda = root().join("tests/lambdas/attack").join(language);
     let (attack_set, target) = (format!("attack={attack}"), format!("target={}", bystander.0.id()));
     let started = run(&lambda, out.path(), &["--set", &attack_set, "--set", &target]);
-    let decision = fallout(&started, fate);
-    // One that dies of it dies again after each start.
-    let live = (!matches!(fate, Killed(_) | Broken)).then(|| until_it_goes_on(&started));
-    if fate == Garbled {
+    let decision = decision_with_outcome(&started, outcome);
+    // A process that dies from the attack dies again after each start.
+    let live = (!matches!(outcome, Killed(_) | Broken)).then(|| until_it_continues(&started));
+    if outcome == Garbled {
         started.until_live("garbage to be counted", |live| live.unwritten >= 100);
     }
     started.signal("INT");
     let finished = started.finish();
-    let code = match fate {
+    let code = match outcome {
         Fault(_) | Killed(_) => Some(Exit::LambdaFaulted),
         Broken => Some(Exit::Internal),
-        Refused(_) | Cut | Garbled => None,
+        Refused(_) | RateLimited | Garbled => None,
     };
     if let Some(code) = code {
-        assert_eq!(finished.status.code(), Some(i32::from(code.code())), "{}", finished.said);
+        assert_eq!(finished.status.code(), Some(i32::from(code.code())), "{}", finished.stderr);
     }
-    println!("{attack}/{language}: {}", in_words(decision.as_ref()));
-    match fate {
+    println!("{attack}/{language}: {}", summary_of(decision.as_ref()));
+    match outcome {
         Fault(kind) => {
             let fault = decision.and_then(|decision| decision.fault).expect("a fault");
             assert_eq!(fault.kind, kind, "{}", fault.message);
@@ -187,19 +184,19 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
                 .triggers
                 .iter()
                 .find(|it| it.label != "flood")
-                .expect("the lambda says what came of it");
+                .expect("the lambda reports the outcome");
             assert_eq!(event.label, "refused", "{event:?}");
             let why = event.attributes["why"].as_str().expect("a text");
             assert!(why.contains(words) && !why.contains("unknown attack"), "{why}");
         }
-        Broken => assert!(finished.said.contains("the run broke"), "{}", finished.said),
-        Cut => assert!(live.is_some_and(|live| live.log_dropped > 1000)),
+        Broken => assert!(finished.stderr.contains("a process failed"), "{}", finished.stderr),
+        RateLimited => assert!(live.is_some_and(|live| live.log_dropped > 1000)),
         Garbled => {
             let written = decisions(out.path());
             let forged =
                 |it: &Decision| it.fault.as_ref().is_some_and(|fault| fault.message == "forged");
             assert!(written.iter().any(forged), "{written:?}");
-            // Its other results are as ever: that it came back from the attack is one of them.
+            // Its other results are unaffected, among them the event after the attack.
             assert!(
                 written
                     .iter()
@@ -219,44 +216,44 @@ fn attacked(attack: &str, language: &str, fate: Fate) {
             assert!(written.iter().any(killed), "{written:?}");
         }
     }
-    assert!(bystander.is_alive(), "the process of somebody else was hit");
+    assert!(bystander.is_alive(), "an unrelated process was hit");
     assert!(
         !Path::new("/tmp/gleaner-escaped").exists(),
-        "a file was written where nobody had allowed it"
+        "a file was written outside of the allowed folders"
     );
 }
 
-/// The decision in which the attack shows; none where it is only counted.
-fn fallout(started: &Started, fate: Fate) -> Option<Decision> {
+/// The decision that shows the outcome; `None` if it is only counted.
+fn decision_with_outcome(started: &RunningProgram, outcome: AttackOutcome) -> Option<Decision> {
     let decision = |wanted: &dyn Fn(&Decision) -> bool| {
         started.until("the attack to show", |line| match line {
-            Line::Lambda(Report::Decision(decision)) if wanted(&decision) => Some(*decision),
+            JsonReport::Lambda(Report::Decision(decision)) if wanted(&decision) => Some(*decision),
             _ => None,
         })
     };
-    // A machine that stops in a wake may put a deadline before it; the lambda attacks again.
+    // If the machine stalls in a wake, a deadline fault may come first; the lambda attacks again.
     let fault = |kind| decision(&|it| it.fault.as_ref().is_some_and(|fault| fault.kind == kind));
-    match fate {
+    match outcome {
         Fault(kind) => Some(fault(kind)),
         Refused(_) => Some(decision(&|decision| !decision.triggers.is_empty())),
         Killed(_) => Some(fault(FaultKind::Killed)),
         Broken => {
             let mut starts = 0;
             started.until("a start after the first", |line| {
-                starts += u32::from(matches!(line, Line::Lambda(Report::Ready)));
+                starts += u32::from(matches!(line, JsonReport::Lambda(Report::Ready)));
                 (starts > 1).then_some(())
             });
             None
         }
-        Cut | Garbled => None,
+        RateLimited | Garbled => None,
     }
 }
 
 /// Waits until the lambda has run for some wakes after its attack.
-fn until_it_goes_on(started: &Started) -> Live {
+fn until_it_continues(started: &RunningProgram) -> LiveStatus {
     let mut seen: BTreeMap<u32, u64> = BTreeMap::new();
-    started.until("the lambda to go on", |line| match line {
-        Line::Lambda(Report::Live(live)) => {
+    started.until("the lambda to continue", |line| match line {
+        JsonReport::Lambda(Report::Live(live)) => {
             let first = *seen.entry(live.restarts).or_insert(live.wakes);
             (live.wakes > first.max(5)).then_some(*live)
         }
@@ -264,7 +261,7 @@ fn until_it_goes_on(started: &Started) -> Live {
     })
 }
 
-fn in_words(decision: Option<&Decision>) -> String {
+fn summary_of(decision: Option<&Decision>) -> String {
     let Some(decision) = decision else { return "counted".to_owned() };
     match (&decision.fault, decision.triggers.first()) {
         (Some(fault), _) => {

@@ -17,7 +17,7 @@ use gleaner_transport::{Clock, LiveSource};
 use self::attacker::{ATTACKS, Attacker};
 use self::blocks::BlockSchedule;
 use self::victim::Victim;
-use crate::measure::{Figure, Twin, cores, bind_to};
+use crate::measure::{Figure, Twin, bind_to, cores};
 
 /// Pairs of blocks for each attack.
 const PAIRS: usize = 20;
@@ -29,8 +29,7 @@ const RATE: &str = "500";
 
 /// All figures, or the reason why they cannot be measured.
 pub fn figures(quick: bool) -> Result<Vec<Figure>, String> {
-    let cores = cores()
-        .map_err(|error| format!("cannot determine the allowed cores: {error}"))?;
+    let cores = cores().map_err(|error| format!("cannot determine the allowed cores: {error}"))?;
     let [own, attacker, ..] = cores[..] else {
         return Err("victim and attacker need one core each".to_owned());
     };
@@ -41,17 +40,10 @@ pub fn figures(quick: bool) -> Result<Vec<Figure>, String> {
     Ok(figures)
 }
 
-<<<<<<< /work/main/bench/src/isolation/mod.rs
-/// A victim of each kind through all attacks, the attacker on the core `theirs`.
-fn attacks(quick: bool, theirs: usize, figures: &mut Vec<Figure>) {
-    let clock = Clock::from_time_of_day();
-    let mut victims = [Kind::Rust, Kind::Python].map(Victim::start);
-=======
 /// Runs all attacks on a victim of each kind, with the attacker on `core`.
 fn attacks(quick: bool, core: usize, figures: &mut Vec<Figure>) {
-    let clock = Clock::of_today();
+    let clock = Clock::from_time_of_day();
     let mut victims = [Twin::Rust, Twin::Python].map(Victim::start);
->>>>>>> /tmp/G/new
     let readers = victims.len().to_string();
     // Far longer than the bench: the player is stopped by a signal.
     let player =

@@ -1,49 +1,48 @@
-//! An empty lambda that answers each sample, and says how late that was.
+//! The victim: an empty lambda that answers each sample and reports the delay.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gleaner_dds::Dds;
-use gleaner_tests::Folder;
-use gleaner_tests::live::{PATIENCE, Started, run};
+use gleaner_tests::TempFolder;
+use gleaner_tests::live::{PATIENCE, RunningProgram, run};
 use gleaner_transport::Clock;
 
 use super::RATE_HZ;
 use super::attacker::Attack;
-use super::blocks::{Course, compare};
-use crate::answers::Answers;
+use super::blocks::{BlockSchedule, compare};
+use crate::answers::RttReceiver;
 use crate::live::lambda;
-use crate::measure::{Figure, Kind, quantile};
+use crate::measure::{Figure, Twin, quantile};
 
-/// A status tells of about so much time before it, and comes no later than that after its end.
+/// Period that a status covers, with the maximum delay until it arrives.
 const STATUS_NS: i64 = 1_050_000_000;
 
 pub(super) struct Victim {
-    kind: Kind,
+    kind: Twin,
     topic: String,
-    /// Of this attack.
-    answers: Option<Arc<Answers>>,
-    started: Started,
-    out: Folder,
-    /// When each status came, and the 99 % of what it took from a sample received to the lambda
-    /// entered, in us.
-    entered: Vec<(i64, f64)>,
+    /// RttReceiver during the current attack.
+    answers: Option<Arc<RttReceiver>>,
+    started: RunningProgram,
+    out: TempFolder,
+    /// Arrival time of each status, and its p99 of the wake latency in us.
+    latencies: Vec<(i64, f64)>,
 }
 
 impl Victim {
-    pub(super) fn start(kind: Kind) -> Self {
-        let (topic, out) = (format!("/rtt/{kind}"), Folder::new());
+    pub(super) fn start(kind: Twin) -> Self {
+        let (topic, out) = (format!("/rtt/{kind}"), TempFolder::new());
         let started = run(&lambda("imu", kind), out.path(), &["--no-record", "--rtt", &topic]);
         started.until_ready();
-        Self { kind, topic, answers: None, started, out, entered: Vec::new() }
+        Self { kind, topic, answers: None, started, out, latencies: Vec::new() }
     }
 
-    /// From now on its answers are heard by `dds`.
-    pub(super) fn hear(&mut self, dds: &mut Dds) {
-        let answers = self.answers.insert(Answers::on(dds, &self.topic));
+    /// Subscribes to its answers with `dds`, and waits for the first one.
+    pub(super) fn subscribe(&mut self, dds: &mut Dds) {
+        let answers = self.answers.insert(RttReceiver::on(dds, &self.topic));
         let deadline = Instant::now() + PATIENCE;
         while answers.take().is_empty() {
-            assert!(Instant::now() < deadline, "{}: no answer is heard", self.kind);
+            assert!(Instant::now() < deadline, "{}: no answer arrives", self.kind);
             std::thread::sleep(Duration::from_millis(10));
         }
     }
@@ -52,53 +51,50 @@ impl Victim {
         self.started.until_live("the first samples", |live| live.wakes > 0);
     }
 
-    /// Hears its statuses until the end of `course`.
-    pub(super) fn listen(&mut self, course: &Course, clock: Clock) {
-        while clock.now() < course.end_ns() {
+    /// Collects its statuses until the end of `schedule`.
+    pub(super) fn collect(&mut self, schedule: &BlockSchedule, clock: Clock) {
+        while clock.now() < schedule.end_ns() {
             let live = self.started.until_live("a status", |_| true);
-            let entered = live.wake_latency.map_or(f64::NAN, |spread| spread.p99_ns as f64 / 1e3);
-            self.entered.push((clock.now(), entered));
+            let p99 = live.wake_latency.map_or(f64::NAN, |spread| spread.p99_ns as f64 / 1e3);
+            self.latencies.push((clock.now(), p99));
         }
     }
 
-    /// What the attack did to it. To be asked once for each attack.
+    /// Adds the figures of one attack. Call it once for each attack.
     pub(super) fn figures(
         &mut self,
         attack: &Attack,
-        course: &Course,
+        schedule: &BlockSchedule,
         clock: Clock,
         figures: &mut Vec<Figure>,
     ) {
         let answers = self.answers.take().map(|answers| answers.take()).unwrap_or_default();
-        // A late answer counts where its sample came.
+        // A late answer counts for the block of its sample.
         let in_us = answers.iter().map(|answer| {
             let sample_ns = answer.at_ns - answer.ns as i64 + clock.offset_ns();
-            (course.block(sample_ns, sample_ns), answer.ns / 1e3)
+            (schedule.block(sample_ns, sample_ns), answer.ns / 1e3)
         });
-        let blocks = course.sorted_in(in_us);
+        let blocks = schedule.grouped(in_us);
         let answered: usize = blocks.iter().map(Vec::len).sum();
         let p99 = blocks.iter().map(|block| quantile(block, 0.99)).collect::<Vec<_>>();
         let of = format!("{attack}, on {}", self.kind);
         figures.push(Figure::at_least(
-            &format!("{of}: samples answered, of those that were due"),
+            &format!("{of}: samples answered"),
             "%",
             99.0,
-            &[100.0 * answered as f64 / (RATE_HZ * course.measured_s())],
+            &[100.0 * answered as f64 / (RATE_HZ * schedule.measured_s())],
         ));
-        compare(&format!("{of}: round trip, 99 %"), attack.is_by_a_lambda(), &p99, figures);
-        let entered =
-            self.entered.drain(..).map(|(at_ns, us)| (course.block(at_ns - STATUS_NS, at_ns), us));
-        let entered = course.sorted_in(entered);
-        let entered = entered.iter().map(|block| quantile(block, 0.5)).collect::<Vec<_>>();
-        compare(
-            &format!("{of}: received to entered, 99 %"),
-            attack.is_by_a_lambda(),
-            &entered,
-            figures,
-        );
+        compare(&format!("{of}: round trip, p99"), attack.is_by_lambda(), &p99, figures);
+        let latencies = self
+            .latencies
+            .drain(..)
+            .map(|(at_ns, us)| (schedule.block(at_ns - STATUS_NS, at_ns), us));
+        let latencies = schedule.grouped(latencies);
+        let latencies = latencies.iter().map(|block| quantile(block, 0.5)).collect::<Vec<_>>();
+        compare(&format!("{of}: wake latency, p99"), attack.is_by_lambda(), &latencies, figures);
     }
 
-    /// Ends it, and tells what it lost all the while.
+    /// Stops it and reports its losses in all attacks.
     pub(super) fn end(self, figures: &mut Vec<Figure>) {
         self.started.signal("INT");
         let live = self.started.finish().ended();
@@ -106,8 +102,7 @@ impl Victim {
             .topics
             .iter()
             .map(|topic| topic.lost.unwrap_or(u64::MAX).saturating_add(topic.skipped));
-        let name =
-            format!("empty lambda, {}: samples lost or passed over in all that time", self.kind);
+        let name = format!("empty lambda, {}: samples lost or skipped in all attacks", self.kind);
         figures.push(Figure::at_most(&name, "samples", 0.0, &[lost.sum::<u64>() as f64]));
         drop(self.out);
     }

@@ -1,4 +1,4 @@
-//! The lambda of the bench on an engine of our own making, without the host around it.
+//! Runs the bench lambda on a bare wasmtime engine, without the host.
 
 use gleaner_compile::Nans;
 use gleaner_tests::root;
@@ -10,24 +10,24 @@ use wasmtime_wasi::{WasiCtx, WasiCtxView, WasiView};
 /// Fuel and epochs that never run out.
 const PLENTY: u64 = u64::MAX / 2;
 
-/// What code is made to do beside its work.
+/// EngineChecks that the compiler adds to the code.
 #[derive(Clone, Copy)]
-pub struct Checks {
+pub struct EngineChecks {
     pub fuel: bool,
     pub epochs: bool,
-    /// Whether every NaN is given the same bits.
+    /// Canonicalises NaNs.
     pub nans: bool,
 }
 
-/// The component as an engine with such checks compiles it.
-pub struct Compiled {
+/// The component, compiled with some checks.
+pub struct BareComponent {
     component: Component,
-    checks: Checks,
+    checks: EngineChecks,
 }
 
 /// Compiles the component.
-pub fn compiled(checks: Checks) -> Compiled {
-    let mut config = gleaner_compile::settings(Nans::AsMade);
+pub fn compile(checks: EngineChecks) -> BareComponent {
+    let mut config = gleaner_compile::settings(Nans::Native);
     config
         .consume_fuel(checks.fuel)
         .epoch_interruption(checks.epochs)
@@ -36,28 +36,31 @@ pub fn compiled(checks: Checks) -> Compiled {
     let path = root().join("bench/lambdas/kernels/rust/build/bench_kernels.wasm");
     let component =
         Component::from_file(&engine, path).expect("a component; run: cargo xtask bench");
-    Compiled { component, checks }
+    BareComponent { component, checks }
 }
 
 /// An instance that does one kind of work.
-pub struct Bare {
-    store: Store<Wasi>,
+pub struct BareInstance {
+    store: Store<BareState>,
     on_wake: Func,
 }
 
-struct Wasi {
+struct BareState {
     ctx: WasiCtx,
     table: ResourceTable,
 }
 
-impl WasiView for Wasi {
+impl WasiView for BareState {
     fn ctx(&mut self) -> WasiCtxView<'_> {
         WasiCtxView { ctx: &mut self.ctx, table: &mut self.table }
     }
 }
 
-/// Kernels call nobody, so what the host offers is there only by name.
-fn refuse_host_calls(linker: &mut Linker<Wasi>, component: &Component) -> wasmtime::Result<()> {
+/// Links the imports of the host to functions that fail: kernels never call them.
+fn refuse_host_calls(
+    linker: &mut Linker<BareState>,
+    component: &Component,
+) -> wasmtime::Result<()> {
     let engine = component.engine();
     for (interface, item) in component.component_type().imports(engine) {
         let ComponentItem::ComponentInstance(items) = item.ty else { continue };
@@ -82,16 +85,16 @@ fn refuse_host_calls(linker: &mut Linker<Wasi>, component: &Component) -> wasmti
     Ok(())
 }
 
-impl Bare {
-    /// The lambda after `init`, told to do `work`.
-    pub fn new(compiled: &Compiled, work: &str) -> Self {
-        let Compiled { component, checks } = compiled;
+impl BareInstance {
+    /// An instance after `init`, configured to do `work`.
+    pub fn new(compiled: &BareComponent, work: &str) -> Self {
+        let BareComponent { component, checks } = compiled;
         let mut linker = Linker::new(component.engine());
         wasmtime_wasi::p2::add_to_linker_sync(&mut linker).expect("WASI");
         refuse_host_calls(&mut linker, component).expect("imports");
         let mut store = Store::new(
             component.engine(),
-            Wasi { ctx: WasiCtx::builder().build(), table: ResourceTable::new() },
+            BareState { ctx: WasiCtx::builder().build(), table: ResourceTable::new() },
         );
         if checks.fuel {
             store.set_fuel(PLENTY).expect("fuel is counted");
@@ -120,18 +123,18 @@ impl Bare {
         Self { store, on_wake }
     }
 
-    /// Does the work `rounds` times; what came out last.
+    /// Does the work `rounds` times; returns the last result.
     pub fn rounds(&mut self, rounds: u64) -> f64 {
         let tick = vec![("at-ns".to_owned(), Val::S64(0)), ("missed".to_owned(), Val::U64(rounds))];
         let wake = Val::Variant("tick".to_owned(), Some(Box::new(Val::Record(tick))));
         let mut answer = [Val::Bool(false)];
         self.on_wake.call(&mut self.store, &[wake], &mut answer).expect("a wake");
         match answer {
-            [Val::Result(Err(Some(said)))] => match *said {
+            [Val::Result(Err(Some(result)))] => match *result {
                 Val::String(number) => number.parse().expect("a number"),
-                other => panic!("said {other:?}"),
+                other => panic!("unexpected result {other:?}"),
             },
-            other => panic!("said {other:?}"),
+            other => panic!("unexpected result {other:?}"),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The lambda of the bench as the host runs it, with a frame in its ring.
+//! Runs the bench lambda in the host, with a frame in its ring.
 
 use std::sync::Arc;
 
@@ -21,17 +21,17 @@ pub const FRAME_BYTES: usize = 1920 * 1080 * 3;
 const TOPIC: &str = "/camera/front/image_raw";
 
 /// A guest that does one kind of work.
-pub struct Hosted {
+pub struct HostedKernel {
     guest: WasmGuest,
     session: Session,
     topic: Arc<Topic>,
     rounds: u64,
-    // The ring is fed as long as it lives.
+    // The ring receives samples as long as this lives.
     _transport: Loopback,
 }
 
-impl Hosted {
-    /// The lambda after `init`, told to do `work` so many times in a wake by a frame.
+impl HostedKernel {
+    /// The lambda after `init`, configured to do `work` `rounds` times in a wake by a frame.
     pub fn new(work: &str, rounds: u64) -> Self {
         let lambda = root().join("bench/lambdas/kernels/rust/build");
         let manifest =
@@ -63,18 +63,18 @@ impl Hosted {
             &lambda.join("bench_kernels.wasm"),
             &cache,
             limits.stack.as_usize(),
-            Nans::AsMade,
+            Nans::Native,
         );
         let loaded = loaded.expect("a component");
         let mut guest = WasmGuest::new(loaded, session.clone(), &limits, None).expect("a guest");
         guest.init().expect("init");
         let mut hosted = Self { guest, session, topic, rounds, _transport: transport };
-        // Memory of the guest grows at the first.
+        // The first wake grows the guest's memory.
         hosted.frame();
         hosted
     }
 
-    /// How often the work is done in [`frame`](Self::frame).
+    /// Repetitions of the work in [`frame`](Self::frame).
     pub fn rounds(&self) -> u64 {
         self.rounds
     }
@@ -85,7 +85,7 @@ impl Hosted {
         self.wake(Wake::Event(sample));
     }
 
-    /// A wake by a tick, in which nothing is done.
+    /// A wake by a tick, which does nothing.
     pub fn tick(&mut self) {
         self.wake(Wake::Tick(Tick { at_ns: 1, missed: 0 }));
     }

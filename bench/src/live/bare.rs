@@ -1,5 +1,5 @@
-//! What the library alone can do: a reader of an IMU that only stamps each sample and answers it,
-//! on one thread.
+//! The baseline: a bare RustDDS reader of an IMU that only stamps and answers each sample, in one
+//! thread.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -16,23 +16,23 @@ use rustdds::{
     DomainParticipant, QosPolicyBuilder, RepresentationIdentifier, Topic, TopicKind, no_key,
 };
 
-/// A thread that answers until it is told to stop.
-pub(super) struct Bare {
+/// A thread that answers until it is stopped.
+pub(super) struct BareReader {
     stop: Arc<AtomicBool>,
     thread: JoinHandle<Vec<f64>>,
 }
 
-impl Bare {
+impl BareReader {
     /// Answers the samples of `input` on `output`.
     pub(super) fn start(input: &str, output: &str) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
-        let (raised, input, output) =
+        let (stop_flag, input, output) =
             (Arc::clone(&stop), format!("rt{input}"), format!("rt{output}"));
-        let thread = thread::spawn(move || answer(&raised, &input, &output));
+        let thread = thread::spawn(move || answer(&stop_flag, &input, &output));
         Self { stop, thread }
     }
 
-    /// The times from input to answer, in ns.
+    /// Stops the thread; returns the times from input to answer, in ns.
     pub(super) fn stop(self) -> Vec<f64> {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join().expect("the bare reader does not panic")
@@ -53,30 +53,31 @@ fn answer(stop: &AtomicBool, input: &str, output: &str) -> Vec<f64> {
     let topic = |name: &str, type_name: &str| -> Topic {
         let topic =
             participant.create_topic(name.to_owned(), type_name.to_owned(), &qos, TopicKind::NoKey);
-        topic.expect("a topic can be made")
+        topic.expect("a topic can be created")
     };
     let (input, output) = (
         topic(input, "sensor_msgs::msg::dds_::Imu_"),
         topic(output, "sensor_msgs::msg::dds_::TimeReference_"),
     );
-    let subscriber = participant.create_subscriber(&qos).expect("a subscriber can be made");
+    let subscriber = participant.create_subscriber(&qos).expect("a subscriber can be created");
     let mut reader = subscriber
-        .create_simple_datareader_no_key::<i64, Adapter>(&input, Some(qos.clone()))
-        .expect("a reader can be made");
-    let publisher = participant.create_publisher(&qos).expect("a publisher can be made");
-    let writer = publisher.create_datawriter_no_key::<Bytes, Adapter>(&output, Some(qos.clone()));
-    let writer = writer.expect("a writer can be made");
-    let mut poll = Poll::new().expect("the system has a poll");
+        .create_simple_datareader_no_key::<i64, StampAdapter>(&input, Some(qos.clone()))
+        .expect("a reader can be created");
+    let publisher = participant.create_publisher(&qos).expect("a publisher can be created");
+    let writer =
+        publisher.create_datawriter_no_key::<Bytes, StampAdapter>(&output, Some(qos.clone()));
+    let writer = writer.expect("a writer can be created");
+    let mut poll = Poll::new().expect("the system supports polling");
     poll.registry()
         .register(&mut reader, Token(0), Interest::READABLE)
         .expect("a reader can be polled");
     let mut events = Events::with_capacity(16);
     let (clock, mut message, mut times) = (Clock::new(0), CdrWriter::new(), Vec::new());
     while !stop.load(Ordering::Relaxed) {
-        // What interrupts it is no reason to stop.
+        // An interrupted poll is no reason to stop.
         let _ = poll.poll(&mut events, Some(Duration::from_millis(100)));
         reader.drain_read_notifications();
-        while let Ok(Some(sample)) = reader.try_take_one_with(Stamp) {
+        while let Ok(Some(sample)) = reader.try_take_one_with(StampDecoder) {
             let stamp = sample.into_value();
             let now = clock.now();
             message.clear();
@@ -88,9 +89,9 @@ fn answer(stop: &AtomicBool, input: &str, output: &str) -> Vec<f64> {
     times
 }
 
-struct Adapter;
+struct StampAdapter;
 
-impl no_key::DeserializerAdapter<i64> for Adapter {
+impl no_key::DeserializerAdapter<i64> for StampAdapter {
     type Error = Infallible;
     type Decoded = i64;
 
@@ -103,7 +104,7 @@ impl no_key::DeserializerAdapter<i64> for Adapter {
     }
 }
 
-impl no_key::SerializerAdapter<Bytes> for Adapter {
+impl no_key::SerializerAdapter<Bytes> for StampAdapter {
     type Error = Infallible;
 
     fn output_encoding() -> RepresentationIdentifier {
@@ -115,11 +116,11 @@ impl no_key::SerializerAdapter<Bytes> for Adapter {
     }
 }
 
-/// Reads the stamp, with which a message with a header begins, in ns.
+/// Decodes the stamp at the begin of a message with a header, in ns.
 #[derive(Copy, Clone)]
-struct Stamp;
+struct StampDecoder;
 
-impl<'de> no_key::Decode<'de, i64> for Stamp {
+impl<'de> no_key::Decode<'de, i64> for StampDecoder {
     type Error = Infallible;
 
     fn decode_bytes(self, cdr: &'de [u8], _: RepresentationIdentifier) -> Result<i64, Infallible> {

@@ -1,45 +1,44 @@
-//! What memory a runtime is to blame for: its own pages, and its part of those that it shares with
-//! others (PSS).
+//! Measures the memory of a runtime: its own pages plus its share of shared ones (PSS).
 
-use gleaner_tests::Copy;
-use gleaner_tests::live::{Started, below};
+use gleaner_tests::LambdaCopy;
+use gleaner_tests::live::{RunningProgram, descendants};
 
-use super::{ended, played, start};
-use crate::measure::{Figure, Kind};
+use super::{play_all, start, stop};
+use crate::measure::{Figure, Twin};
 
-/// A runtime alone, that is without others to share its pages with, and with next to no memory for
+/// Measures a single runtime, which shares its pages with no other, with minimal memory for
 /// samples.
 pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
-    for kind in [Kind::Rust, Kind::Python] {
-        let lambda = Copy::of(&format!("bench/lambdas/imu/{}", kind.folder()), |manifest| {
-            assert!(manifest.contains("depth = 512"), "it has another depth");
+    for kind in [Twin::Rust, Twin::Python] {
+        let lambda = LambdaCopy::of(&format!("bench/lambdas/imu/{}", kind.folder()), |manifest| {
+            assert!(manifest.contains("depth = 512"), "the depth has changed");
             manifest.replace("depth = 512", "depth = 1")
         });
         let started = vec![start(lambda.path(), &["--no-record"])];
         let duration = seconds.to_string();
-        played(
+        play_all(
             &started,
             &[vec!["--imu", "100", "--wait", "1", "--duration", &duration]],
             &mut Vec::new(),
         );
         let pss = started.iter().map(|(started, _)| megabytes(started)).collect::<Vec<_>>();
-        ended(started);
+        stop(started);
         let name = format!("one runtime with DDS, without slots, {kind}: PSS");
         figures.push(match kind {
-            Kind::Rust => Figure::at_most(&name, "MB", 20.0, &pss),
-            Kind::Python => Figure::told(&name, "MB", &pss),
+            Twin::Rust => Figure::at_most(&name, "MB", 20.0, &pss),
+            Twin::Python => Figure::without_goal(&name, "MB", &pss),
         });
     }
 }
 
-/// PSS of the process in which the lambda of `started` runs, in MB; no number where the system does
-/// not tell.
-pub(super) fn megabytes(started: &Started) -> f64 {
+/// PSS of the process in which the lambda of `started` runs, in MB; NaN where the system does not
+/// provide it.
+pub(super) fn megabytes(started: &RunningProgram) -> f64 {
     let file = |pid: u32, name: &str| {
         std::fs::read_to_string(format!("/proc/{pid}/{name}")).unwrap_or_default()
     };
-    // Below the shim there is nobody else.
-    let mut runtimes = below(started.pid(), "")
+    // The only other process below the shim is the runtime.
+    let mut runtimes = descendants(started.pid(), "")
         .into_iter()
         .filter(|pid| file(*pid, "comm").trim() != "gleaner-shim");
     let rollup = runtimes.next().map(|pid| file(pid, "smaps_rollup")).unwrap_or_default();

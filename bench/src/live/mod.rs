@@ -1,5 +1,5 @@
-//! Live topics: what arrives, how fast it is answered, and what that costs. In a private network,
-//! with our player on Cyclone DDS.
+//! Measures live topics: losses, latencies and costs, in a private network with `gleaner-player`
+//! (Cyclone DDS) as publisher.
 
 mod bare;
 mod footprint;
@@ -7,34 +7,34 @@ mod rounds;
 
 use std::path::{Path, PathBuf};
 
-use gleaner_protocol::Live;
-use gleaner_tests::live::{Started, no_player, play, run};
-use gleaner_tests::{Folder, namespace, root};
+use gleaner_protocol::LiveStatus;
+use gleaner_tests::live::{RunningProgram, no_player, play, run};
+use gleaner_tests::{TempFolder, namespace, root};
 
-use crate::measure::{Figure, Kind};
+use crate::measure::{Figure, Twin};
 
-/// Set in the process that is alone in its network.
+/// Environment variable of the process in the private network.
 const ALONE: &str = "GLEANER_BENCH_ALONE";
 
-/// Where the system says how large a socket's buffer may be. It counts for all networks, and can be
-/// changed in the first only.
+/// The system's limit of socket buffers. It applies to all network namespaces, and can be changed
+/// in the first one only.
 const BUFFER_LIMIT: &str = "/proc/sys/net/core/rmem_max";
 const BUFFER_BYTES: u64 = 64 << 20;
 
-/// The second camera of `bench/lambdas/rig`.
+/// Remap of the second camera of `bench/lambdas/rig`.
 const REAR: &str = "/camera/synthetic/image_raw:=/camera/rear/image_raw";
 
-/// Runs this program again in a network of its own; `None` in the process that is there already.
+/// Runs this program again in a private network; `None` in that process.
 ///
-/// The limit of socket buffers is raised meanwhile, where that is allowed.
-pub fn elsewhere() -> Option<Result<bool, String>> {
+/// Meanwhile the limit of socket buffers is raised, if that is permitted.
+pub fn in_private_network() -> Option<Result<bool, String>> {
     if std::env::var_os(ALONE).is_some() {
         return None;
     }
-    Some(again())
+    Some(start_in_private_network())
 }
 
-fn again() -> Result<bool, String> {
+fn start_in_private_network() -> Result<bool, String> {
     if let Some(why) = namespace::unavailable().or(no_player()) {
         return Err(why.to_owned());
     }
@@ -43,7 +43,7 @@ fn again() -> Result<bool, String> {
     let raised = is_small && std::fs::write(BUFFER_LIMIT, BUFFER_BYTES.to_string()).is_ok();
     let status = namespace::again(ALONE, "1").args(std::env::args_os().skip(1)).status();
     if raised {
-        // As it was: others on this machine did not ask for it.
+        // Restored for the other users of this machine.
         let _ = std::fs::write(BUFFER_LIMIT, before.trim());
     }
     status.map(|status| status.success()).map_err(|error| error.to_string())
@@ -64,8 +64,8 @@ pub fn figures(quick: bool) -> Vec<Figure> {
             &[&["--synthetic", FULL_HD, "--imu", "1000"]],
             60,
         ),
-        // One lambda with three inputs. A player has one camera, so the second one has a player of
-        // its own.
+        // One lambda with three inputs. A player has one camera, so the second one needs another
+        // player.
         (
             "two cameras of 1080p at 30 Hz and an IMU at 1 kHz at once",
             &["rig"],
@@ -84,52 +84,56 @@ pub fn figures(quick: bool) -> Vec<Figure> {
     figures
 }
 
-pub(crate) fn lambda(name: &str, kind: Kind) -> PathBuf {
+pub(crate) fn lambda(name: &str, kind: Twin) -> PathBuf {
     root().join("bench/lambdas").join(name).join(kind.folder())
 }
 
-fn start(lambda: &Path, args: &[&str]) -> (Started, Folder) {
-    let out = Folder::new();
+fn start(lambda: &Path, args: &[&str]) -> (RunningProgram, TempFolder) {
+    let out = TempFolder::new();
     let started = run(lambda, out.path(), args);
     started.until_ready();
     (started, out)
 }
 
-/// Plays to the end, with a player for each of `players`, and then asks how the lambdas were. The
-/// statuses of the first one meanwhile go to `seen`.
-fn to_the_end(
-    started: Vec<(Started, Folder)>,
+/// Plays to the end, with a process for each of `players`, then stops the lambdas and returns their
+/// final statuses. The statuses of the first lambda meanwhile go to `seen`.
+fn play_and_stop(
+    started: Vec<(RunningProgram, TempFolder)>,
     players: &[Vec<&str>],
-    seen: &mut Vec<Live>,
-) -> Vec<Live> {
-    played(&started, players, seen);
-    ended(started)
+    seen: &mut Vec<LiveStatus>,
+) -> Vec<LiveStatus> {
+    play_all(&started, players, seen);
+    stop(started)
 }
 
-fn ended(started: Vec<(Started, Folder)>) -> Vec<Live> {
+fn stop(started: Vec<(RunningProgram, TempFolder)>) -> Vec<LiveStatus> {
     started.iter().for_each(|(started, _)| started.signal("INT"));
     started.into_iter().map(|(started, _out)| started.finish().ended()).collect()
 }
 
-/// As [`to_the_end`], and the lambdas go on.
-fn played(started: &[(Started, Folder)], players: &[Vec<&str>], seen: &mut Vec<Live>) {
+/// Plays to the end; the lambdas keep running.
+fn play_all(
+    started: &[(RunningProgram, TempFolder)],
+    players: &[Vec<&str>],
+    seen: &mut Vec<LiveStatus>,
+) {
     let playing: Vec<_> = players.iter().map(|player| play(player)).collect();
     let mut has_begun = false;
     let mut is_over = false;
     while !is_over {
         let live = started[0].0.until_live("a status", |_| true);
-        // Whatever was received, as all may be lost; or all were there between two statuses.
+        // Begun if something was received, as everything may be lost, or if all writers are there.
         has_begun |= live.topics.iter().all(|topic| topic.writers > Some(0) || topic.received > 0);
         is_over = has_begun && live.topics.iter().all(|topic| topic.writers == Some(0));
         seen.push(live);
     }
     for played in playing {
         let played = played.finish();
-        assert!(played.status.success(), "{}", played.said);
+        assert!(played.status.success(), "{}", played.stderr);
     }
 }
 
-/// What the empty `lambdas` receive, each in a process of its own, and what that takes.
+/// Measures what the empty `lambdas` receive, each in its own process, and their costs.
 fn receive(
     name: &str,
     lambdas: &[&str],
@@ -139,7 +143,7 @@ fn receive(
 ) {
     let started = lambdas
         .iter()
-        .map(|lambda| start(&self::lambda(lambda, Kind::Rust), &["--no-record"]))
+        .map(|lambda| start(&self::lambda(lambda, Twin::Rust), &["--no-record"]))
         .collect();
     let duration = seconds.to_string();
     let players: Vec<_> = players
@@ -147,15 +151,15 @@ fn receive(
         .map(|player| [player, &["--wait", "1", "--duration", &duration][..]].concat())
         .collect();
     let mut seen = Vec::new();
-    let ended = to_the_end(started, &players, &mut seen);
+    let ended = play_and_stop(started, &players, &mut seen);
     let topics: usize = ended.iter().map(|live| live.topics.len()).sum();
     for live in &ended {
-        let granted = live.network.buffer_granted >= live.network.buffer_asked;
+        let granted = live.network.buffer_granted >= live.network.buffer_requested;
         let buffer = live.network.buffer_granted as f64 / f64::from(1 << 20);
         for topic in &live.topics {
             let of = if topics > 1 { format!("{name}: {}", topic.name) } else { name.to_owned() };
             let refused = topic.no_slot + topic.too_big + topic.malformed;
-            figures.push(Figure::told(
+            figures.push(Figure::without_goal(
                 &format!("{of}: received in {seconds} s"),
                 "samples",
                 &[topic.received as f64],
@@ -168,33 +172,37 @@ fn receive(
             figures.push(if granted {
                 Figure::at_most(&lost, "samples", 0.0, &[count as f64])
             } else {
-                Figure::told(&lost, "samples", &[count as f64])
+                Figure::without_goal(&lost, "samples", &[count as f64])
             });
         }
-        // What a process takes is said once, however many topics it has.
+        // Costs of a process are reported once, for all of its topics.
         let of = match &live.topics[..] {
             [topic] if topics > 1 => format!("{name}: {}", topic.name),
             _ => name.to_owned(),
         };
         let cpu = 100.0 * live.cpu_s / live.up_s;
-        figures.push(Figure::told(&format!("{of}: share of a core"), "%", &[cpu]));
+        figures.push(Figure::without_goal(&format!("{of}: share of a core"), "%", &[cpu]));
         if let Some(wake_latency) = live.wake_latency {
-            for (what, ns) in [("median", wake_latency.p50_ns), ("99 %", wake_latency.p99_ns)] {
-                figures.push(Figure::told(
-                    &format!("{of}: wake-up, {what}"),
+            for (what, ns) in [("p50", wake_latency.p50_ns), ("p99", wake_latency.p99_ns)] {
+                figures.push(Figure::without_goal(
+                    &format!("{of}: wake latency, {what}"),
                     "us",
                     &[ns as f64 / 1e3],
                 ));
             }
         }
     }
-    // Once everything is warm, until the end.
-    let rss = |live: &Live| live.rss_bytes as f64 / f64::from(1 << 20);
+    // From the first quarter of the time, after warm-up, until the end.
+    let rss = |live: &LiveStatus| live.rss_bytes as f64 / f64::from(1 << 20);
     if let (Some(warm), Some(last)) = (seen.get(seen.len() / 4), seen.last()) {
         let growth = 100.0 * (rss(last) / rss(warm) - 1.0);
-        figures.push(Figure::told(&format!("{name}: resident memory"), "MiB", &[rss(last)]));
+        figures.push(Figure::without_goal(
+            &format!("{name}: resident memory"),
+            "MiB",
+            &[rss(last)],
+        ));
         figures.push(Figure::at_most(
-            &format!("{name}: its growth after a quarter of the time"),
+            &format!("{name}: memory growth after a quarter of the time"),
             "%",
             2.0,
             &[growth],
@@ -202,33 +210,41 @@ fn receive(
     }
 }
 
-/// So many runtimes on one machine: whether all find the one publisher, and what they take.
+/// Measures `count` runtimes on one machine: whether all find the publisher, and their costs.
 fn many(count: usize, seconds: u32, figures: &mut Vec<Figure>) {
     let started: Vec<_> =
-        (0..count).map(|_| start(&lambda("imu", Kind::Rust), &["--no-record"])).collect();
+        (0..count).map(|_| start(&lambda("imu", Twin::Rust), &["--no-record"])).collect();
     let (count, duration) = (count.to_string(), seconds.to_string());
     let player = vec!["--imu", "100", "--wait", &count, "--duration", &duration];
-    played(&started, &[player], &mut Vec::new());
+    play_all(&started, &[player], &mut Vec::new());
     let pss: Vec<f64> = started.iter().map(|(started, _)| footprint::megabytes(started)).collect();
-    let ended = ended(started);
-    let heard = ended.iter().filter(|live| live.topics[0].received > 0).count();
-    let whole = ended.iter().filter(|live| live.topics[0].lost == Some(0)).count();
+    let ended = stop(started);
+    let connected = ended.iter().filter(|live| live.topics[0].received > 0).count();
+    let lossless = ended.iter().filter(|live| live.topics[0].lost == Some(0)).count();
     figures.push(Figure::at_least(
         &format!("{count} runtimes: found the publisher"),
         "runtimes",
         ended.len() as f64,
-        &[heard as f64],
+        &[connected as f64],
     ));
     figures.push(Figure::at_least(
-        &format!("{count} runtimes: lost nothing"),
+        &format!("{count} runtimes: no losses"),
         "runtimes",
         ended.len() as f64,
-        &[whole as f64],
+        &[lossless as f64],
     ));
     let rss: Vec<f64> =
         ended.iter().map(|live| live.rss_bytes as f64 / f64::from(1 << 20)).collect();
-    figures.push(Figure::told(&format!("{count} runtimes: resident memory of each"), "MiB", &rss));
-    figures.push(Figure::told(&format!("{count} runtimes: PSS of each"), "MB", &pss));
+    figures.push(Figure::without_goal(
+        &format!("{count} runtimes: resident memory of each"),
+        "MiB",
+        &rss,
+    ));
+    figures.push(Figure::without_goal(&format!("{count} runtimes: PSS of each"), "MB", &pss));
     let cpu: Vec<f64> = ended.iter().map(|live| 100.0 * live.cpu_s / live.up_s).collect();
-    figures.push(Figure::told(&format!("{count} runtimes: share of a core of each"), "%", &cpu));
+    figures.push(Figure::without_goal(
+        &format!("{count} runtimes: share of a core of each"),
+        "%",
+        &cpu,
+    ));
 }

@@ -1,54 +1,56 @@
-//! The recorder as a replay has it: one thread, which writes as well. Fed at the pace of a vehicle.
+//! The recorder as a replay runs it, in one thread, fed at the pace of a vehicle.
 
 use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_journal::Entry;
+use gleaner_journal::JournalEntry;
 use gleaner_lambda::manifest::{Manifest, Store};
-use gleaner_recorder::{Folder as Clips, Member, Recorder, Settings, Topic, TopicId};
-use gleaner_tests::Folder;
+use gleaner_recorder::{
+    LambdaSpec, Recorder, RecordingFolder as Clips, Settings, TopicId, TopicSchema,
+};
+use gleaner_tests::TempFolder;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
 use gleaner_vitals::usage;
 
 use super::{FRAMES_PER_S, TYPE, Traffic, header};
 
 const PREROLL_BYTES: u64 = 64 << 20;
 
-/// What a vehicle would feel of a recorder.
-pub struct Load {
-    /// MB/s that arrived.
+/// RecorderLoad that the recorder causes.
+pub struct RecorderLoad {
+    /// Received MB/s.
     pub megabytes_per_s: f64,
-    /// Time on a core, in % of the time that passed.
+    /// CPU time, in % of the elapsed time.
     pub cpu_percent: f64,
-    /// Memory of the process beyond what it had before, in MiB, at most.
+    /// Maximum memory of the process beyond that at the start, in MiB.
     pub memory_mib: f64,
-    /// The most that the preroll took, in % of its bound.
+    /// Maximum size of the preroll, in % of its limit.
     pub preroll_percent: f64,
-    /// Part of the time that is in a clip, in %.
+    /// Share of the time that is in a clip, in %.
     pub recorded_percent: f64,
 }
 
-struct Lane {
+struct RecorderSink {
     recorder: Arc<Mutex<Recorder>>,
     topic: TopicId,
 }
 
-impl Sink for Lane {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Verdict {
+impl Sink for RecorderSink {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
         self.recorder
             .lock()
             .expect("one thread")
             .sample(self.topic, meta, cdr)
             .expect("the disk has room");
-        Verdict::Taken
+        Delivery::Taken
     }
 }
 
 /// Records for `seconds`, with a trigger every 15 s and windows of 5 s and 5 s.
-pub fn record(seconds: u64, store: Store) -> Load {
-    let out = Folder::new();
+pub fn record(seconds: u64, store: Store) -> RecorderLoad {
+    let out = TempFolder::new();
     let before = usage::resident() as f64;
     let (folder, _) = Clips::open(out.path()).expect("an empty folder");
     let settings = Settings {
@@ -75,24 +77,24 @@ pub fn record(seconds: u64, store: Store) -> Load {
         .expect("with [record]");
     let lambda = {
         let mut recorder = recorder.lock().expect("one thread");
-        recorder.add_lambda(Member { header, rules, digest: "0".repeat(64), topics })
+        recorder.add_lambda(LambdaSpec { header, rules, digest: "0".repeat(64), topics })
     };
 
     let (started, cpu) = (Instant::now(), usage::cpu_seconds());
     let (mut bytes, mut peak, mut preroll) = (0, before, 0.0_f64);
     for n in 0..seconds * FRAMES_PER_S {
         let at_ns = (n * 1_000_000_000 / FRAMES_PER_S) as i64;
-        // Until the moment of this frame.
+        // Wait until this frame is due.
         if let Some(early) = Duration::from_nanos(at_ns as u64).checked_sub(started.elapsed()) {
             thread::sleep(early);
         }
         traffic.frame(n, at_ns, |name, meta, cdr| {
-            loopback.publish(name, meta, cdr).expect("the topic is there");
+            loopback.publish(name, meta, cdr).expect("the topic exists");
             bytes += cdr.len();
         });
         let mut recorder = recorder.lock().expect("one thread");
         recorder.wake(lambda, &wake(n, at_ns + 30_000_000)).expect("the disk has room");
-        // In memory it is one block of that size; on disk the system tells.
+        // In memory the preroll is one block of that size; on disk its files are measured.
         let held = recorder.counts().preroll_highest as f64;
         drop(recorder);
         let taken = if store == Store::Disk { files(&out.path().join("preroll")) } else { held };
@@ -108,7 +110,7 @@ pub fn record(seconds: u64, store: Store) -> Load {
         .iter()
         .map(|clip| clip.last_ns.unwrap_or(0) - clip.first_ns.unwrap_or(0))
         .sum();
-    Load {
+    RecorderLoad {
         megabytes_per_s: bytes as f64 / 1e6 / passed,
         cpu_percent: 100.0 * cpu_s / passed,
         memory_mib: (peak - before) / f64::from(1 << 20),
@@ -134,7 +136,7 @@ postroll = "5s"
 fn subscribe(loopback: &mut Loopback, recorder: &Arc<Mutex<Recorder>>, name: &str) -> TopicId {
     let type_name = TYPE;
     loopback.add_topic(name, type_name, "");
-    let topic = Topic {
+    let topic = TopicSchema {
         name: name.to_owned(),
         type_name: type_name.to_owned(),
         definitions: None,
@@ -149,17 +151,17 @@ fn subscribe(loopback: &mut Loopback, recorder: &Arc<Mutex<Recorder>>, name: &st
         qos: Default::default(),
     };
     loopback
-        .subscribe(&spec, Arc::new(Lane { recorder: recorder.clone(), topic }))
-        .expect("the topic is there");
+        .subscribe(&spec, Arc::new(RecorderSink { recorder: recorder.clone(), topic }))
+        .expect("the topic exists");
     topic
 }
 
 /// A trigger every 15 s.
-fn wake(n: u64, at_ns: i64) -> Entry {
+fn wake(n: u64, at_ns: i64) -> JournalEntry {
     super::wake(at_ns, n % (15 * FRAMES_PER_S) == 5 * FRAMES_PER_S)
 }
 
-/// Bytes of all files in a folder.
+/// Total size of the files in a folder, in bytes.
 fn files(folder: &std::path::Path) -> f64 {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     entries.filter_map(|entry| entry.metadata().ok()).map(|metadata| metadata.len() as f64).sum()

@@ -1,14 +1,14 @@
 //! The recorder under load: 20 MB/s on ten topics, from the loopback transport, at the pace of a
 //! vehicle.
 //!
-//! - `inline`: as a replay has it, in one thread.
-//! - `process`: as a vehicle has it: the whole program, but for the network and a process of its
-//!   own.
+//! - `inline`: as a replay runs it, in one thread.
+//! - `process`: the whole program as a vehicle runs it, except for the network and the process
+//!   boundary.
 
 mod inline;
 mod process;
 
-use gleaner_journal::{Entry, Header, Said, Seen, Woken};
+use gleaner_journal::{InputView, JournalEntry, JournalHeader, LogDigest, WakeSource};
 use gleaner_lambda::{Trigger, TriggerKind};
 use gleaner_messages::Endian;
 use gleaner_transport::{Guid, SampleMeta};
@@ -17,7 +17,7 @@ pub use inline::record;
 pub use process::record_live;
 
 const TYPE: &str = "std_msgs/msg/ByteMultiArray";
-/// Of the camera: with it, all topics together make 20 MB/s.
+/// Bytes of a camera frame, chosen so that all topics together make 20 MB/s.
 const FRAME_BYTES: usize = 652_000;
 const FRAMES_PER_S: u64 = 30;
 const IMU_BYTES: usize = 324;
@@ -25,7 +25,7 @@ const IMU_PER_FRAME: u64 = 10;
 const STATUS_BYTES: usize = 1000;
 const STATUS_TOPICS: usize = 8;
 
-/// What comes: a camera, an IMU, and eight topics of little.
+/// The published data: a camera, an IMU, and eight topics with small messages.
 struct Traffic {
     names: Vec<String>,
     frame: Vec<u8>,
@@ -36,7 +36,7 @@ impl Traffic {
     fn new() -> Traffic {
         let status = (0..STATUS_TOPICS).map(|n| format!("/status_{n}"));
         let names = ["/camera".to_owned(), "/imu".to_owned()].into_iter().chain(status).collect();
-        // Like a JPEG, it cannot be made smaller.
+        // Incompressible, like a JPEG.
         let mut noise = 0x2545_f491_4f6c_dd1d_u64;
         let noise = std::iter::repeat_with(|| {
             noise ^= noise << 13;
@@ -51,7 +51,7 @@ impl Traffic {
         &self.names
     }
 
-    /// What comes with frame `n`, at `at_ns` and until the next one.
+    /// Publishes frame `n` at `at_ns`, and the messages up to the next frame.
     fn frame(&self, n: u64, at_ns: i64, mut publish: impl FnMut(&str, &SampleMeta, &[u8])) {
         let mut publish = |name: &str, at_ns: i64, seq: u64, cdr: &[u8]| {
             let (writer, endian) = (Guid::default(), Endian::Little);
@@ -76,14 +76,14 @@ impl Traffic {
     }
 }
 
-fn header() -> Header {
-    Header {
+fn header() -> JournalHeader {
+    JournalHeader {
         gleaner: env!("CARGO_PKG_VERSION").to_owned(),
         engine: "none".to_owned(),
         machine: std::env::consts::ARCH.to_owned(),
         lambda: "load".to_owned(),
         version: "0.1.0".to_owned(),
-        kind: gleaner_lambda::manifest::Kind::Wasm,
+        kind: gleaner_lambda::manifest::LambdaKind::Wasm,
         files: Vec::new(),
         models: Vec::new(),
         manifest: String::new(),
@@ -98,20 +98,20 @@ fn header() -> Header {
     }
 }
 
-fn wake(at_ns: i64, triggers: bool) -> Entry {
+fn wake(at_ns: i64, triggers: bool) -> JournalEntry {
     let trigger = Trigger {
         kind: TriggerKind::Event,
         label: "load".to_owned(),
         score: None,
         attributes: serde_json::Map::new(),
     };
-    Entry {
+    JournalEntry {
         at_ns,
-        cause: Woken::Tick { missed: 0 },
-        seen: Vec::<Seen>::new(),
+        cause: WakeSource::Tick { missed: 0 },
+        seen: Vec::<InputView>::new(),
         triggers: if triggers { vec![trigger] } else { Vec::new() },
         fault: None,
         fuel: Some(1000),
-        log: Said::default(),
+        log: LogDigest::default(),
     }
 }

@@ -1,4 +1,4 @@
-//! `fuzz-seeds FOLDER`: writes what fuzzers begin with to a folder.
+//! `fuzz-seeds FOLDER`: writes the seeds and dictionaries of all targets to a folder.
 
 use std::path::Path;
 use std::process::ExitCode;

@@ -1,4 +1,4 @@
-//! The component `driver`, what it sees, and what is promised of each of its wakes.
+//! Runs the component `driver` on an input and checks the guarantees of each wake.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
@@ -7,12 +7,12 @@ use gleaner_base::ByteSize;
 use gleaner_compile::Nans;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Topic, Wake};
-use gleaner_host::api::log::{LINE_BYTES, Line};
+use gleaner_host::api::log::{LINE_BYTES, LogLine};
 use gleaner_host::api::trigger::{ATTRIBUTES, LABEL_BYTES, PER_WAKE};
 use gleaner_host::guest::Guest;
 use gleaner_host::guest::wasm::{Loaded, WasmGuest};
 use gleaner_host::input::open_inputs;
-use gleaner_journal::{Decoder, Encoder, Entry, Woken};
+use gleaner_journal::{Decoder, Encoder, JournalEntry, WakeSource};
 use gleaner_lambda::Manifest;
 use gleaner_messages::{Endian, Sources};
 use gleaner_operations::Operation::{
@@ -23,47 +23,47 @@ use gleaner_transport::{Guid, SampleMeta};
 
 use super::pictures::{coded, raw};
 use super::{picture, program};
-use crate::input::Input;
+use crate::input::FuzzInput;
 
-/// What the host may allocate for an input: the pictures that a lambda makes, 4 MiB by the
-/// manifest, and as much for all else. Samples and the memory of the guest are mapped.
+/// Host memory budget of an input: 4 MiB for decoded frames by the manifest, and as much for
+/// everything else. Samples and the guest's memory are mapped, so they do not count.
 pub(super) const MEMORY: usize = 8 << 20;
 
-/// The largest sample, and what a picture may become; the sound ones have 9 KiB of pixels.
+/// Maximum sample size and decoded size; the valid pictures have 9 KiB of pixels.
 const SAMPLE: ByteSize = ByteSize::kib(16);
 const DECODED: ByteSize = ByteSize::kib(32);
 
-/// How long a fault's message is at most: what a panic says is a line of a log.
+/// Maximum length of a fault's message: a panic's message is a log line.
 const MESSAGE_BYTES: usize = LINE_BYTES + 256;
 
-/// Calls that take all frames there are, and one more. How much fuel they burn tells whether any is
+/// Calls that use every available frame, and one more. The burnt fuel shows whether a frame is
 /// missing.
-fn known_calls() -> Vec<u8> {
+fn reference_calls() -> Vec<u8> {
     let (small, gray) =
         ([(Resize, &[0, 0, 16, 16][..]), (Resize, &[1, 0, 16, 16])], [(ToGray, &[2][..])]);
     [
-        // The cameras, a field of each, their newest samples, and the pictures of these.
+        // Both cameras, a field of each, their newest samples, and the frames of these.
         program(&[(Topics, &[1]), (Topics, &[2]), (Field, &[0, 0, 2]), (Field, &[1, 0, 4])]),
         program(&[(Newest, &[0]), (Newest, &[1]), (AsFrame, &[1]), (AsFrame, &[2])]),
-        // Their light, and a column.
+        // Mean luma of both, and a column.
         program(&[(MeanLuma, &[0, 0]), (MeanLuma, &[1, 0]), (Column, &[0, 0, 1, 0, 0, 0])]),
-        // Four in another size, and eleven in grey.
+        // Four frames resized, and eleven in grey.
         program(&small).repeat(2),
         program(&gray).repeat(11),
     ]
     .concat()
 }
 
-/// One wake, as a journal has it.
+/// The results of one wake, as a journal records them.
 #[derive(Debug, PartialEq)]
-pub(super) struct Woke {
-    /// Whether `driver` was there and had a program.
+pub(super) struct DriverWake {
+    /// Set if `driver` received its program.
     pub(super) ran: bool,
-    entry: Entry,
-    log: Vec<Line>,
+    entry: JournalEntry,
+    log: Vec<LogLine>,
 }
 
-/// What all instances have in common.
+/// State that all instances share.
 struct Common {
     manifest: Manifest,
     loaded: Loaded,
@@ -85,20 +85,20 @@ fn common() -> &'static Common {
             panic!("{what}; run: cargo xtask fuzz calls --seconds 1")
         };
         let mut manifest = Manifest::load(&lambda).unwrap_or_else(|error| missing(&error));
-        // All of it is mapped and touched for each input of the fuzzer: a quarter of the time would
-        // go there.
+        // All of it is mapped and touched for each fuzz input: the manifest's sizes would take a
+        // quarter of the time.
         for input in &mut manifest.inputs {
             input.max_size = SAMPLE;
             input.decoded_size = input.decoded_size.map(|_| DECODED);
         }
         let (code, cache) = (lambda.join("driver.wasm"), root.join("target/test-cache/gleaner"));
         let stack = manifest.limits.stack.as_usize();
-        let loaded = Loaded::open(&code, &cache, stack, Nans::AsMade)
+        let loaded = Loaded::open(&code, &cache, stack, Nans::Native)
             .unwrap_or_else(|error| missing(&error));
         let definition = |name| {
             let text = Sources::default()
                 .find(name)
-                .expect("a bundled type is whole")
+                .expect("bundled types are complete")
                 .expect("the type is bundled");
             (name, text.to_string())
         };
@@ -108,20 +108,20 @@ fn common() -> &'static Common {
     })
 }
 
-/// What known calls are answered with, by an instance that is the first on its inputs: the wake's
-/// fuel, which tells refusals apart.
-pub(super) fn known() -> Option<u64> {
+/// Fuel of a wake that makes the reference calls, in the first instance on its inputs. The fuel
+/// differs if a call is refused.
+pub(super) fn reference_fuel() -> Option<u64> {
     static FUEL: OnceLock<Option<u64>> = OnceLock::new();
     *FUEL.get_or_init(|| {
-        let fuel = Driver::new().give_back();
-        assert!(fuel.is_some(), "the known calls need inputs");
+        let fuel = DriverInstance::new().run_reference();
+        assert!(fuel.is_some(), "the reference calls need inputs");
         fuel
     })
 }
 
-/// An instance of `driver` and what it sees. Each input of a fuzzer has one of its own, so that
-/// what it does happens again.
-pub(super) struct Driver {
+/// An instance of `driver` with its topics. Each fuzz input gets an instance of its own, so that
+/// its results can be reproduced.
+pub(super) struct DriverInstance {
     guest: WasmGuest,
     session: Session,
     transport: Loopback,
@@ -131,7 +131,7 @@ pub(super) struct Driver {
     sent: u64,
 }
 
-impl Driver {
+impl DriverInstance {
     pub(super) fn new() -> Self {
         let Common { manifest, loaded, definitions, .. } = common();
         let mut transport = Loopback::new();
@@ -146,7 +146,7 @@ impl Driver {
             .expect("descriptors are left");
         let unused = inputs.iter().map(Arc::strong_count).collect();
         let mut driver = Self { guest, session, transport, inputs, unused, sent: 0 };
-        driver.guest.init().expect("driver does nothing at its start");
+        driver.guest.init().expect("`init` of driver does nothing");
         driver
     }
 
@@ -164,47 +164,47 @@ impl Driver {
         self.transport.publish(topic, &meta, cdr).expect("the topic was added");
     }
 
-    /// Runs a wake as an input says it.
-    pub(super) fn wake(&mut self, wake: &[u8]) -> Woke {
+    /// Runs one wake of an input.
+    pub(super) fn wake(&mut self, wake: &[u8]) -> DriverWake {
         let Common { raw, coded, .. } = common();
-        let mut input = Input(wake);
-        for (topic, sound) in [("/camera/raw", raw), ("/camera/coded", coded)] {
-            let (cdr, endian) = message(&mut input, sound);
+        let mut input = FuzzInput(wake);
+        for (topic, valid) in [("/camera/raw", raw), ("/camera/coded", coded)] {
+            let (cdr, endian) = message(&mut input, valid);
             self.publish(topic, &cdr, endian);
         }
         self.run(input.0)
     }
 
-    fn run(&mut self, program: &[u8]) -> Woke {
+    fn run(&mut self, program: &[u8]) -> DriverWake {
         let mut cdr = (program.len() as u32).to_le_bytes().to_vec();
         cdr.extend(program);
         self.publish("/program", &cdr, Endian::Little);
         let at_ns = self.sent as i64 * 1_000_000;
         self.session.begin(at_ns);
-        // It keeps what it likes: then there may be no room for the program, and the one before
-        // runs again.
+        // The instance may hold all samples: then there is no slot for the program, and the
+        // previous program runs again.
         let newest = self.inputs[0].newest();
         let ran = newest.as_ref().is_some_and(|sample| sample.identity().seq == self.sent);
         let outcome = newest.map(|sample| self.guest.wake(Wake::Event(sample)));
-        let (log, said) = self.session.take_log();
+        let (log, digest) = self.session.take_log();
         let (result, fuel) =
             outcome.map_or((Ok(()), None), |outcome| (outcome.result, outcome.fuel));
         let (triggers, cause) =
-            (self.session.end(), Woken::Sample { writer: [0; 16], seq: self.sent });
-        let entry = Entry {
+            (self.session.end(), WakeSource::Sample { writer: [0; 16], seq: self.sent });
+        let entry = JournalEntry {
             at_ns,
             cause,
             seen: Vec::new(),
             triggers,
             fault: result.err(),
             fuel,
-            log: said,
+            log: digest,
         };
-        self.hold_to_promises(&entry, &log);
-        Woke { ran, entry, log }
+        self.check_guarantees(&entry, &log);
+        DriverWake { ran, entry, log }
     }
 
-    fn hold_to_promises(&self, entry: &Entry, log: &[Line]) {
+    fn check_guarantees(&self, entry: &JournalEntry, log: &[LogLine]) {
         let limits = &common().manifest.limits;
         match &entry.fault {
             Some(fault) => {
@@ -213,11 +213,11 @@ impl Driver {
                     (1..=MESSAGE_BYTES).contains(&length),
                     "a fault with a message of {length} bytes"
                 );
-                assert_eq!(self.held(), self.unused, "after a fault something of it is still held");
+                assert_eq!(self.held(), self.unused, "a faulted instance still holds samples");
             }
             None => assert!(
                 entry.fuel.is_none_or(|fuel| fuel <= limits.fuel),
-                "{:?} is more than allowed",
+                "{:?} exceeds the fuel limit",
                 entry.fuel
             ),
         }
@@ -228,31 +228,32 @@ impl Driver {
                     && trigger.attributes.len() <= ATTRIBUTES
             );
         }
-        assert!(log.iter().all(|line| line.message.len() <= LINE_BYTES), "a line that is too long");
+        assert!(log.iter().all(|line| line.message.len() <= LINE_BYTES), "a log line is too long");
         let mut bytes = Vec::new();
         Encoder::new(0).encode(entry, &mut bytes);
         let mut rest = bytes.as_slice();
-        let read = Decoder::new(0).decode(&mut rest).expect("what a wake decides can be noted");
-        assert!(read == *entry && rest.is_empty(), "noted as {read:?}, not as {entry:?}");
+        let read = Decoder::new(0).decode(&mut rest).expect("a decision can be encoded");
+        assert!(read == *entry && rest.is_empty(), "decoded {read:?}, not {entry:?}");
     }
 
     fn held(&self) -> Vec<usize> {
         self.inputs.iter().map(Arc::strong_count).collect()
     }
 
-    /// Ends the instance and runs known calls in another one: what the first held is there for it.
-    pub(super) fn give_back(&mut self) -> Option<u64> {
-        self.guest.init().expect("driver does nothing at its start");
-        assert_eq!(self.held(), self.unused, "what is gone still holds something");
+    /// Restarts the instance and makes the reference calls: everything that the previous instance
+    /// held is available again.
+    pub(super) fn run_reference(&mut self) -> Option<u64> {
+        self.guest.init().expect("`init` of driver does nothing");
+        assert_eq!(self.held(), self.unused, "an ended instance still holds samples");
         let Common { raw, coded, .. } = common();
         self.publish("/camera/raw", &raw[0], Endian::Little);
         self.publish("/camera/coded", &coded[0], Endian::Little);
-        let woke = self.run(&known_calls());
-        assert!(woke.ran && woke.entry.fault.is_none(), "{woke:?}");
-        woke.entry.fuel
+        let wake = self.run(&reference_calls());
+        assert!(wake.ran && wake.entry.fault.is_none(), "{wake:?}");
+        wake.entry.fuel
     }
 
-    /// What it held goes with it, and nothing else holds the inputs.
+    /// Drops the instance and checks that its inputs have no other owner.
     pub(super) fn end(self) {
         let Self { guest, session, transport, inputs, .. } = self;
         drop((guest, session, transport));
@@ -260,15 +261,15 @@ impl Driver {
     }
 }
 
-/// One of the sound messages, as `input` changes it.
-fn message(input: &mut Input, sound: &[Vec<u8>]) -> (Vec<u8>, Endian) {
+/// One of the valid messages, modified as `input` describes.
+fn message(input: &mut FuzzInput, valid: &[Vec<u8>]) -> (Vec<u8>, Endian) {
     let how = input.u8();
     let endian = if how & picture::BIG_ENDIAN == 0 { Endian::Little } else { Endian::Big };
     if how & picture::OWN != 0 {
         let length = input.u8();
         return (input.bytes(length.into()).to_vec(), endian);
     }
-    let mut message = sound[usize::from(how & picture::WHICH) % sound.len()].clone();
+    let mut message = valid[usize::from(how & picture::WHICH) % valid.len()].clone();
     if how & picture::SHORT != 0 {
         message.truncate(input.u16().into());
     }

@@ -1,61 +1,64 @@
-//! Calls of a lambda into the host, through the WIT: the component `driver`
-//! (`tests/lambdas/driver`) makes those that an input says.
+//! Fuzzes calls of a lambda into the host, through the WIT: the component `driver`
+//! (`tests/lambdas/driver`) makes the calls that an input lists.
 //!
-//! An input is a list of wakes, with [`WAKE`] between them. A wake is a byte for each of the two
-//! pictures, with what it says they are changed by, and then the program of `driver`.
+//! An input is a list of wakes, separated by [`WAKE`]. A wake is, for each of the two pictures, a
+//! byte and the modifications that it announces, and then the program of `driver`.
 
 #[cfg(feature = "calls")]
 mod driver;
 #[cfg(feature = "calls")]
 mod pictures;
 
-use gleaner_operations::{Operation, Step};
+use gleaner_operations::{DriverStep, Operation};
 
-/// What stands between two wakes.
+/// Separator of wakes.
 pub const WAKE: &[u8] = b"WAKE";
 
-/// The byte before each picture.
+/// Bits of the byte before each picture.
 pub mod picture {
-    /// These bits choose one of four.
+    /// Index of one of four pictures.
     pub const WHICH: u8 = 3;
-    /// Its sample says that it is big-endian.
+    /// The sample is marked as big-endian.
     pub const BIG_ENDIAN: u8 = 4;
-    /// It ends behind as many bytes as the next two say.
+    /// The message is truncated to a length in two bytes.
     pub const SHORT: u8 = 8;
-    /// Times 16: how often two bytes for a place and one for a value follow.
+    /// Times 16: number of modifications that follow, two bytes for an offset and one for a value.
     pub const CHANGES: u8 = 0x70;
-    /// It is what follows: a length in a byte, and so many bytes.
+    /// The message itself follows: its length in a byte, then its bytes.
     pub const OWN: u8 = 0x80;
 }
 
 /// Calls with their arguments, as a program for `driver`.
 pub fn program(calls: &[(Operation, &[u8])]) -> Vec<u8> {
-    calls.iter().flat_map(|(operation, arguments)| Step::Call(*operation).with(arguments)).collect()
+    calls
+        .iter()
+        .flat_map(|(operation, arguments)| DriverStep::Call(*operation).with(arguments))
+        .collect()
 }
 
-/// Makes the calls twice, and then some that are known by another instance. Whether each wake of it
-/// could run.
+/// Makes the calls twice, then the reference calls in another instance. Returns whether each wake
+/// of the first run received its program.
 #[cfg(feature = "calls")]
 pub fn check(data: &[u8]) -> bool {
     use crate::budget;
-    use driver::{Driver, MEMORY, known};
+    use driver::{DriverInstance, MEMORY, reference_fuel};
 
-    let known = known();
+    let reference = reference_fuel();
     budget::within(MEMORY, || {
         let run = || {
-            let mut driver = Driver::new();
-            let woke: Vec<_> = wakes(data).into_iter().map(|wake| driver.wake(wake)).collect();
-            (woke, driver)
+            let mut driver = DriverInstance::new();
+            let results: Vec<_> = wakes(data).into_iter().map(|wake| driver.wake(wake)).collect();
+            (results, driver)
         };
         let (first, mut driver) = run();
-        assert_eq!(driver.give_back(), known, "what was lent to an instance before is missing");
+        assert_eq!(driver.run_reference(), reference, "a frame of an earlier instance is missing");
         driver.end();
-        assert_eq!(first, run().0, "the same calls are decided otherwise");
+        assert_eq!(first, run().0, "the same calls have another result");
         first.iter().all(|wake| wake.ran)
     })
 }
 
-/// The parts of an input: so many wakes at most, so that each has its share of the time.
+/// Splits an input into at most `WAKES_MAX` wakes, so that each has its share of the time.
 #[cfg(feature = "calls")]
 fn wakes(data: &[u8]) -> Vec<&[u8]> {
     const WAKES_MAX: usize = 8;

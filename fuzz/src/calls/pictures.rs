@@ -1,4 +1,4 @@
-//! Pictures that lambdas see, as messages: raw ones in four encodings, and four files.
+//! Valid image messages: raw ones in four encodings, and four compressed files.
 
 use gleaner_messages::CdrWriter;
 use jpeg_encoder::{ColorType, Encoder};
@@ -57,7 +57,7 @@ fn jpeg(colour: ColorType, bytes_per_pixel: usize, progressive: bool) -> Vec<u8>
     encoder.set_progressive(progressive);
     encoder
         .encode(&pixels(bytes_per_pixel), WIDTH, HEIGHT, colour)
-        .expect("the pixels are as many as the size says");
+        .expect("the number of pixels matches the size");
     file
 }
 
@@ -66,7 +66,7 @@ fn png() -> Vec<u8> {
     let mut encoder = png::Encoder::new(&mut file, WIDTH.into(), HEIGHT.into());
     encoder.set_color(png::ColorType::Rgb);
     let mut writer = encoder.write_header().expect("memory takes what is written to it");
-    writer.write_image_data(&pixels(3)).expect("the pixels are as many as the size says");
+    writer.write_image_data(&pixels(3)).expect("the number of pixels matches the size");
     writer.finish().expect("memory takes what is written to it");
     file
 }

@@ -1,15 +1,15 @@
-//! Programs of `driver`: one for each of its calls, and some that go on for longer.
+//! Seeds: programs of `driver`, one for each of its calls, and some longer ones.
 
 use gleaner_operations::Operation::{Append, ScratchGet, ScratchPut, Start};
 use gleaner_operations::Operation::{
     AsFrame, Event, Field, Histogram, Last, Log, MeanLuma, Resize, ToGray,
 };
-use gleaner_operations::{Extra, Operation, Step, setup};
+use gleaner_operations::{DriverStep, Extra, Operation, setup};
 
 use crate::calls::{WAKE, program};
 
-/// Words of programs: paths, names of inputs, and arguments. What calls need others before them,
-/// seeds have.
+/// Dictionary of programs: paths, names of inputs, and arguments. Calls that need earlier calls are
+/// in the seeds.
 pub const WORDS: &[&str] = &[
     "WAKE",
     "program",
@@ -21,9 +21,9 @@ pub const WORDS: &[&str] = &[
     "header.stamp.sec",
     // All samples of an input.
     "\u{1}\u{7f}\u{7f}\0\0",
-    // A picture in another size.
+    // A frame in another size.
     "\0\0 \u{10}",
-    // Too much memory, and as much as may be said.
+    // Too much memory, and the longest text.
     "\0\0\u{7f}\0",
     "\0\0\0\u{4}\0",
 ];
@@ -31,48 +31,50 @@ pub const WORDS: &[&str] = &[
 /// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let operations = || {
-        Operation::ALL.iter().map(|operation| Step::Call(*operation).with(arguments(*operation)))
+        Operation::ALL
+            .iter()
+            .map(|operation| DriverStep::Call(*operation).with(arguments(*operation)))
     };
-    let extras = Extra::ALL.map(|extra| Step::Extra(extra).with(taken(extra)));
-    let looked = looked();
+    let extras = Extra::ALL.map(|extra| DriverStep::Extra(extra).with(extra_arguments(extra)));
+    let prelude = prelude();
     let mut seeds: Vec<_> =
-        operations().chain(extras).map(|step| wake(&[&looked[..], &step].concat())).collect();
+        operations().chain(extras).map(|step| wake(&[&prelude[..], &step].concat())).collect();
     let each: Vec<_> = operations().flatten().collect();
     let made =
         program(&[(Resize, &[0, 0, 60, 50]), (Resize, &[1, 0, 9, 9]), (ToGray, &[0])]).repeat(9);
-    let forget = |frame| Step::Extra(Extra::ForgetFrame).with(&[frame]);
+    let forget = |frame| DriverStep::Extra(Extra::ForgetFrame).with(&[frame]);
     let last = program(&[(Resize, &[1, 0, 0, 0])]);
-    let frames = [&looked[..], &made, &forget(3), &forget(0), &last].concat();
+    let frames = [&prelude[..], &made, &forget(3), &forget(0), &last].concat();
     let scratch = program(&[
         (ScratchPut, &[0, 0, 0, 2, 0]),
         (ScratchPut, &[1, 0, 0, 2, 0]),
         (Append, &[2, 255, 255]),
         (ScratchGet, &[1, 1, 0, 0, 0, 0, 0, 0, 0, 9, 0, 0, 0]),
     ]);
-    let trigger = |n| Step::Call(Event).with(&[1, b'a' + n, 0, 0, 0, 0, 0, 0, 240, 63]);
+    let trigger = |n| DriverStep::Call(Event).with(&[1, b'a' + n, 0, 0, 0, 0, 0, 0, 240, 63]);
     let triggers: Vec<u8> = (0..20).flat_map(trigger).collect();
     let long = [255, 0, 0, 31, 0];
-    let said = [
-        Step::Call(Log).with(&[1]),
-        Step::Extra(Extra::Print).with(&[]),
-        Step::Call(Start).with(&[]),
+    let logging = [
+        DriverStep::Call(Log).with(&[1]),
+        DriverStep::Extra(Extra::Print).with(&[]),
+        DriverStep::Call(Start).with(&[]),
     ];
-    let texts = said.map(|step| [&step[..], &long].concat()).concat();
-    let panic = Step::Extra(Extra::Panic).with(&[0xba, 3, b'n', b'o', b'!']);
-    let exit = Step::Extra(Extra::Exit).with(&[0xba, 3]);
-    let memory = Step::Extra(Extra::Allocate).with(&[255, 255, 127, 0]);
+    let texts = logging.map(|step| [&step[..], &long].concat()).concat();
+    let panic = DriverStep::Extra(Extra::Panic).with(&[0xba, 3, b'n', b'o', b'!']);
+    let exit = DriverStep::Extra(Extra::Exit).with(&[0xba, 3]);
+    let memory = DriverStep::Extra(Extra::Allocate).with(&[255, 255, 127, 0]);
     let much = program(&[(Histogram, &[0, 0]), (Last, &[1, 4, 0, 0, 0])]).repeat(70);
-    let fuel = [&looked[..], &much].concat();
+    let fuel = [&prelude[..], &much].concat();
     let others = [0x12_u8, 0x51, 2, 3, 4, 0x88, 4, 9, 9, 9, 9];
     let glance = program(&[(AsFrame, &[0]), (MeanLuma, &[2, 0])]);
-    let kept = [wake(&frames), wake(&glance), wake(&panic), wake(&looked)].join(WAKE);
+    let kept = [wake(&frames), wake(&glance), wake(&panic), wake(&prelude)].join(WAKE);
     let changed = [
         vec![1, 0x12, 200, 0, 3],
         vec![0x5e, 30, 1, 8, 0, 255, 40, 0, 9, 3, 0, 1],
         vec![0x83, 1, 2, 3, 2],
     ];
-    let light = Step::Call(Histogram).with(&[0, 0]);
-    seeds.extend(changed.map(|pictures| [&pictures[..], &looked, &light].concat()));
+    let light = DriverStep::Call(Histogram).with(&[0, 0]);
+    seeds.extend(changed.map(|pictures| [&pictures[..], &prelude, &light].concat()));
     for program in
         [&each[..], &frames, &scratch, &triggers, &texts, &panic, &exit, &memory, &fuel, &others]
     {
@@ -85,8 +87,8 @@ pub fn all() -> Vec<Vec<u8>> {
     seeds
 }
 
-/// [`setup`], and what of the coded camera it leaves out: a field, and the picture.
-fn looked() -> Vec<u8> {
+/// [`setup`], plus a field and the frame of the coded camera.
+fn prelude() -> Vec<u8> {
     [setup(), program(&[(Field, &[2, 0, 5]), (AsFrame, &[1])])].concat()
 }
 
@@ -95,13 +97,13 @@ fn wake(program: &[u8]) -> Vec<u8> {
     [&[0, 0], program].concat()
 }
 
-/// Of the expensive call of an operation, and where nothing can be called, of any.
+/// Arguments of the operation's most expensive call; dummy arguments if it has none.
 fn arguments(operation: Operation) -> &'static [u8] {
     operation.price().calls().map_or(&[0, 0, 8, 0, 0, 0], |[_, (arguments, _)]| arguments)
 }
 
-/// What a step that is no call takes.
-fn taken(extra: Extra) -> &'static [u8] {
+/// Arguments of a step that is not a call.
+fn extra_arguments(extra: Extra) -> &'static [u8] {
     match extra {
         Extra::Reset | Extra::Wasi => &[],
         Extra::ForgetTopic | Extra::ForgetField | Extra::ForgetSample | Extra::ForgetFrame => &[1],

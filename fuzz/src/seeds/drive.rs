@@ -1,5 +1,5 @@
-//! Small drives, written in every way that the writer knows; most without checksums, which a fuzzer
-//! would not get past.
+//! Seeds: small drives, written with every option of the writer; most without checksums, which a
+//! fuzzer would not get past.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -7,7 +7,7 @@ use std::io::Cursor;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, WriteOptions};
 
-/// Words of channels and of metadata.
+/// Dictionary of channels and metadata.
 pub const WORDS: &[&str] = &[
     "ros2msg",
     "cdr",
@@ -44,8 +44,7 @@ pub fn all() -> Vec<Vec<u8>> {
 }
 
 fn drive(options: WriteOptions) -> Vec<u8> {
-    let mut writer =
-        options.create(Cursor::new(Vec::new())).expect("memory takes what is written to it");
+    let mut writer = options.create(Cursor::new(Vec::new())).expect("writing to memory succeeds");
     let schema =
         writer.add_schema("test_msgs/msg/Number", "ros2msg", b"int64 value\n").expect("a schema");
     let writers = BTreeMap::from([
@@ -79,6 +78,6 @@ fn drive(options: WriteOptions) -> Vec<u8> {
         data: b"abc"[..].into(),
     };
     writer.attach(&attachment).expect("an attachment");
-    writer.finish().expect("memory takes what is written to it");
+    writer.finish().expect("writing to memory succeeds");
     writer.into_inner().into_inner()
 }

@@ -1,4 +1,4 @@
-//! Small images of every kind that is written somewhere, and pixels in every encoding.
+//! Seeds: small images in every common file variant, and pixels in every encoding.
 
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use png::{BitDepth, ColorType as Png};
@@ -63,7 +63,7 @@ fn jpeg(colour: ColorType, sampling: SamplingFactor, progressive: bool) -> Vec<u
     let channels = if colour == ColorType::Luma { 1 } else { 3 };
     encoder
         .encode(&pixels(channels), SIDE, SIDE, colour)
-        .expect("the pixels are as many as the size says");
+        .expect("the number of pixels matches the size");
     file
 }
 
@@ -76,11 +76,11 @@ fn png(colour: Png, depth: BitDepth, bytes_per_pixel: usize) -> Vec<u8> {
         encoder
             .set_palette((0..=255).flat_map(|level| [level, 255 - level, 7]).collect::<Vec<u8>>());
     }
-    let mut writer = encoder.write_header().expect("memory takes what is written to it");
+    let mut writer = encoder.write_header().expect("writing to memory succeeds");
     writer
         .write_image_data(&pixels(bytes_per_pixel))
-        .expect("the pixels are as many as the size says");
-    writer.finish().expect("memory takes what is written to it");
+        .expect("the number of pixels matches the size");
+    writer.finish().expect("writing to memory succeeds");
     file
 }
 

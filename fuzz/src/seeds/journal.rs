@@ -1,13 +1,16 @@
-//! Journals of a lambda with two inputs, with every kind of wake.
+//! Seeds: journals of a lambda with two inputs, with every kind of wake.
 
-use gleaner_journal::{Encoder, End, Entry, Header, JournalInput, Said, Seen, Woken, Writer};
-use gleaner_lambda::manifest::Kind;
+use gleaner_journal::{
+    Encoder, InputView, JournalEnd, JournalEntry, JournalHeader, JournalInput, JournalWriter,
+    LogDigest, WakeSource,
+};
+use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 use serde_json::{Map, json};
 
 use crate::journal::mode;
 
-/// Words of headers and of attributes.
+/// Dictionary of headers and attributes.
 pub const WORDS: &[&str] = &[
     "gleaner",
     "engine",
@@ -40,15 +43,16 @@ pub const WORDS: &[&str] = &[
     "crc32",
 ];
 
-/// Kinds of blocks.
+/// Kind of the blocks that hold wakes.
 const WAKES: u8 = 2;
 
 /// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
     let header = header();
-    let mut writer = Writer::begin(vec![mode::FILE], &header).expect("the header has two inputs");
+    let mut writer =
+        JournalWriter::begin(vec![mode::FILE], &header).expect("the header has two inputs");
     entries().iter().for_each(|entry| writer.wake(entry).expect("the wake has two inputs"));
-    let file = writer.finish(&end()).expect("memory takes what is written to it");
+    let file = writer.finish(&end()).expect("writing to memory succeeds");
     let json = |value: serde_json::Value| value.to_string().into_bytes();
     let blocks = [
         (1, json(serde_json::to_value(&header).expect("a header is JSON"))),
@@ -65,8 +69,8 @@ pub fn all() -> Vec<Vec<u8>> {
     vec![file, sealed, alone]
 }
 
-fn end() -> End {
-    End { wakes: entries().len() as u64, samples: vec![4, 40], drives: Vec::new() }
+fn end() -> JournalEnd {
+    JournalEnd { wakes: entries().len() as u64, samples: vec![4, 40], drives: Vec::new() }
 }
 
 fn wakes() -> Vec<u8> {
@@ -75,20 +79,20 @@ fn wakes() -> Vec<u8> {
     bytes
 }
 
-pub(super) fn header() -> Header {
+pub(super) fn header() -> JournalHeader {
     let input = |name: &str| JournalInput {
         name: name.to_owned(),
         topic: format!("/{name}"),
         wire_topic: format!("/car/{name}"),
         type_name: "sensor_msgs/msg/Imu".to_owned(),
     };
-    Header {
+    JournalHeader {
         gleaner: "0".to_owned(),
         engine: "none".to_owned(),
         machine: "x".to_owned(),
         lambda: "brake".to_owned(),
         version: "0.1.0".to_owned(),
-        kind: Kind::Wasm,
+        kind: LambdaKind::Wasm,
         files: Vec::new(),
         models: Vec::new(),
         manifest: String::new(),
@@ -103,21 +107,21 @@ pub(super) fn header() -> Header {
     }
 }
 
-pub(super) fn entries() -> Vec<Entry> {
-    let seen = |seq: u64| Seen {
+pub(super) fn entries() -> Vec<JournalEntry> {
+    let seen = |seq: u64| InputView {
         new: seq % 40,
         digest: seq as u32,
         newest: Some(([7; 16], seq)),
         reach: 3,
     };
-    let usual = |seq: u64| Entry {
+    let usual = |seq: u64| JournalEntry {
         at_ns: 1_500_000_000_000_000_000 + 100_000_000 * seq as i64,
-        cause: Woken::Sample { writer: [7; 16], seq },
+        cause: WakeSource::Sample { writer: [7; 16], seq },
         seen: vec![seen(seq), seen(10 * seq)],
         triggers: Vec::new(),
         fault: None,
         fuel: Some(250_000 + seq),
-        log: Said::default(),
+        log: LogDigest::default(),
     };
     let mut attributes = Map::new();
     attributes.insert("speed".to_owned(), json!([1.5, -0.0, null, "text", { "a": 1e300 }]));
@@ -135,9 +139,13 @@ pub(super) fn entries() -> Vec<Entry> {
     };
     vec![
         usual(1),
-        Entry { triggers: vec![trigger], ..usual(2) },
-        Entry { fault: Some(fault), fuel: None, ..usual(3) },
-        Entry { cause: Woken::Tick { missed: 2 }, log: Said { lines: 1, digest: 5 }, ..usual(4) },
-        Entry { seen: vec![Seen::default(); 2], ..usual(90) },
+        JournalEntry { triggers: vec![trigger], ..usual(2) },
+        JournalEntry { fault: Some(fault), fuel: None, ..usual(3) },
+        JournalEntry {
+            cause: WakeSource::Tick { missed: 2 },
+            log: LogDigest { lines: 1, digest: 5 },
+            ..usual(4)
+        },
+        JournalEntry { seen: vec![InputView::default(); 2], ..usual(90) },
     ]
 }

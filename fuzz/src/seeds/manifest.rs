@@ -1,6 +1,6 @@
-//! The examples' manifests, and one that uses every key.
+//! Seeds: the examples' manifests, and one that uses every key.
 
-/// The keys and words of manifests.
+/// Keys and values of manifests.
 pub const WORDS: &[&str] = &[
     "[lambda]",
     "[schedule]",

@@ -1,10 +1,10 @@
-//! Messages full of ones, which are lengths too, of every type.
+//! Seeds: messages full of ones, which are valid lengths too, of every type.
 
 use gleaner_messages::{CdrWriter, Sources};
 
 use crate::message::{TYPES, mode};
 
-/// Words of definitions, and parts of paths.
+/// Dictionary of definitions and paths.
 pub const WORDS: &[&str] = &[
     "bool",
     "byte",
@@ -43,11 +43,15 @@ pub const WORDS: &[&str] = &[
 
 /// Definitions of every kind of field.
 const DEFINED: [&str; 4] = [
-    "bool a\nint8 b\nuint16 c\nfloat64 d\nstring e\nint32[3] f\nuint8[] g\nfloat32[<=4] h\nstring[] i\nstring<=8[2] j\nint8 K=3\n",
-    "Header header\nOther[] others\nOther[2] two\n===\nMSG: pkg/Other\nstring name\nint64[] numbers\n===\nMSG: std_msgs/Header\n\
+    "bool a\nint8 b\nuint16 c\nfloat64 d\nstring e\nint32[3] f\nuint8[] g\nfloat32[<=4] h\n\
+     string[] i\nstring<=8[2] j\nint8 K=3\n",
+    "Header header\nOther[] others\nOther[2] two\n===\nMSG: pkg/Other\nstring name\n\
+     int64[] numbers\n===\nMSG: std_msgs/Header\n\
      builtin_interfaces/Time stamp\nstring frame_id\n",
-    "builtin_interfaces/Time stamp\nEmpty nothing\nEmpty[3] more\nwstring wide\nint8 behind\n===\nMSG: pkg/Empty\n",
-    "pkg/msg/A a\n===\nMSG: pkg/A\nB[4] b\n===\nMSG: pkg/B\nC[] c\n===\nMSG: pkg/C\nstring[2] d\nfloat64 e # with a comment\n",
+    "builtin_interfaces/Time stamp\nEmpty nothing\nEmpty[3] more\nwstring wide\nint8 behind\n\
+     ===\nMSG: pkg/Empty\n",
+    "pkg/msg/A a\n===\nMSG: pkg/A\nB[4] b\n===\nMSG: pkg/B\nC[] c\n===\nMSG: pkg/C\n\
+     string[2] d\nfloat64 e # with a comment\n",
 ];
 
 /// All seeds.
@@ -68,7 +72,7 @@ pub fn all() -> Vec<Vec<u8>> {
     {
         let text = Sources::default()
             .find(name)
-            .expect("a bundled type is whole")
+            .expect("bundled types are complete")
             .expect("the type is bundled");
         seeds.push(defined(&text, &ones(0)));
     }

@@ -1,5 +1,5 @@
-//! What a fuzzer begins with: small sound inputs, made anew when they are needed, so that none has
-//! to be kept.
+//! Seeds and dictionaries of all targets: small valid inputs, generated when needed, so that none
+//! is stored.
 
 pub mod bag;
 pub mod calls;
@@ -16,12 +16,12 @@ use std::path::Path;
 
 use crate::TARGETS;
 
-/// Writes the seeds of each target to files in a folder of its name, its words to `<name>.dict`, as
-/// libFuzzer reads them, and the longest input to `<name>.longest`, in bytes.
+/// Writes the seeds of each target to files in a folder of its name, its dictionary to
+/// `<name>.dict` in libFuzzer's format, and the longest input to `<name>.longest`, in bytes.
 ///
 /// # Errors
 ///
-/// What the system says.
+/// The error of the file system.
 pub fn write(folder: &Path) -> io::Result<()> {
     for target in TARGETS {
         let seeds = folder.join(target.name);
@@ -36,7 +36,7 @@ pub fn write(folder: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// libFuzzer knows bytes as hexadecimal digits, and no other escapes that are worth it.
+/// Escapes as libFuzzer reads it: bytes as hexadecimal digits.
 fn escaped(word: &str) -> String {
     let plain = |byte: u8| (byte.is_ascii_graphic() || byte == b' ') && !b"\"\\".contains(&byte);
     word.bytes()

@@ -1,85 +1,84 @@
-//! What of the host a lambda can call: one line for each function and method of `wit/`, with what
-//! it costs.
+//! The host functions that a lambda can call: one entry for each function and method of `wit/`,
+//! with its price.
 //!
-//! Tests, the lambda `driver` and the fuzzer of calls go through this list, so that a call which is
-//! missing in one of them does not compile or fails. `tests/tests/house/wit.rs` holds it against
-//! `wit/`, `host/tests/library/host_calls.rs` holds the prices against what the host charges, and
-//! `host/tests/library/calls.rs` tries the deadlines. It names nothing of ours, since `driver` is a
-//! component.
+//! Tests, the lambda `driver` and the fuzzer of calls use this list, so that a function missing in
+//! one of them is a compile error or a failed test. `tests/tests/house/wit.rs` compares it with
+//! `wit/`, `host/tests/library/host_calls.rs` compares the prices with the host's, and
+//! `host/tests/library/calls.rs` tests the deadlines. It depends on no other crate of the
+//! workspace, because `driver` is a component.
 
 mod list;
 mod step;
 
 pub use list::Operation;
-pub use step::{Extra, Step};
+pub use step::{DriverStep, Extra};
 
-/// Bytes of the pixels of the picture that [`setup`] looks at: 64 by 48, rgb8. The coded one has as
-/// many.
+/// Bytes of the pixels of the raw image in [`setup`]: 64 by 48, rgb8. The coded one has as many.
 pub const PIXELS: u64 = 64 * 48 * 3;
-/// Bytes of the message that it stands in, as `gleaner_tests::drive::image` makes it.
+/// Bytes of its message, as created by `gleaner_tests::drive::image`.
 pub const MESSAGE: u64 = 44 + PIXELS;
 
-/// How a call meets the deadline.
+/// Handling of the deadline in a call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Deadline {
-    /// It takes no longer than copying what one call may copy, so it does not look.
+    /// It takes no longer than copying the bytes allowed in one call, so it does not check.
     Short,
-    /// It looks at the deadline before and while it works.
-    Looked,
+    /// It checks the deadline before and during its work.
+    Checked,
 }
 
-/// A call of an operation, in the language of `driver`, and what the host charges for it.
+/// A call of an operation, in the language of `driver`, with the host's price.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Call {
-    /// What follows the byte of the operation.
+pub struct PricedCall {
+    /// The bytes after that of the operation.
     pub arguments: &'static [u8],
     /// Bytes that it touches, by the rules of its price.
     pub bytes: u64,
 }
 
-/// What an operation costs.
+/// The price of an operation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Price {
-    /// A unit for each eight bytes that the host touches, beside what a call costs by itself: shown
-    /// on a modest and on an expensive call. Where both are alike, all calls are.
-    Bytes([Call; 2]),
-    /// As [`Price::Bytes`], and the price of a further call, for making something.
-    Made([Call; 2]),
-    /// It cannot be called in this build, as nothing makes what it is a method of.
+    /// A unit for each eight bytes that the host touches, plus the base price of a call, for a
+    /// cheap and an expensive call. If both are equal, all calls have this price.
+    Bytes([PricedCall; 2]),
+    /// As [`Price::Bytes`], plus the price of another call, for creating an object.
+    Create([PricedCall; 2]),
+    /// It cannot be called in this build, because no object has this method.
     Never,
 }
 
-/// What a call costs by itself, in units of fuel.
+/// Base price of a call in units of fuel.
 const CALL: u64 = 20;
 
 impl Price {
-    /// The two calls, with their price in units of fuel; none where there are no calls.
+    /// The two calls, with their price in units of fuel; `None` if it cannot be called.
     pub fn calls(self) -> Option<[(&'static [u8], u64); 2]> {
         let (calls, each) = match self {
             Self::Bytes(calls) => (calls, CALL),
-            Self::Made(calls) => (calls, 2 * CALL),
+            Self::Create(calls) => (calls, 2 * CALL),
             Self::Never => return None,
         };
         Some(calls.map(|call| (call.arguments, each + call.bytes / 8)))
     }
 }
 
-/// A program for `driver` with which calls begin: all topics, by number the program's, the raw
-/// camera's and the coded one's; of the raw one the seconds of its stamp and its width; the newest
-/// sample of both; the raw one as a frame; `b` in scratch.
+/// A prelude for programs of `driver`: opens all topics, in the order program, raw camera, coded
+/// camera; of the raw one the fields seconds of the stamp and width; the newest sample of both; the
+/// raw one as a frame; `b` in scratch.
 pub fn setup() -> Vec<u8> {
     use Operation::{AsFrame, Field, Input, Newest, ScratchPut};
     let steps = [
-        (Step::Extra(Extra::Reset), &[][..]),
-        (Step::Call(Input), &[0]),
-        (Step::Call(Input), &[1]),
-        (Step::Call(Input), &[2]),
-        (Step::Call(Field), &[1, 0, 4]),
-        (Step::Call(Field), &[1, 0, 2]),
-        (Step::Call(Newest), &[1]),
-        (Step::Call(Newest), &[2]),
-        (Step::Call(AsFrame), &[0]),
-        (Step::Call(ScratchPut), &[1, 0, 16, 0, 0]),
+        (DriverStep::Extra(Extra::Reset), &[][..]),
+        (DriverStep::Call(Input), &[0]),
+        (DriverStep::Call(Input), &[1]),
+        (DriverStep::Call(Input), &[2]),
+        (DriverStep::Call(Field), &[1, 0, 4]),
+        (DriverStep::Call(Field), &[1, 0, 2]),
+        (DriverStep::Call(Newest), &[1]),
+        (DriverStep::Call(Newest), &[2]),
+        (DriverStep::Call(AsFrame), &[0]),
+        (DriverStep::Call(ScratchPut), &[1, 0, 16, 0, 0]),
     ];
     steps.into_iter().flat_map(|(step, arguments)| step.with(arguments)).collect()
 }

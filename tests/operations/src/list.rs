@@ -1,16 +1,16 @@
-//! The list. A further operation is a line here; then the compiler and the tests say what it needs
+//! The list. When a line is added here, the compiler and the tests report what is missing
 //! elsewhere.
 
-use crate::Deadline::{self, Looked, Short};
-use crate::Price::{self, Bytes, Made, Never};
-use crate::{Call, MESSAGE, PIXELS};
+use crate::Deadline::{self, Checked, Short};
+use crate::Price::{self, Bytes, Create, Never};
+use crate::{MESSAGE, PIXELS, PricedCall};
 
-/// Each line: the name in Rust, the name in the WIT, how it meets the deadline, and what it costs
+/// Each line: the name in Rust, the name in the WIT, the handling of the deadline, and the price
 /// after [`crate::setup`].
 macro_rules! operations {
     ($($operation:ident $name:literal $deadline:ident $price:expr;)*) => {
-        /// A function or a method of the WIT. What others need comes first, so that small numbers
-        /// find a way.
+        /// A function or a method of the WIT. Those that others depend on come first, so that small
+        /// numbers in fuzz inputs reach them.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         #[allow(missing_docs)]
         pub enum Operation { $($operation),* }
@@ -19,17 +19,17 @@ macro_rules! operations {
             /// All of them.
             pub const ALL: &[Self] = &[$(Self::$operation),*];
 
-            /// Interface, resource and function, as in the WIT.
+            /// Interface, resource and function in the WIT.
             pub fn name(self) -> &'static str {
                 match self { $(Self::$operation => $name),* }
             }
 
-            /// How it meets the deadline.
+            /// Its handling of the deadline.
             pub fn deadline(self) -> Deadline {
                 match self { $(Self::$operation => $deadline),* }
             }
 
-            /// What it costs.
+            /// Its price.
             pub fn price(self) -> Price {
                 match self { $(Self::$operation => $price),* }
             }
@@ -37,9 +37,9 @@ macro_rules! operations {
     };
 }
 
-/// A call with these arguments, which touches so many bytes.
-const fn call(arguments: &'static [u8], bytes: u64) -> Call {
-    Call { arguments, bytes }
+/// A call with these arguments, which touches this many bytes.
+const fn call(arguments: &'static [u8], bytes: u64) -> PricedCall {
+    PricedCall { arguments, bytes }
 }
 
 /// The same price for every call.
@@ -50,12 +50,15 @@ const fn each(arguments: &'static [u8], bytes: u64) -> Price {
 operations! {
     Input "data.input" Short Bytes([call(&[3, 1, b'x'], 1), call(&[3, 255, 0, 16, 0, 0], 4096)]);
     Newest "data.topic.newest" Short each(&[1], 0);
-    AsFrame "data.sample.as-frame" Looked Bytes([call(&[0], 0), call(&[1], 40 * PIXELS)]);
-    Field "data.topic.field" Short Bytes([call(&[1, 1, 1, b'x'], 1), call(&[1, 1, 255, 232, 3, 0, 0], 1000)]);
+    AsFrame "data.sample.as-frame" Checked Bytes([call(&[0], 0), call(&[1], 40 * PIXELS)]);
+    Field "data.topic.field" Short
+        Bytes([call(&[1, 1, 1, b'x'], 1), call(&[1, 1, 255, 232, 3, 0, 0], 1000)]);
     Last "data.topic.last" Short Bytes([call(&[1, 0, 0, 0, 0], 0), call(&[1, 4, 0, 0, 0], 4 * 64)]);
-    Since "data.topic.since" Short Bytes([call(&[1, 0, 0, 0, 0, 0, 0, 0, 127], 0), call(&[1], 4 * 64)]);
-    Column "data.topic.column" Looked Bytes([call(&[1, 0, 1, 0, 0, 0], 64), call(&[1, 0, 4, 0, 0, 0], 4 * 64)]);
-    ColumnSince "data.topic.column-since" Looked
+    Since "data.topic.since" Short
+        Bytes([call(&[1, 0, 0, 0, 0, 0, 0, 0, 127], 0), call(&[1], 4 * 64)]);
+    Column "data.topic.column" Checked
+        Bytes([call(&[1, 0, 1, 0, 0, 0], 64), call(&[1, 0, 4, 0, 0, 0], 4 * 64)]);
+    ColumnSince "data.topic.column-since" Checked
         Bytes([call(&[1, 0, 0, 0, 0, 0, 0, 0, 0, 127], 0), call(&[1, 0], 4 * 64)]);
     Name "data.topic.name" Short each(&[1], 0);
     RosTopic "data.topic.ros-topic" Short each(&[1], 0);
@@ -65,7 +68,8 @@ operations! {
     SampleIdentity "data.sample.identity" Short each(&[0], 0);
     SampleStamps "data.sample.stamps" Short each(&[0], 0);
     Size "data.sample.size" Short each(&[0], 0);
-    MeanLuma "data.frame.mean-luma" Looked Bytes([call(&[0, 2, 2, 3, 8, 1], 24), call(&[0, 0], PIXELS)]);
+    MeanLuma "data.frame.mean-luma" Checked
+        Bytes([call(&[0, 2, 2, 3, 8, 1], 24), call(&[0, 0], PIXELS)]);
     BigEndian "data.sample.big-endian" Short each(&[0], 0);
     Get "data.sample.get" Short each(&[0, 0], MESSAGE);
     Number "data.sample.number" Short each(&[0, 0], 64);
@@ -74,28 +78,34 @@ operations! {
     Info "data.frame.info" Short each(&[0], 0);
     FrameIdentity "data.frame.identity" Short each(&[0], 0);
     FrameStamps "data.frame.stamps" Short each(&[0], 0);
-    Histogram "data.frame.histogram" Looked Bytes([call(&[0, 2, 2, 3, 8, 1], 8 * 24), call(&[0, 0], 8 * PIXELS)]);
-    Resize "data.frame.resize" Looked
+    Histogram "data.frame.histogram" Checked
+        Bytes([call(&[0, 2, 2, 3, 8, 1], 8 * 24), call(&[0, 0], 8 * PIXELS)]);
+    Resize "data.frame.resize" Checked
         Bytes([call(&[0, 0, 1, 1], 29_232), call(&[0, 1, 32, 0, 0, 0, 24, 0, 0, 0], 101_376)]);
-    ToGray "data.frame.to-gray" Looked each(&[0], 4 * PIXELS);
+    ToGray "data.frame.to-gray" Checked each(&[0], 4 * PIXELS);
     Read "data.frame.read" Short
         Bytes([call(&[0], 0), call(&[0, 0, 0, 0, 0, 0, 0, 0, 0, 64, 31, 0, 0], 8000)]);
     Inputs "data.inputs" Short each(&[], 3 * 64);
     NowNs "data.now-ns" Short each(&[], 0);
     Event "trigger.event" Short Bytes([call(&[1, b'e'], 1), call(&[255, 0, 16, 0, 0], 4096)]);
-    // With an attribute: 64 bytes, one of its key, and 8 of its value.
+    // With an attribute: 64 bytes, one for its key, and 8 for its value.
     Start "trigger.start" Short Bytes([call(&[1, b's'], 74), call(&[255, 0, 16, 0, 0], 4096 + 73)]);
     Stop "trigger.stop" Short Bytes([call(&[1, b's'], 1), call(&[255, 0, 16, 0, 0], 4096)]);
     Log "log.log" Short Bytes([call(&[1, 1, b'l'], 1), call(&[1, 255, 0, 16, 0, 0], 4096)]);
     FromValues "inference.tensor.from-values" Short
-        Made([call(&[1, 0, 0, 0, 1, 0, 0, 0, 1, 0], 8 + 4), call(&[1, 0, 0, 0, 0, 4, 0, 0, 0, 4], 8 + 4096)]);
+        Create([
+            call(&[1, 0, 0, 0, 1, 0, 0, 0, 1, 0], 8 + 4),
+            call(&[1, 0, 0, 0, 0, 4, 0, 0, 0, 4], 8 + 4096),
+        ]);
     FromFrame "inference.tensor.from-frame" Short each(&[0, 8, 0, 0, 0, 8, 0, 0, 0, 100], 0);
-    Open "inference.model.open" Short Made([call(&[1, b'm'], 1), call(&[255, 0, 16, 0, 0], 4096)]);
+    Open "inference.model.open" Short
+        Create([call(&[1, b'm'], 1), call(&[255, 0, 16, 0, 0], 4096)]);
     Shape "inference.tensor.shape" Short Never;
     TensorRead "inference.tensor.read" Short Never;
     Run "inference.model.run" Short Never;
     Detect "inference.model.detect" Short Never;
-    ScratchPut "scratch.put" Short Bytes([call(&[0, 0, 0, 0, 0], 1), call(&[0, 0, 16, 0, 0], 1 + 4096)]);
+    ScratchPut "scratch.put" Short
+        Bytes([call(&[0, 0, 0, 0, 0], 1), call(&[0, 0, 16, 0, 0], 1 + 4096)]);
     Append "scratch.append" Short Bytes([call(&[0, 0, 0], 1), call(&[0, 0, 16], 1 + 4096)]);
     ScratchGet "scratch.get" Short
         Bytes([call(&[1], 1), call(&[1, 0, 0, 0, 0, 0, 0, 0, 0, 160, 15, 0, 0], 1 + 4000)]);

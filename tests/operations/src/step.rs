@@ -1,18 +1,18 @@
-//! Steps of a program for `driver`: a byte for what to do, then what it takes.
+//! Steps of a program for `driver`: a byte for the operation, then its arguments.
 
 use crate::Operation;
 
-/// A step.
+/// A step of a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Step {
+pub enum DriverStep {
     /// A call of the host.
     Call(Operation),
     /// Something else.
     Extra(Extra),
 }
 
-/// What a program does besides calls: to what it was given, to its memory, and to the WASI that a
-/// library calls.
+/// Steps other than calls: on objects of the lambda, on its memory, and on the WASI that libraries
+/// call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum Extra {
@@ -54,8 +54,8 @@ impl Extra {
     ];
 }
 
-impl Step {
-    /// What a byte stands for. Each byte is a step.
+impl DriverStep {
+    /// The step for a byte. Every byte is a step.
     pub fn of(byte: u8) -> Self {
         let number = usize::from(byte) % (Operation::ALL.len() + Extra::ALL.len());
         match Operation::ALL.get(number) {
@@ -64,7 +64,7 @@ impl Step {
         }
     }
 
-    /// The smallest byte that stands for it.
+    /// The smallest byte for the step.
     pub fn byte(self) -> u8 {
         let number = match self {
             Self::Call(operation) => operation as usize,
@@ -73,7 +73,7 @@ impl Step {
         u8::try_from(number).expect("there are fewer than 256 steps")
     }
 
-    /// Its bytes, with what it takes.
+    /// Its bytes, followed by those of its arguments.
     pub fn with(self, arguments: &[u8]) -> Vec<u8> {
         [&[self.byte()], arguments].concat()
     }
@@ -84,10 +84,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_step_has_a_byte_of_its_own() {
-        let calls = Operation::ALL.iter().map(|operation| Step::Call(*operation));
-        let steps: Vec<_> = calls.chain(Extra::ALL.map(Step::Extra)).collect();
+    fn every_step_has_its_own_byte() {
+        let calls = Operation::ALL.iter().map(|operation| DriverStep::Call(*operation));
+        let steps: Vec<_> = calls.chain(Extra::ALL.map(DriverStep::Extra)).collect();
         assert!(steps.iter().enumerate().all(|(number, step)| usize::from(step.byte()) == number));
-        assert!(steps.iter().all(|step| Step::of(step.byte()) == *step));
+        assert!(steps.iter().all(|step| DriverStep::of(step.byte()) == *step));
     }
 }

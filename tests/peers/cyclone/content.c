@@ -60,7 +60,7 @@ static uint32_t sum_sequence(uint32_t sum, const Bytes *bytes)
   return sum_bytes(sum_u32(sum, bytes->_length), bytes->_buffer, bytes->_length);
 }
 
-// The 37 numbers behind an Imu's header lie one after the other, in memory as on the wire.
+// The 37 numbers after an Imu's header are contiguous, in memory and in wire format.
 #define IMU_REALS 37
 _Static_assert(sizeof(Imu) == sizeof(Header) + IMU_REALS * sizeof(double), "an Imu has no gaps");
 

@@ -1,4 +1,4 @@
-// What a message of each type holds, and the sum of one that was received.
+// The content of a message of each type, and the checksum of a received one.
 #ifndef GLEANER_PEERS_CONTENT_H
 #define GLEANER_PEERS_CONTENT_H
 
@@ -15,15 +15,15 @@ struct content {
   const char *type; // as in `Imu`
   const dds_topic_descriptor_t *descriptor;
   size_t size;
-  // Makes message `n` of what may be message `n - 1`, or zeros.
+  // Fills in message `n`; the memory holds message `n - 1`, or zeros.
   void (*fill)(void *message, uint32_t n, const struct shape *shape);
   uint32_t (*sum)(const void *message);
 };
 
-// The type of that name; NULL if there is none.
+// The type with this name; NULL if there is none.
 const struct content *content_of(const char *type);
 
-// Every type here begins with a header: its stamp tells which message it is.
+// Every type begins with a header, whose stamp gives the number of the message.
 int32_t message_sec(const void *message);
 uint32_t message_nanosec(const void *message);
 

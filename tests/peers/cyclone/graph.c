@@ -1,4 +1,5 @@
-// Reads what nodes say of themselves on ros_discovery_info, as a ROS 2 node on Cyclone DDS does, and prints it as lines of JSON.
+// Reads the messages of nodes on ros_discovery_info, as a ROS 2 node on Cyclone DDS does, and prints
+// them as lines of JSON.
 // Built once for each size of a Gid. Ends with its standard input.
 #include <stdio.h>
 #include <stdlib.h>
@@ -45,7 +46,7 @@ static void print_participant(const Participant *participant)
   printf("]}\n");
 }
 
-// Says of itself, as a node would, that there is one: by this others learn the size of a Gid here.
+// Announces itself as a node would: others detect the size of a Gid by this message.
 static void introduce(dds_entity_t writer)
 {
   Node node = {.node_namespace = "/", .node_name = "peer"};
@@ -67,7 +68,7 @@ int main(void)
   dds_qset_history(qos, DDS_HISTORY_KEEP_LAST, 1);
   dds_entity_t writer = dds_create_writer(participant, topic, qos, NULL);
   dds_qset_history(qos, DDS_HISTORY_KEEP_ALL, 0);
-  // What is said here is not heard here.
+  // Its own messages are not received.
   dds_qset_ignorelocal(qos, DDS_IGNORELOCAL_PARTICIPANT);
   dds_entity_t reader = dds_create_reader(participant, topic, qos, NULL);
   if (writer < 0 || reader < 0) {

@@ -1,9 +1,11 @@
-// A peer on Cyclone DDS: writes or reads one topic, and says so in lines of JSON.
+// A peer on Cyclone DDS: writes or reads one topic, and prints events as lines of JSON.
 //
-//   cyclone-peer pub|sub TYPE TOPIC [--count N] [--rate HZ] [--size WxH|BYTES] [--depth N] [--readers N]
-//                [--reliability reliable|best_effort] [--durability volatile|transient_local]
+//   cyclone-peer pub|sub TYPE TOPIC [--count N] [--rate HZ] [--size WxH|BYTES] [--depth N]
+//                [--readers N] [--reliability reliable|best_effort]
+//                [--durability volatile|transient_local]
 //
-// `pub` waits for N readers (1), writes N messages (0: without end) and stays; `sub` reads. Either ends with its standard input.
+// `pub` waits for N readers (1), writes N messages (0: without end) and stays; `sub` reads. Both end
+// with their standard input.
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -125,7 +127,7 @@ int main(int argc, char **argv)
   dds_qset_durability(qos, o.durability);
   dds_history_kind_t history = o.depth > 0 ? DDS_HISTORY_KEEP_LAST : DDS_HISTORY_KEEP_ALL;
   dds_qset_history(qos, history, o.depth);
-  // What those who come later get; as rmw_cyclonedds does, the same.
+  // The history for late readers is the same, as in rmw_cyclonedds.
   dds_qset_durability_service(qos, 0, history, o.depth, DDS_LENGTH_UNLIMITED, DDS_LENGTH_UNLIMITED, DDS_LENGTH_UNLIMITED);
   if (strcmp(argv[1], "pub") == 0) {
     dds_entity_t writer = dds_create_writer(participant, topic, qos, NULL);

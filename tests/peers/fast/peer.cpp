@@ -1,9 +1,11 @@
-// A peer on Fast DDS: writes or reads one topic, and says so in lines of JSON.
+// A peer on Fast DDS: writes or reads one topic, and prints events as lines of JSON.
 //
-//   fast-peer pub|sub Imu|Image|CompressedImage|PointCloud2 TOPIC [--count N] [--rate HZ] [--size WxH|BYTES] [--depth N]
-//             [--readers N] [--reliability reliable|best_effort] [--durability volatile|transient_local]
+//   fast-peer pub|sub Imu|Image|CompressedImage|PointCloud2 TOPIC [--count N] [--rate HZ]
+//             [--size WxH|BYTES] [--depth N] [--readers N]
+//             [--reliability reliable|best_effort] [--durability volatile|transient_local]
 //
-// `pub` waits for N readers (1), writes N messages (0: without end) and stays; `sub` reads. Either ends with its standard input.
+// `pub` waits for N readers (1), writes N messages (0: without end) and stays; `sub` reads. Both end
+// with their standard input.
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
@@ -212,7 +214,7 @@ void set_qos(Qos &qos, const Options &o)
   qos.history().kind = o.depth > 0 ? KEEP_LAST_HISTORY_QOS : KEEP_ALL_HISTORY_QOS;
   if (o.depth > 0)
     qos.history().depth = o.depth;
-  // As rmw_fastrtps does: memory follows what is sent, instead of a largest message that nobody knows.
+  // As rmw_fastrtps does: memory grows with the messages, whose maximum size is not known.
   qos.endpoint().history_memory_policy = eprosima::fastrtps::rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
 }
 
@@ -277,7 +279,7 @@ void run(const std::string &how, const Options &o)
   DomainParticipant *participant = factory->create_participant(0, PARTICIPANT_QOS_DEFAULT);
   need(participant != nullptr, "no participant");
   TypeSupport type(new Support());
-  // Only their names are known to the types that rmw_fastrtps registers.
+  // rmw_fastrtps registers its types by name only.
   type->auto_fill_type_information(false);
   type->auto_fill_type_object(false);
   type.register_type(participant);

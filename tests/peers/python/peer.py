@@ -1,9 +1,10 @@
-"""A peer on Cyclone DDS in Python: writes or reads one topic of Imu, and says so in lines of JSON.
+"""A peer on Cyclone DDS in Python: writes or reads one topic of Imu, and prints events as JSON.
 
     peer.py pub|sub Imu TOPIC [--count N] [--rate HZ] [--depth N] [--readers N]
             [--reliability reliable|best_effort] [--durability volatile|transient_local]
 
-`pub` waits for N readers (1), writes N messages (0: without end) and stays; `sub` reads. Either ends with its standard input.
+`pub` waits for N readers (1), writes N messages (0: without end) and stays; `sub` reads. Both end
+with their standard input.
 """
 
 import argparse
@@ -72,7 +73,7 @@ class Imu(IdlStruct, typename="sensor_msgs.msg.dds_.Imu_"):
 
 
 def content(n: int) -> Imu:
-    """Message `n`: what is in it follows from its number, see tests/src/peers/message.rs."""
+    """Message `n`; its content follows from its number, see tests/src/peers/message.rs."""
     reals = [100.0 * n + k + 0.25 for k in range(REALS)]
     header = Header(Time(1000 + n, 7 * n + 3), f"frame_{n}")
     return Imu(
@@ -90,28 +91,31 @@ def check(imu: Imu) -> int:
     """CRC-32 of the fields in wire order, little-endian, without padding: see tests/peers/sum.h."""
     frame = imu.header.frame_id.encode() + b"\0"
     q, w, a = imu.orientation, imu.angular_velocity, imu.linear_acceleration
-    reals = [q.x, q.y, q.z, q.w, *imu.orientation_covariance, w.x, w.y, w.z, *imu.angular_velocity_covariance]
+    reals = [q.x, q.y, q.z, q.w, *imu.orientation_covariance]
+    reals += [w.x, w.y, w.z, *imu.angular_velocity_covariance]
     reals += [a.x, a.y, a.z, *imu.linear_acceleration_covariance]
     stamp = struct.pack("<iII", imu.header.stamp.sec, imu.header.stamp.nanosec, len(frame))
     return zlib.crc32(stamp + frame + struct.pack(f"<{REALS}d", *reals))
 
 
-def say(**what: object) -> None:
+def report(**what: object) -> None:
     print(json.dumps(what, separators=(",", ":")), flush=True)
 
 
 def ended(seconds: float) -> bool:
-    """Waits so long at most; whether standard input has ended by then."""
+    """Waits for at most `seconds`; returns whether standard input has ended."""
     ready, _, _ = select.select([sys.stdin.buffer], [], [], seconds)
     return bool(ready) and not sys.stdin.buffer.raw.read(64)
 
 
-def publish(participant: DomainParticipant, topic: Topic, qos: Qos, options: argparse.Namespace) -> None:
+def publish(
+    participant: DomainParticipant, topic: Topic, qos: Qos, options: argparse.Namespace
+) -> None:
     writer = DataWriter(participant, topic, qos=qos)
     while (count := len(writer.get_matched_subscriptions())) < options.readers:
         if ended(0.002):
             return
-    say(event="matched", count=count)
+    report(event="matched", count=count)
     due, n = time.monotonic(), 0
     while options.count == 0 or n < options.count:
         n += 1
@@ -121,7 +125,7 @@ def publish(participant: DomainParticipant, topic: Topic, qos: Qos, options: arg
         writer.write(message)
         if ended(0):
             return
-    say(event="written", count=n)
+    report(event="written", count=n)
     while not ended(1):
         pass
 
@@ -132,11 +136,12 @@ def subscribe(participant: DomainParticipant, topic: Topic, qos: Qos) -> None:
         matched = len(reader.get_matched_publications())
         if matched != writers:
             writers = matched
-            say(event="matched", count=writers)
+            report(event="matched", count=writers)
         for imu in reader.take(N=1000):
             if isinstance(imu, Imu):
                 stamp = imu.header.stamp
-                say(event="sample", seq=stamp.sec - 1000, stamp=stamp.sec * 10**9 + stamp.nanosec, sum=check(imu))
+                stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+                report(event="sample", seq=stamp.sec - 1000, stamp=stamp_ns, sum=check(imu))
 
 
 def main() -> None:
@@ -153,11 +158,13 @@ def main() -> None:
     options = parser.parse_args()
     reliable = options.reliability == "reliable"
     history = Policy.History.KeepLast(options.depth) if options.depth else Policy.History.KeepAll
+    is_volatile = options.durability == "volatile"
+    best_effort = Policy.Reliability.BestEffort
     qos = Qos(
-        Policy.Reliability.Reliable(duration(seconds=10)) if reliable else Policy.Reliability.BestEffort,
-        Policy.Durability.Volatile if options.durability == "volatile" else Policy.Durability.TransientLocal,
+        Policy.Reliability.Reliable(duration(seconds=10)) if reliable else best_effort,
+        Policy.Durability.Volatile if is_volatile else Policy.Durability.TransientLocal,
         history,
-        # What those who come later get; as rmw_cyclonedds does, the same.
+        # The history for late readers is the same, as in rmw_cyclonedds.
         Policy.DurabilityService(0, history, -1, -1, -1),
     )
     participant = DomainParticipant()

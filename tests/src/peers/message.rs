@@ -1,13 +1,13 @@
-//! The messages that peers send each other: what is in one follows from its number, so that every
-//! byte can be checked.
+//! The test messages of peers. Their content follows from their number, so that every byte can be
+//! checked.
 //!
-//! The same formulas stand in `tests/peers/sum.h` and `tests/peers/python/peer.py`.
+//! `tests/peers/sum.h` and `tests/peers/python/peer.py` contain the same formulas.
 
 use gleaner_messages::Endian;
 
-/// A type that peers speak, and how large its messages are.
+/// A type of test messages, with their size.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub enum Type {
+pub enum MessageType {
     /// `sensor_msgs/msg/Imu`, about 330 bytes.
     Imu,
     /// `sensor_msgs/msg/Image`, `rgb8`.
@@ -17,17 +17,17 @@ pub enum Type {
         /// Rows.
         height: u32,
     },
-    /// `sensor_msgs/msg/CompressedImage` of so many bytes.
+    /// `sensor_msgs/msg/CompressedImage` with this many bytes.
     CompressedImage(u32),
-    /// `sensor_msgs/msg/PointCloud2` of so many bytes, a multiple of 16.
+    /// `sensor_msgs/msg/PointCloud2` with this many bytes, a multiple of 16.
     PointCloud2(u32),
     /// `sensor_msgs/msg/TimeReference`, about 40 bytes.
     TimeReference,
 }
 
-/// One value of a message, as it stands on the wire.
+/// One value of a message in wire format.
 #[derive(Clone, Debug, PartialEq)]
-enum Piece {
+enum WireValue {
     U8(u8),
     U32(u32),
     F64(f64),
@@ -35,12 +35,12 @@ enum Piece {
     Bytes(Vec<u8>),
 }
 
-/// A message as a row of values.
+/// A message as a list of values.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Message(Vec<Piece>);
+pub struct PeerMessage(Vec<WireValue>);
 
-impl Type {
-    /// As in `Imu`.
+impl MessageType {
+    /// The name without its package, such as `Imu`.
     pub fn short_name(self) -> &'static str {
         match self {
             Self::Imu => "Imu",
@@ -51,12 +51,12 @@ impl Type {
         }
     }
 
-    /// As in `sensor_msgs/msg/Imu`.
+    /// The full name, such as `sensor_msgs/msg/Imu`.
     pub fn name(self) -> String {
         format!("sensor_msgs/msg/{}", self.short_name())
     }
 
-    /// What a peer takes behind `--size`; none if there is nothing to choose.
+    /// The value of a peer's option `--size`; `None` for types of a fixed size.
     pub fn size(self) -> Option<String> {
         match self {
             Self::Imu | Self::TimeReference => None,
@@ -65,9 +65,9 @@ impl Type {
         }
     }
 
-    /// Message `n`, from 1.
-    pub fn message(self, n: u32) -> Message {
-        use Piece::{Bytes, F64, Text, U8, U32};
+    /// PeerMessage `n`, from 1.
+    pub fn message(self, n: u32) -> PeerMessage {
+        use WireValue::{Bytes, F64, Text, U8, U32};
         let time = |n: u32| [U32(1000 + n), U32(7 * n + 3)];
         let bytes = |length: u32| {
             Bytes((0..length).map(|at| (31 * u64::from(at) + 7 * u64::from(n)) as u8).collect())
@@ -103,11 +103,11 @@ impl Type {
                 pieces.push(Text("gps".to_owned()));
             }
         }
-        Message(pieces)
+        PeerMessage(pieces)
     }
 }
 
-impl Message {
+impl PeerMessage {
     /// The message as CDR, without encapsulation.
     pub fn cdr(&self) -> Vec<u8> {
         let mut cdr = Vec::new();
@@ -118,14 +118,14 @@ impl Message {
         cdr
     }
 
-    /// CRC-32 of its values without padding: what peers print of it.
+    /// CRC-32 of its values without padding; peers print it.
     pub fn sum(&self) -> u32 {
         let mut bytes = Vec::new();
         self.0.iter().for_each(|piece| piece.write(&mut bytes));
         crc32fast::hash(&bytes)
     }
 
-    /// Where `cdr` differs from this message; padding counts for nothing, whatever it holds.
+    /// The first difference between `cdr` and this message; the content of padding is ignored.
     pub fn differs(&self, cdr: &[u8], endian: Endian) -> Option<String> {
         if endian != Endian::Little {
             return Some(format!("{endian:?} endian"));
@@ -140,12 +140,12 @@ impl Message {
             }
             at += wanted.len();
         }
-        // A payload is filled up to a multiple of four.
+        // The payload is padded to a multiple of four.
         (cdr.len() - at > 3).then(|| format!("{} bytes too many", cdr.len() - at))
     }
 }
 
-impl Piece {
+impl WireValue {
     fn alignment(&self) -> usize {
         match self {
             Self::U8(_) => 1,
@@ -154,7 +154,7 @@ impl Piece {
         }
     }
 
-    /// Appends it, little-endian, without padding.
+    /// Appends the value, little-endian, without padding.
     fn write(&self, to: &mut Vec<u8>) {
         match self {
             Self::U8(value) => to.push(*value),

@@ -1,4 +1,4 @@
-//! Programs on other people's DDS: starting one, and hearing what it says. `cargo xtask peers`
+//! Starts peers, programs on other DDS implementations, and reads their output. `cargo xtask peers`
 //! builds them.
 
 pub mod message;
@@ -12,63 +12,62 @@ use std::time::{Duration, Instant};
 
 use serde::Deserialize;
 
-use message::Type;
+use message::MessageType;
 
-/// How long a peer may take for anything: far longer than it does, so that only one that hangs is
-/// caught.
+/// Maximum wait for a peer: far longer than needed, so that only a hang reaches it.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Whose DDS it is.
+/// The implementation of DDS.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum PeerKind {
     /// Cyclone DDS in C.
     Cyclone,
     /// Fast DDS in C++.
     Fast,
     /// Cyclone DDS in Python.
     Python,
-    /// Cyclone DDS in C, on `ros_discovery_info` with Gids of so many bytes.
+    /// Cyclone DDS in C, on `ros_discovery_info` with Gids of this many bytes.
     Graph(usize),
 }
 
-/// One line of a peer.
+/// A line that a peer prints.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(tag = "event", rename_all = "lowercase")]
-pub enum Said {
-    /// It is connected to so many.
+pub enum PeerEvent {
+    /// The number of matched peers has changed.
     Matched {
-        /// How many there are now.
+        /// The current number.
         count: u32,
     },
-    /// It has written all that it was asked for.
+    /// All requested messages were written.
     Written {
-        /// How many those were.
+        /// Their number.
         count: u32,
     },
-    /// It has received a message.
+    /// A message was received.
     Sample {
         /// The message's number.
         seq: u32,
         /// Its stamp in ns.
         stamp: i64,
-        /// See [`message::Message::sum`].
+        /// See [`message::PeerMessage::sum`].
         sum: u32,
     },
-    /// It has heard of a participant's nodes.
+    /// The nodes of a participant were received.
     Graph {
         /// The participant, in hex.
         gid: String,
         /// Its nodes.
-        nodes: Vec<Node>,
+        nodes: Vec<PeerNode>,
     },
 }
 
-/// A node, as a participant tells of it.
+/// A node, as announced by its participant.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
-pub struct Node {
-    /// Such as `/gleaner`.
+pub struct PeerNode {
+    /// Namespace, such as `/gleaner`.
     pub namespace: String,
-    /// Such as `hello`.
+    /// Name, such as `hello`.
     pub name: String,
     /// Its readers, in hex.
     pub readers: Vec<String>,
@@ -76,8 +75,8 @@ pub struct Node {
     pub writers: Vec<String>,
 }
 
-impl Kind {
-    /// Why it cannot be started; `None` if it can.
+impl PeerKind {
+    /// The reason why it cannot be started; `None` if it can.
     pub fn unavailable(self) -> Option<&'static str> {
         if self.files().iter().all(|file| file.is_file()) {
             None
@@ -101,7 +100,7 @@ impl Kind {
         }
     }
 
-    /// The program, without arguments of its own.
+    /// The program, without further arguments.
     pub fn command(self) -> Command {
         let files = self.files();
         let mut command = Command::new(&files[0]);
@@ -109,22 +108,23 @@ impl Kind {
         command
     }
 
-    /// The program, to write messages of a type on a topic. `options` are further ones, such as
-    /// `--count 200`.
-    pub fn publisher(self, ty: Type, topic: &str, options: &str) -> Command {
+    /// The program as a writer of messages of a type on a topic. `options` are further ones, such
+    /// as `--count 200`.
+    pub fn publisher(self, ty: MessageType, topic: &str, options: &str) -> Command {
         let mut command = self.command();
         command.args(["pub", ty.short_name(), topic]).args(options.split_whitespace());
         if let Some(size) = ty.size() {
             command.args(["--size", &size]);
         }
-        // As people are told to do for images: fragments of 63 KB instead of 1344 bytes.
-        let settings = "<General><MaxMessageSize>65500B</MaxMessageSize><FragmentSize>63000B</FragmentSize></General>";
+        // As documented for images: fragments of 63 KB instead of 1344 bytes.
+        let settings = "<General><MaxMessageSize>65500B</MaxMessageSize>\
+                        <FragmentSize>63000B</FragmentSize></General>";
         command.env("CYCLONEDDS_URI", settings);
         command
     }
 
-    /// The program, to read messages of a type from a topic, without forgetting any.
-    pub fn subscriber(self, ty: Type, topic: &str, options: &str) -> Command {
+    /// The program as a reader of messages of a type from a topic, keeping all of them.
+    pub fn subscriber(self, ty: MessageType, topic: &str, options: &str) -> Command {
         let mut command = self.command();
         command
             .args(["sub", ty.short_name(), topic, "--depth", "0"])
@@ -133,11 +133,11 @@ impl Kind {
     }
 }
 
-/// A peer that runs. It is ended with this.
+/// A running peer, stopped on drop.
 pub struct Peer {
     child: Child,
     stdin: Option<ChildStdin>,
-    said: Receiver<Said>,
+    events: Receiver<PeerEvent>,
 }
 
 impl Peer {
@@ -145,34 +145,34 @@ impl Peer {
     ///
     /// # Panics
     ///
-    /// If the program is not there; see [`Kind::unavailable`].
+    /// If the program does not exist; see [`PeerKind::unavailable`].
     pub fn start(mut command: Command) -> Self {
         let mut child =
             command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("a peer starts");
         let stdout = BufReader::new(child.stdout.take().expect("its output is a pipe"));
-        let (say, said) = mpsc::channel();
+        let (sender, events) = mpsc::channel();
         thread::spawn(move || {
             for line in stdout.lines().map_while(Result::ok) {
                 match serde_json::from_str(&line) {
-                    // Nobody has to listen to the end.
-                    Ok(event) => drop(say.send(event)),
+                    // The receiver may be gone.
+                    Ok(event) => drop(sender.send(event)),
                     Err(error) => eprintln!("peer: {line} ({error})"),
                 }
             }
         });
         let stdin = child.stdin.take();
-        Self { child, stdin, said }
+        Self { child, stdin, events }
     }
 
-    /// The next thing it says that `wanted` makes something of.
+    /// Waits for the first further event for which `wanted` returns a value.
     ///
     /// # Errors
     ///
-    /// In words, if it ends or is silent for too long.
+    /// A description, if the peer ends or prints nothing for too long.
     pub fn wait<T>(
         &mut self,
         what: &str,
-        wanted: impl FnMut(Said) -> Option<T>,
+        wanted: impl FnMut(PeerEvent) -> Option<T>,
     ) -> Result<T, String> {
         self.wait_for(PATIENCE, wanted).ok_or_else(|| {
             let state = self.child.try_wait().map(|ended| ended.map(|status| status.to_string()));
@@ -180,57 +180,61 @@ impl Peer {
         })
     }
 
-    /// What `wanted` makes of the next lines; `None` if none of them comes in time.
+    /// Waits for the first further event for which `wanted` returns a value; `None` on timeout.
     pub fn wait_for<T>(
         &mut self,
         patience: Duration,
-        mut wanted: impl FnMut(Said) -> Option<T>,
+        mut wanted: impl FnMut(PeerEvent) -> Option<T>,
     ) -> Option<T> {
         let deadline = Instant::now() + patience;
         loop {
-            let said =
-                self.said.recv_timeout(deadline.saturating_duration_since(Instant::now())).ok()?;
-            if let Some(found) = wanted(said) {
+            let event = self
+                .events
+                .recv_timeout(deadline.saturating_duration_since(Instant::now()))
+                .ok()?;
+            if let Some(found) = wanted(event) {
                 return Some(found);
             }
         }
     }
 
-    /// Waits until it has written all that it was asked for.
+    /// Waits until it has written all requested messages.
     ///
     /// # Errors
     ///
     /// As [`wait`](Self::wait).
     pub fn written(&mut self) -> Result<(), String> {
-        self.wait("a peer to write", |said| matches!(said, Said::Written { .. }).then_some(()))
+        self.wait("a peer to write", |event| {
+            matches!(event, PeerEvent::Written { .. }).then_some(())
+        })
     }
 
-    /// Waits until it is connected to somebody.
+    /// Waits until it is connected to a peer.
     ///
     /// # Errors
     ///
     /// As [`wait`](Self::wait).
     pub fn matched(&mut self) -> Result<(), String> {
-        self.wait("a peer to be connected", |said| {
-            matches!(said, Said::Matched { count: 1.. }).then_some(())
+        self.wait("a peer to be connected", |event| {
+            matches!(event, PeerEvent::Matched { count: 1.. }).then_some(())
         })
     }
 
-    /// How it ended, in words; `None` while it runs.
+    /// Its exit status as text; `None` while it runs.
     pub fn ended(&mut self) -> Option<String> {
         self.child
             .try_wait()
             .map_or_else(|error| Some(error.to_string()), |ended| Some(ended?.to_string()))
     }
 
-    /// Ends it at once, without its knowing.
+    /// Kills it, so that it cannot leave the network properly.
     pub fn kill(mut self) {
         let _ = self.child.kill();
     }
 }
 
 impl Drop for Peer {
-    /// Lets it end by itself, so that it says goodbye to others; one that does not is killed.
+    /// Lets it end by itself, so that it leaves the network properly; kills it after 10 s.
     fn drop(&mut self) {
         drop(self.stdin.take());
         let deadline = Instant::now() + Duration::from_secs(10);

@@ -1,38 +1,38 @@
-//! What a recorder counts live is in the summary of the run, and a vehicle's limits are the same
-//! for it and for the lambda.
+//! The counts of a live recorder are in the summary of the run, and the vehicle's limits apply to
+//! the recorder and to the lambda alike.
 
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use gleaner_protocol::Live;
+use gleaner_protocol::LiveStatus;
 use gleaner_protocol::link::{RecorderReport, RecorderStatus};
-use gleaner_tests::live::{Line, run};
-use gleaner_tests::{Copy, Folder, program};
+use gleaner_tests::live::{JsonReport, run};
+use gleaner_tests::{LambdaCopy, TempFolder, program};
 use libtest_mimic::Failed;
 
-use crate::Case;
+use crate::DdsCase;
 
-pub const CASES: &[Case] = &[
-    Case {
-        name: "what_a_full_disk_held_back_is_in_the_summary_and_in_the_report",
+pub const CASES: &[DdsCase] = &[
+    DdsCase {
+        name: "triggers_suppressed_by_a_full_disk_are_in_the_summary_and_in_the_report",
         needs: &[],
         run: disk_suppressed,
     },
-    Case {
-        name: "a_recorder_takes_a_lambda_that_its_vehicle_makes_smaller",
+    DdsCase {
+        name: "a_recorder_accepts_a_lambda_with_the_lower_limits_of_its_vehicle",
         needs: &[],
         run: on_a_vehicle,
     },
 ];
 
 fn disk_suppressed() -> Result<(), Failed> {
-    let out = Folder::new();
+    let out = TempFolder::new();
     let floor = u64::MAX.to_string();
     let (last, summary) = recorded(out.path(), "", &["--disk-floor", &floor], |status| {
         status.recording.disk_suppressed > 2
     })?;
-    // The lambda went on until it was stopped.
+    // The lambda continued until it was stopped.
     if summary.recording.disk_suppressed < last.recording.disk_suppressed {
         return Err(format!("{:?}, and before {:?}", summary.recording, last.recording).into());
     }
@@ -50,7 +50,7 @@ fn disk_suppressed() -> Result<(), Failed> {
 }
 
 fn on_a_vehicle() -> Result<(), Failed> {
-    let out = Folder::new();
+    let out = TempFolder::new();
     let vehicle = out.write("vehicle.toml", "[limits]\nlog_lines = 7\n");
     let vehicle = vehicle.to_str().ok_or("a plain path")?;
     let results = out.path().join("live");
@@ -65,8 +65,8 @@ fn on_a_vehicle() -> Result<(), Failed> {
     }
 }
 
-/// Runs a lambda that triggers ten times a second until its recorder reports what is `wanted`; what
-/// it reported then, and what the summary says of the recorder.
+/// Runs a lambda that triggers ten times a second until `wanted` holds for a status of its
+/// recorder. Returns that status, and the recorder's counts in the summary.
 fn recorded(
     out: &Path,
     record: &str,
@@ -74,16 +74,17 @@ fn recorded(
     wanted: fn(&RecorderStatus) -> bool,
 ) -> Result<(RecorderStatus, RecorderStatus), Failed> {
     let record = format!("\n[record]\ntopics = [\"/imu/data\"]\n{record}");
-    let lambda = Copy::of("tests/lambdas/ticker/rust", |manifest| manifest + &record);
+    let lambda = LambdaCopy::of("tests/lambdas/ticker/rust", |manifest| manifest + &record);
     let started = run(lambda.path(), out, args);
     let last = started.until("counts of the recorder", |line| match line {
-        Line::Recorder(RecorderReport::Status(status)) if wanted(&status) => Some(*status),
+        JsonReport::Recorder(RecorderReport::Status(status)) if wanted(&status) => Some(*status),
         _ => None,
     });
     started.signal("INT");
     let finished = started.finish();
-    let summary: Live = serde_json::from_slice(&fs::read(out.join("summary.json"))?)?;
-    let of_recorder =
-        summary.recording.ok_or_else(|| format!("no counts of the recorder: {}", finished.said))?;
+    let summary: LiveStatus = serde_json::from_slice(&fs::read(out.join("summary.json"))?)?;
+    let of_recorder = summary
+        .recording
+        .ok_or_else(|| format!("no counts of the recorder: {}", finished.stderr))?;
     Ok((last, *of_recorder))
 }

@@ -1,42 +1,46 @@
-//! Losses, and packets that somebody made to do harm.
+//! Packet losses, and packets crafted to do harm.
 
 use std::collections::BTreeSet;
 use std::net::UdpSocket;
 use std::process::Command;
 
 use gleaner_dds::Dds;
-use gleaner_tests::peers::message::Type;
-use gleaner_tests::peers::{Kind, PATIENCE, Peer};
+use gleaner_tests::peers::message::MessageType;
+use gleaner_tests::peers::{PATIENCE, Peer, PeerKind};
 use gleaner_transport::{LiveSource, Qos, Transport};
 use gleaner_vitals::usage;
 use libtest_mimic::Failed;
 
-use crate::ours::{Heard, join};
-use crate::rtps::{ANY, Entity, Random, SPDP_READER, broken, data_frag, packet, sound};
-use crate::{Case, Need};
+use crate::receiver::{TopicReceiver, join};
+use crate::rtps::{ANY, Entity, SPDP_READER, XorShift64, broken, data_frag, packet, valid_packets};
+use crate::{DdsCase, Need};
 
-const CYCLONE: Need = Need::Peer(Kind::Cyclone);
+const CYCLONE: Need = Need::Peer(PeerKind::Cyclone);
 
-pub const CASES: &[Case] = &[
-    Case {
-        name: "of_a_network_that_loses_packets_nothing_is_lost_silently",
+pub const CASES: &[DdsCase] = &[
+    DdsCase {
+        name: "packets_lost_by_the_network_are_counted",
         needs: &[CYCLONE, Need::Nft],
         run: lossy,
     },
-    Case { name: "a_thousand_broken_packets_do_no_harm", needs: &[CYCLONE], run: broken_packets },
-    Case {
-        name: "fragments_of_messages_that_never_come_whole_take_bounded_memory",
+    DdsCase {
+        name: "a_thousand_broken_packets_do_no_harm",
+        needs: &[CYCLONE],
+        run: broken_packets,
+    },
+    DdsCase {
+        name: "fragments_of_messages_that_never_complete_take_bounded_memory",
         needs: &[CYCLONE],
         run: || claims(1 << 19),
     },
-    Case {
+    DdsCase {
         name: "a_fragment_that_claims_four_gib_takes_no_memory",
         needs: &[CYCLONE],
         run: || claims(u32::MAX),
     },
 ];
 
-/// What hostile packets may add to this process's memory. RustDDS keeps 128 unfinished messages of
+/// Memory that hostile packets may add to this process. RustDDS keeps 128 incomplete messages of
 /// each writer for each reader.
 const MEMORY_KIB: u64 = 192 << 10;
 
@@ -45,25 +49,25 @@ fn lossy() -> Result<(), Failed> {
     for rule in [
         "add table inet lossy",
         "add chain inet lossy in { type filter hook input priority 0 ; }",
-        // One packet of a hundred, by chance.
+        // A random packet in a hundred.
         "add rule inet lossy in meta l4proto udp numgen random mod 100 == 0 counter drop",
     ] {
         if !Command::new("nft").args(rule.split(' ')).status()?.success() {
-            return Err(format!("nft refuses `{rule}`").into());
+            return Err(format!("nft rejects `{rule}`").into());
         }
     }
     let mut dds = join(None)?;
-    let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
-    let _peer = Peer::start(Kind::Cyclone.publisher(
-        Type::Imu,
+    let receiver = TopicReceiver::new(&mut dds, MessageType::Imu, "/sensor", Qos::Auto)?;
+    let _peer = Peer::start(PeerKind::Cyclone.publisher(
+        MessageType::Imu,
         "/sensor",
         &format!("--count {COUNT} --rate 200"),
     ));
-    let samples = heard.wait("all messages, or word of their loss", |samples| {
-        let lost = dds.status(heard.subscription).lost.unwrap_or(0);
+    let samples = receiver.wait("all messages, or a count of lost ones", |samples| {
+        let lost = dds.status(receiver.subscription).lost.unwrap_or(0);
         samples.len() as u64 + lost >= COUNT
     })?;
-    let lost = dds.status(heard.subscription).lost;
+    let lost = dds.status(receiver.subscription).lost;
     let rules = Command::new("nft").args(["list", "ruleset"]).output()?;
     let rules = String::from_utf8_lossy(&rules.stdout).into_owned();
     println!(
@@ -72,7 +76,7 @@ fn lossy() -> Result<(), Failed> {
         rules.lines().find(|l| l.contains("counter")).unwrap_or("")
     );
     if rules.contains("packets 0 ") {
-        return Err("nothing was dropped: the test shows nothing".into());
+        return Err("no packet was dropped: the test has no effect".into());
     }
     let distinct: BTreeSet<_> = samples.iter().map(|sample| sample.meta.seq).collect();
     let (arrived, lost) = (samples.len() as u64, lost.unwrap_or(0));
@@ -90,19 +94,23 @@ fn broken_packets() -> Result<(), Failed> {
     let mut dds = join(None)?;
     let ports = udp_ports()?;
     let announcement = announcement(&ports)?;
-    let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
-    let victim = Peer::start(Kind::Cyclone.publisher(Type::Imu, "/sensor", "--count 0 --rate 100"));
+    let receiver = TopicReceiver::new(&mut dds, MessageType::Imu, "/sensor", Qos::Auto)?;
+    let victim = Peer::start(PeerKind::Cyclone.publisher(
+        MessageType::Imu,
+        "/sensor",
+        "--count 0 --rate 100",
+    ));
     let writer =
-        heard.wait("a writer to speak for", |samples| samples.len() >= 20)?[0].meta.writer.0;
+        receiver.wait("a writer to impersonate", |samples| samples.len() >= 20)?[0].meta.writer.0;
     let before = memory_kib()?;
 
     let (prefix, entity): ([u8; 12], Entity) =
         (*writer.first_chunk().unwrap(), *writer.last_chunk().unwrap());
-    let mut seeds = sound(prefix, entity, &Type::Imu.message(1).cdr());
-    // The same from a stranger, and what a real participant says when it introduces itself.
-    seeds.extend(sound([0x77; 12], entity, &Type::Imu.message(1).cdr()));
+    let mut seeds = valid_packets(prefix, entity, &MessageType::Imu.message(1).cdr());
+    // The same from an unknown participant, and the announcement of a real one.
+    seeds.extend(valid_packets([0x77; 12], entity, &MessageType::Imu.message(1).cdr()));
     seeds.extend(vec![announcement; 10]);
-    let mut random = Random(0x9e37_79b9_7f4a_7c15);
+    let mut random = XorShift64(0x9e37_79b9_7f4a_7c15);
     let (socket, mut sent) = (UdpSocket::bind("127.0.0.1:0")?, 0);
     while sent < 1000 {
         let packet = broken(&seeds[random.below(seeds.len())], &mut random);
@@ -111,17 +119,20 @@ fn broken_packets() -> Result<(), Failed> {
         }
         sent += 1;
     }
-    // Whoever has a writer's name can speak for it, and may have told that nothing comes any more.
-    // Others are heard.
+    // An attacker who uses a writer's id can send in its name, and may have announced its end.
+    // Other writers are still received.
     drop(victim);
-    still_heard(&mut dds)?;
+    still_receives(&mut dds)?;
     let after = memory_kib()?;
     println!(
         "{sent} broken packets to each of {} ports; memory at most {before}, then {after} KiB",
         ports.len()
     );
     if let Some(dead) = dds.health().dead {
-        return Err(format!("good messages arrive, but we are said to be dead: {dead}").into());
+        return Err(format!(
+            "valid messages arrive, but the participant reports its death: {dead}"
+        )
+        .into());
     }
     if after - before > MEMORY_KIB {
         return Err(format!("memory rose from {before} to {after} KiB").into());
@@ -129,15 +140,19 @@ fn broken_packets() -> Result<(), Failed> {
     Ok(())
 }
 
-/// Fragments of 500 messages that claim so much each, for a reader of ours and for one that every
-/// participant has.
+/// Sends fragments of 500 messages with the claimed size `size`, to the test's reader and to one
+/// that every participant has.
 fn claims(size: u32) -> Result<(), Failed> {
     let mut dds = join(None)?;
     let ports = udp_ports()?;
-    let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
-    let victim = Peer::start(Kind::Cyclone.publisher(Type::Imu, "/sensor", "--count 0 --rate 100"));
+    let receiver = TopicReceiver::new(&mut dds, MessageType::Imu, "/sensor", Qos::Auto)?;
+    let victim = Peer::start(PeerKind::Cyclone.publisher(
+        MessageType::Imu,
+        "/sensor",
+        "--count 0 --rate 100",
+    ));
     let writer =
-        heard.wait("a writer to speak for", |samples| samples.len() >= 20)?[0].meta.writer.0;
+        receiver.wait("a writer to impersonate", |samples| samples.len() >= 20)?[0].meta.writer.0;
     let before = memory_kib()?;
     let (prefix, entity): ([u8; 12], Entity) =
         (*writer.first_chunk().unwrap(), *writer.last_chunk().unwrap());
@@ -152,7 +167,7 @@ fn claims(size: u32) -> Result<(), Failed> {
         }
     }
     drop(victim);
-    still_heard(&mut dds)?;
+    still_receives(&mut dds)?;
     let after = memory_kib()?;
     println!(
         "1000 fragments that claim {size} bytes each: memory at most {before}, then {after} KiB"
@@ -164,15 +179,16 @@ fn claims(size: u32) -> Result<(), Failed> {
     }
 }
 
-/// Somebody new writes on a new topic, and every message of it arrives.
-fn still_heard(dds: &mut Dds) -> Result<(), Failed> {
-    let heard = Heard::on(dds, Type::TimeReference, "/after", Qos::Auto)?;
+/// A new writer on a new topic: every message arrives.
+fn still_receives(dds: &mut Dds) -> Result<(), Failed> {
+    let receiver = TopicReceiver::new(dds, MessageType::TimeReference, "/after", Qos::Auto)?;
     let options = "--count 200 --rate 200";
-    let _peer = Peer::start(Kind::Cyclone.publisher(Type::TimeReference, "/after", options));
-    heard.all(dds, 200)
+    let _peer =
+        Peer::start(PeerKind::Cyclone.publisher(MessageType::TimeReference, "/after", options));
+    receiver.all(dds, 200)
 }
 
-/// The ports of all sockets in this network: called while only we have some.
+/// The ports of all UDP sockets in this network, to be called while only this process has some.
 pub fn udp_ports() -> Result<Vec<u16>, Failed> {
     let table = std::fs::read_to_string("/proc/self/net/udp")?;
     let port = |line: &str| {
@@ -181,18 +197,18 @@ pub fn udp_ports() -> Result<Vec<u16>, Failed> {
     let mut ports: Vec<u16> = table.lines().skip(1).filter_map(port).collect();
     ports.sort_unstable();
     ports.dedup();
-    if ports.len() < 2 { Err(format!("we have no sockets: {table}").into()) } else { Ok(ports) }
+    if ports.len() < 2 { Err(format!("there are no sockets: {table}").into()) } else { Ok(ports) }
 }
 
-/// What a participant says when it introduces itself, in the name of one that does not exist.
+/// The announcement that a participant sends, with the id of one that does not exist.
 ///
-/// Ours is sent to the first ports that others on this machine might have: a plain socket on one of
-/// those hears it.
-pub fn announcement(ours: &[u16]) -> Result<Vec<u8>, Failed> {
+/// The participant sends it to the first ports that others on this machine might have; a plain
+/// socket on one of those receives it.
+pub fn announcement(own: &[u16]) -> Result<Vec<u8>, Failed> {
     // DDSI-RTPS 2.3, section 9.6.1: unicast discovery in domain 0 is at 7410 and two more for each
     // participant.
     let sockets =
-        (1..12).map(|participant| 7410 + 2 * participant).filter(|port| !ours.contains(port));
+        (1..12).map(|participant| 7410 + 2 * participant).filter(|port| !own.contains(port));
     let socket = sockets.filter_map(|port| UdpSocket::bind(("127.0.0.1", port)).ok()).next_back();
     let socket = socket.ok_or("all ports of discovery are taken")?;
     socket.set_read_timeout(Some(PATIENCE))?;
@@ -211,8 +227,8 @@ pub fn announcement(ours: &[u16]) -> Result<Vec<u8>, Failed> {
 
 /// The most memory that this process ever had, in KiB.
 fn memory_kib() -> Result<u64, Failed> {
-    match usage::most_resident() {
-        0 => Err("the system does not tell how much memory we have".into()),
+    match usage::peak_resident() {
+        0 => Err("cannot determine the memory of this process".into()),
         bytes => Ok(bytes >> 10),
     }
 }

@@ -1,123 +1,140 @@
-//! What peers write, we hear.
+//! Gleaner receives the messages that peers write.
 
 use std::collections::BTreeSet;
 
-use gleaner_tests::peers::message::Type;
-use gleaner_tests::peers::{Kind, Peer};
+use gleaner_tests::peers::message::MessageType;
+use gleaner_tests::peers::{Peer, PeerKind};
 use gleaner_transport::{Qos, Transport};
 use libtest_mimic::Failed;
 
-use crate::ours::{Heard, Sample, join, number};
-use crate::{Case, Need};
+use crate::receiver::{ReceivedSample, TopicReceiver, join, number};
+use crate::{DdsCase, Need};
 
-const CYCLONE: &[Need] = &[Need::Peer(Kind::Cyclone)];
-const FAST: &[Need] = &[Need::Peer(Kind::Fast)];
+const CYCLONE: &[Need] = &[Need::Peer(PeerKind::Cyclone)];
+const FAST: &[Need] = &[Need::Peer(PeerKind::Fast)];
 
-pub const CASES: &[Case] = &[
-    Case { name: "an_imu_of_cyclone_arrives_whole", needs: CYCLONE, run: || imu(Kind::Cyclone) },
-    Case { name: "an_imu_of_fast_dds_arrives_whole", needs: FAST, run: || imu(Kind::Fast) },
-    Case {
-        name: "an_imu_of_python_arrives_whole",
-        needs: &[Need::Peer(Kind::Python)],
-        run: || imu(Kind::Python),
-    },
-    Case {
-        name: "images_of_cyclone_in_1080p_arrive_whole",
+pub const CASES: &[DdsCase] = &[
+    DdsCase {
+        name: "an_imu_of_cyclone_arrives_complete",
         needs: CYCLONE,
-        run: || images(Kind::Cyclone),
+        run: || imu(PeerKind::Cyclone),
     },
-    Case {
-        name: "images_of_fast_dds_in_1080p_arrive_whole",
+    DdsCase {
+        name: "an_imu_of_fast_dds_arrives_complete",
         needs: FAST,
-        run: || images(Kind::Fast),
+        run: || imu(PeerKind::Fast),
     },
-    Case {
-        name: "compressed_images_of_cyclone_arrive_whole",
+    DdsCase {
+        name: "an_imu_of_python_arrives_complete",
+        needs: &[Need::Peer(PeerKind::Python)],
+        run: || imu(PeerKind::Python),
+    },
+    DdsCase {
+        name: "images_of_cyclone_in_1080p_arrive_complete",
         needs: CYCLONE,
-        run: || compressed(Kind::Cyclone),
+        run: || images(PeerKind::Cyclone),
     },
-    Case {
-        name: "compressed_images_of_fast_dds_arrive_whole",
+    DdsCase {
+        name: "images_of_fast_dds_in_1080p_arrive_complete",
         needs: FAST,
-        run: || compressed(Kind::Fast),
+        run: || images(PeerKind::Fast),
     },
-    Case {
-        name: "point_clouds_of_cyclone_arrive_whole",
+    DdsCase {
+        name: "compressed_images_of_cyclone_arrive_complete",
         needs: CYCLONE,
-        run: || clouds(Kind::Cyclone),
+        run: || compressed(PeerKind::Cyclone),
     },
-    Case { name: "point_clouds_of_fast_dds_arrive_whole", needs: FAST, run: || clouds(Kind::Fast) },
-    Case { name: "a_best_effort_writer_is_heard", needs: CYCLONE, run: best_effort },
-    Case {
-        name: "what_a_transient_local_writer_wrote_before_is_heard",
+    DdsCase {
+        name: "compressed_images_of_fast_dds_arrive_complete",
+        needs: FAST,
+        run: || compressed(PeerKind::Fast),
+    },
+    DdsCase {
+        name: "point_clouds_of_cyclone_arrive_complete",
+        needs: CYCLONE,
+        run: || clouds(PeerKind::Cyclone),
+    },
+    DdsCase {
+        name: "point_clouds_of_fast_dds_arrive_complete",
+        needs: FAST,
+        run: || clouds(PeerKind::Fast),
+    },
+    DdsCase {
+        name: "samples_of_a_best_effort_writer_are_received",
+        needs: CYCLONE,
+        run: best_effort,
+    },
+    DdsCase {
+        name: "earlier_samples_of_a_transient_local_writer_are_received",
         needs: CYCLONE,
         run: transient_local,
     },
-    Case { name: "writers_with_different_offers_are_both_heard", needs: CYCLONE, run: mixed },
-    Case {
-        name: "a_publisher_that_is_killed_and_started_again_is_heard_again",
+    DdsCase { name: "writers_with_different_qos_are_both_received", needs: CYCLONE, run: mixed },
+    DdsCase {
+        name: "a_publisher_that_is_killed_and_restarted_is_received_again",
         needs: CYCLONE,
         run: restarts,
     },
 ];
 
-fn imu(kind: Kind) -> Result<(), Failed> {
-    whole(kind, Type::Imu, 200, 100)
+fn imu(kind: PeerKind) -> Result<(), Failed> {
+    complete(kind, MessageType::Imu, 200, 100)
 }
 
-fn images(kind: Kind) -> Result<(), Failed> {
-    whole(kind, Type::Image { width: 1920, height: 1080 }, 20, 10)
+fn images(kind: PeerKind) -> Result<(), Failed> {
+    complete(kind, MessageType::Image { width: 1920, height: 1080 }, 20, 10)
 }
 
-fn compressed(kind: Kind) -> Result<(), Failed> {
-    whole(kind, Type::CompressedImage(200_000), 100, 30)
+fn compressed(kind: PeerKind) -> Result<(), Failed> {
+    complete(kind, MessageType::CompressedImage(200_000), 100, 30)
 }
 
-fn clouds(kind: Kind) -> Result<(), Failed> {
-    whole(kind, Type::PointCloud2(1 << 20), 50, 10)
+fn clouds(kind: PeerKind) -> Result<(), Failed> {
+    complete(kind, MessageType::PointCloud2(1 << 20), 50, 10)
 }
 
-fn whole(kind: Kind, ty: Type, count: u32, rate_hz: u32) -> Result<(), Failed> {
+fn complete(kind: PeerKind, ty: MessageType, count: u32, rate_hz: u32) -> Result<(), Failed> {
     let mut dds = join(None)?;
-    let heard = Heard::on(&mut dds, ty, "/sensor", Qos::Auto)?;
+    let receiver = TopicReceiver::new(&mut dds, ty, "/sensor", Qos::Auto)?;
     let _peer =
         Peer::start(kind.publisher(ty, "/sensor", &format!("--count {count} --rate {rate_hz}")));
-    heard.all(&dds, count)
+    receiver.all(&dds, count)
 }
 
 fn best_effort() -> Result<(), Failed> {
     let mut dds = join(None)?;
-    let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
+    let receiver = TopicReceiver::new(&mut dds, MessageType::Imu, "/sensor", Qos::Auto)?;
     let options = "--count 0 --rate 100 --reliability best_effort";
-    let _peer = Peer::start(Kind::Cyclone.publisher(Type::Imu, "/sensor", options));
-    // The first may be gone before we are connected: nothing is sent again.
-    let samples = heard.wait("messages of a best-effort writer", |samples| samples.len() >= 100)?;
-    heard.in_order(samples.iter().take(100), number(&samples[0]))
+    let _peer = Peer::start(PeerKind::Cyclone.publisher(MessageType::Imu, "/sensor", options));
+    // The first ones may be sent before the connection: they are not sent again.
+    let samples =
+        receiver.wait("messages of a best-effort writer", |samples| samples.len() >= 100)?;
+    receiver.in_order(samples.iter().take(100), number(&samples[0]))
 }
 
 fn transient_local() -> Result<(), Failed> {
     let options = "--count 7 --rate 100 --durability transient_local --readers 0";
-    let mut peer = Peer::start(Kind::Cyclone.publisher(Type::Imu, "/sensor", options));
+    let mut peer = Peer::start(PeerKind::Cyclone.publisher(MessageType::Imu, "/sensor", options));
     peer.written()?;
     let mut dds = join(None)?;
-    let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
-    heard.all(&dds, 7)
+    let receiver = TopicReceiver::new(&mut dds, MessageType::Imu, "/sensor", Qos::Auto)?;
+    receiver.all(&dds, 7)
 }
 
 fn mixed() -> Result<(), Failed> {
     let mut dds = join(None)?;
-    let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
+    let receiver = TopicReceiver::new(&mut dds, MessageType::Imu, "/sensor", Qos::Auto)?;
     let start = |offer: &str| {
-        Peer::start(Kind::Cyclone.publisher(
-            Type::Imu,
+        Peer::start(PeerKind::Cyclone.publisher(
+            MessageType::Imu,
             "/sensor",
             &format!("--count 0 --rate 50 {offer}"),
         ))
     };
     let _first = start("--reliability reliable --durability transient_local");
-    drop(heard.wait("the first writer", |samples| samples.len() >= 10)?);
+    drop(receiver.wait("the first writer", |samples| samples.len() >= 10)?);
     let _second = start("--reliability best_effort");
-    let writers_of = |samples: &[Sample]| {
+    let writers_of = |samples: &[ReceivedSample]| {
         samples
             .iter()
             .rev()
@@ -126,30 +143,34 @@ fn mixed() -> Result<(), Failed> {
             .collect::<BTreeSet<_>>()
             .len()
     };
-    heard.wait("both writers at once", |samples| writers_of(samples) == 2).map(drop)
+    receiver.wait("both writers at once", |samples| writers_of(samples) == 2).map(drop)
 }
 
 fn restarts() -> Result<(), Failed> {
     let times = gleaner_tests::times("GLEANER_RESTARTS", 5);
     let mut dds = join(None)?;
-    let heard = Heard::on(&mut dds, Type::Imu, "/sensor", Qos::Auto)?;
-    let mut known = BTreeSet::new();
+    let receiver = TopicReceiver::new(&mut dds, MessageType::Imu, "/sensor", Qos::Auto)?;
+    let mut earlier = BTreeSet::new();
     for time in 0..times {
-        let peer =
-            Peer::start(Kind::Cyclone.publisher(Type::Imu, "/sensor", "--count 0 --rate 200"));
-        let before = heard.count();
-        // Of a writer that is new, so that a late message of the last one does not count.
-        let fresh = |sample: &Sample, known: &BTreeSet<_>| !known.contains(&sample.meta.writer);
-        let samples = heard
-            .wait("a publisher that was started again", |samples| {
-                samples[before..].iter().filter(|sample| fresh(sample, &known)).count() >= 5
+        let peer = Peer::start(PeerKind::Cyclone.publisher(
+            MessageType::Imu,
+            "/sensor",
+            "--count 0 --rate 200",
+        ));
+        let before = receiver.count();
+        // Only a new writer counts, not a late message of the previous one.
+        let is_new =
+            |sample: &ReceivedSample, earlier: &BTreeSet<_>| !earlier.contains(&sample.meta.writer);
+        let samples = receiver
+            .wait("a restarted publisher", |samples| {
+                samples[before..].iter().filter(|sample| is_new(sample, &earlier)).count() >= 5
             })
             .map_err(|failed| format!("start {time}: {}", failed.message().unwrap_or_default()))?;
-        known.extend(samples.iter().map(|sample| sample.meta.writer));
+        earlier.extend(samples.iter().map(|sample| sample.meta.writer));
         drop(samples);
         peer.kill();
     }
-    let status = dds.status(heard.subscription);
-    println!("{times} restarts, {} messages, {status:?}", heard.count());
+    let status = dds.status(receiver.subscription);
+    println!("{times} restarts, {} messages, {status:?}", receiver.count());
     Ok(())
 }

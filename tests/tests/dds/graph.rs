@@ -1,51 +1,51 @@
-//! Nodes of others see us: `ros_discovery_info`, as a program reads it that knows one size of Gid.
-
+//! Nodes of ROS 2 see the nodes of Gleaner: `ros_discovery_info`, read by a program with one size
+//! of Gid.
 use gleaner_dds::Distro;
-use gleaner_tests::peers::message::Type;
-use gleaner_tests::peers::{Kind, Node, Peer, Said};
+use gleaner_tests::peers::message::MessageType;
+use gleaner_tests::peers::{Peer, PeerEvent, PeerKind, PeerNode};
 use gleaner_transport::Qos;
 use libtest_mimic::Failed;
 
-use crate::ours::{Heard, join};
-use crate::{Case, Need};
+use crate::receiver::{TopicReceiver, join};
+use crate::{DdsCase, Need};
 
-const NEED_24: &[Need] = &[Need::Peer(Kind::Graph(24))];
-const NEED_16: &[Need] = &[Need::Peer(Kind::Graph(16))];
+const NEED_24: &[Need] = &[Need::Peer(PeerKind::Graph(24))];
+const NEED_16: &[Need] = &[Need::Peer(PeerKind::Graph(16))];
 
-pub const CASES: &[Case] = &[
-    Case {
-        name: "a_node_of_humble_sees_ours",
+pub const CASES: &[DdsCase] = &[
+    DdsCase {
+        name: "a_node_of_humble_sees_the_nodes_of_gleaner",
         needs: NEED_24,
         run: || seen(24, Some(Distro::Humble)),
     },
-    Case {
-        name: "a_node_of_jazzy_sees_ours",
+    DdsCase {
+        name: "a_node_of_jazzy_sees_the_nodes_of_gleaner",
         needs: NEED_16,
         run: || seen(16, Some(Distro::Newer)),
     },
-    Case { name: "that_others_are_of_humble_is_found_out", needs: NEED_24, run: || seen(24, None) },
-    Case { name: "that_others_are_of_jazzy_is_found_out", needs: NEED_16, run: || seen(16, None) },
+    DdsCase { name: "the_distribution_humble_is_detected", needs: NEED_24, run: || seen(24, None) },
+    DdsCase { name: "the_distribution_jazzy_is_detected", needs: NEED_16, run: || seen(16, None) },
 ];
 
 fn seen(gid_bytes: usize, distro: Option<Distro>) -> Result<(), Failed> {
-    let mut peer = Peer::start(Kind::Graph(gid_bytes).command());
+    let mut peer = Peer::start(PeerKind::Graph(gid_bytes).command());
     let mut dds = join(distro)?;
-    let _writer = dds.writer("/ours", &Type::TimeReference.name(), 10)?;
+    let _writer = dds.writer("/output", &MessageType::TimeReference.name(), 10)?;
     let qos = Qos::Fixed { reliable: true, transient_local: false, depth: 10 };
-    let _heard = Heard::on(&mut dds, Type::Imu, "/sensor", qos)?;
-    // It may be told in steps, as readers and writers come to be; in the end all is there.
-    let (gid, node) = peer.wait("our node with a reader and a writer", |said| match said {
-        Said::Graph { gid, nodes } => {
-            let complete = |node: &Node| !node.readers.is_empty() && !node.writers.is_empty();
+    let _receiver = TopicReceiver::new(&mut dds, MessageType::Imu, "/sensor", qos)?;
+    // It may be announced in steps, as readers and writers are created; the last one is complete.
+    let (gid, node) = peer.wait("the node with a reader and a writer", |event| match event {
+        PeerEvent::Graph { gid, nodes } => {
+            let complete = |node: &PeerNode| !node.readers.is_empty() && !node.writers.is_empty();
             nodes.into_iter().find(complete).map(|node| (gid, node))
         }
         _ => None,
     })?;
     if (node.namespace.as_str(), node.name.as_str()) != ("/gleaner", "tests") {
-        return Err(format!("our node is called {node:?}").into());
+        return Err(format!("the node is {node:?}").into());
     }
-    // The first twelve bytes are the participant's, the same in all; what a Gid has more than
-    // sixteen is zeros.
+    // The first twelve bytes are the participant's, the same in all; bytes of a Gid beyond sixteen
+    // are zeros.
     for other in node.readers.iter().chain(&node.writers).chain([&gid]) {
         let zeros = other.get(32..).is_some_and(|rest| rest.bytes().all(|digit| digit == b'0'));
         if other.len() != 2 * gid_bytes || other[..24] != gid[..24] || !zeros {

@@ -1,14 +1,15 @@
-//! Live topics with programs on other people's DDS: what they write arrives whole, what we write
-//! arrives there, and neither restarts, losses nor hostile packets keep it from doing so.
+//! Live topics with peers on other DDS implementations: messages arrive complete in both
+//! directions, in spite of restarts, losses and hostile packets.
 //!
-//! Each case is this program once more, in a network of its own (`gleaner_tests::namespace`).
-//! `GLEANER_RESTARTS` says how often a publisher is killed; 5 times if it does not.
+//! Each case runs in another process of this program, in a private network
+//! (`gleaner_tests::namespace`). `GLEANER_RESTARTS` sets the number of restarts of a publisher; the
+//! default is 5.
 
 mod counted;
 mod faults;
 mod from_peers;
 mod graph;
-mod ours;
+mod receiver;
 mod rtps;
 mod to_peers;
 mod together;
@@ -17,26 +18,26 @@ use std::process::{ExitCode, Stdio};
 use std::sync::{PoisonError, RwLock};
 
 use gleaner_tests::namespace;
-use gleaner_tests::peers::Kind;
+use gleaner_tests::peers::PeerKind;
 use libtest_mimic::{Arguments, Failed, Trial};
 
-/// What a case needs besides a network of its own.
+/// Requirement of a case besides a private network.
 #[derive(Copy, Clone)]
 enum Need {
-    Peer(Kind),
+    Peer(PeerKind),
     /// Rules that drop packets.
     Nft,
 }
 
-type Run = fn() -> Result<(), Failed>;
+type CaseFn = fn() -> Result<(), Failed>;
 
-struct Case {
+struct DdsCase {
     name: &'static str,
     needs: &'static [Need],
-    run: Run,
+    run: CaseFn,
 }
 
-/// Tells this program which case it is.
+/// Environment variable with the case that this process runs.
 const CASE: &str = "GLEANER_DDS_CASE";
 
 fn main() -> ExitCode {
@@ -50,9 +51,7 @@ fn main() -> ExitCode {
     ];
     let cases = || suites.into_iter().flatten();
     if let Ok(name) = std::env::var(CASE) {
-        let case = cases()
-            .find(|case| case.name == name)
-            .expect("this program gives itself the names of its cases");
+        let case = cases().find(|case| case.name == name).expect("the name is that of a case");
         return match (case.run)() {
             Ok(()) => ExitCode::SUCCESS,
             Err(failed) => {
@@ -62,7 +61,7 @@ fn main() -> ExitCode {
         };
     }
     let mut arguments = Arguments::from_args();
-    // They wait for most of their time, and each is in a network of its own.
+    // They mostly wait, and each is in its own network.
     arguments.test_threads.get_or_insert(3);
     let trials = cases().map(|case| {
         let run = || run(case);
@@ -74,21 +73,20 @@ fn main() -> ExitCode {
     libtest_mimic::run(&arguments, trials.collect()).exit_code()
 }
 
-/// Runs a case in a process of its own; one that moves images or point clouds while no other runs:
-/// two of them at the same time would show how small this machine is.
-fn run(case: &Case) -> Result<(), Failed> {
+/// Runs a case in another process. Cases with images or point clouds run alone: two at the same
+/// time would overload the machine.
+fn run(case: &DdsCase) -> Result<(), Failed> {
     static RUNNING: RwLock<()> = RwLock::new(());
-    let is_large = ["images", "point_clouds"].iter().any(|large| case.name.contains(large));
-    let _alone = is_large.then(|| RUNNING.write().unwrap_or_else(PoisonError::into_inner));
-    let _beside_others =
-        (!is_large).then(|| RUNNING.read().unwrap_or_else(PoisonError::into_inner));
+    let is_large = ["images", "point_clouds"].iter().any(|word| case.name.contains(word));
+    let _exclusive = is_large.then(|| RUNNING.write().unwrap_or_else(PoisonError::into_inner));
+    let _shared = (!is_large).then(|| RUNNING.read().unwrap_or_else(PoisonError::into_inner));
     namespace::case(CASE, case.name)
 }
 
-fn unavailable(case: &Case) -> Option<&'static str> {
+fn unavailable(case: &DdsCase) -> Option<&'static str> {
     let missing = |need: &Need| match need {
         Need::Peer(kind) => kind.unavailable(),
-        Need::Nft => (!can_filter()).then_some("no packets can be dropped here: nft is needed"),
+        Need::Nft => (!can_filter()).then_some("cannot drop packets: nft is needed"),
     };
     namespace::unavailable().or_else(|| case.needs.iter().find_map(missing))
 }

@@ -1,7 +1,6 @@
-//! Packets of RTPS, sound and broken, made by hand. Source: OMG DDSI-RTPS 2.3, sections 8.3.7 and
-//! 9.4.5.
+//! Builds RTPS packets, valid and broken. Source: OMG DDSI-RTPS 2.3, sections 8.3.7 and 9.4.5.
 
-/// The four bytes that name an endpoint within a participant.
+/// Id of an endpoint within a participant.
 pub type Entity = [u8; 4];
 
 /// Any reader.
@@ -18,9 +17,9 @@ const DATA_FRAG: u8 = 0x16;
 const LITTLE: u8 = 1;
 const HAS_DATA: u8 = 4;
 
-/// A packet from the participant with that prefix.
+/// A packet from the participant with this prefix.
 pub fn packet(prefix: [u8; 12], submessages: &[Vec<u8>]) -> Vec<u8> {
-    // Version 2.3, a vendor that stands for Cyclone DDS.
+    // Version 2.3, and the vendor id of Cyclone DDS.
     [&b"RTPS\x02\x03\x01\x10"[..], &prefix, &submessages.concat()].concat()
 }
 
@@ -55,9 +54,8 @@ pub fn data_frag(reader: Entity, writer: Entity, seq: u64, size: u32, payload: &
     )
 }
 
-/// One packet of each kind that there is, as the writer `writer` of the participant `prefix` could
-/// send it.
-pub fn sound(prefix: [u8; 12], writer: Entity, cdr: &[u8]) -> Vec<Vec<u8>> {
+/// A valid packet of each kind, from the writer `writer` of the participant `prefix`.
+pub fn valid_packets(prefix: [u8; 12], writer: Entity, cdr: &[u8]) -> Vec<Vec<u8>> {
     let sample = [&[0, 1, 0, 0][..], cdr].concat();
     // A list of parameters: PID_TOPIC_NAME with four characters, then the end.
     let parameters = b"\0\x03\0\0\x05\0\x08\0\x04\0\0\0abc\0\x01\0\0\0";
@@ -66,7 +64,7 @@ pub fn sound(prefix: [u8; 12], writer: Entity, cdr: &[u8]) -> Vec<Vec<u8>> {
     vec![
         one(data(ANY, writer, 1_000, &sample)),
         one(data(ANY, writer, u64::MAX >> 1, &sample)),
-        // An encapsulation that nobody knows, and none at all.
+        // An unknown encapsulation, and none at all.
         one(data(ANY, writer, 1_001, &[0xff, 0xee, 0, 0, 1, 2, 3, 4])),
         one(data(ANY, writer, 1_002, &[])),
         one(data_frag(ANY, writer, 2_000, 4_096, &sample)),
@@ -85,14 +83,14 @@ pub fn sound(prefix: [u8; 12], writer: Entity, cdr: &[u8]) -> Vec<Vec<u8>> {
             &[&writer, &ANY, &number(1), &word(1), &word(256), &[0xff; 32], &word(7)],
         )),
         one(submessage(0x13, 0, &[&ANY, &writer, &number(1), &word(900), &word(7)])),
-        // INFO_SRC, INFO_DST, INFO_REPLY with more locators than the packet has, PAD, one that
-        // nobody knows.
+        // INFO_SRC, INFO_DST, INFO_REPLY with more locators than the packet has, PAD, an unknown
+        // kind.
         one(submessage(0x0c, 0, &[&word(0), &[2, 3, 1, 16], &[0xaa; 12]])),
         one(submessage(0x0e, 0, &[&[0xaa; 12]])),
         one(submessage(0x0f, 0, &[&word(0x0fff_ffff), &[0; 24]])),
         one(submessage(0x01, 0, &[&[0; 8]])),
         one(submessage(0x7f, 0, &[&[0; 8]])),
-        // What discovery is made of.
+        // Discovery.
         one(data(ANY, SPDP_WRITER, 1, parameters)),
         one(data(SPDP_READER, SPDP_WRITER, 2, &parameters[..12])),
         one(data(ANY, SEDP_WRITERS, 1, parameters)),
@@ -100,11 +98,11 @@ pub fn sound(prefix: [u8; 12], writer: Entity, cdr: &[u8]) -> Vec<Vec<u8>> {
     ]
 }
 
-/// xorshift64: what is made with it can be made again.
-pub struct Random(pub u64);
+/// The generator xorshift64: the same numbers in every run.
+pub struct XorShift64(pub u64);
 
-impl Random {
-    /// Below `n`, which is not 0.
+impl XorShift64 {
+    /// A number below `n`, which is not 0.
     pub fn below(&mut self, n: usize) -> usize {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;
@@ -113,9 +111,9 @@ impl Random {
     }
 }
 
-/// Breaks a packet in one of several ways, behind the first four bytes: without those nobody reads
-/// further.
-pub fn broken(packet: &[u8], random: &mut Random) -> Vec<u8> {
+/// Breaks a packet in one of several ways, after the first four bytes: without those it would be
+/// ignored.
+pub fn broken(packet: &[u8], random: &mut XorShift64) -> Vec<u8> {
     const EXTREMES: [u32; 5] = [0, 1, 0x7fff_ffff, 0x8000_0000, u32::MAX];
     let mut packet = packet.to_vec();
     match random.below(5) {
@@ -144,7 +142,7 @@ pub fn broken(packet: &[u8], random: &mut Random) -> Vec<u8> {
     packet
 }
 
-/// Where the submessages of a packet start, as far as their lengths tell.
+/// Offsets of the submessages of a packet, by their lengths.
 fn starts(packet: &[u8]) -> Vec<usize> {
     let (mut starts, mut at) = (Vec::new(), HEADER);
     while let Some([_, flags, length @ ..]) = packet.get(at..at + 4) {

@@ -1,97 +1,105 @@
-//! What we write, peers hear.
+//! Peers receive the messages that Gleaner writes.
 
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_tests::peers::message::Type;
-use gleaner_tests::peers::{Kind, PATIENCE, Peer, Said};
+use gleaner_tests::peers::message::MessageType;
+use gleaner_tests::peers::{PATIENCE, Peer, PeerEvent, PeerKind};
 use libtest_mimic::Failed;
 
-use crate::ours::join;
-use crate::{Case, Need};
+use crate::receiver::join;
+use crate::{DdsCase, Need};
 
-const CYCLONE: &[Need] = &[Need::Peer(Kind::Cyclone)];
-const FAST: &[Need] = &[Need::Peer(Kind::Fast)];
+const CYCLONE: &[Need] = &[Need::Peer(PeerKind::Cyclone)];
+const FAST: &[Need] = &[Need::Peer(PeerKind::Fast)];
 
-/// What goes out in fragments: RustDDS writes 256 bytes in each.
-const IMAGE: Type = Type::Image { width: 64, height: 48 };
-const COMPRESSED: Type = Type::CompressedImage(5_000);
-const CLOUD: Type = Type::PointCloud2(4_096);
+/// Messages that are sent in fragments: RustDDS writes 256 bytes in each.
+const IMAGE: MessageType = MessageType::Image { width: 64, height: 48 };
+const COMPRESSED: MessageType = MessageType::CompressedImage(5_000);
+const CLOUD: MessageType = MessageType::PointCloud2(4_096);
 
-pub const CASES: &[Case] = &[
-    Case {
-        name: "cyclone_hears_our_imu",
+pub const CASES: &[DdsCase] = &[
+    DdsCase {
+        name: "cyclone_receives_the_imu",
         needs: CYCLONE,
-        run: || heard_by(Kind::Cyclone, Type::Imu),
+        run: || received_by(PeerKind::Cyclone, MessageType::Imu),
     },
-    Case {
-        name: "cyclone_hears_our_time_reference",
+    DdsCase {
+        name: "cyclone_receives_the_time_reference",
         needs: CYCLONE,
-        run: || heard_by(Kind::Cyclone, Type::TimeReference),
+        run: || received_by(PeerKind::Cyclone, MessageType::TimeReference),
     },
-    Case {
-        name: "cyclone_hears_our_images",
+    DdsCase {
+        name: "cyclone_receives_the_images",
         needs: CYCLONE,
-        run: || heard_by(Kind::Cyclone, IMAGE),
+        run: || received_by(PeerKind::Cyclone, IMAGE),
     },
-    Case {
-        name: "cyclone_hears_our_compressed_images",
+    DdsCase {
+        name: "cyclone_receives_the_compressed_images",
         needs: CYCLONE,
-        run: || heard_by(Kind::Cyclone, COMPRESSED),
+        run: || received_by(PeerKind::Cyclone, COMPRESSED),
     },
-    Case {
-        name: "cyclone_hears_our_point_clouds",
+    DdsCase {
+        name: "cyclone_receives_the_point_clouds",
         needs: CYCLONE,
-        run: || heard_by(Kind::Cyclone, CLOUD),
+        run: || received_by(PeerKind::Cyclone, CLOUD),
     },
-    Case { name: "fast_dds_hears_our_imu", needs: FAST, run: || heard_by(Kind::Fast, Type::Imu) },
-    Case { name: "fast_dds_hears_our_images", needs: FAST, run: || heard_by(Kind::Fast, IMAGE) },
-    Case {
-        name: "fast_dds_hears_our_compressed_images",
+    DdsCase {
+        name: "fast_dds_receives_the_imu",
         needs: FAST,
-        run: || heard_by(Kind::Fast, COMPRESSED),
+        run: || received_by(PeerKind::Fast, MessageType::Imu),
     },
-    Case {
-        name: "fast_dds_hears_our_point_clouds",
+    DdsCase {
+        name: "fast_dds_receives_the_images",
         needs: FAST,
-        run: || heard_by(Kind::Fast, CLOUD),
+        run: || received_by(PeerKind::Fast, IMAGE),
     },
-    Case {
-        name: "python_hears_our_imu",
-        needs: &[Need::Peer(Kind::Python)],
-        run: || heard_by(Kind::Python, Type::Imu),
+    DdsCase {
+        name: "fast_dds_receives_the_compressed_images",
+        needs: FAST,
+        run: || received_by(PeerKind::Fast, COMPRESSED),
+    },
+    DdsCase {
+        name: "fast_dds_receives_the_point_clouds",
+        needs: FAST,
+        run: || received_by(PeerKind::Fast, CLOUD),
+    },
+    DdsCase {
+        name: "python_receives_the_imu",
+        needs: &[Need::Peer(PeerKind::Python)],
+        run: || received_by(PeerKind::Python, MessageType::Imu),
     },
 ];
 
 const COUNT: u32 = 200;
-/// Number of the first message before those that count.
+/// Number of the first message before the counted ones.
 const FIRST_BEFORE: u32 = 10_000;
 
-fn heard_by(kind: Kind, ty: Type) -> Result<(), Failed> {
-    let mut peer = Peer::start(kind.subscriber(ty, "/ours", ""));
+fn received_by(kind: PeerKind, ty: MessageType) -> Result<(), Failed> {
+    let mut peer = Peer::start(kind.subscriber(ty, "/output", ""));
     let dds = join(None)?;
-    let writer = dds.writer("/ours", &ty.name(), 10)?;
+    let writer = dds.writer("/output", &ty.name(), 10)?;
     peer.matched()?;
     let deadline = Instant::now() + PATIENCE;
     while writer.readers() == 0 {
         if Instant::now() > deadline {
-            return Err("the peer is connected, and we know of no reader".into());
+            return Err("the peer is connected, but the writer has no reader".into());
         }
         thread::sleep(Duration::from_millis(5));
     }
-    // Both sides know of each other, but a reader of Cyclone takes nothing of a writer before its
-    // first heartbeat, and what is volatile does not come again. So there are some before those
-    // that count.
+    // Both sides are matched, but a reader of Cyclone accepts nothing from a writer before its
+    // first heartbeat, and volatile messages are not sent again. So some messages precede the
+    // counted ones.
     let mut before = FIRST_BEFORE;
-    let heard = |said| matches!(said, Said::Sample { .. }).then_some(());
+    let is_sample = |event| matches!(event, PeerEvent::Sample { .. }).then_some(());
     loop {
         writer.write(&ty.message(before).cdr())?;
-        if peer.wait_for(Duration::from_millis(50), heard).is_some() {
+        if peer.wait_for(Duration::from_millis(50), is_sample).is_some() {
             break;
         }
         before += 1;
         if Instant::now() > deadline {
-            return Err(format!("{} messages, and none was heard", before - FIRST_BEFORE).into());
+            return Err(format!("{} messages, and none was received", before - FIRST_BEFORE).into());
         }
     }
     let started = Instant::now();
@@ -100,12 +108,12 @@ fn heard_by(kind: Kind, ty: Type) -> Result<(), Failed> {
         writer.write(&ty.message(n).cdr())?;
     }
     for n in 1..=COUNT {
-        let (seq, sum) = peer.wait(&format!("message {n}"), |said| match said {
-            Said::Sample { seq, sum, .. } if seq < FIRST_BEFORE => Some((seq, sum)),
+        let (seq, sum) = peer.wait(&format!("message {n}"), |event| match event {
+            PeerEvent::Sample { seq, sum, .. } if seq < FIRST_BEFORE => Some((seq, sum)),
             _ => None,
         })?;
         if (seq, sum) != (n, ty.message(n).sum()) {
-            return Err(format!("message {n} came as number {seq} with sum {sum}").into());
+            return Err(format!("message {n} arrived as number {seq} with sum {sum}").into());
         }
     }
     Ok(())

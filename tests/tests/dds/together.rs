@@ -1,40 +1,40 @@
-//! Several of our participants read one topic: its writer keeps running, and each of them receives
-//! samples.
+//! Several participants of Gleaner read one topic: its writer keeps running, and each of them
+//! receives samples.
 
 use gleaner_dds::Dds;
 use gleaner_tests::live::run;
-use gleaner_tests::peers::message::Type;
-use gleaner_tests::peers::{Kind, Peer};
-use gleaner_tests::{Folder, root};
+use gleaner_tests::peers::message::MessageType;
+use gleaner_tests::peers::{Peer, PeerKind};
+use gleaner_tests::{TempFolder, root};
 use gleaner_transport::Qos;
 use libtest_mimic::Failed;
 
 use crate::faults::{announcement, udp_ports};
-use crate::ours::{Heard, join};
-use crate::{Case, Need};
+use crate::receiver::{TopicReceiver, join};
+use crate::{DdsCase, Need};
 
-pub const CASES: &[Case] = &[
-    Case {
-        name: "fast_dds_outlives_several_readers_of_its_topic",
-        needs: &[Need::Peer(Kind::Fast)],
-        run: || outlived(Kind::Fast),
+pub const CASES: &[DdsCase] = &[
+    DdsCase {
+        name: "fast_dds_survives_several_readers_of_its_topic",
+        needs: &[Need::Peer(PeerKind::Fast)],
+        run: || survives(PeerKind::Fast),
     },
-    Case {
-        name: "cyclone_outlives_several_readers_of_its_topic",
-        needs: &[Need::Peer(Kind::Cyclone)],
-        run: || outlived(Kind::Cyclone),
+    DdsCase {
+        name: "cyclone_survives_several_readers_of_its_topic",
+        needs: &[Need::Peer(PeerKind::Cyclone)],
+        run: || survives(PeerKind::Cyclone),
     },
-    Case {
+    DdsCase {
         name: "no_multicast_address_is_announced_for_samples",
         needs: &[],
-        run: || announced(|| join(None)),
+        run: || announces_no_multicast(|| join(None)),
     },
-    Case {
+    DdsCase {
         name: "no_multicast_address_is_announced_by_a_python_lambda",
         needs: &[],
         run: || {
-            let out = Folder::new();
-            announced(|| {
+            let out = TempFolder::new();
+            announces_no_multicast(|| {
                 let lambda =
                     run(&root().join("tests/lambdas/ticker/python"), out.path(), &["--no-record"]);
                 lambda.until_ready();
@@ -52,34 +52,39 @@ const SAMPLES: usize = 10;
 const METATRAFFIC_MULTICAST_LOCATOR: u16 = 0x0033;
 const DEFAULT_MULTICAST_LOCATOR: u16 = 0x0048;
 
-fn outlived(kind: Kind) -> Result<(), Failed> {
-    let publisher = || Peer::start(kind.publisher(Type::Imu, TOPIC, "--count 0 --rate 100"));
+fn survives(kind: PeerKind) -> Result<(), Failed> {
+    let publisher = || Peer::start(kind.publisher(MessageType::Imu, TOPIC, "--count 0 --rate 100"));
     let mut early = publisher();
     for readers in READERS {
-        let mut ours = (0..readers).map(|_| join(None)).collect::<Result<Vec<Dds>, Failed>>()?;
+        let mut participants =
+            (0..readers).map(|_| join(None)).collect::<Result<Vec<Dds>, Failed>>()?;
         let qos = Qos::Fixed { reliable: true, transient_local: false, depth: 10 };
-        let subscribe = |dds: &mut Dds| Heard::on(dds, Type::Imu, TOPIC, qos);
-        let mut heard = ours.iter_mut().map(subscribe).collect::<Result<Vec<Heard>, Failed>>()?;
-        receives(&mut early, &heard)?;
-        // A writer may send to one reader in another way than to several.
-        ours.truncate(1);
-        heard.truncate(1);
-        receives(&mut early, &heard)?;
+        let subscribe = |dds: &mut Dds| TopicReceiver::new(dds, MessageType::Imu, TOPIC, qos);
+        let mut receivers = participants
+            .iter_mut()
+            .map(subscribe)
+            .collect::<Result<Vec<TopicReceiver>, Failed>>()?;
+        receives(&mut early, &receivers)?;
+        // A writer may send to a single reader differently than to several.
+        participants.truncate(1);
+        receivers.truncate(1);
+        receives(&mut early, &receivers)?;
     }
-    let mut ours = [join(None)?, join(None)?];
-    let subscribe = |dds: &mut Dds| Heard::on(dds, Type::Imu, TOPIC, Qos::Auto);
-    let heard = ours.iter_mut().map(subscribe).collect::<Result<Vec<Heard>, Failed>>()?;
-    receives(&mut early, &heard)?;
+    let mut participants = [join(None)?, join(None)?];
+    let subscribe = |dds: &mut Dds| TopicReceiver::new(dds, MessageType::Imu, TOPIC, Qos::Auto);
+    let receivers =
+        participants.iter_mut().map(subscribe).collect::<Result<Vec<TopicReceiver>, Failed>>()?;
+    receives(&mut early, &receivers)?;
     drop(early);
-    receives(&mut publisher(), &heard)
+    receives(&mut publisher(), &receivers)
 }
 
-/// Waits until each has received more, or the writer has ended.
-fn receives(writer: &mut Peer, heard: &[Heard]) -> Result<(), Failed> {
-    for heard in heard {
-        let enough = heard.count() + SAMPLES;
+/// Waits until each receiver has received more, or the writer has ended.
+fn receives(writer: &mut Peer, receivers: &[TopicReceiver]) -> Result<(), Failed> {
+    for receiver in receivers {
+        let enough = receiver.count() + SAMPLES;
         let mut ended = None;
-        drop(heard.wait("samples", |samples| {
+        drop(receiver.wait("samples", |samples| {
             ended = writer.ended();
             ended.is_some() || samples.len() >= enough
         })?);
@@ -90,9 +95,9 @@ fn receives(writer: &mut Peer, heard: &[Heard]) -> Result<(), Failed> {
     Ok(())
 }
 
-/// Looks at what the one participant in this network announces, which lives as long as the result
-/// of `start`.
-fn announced<T>(start: impl FnOnce() -> Result<T, Failed>) -> Result<(), Failed> {
+/// Checks the announcement of the only participant in this network, which lives as long as the
+/// result of `start`.
+fn announces_no_multicast<T>(start: impl FnOnce() -> Result<T, Failed>) -> Result<(), Failed> {
     let _participant = start()?;
     let packet = announcement(&udp_ports()?)?;
     let announces = |parameter: u16| {

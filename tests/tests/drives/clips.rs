@@ -1,4 +1,4 @@
-//! Clips hold exactly the messages of their windows, and the readers of others can read them.
+//! Clips hold exactly the messages of their windows, and third-party readers can read them.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -7,7 +7,9 @@ use std::process::Command;
 
 use gleaner_lambda::Clip;
 use gleaner_tests::drive::corrupted;
-use gleaner_tests::{Copy, Folder, Run, replay_to, root, sample_drive, shared_drive};
+use gleaner_tests::{
+    LambdaCopy, ReplayRun, TempFolder, replay_to, root, sample_drive, shared_drive,
+};
 use libtest_mimic::{Failed, Trial};
 
 const TOPICS: [&str; 3] = ["/camera/front/compressed", "/imu/data", "/vehicle/speed"];
@@ -20,26 +22,26 @@ pub fn trials() -> Vec<Trial> {
             windows("10,21", &[(5.0, 15.0, 1), (16.0, 26.0, 1)])
         }),
         Trial::test("a_start_lasts_until_its_stop", starts_and_stops),
-        Trial::test("a_window_that_outlasts_the_drive_is_short_and_says_so", at_the_end),
-        Trial::test("a_preroll_from_before_the_drive_is_short_and_says_so", at_the_begin),
-        Trial::test("a_long_recording_goes_on_in_a_next_clip_without_a_gap", rolls_over),
-        Trial::test("what_the_preroll_has_no_room_for_is_counted_and_said", evicted_early),
+        Trial::test("a_window_beyond_the_end_of_the_drive_is_marked_incomplete", at_the_end),
+        Trial::test("a_preroll_from_before_the_drive_is_marked_incomplete", at_the_begin),
+        Trial::test("a_long_recording_continues_in_another_clip_without_a_gap", rolls_over),
+        Trial::test(
+            "messages_that_do_not_fit_into_the_preroll_are_counted_and_reported",
+            evicted_early,
+        ),
         Trial::test("a_preroll_on_disk_gives_the_same_clips", on_disk),
         Trial::test(
-            "a_topic_that_the_drive_does_not_have_is_listed_with_no_message",
+            "a_topic_that_the_drive_does_not_have_is_listed_without_messages",
             missing_topic,
         ),
         Trial::test("a_second_replay_replaces_the_clips_of_the_first", replaced),
-        Trial::test("a_clip_that_somebody_copied_there_is_left_alone", copied),
+        Trial::test("a_clip_that_the_user_copied_there_is_kept", copied),
         Trial::test("without_record_there_are_no_clips", no_record),
-        Trial::test("two_topics_that_are_one_of_the_drive_are_recorded_once", one_of_two),
-        Trial::test("where_a_drive_is_damaged_its_clip_ends_short", damaged),
-        Trial::test(
-            "a_lambda_that_does_not_start_leaves_every_earlier_result_as_it_was",
-            not_started,
-        ),
-        Trial::test("a_second_replay_at_once_is_refused_without_clips_too", busy_without_clips),
-        Trial::test("a_second_replay_at_once_does_not_touch_the_results_of_the_first", busy),
+        Trial::test("two_topics_remapped_to_one_are_recorded_once", one_of_two),
+        Trial::test("a_clip_ends_where_its_drive_is_damaged", damaged),
+        Trial::test("a_lambda_that_does_not_start_keeps_all_earlier_results", not_started),
+        Trial::test("a_concurrent_replay_is_refused_also_without_clips", busy_without_clips),
+        Trial::test("a_concurrent_replay_does_not_change_the_results_of_the_first", busy),
     ];
     let mut read = |name: &'static str,
                     drive: Result<PathBuf, String>,
@@ -62,7 +64,7 @@ pub fn trials() -> Vec<Trial> {
     trials
 }
 
-/// The Python that `cargo xtask test` sets up, if it has the readers.
+/// The Python of `cargo xtask test`, if it has the readers.
 fn python() -> Result<PathBuf, String> {
     let python = root().join(".venv/bin/python3");
     let has = Command::new(&python).args(["-I", "-c", "import mcap, mcap_ros2, rosbags"]).output();
@@ -77,8 +79,8 @@ fn alarm() -> PathBuf {
     root().join("tests/lambdas/alarm/rust")
 }
 
-fn record(lambda: &Path, drive: &Path, args: &[&str]) -> Result<(Folder, Run), Failed> {
-    let out = Folder::new();
+fn record(lambda: &Path, drive: &Path, args: &[&str]) -> Result<(TempFolder, ReplayRun), Failed> {
+    let out = TempFolder::new();
     let run = replay_to(out.path(), lambda, &[drive.to_owned()], args);
     if run.exit == 0 {
         Ok((out, run))
@@ -87,7 +89,7 @@ fn record(lambda: &Path, drive: &Path, args: &[&str]) -> Result<(Folder, Run), F
     }
 }
 
-fn seconds(run: &Run, at_ns: i64) -> f64 {
+fn seconds(run: &ReplayRun, at_ns: i64) -> f64 {
     let start_ns = run.summary.as_ref().map_or(0, |summary| summary.start_ns);
     (at_ns - start_ns) as f64 / 1e9
 }
@@ -100,7 +102,7 @@ fn same<T: PartialEq + std::fmt::Debug>(found: &T, expected: &T) -> Result<(), F
     }
 }
 
-/// Events at `event_s` give clips from, to and of so many triggers.
+/// Events at `event_s` give clips with these begins, ends and numbers of triggers.
 fn windows(event_s: &str, expected: &[(f64, f64, u64)]) -> Result<(), Failed> {
     let (out, run) = record(&alarm(), &sample_drive(), &["--set", &format!("event_s={event_s}")])?;
     let tenths = |clip: &Clip| {
@@ -109,12 +111,12 @@ fn windows(event_s: &str, expected: &[(f64, f64, u64)]) -> Result<(), Failed> {
         (from, to, clip.triggers)
     };
     same(&run.clips.iter().map(tenths).collect(), &expected.to_vec())?;
-    run.clips.iter().try_for_each(|clip| whole(out.path(), clip, clip.from_ns, clip.to_ns))
+    run.clips.iter().try_for_each(|clip| is_complete(out.path(), clip, clip.from_ns, clip.to_ns))
 }
 
-/// The clip is there with its thumbnail, and holds as many messages of each topic as the drive has
-/// in its window.
-fn whole(out: &Path, clip: &Clip, from_ns: i64, to_ns: i64) -> Result<(), Failed> {
+/// Checks that the clip and its thumbnail exist, and that it holds exactly the messages of the
+/// drive in its window.
+fn is_complete(out: &Path, clip: &Clip, from_ns: i64, to_ns: i64) -> Result<(), Failed> {
     let thumbnail = clip.thumbnail.as_ref().ok_or("no thumbnail")?;
     same(&std::fs::read(out.join(thumbnail))?.starts_with(&[0xff, 0xd8]), &true)?;
     same(&std::fs::metadata(out.join(&clip.file))?.len(), &clip.bytes)?;
@@ -138,11 +140,11 @@ fn whole(out: &Path, clip: &Clip, from_ns: i64, to_ns: i64) -> Result<(), Failed
     Ok(())
 }
 
-/// Topic, log time, publish time and bytes.
-type Message = (String, i64, u64, Vec<u8>);
+/// Topic, log time, publish time and bytes of a message.
+type ClipContent = (String, i64, u64, Vec<u8>);
 
-/// Every message, sorted.
-fn messages(path: &Path) -> Result<Vec<Message>, Failed> {
+/// All messages, sorted.
+fn messages(path: &Path) -> Result<Vec<ClipContent>, Failed> {
     let bytes = std::fs::read(path)?;
     let mut all = Vec::new();
     for message in mcap::MessageStream::new(&bytes)? {
@@ -164,8 +166,8 @@ fn starts_and_stops() -> Result<(), Failed> {
     same(&run.clips.len(), &1)?;
     let clip = &run.clips[0];
     same(&[clip.from_ns, clip.to_ns].map(|at_ns| seconds(&run, at_ns).round()), &[7.0, 25.0])?;
-    same(&clip.short, &Vec::new())?;
-    whole(out.path(), clip, clip.from_ns, clip.to_ns)
+    same(&clip.incomplete, &Vec::new())?;
+    is_complete(out.path(), clip, clip.from_ns, clip.to_ns)
 }
 
 fn at_the_end() -> Result<(), Failed> {
@@ -173,20 +175,20 @@ fn at_the_end() -> Result<(), Failed> {
         record(&alarm(), &sample_drive(), &["--set", "event_s=38", "--set", "start_s=20"])?;
     same(&run.clips.len(), &1)?;
     let clip = &run.clips[0];
-    same(&clip.short.iter().any(|why| why.contains("the drive ended")), &true)?;
-    whole(out.path(), clip, clip.from_ns, i64::MAX)
+    same(&clip.incomplete.iter().any(|why| why.contains("the drive ended")), &true)?;
+    is_complete(out.path(), clip, clip.from_ns, i64::MAX)
 }
 
 fn at_the_begin() -> Result<(), Failed> {
     let (out, run) = record(&alarm(), &sample_drive(), &["--set", "event_s=2"])?;
     same(&run.clips.len(), &1)?;
     let clip = &run.clips[0];
-    same(&clip.short.iter().any(|why| why.contains("preroll")), &true)?;
-    whole(out.path(), clip, i64::MIN, clip.to_ns)
+    same(&clip.incomplete.iter().any(|why| why.contains("preroll")), &true)?;
+    is_complete(out.path(), clip, i64::MIN, clip.to_ns)
 }
 
 fn rolls_over() -> Result<(), Failed> {
-    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+    let lambda = LambdaCopy::of("tests/lambdas/alarm/rust", |manifest| {
         manifest.replace("[record]", "[record]\nmax_length = \"7s\"")
     });
     let (out, run) =
@@ -204,11 +206,11 @@ fn rolls_over() -> Result<(), Failed> {
         .filter(|message| (first.from_ns..=last.to_ns).contains(&message.1))
         .collect::<Vec<_>>();
     same(&(found == wanted, found.len()), &(true, wanted.len()))?;
-    same(&first.short.iter().any(|why| why.contains("next clip")), &true)
+    same(&first.incomplete.iter().any(|why| why.contains("next clip")), &true)
 }
 
 fn evicted_early() -> Result<(), Failed> {
-    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+    let lambda = LambdaCopy::of("tests/lambdas/alarm/rust", |manifest| {
         manifest
             .replace("[record]", "[record]\npreroll_size = \"1 MiB\"")
             .replace("preroll = \"5s\"", "preroll = \"20s\"")
@@ -229,11 +231,11 @@ fn evicted_early() -> Result<(), Failed> {
         &messages(&out.path().join(&clip.file))?.len(),
         &(clip.topics.iter().map(|topic| topic.messages).sum::<u64>() as usize),
     )?;
-    same(&clip.short.iter().any(|why| why.contains("preroll_size")), &true)
+    same(&clip.incomplete.iter().any(|why| why.contains("preroll_size")), &true)
 }
 
 fn on_disk() -> Result<(), Failed> {
-    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+    let lambda = LambdaCopy::of("tests/lambdas/alarm/rust", |manifest| {
         manifest.replace("[record]", "[record]\nstore = \"disk\"")
     });
     let args = ["--set", "event_s=10,14,30"];
@@ -249,7 +251,7 @@ fn on_disk() -> Result<(), Failed> {
 }
 
 fn missing_topic() -> Result<(), Failed> {
-    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+    let lambda = LambdaCopy::of("tests/lambdas/alarm/rust", |manifest| {
         manifest.replace("/vehicle/speed", "/lidar/points")
     });
     let (_out, run) = record(lambda.path(), &sample_drive(), &["--set", "event_s=10"])?;
@@ -257,7 +259,7 @@ fn missing_topic() -> Result<(), Failed> {
         .topics
         .iter()
         .find(|topic| topic.topic == "/lidar/points")
-        .ok_or("it is not listed")?;
+        .ok_or("the topic is not listed")?;
     same(&(lidar.messages, lidar.received, &lidar.type_name), &(0, Some(0), &None))?;
     same(&run.stderr.contains("/lidar/points"), &true)
 }
@@ -285,23 +287,23 @@ fn copied() -> Result<(), Failed> {
 fn no_record() -> Result<(), Failed> {
     let (out, run) = record(&alarm(), &sample_drive(), &["--set", "event_s=10", "--no-record"])?;
     same(&(run.clips.len(), out.path().join("clips").exists()), &(0, false))?;
-    // Clips of an earlier replay do not stay beside results that made none.
+    // Clips of an earlier replay do not remain beside results without clips.
     let (out, _run) = record(&alarm(), &sample_drive(), &["--set", "event_s=10"])?;
     let again = replay_to(out.path(), &alarm(), &[sample_drive()], &["--no-record"]);
     same(&(again.clips.len(), again.summary.map(|summary| summary.clips_replaced)), &(0, Some(1)))
 }
 
 fn one_of_two() -> Result<(), Failed> {
-    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+    let lambda = LambdaCopy::of("tests/lambdas/alarm/rust", |manifest| {
         manifest.replace("topics = [", "topics = [\"/imu/other\", ")
     });
     let args = ["--set", "event_s=10", "--remap", "/imu/other:=/imu/data"];
     let (out, run) = record(lambda.path(), &sample_drive(), &args)?;
-    whole(out.path(), &run.clips[0], run.clips[0].from_ns, run.clips[0].to_ns)
+    is_complete(out.path(), &run.clips[0], run.clips[0].from_ns, run.clips[0].to_ns)
 }
 
 fn damaged() -> Result<(), Failed> {
-    let (out, folder) = (Folder::new(), Folder::new());
+    let (out, folder) = (TempFolder::new(), TempFolder::new());
     let run = replay_to(
         out.path(),
         &alarm(),
@@ -310,7 +312,7 @@ fn damaged() -> Result<(), Failed> {
     );
     same(&(run.exit, run.clips.len()), &(7, 1))?;
     let clip = &run.clips[0];
-    same(&clip.short.iter().any(|why| why.contains("the drive ended")), &true)?;
+    same(&clip.incomplete.iter().any(|why| why.contains("the drive ended")), &true)?;
     same(
         &(Some(clip.to_ns) >= clip.last_ns, messages(&out.path().join(&clip.file))?.len() > 1000),
         &(true, true),
@@ -319,7 +321,7 @@ fn damaged() -> Result<(), Failed> {
 
 fn busy() -> Result<(), Failed> {
     let (out, _run) = record(&alarm(), &sample_drive(), &["--set", "event_s=10"])?;
-    let (first, recovered) = gleaner_recorder::Folder::open(out.path())?;
+    let (first, recovered) = gleaner_recorder::RecordingFolder::open(out.path())?;
     same(&recovered.len(), &0)?;
     let before = std::fs::read_to_string(out.path().join("decisions.jsonl"))?;
     let second = replay_to(out.path(), &alarm(), &[sample_drive()], &["--set", "event_s=20"]);
@@ -336,9 +338,9 @@ fn busy_without_clips() -> Result<(), Failed> {
     lock.try_lock()?;
     let before = files(out.path())?;
     let second = replay_to(out.path(), &alarm(), &[sample_drive()], &args);
-    let said = format!("another replay writes into `{}`", out.path().display());
+    let expected = format!("another replay writes into `{}`", out.path().display());
     same(
-        &(second.exit, second.stderr.contains(&said), second.stderr.contains("--out DIR")),
+        &(second.exit, second.stderr.contains(&expected), second.stderr.contains("--out DIR")),
         &(1, true, true),
     )?;
     same(&(files(out.path())? == before), &true)?;
@@ -348,9 +350,9 @@ fn busy_without_clips() -> Result<(), Failed> {
 
 fn not_started() -> Result<(), Failed> {
     for with in [&[][..], &["--no-record"]] {
-        let out = Folder::new();
+        let out = TempFolder::new();
         let journal = out.path().join("wakes.journal");
-        let args = [&["--journal", journal.to_str().ok_or("no text")?], with].concat();
+        let args = [&["--journal", journal.to_str().ok_or("not UTF-8")?], with].concat();
         let replay = |event: &str| {
             replay_to(
                 out.path(),
@@ -369,7 +371,7 @@ fn not_started() -> Result<(), Failed> {
     Ok(())
 }
 
-/// Every file in `folder` and below it, with its content.
+/// Every file in and below `folder`, with its content.
 fn files(folder: &Path) -> Result<BTreeMap<PathBuf, Vec<u8>>, Failed> {
     let mut found = BTreeMap::new();
     for entry in std::fs::read_dir(folder)? {
@@ -384,8 +386,8 @@ fn files(folder: &Path) -> Result<BTreeMap<PathBuf, Vec<u8>>, Failed> {
     Ok(found)
 }
 
-/// Three readers of others find exactly the messages of each clip's window, byte for byte as in the
-/// drive.
+/// Three third-party readers find exactly the messages of each clip's window, byte for byte as in
+/// the drive.
 fn reads(python: &Path, drive: &Path, args: &[&str]) -> Result<(), Failed> {
     let (out, run) = record(&alarm(), drive, args)?;
     same(&(run.clips.len() >= 2), &true)?;

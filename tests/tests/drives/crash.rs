@@ -1,7 +1,7 @@
-//! Whatever ends the recorder, a clip that is listed is whole, and nothing under a final name is
+//! Kills the recorder at any moment: listed clips are complete, and no file with a final name is
 //! broken.
 //!
-//! `GLEANER_KILLS` says how often the process is killed; 25 times if it does not.
+//! `GLEANER_KILLS` sets how often the process is killed; the default is 25.
 
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
@@ -13,12 +13,12 @@ use std::time::{Duration, Instant};
 
 use gleaner_drives::Replay;
 use gleaner_lambda::Clip;
-use gleaner_recorder::Folder as Clips;
-use gleaner_tests::{Copy, Folder, program, root, runtime, sample_drive, times};
-use gleaner_transport::{SampleMeta, Sink, TopicSpec, Transport, Verdict};
+use gleaner_recorder::RecordingFolder as Clips;
+use gleaner_tests::{LambdaCopy, TempFolder, program, root, runtime, sample_drive, times};
+use gleaner_transport::{Delivery, SampleMeta, Sink, TopicSpec, Transport};
 use libtest_mimic::{Failed, Trial};
 
-/// Events all along the drive, so that clips begin and end at many moments.
+/// Events throughout the drive, so that clips begin and end at many times.
 const EVENTS: &str = "event_s=2,8,14,20,26,32,38";
 
 pub fn trials() -> Vec<Trial> {
@@ -29,21 +29,21 @@ pub fn trials() -> Vec<Trial> {
             || killed("disk"),
         ),
     ];
-    let name = "a_replay_killed_while_it_replaces_clips_leaves_none_of_them_to_the_next";
+    let name = "clips_of_a_replay_killed_while_replacing_them_are_not_listed_by_the_next";
     trials.push(Trial::test(name, killed_while_replacing));
-    let name = "a_full_disk_is_an_error_with_a_name_and_leaves_nothing_broken";
+    let name = "a_full_disk_is_reported_and_leaves_nothing_broken";
     trials.push(if can_mount() {
         Trial::test(name, full_disk)
     } else {
-        Trial::test(format!("{name} [no file system can be mounted here]"), || Ok(()))
+        Trial::test(format!("{name} [cannot mount a file system]"), || Ok(()))
             .with_ignored_flag(true)
     });
     trials
 }
 
 /// `alarm`, with short windows, so that there are several clips.
-fn alarm(store: &str) -> Copy {
-    Copy::of("tests/lambdas/alarm/rust", |manifest| {
+fn alarm(store: &str) -> LambdaCopy {
+    LambdaCopy::of("tests/lambdas/alarm/rust", |manifest| {
         let manifest = manifest
             .replace("preroll = \"5s\"", "preroll = \"2s\"")
             .replace("postroll = \"5s\"", "postroll = \"2s\"");
@@ -60,10 +60,10 @@ fn replay(lambda: &Path, out: &Path) -> Command {
 
 fn killed(store: &str) -> Result<(), Failed> {
     let lambda = alarm(store);
-    let out = Folder::new();
-    // The first compiles the lambda.
+    let out = TempFolder::new();
+    // The first run compiles the lambda.
     replay(lambda.path(), out.path()).status()?;
-    // One that others held up would put most kills behind the end.
+    // A run that is delayed would put most kills after the end.
     let mut duration = Duration::MAX;
     for _ in 0..3 {
         let started = Instant::now();
@@ -72,21 +72,20 @@ fn killed(store: &str) -> Result<(), Failed> {
     }
     let kills = times("GLEANER_KILLS", 25);
     let mut seen = [0_u32; 3];
-    let mut out = Folder::new();
+    let mut out = TempFolder::new();
     let mut random = 0x9e37_79b9_7f4a_7c15_u64;
     let mut killed = 0;
-    // Kills that met nothing show nothing: it goes on until some have.
+    // Kills outside of the recording show nothing: continue until some hit it.
     while killed < kills || killed < 10 * kills && (seen[0] == 0 || seen[1] == 0) {
         let kill = killed;
         killed += 1;
-        // xorshift64: the moments differ, and a run can be repeated as far as a machine repeats
-        // itself.
+        // xorshift64: the times differ, and are the same in each run.
         random ^= random << 13;
         random ^= random >> 7;
         random ^= random << 17;
-        // Every third one meets what the two before it left, so that recovery is killed, too.
+        // Every third kill meets the state that the two before it left, so recovery is killed too.
         if kill % 3 == 0 {
-            out = Folder::new();
+            out = TempFolder::new();
         }
         let mut child = replay(lambda.path(), out.path()).spawn()?;
         thread::sleep(Duration::from_nanos(
@@ -94,32 +93,33 @@ fn killed(store: &str) -> Result<(), Failed> {
         ));
         child.kill()?;
         child.wait()?;
-        let here = |why: Failed| {
+        let with_context = |why: Failed| {
             Failed::from(format!("kill {kill}: {}", why.message().unwrap_or_default()))
         };
         for clip in listed(out.path())? {
-            whole(&out.path().join(&clip.file)).map_err(here)?;
+            is_complete(&out.path().join(&clip.file)).map_err(with_context)?;
         }
         if kill % 3 < 2 {
             continue;
         }
-        let found = inspect(out.path()).map_err(here)?;
+        let found = inspect(out.path()).map_err(with_context)?;
         seen[0] += u32::from(found.listed > 0);
         seen[1] += u32::from(found.recovered > 0);
         seen[2] += found.recovered as u32;
     }
     println!(
-        "{store}: {killed} kills, three in each folder: {} folders had listed clips, {} something to recover, {} clips",
+        "{store}: {killed} kills, three in each folder: {} folders had listed clips, \
+         {} clips to recover, {} clips",
         seen[0], seen[1], seen[2]
     );
     if seen[0] == 0 || seen[1] == 0 {
-        return Err(format!("no kill met a recorder at work: {seen:?}").into());
+        return Err(format!("no kill hit a running recorder: {seen:?}").into());
     }
     Ok(())
 }
 
 /// Clips of an earlier replay that a kill leaves half deleted are never listed as results of the
-/// next one.
+/// next replay.
 fn killed_while_replacing() -> Result<(), Failed> {
     const EARLIER: u64 = 1000;
     let lambda = alarm("ram");
@@ -128,9 +128,9 @@ fn killed_while_replacing() -> Result<(), Failed> {
         replay.args(["--set", "event_s=30"]);
         replay
     };
-    let mut met = 0;
+    let mut hits = 0;
     for _ in 0..20 {
-        let out = Folder::new();
+        let out = TempFolder::new();
         replay(lambda.path(), out.path()).status()?;
         let clips = out.path().join("clips");
         let first = listed(out.path())?.remove(0);
@@ -145,42 +145,42 @@ fn killed_while_replacing() -> Result<(), Failed> {
         }
         std::fs::write(out.path().join("clips.jsonl"), list)?;
         let earlier = listed_names(out.path())?;
-        let are_left = || earlier.iter().filter(|name| clips.join(name).exists()).count();
+        let remaining = || earlier.iter().filter(|name| clips.join(name).exists()).count();
         let mut child = other(out.path()).spawn()?;
         while out.path().join(&first.file).exists() && child.try_wait()?.is_none() {}
         child.kill()?;
         child.wait()?;
-        met += u32::from((1..earlier.len()).contains(&are_left()));
+        hits += u32::from((1..earlier.len()).contains(&remaining()));
         other(out.path()).status()?;
-        let strangers: Vec<_> = listed_names(out.path())?.intersection(&earlier).cloned().collect();
-        if !strangers.is_empty() || are_left() > 0 {
-            let first = strangers.first();
-            let (listed, left) = (strangers.len(), are_left());
+        let wrong: Vec<_> = listed_names(out.path())?.intersection(&earlier).cloned().collect();
+        if !wrong.is_empty() || remaining() > 0 {
+            let first = wrong.first();
+            let (listed, left) = (wrong.len(), remaining());
             return Err(format!(
-                "{listed} clips of an earlier replay are listed, {left} are left: {first:?}"
+                "{listed} clips of an earlier replay are listed, {left} remain: {first:?}"
             )
             .into());
         }
-        if met >= 3 {
+        if hits >= 3 {
             return Ok(());
         }
     }
-    if met > 0 { Ok(()) } else { Err("no kill met a replay that replaces clips".into()) }
+    if hits > 0 { Ok(()) } else { Err("no kill hit a replay that replaces clips".into()) }
 }
 
-struct Found {
+struct CrashRemains {
     listed: usize,
     recovered: usize,
 }
 
-/// Looks at what a process left: listed clips at once, the others after the next start.
-fn inspect(out: &Path) -> Result<Found, Failed> {
+/// Checks the remains of a process: listed clips at once, the others after the next start.
+fn inspect(out: &Path) -> Result<CrashRemains, Failed> {
     let listed = listed(out)?;
     for clip in &listed {
-        whole(&out.join(&clip.file))?;
+        is_complete(&out.join(&clip.file))?;
     }
     if !out.join("clips").exists() {
-        return Ok(Found { listed: 0, recovered: 0 });
+        return Ok(CrashRemains { listed: 0, recovered: 0 });
     }
     let (_folder, recovered) = Clips::open(out)?;
     let names = listed_names(out)?;
@@ -189,28 +189,28 @@ fn inspect(out: &Path) -> Result<Found, Failed> {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         match path.extension().and_then(OsStr::to_str) {
             Some("mcap") => {
-                whole(&path)?;
+                is_complete(&path)?;
                 if !names.contains(&name) {
                     return Err(format!("`{name}` is not listed").into());
                 }
             }
             Some("jpg") => {
                 if !std::fs::read(&path)?.ends_with(&[0xff, 0xd9]) {
-                    return Err(format!("`{name}` is cut off").into());
+                    return Err(format!("`{name}` is truncated").into());
                 }
             }
             _ if name.starts_with('.') => {}
-            _ => return Err(format!("`{name}` was left behind").into()),
+            _ => return Err(format!("`{name}` is an orphan").into()),
         }
     }
-    Ok(Found { listed: listed.len(), recovered: recovered.len() })
+    Ok(CrashRemains { listed: listed.len(), recovered: recovered.len() })
 }
 
-/// The whole lines of `clips.jsonl`.
+/// The complete lines of `clips.jsonl`.
 fn listed(out: &Path) -> Result<Vec<Clip>, Failed> {
     let text = std::fs::read_to_string(out.join("clips.jsonl")).unwrap_or_default();
-    let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-    whole.lines().map(|line| Ok(serde_json::from_str(line)?)).collect()
+    let complete = text.rfind('\n').map_or("", |end| &text[..end]);
+    complete.lines().map(|line| Ok(serde_json::from_str(line)?)).collect()
 }
 
 fn listed_names(out: &Path) -> Result<BTreeSet<String>, Failed> {
@@ -220,12 +220,12 @@ fn listed_names(out: &Path) -> Result<BTreeSet<String>, Failed> {
     Ok(names.collect())
 }
 
-/// Reads a clip to its end, all checksums included.
-fn whole(path: &PathBuf) -> Result<(), Failed> {
-    struct Nowhere;
-    impl Sink for Nowhere {
-        fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Verdict {
-            Verdict::Taken
+/// Reads a clip to its end and checks all checksums.
+fn is_complete(path: &PathBuf) -> Result<(), Failed> {
+    struct DiscardSink;
+    impl Sink for DiscardSink {
+        fn deliver(&self, _: &SampleMeta, _: &[u8]) -> Delivery {
+            Delivery::Taken
         }
     }
     let failed =
@@ -239,13 +239,13 @@ fn whole(path: &PathBuf) -> Result<(), Failed> {
             max_bytes: usize::MAX,
             qos: Default::default(),
         };
-        clip.subscribe(&spec, Arc::new(Nowhere)).map_err(|error| failed(&error))?;
+        clip.subscribe(&spec, Arc::new(DiscardSink)).map_err(|error| failed(&error))?;
     }
     while clip.step().map_err(|error| failed(&error))?.is_some() {}
     Ok(())
 }
 
-/// In a mount namespace of its own: the disk is a small tmpfs, what is left on it is copied out.
+/// Script for a mount namespace: the disk is a small tmpfs, whose files are copied out at the end.
 const ON_A_SMALL_DISK: &str = r#"
 set -e
 mount -t tmpfs -o size="$1" tmpfs "$2"
@@ -265,7 +265,7 @@ fn in_namespace(script: &str, args: &[&OsStr]) -> Command {
 }
 
 fn can_mount() -> bool {
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let mount =
         in_namespace("mount -t tmpfs -o size=16k tmpfs \"$1\"", &[folder.path().as_ref()]).output();
     mount.is_ok_and(|output| output.status.success())
@@ -274,12 +274,12 @@ fn can_mount() -> bool {
 fn full_disk() -> Result<(), Failed> {
     for store in ["ram", "disk"] {
         let lambda = alarm(store);
-        // The first compiles the lambda.
-        replay(lambda.path(), Folder::new().path()).status()?;
+        // The first run compiles the lambda.
+        replay(lambda.path(), TempFolder::new().path()).status()?;
         let (mut full, mut fits) = (0, 0);
         let mut kib = 4;
         while kib < 16_384 {
-            let (disk, copy) = (Folder::new(), Folder::new());
+            let (disk, copy) = (TempFolder::new(), TempFolder::new());
             std::fs::create_dir(copy.path().join("left"))?;
             let size = format!("{kib}k");
             let (program, drive) = (program("gleaner-runtime"), sample_drive());
@@ -299,34 +299,37 @@ fn full_disk() -> Result<(), Failed> {
             ]);
             let mut replay = in_namespace(ON_A_SMALL_DISK, &args);
             let output = replay.env("XDG_CACHE_HOME", root().join("target/test-cache")).output()?;
-            let said = std::fs::read_to_string(copy.path().join("stderr"))?;
-            let here = |why: &str| Failed::from(format!("{store}, {kib} KiB: {why}\n{said}"));
+            let stderr = std::fs::read_to_string(copy.path().join("stderr"))?;
+            let with_context =
+                |why: &str| Failed::from(format!("{store}, {kib} KiB: {why}\n{stderr}"));
             match String::from_utf8_lossy(&output.stdout).trim() {
                 "0" => fits += 1,
                 "1" => {
                     full += 1;
-                    if said.contains("panicked")
-                        || !said.contains("error: cannot")
-                        || !said.contains("No space left")
+                    if stderr.contains("panicked")
+                        || !stderr.contains("error: cannot")
+                        || !stderr.contains("No space left")
                     {
-                        return Err(here("the error does not say what happened"));
+                        return Err(with_context("the error does not name the cause"));
                     }
-                    if !said.contains("make room")
-                        || !said.contains(&*disk.path().to_string_lossy())
+                    if !stderr.contains("make room")
+                        || !stderr.contains(&*disk.path().to_string_lossy())
                     {
-                        return Err(here("the error names neither the file nor the way out"));
+                        return Err(with_context(
+                            "the error names neither the file nor the way out",
+                        ));
                     }
                 }
                 other => {
-                    return Err(here(&format!(
+                    return Err(with_context(&format!(
                         "ended with {other}: {}",
                         String::from_utf8_lossy(&output.stderr)
                     )));
                 }
             }
             inspect(&copy.path().join("left"))
-                .map_err(|why| here(why.message().unwrap_or_default()))?;
-            // Closer together where more of the small writes happen.
+                .map_err(|why| with_context(why.message().unwrap_or_default()))?;
+            // Smaller steps where most of the small writes happen.
             kib += if kib < 256 { 12 } else { kib / 8 };
         }
         println!("{store}: {full} disks were too small, {fits} large enough");

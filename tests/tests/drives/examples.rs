@@ -1,17 +1,18 @@
-//! The examples and test lambdas over recorded drives: decisions as expected, and twins that agree.
+//! Runs the examples and test lambdas over recorded drives: decisions as expected, and twins that
+//! agree.
 //!
-//! Drives that cannot come with the project lie in `../shared/data`; where they are missing, their
-//! tests are ignored with that reason.
+//! Drives that cannot be part of the project are in `../shared/data`; tests without their drive are
+//! ignored with that reason.
 
 use std::path::{Path, PathBuf};
 
 use gleaner_lambda::twins_differ;
-use gleaner_tests::{Run, replay, root, sample_drive, shared_drive};
+use gleaner_tests::{ReplayRun, replay, root, sample_drive, shared_drive};
 use libtest_mimic::{Failed, Trial};
 
 const KINDS: [&str; 2] = ["rust", "python"];
 
-/// Those with values that suit the sample drive, whose braking is gentle.
+/// The examples, with settings that suit the gentle braking of the sample drive.
 const EXAMPLES: [(&str, &[&str]); 3] = [
     ("hello", &["--set", "brake_mps2=-1.4"]),
     ("brake-dark", &["--set", "brake_mps2=-1.4"]),
@@ -34,7 +35,7 @@ pub fn trials() -> Vec<Trial> {
             },
         ));
     }
-    trials.push(Trial::test("every_function_answers_both_twins_the_same", every_answer));
+    trials.push(Trial::test("every_function_returns_the_same_to_both_twins", all_results));
     for kind in KINDS {
         trials.push(shared(
             format!("brake_dark_in_{kind}_finds_both_brakings_at_night"),
@@ -71,7 +72,7 @@ pub fn trials() -> Vec<Trial> {
     trials
 }
 
-/// A test on a drive beside the checkout; ignored, with the reason in its name, where that is
+/// A test on a drive beside the checkout; ignored, with the reason in its name, if the drive is
 /// missing.
 fn shared(
     name: String,
@@ -84,7 +85,7 @@ fn shared(
     }
 }
 
-fn run(lambda: &str, kind: &str, drive: &Path, args: &[&str]) -> Result<Run, Failed> {
+fn run(lambda: &str, kind: &str, drive: &Path, args: &[&str]) -> Result<ReplayRun, Failed> {
     let run = replay(&root().join(lambda).join(kind), &[drive.to_owned()], args);
     if run.exit == 0 { Ok(run) } else { Err(format!("exit {}: {}", run.exit, run.stderr).into()) }
 }
@@ -100,7 +101,7 @@ fn twins(lambda: &str, drive: &Path, args: &[&str]) -> Result<(), Failed> {
     let (rust, python) = (run(lambda, "rust", drive, args)?, run(lambda, "python", drive, args)?);
     same(&rust.decisions.len(), &python.decisions.len())?;
     if rust.decisions.is_empty() {
-        return Err("no wake at all".into());
+        return Err("no wakes".into());
     }
     match rust.decisions.iter().zip(&python.decisions).find_map(|(a, b)| twins_differ(a, b)) {
         Some(difference) => Err(difference.into()),
@@ -108,8 +109,8 @@ fn twins(lambda: &str, drive: &Path, args: &[&str]) -> Result<(), Failed> {
     }
 }
 
-/// What `probe` is answered, attribute by attribute, to the last digit.
-fn every_answer() -> Result<(), Failed> {
+/// Compares all results that `probe` reports, attribute by attribute, to the last digit.
+fn all_results() -> Result<(), Failed> {
     let [rust, python] = KINDS.map(|kind| run("tests/lambdas/probe", kind, &sample_drive(), &[]));
     let (rust, python) = (rust?, python?);
     same(&rust.decisions.len(), &10)?;
@@ -117,17 +118,18 @@ fn every_answer() -> Result<(), Failed> {
         same(&a.triggers.iter().map(|trigger| trigger.label.as_str()).collect(), &PROBED.to_vec())?;
         same(&a.triggers, &b.triggers)?;
     }
-    let kept = |run: &Run| run.log.iter().map(|line| line["message"].clone()).collect::<Vec<_>>();
+    let kept =
+        |run: &ReplayRun| run.log.iter().map(|line| line["message"].clone()).collect::<Vec<_>>();
     same(&kept(&rust), &kept(&python))?;
     same(&rust.log.len(), &10)?;
-    // The first picture is of the day; and no refusal was an answer.
+    // The first image was taken by day; and each refusal is the expected one.
     let first = &rust.decisions[0].triggers;
     same(&first[2].score.is_some_and(|luma| (75.0..132.0).contains(&luma)), &true)?;
     let refusals = first[3].attributes.values().map(|kind| kind.as_str().unwrap_or_default());
     same(&refusals.collect::<Vec<_>>(), &REFUSALS.to_vec())
 }
 
-/// What `probe` triggers at each wake, and which refusals it provokes, in its order.
+/// Labels that `probe` triggers in each wake, and the refusals that it provokes, in its order.
 const PROBED: [&str; 6] = ["topic", "sample", "frame", "refusals", "recording", "recording"];
 const REFUSALS: [&str; 13] = [
     "no-such-input",
@@ -155,7 +157,7 @@ fn at(drive: &Path, lambda: &str, kind: &str, onsets: &[f64]) -> Result<(), Fail
     Err(format!("triggers at {seconds:?}, expected near {onsets:?}").into())
 }
 
-/// One trigger in each labelled hard braking, and none elsewhere.
+/// Exactly one trigger in each labelled hard braking, and no other.
 fn within_truth(drive: &Path, kind: &str) -> Result<(), Failed> {
     let truth = truth(drive)?;
     let events = truth["labelled_events"].as_array().ok_or("the truth has no labelled events")?;

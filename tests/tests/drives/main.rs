@@ -1,7 +1,7 @@
-//! What replays of drives leave: decisions of the examples, clips, and what is whole after a crash.
+//! Results of replays: decisions of the examples, clips, and the state after a crash.
 //!
-//! Some drives, readers and file systems are not everywhere; a test that lacks them is ignored,
-//! with that reason.
+//! Some drives, readers and file systems are not available everywhere; a test that needs one is
+//! ignored then, with that reason.
 
 mod clips;
 mod crash;

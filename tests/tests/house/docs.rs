@@ -1,5 +1,5 @@
-//! The pages are true: links lead somewhere, commands exist, code is an excerpt of files that are
-//! tested, and what a page says that a command prints, it prints.
+//! The pages are correct: links resolve, commands exist, code is quoted from tested files, and
+//! documented output is real output.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -14,7 +14,7 @@ use gleaner_tests::markdown::{anchors, blocks, links};
 use gleaner_tests::tree::{File, files};
 use gleaner_tests::{program, root};
 
-/// Whose Rust is all excerpts. The other pages show fragments that stand for themselves.
+/// Pages whose Rust code is all quoted from files. Other pages show fragments of their own.
 const EXCERPTS_ONLY: [&str; 4] =
     ["docs/first-rust.md", "docs/data.md", "docs/cookbook.md", "docs/errors.md"];
 
@@ -25,14 +25,14 @@ fn pages() -> Vec<File> {
         .collect()
 }
 
-/// Fails with every problem on a line of its own.
+/// Fails with each problem on its own line.
 #[track_caller]
 fn none(problems: Vec<String>) {
     assert!(problems.is_empty(), "\n{}", problems.join("\n"));
 }
 
 #[test]
-fn every_link_leads_to_a_file_and_to_a_heading_that_is_there() {
+fn every_link_leads_to_an_existing_file_and_heading() {
     let mut problems = Vec::new();
     let mut seen = 0;
     for page in pages() {
@@ -51,7 +51,7 @@ fn every_link_leads_to_a_file_and_to_a_heading_that_is_there() {
                     .is_ok_and(|text| anchors(&text).iter().any(|a| Some(&**a) == anchor))
             };
             if !file.exists() || anchor.is_some() && !known() {
-                problems.push(format!("{}:{line}: `{target}` leads nowhere", page.path));
+                problems.push(format!("{}:{line}: `{target}` does not exist", page.path));
             }
         }
     }
@@ -65,14 +65,14 @@ fn the_book_has_every_page_once_and_its_pages_link_to_files_and_pages_of_the_boo
     let chapters: Vec<_> =
         links(&summary).into_iter().map(|(_, target)| normal("docs", &target)).collect();
     let distinct: BTreeSet<_> = chapters.iter().cloned().collect();
-    assert_eq!(distinct.len(), chapters.len(), "a page stands twice in docs/SUMMARY.md");
+    assert_eq!(distinct.len(), chapters.len(), "a page is twice in docs/SUMMARY.md");
     let mut problems = Vec::new();
     for page in pages() {
         if page.path.starts_with("docs/")
             && page.path != "docs/SUMMARY.md"
             && !distinct.contains(&page.path)
         {
-            problems.push(format!("docs/SUMMARY.md lacks {}", page.path));
+            problems.push(format!("missing in docs/SUMMARY.md: {}", page.path));
         }
         if !distinct.contains(&page.path) {
             continue;
@@ -83,7 +83,7 @@ fn the_book_has_every_page_once_and_its_pages_link_to_files_and_pages_of_the_boo
             if target.contains("://") || target.starts_with('#') {
                 continue;
             }
-            // A book has no view of a folder, and renders no page that is none of its own.
+            // A book cannot show a folder, and does not render pages of others.
             if root().join(&to).is_dir() || to.ends_with(".md") && !distinct.contains(&to) {
                 problems.push(format!(
                     "{}:{line}: `{target}` is not in the book; link to a file or a chapter",
@@ -95,7 +95,7 @@ fn the_book_has_every_page_once_and_its_pages_link_to_files_and_pages_of_the_boo
     none(problems);
 }
 
-/// `target` as seen from `folder`, without `..`.
+/// Resolves `target` relative to `folder`, without `..`.
 fn normal(folder: &str, target: &str) -> String {
     let mut parts: Vec<&str> = folder.split('/').filter(|part| !part.is_empty()).collect();
     for part in target.split('/').filter(|part| !part.is_empty() && *part != ".") {
@@ -109,14 +109,15 @@ fn normal(folder: &str, target: &str) -> String {
 }
 
 #[test]
-fn every_excerpt_stands_in_the_file_that_it_names() {
+fn every_excerpt_is_in_the_file_that_it_names() {
     let mut problems = Vec::new();
     let mut seen = 0;
     for page in pages() {
         for block in blocks(&page.text) {
             let Some(file) = &block.file else {
                 if block.language.starts_with("rust") && EXCERPTS_ONLY.contains(&&*page.path) {
-                    problems.push(format!("{}:{}: whose excerpt is this?", page.path, block.line));
+                    problems
+                        .push(format!("{}:{}: this excerpt names no file", page.path, block.line));
                 }
                 continue;
             };
@@ -127,8 +128,7 @@ fn every_excerpt_stands_in_the_file_that_it_names() {
             if excerpt.is_empty()
                 || !lines.windows(excerpt.len()).any(|window| indented_alike(window, &excerpt))
             {
-                problems
-                    .push(format!("{}:{}: this does not stand in `{file}`", page.path, block.line));
+                problems.push(format!("{}:{}: this is not in `{file}`", page.path, block.line));
             }
         }
     }
@@ -136,7 +136,7 @@ fn every_excerpt_stands_in_the_file_that_it_names() {
     none(problems);
 }
 
-/// Whether lines are the same, but that all of the first may be further to the right.
+/// Returns whether the lines are equal, except for a common indentation of the first ones.
 fn indented_alike(lines: &[&str], excerpt: &[&str]) -> bool {
     let indent = |line: &str| line.len() - line.trim_start().len();
     let shift = indent(lines[0]).saturating_sub(indent(excerpt[0]));
@@ -147,15 +147,15 @@ fn indented_alike(lines: &[&str], excerpt: &[&str]) -> bool {
 }
 
 #[test]
-fn manifests_that_are_shown_whole_can_be_used() {
+fn complete_manifests_on_pages_are_valid() {
     let mut seen = 0;
     for page in pages() {
         for block in blocks(&page.text).into_iter().filter(|block| block.language == "toml") {
             let text = block.lines.join("\n");
             if text.contains("[lambda]") && text.contains("[schedule]") {
-                let said =
+                let error =
                     Manifest::parse(&text, "lambda.toml").err().map(|error| error.to_string());
-                assert_eq!(said, None, "{}:{}", page.path, block.line);
+                assert_eq!(error, None, "{}:{}", page.path, block.line);
                 seen += 1;
             }
         }
@@ -164,13 +164,14 @@ fn manifests_that_are_shown_whole_can_be_used() {
 }
 
 #[test]
-fn python_that_is_shown_compiles() {
+fn python_on_pages_compiles() {
     let mut python =
         Command::new(Parts::find().and_then(|parts| parts.python(None)).expect("a Python"));
-    // A fragment may return or wait outside of a function, so each is the body of one.
-    let check = "import ast, json, sys, textwrap\nfor name, text in json.load(sys.stdin):\n try:\n  try: ast.parse(text)\n  \
-                 except SyntaxError: ast.parse('async def fragment():\\n' + textwrap.indent(text, ' '))\n except SyntaxError as \
-                 error: print(name, error)";
+    // A fragment may return or await outside of a function, so each is tried as a function body.
+    let check = "import ast, json, sys, textwrap\n\
+                 for name, text in json.load(sys.stdin):\n try:\n  try: ast.parse(text)\n  \
+                 except SyntaxError: ast.parse('async def fragment():\\n' + \
+                 textwrap.indent(text, ' '))\n except SyntaxError as error: print(name, error)";
     let mut shown = Vec::new();
     for page in pages() {
         for block in blocks(&page.text).into_iter().filter(|block| block.language == "python") {
@@ -192,7 +193,7 @@ fn python_that_is_shown_compiles() {
 }
 
 #[test]
-fn every_command_that_is_shown_exists_with_its_flags() {
+fn every_command_on_pages_exists_with_its_flags() {
     let mut helps = BTreeMap::new();
     let mut problems = Vec::new();
     let mut seen = 0;
@@ -216,8 +217,10 @@ fn every_command_that_is_shown_exists_with_its_flags() {
                 let name = words.next().unwrap_or_default().to_owned();
                 let help = helps.entry(name.clone()).or_insert_with(|| help(&name));
                 match help {
-                    None => problems.push(format!("{}: there is no `gleaner {name}`", page.path)),
-                    // What `play` takes is the player's business, which need not be built.
+                    None => {
+                        problems.push(format!("{}: `gleaner {name}` does not exist", page.path))
+                    }
+                    // The arguments of `play` are the player's, which may not be built.
                     Some(_) if name == "play" => {}
                     Some(help) => {
                         let flags = words.filter(|word| word.starts_with("--"));
@@ -240,7 +243,7 @@ fn every_command_that_is_shown_exists_with_its_flags() {
     none(problems);
 }
 
-/// What `gleaner NAME --help` prints; none if there is no such command.
+/// The output of `gleaner NAME --help`; `None` if there is no such command.
 fn help(name: &str) -> Option<String> {
     if name.starts_with("--") {
         return Some(name.to_owned());
@@ -254,7 +257,7 @@ fn help(name: &str) -> Option<String> {
 }
 
 #[test]
-fn every_recipe_is_in_the_book_with_what_it_finds() {
+fn every_recipe_is_in_the_book_with_its_output() {
     let book = fs::read_to_string(root().join("docs/cookbook.md")).expect("docs/cookbook.md");
     for folder in fs::read_dir(root().join("examples/cookbook")).expect("a cookbook") {
         let folder = folder.expect("it can be listed").path();
@@ -262,15 +265,15 @@ fn every_recipe_is_in_the_book_with_what_it_finds() {
         let name = folder.file_name().unwrap().to_string_lossy();
         assert!(
             book.contains(&format!("](../examples/cookbook/{name}/lambda.toml)")),
-            "docs/cookbook.md lacks {name}"
+            "{name} is missing in docs/cookbook.md"
         );
         let transcript = format!("```text\n$ {}\n```", expected.trim_end());
-        assert!(book.contains(&transcript), "docs/cookbook.md should say:\n{transcript}");
+        assert!(book.contains(&transcript), "docs/cookbook.md should contain:\n{transcript}");
     }
 }
 
 #[test]
-fn what_is_made_of_the_manifests_types_is_not_stale() {
+fn files_generated_from_the_manifests_types_are_up_to_date() {
     for file in GENERATED {
         let now = fs::read_to_string(root().join(file.path)).expect(file.path);
         let text = file.text(&now).unwrap_or_else(|why| panic!("{why}"));
@@ -283,15 +286,16 @@ fn every_file_that_a_recipe_for_changes_names_exists() {
     let page = fs::read_to_string(root().join("CONTRIBUTING.md")).expect("CONTRIBUTING.md");
     let (mut seen, mut problems) = (0, Vec::new());
     for (index, line) in page.lines().enumerate() {
-        // Between two marks is code.
+        // Every second part between backticks is code.
         for word in line.split('`').skip(1).step_by(2) {
             let is_file = Path::new(word)
                 .extension()
-                .is_some_and(|end| end.to_str().is_some_and(is_a_file_ending));
+                .is_some_and(|end| end.to_str().is_some_and(is_source_extension));
             if is_file || word.contains('/') && !word.contains(' ') {
                 seen += 1;
                 if !root().join(word).exists() {
-                    problems.push(format!("CONTRIBUTING.md:{}: there is no `{word}`", index + 1));
+                    problems
+                        .push(format!("CONTRIBUTING.md:{}: `{word}` does not exist", index + 1));
                 }
             }
         }
@@ -300,7 +304,7 @@ fn every_file_that_a_recipe_for_changes_names_exists() {
     none(problems);
 }
 
-fn is_a_file_ending(end: &str) -> bool {
+fn is_source_extension(end: &str) -> bool {
     ["css", "js", "md", "py", "rs", "sh", "toml", "txt", "wit"].contains(&end)
 }
 

@@ -1,6 +1,6 @@
-//! The WIT is one page for both languages: what it offers, the Rust SDK must offer, the probes must
-//! call, and the list of operations must have. (`guest-sdk-python/tests/test_contract.py` looks at
-//! the Python SDK, and the compiler at the host.)
+//! Both languages implement the same WIT: each of its functions is in the Rust SDK, in the probes
+//! and in the list of operations. (`guest-sdk-python/tests/test_contract.py` checks the Python SDK,
+//! and the compiler the host.)
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -22,7 +22,7 @@ fn functions() -> BTreeSet<String> {
                 let of = resource.map_or_else(String::new, |resource| format!("{resource}."));
                 assert!(
                     found.insert(format!("{interface}.{of}{name}")),
-                    "`{name}` stands twice in {interface}.wit"
+                    "`{name}` is twice in {interface}.wit"
                 );
             }
         }
@@ -40,25 +40,25 @@ fn read(path: &str) -> String {
     fs::read_to_string(root().join(path)).unwrap_or_else(|_| panic!("no {path}"))
 }
 
-/// The last part of a name, as Rust and Python spell it.
+/// The last part of a name, as spelled in Rust and Python.
 fn spelled(name: &str) -> String {
     name.rsplit('.').next().unwrap_or(name).replace('-', "_")
 }
 
 #[test]
-fn the_list_of_operations_is_that_of_the_interface() {
+fn the_list_of_operations_matches_the_interface() {
     let listed: BTreeSet<_> =
         Operation::ALL.iter().map(|operation| operation.name().to_owned()).collect();
     assert_eq!(
         listed.len(),
         Operation::ALL.len(),
-        "an operation stands twice in tests/operations/src/list.rs"
+        "an operation is twice in tests/operations/src/list.rs"
     );
     let offered = functions();
     let lacking: Vec<_> = offered.difference(&listed).collect();
     let beyond: Vec<_> = listed.difference(&offered).collect();
-    assert!(lacking.is_empty(), "tests/operations/src/list.rs lacks {lacking:?} of wit/");
-    assert!(beyond.is_empty(), "tests/operations/src/list.rs has {beyond:?}, which wit/ has not");
+    assert!(lacking.is_empty(), "missing in tests/operations/src/list.rs: {lacking:?}");
+    assert!(beyond.is_empty(), "missing in wit/: {beyond:?}");
     assert!(offered.len() >= 40, "only {} functions were found in wit/", offered.len());
 }
 
@@ -76,8 +76,8 @@ fn the_rust_sdk_calls_every_function_of_the_interface() {
 
 #[test]
 fn twins_among_the_test_lambdas_call_every_function() {
-    // That both are answered the same `drives` tests, and that the fake of the Rust SDK answers the
-    // same `native`.
+    // `drives` tests that both get the same results, and `native` that the fake host of the Rust
+    // SDK returns the same.
     for file in ["rust/src/lib.rs", "python/main.py"] {
         let text =
             ["probe", "keeper"].map(|name| read(&format!("tests/lambdas/{name}/{file}"))).concat();

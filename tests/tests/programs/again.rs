@@ -1,23 +1,23 @@
-//! The same lambda, drive and journal again: the same decisions, to the last bit. How often is
-//! `GLEANER_AGAIN`.
+//! Repeated replays and verifications make the same decisions, to the last bit. `GLEANER_AGAIN`
+//! sets the number of repetitions.
 
 use std::collections::HashSet;
 use std::path::Path;
 
-use gleaner_journal::{Entry, Reader};
-use gleaner_tests::{Folder, replay_to, root, sample_drive, times, verify};
+use gleaner_journal::{JournalEntry, JournalReader};
+use gleaner_tests::{TempFolder, replay_to, root, sample_drive, times, verify};
 use serde_json::Value;
 
-/// What a replay leaves, but for times of this machine.
+/// Results of a replay, without durations.
 #[derive(PartialEq)]
-struct Left {
+struct TimelessResults {
     /// Lines of `decisions.jsonl`, with the fuel of each wake.
     decisions: Vec<String>,
     log: String,
-    journal: Vec<Entry>,
+    journal: Vec<JournalEntry>,
 }
 
-fn left(folder: &Path) -> Left {
+fn results(folder: &Path) -> TimelessResults {
     let read = |name: &str| std::fs::read_to_string(folder.join(name)).unwrap();
     let timeless = |line: &str| {
         let mut decision: serde_json::Map<String, Value> = serde_json::from_str(line).unwrap();
@@ -25,9 +25,9 @@ fn left(folder: &Path) -> Left {
         Value::Object(decision).to_string()
     };
     let journal = std::fs::read(folder.join("wakes.journal")).unwrap();
-    let mut journal = Reader::open(journal.as_slice()).unwrap();
+    let mut journal = JournalReader::open(journal.as_slice()).unwrap();
     let entries = std::iter::from_fn(|| journal.next().unwrap()).collect();
-    Left {
+    TimelessResults {
         decisions: read("decisions.jsonl").lines().map(timeless).collect(),
         log: read("log.jsonl"),
         journal: entries,
@@ -36,7 +36,7 @@ fn left(folder: &Path) -> Left {
 
 #[test]
 fn a_lambda_that_faults_now_and_then_decides_the_same_bits_each_time() {
-    let (lambda, folder) = (root().join("tests/lambdas/misbehave/rust"), Folder::new());
+    let (lambda, folder) = (root().join("tests/lambdas/misbehave/rust"), TempFolder::new());
     let first = folder.path().join("first/wakes.journal");
     let replayed = |name: &str| {
         let out = folder.path().join(name);
@@ -45,12 +45,12 @@ fn a_lambda_that_faults_now_and_then_decides_the_same_bits_each_time() {
         let args =
             ["--set", "behaviour=now_and_then", "--all", "--journal", journal.to_str().unwrap()];
         let run = replay_to(&out, &lambda, &[sample_drive()], &args);
-        (left(&out), run)
+        (results(&out), run)
     };
     let (expected, run) = replayed("first");
     let kinds: HashSet<_> =
         run.decisions.iter().filter_map(|decision| Some(decision.fault.as_ref()?.kind)).collect();
-    assert!(kinds.len() >= 6, "it faults by {kinds:?} only");
+    assert!(kinds.len() >= 6, "only faults of {kinds:?}");
     assert!(run.decisions.iter().any(|decision| !decision.triggers.is_empty()));
     assert_eq!(
         (expected.decisions.len(), expected.journal.len()),
@@ -60,8 +60,8 @@ fn a_lambda_that_faults_now_and_then_decides_the_same_bits_each_time() {
         let (now, _) = replayed("again");
         let line =
             expected.decisions.iter().zip(&now.decisions).position(|(before, now)| before != now);
-        assert_eq!(line, None, "time {time}: this decision is another");
-        assert!(now == expected, "time {time}: the log or the journal is another");
+        assert_eq!(line, None, "time {time}: this decision differs");
+        assert!(now == expected, "time {time}: the log or the journal differs");
         let again = verify(&[
             "replay".as_ref(),
             lambda.as_ref(),

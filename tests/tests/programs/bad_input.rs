@@ -1,19 +1,21 @@
-//! Everything that a user can get wrong, and what Gleaner says about it: the message names the
-//! thing, the cause and the way out, and the exit code tells scripts which kind of mistake it was.
+//! Mistakes of users and the messages about them: a message names the object, the cause and the
+//! way out, and the exit code gives scripts the kind of mistake.
 
 use std::path::PathBuf;
 
 use gleaner_lambda::FaultKind;
 use gleaner_tests::drive::{COMPRESSED, IMAGE, compressed, corrupted, image, one_topic, truncated};
-use gleaner_tests::{Copy, Folder, Run, replay, replay_to, root, runtime, sample_drive};
+use gleaner_tests::{
+    LambdaCopy, ReplayRun, TempFolder, replay, replay_to, root, runtime, sample_drive,
+};
 
 const USAGE: u8 = 2;
 const FAULTED: u8 = 6;
 const DAMAGED: u8 = 7;
 
 /// Replays a copy of `hello` with a changed manifest over the sample drive.
-fn hello(change: impl Fn(String) -> String, args: &[&str]) -> Run {
-    replay(Copy::of("examples/hello/rust", change).path(), &[sample_drive()], args)
+fn hello(change: impl Fn(String) -> String, args: &[&str]) -> ReplayRun {
+    replay(LambdaCopy::of("examples/hello/rust", change).path(), &[sample_drive()], args)
 }
 
 fn replaced(from: &'static str, to: &'static str) -> impl Fn(String) -> String {
@@ -23,11 +25,11 @@ fn replaced(from: &'static str, to: &'static str) -> impl Fn(String) -> String {
     }
 }
 
-/// Asserts that each of `said` stands in the message, in this order.
+/// Asserts that each of `parts` is in the message, in this order.
 #[track_caller]
-fn says(run: &Run, said: &[&str]) {
+fn assert_message(run: &ReplayRun, parts: &[&str]) {
     let mut rest = run.stderr.as_str();
-    for part in said {
+    for part in parts {
         let at = rest.find(part).unwrap_or_else(|| panic!("no `{part}` in:\n{}", run.stderr));
         rest = &rest[at + part.len()..];
     }
@@ -36,7 +38,7 @@ fn says(run: &Run, said: &[&str]) {
 #[test]
 fn an_unknown_key_is_named_with_its_line_and_the_nearest_one() {
     let run = hello(replaced("depth = 512", "dept = 512"), &[]);
-    says(
+    assert_message(
         run.must_exit(USAGE),
         &[
             "error: ",
@@ -49,7 +51,7 @@ fn an_unknown_key_is_named_with_its_line_and_the_nearest_one() {
 #[test]
 fn depth_zero_is_refused_with_its_bounds() {
     let run = hello(replaced("depth = 512", "depth = 0"), &[]);
-    says(
+    assert_message(
         run.must_exit(USAGE),
         &[
             "line 16: `input.depth` is 0, below the minimum of 1",
@@ -61,7 +63,7 @@ fn depth_zero_is_refused_with_its_bounds() {
 #[test]
 fn a_missing_topic_is_named_with_the_nearest_and_with_remap() {
     let run = hello(replaced("topic = \"/imu/data\"", "topic = \"/imu/dta\""), &[]);
-    says(
+    assert_message(
         run.must_exit(USAGE),
         &[
             "error: cannot start lambda `hello`",
@@ -85,9 +87,12 @@ fn remap_finds_a_topic_of_another_name() {
 }
 
 #[test]
-fn a_remap_of_a_topic_that_no_input_has_is_refused() {
+fn a_remap_of_an_unknown_topic_is_refused() {
     let run = hello(|manifest| manifest, &["--remap", "/imu:=/imu/data"]);
-    says(run.must_exit(USAGE), &["no input has the topic `/imu` of --remap", "`/imu/data`"]);
+    assert_message(
+        run.must_exit(USAGE),
+        &["no input has the topic `/imu` of --remap", "`/imu/data`"],
+    );
 }
 
 #[test]
@@ -96,7 +101,7 @@ fn a_wrong_type_is_named_with_the_one_found() {
         replaced("type = \"sensor_msgs/msg/Imu\"", "type = \"sensor_msgs/msg/NavSatFix\""),
         &[],
     );
-    says(
+    assert_message(
         run.must_exit(USAGE),
         &[
             "topic `/imu/data` has type `sensor_msgs/msg/Imu`, not `sensor_msgs/msg/NavSatFix`",
@@ -109,18 +114,21 @@ fn a_wrong_type_is_named_with_the_one_found() {
 #[test]
 fn set_of_an_unknown_key_names_the_nearest() {
     let run = hello(|manifest| manifest, &["--set", "brake_mps=-1.4"]);
-    says(run.must_exit(USAGE), &["lambda `hello` has no config value `brake_mps`", "brake_mps2"]);
+    assert_message(
+        run.must_exit(USAGE),
+        &["lambda `hello` has no config value `brake_mps`", "brake_mps2"],
+    );
 }
 
 #[test]
-fn set_of_a_wrong_type_says_what_is_wanted() {
+fn set_of_a_wrong_type_names_the_right_type() {
     let run = hello(|manifest| manifest, &["--set", "brake_mps2=hard"]);
-    says(run.must_exit(USAGE), &["`brake_mps2`", "`hard`", "a number"]);
+    assert_message(run.must_exit(USAGE), &["`brake_mps2`", "`hard`", "a number"]);
 }
 
 #[test]
-fn a_truncated_drive_keeps_what_was_decided_before_the_cut() {
-    let folder = Folder::new();
+fn a_truncated_drive_keeps_the_decisions_before_its_end() {
+    let folder = TempFolder::new();
     let lambda = root().join("examples/hello/rust");
     let run = replay(&lambda, &[truncated(&folder, 0.5)], &["--set", "brake_mps2=-1.4"]);
     let summary = run.must_exit(DAMAGED).summary.as_ref().expect("a summary of what was read");
@@ -133,7 +141,7 @@ fn a_truncated_drive_keeps_what_was_decided_before_the_cut() {
 
 #[test]
 fn a_corrupt_chunk_ends_the_drive_and_is_named() {
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let run = replay(
         &root().join("examples/hello/rust"),
         &[corrupted(&folder)],
@@ -146,13 +154,16 @@ fn a_corrupt_chunk_ends_the_drive_and_is_named() {
 }
 
 #[test]
-fn a_drive_that_is_none_is_refused() {
-    let folder = Folder::new();
+fn a_file_that_is_not_a_drive_is_refused() {
+    let folder = TempFolder::new();
     let text = folder.write("notes.mcap", "this is no drive");
     let lambda = root().join("examples/hello/rust");
-    says(replay(&lambda, &[text], &[]).must_exit(USAGE), &["notes.mcap` is not an MCAP file"]);
+    assert_message(
+        replay(&lambda, &[text], &[]).must_exit(USAGE),
+        &["notes.mcap` is not an MCAP file"],
+    );
     let missing = folder.path().join("missing.mcap");
-    says(
+    assert_message(
         replay(&lambda, &[missing], &[]).must_exit(USAGE),
         &["cannot open drive", "missing.mcap", "No such file"],
     );
@@ -161,7 +172,7 @@ fn a_drive_that_is_none_is_refused() {
 #[test]
 fn a_component_of_another_world_is_refused_by_name() {
     let run = with_component("(component)");
-    says(
+    assert_message(
         run.must_exit(USAGE),
         &[
             "error: cannot load lambda `hello`",
@@ -174,17 +185,18 @@ fn a_component_of_another_world_is_refused_by_name() {
 }
 
 #[test]
-fn an_import_that_the_host_does_not_have_is_named() {
+fn an_import_that_the_host_does_not_provide_is_named() {
     let run = with_component(
-        r#"(component (import "acme:radar/sweep@1.0.0" (instance)) (import "acme:radar/scan@1.0.0" (func)))"#,
+        r#"(component (import "acme:radar/sweep@1.0.0" (instance))
+            (import "acme:radar/scan@1.0.0" (func)))"#,
     );
-    says(run.must_exit(USAGE), &["does not fit the world", "acme:radar/s"]);
+    assert_message(run.must_exit(USAGE), &["does not fit the world", "acme:radar/s"]);
 }
 
 #[test]
 fn a_small_component_that_grows_while_it_is_compiled_is_refused() {
-    // Each component holds sixty instances of the one before: a few kilobytes that stand for
-    // thirteen million.
+    // Each component holds sixty instances of the previous one: a few kilobytes expand to thirteen
+    // million instances.
     let mut text =
         "(component (component $c0 (core module $m) (core instance (instantiate $m)))".to_owned();
     for level in 1..=4 {
@@ -192,36 +204,36 @@ fn a_small_component_that_grows_while_it_is_compiled_is_refused() {
         text += &format!("(component $c{level} {instances})");
     }
     let run = with_component(&(text + "(instance (instantiate $c4)))"));
-    says(
+    assert_message(
         run.must_exit(USAGE),
         &["cannot compile component", "hello.wasm", "it takes more than 2048 MiB of memory"],
     );
 }
 
-fn with_component(text: &str) -> Run {
-    let copy = Copy::of("examples/hello/rust", |manifest| manifest);
+fn with_component(text: &str) -> ReplayRun {
+    let copy = LambdaCopy::of("examples/hello/rust", |manifest| manifest);
     copy.replace("hello.wasm", wat::parse_str(text).expect("the test's own component"));
     replay(copy.path(), &[sample_drive()], &[])
 }
 
 #[test]
 fn a_lambda_that_is_not_built_names_the_command() {
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     folder.write(
         "lambda.toml",
         std::fs::read(root().join("examples/hello/rust/lambda.toml")).unwrap(),
     );
     let run = replay(folder.path(), &[sample_drive()], &[]);
-    says(run.must_exit(USAGE), &["help:", "gleaner build"]);
+    assert_message(run.must_exit(USAGE), &["help:", "gleaner build"]);
 }
 
 #[test]
-fn results_within_the_build_are_refused_under_whatever_name() {
-    let copy = Copy::of("examples/hello/rust", |manifest| manifest);
+fn results_inside_the_build_are_refused_by_any_path() {
+    let copy = LambdaCopy::of("examples/hello/rust", |manifest| manifest);
     std::os::unix::fs::symlink(copy.path().join("build"), copy.path().join("link")).unwrap();
     for out in ["build", "build/out", "link/out/a"] {
         let run = replay_to(&copy.path().join(out), copy.path(), &[sample_drive()], &[]);
-        says(
+        assert_message(
             run.must_exit(USAGE),
             &[out, "lies in the build, and would change the lambda", "help:", "--out DIR"],
         );
@@ -231,19 +243,19 @@ fn results_within_the_build_are_refused_under_whatever_name() {
 
 #[test]
 fn a_build_older_than_its_sources_names_the_source() {
-    let copy = Copy::of("examples/hello/rust", |manifest| manifest);
+    let copy = LambdaCopy::of("examples/hello/rust", |manifest| manifest);
     std::fs::create_dir_all(copy.path().join("src")).unwrap();
     let source = std::fs::File::create(copy.path().join("src/lib.rs")).unwrap();
     source.set_modified(std::time::SystemTime::now() + std::time::Duration::from_secs(60)).unwrap();
     let run = replay(copy.path(), &[sample_drive()], &[]);
-    says(run.must_exit(USAGE), &["src/lib.rs", "help:", "gleaner build"]);
+    assert_message(run.must_exit(USAGE), &["src/lib.rs", "help:", "gleaner build"]);
 }
 
 #[test]
-fn a_path_that_names_no_field_ends_the_start_with_the_fields_there_are() {
+fn an_unknown_field_path_fails_the_start_and_lists_the_fields() {
     for kind in ["rust", "python"] {
         let run = misbehave(kind, "bad_field");
-        says(
+        assert_message(
             run.must_exit(FAULTED),
             &["cannot start lambda `misbehave`", "in init: ", "has no field `w`", "x, y, z"],
         );
@@ -251,56 +263,57 @@ fn a_path_that_names_no_field_ends_the_start_with_the_fields_there_are() {
 }
 
 #[test]
-fn python_that_raises_in_import_ends_the_start_with_its_traceback() {
+fn an_exception_in_import_fails_the_start_with_its_traceback() {
     let run = replay(&root().join("tests/lambdas/raise-in-import/python"), &[sample_drive()], &[]);
-    says(run.must_exit(FAULTED), &["error: cannot start lambda", "in import", "main.py"]);
+    assert_message(run.must_exit(FAULTED), &["error: cannot start lambda", "in import", "main.py"]);
 }
 
 #[test]
-fn python_that_raises_in_init_ends_the_start_with_its_traceback() {
+fn an_exception_in_init_fails_the_start_with_its_traceback() {
     let run = misbehave("python", "error_in_init");
-    says(
+    assert_message(
         run.must_exit(FAULTED),
         &["cannot start lambda `misbehave`", "in init", "main.py", "line"],
     );
 }
 
 #[test]
-fn what_a_lambda_said_before_its_init_failed_is_shown() {
-    let copy = Copy::of("tests/lambdas/misbehave/python", |manifest| manifest);
-    let init = "def __init__(self, ctx):\n        print('no tea')\n        raise RuntimeError('no, not today')";
+fn the_log_of_a_failed_init_is_shown() {
+    let copy = LambdaCopy::of("tests/lambdas/misbehave/python", |manifest| manifest);
+    let init = "def __init__(self, ctx):\n        print('no tea')\n        \
+                raise RuntimeError('no, not today')";
     copy.replace(
         "main.py",
         format!("class Lambda:\n    {init}\n\n    def on_event(self, ctx, event):\n        pass\n"),
     );
     let run = replay(copy.path(), &[sample_drive()], &[]);
-    says(
+    assert_message(
         run.must_exit(FAULTED),
         &["log: no tea", "error: cannot start lambda `misbehave`", "no, not today"],
     );
 }
 
 #[test]
-fn python_that_raises_in_an_event_has_the_traceback_in_its_decision() {
+fn an_exception_in_an_event_has_its_traceback_in_the_decision() {
     let run = misbehave("python", "error");
     let (kind, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
     assert_eq!(kind, FaultKind::Exception);
     assert!(message.contains("main.py") && message.contains("in on_event"), "{message}");
-    went_on(&run);
+    assert_continued(&run);
 }
 
 #[test]
-fn an_exit_of_python_code_is_a_fault_and_not_the_end() {
+fn an_exit_in_python_code_is_a_fault_and_does_not_end_the_replay() {
     let run = misbehave("python", "exit");
     let (kind, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
     assert_eq!(kind, FaultKind::Exception);
     assert!(message.contains("SystemExit"), "{message}");
-    went_on(&run);
+    assert_continued(&run);
 }
 
-/// Every wake faulted, and every wake has its decision; between them, the lambda rested.
+/// Asserts that every wake faulted and has its decision, with back-off between them.
 #[track_caller]
-fn went_on(run: &Run) {
+fn assert_continued(run: &ReplayRun) {
     let summary = run.summary.as_ref().expect("a summary");
     assert!(run.decisions.len() > 8, "{} decisions", run.decisions.len());
     assert_eq!(
@@ -311,23 +324,23 @@ fn went_on(run: &Run) {
 }
 
 #[test]
-fn twins_are_refused_with_the_same_words() {
+fn twins_get_the_same_error_messages() {
     for behaviour in ["huge_label", "too_many_triggers", "not_a_frame", "nan_score"] {
         let [rust, python] = ["rust", "python"]
             .map(|kind| misbehave(kind, behaviour).first_fault().expect("a fault").1);
-        let said = rust.lines().next().unwrap_or_default();
-        assert!(python.contains(said), "{behaviour}: {rust:?} and {python:?}");
+        let error = rust.lines().next().unwrap_or_default();
+        assert!(python.contains(error), "{behaviour}: {rust:?} and {python:?}");
     }
 }
 
-fn misbehave(kind: &str, behaviour: &str) -> Run {
+fn misbehave(kind: &str, behaviour: &str) -> ReplayRun {
     let lambda = root().join("tests/lambdas/misbehave").join(kind);
     replay(&lambda, &[sample_drive()], &["--set", &format!("behaviour={behaviour}")])
 }
 
-/// Replays `pixels`, of both kinds, over a drive of one raw image.
-fn pixels_of(message: Vec<u8>) -> [Run; 2] {
-    let folder = Folder::new();
+/// Replays `pixels`, in both languages, over a drive with one raw image.
+fn pixels_of(message: Vec<u8>) -> [ReplayRun; 2] {
+    let folder = TempFolder::new();
     let drive = one_topic(
         &folder,
         "/camera/front/image_raw",
@@ -338,13 +351,13 @@ fn pixels_of(message: Vec<u8>) -> [Run; 2] {
     pixels_over(&[drive])
 }
 
-fn pixels_over(drives: &[PathBuf]) -> [Run; 2] {
+fn pixels_over(drives: &[PathBuf]) -> [ReplayRun; 2] {
     ["rust", "python"]
         .map(|kind| replay(&root().join("tests/lambdas/pixels").join(kind), drives, &[]))
 }
 
 #[test]
-fn an_image_whose_size_its_bytes_cannot_hold_is_refused_with_the_numbers() {
+fn an_image_with_too_few_bytes_for_its_size_is_refused_with_the_numbers() {
     for run in pixels_of(image(4000, 3000, "rgb8", 12000, &[0; 100])) {
         let (_, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
         assert!(message.contains("4000x3000") && message.contains("it has 100"), "{message}");
@@ -372,7 +385,7 @@ fn an_image_of_no_size_or_unknown_encoding_is_refused() {
 }
 
 #[test]
-fn a_message_that_ends_too_early_is_malformed_and_not_the_end() {
+fn a_truncated_message_is_malformed_and_does_not_end_the_replay() {
     let mut cut = image(10, 10, "mono8", 10, &[0; 100]);
     cut.truncate(40);
     for run in pixels_of(cut) {
@@ -383,11 +396,11 @@ fn a_message_that_ends_too_early_is_malformed_and_not_the_end() {
 
 #[test]
 fn a_jpeg_bomb_is_refused_before_memory_is_touched() {
-    // A header of 65,500 x 65,500 pixels, and nothing behind it.
+    // A header of 65,500 x 65,500 pixels without data.
     let mut bomb = vec![0xFF, 0xD8, 0xFF, 0xC0, 0, 17, 8];
     bomb.extend([0xFF, 0xDC, 0xFF, 0xDC, 3, 1, 0x11, 0, 2, 0x11, 0, 3, 0x11, 0]);
     bomb.extend([0xFF, 0xDA, 0, 12, 3, 1, 0, 2, 0, 3, 0, 0, 63, 0, 0xFF, 0xD9]);
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let topic = "/camera/front/image_raw";
     let drive = one_topic(
         &folder,
@@ -397,7 +410,7 @@ fn a_jpeg_bomb_is_refused_before_memory_is_touched() {
         &[(1, compressed(&bomb))],
     );
     for kind in ["rust", "python"] {
-        let copy = Copy::of(
+        let copy = LambdaCopy::of(
             &format!("tests/lambdas/pixels/{kind}"),
             replaced("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
         );
@@ -410,8 +423,8 @@ fn a_jpeg_bomb_is_refused_before_memory_is_touched() {
 }
 
 #[test]
-fn a_sample_larger_than_max_size_is_counted_and_said() {
-    let folder = Folder::new();
+fn a_sample_larger_than_max_size_is_counted_and_reported() {
+    let folder = TempFolder::new();
     let message = image(1000, 1000, "rgb8", 3000, &vec![7; 3_000_000]);
     let drive = one_topic(
         &folder,
@@ -426,14 +439,14 @@ fn a_sample_larger_than_max_size_is_counted_and_said() {
             (summary.wakes, summary.topics[0].too_big, summary.topics[0].received),
             (0, 1, 0)
         );
-        says(&run, &["samples dropped: larger than max_size", "camera", "1048576"]);
+        assert_message(&run, &["samples dropped: larger than max_size", "camera", "1048576"]);
     }
 }
 
 #[test]
-fn a_page_of_the_shim_that_is_none_is_refused() {
-    let folder = Folder::new();
-    // No number, none that can be a page, a file that is not open.
+fn an_invalid_page_of_the_shim_is_refused() {
+    let folder = TempFolder::new();
+    // Not a number, a number that cannot be the page, a file that is not open.
     for number in ["", "seven", "-4", "1", "99999"] {
         let mut replay = runtime();
         replay.env("GLEANER_PULSE", number).arg("replay").arg(root().join("examples/hello/rust"));
@@ -443,11 +456,12 @@ fn a_page_of_the_shim_that_is_none_is_refused() {
             .arg(folder.path())
             .output()
             .expect("gleaner-runtime starts");
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(1), "{number}: {said}");
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{number}: {stderr}");
         assert!(
-            said.contains("cannot use the shim's page") && said.contains("cause: GLEANER_PULSE "),
-            "{said}"
+            stderr.contains("cannot use the shim's page")
+                && stderr.contains("cause: GLEANER_PULSE "),
+            "{stderr}"
         );
     }
 }

@@ -1,5 +1,5 @@
-//! Drives as people have them: what a lambda decides over a rosbag2 directory is what it decides
-//! over the same drive in MCAP.
+//! Drives in other formats: a lambda makes the same decisions over a rosbag2 directory as over the
+//! same drive in MCAP.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -7,10 +7,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_lambda::Manifest;
-use gleaner_protocol::DriveSeen;
+use gleaner_protocol::DriveInfo;
 use gleaner_tests::bag::directory;
 use gleaner_tests::drive::{IMAGE, changed, image, one_topic};
-use gleaner_tests::{Copy, Folder, Run, program, replay, replay_to, root, sample_drive, verify};
+use gleaner_tests::{
+    LambdaCopy, ReplayRun, TempFolder, program, replay, replay_to, root, sample_drive, verify,
+};
 
 const OK: u8 = 0;
 const USAGE: u8 = 2;
@@ -21,12 +23,12 @@ fn lambda(example: &str, kind: &str) -> PathBuf {
     root().join("examples").join(example).join(kind)
 }
 
-fn braking(lambda: &Path, drive: &Path, args: &[&str]) -> Run {
+fn braking(lambda: &Path, drive: &Path, args: &[&str]) -> ReplayRun {
     replay(lambda, &[drive.to_owned()], &[&["--set", "brake_mps2=-1.4"], args].concat())
 }
 
-/// Time, topic and triggers of each decision: what a lambda makes of a drive, however it is stored.
-fn decided(run: &Run) -> Vec<String> {
+/// Time, topic and triggers of each decision, which do not depend on the storage of the drive.
+fn decided(run: &ReplayRun) -> Vec<String> {
     run.decisions
         .iter()
         .map(|decision| format!("{} {:?} {:?}", decision.at_ns, decision.topic, decision.triggers))
@@ -35,28 +37,28 @@ fn decided(run: &Run) -> Vec<String> {
 
 #[test]
 fn a_database_of_an_old_distribution_leads_to_the_same_decisions_and_clips() {
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let bag = directory(&folder, 1);
     for example in ["hello", "brake-dark"] {
         for kind in ["rust", "python"] {
             let lambda = lambda(example, kind);
-            let (ours, theirs) =
+            let (mcap, bag_run) =
                 (braking(&lambda, &sample_drive(), &["--all"]), braking(&lambda, &bag, &["--all"]));
-            ours.must_exit(OK);
-            theirs.must_exit(OK);
-            assert!(ours.decisions.len() > 300);
-            assert_eq!(decided(&ours), decided(&theirs), "{example} in {kind}");
-            let clips = |run: &Run| {
+            mcap.must_exit(OK);
+            bag_run.must_exit(OK);
+            assert!(mcap.decisions.len() > 300);
+            assert_eq!(decided(&mcap), decided(&bag_run), "{example} in {kind}");
+            let clips = |run: &ReplayRun| {
                 run.clips.iter().map(|clip| (clip.first_ns, clip.last_ns)).collect::<Vec<_>>()
             };
-            assert_eq!(clips(&ours), clips(&theirs), "{example} in {kind}");
+            assert_eq!(clips(&mcap), clips(&bag_run), "{example} in {kind}");
         }
     }
 }
 
 #[test]
-fn a_packed_drive_is_unpacked_beside_the_results_for_both_kinds() {
-    let (folder, out) = (Folder::new(), Folder::new());
+fn a_compressed_drive_is_unpacked_beside_the_results_for_both_kinds() {
+    let (folder, out) = (TempFolder::new(), TempFolder::new());
     let database = directory(&folder, 1).join("drive_0.db3");
     for (name, drive) in [("drive.mcap.zstd", sample_drive()), ("drive.db3.zstd", database)] {
         let packed =
@@ -80,7 +82,7 @@ fn a_packed_drive_is_unpacked_beside_the_results_for_both_kinds() {
 }
 
 #[test]
-fn a_part_of_a_drive_is_what_lies_between_two_times() {
+fn a_part_of_a_drive_lies_between_two_times() {
     let lambda = lambda("hello", "rust");
     let all = braking(&lambda, &sample_drive(), &["--all"]);
     let start_ns = all.summary.as_ref().unwrap().start_ns;
@@ -97,19 +99,21 @@ fn a_part_of_a_drive_is_what_lies_between_two_times() {
             .filter(|at_ns| span.contains(at_ns));
         assert!(expected.eq(stamps), "--from {from}");
         let summary = part.summary.as_ref().unwrap();
-        // Seconds in the results stay those of the drive.
+        // Times in the results are relative to the whole drive.
         assert_eq!((summary.start_ns, summary.part.from_ns), (start_ns, Some(span.start)));
     }
 }
 
 #[test]
-fn a_part_that_is_none_is_refused_with_what_there_is() {
+fn an_empty_part_is_refused_with_the_length_of_the_drive() {
     let lambda = lambda("hello", "rust");
     for args in [["--from", "41"], ["--to", "0"], ["--from", "@9000000000"], ["--to", "@5"]] {
         let run = braking(&lambda, &sample_drive(), &args);
         run.must_exit(USAGE);
-        for said in ["nothing in the part", args[0], "the drive is 39.993 s long", "from @"] {
-            assert!(run.stderr.contains(said), "{args:?}: {}", run.stderr);
+        for expected in
+            ["no message in the requested range", args[0], "the drive is 39.993 s long", "from @"]
+        {
+            assert!(run.stderr.contains(expected), "{args:?}: {}", run.stderr);
         }
     }
     assert!(
@@ -121,7 +125,7 @@ fn a_part_that_is_none_is_refused_with_what_there_is() {
 }
 
 #[test]
-fn clips_hold_the_topics_that_the_command_line_chooses() {
+fn clips_hold_the_topics_of_the_command_line() {
     let lambda = lambda("brake-dark", "rust");
     let kept = |args: &[&str]| {
         let run = braking(&lambda, &sample_drive(), args);
@@ -137,31 +141,32 @@ fn clips_hold_the_topics_that_the_command_line_chooses() {
         ["/vehicle/speed", "/imu/data"]
     );
     let none = braking(&lambda, &sample_drive(), &["--topics", "/lidar/*"]);
-    let said = &none.must_exit(USAGE).stderr;
-    assert!(said.contains("no topic `/lidar/*`") && said.contains("`/imu/data`"), "{said}");
+    let stderr = &none.must_exit(USAGE).stderr;
+    assert!(stderr.contains("no topic `/lidar/*`") && stderr.contains("`/imu/data`"), "{stderr}");
     let ticker = root().join("tests/lambdas/ticker/rust");
     let without = replay(&ticker, &[sample_drive()], &["--topics", "*"]);
     assert!(without.must_exit(USAGE).stderr.contains("[record]"), "{}", without.stderr);
 }
 
 #[test]
-fn what_is_recorded_moves_no_tick() {
-    // The wheels' speed begins 3 ms later than the camera.
-    let lambda = Copy::of("tests/lambdas/ticker/python", |manifest| {
+fn recorded_topics_do_not_change_the_times_of_ticks() {
+    // The wheel speed begins 3 ms after the camera.
+    let lambda = LambdaCopy::of("tests/lambdas/ticker/python", |manifest| {
         manifest
             .replace("/imu/data", "/vehicle/speed")
             .replace("sensor_msgs/msg/Imu", "geometry_msgs/msg/TwistStamped")
-            + "\n[record]\ntopics = [\"/vehicle/speed\"]\npreroll = \"100ms\"\npostroll = \"100ms\"\n"
+            + "\n[record]\ntopics = [\"/vehicle/speed\"]\npreroll = \"100ms\"\n\
+               postroll = \"100ms\"\n"
     });
     lambda.replace("main.py", "def on_tick(ctx):\n    pass\n");
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let journal = folder.path().join("ticks.journal");
     let ticks = |args: &[&str]| {
         let run = replay(lambda.path(), &[sample_drive()], &[&["--all"], args].concat());
         run.must_exit(OK).decisions.iter().map(|decision| decision.at_ns).collect::<Vec<_>>()
     };
     let alone = ticks(&["--no-record"]);
-    assert_eq!(alone.len(), 399, "one each 100 ms of the drive, the first after 100 ms");
+    assert_eq!(alone.len(), 399, "every 100 ms of the drive, the first after 100 ms");
     assert_eq!(ticks(&[]), alone);
     assert_eq!(ticks(&["--topics", "*", "--journal", journal.to_str().unwrap()]), alone);
     let drive = sample_drive();
@@ -172,12 +177,12 @@ fn what_is_recorded_moves_no_tick() {
         "--verify".as_ref(),
         journal.as_os_str(),
     ];
-    assert_eq!(verify(&line).verified.expect("it is verified").wakes, 399);
+    assert_eq!(verify(&line).verified.expect("the journal is verified").wakes, 399);
 }
 
 #[test]
-fn a_journal_of_a_part_of_a_directory_is_verified_as_it_is() {
-    let folder = Folder::new();
+fn a_journal_of_a_part_of_a_directory_is_verified_over_the_same_part() {
+    let folder = TempFolder::new();
     let (bag, lambda) = (directory(&folder, 1), lambda("hello", "rust"));
     let journal = folder.path().join("part.journal");
     let journal_arg = journal.to_str().unwrap();
@@ -197,10 +202,10 @@ fn a_journal_of_a_part_of_a_directory_is_verified_as_it_is() {
             .concat();
         verify(&line.iter().map(AsRef::as_ref).collect::<Vec<_>>())
     };
-    let verified = again(&[]).verified.expect("it is verified");
+    let verified = again(&[]).verified.expect("the journal is verified");
     assert!(verified.wakes > 1000 && verified.wakes < 2000 && !verified.truncated, "{verified:?}");
     assert!(again(&["--from", "6"]).stderr.contains("cannot be used with"));
-    // Every file of a directory counts, and so does what no lambda reads.
+    // Every byte of the directory's files counts, even those that no lambda reads.
     let db = rusqlite::Connection::open(bag.join("drive_0.db3")).unwrap();
     db.execute("UPDATE schema SET ros_distro = 'jammed'", []).unwrap();
     drop(db);
@@ -210,31 +215,31 @@ fn a_journal_of_a_part_of_a_directory_is_verified_as_it_is() {
 }
 
 #[test]
-fn a_database_that_was_cut_off_keeps_what_was_decided_before() {
-    let folder = Folder::new();
+fn a_truncated_database_keeps_the_decisions_before_its_end() {
+    let folder = TempFolder::new();
     let bag = directory(&folder, 1);
     let path = bag.join("drive_0.db3");
     let bytes = fs::read(&path).unwrap();
-    // Behind the pages on which all others hang.
+    // After the pages that all others depend on.
     fs::write(&path, &bytes[..bytes.len() / 10 * 9]).unwrap();
     let run = braking(&lambda("hello", "rust"), &bag, &["--no-record"]);
     let summary = run.must_exit(DAMAGED).summary.as_ref().unwrap();
     assert!(summary.wakes > 1000, "{}", summary.wakes);
     let damaged = summary.damaged.as_deref().unwrap();
-    for said in [
+    for expected in [
         "drive_0.db3` is damaged at the message after number",
-        "it was cut off",
+        "it was truncated",
         "of 4170 messages, up to",
         "results up to the damage are kept",
         ".recover",
     ] {
-        assert!(damaged.contains(said), "{damaged}");
+        assert!(damaged.contains(expected), "{damaged}");
     }
 }
 
 #[test]
-fn a_stamp_beyond_all_clocks_ends_the_drive_and_what_was_decided_before_is_kept() {
-    let folder = Folder::new();
+fn a_stamp_out_of_range_ends_the_drive_and_earlier_decisions_are_kept() {
+    let folder = TempFolder::new();
     let drive = changed(&folder, |message| {
         message.log_time |= u64::from(message.at_s > 30.0) << 63;
         true
@@ -253,8 +258,8 @@ fn a_stamp_beyond_all_clocks_ends_the_drive_and_what_was_decided_before_is_kept(
 }
 
 #[test]
-fn a_directory_that_cannot_be_used_says_why_and_what_to_do() {
-    let (folder, lambda) = (Folder::new(), lambda("hello", "rust"));
+fn a_directory_that_cannot_be_used_is_refused_with_cause_and_help() {
+    let (folder, lambda) = (TempFolder::new(), lambda("hello", "rust"));
     let bag = directory(&folder, 1);
     folder.write(
         "drive/metadata.yaml",
@@ -262,14 +267,14 @@ fn a_directory_that_cannot_be_used_says_why_and_what_to_do() {
     );
     let run = braking(&lambda, &bag, &[]);
     run.must_exit(USAGE);
-    for said in [
+    for expected in [
         "error: cannot use `",
         "metadata.yaml`",
         "cause: its storage is `bag_v2`",
         "help:  ",
         "ros2 bag reindex",
     ] {
-        assert!(run.stderr.contains(said), "{}", run.stderr);
+        assert!(run.stderr.contains(expected), "{}", run.stderr);
     }
     fs::remove_file(bag.join("metadata.yaml")).unwrap();
     let run = braking(&lambda, &bag, &["--no-record"]);
@@ -279,11 +284,11 @@ fn a_directory_that_cannot_be_used_says_why_and_what_to_do() {
 }
 
 #[test]
-fn files_that_the_metadata_pass_over_are_named() {
-    let (folder, lambda) = (Folder::new(), lambda("hello", "rust"));
+fn files_that_the_metadata_omit_are_named() {
+    let (folder, lambda) = (TempFolder::new(), lambda("hello", "rust"));
     let bag = directory(&folder, 1);
     assert!(!braking(&lambda, &bag, &["--no-record"]).must_exit(OK).stderr.contains("not read"));
-    // The same file, packed later: nothing is left out.
+    // The same file, compressed later: nothing is omitted.
     folder.write("drive/drive_0.db3.zstd", "");
     assert!(!braking(&lambda, &bag, &["--no-record"]).must_exit(OK).stderr.contains("not read"));
     fs::copy(bag.join("drive_0.db3"), bag.join("drive_1.db3")).unwrap();
@@ -293,12 +298,12 @@ fn files_that_the_metadata_pass_over_are_named() {
 }
 
 #[test]
-fn a_drive_with_hours_between_its_messages_and_hostile_sizes_is_shown_as_it_is() {
+fn long_gaps_and_hostile_sizes_in_a_drive_are_shown_unchanged() {
     let message = || image(u32::MAX, u32::MAX, "rgb8", 3, &[0; 3]);
     for (last, gap) in
         [(7_200_000_000_001, "  7200000.0 ms  "), (i64::MAX as u64, "  9223372036854.8 ms  ")]
     {
-        let folder = Folder::new();
+        let folder = TempFolder::new();
         let messages = [(1, message()), (last, message())];
         let drive = one_topic(&folder, "/camera", "sensor_msgs/msg/Image", IMAGE, &messages);
         let output = Command::new(program("gleaner")).arg("inspect").arg(drive).output().unwrap();
@@ -309,8 +314,8 @@ fn a_drive_with_hours_between_its_messages_and_hostile_sizes_is_shown_as_it_is()
 }
 
 #[test]
-fn what_is_in_a_drive_is_shown_without_a_lambda() {
-    let folder = Folder::new();
+fn the_content_of_a_drive_is_shown_without_a_lambda() {
+    let folder = TempFolder::new();
     let bag = directory(&folder, 1);
     let topics = |args: &[&str]| {
         let output = Command::new(program("gleaner")).arg("inspect").args(args).output().unwrap();
@@ -319,7 +324,7 @@ fn what_is_in_a_drive_is_shown_without_a_lambda() {
     for drive in [bag, sample_drive()] {
         let (code, json) = topics(&[drive.to_str().unwrap(), "--json"]);
         assert_eq!(code, Some(0));
-        let seen: DriveSeen = serde_json::from_str(&json).unwrap();
+        let seen: DriveInfo = serde_json::from_str(&json).unwrap();
         let found: Vec<_> = seen
             .topics
             .iter()
@@ -333,13 +338,13 @@ fn what_is_in_a_drive_is_shown_without_a_lambda() {
         let imu = &seen.topics[1];
         let interval = imu.interval.unwrap();
         assert_eq!(
-            (imu.read, interval.n, imu.missing, imu.largest_bytes),
+            (imu.messages_read, interval.n, imu.missing, imu.largest_bytes),
             (4170, 4169, Some(0), 320)
         );
         assert!((9_500_000..9_700_000).contains(&interval.p50_ns), "{interval:?}");
         let picture = seen.topics[0].picture.clone().unwrap();
         assert_eq!((picture.width, picture.height, picture.is_compressed), (640, 360, true));
-        // What is suggested is a manifest's.
+        // The suggested tables are valid in a manifest.
         let lambda =
             "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\n";
         let (_, tables) = text.split_once("for lambda.toml:\n").unwrap();

@@ -1,13 +1,13 @@
-//! `gleaner check`: what a lambda without samples already shows.
+//! `gleaner check`: mistakes that it finds without samples.
 
 use std::path::Path;
 use std::process::Command;
 
-use gleaner_protocol::{Checked, Place};
-use gleaner_tests::{Copy, program, root};
+use gleaner_protocol::{CheckReport, NeedPlace};
+use gleaner_tests::{LambdaCopy, program, root};
 
-/// Its result, or what it said instead.
-fn check(lambda: &Path) -> Result<Checked, String> {
+/// Its result, or its standard error.
+fn check(lambda: &Path) -> Result<CheckReport, String> {
     let mut check = Command::new(program("gleaner"));
     check
         .env("XDG_CACHE_HOME", root().join("target/test-cache"))
@@ -29,13 +29,13 @@ fn init_is_run_and_the_memory_of_every_input_counted_in_both_languages() {
         let need = |purpose: &str| {
             checked.needs.iter().find(|need| need.purpose.starts_with(purpose)).unwrap()
         };
-        // 512 that it sees, as many to spare, 8 that it may hold, one being written, one that a
-        // wake looks at; each rounded up.
+        // 512 visible samples, as many spare ones, 8 that may be held, one being written, one that
+        // a wake uses; each rounded up.
         let imu = need("input `imu`").bytes.unwrap();
         assert!((1034 * 4096..1034 * 4300).contains(&imu), "{imu}");
         let preroll = need("recorder: preroll");
         assert_eq!((preroll.bytes, preroll.preallocated), (Some(64 << 20), true));
-        assert_eq!((need("clips").bytes, need("clips").place), (None, Place::Disk));
+        assert_eq!((need("clips").bytes, need("clips").place), (None, NeedPlace::Disk));
         let rings = checked
             .needs
             .iter()
@@ -46,21 +46,21 @@ fn init_is_run_and_the_memory_of_every_input_counted_in_both_languages() {
 }
 
 #[test]
-fn a_field_or_an_input_that_is_not_there_is_found_without_a_drive() {
-    let renamed = Copy::of("examples/hello/python", |manifest| {
+fn an_unknown_field_or_input_is_found_without_a_drive() {
+    let renamed = LambdaCopy::of("examples/hello/python", |manifest| {
         manifest.replace("sensor_msgs/msg/Imu", "sensor_msgs/msg/Range")
     });
-    let said = check(renamed.path()).unwrap_err();
-    assert!(said.contains("has no field `linear_acceleration`"), "{said}");
+    let stderr = check(renamed.path()).unwrap_err();
+    assert!(stderr.contains("has no field `linear_acceleration`"), "{stderr}");
     let renamed =
-        Copy::of("examples/hello/rust", |manifest| manifest.replace("\"imu\"", "\"gyro\""));
-    let said = check(renamed.path()).unwrap_err();
-    assert!(said.contains("`imu`") && said.contains("gyro"), "{said}");
+        LambdaCopy::of("examples/hello/rust", |manifest| manifest.replace("\"imu\"", "\"gyro\""));
+    let stderr = check(renamed.path()).unwrap_err();
+    assert!(stderr.contains("`imu`") && stderr.contains("gyro"), "{stderr}");
 }
 
 #[test]
-fn a_type_that_nobody_here_knows_is_a_note_and_init_waits_for_it() {
-    let foreign = Copy::of("examples/hello/python", |manifest| {
+fn an_unknown_type_is_a_note_and_init_is_not_run() {
+    let foreign = LambdaCopy::of("examples/hello/python", |manifest| {
         manifest.replace("sensor_msgs/msg/Imu", "car_msgs/msg/Motion")
     });
     let checked = check(foreign.path()).unwrap();

@@ -1,13 +1,13 @@
-//! The command `gleaner` with the real runtime, as people and scripts use it.
+//! The command `gleaner` with the real runtime, as users and scripts use it.
 
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use gleaner_parts::Parts;
-use gleaner_protocol::Summary;
+use gleaner_protocol::ReplaySummary;
 use gleaner_tests::drive::truncated;
-use gleaner_tests::{Copy, Folder, program, root, sample_drive};
+use gleaner_tests::{LambdaCopy, TempFolder, program, root, sample_drive};
 
 const OK: i32 = 0;
 const USAGE: i32 = 2;
@@ -15,10 +15,10 @@ const FAULTED: i32 = 6;
 const DAMAGED: i32 = 7;
 
 /// `gleaner replay` of a lambda over a drive, with results in `out`.
-fn replay(lambda: &Path, drive: &Path, out: &Folder, args: &[&str]) -> Command {
+fn replay(lambda: &Path, drive: &Path, out: &TempFolder, args: &[&str]) -> Command {
     let mut gleaner = Command::new(program("gleaner"));
     gleaner.arg("replay").arg(lambda).arg(drive).args(args).arg("--out").arg(out.path());
-    // The tests' own, as for every replay of theirs.
+    // The tests' own cache, as for every replay of the tests.
     gleaner.env("XDG_CACHE_HOME", root().join("target/test-cache"));
     gleaner
 }
@@ -26,7 +26,7 @@ fn replay(lambda: &Path, drive: &Path, out: &Folder, args: &[&str]) -> Command {
 /// Output of a program that must end with `code`: standard output and standard error.
 #[track_caller]
 fn ends_with(code: i32, command: &mut Command) -> (String, String) {
-    let Output { status, stdout, stderr } = command.output().expect("it starts");
+    let Output { status, stdout, stderr } = command.output().expect("the program starts");
     let [stdout, stderr] = [stdout, stderr].map(|text| String::from_utf8_lossy(&text).into_owned());
     assert_eq!(status.code(), Some(code), "{stdout}{stderr}");
     (stdout, stderr)
@@ -37,14 +37,15 @@ fn hello() -> PathBuf {
 }
 
 #[test]
-fn json_is_the_summary_of_what_was_asked_for() {
-    let (out, drive) = (Folder::new(), sample_drive());
-    let car = Copy::of("examples/hello/rust", |manifest| {
+fn json_is_the_summary_of_the_replay() {
+    let (out, drive) = (TempFolder::new(), sample_drive());
+    let car = LambdaCopy::of("examples/hello/rust", |manifest| {
         manifest.replace("\"/imu/data\"", "\"/car/imu\"")
     });
     let args = ["--set", "brake_mps2=-1.4", "--remap", "/car/imu:=/imu/data", "--all", "--json"];
     let (stdout, stderr) = ends_with(OK, &mut replay(car.path(), &drive, &out, &args));
-    let summary: Summary = serde_json::from_str(&stdout).expect("one summary and nothing else");
+    let summary: ReplaySummary =
+        serde_json::from_str(&stdout).expect("one summary and nothing else");
     assert_eq!((summary.lambda.as_str(), summary.triggers, summary.faults), ("hello", 3, 0));
     assert_eq!((&summary.drive, summary.out.as_path()), (&vec![drive], out.path()));
     assert_eq!(stderr, "");
@@ -58,8 +59,8 @@ fn json_is_the_summary_of_what_was_asked_for() {
 }
 
 #[test]
-fn people_are_told_each_trigger_and_where_the_files_are() {
-    let out = Folder::new();
+fn each_trigger_and_the_result_files_are_listed() {
+    let out = TempFolder::new();
     let args = ["--set", "brake_mps2=-1.4"];
     let (stdout, _) = ends_with(OK, &mut replay(&hello(), &sample_drive(), &out, &args));
     assert!(stdout.starts_with("hello 0.1.0 (wasm): 3 triggers in "), "{stdout}");
@@ -75,7 +76,7 @@ fn people_are_told_each_trigger_and_where_the_files_are() {
 
 #[test]
 fn a_mistake_is_explained_once_and_ends_with_its_code() {
-    let out = Folder::new();
+    let out = TempFolder::new();
     let args = ["--set", "brake_mps=-1.4"];
     let (stdout, stderr) = ends_with(USAGE, &mut replay(&hello(), &sample_drive(), &out, &args));
     assert_eq!(stdout, "");
@@ -85,7 +86,7 @@ fn a_mistake_is_explained_once_and_ends_with_its_code() {
 
 #[test]
 fn a_faulty_lambda_gets_a_summary_with_the_cause() {
-    let (out, lambda) = (Folder::new(), root().join("tests/lambdas/misbehave/rust"));
+    let (out, lambda) = (TempFolder::new(), root().join("tests/lambdas/misbehave/rust"));
     let args = ["--set", "behaviour=panic"];
     let (stdout, _) = ends_with(FAULTED, &mut replay(&lambda, &sample_drive(), &out, &args));
     assert!(stdout.contains(" faults\n") && stdout.contains("x trap: "), "{stdout}");
@@ -93,7 +94,7 @@ fn a_faulty_lambda_gets_a_summary_with_the_cause() {
 
 #[test]
 fn a_damaged_drive_gets_a_summary_of_what_was_read() {
-    let (folder, out) = (Folder::new(), Folder::new());
+    let (folder, out) = (TempFolder::new(), TempFolder::new());
     let args = ["--set", "brake_mps2=-1.4"];
     let (stdout, _) =
         ends_with(DAMAGED, &mut replay(&hello(), &truncated(&folder, 0.5), &out, &args));
@@ -101,9 +102,9 @@ fn a_damaged_drive_gets_a_summary_of_what_was_read() {
 }
 
 #[test]
-fn a_reader_that_is_gone_is_no_failure() {
+fn a_closed_standard_output_is_no_failure() {
     for args in [&[][..], &["--json"]] {
-        let out = Folder::new();
+        let out = TempFolder::new();
         let mut gleaner = replay(&hello(), &sample_drive(), &out, args);
         let (reader, writer) = io::pipe().expect("a pipe");
         drop(reader);
@@ -113,17 +114,17 @@ fn a_reader_that_is_gone_is_no_failure() {
     }
 }
 
-/// Runs its arguments on a terminal of their own, and shows what appears there.
+/// Runs its arguments in a new terminal, and prints the terminal's output.
 const TERMINAL: &str =
     "import os, pty, sys; sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))";
 
 #[test]
 fn on_a_terminal_an_error_is_shown_to_its_last_line() {
-    let out = Folder::new();
+    let out = TempFolder::new();
     let typo = ["--set", "brake_mps=-1.4"];
     let (_, plain) = ends_with(USAGE, &mut replay(&hello(), &sample_drive(), &out, &typo));
     let python = Parts::find().and_then(|parts| parts.python(None)).expect("a Python");
-    // Once may be luck.
+    // A single run could pass by chance.
     for _ in 0..5 {
         let gleaner = replay(&hello(), &sample_drive(), &out, &typo);
         let mut terminal = Command::new(&python);

@@ -1,52 +1,52 @@
-//! The recipes of the cookbook in the real host: on the sample drive as `expected.txt` says, and,
-//! where that has no such moment, on the sample drive with the moment put into it.
+//! The recipes of the cookbook in the real host: on the sample drive, as `expected.txt` documents,
+//! and, for events that it does not contain, on the sample drive with such an event inserted.
 
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::PathBuf;
 
 use gleaner_lambda::Manifest;
-use gleaner_lambda::manifest::Kind;
-use gleaner_tests::drive::{Changed, changed};
-use gleaner_tests::{Folder, Run, replay, root, sample_drive};
+use gleaner_lambda::manifest::LambdaKind;
+use gleaner_tests::drive::{DriveMessage, changed};
+use gleaner_tests::{ReplayRun, TempFolder, replay, root, sample_drive};
 
 const IMU: &str = "/imu/data";
 const SPEED: &str = "/vehicle/speed";
 const CAMERA: &str = "/camera/front/compressed";
 
-/// `linear_acceleration.y` of an IMU message: behind orientation, angular velocity and their
-/// covariances.
+/// Index of `linear_acceleration.y` in an IMU message: after orientation, angular velocity and
+/// their covariances.
 const LATERAL: usize = 4 + 9 + 3 + 9 + 1;
-/// `twist.linear.x`.
+/// Index of `twist.linear.x`.
 const FORWARD: usize = 0;
 
 fn recipes() -> Vec<PathBuf> {
-    let folders = fs::read_dir(root().join("examples/cookbook")).expect("there is a cookbook");
-    let folders = folders.map(|folder| folder.expect("it can be listed").path());
+    let folders = fs::read_dir(root().join("examples/cookbook")).expect("the cookbook exists");
+    let folders = folders.map(|folder| folder.expect("the folder can be listed").path());
     let mut recipes: Vec<_> =
         folders.filter(|folder| folder.join("lambda.toml").is_file()).collect();
     recipes.sort();
     recipes
 }
 
-/// A recipe on the sample drive with each message as `change` leaves it.
-fn on(recipe: &str, change: impl FnMut(&mut Changed) -> bool) -> Run {
-    let folder = Folder::new();
+/// Runs a recipe on the sample drive with each message changed by `change`.
+fn on(recipe: &str, change: impl FnMut(&mut DriveMessage) -> bool) -> ReplayRun {
+    let folder = TempFolder::new();
     let drive = changed(&folder, change);
     let run = replay(&root().join("examples/cookbook").join(recipe), &[drive], &[]);
     run.must_exit(0);
     run
 }
 
-/// What a run found: labels, and times in seconds, rounded down to tenths.
-fn found(run: &Run) -> Vec<(String, f64)> {
+/// Labels and times of a run; seconds are rounded down to tenths.
+fn found(run: &ReplayRun) -> Vec<(String, f64)> {
     run.labels()
         .into_iter()
         .zip(run.seconds().into_iter().map(|second| (second * 10.0).floor() / 10.0))
         .collect()
 }
 
-fn is(message: &Changed, topic: &str, from_s: f64, to_s: f64) -> bool {
+fn is(message: &DriveMessage, topic: &str, from_s: f64, to_s: f64) -> bool {
     message.topic == topic && (from_s..to_s).contains(&message.at_s)
 }
 
@@ -57,7 +57,7 @@ fn there_are_ten_recipes_five_in_each_language() {
         .map(|recipe| Manifest::load(recipe).unwrap().lambda.kind)
         .collect::<Vec<_>>();
     let count = |kind| kinds.iter().filter(|other| **other == kind).count();
-    assert_eq!((count(Kind::Wasm), count(Kind::Python)), (5, 5));
+    assert_eq!((count(LambdaKind::Wasm), count(LambdaKind::Python)), (5, 5));
 }
 
 #[test]
@@ -81,13 +81,13 @@ fn every_recipe_decides_as_expected_on_the_sample_drive() {
             with_moments.insert(name);
         }
     }
-    // The others have a test below.
+    // The others have tests of their own.
     let expected = ["dark-to-bright", "every-kilometre", "novelty", "pothole", "stopped"];
     assert_eq!(with_moments, expected.map(str::to_owned).into());
 }
 
 #[test]
-fn a_push_to_both_sides_is_a_swerve_and_a_bend_is_none() {
+fn a_push_to_both_sides_is_a_swerve_and_a_bend_is_not() {
     let swerve = on("swerve", |message| {
         if is(message, IMU, 20.0, 21.0) {
             message.set(LATERAL, if message.at_s < 20.5 { 4.0 } else { -4.0 });
@@ -105,7 +105,7 @@ fn a_push_to_both_sides_is_a_swerve_and_a_bend_is_none() {
 }
 
 #[test]
-fn standing_is_recorded_from_its_third_second_until_the_car_goes() {
+fn a_stop_is_recorded_from_its_third_second_until_the_car_moves() {
     let run = on("stopped", |message| {
         if is(message, SPEED, 12.0, 20.0) {
             message.set(FORWARD, 0.0);
@@ -118,7 +118,7 @@ fn standing_is_recorded_from_its_third_second_until_the_car_goes() {
 }
 
 #[test]
-fn a_speed_that_jumps_while_nothing_pushes_is_a_mismatch() {
+fn a_jump_of_speed_without_acceleration_is_a_mismatch() {
     let run = on("speed-mismatch", |message| {
         if is(message, SPEED, 20.0, 60.0) {
             message.set(FORWARD, 25.0);
@@ -129,18 +129,21 @@ fn a_speed_that_jumps_while_nothing_pushes_is_a_mismatch() {
 }
 
 #[test]
-fn a_silent_sensor_is_told_once_and_its_return_is_logged() {
+fn a_silent_sensor_is_reported_once_and_its_return_is_logged() {
     let run = on("sensor-silent", |message| !is(message, IMU, 10.0, 13.0));
     let [(label, at_s)] = &found(&run)[..] else { panic!("{:?}", found(&run)) };
     assert!(label == "sensor-silent" && (10.9..=11.2).contains(at_s), "{at_s}");
     let trigger = run.decisions.iter().flat_map(|decision| &decision.triggers).next().unwrap();
     assert_eq!(trigger.attributes["topic"], IMU);
-    let said = run.log.iter().filter_map(|line| line["message"].as_str()).collect::<Vec<_>>();
-    assert!(said.iter().any(|line| line.starts_with("/imu/data is back after 3.")), "{said:?}");
+    let messages = run.log.iter().filter_map(|line| line["message"].as_str()).collect::<Vec<_>>();
+    assert!(
+        messages.iter().any(|line| line.starts_with("/imu/data is back after 3.")),
+        "{messages:?}"
+    );
 }
 
 #[test]
-fn a_clock_that_jumps_is_told_once_and_a_late_sample_is_not() {
+fn a_clock_jump_is_reported_once_and_a_late_sample_is_not() {
     let jumped = on("time-jump", |message| {
         if is(message, IMU, 20.0, 60.0) {
             message.shift_stamp(-2);
@@ -162,7 +165,7 @@ fn a_clock_that_jumps_is_told_once_and_a_late_sample_is_not() {
 }
 
 #[test]
-fn the_same_picture_again_and_again_is_told_once_if_the_car_moves() {
+fn a_frozen_image_is_reported_once_if_the_car_moves() {
     let freeze = |speed: Option<f64>| {
         let mut kept = Vec::new();
         on("frozen-image", move |message| {

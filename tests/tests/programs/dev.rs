@@ -1,34 +1,34 @@
-//! `gleaner dev`: what is saved is built, replayed and compared, until somebody ends it.
+//! `gleaner dev`: each saved change is built, replayed and compared, until the command is stopped.
 
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
-use gleaner_tests::{Folder, program, root, sample_drive};
+use gleaner_tests::{TempFolder, program, root, sample_drive};
 
 /// A build and a replay take a second or two; a busy machine needs longer.
 const DEADLINE: Duration = Duration::from_secs(120);
 
-/// `gleaner dev`, and the lines that it writes, wherever.
-struct Dev {
+/// `gleaner dev`, with the lines of both of its output streams.
+struct DevCommand {
     child: Child,
     lines: Receiver<String>,
 }
 
-impl Drop for Dev {
+impl Drop for DevCommand {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-impl Dev {
-    fn start(lambda: &Folder) -> Self {
+impl DevCommand {
+    fn start(lambda: &TempFolder) -> Self {
         let mut gleaner = Command::new(program("gleaner"));
         gleaner.arg("dev").arg(lambda.path()).arg(sample_drive()).arg("--no-record");
         gleaner.env("XDG_CACHE_HOME", root().join("target/test-cache"));
-        // One pipe for both streams, so that lines come in the order in which they are written.
+        // One pipe for both streams, so that lines arrive in the order in which they are written.
         let (reader, writer) = std::io::pipe().expect("a pipe");
         let child = gleaner
             .stdout(writer.try_clone().expect("a pipe"))
@@ -45,14 +45,14 @@ impl Dev {
         Self { child, lines }
     }
 
-    /// What it writes until it waits for the next change.
+    /// The output until it waits for the next change.
     fn round(&self) -> String {
         let mut round = String::new();
         loop {
             let line = self
                 .lines
                 .recv_timeout(DEADLINE)
-                .unwrap_or_else(|_| panic!("it does not come to an end: {round}"));
+                .unwrap_or_else(|_| panic!("no end of the round: {round}"));
             if line.starts_with("waiting for changes in ") {
                 return round;
             }
@@ -63,15 +63,14 @@ impl Dev {
 }
 
 #[test]
-fn each_change_is_built_replayed_and_compared_with_the_replay_before() {
-    let (lambda, source) = (Folder::new(), root().join("examples/hello/python"));
-    let read =
-        |name: &str| std::fs::read_to_string(source.join(name)).expect("the example is there");
+fn each_change_is_built_replayed_and_compared_with_the_previous_replay() {
+    let (lambda, source) = (TempFolder::new(), root().join("examples/hello/python"));
+    let read = |name: &str| std::fs::read_to_string(source.join(name)).expect("the example exists");
     let (manifest, main) = (read("lambda.toml"), read("main.py"));
     lambda.write("lambda.toml", &manifest);
     lambda.write("main.py", &main);
 
-    let dev = Dev::start(&lambda);
+    let dev = DevCommand::start(&lambda);
     let first = dev.round();
     assert!(
         first.contains("built ") && first.contains("hello 0.1.0 (python): 0 triggers"),
@@ -86,7 +85,7 @@ fn each_change_is_built_replayed_and_compared_with_the_replay_before() {
         gentler.contains("brake_mps2: -3 → -1.4") || gentler.contains("brake_mps2: -3.0 → -1.4"),
         "{gentler}"
     );
-    assert!(gentler.contains("triggers: 0 the same, 0 gone, 3 new, 0 changed"), "{gentler}");
+    assert!(gentler.contains("triggers: 0 identical, 0 removed, 3 added, 0 changed"), "{gentler}");
 
     lambda.write("main.py", format!("{main}\n)"));
     let broken = dev.round();
@@ -95,8 +94,8 @@ fn each_change_is_built_replayed_and_compared_with_the_replay_before() {
         "{broken}"
     );
 
-    // Compared with the last that worked.
+    // Compared with the last successful replay.
     lambda.write("main.py", format!("{main}\n# mended\n"));
     let mended = dev.round();
-    assert!(mended.contains("3 triggers the same"), "{mended}");
+    assert!(mended.contains("3 triggers identical"), "{mended}");
 }

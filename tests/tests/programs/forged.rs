@@ -1,8 +1,8 @@
-//! A clip whose statements, messages or attachments were changed is refused, and the record and the
-//! key are named.
+//! A clip with changed statements, messages or attachments is refused; the message names the record
+//! and the key.
 //!
-//! Each forgery writes the clip again with right checksums of its own, so that nothing but the
-//! comparison of the clip with itself can find it.
+//! Each forgery writes the clip with correct checksums, so that only the comparison of the clip
+//! with itself can find it.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -11,31 +11,31 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use gleaner_lambda::Clip;
-use gleaner_tests::parts::{Attached, Parts};
-use gleaner_tests::{Folder, Verification, replay_to, root, sample_drive, verify};
+use gleaner_tests::parts::{ClipAttachment, ClipParts};
+use gleaner_tests::{TempFolder, Verification, replay_to, root, sample_drive, verify};
 use mcap::Channel;
 use mcap::records::Metadata;
 
 const CAMERA: &str = "/camera/front/compressed";
 const IMU: &str = "/imu/data";
 
-/// A clip of hello that begins after the drive.
-struct Recorded {
+/// Clips of hello, the last of which begin later than the drive.
+struct RecordedClips {
     lambda: PathBuf,
-    out: Folder,
+    out: TempFolder,
     clips: Vec<PathBuf>,
 }
 
-impl Recorded {
+impl RecordedClips {
     fn of(kind: &str) -> Self {
-        let (lambda, out) = (root().join("examples/hello").join(kind), Folder::new());
+        let (lambda, out) = (root().join("examples/hello").join(kind), TempFolder::new());
         let run = replay_to(out.path(), &lambda, &[sample_drive()], &["--set", "brake_mps2=-1.4"]);
         run.must_exit(0);
         let clips = run.clips.iter().map(|clip| out.path().join(&clip.file)).collect();
         Self { lambda, out, clips }
     }
 
-    fn verify(&self, parts: &Parts) -> Verification {
+    fn verify(&self, parts: &ClipParts) -> Verification {
         let path = self.out.write("forged.mcap", parts.bytes());
         verify(&[
             "verify".as_ref(),
@@ -46,14 +46,14 @@ impl Recorded {
     }
 }
 
-/// A forgery: its name, what it does, and words of the refusal.
-type Forgery = (String, Box<dyn Fn(&mut Parts)>, Vec<String>);
+/// A forgery: its name, its change, and words of the error.
+type Forgery = (String, Box<dyn Fn(&mut ClipParts)>, Vec<String>);
 
-fn forgery(name: &str, words: &[&str], change: impl Fn(&mut Parts) + 'static) -> Forgery {
+fn forgery(name: &str, words: &[&str], change: impl Fn(&mut ClipParts) + 'static) -> Forgery {
     (name.to_owned(), Box::new(change), words.iter().map(|word| (*word).to_owned()).collect())
 }
 
-/// Another value of the same kind, as far as that can be.
+/// Another value of the same kind, if possible.
 fn other(value: &str) -> String {
     match value.parse::<i64>() {
         Ok(number) => (number + 1).to_string(),
@@ -61,20 +61,19 @@ fn other(value: &str) -> String {
     }
 }
 
-/// Every record dropped and doubled, with a key more, and without each of its keys and with another
-/// value of it.
-fn records(parts: &Parts) -> Vec<Forgery> {
+/// Drops and duplicates every record, adds a key, and removes or changes each key.
+fn records(parts: &ClipParts) -> Vec<Forgery> {
     let mut forgeries = Vec::new();
     for (index, Metadata { name, metadata }) in parts.metadata.iter().enumerate() {
         let of = |what: &str| format!("{what}: record {index}, {name}");
         let named = &[name.as_str()];
         forgeries
             .push(forgery(&of("dropped"), named, move |parts| drop(parts.metadata.remove(index))));
-        forgeries.push(forgery(&of("doubled"), named, move |parts| {
+        forgeries.push(forgery(&of("duplicated"), named, move |parts| {
             let double = parts.metadata[index].clone();
             parts.metadata.push(double);
         }));
-        forgeries.push(forgery(&of("a key more"), &[name, "more"], move |parts| {
+        forgeries.push(forgery(&of("an additional key"), &[name, "more"], move |parts| {
             parts.metadata[index].metadata.insert("more".to_owned(), "1".to_owned());
         }));
         for key in metadata.keys() {
@@ -92,7 +91,7 @@ fn records(parts: &Parts) -> Vec<Forgery> {
     forgeries
 }
 
-/// Changes that more than one place of the clip agrees with.
+/// Changes that are consistent in more than one place of the clip.
 fn statements() -> Vec<Forgery> {
     vec![
         forgery("attributes of a decision", &["gleaner.decision"], |parts| {
@@ -121,21 +120,21 @@ fn statements() -> Vec<Forgery> {
                 .record("begin")
                 .insert("moment".to_owned(), serde_json::to_string(&moment).unwrap());
         }),
-        forgery("one trigger less, everywhere", &["gleaner.decision", "trigger 1"], |parts| {
+        forgery("one trigger fewer, everywhere", &["gleaner.decision", "trigger 1"], |parts| {
             parts.metadata.retain(|metadata| metadata.name != "gleaner.decision");
             parts.record("clip").insert("triggers".to_owned(), "0".to_owned());
             parts.change_line(|line| {
                 line.triggers = 0;
                 line.moments.clear();
-                line.short.push("continues the clip before".to_owned());
+                line.incomplete.push("continues the clip before".to_owned());
             });
             let short = serde_json::from_str::<Clip>(&parts.record("clip")["line"])
                 .unwrap()
-                .short
+                .incomplete
                 .join("; ");
-            parts.record("clip").insert("short".to_owned(), short);
+            parts.record("clip").insert("incomplete".to_owned(), short);
         }),
-        forgery("one trigger more, counted only", &["gleaner.clip", "triggers"], |parts| {
+        forgery("one additional trigger, counted only", &["gleaner.clip", "triggers"], |parts| {
             parts.record("clip").insert("triggers".to_owned(), "7".to_owned());
             parts.change_line(|line| line.triggers = 7);
         }),
@@ -169,10 +168,10 @@ fn statements() -> Vec<Forgery> {
                     .for_each(|of| of.received = Some(1000));
             });
         }),
-        forgery("a number beyond all bounds", &["gleaner.topic", "overwritten"], |parts| {
+        forgery("a number out of range", &["gleaner.topic", "overwritten"], |parts| {
             parts.topic(CAMERA).insert("overwritten".to_owned(), u64::MAX.to_string());
         }),
-        forgery("a record of no recorder", &["gleaner.more"], |parts| {
+        forgery("a record that no recorder writes", &["gleaner.more"], |parts| {
             parts
                 .metadata
                 .push(Metadata { name: "gleaner.more".to_owned(), metadata: BTreeMap::new() });
@@ -180,11 +179,11 @@ fn statements() -> Vec<Forgery> {
     ]
 }
 
-/// Changes of messages.
+/// Changed messages.
 fn messages() -> Vec<Forgery> {
     let camera = &["gleaner.topic", CAMERA];
     let checksum = &["gleaner.topic", CAMERA, "checksum"];
-    let state_none = |parts: &mut Parts| {
+    let state_no_messages = |parts: &mut ClipParts| {
         parts.topic(CAMERA).insert("messages".to_owned(), "0".to_owned());
         parts.topic(CAMERA).insert("checksum".to_owned(), "0".repeat(16));
     };
@@ -192,14 +191,14 @@ fn messages() -> Vec<Forgery> {
         forgery("no camera message", checksum, |parts| parts.drop_messages_of(CAMERA)),
         forgery("no camera message, and 0 stated", &["gleaner.topic", CAMERA], move |parts| {
             parts.drop_messages_of(CAMERA);
-            state_none(parts);
+            state_no_messages(parts);
         }),
         forgery(
             "no camera message, and 0 stated twice",
             &["gleaner.topic", CAMERA, "received"],
             move |parts| {
                 parts.drop_messages_of(CAMERA);
-                state_none(parts);
+                state_no_messages(parts);
                 parts.change_line(|line| {
                     line.topics
                         .iter_mut()
@@ -212,12 +211,12 @@ fn messages() -> Vec<Forgery> {
             parts.drop_messages_of(CAMERA);
             parts.metadata.retain(|metadata| metadata.name != "gleaner.topic");
         }),
-        forgery("one camera message less", checksum, |parts| {
+        forgery("one camera message fewer", checksum, |parts| {
             let first = parts.channel_of(CAMERA);
             let index = parts.messages.iter().position(|(channel, ..)| *channel == first).unwrap();
             parts.messages.remove(index);
         }),
-        forgery("one camera message less, and one less stated", camera, |parts| {
+        forgery("one camera message fewer, and one fewer stated", camera, |parts| {
             let first = parts.channel_of(CAMERA);
             let index = parts.messages.iter().position(|(channel, ..)| *channel == first).unwrap();
             parts.messages.remove(index);
@@ -283,17 +282,18 @@ fn messages() -> Vec<Forgery> {
     ]
 }
 
-/// Changes of the files within the clip. `other` is the journal of another clip.
-fn attachments(other: Attached) -> Vec<Forgery> {
-    let picture =
-        |parts: &Parts| parts.attachments.iter().position(|of| of.name == "thumbnail.jpg").unwrap();
+/// Changed attachments. `other` is the journal of another clip.
+fn attachments(other: ClipAttachment) -> Vec<Forgery> {
+    let thumbnail = |parts: &ClipParts| {
+        parts.attachments.iter().position(|of| of.name == "thumbnail.jpg").unwrap()
+    };
     vec![
         forgery("a second journal of garbage", &["attachment `journal/hello.journal`"], |parts| {
-            let garbage = Attached { data: b"garbage".to_vec(), ..parts.journal().clone() };
+            let garbage = ClipAttachment { data: b"garbage".to_vec(), ..parts.journal().clone() };
             parts.attachments.push(garbage);
         }),
         forgery("a second journal of garbage before the first", &["journal"], |parts| {
-            let garbage = Attached { data: b"garbage".to_vec(), ..parts.journal().clone() };
+            let garbage = ClipAttachment { data: b"garbage".to_vec(), ..parts.journal().clone() };
             parts.attachments.insert(0, garbage);
         }),
         forgery("the journal twice", &["attachment `journal/hello.journal`"], |parts| {
@@ -309,7 +309,7 @@ fn attachments(other: Attached) -> Vec<Forgery> {
             let middle = data.len() / 2;
             data[middle] ^= 1;
         }),
-        forgery("a journal that is cut off", &["has no end"], |parts| {
+        forgery("a truncated journal", &["has no end"], |parts| {
             let data = &mut parts.journal().data;
             data.truncate(data.len() - 5);
         }),
@@ -323,7 +323,7 @@ fn attachments(other: Attached) -> Vec<Forgery> {
             "the journal of a lambda that is not in the clip",
             &["attachment `journal/other.journal`"],
             |parts| {
-                let other = Attached {
+                let other = ClipAttachment {
                     name: "journal/other.journal".to_owned(),
                     ..parts.journal().clone()
                 };
@@ -331,40 +331,40 @@ fn attachments(other: Attached) -> Vec<Forgery> {
             },
         ),
         forgery("another thumbnail", &["gleaner.clip", "thumbnail"], move |parts| {
-            let index = picture(parts);
+            let index = thumbnail(parts);
             *parts.attachments[index].data.last_mut().unwrap() ^= 1;
         }),
         forgery("no thumbnail", &["gleaner.clip", "thumbnail"], move |parts| {
-            let index = picture(parts);
+            let index = thumbnail(parts);
             parts.attachments.remove(index);
         }),
         forgery("two thumbnails", &["attachment `thumbnail.jpg`"], move |parts| {
-            let double = parts.attachments[picture(parts)].clone();
+            let double = parts.attachments[thumbnail(parts)].clone();
             parts.attachments.push(double);
         }),
-        forgery("a file of somebody else", &["attachment `notes.txt`"], |parts| {
-            let notes = Attached { name: "notes.txt".to_owned(), ..parts.journal().clone() };
+        forgery("an unknown file", &["attachment `notes.txt`"], |parts| {
+            let notes = ClipAttachment { name: "notes.txt".to_owned(), ..parts.journal().clone() };
             parts.attachments.push(notes);
         }),
     ]
 }
 
-fn refused(kind: &str) {
-    let recorded = Recorded::of(kind);
-    let mut whole = Parts::of(&recorded.clips[1]);
-    let control = recorded.verify(&whole);
-    assert_eq!(control.exit, 0, "the clip is not forged: {}", control.stderr);
-    let other = Parts::of(&recorded.clips[0]).journal().clone();
+fn all_forgeries_are_refused(kind: &str) {
+    let recorded = RecordedClips::of(kind);
+    let mut original = ClipParts::of(&recorded.clips[1]);
+    let control = recorded.verify(&original);
+    assert_eq!(control.exit, 0, "the original clip is refused: {}", control.stderr);
+    let other = ClipParts::of(&recorded.clips[0]).journal().clone();
     assert!(
-        whole.messages_of(CAMERA).len() > 10
-            && whole.metadata.iter().any(|of| of.name == "gleaner.decision")
+        original.messages_of(CAMERA).len() > 10
+            && original.metadata.iter().any(|of| of.name == "gleaner.decision")
     );
-    let all = [records(&whole), statements(), messages(), attachments(other)];
+    let all = [records(&original), statements(), messages(), attachments(other)];
     let forgeries: Vec<Forgery> = all.into_iter().flatten().collect();
     assert!(forgeries.len() > 150, "{}", forgeries.len());
     let mut accepted = Vec::new();
     for (name, change, words) in &forgeries {
-        let mut forged = whole.clone();
+        let mut forged = original.clone();
         change(&mut forged);
         let Verification { exit, stderr, .. } = recorded.verify(&forged);
         let missing: Vec<_> = words.iter().filter(|word| !stderr.contains(word.as_str())).collect();
@@ -384,10 +384,10 @@ fn refused(kind: &str) {
 
 #[test]
 fn every_forged_clip_of_a_wasm_lambda_is_refused() {
-    refused("rust");
+    all_forgeries_are_refused("rust");
 }
 
 #[test]
 fn every_forged_clip_of_a_python_lambda_is_refused() {
-    refused("python");
+    all_forgeries_are_refused("python");
 }

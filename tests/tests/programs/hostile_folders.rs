@@ -1,6 +1,6 @@
-//! Folders that were made to do harm: links, pipes, devices and files without an end, wherever a
-//! program of ours reads what a lambda's author has put there. Each command ends, names the file
-//! and the way out, and leaves nothing half made.
+//! Hostile folders: links, pipes, devices and endless files wherever a program reads files of a
+//! lambda's author. Each command ends, names the file and the way out, and leaves no partial
+//! results.
 
 use std::fs::{self, File};
 use std::os::unix::fs::symlink;
@@ -8,38 +8,40 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_parts::Parts;
-use gleaner_tests::{Folder, program, root, sample_drive};
+use gleaner_tests::{TempFolder, program, root, sample_drive};
 
 const USAGE: i32 = 2;
 
-/// Seconds after which a command counts as one that waits for ever; each takes some milliseconds.
-const HANGS: &str = "120";
+/// Timeout of a command in seconds; each takes some milliseconds.
+const TIMEOUT_S: &str = "120";
 
-const MANIFEST: &str = "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'\n\
-                        [[model]]\nname = 'm'\nfile = 'm.onnx'\nsha256 = '0000000000000000000000000000000000000000000000000000000000000000'\n";
+const MANIFEST: &str = "lambda = { name = 'x', version = '0.1.0', kind = 'python', \
+                        entry = 'main.py' }\nschedule.period = '1s'\n\
+                        [[model]]\nname = 'm'\nfile = 'm.onnx'\nsha256 = \
+                        '0000000000000000000000000000000000000000000000000000000000000000'\n";
 
-/// What a bad file is.
+/// Kind of a hostile file.
 #[derive(Clone, Copy, Debug)]
-enum Bad {
-    /// A link to the file of somebody else.
+enum HostileFile {
+    /// A link to a file outside of the lambda.
     Link,
-    /// A link to the folder of somebody else.
+    /// A link to a folder outside of the lambda.
     LinkToFolder,
-    /// A link to a device without an end.
+    /// A link to an endless device.
     Device,
     Pipe,
-    /// A terabyte that takes no disk.
+    /// A file of a terabyte that takes no disk space.
     Sparse,
 }
 
-/// A lambda in Python, and what is none of its business.
-struct Lambda {
-    all: Folder,
+/// A lambda in Python, and files outside of it.
+struct TestLambda {
+    all: TempFolder,
 }
 
-impl Lambda {
+impl TestLambda {
     fn new() -> Self {
-        let all = Folder::new();
+        let all = TempFolder::new();
         all.write("secret/a/msg/X.msg", "secret");
         all.write("lambda/lambda.toml", MANIFEST);
         all.write("lambda/main.py", "def on_tick(ctx):\n    pass\n");
@@ -57,8 +59,8 @@ impl Lambda {
         self.all.path().join("lambda").join(name)
     }
 
-    /// Puts a bad file in the place of `name`; what the message about it has to name.
-    fn spoil(&self, name: &str, bad: Bad) -> String {
+    /// Replaces `name` by a hostile file; returns the text that the error must contain.
+    fn spoil(&self, name: &str, kind: HostileFile) -> String {
         let (path, secret) = (self.path(name), self.all.path().join("secret"));
         let _ = fs::remove_file(&path);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -66,15 +68,15 @@ impl Lambda {
             symlink(target, &path).unwrap();
             format!("it is a link to `{}`, outside of `", target.display())
         };
-        let why = match bad {
-            Bad::Link => leads_to(&secret.join("a/msg/X.msg")),
-            Bad::LinkToFolder => leads_to(&secret),
-            Bad::Device => leads_to(Path::new("/dev/zero")),
-            Bad::Pipe => {
+        let why = match kind {
+            HostileFile::Link => leads_to(&secret.join("a/msg/X.msg")),
+            HostileFile::LinkToFolder => leads_to(&secret),
+            HostileFile::Device => leads_to(Path::new("/dev/zero")),
+            HostileFile::Pipe => {
                 assert!(Command::new("mkfifo").arg(&path).status().unwrap().success());
-                "it is no file".to_owned()
+                "it is not a regular file".to_owned()
             }
-            Bad::Sparse => {
+            HostileFile::Sparse => {
                 File::create(&path).unwrap().set_len(1 << 40).unwrap();
                 String::new()
             }
@@ -82,68 +84,75 @@ impl Lambda {
         format!("{name}` {why}")
     }
 
-    /// Runs a command on the lambda: its exit code, and what it said of an error.
+    /// Runs a command on the lambda; returns its exit code and standard error.
     fn gleaner(&self, args: &[&str]) -> (i32, String) {
         let mut gleaner = Command::new("timeout");
-        gleaner.arg(HANGS).arg(program("gleaner")).arg(args[0]).args(&args[1..]).arg(self.path(""));
+        gleaner
+            .arg(TIMEOUT_S)
+            .arg(program("gleaner"))
+            .arg(args[0])
+            .args(&args[1..])
+            .arg(self.path(""));
         if args[0] == "replay" {
             gleaner.arg(sample_drive());
         }
         gleaner
             .env("XDG_CACHE_HOME", root().join("target/test-cache"))
             .env_remove("GLEANER_PYTHON");
-        let output = gleaner.output().expect("it starts");
+        let output = gleaner.output().expect("the program starts");
         (output.status.code().unwrap_or(128), String::from_utf8_lossy(&output.stderr).into_owned())
     }
 
-    /// Runs a command, which must refuse what is in `wanted`, a file and the reason.
+    /// Runs a command, which must refuse the file for the reason in `wanted`.
     #[track_caller]
     fn refuses(&self, args: &[&str], wanted: &str) {
-        let (code, said) = self.gleaner(args);
-        assert_eq!(code, USAGE, "{args:?} {wanted}: {said}");
+        let (code, stderr) = self.gleaner(args);
+        assert_eq!(code, USAGE, "{args:?} {wanted}: {stderr}");
         let (name, why) = wanted.split_once("` ").unwrap();
         assert!(
-            said.contains(&format!("{name}`")) && said.contains(why) && said.contains("help:"),
-            "{wanted}: {said}"
+            stderr.contains(&format!("{name}`"))
+                && stderr.contains(why)
+                && stderr.contains("help:"),
+            "{wanted}: {stderr}"
         );
     }
 }
 
 #[test]
-fn a_build_refuses_by_name_what_is_no_file_of_its_folder_and_leaves_nothing() {
-    for (name, bad) in [
-        ("lambda.toml", Bad::Link),
-        ("lambda.toml", Bad::Device),
-        ("lambda.toml", Bad::Pipe),
-        ("lambda.toml", Bad::Sparse),
-        ("main.py", Bad::Link),
-        ("main.py", Bad::Device),
-        ("main.py", Bad::Pipe),
-        ("main.py", Bad::Sparse),
-        ("part/of.py", Bad::Link),
-        ("part/of.py", Bad::Sparse),
-        ("m.onnx", Bad::Link),
-        ("m.onnx", Bad::Device),
-        ("m.onnx", Bad::Pipe),
-        ("m.onnx", Bad::Sparse),
-        ("msg/a/msg/X.msg", Bad::Link),
-        ("msg/a/msg/X.msg", Bad::Sparse),
-        ("msg", Bad::LinkToFolder),
+fn a_build_names_and_refuses_hostile_files_and_leaves_nothing() {
+    for (name, kind) in [
+        ("lambda.toml", HostileFile::Link),
+        ("lambda.toml", HostileFile::Device),
+        ("lambda.toml", HostileFile::Pipe),
+        ("lambda.toml", HostileFile::Sparse),
+        ("main.py", HostileFile::Link),
+        ("main.py", HostileFile::Device),
+        ("main.py", HostileFile::Pipe),
+        ("main.py", HostileFile::Sparse),
+        ("part/of.py", HostileFile::Link),
+        ("part/of.py", HostileFile::Sparse),
+        ("m.onnx", HostileFile::Link),
+        ("m.onnx", HostileFile::Device),
+        ("m.onnx", HostileFile::Pipe),
+        ("m.onnx", HostileFile::Sparse),
+        ("msg/a/msg/X.msg", HostileFile::Link),
+        ("msg/a/msg/X.msg", HostileFile::Sparse),
+        ("msg", HostileFile::LinkToFolder),
     ] {
-        let lambda = Lambda::new();
-        // As a build that was killed leaves it.
+        let lambda = TestLambda::new();
+        // The state after a killed build.
         lambda.all.write("lambda/.build.partial/half.py", "");
-        let wanted = lambda.spoil(name, bad);
+        let wanted = lambda.spoil(name, kind);
         lambda.refuses(&["build"], &wanted);
         assert!(!lambda.path("build").exists(), "{wanted}");
-        // A manifest that cannot be read names no build.
+        // A manifest that cannot be read gives no build folder.
         assert!(name == "lambda.toml" || !lambda.path(".build.partial").exists(), "{wanted}");
     }
 }
 
 #[test]
-fn a_link_within_the_folder_is_built_as_the_file_that_it_leads_to() {
-    let lambda = Lambda::new();
+fn a_link_within_the_folder_is_built_as_its_target() {
+    let lambda = TestLambda::new();
     symlink("main.py", lambda.path("short.py")).unwrap();
     symlink(lambda.path("main.py"), lambda.path("long.py")).unwrap();
     assert_eq!(lambda.gleaner(&["build"]), (0, String::new()));
@@ -155,34 +164,34 @@ fn a_link_within_the_folder_is_built_as_the_file_that_it_leads_to() {
 }
 
 #[test]
-fn many_files_without_much_in_them_do_not_fill_the_disk() {
-    let lambda = Lambda::new();
+fn many_sparse_files_do_not_fill_the_disk() {
+    let lambda = TestLambda::new();
     for number in 0..300 {
         let file = File::create(lambda.path(&format!("x{number}.py"))).unwrap();
         file.set_len(gleaner_lambda::SOURCE_MAX.bytes()).unwrap();
     }
-    let (code, said) = lambda.gleaner(&["build"]);
-    assert_eq!(code, USAGE, "{said}");
-    assert!(said.contains("more than 4 GiB") && said.contains("help:"), "{said}");
+    let (code, stderr) = lambda.gleaner(&["build"]);
+    assert_eq!(code, USAGE, "{stderr}");
+    assert!(stderr.contains("more than 4 GiB") && stderr.contains("help:"), "{stderr}");
     assert!(!lambda.path(".build.partial").exists());
 }
 
 #[test]
-fn every_command_refuses_by_name_what_is_no_file_of_a_build() {
-    for (name, bad) in [
-        ("build/lambda.toml", Bad::Link),
-        ("build/lambda.toml", Bad::Pipe),
-        ("build/lambda.toml", Bad::Sparse),
-        ("build/main.py", Bad::Link),
-        ("build/main.py", Bad::Device),
-        ("build/main.py", Bad::Pipe),
-        ("build/main.py", Bad::Sparse),
-        ("build/more/notes", Bad::Link),
-        ("build/more/notes", Bad::Pipe),
-        ("build/more/notes", Bad::Sparse),
+fn every_command_names_and_refuses_hostile_files_of_a_build() {
+    for (name, kind) in [
+        ("build/lambda.toml", HostileFile::Link),
+        ("build/lambda.toml", HostileFile::Pipe),
+        ("build/lambda.toml", HostileFile::Sparse),
+        ("build/main.py", HostileFile::Link),
+        ("build/main.py", HostileFile::Device),
+        ("build/main.py", HostileFile::Pipe),
+        ("build/main.py", HostileFile::Sparse),
+        ("build/more/notes", HostileFile::Link),
+        ("build/more/notes", HostileFile::Pipe),
+        ("build/more/notes", HostileFile::Sparse),
     ] {
-        let lambda = Lambda::built();
-        let wanted = lambda.spoil(name, bad);
+        let lambda = TestLambda::built();
+        let wanted = lambda.spoil(name, kind);
         let journal = lambda.all.path().join("journal");
         for args in [
             &["replay"][..],
@@ -198,24 +207,24 @@ fn every_command_refuses_by_name_what_is_no_file_of_a_build() {
 }
 
 #[test]
-fn an_environment_whose_description_is_no_file_is_refused_and_no_other_taken() {
-    let lambda = Lambda::built();
-    let python = Parts::find().and_then(|parts| parts.python(None)).expect("there is a Python");
+fn an_environment_with_a_hostile_description_is_refused() {
+    let lambda = TestLambda::built();
+    let python = Parts::find().and_then(|parts| parts.python(None)).expect("Python is installed");
     fs::create_dir_all(lambda.path(".venv/bin")).unwrap();
     symlink(python, lambda.path(".venv/bin/python3")).unwrap();
-    for bad in [Bad::Pipe, Bad::Device, Bad::Link, Bad::Sparse] {
-        let wanted = lambda.spoil(".venv/pyvenv.cfg", bad);
+    for kind in [HostileFile::Pipe, HostileFile::Device, HostileFile::Link, HostileFile::Sparse] {
+        let wanted = lambda.spoil(".venv/pyvenv.cfg", kind);
         lambda.refuses(&["replay"], &wanted);
         lambda.refuses(&["check"], &wanted);
     }
 }
 
 #[test]
-fn an_update_refuses_a_manifest_that_is_no_file() {
-    let lambda = Lambda::new();
+fn an_update_refuses_a_hostile_manifest() {
+    let lambda = TestLambda::new();
     fs::create_dir(lambda.path(".gleaner")).unwrap();
-    for bad in [Bad::Pipe, Bad::Device, Bad::Link, Bad::Sparse] {
-        let wanted = lambda.spoil("lambda.toml", bad);
+    for kind in [HostileFile::Pipe, HostileFile::Device, HostileFile::Link, HostileFile::Sparse] {
+        let wanted = lambda.spoil("lambda.toml", kind);
         lambda.refuses(&["new", "--update"], &wanted);
     }
 }

@@ -1,27 +1,29 @@
-//! A journal makes every decision again, and whatever was changed since is found and named.
+//! Verifying a journal repeats every decision, and names anything that has changed since.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use gleaner_tests::{Copy, Folder, Run, Verification, replay_to, root, sample_drive, verify};
+use gleaner_tests::{
+    LambdaCopy, ReplayRun, TempFolder, Verification, replay_to, root, sample_drive, verify,
+};
 
 const HELLO: &str = "examples/hello/rust";
 const BRAKING: [&str; 2] = ["--set", "brake_mps2=-1.4"];
 
-struct Journaled {
-    out: Folder,
+struct JournaledRun {
+    out: TempFolder,
     journal: PathBuf,
-    run: Run,
+    run: ReplayRun,
 }
 
-fn journaled(lambda: &Path, drive: &Path, args: &[&str]) -> Journaled {
-    let out = Folder::new();
+fn journaled(lambda: &Path, drive: &Path, args: &[&str]) -> JournaledRun {
+    let out = TempFolder::new();
     let journal = out.path().join("wakes.journal");
     let args = [args, &["--journal", journal.to_str().unwrap()]].concat();
     let run = replay_to(out.path(), lambda, &[drive.to_owned()], &args);
-    Journaled { out, journal, run }
+    JournaledRun { out, journal, run }
 }
 
 fn verify_drive(lambda: &Path, drive: &Path, journal: &Path, args: &[&str]) -> Verification {
@@ -45,9 +47,8 @@ fn differs(verification: &Verification, exit: u8, words: &[&str]) {
     assert!(verification.verified.is_none());
 }
 
-/// The sample drive with a byte of its `n`th IMU message changed, in a file whose checksums are
-/// right.
-fn forged(folder: &Folder, n: usize) -> PathBuf {
+/// The sample drive with a changed byte in its `n`th IMU message and correct checksums.
+fn forged(folder: &TempFolder, n: usize) -> PathBuf {
     let bytes = std::fs::read(sample_drive()).unwrap();
     let mut file = Cursor::new(Vec::new());
     let mut writer = mcap::WriteOptions::new().profile("ros2").create(&mut file).unwrap();
@@ -77,9 +78,9 @@ fn forged(folder: &Folder, n: usize) -> PathBuf {
     folder.write(&format!("forged-{n}.mcap"), file.into_inner())
 }
 
-/// Replays with a journal and makes every decision again; gives the number of faults, and of wakes
-/// passed over after them.
-fn proved(lambda: &Path, args: &[&str]) -> (u64, u64) {
+/// Replays with a journal and verifies it; returns the number of faults, and of wakes skipped by
+/// back-off.
+fn verified(lambda: &Path, args: &[&str]) -> (u64, u64) {
     let journaled = journaled(lambda, &sample_drive(), args);
     assert!([0, 6].contains(&journaled.run.exit), "{}", journaled.run.stderr);
     let summary = journaled.run.summary.unwrap();
@@ -92,7 +93,7 @@ fn proved(lambda: &Path, args: &[&str]) -> (u64, u64) {
 }
 
 #[test]
-fn every_decision_of_every_lambda_is_made_again() {
+fn every_decision_of_every_lambda_is_repeated() {
     let lambdas: [(&str, &[&str]); 5] = [
         ("examples/hello", &BRAKING),
         ("examples/brake-dark", &BRAKING),
@@ -103,13 +104,13 @@ fn every_decision_of_every_lambda_is_made_again() {
     for (lambda, args) in lambdas {
         for kind in ["rust", "python"] {
             let lambda = root().join(lambda).join(kind);
-            assert_eq!(proved(&lambda, args), (0, 0));
+            assert_eq!(verified(&lambda, args), (0, 0));
         }
     }
 }
 
 #[test]
-fn every_fault_happens_again() {
+fn every_fault_is_repeated() {
     let faults = [
         "error",
         "panic",
@@ -126,15 +127,15 @@ fn every_fault_happens_again() {
         for behaviour in behaviours {
             let lambda = root().join("tests/lambdas/misbehave").join(kind);
             let (faults, backed_off) =
-                proved(&lambda, &["--set", &format!("behaviour={behaviour}")]);
+                verified(&lambda, &["--set", &format!("behaviour={behaviour}")]);
             assert!(faults > 8, "{behaviour} in {kind} faulted {faults} times");
             assert!(
                 faults + backed_off > 4000,
-                "{behaviour} in {kind} rested in {backed_off} wakes"
+                "{behaviour} in {kind} backed off in {backed_off} wakes"
             );
         }
         for behaviour in ["hold", "log_flood", "print"] {
-            proved(
+            verified(
                 &root().join("tests/lambdas/misbehave").join(kind),
                 &["--set", &format!("behaviour={behaviour}")],
             );
@@ -145,7 +146,7 @@ fn every_fault_happens_again() {
 #[test]
 fn a_changed_sample_is_found_with_its_input_and_its_wake() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     for n in [0, 1000, 4169] {
         let again = verify_drive(&root().join(HELLO), &forged(&folder, n), &journaled.journal, &[]);
         let wake = format!("wake {} of lambda `hello`", n + 1);
@@ -156,10 +157,10 @@ fn a_changed_sample_is_found_with_its_input_and_its_wake() {
 #[test]
 fn a_flipped_byte_anywhere_in_the_drive_is_found() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
-    let (folder, whole) = (Folder::new(), std::fs::read(sample_drive()).unwrap());
+    let (folder, complete) = (TempFolder::new(), std::fs::read(sample_drive()).unwrap());
     for part in 0..24 {
-        let at = whole.len() / 24 * part + part * 131;
-        let mut bytes = whole.clone();
+        let at = complete.len() / 24 * part + part * 131;
+        let mut bytes = complete.clone();
         bytes[at] ^= 0x10;
         let drive = folder.write("flipped.mcap", &bytes);
         let again = verify_drive(&root().join(HELLO), &drive, &journaled.journal, &[]);
@@ -176,12 +177,12 @@ fn a_flipped_byte_anywhere_in_the_drive_is_found() {
 #[test]
 fn another_build_is_named_by_the_file_that_changed() {
     for (lambda, file) in [(HELLO, "hello.wasm"), ("examples/hello/python", "main.py")] {
-        let copy = Copy::of(lambda, |manifest| manifest);
+        let copy = LambdaCopy::of(lambda, |manifest| manifest);
         let journaled = journaled(copy.path(), &sample_drive(), &BRAKING);
         assert_eq!(journaled.run.exit, 0, "{}", journaled.run.stderr);
         let path = copy.path().join("build").join(file);
         let mut bytes = std::fs::read(&path).unwrap();
-        // In a comment, a name or a custom section: the lambda would run as before.
+        // In a comment, a name or a custom section: the lambda would still run in the same way.
         let last = bytes.len() - 1;
         bytes[last] = if file.ends_with("wasm") { bytes[last] ^ 1 } else { b' ' };
         copy.replace(file, &bytes);
@@ -191,8 +192,8 @@ fn another_build_is_named_by_the_file_that_changed() {
 }
 
 #[test]
-fn another_manifest_is_found_and_another_record_table_is_none() {
-    let copy = Copy::of(HELLO, |manifest| manifest);
+fn a_changed_manifest_is_found_and_a_changed_record_table_is_accepted() {
+    let copy = LambdaCopy::of(HELLO, |manifest| manifest);
     let journaled = journaled(copy.path(), &sample_drive(), &BRAKING);
     let manifest = std::fs::read_to_string(copy.path().join("build/lambda.toml")).unwrap();
     copy.replace(
@@ -212,13 +213,13 @@ fn another_manifest_is_found_and_another_record_table_is_none() {
 }
 
 #[test]
-fn a_lambda_whose_nans_are_the_same_everywhere_says_so() {
+fn canonical_nans_are_recorded_in_the_journal() {
     let at = |toml: &str| toml.replace("kind = \"wasm\"", "kind = \"wasm\"\ndeterministic = true");
-    let copy = Copy::of(HELLO, |toml| at(&toml));
+    let copy = LambdaCopy::of(HELLO, |toml| at(&toml));
     let journaled = journaled(copy.path(), &sample_drive(), &BRAKING);
     assert_eq!(journaled.run.exit, 0, "{}", journaled.run.stderr);
-    // It is other native code, for which there is another entry; what it decides is what any other
-    // decides, as it looks at no NaN.
+    // Its native code differs and has another cache entry; its decisions are equal, because it
+    // uses no NaN.
     let plain = self::journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
     assert_eq!(journaled.run.labels(), plain.run.labels());
     let names = |journal: &Path| {
@@ -232,7 +233,7 @@ fn a_lambda_whose_nans_are_the_same_everywhere_says_so() {
 }
 
 #[test]
-fn another_config_is_named_by_its_key_and_the_same_one_need_not_be_given() {
+fn a_changed_config_is_named_by_its_key_and_the_recorded_one_is_the_default() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
     let again = |args: &[&str]| {
         verify_drive(&root().join(HELLO), &sample_drive(), &journaled.journal, args)
@@ -244,10 +245,10 @@ fn another_config_is_named_by_its_key_and_the_same_one_need_not_be_given() {
 #[test]
 fn a_flipped_byte_in_the_journal_is_found() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
-    let whole = std::fs::read(&journaled.journal).unwrap();
+    let complete = std::fs::read(&journaled.journal).unwrap();
     for part in 0..16 {
-        let at = whole.len() / 16 * part + part;
-        let mut bytes = whole.clone();
+        let at = complete.len() / 16 * part + part;
+        let mut bytes = complete.clone();
         bytes[at] ^= 0x04;
         let changed = journaled.out.write("changed.journal", &bytes);
         let again = verify_drive(&root().join(HELLO), &sample_drive(), &changed, &[]);
@@ -256,28 +257,28 @@ fn a_flipped_byte_in_the_journal_is_found() {
 }
 
 #[test]
-fn a_journal_whose_writer_died_proves_what_it_holds() {
+fn a_journal_of_a_killed_process_verifies_its_complete_wakes() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
-    let whole = std::fs::read(&journaled.journal).unwrap();
-    let cut = journaled.out.write("cut.journal", &whole[..whole.len() * 9 / 10]);
+    let complete = std::fs::read(&journaled.journal).unwrap();
+    let cut = journaled.out.write("cut.journal", &complete[..complete.len() * 9 / 10]);
     let again = verify_drive(&root().join(HELLO), &sample_drive(), &cut, &[]);
     let verified = again.verified.unwrap_or_else(|| panic!("{}", again.stderr));
     assert!(verified.truncated && verified.wakes > 100 && verified.wakes < 4170, "{verified:?}");
 }
 
 #[test]
-fn a_journal_without_a_whole_wake_proves_nothing() {
+fn a_journal_without_a_complete_wake_is_refused() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
-    let whole = std::fs::read(&journaled.journal).unwrap();
-    let cut = journaled.out.write("cut.journal", &whole[..2000]);
+    let complete = std::fs::read(&journaled.journal).unwrap();
+    let cut = journaled.out.write("cut.journal", &complete[..2000]);
     let again = verify_drive(&root().join(HELLO), &sample_drive(), &cut, &[]);
-    differs(&again, 2, &["cut.journal", "no whole wake"]);
+    differs(&again, 2, &["cut.journal", "no complete wake"]);
 }
 
 #[test]
 fn the_wrong_drive_and_a_clip_in_the_place_of_a_journal_are_named() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let again = verify_drive(&root().join(HELLO), &forged(&folder, 9), &journaled.journal, &[]);
     differs(&again, 4, &["wake 10 of", "drive `forged-9.mcap`", "CRC-32"]);
     let clip = journaled.out.path().join(&journaled.run.clips[0].file);
@@ -286,7 +287,7 @@ fn the_wrong_drive_and_a_clip_in_the_place_of_a_journal_are_named() {
 }
 
 #[test]
-fn a_clip_proves_its_decisions_alone_and_says_which_it_cannot() {
+fn a_clip_verifies_its_decisions_and_counts_those_it_cannot() {
     for kind in ["rust", "python"] {
         for example in ["hello", "brake-dark"] {
             let lambda = root().join("examples").join(example).join(kind);
@@ -301,8 +302,8 @@ fn a_clip_proves_its_decisions_alone_and_says_which_it_cannot() {
                     verified.wakes > 50 && verified.uncovered < verified.wakes / 2,
                     "{verified:?}"
                 );
-                // Half a second of the first wakes reaches back before a clip that does not begin
-                // with the drive.
+                // The window of the first wakes, half a second, begins before the clip, unless the
+                // clip begins with the drive.
                 let from_the_start =
                     clip.first_ns == journaled.run.summary.as_ref().map(|summary| summary.start_ns);
                 assert_eq!(verified.uncovered == 0, from_the_start, "{verified:?}");
@@ -312,31 +313,34 @@ fn a_clip_proves_its_decisions_alone_and_says_which_it_cannot() {
 }
 
 #[test]
-fn a_clip_without_a_topic_that_the_lambda_reads_cannot_be_proved_alone() {
-    let lambda =
-        Copy::of("examples/brake-dark/rust", |manifest| manifest.replace("\"/imu/data\", ", ""));
+fn a_clip_without_a_topic_that_the_lambda_reads_cannot_be_verified() {
+    let lambda = LambdaCopy::of("examples/brake-dark/rust", |manifest| {
+        manifest.replace("\"/imu/data\", ", "")
+    });
     let journaled = journaled(lambda.path(), &sample_drive(), &BRAKING);
     let clip = journaled.out.path().join(&journaled.run.clips[0].file);
     differs(&verify_clip(lambda.path(), &clip), 2, &["/imu/data", "[record]", "--verify"]);
 }
 
 #[test]
-fn a_clip_that_shows_no_trigger_to_the_lambda_proves_nothing_and_says_so() {
-    // Half a second is what hello looks back.
-    let lambda =
-        Copy::of(HELLO, |manifest| manifest.replace("preroll = \"5s\"", "preroll = \"100ms\""));
+fn a_clip_that_covers_no_trigger_cannot_be_verified() {
+    // hello looks back half a second.
+    let lambda = LambdaCopy::of(HELLO, |manifest| {
+        manifest.replace("preroll = \"5s\"", "preroll = \"100ms\"")
+    });
     let journaled = journaled(lambda.path(), &sample_drive(), &BRAKING);
     let clip = journaled.out.path().join(&journaled.run.clips[2].file);
     differs(&verify_clip(lambda.path(), &clip), 2, &["proves no trigger", "preroll", "--verify"]);
 }
 
 #[test]
-fn a_clip_proves_a_lambda_that_logs_more_than_the_rate_limit_lets_pass() {
-    let lambda = Copy::of("tests/lambdas/misbehave/rust", |manifest| {
-        let record = "[record]\ntopics = [\"/imu/data\"]\npreroll = \"2s\"\npostroll = \"0s\"\ncooldown = \"30s\"\n";
+fn a_clip_of_a_lambda_over_its_log_rate_limit_can_be_verified() {
+    let lambda = LambdaCopy::of("tests/lambdas/misbehave/rust", |manifest| {
+        let record = "[record]\ntopics = [\"/imu/data\"]\npreroll = \"2s\"\n\
+                      postroll = \"0s\"\ncooldown = \"30s\"\n";
         format!("{manifest}\n{record}")
     });
-    // It triggers and then faults in every wake, so that each is a fresh lambda.
+    // It triggers and then faults in every wake, so that each wake has a new instance.
     let journaled =
         journaled(lambda.path(), &sample_drive(), &["--set", "behaviour=event_then_error"]);
     assert!(journaled.run.clips.len() >= 2);
@@ -349,10 +353,10 @@ fn a_clip_proves_a_lambda_that_logs_more_than_the_rate_limit_lets_pass() {
 #[test]
 fn a_changed_clip_is_found() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
-    let whole = std::fs::read(journaled.out.path().join(&journaled.run.clips[0].file)).unwrap();
+    let complete = std::fs::read(journaled.out.path().join(&journaled.run.clips[0].file)).unwrap();
     for part in 0..16 {
-        let at = whole.len() / 16 * part + part;
-        let mut bytes = whole.clone();
+        let at = complete.len() / 16 * part + part;
+        let mut bytes = complete.clone();
         bytes[at] ^= 0x20;
         let changed = journaled.out.write("changed.mcap", &bytes);
         let again = verify_clip(&root().join(HELLO), &changed);
@@ -366,7 +370,7 @@ fn a_changed_clip_is_found() {
 }
 
 #[test]
-fn another_lambda_finds_no_journal_of_its_own_in_a_clip() {
+fn a_clip_without_a_journal_of_the_lambda_is_refused() {
     let journaled = journaled(&root().join(HELLO), &sample_drive(), &BRAKING);
     let clip = journaled.out.path().join(&journaled.run.clips[0].file);
     let again = verify_clip(&root().join("examples/brake-dark/rust"), &clip);

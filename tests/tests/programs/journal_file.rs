@@ -1,19 +1,21 @@
-//! The file of `--journal`: one replay writes it at a time, equal replays write equal bytes, and a
-//! kill leaves what was decided.
+//! The file of `--journal`: only one replay writes it at a time, equal replays write equal bytes,
+//! and a kill keeps the decisions.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
 
-use gleaner_journal::{Reader, Writer};
+use gleaner_journal::{JournalReader, JournalWriter};
 use gleaner_lambda::{Clip, Decision};
-use gleaner_tests::{Copy, Folder, Verification, replay_to, root, runtime, sample_drive, verify};
+use gleaner_tests::{
+    LambdaCopy, TempFolder, Verification, replay_to, root, runtime, sample_drive, verify,
+};
 
 const HELLO: &str = "examples/hello/rust";
 const BRAKING: [&str; 2] = ["--set", "brake_mps2=-1.4"];
 
-/// Replays hello into `out` with the journal `journal`, and more arguments.
-fn journaled(out: &Folder, journal: &Path, args: &[&str]) -> gleaner_tests::Run {
+/// Replays hello into `out` with the journal `journal` and further arguments.
+fn journaled(out: &TempFolder, journal: &Path, args: &[&str]) -> gleaner_tests::ReplayRun {
     let args = [&BRAKING[..], &["--journal", journal.to_str().unwrap()], args].concat();
     replay_to(out.path(), &root().join(HELLO), &[sample_drive()], &args)
 }
@@ -32,8 +34,8 @@ fn hello() -> PathBuf {
 }
 
 #[test]
-fn a_journal_that_another_process_writes_is_refused_and_left_as_it_is() {
-    let (first, second) = (Folder::new(), Folder::new());
+fn a_journal_that_another_process_writes_is_refused_and_unchanged() {
+    let (first, second) = (TempFolder::new(), TempFolder::new());
     let journal = first.path().join("x.journal");
     journaled(&first, &journal, &[]).must_exit(0);
     let before = std::fs::read(&journal).unwrap();
@@ -43,13 +45,14 @@ fn a_journal_that_another_process_writes_is_refused_and_left_as_it_is() {
     for repeat in ["1", "2"] {
         let busy = journaled(&second, &journal, &["--repeat", repeat]);
         busy.must_exit(1);
-        let said = format!("another process writes or verifies journal `{}`", journal.display());
+        let expected =
+            format!("another process writes or verifies journal `{}`", journal.display());
         assert!(
-            busy.stderr.contains(&said) && busy.stderr.contains("--journal FILE"),
+            busy.stderr.contains(&expected) && busy.stderr.contains("--journal FILE"),
             "{}",
             busy.stderr
         );
-        // The results of before are whole.
+        // The earlier results are complete.
         assert_eq!(
             (busy.decisions.len(), busy.clips.len()),
             (results.decisions.len(), results.clips.len())
@@ -58,7 +61,7 @@ fn a_journal_that_another_process_writes_is_refused_and_left_as_it_is() {
     let again = verify_drive(&hello(), &journal, &[]);
     assert_eq!(again.exit, 2, "{}", again.stderr);
     assert!(
-        again.stderr.contains("a replay writes journal") && again.stderr.contains("x.journal"),
+        again.stderr.contains("a replay is writing journal") && again.stderr.contains("x.journal"),
         "{}",
         again.stderr
     );
@@ -68,8 +71,8 @@ fn a_journal_that_another_process_writes_is_refused_and_left_as_it_is() {
 }
 
 #[test]
-fn of_two_replays_with_one_journal_at_least_one_writes_it_whole() {
-    let folder = Folder::new();
+fn of_two_replays_with_one_journal_at_least_one_writes_it_completely() {
+    let folder = TempFolder::new();
     let journal = folder.path().join("x.journal");
     for round in 0..8 {
         let _ = std::fs::remove_file(&journal);
@@ -96,14 +99,14 @@ fn of_two_replays_with_one_journal_at_least_one_writes_it_whole() {
             "round {round}: {outputs:?}"
         );
         for index in &refused {
-            let said = String::from_utf8_lossy(&outputs[*index].stderr);
-            assert!(said.contains("another process writes"), "round {round}: {said}");
+            let stderr = String::from_utf8_lossy(&outputs[*index].stderr);
+            assert!(stderr.contains("another process writes"), "round {round}: {stderr}");
         }
-        // Of two that came one after the other, the later one.
-        let proved = brakes
+        // If they ran one after the other, the journal is the later one's.
+        let verified = brakes
             .iter()
             .filter(|brake| verify_drive(&hello(), &journal, &["--set", brake]).exit == 0);
-        assert_eq!(proved.count(), 1, "round {round}: {refused:?} refused");
+        assert_eq!(verified.count(), 1, "round {round}: {refused:?} refused");
     }
 }
 
@@ -113,7 +116,7 @@ fn equal_replays_write_equal_journals() {
         let lambda = root().join("examples/hello").join(kind);
         let journals: Vec<_> = (0..3)
             .map(|_| {
-                let out = Folder::new();
+                let out = TempFolder::new();
                 let journal = out.path().join("x.journal");
                 let args = [&BRAKING[..], &["--journal", journal.to_str().unwrap()]].concat();
                 replay_to(out.path(), &lambda, &[sample_drive()], &args).must_exit(0);
@@ -127,13 +130,16 @@ fn equal_replays_write_equal_journals() {
     }
 }
 
-/// The journal, with its header changed and all checksums right.
-fn with_header(journal: &Path, change: impl FnOnce(&mut gleaner_journal::Header)) -> Vec<u8> {
+/// The journal with a changed header and correct checksums.
+fn with_header(
+    journal: &Path,
+    change: impl FnOnce(&mut gleaner_journal::JournalHeader),
+) -> Vec<u8> {
     let bytes = std::fs::read(journal).unwrap();
-    let mut reader = Reader::open(&bytes[..]).unwrap();
+    let mut reader = JournalReader::open(&bytes[..]).unwrap();
     let mut header = reader.header().clone();
     change(&mut header);
-    let mut writer = Writer::begin(Vec::new(), &header).unwrap();
+    let mut writer = JournalWriter::begin(Vec::new(), &header).unwrap();
     while let Some(entry) = reader.next().unwrap() {
         writer.wake(&entry).unwrap();
     }
@@ -141,25 +147,25 @@ fn with_header(journal: &Path, change: impl FnOnce(&mut gleaner_journal::Header)
 }
 
 #[test]
-fn tighter_limits_in_a_header_are_noted_and_wider_ones_differ() {
-    let out = Folder::new();
+fn lower_limits_in_a_header_are_noted_and_higher_ones_are_differences() {
+    let out = TempFolder::new();
     let journal = out.path().join("x.journal");
     journaled(&out, &journal, &[]).must_exit(0);
     let fuel = |fuel: u64| {
         out.write("forged.journal", with_header(&journal, |header| header.limits.fuel = fuel))
     };
-    let whole = verify_drive(&hello(), &fuel(10_000_000), &[]).verified.unwrap();
-    assert_eq!(whole.notes, [""; 0]);
-    let tighter = verify_drive(&hello(), &fuel(9_000_000), &[]);
-    let notes = tighter.verified.unwrap_or_else(|| panic!("{}", tighter.stderr)).notes;
+    let complete = verify_drive(&hello(), &fuel(10_000_000), &[]).verified.unwrap();
+    assert_eq!(complete.notes, [""; 0]);
+    let lower = verify_drive(&hello(), &fuel(9_000_000), &[]);
+    let notes = lower.verified.unwrap_or_else(|| panic!("{}", lower.stderr)).notes;
     assert!(
         matches!(&notes[..], [note] if note.contains("limit `fuel`: 9000000 in the journal")),
         "{notes:?}"
     );
-    // Limits that cannot have held: each wake is made again under them.
-    let too_tight = verify_drive(&hello(), &fuel(1000), &[]);
-    let wider = verify_drive(&hello(), &fuel(10_000_001), &[]);
-    for (forged, word) in [(too_tight, "fuel"), (wider, "limit `fuel`")] {
+    // Limits that cannot have applied: each wake is repeated under them.
+    let too_low = verify_drive(&hello(), &fuel(1000), &[]);
+    let higher = verify_drive(&hello(), &fuel(10_000_001), &[]);
+    for (forged, word) in [(too_low, "fuel"), (higher, "limit `fuel`")] {
         assert_eq!(forged.exit, 4, "{}", forged.stderr);
         assert!(forged.stderr.contains(word), "{}", forged.stderr);
     }
@@ -171,8 +177,8 @@ fn tighter_limits_in_a_header_are_noted_and_wider_ones_differ() {
 }
 
 #[test]
-fn a_journal_that_begins_in_the_middle_is_no_journal_of_a_replay() {
-    let out = Folder::new();
+fn a_journal_that_begins_in_the_middle_is_refused() {
+    let out = TempFolder::new();
     let journal = out.path().join("x.journal");
     journaled(&out, &journal, &[]).must_exit(0);
     let forged =
@@ -186,17 +192,17 @@ fn a_journal_that_begins_in_the_middle_is_no_journal_of_a_replay() {
     );
 }
 
-/// Kills a replay when it has listed a clip.
+/// Kills a replay after it has listed a clip.
 #[test]
-fn what_a_listed_clip_is_about_is_in_the_decisions_and_in_the_journal_after_a_kill() {
-    let lambda = Copy::of("tests/lambdas/alarm/rust", |manifest| {
+fn moments_of_listed_clips_are_in_decisions_and_journal_after_a_kill() {
+    let lambda = LambdaCopy::of("tests/lambdas/alarm/rust", |manifest| {
         manifest
             .replace("preroll = \"5s\"", "preroll = \"100ms\"")
             .replace("postroll = \"5s\"", "postroll = \"100ms\"")
     });
-    let mut met = 0;
+    let mut hits = 0;
     for attempt in 0..20 {
-        let out = Folder::new();
+        let out = TempFolder::new();
         let journal = out.path().join("x.journal");
         let events: Vec<String> = (1..20).map(|second| (2 * second).to_string()).collect();
         let mut replay = runtime();
@@ -214,35 +220,35 @@ fn what_a_listed_clip_is_about_is_in_the_decisions_and_in_the_journal_after_a_ki
             lines::<Clip>(out.path(), "clips.jsonl"),
             lines::<Decision>(out.path(), "decisions.jsonl"),
         );
-        let mut reader = Reader::open(std::fs::File::open(&journal).unwrap()).unwrap();
+        let mut reader = JournalReader::open(std::fs::File::open(&journal).unwrap()).unwrap();
         let mut wakes = Vec::new();
         while let Some(entry) = reader.next().unwrap() {
             wakes.push(entry.at_ns);
         }
         for moment in clips.iter().flat_map(|clip| &clip.moments) {
-            let is_there = decisions.iter().any(|decision| decision.at_ns == moment.at_ns);
-            assert!(is_there, "attempt {attempt}: no decision at {} ns", moment.at_ns);
+            let is_decided = decisions.iter().any(|decision| decision.at_ns == moment.at_ns);
+            assert!(is_decided, "attempt {attempt}: no decision at {} ns", moment.at_ns);
             assert!(
                 wakes.contains(&moment.at_ns),
                 "attempt {attempt}: no wake at {} ns",
                 moment.at_ns
             );
         }
-        met += usize::from(!clips.is_empty() && clips.len() < events.len());
+        hits += usize::from(!clips.is_empty() && clips.len() < events.len());
     }
-    assert!(met > 0, "no kill met a replay that had listed a clip");
+    assert!(hits > 0, "no kill hit a replay that had listed a clip");
 }
 
-/// The whole lines of a file of results.
+/// The complete lines of a result file.
 fn lines<T: serde::de::DeserializeOwned>(out: &Path, name: &str) -> Vec<T> {
     let text = std::fs::read_to_string(out.join(name)).unwrap_or_default();
-    let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-    whole.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    let complete = text.rfind('\n').map_or("", |end| &text[..end]);
+    complete.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
 #[test]
 fn a_journal_is_not_written_into_a_file_of_the_results() {
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     for name in ["clips.jsonl", "decisions.jsonl", "summary.json"] {
         let journal = folder.path().join(name);
         let args = ["--journal", journal.to_str().unwrap()];
@@ -253,14 +259,14 @@ fn a_journal_is_not_written_into_a_file_of_the_results() {
 }
 
 #[test]
-fn a_journal_of_another_version_or_that_is_cut_off_is_replaced() {
-    let out = Folder::new();
+fn a_truncated_journal_or_one_of_another_version_is_replaced() {
+    let out = TempFolder::new();
     let written = out.path().join("x.journal");
     journaled(&out, &written, &[]).must_exit(0);
-    let whole = std::fs::read(&written).unwrap();
-    let mut newer = whole.clone();
+    let complete = std::fs::read(&written).unwrap();
+    let mut newer = complete.clone();
     newer[8] = 99;
-    for found in [&newer[..], &whole[..20], &whole[..whole.len() - 1], b""] {
+    for found in [&newer[..], &complete[..20], &complete[..complete.len() - 1], b""] {
         let journal = out.write("again.journal", found);
         journaled(&out, &journal, &[]).must_exit(0);
         let again = verify_drive(&hello(), &journal, &[]);
@@ -271,7 +277,7 @@ fn a_journal_of_another_version_or_that_is_cut_off_is_replaced() {
 
 #[test]
 fn a_journal_is_not_written_over_a_drive() {
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let drive = folder.write("drive.mcap", std::fs::read(sample_drive()).unwrap());
     let run = replay_to(
         folder.path(),

@@ -1,4 +1,4 @@
-//! Programs of ours, started as people and scripts do, as one program: each file is a subject.
+//! Starts Gleaner's programs as users and scripts do; each file is a subject.
 
 mod again;
 mod bad_input;

@@ -1,21 +1,21 @@
-//! What the report of a replay is drawn from: what a lambda read, what its wakes cost, what a
-//! camera saw when it triggered.
+//! The data of a replay's report: values that the lambda read, costs of its wakes, and images of a
+//! camera at its triggers.
 
 use std::fs;
 
 use gleaner_lambda::signals::{Curve, Signals};
-use gleaner_tests::{Folder, Run, replay_to, root, sample_drive};
+use gleaner_tests::{ReplayRun, TempFolder, replay_to, root, sample_drive};
 
 const OK: u8 = 0;
 const BRAKING: [&str; 2] = ["--set", "brake_mps2=-1.4"];
 
-fn signals(lambda: &str, args: &[&str]) -> (Folder, Run, Signals) {
-    let folder = Folder::new();
+fn signals(lambda: &str, args: &[&str]) -> (TempFolder, ReplayRun, Signals) {
+    let folder = TempFolder::new();
     let run = replay_to(folder.path(), &root().join(lambda), &[sample_drive()], args);
     run.must_exit(OK);
     let text =
-        fs::read_to_string(folder.path().join("signals.json")).expect("a replay leaves signals");
-    let signals = serde_json::from_str(&text).expect("they are what the protocol says");
+        fs::read_to_string(folder.path().join("signals.json")).expect("a replay writes signals");
+    let signals = serde_json::from_str(&text).expect("signals have the format of the protocol");
     (folder, run, signals)
 }
 
@@ -28,7 +28,7 @@ fn curve<'a>(signals: &'a Signals, path: &str) -> &'a Curve {
 }
 
 #[test]
-fn a_replay_keeps_what_was_read_and_what_it_cost() {
+fn a_replay_keeps_the_values_that_were_read_and_the_costs() {
     for (kind, has_fuel) in [("rust", true), ("python", false)] {
         let (folder, run, signals) = signals(&format!("examples/hello/{kind}"), &BRAKING);
         let summary = run.summary.as_ref().unwrap();
@@ -48,7 +48,7 @@ fn a_replay_keeps_what_was_read_and_what_it_cost() {
             (signals.run_ns.count, signals.fuel.as_ref().map(|fuel| fuel.count)),
             (4170, has_fuel.then_some(4170))
         );
-        // What wakes are known to take, give or take a machine: their sum is in the summary, too.
+        // Plausible durations of wakes; their sum is in the summary, too.
         assert!(
             signals.run_ns.p50 > 100 && signals.run_ns.max as f64 / 1e9 <= 1.02 * summary.run_s,
             "{:?}",
@@ -63,7 +63,7 @@ fn a_replay_keeps_what_was_read_and_what_it_cost() {
             signals.config["brake_mps2"],
             gleaner_lambda::manifest::ConfigValue::Float(-1.4)
         );
-        // The lambda does not see the camera; the recorder does.
+        // Images come from the recorder: the lambda does not read the camera.
         assert_eq!(summary.triggers, 3);
         let stamps = run.decisions.iter().map(|decision| decision.at_ns).collect::<Vec<_>>();
         assert_eq!(
@@ -81,30 +81,32 @@ fn a_replay_keeps_what_was_read_and_what_it_cost() {
 }
 
 #[test]
-fn twins_leave_the_same_curves_and_so_does_each_pass() {
+fn twins_and_repeated_passes_give_the_same_curves() {
     let brake_dark = |kind: &str, args: &[&str]| {
         let (_, _, signals) =
             signals(&format!("examples/brake-dark/{kind}"), &[&BRAKING, args].concat());
         (signals.curves, signals.curves_omitted)
     };
-    let (curves, left_out) = brake_dark("rust", &[]);
-    assert_eq!((curves.len(), left_out), (2, 0), "{curves:?}");
+    let (curves, omitted) = brake_dark("rust", &[]);
+    assert_eq!((curves.len(), omitted), (2, 0), "{curves:?}");
     assert_eq!(brake_dark("python", &[]).0, curves);
     assert_eq!(brake_dark("rust", &["--repeat", "2", "--no-record"]).0, curves);
 }
 
 #[test]
-fn a_lambda_that_reads_a_thousand_fields_has_curves_of_the_first() {
-    let lambda = gleaner_tests::Copy::of("tests/lambdas/ticker/python", |manifest| manifest);
+fn a_lambda_that_reads_many_fields_has_curves_of_the_first() {
+    let lambda = gleaner_tests::LambdaCopy::of("tests/lambdas/ticker/python", |manifest| manifest);
     lambda.replace(
         "main.py",
-        "def on_tick(ctx):\n    imu = ctx.input('imu')\n    sample = imu.newest()\n    if sample is None:\n        return\n\
-         \x20   for name in ('orientation', 'angular_velocity', 'linear_acceleration'):\n\
-         \x20       for n in range(9):\n            sample.number(imu.field(f'{name}_covariance[{n}]'))\n\
-         \x20       for axis in 'xyz':\n            sample.number(imu.field(f'{name}.{axis}'))\n\
-         \x20   sample.get(imu.field('header.frame_id'))\n",
+        "def on_tick(ctx):\n    imu = ctx.input('imu')\n    sample = imu.newest()\n    \
+         if sample is None:\n        return\n    \
+         for name in ('orientation', 'angular_velocity', 'linear_acceleration'):\n        \
+         for n in range(9):\n            \
+         sample.number(imu.field(f'{name}_covariance[{n}]'))\n        \
+         for axis in 'xyz':\n            sample.number(imu.field(f'{name}.{axis}'))\n    \
+         sample.get(imu.field('header.frame_id'))\n",
     );
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let run = replay_to(folder.path(), lambda.path(), &[sample_drive()], &[]);
     run.must_exit(OK);
     let signals: Signals =

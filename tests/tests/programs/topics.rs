@@ -1,27 +1,26 @@
-//! Drives of many topics, and of topics that cannot be read: what is looked at, what clips hold,
-//! and what is refused.
+//! Drives with many topics, and with topics that cannot be read: inspection, clips, refusals.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::path::PathBuf;
 use std::process::Command;
 
-use gleaner_protocol::{DriveSeen, Report};
+use gleaner_protocol::{DriveInfo, Report};
 use gleaner_tests::drive::with_topics;
-use gleaner_tests::{Folder, Run, program, replay, root, sample_drive};
+use gleaner_tests::{ReplayRun, TempFolder, program, replay, root, sample_drive};
 
 const USAGE: u8 = 2;
-/// What one topic took, 82 KiB, would exceed it beyond 12,000 topics.
+/// Limit of address space. At 82 KiB for each topic, 12,000 topics would exceed it.
 const ADDRESSES_KIB: u32 = 1 << 20;
 
-fn braking(drives: &[PathBuf], args: &[&str]) -> Run {
+fn braking(drives: &[PathBuf], args: &[&str]) -> ReplayRun {
     let lambda = root().join("examples/hello/rust");
     replay(&lambda, drives, &[&["--set", "brake_mps2=-1.4"], args].concat())
 }
 
 #[test]
-fn a_file_of_sixty_thousand_topics_is_looked_into_in_bounded_memory() {
-    let folder = Folder::new();
+fn a_file_of_sixty_thousand_topics_is_inspected_in_bounded_memory() {
+    let folder = TempFolder::new();
     let drive = with_topics(&folder, 60_000);
     let line = format!("ulimit -v {ADDRESSES_KIB}; exec \"$0\" \"$@\"");
     let mut inspect = Command::new("sh");
@@ -33,20 +32,25 @@ fn a_file_of_sixty_thousand_topics_is_looked_into_in_bounded_memory() {
     else {
         panic!("{reports}")
     };
-    let DriveSeen { topics, skipped, .. } = seen;
+    let DriveInfo { topics, skipped, .. } = seen;
     assert_eq!(topics.len() as u64 + skipped, 60_001);
     assert_eq!(skipped, 60_001 - 4096);
     let imu = topics
         .iter()
         .find(|topic| topic.topic == "/imu/data")
-        .expect("it has a name among the first");
-    assert_eq!((imu.read, imu.messages), (4170, Some(4170)));
-    assert!(topics.iter().filter(|topic| topic.topic != "/imu/data").all(|topic| topic.read == 10));
+        .expect("it is among the first names");
+    assert_eq!((imu.messages_read, imu.messages), (4170, Some(4170)));
+    assert!(
+        topics
+            .iter()
+            .filter(|topic| topic.topic != "/imu/data")
+            .all(|topic| topic.messages_read == 10)
+    );
 }
 
 #[test]
-fn topics_with_messages_are_looked_at_before_those_without() {
-    let folder = Folder::new();
+fn topics_with_messages_are_inspected_before_those_without() {
+    let folder = TempFolder::new();
     let mut file = Cursor::new(Vec::new());
     let mut writer = mcap::WriteOptions::new().create(&mut file).unwrap();
     let schema = writer.add_schema("std_msgs/msg/String", "ros2msg", b"string data").unwrap();
@@ -62,15 +66,12 @@ fn topics_with_messages_are_looked_at_before_those_without() {
     let drive = folder.write("sparse.mcap", file.into_inner());
     let output = Command::new(program("gleaner")).arg("inspect").arg(drive).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout);
-    assert!(
-        text.contains("/last ") && text.contains("and 905 more topics, not looked at"),
-        "{text}"
-    );
+    assert!(text.contains("/last ") && text.contains("and 905 more topics, not read"), "{text}");
 }
 
 #[test]
 fn clips_hold_all_topics_of_a_drive_of_five_hundred() {
-    let folder = Folder::new();
+    let folder = TempFolder::new();
     let run = braking(&[with_topics(&folder, 500)], &["--topics", "*"]);
     let clips = &run.must_exit(0).clips;
     assert_eq!(clips.len(), 2);
@@ -84,26 +85,26 @@ fn clips_hold_all_topics_of_a_drive_of_five_hundred() {
 }
 
 #[test]
-fn more_topics_than_clips_hold_are_counted_before_anything_is_read() {
-    let folder = Folder::new();
+fn more_topics_than_clips_can_hold_are_refused_before_reading() {
+    let folder = TempFolder::new();
     let drive = with_topics(&folder, 2000);
     let run = braking(std::slice::from_ref(&drive), &["--topics", "*"]);
-    let said = &run.must_exit(USAGE).stderr;
-    assert!(said.contains("--topics chooses 2001 topics; clips hold at most 1024"), "{said}");
-    assert!(said.contains("help:  choose fewer: --topics PATTERN"), "{said}");
-    // A message names some of them only.
+    let stderr = &run.must_exit(USAGE).stderr;
+    assert!(stderr.contains("--topics chooses 2001 topics; clips hold at most 1024"), "{stderr}");
+    assert!(stderr.contains("help:  choose fewer: --topics PATTERN"), "{stderr}");
+    // The message lists only some of them.
     let none = braking(&[drive], &["--topics", "/lidar/*"]);
-    let said = &none.must_exit(USAGE).stderr;
+    let stderr = &none.must_exit(USAGE).stderr;
     assert!(
-        said.contains("the drive has no topic `/lidar/*`") && said.contains("and 1981 more"),
-        "{said}"
+        stderr.contains("the drive has no topic `/lidar/*`") && stderr.contains("and 1981 more"),
+        "{stderr}"
     );
-    assert!(said.len() < 2000, "{said}");
+    assert!(stderr.len() < 2000, "{stderr}");
 }
 
 #[test]
-fn a_pattern_that_matches_nothing_readable_names_what_is() {
-    let folder = Folder::new();
+fn a_pattern_without_readable_topics_is_refused_with_those_that_are() {
+    let folder = TempFolder::new();
     let mut file = Cursor::new(Vec::new());
     let mut writer = mcap::WriteOptions::new().create(&mut file).unwrap();
     let channel_id = writer.add_channel(0, "/notes", "json", &BTreeMap::new()).unwrap();
@@ -116,17 +117,17 @@ fn a_pattern_that_matches_nothing_readable_names_what_is() {
     let drives = [sample_drive(), folder.write("notes.mcap", file.into_inner())];
     for pattern in ["/notes", "/no*"] {
         let run = braking(&drives, &["--topics", pattern]);
-        let said = &run.must_exit(USAGE).stderr;
+        let stderr = &run.must_exit(USAGE).stderr;
         assert!(
-            said.contains(&format!(
+            stderr.contains(&format!(
                 "error: no topic that --topics `{pattern}` matches can be recorded"
             )),
-            "{said}"
+            "{stderr}"
         );
-        assert!(said.contains("cause: topic `/notes` has message encoding `json`"), "{said}");
+        assert!(stderr.contains("cause: topic `/notes` has message encoding `json`"), "{stderr}");
         assert!(
-            said.contains("help:  the drive has `/camera/front/compressed`, `/imu/data`"),
-            "{said}"
+            stderr.contains("help:  the drive has `/camera/front/compressed`, `/imu/data`"),
+            "{stderr}"
         );
     }
     let all = braking(&drives, &["--topics", "*"]);

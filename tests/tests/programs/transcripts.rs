@@ -1,5 +1,5 @@
-//! What pages show of commands is what these print. `GLEANER_BLESS=1 cargo test --release -p
-//! gleaner-tests --test programs transcripts` writes what they print today into the pages.
+//! Commands print what the pages document. `GLEANER_BLESS=1 cargo test --release -p gleaner-tests
+//! --test programs transcripts` writes their current output into the pages.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -9,11 +9,11 @@ use std::time::{Duration, SystemTime};
 use gleaner_parts::Parts;
 use gleaner_tests::drive::{corrupted, truncated};
 use gleaner_tests::transcript::{fits, perform, rewritten, steps};
-use gleaner_tests::{Folder, copy_lambda, root, sample_drive};
+use gleaner_tests::{TempFolder, copy_lambda, root, sample_drive};
 
-/// Does again what a page shows.
+/// Repeats the transcripts of a page.
 #[track_caller]
-fn holds(page: &str, folder: &Folder) {
+fn assert_transcripts(page: &str, folder: &TempFolder) {
     let path = root().join(page);
     let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{page}: {error}"));
     let mut printed = Vec::new();
@@ -33,34 +33,34 @@ fn holds(page: &str, folder: &Folder) {
     }
 }
 
-/// A folder with the sample drive.
-fn with_drive() -> Folder {
-    let folder = Folder::new();
+/// A temporary folder with the sample drive.
+fn with_drive() -> TempFolder {
+    let folder = TempFolder::new();
     symlink(sample_drive(), folder.path().join("highway_drive.mcap"))
         .expect("the folder is writable");
     folder
 }
 
 #[test]
-fn the_first_lambda_in_rust_goes_as_its_page_says() {
-    holds("docs/first-rust.md", &with_drive());
+fn the_page_of_the_first_lambda_in_rust_is_correct() {
+    assert_transcripts("docs/first-rust.md", &with_drive());
 }
 
 #[test]
-fn the_first_lambda_in_python_goes_as_its_page_says() {
-    holds("docs/first-python.md", &with_drive());
+fn the_page_of_the_first_lambda_in_python_is_correct() {
+    assert_transcripts("docs/first-python.md", &with_drive());
 }
 
 #[test]
-fn the_messages_of_what_goes_wrong_are_those_of_their_page() {
-    holds("docs/errors.md", &kitchen());
+fn the_page_of_error_messages_is_correct() {
+    assert_transcripts("docs/errors.md", &faulty_lambdas());
 }
 
 const RUST: &str = "examples/hello/rust";
 const PYTHON: &str = "examples/hello/python";
 
-/// Lambdas and drives with one thing wrong each, by the names that the page gives them.
-fn kitchen() -> Folder {
+/// Lambdas and drives with one mistake each, by their names on the page.
+fn faulty_lambdas() -> TempFolder {
     let folder = with_drive();
     let replaced = |from: &'static str, to: &'static str| {
         move |manifest: String| {
@@ -86,7 +86,7 @@ fn kitchen() -> Folder {
     ] {
         copy_lambda(RUST, &folder, name, replaced(from, to));
     }
-    // Rings of messages without a field of that name.
+    // An input with a type that does not have the field.
     copy_lambda(
         PYTHON,
         &folder,
@@ -143,7 +143,7 @@ fn kitchen() -> Folder {
 }
 
 #[test]
-fn a_transcript_may_leave_out_what_differs() {
+fn a_transcript_may_omit_text_that_differs() {
     let lines = |text: &str| text.lines().map(str::to_owned).collect::<Vec<_>>();
     let printed = lines("a 1 b\nc\nd\ne 2");
     for (shown, holds) in [

@@ -1,9 +1,11 @@
-//! A vehicle makes the limits of a lambda smaller: in a replay, in what its journal says, and when
-//! that is made again.
+//! A vehicle lowers the limits of a lambda: in a replay, in its journal, and when the journal is
+//! verified.
 
 use std::path::Path;
 
-use gleaner_tests::{Copy, Folder, Run, Verification, replay_to, root, sample_drive, verify};
+use gleaner_tests::{
+    LambdaCopy, ReplayRun, TempFolder, Verification, replay_to, root, sample_drive, verify,
+};
 
 const OK: u8 = 0;
 const USAGE: u8 = 2;
@@ -11,15 +13,15 @@ const DIFFERS: i32 = 4;
 const FAULTED: u8 = 6;
 const BRAKING: [&str; 2] = ["--set", "brake_mps2=-1.4"];
 
-/// Replays a lambda on the vehicle that `vehicle` describes.
-fn on(folder: &Folder, lambda: &Path, vehicle: &str, args: &[&str]) -> Run {
+/// Replays a lambda on the vehicle described by `vehicle`.
+fn on(folder: &TempFolder, lambda: &Path, vehicle: &str, args: &[&str]) -> ReplayRun {
     let file = folder.write("vehicle.toml", vehicle);
     let args = [args, &["--vehicle", file.to_str().unwrap()]].concat();
     replay_to(&folder.path().join("out"), lambda, &[sample_drive()], &args)
 }
 
-/// Makes the journal again on that vehicle, if one is named.
-fn again(folder: &Folder, lambda: &Path, vehicle: Option<&str>) -> Verification {
+/// Verifies the journal, on that vehicle if one is given.
+fn again(folder: &TempFolder, lambda: &Path, vehicle: Option<&str>) -> Verification {
     let (drive, journal) = (sample_drive(), folder.path().join("journal"));
     let mut args = vec![
         "replay".as_ref(),
@@ -36,8 +38,8 @@ fn again(folder: &Folder, lambda: &Path, vehicle: Option<&str>) -> Verification 
 }
 
 #[test]
-fn the_smaller_limit_holds_and_is_named() {
-    let (folder, lambda) = (Folder::new(), root().join("examples/hello/rust"));
+fn the_lower_limit_applies_and_is_named() {
+    let (folder, lambda) = (TempFolder::new(), root().join("examples/hello/rust"));
     let run = on(&folder, &lambda, "[limits]\nfuel = 1_000\nmemory = \"1 GiB\"\n", &[]);
     let (_, message) = run.must_exit(FAULTED).first_fault().expect("a fault");
     assert!(message.ends_with("of 1000 units of fuel"), "{message}");
@@ -52,28 +54,28 @@ fn the_smaller_limit_holds_and_is_named() {
 
 #[test]
 fn a_mistake_in_the_file_of_a_vehicle_is_refused_with_its_line() {
-    let (folder, lambda) = (Folder::new(), root().join("examples/hello/rust"));
+    let (folder, lambda) = (TempFolder::new(), root().join("examples/hello/rust"));
     let run = on(&folder, &lambda, "[limits]\nfule = 1_000\n", &[]);
-    let said = &run.must_exit(USAGE).stderr;
+    let stderr = &run.must_exit(USAGE).stderr;
     assert!(
-        said.contains("vehicle.toml, line 2: unknown key `fule`") && said.contains("`fuel`?"),
-        "{said}"
+        stderr.contains("vehicle.toml, line 2: unknown key `fule`") && stderr.contains("`fuel`?"),
+        "{stderr}"
     );
 }
 
 #[test]
-fn a_journal_is_made_again_under_the_limits_that_it_names() {
-    let (folder, lambda) = (Folder::new(), root().join("examples/hello/rust"));
+fn a_journal_is_verified_under_the_limits_that_it_records() {
+    let (folder, lambda) = (TempFolder::new(), root().join("examples/hello/rust"));
     let journal = folder.path().join("journal");
-    let tight = "[limits]\nfuel = 100_000\n";
+    let strict = "[limits]\nfuel = 100_000\n";
     on(
         &folder,
         &lambda,
-        tight,
+        strict,
         &[&BRAKING[..], &["--journal", journal.to_str().unwrap()]].concat(),
     )
     .must_exit(OK);
-    for vehicle in [None, Some(tight)] {
+    for vehicle in [None, Some(strict)] {
         let again = again(&folder, &lambda, vehicle);
         assert!(again.verified.is_some(), "{}", again.stderr);
     }
@@ -82,8 +84,8 @@ fn a_journal_is_made_again_under_the_limits_that_it_names() {
     for part in ["limit `fuel`", "in the journal: 100000", "now:            200000", "--vehicle"] {
         assert!(other.stderr.contains(part), "{part}: {}", other.stderr);
     }
-    // A journal cannot have more than the manifest gives.
-    let poor = Copy::of("examples/hello/rust", |manifest| {
+    // The limits of a journal cannot exceed those of the manifest.
+    let poor = LambdaCopy::of("examples/hello/rust", |manifest| {
         manifest.replace("fuel = 10_000_000", "fuel = 50_000")
     });
     let poor = again(&folder, poor.path(), None);
@@ -97,7 +99,8 @@ fn a_journal_is_made_again_under_the_limits_that_it_names() {
 #[test]
 fn both_kinds_drop_log_lines_and_refuse_triggers_at_the_same_limits() {
     for kind in ["rust", "python"] {
-        let (folder, lambda) = (Folder::new(), root().join("tests/lambdas/misbehave").join(kind));
+        let (folder, lambda) =
+            (TempFolder::new(), root().join("tests/lambdas/misbehave").join(kind));
         let summary = |vehicle: &str, behaviour: &str| {
             let behaviour = format!("behaviour={behaviour}");
             on(&folder, &lambda, vehicle, &["--set", &behaviour]).summary.expect("a summary")
@@ -112,7 +115,7 @@ fn both_kinds_drop_log_lines_and_refuse_triggers_at_the_same_limits() {
         assert_eq!((all.triggers, all.triggers_refused), (all.wakes, 0), "{kind}");
         assert!(
             all.backed_off > 4000 && all.wakes < 30,
-            "{kind}: {} wakes, {} passed over",
+            "{kind}: {} wakes, {} backed off",
             all.wakes,
             all.backed_off
         );

@@ -1,4 +1,4 @@
-"""Does nothing: what is left is what hosting costs."""
+"""Does nothing: measures the overhead of the host."""
 
 import gleaner
 

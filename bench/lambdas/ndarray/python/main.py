@@ -1,4 +1,4 @@
-"""Measures how long a frame takes to become an array, in nanoseconds, and reports it as a score."""
+"""Measures the time to create an array over a frame, and reports it in ns as a score."""
 
 import timeit
 

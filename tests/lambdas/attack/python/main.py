@@ -1,8 +1,9 @@
-"""A lambda that attacks whatever is around it, once, in its third wake. It says with an event what came of that: `refused` with
-the error, or `escaped`.
+"""Attacks its environment, once, in its third wake.
 
-For a bench it attacks again and again instead: every other `every_ms` milliseconds of the day's time. Two good wakes come before each
-attack that is a fault, so that it is never made to rest."""
+An event reports the outcome: `refused` with the error, or `escaped`.
+
+For a bench it attacks repeatedly instead: in every other interval of `every_ms` milliseconds of the
+wall clock. Two good wakes precede each attack that is a fault, which prevents back-off."""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ class Lambda:
         self.every_ms: int = ctx.config["every_ms"]
         self.touch_mib: int = ctx.config["touch_mib"]
         self.wakes = 0
-        # Of the attack before, after which this object was made anew.
+        # Objects of the previous attack, which ended in re-initialisation.
         KEPT.clear()
 
     def on_tick(self, ctx: Context) -> None:
@@ -68,17 +69,18 @@ class Lambda:
             KEPT.append(bytearray(1 << 20))
 
     def read_only_memory(self, ctx: Context) -> None:
-        """What is filled and then made read-only the kernel's limit of data forgets."""
+        """Memory that is filled and then made read-only no longer counts for RLIMIT_DATA."""
         libc = ctypes.CDLL(None, use_errno=True)
         libc.mmap.restype = ctypes.c_void_p
         size, private_anonymous, writable, readable = 16 << 20, 0x22, 3, 1
         for _ in range(6):
-            place = ctypes.c_void_p(libc.mmap(None, ctypes.c_size_t(size), writable, private_anonymous, -1, 0))
+            place = libc.mmap(None, ctypes.c_size_t(size), writable, private_anonymous, -1, 0)
+            place = ctypes.c_void_p(place)
             ctypes.memset(place, 1, size)
             libc.mprotect(place, ctypes.c_size_t(size), readable)
 
     def page_tables(self, ctx: Context) -> None:
-        """Reads a page in each 2 MiB of addresses: of nothing but zeros, each with a page of tables."""
+        """Reads a page in each 2 MiB of addresses: zeros, each with its own page table."""
         libc = ctypes.CDLL(None, use_errno=True)
         libc.mmap.restype = ctypes.c_void_p
         size, private_anonymous, readable = 64 << 30, 0x22, 1
@@ -87,13 +89,13 @@ class Lambda:
             ctypes.string_at(page, 1)
 
     def threads(self, ctx: Context) -> None:
-        """As many as there can be, each with a small stack."""
+        """Starts as many threads as possible, each with a small stack."""
         threading.stack_size(32 << 10)
         for _ in range(2000):
             threading.Thread(target=time.sleep, args=(3600,), daemon=True).start()
 
     def full(self, ctx: Context) -> None:
-        """Keeps all memory that there is, whatever it is told, and leaves the host less than it needs for a line of the log."""
+        """Keeps all available memory, and leaves the host too little for a log line."""
         line = "x" * 4000
         pieces: List[List[bytearray]] = [[] for _ in range(5)]
         KEPT.append(pieces)
@@ -104,12 +106,12 @@ class Lambda:
             except MemoryError:
                 pass
         while True:
-            # Room for the bytes of the line in Python, and none for those in the host.
+            # Enough for the bytes of the line in Python, not for those in the host.
             pieces[2].pop()
             ctx.log("info", line)
 
     def touch(self, ctx: Context) -> None:
-        """All memory that it may have, over and over: what caches and the bus have to carry."""
+        """Writes all of its memory over and over: load for caches and the memory bus."""
         pieces = [bytearray(1 << 20) for _ in range(self.touch_mib)]
         ones = bytes([1]) * (1 << 20)
         while True:
@@ -117,7 +119,7 @@ class Lambda:
                 piece[:] = ones
 
     def numpy(self, ctx: Context) -> None:
-        """Native code that keeps its core busy, and comes back to the interpreter only now and then."""
+        """Keeps its core busy in native code, which rarely returns to the interpreter."""
         import numpy
 
         a = numpy.ones((256, 256))
@@ -160,16 +162,17 @@ class Lambda:
             return file.write("here I was")
 
     def results(self, ctx: Context) -> object:
-        """Looks for a file that this process could write: cutting it to a terabyte would be the next step."""
+        """Looks for a writable file: extending it to a terabyte would be the next step."""
         writable = []
         for number in map(int, os.listdir("/proc/self/fd")):
             try:
                 mode, flags = os.fstat(number).st_mode, fcntl.fcntl(number, fcntl.F_GETFL)
                 path = os.readlink(f"/proc/self/fd/{number}")
             except OSError:
-                continue  # That of the listing.
+                continue  # The descriptor of the listing.
             # The page that the shim watches has a size that cannot be changed.
-            if stat.S_ISREG(mode) and flags & os.O_ACCMODE != os.O_RDONLY and "gleaner-pulse" not in path:
+            is_writable = stat.S_ISREG(mode) and flags & os.O_ACCMODE != os.O_RDONLY
+            if is_writable and "gleaner-pulse" not in path:
                 writable.append(path)
         with open("/proc/self/cmdline") as file:
             out = next(word[6:] for word in file.read().split("\0") if word.startswith("--out="))
@@ -186,14 +189,17 @@ class Lambda:
         return writable
 
     def forge(self, ctx: Context) -> None:
-        """Writes garbage, and a decision that was never made, into every pipe."""
-        forged = b'{"decision":{"at_ns":7,"cause":"tick","triggers":[],"fault":{"kind":"trap","message":"forged"},"run_ns":1}}\n'
+        """Writes garbage, and an invented decision, into every pipe."""
+        forged = (
+            b'{"decision":{"at_ns":7,"cause":"tick","triggers":[],'
+            b'"fault":{"kind":"trap","message":"forged"},"run_ns":1}}\n'
+        )
         for number in map(int, os.listdir("/proc/self/fd")):
             try:
                 if stat.S_ISFIFO(os.fstat(number).st_mode):
                     os.write(number, b"\n" + b"garbage\n" * 100 + forged)
             except OSError:
-                pass  # That of the listing, or an end to read from.
+                pass  # The descriptor of the listing, or a read end.
 
     def chmod(self, ctx: Context) -> None:
         os.chmod(__file__, 0o600)
@@ -218,8 +224,8 @@ class Lambda:
         return resource.prlimit(self.target, resource.RLIMIT_CPU, (0, 0))
 
     def owner(self, ctx: Context) -> object:
-        ours, _theirs = socket.socketpair()
-        return fcntl.fcntl(ours, fcntl.F_SETOWN, self.target)
+        sender, _receiver = socket.socketpair()
+        return fcntl.fcntl(sender, fcntl.F_SETOWN, self.target)
 
     def datagrams(self, ctx: Context) -> object:
         return socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -228,13 +234,14 @@ class Lambda:
         return mmap.mmap(-1, 1 << 30)
 
     def moved_stack(self, ctx: Context) -> object:
-        """The stack counts as no data, wherever it is."""
+        """The stack is not limited as data, wherever it is."""
         libc = ctypes.CDLL(None, use_errno=True)
         libc.mremap.restype = ctypes.c_void_p
         with open("/proc/self/maps") as maps:
             line = next(line for line in maps if line.endswith("[stack]\n"))
         page, may_move = int(line.split("-")[0], 16), 1
-        moved = libc.mremap(ctypes.c_void_p(page), ctypes.c_size_t(4096), ctypes.c_size_t(1 << 30), may_move)
+        old, new = ctypes.c_size_t(4096), ctypes.c_size_t(1 << 30)
+        moved = libc.mremap(ctypes.c_void_p(page), old, new, may_move)
         if moved == ctypes.c_void_p(-1).value:
             raise OSError(ctypes.get_errno(), "mremap")
         return moved
@@ -243,12 +250,12 @@ class Lambda:
         return mmap.mmap(os.open("/dev/zero", os.O_RDWR), 1 << 30)
 
     def lease(self, ctx: Context) -> object:
-        """Whoever wants to open the file would wait for us."""
+        """Other processes that open the file would wait for this one."""
         lease = 1024
         return fcntl.fcntl(os.open(__file__, os.O_RDONLY), lease, fcntl.F_RDLCK)
 
     def pinned(self, ctx: Context) -> object:
-        """A pipe would hold the page, and with huge pages 2 MiB, after it was unmapped."""
+        """A pipe would hold the page, with huge pages 2 MiB, after it was unmapped."""
         page = mmap.mmap(-1, 4096)
         piece = (ctypes.c_ulong * 2)(ctypes.addressof(ctypes.c_char.from_buffer(page)), 4096)
         libc = ctypes.CDLL(None, use_errno=True)
@@ -257,13 +264,13 @@ class Lambda:
         return "pinned"
 
     def lock(self, ctx: Context) -> None:
-        """Other programs that lock the file would wait for this one."""
+        """Other processes that lock the file would wait for this one."""
         fcntl.flock(os.open(__file__, os.O_RDONLY), fcntl.LOCK_EX)
 
     def in_flight(self, ctx: Context) -> object:
-        """Of files on their way the kernel counts those of all processes of a user."""
-        ours, _theirs = socket.socketpair()
-        return socket.send_fds(ours, [b"x"], [0])
+        """The kernel counts files in flight for all processes of a user together."""
+        sender, _receiver = socket.socketpair()
+        return socket.send_fds(sender, [b"x"], [0])
 
     def watch(self, ctx: Context) -> object:
         libc = ctypes.CDLL(None, use_errno=True)
@@ -273,14 +280,14 @@ class Lambda:
         return watch
 
     def timer(self, ctx: Context) -> object:
-        """One counts as a signal that waits, of which a user has a few."""
+        """A timer counts as a pending signal, of which a user has a limited number."""
         libc, timer = ctypes.CDLL(None, use_errno=True), ctypes.c_void_p()
         if libc.timer_create(0, None, ctypes.byref(timer)) != 0:
             raise OSError(ctypes.get_errno(), "timer_create")
         return timer.value
 
     def descriptors(self, ctx: Context) -> object:
-        """With half of them one could watch the other half."""
+        """Half of the descriptors could be used to watch the other half."""
         held: List[int] = []
         try:
             while len(held) < 1000:
@@ -295,7 +302,7 @@ class Lambda:
         return fcntl.fcntl(os.pipe()[1], set_size, 1 << 20)
 
     def settings(self, ctx: Context) -> object:
-        """Programs that were installed by hand keep them in `etc` there, tokens included."""
+        """Manually installed programs keep settings in `etc` there, tokens included."""
         return os.listdir("/usr/local")
 
     def replace(self, ctx: Context) -> None:
@@ -318,7 +325,7 @@ class Lambda:
             pass
 
     def late(self, ctx: Context) -> None:
-        """Comes back before it is killed."""
+        """Returns before it is killed."""
         signal.signal(signal.SIGALRM, signal.SIG_IGN)
         until = time.monotonic() + 0.6
         while time.monotonic() < until:
@@ -329,14 +336,14 @@ class Lambda:
         time.sleep(0.6)
 
     def descriptors_closed(self, ctx: Context) -> None:
-        """Its sockets, its results and its reports, ours included."""
+        """Closes its sockets, its results and its reports, those of the host included."""
         os.closerange(3, 4096)
 
     def terminate(self, ctx: Context) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
     def stop(self, ctx: Context) -> None:
-        """Between two wakes nothing is overdue."""
+        """Stops the process between two wakes, when no deadline is running."""
         threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGSTOP)).start()
 
     def exit(self, ctx: Context) -> None:

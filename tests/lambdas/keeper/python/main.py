@@ -1,4 +1,6 @@
-"""Counts its wakes in scratch, fills that up, and faults in every third wake. Its twin must say the same."""
+"""Counts its wakes in scratch, fills it up, and faults in every third wake.
+
+Its twin must report the same."""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ from typing import Dict, Union
 
 from gleaner import Context, ScratchError
 
-# What is added in each wake until there is no room.
+# Bytes that are added in each wake until scratch is full.
 BULK = 100_000
 
 
@@ -24,17 +26,17 @@ class Lambda:
         wakes = before + 1
         ctx.scratch.put("wakes", wakes.to_bytes(8, "little"))
         try:
-            # Not only `bytes` are taken.
+            # Not only `bytes` are accepted.
             ctx.scratch.append("bulk", bytearray([wakes % 256]) * BULK)
         except ScratchError as error:
             ctx.scratch.remove("bulk")
             ctx.event("full", 1.0, why=str(error))
-        said: Dict[str, Union[int, str]] = {"free": ctx.scratch.free()}
-        said.update((entry.name, entry.bytes) for entry in ctx.scratch.entries())
+        report: Dict[str, Union[int, str]] = {"free": ctx.scratch.free()}
+        report.update((entry.name, entry.bytes) for entry in ctx.scratch.entries())
         try:
-            said["last"] = str(list(ctx.scratch.get("bulk", (wakes - 1) % 10 * BULK, 2)))
+            report["last"] = str(list(ctx.scratch.get("bulk", (wakes - 1) % 10 * BULK, 2)))
         except ScratchError:
             pass
-        ctx.event("kept", wakes, **said)
+        ctx.event("kept", wakes, **report)
         if wakes % 3 == 0:
             raise ValueError("every third time")

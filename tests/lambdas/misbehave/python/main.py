@@ -1,4 +1,4 @@
-"""A lambda that does what its configuration says a lambda must not do. The host has to stay whole."""
+"""Breaks the rules for lambdas as configured. The host must not be harmed."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Lambda:
         self.recurse(ctx, event)
 
     def error_mostly(self, ctx: Context, event: Sample) -> None:
-        """Keeps what it can and fails, seven times of eight; else it says how much memory its process ever had."""
+        """Keeps samples and fails, seven times of eight; else it reports its peak memory."""
         global WAKES
         WAKES += 1
         self.held += [event, *ctx.input("imu").last(8), ctx.input("imu").field("orientation.x")]
@@ -59,7 +59,7 @@ class Lambda:
         ctx.event("was", 1.0, kib=int(line.split()[1]))
 
     def hoard(self, ctx: Context, event: Sample) -> None:
-        """Has more and more memory of its own, which goes with this object."""
+        """Allocates more and more memory, which is freed with this object."""
         self.held.append(b"x" * (1 << 20))
 
     def exit(self, ctx: Context, event: Sample) -> None:
@@ -96,7 +96,7 @@ class Lambda:
         print("wake", self.wakes, "of", self.behaviour, file=sys.stderr)
 
     def write(self, ctx: Context, event: Sample) -> None:
-        """Looks for whatever it can write: files that are open, and places in the folder `target`."""
+        """Tries to write: to open files, and to places in the folder `target`."""
         for fd in map(int, os.listdir("/proc/self/fd")):
             try:
                 is_file = stat.S_ISREG(os.fstat(fd).st_mode)
@@ -104,10 +104,11 @@ class Lambda:
                 name = os.readlink(f"/proc/self/fd/{fd}")
             except OSError:
                 continue
-            # The page that the shim reads is memory, and no file of anybody.
+            # The page that the shim reads is memory, not a file.
             if is_file and writes and "memfd:" not in name:
                 ctx.event("escaped", 1.0, found=name)
-        for name in ("new", "decisions.jsonl", "log.jsonl", ".lock", "clips.jsonl", "drive.journal"):
+        names = ("new", "decisions.jsonl", "log.jsonl", ".lock", "clips.jsonl", "drive.journal")
+        for name in names:
             try:
                 with open(os.path.join(self.target, name), "ab"):
                     ctx.event("escaped", 1.0, found=name)
@@ -115,7 +116,7 @@ class Lambda:
                 pass
 
     def forge_end(self, ctx: Context, event: Sample) -> None:
-        """Ends its process as a program of the host would, with a message of that."""
+        """Ends its process as a program of the host would, with such a message."""
         ctx.event("before", 1.0)
         if self.wakes == 3:
             os.write(2, b"error: the drive is damaged\n")
@@ -126,7 +127,7 @@ class Lambda:
             os.kill(os.getpid(), signal.SIGKILL)
 
     def forge_messages(self, ctx: Context, event: Sample) -> None:
-        """Writes a message of the host into each pipe that is open."""
+        """Writes a message of the host into each open pipe."""
         message = b"x" * (5 << 20) if self.target == "long" else self.target.encode() + b"\n"
         if self.wakes == 3:
             for fd in range(3, 64):

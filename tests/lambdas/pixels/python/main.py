@@ -1,4 +1,4 @@
-"""Hashes the pixels of every frame (FNV-1a, 32 bits, rows without padding) and says it as a label."""
+"""Hashes the pixels of every frame (FNV-1a, 32 bits, rows without padding) as a label."""
 
 from gleaner import Context, Sample
 

@@ -1,4 +1,4 @@
-"""Calls every function of the interface and says what it answers. Its twin must be answered the same."""
+"""Calls every function of the interface and reports the results. Its twin must get the same."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ class Lambda:
     def __init__(self, ctx: Context) -> None:
         config = dict(ctx.config)
         self.every: int = config.pop("every")
-        if config != {"number": 1.5, "count": 3, "yes": True, "word": "probe"} or ctx.inputs() != ["camera", "imu"]:
+        expected = {"number": 1.5, "count": 3, "yes": True, "word": "probe"}
+        if config != expected or ctx.inputs() != ["camera", "imu"]:
             raise ValueError(f"unexpected {ctx.config}")
         self.camera, self.imu = ctx.input("camera"), ctx.input("imu")
         self.forward = self.imu.field("linear_acceleration.x")
@@ -22,7 +23,7 @@ class Lambda:
         self.data = self.camera.field("data")
 
     def on_event(self, ctx: Context, sample: Sample) -> None:
-        # Hashing is slow in Python: some of the pictures will do.
+        # Hashing is slow in Python, so only some images are used.
         if sample.identity.seq % self.every != 0:
             return
         self.topics(ctx)
@@ -78,7 +79,8 @@ class Lambda:
         info = frame.info
         corner = Roi(10, 20, 33, 44)
         small, gray = frame.resize(60, 40), frame.to_gray()
-        assert np.array_equal(frame.array().ravel()[1000:6000], np.frombuffer(frame.read(1000, 5000), np.uint8))
+        read = np.frombuffer(frame.read(1000, 5000), np.uint8)
+        assert np.array_equal(frame.array().ravel()[1000:6000], read)
         ctx.event(
             "frame",
             frame.mean_luma(),
@@ -124,7 +126,7 @@ class Lambda:
 
 
 def kind(call: Callable[[], Any]) -> str:
-    """Which refusal it was; `none` for an answer."""
+    """Returns the kind of the refusal; `none` for a result."""
     try:
         call()
     except Error as error:

@@ -1,4 +1,6 @@
-"""A lambda that is slower than its camera, or keeps what it sees. The host must neither fall behind nor lose anything uncounted."""
+"""Is slower than its camera, or keeps all samples.
+
+The host must not fall behind, and must count all losses."""
 
 import time
 
@@ -11,13 +13,14 @@ class Lambda:
         self.seconds = float(ctx.config["seconds"])
         self.camera = ctx.input("camera")
         self.kept: list[gleaner.Sample] = []
-        # Samples received less the number of the newest, at the least: one that is lost has a number, too.
+        # Minimum of the number of received samples minus the number of the newest; lost samples
+        # have a number, too.
         self.least: int | None = None
 
     def on_event(self, ctx: gleaner.Context, sample: gleaner.Sample) -> None:
         ahead = self.camera.counts().received - sample.identity.seq
         self.least = ahead if self.least is None else min(self.least, ahead)
-        # One may arrive between being chosen and being looked at.
+        # One may arrive between selection and check.
         if ahead - self.least > 1:
             ctx.event("stale", float(ahead))
         if self.behaviour == "sleep":

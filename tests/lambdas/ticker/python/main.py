@@ -1,4 +1,6 @@
-"""Says at each tick what time it is, what it missed, and the newest acceleration. Its twin must say the same."""
+"""Reports at each tick the time, the missed ticks, and the newest acceleration.
+
+Its twin must report the same."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-//! Does nothing: what is left is what hosting costs.
+//! Does nothing: measures the overhead of the host.
 
 use gleaner_sdk::{Config, Lambda, Result, Sample};
 
-struct Empty;
+struct ImuLambda;
 
-impl Lambda for Empty {
+impl Lambda for ImuLambda {
     fn init(_config: &Config) -> Result<Self> {
         Ok(Self)
     }
@@ -14,4 +14,4 @@ impl Lambda for Empty {
     }
 }
 
-gleaner_sdk::lambda!(Empty);
+gleaner_sdk::lambda!(ImuLambda);

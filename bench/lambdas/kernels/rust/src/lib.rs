@@ -1,5 +1,5 @@
-//! Does one thing over and over, for as many rounds as its caller says. The bench calls [`Work`]
-//! natively, too.
+//! Repeats one kind of work, as many rounds as its caller requests. The bench also calls [`Work`]
+//! natively.
 
 use std::hint::black_box;
 
@@ -11,29 +11,29 @@ use gleaner_sdk::{Config, Error, Lambda, Result, Sample, Tick, now_ns};
 const WIDTH: u32 = 1920;
 const HEIGHT: u32 = 1080;
 
-/// Bytes of a frame at a time.
+/// Bytes of a piece of a frame.
 const PIECE: u32 = 64 << 10;
 
-/// One kernel with its input and the place for its output.
+/// One kernel with its input and the buffer for its output.
 pub enum Work {
     /// Density of a signal of `f32`.
     Single(Density<f32>),
     /// Density of a signal of `f64`.
     Double(Density<f64>),
-    /// Something over a picture of 1920x1080 bgr8.
+    /// A kernel over an image of 1920x1080 bgr8.
     Pixels {
         /// Width * height * 3 bytes.
         bgr: Vec<u8>,
-        /// A kernel; it may use the place for its result.
+        /// The kernel; it may use the buffer for its result.
         kernel: fn(&Image<'_>, &mut [u8]) -> Result<f64>,
-        /// As large as the largest result.
+        /// A buffer as large as the largest result.
         out: Vec<u8>,
     },
     /// Mean of 65,536 numbers.
     Mean(Vec<f64>),
 }
 
-/// A plan, a signal and the place for its density.
+/// A plan, a signal and the buffer for its density.
 pub struct Density<T: Real> {
     plan: Spectrum<T>,
     signal: Vec<T>,
@@ -58,11 +58,11 @@ impl<T: Real + Into<f64>> Density<T> {
 }
 
 impl Work {
-    /// What is called `name`.
+    /// The work with the name `name`.
     ///
     /// # Errors
     ///
-    /// If nothing is.
+    /// If there is none.
     pub fn new(name: &str) -> Result<Self> {
         let pixels = |kernel| {
             let bgr = noise((WIDTH * HEIGHT * 3) as usize);
@@ -85,15 +85,15 @@ impl Work {
                 Ok(f64::from(out[out.len() / 2]))
             }),
             "mean" => Ok(Self::Mean(noise(1 << 16).into_iter().map(f64::from).collect())),
-            _ => Err(Error::new(format!("there is no work called `{name}`"))),
+            _ => Err(Error::new(format!("unknown work `{name}`"))),
         }
     }
 
-    /// Does it once; the number depends on what came out.
+    /// Does the work once; the returned number depends on the result.
     ///
     /// # Errors
     ///
-    /// None, if the kernels are right.
+    /// Only if a kernel has a defect.
     pub fn round(&mut self) -> Result<f64> {
         match self {
             Self::Single(density) => density.round(),
@@ -106,7 +106,7 @@ impl Work {
         }
     }
 
-    /// Does it `rounds` times; what came out last.
+    /// Does the work `rounds` times; returns the last number.
     ///
     /// # Errors
     ///
@@ -116,7 +116,7 @@ impl Work {
     }
 }
 
-/// Bytes that look random and are the same in every run.
+/// Pseudo-random bytes, the same in every run.
 fn noise(count: usize) -> Vec<u8> {
     let mut state = 1_u32;
     let next = || {
@@ -129,7 +129,7 @@ fn noise(count: usize) -> Vec<u8> {
 struct Kernels {
     name: String,
     rounds: i64,
-    /// None for what needs a host.
+    /// `None` for work that needs a host.
     work: Option<Work>,
     pixels: Vec<u8>,
 }
@@ -145,8 +145,8 @@ impl Lambda for Kernels {
         Ok(Self { name, rounds: config.integer("rounds")?, work, pixels: Vec::new() })
     }
 
-    /// Work with the host, which has a frame: all pixels in pieces, kept or only passing through,
-    /// or the smallest call there is.
+    /// Does work with the host, which has a frame: reads all pixels in pieces, with or without
+    /// storing them, or makes the smallest host call.
     fn on_event(&mut self, sample: Sample) -> Result<()> {
         if self.name == "call" {
             for _ in 0..self.rounds {
@@ -171,8 +171,8 @@ impl Lambda for Kernels {
         Ok(())
     }
 
-    /// Work without a host: `missed` rounds. What came out is told as an error, the only words that
-    /// a wake returns.
+    /// Does work without a host: `missed` rounds. The result is returned as an error, the only text
+    /// that a wake returns.
     fn on_tick(&mut self, tick: Tick) -> Result<()> {
         if tick.missed == 0 {
             return Ok(());

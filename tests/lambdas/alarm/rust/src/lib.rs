@@ -1,5 +1,4 @@
-//! A lambda that triggers at the times that its configuration says, so that a test knows the
-//! windows.
+//! Triggers at the configured times, so that the windows are known.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, event, now_ns, start, stop};
 
@@ -37,7 +36,7 @@ impl Lambda for Alarm {
     }
 }
 
-/// Times in ns, the earliest last.
+/// Parses times into ns, sorted with the earliest last.
 fn times(text: &str) -> Result<Vec<i64>> {
     let seconds =
         text.split(',').filter(|part| !part.is_empty()).map(|part| part.trim().parse::<f64>());
@@ -49,7 +48,7 @@ fn times(text: &str) -> Result<Vec<i64>> {
     Ok(times)
 }
 
-/// Whether the next of `times` has come; then it is taken.
+/// Returns whether the next of `times` is due, and removes it then.
 fn due(times: &mut Vec<i64>, passed: i64) -> bool {
     let is_due = times.last().is_some_and(|time| passed >= *time);
     if is_due {

@@ -1,8 +1,8 @@
-//! A lambda that attacks whatever is around it, once, in its third wake. It says with an event what
-//! came of that: `refused` with the error, or `escaped`.
+//! Attacks its environment, once, in its third wake. An event reports the outcome: `refused` with
+//! the error, or `escaped`.
 //!
-//! For a bench it attacks again and again instead: every other `every_ms` milliseconds of the day's
-//! time. Two good wakes come before each attack that is a fault, so that it is never made to rest.
+//! For a bench it attacks repeatedly instead: in every other interval of `every_ms` milliseconds of
+//! the wall clock. Two good wakes precede each attack that is a fault, which prevents back-off.
 
 use std::time::Duration;
 
@@ -56,7 +56,7 @@ impl Attack {
             "memory" => loop {
                 self.bytes.push(std::hint::black_box(Vec::with_capacity(1 << 20)));
             },
-            // All memory that it may have, over and over: what caches and the bus have to carry.
+            // Writes all of its memory over and over: load for caches and the memory bus.
             "touch" => {
                 self.bytes = (0..self.touch_mib).map(|_| vec![0; 1 << 20]).collect();
                 loop {

@@ -1,12 +1,12 @@
-//! A lambda that makes the calls which the bytes of a sample say, with whatever arguments: the host
-//! must stay whole.
+//! Makes the calls that the bytes of a sample list, with arbitrary arguments: the host must not be
+//! harmed.
 //!
-//! A program is a list of steps (`tests/operations`): a byte for the call, then what it takes. What
-//! a call gives is kept, and later steps take from it by number, so that they come in every order.
-//! What is missing at the end of the bytes is 0. Refusals are expected; a step that says so ends in
-//! a panic instead.
+//! A program is a list of steps (`tests/operations`): a byte for the call, then its arguments. The
+//! results of calls are held, and later steps use them by number, so that they occur in every
+//! order. Bytes beyond the end of the program are 0. Refusals are expected; only an explicit step
+//! panics.
 
-use gleaner_operations::{Extra, Operation, Step};
+use gleaner_operations::{DriverStep, Extra, Operation};
 use gleaner_sdk::data::{Frame, Roi};
 use gleaner_sdk::inference::{DetectOptions, Model, Preprocess, Tensor};
 use gleaner_sdk::log::{error, trace, warn};
@@ -15,13 +15,13 @@ use gleaner_sdk::{
     stop,
 };
 
-/// Steps of one wake: more would only use up its fuel.
+/// Maximum number of steps in a wake: more would only burn its fuel.
 const STEPS: usize = 256;
-/// Most that is said in one call, in bytes. The host takes 1 MiB.
+/// Maximum length of a text in bytes. The host accepts 1 MiB.
 const TEXT: usize = 2 << 20;
 
 #[derive(Default)]
-struct Kept {
+struct HeldObjects {
     topics: Vec<Topic>,
     fields: Vec<Field>,
     samples: Vec<Sample>,
@@ -30,34 +30,34 @@ struct Kept {
     models: Vec<Model>,
 }
 
-struct Driver {
-    kept: Kept,
+struct ProgramDriver {
+    held: HeldObjects,
 }
 
-impl Lambda for Driver {
+impl Lambda for ProgramDriver {
     fn init(_: &Config) -> Result<Self> {
-        Ok(Self { kept: Kept::default() })
+        Ok(Self { held: HeldObjects::default() })
     }
 
     fn on_event(&mut self, sample: Sample) -> Result<()> {
         let program = sample.cdr(4, u32::MAX);
         let mut bytes = Bytes(&program);
-        self.kept.samples.push(sample);
+        self.held.samples.push(sample);
         for _ in 0..STEPS {
             if bytes.0.is_empty() {
                 break;
             }
-            self.kept.step(&mut bytes);
+            self.held.step(&mut bytes);
         }
         Ok(())
     }
 }
 
-impl Kept {
+impl HeldObjects {
     fn step(&mut self, bytes: &mut Bytes) {
-        match Step::of(bytes.u8()) {
-            Step::Call(operation) => self.call(operation, bytes),
-            Step::Extra(extra) => self.extra(extra, bytes),
+        match DriverStep::of(bytes.u8()) {
+            DriverStep::Call(operation) => self.call(operation, bytes),
+            DriverStep::Extra(extra) => self.extra(extra, bytes),
         }
     }
 
@@ -65,7 +65,7 @@ impl Kept {
         match operation {
             Operation::Input => self.topics.extend(match bytes.u8() % 4 {
                 3 => input(&bytes.text()),
-                known => input(["program", "raw", "coded"][usize::from(known)]),
+                number => input(["program", "raw", "coded"][usize::from(number)]),
             }),
             Operation::Inputs => drop(inputs()),
             Operation::NowNs => drop(now_ns()),
@@ -227,23 +227,23 @@ impl Kept {
     }
 }
 
-fn of<'a, T>(kept: &'a [T], bytes: &mut Bytes) -> Option<&'a T> {
+fn of<'a, T>(held: &'a [T], bytes: &mut Bytes) -> Option<&'a T> {
     let number = usize::from(bytes.u8());
-    kept.get(number.checked_rem(kept.len())?)
+    held.get(number.checked_rem(held.len())?)
 }
 
-fn keep<T>(kept: &mut Vec<T>, more: Option<impl Iterator<Item = T>>) {
-    kept.extend(more.into_iter().flatten());
+fn keep<T>(held: &mut Vec<T>, more: Option<impl Iterator<Item = T>>) {
+    held.extend(more.into_iter().flatten());
 }
 
-fn forget<T>(kept: &mut Vec<T>, bytes: &mut Bytes) {
+fn forget<T>(held: &mut Vec<T>, bytes: &mut Bytes) {
     let number = usize::from(bytes.u8());
-    if let Some(number) = number.checked_rem(kept.len()) {
-        kept.swap_remove(number);
+    if let Some(number) = number.checked_rem(held.len()) {
+        held.swap_remove(number);
     }
 }
 
-/// A program, taken apart from its begin.
+/// Splits a program into numbers and texts, front to back.
 struct Bytes<'a>(&'a [u8]);
 
 impl Bytes<'_> {
@@ -279,7 +279,7 @@ impl Bytes<'_> {
         f64::from_le_bytes(self.array())
     }
 
-    /// Some bytes as text; or one letter, so often that it is longer than anything may be.
+    /// A few bytes as text; or one letter, repeated beyond all limits.
     fn text(&mut self) -> String {
         match self.u8() {
             255 => "x".repeat(self.u32() as usize % TEXT),
@@ -331,4 +331,4 @@ impl Bytes<'_> {
     }
 }
 
-gleaner_sdk::lambda!(Driver);
+gleaner_sdk::lambda!(ProgramDriver);

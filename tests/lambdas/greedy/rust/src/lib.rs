@@ -1,4 +1,4 @@
-//! A lambda that takes more than its share, as its configuration says. The host has to notice.
+//! Exceeds its limits as configured. The host must detect it.
 
 use gleaner_sdk::{Config, Error, Field, Frame, Lambda, Result, Sample, Topic, event, input, log};
 

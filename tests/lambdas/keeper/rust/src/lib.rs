@@ -1,9 +1,9 @@
-//! Counts its wakes in scratch, fills that up, and faults in every third wake. Its twin must say
+//! Counts its wakes in scratch, fills it up, and faults in every third wake. Its twin must report
 //! the same.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Tick, event, scratch};
 
-/// What is added in each wake until there is no room.
+/// Bytes that are added in each wake until scratch is full.
 const BULK: usize = 100_000;
 
 /// The lambda.

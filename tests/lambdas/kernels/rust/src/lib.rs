@@ -1,18 +1,18 @@
-//! Says what every kernel of the SDK makes of made-up pixels and signals: a test calls [`results`]
-//! natively and compares.
+//! Reports the results of every kernel of the SDK on synthetic pixels and signals: a test calls
+//! [`results`] natively and compares.
 
 use gleaner_sdk::data::{Encoding, Roi, encoding_name};
 use gleaner_sdk::kernels::fft::{Real, Spectrum, band_power};
 use gleaner_sdk::kernels::{Image, downscale, histogram, luma, mean};
 use gleaner_sdk::{Config, Lambda, Result, Sample, event};
 
-/// What a kernel made of its input.
-pub struct Made {
+/// Results of a kernel.
+pub struct KernelResult {
     /// The kernel.
     pub kernel: &'static str,
-    /// Of all bytes of all results that are equal everywhere (FNV-1a, 64 bits).
+    /// Digest of all results that are equal on every machine (FNV-1a, 64 bits).
     pub digest: u64,
-    /// Of floating point that may differ in its last bits; else 0.
+    /// Floating-point result that may differ in its last bits; else 0.
     pub number: f64,
 }
 
@@ -20,8 +20,8 @@ pub struct Made {
 ///
 /// # Errors
 ///
-/// None, if the kernels are right.
-pub fn results() -> Result<Vec<Made>> {
+/// Only if a kernel has a defect.
+pub fn results() -> Result<Vec<KernelResult>> {
     let mut kernels = [
         Digest::of("mean_luma"),
         Digest::of("mean_rgb"),
@@ -57,15 +57,15 @@ pub fn results() -> Result<Vec<Made>> {
             }
         }
     }
-    let mut results = kernels.into_iter().chain([smaller]).map(Digest::made).collect::<Vec<_>>();
+    let mut results = kernels.into_iter().chain([smaller]).map(Digest::result).collect::<Vec<_>>();
     results.push(signal_mean());
-    results.push(Made { kernel: "spectrum_f32", digest: 0, number: spectrum::<f32>()? });
-    results.push(Made { kernel: "spectrum_f64", digest: 0, number: spectrum::<f64>()? });
+    results.push(KernelResult { kernel: "spectrum_f32", digest: 0, number: spectrum::<f32>()? });
+    results.push(KernelResult { kernel: "spectrum_f64", digest: 0, number: spectrum::<f64>()? });
     Ok(results)
 }
 
-/// Sums of floating point in a fixed order: equal bits everywhere.
-fn signal_mean() -> Made {
+/// Digest of floating-point sums in a fixed order: equal bits on every machine.
+fn signal_mean() -> KernelResult {
     let mut digest = Digest::of("mean");
     for count in [1, 15, 16, 50, 1001] {
         let values = noise(count)
@@ -74,10 +74,10 @@ fn signal_mean() -> Made {
             .collect::<Vec<_>>();
         digest.add(&mean::mean(&values).unwrap_or_default().to_bits().to_le_bytes());
     }
-    digest.made()
+    digest.result()
 }
 
-/// Powers of some bands at several lengths, added up.
+/// Sum of the powers of some bands at several lengths.
 fn spectrum<T: Real + Into<f64>>() -> Result<f64> {
     let mut sum = 0.0;
     for samples in [6, 64, 100, 128, 1024] {
@@ -92,7 +92,7 @@ fn spectrum<T: Real + Into<f64>>() -> Result<f64> {
     Ok(sum)
 }
 
-/// Bytes that look random and are the same in every run.
+/// Pseudo-random bytes, the same in every run.
 fn noise(count: u32) -> Vec<u8> {
     let mut state = count;
     let next = || {
@@ -118,26 +118,26 @@ impl Digest {
         self.state = bytes.iter().fold(self.state, step);
     }
 
-    fn made(self) -> Made {
-        Made { kernel: self.kernel, digest: self.state, number: 0.0 }
+    fn result(self) -> KernelResult {
+        KernelResult { kernel: self.kernel, digest: self.state, number: 0.0 }
     }
 }
 
 struct Kernels {
-    said: bool,
+    is_done: bool,
 }
 
 impl Lambda for Kernels {
     fn init(_config: &Config) -> Result<Self> {
-        Ok(Self { said: false })
+        Ok(Self { is_done: false })
     }
 
     fn on_event(&mut self, _sample: Sample) -> Result<()> {
-        // It would be the same at every wake.
-        if std::mem::replace(&mut self.said, true) {
+        // The results are the same in every wake.
+        if std::mem::replace(&mut self.is_done, true) {
             return Ok(());
         }
-        for Made { kernel, digest, number } in results()? {
+        for KernelResult { kernel, digest, number } in results()? {
             event(&format!("{kernel} {digest:016x}"), number).send()?;
         }
         Ok(())

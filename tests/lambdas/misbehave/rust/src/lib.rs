@@ -1,4 +1,4 @@
-//! A lambda that does what its configuration says a lambda must not do. The host has to stay whole.
+//! Breaks the rules for lambdas as configured. The host must not be harmed.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, event, input, log};
 
@@ -61,7 +61,7 @@ impl Lambda for Misbehave {
                 panic!("after the event");
             }
             "nan_score" => event("x", f64::NAN).send()?,
-            // Which NaN it is depends on the processor.
+            // The bits of this NaN depend on the processor.
             "nan_bits" => {
                 let [a, b] = std::hint::black_box([0.0_f64, 0.0]);
                 event("nan", 0.0)
@@ -72,7 +72,7 @@ impl Lambda for Misbehave {
             "measure" => {
                 let x = sample.number(&input("imu")?.field("linear_acceleration.x")?)?;
                 let measured = event("measured", (x * self.wakes as f64).sin()).with("x", x);
-                // In a minute there are more of them than are allowed.
+                // In a minute these exceed the limit of events.
                 log::info(&format!("{:?} of {x}", measured.send()));
             }
             "log_flood" => (0..1000).for_each(|i| log::info(&format!("line {i}"))),
@@ -84,7 +84,7 @@ impl Lambda for Misbehave {
     }
 }
 
-/// What to do after so many samples: mostly work, but each kind of fault again and again.
+/// The behaviour after `received` samples: mostly work, and each kind of fault now and then.
 fn now_and_then(received: u64) -> &'static str {
     match received % 64 {
         7 => "panic",

@@ -1,10 +1,10 @@
-//! Hashes the pixels of every frame (FNV-1a, 32 bits, rows without padding) and says it as a label.
+//! Hashes the pixels of every frame (FNV-1a, 32 bits, rows without padding); reports it as a label.
 
 use gleaner_sdk::{Config, Lambda, Result, Sample, event};
 
-struct Pixels;
+struct PixelHasher;
 
-impl Lambda for Pixels {
+impl Lambda for PixelHasher {
     fn init(_config: &Config) -> Result<Self> {
         Ok(Self)
     }
@@ -19,7 +19,7 @@ fn fnv1a(hash: u32, bytes: &[u8]) -> u32 {
     bytes.iter().fold(hash, |hash, byte| (hash ^ u32::from(*byte)).wrapping_mul(0x0100_0193))
 }
 
-gleaner_sdk::lambda!(Pixels);
+gleaner_sdk::lambda!(PixelHasher);
 
 #[cfg(test)]
 mod tests {

@@ -1,5 +1,4 @@
-//! Calls every function of the interface and says what it answers. Its twin must be answered the
-//! same.
+//! Calls every function of the interface and reports the results. Its twin must get the same.
 
 use gleaner_sdk::data::{Roi, Value, encoding_name};
 use gleaner_sdk::inference::{Model, Preprocess, Tensor};
@@ -44,7 +43,7 @@ impl Lambda for Probe {
     }
 
     fn on_event(&mut self, sample: Sample) -> Result<()> {
-        // Hashing is slow in Python: some of the pictures will do.
+        // Hashing is slow in Python, so only some images are used.
         if !sample.identity().seq.is_multiple_of(self.every) {
             return Ok(());
         }
@@ -179,7 +178,7 @@ impl Probe {
     }
 }
 
-/// Which refusal it was; `none` for an answer.
+/// The kind of the refusal; `none` for a result.
 fn kind<T>(answer: Result<T>) -> &'static str {
     answer.err().and_then(|error| error.kind()).unwrap_or("none")
 }

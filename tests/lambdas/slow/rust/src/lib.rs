@@ -1,5 +1,5 @@
-//! A lambda that is slower than its camera, or keeps what it sees. The host must neither fall
-//! behind nor lose anything uncounted.
+//! Is slower than its camera, or keeps all samples. The host must not fall behind, and must count
+//! all losses.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, Topic, event, input};
 
@@ -8,8 +8,8 @@ struct Slow {
     rounds: i64,
     camera: Topic,
     kept: Vec<Sample>,
-    /// Samples received less the number of the newest, at the least: one that is lost has a number,
-    /// too.
+    /// Minimum of the number of received samples minus the number of the newest; lost samples have
+    /// a number, too.
     least: i64,
 }
 
@@ -29,7 +29,7 @@ impl Lambda for Slow {
         let ahead =
             self.camera.counts().received.cast_signed() - sample.identity().seq.cast_signed();
         self.least = self.least.min(ahead);
-        // One may arrive between being chosen and being looked at.
+        // One may arrive between selection and check.
         if ahead - self.least > 1 {
             event("stale", ahead as f64).send()?;
         }

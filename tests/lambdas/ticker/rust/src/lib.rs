@@ -1,5 +1,5 @@
-//! Says at each tick what time it is, what it missed, and the newest acceleration. Its twin must
-//! say the same.
+//! Reports at each tick the time, the missed ticks, and the newest acceleration. Its twin must
+//! report the same.
 
 use gleaner_sdk::{Config, Field, Lambda, Result, Tick, Topic, event, input, now_ns};
 

@@ -1,17 +1,17 @@
-//! Our side: a participant, and a sink that keeps what it is given.
+//! The receiving side: a participant, and a sink that stores the samples.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use gleaner_dds::{Dds, DdsOptions, Distro};
 use gleaner_tests::peers::PATIENCE;
-use gleaner_tests::peers::message::Type;
+use gleaner_tests::peers::message::MessageType;
 use gleaner_transport::{
-    Delivery, Guid, Qos, SampleMeta, Sink, Status, Subscription, TopicSpec, Transport,
+    Delivery, Guid, Qos, ReceptionStatus, SampleMeta, Sink, Subscription, TopicSpec, Transport,
 };
 use libtest_mimic::Failed;
 
-/// The largest message here: an image of 1080p.
+/// The largest message: an image of 1080p.
 const LARGEST: usize = 7 << 20;
 
 /// Joins the domain.
@@ -22,97 +22,97 @@ pub fn join(distro: Option<Distro>) -> Result<Dds, Failed> {
     Ok(Dds::open(options)?)
 }
 
-/// A sample that was heard.
-pub struct Sample {
+/// A received sample.
+pub struct ReceivedSample {
     pub meta: SampleMeta,
     pub cdr: Vec<u8>,
 }
 
 #[derive(Default)]
-struct Memory {
-    samples: Mutex<Vec<Sample>>,
+struct SampleStore {
+    samples: Mutex<Vec<ReceivedSample>>,
     arrived: Condvar,
 }
 
-impl Sink for Memory {
+impl Sink for SampleStore {
     fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
-        self.samples.lock().unwrap().push(Sample { meta: *meta, cdr: cdr.to_vec() });
+        self.samples.lock().unwrap().push(ReceivedSample { meta: *meta, cdr: cdr.to_vec() });
         self.arrived.notify_all();
         Delivery::Taken
     }
 }
 
-/// One topic that we listen to.
-pub struct Heard {
+/// A subscription with its samples.
+pub struct TopicReceiver {
     pub subscription: Subscription,
-    ty: Type,
-    memory: Arc<Memory>,
+    ty: MessageType,
+    store: Arc<SampleStore>,
 }
 
-impl Heard {
+impl TopicReceiver {
     /// Subscribes.
-    pub fn on(dds: &mut Dds, ty: Type, topic: &str, qos: Qos) -> Result<Self, Failed> {
-        let memory = Arc::new(Memory::default());
+    pub fn new(dds: &mut Dds, ty: MessageType, topic: &str, qos: Qos) -> Result<Self, Failed> {
+        let store = Arc::new(SampleStore::default());
         let (topic, type_name) = (topic.to_owned(), ty.name());
         let spec = TopicSpec { topic, type_name, queue: 100, max_bytes: LARGEST, qos };
-        Ok(Self { subscription: dds.subscribe(&spec, memory.clone())?, ty, memory })
+        Ok(Self { subscription: dds.subscribe(&spec, store.clone())?, ty, store })
     }
 
-    /// Waits until what was heard is `enough`, and returns it.
+    /// Waits until `enough` holds for the received samples, and returns them.
     pub fn wait(
         &self,
         what: &str,
-        mut enough: impl FnMut(&[Sample]) -> bool,
-    ) -> Result<MutexGuard<'_, Vec<Sample>>, Failed> {
-        let mut samples = self.memory.samples.lock().unwrap();
+        mut enough: impl FnMut(&[ReceivedSample]) -> bool,
+    ) -> Result<MutexGuard<'_, Vec<ReceivedSample>>, Failed> {
+        let mut samples = self.store.samples.lock().unwrap();
         let deadline = Instant::now() + PATIENCE;
         while !enough(&samples) {
             if Instant::now() > deadline {
                 return Err(
-                    format!("waited for {what}; {} samples were heard", samples.len()).into()
+                    format!("waited for {what}; {} samples were received", samples.len()).into()
                 );
             }
-            // Asked again now and then: that something was lost comes without a sample.
+            // Checked again periodically: a loss is counted without a sample.
             samples =
-                self.memory.arrived.wait_timeout(samples, Duration::from_millis(100)).unwrap().0;
+                self.store.arrived.wait_timeout(samples, Duration::from_millis(100)).unwrap().0;
         }
         Ok(samples)
     }
 
-    /// How many were heard by now.
+    /// Number of samples received so far.
     pub fn count(&self) -> usize {
-        self.memory.samples.lock().unwrap().len()
+        self.store.samples.lock().unwrap().len()
     }
 
-    /// Waits for messages 1 to `count` of one writer: each once, in order, every byte as it should
-    /// be, none counted as lost.
+    /// Waits for messages 1 to `count` of one writer: each once, in order, every byte correct, none
+    /// counted as lost.
     pub fn all(&self, dds: &Dds, count: u32) -> Result<(), Failed> {
         let samples = self.wait("all messages", |samples| samples.len() >= count as usize)?;
         if samples.len() > count as usize {
             return Err(format!("{} samples for {count} messages", samples.len()).into());
         }
         self.in_order(samples.iter(), 1)?;
-        // A comparison that finds nothing because it is blind shows nothing.
+        // Checks that the comparison finds a difference.
         if self.in_order(samples.iter().take(1), 2).is_ok() {
             return Err("message 1 passes for message 2".into());
         }
         drop(samples);
         let status = dds.status(self.subscription);
-        let Status { lost, malformed, qos_warnings, .. } = &status;
+        let ReceptionStatus { lost, malformed, qos_warnings, .. } = &status;
         if *lost != Some(0) || *malformed != 0 || !qos_warnings.is_empty() {
             return Err(format!("all messages arrived, but the status is {status:?}").into());
         }
         Ok(())
     }
 
-    /// Checks that `samples` are messages from `first` on, of one writer, without a gap.
+    /// Checks that `samples` are consecutive messages of one writer, beginning with `first`.
     pub fn in_order<'s>(
         &self,
-        samples: impl IntoIterator<Item = &'s Sample>,
+        samples: impl IntoIterator<Item = &'s ReceivedSample>,
         first: u32,
     ) -> Result<(), Failed> {
         let mut before: Option<(Guid, u64)> = None;
-        for (n, Sample { meta, cdr }) in (first..).zip(samples) {
+        for (n, ReceivedSample { meta, cdr }) in (first..).zip(samples) {
             if let Some(how) = self.ty.message(n).differs(cdr, meta.endian) {
                 return Err(format!("message {n}: {how}").into());
             }
@@ -126,7 +126,7 @@ impl Heard {
 }
 
 /// The number of a message, from its stamp.
-pub fn number(sample: &Sample) -> u32 {
+pub fn number(sample: &ReceivedSample) -> u32 {
     let sec = sample.cdr.first_chunk().map_or(0, |sec| i32::from_le_bytes(*sec));
     u32::try_from(sec - 1000).unwrap_or(0)
 }
