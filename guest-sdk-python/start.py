@@ -52,7 +52,7 @@ def load(path: str) -> ModuleType:
     loader = ExtensionFileLoader("_gleaner", path)
     spec = importlib.util.spec_from_file_location("_gleaner", path, loader=loader)
     try:
-        assert spec is not None, "a spec is made whenever a loader is given"
+        assert spec is not None, "a loader is passed, so there is a spec"
         module = importlib.util.module_from_spec(spec)
         loader.exec_module(module)
     except ImportError as error:

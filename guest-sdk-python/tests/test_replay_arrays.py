@@ -90,8 +90,8 @@ class Arrays(unittest.TestCase):
         self.assertEqual([t.score for t in run.triggers], [3.0])
         refused: Cases = [
             ({"limt": 1}, "did you mean `limit`"),
-            ({"limit": "1"}, "give a number"),
-            ({"limit": float("nan")}, "give a number"),
+            ({"limit": "1"}, "use a number"),
+            ({"limit": float("nan")}, "use a number"),
             ({"limit": 11}, "its max is 10"),
         ]
         for config, why in refused:
@@ -263,7 +263,7 @@ class Manifests(unittest.TestCase):
             ({"schedule": {"period": "1 day"}}, 'for example "50ms"'),
             ({"schedule": {"period": "1us"}}, "its range is 1000000 to"),
             ({"input": [{**one, "depth": 0}]}, "has a `depth` of 0"),
-            ({"input": [{**one, "depth": True}]}, "no whole number"),
+            ({"input": [{**one, "depth": True}]}, "not a whole number"),
             ({"input": [{**one, "dept": 1}]}, "did you mean `depth`"),
             ({"input": [{**one, "max_size": "1 MB"}]}, 'for example "2 MiB"'),
             ({"input": [{**one, "type": "Imu"}]}, "has the type `Imu`"),
@@ -272,7 +272,7 @@ class Manifests(unittest.TestCase):
             ({"limits": {"log_lines": 0}}, "has a `log_lines` of 0"),
             ({"limits": {"deadline": 5}}, 'for example "50ms"'),
             ({"config": {"a": {"unit": "m"}}}, "`config.a` has no `default`"),
-            ({"config": {"a": [1]}}, "`default` of another type"),
+            ({"config": {"a": [1]}}, "`default` of an unsupported type"),
         ]
         for tables, why in refused:
             with self.subTest(why=why), self.assertRaisesRegex(ReplayError, why):

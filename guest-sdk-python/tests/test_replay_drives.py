@@ -113,7 +113,7 @@ class Drives(unittest.TestCase):
         self.assertTrue(8 < column.values.mean() < 11, "gravity")
         with self.assertRaisesRegex(DataError, "has no field `linear`"):
             sample.column("/imu/data", "linear.z")
-        with self.assertRaisesRegex(ReplayError, "is no number"):
+        with self.assertRaisesRegex(ReplayError, "is not a number"):
             sample.column("/imu/data", "header.frame_id")
         with self.assertRaisesRegex(ReplayError, "did you mean `/imu/data`"):
             sample.column("/imu/dat", "linear_acceleration.z")

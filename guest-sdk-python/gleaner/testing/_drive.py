@@ -123,7 +123,7 @@ class Drive:
             try:
                 values.append(field.number(types.decode(arrival.cdr, type_name)))
             except NotANumber:
-                raise ReplayError(f"field `{path}` of `{type_name}` is no number") from None
+                raise ReplayError(f"field `{path}` of `{type_name}` is not a number") from None
             except MissingElement as error:
                 raise ReplayError(f"cannot read `{path}` of `{topic}`", str(error)) from None
             at_ns.append(arrival.at_ns)

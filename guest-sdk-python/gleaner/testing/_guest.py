@@ -20,7 +20,7 @@ from ._ring import Cell
 from ._schedule import Tick
 from ._session import LINE_BYTES, Scratch, Session
 
-Given = Union[type, ModuleType, str, "os.PathLike[str]"]
+LambdaSource = Union[type, ModuleType, str, "os.PathLike[str]"]
 Wake = Union[Tick, Tuple[InputState, Cell]]
 
 
@@ -35,7 +35,7 @@ class Guest:
     """One lambda over one session."""
 
     def __init__(
-        self, given: Given, manifest: Manifest, session: Session, sources: List[InputState]
+        self, given: LambdaSource, manifest: Manifest, session: Session, sources: List[InputState]
     ) -> None:
         self._given, self._manifest, self._session, self._sources = (
             given,
@@ -144,7 +144,7 @@ def folder(given: Union[str, "os.PathLike[str]"]) -> Path:
     return path if path.is_dir() else path.parent
 
 
-def home(given: Given) -> Optional[Path]:
+def home(given: LambdaSource) -> Optional[Path]:
     """Folder of a lambda; None if it has no file, as a class in a notebook. Raises ReplayError."""
     if isinstance(given, (str, os.PathLike)):
         return folder(given)
@@ -154,7 +154,7 @@ def home(given: Given) -> Optional[Path]:
         return None
 
 
-def manifest_beside(given: Given) -> Path:
+def manifest_beside(given: LambdaSource) -> Path:
     """Path of the manifest in the folder of the lambda. Raises ReplayError."""
     if isinstance(given, (str, os.PathLike)):
         return folder(given) / "lambda.toml"
@@ -168,7 +168,7 @@ def manifest_beside(given: Given) -> Path:
 
 
 @contextlib.contextmanager
-def guarded(log: Optional[Callable[[Any, str], None]], given: Given) -> Iterator[None]:
+def guarded(log: Optional[Callable[[Any, str], None]], given: LambdaSource) -> Iterator[None]:
     """Redirects printed text to ``log``, if there is one. On exit restores the interpreter, and
     removes the modules that were imported from the folder of the lambda ``given``."""
     streams, path, writes = (sys.stdout, sys.stderr), list(sys.path), sys.dont_write_bytecode

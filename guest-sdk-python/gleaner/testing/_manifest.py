@@ -96,7 +96,9 @@ def _parsed(path: Path, text: str) -> Mapping[str, Any]:
     try:
         parsed: Dict[str, Any] = toml.loads(text)
     except toml.TOMLDecodeError as error:
-        raise ReplayError(f"cannot use manifest `{path}`", f"it is no TOML: {error}") from None
+        raise ReplayError(
+            f"cannot use manifest `{path}`", f"it is not valid TOML: {error}"
+        ) from None
     return parsed
 
 
@@ -230,7 +232,7 @@ def _item(file: str, name: str, entry: Any, overrides: Mapping[str, Any]) -> Con
     )
     if not isinstance(default, (bool, int, float, str)) or not _is_finite(default):
         raise table.refusal(
-            "has a `default` of another type", "give a number, a text, or true or false"
+            "has a `default` of an unsupported type", "use a number, a text, true or false"
         )
     value: Any = default if name not in overrides else _same_type(name, default, overrides[name])
     for key in ("min", "max"):
@@ -250,7 +252,7 @@ def _same_type(name: str, default: ConfigValue, given: Any) -> ConfigValue:
         wanted = {bool: "True or False", int: "a whole number", float: "a number", str: "a text"}[
             type(default)
         ]
-        raise ReplayError(f"config value `{name}` cannot be {given!r}", help=f"give {wanted}")
+        raise ReplayError(f"config value `{name}` cannot be {given!r}", help=f"use {wanted}")
     value: ConfigValue = plain
     return value
 

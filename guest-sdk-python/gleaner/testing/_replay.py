@@ -14,7 +14,7 @@ from ._data import InputState
 from ._drive import Drive, Name
 from ._error import ReplayError, quoted
 from ._frame import Budget, FramePool
-from ._guest import Given, Guest, Wake, guarded, home, manifest_beside
+from ._guest import LambdaSource, Guest, Wake, guarded, home, manifest_beside
 from ._manifest import Manifest
 from ._run import Decision, Fault, Run
 from ._schedule import Event, Periodic, Schedule, Tick
@@ -38,7 +38,7 @@ Tables = Mapping[str, Mapping[str, Any]]
 
 
 def replay(
-    lambda_: Given,
+    lambda_: LambdaSource,
     drive: Union[Name, Sequence[Name], Drive, Tables],
     *,
     manifest: Optional[_manifest.ManifestSource] = None,
@@ -80,7 +80,12 @@ class _ReplayLoop:
     """The event loop of one replay."""
 
     def __init__(
-        self, given: Given, manifest: Manifest, drive: Any, remap: Dict[str, str], more: Definitions
+        self,
+        given: LambdaSource,
+        manifest: Manifest,
+        drive: Any,
+        remap: Dict[str, str],
+        more: Definitions,
     ) -> None:
         self._given, self._manifest, self._session = given, manifest, Session(manifest.limits)
         _check_remap(remap, manifest)

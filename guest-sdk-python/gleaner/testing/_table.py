@@ -20,7 +20,7 @@ class Table:
     def __init__(self, file: str, title: str, entries: Any, known: Sequence[str]) -> None:
         self.file, self.title = file, title
         if not isinstance(entries, Mapping):
-            raise self.refusal("is no table", "see docs/manifest.md for its keys")
+            raise self.refusal("is not a table", "see docs/manifest.md for its keys")
         self.entries = entries
         for key in entries:
             if key not in known:
@@ -42,7 +42,7 @@ class Table:
     def text(self, key: str, example: str) -> str:
         value = self.need(key, example)
         if not isinstance(value, str):
-            raise self.refusal(f"has a `{key}` that is no text", f"give {example}")
+            raise self.refusal(f"has a `{key}` that is not a text", f"give {example}")
         return value
 
     def form(self, key: str, example: str, rule: "re.Pattern[str]", longest: int) -> str:
@@ -63,7 +63,7 @@ class Table:
         value = self.entries.get(key, bounds[1])
         if isinstance(value, bool) or not isinstance(value, int):
             raise self.refusal(
-                f"has a `{key}` that is no whole number", f"for example {key} = {bounds[1]}"
+                f"has a `{key}` that is not a whole number", f"for example {key} = {bounds[1]}"
             )
         return self._within(key, value, bounds)
 
@@ -97,7 +97,7 @@ class Table:
         value = self.entries.get(key, [])
         if not isinstance(value, list) or len(value) > ITEMS_MAX:
             raise self.refusal(
-                f"has a `{key}` that is no list of at most {ITEMS_MAX}",
+                f"has a `{key}` that is not a list of at most {ITEMS_MAX} items",
                 "see docs/manifest.md for its keys",
             )
         return value

@@ -108,7 +108,7 @@ class Definitions:
         self._folder = folder
         self._given: Dict[str, Any] = {}
         for type_name, text in texts.items():
-            self._given.update(_parsed(type_name, text, "give the text of its .msg"))
+            self._given.update(_parsed(type_name, text, "pass the text of its .msg"))
 
     def find(self, type_name: str) -> Any:
         """Returns the definition of a type, or None. Texts come before files of the folder, and

@@ -1,6 +1,6 @@
 //! The outcome of a wake.
 
-pub use gleaner_rules::triggers::{AttributeValue, Kind as TriggerKind};
+pub use gleaner_rules::triggers::{AttributeValue, TriggerKind};
 
 /// The outcome of one wake: the fields of a line of `decisions.jsonl`, without the writer, fuel and
 /// time.

@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
-use gleaner_rules::frames::{Budget, NoRoom, Taken};
+use gleaner_rules::frames::{Budget, FrameLease, NoRoom};
 use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 use gleaner_rules::pixels::{self as rules, Bayer, PixelError, PixelErrorKind, View, ops};
 use gleaner_rules::refused;
@@ -78,7 +78,7 @@ pub struct Frame {
     stamps: Stamps,
     info: FrameInfo,
     pixels: PixelData,
-    _taken: Taken,
+    _taken: FrameLease,
     _handle: Handle,
 }
 
@@ -112,7 +112,7 @@ impl Frame {
         (source, identity, stamps): (Arc<InputState>, Identity, Stamps),
         info: FrameInfo,
         pixels: PixelData,
-        taken: Taken,
+        taken: FrameLease,
     ) -> Self {
         let handle = source.handles.acquire();
         Self { source, identity, stamps, info, pixels, _taken: taken, _handle: handle }

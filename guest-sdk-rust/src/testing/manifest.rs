@@ -79,7 +79,7 @@ struct ConfigItem {
 pub(super) fn read(text: &str) -> Result<Manifest> {
     let entries = text.parse::<toml::Table>();
     let entries = entries.map_err(|error| {
-        Error::new("cannot use the manifest", format!("it is no TOML: {error}"), "")
+        Error::new("cannot use the manifest", format!("it is not valid TOML: {error}"), "")
     })?;
     let known = ["lambda", "schedule", "input", "model", "record", "limits", "config"];
     let root = Table::of("the file", &entries, &known)?;
@@ -204,7 +204,7 @@ fn limits(root: &Table) -> Result<Limits> {
 fn items(root: &Table) -> Result<Vec<ConfigItem>> {
     let Some(value) = root.get("config") else { return Ok(Vec::new()) };
     let entries = value.as_table().ok_or_else(|| {
-        root.refusal("has a `config` that is no table", "see docs/manifest.md for its keys")
+        root.refusal("has a `config` that is not a table", "see docs/manifest.md for its keys")
     })?;
     entries.iter().map(|(name, value)| item(name, value)).collect()
 }
@@ -214,19 +214,20 @@ fn item(name: &str, value: &Value) -> Result<ConfigItem> {
     let plain = toml::Table::from_iter([("default".to_owned(), value.clone())]);
     let entries = value.as_table().unwrap_or(&plain);
     let table = Table::of(&title, entries, &["default", "min", "max", "unit", "description"])?;
-    let default =
-        match table.need("default", "default = 1.0, or another value that says what type it is")? {
-            Value::Boolean(value) => ConfigValue::Boolean(*value),
-            Value::Integer(value) => ConfigValue::Integer(*value),
-            Value::Float(value) if value.is_finite() => ConfigValue::Real(*value),
-            Value::String(value) => ConfigValue::Text(value.clone()),
-            _ => {
-                return Err(table.refusal(
-                    "has a `default` of another type",
-                    "give a number, a text, or true or false",
-                ));
-            }
-        };
+    let default = match table
+        .need("default", "default = 1.0, or another value, whose type is that of the item")?
+    {
+        Value::Boolean(value) => ConfigValue::Boolean(*value),
+        Value::Integer(value) => ConfigValue::Integer(*value),
+        Value::Float(value) if value.is_finite() => ConfigValue::Real(*value),
+        Value::String(value) => ConfigValue::Text(value.clone()),
+        _ => {
+            return Err(table.refusal(
+                "has a `default` of an unsupported type",
+                "use a number, a text, true or false",
+            ));
+        }
+    };
     let limit = |key: &str| match (table.get(key), &default) {
         (None, _) => Ok(None),
         (Some(Value::Integer(limit)), ConfigValue::Integer(_) | ConfigValue::Real(_)) => {
@@ -235,7 +236,7 @@ fn item(name: &str, value: &Value) -> Result<ConfigItem> {
         (Some(Value::Float(limit)), ConfigValue::Real(_)) if limit.is_finite() => Ok(Some(*limit)),
         _ => Err(table.refusal(
             &format!("has a `{key}` that does not fit its default"),
-            "give numbers of one type",
+            "use numbers of the same type",
         )),
     };
     let item =
@@ -253,11 +254,7 @@ impl ConfigItem {
         };
         let refuse = |which, limit| {
             let what = format!("config value `{}` cannot be {number}", self.name);
-            Err(Error::new(
-                what,
-                format!("its {which} is {limit}"),
-                "give a value within its range",
-            ))
+            Err(Error::new(what, format!("its {which} is {limit}"), "use a value within the range"))
         };
         match (self.min, self.max) {
             (Some(min), _) if number < min => refuse("min", min),
@@ -284,7 +281,7 @@ impl ConfigItem {
                     ConfigValue::Text(_) => "a text",
                 };
                 let what = format!("config value `{}` cannot be {given:?}", self.name);
-                return Err(Error::new(what, "", format!("give {wanted}")));
+                return Err(Error::new(what, "", format!("use {wanted}")));
             }
         };
         self.within(&value)?;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_rules::path::{Malformed, Segment, segments};
+use gleaner_rules::path::{MalformedPath, PathSegment, segments};
 use gleaner_rules::text::quoted;
 
 use super::error::nearest;
@@ -32,9 +32,9 @@ pub(super) enum MissingField {
 
 impl FieldPath {
     /// Parses a path. The error names the position of the mistake.
-    pub(super) fn new(text: &str) -> Result<Self, Malformed> {
+    pub(super) fn new(text: &str) -> Result<Self, MalformedPath> {
         let element = match segments(text)?.last() {
-            Some(Segment::Index(index)) => {
+            Some(PathSegment::Index(index)) => {
                 text.rsplit_once('[').map(|(array, _)| (array.to_owned(), *index))
             }
             _ => None,

@@ -216,7 +216,7 @@ impl<L: Lambda> Run<L> {
 
     /// Runs one wake and adds its decision. Triggers before a fault still count.
     fn wake(&mut self, at_ns: i64, due: DueWake) {
-        if self.faults.rests(at_ns) {
+        if self.faults.is_backing_off(at_ns) {
             self.session.lock().backed_off += 1;
             return;
         }

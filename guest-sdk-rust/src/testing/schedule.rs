@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use gleaner_rules::schedule::{self as rules, Ring};
+use gleaner_rules::schedule::{self as rules, RingView};
 
 use super::data::InputState;
 use super::ring::Cell;
@@ -13,7 +13,7 @@ pub(super) type Schedule = rules::Schedule<EventInput>;
 /// `latest` and `each` are the same here.
 pub(super) struct EventInput(pub(super) Arc<InputState>);
 
-impl Ring for EventInput {
+impl RingView for EventInput {
     type Sample = (Arc<InputState>, Arc<Cell>);
 
     fn head(&self) -> u64 {

@@ -23,7 +23,7 @@ pub(super) struct Table<'a> {
 
 impl<'a> Table<'a> {
     pub(super) fn new(title: &str, value: &'a Value, known: &[&str]) -> Result<Self> {
-        let entries = value.as_table().ok_or_else(|| refusal(title, "is no table", SEE))?;
+        let entries = value.as_table().ok_or_else(|| refusal(title, "is not a table", SEE))?;
         Self::of(title, entries, known)
     }
 
@@ -64,7 +64,7 @@ impl<'a> Table<'a> {
                 let shown = text.chars().take(64).collect::<String>();
                 Err(self.refusal(&format!("has the {key} `{shown}`"), &help))
             }
-            None => Err(self.refusal(&format!("has a `{key}` that is no text"), &help)),
+            None => Err(self.refusal(&format!("has a `{key}` that is not a text"), &help)),
         }
     }
 
@@ -82,7 +82,7 @@ impl<'a> Table<'a> {
         let help = || format!("for example {key} = {}", bounds.1);
         let whole = value.as_integer();
         let whole = whole.ok_or_else(|| {
-            self.refusal(&format!("has a `{key}` that is no whole number"), &help())
+            self.refusal(&format!("has a `{key}` that is not a whole number"), &help())
         })?;
         self.within(key, u64::try_from(whole).ok(), value, bounds)
     }
@@ -130,7 +130,7 @@ impl<'a> Table<'a> {
     pub(super) fn list(&self, key: &str) -> Result<&'a [Value]> {
         let Some(value) = self.get(key) else { return Ok(&[]) };
         let list = value.as_array().filter(|list| list.len() <= ITEMS_MAX);
-        let why = || format!("has a `{key}` that is no list of at most {ITEMS_MAX}");
+        let why = || format!("has a `{key}` that is not a list of at most {ITEMS_MAX} items");
         list.map(Vec::as_slice).ok_or_else(|| self.refusal(&why(), SEE))
     }
 }

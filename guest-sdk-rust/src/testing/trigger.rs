@@ -2,7 +2,7 @@
 //! `gleaner_rules::triggers`.
 
 pub use gleaner_rules::triggers::{Attribute, AttributeValue};
-use gleaner_rules::triggers::{Kind, TriggerError as Refused};
+use gleaner_rules::triggers::{TriggerError as Refused, TriggerKind};
 
 use super::decision::Trigger;
 use super::session::current;
@@ -24,18 +24,23 @@ refusal!(TriggerError);
 type CallResult = Result<(), TriggerError>;
 
 pub(crate) fn event(label: &str, score: f64, attributes: &[Attribute]) -> CallResult {
-    cause(Kind::Event, label, Some(score), attributes)
+    cause(TriggerKind::Event, label, Some(score), attributes)
 }
 
 pub(crate) fn start(label: &str, attributes: &[Attribute]) -> CallResult {
-    cause(Kind::Start, label, None, attributes)
+    cause(TriggerKind::Start, label, None, attributes)
 }
 
 pub(crate) fn stop(label: &str) -> CallResult {
-    cause(Kind::Stop, label, None, &[])
+    cause(TriggerKind::Stop, label, None, &[])
 }
 
-fn cause(kind: Kind, label: &str, score: Option<f64>, attributes: &[Attribute]) -> CallResult {
+fn cause(
+    kind: TriggerKind,
+    label: &str,
+    score: Option<f64>,
+    attributes: &[Attribute],
+) -> CallResult {
     let session = current();
     let text = |value: &AttributeValue| {
         if let AttributeValue::Text(text) = value { text.len() } else { 0 }

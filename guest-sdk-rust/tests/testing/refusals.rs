@@ -156,8 +156,8 @@ fn invalid_manifests_and_settings_are_refused_with_a_way_out() {
             &format!("{schedule}[config]\nx = {{ default = 1, max = 0 }}\n"),
             "config value `x` cannot be 1\n  cause: its max is 0",
         ),
-        (&format!("{schedule}[config]\nx = [1]\n"), "has a `default` of another type"),
-        ("x = ", "it is no TOML"),
+        (&format!("{schedule}[config]\nx = [1]\n"), "has a `default` of an unsupported type"),
+        ("x = ", "it is not valid TOML"),
     ] {
         let error = Host::from_manifest(&manifest(rest))
             .load::<TestLambda>()
@@ -180,9 +180,9 @@ fn invalid_manifests_and_settings_are_refused_with_a_way_out() {
         (host().set("rat", 1.0), "no config value `rat`\n  help:  did you mean `rate`?"),
         (
             host().set("count", 1.0),
-            "config value `count` cannot be Real(1.0)\n  help:  give a whole number",
+            "config value `count` cannot be Real(1.0)\n  help:  use a whole number",
         ),
-        (host().set("rate", f64::NAN), "give a finite number"),
+        (host().set("rate", f64::NAN), "use a finite number"),
         (host().blank("imo", Message::new()), "no input `imo` for a blank message"),
     ] {
         let error = host.load::<TestLambda>().err().unwrap().to_string();
