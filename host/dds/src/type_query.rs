@@ -101,7 +101,7 @@ struct ServiceCall {
     target: QueryTarget,
     writer: RawWriter,
     reader: RawReader,
-    sent: Option<(SequenceNumber, Option<Header>)>,
+    sent: Option<(SequenceNumber, Option<RequestHeader>)>,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -275,7 +275,7 @@ impl ServiceCall {
     }
 
     /// The header of request and answer, if the node's DDS uses one.
-    fn header(&self, context: &ReceiveContext<'_>, query: &TypeQuery) -> Option<Header> {
+    fn header(&self, context: &ReceiveContext<'_>, query: &TypeQuery) -> Option<RequestHeader> {
         let guid = self.writer.guid().to_bytes();
         let vendor =
             context.state.peers().vendor(prefix(&rustdds::GUID::from_bytes(self.target.writer.0)));
@@ -285,7 +285,7 @@ impl ServiceCall {
             _ => query.before.unanswered % 2 == 1,
         };
         let own = *guid.last_chunk::<8>().expect("8 of 16 bytes");
-        with.then(|| Header([u64::from_le_bytes(own), query.ticket]))
+        with.then(|| RequestHeader([u64::from_le_bytes(own), query.ticket]))
     }
 
     /// Sends the request once both endpoints are matched. Returns `None` until then.

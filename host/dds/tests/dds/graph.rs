@@ -105,10 +105,10 @@ fn listed(distro: Distro) {
     let mut dds = open(domain, None);
     let peer = Peer::join(domain);
     let reader = peer.reader(TOPIC, TYPE, &policies(true, true));
-    let ours =
+    let subscription =
         dds.subscribe(&spec("/imu", gleaner_transport::Qos::Auto), KeptSamples::new()).unwrap();
     let imu = peer.writer("/imu", true, false);
-    connected(&dds, ours, 1);
+    connected(&dds, subscription, 1);
     let out = dds.writer("/out", "std_msgs/msg/String", 5).unwrap();
     let _node = announce(&peer, gid);
 
@@ -171,12 +171,12 @@ fn both() {
             parse(&message, 24).is_some_and(|message| message.nodes.is_empty())
         })
     });
-    let ours = |peer: &Peer| {
+    let graph_writers = |peer: &Peer| {
         let info = peer.0.discovered_writers();
         info.iter().filter(|writer| writer.publication_topic_data.topic_name == TOPIC).count()
     };
     // Two peers, each of which discovers the other.
-    until("our writer's end", || ours(&old) <= 2 && ours(&new) <= 2);
+    until("our writer's end", || graph_writers(&old) <= 2 && graph_writers(&new) <= 2);
 }
 
 fn wrong_distro() {

@@ -106,9 +106,9 @@ impl Sink for Copies {
 
     fn copy(&self, cdr: &[u8]) -> Option<Delivery> {
         let taken = (cdr.len() <= 8).then(|| cdr.to_vec());
-        let verdict = if taken.is_some() { Delivery::Taken } else { Delivery::TooBig };
+        let delivery = if taken.is_some() { Delivery::Taken } else { Delivery::TooBig };
         *self.copied.lock().unwrap() = taken;
-        Some(verdict)
+        Some(delivery)
     }
 
     fn accept(&self, meta: &SampleMeta) {

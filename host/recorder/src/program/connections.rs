@@ -66,7 +66,7 @@ pub(super) fn starter(
     Builder::new().name("starter".to_owned()).spawn(move || {
         let mut control = ControlServer::new(control);
         loop {
-            let event = match control.order() {
+            let event = match control.receive() {
                 Ok(Some(ControlMessage::Add(add, socket))) => register(add, socket, &reader)
                     .map_or(LoopEvent::Refused, |registration| {
                         LoopEvent::Registered(Box::new(registration))
@@ -129,7 +129,7 @@ fn read_link(
     reader: &Thread,
 ) {
     loop {
-        let event = match link.hear() {
+        let event = match link.receive() {
             Ok(Some(LambdaMessage::Hello(header))) => match expected.differs(&header) {
                 None => LambdaEvent::Hello(header),
                 Some(why) => LambdaEvent::Mismatch(why),

@@ -125,7 +125,7 @@ mod tests {
             assert!(Instant::now() < deadline, "{}", noted());
             std::thread::yield_now();
         }
-        assert_eq!(noted(), "{\"loss\":\"failed\",\"at_ns\":7,\"why\":\"x\"}\n");
+        assert_eq!(noted(), "{\"loss\":\"failed\",\"at_ns\":7,\"reason\":\"x\"}\n");
         // The loss itself may have found room that had just become free.
         assert!(reports.dropped >= 1);
         // A starter that reads again gets every queued report.

@@ -36,23 +36,23 @@ impl WaitingTriggers {
             self.moments.push_back((lambda, moment));
             return;
         }
-        let (whose, at) = match self
+        let (owner, at) = match self
             .moments
             .iter()
-            .position(|(whose, moment)| !windows.covers(*whose, moment.at_ns))
+            .position(|(owner, moment)| !windows.covers(*owner, moment.at_ns))
         {
             Some(index) => {
                 let gone = self
                     .moments
                     .remove(index)
-                    .map_or((lambda, moment.at_ns), |(whose, gone)| (whose, gone.at_ns));
+                    .map_or((lambda, moment.at_ns), |(owner, gone)| (owner, gone.at_ns));
                 self.moments.push_back((lambda, moment));
                 gone
             }
             None => (lambda, moment.at_ns),
         };
         let counted =
-            self.counted.entry(whose).or_insert(CountedTriggers { from: at, to: at, count: 0 });
+            self.counted.entry(owner).or_insert(CountedTriggers { from: at, to: at, count: 0 });
         *counted = CountedTriggers {
             from: counted.from.min(at),
             to: counted.to.max(at),
@@ -64,7 +64,7 @@ impl WaitingTriggers {
     pub(super) fn find(&self, lambda: usize, at_ns: i64) -> Option<&Moment> {
         self.moments
             .iter()
-            .find(|(whose, moment)| *whose == lambda && moment.at_ns == at_ns)
+            .find(|(owner, moment)| *owner == lambda && moment.at_ns == at_ns)
             .map(|(_, moment)| moment)
     }
 

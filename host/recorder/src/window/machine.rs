@@ -365,7 +365,7 @@ impl Windows {
 
 impl WindowLambda {
     fn started_by(&self, by: TriggeredBy) -> usize {
-        self.started.iter().filter(|(whose, _)| *whose == by).count()
+        self.started.iter().filter(|(origin, _)| *origin == by).count()
     }
 }
 

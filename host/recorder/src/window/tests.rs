@@ -202,7 +202,7 @@ fn model(rules: &[WindowRules], triggers: &[(i64, usize, TriggerKind)]) -> Vec<V
     for (lambda, rules) in rules.iter().enumerate() {
         let mut opened_at = None;
         let mut started: Option<i64> = None;
-        for (at, _, kind) in triggers.iter().filter(|(_, whose, _)| *whose == lambda) {
+        for (at, _, kind) in triggers.iter().filter(|(_, owner, _)| *owner == lambda) {
             let cool = opened_at.is_none_or(|opened: i64| *at >= opened + rules.cooldown_ns);
             match (kind, started) {
                 (Stop, Some(from)) => {

@@ -149,16 +149,18 @@ fn links_with_names_of_unfinished_files_are_replaced() {
         let scratch = TestDir::new();
         let precious = precious(&scratch);
         fs::create_dir_all(scratch.0.join("clips")).unwrap();
-        let stem = "clips/hello-20180802T083452.000Z";
-        for name in
-            [&format!("{stem}.mcap.part"), &format!("{stem}-2.jpg.part"), "clips.jsonl.part"]
-        {
+        let clip_name = "clips/hello-20180802T083452.000Z";
+        for name in [
+            &format!("{clip_name}.mcap.part"),
+            &format!("{clip_name}-2.jpg.part"),
+            "clips.jsonl.part",
+        ] {
             put(&precious, &scratch.0.join(name));
         }
         RecordingFolder::open(&scratch.0).unwrap().0.replace(&[]).unwrap();
         let clips = one_clip(&scratch, Store::Disk).unwrap();
         assert_eq!(clips.len(), 1, "{why}");
-        assert!(clips[0].file.to_str().unwrap().starts_with(stem), "{:?}", clips[0].file);
+        assert!(clips[0].file.to_str().unwrap().starts_with(clip_name), "{:?}", clips[0].file);
         assert_eq!(stamps(&scratch, &clips[0], "/a"), every(500, 1300, 10), "{why}");
         assert!(is_untouched(&precious), "{why}");
         assert!(!precious.with_extension("nothing").exists());

@@ -33,7 +33,7 @@ fn two_lambdas_record_and_neither_can_act_as_the_other() {
     let refused = RecorderLink::new(running.control.add(&add(&first)).unwrap())
         .hello(&second_header, PATIENCE);
     assert!(
-        matches!(&refused, Err(LinkError::Refused { why }) if why.contains("`second`")),
+        matches!(&refused, Err(LinkError::Refused { reason }) if reason.contains("`second`")),
         "{refused:?}"
     );
     one.hello(&first_header, PATIENCE).unwrap();
@@ -179,7 +179,7 @@ fn the_limits_of_a_vehicle_apply_to_the_manifest_in_the_recorder() {
         .hello(&as_in_manifest, PATIENCE);
     let limit = "its limit `fuel` is `50000000`; the starter announced `10000`";
     assert!(
-        matches!(&refused, Err(LinkError::Refused { why }) if why.contains(limit)),
+        matches!(&refused, Err(LinkError::Refused { reason }) if reason.contains(limit)),
         "{refused:?}"
     );
     let mut link = RecorderLink::new(running.control.add(&announced).unwrap());

@@ -67,7 +67,7 @@ fn expected(plan: &Plan) -> Vec<Contents> {
     let mut windows: Vec<(usize, i64, i64)> = Vec::new();
     for (lambda, ((preroll, postroll, cooldown), _)) in plan.lambdas.iter().enumerate() {
         let (mut opened, mut started) = (None, None);
-        for (at, _, kind) in plan.triggers.iter().filter(|(_, whose, _)| *whose == lambda) {
+        for (at, _, kind) in plan.triggers.iter().filter(|(_, owner, _)| *owner == lambda) {
             let cool = opened.is_none_or(|opened: i64| *at >= opened + cooldown);
             match (kind, started) {
                 (Stop, Some(from)) => {
