@@ -4,7 +4,7 @@
 The objects of the host implement the protocols here; plain values are named tuples. A property is
 constant and costs nothing; a method calls the host.
 
-A handle keeps its sample in the ring until the handle is dropped: a held sample cannot be
+A handle keeps its sample in memory until the handle is dropped: a held sample cannot be
 overwritten. If a lambda holds too many, the ring refuses new samples (``Counts.no_slot``).
 
 The maximum numbers of bytes and items below are the defaults of ``call_bytes`` and ``call_items``

@@ -105,7 +105,7 @@ class Cases(unittest.TestCase):
         )
 
     def test_faults(self) -> None:
-        notes = {_replay.REINITIALISED: "made anew", _replay.BACKS_OFF: "rests"}
+        notes = {_replay.REINITIALISED: "made anew", _replay.BACKING_OFF: "rests"}
 
         def start(_: Dict[str, Any]) -> Calls:
             run = _replay._ReplayLoop.__new__(_replay._ReplayLoop)
@@ -114,9 +114,9 @@ class Cases(unittest.TestCase):
             run._in_a_row, run._backoff_ns, run._backoff = 0, 0, (0, 0)
 
             def wake(at_ms: int, faults: bool) -> Any:
-                fault = (
-                    SimpleNamespace(kind="exception", message="", allowed=None) if faults else None
-                )
+                fault = None
+                if faults:
+                    fault = SimpleNamespace(kind="exception", message="", allowed=None)
                 run._guest = SimpleNamespace(wake=lambda _: fault)  # type: ignore[assignment]
                 decided, noted = len(run._decisions), len(run._session.lines)
                 run._wake(at_ms * MS, Tick(at_ms * MS, 0))
@@ -234,13 +234,9 @@ class Cases(unittest.TestCase):
                 return most
 
             def value(path: str, sort: str, size: int) -> Any:
-                found = (
-                    np.zeros(size)
-                    if sort == "numbers"
-                    else 1
-                    if sort == "one"
-                    else values[sort] * size
-                )
+                found: Any = np.zeros(size) if sort == "numbers" else 1
+                if sort in values:
+                    found = values[sort] * size
                 source: Any = SimpleNamespace(limits=limits, message=lambda _: None)
                 fields: Any = SimpleNamespace(
                     of=lambda _: SimpleNamespace(text=path, value=lambda _: found)
@@ -250,11 +246,9 @@ class Cases(unittest.TestCase):
                 return refused(lambda: sample.get(path))
 
             def elsewhere(path: str, *inputs: str) -> Any:
-                belongs, asked = (
-                    SimpleNamespace(declared=SimpleNamespace(name=name)) for name in inputs
-                )
-                field = Field(belongs, SimpleNamespace(text=path))  # type: ignore[arg-type]
-                return refused(lambda: FieldCache(asked).of(field))  # type: ignore[arg-type]
+                own, other = (SimpleNamespace(declared=SimpleNamespace(name=n)) for n in inputs)
+                field = Field(own, SimpleNamespace(text=path))  # type: ignore[arg-type]
+                return refused(lambda: FieldCache(other).of(field))  # type: ignore[arg-type]
 
             def no_number(path: str, type_name: str) -> Any:
                 source: Any = SimpleNamespace(

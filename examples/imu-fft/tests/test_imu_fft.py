@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gleaner.testing import Moment, Run, replay
+from gleaner.testing import Run, Trigger, replay
 
 EXAMPLES = Path(__file__).resolve().parents[2]
 PYTHON = EXAMPLES / "imu-fft" / "python"
@@ -157,7 +157,7 @@ def test_the_peak_of_a_walk_is_the_frequency_of_its_steps() -> None:
     assert len(run.triggers) >= 4
 
 
-def nearest(triggers: list[Moment], at_s: float) -> Moment:
+def nearest(triggers: list[Trigger], at_s: float) -> Trigger:
     """The window that ends nearest to an instant."""
     return min(triggers, key=lambda trigger: abs(trigger.at_s - at_s))
 

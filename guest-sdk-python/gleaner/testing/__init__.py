@@ -30,17 +30,17 @@ from ._error import ReplayError, StartError
 from ._replay import replay
 from ._run import Decision, Fault, Run
 from ._session import LogLine
-from ._windows import Moment, Window
+from ._windows import Trigger, Window
 
 __all__ = [
     "Decision",
     "Drive",
     "Fault",
     "LogLine",
-    "Moment",
     "ReplayError",
     "Run",
     "StartError",
+    "Trigger",
     "Window",
     "replay",
 ]

@@ -24,12 +24,8 @@ class InputState:
     def __init__(
         self, declared: Input, types: Types, limits: Mapping[str, int], frame_pool: FramePool
     ) -> None:
-        self.declared, self.types, self.limits, self.frame_pool = (
-            declared,
-            types,
-            limits,
-            frame_pool,
-        )
+        self.declared, self.types = declared, types
+        self.limits, self.frame_pool = limits, frame_pool
         self.ring = Ring(declared.depth, declared.hold, declared.max_size)
         self.skipped = 0
         self.is_stamped = types.is_stamped(declared.type_name)

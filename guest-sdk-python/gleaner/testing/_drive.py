@@ -65,11 +65,9 @@ class Drive:
         """Type of a topic. Raises ReplayError, which names the most similar topic."""
         if topic not in self.topics:
             near = nearest(topic, self.topics)
-            help = (
-                f"did you mean `{near}`?"
-                if near
-                else "pass remap={FROM: TO} if the lambda uses another name"
-            )
+            help = "pass remap={FROM: TO} if the lambda uses another name"
+            if near:
+                help = f"did you mean `{near}`?"
             cause = f"it has no topic `{topic}`; it has {quoted(self.topics)}"
             raise ReplayError(f"cannot use drive `{self._shown}`", cause, help)
         return self.topics[topic]
@@ -103,9 +101,8 @@ class Drive:
                 )
                 for file, channel, connection, raw in ordered:
                     writer = _writer(file, channel)
-                    seq = counted[connection.topic, writer] = (
-                        counted.get((connection.topic, writer), 0) + 1
-                    )
+                    key = connection.topic, writer
+                    seq = counted[key] = counted.get(key, 0) + 1
                     data = _checked(self._shown, connection.topic, raw)
                     yield Delivery(connection.topic, Arrival(at_ns, at_ns, writer, seq, data))
 

@@ -68,11 +68,8 @@ class FramePool:
     """Limits and decoded images of one input."""
 
     def __init__(self, declared: Input, budget: Budget) -> None:
-        self._slots, self._slot_bytes, self.budget = (
-            declared.hold + 1,
-            declared.decoded_size,
-            budget,
-        )
+        self._slots, self._slot_bytes = declared.hold + 1, declared.decoded_size
+        self.budget = budget
         self._held: List[weakref.ref[DecodedImage]] = []
         self._newest: Optional[Tuple[int, DecodedImage]] = None
 

@@ -37,12 +37,8 @@ class Guest:
     def __init__(
         self, given: LambdaSource, manifest: Manifest, session: Session, sources: List[InputState]
     ) -> None:
-        self._given, self._manifest, self._session, self._sources = (
-            given,
-            manifest,
-            session,
-            sources,
-        )
+        self._given, self._manifest = given, manifest
+        self._session, self._sources = session, sources
         self._scratch = Scratch(session.limits)
         self._create: Optional[Callable[[Context], Callable[..., object]]] = None
         self._instance: Optional[Tuple[Context, Callable[..., object]]] = None

@@ -215,11 +215,9 @@ def _config(root: Table, overrides: Mapping[str, Any]) -> Dict[str, ConfigValue]
     for name in overrides:
         if name not in items:
             near = nearest(name, items.entries)
-            help = (
-                f"did you mean `{near}`?"
-                if near
-                else f"its config values are {quoted(items.entries)}"
-            )
+            help = f"its config values are {quoted(items.entries)}"
+            if near:
+                help = f"did you mean `{near}`?"
             raise ReplayError(f"the lambda has no config value `{name}`", help=help)
     return {name: _item(root.file, name, entry, overrides) for name, entry in items.entries.items()}
 

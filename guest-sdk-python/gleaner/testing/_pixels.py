@@ -210,10 +210,8 @@ def resize(shown: Picture, width: int, height: int) -> Picture:
         across @ (down @ pixels[..., channel].astype(np.float64)).T
         for channel in range(pixels.shape[2])
     ]
-    sums, total = (
-        np.stack([plane.T for plane in planes], axis=-1).astype(np.int64),
-        down_total * across_total,
-    )
+    sums = np.stack([plane.T for plane in planes], axis=-1).astype(np.int64)
+    total = down_total * across_total
     made = ((sums + total // 2) // total).astype(np.uint8)
     return tight(made[..., 0], "mono8") if shown.is_grey else tight(made, "rgb8")
 

@@ -20,16 +20,16 @@ from ._run import Decision, Fault, Run
 from ._schedule import Event, Periodic, Schedule, Tick
 from ._session import Session
 from ._types import Definitions
-from ._windows import Moment, windows
+from ._windows import Trigger, windows
 
 FAULTS_IN_A_ROW = 8
-SHORTEST_BACKOFF_NS, LONGEST_BACKOFF_NS = 100_000_000, 10_000_000_000
+MIN_BACKOFF_NS, MAX_BACKOFF_NS = 100_000_000, 10_000_000_000
 
 REINITIALISED = (
     "gleaner: the lambda was made anew after a fault: what it kept in its variables is gone "
     "(in Python, all but the globals of its module)"
 )
-BACKS_OFF = (
+BACKING_OFF = (
     "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms "
     "and twice as long after each further fault, 10 s at most, until a wake ends well"
 )
@@ -113,10 +113,8 @@ class _ReplayLoop:
                 raise ReplayError(
                     f"input `{declared.name}` is of type `{declared.type_name}`", cause
                 )
-        types, budget = (
-            drive.types([declared.type_name for declared in inputs], more),
-            Budget(limits),
-        )
+        types = drive.types([declared.type_name for declared in inputs], more)
+        budget = Budget(limits)
         return [
             InputState(declared, types, limits, FramePool(declared, budget)) for declared in inputs
         ]
@@ -169,32 +167,29 @@ class _ReplayLoop:
         run_ns = time.perf_counter_ns() - started
         at_s = (at_ns - self._drive.start_ns) / 1e9
         triggers = [
-            Moment(at_s, at_ns, it.kind, it.label, it.score, it.attributes) for it in session.end()
+            Trigger(at_s, at_ns, it.kind, it.label, it.score, it.attributes) for it in session.end()
         ]
-        decision_fault = (
-            None if fault is None else Fault(fault.kind, fault.message, None, fault.allowed)
+        shown = None
+        if fault is not None:
+            shown = Fault(fault.kind, fault.message, None, fault.allowed)
+        decision = Decision(
+            at_ns=at_ns, **_cause(wake), triggers=triggers, fault=shown, run_ns=run_ns
         )
-        self._decisions.append(
-            Decision(
-                at_ns=at_ns, **_cause(wake), triggers=triggers, fault=decision_fault, run_ns=run_ns
-            )
-        )
+        self._decisions.append(decision)
         self._count(at_ns, fault is not None)
 
     def _count(self, at_ns: int, faulted: bool) -> None:
-        """Starts back-off after ``FAULTS_IN_A_ROW`` faults in a row; each further one doubles
-        it."""
+        """Starts back-off after ``FAULTS_IN_A_ROW`` faults; each further one doubles it."""
         if not faulted:
             self._in_a_row, self._backoff_ns, self._backoff = 0, 0, (0, 0)
             return
         self._in_a_row += 1
         if self._in_a_row >= FAULTS_IN_A_ROW:
-            self._backoff_ns = min(
-                max(2 * self._backoff_ns, SHORTEST_BACKOFF_NS), LONGEST_BACKOFF_NS
-            )
+            doubled_ns = max(2 * self._backoff_ns, MIN_BACKOFF_NS)
+            self._backoff_ns = min(doubled_ns, MAX_BACKOFF_NS)
             self._backoff = (at_ns, at_ns + self._backoff_ns)
         if self._in_a_row == FAULTS_IN_A_ROW:
-            self._session.note(BACKS_OFF)
+            self._session.note(BACKING_OFF)
 
 
 def _cause(wake: Wake) -> Dict[str, Any]:

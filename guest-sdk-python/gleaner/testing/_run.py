@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..data import Counts
 from ._session import LogLine
-from ._windows import Moment, Window
+from ._windows import Trigger, Window
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Decision:
     writer: Optional[str]
     seq: Optional[int]
     """Sequence number, counted from 1. In the host it is that of the recording, if it has one."""
-    triggers: List[Moment]
+    triggers: List[Trigger]
     fault: Optional[Fault]
     run_ns: int
     """Run time of the wake on this machine, in ns."""
@@ -78,7 +78,7 @@ class Run:
     it."""
 
     @property
-    def triggers(self) -> List[Moment]:
+    def triggers(self) -> List[Trigger]:
         """All triggers, in the order of the calls."""
         return [trigger for decision in self.decisions for trigger in decision.triggers]
 

@@ -13,7 +13,7 @@ STARTED_MAX = 64
 
 
 @dataclass(frozen=True)
-class Moment:
+class Trigger:
     """A trigger, with the time of its wake."""
 
     at_s: float
@@ -31,14 +31,14 @@ class Window(NamedTuple):
     """A time range that clips would cover, both ends included."""
 
     from_s: float
-    """Start in seconds, as in :class:`Moment`."""
+    """Start in seconds, as in :class:`Trigger`."""
     to_s: float
     from_ns: int
     to_ns: int
 
 
 def windows(
-    record: Optional[Record], triggers: Iterable[Moment], start_ns: int, end_ns: int
+    record: Optional[Record], triggers: Iterable[Trigger], start_ns: int, end_ns: int
 ) -> List[Window]:
     """The windows by time; overlapping ones are merged. A recording without a ``stop`` ends with
     the drive. A window is one clip here, also where the recorder would split it by length."""
