@@ -27,7 +27,7 @@ impl Invoker {
     /// Returns whether to skip this wake: the lambda backs off after faults, which is counted here,
     /// or its worker had no slot for the sample, which the worker counts.
     pub fn is_backing_off(&mut self, wake: &Wake) -> bool {
-        let is_backing_off = self.faults.rests(wake.at_ns());
+        let is_backing_off = self.faults.is_backing_off(wake.at_ns());
         if is_backing_off {
             self.session.count_backed_off();
         }
@@ -104,7 +104,7 @@ fn cause(wake: &Wake) -> Decision {
 mod tests {
     use gleaner_lambda::manifest::Limits;
     use gleaner_lambda::{Fault, FaultKind};
-    use gleaner_rules::faults::{MADE_ANEW, RESTS};
+    use gleaner_rules::faults::{BACKING_OFF, REINITIALISED};
 
     use super::*;
     use crate::api::data::Tick;
@@ -178,7 +178,7 @@ mod tests {
         let (lines, digest) = session.take_log();
         assert_eq!(
             lines.iter().map(|line| line.message.as_str()).collect::<Vec<_>>(),
-            [MADE_ANEW, RESTS]
+            [REINITIALISED, BACKING_OFF]
         );
         assert_eq!((lines[0].at_ns, lines[1].at_ns, digest.lines), (10 * MS, 70 * MS, 0));
         // Again in the next second: state was lost again.

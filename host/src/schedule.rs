@@ -13,7 +13,7 @@ pub struct WakeSchedule(rules::Schedule<EventInput>);
 /// The input whose samples wake the lambda.
 struct EventInput(Arc<Topic>);
 
-impl rules::Ring for EventInput {
+impl rules::RingView for EventInput {
     type Sample = Sample;
 
     fn head(&self) -> u64 {

@@ -10,7 +10,7 @@ use gleaner_lambda::{Fault, Trigger, TriggerKind};
 
 /// The reason why some bytes are not a wake.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum Malformed {
+pub enum MalformedWake {
     /// They end within a wake.
     #[error("a wake continues beyond the end of its block")]
     Short,
@@ -48,7 +48,7 @@ pub enum Malformed {
     Attributes,
 }
 
-type Result<T> = std::result::Result<T, Malformed>;
+type Result<T> = std::result::Result<T, MalformedWake>;
 
 /// Decodes the output of an [`Encoder`](super::Encoder). Its input is untrusted: no memory is
 /// allocated for a count before the counted bytes are known to exist.
@@ -71,13 +71,13 @@ impl Decoder {
     ///
     /// # Errors
     ///
-    /// [`Malformed`]; then the rest of `bytes` has no meaning, nor have wakes that were encoded
+    /// [`MalformedWake`]; then the rest of `bytes` has no meaning, nor have wakes that were encoded
     /// relative to this one.
     pub fn decode(&mut self, bytes: &mut &[u8]) -> Result<JournalEntry> {
         let previous = &self.previous;
         let [flags] = array(bytes)?;
         if flags & flag::RESERVED != 0 {
-            return Err(Malformed::Unknown { what: "flags", value: flags });
+            return Err(MalformedWake::Unknown { what: "flags", value: flags });
         }
         let at_ns = difference(bytes, previous.expected_at_ns() as u64)? as i64;
         let cause = cause(flags, previous, bytes)?;
@@ -87,7 +87,7 @@ impl Decoder {
         };
         // Each input has at least one byte.
         if bytes.len() < previous.inputs.len() {
-            return Err(Malformed::Short);
+            return Err(MalformedWake::Short);
         }
         let seen =
             previous.inputs.iter().map(|previous| input(previous, bytes)).collect::<Result<_>>()?;
@@ -101,7 +101,7 @@ impl Decoder {
 }
 
 fn array<const N: usize>(bytes: &mut &[u8]) -> Result<[u8; N]> {
-    let (array, rest) = bytes.split_first_chunk().ok_or(Malformed::Short)?;
+    let (array, rest) = bytes.split_first_chunk().ok_or(MalformedWake::Short)?;
     *bytes = rest;
     Ok(*array)
 }
@@ -109,7 +109,7 @@ fn array<const N: usize>(bytes: &mut &[u8]) -> Result<[u8; N]> {
 fn number(bytes: &mut &[u8]) -> Result<u64> {
     let ends = bytes.iter().take(super::number::NUMBER_MAX).any(|byte| byte & 0x80 == 0);
     let short = !ends && bytes.len() < super::number::NUMBER_MAX;
-    take(bytes).ok_or(if short { Malformed::Short } else { Malformed::Number })
+    take(bytes).ok_or(if short { MalformedWake::Short } else { MalformedWake::Number })
 }
 
 fn difference(bytes: &mut &[u8], expected: u64) -> Result<u64> {
@@ -118,15 +118,15 @@ fn difference(bytes: &mut &[u8], expected: u64) -> Result<u64> {
 
 /// Removes and returns `len` bytes.
 fn slice<'b>(bytes: &mut &'b [u8], len: u64) -> Result<&'b [u8]> {
-    let len = usize::try_from(len).map_err(|_| Malformed::Short)?;
-    let (slice, rest) = bytes.split_at_checked(len).ok_or(Malformed::Short)?;
+    let len = usize::try_from(len).map_err(|_| MalformedWake::Short)?;
+    let (slice, rest) = bytes.split_at_checked(len).ok_or(MalformedWake::Short)?;
     *bytes = rest;
     Ok(slice)
 }
 
 fn text(bytes: &mut &[u8]) -> Result<String> {
     let len = number(bytes)?;
-    let text = std::str::from_utf8(slice(bytes, len)?).map_err(|_| Malformed::Text)?;
+    let text = std::str::from_utf8(slice(bytes, len)?).map_err(|_| MalformedWake::Text)?;
     Ok(text.to_owned())
 }
 
@@ -134,7 +134,7 @@ fn cause(flags: u8, previous: &PreviousWake, bytes: &mut &[u8]) -> Result<WakeSo
     let (writer_follows, number_follows) = (flags & flag::WRITER != 0, flags & flag::NUMBER != 0);
     if flags & flag::TICK != 0 {
         if writer_follows {
-            return Err(Malformed::Unknown { what: "flags", value: flags });
+            return Err(MalformedWake::Unknown { what: "flags", value: flags });
         }
         return Ok(WakeSource::Tick { missed: if number_follows { number(bytes)? } else { 0 } });
     }
@@ -150,7 +150,7 @@ fn input(previous: &PreviousInput, bytes: &mut &[u8]) -> Result<InputView> {
     let [set] = array(bytes)?;
     let mut new = u64::from(set & seen::NEW);
     if set & seen::NEW == seen::NEW {
-        new = new.checked_add(number(bytes)?).ok_or(Malformed::Number)?;
+        new = new.checked_add(number(bytes)?).ok_or(MalformedWake::Number)?;
     }
     let digest = if set & seen::DIGEST != 0 { u32::from_le_bytes(array(bytes)?) } else { 0 };
     let expected = previous.expected_newest(new);
@@ -163,7 +163,7 @@ fn input(previous: &PreviousInput, bytes: &mut &[u8]) -> Result<InputView> {
             }
             ([newest::OTHER_WRITER], _) => Some((array(bytes)?, number(bytes)?)),
             ([value], _) => {
-                return Err(Malformed::Unknown { what: "form of a newest sample", value });
+                return Err(MalformedWake::Unknown { what: "form of a newest sample", value });
             }
         },
     };
@@ -174,7 +174,7 @@ fn input(previous: &PreviousInput, bytes: &mut &[u8]) -> Result<InputView> {
 fn triggers(bytes: &mut &[u8]) -> Result<Vec<Trigger>> {
     let found = number(bytes)?;
     if found > TRIGGERS_MAX as u64 {
-        return Err(Malformed::Triggers { found });
+        return Err(MalformedWake::Triggers { found });
     }
     (0..found).map(|_| trigger(bytes)).collect()
 }
@@ -185,7 +185,7 @@ fn trigger(bytes: &mut &[u8]) -> Result<Trigger> {
         0 => TriggerKind::Event,
         1 => TriggerKind::Start,
         2 => TriggerKind::Stop,
-        _ => return Err(Malformed::Unknown { what: "kind of trigger", value: first }),
+        _ => return Err(MalformedWake::Unknown { what: "kind of trigger", value: first }),
     };
     let label = text(bytes)?;
     let score = match first & TRIGGER_SCORE != 0 {
@@ -193,7 +193,7 @@ fn trigger(bytes: &mut &[u8]) -> Result<Trigger> {
         false => None,
     };
     if score.is_some_and(|score| !score.is_finite()) {
-        return Err(Malformed::Score);
+        return Err(MalformedWake::Score);
     }
     Ok(Trigger { kind, label, score, attributes: attributes(bytes)? })
 }
@@ -201,8 +201,8 @@ fn trigger(bytes: &mut &[u8]) -> Result<Trigger> {
 fn attributes(bytes: &mut &[u8]) -> Result<Map<String, Value>> {
     match number(bytes)? {
         0 => Ok(Map::new()),
-        found if found > ATTRIBUTES_MAX as u64 => Err(Malformed::LongAttributes { found }),
-        len => serde_json::from_slice(slice(bytes, len)?).map_err(|_| Malformed::Attributes),
+        found if found > ATTRIBUTES_MAX as u64 => Err(MalformedWake::LongAttributes { found }),
+        len => serde_json::from_slice(slice(bytes, len)?).map_err(|_| MalformedWake::Attributes),
     }
 }
 
@@ -210,7 +210,7 @@ fn fault(bytes: &mut &[u8]) -> Result<Fault> {
     let [first] = array(bytes)?;
     let known = FAULTS.get(usize::from(first & !(FAULT_USED | FAULT_ALLOWED)));
     let Some((kind, _)) = known else {
-        return Err(Malformed::Unknown { what: "kind of fault", value: first });
+        return Err(MalformedWake::Unknown { what: "kind of fault", value: first });
     };
     let message = text(bytes)?;
     let used = if first & FAULT_USED != 0 { Some(number(bytes)?) } else { None };
@@ -219,6 +219,6 @@ fn fault(bytes: &mut &[u8]) -> Result<Fault> {
 }
 
 fn log_digest(bytes: &mut &[u8]) -> Result<LogDigest> {
-    let lines = u32::try_from(number(bytes)?).map_err(|_| Malformed::Number)?;
+    let lines = u32::try_from(number(bytes)?).map_err(|_| MalformedWake::Number)?;
     Ok(LogDigest { lines, digest: u32::from_le_bytes(array(bytes)?) })
 }

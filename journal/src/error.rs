@@ -1,7 +1,7 @@
 use std::io;
 
 use super::block::PAYLOAD_MAX;
-use super::{INPUTS_MAX, Malformed, VERSION};
+use super::{INPUTS_MAX, MalformedWake, VERSION};
 use gleaner_base::{Exit, Explain};
 
 /// The reason why a journal cannot be read, or not to its end.
@@ -84,7 +84,7 @@ pub enum Damage {
     EventInput,
     /// A wake cannot be decoded.
     #[error("one of its wakes cannot be decoded")]
-    Wake(#[source] Malformed),
+    Wake(#[source] MalformedWake),
     /// A block of wakes continues after the last wake.
     #[error("bytes follow the last wake of the block")]
     AfterWakes,

@@ -20,7 +20,7 @@ mod read;
 mod tests;
 mod write;
 
-pub use decode::{Decoder, Malformed};
+pub use decode::{Decoder, MalformedWake};
 pub use encode::Encoder;
 pub use entry::{InputView, JournalEntry, LogDigest, WakeSource};
 pub use error::{Damage, JournalError};

@@ -185,7 +185,7 @@ impl<R: Read> JournalReader<R> {
             }
             NextBlock::Block(kind::WAKES, payload) => {
                 let mut wakes = payload.as_slice();
-                self.left = take(&mut wakes).ok_or(Damage::Wake(super::Malformed::Short))?;
+                self.left = take(&mut wakes).ok_or(Damage::Wake(super::MalformedWake::Short))?;
                 self.read = payload.len() - wakes.len();
                 if self.left == 0 && !wakes.is_empty() {
                     return Err(ReadStop::Damage(Damage::AfterWakes));

@@ -6,18 +6,18 @@ pub const FAULTS_IN_A_ROW: u32 = 8;
 
 /// The first rest; each further fault doubles it. It counts from the time of the wake: one that
 /// runs for longer than its rest, as a long `init` does, has none.
-const SHORTEST_REST_NS: i64 = 100_000_000;
+const MIN_BACKOFF_NS: i64 = 100_000_000;
 
 /// The longest rest: so long it takes at most until a lambda runs again whose cause of faults is
 /// gone. A lambda that always takes all of a deadline of 100 ms then has a hundredth of the time.
-const LONGEST_REST_NS: i64 = 10_000_000_000;
+const MAX_BACKOFF_NS: i64 = 10_000_000_000;
 
 /// What the log says when a wake finds a fresh lambda.
-pub const MADE_ANEW: &str = "gleaner: the lambda was made anew after a fault: what it kept in its variables is gone \
+pub const REINITIALISED: &str = "gleaner: the lambda was made anew after a fault: what it kept in its variables is gone \
                              (in Python, all but the globals of its module)";
 
 /// What the log says when a lambda begins to rest.
-pub const RESTS: &str = "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms and \
+pub const BACKING_OFF: &str = "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms and \
                          twice as long after each further fault, 10 s at most, until a wake ends well";
 
 /// Faults without a good wake between them. Time is that of the lambda, so that a replay rests as
@@ -25,21 +25,21 @@ pub const RESTS: &str = "gleaner: the lambda faulted 8 times in a row: wakes are
 #[derive(Debug, Default)]
 pub struct Faults {
     in_a_row: u32,
-    rest_ns: i64,
+    backoff_ns: i64,
     /// From the wake that faulted last until the first that may run, without the latter.
-    rest: Option<(i64, i64)>,
+    backoff: Option<(i64, i64)>,
 }
 
 impl Faults {
     /// Returns whether to skip a wake at that time. A clock that went back is no reason to rest for
     /// long.
-    pub fn rests(&self, at_ns: i64) -> bool {
-        self.rest.is_some_and(|(from, until)| (from..until).contains(&at_ns))
+    pub fn is_backing_off(&self, at_ns: i64) -> bool {
+        self.backoff.is_some_and(|(from, until)| (from..until).contains(&at_ns))
     }
 
     /// What the log says as a wake begins.
     pub fn begin(&self) -> Option<&'static str> {
-        (self.in_a_row > 0).then_some(MADE_ANEW)
+        (self.in_a_row > 0).then_some(REINITIALISED)
     }
 
     /// Counts how the wake at `at_ns` ended, and returns what the log says of it.
@@ -52,8 +52,8 @@ impl Faults {
         if self.in_a_row < FAULTS_IN_A_ROW {
             return None;
         }
-        self.rest_ns = (2 * self.rest_ns).clamp(SHORTEST_REST_NS, LONGEST_REST_NS);
-        self.rest = Some((at_ns, at_ns.saturating_add(self.rest_ns)));
-        (self.in_a_row == FAULTS_IN_A_ROW).then_some(RESTS)
+        self.backoff_ns = (2 * self.backoff_ns).clamp(MIN_BACKOFF_NS, MAX_BACKOFF_NS);
+        self.backoff = Some((at_ns, at_ns.saturating_add(self.backoff_ns)));
+        (self.in_a_row == FAULTS_IN_A_ROW).then_some(BACKING_OFF)
     }
 }

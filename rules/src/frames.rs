@@ -7,10 +7,10 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Frames and bytes that are left, shared by all inputs of a lambda.
 #[derive(Clone, Debug)]
-pub struct Budget(Arc<Left>);
+pub struct Budget(Arc<Remaining>);
 
 #[derive(Debug)]
-struct Left {
+struct Remaining {
     frames: AtomicUsize,
     frames_allowed: usize,
     bytes: AtomicUsize,
@@ -18,7 +18,7 @@ struct Left {
 
 /// A frame that is held, and what it takes; given back when it is dropped.
 #[derive(Debug)]
-pub struct Taken {
+pub struct FrameLease {
     budget: Budget,
     bytes: usize,
 }
@@ -62,7 +62,7 @@ impl Budget {
     /// A budget of that many frames and bytes.
     pub fn new(frames: usize, bytes: usize) -> Self {
         let (left, bytes) = (AtomicUsize::new(frames), AtomicUsize::new(bytes));
-        Self(Arc::new(Left { frames: left, frames_allowed: frames, bytes }))
+        Self(Arc::new(Remaining { frames: left, frames_allowed: frames, bytes }))
     }
 
     /// Whether there is room for a frame of so many bytes, but for the number of frames.
@@ -75,21 +75,21 @@ impl Budget {
     /// # Errors
     ///
     /// [`NoRoom`]; nothing is taken then.
-    pub fn take(&self, bytes: usize) -> Result<Taken, NoRoom> {
+    pub fn take(&self, bytes: usize) -> Result<FrameLease, NoRoom> {
         let take = |from: &AtomicUsize, n: usize| {
             from.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(n))
         };
         let allowed = self.0.frames_allowed;
         take(&self.0.frames, 1).map_err(|_| NoRoom::Frames { allowed })?;
         // From here on the frame is given back, whatever comes.
-        let mut taken = Taken { budget: self.clone(), bytes: 0 };
+        let mut taken = FrameLease { budget: self.clone(), bytes: 0 };
         take(&self.0.bytes, bytes).map_err(|left| NoRoom::Bytes { asked: bytes, left })?;
         taken.bytes = bytes;
         Ok(taken)
     }
 }
 
-impl Drop for Taken {
+impl Drop for FrameLease {
     fn drop(&mut self) {
         self.budget.0.bytes.fetch_add(self.bytes, Ordering::Relaxed);
         self.budget.0.frames.fetch_add(1, Ordering::Relaxed);

@@ -5,7 +5,7 @@ use std::fmt;
 
 /// One step of a written path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Segment<'p> {
+pub enum PathSegment<'p> {
     /// A field of a message.
     Name(&'p str),
     /// An element of an array.
@@ -14,28 +14,28 @@ pub enum Segment<'p> {
 
 /// A text that is no path.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Malformed {
+pub struct MalformedPath {
     /// The text.
     pub path: String,
     /// From where on it makes no sense.
     pub rest: String,
 }
 
-impl fmt::Display for Malformed {
+impl fmt::Display for MalformedPath {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "path `{}` is malformed at `{}`; write it like `a.b[3].c`", self.path, self.rest)
     }
 }
 
-impl std::error::Error for Malformed {}
+impl std::error::Error for MalformedPath {}
 
 /// The steps of `path`, at least one; the first is a name, and so is each behind a point.
 ///
 /// # Errors
 ///
-/// [`Malformed`] says from where on it makes no sense.
-pub fn segments(path: &str) -> Result<Vec<Segment<'_>>, Malformed> {
-    let malformed = |rest: &str| Malformed { path: path.to_owned(), rest: rest.to_owned() };
+/// [`MalformedPath`] says from where on it makes no sense.
+pub fn segments(path: &str) -> Result<Vec<PathSegment<'_>>, MalformedPath> {
+    let malformed = |rest: &str| MalformedPath { path: path.to_owned(), rest: rest.to_owned() };
     let mut segments = Vec::new();
     let mut rest = path;
     loop {
@@ -45,12 +45,12 @@ pub fn segments(path: &str) -> Result<Vec<Segment<'_>>, Malformed> {
         if name.is_empty() {
             return Err(malformed(rest));
         }
-        segments.push(Segment::Name(name));
+        segments.push(PathSegment::Name(name));
         while let Some(inside) = tail.strip_prefix('[') {
             let (digits, behind) = inside.split_once(']').ok_or_else(|| malformed(tail))?;
             let is_number = digits.bytes().all(|byte| byte.is_ascii_digit());
             let index = digits.parse().ok().filter(|_| is_number);
-            segments.push(Segment::Index(index.ok_or_else(|| malformed(tail))?));
+            segments.push(PathSegment::Index(index.ok_or_else(|| malformed(tail))?));
             tail = behind;
         }
         if tail.is_empty() {

@@ -2,7 +2,7 @@
 
 use std::fmt::Display;
 
-use crate::text::{Rounded, quoted};
+use crate::text::{RoundedBytes, quoted};
 
 /// No input has that name.
 pub fn no_such_input<S: AsRef<str>>(asked: &str, known: impl IntoIterator<Item = S>) -> String {
@@ -46,7 +46,7 @@ pub fn no_slot(topic: &str, input: &str) -> String {
 
 /// Why a JPEG or PNG is too large: what it needs, and what its input's slots have.
 pub fn too_many_pixels((width, height): (u32, u32), needed: u64, allowed: u64) -> String {
-    let (needed, allowed) = (Rounded::up(needed), Rounded::down(allowed));
+    let (needed, allowed) = (RoundedBytes::up(needed), RoundedBytes::down(allowed));
     format!(
         "image says it is {width}x{height} ({needed} as rgb8); this input's decoded_size is {allowed}"
     )

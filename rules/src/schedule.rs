@@ -8,7 +8,7 @@
 const CATCH_UP_TICKS: u64 = 100_000;
 
 /// What a schedule sees of the ring of one input.
-pub trait Ring {
+pub trait RingView {
     /// One sample in the ring.
     type Sample;
 
@@ -46,14 +46,14 @@ pub struct Tick {
 #[derive(Debug)]
 pub enum Schedule<R> {
     /// One wake for each sample, or for the newest one.
-    Event(Event<R>),
+    Event(EventSchedule<R>),
     /// One wake for each period.
-    Periodic(Periodic),
+    Periodic(PeriodicSchedule),
 }
 
 /// Wakes on new samples of one input.
 #[derive(Debug)]
-pub struct Event<R> {
+pub struct EventSchedule<R> {
     ring: R,
     backlog: Backlog,
     /// Position in the ring of the first sample that has not been considered.
@@ -62,7 +62,7 @@ pub struct Event<R> {
 
 /// Wakes on a period, counted from the start of the drive, or live of the run.
 #[derive(Debug)]
-pub struct Periodic {
+pub struct PeriodicSchedule {
     period_ns: i64,
     /// Live, a tick whose successor is due as well is missed: nobody waits for what is late.
     live: bool,
@@ -71,17 +71,17 @@ pub struct Periodic {
     missed_total: u64,
 }
 
-impl<R: Ring> Schedule<R> {
+impl<R: RingView> Schedule<R> {
     /// Wakes on samples of `ring`.
     pub fn event(ring: R, backlog: Backlog) -> Self {
-        Self::Event(Event { ring, backlog, next: 0 })
+        Self::Event(EventSchedule { ring, backlog, next: 0 })
     }
 
     /// Wakes every `period_ns`, from 1. Time begins with [`Schedule::begin`], or else at the first
     /// look for a tick.
     pub fn periodic(period_ns: i64) -> Self {
         let period_ns = period_ns.max(1);
-        Self::Periodic(Periodic {
+        Self::Periodic(PeriodicSchedule {
             period_ns,
             live: false,
             due_ns: None,
@@ -147,7 +147,7 @@ impl<R: Ring> Schedule<R> {
     }
 }
 
-impl<R: Ring> Event<R> {
+impl<R: RingView> EventSchedule<R> {
     fn next(&mut self) -> Option<R::Sample> {
         let ring = &self.ring;
         let head = ring.head();
@@ -175,7 +175,7 @@ impl<R: Ring> Event<R> {
     }
 }
 
-impl Periodic {
+impl PeriodicSchedule {
     fn next(&mut self, now_ns: i64) -> Option<Tick> {
         let Some(due_ns) = self.due_ns else {
             self.due_ns = Some(now_ns.saturating_add(self.period_ns));
@@ -225,9 +225,9 @@ mod tests {
 
     /// A ring into which nothing comes.
     #[derive(Debug)]
-    struct Empty;
+    struct EmptyRing;
 
-    impl Ring for Empty {
+    impl RingView for EmptyRing {
         type Sample = ();
 
         fn head(&self) -> u64 {
@@ -251,7 +251,7 @@ mod tests {
 
     #[test]
     fn a_jump_of_the_clock_counts_missed_ticks_instead_of_running_them() {
-        let mut schedule = Schedule::<Empty>::periodic(1);
+        let mut schedule = Schedule::<EmptyRing>::periodic(1);
         assert_eq!(schedule.next_tick(0), None);
         assert_eq!(schedule.next_tick(i64::MAX - 10), None);
         // Due at 1, 2, and so on up to, not including, `i64::MAX - 10`.

@@ -51,7 +51,7 @@ impl fmt::Display for ScratchError {
             Self::WrongName(name) => {
                 write!(
                     f,
-                    "`{name}` is no name for scratch; give 1 to 128 bytes without control characters"
+                    "`{name}` is not a name for scratch; give 1 to 128 bytes without control characters"
                 )
             }
         }

@@ -34,14 +34,14 @@ fn turns_text(character: char) -> bool {
 /// A number of bytes for people: exact below 1 MiB, then in tenths of a MiB. What is needed rounds
 /// up and what is allowed rounds down, so that a message never says "8 MiB, and 8 MiB is allowed".
 #[derive(Clone, Copy, Debug)]
-pub struct Rounded {
+pub struct RoundedBytes {
     bytes: u64,
     tenths: u64,
 }
 
 const MIB: u64 = 1 << 20;
 
-impl Rounded {
+impl RoundedBytes {
     /// What is needed.
     pub fn up(bytes: u64) -> Self {
         let tenths = (bytes / MIB * 10).saturating_add((bytes % MIB * 10).div_ceil(MIB));
@@ -55,7 +55,7 @@ impl Rounded {
     }
 }
 
-impl fmt::Display for Rounded {
+impl fmt::Display for RoundedBytes {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match (self.bytes, self.tenths) {
             (bytes, _) if bytes < MIB => write!(f, "{bytes} bytes"),
@@ -71,11 +71,11 @@ mod tests {
 
     #[test]
     fn sizes_are_rounded_against_the_one_who_asks() {
-        assert_eq!(Rounded::down(8 << 20).to_string(), "8 MiB");
-        assert_eq!(Rounded::up((8 << 20) + 1).to_string(), "8.1 MiB");
-        assert_eq!(Rounded::down((8 << 20) - 1).to_string(), "7.9 MiB");
-        assert_eq!(Rounded::up(12_870_750_000).to_string(), "12274.6 MiB");
-        assert_eq!(Rounded::up(768).to_string(), "768 bytes");
-        assert_eq!(Rounded::up(u64::MAX).to_string(), "17592186044416 MiB");
+        assert_eq!(RoundedBytes::down(8 << 20).to_string(), "8 MiB");
+        assert_eq!(RoundedBytes::up((8 << 20) + 1).to_string(), "8.1 MiB");
+        assert_eq!(RoundedBytes::down((8 << 20) - 1).to_string(), "7.9 MiB");
+        assert_eq!(RoundedBytes::up(12_870_750_000).to_string(), "12274.6 MiB");
+        assert_eq!(RoundedBytes::up(768).to_string(), "768 bytes");
+        assert_eq!(RoundedBytes::up(u64::MAX).to_string(), "17592186044416 MiB");
     }
 }

@@ -19,7 +19,7 @@ const MINUTE_NS: i64 = 60_000_000_000;
 
 /// What a trigger asks of the recorder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum TriggerKind {
     /// Keep the time around this wake.
     Event,
     /// Begin a recording that lasts until `Stop`.
@@ -169,7 +169,7 @@ impl<T> Triggers<T> {
     pub fn cause(
         &mut self,
         now_ns: i64,
-        kind: Kind,
+        kind: TriggerKind,
         (label, score): (&str, Option<f64>),
         attributes: Vec<Attribute>,
         make: impl FnOnce(Vec<Attribute>) -> T,
@@ -178,7 +178,7 @@ impl<T> Triggers<T> {
             return Err(TriggerError::NoWake);
         }
         // Who has used up the minute may still end what was begun.
-        if kind != Kind::Stop {
+        if kind != TriggerKind::Stop {
             self.check_rate(now_ns)?;
         }
         let wake = self.wake.as_mut().ok_or(TriggerError::NoWake)?;

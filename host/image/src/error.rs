@@ -2,7 +2,7 @@
 
 use gleaner_rules::pixels::{PixelError, PixelErrorKind};
 use gleaner_rules::refused;
-use gleaner_rules::text::Rounded;
+use gleaner_rules::text::RoundedBytes;
 
 use super::{Format, ImageHeader};
 
@@ -37,8 +37,8 @@ pub enum ImageError {
     /// A file whose decoder would need far more memory than its pixels.
     #[error(
         "{format} of {width}x{height} needs {} to decode, besides its pixels; {} is allowed",
-        Rounded::up(*needed),
-        Rounded::down(*allowed as u64)
+        RoundedBytes::up(*needed),
+        RoundedBytes::down(*allowed as u64)
     )]
     WorkingMemory {
         /// Format of the file.

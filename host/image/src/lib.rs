@@ -15,5 +15,5 @@ mod error;
 pub use decode::{Format, ImageHeader, decode_rgb8, decode_rgb8_paced, probe};
 pub use error::ImageError;
 pub use gleaner_rules::pixels::{
-    Bayer, Encoding, MAX_SIDE, Pace, PixelError, PixelErrorKind, Roi, View, ops,
+    Bayer, Encoding, MAX_SIDE, PixelError, PixelErrorKind, Roi, StopCheck, View, ops,
 };

@@ -1,6 +1,6 @@
 //! Compiles field paths such as `a.b[3].c` to a skip program; errors name the valid alternatives.
 
-use gleaner_rules::path::{Malformed, Segment, segments};
+use gleaner_rules::path::{MalformedPath, PathSegment, segments};
 
 use super::cdr::{CdrError, Cursor, Endian};
 use super::definitions::{Definitions, Struct, full_name};
@@ -24,7 +24,7 @@ pub struct FieldPath {
 pub enum PathError {
     /// The path is not of the form `a.b[3].c`.
     #[error(transparent)]
-    Syntax(#[from] Malformed),
+    Syntax(#[from] MalformedPath),
     /// A type has no field of this name.
     #[error(
         "type `{type_name}` has no field `{field}`{}; it has: {}",
@@ -164,9 +164,9 @@ impl Compiler<'_> {
     fn enter_struct(
         &mut self,
         owner: &Struct,
-        segments: &[Segment<'_>],
+        segments: &[PathSegment<'_>],
     ) -> Result<Leaf, PathError> {
-        let Some((Segment::Name(name), rest)) = segments.split_first() else {
+        let Some((PathSegment::Name(name), rest)) = segments.split_first() else {
             // `a[0][1]`: a second index on an array of structs.
             return Err(self.whole(owner));
         };
@@ -192,11 +192,11 @@ impl Compiler<'_> {
                 Element::WideText => Err(self.wide(field)),
                 Element::Struct(_) => Err(self.needs_index(field)),
             },
-            (count, [Segment::Index(index), rest @ ..]) => {
+            (count, [PathSegment::Index(index), rest @ ..]) => {
                 self.skip_to_element(field, count, *index)?;
                 self.enter_element(field, rest)
             }
-            (_, [Segment::Name(_), ..]) => Err(self.needs_index(field)),
+            (_, [PathSegment::Name(_), ..]) => Err(self.needs_index(field)),
         }
     }
 
@@ -204,7 +204,7 @@ impl Compiler<'_> {
     fn enter_element(
         &mut self,
         field: &FieldDefinition<usize>,
-        rest: &[Segment<'_>],
+        rest: &[PathSegment<'_>],
     ) -> Result<Leaf, PathError> {
         match (&field.element, rest) {
             (Element::Struct(index), []) => Err(self.whole(self.definitions.get(*index))),

@@ -12,10 +12,10 @@ use super::data::{DataError, Identity, OutOfFuel, Sample, Stamps};
 pub use super::images::Images;
 use super::shared_bytes::SharedBytes;
 use gleaner_image::{
-    self as image, Encoding, ImageError, Pace, PixelError, PixelErrorKind, Roi, View, ops,
+    self as image, Encoding, ImageError, PixelError, PixelErrorKind, Roi, StopCheck, View, ops,
 };
 pub use gleaner_rules::frames::Budget;
-use gleaner_rules::frames::Taken;
+use gleaner_rules::frames::FrameLease;
 use gleaner_rules::names::{COMPRESSED_IMAGE, IMAGE};
 
 /// Bytes of pixels that the fastest machine decodes per microsecond: four times the measured speed
@@ -86,7 +86,7 @@ pub struct Frame {
     source: FrameOrigin,
     info: Info,
     pixels: SharedBytes,
-    _taken: Taken,
+    _taken: FrameLease,
 }
 
 /// The sample of a frame: its topic, identity and stamps, without its slot.
@@ -118,7 +118,7 @@ impl Frame {
         source: FrameOrigin,
         sample: &Sample,
         raw: &ImageView<'_>,
-        taken: Taken,
+        taken: FrameLease,
     ) -> Result<Self, DataError> {
         let encoding =
             Encoding::from_ros(raw.encoding).map_err(|error| source.not_a_frame(error))?;
@@ -140,7 +140,7 @@ impl Frame {
         source: FrameOrigin,
         sample: &Sample,
         data: &[u8],
-        taken: Taken,
+        taken: FrameLease,
     ) -> Result<Self, DataError> {
         let owner = Arc::clone(&source.topic);
         let images = &owner.images;
@@ -168,7 +168,7 @@ impl Frame {
         Ok(Self::of_decoded(source, lease, taken))
     }
 
-    fn of_decoded(source: FrameOrigin, lease: Lease<Info>, taken: Taken) -> Self {
+    fn of_decoded(source: FrameOrigin, lease: Lease<Info>, taken: FrameLease) -> Self {
         Self { source, info: *lease.meta(), pixels: SharedBytes::of_decoded(lease), _taken: taken }
     }
 
@@ -294,7 +294,8 @@ impl Paid<'_> {
     ) -> Result<T, DataError> {
         let source = &self.0.source;
         let in_time = || source.topic.per_call.due.check().is_ok();
-        work(&self.0.view()?.paced(&Pace::new(&in_time))).map_err(|error| source.refused(error))
+        work(&self.0.view()?.with_stop_check(&StopCheck::new(&in_time)))
+            .map_err(|error| source.refused(error))
     }
 
     /// Creates a new frame.
@@ -365,7 +366,7 @@ fn decode(source: &FrameOrigin, pool: &Pool<Info>, data: &[u8]) -> Result<Lease<
         DraftError::TooBig { .. } => too_large(),
     })?;
     let in_time = || source.topic.per_call.due.check().is_ok();
-    image::decode_rgb8_paced(data, &header, allowed, &mut draft, &Pace::new(&in_time))
+    image::decode_rgb8_paced(data, &header, allowed, &mut draft, &StopCheck::new(&in_time))
         .map_err(|error| source.refused(error))?;
     Ok(draft.seal(Info::tight(header.width, header.height, Encoding::Rgb8)))
 }

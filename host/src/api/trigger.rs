@@ -3,7 +3,7 @@
 use gleaner_lambda::{Trigger, TriggerKind};
 pub(super) use gleaner_rules::triggers::Triggers;
 pub use gleaner_rules::triggers::{ATTRIBUTES, Attribute, AttributeValue, LABEL_BYTES, PER_WAKE};
-use gleaner_rules::triggers::{Kind, TriggerError as Refusal};
+use gleaner_rules::triggers::{TriggerError as Refusal, TriggerKind as RuleKind};
 use serde_json::Value;
 
 use super::Session;
@@ -120,11 +120,11 @@ impl Session {
     }
 }
 
-fn rule_kind(kind: TriggerKind) -> Kind {
+fn rule_kind(kind: TriggerKind) -> RuleKind {
     match kind {
-        TriggerKind::Event => Kind::Event,
-        TriggerKind::Start => Kind::Start,
-        TriggerKind::Stop => Kind::Stop,
+        TriggerKind::Event => RuleKind::Event,
+        TriggerKind::Start => RuleKind::Start,
+        TriggerKind::Stop => RuleKind::Stop,
     }
 }
 

@@ -117,12 +117,12 @@ fn invalid_blocks_with_correct_checksums_are_refused() {
     let nowhere = JournalHeader { event_input: Some(1), ..header };
     assert_eq!(why(&[header_block(&nowhere)]), Damage::EventInput);
     let wakes = |payload: &[u8]| why(&[first.clone(), (kind::WAKES, payload.to_vec())]);
-    assert_eq!(wakes(&[]), Damage::Wake(Malformed::Short));
+    assert_eq!(wakes(&[]), Damage::Wake(MalformedWake::Short));
     assert_eq!(wakes(&[0, 0]), Damage::AfterWakes);
     assert_eq!(wakes(&[1, 1, 0, 0, 0]), Damage::AfterWakes);
-    assert_eq!(wakes(&[2, 1, 0, 0]), Damage::Wake(Malformed::Short));
+    assert_eq!(wakes(&[2, 1, 0, 0]), Damage::Wake(MalformedWake::Short));
     let claim = [&[0xff; 9][..], &[1], &[1, 0, 0]].concat();
-    assert_eq!(wakes(&claim), Damage::Wake(Malformed::Short));
+    assert_eq!(wakes(&claim), Damage::Wake(MalformedWake::Short));
 }
 
 #[test]
@@ -244,38 +244,38 @@ fn counts_in_a_wake_are_checked_before_memory_is_allocated() {
     let decode =
         |inputs: usize, bytes: &[u8]| Decoder::new(inputs).decode(&mut &*bytes).unwrap_err();
     let (tick, triggers, fault, log) = (1_u8, 1 << 4, 1 << 5, 1 << 6);
-    assert_eq!(decode(1 << 40 >> 20, &[tick, 0, 0]), Malformed::Short);
-    assert_eq!(decode(0, &[]), Malformed::Short);
-    assert_eq!(decode(0, &[tick, 0x80]), Malformed::Short);
-    assert_eq!(decode(0, &[&[tick][..], &[0xff; 10]].concat()), Malformed::Number);
-    assert_eq!(decode(0, &[1 << 7, 0]), Malformed::Unknown { what: "flags", value: 0x80 });
-    assert_eq!(decode(0, &[tick | 2, 0]), Malformed::Unknown { what: "flags", value: 3 });
-    assert_eq!(decode(0, &[tick | triggers, 0, 65]), Malformed::Triggers { found: 65 });
-    assert_eq!(decode(0, &[tick | triggers, 0, 64]), Malformed::Short);
-    let kind = Malformed::Unknown { what: "kind of trigger", value: 3 };
+    assert_eq!(decode(1 << 40 >> 20, &[tick, 0, 0]), MalformedWake::Short);
+    assert_eq!(decode(0, &[]), MalformedWake::Short);
+    assert_eq!(decode(0, &[tick, 0x80]), MalformedWake::Short);
+    assert_eq!(decode(0, &[&[tick][..], &[0xff; 10]].concat()), MalformedWake::Number);
+    assert_eq!(decode(0, &[1 << 7, 0]), MalformedWake::Unknown { what: "flags", value: 0x80 });
+    assert_eq!(decode(0, &[tick | 2, 0]), MalformedWake::Unknown { what: "flags", value: 3 });
+    assert_eq!(decode(0, &[tick | triggers, 0, 65]), MalformedWake::Triggers { found: 65 });
+    assert_eq!(decode(0, &[tick | triggers, 0, 64]), MalformedWake::Short);
+    let kind = MalformedWake::Unknown { what: "kind of trigger", value: 3 };
     assert_eq!(decode(0, &[tick | triggers, 0, 1, 3, 0, 0]), kind);
     let long_label = [tick | triggers, 0, 1, 0, 0xff, 0xff, 0xff, 0xff, 0x7f];
-    assert_eq!(decode(0, &long_label), Malformed::Short);
-    assert_eq!(decode(0, &[tick | triggers, 0, 1, 0, 1, 0xff, 0]), Malformed::Text);
+    assert_eq!(decode(0, &long_label), MalformedWake::Short);
+    assert_eq!(decode(0, &[tick | triggers, 0, 1, 0, 1, 0xff, 0]), MalformedWake::Text);
     let nan = [&[tick | triggers, 0, 1, 4, 0][..], &f64::NAN.to_le_bytes(), &[0]].concat();
-    assert_eq!(decode(0, &nan), Malformed::Score);
+    assert_eq!(decode(0, &nan), MalformedWake::Score);
     let found = ATTRIBUTES_MAX as u64 + 1;
     assert_eq!(
         decode(0, &[tick | triggers, 0, 1, 0, 0, 0x81, 0x80, 8]),
-        Malformed::LongAttributes { found }
+        MalformedWake::LongAttributes { found }
     );
-    assert_eq!(decode(0, &[tick | triggers, 0, 1, 0, 0, 2, b'[', b']']), Malformed::Attributes);
+    assert_eq!(decode(0, &[tick | triggers, 0, 1, 0, 0, 2, b'[', b']']), MalformedWake::Attributes);
     let mut deep = vec![tick | triggers, 0, 1, 0, 0, 0x80, 0x80, 4];
     deep.extend(br#"{"a":"#.repeat(1 << 14));
-    assert_eq!(decode(0, &deep), Malformed::Attributes);
-    let kind = Malformed::Unknown { what: "kind of fault", value: 8 | 7 << 5 };
+    assert_eq!(decode(0, &deep), MalformedWake::Attributes);
+    let kind = MalformedWake::Unknown { what: "kind of fault", value: 8 | 7 << 5 };
     assert_eq!(decode(0, &[tick | fault, 0, 8 | 7 << 5, 0]), kind);
     assert_eq!(
         decode(0, &[tick | log, 0, 0xff, 0xff, 0xff, 0xff, 0x7f, 0, 0, 0, 0]),
-        Malformed::Number
+        MalformedWake::Number
     );
-    let form = Malformed::Unknown { what: "form of a newest sample", value: 1 };
+    let form = MalformedWake::Unknown { what: "form of a newest sample", value: 1 };
     assert_eq!(decode(1, &[tick, 0, 1 << 5, 1, 0]), form);
     let overflow = [&[tick, 0, 31][..], &[0xff; 9], &[1]].concat();
-    assert_eq!(decode(1, &overflow), Malformed::Number);
+    assert_eq!(decode(1, &overflow), MalformedWake::Number);
 }

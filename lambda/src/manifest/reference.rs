@@ -60,11 +60,11 @@ brake_mps2 = { default = -3.0, unit = "m/s^2", description = "mean forward accel
 dark_luma = { default = 50.0, min = 0, max = 255, description = "mean grey below this is dark" }
 ```
 
-- A *size* is a whole number and a unit: `"2 MiB"`; B, KiB, MiB, GiB.
-- A *duration* is a number and a unit: `"50ms"`, `"1.5s"`; us, ms, s, min, h.
+- A *size* is a whole number and a unit (B, KiB, MiB, GiB): `"2 MiB"`.
+- A *duration* is a number and a unit (us, ms, s, min, h): `"50ms"`, `"1.5s"`.
 - *Images and clouds* are inputs of `sensor_msgs/msg/Image`, `CompressedImage` and `PointCloud2`.
 - An unknown key is refused with its line and the nearest known key, a number out of range with the range
-  ([errors.md](errors.md)). What happens beyond a limit: [limits.md](limits.md).
+  ([errors.md](errors.md)). The effects of a limit are in [limits.md](limits.md).
 
 <!-- `cargo xtask bless` writes this page from the types in `lambda/src/manifest`. -->
 "##;
@@ -197,7 +197,9 @@ fn input() -> Section {
         "A topic that the lambda reads; any number of them, each with its own name and topic.\n\
          Memory is allocated before the first sample, {} at most for all inputs:\n\
          (`depth` + `hold` + 1) × `max_size`, \
-         and for compressed images (`hold` + 1) × `decoded_size`.",
+         and for compressed images (`hold` + 1) × `decoded_size`.\n\
+         Live, each input takes (`depth` + 1) × `max_size` more; \
+         if `max_size` is above 64 KiB, 3 × `max_size` at most.",
         bounds::INPUTS_MEMORY_MAX
     );
     Section { title: "[[input]]", note, keys }

@@ -90,7 +90,7 @@ pub enum PixelError {
         /// Bytes of the caller's slice.
         found: usize,
     },
-    /// The caller's [`Pace`](super::Pace) ended an operation.
+    /// The caller's [`StopCheck`](super::StopCheck) ended an operation.
     Stopped,
 }
 

@@ -10,10 +10,10 @@
 mod encoding;
 mod error;
 pub mod ops;
-mod pace;
+mod stop_check;
 mod view;
 
 pub use encoding::{Bayer, Encoding};
 pub use error::{PixelError, PixelErrorKind};
-pub use pace::Pace;
+pub use stop_check::StopCheck;
 pub use view::{MAX_SIDE, Roi, View, check_size};

@@ -1,6 +1,6 @@
 //! An image as it lies in memory, once its size has been checked.
 
-use super::{Encoding, Pace, PixelError};
+use super::{Encoding, PixelError, StopCheck};
 
 /// Largest width and height of an image, in pixels.
 pub const MAX_SIDE: u32 = 65_535;
@@ -16,7 +16,7 @@ pub struct View<'a> {
     encoding: Encoding,
     big_endian: bool,
     data: &'a [u8],
-    pace: Option<&'a Pace<'a>>,
+    stop_check: Option<&'a StopCheck<'a>>,
 }
 
 impl<'a> View<'a> {
@@ -56,18 +56,26 @@ impl<'a> View<'a> {
             return Err(PixelError::Data { width, height, encoding, step, needed, found });
         }
         let data = &data[..needed];
-        Ok(Self { width, height, step: step as usize, encoding, big_endian, data, pace: None })
+        Ok(Self {
+            width,
+            height,
+            step: step as usize,
+            encoding,
+            big_endian,
+            data,
+            stop_check: None,
+        })
     }
 
-    /// The same image, on which operations ask `pace` as they go.
+    /// The same image, on which operations ask `stop_check` as they go.
     #[must_use]
-    pub fn paced(self, pace: &'a Pace<'a>) -> Self {
-        Self { pace: Some(pace), ..self }
+    pub fn with_stop_check(self, stop_check: &'a StopCheck<'a>) -> Self {
+        Self { stop_check: Some(stop_check), ..self }
     }
 
     /// Asks whether an operation may go on to the next so many bytes.
-    pub(super) fn go_on(&self, bytes: usize) -> Result<(), PixelError> {
-        self.pace.map_or(Ok(()), |pace| pace.go_on(bytes))
+    pub(super) fn check_stop(&self, bytes: usize) -> Result<(), PixelError> {
+        self.stop_check.map_or(Ok(()), |stop_check| stop_check.check(bytes))
     }
 
     /// Pixels per row, 1 to [`MAX_SIDE`].

@@ -3,7 +3,7 @@
 use gleaner_rules::frames::Budget;
 use gleaner_rules::log::{Rate, line};
 use gleaner_rules::scratch::{Scratch, ScratchError};
-use gleaner_rules::triggers::{Attribute, AttributeValue, Kind, TriggerError, Triggers};
+use gleaner_rules::triggers::{Attribute, AttributeValue, TriggerError, TriggerKind, Triggers};
 use serde_json::{Value, json};
 
 use crate::{float, ns, refused, replay, text, whole};
@@ -23,7 +23,7 @@ fn attributes(given: &Value) -> Vec<Attribute> {
 fn cause(
     triggers: &mut Triggers<String>,
     at_ns: i64,
-    kind: Kind,
+    kind: TriggerKind,
     (label, score): (&Value, Option<f64>),
     attributes: Vec<Attribute>,
 ) -> Value {
@@ -47,19 +47,28 @@ fn triggers() {
             "end" => json!(triggers.end()),
             "init" => {
                 let wake = triggers.suspend();
-                let answer =
-                    cause(&mut triggers, at_ns, Kind::Event, (&given[0], Some(1.0)), Vec::new());
+                let answer = cause(
+                    &mut triggers,
+                    at_ns,
+                    TriggerKind::Event,
+                    (&given[0], Some(1.0)),
+                    Vec::new(),
+                );
                 triggers.resume(wake);
                 answer
             }
             "event" => {
                 let asked = (&given[0], Some(float(&given[1])));
-                cause(&mut triggers, at_ns, Kind::Event, asked, attributes(&given[2]))
+                cause(&mut triggers, at_ns, TriggerKind::Event, asked, attributes(&given[2]))
             }
-            "start" => {
-                cause(&mut triggers, at_ns, Kind::Start, (&given[0], None), attributes(&given[1]))
-            }
-            "stop" => cause(&mut triggers, at_ns, Kind::Stop, (&given[0], None), Vec::new()),
+            "start" => cause(
+                &mut triggers,
+                at_ns,
+                TriggerKind::Start,
+                (&given[0], None),
+                attributes(&given[1]),
+            ),
+            "stop" => cause(&mut triggers, at_ns, TriggerKind::Stop, (&given[0], None), Vec::new()),
             "refused" => json!(triggers.refused()),
             other => panic!("{other}"),
         })

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use gleaner_rules::clamps::{self, Length, PerCall, WrongField};
-use gleaner_rules::path::{Segment, segments};
+use gleaner_rules::path::{PathSegment, segments};
 use gleaner_rules::ring::{Counts, Ring};
 use gleaner_rules::{names, units};
 use serde_json::{Value, json};
@@ -96,9 +96,9 @@ fn paths() {
     replay("paths", include_str!("../../cases/paths.json"), |_| {
         Box::new(|call, given| match call {
             "segments" => {
-                let plain = |segment: &Segment<'_>| match segment {
-                    Segment::Name(name) => json!(name),
-                    Segment::Index(index) => json!(index),
+                let plain = |segment: &PathSegment<'_>| match segment {
+                    PathSegment::Name(name) => json!(name),
+                    PathSegment::Index(index) => json!(index),
                 };
                 segments(text(&given[0])).unwrap().iter().map(plain).collect()
             }

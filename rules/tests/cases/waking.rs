@@ -3,7 +3,7 @@
 use std::cell::Cell;
 use std::rc::Rc;
 
-use gleaner_rules::faults::{Faults, MADE_ANEW};
+use gleaner_rules::faults::{Faults, REINITIALISED};
 use gleaner_rules::log::Rate;
 use gleaner_rules::ring::Ring;
 use gleaner_rules::schedule::{self, Backlog, Schedule};
@@ -15,7 +15,7 @@ use crate::{Answers, ns, replay, whole};
 #[derive(Clone)]
 struct Shown(Rc<(std::cell::RefCell<Ring<()>>, Cell<u64>)>);
 
-impl schedule::Ring for Shown {
+impl schedule::RingView for Shown {
     type Sample = u64;
 
     fn head(&self) -> u64 {
@@ -78,12 +78,12 @@ fn rests_after_faults() {
         let (mut faults, mut log) = (Faults::default(), Rate::new(0, 0));
         Box::new(move |_, given| {
             let at_ns = ns(&given[0]) * 1_000_000;
-            if faults.rests(at_ns) {
+            if faults.is_backing_off(at_ns) {
                 return json!("rests");
             }
             let notes = [faults.begin(), faults.end(at_ns, given[1] == true)];
             let notes = notes.into_iter().flatten().filter(|note| log.notes(at_ns, note));
-            notes.map(|note| if note == MADE_ANEW { "made anew" } else { "rests" }).collect()
+            notes.map(|note| if note == REINITIALISED { "made anew" } else { "rests" }).collect()
         })
     });
 }

@@ -13,7 +13,7 @@
 
 use std::cell::Cell;
 
-use gleaner_rules::pixels::{Pace, PixelError, check_size};
+use gleaner_rules::pixels::{PixelError, StopCheck, check_size};
 use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
@@ -40,7 +40,7 @@ pub(super) fn decode(
     header: &ImageHeader,
     allowed: usize,
     out: &mut [u8],
-    pace: &Pace<'_>,
+    pace: &StopCheck<'_>,
 ) -> Result<(), ImageError> {
     let &ImageHeader { format, width, height } = header;
     let needed = frame(data)?.working_memory();

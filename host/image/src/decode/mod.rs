@@ -17,7 +17,7 @@ mod tests;
 
 use std::fmt;
 
-use super::{ImageError, Pace, PixelError};
+use super::{ImageError, PixelError, StopCheck};
 
 /// Format of an image file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -103,7 +103,7 @@ pub fn decode_rgb8(
     max_bytes: usize,
     out: &mut [u8],
 ) -> Result<(), ImageError> {
-    decode_rgb8_paced(data, header, max_bytes, out, &Pace::new(&|| true))
+    decode_rgb8_paced(data, header, max_bytes, out, &StopCheck::new(&|| true))
 }
 
 /// As [`decode_rgb8`], for a caller that may want to stop it. The last step of a progressive JPEG,
@@ -117,7 +117,7 @@ pub fn decode_rgb8_paced(
     header: &ImageHeader,
     max_bytes: usize,
     out: &mut [u8],
-    pace: &Pace<'_>,
+    pace: &StopCheck<'_>,
 ) -> Result<(), ImageError> {
     let found = probe(data)?;
     if found != *header {

@@ -2,7 +2,7 @@
 
 use std::cell::Cell;
 
-use gleaner_rules::pixels::Pace;
+use gleaner_rules::pixels::StopCheck;
 use zune_core::bytestream::{ZByteIoError, ZByteReaderTrait, ZCursor, ZSeekFrom};
 
 /// Cost of a byte of a JPEG, in bytes of other work: it becomes a dozen bytes of pixels or more,
@@ -12,17 +12,17 @@ const WEIGHT: usize = 64;
 /// Reads `data`, and fails once `pace` requests the decoder to stop; `stopped` records that.
 pub(super) struct PacedReader<'a> {
     data: ZCursor<&'a [u8]>,
-    pace: &'a Pace<'a>,
+    pace: &'a StopCheck<'a>,
     stopped: &'a Cell<bool>,
 }
 
 impl<'a> PacedReader<'a> {
-    pub(super) fn new(data: &'a [u8], pace: &'a Pace<'a>, stopped: &'a Cell<bool>) -> Self {
+    pub(super) fn new(data: &'a [u8], pace: &'a StopCheck<'a>, stopped: &'a Cell<bool>) -> Self {
         Self { data: ZCursor::new(data), pace, stopped }
     }
 
     fn go_on(&self, bytes: usize) -> Result<(), ZByteIoError> {
-        if self.stopped.get() || self.pace.go_on(bytes.saturating_mul(WEIGHT)).is_err() {
+        if self.stopped.get() || self.pace.check(bytes.saturating_mul(WEIGHT)).is_err() {
             self.stopped.set(true);
             return Err(ZByteIoError::Generic("stopped"));
         }

@@ -2,7 +2,7 @@
 
 use std::io::{Cursor, ErrorKind};
 
-use gleaner_rules::pixels::{Pace, check_size};
+use gleaner_rules::pixels::{StopCheck, check_size};
 use png::{ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Transformations};
 
 use super::{Format, ImageHeader};
@@ -35,7 +35,7 @@ pub(super) fn decode(
     header: &ImageHeader,
     allowed: usize,
     out: &mut [u8],
-    pace: &Pace<'_>,
+    pace: &StopCheck<'_>,
 ) -> Result<(), ImageError> {
     let &ImageHeader { width, height, .. } = header;
     let refused = |source| match source {
@@ -62,7 +62,7 @@ pub(super) fn decode(
     let mut rows = 0;
     while let Some(interlace) = reader.read_row(&mut line).map_err(refused)? {
         // Inflating takes several times as long as other work on as many bytes.
-        pace.go_on(8 * stride)?;
+        pace.check(8 * stride)?;
         match interlace {
             InterlaceInfo::Null(_) => {
                 let Some(row) = out.chunks_exact_mut(stride).nth(rows) else {

@@ -31,7 +31,7 @@ fn decoding_stops_when_its_caller_requests_it() {
         let header = probe(file).unwrap();
         let mut out = vec![0; header.rgb8_len().unwrap()];
         let mut decode = |may_go_on: &dyn Fn() -> bool| {
-            decode_rgb8_paced(file, &header, 1 << 20, &mut out, &Pace::new(may_go_on))
+            decode_rgb8_paced(file, &header, 1 << 20, &mut out, &StopCheck::new(may_go_on))
                 .map(|()| out.clone())
         };
         let stopped = decode(&|| false);

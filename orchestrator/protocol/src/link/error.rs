@@ -4,7 +4,7 @@ use rustix::io::Errno;
 
 use super::FRAME_MAX;
 use gleaner_base::{Exit, Explain};
-use gleaner_journal::Malformed;
+use gleaner_journal::MalformedWake;
 
 /// An error of a connection between two programs.
 #[derive(Debug, thiserror::Error)]
@@ -71,7 +71,7 @@ pub enum LinkError {
         /// Its sender.
         peer: &'static str,
         /// The cause.
-        source: Malformed,
+        source: MalformedWake,
     },
     /// A lambda was added without its socket.
     #[error("frame `add` came without a socket")]

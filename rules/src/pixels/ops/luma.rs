@@ -1,6 +1,6 @@
 //! How bright an image is.
 
-use super::pixels::Pixels;
+use super::pixels::PixelFormat;
 use crate::pixels::{PixelError, Roi, View};
 
 /// Byte positions that are summed side by side. 48 bytes are whole pixels of 1, 2, 3 and 4 bytes
@@ -23,11 +23,11 @@ const GROUPS: usize = 257;
 ///
 /// Source: luma weights of ITU-R BT.601.
 pub fn mean_luma(view: &View<'_>, roi: Option<Roi>) -> Result<f64, PixelError> {
-    let pixels = Pixels::of(view, "mean luma")?;
+    let pixels = PixelFormat::of(view, "mean luma")?;
     let roi = view.clip(roi)?;
     let mut lanes = [0; LANES];
     for row in view.rows_of(roi) {
-        view.go_on(row.len())?;
+        view.check_stop(row.len())?;
         add_bytes(row, &mut lanes);
     }
     // Sums per byte of a pixel: lane `i` holds byte `i % bytes_per_pixel` of some pixels.
@@ -39,11 +39,11 @@ pub fn mean_luma(view: &View<'_>, roi: Option<Roi>) -> Result<f64, PixelError> {
         |red: usize, blue: usize| (299 * bytes[red] + 587 * bytes[1] + 114 * bytes[blue], 1000);
     // At most 65,535^2 pixels of 255 * 1000: below 2^51, so neither `u64` nor `f64` rounds.
     let (sum, scale) = match pixels {
-        Pixels::Grey8 | Pixels::Yuyv => (bytes[0], 1),
-        Pixels::Uyvy => (bytes[1], 1),
-        Pixels::Grey16 { high } => (256 * bytes[high] + bytes[1 - high], 257),
-        Pixels::Rgb | Pixels::Rgba => colour(0, 2),
-        Pixels::Bgr | Pixels::Bgra => colour(2, 0),
+        PixelFormat::Grey8 | PixelFormat::Yuyv => (bytes[0], 1),
+        PixelFormat::Uyvy => (bytes[1], 1),
+        PixelFormat::Grey16 { high } => (256 * bytes[high] + bytes[1 - high], 257),
+        PixelFormat::Rgb | PixelFormat::Rgba => colour(0, 2),
+        PixelFormat::Bgr | PixelFormat::Bgra => colour(2, 0),
     };
     let count = u64::from(roi.width) * u64::from(roi.height);
     Ok(sum as f64 / (scale * count) as f64)
@@ -76,13 +76,13 @@ fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
 /// [`PixelError::Roi`] if no pixel is in `roi`, [`PixelError::Raw`] for a Bayer image,
 /// [`PixelError::Stopped`].
 pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], PixelError> {
-    let pixels = Pixels::of(view, "histogram")?;
+    let pixels = PixelFormat::of(view, "histogram")?;
     let roi = view.clip(roi)?;
     // 65,535^2 pixels of one level still fit a `u32`.
     let mut counts = [0; 256];
     let mut levels = [0; 512];
     for row in view.rows_of(roi) {
-        view.go_on(row.len())?;
+        view.check_stop(row.len())?;
         let pixel = view.encoding().bytes_per_pixel();
         for piece in row.chunks(levels.len() * pixel) {
             let levels = &mut levels[..piece.len() / pixel];
@@ -105,7 +105,7 @@ pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], PixelE
 /// [`PixelError::Output`] if `out` has another length, [`PixelError::Raw`] for a Bayer image,
 /// [`PixelError::Stopped`].
 pub fn to_gray(view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
-    let pixels = Pixels::of(view, "grey image")?;
+    let pixels = PixelFormat::of(view, "grey image")?;
     let width = view.width() as usize;
     // The view has at least one byte for each pixel, so their number is a `usize`.
     let needed = width * view.height() as usize;
@@ -114,7 +114,7 @@ pub fn to_gray(view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
     }
     for (y, levels) in (0..view.height()).zip(out.chunks_exact_mut(width)) {
         let row = view.row(y);
-        view.go_on(row.len())?;
+        view.check_stop(row.len())?;
         pixels.grey(row, levels);
     }
     Ok(())

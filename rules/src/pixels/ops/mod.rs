@@ -1,7 +1,7 @@
 //! What the host computes on frames for lambdas.
 //!
 //! Inside: grey levels (`luma`), size (`resize`), and how a pixel of each encoding is read
-//! (`pixels`). Every operation asks the view between rows whether it may go on ([`View::paced`]).
+//! (`pixels`). Every operation asks the view between rows whether it may go on ([`View::with_stop_check`]).
 //! All of it is exact integer arithmetic on a checked [`View`], so that every CPU and every call
 //! gives the same result, however the compiler arranges the loops.
 //!

@@ -4,7 +4,7 @@ use crate::pixels::{Encoding, PixelError, View};
 
 /// The pixels of an image that are not raw: every encoding that has a grey level.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Pixels {
+pub(super) enum PixelFormat {
     Grey8,
     /// `high` is the offset of the high byte in a pixel, 0 or 1.
     Grey16 {
@@ -18,7 +18,7 @@ pub(super) enum Pixels {
     Yuyv,
 }
 
-impl Pixels {
+impl PixelFormat {
     /// The pixels of `view`, or why `operation` cannot read them.
     pub(super) fn of(view: &View<'_>, operation: &'static str) -> Result<Self, PixelError> {
         Ok(match view.encoding() {

@@ -13,8 +13,8 @@
 //! or wider, but where the image grows downwards each old row gets its new width once, and serves
 //! several new rows. Sums are exact, so both give the same bytes.
 
-use super::pixels::Pixels;
-use super::rounded::Rounded;
+use super::pixels::PixelFormat;
+use super::rounded::RoundedDivision;
 use crate::pixels::{Encoding, PixelError, View};
 
 /// Largest width and height of a resized image, in pixels.
@@ -28,7 +28,7 @@ pub const MAX_RESIZED_SIDE: u32 = 16_384;
 /// [`PixelError::ResizeTo`] if a side is 0 or above [`MAX_RESIZED_SIDE`], [`PixelError::Raw`] for a
 /// Bayer image.
 pub fn resized(view: &View<'_>, width: u32, height: u32) -> Result<(Encoding, usize), PixelError> {
-    Pixels::of(view, "resize")?;
+    PixelFormat::of(view, "resize")?;
     let fits = |side| (1..=MAX_RESIZED_SIDE).contains(&side);
     if !fits(width) || !fits(height) {
         return Err(PixelError::ResizeTo { width, height });
@@ -70,7 +70,7 @@ pub fn resize(
     height: u32,
     out: &mut [u8],
 ) -> Result<Encoding, PixelError> {
-    let pixels = Pixels::of(view, "resize")?;
+    let pixels = PixelFormat::of(view, "resize")?;
     let (encoding, needed) = resized(view, width, height)?;
     if out.len() != needed {
         return Err(PixelError::Output { operation: "resize", needed, found: out.len() });
@@ -86,18 +86,18 @@ pub fn resize(
 
 /// A resize of images with `CHANNELS` numbers per pixel.
 struct Resize<const CHANNELS: usize> {
-    pixels: Pixels,
+    pixels: PixelFormat,
     down: Axis,
     /// Of each new column.
     across: Vec<Taps>,
-    rounded: Rounded,
+    rounded: RoundedDivision,
     /// An old row, where its pixels have to be rearranged.
     row: Vec<u8>,
 }
 
 impl<const CHANNELS: usize> Resize<CHANNELS> {
-    fn new(pixels: Pixels, across: Axis, down: Axis) -> Self {
-        let rounded = Rounded::to(u64::from(down.total()) * u64::from(across.total()));
+    fn new(pixels: PixelFormat, across: Axis, down: Axis) -> Self {
+        let rounded = RoundedDivision::to(u64::from(down.total()) * u64::from(across.total()));
         let row = vec![0; across.from as usize * CHANNELS];
         Self {
             pixels,
@@ -120,11 +120,11 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
     fn shrink_down(mut self, view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
         let mut columns = vec![0_u32; self.row.len()];
         for (y, line) in (0..).zip(out.chunks_exact_mut(self.across.len() * CHANNELS)) {
-            view.go_on(line.len())?;
+            view.check_stop(line.len())?;
             columns.fill(0);
             let taps = self.down.taps(y);
             for source in taps.first..=taps.last {
-                view.go_on(columns.len())?;
+                view.check_stop(columns.len())?;
                 add_weighted(
                     self.pixels.row::<CHANNELS>(view.row(source), &mut self.row),
                     taps.weight(source),
@@ -148,7 +148,7 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
         for (y, line) in (0..).zip(out.chunks_exact_mut(width)) {
             let taps = self.down.taps(y);
             while next <= taps.last {
-                view.go_on(self.row.len() + width)?;
+                view.check_stop(self.row.len() + width)?;
                 blended.swap(0, 1);
                 let row = self.pixels.row::<CHANNELS>(view.row(next), &mut self.row);
                 let (row, _) = row.as_chunks::<CHANNELS>();
@@ -160,7 +160,7 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
                 }
                 next += 1;
             }
-            view.go_on(width)?;
+            view.check_stop(width)?;
             // An old row at the edge is alone, and the lower one.
             let upper = if taps.first == taps.last { &blended[1] } else { &blended[0] };
             let (head, tail) = (u64::from(taps.head), u64::from(taps.tail));

@@ -2,7 +2,7 @@
 
 /// Division by a divisor below 2^32, rounded to nearest; a half goes up.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Rounded {
+pub(super) struct RoundedDivision {
     half: u64,
     /// 2^63 times the largest power of 2 that is not above the divisor, divided by it and rounded
     /// up.
@@ -10,7 +10,7 @@ pub(super) struct Rounded {
     shift: u32,
 }
 
-impl Rounded {
+impl RoundedDivision {
     /// Division by `divisor`, 1 to 2^32 - 1.
     pub(super) fn to(divisor: u64) -> Self {
         let shift = divisor.ilog2();
@@ -46,7 +46,7 @@ mod tests {
         for divisor in
             small.chain(powers).chain(large).filter(|divisor| (1..1 << 32).contains(divisor))
         {
-            let rounded = Rounded::to(divisor);
+            let rounded = RoundedDivision::to(divisor);
             for whole in 0..=255 {
                 let step = whole * divisor;
                 for sum in [

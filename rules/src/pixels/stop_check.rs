@@ -10,33 +10,33 @@ use super::PixelError;
 const STRIDE: usize = 64 << 10;
 
 /// A question that operations ask now and then: may they go on?
-pub struct Pace<'a> {
-    may_go_on: &'a dyn Fn() -> bool,
+pub struct StopCheck<'a> {
+    may_continue: &'a dyn Fn() -> bool,
     /// Bytes until the next question.
     left: Cell<usize>,
 }
 
-impl<'a> Pace<'a> {
-    /// Asks `may_go_on` at the beginning of an operation, and again before each further stretch of
+impl<'a> StopCheck<'a> {
+    /// Asks `may_continue` at the beginning of an operation, and again before each further stretch of
     /// it.
-    pub fn new(may_go_on: &'a dyn Fn() -> bool) -> Self {
-        Self { may_go_on, left: Cell::new(0) }
+    pub fn new(may_continue: &'a dyn Fn() -> bool) -> Self {
+        Self { may_continue, left: Cell::new(0) }
     }
 
     /// Asks, if it is time to, before so many bytes are worked on.
-    pub fn go_on(&self, bytes: usize) -> Result<(), PixelError> {
+    pub fn check(&self, bytes: usize) -> Result<(), PixelError> {
         if let Some(left) = self.left.get().checked_sub(bytes) {
             self.left.set(left);
             return Ok(());
         }
         self.left.set(STRIDE);
-        if (self.may_go_on)() { Ok(()) } else { Err(PixelError::Stopped) }
+        if (self.may_continue)() { Ok(()) } else { Err(PixelError::Stopped) }
     }
 }
 
-impl fmt::Debug for Pace<'_> {
+impl fmt::Debug for StopCheck<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Pace").field("left", &self.left).finish_non_exhaustive()
+        f.debug_struct("StopCheck").field("left", &self.left).finish_non_exhaustive()
     }
 }
 
@@ -53,13 +53,14 @@ mod tests {
     ) -> Result<(), PixelError> {
         let data = vec![200; 1024 * 3 * 1024];
         let questions = Cell::new(0);
-        let may_go_on = || {
+        let may_continue = || {
             questions.set(questions.get() + 1);
             questions.get() < asked
         };
-        let pace = Pace::new(&may_go_on);
-        let view =
-            View::new(1024, 1024, 3 * 1024, Encoding::Rgb8, false, &data).unwrap().paced(&pace);
+        let pace = StopCheck::new(&may_continue);
+        let view = View::new(1024, 1024, 3 * 1024, Encoding::Rgb8, false, &data)
+            .unwrap()
+            .with_stop_check(&pace);
         let result = operation(&view);
         assert!(questions.get() <= asked, "it went on after it was stopped");
         result
