@@ -194,7 +194,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     let written = results.map_or(Ok(()), |results| results.end().finish(&record));
     match written {
         // The runtime's exit code does not include this failure.
-        Err(failure) if record.is_in_order() => Err(failure),
+        Err(failure) if record.is_complete() => Err(failure),
         Err(failure) => {
             eprintln!("{failure}");
             Ok(exit_like(&record))

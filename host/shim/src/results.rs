@@ -174,7 +174,8 @@ impl ItemWriter {
             && record.signal.is_none()
             && record.killed.is_none();
         // None if the lambda was not entered.
-        let undecided = self.woken_by.clone().and_then(|woken_by| record.undecided(woken_by));
+        let undecided =
+            self.woken_by.clone().and_then(|woken_by| record.interrupted_wake(woken_by));
         if let Some(decision) = undecided.filter(|_| !is_complete) {
             self.keep(&decision);
             self.flush();
@@ -285,7 +286,7 @@ impl ItemWriter {
 
 /// Opens the result files in `folder`.
 fn open_output(folder: &Path, again: bool) -> Result<Output, OutputError> {
-    Ok(Output::begin(folder, true, again)?.with_log_of(LIVE_LOG_MAX.bytes()))
+    Ok(Output::begin(folder, true, again)?.with_log_rotation(LIVE_LOG_MAX.bytes()))
 }
 
 /// Waits for `items`, if given, for `ended` and for at most `timeout`. Returns whether `ended` is
