@@ -185,7 +185,7 @@ mod tests {
     fn a_small_socket_buffer_is_reported_with_help() {
         assert_eq!(socket_buffer(Some(64 << 20)).state, Severity::Ok);
         let small = socket_buffer(Some(212_992));
-        assert_eq!(small.detail, "208 KiB at most: bursts of large messages will be lost");
+        assert_eq!(small.detail, "up to 208 KiB: bursts of large messages will be lost");
         assert!(small.help.unwrap().contains("net.core.rmem_max=67108864"));
     }
 

@@ -89,7 +89,7 @@ fn a_folder_needs_a_name_that_a_lambda_can_have() {
     for (path, message) in [
         ("/", "does not end with a name"),
         ("..", "does not end with a name"),
-        ("My Lambda", "is no lambda name"),
+        ("My Lambda", "is not a lambda name"),
     ] {
         let error = name_of(Path::new(path)).unwrap_err();
         assert!(error.to_string().contains(message) && error.help().is_some(), "{error}");

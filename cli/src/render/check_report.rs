@@ -51,7 +51,7 @@ fn write(text: &mut String, report: &CheckReport, paint: Paint) -> fmt::Result {
             let bytes = need.bytes.map_or_else(|| "unbounded".to_owned(), size);
             let is_exact = need.preallocated || need.bytes.is_none();
             let bytes = if is_exact { bytes } else { format!("up to {bytes}") };
-            writeln!(text, "{bytes:>15}  {}", visible(&need.purpose))?;
+            writeln!(text, "{bytes:>16}  {}", visible(&need.purpose))?;
         }
     }
     writeln!(
@@ -92,11 +92,11 @@ mod tests {
         let expected = "dip 0.1.0 (wasmtime 48): loaded, init took 0.2 ms
   log: ready
 memory: 3.0 MiB preallocated, up to 67.0 MiB
-        3.0 MiB  input `imu`
-up to 64.0 MiB  preroll
+         3.0 MiB  input `imu`
+  up to 64.0 MiB  preroll
 disk: 4.0 MiB preallocated, up to 4.0 MiB, plus unbounded needs
-        4.0 MiB  model `m`
-      unbounded  clips
+         4.0 MiB  model `m`
+       unbounded  clips
 resident memory: 30.0 MiB, with rings, before any sample
 ";
         assert_eq!(check_report(&found, Paint::new(false)), expected);
