@@ -40,8 +40,8 @@ pub enum OutputError {
         /// The cause.
         source: FileError,
     },
-    /// Its `summary.json` or `signals.json` is not a file of Gleaner.
-    #[error("`{}` was not written by gleaner", path.display())]
+    /// Its `summary.json` or `signals.json` is not valid.
+    #[error("`{}` is not a result file of this gleaner", path.display())]
     Invalid {
         /// The file.
         path: PathBuf,

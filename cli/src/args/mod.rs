@@ -21,7 +21,7 @@ pub struct Cli {
 /// Commands of `gleaner`.
 #[derive(Subcommand, Debug)]
 pub enum CliCommand {
-    /// Show topics, rates, gaps and sizes of a recorded drive, and [[input]] tables for a manifest
+    /// Show topics, rates, gaps and sizes of a drive, and [[input]] tables for a manifest
     Inspect(InspectArgs),
     /// Create a folder with a new lambda: an example with a test and the SDK
     New(NewArgs),
@@ -42,8 +42,7 @@ pub enum CliCommand {
     ///
     /// Exits with 0 if the decisions are identical, and with 4 if they differ.
     Diff(DiffArgs),
-    /// Rebuild and replay a lambda whenever a source is saved, and show the changes in its
-    /// decisions
+    /// Build and replay a lambda on each save of a source, and show changed decisions
     Dev(DevArgs),
     /// Repeat the decisions of a clip, and compare them with its journal
     ///

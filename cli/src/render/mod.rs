@@ -285,7 +285,7 @@ fn write_summary(
     if summary.wall_s > 0.0 && span_s > 0.0 {
         write!(text, " ({}x real time)", grouped((span_s / summary.wall_s).round() as u64))?;
     }
-    write!(text, ", run time {:.3} s", summary.run_s)?;
+    write!(text, ", total run time {:.3} s", summary.run_s)?;
     if summary.decode_s > 0.0 {
         write!(
             text,
@@ -329,14 +329,13 @@ fn more(text: &mut String, count: u64) -> fmt::Result {
 /// Losses by cause. Samples that newer ones overwrote in a ring do not count as lost.
 fn losses(summary: &ReplaySummary) -> Vec<String> {
     let of_topic = |topic: &TopicReport| {
-        let fault_groups = [
+        let causes = [
             (topic.lost.unwrap_or(0), "upstream"),
             (topic.no_slot, "no free slot: the lambda holds too many"),
             (topic.too_big, "larger than `max_size`"),
         ];
         let name = visible(&topic.topic);
-        fault_groups
-            .map(|(count, why)| (count, format!("{} of {name}, {why}", counted(count, "sample"))))
+        causes.map(|(count, why)| (count, format!("{} of {name}, {why}", counted(count, "sample"))))
     };
     let overall = [
         (summary.skipped, format!("{}, skipped", counted(summary.skipped, "event sample"))),

@@ -87,7 +87,7 @@ fn a_summary_has_triggers_with_times_speed_and_files() {
         summary(&replay(), &digest, &[], PLAIN),
         "brake-dark 0.1.0 (wasm): 1 trigger in 1,200 wakes, 40.0 s of drive\n    \
             10.810 s  brake-dark  1.46\n  \
-          2,400 wakes/s (80x real time), run time 0.400 s (25 % decoding), peak memory 12.0 MiB\n  \
+          2,400 wakes/s (80x real time), total run time 0.400 s (25 % decoding), peak memory 12.0 MiB\n  \
           out/demo: decisions.jsonl, log.jsonl, summary.json\n"
     );
 }

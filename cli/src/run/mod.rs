@@ -21,7 +21,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::process_group::{ProcessGroup, RunEnd};
 use self::screen::Screen;
-use self::summary::Earlier;
+use self::summary::EarlierCounts;
 use crate::args::RunArgs;
 
 /// Delay before the first restart; it doubles with each further one.
@@ -52,13 +52,13 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     let mut delay = DELAY;
     let mut restarts = 0;
     let mut failures = Failures::default();
-    let mut earlier = Earlier::default();
+    let mut earlier = EarlierCounts::default();
     let is_over = || args.last.is_some_and(|seconds| started.elapsed().as_secs() >= seconds.into());
     loop {
         let left = args
             .last
             .map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
-        let started_at = Instant::now();
+        let attempt_started = Instant::now();
         // The runtime reads the same file at each start and reports if it cannot be used. That does
         // not end the run.
         most = allowed().unwrap_or(most);
@@ -82,7 +82,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
         }
         earlier.add(group.last_status(), group.recorder_status(), group.has_lost_wake());
         restarts += 1;
-        delay = if started_at.elapsed() >= HEALTHY { DELAY } else { delay };
+        delay = if attempt_started.elapsed() >= HEALTHY { DELAY } else { delay };
         let reason = failures.reason.as_deref().unwrap_or_default();
         screen.warn(&format!("{reason}; restarting in {} s (restart {restarts})", delay.as_secs()));
         let until = Instant::now() + delay;

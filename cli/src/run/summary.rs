@@ -11,14 +11,14 @@ use gleaner_protocol::link::RecorderStatus;
 
 /// Sum of the counts of ended processes of a run.
 #[derive(Default)]
-pub(super) struct Earlier {
+pub(super) struct EarlierCounts {
     live: Option<LiveStatus>,
     recorder: Option<Box<RecorderStatus>>,
     /// Wakes during which their process ended, so that it did not count them.
     lost_wakes: u64,
 }
 
-impl Earlier {
+impl EarlierCounts {
     /// Adds the last statuses of an ended lambda process and recorder. If a process failed, up to a
     /// second of counts is missing.
     pub(super) fn add(
@@ -135,7 +135,7 @@ mod tests {
     #[test]
     fn the_counts_of_the_recorder_are_added_to_those_of_the_shim() {
         let summary = completed(&live(5, 3), |out| {
-            Earlier::default().complete(Some(live(5, 1)), recorder(7), out).unwrap();
+            EarlierCounts::default().complete(Some(live(5, 1)), recorder(7), out).unwrap();
         });
         assert_eq!((summary.wakes, summary.unwritten), (5, 3));
         assert_eq!(summary.recording.unwrap().recording.disk_suppressed, 7);
@@ -144,7 +144,7 @@ mod tests {
     #[test]
     fn the_summary_of_the_shim_stays_if_there_is_nothing_to_add() {
         let summary = completed(&live(5, 3), |out| {
-            Earlier::default().complete(Some(live(5, 1)), None, out).unwrap();
+            EarlierCounts::default().complete(Some(live(5, 1)), None, out).unwrap();
         });
         assert_eq!(summary, live(5, 3));
     }
@@ -152,7 +152,7 @@ mod tests {
     #[test]
     fn recorders_are_summed_up_even_if_their_lambda_reported_nothing() {
         let summary = completed(&live(5, 3), |out| {
-            let mut earlier = Earlier::default();
+            let mut earlier = EarlierCounts::default();
             earlier.add(Some(live(10, 0)), recorder(1), false);
             earlier.add(None, recorder(20), true);
             earlier.complete(Some(live(5, 1)), recorder(300), out).unwrap();

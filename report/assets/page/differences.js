@@ -30,7 +30,7 @@ function changeCard(page) {
   const rows = [
     ...diff.config.map(({ what, a, b }) => [`config ${what}`, word(a), word(b), ""]),
     ...diff.counts.map(({ what, a, b }) => [what, word(a), word(b), ""]),
-    ...diff.cost.map(({ what, unit, a, b, ratio }) => [`${what}, median`, ...[a, b].map((value) => (value === null ? "unknown" : amount(value, unit))), ratio === null ? "" : `x${Number(ratio.toPrecision(3))}`]),
+    ...diff.cost.map(({ what, unit, a, b, ratio }) => [`${what}, p50`, ...[a, b].map((value) => (value === null ? "unknown" : amount(value, unit))), ratio === null ? "" : `x${Number(ratio.toPrecision(3))}`]),
   ];
   if (rows.length === 0) return null;
   const columns = [

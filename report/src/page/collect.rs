@@ -327,7 +327,7 @@ fn facts(summary: &RunSummary) -> Vec<Fact> {
                 String::new()
             };
             vec![
-                fact("run time", format!("{:.3} s{decoding}", summary.run_s)),
+                fact("total run time", format!("{:.3} s{decoding}", summary.run_s)),
                 fact("replayed in", format!("{:.3} s", summary.wall_s)),
                 fact("speed", format!("{} wakes/s", grouped(summary.wakes_per_s.round() as u64))),
                 fact("peak memory", size(summary.peak_rss_bytes)),
