@@ -21,7 +21,7 @@ pub struct Cli {
 /// Commands of `gleaner`.
 #[derive(Subcommand, Debug)]
 pub enum CliCommand {
-    /// Show topics, rates, gaps and sizes of a drive, and [[input]] tables for a manifest
+    /// Show topics, rates, gaps and sizes of a drive, and `[[input]]` tables for a manifest
     Inspect(InspectArgs),
     /// Create a folder with a new lambda: an example with a test and the SDK
     New(NewArgs),
