@@ -105,7 +105,7 @@ class Cases(unittest.TestCase):
         )
 
     def test_faults(self) -> None:
-        notes = {_replay.REINITIALISED: "made anew", _replay.BACKING_OFF: "rests"}
+        notes = {_replay.REINITIALISED: "re-initialised", _replay.BACKING_OFF: "backs off"}
 
         def start(_: Dict[str, Any]) -> Calls:
             run = _replay._ReplayLoop.__new__(_replay._ReplayLoop)
@@ -121,7 +121,7 @@ class Cases(unittest.TestCase):
                 decided, noted = len(run._decisions), len(run._session.lines)
                 run._wake(at_ms * MS, Tick(at_ms * MS, 0))
                 lines = [notes[line.message] for line in run._session.lines[noted:]]
-                return lines if len(run._decisions) > decided else "rests"
+                return lines if len(run._decisions) > decided else "backs off"
 
             return {"wake": wake}
 

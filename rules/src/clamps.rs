@@ -1,32 +1,32 @@
-//! How much one call of a lambda hands out, and which paths it may ask with.
+//! Limits of one call of a lambda: the size of results and of field paths.
 
 use std::fmt;
 use std::ops::Range;
 
 use crate::text::cut;
 
-/// Most samples that one call hands out.
+/// Maximum number of samples that one call returns.
 pub const SAMPLES_PER_CALL: usize = 256;
 /// Longest list of strings in one field.
 pub const TEXTS_PER_FIELD: usize = 4096;
 /// Longest path of a field, in bytes.
 pub const PATH_BYTES: usize = 1024;
 
-/// What `[limits]` let one call hand out.
+/// Limits of `[limits]` for the result of one call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PerCall {
-    /// Bytes that it copies out.
+    /// Maximum number of bytes.
     pub bytes: usize,
-    /// Values of a column or of a list.
+    /// Maximum number of values of a column or list.
     pub items: usize,
 }
 
-/// How long a value is, by its sort.
+/// Length of a value, by its kind.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Length {
-    /// A number or a truth value.
+    /// A number or a boolean.
     One,
-    /// Bytes of a text.
+    /// Text, in bytes.
     Text(usize),
     /// Bytes.
     Bytes(usize),
@@ -37,16 +37,16 @@ pub enum Length {
 }
 
 impl PerCall {
-    /// Samples that one call hands out at most.
+    /// Returns the maximum number of samples.
     pub fn samples(self) -> usize {
         self.items.min(SAMPLES_PER_CALL)
     }
 
-    /// Refuses a value that is longer than one call hands out: it is never cut.
+    /// Refuses a value that is too long for one call. Values are never cut.
     ///
     /// # Errors
     ///
-    /// [`WrongField`] says how long it is.
+    /// [`WrongField`], with its length.
     pub fn value(self, path: &str, length: Length) -> Result<(), WrongField> {
         let (len, most) = match length {
             Length::One => return Ok(()),
@@ -59,46 +59,46 @@ impl PerCall {
         }
         Err(WrongField::new(
             path,
-            format!("has {len} items, one call hands out {most}; read it with `cdr`"),
+            format!("has {len} items; one call returns at most {most}: read it with `cdr`"),
         ))
     }
 
-    /// The place of `len` bytes from `offset` in a `whole` of so many, clamped to what it has and
-    /// to what one call hands out.
+    /// Returns the range of `len` bytes from `offset`, clamped to a length of `whole` and to the
+    /// limit of one call.
     pub fn piece(self, whole: usize, offset: u64, len: u32) -> Range<usize> {
         piece(whole, offset, self.bytes.min(len as usize))
     }
 }
 
-/// The place of `len` bytes from `offset` in a `whole` of so many, clamped to what it has.
+/// Returns the range of `len` bytes from `offset`, clamped to a length of `whole`.
 pub fn piece(whole: usize, offset: u64, len: usize) -> Range<usize> {
     let from = usize::try_from(offset).unwrap_or(usize::MAX).min(whole);
     from..from + len.min(whole - from)
 }
 
-/// A field that is no number, is too long, or belongs to another input.
+/// A field that is not a number, is too long, or belongs to another input.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WrongField {
     /// The path, or the start of a long one.
     pub path: String,
-    /// What is wrong with it.
+    /// The reason, which follows the path in the message.
     pub why: String,
 }
 
 impl WrongField {
-    /// `why` goes on behind the path.
+    /// Creates the error; `why` follows the path in the message.
     pub fn new(path: &str, why: impl Into<String>) -> Self {
         Self { path: path.to_owned(), why: why.into() }
     }
 
-    /// A field of `type_name` that is read as a number and is none.
+    /// The error for a field of `type_name` that is read as a number and is not one.
     pub fn no_number(path: &str, type_name: &str) -> Self {
-        Self::new(path, format!("of `{type_name}` is no number"))
+        Self::new(path, format!("of `{type_name}` is not a number"))
     }
 
-    /// A field of the input `belongs` that `asked` was asked for.
-    pub fn elsewhere(path: &str, belongs: &str, asked: &str) -> Self {
-        Self::new(path, format!("belongs to input `{belongs}`, not to `{asked}`"))
+    /// The error for a field of the input `belongs`, used on the input `used`.
+    pub fn elsewhere(path: &str, belongs: &str, used: &str) -> Self {
+        Self::new(path, format!("belongs to input `{belongs}`, not to `{used}`"))
     }
 }
 
@@ -110,15 +110,15 @@ impl fmt::Display for WrongField {
 
 impl std::error::Error for WrongField {}
 
-/// Refuses a path that is too long, before anything looks at it.
+/// Refuses a path that is too long, before it is parsed.
 ///
 /// # Errors
 ///
-/// [`WrongField`] says how long it is.
+/// [`WrongField`], with its length.
 pub fn path(path: &str) -> Result<(), WrongField> {
     let len = path.len();
     if len <= PATH_BYTES {
         return Ok(());
     }
-    Err(WrongField::new(cut(path, 64), format!("has {len} bytes; a path has {PATH_BYTES} at most")))
+    Err(WrongField::new(cut(path, 64), format!("has {len} bytes; a path has at most {PATH_BYTES}")))
 }

@@ -1,48 +1,49 @@
-//! When a lambda that faults again and again rests.
+//! The back-off of a lambda that faults repeatedly.
 
-/// Faults in a row that are taken for bad luck, or for one bad second of a sensor. From then on the
-/// lambda rests.
+/// Number of consecutive faults at which the back-off starts. Fewer may be caused by one bad second
+/// of a sensor.
 pub const FAULTS_IN_A_ROW: u32 = 8;
 
-/// The first rest; each further fault doubles it. It counts from the time of the wake: one that
-/// runs for longer than its rest, as a long `init` does, has none.
+/// The first back-off; each further fault doubles it. It counts from the time of the wake, so that
+/// a wake that takes longer than its back-off, for example by a long `init`, has none.
 const MIN_BACKOFF_NS: i64 = 100_000_000;
 
-/// The longest rest: so long it takes at most until a lambda runs again whose cause of faults is
-/// gone. A lambda that always takes all of a deadline of 100 ms then has a hundredth of the time.
+/// The longest back-off, and so the longest time until a lambda runs again after the cause of its
+/// faults has ended. A lambda that always uses up a deadline of 100 ms then takes 1 % of the time.
 const MAX_BACKOFF_NS: i64 = 10_000_000_000;
 
-/// What the log says when a wake finds a fresh lambda.
-pub const REINITIALISED: &str = "gleaner: the lambda was made anew after a fault: what it kept in its variables is gone \
-                             (in Python, all but the globals of its module)";
+/// Log line of a wake that re-initialised the lambda.
+pub const REINITIALISED: &str = "gleaner: the lambda was re-initialised after a fault: \
+                                 its variables are lost \
+                                 (in Python, all but the globals of its module)";
 
-/// What the log says when a lambda begins to rest.
-pub const BACKING_OFF: &str = "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms and \
-                         twice as long after each further fault, 10 s at most, until a wake ends well";
+/// Log line at the start of the back-off.
+pub const BACKING_OFF: &str = "gleaner: the lambda faulted 8 times in a row: \
+                               wakes are skipped and counted, for 100 ms and twice as long after \
+                               each further fault, at most 10 s, until a wake succeeds";
 
-/// Faults without a good wake between them. Time is that of the lambda, so that a replay rests as
-/// the vehicle did.
+/// Counts consecutive faults. Time is that of the lambda, so that a replay backs off as the vehicle
+/// did.
 #[derive(Debug, Default)]
 pub struct Faults {
     in_a_row: u32,
     backoff_ns: i64,
-    /// From the wake that faulted last until the first that may run, without the latter.
+    /// From the last wake that faulted until the first that may run, exclusive.
     backoff: Option<(i64, i64)>,
 }
 
 impl Faults {
-    /// Returns whether to skip a wake at that time. A clock that went back is no reason to rest for
-    /// long.
+    /// Returns whether to skip a wake at that time. A clock that goes back ends the back-off.
     pub fn is_backing_off(&self, at_ns: i64) -> bool {
         self.backoff.is_some_and(|(from, until)| (from..until).contains(&at_ns))
     }
 
-    /// What the log says as a wake begins.
+    /// Returns the log line for the start of a wake, if any.
     pub fn begin(&self) -> Option<&'static str> {
         (self.in_a_row > 0).then_some(REINITIALISED)
     }
 
-    /// Counts how the wake at `at_ns` ended, and returns what the log says of it.
+    /// Counts the end of the wake at `at_ns`; returns the log line for it, if any.
     pub fn end(&mut self, at_ns: i64, faulted: bool) -> Option<&'static str> {
         if !faulted {
             *self = Self::default();

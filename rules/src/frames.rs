@@ -1,11 +1,10 @@
-//! How many frames a lambda may hold at a time, and how many bytes those that it makes may take
-//! together.
+//! Limits the number of frames that a lambda holds, and the memory of those that it makes.
 
 use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Frames and bytes that are left, shared by all inputs of a lambda.
+/// The budget of frames and bytes, shared by all inputs of a lambda.
 #[derive(Clone, Debug)]
 pub struct Budget(Arc<Remaining>);
 
@@ -16,26 +15,26 @@ struct Remaining {
     bytes: AtomicUsize,
 }
 
-/// A frame that is held, and what it takes; given back when it is dropped.
+/// The share of one frame; returned to the budget when dropped.
 #[derive(Debug)]
 pub struct FrameLease {
     budget: Budget,
     bytes: usize,
 }
 
-/// Why there is no room for one more frame.
+/// The reason why another frame is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum NoRoom {
-    /// The lambda holds as many frames as it may.
+    /// The lambda holds the maximum number of frames.
     Frames {
-        /// How many that is.
+        /// The maximum.
         allowed: usize,
     },
-    /// The frames that it made take too much.
+    /// The frames that it made use too much memory.
     Bytes {
         /// Bytes of the new frame.
-        asked: usize,
-        /// Bytes that are left.
+        needed: usize,
+        /// Remaining bytes.
         left: usize,
     },
 }
@@ -47,8 +46,8 @@ impl fmt::Display for NoRoom {
                 write!(f, "the lambda holds {allowed} frames; ")?;
                 "frames"
             }
-            Self::Bytes { asked, left } => {
-                write!(f, "{asked} bytes for a new frame, {left} are left; ")?;
+            Self::Bytes { needed, left } => {
+                write!(f, "a new frame needs {needed} bytes, and {left} are left; ")?;
                 "memory"
             }
         };
@@ -59,18 +58,18 @@ impl fmt::Display for NoRoom {
 impl std::error::Error for NoRoom {}
 
 impl Budget {
-    /// A budget of that many frames and bytes.
+    /// Creates a budget of so many frames and bytes.
     pub fn new(frames: usize, bytes: usize) -> Self {
         let (left, bytes) = (AtomicUsize::new(frames), AtomicUsize::new(bytes));
         Self(Arc::new(Remaining { frames: left, frames_allowed: frames, bytes }))
     }
 
-    /// Whether there is room for a frame of so many bytes, but for the number of frames.
+    /// Returns whether so many bytes are left, regardless of the number of frames.
     pub fn has(&self, bytes: usize) -> bool {
         bytes <= self.0.bytes.load(Ordering::Relaxed)
     }
 
-    /// Takes room for a frame that was made of `bytes`, or of none for one that lies elsewhere.
+    /// Reserves a frame of `bytes`; 0 for a frame whose pixels are in a slot.
     ///
     /// # Errors
     ///
@@ -81,9 +80,9 @@ impl Budget {
         };
         let allowed = self.0.frames_allowed;
         take(&self.0.frames, 1).map_err(|_| NoRoom::Frames { allowed })?;
-        // From here on the frame is given back, whatever comes.
+        // From here on, dropping the lease returns the frame.
         let mut taken = FrameLease { budget: self.clone(), bytes: 0 };
-        take(&self.0.bytes, bytes).map_err(|left| NoRoom::Bytes { asked: bytes, left })?;
+        take(&self.0.bytes, bytes).map_err(|left| NoRoom::Bytes { needed: bytes, left })?;
         taken.bytes = bytes;
         Ok(taken)
     }

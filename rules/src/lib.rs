@@ -1,16 +1,16 @@
-//! The rules that a lambda can meet, each written once.
+//! The rules that apply to lambdas, each written once.
 //!
-//! The host and, natively, `gleaner_sdk::testing` keep them with this code: when a lambda runs
-//! ([`schedule`]), when it rests ([`faults`]), what it may cause, say and keep ([`triggers`],
-//! [`log`], [`scratch`]), what it sees of an input and how much of it at once ([`ring`],
-//! [`clamps`], [`path`], [`frames`]), what its frames are and what is computed on them
-//! ([`pixels`]), and how names, sizes and durations are written in its manifest ([`names`],
-//! [`units`]). `cases/*.json` has calls and answers for each; the Python SDK, which has these rules
-//! a second time, answers the same cases.
+//! The host and, natively, `gleaner_sdk::testing` enforce them with this code: the schedule of a
+//! lambda ([`schedule`]), its back-off ([`faults`]), its triggers, log lines and stored bytes
+//! ([`triggers`], [`log`], [`scratch`]), its view of an input and the limits of one call ([`ring`],
+//! [`clamps`], [`path`], [`frames`]), its frames and the operations on them ([`pixels`]), and the
+//! form of names, sizes and durations in its manifest ([`names`], [`units`]). `cases/*.json` has
+//! calls and results for each; the Python SDK, which implements these rules again, passes the same
+//! cases.
 //!
-//! Never: a dependency, since this travels with the SDK into the folder of every new lambda; a
-//! clock, a file or a thread; anything of the host or of WebAssembly. What time it is, and what a
-//! ring shows, the caller says.
+//! Never: a dependency, since this is copied with the SDK into the folder of every new lambda; a
+//! clock, a file or a thread; anything of the host or of WebAssembly. The caller provides the time
+//! and the content of rings.
 
 pub mod clamps;
 pub mod faults;

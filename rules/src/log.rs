@@ -1,4 +1,4 @@
-//! How much a lambda may write to its log.
+//! Rate limits of a lambda's log.
 
 use crate::text::cut;
 
@@ -7,26 +7,26 @@ pub const LINE_BYTES: usize = 4096;
 
 const SECOND_NS: i64 = 1_000_000_000;
 
-/// What was written in a second of the lambda's time, and what was dropped so far.
+/// Counts log lines per second of the lambda's time, and dropped lines.
 #[derive(Debug)]
 pub struct Rate {
     lines_per_second: u64,
     bytes_per_second: u64,
-    /// The second in which was written last, and how many lines and bytes.
+    /// The second of the last line, with its number of lines and bytes.
     window: (i64, u64, u64),
-    /// What the host noted in a second.
+    /// Texts that the host noted in one second.
     notes: (i64, Vec<&'static str>),
     dropped: u64,
 }
 
 impl Rate {
-    /// Nothing was written yet.
+    /// Creates a counter with these limits.
     pub fn new(lines_per_second: u64, bytes_per_second: u64) -> Self {
         let (window, notes) = Default::default();
         Self { lines_per_second, bytes_per_second, window, notes, dropped: 0 }
     }
 
-    /// Returns whether one more line is kept, which was cut before; else it is counted.
+    /// Counts a line, which was cut before. Returns whether it is kept; otherwise it is dropped.
     pub fn keeps(&mut self, at_ns: i64, line: &str) -> bool {
         let second = at_ns.div_euclid(SECOND_NS);
         if self.window.0 != second {
@@ -42,8 +42,8 @@ impl Rate {
         true
     }
 
-    /// Returns whether the host says this now: each text once in a second, beside what the lambda
-    /// may write.
+    /// Returns whether the host logs `text` now: each text once a second, beyond the limits of the
+    /// lambda.
     pub fn notes(&mut self, at_ns: i64, text: &'static str) -> bool {
         let second = at_ns.div_euclid(SECOND_NS);
         if self.notes.0 != second {
@@ -56,7 +56,7 @@ impl Rate {
         is_new
     }
 
-    /// Lines that were dropped, since the start.
+    /// Returns the number of dropped lines since the start.
     pub fn dropped(&self) -> u64 {
         self.dropped
     }
@@ -67,7 +67,7 @@ impl Rate {
     }
 }
 
-/// A line as it is kept at most.
+/// Cuts a line to its maximum length.
 pub fn line(message: &str) -> &str {
     cut(message, LINE_BYTES)
 }

@@ -1,14 +1,15 @@
-//! Names in a manifest: of lambdas and inputs, of topics, and of message types.
+//! Checks names in a manifest: of lambdas and inputs, of topics, and of message types.
 
 /// Longest topic name that rmw accepts, in bytes.
 const TOPIC_NAME_MAX: usize = 247;
 
 /// The type of raw images.
 pub const IMAGE: &str = "sensor_msgs/msg/Image";
-/// The type of images that are decoded.
+/// The type of compressed images.
 pub const COMPRESSED_IMAGE: &str = "sensor_msgs/msg/CompressedImage";
 
-/// 1 to 63 characters, first a lower-case letter, then those, digits and `extra`.
+/// Returns whether `text` has 1 to 63 characters: first a lower-case letter, then those, digits and
+/// `extra`.
 fn is_name(text: &str, extra: &[u8]) -> bool {
     let rest =
         |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || extra.contains(&byte);
@@ -17,17 +18,17 @@ fn is_name(text: &str, extra: &[u8]) -> bool {
         && text.bytes().all(rest)
 }
 
-/// Whether a lambda can have this name.
+/// Returns whether `text` is a valid name of a lambda.
 pub fn is_lambda(text: &str) -> bool {
     is_name(text, b"-")
 }
 
-/// Whether an input, a model or a value of `[config]` can have this name.
+/// Returns whether `text` is a valid name of an input, a model or a value of `[config]`.
 pub fn is_item(text: &str) -> bool {
     is_name(text, b"_-")
 }
 
-/// Whether a ROS topic can have this name, which is absolute.
+/// Returns whether `text` is a valid, absolute name of a ROS topic.
 pub fn is_topic(text: &str) -> bool {
     let token = |part: &str| {
         part.bytes().next().is_some_and(|first| !first.is_ascii_digit())
@@ -37,7 +38,7 @@ pub fn is_topic(text: &str) -> bool {
         && text.strip_prefix('/').is_some_and(|parts| parts.split('/').all(token))
 }
 
-/// Whether a ROS message type can have this name, such as `sensor_msgs/msg/Imu`.
+/// Returns whether `text` is a valid name of a ROS message type, such as `sensor_msgs/msg/Imu`.
 pub fn is_type(text: &str) -> bool {
     let mut parts = text.split('/');
     let (Some(package), Some("msg"), Some(name), None) =
@@ -52,12 +53,12 @@ pub fn is_type(text: &str) -> bool {
         && name.bytes().all(|byte| byte.is_ascii_alphanumeric())
 }
 
-/// Whether samples of this type are seen as frames.
+/// Returns whether samples of this type are frames.
 pub fn is_frame(type_name: &str) -> bool {
     type_name == IMAGE || type_name == COMPRESSED_IMAGE
 }
 
-/// Whether samples of this type are large, so that few of them are kept: frames and point clouds.
+/// Returns whether samples of this type are large, so that few are kept: frames and point clouds.
 pub fn is_large(type_name: &str) -> bool {
     type_name == "sensor_msgs/msg/PointCloud2" || is_frame(type_name)
 }

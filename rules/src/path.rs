@@ -1,9 +1,9 @@
-//! Paths of fields, such as `a.b[3].c`: their syntax. Which fields there are, definitions or
-//! messages say.
+//! Parses paths of fields, such as `a.b[3].c`. Only the syntax is checked, not whether a field
+//! exists.
 
 use std::fmt;
 
-/// One step of a written path.
+/// One step of a path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PathSegment<'p> {
     /// A field of a message.
@@ -12,12 +12,12 @@ pub enum PathSegment<'p> {
     Index(usize),
 }
 
-/// A text that is no path.
+/// A text that is not a path.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MalformedPath {
     /// The text.
     pub path: String,
-    /// From where on it makes no sense.
+    /// The invalid rest of it.
     pub rest: String,
 }
 
@@ -29,11 +29,11 @@ impl fmt::Display for MalformedPath {
 
 impl std::error::Error for MalformedPath {}
 
-/// The steps of `path`, at least one; the first is a name, and so is each behind a point.
+/// Returns the steps of `path`, at least one; the first is a name, and so is each after a dot.
 ///
 /// # Errors
 ///
-/// [`MalformedPath`] says from where on it makes no sense.
+/// [`MalformedPath`], with the invalid rest.
 pub fn segments(path: &str) -> Result<Vec<PathSegment<'_>>, MalformedPath> {
     let malformed = |rest: &str| MalformedPath { path: path.to_owned(), rest: rest.to_owned() };
     let mut segments = Vec::new();

@@ -1,27 +1,27 @@
-//! The newest samples of one input, within a number of cells: what the lambda holds stays, and may
-//! cost others their place.
+//! A ring of the newest samples of one input, in a fixed number of cells. Samples that the lambda
+//! holds keep their cells, and may displace others.
 //!
-//! This is what a ring shows, said plainly and for one thread. The host's ring, in `host/buffers`,
-//! shows the same without a lock.
+//! This is a simple version for one thread. The host's ring, in `host/buffers`, behaves alike
+//! without a lock.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// One sample in its place. Whoever has a second `Arc` of it holds it.
+/// A cell with a sample. It is held while there is a second `Arc` of it.
 #[derive(Debug)]
 pub struct Cell<T> {
     /// The sample.
     pub sample: T,
-    /// How many entered before it.
+    /// Number of samples that entered before it.
     pub position: u64,
 }
 
-/// What a ring has received and lost since it was made.
+/// Counts of a ring since its creation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
     /// Samples that entered.
     pub received: u64,
-    /// Samples that left, to make room for newer ones.
+    /// Samples that newer ones replaced.
     pub overwritten: u64,
     /// Samples refused because every cell was held.
     pub no_slot: u64,
@@ -36,10 +36,10 @@ pub struct Ring<T> {
     cells: usize,
     max_size: usize,
     counts: Counts,
-    /// In the order of their positions.
+    /// Shown cells, in the order of their positions.
     shown: VecDeque<Arc<Cell<T>>>,
-    /// No longer shown, and held.
-    left: Vec<Arc<Cell<T>>>,
+    /// Cells that are held, but no longer shown.
+    hidden: Vec<Arc<Cell<T>>>,
 }
 
 fn is_held<T>(cell: &Arc<Cell<T>>) -> bool {
@@ -47,20 +47,20 @@ fn is_held<T>(cell: &Arc<Cell<T>>) -> bool {
 }
 
 impl<T> Ring<T> {
-    /// A ring of which nothing has arrived yet.
+    /// Creates an empty ring.
     pub fn new(depth: usize, hold: usize, max_size: usize) -> Self {
-        let (counts, shown, left) = Default::default();
-        Self { depth, cells: depth + hold + 1, max_size, counts, shown, left }
+        let (counts, shown, hidden) = Default::default();
+        Self { depth, cells: depth + hold + 1, max_size, counts, shown, hidden }
     }
 
-    /// Takes a sample of `bytes` in, or counts why not.
+    /// Adds a sample of `bytes`, or counts the reason why it is refused.
     pub fn push(&mut self, sample: T, bytes: usize) {
         if bytes > self.max_size {
             self.counts.too_big += 1;
             return;
         }
-        self.left.retain(is_held);
-        if self.shown.len() + self.left.len() >= self.cells && !self.evict() {
+        self.hidden.retain(is_held);
+        if self.shown.len() + self.hidden.len() >= self.cells && !self.evict() {
             self.counts.no_slot += 1;
             return;
         }
@@ -73,39 +73,40 @@ impl<T> Ring<T> {
         if let Some(cell) = leaving {
             self.counts.overwritten += 1;
             if is_held(&cell) {
-                self.left.push(cell);
+                self.hidden.push(cell);
             }
         }
     }
 
-    /// Lets the oldest sample go that nobody holds.
+    /// Evicts the oldest sample that is not held. Returns `false` if there is none.
     fn evict(&mut self) -> bool {
         let oldest = self.shown.iter().position(|cell| !is_held(cell));
         self.counts.overwritten += u64::from(oldest.is_some());
         oldest.is_some_and(|at| self.shown.remove(at).is_some())
     }
 
-    /// How many samples are shown at most.
+    /// Returns the maximum number of shown samples.
     pub fn depth(&self) -> usize {
         self.depth
     }
 
-    /// What became of the samples.
+    /// Returns the counts.
     pub fn counts(&self) -> Counts {
         self.counts
     }
 
-    /// The sample at a position, if it is shown.
+    /// Returns the sample at a position, if it is shown.
     pub fn get(&self, position: u64) -> Option<Arc<Cell<T>>> {
         self.shown.iter().find(|cell| cell.position == position).cloned()
     }
 
-    /// The newest sample that is shown.
+    /// Returns the newest shown sample.
     pub fn newest(&self) -> Option<Arc<Cell<T>>> {
         self.shown.back().cloned()
     }
 
-    /// The newest samples back to the first one that `keep` refuses, `most` at most; oldest first.
+    /// Returns the newest samples back to the first one that `keep` refuses, at most `most`; oldest
+    /// first.
     pub fn newest_while(&self, most: usize, keep: impl Fn(&T) -> bool) -> Vec<Arc<Cell<T>>> {
         let newest = self.shown.iter().rev().take(most).take_while(|cell| keep(&cell.sample));
         let mut found = newest.cloned().collect::<Vec<_>>();

@@ -1,42 +1,43 @@
-//! When a lambda runs: for each new sample of one input, or every so often.
+//! The schedule of a lambda: on new samples of one input, or periodic.
 //!
-//! A schedule only looks at rings and times; it never runs anything, and it counts what it passes
-//! over.
+//! A schedule only reads rings and times; it never runs anything, and it counts skipped samples and
+//! missed ticks.
 
-/// Ticks made up for in one gap between two samples. A longer gap (a clock that jumped, two drives
-/// far apart) is counted as missed, so that a bad stamp cannot keep a replay busy for years.
+/// Maximum number of ticks that run in one gap between two samples. Those of a longer gap (a clock
+/// that jumped, two drives far apart) are missed, so that a bad stamp cannot keep a replay busy for
+/// years.
 const CATCH_UP_TICKS: u64 = 100_000;
 
-/// What a schedule sees of the ring of one input.
+/// The view of a schedule on the ring of one input.
 pub trait RingView {
     /// One sample in the ring.
     type Sample;
 
-    /// Number of samples that entered so far: the position that the next one will have.
+    /// Returns the number of samples that entered so far, which is the position of the next one.
     fn head(&self) -> u64;
-    /// How many samples the lambda sees at most.
+    /// Returns the maximum number of samples that the lambda sees.
     fn depth(&self) -> usize;
-    /// The sample at a position, if it is still there.
+    /// Returns the sample at a position, if it is still in the ring.
     fn get(&self, position: u64) -> Option<Self::Sample>;
-    /// The newest sample, and its position.
+    /// Returns the newest sample, with its position.
     fn newest(&self) -> Option<(u64, Self::Sample)>;
     /// Counts samples that should have woken the lambda and did not.
     fn skip(&self, samples: u64);
 }
 
-/// Which samples wake a lambda that was busy.
+/// The samples that wake a lambda after it was busy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Backlog {
-    /// Each that is still in the ring.
+    /// Each sample that is still in the ring.
     Each,
-    /// The newest one.
+    /// The newest sample.
     Latest,
 }
 
 /// A periodic wake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tick {
-    /// When it was due, in nanoseconds.
+    /// Its due time, in nanoseconds.
     pub at_ns: i64,
     /// Ticks that were due since the previous wake and did not happen.
     pub missed: u64,
@@ -60,11 +61,11 @@ pub struct EventSchedule<R> {
     next: u64,
 }
 
-/// Wakes on a period, counted from the start of the drive, or live of the run.
+/// Wakes on a period, counted from the start of the drive, or of a live run.
 #[derive(Debug)]
 pub struct PeriodicSchedule {
     period_ns: i64,
-    /// Live, a tick whose successor is due as well is missed: nobody waits for what is late.
+    /// Set if live: then a tick is missed if its successor is due as well.
     live: bool,
     due_ns: Option<i64>,
     missed: u64,
@@ -77,8 +78,8 @@ impl<R: RingView> Schedule<R> {
         Self::Event(EventSchedule { ring, backlog, next: 0 })
     }
 
-    /// Wakes every `period_ns`, from 1. Time begins with [`Schedule::begin`], or else at the first
-    /// look for a tick.
+    /// Wakes every `period_ns`, at least 1. Time begins with [`Schedule::begin`], or else at the
+    /// first call of [`Schedule::next_tick`].
     pub fn periodic(period_ns: i64) -> Self {
         let period_ns = period_ns.max(1);
         Self::Periodic(PeriodicSchedule {
@@ -90,14 +91,14 @@ impl<R: RingView> Schedule<R> {
         })
     }
 
-    /// Time begins, in a replay: the first tick comes a period later.
+    /// Sets the start time of a replay: the first tick is due a period later.
     pub fn begin(&mut self, at_ns: i64) {
         if let Self::Periodic(periodic) = self {
             periodic.due_ns = Some(at_ns.saturating_add(periodic.period_ns));
         }
     }
 
-    /// Time begins where it does not wait.
+    /// Sets the start time of a live run.
     pub fn begin_live(&mut self, now_ns: i64) {
         self.begin(now_ns);
         if let Self::Periodic(periodic) = self {
@@ -105,7 +106,7 @@ impl<R: RingView> Schedule<R> {
         }
     }
 
-    /// When the next tick is due, if time causes any.
+    /// Returns the due time of the next tick; `None` without ticks.
     pub fn next_due(&self) -> Option<i64> {
         match self {
             Self::Event(_) => None,
@@ -113,7 +114,7 @@ impl<R: RingView> Schedule<R> {
         }
     }
 
-    /// The next sample that has arrived and wakes the lambda.
+    /// Returns the next arrived sample that wakes the lambda.
     pub fn next_event(&mut self) -> Option<R::Sample> {
         match self {
             Self::Event(event) => event.next(),
@@ -121,7 +122,8 @@ impl<R: RingView> Schedule<R> {
         }
     }
 
-    /// The next tick that is due before `now_ns`, or live by then; call again until there is none.
+    /// Returns the next tick that is due before `now_ns`, or, if live, by then. Call it until it
+    /// returns `None`.
     pub fn next_tick(&mut self, now_ns: i64) -> Option<Tick> {
         match self {
             Self::Event(_) => None,
@@ -129,7 +131,7 @@ impl<R: RingView> Schedule<R> {
         }
     }
 
-    /// At the end: what has arrived and woken nobody was skipped.
+    /// Counts samples that arrived and woke no lambda as skipped, at the end.
     pub fn finish(&mut self) {
         if let Self::Event(event) = self {
             let head = event.ring.head();
@@ -138,7 +140,7 @@ impl<R: RingView> Schedule<R> {
         }
     }
 
-    /// Ticks that were due and did not happen.
+    /// Returns the number of missed ticks.
     pub fn missed(&self) -> u64 {
         match self {
             Self::Event(_) => 0,
@@ -156,14 +158,15 @@ impl<R: RingView> EventSchedule<R> {
         }
         let found = match self.backlog {
             Backlog::Each => {
-                // What left the ring before this schedule came to it cannot wake any more.
+                // Samples that left the ring before this schedule reached them cannot wake the
+                // lambda.
                 let oldest = head.saturating_sub(ring.depth() as u64).max(self.next);
                 (oldest..head).find_map(|position| Some((position, ring.get(position)?)))
             }
             Backlog::Latest => ring.newest(),
         };
-        // While the newest sample is being replaced, a reader may find an older one: what was
-        // judged is not judged again.
+        // While the newest sample is being replaced, a reader may find an older one, which must not
+        // wake the lambda again.
         let Some((position, sample)) = found.filter(|(position, _)| *position >= self.next) else {
             ring.skip(head - self.next);
             self.next = head;
@@ -192,7 +195,7 @@ impl PeriodicSchedule {
         if behind > CATCH_UP_TICKS {
             self.missed += behind;
             self.missed_total += behind;
-            // In step with the ticks before; the next one is due at `now_ns` or later.
+            // Keeps the phase of the earlier ticks; the next one is due at `now_ns` or later.
             self.due_ns = Some(self.later(due_ns, behind));
             return None;
         }
@@ -200,7 +203,7 @@ impl PeriodicSchedule {
         Some(Tick { at_ns: due_ns, missed: std::mem::take(&mut self.missed) })
     }
 
-    /// The newest of the ticks that are due by now.
+    /// Returns the newest of the ticks that are due by now.
     fn newest_due(&mut self, due_ns: i64, now_ns: i64) -> Option<Tick> {
         if due_ns > now_ns {
             return None;
@@ -223,7 +226,7 @@ impl PeriodicSchedule {
 mod tests {
     use super::*;
 
-    /// A ring into which nothing comes.
+    /// A ring without samples.
     #[derive(Debug)]
     struct EmptyRing;
 

@@ -1,4 +1,4 @@
-//! What the host keeps for a lambda, by name, within `scratch` of `[limits]`.
+//! Scratch: named bytes that the host keeps for a lambda, up to `scratch` of `[limits]`.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -7,30 +7,30 @@ use crate::text::visible;
 
 /// Longest name, in bytes.
 const NAME_BYTES: usize = 128;
-/// Most entries.
+/// Maximum number of entries.
 const ENTRIES: usize = 1024;
-/// What an entry takes beside its name and its bytes: about what it costs the host.
+/// Charge for each entry besides its name and its bytes, about the overhead of the host.
 const ENTRY_BYTES: u64 = 64;
-/// Bytes are kept in pieces of so many, so that no call moves more than that.
+/// Length of the pieces in which bytes are kept, so that no call moves more than that.
 const PIECE_BYTES: usize = 1 << 20;
 
-/// Why something was not kept or not found.
+/// The reason why an entry was not kept or not found.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ScratchError {
-    /// It would take more than is granted.
+    /// The entry exceeds the free bytes.
     NoRoom {
-        /// What was to be kept.
+        /// Name of the entry.
         name: String,
-        /// Bytes that it would take in addition.
+        /// Additional bytes that it needs.
         needed: u64,
-        /// Bytes that are free.
+        /// Free bytes.
         free: u64,
     },
-    /// There are as many entries as there can be.
+    /// The maximum number of entries is reached.
     TooMany(String),
-    /// Nothing has that name.
+    /// No entry has that name.
     NoSuchEntry(String),
-    /// A name that cannot be one.
+    /// The name is invalid.
     WrongName(String),
 }
 
@@ -39,10 +39,10 @@ impl fmt::Display for ScratchError {
         match self {
             Self::NoRoom { name, needed, free } => {
                 write!(f, "`{name}` needs {needed} bytes of scratch and {free} are free; ")?;
-                write!(f, "remove entries, or ask for more by `scratch` in [limits]")
+                write!(f, "remove entries, or raise `scratch` in [limits]")
             }
             Self::TooMany(name) => {
-                write!(f, "there is no room for `{name}` beside {ENTRIES} entries; ")?;
+                write!(f, "cannot add `{name}`: scratch has {ENTRIES} entries, the maximum; ")?;
                 write!(f, "remove some, or append to one of them")
             }
             Self::NoSuchEntry(name) => {
@@ -51,7 +51,8 @@ impl fmt::Display for ScratchError {
             Self::WrongName(name) => {
                 write!(
                     f,
-                    "`{name}` is not a name for scratch; give 1 to 128 bytes without control characters"
+                    "`{name}` is not a name for scratch; \
+                     give 1 to 128 bytes without control characters"
                 )
             }
         }
@@ -60,7 +61,7 @@ impl fmt::Display for ScratchError {
 
 impl std::error::Error for ScratchError {}
 
-/// Something that is kept.
+/// An entry of scratch.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Entry {
     /// Its name.
@@ -69,26 +70,26 @@ pub struct Entry {
     pub bytes: u64,
 }
 
-/// Entries by name, and what they take.
+/// Entries by name, with their total size.
 pub struct Scratch {
     granted: u64,
-    most_given: usize,
+    call_bytes: usize,
     used: u64,
     entries: BTreeMap<String, Pieces>,
 }
 
 impl Scratch {
-    /// Room for `granted` bytes, of which one call gives `most_given` at most.
-    pub fn new(granted: u64, most_given: usize) -> Self {
-        Self { granted, most_given, used: 0, entries: BTreeMap::new() }
+    /// Creates a store for `granted` bytes; one call returns at most `call_bytes`.
+    pub fn new(granted: u64, call_bytes: usize) -> Self {
+        Self { granted, call_bytes, used: 0, entries: BTreeMap::new() }
     }
 
-    /// Bytes for which there is room.
+    /// Returns the number of free bytes.
     pub fn free(&self) -> u64 {
         self.granted - self.used
     }
 
-    /// Everything that is kept, in the order of the names' bytes.
+    /// Returns all entries, sorted by the bytes of their names.
     pub fn entries(&self) -> Vec<Entry> {
         self.entries
             .iter()
@@ -96,16 +97,16 @@ impl Scratch {
             .collect()
     }
 
-    /// Keeps `bytes` under a name, in place of what was there.
+    /// Keeps `bytes` under a name, and replaces an earlier entry.
     ///
     /// # Errors
     ///
-    /// [`ScratchError`]; nothing has changed then.
+    /// [`ScratchError`]; then nothing has changed.
     pub fn put(&mut self, name: &str, bytes: &[u8]) -> Result<(), ScratchError> {
         self.keep(name, bytes, true)
     }
 
-    /// Keeps `bytes` behind what is there already under that name.
+    /// Appends `bytes` to the entry of that name, which is created if it does not exist.
     ///
     /// # Errors
     ///
@@ -114,26 +115,26 @@ impl Scratch {
         self.keep(name, bytes, false)
     }
 
-    /// Keeps `bytes` behind what is there, or in place of it.
+    /// Appends `bytes` to an entry, or replaces it.
     fn keep(&mut self, name: &str, bytes: &[u8], in_place: bool) -> Result<(), ScratchError> {
         if name.is_empty() || name.len() > NAME_BYTES || name.chars().any(char::is_control) {
             return Err(ScratchError::WrongName(shown(name)));
         }
-        let there = self.entries.get(name).map(Pieces::len);
-        if there.is_none() && self.entries.len() >= ENTRIES {
+        let existing = self.entries.get(name).map(Pieces::len);
+        if existing.is_none() && self.entries.len() >= ENTRIES {
             return Err(ScratchError::TooMany(shown(name)));
         }
-        let given_back = if in_place { there.unwrap_or(0) } else { 0 };
-        let new = there.map_or(ENTRY_BYTES + name.len() as u64, |_| 0) + bytes.len() as u64;
+        let released = if in_place { existing.unwrap_or(0) } else { 0 };
+        let new = existing.map_or(ENTRY_BYTES + name.len() as u64, |_| 0) + bytes.len() as u64;
         let no_room = |free| ScratchError::NoRoom {
             name: shown(name),
-            needed: new.saturating_sub(given_back),
+            needed: new.saturating_sub(released),
             free,
         };
-        if new > self.free() + given_back {
+        if new > self.free() + released {
             return Err(no_room(self.free()));
         }
-        // What was there stays until all of the new is made.
+        // An existing entry stays until the new one is complete.
         let made = match self.entries.get_mut(name).filter(|_| !in_place) {
             Some(pieces) => pieces.append(bytes),
             None => {
@@ -146,14 +147,14 @@ impl Scratch {
             }
         };
         if !made {
-            // The process may not have what it was granted.
+            // The process may have less memory than granted.
             return Err(no_room(0));
         }
-        self.used = self.used + new - given_back;
+        self.used = self.used + new - released;
         Ok(())
     }
 
-    /// Bytes from `offset`, `len` at most; clamped to what is there, and to what one call gives.
+    /// Returns up to `len` bytes from `offset`, clamped to the entry and to the limit of one call.
     ///
     /// # Errors
     ///
@@ -162,11 +163,11 @@ impl Scratch {
         let pieces =
             self.entries.get(name).ok_or_else(|| ScratchError::NoSuchEntry(shown(name)))?;
         let from = offset.min(pieces.len());
-        let len = len.min(pieces.len() - from).min(self.most_given as u64);
+        let len = len.min(pieces.len() - from).min(self.call_bytes as u64);
         Ok(pieces.read(from as usize, len as usize))
     }
 
-    /// Forgets what is kept under a name.
+    /// Removes an entry.
     ///
     /// # Errors
     ///
@@ -179,12 +180,12 @@ impl Scratch {
     }
 }
 
-/// A name in a message, which may be none that can be.
+/// Formats a name, valid or not, for a message.
 fn shown(name: &str) -> String {
     visible(&name.chars().take(NAME_BYTES).collect::<String>())
 }
 
-/// Bytes in pieces, of which all but the last are full.
+/// Bytes in pieces, all but the last of which are full.
 #[derive(Default)]
 struct Pieces(Vec<Vec<u8>>);
 
@@ -194,17 +195,17 @@ impl Pieces {
         (full + self.0.last().map_or(0, Vec::len)) as u64
     }
 
-    /// Adds `bytes`; false if there is no memory for them, and nothing was added.
+    /// Appends `bytes`. Returns `false` if there is no memory for them; then nothing was added.
     fn append(&mut self, mut bytes: &[u8]) -> bool {
         let before = self.len();
         while !bytes.is_empty() {
             if self.0.last().is_none_or(|piece| piece.len() == PIECE_BYTES) {
                 self.0.push(Vec::new());
             }
-            let piece = self.0.last_mut().expect("one was there, or was made");
+            let piece = self.0.last_mut().expect("a piece was added if there was none");
             let (now, later) = bytes.split_at(bytes.len().min(PIECE_BYTES - piece.len()));
             if piece.capacity() - piece.len() < now.len() {
-                // Twice as much each time, and never beyond a piece.
+                // Doubles the capacity, up to a piece.
                 let more = now.len().max(piece.len().min(PIECE_BYTES - piece.len()));
                 if piece.try_reserve_exact(more).is_err() {
                     self.cut(before);
@@ -225,7 +226,7 @@ impl Pieces {
         }
     }
 
-    /// `len` bytes from `from`, all of which are there.
+    /// Returns `len` bytes from `from`, which must exist.
     fn read(&self, mut from: usize, len: usize) -> Vec<u8> {
         let mut read = Vec::with_capacity(len);
         while read.len() < len {
@@ -243,7 +244,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bytes_go_on_from_piece_to_piece_and_a_call_gives_no_more_than_its_limit() {
+    fn bytes_continue_across_pieces_and_a_call_returns_at_most_its_limit() {
         let mut scratch = Scratch::new(8 << 20, 1 << 20);
         let bytes: Vec<u8> = (0..3_000_000_u32).map(|n| (n % 251) as u8).collect();
         for part in bytes.chunks(700_001) {
@@ -262,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_back_is_what_was_there() {
+    fn cutting_restores_the_earlier_bytes() {
         for len in [0, 1, PIECE_BYTES - 1, PIECE_BYTES, PIECE_BYTES + 1, 2 * PIECE_BYTES] {
             let mut pieces = Pieces::default();
             let bytes: Vec<u8> = (0..len).map(|n| n as u8).collect();

@@ -1,23 +1,23 @@
-//! Texts of a lambda, made to fit, and words for messages.
+//! Cuts and escapes texts of a lambda, and formats names and sizes for messages.
 
 use std::fmt;
 
-/// The longest start of `text` that fits into `bytes` and ends at a character boundary.
+/// Returns the longest prefix of `text` that fits into `bytes` and ends at a character boundary.
 pub fn cut(text: &str, bytes: usize) -> &str {
     &text[..text.floor_char_boundary(bytes)]
 }
 
-/// `` `a`, `b` ``, or `none`.
+/// Formats names as `` `a`, `b` ``, or `none`.
 pub fn quoted<S: AsRef<str>>(names: impl IntoIterator<Item = S>) -> String {
     let listed = names.into_iter().map(|name| format!("`{}`", name.as_ref())).collect::<Vec<_>>();
     if listed.is_empty() { "none".to_owned() } else { listed.join(", ") }
 }
 
-/// `text` with its control characters written out, so that none acts on a terminal.
+/// Escapes the control characters of `text`, so that none acts on a terminal.
 pub fn visible(text: &str) -> String {
     let mut shown = String::with_capacity(text.len());
     for character in text.chars() {
-        match character.is_control() || turns_text(character) {
+        match character.is_control() || is_bidi_control(character) {
             true => shown.extend(character.escape_default()),
             false => shown.push(character),
         }
@@ -25,14 +25,21 @@ pub fn visible(text: &str) -> String {
     shown
 }
 
-/// Whether it makes a terminal show text in another order than it is written: the bidirectional
-/// controls of Unicode.
-fn turns_text(character: char) -> bool {
-    matches!(character, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+/// Returns whether it is a bidirectional control of Unicode, which makes a terminal show text in
+/// another order.
+fn is_bidi_control(character: char) -> bool {
+    matches!(
+        character,
+        '\u{61c}'
+            | '\u{200e}'
+            | '\u{200f}'
+            | '\u{202a}'..='\u{202e}'
+            | '\u{2066}'..='\u{2069}'
+    )
 }
 
-/// A number of bytes for people: exact below 1 MiB, then in tenths of a MiB. What is needed rounds
-/// up and what is allowed rounds down, so that a message never says "8 MiB, and 8 MiB is allowed".
+/// A number of bytes for a message: exact below 1 MiB, then in tenths of a MiB. Needed bytes are
+/// rounded up and allowed ones down, so that a message never reads "8 MiB, and 8 MiB is allowed".
 #[derive(Clone, Copy, Debug)]
 pub struct RoundedBytes {
     bytes: u64,
@@ -42,13 +49,13 @@ pub struct RoundedBytes {
 const MIB: u64 = 1 << 20;
 
 impl RoundedBytes {
-    /// What is needed.
+    /// Rounds needed bytes.
     pub fn up(bytes: u64) -> Self {
         let tenths = (bytes / MIB * 10).saturating_add((bytes % MIB * 10).div_ceil(MIB));
         Self { bytes, tenths }
     }
 
-    /// What is allowed.
+    /// Rounds allowed bytes.
     pub fn down(bytes: u64) -> Self {
         let tenths = (bytes / MIB * 10).saturating_add(bytes % MIB * 10 / MIB);
         Self { bytes, tenths }
@@ -70,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_are_rounded_against_the_one_who_asks() {
+    fn needed_sizes_are_rounded_up_and_allowed_ones_down() {
         assert_eq!(RoundedBytes::down(8 << 20).to_string(), "8 MiB");
         assert_eq!(RoundedBytes::up((8 << 20) + 1).to_string(), "8.1 MiB");
         assert_eq!(RoundedBytes::down((8 << 20) - 1).to_string(), "7.9 MiB");

@@ -1,12 +1,12 @@
-//! What a lambda may cause: how many triggers, of which form, and how often.
+//! Limits and checks of triggers: their number, form and rate.
 
 use std::fmt;
 
 use crate::text::cut;
 
-/// Triggers that one wake may cause.
+/// Maximum number of triggers of one wake.
 pub const PER_WAKE: usize = 16;
-/// Attributes that one trigger may carry.
+/// Maximum number of attributes of one trigger.
 pub const ATTRIBUTES: usize = 16;
 /// Longest label, in bytes.
 pub const LABEL_BYTES: usize = 128;
@@ -17,10 +17,10 @@ pub const TEXT_BYTES: usize = 1024;
 
 const MINUTE_NS: i64 = 60_000_000_000;
 
-/// What a trigger asks of the recorder.
+/// The action that a trigger requests from the recorder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TriggerKind {
-    /// Keep the time around this wake.
+    /// Record the window around this wake.
     Event,
     /// Begin a recording that lasts until `Stop`.
     Start,
@@ -28,12 +28,12 @@ pub enum TriggerKind {
     Stop,
 }
 
-/// A named fact that travels with a trigger.
+/// A named value of a trigger.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Attribute {
-    /// 1 to [`KEY_BYTES`] bytes, once for each trigger.
+    /// 1 to [`KEY_BYTES`] bytes, unique for each trigger.
     pub key: String,
-    /// The fact.
+    /// Its value.
     pub value: AttributeValue,
 }
 
@@ -49,7 +49,7 @@ pub enum AttributeValue {
     Text(String),
 }
 
-/// A refused call; it had no effect.
+/// The reason for a refused call, which had no effect.
 #[derive(Clone, Debug, PartialEq)]
 #[allow(missing_docs)]
 pub enum TriggerError {
@@ -64,7 +64,7 @@ pub enum TriggerError {
 }
 
 impl TriggerError {
-    /// Whether it was one trigger too many, rather than a wrong one.
+    /// Returns whether it was one trigger too many, rather than an invalid one.
     pub const fn is_too_many(&self) -> bool {
         matches!(self, Self::TooMany | Self::TooOften { .. })
     }
@@ -89,7 +89,7 @@ impl fmt::Display for TriggerError {
             Self::NoWake => {
                 write!(
                     f,
-                    "triggers belong to a wake: in init, and between two wakes, there are none"
+                    "triggers belong to a wake: they are refused in init and between two wakes"
                 )
             }
             Self::TooMany => {
@@ -108,10 +108,10 @@ impl fmt::Display for TriggerError {
 
 impl std::error::Error for TriggerError {}
 
-/// Triggers of the current wake, and how many there were in this minute of the lambda's time.
+/// Triggers of the current wake, and their number in the current minute of the lambda's time.
 #[derive(Debug)]
 pub struct Triggers<T> {
-    /// None outside of a wake, where nothing can be caused.
+    /// `None` outside of a wake, where triggers are refused.
     wake: Option<Vec<T>>,
     per_minute: u64,
     minute: i64,
@@ -120,52 +120,52 @@ pub struct Triggers<T> {
 }
 
 impl<T> Triggers<T> {
-    /// Outside of a wake.
+    /// Creates an empty list, outside of a wake.
     pub fn new(per_minute: u64) -> Self {
         Self { wake: None, per_minute, minute: 0, caused: 0, refused: 0 }
     }
 
-    /// Begins a wake: what an earlier one left behind is dropped.
+    /// Begins a wake; drops triggers of an earlier one.
     pub fn begin(&mut self) {
         self.wake = Some(Vec::new());
     }
 
-    /// Ends a wake and takes what it caused, in the order of the calls.
+    /// Ends a wake; returns its triggers, in the order of the calls.
     pub fn end(&mut self) -> Vec<T> {
         self.wake.take().unwrap_or_default()
     }
 
-    /// Something begins that may come in the middle of a wake but is no part of it, such as an
-    /// `init`: it can cause nothing.
+    /// Suspends a wake, for example for an `init` in its middle, which may not trigger. Returns the
+    /// triggers of the wake.
     pub fn suspend(&mut self) -> Option<Vec<T>> {
         self.wake.take()
     }
 
-    /// It is over; `wake` is what [`Triggers::suspend`] gave.
+    /// Resumes a wake with the result of [`Triggers::suspend`].
     pub fn resume(&mut self, wake: Option<Vec<T>>) {
         self.wake = wake;
     }
 
-    /// What this wake has caused so far.
+    /// Returns the triggers of this wake so far.
     pub fn list(&self) -> &[T] {
         self.wake.as_deref().unwrap_or_default()
     }
 
-    /// Triggers refused by the rate, since the start.
+    /// Returns the number of triggers refused by the rate limit, since the start.
     pub fn refused(&self) -> u64 {
         self.refused
     }
 
-    /// Adds triggers that were refused in another process.
+    /// Adds the number of triggers refused in another process.
     pub fn add_refused(&mut self, refused: u64) {
         self.refused = self.refused.saturating_add(refused);
     }
 
-    /// Causes one more trigger at `now_ns`, as `make` makes it.
+    /// Adds a trigger at `now_ns`, which `make` creates.
     ///
     /// # Errors
     ///
-    /// [`TriggerError`] if a limit is passed; nothing is caused then.
+    /// [`TriggerError`] if a limit is exceeded; then no trigger is added.
     pub fn cause(
         &mut self,
         now_ns: i64,
@@ -177,7 +177,7 @@ impl<T> Triggers<T> {
         if self.wake.is_none() {
             return Err(TriggerError::NoWake);
         }
-        // Who has used up the minute may still end what was begun.
+        // A lambda over the limit per minute may still end a recording.
         if kind != TriggerKind::Stop {
             self.check_rate(now_ns)?;
         }
@@ -204,7 +204,7 @@ impl<T> Triggers<T> {
     }
 }
 
-/// Refuses what would break the record of triggers.
+/// Refuses an invalid label, score or attribute.
 fn check(label: &str, score: Option<f64>, attributes: &[Attribute]) -> Result<(), TriggerError> {
     match label.len() {
         0 => return Err(TriggerError::NoLabel),

@@ -1,9 +1,9 @@
-//! Sizes and durations as people write them in `lambda.toml`: `"2 MiB"`, `"50ms"`.
+//! Parses and formats sizes and durations, as in `lambda.toml`: `"2 MiB"`, `"50ms"`.
 
-/// Largest first, so that the first that divides a size is the one to show it in.
+/// Units of sizes, largest first: a size is formatted in the first that divides it.
 const SIZES: [(&str, u64); 4] = [("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10), ("B", 1)];
 
-/// Largest first; a duration is written in any, and shown in the first that divides it.
+/// Units of durations, largest first: a duration is formatted in the first that divides it.
 const TIMES: [(&str, u64); 6] = [
     ("h", 3_600_000_000_000),
     ("min", 60_000_000_000),
@@ -13,14 +13,14 @@ const TIMES: [(&str, u64); 6] = [
     ("ns", 1),
 ];
 
-/// How a size is written.
+/// Help on the form of a size.
 pub const SIZE_RULE: &str =
     "write a whole number and its unit, B, KiB, MiB or GiB, for example \"2 MiB\"";
-/// How a duration is written.
+/// Help on the form of a duration.
 pub const TIME_RULE: &str =
     "write a number and its unit, us, ms, s, min or h, for example \"50ms\" or \"1.5s\"";
 
-/// The number and the unit of `2 MiB` or `2MiB`; without a unit the second is empty.
+/// Splits `2 MiB` or `2MiB` into number and unit, which may be empty.
 fn split(text: &str) -> (&str, &str) {
     let text = text.trim();
     let end = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
@@ -32,14 +32,14 @@ fn factor(units: &[(&str, u64)], unit: &str) -> Option<u64> {
     units.iter().find(|(name, _)| *name == unit).map(|(_, factor)| *factor)
 }
 
-/// The bytes that `text` stands for; without a unit it is a number of bytes.
+/// Parses a size into bytes; without a unit it is a number of bytes.
 pub fn size(text: &str) -> Option<u64> {
     let (number, unit) = split(text);
     let factor = if unit.is_empty() { 1 } else { factor(&SIZES, unit)? };
     number.parse::<u64>().ok()?.checked_mul(factor)
 }
 
-/// The nanoseconds that `text` stands for: exact, so it has no parts of one.
+/// Parses a duration into nanoseconds; fractions of a nanosecond are refused.
 pub fn duration(text: &str) -> Option<u64> {
     let (number, unit) = split(text);
     let factor = factor(&TIMES, unit)?;
@@ -51,17 +51,17 @@ pub fn duration(text: &str) -> Option<u64> {
     whole.checked_add(u64::try_from(part).ok()?)
 }
 
-/// Digits and nothing else: `u64::from_str` also takes a sign.
+/// Parses digits only: `u64::from_str` also accepts a sign.
 fn digits(text: &str) -> Option<u64> {
     if text.bytes().all(|byte| byte.is_ascii_digit()) { text.parse().ok() } else { None }
 }
 
-/// A size in the largest unit that keeps it whole: `2 MiB`, `1536 B`.
+/// Formats a size in the largest unit that gives a whole number: `2 MiB`, `1536 B`.
 pub fn size_in_words(bytes: u64) -> String {
     in_largest(bytes, &SIZES, " ")
 }
 
-/// A duration in the largest unit that keeps it whole: `1500ms`, `5s`, `2min`.
+/// Formats a duration in the largest unit that gives a whole number: `1500ms`, `5s`, `2min`.
 pub fn duration_in_words(ns: u64) -> String {
     if ns == 0 { "0s".to_owned() } else { in_largest(ns, &TIMES, "") }
 }

@@ -1,6 +1,6 @@
-//! Each rule answers the calls in `cases/*.json` as they say: a call is a list of its name, what it
-//! is given, and its answer. The Python SDK, where the rules stand a second time, answers the same;
-//! but for cases that say why they are `not in Python`.
+//! Checks each rule against `cases/*.json`: a call is a list of its name, its arguments, and its
+//! result. The Python SDK, which implements the rules again, passes the same cases, except those
+//! with a reason why they are `not in Python`.
 
 mod cases {
     pub mod causing;
@@ -11,25 +11,24 @@ mod cases {
 
 use serde_json::{Value, json};
 
-/// What answers the calls of one case, one after the other: the name of a call, and what it is
-/// given.
-type Answers<'a> = Box<dyn FnMut(&str, &[Value]) -> Value + 'a>;
+/// Replies to the calls of one case, given the name of a call and its arguments.
+type CaseReplies<'a> = Box<dyn FnMut(&str, &[Value]) -> Value + 'a>;
 
-/// Replays all cases of a file; `start` is given what a case is about.
+/// Replays all cases of a file; `start` gets the settings of a case.
 #[track_caller]
-fn replay(file: &str, cases: &str, start: impl Fn(&Value) -> Answers<'static>) {
+fn replay(file: &str, cases: &str, start: impl Fn(&Value) -> CaseReplies<'static>) {
     let cases: Vec<Value> = serde_json::from_str(cases).unwrap();
     assert!(!cases.is_empty(), "{file}");
     for case in &cases {
-        let mut answers = start(&case["given"]);
+        let mut reply = start(&case["given"]);
         for (n, call) in case["calls"].as_array().unwrap().iter().enumerate() {
             let [name, arguments @ .., wanted] = call.as_array().unwrap().as_slice() else {
-                panic!("{call} is no call")
+                panic!("{call} is not a call")
             };
             let arguments = arguments.iter().map(plain).collect::<Vec<_>>();
             let name = name.as_str().unwrap();
             assert_eq!(
-                &answers(name, &arguments),
+                &reply(name, &arguments),
                 wanted,
                 "{file}: {}: call {n}, {name}",
                 case["name"]
@@ -38,7 +37,7 @@ fn replay(file: &str, cases: &str, start: impl Fn(&Value) -> Answers<'static>) {
     }
 }
 
-/// A long text may be written shorter.
+/// Expands the short form of a long text.
 fn plain(given: &Value) -> Value {
     match given {
         Value::Object(repeated) if repeated.contains_key("times") => {
@@ -49,7 +48,7 @@ fn plain(given: &Value) -> Value {
     }
 }
 
-/// A number that may be none.
+/// Parses a number, which may be NaN or infinite.
 fn float(given: &Value) -> f64 {
     given.as_f64().unwrap_or_else(|| given["float"].as_str().unwrap().parse().unwrap())
 }
@@ -66,7 +65,7 @@ fn ns(given: &Value) -> i64 {
     given.as_i64().unwrap()
 }
 
-/// Nothing, or why not.
+/// Returns null, or the error text.
 fn refused<T>(result: Result<T, impl ToString>) -> Value {
     result.err().map_or(Value::Null, |error| json!(error.to_string()))
 }

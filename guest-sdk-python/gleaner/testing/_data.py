@@ -51,7 +51,7 @@ class InputState:
             return path.number(self.message(cell))
         except NotANumber:
             raise DataError(
-                f"field `{path.text}` of `{self.declared.type_name}` is no number", "wrong-field"
+                f"field `{path.text}` of `{self.declared.type_name}` is not a number", "wrong-field"
             ) from None
         except MissingElement as error:
             raise self.malformed(str(error)) from None
@@ -115,7 +115,7 @@ class FieldCache:
         if field is None:
             size = len(path.encode())
             if size > PATH_BYTES:
-                why = f"has {size} bytes; a path has {PATH_BYTES} at most"
+                why = f"has {size} bytes; a path has at most {PATH_BYTES}"
                 raise DataError(f"field `{cut(path, 64)}` {why}", "wrong-field")
             field = Field(
                 self._source,
@@ -161,7 +161,7 @@ class Sample:
             raise source.malformed(str(error)) from None
         most = self._most(value)
         if most is not None and _length(value) > most:
-            why = f"has {_length(value)} items, one call hands out {most}; read it with `cdr`"
+            why = f"has {_length(value)} items; one call returns at most {most}: read it with `cdr`"
             raise DataError(f"field `{path.text}` {why}", "wrong-field")
         return value
 

@@ -38,7 +38,7 @@ class Budget:
         if size > self.bytes:
             why = "drop frames that are not needed, or raise `memory` in [limits]"
             raise DataError(
-                f"{size} bytes for a new frame, {self.bytes} are left; {why}", "no-room"
+                f"a new frame needs {size} bytes, and {self.bytes} are left; {why}", "no-room"
             )
         return Reservation(self, size)
 
@@ -79,7 +79,7 @@ class FramePool:
         """Creates the frame of a message. Raises DataError."""
         if declared.type_name not in ("sensor_msgs/msg/Image", COMPRESSED_IMAGE):
             raise DataError(
-                f"a sample of `{declared.topic}` is no image: its type is `{declared.type_name}`",
+                f"a sample of `{declared.topic}` is not an image: its type is `{declared.type_name}`",
                 "not-a-frame",
             )
         given = message()
@@ -107,7 +107,7 @@ class FramePool:
         opened = _open(declared, data)
         width, height = opened.size
         if 3 * width * height > self._slot_bytes:
-            says = f"image says it is {width}x{height} ({_size(3 * width * height)} as rgb8)"
+            says = f"image has a size of {width}x{height} ({_size(3 * width * height)} as rgb8)"
             raise _too_large(
                 declared, f"{says}; this input's decoded_size is {_size(self._slot_bytes)}"
             )
@@ -163,7 +163,7 @@ def _size(count: int) -> str:
 
 
 def _not_a_frame(topic: str, error: ImageError) -> DataError:
-    return DataError(f"a sample of `{topic}` is no image that can be read: {error}", "not-a-frame")
+    return DataError(f"a sample of `{topic}` is not a readable image: {error}", "not-a-frame")
 
 
 class View:

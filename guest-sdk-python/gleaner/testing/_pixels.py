@@ -83,7 +83,7 @@ def picture(
     for side in (width, height):
         if not 1 <= side <= MAX_SIDE:
             raise ImageError(
-                f"image says it is {width}x{height}; each side must be 1 to {MAX_SIDE}"
+                f"image size is {width}x{height}; each side must be 1 to {MAX_SIDE}"
             )
     if name in PAIRS and width % 2:
         raise ImageError(
@@ -93,7 +93,7 @@ def picture(
     row = width * LAYOUTS[name][0]
     if step < row:
         raise ImageError(
-            f"image of {width}x{height} {ros_name} says a row has {step} bytes; it needs {row}"
+            f"image of {width}x{height} {ros_name} has a step of {step} bytes; a row needs {row}"
         )
     needed = step * (height - 1) + row
     if len(data) < needed:

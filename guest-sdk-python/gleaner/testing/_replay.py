@@ -26,12 +26,12 @@ FAULTS_IN_A_ROW = 8
 MIN_BACKOFF_NS, MAX_BACKOFF_NS = 100_000_000, 10_000_000_000
 
 REINITIALISED = (
-    "gleaner: the lambda was made anew after a fault: what it kept in its variables is gone "
+    "gleaner: the lambda was re-initialised after a fault: its variables are lost "
     "(in Python, all but the globals of its module)"
 )
 BACKING_OFF = (
-    "gleaner: the lambda faulted 8 times in a row: wakes are passed over and counted, for 100 ms "
-    "and twice as long after each further fault, 10 s at most, until a wake ends well"
+    "gleaner: the lambda faulted 8 times in a row: wakes are skipped and counted, for 100 ms "
+    "and twice as long after each further fault, at most 10 s, until a wake succeeds"
 )
 
 Tables = Mapping[str, Mapping[str, Any]]

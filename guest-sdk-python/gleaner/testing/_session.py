@@ -78,7 +78,7 @@ class Session:
         plain = {key: _attribute(label, key, value) for key, value in attributes.items()}
         if self._triggers is None:
             raise _invalid(
-                "triggers belong to a wake: in init, and between two wakes, there are none"
+                "triggers belong to a wake: they are refused in init and between two wakes"
             )
         # A lambda over the limit per minute may still end a recording.
         if kind != "stop":
@@ -161,7 +161,7 @@ class Scratch:
         there = self._entries.get(name)
         if there is None and len(self._entries) >= ENTRIES:
             raise ScratchError(
-                f"there is no room for `{name}` beside {ENTRIES} entries; remove some, or append "
+                f"cannot add `{name}`: scratch has {ENTRIES} entries, the maximum; remove some, or append "
                 "to one of them",
                 "no-room",
             )
@@ -172,7 +172,7 @@ class Scratch:
                 f"`{name}` needs {needed - given_back} bytes of scratch and {self.free()} are free"
             )
             raise ScratchError(
-                f"{why}; remove entries, or ask for more by `scratch` in [limits]", "no-room"
+                f"{why}; remove entries, or raise `scratch` in [limits]", "no-room"
             )
         self._entries[name] = given if in_place or there is None else there + given
         self._used += needed - given_back

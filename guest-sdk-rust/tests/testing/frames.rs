@@ -54,9 +54,9 @@ fn operations_read_the_pixels_and_errors_have_a_kind() {
 fn inconsistent_images_are_refused_with_the_message_of_the_host() {
     let mut run = on_event(camera(false, ""), |sample| sample.as_frame().map(drop));
     for (n, (width, height, step, name, bytes, why)) in (0..).zip([
-        (4, 2, 11, "rgb8", 99, "image of 4x2 rgb8 says a row has 11 bytes; it needs 12"),
+        (4, 2, 11, "rgb8", 99, "image of 4x2 rgb8 has a step of 11 bytes; a row needs 12"),
         (4, 2, 12, "rgb8", 23, "image of 4x2 rgb8 with 12 bytes per row needs 24 bytes; it has 23"),
-        (0, 2, 12, "rgb8", 99, "image says it is 0x2; each side must be 1 to 65535"),
+        (0, 2, 12, "rgb8", 99, "image size is 0x2; each side must be 1 to 65535"),
         (4, 2, 4, "x", 9, "encoding `x` is not supported; supported are rgb8, bgr8, 8UC3, "),
     ]) {
         let message = Message::new().with("width", width).with("height", height).with("step", step);
@@ -64,7 +64,7 @@ fn inconsistent_images_are_refused_with_the_message_of_the_host() {
             message.with("encoding", name).with("is_bigendian", 0).with("data", vec![0_u8; bytes]);
         let decisions = run.deliver("camera", n, message).unwrap();
         let fault = decisions[0].fault.as_ref().unwrap();
-        let wanted = format!("a sample of `/camera` is no image that can be read: {why}");
+        let wanted = format!("a sample of `/camera` is not a readable image: {why}");
         assert!(fault.message.starts_with(&wanted), "{}", fault.message);
     }
 }
@@ -85,7 +85,7 @@ fn decoded_images_are_limited_by_slots_and_size_and_each_is_decoded_once() {
     run.deliver("camera", 1, picture(11)).unwrap();
     let fault = run.faults().next().unwrap();
     assert!(
-        fault.message.contains("is too large: image says it is 11x11 (363 bytes as rgb8)"),
+        fault.message.contains("is too large: image has a size of 11x11 (363 bytes as rgb8)"),
         "{fault:?}"
     );
     let jpeg = run.deliver("camera", 2, Message::new().with("data", vec![0xff_u8, 0xd8])).unwrap();
@@ -119,7 +119,7 @@ fn frames_and_their_bytes_are_limited_and_released() {
         assert_eq!(large.info().size, 1_000_000);
         let (kind, why) = refused(frame.resize(300, 300)).ok_or(Error::new("there is room"))?;
         assert_eq!(kind, Some("no-room"));
-        assert!(why.contains("90000 bytes for a new frame, 48576 are left"), "{why}");
+        assert!(why.contains("a new frame needs 90000 bytes, and 48576 are left"), "{why}");
         let third = frame.to_gray()?;
         let (_, why) = refused(frame.to_gray()).ok_or(Error::new("there are four"))?;
         assert!(why.contains("the lambda holds 3 frames"), "{why}");

@@ -83,7 +83,7 @@ fn triggers_before_a_fault_count_and_the_next_wake_has_a_fresh_instance() {
         faults,
         [(FaultKind::Exception, "an error"), (FaultKind::Trap, "panicked: a panic of 2")]
     );
-    assert!(run.log()[0].message.contains("made anew after a fault"));
+    assert!(run.log()[0].message.contains("re-initialised after a fault"));
 }
 
 #[test]

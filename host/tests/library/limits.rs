@@ -274,7 +274,7 @@ fn one_call_hands_out_one_mebibyte_of_a_message() {
     }
     refused(
         &sample.get(&topic.field("x").unwrap()),
-        "has 1048577 items, one call hands out 1048576",
+        "has 1048577 items; one call returns at most 1048576",
     );
 }
 
@@ -306,12 +306,12 @@ fn a_list_that_is_longer_than_one_call_hands_out_is_refused_and_not_cut() {
     get("string[] x\n", &texts(TEXTS_PER_FIELD)).unwrap();
     refused(
         &get("string[] x\n", &texts(TEXTS_PER_FIELD + 1)),
-        "has 4097 items, one call hands out 4096",
+        "has 4097 items; one call returns at most 4096",
     );
     get("uint16[] x\n", &numbers(COLUMN_LEN)).unwrap();
     refused(
         &get("uint16[] x\n", &numbers(COLUMN_LEN + 1)),
-        "has 65537 items, one call hands out 65536",
+        "has 65537 items; one call returns at most 65536",
     );
 }
 
@@ -319,7 +319,7 @@ fn a_list_that_is_longer_than_one_call_hands_out_is_refused_and_not_cut() {
 fn a_path_is_not_read_if_it_is_too_long() {
     let topic = topic(only("uint8 x\n"), 1, "16 B", 0, &[]);
     let path = "x".repeat(PATH_BYTES + 1);
-    refused(&topic.field(&path), "has 1025 bytes; a path has 1024 at most");
+    refused(&topic.field(&path), "has 1025 bytes; a path has at most 1024");
     assert!(matches!(topic.field(&path[1..]), Err(DataError::NoSuchField(_))));
 }
 

@@ -189,7 +189,10 @@ fn refusals_of_the_host_reach_the_lambda_as_errors() {
         ("huge_label", "the label has 1000 bytes; at most 128 are allowed"),
         ("nan_score", "the score of `x` is NaN; it must be finite"),
         ("too_many_triggers", "this wake has caused 16 triggers already; further ones are refused"),
-        ("not_a_frame", "a sample of `/imu/data` is no image: its type is `sensor_msgs/msg/Imu`"),
+        (
+            "not_a_frame",
+            "a sample of `/imu/data` is not an image: its type is `sensor_msgs/msg/Imu`",
+        ),
     ] {
         let (kind, message) = MisbehavingGuest::of(behaviour).fault();
         assert_eq!(kind, FaultKind::Exception);

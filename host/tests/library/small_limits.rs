@@ -200,7 +200,10 @@ fn the_bytes_that_one_call_returns_are_limited() {
     let sample = topic.newest().unwrap();
     assert_eq!(sample.cdr(0, u32::MAX).unwrap().len(), 64 << 10);
     let error = sample.get(&topic.field("x").unwrap()).map(drop).unwrap_err();
-    assert!(error.to_string().contains("has 100000 items, one call hands out 65536"), "{error}");
+    assert!(
+        error.to_string().contains("has 100000 items; one call returns at most 65536"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -222,7 +225,7 @@ fn the_items_that_one_call_returns_are_limited() {
     get("uint16[] x\n", &numbers(20)).unwrap();
     for error in [get("string[] x\n", &texts(21)), get("uint16[] x\n", &numbers(21))] {
         assert!(
-            matches!(&error, Err(DataError::WrongField(refusal)) if refusal.to_string().contains("hands out 20")),
+            matches!(&error, Err(DataError::WrongField(refusal)) if refusal.to_string().contains("returns at most 20")),
             "{error:?}"
         );
     }

@@ -1,4 +1,4 @@
-//! What the bytes of a pixel mean: the encodings of `sensor_msgs/msg/Image` that we read.
+//! Pixel encodings: the supported ones of `sensor_msgs/msg/Image`.
 
 use super::error::{PixelError, shortened};
 
@@ -16,22 +16,22 @@ pub enum Bayer {
     Grbg,
 }
 
-/// How a pixel is stored.
+/// The encoding of a pixel.
 ///
 /// Source: `sensor_msgs/image_encodings.hpp` of ROS 2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Encoding {
     /// Red, green, blue; a byte each.
     Rgb8,
-    /// Blue, green, red; a byte each. Also what `8UC3`, the OpenCV type, is read as.
+    /// Blue, green, red; a byte each. Also `8UC3`, the OpenCV type.
     Bgr8,
     /// Red, green, blue, alpha; a byte each.
     Rgba8,
     /// Blue, green, red, alpha; a byte each.
     Bgra8,
-    /// Grey, a byte. Also what `8UC1` is read as.
+    /// Grey, a byte. Also `8UC1`.
     Mono8,
-    /// Grey, two bytes in the order that the message states. Also what `16UC1` is read as.
+    /// Grey, two bytes in the order that the message states. Also `16UC1`.
     Mono16,
     /// Two pixels in four bytes: U, Y of the left one, V, Y of the right one. Also called `yuv422`.
     Yuv422Uyvy,
@@ -44,8 +44,7 @@ pub enum Encoding {
     Bayer16(Bayer),
 }
 
-/// Every name that is understood. Where an encoding has several names, the first is the one that
-/// [`Encoding::name`] gives back.
+/// All supported names. Of several names of an encoding, the first is that of [`Encoding::name`].
 const NAMES: [(&str, Encoding); 21] = [
     ("rgb8", Encoding::Rgb8),
     ("bgr8", Encoding::Bgr8),
@@ -71,11 +70,11 @@ const NAMES: [(&str, Encoding); 21] = [
 ];
 
 impl Encoding {
-    /// The encoding that ROS calls `name`.
+    /// Returns the encoding of this name in ROS.
     ///
     /// # Errors
     ///
-    /// [`PixelError::UnknownEncoding`] with the list of names that are understood.
+    /// [`PixelError::UnknownEncoding`] with the list of supported names.
     pub fn from_ros(name: &str) -> Result<Self, PixelError> {
         NAMES.iter().find(|(known, _)| *known == name).map(|(_, encoding)| *encoding).ok_or_else(
             || PixelError::UnknownEncoding {
@@ -85,7 +84,7 @@ impl Encoding {
         )
     }
 
-    /// The name of the encoding in ROS; of several names for one encoding, the current one.
+    /// Returns the name in ROS; of several names, the current one.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Rgb8 => "rgb8",
@@ -107,7 +106,7 @@ impl Encoding {
         }
     }
 
-    /// Bytes from a pixel to its right neighbour. For the yuv422 encodings, the half of a pair.
+    /// Returns the bytes per pixel. For the yuv422 encodings, half of a pair.
     pub const fn bytes_per_pixel(self) -> usize {
         match self {
             Self::Mono8 | Self::Bayer8(_) => 1,
@@ -117,8 +116,8 @@ impl Encoding {
         }
     }
 
-    /// Numbers that a pixel holds: 1 for grey and raw, 3 for colour, 4 with alpha; 2 for the yuv422
-    /// encodings, where a pixel has its own Y and half of a U, V pair.
+    /// Returns the channels per pixel: 1 for grey and raw, 3 for colour, 4 with alpha; 2 for the
+    /// yuv422 encodings, where a pixel has its own Y and half of a U, V pair.
     pub const fn channels(self) -> usize {
         match self {
             Self::Mono8 | Self::Mono16 | Self::Bayer8(_) | Self::Bayer16(_) => 1,
@@ -128,17 +127,17 @@ impl Encoding {
         }
     }
 
-    /// Whether two neighbours share their colour, so that a row needs an even number of pixels.
+    /// Returns whether two neighbours share their colour, so that a row needs an even width.
     pub const fn is_paired(self) -> bool {
         matches!(self, Self::Yuv422Uyvy | Self::Yuv422Yuyv)
     }
 
-    /// Whether this is what a sensor saw behind its colour filter, before any pixel has a colour.
+    /// Returns whether this is raw data of a sensor with a colour filter, before debayering.
     pub const fn is_raw(self) -> bool {
         matches!(self, Self::Bayer8(_) | Self::Bayer16(_))
     }
 
-    /// Whether the image has no colour: one grey value per pixel.
+    /// Returns whether the image is grey: one value per pixel.
     pub const fn is_grey(self) -> bool {
         matches!(self, Self::Mono8 | Self::Mono16)
     }
@@ -149,7 +148,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_encoding_is_found_again_under_its_own_name() {
+    fn every_encoding_is_found_by_its_name() {
         for (_, encoding) in NAMES {
             assert_eq!(Encoding::from_ros(encoding.name()).unwrap(), encoding);
         }
@@ -184,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pixel_has_as_many_bytes_as_its_numbers_need() {
+    fn a_pixel_has_the_bytes_of_its_channels() {
         let sizes = |name| {
             let encoding = Encoding::from_ros(name).unwrap();
             (encoding.channels(), encoding.bytes_per_pixel())

@@ -1,22 +1,22 @@
-//! Why pixels are no image, or an operation on them has no result, in the words that a user sees.
+//! Errors of images and of operations on them, with their messages for users.
 
 use std::fmt;
 
 use super::ops::MAX_RESIZED_SIDE;
 use super::{Encoding, MAX_SIDE, Roi};
 
-/// An image that contradicts itself, or a request about one that makes no sense.
+/// An invalid image, or an invalid request on an image.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PixelError {
-    /// A name that is no encoding which we read.
+    /// An unsupported encoding.
     UnknownEncoding {
-        /// What the message says, at most 40 characters of it.
+        /// The name in the message, cut to 40 characters.
         name: String,
-        /// The names that are understood.
+        /// The supported names.
         supported: String,
     },
-    /// No pixels, or more than any camera delivers.
+    /// No pixels, or too many.
     Size {
         /// Pixels per row.
         width: u32,
@@ -29,33 +29,33 @@ pub enum PixelError {
         width: u32,
         /// Rows.
         height: u32,
-        /// What a pixel is.
+        /// The encoding.
         encoding: Encoding,
-        /// Bytes from a row to the next, as the message says.
+        /// Bytes from a row to the next, by the message.
         step: u32,
-        /// Bytes that the pixels of a row fill.
+        /// Bytes of the pixels of a row.
         needed: usize,
     },
-    /// Fewer bytes than the size asks for.
+    /// Too few bytes for the size.
     Data {
         /// Pixels per row.
         width: u32,
         /// Rows.
         height: u32,
-        /// What a pixel is.
+        /// The encoding.
         encoding: Encoding,
         /// Bytes from a row to the next.
         step: u32,
         /// Bytes up to the end of the last row.
         needed: usize,
-        /// Bytes that are there.
+        /// Available bytes.
         found: usize,
     },
-    /// A pixel without the neighbour that holds the other half of its colour.
+    /// A pixel without the neighbour that has the other half of its colour.
     OddWidth {
         /// Pixels per row.
         width: u32,
-        /// What a pixel is.
+        /// The encoding.
         encoding: Encoding,
     },
     /// A region without a pixel.
@@ -67,46 +67,46 @@ pub enum PixelError {
         /// Rows of the image.
         height: u32,
     },
-    /// An operation on colours, asked of an image that has none yet.
+    /// An operation on colours of an image that is not debayered.
     Raw {
-        /// What was asked.
+        /// The operation.
         operation: &'static str,
-        /// What a pixel is.
+        /// The encoding.
         encoding: Encoding,
     },
-    /// A result of no size, or of an absurd one.
+    /// A size of 0, or too large a size, for the result.
     ResizeTo {
-        /// Pixels per row that were asked for.
+        /// Requested pixels per row.
         width: u32,
-        /// Rows that were asked for.
+        /// Requested rows.
         height: u32,
     },
-    /// The caller's memory does not fit the result.
+    /// The length of the caller's slice is not that of the result.
     Output {
-        /// What was asked.
+        /// The operation.
         operation: &'static str,
         /// Bytes of the result.
         needed: usize,
         /// Bytes of the caller's slice.
         found: usize,
     },
-    /// The caller's [`StopCheck`](super::StopCheck) ended an operation.
+    /// The caller's [`StopCheck`](super::StopCheck) ended the operation.
     Stopped,
 }
 
-/// What kind of refusal a [`PixelError`] is, to a caller that answers for others.
+/// The kind of a [`PixelError`], for conversion to other errors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PixelErrorKind {
-    /// The image, or the operation on such an image, makes no sense or costs too much.
+    /// The image is invalid, or does not support the operation.
     Unreadable,
-    /// The region or the size that was asked for.
+    /// The requested region or size is invalid.
     OutOfRange,
-    /// The caller ended it.
+    /// The caller stopped it.
     Stopped,
 }
 
 impl PixelError {
-    /// Returns the kind. Each error has to say which it is.
+    /// Returns the kind.
     pub const fn kind(&self) -> PixelErrorKind {
         match self {
             Self::Roi { .. } | Self::ResizeTo { .. } => PixelErrorKind::OutOfRange,
@@ -129,13 +129,14 @@ impl fmt::Display for PixelError {
                 write!(f, "encoding `{name}` is not supported; supported are {supported}")
             }
             Self::Size { width, height } => {
-                write!(f, "image says it is {width}x{height}; each side must be 1 to {MAX_SIDE}")
+                write!(f, "image size is {width}x{height}; each side must be 1 to {MAX_SIDE}")
             }
             Self::Step { width, height, encoding, step, needed } => {
                 let name = encoding.name();
                 write!(
                     f,
-                    "image of {width}x{height} {name} says a row has {step} bytes; it needs {needed}"
+                    "image of {width}x{height} {name} has a step of {step} bytes; \
+                     a row needs {needed}"
                 )
             }
             Self::Data { width, height, encoding, step, needed, found } => {
@@ -153,7 +154,8 @@ impl fmt::Display for PixelError {
             Self::Roi { roi: Roi { x, y, width: across, height: down }, width, height } => {
                 write!(
                     f,
-                    "region {across}x{down} at ({x}, {y}) has no pixel in the image of {width}x{height}"
+                    "region {across}x{down} at ({x}, {y}) has no pixel \
+                     in the image of {width}x{height}"
                 )
             }
             Self::Raw { operation, encoding } => {
@@ -164,7 +166,7 @@ impl fmt::Display for PixelError {
                 write!(f, "resize to {width}x{height}: each side must be 1 to {MAX_RESIZED_SIDE}")
             }
             Self::Output { operation, needed, found } => {
-                write!(f, "{operation} makes {needed} bytes; the place for them has {found}")
+                write!(f, "{operation} needs {needed} bytes; the output has {found}")
             }
             Self::Stopped => write!(f, "stopped by the caller before the end"),
         }
@@ -173,7 +175,7 @@ impl fmt::Display for PixelError {
 
 impl std::error::Error for PixelError {}
 
-/// `name` for a message: a hostile one must not fill the log.
+/// Cuts `name` for a message: a hostile one must not fill the log.
 pub(super) fn shortened(name: &str) -> String {
     const LONGEST: usize = 40;
     match name.char_indices().nth(LONGEST) {

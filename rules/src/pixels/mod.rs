@@ -1,11 +1,11 @@
-//! A frame as pixels: what an image message means ([`Encoding`], [`View`]) and the operations that
-//! the host offers to lambdas ([`ops`]).
+//! The pixels of a frame: the interpretation of image messages ([`Encoding`], [`View`]) and the
+//! operations that the host offers to lambdas ([`ops`]).
 //!
-//! All of it works on plain slices that the caller owns, and all arithmetic on pixels is in
-//! integers, so that a result is equal on every CPU and in every replay.
+//! All code works on slices of the caller, and all arithmetic on pixels is in integers, so that a
+//! result is equal on every CPU and in every replay.
 //!
-//! Never: a number out of a message that is used before it is checked against the bytes that are
-//! really there; floating point, before one last division.
+//! Never: use of a number from a message before it is checked against the available bytes; floating
+//! point, except for one last division.
 
 mod encoding;
 mod error;

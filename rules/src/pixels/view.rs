@@ -1,13 +1,13 @@
-//! An image as it lies in memory, once its size has been checked.
+//! An image in memory, with a validated size.
 
 use super::{Encoding, PixelError, StopCheck};
 
 /// Largest width and height of an image, in pixels.
 pub const MAX_SIDE: u32 = 65_535;
 
-/// An image whose size, step and bytes are known to fit together.
+/// An image with a validated size, step and length.
 ///
-/// Only [`View::new`] makes one, so nothing that works on a view has to check again.
+/// Only [`View::new`] creates one, so code that uses a view does not have to check again.
 #[derive(Debug, Clone, Copy)]
 pub struct View<'a> {
     width: u32,
@@ -20,15 +20,15 @@ pub struct View<'a> {
 }
 
 impl<'a> View<'a> {
-    /// The image of `width` x `height` pixels in `data`, where a row starts every `step` bytes, as
-    /// the fields of `sensor_msgs/msg/Image` say. `big_endian` is the order of 16 bit values and
-    /// means nothing for the other encodings. Bytes behind a row and behind the image are ignored;
-    /// those behind the last row may be missing.
+    /// Creates a view of the image of `width` x `height` pixels in `data`, where a row starts every
+    /// `step` bytes, as in `sensor_msgs/msg/Image`. `big_endian` is the order of 16 bit values, and
+    /// ignored for other encodings. Bytes after each row and after the image are ignored; those
+    /// after the last row may be missing.
     ///
     /// # Errors
     ///
     /// [`PixelError::Size`], [`PixelError::Step`], [`PixelError::Data`] or
-    /// [`PixelError::OddWidth`], with the numbers that do not fit.
+    /// [`PixelError::OddWidth`], with the conflicting numbers.
     pub fn new(
         width: u32,
         height: u32,
@@ -67,55 +67,55 @@ impl<'a> View<'a> {
         })
     }
 
-    /// The same image, on which operations ask `stop_check` as they go.
+    /// Returns the same image with `stop_check` for its operations.
     #[must_use]
     pub fn with_stop_check(self, stop_check: &'a StopCheck<'a>) -> Self {
         Self { stop_check: Some(stop_check), ..self }
     }
 
-    /// Asks whether an operation may go on to the next so many bytes.
+    /// Checks whether an operation may process so many further bytes.
     pub(super) fn check_stop(&self, bytes: usize) -> Result<(), PixelError> {
         self.stop_check.map_or(Ok(()), |stop_check| stop_check.check(bytes))
     }
 
-    /// Pixels per row, 1 to [`MAX_SIDE`].
+    /// Returns the pixels per row, 1 to [`MAX_SIDE`].
     pub const fn width(&self) -> u32 {
         self.width
     }
 
-    /// Rows, 1 to [`MAX_SIDE`].
+    /// Returns the number of rows, 1 to [`MAX_SIDE`].
     pub const fn height(&self) -> u32 {
         self.height
     }
 
-    /// Bytes from the start of a row to the start of the next.
+    /// Returns the bytes from the start of a row to the start of the next.
     pub const fn step(&self) -> usize {
         self.step
     }
 
-    /// All rows; the last one without padding.
+    /// Returns all rows; the last one without padding.
     pub const fn bytes(&self) -> &'a [u8] {
         self.data
     }
 
-    /// What a pixel is.
+    /// Returns the encoding.
     pub const fn encoding(&self) -> Encoding {
         self.encoding
     }
 
-    /// Whether 16 bit values have their high byte first.
+    /// Returns whether 16 bit values have their high byte first.
     pub const fn big_endian(&self) -> bool {
         self.big_endian
     }
 
-    /// The pixels of row `y`, without the padding; empty if there is no such row.
+    /// Returns the pixels of row `y`, without the padding; empty if there is no such row.
     pub fn row(&self, y: u32) -> &'a [u8] {
         let start = (y as usize).saturating_mul(self.step);
         let pixels = self.width as usize * self.encoding.bytes_per_pixel();
         self.data.get(start..).and_then(|rest| rest.get(..pixels)).unwrap_or(&[])
     }
 
-    /// The part of `roi` that lies in the image, or the whole image without one.
+    /// Returns the part of `roi` inside the image; the whole image without a region.
     ///
     /// # Errors
     ///
@@ -135,7 +135,7 @@ impl<'a> View<'a> {
         })
     }
 
-    /// The bytes of `roi`, which [`View::clip`] has made, row by row from the top.
+    /// Returns the bytes of `roi`, a result of [`View::clip`], row by row from the top.
     pub(super) fn rows_of(&self, roi: Roi) -> impl Iterator<Item = &'a [u8]> + use<'a> {
         let view = *self;
         let pixel = view.encoding.bytes_per_pixel();
@@ -144,7 +144,7 @@ impl<'a> View<'a> {
     }
 }
 
-/// Refuses an image without pixels and one with absurdly many.
+/// Refuses an image without pixels, or with too many.
 pub fn check_size(width: u32, height: u32) -> Result<(), PixelError> {
     let fits = |side| (1..=MAX_SIDE).contains(&side);
     if fits(width) && fits(height) { Ok(()) } else { Err(PixelError::Size { width, height }) }
@@ -152,7 +152,7 @@ pub fn check_size(width: u32, height: u32) -> Result<(), PixelError> {
 
 /// A rectangle of pixels; its corner (`x`, `y`) counts from the top left of the image.
 ///
-/// A region that is partly outside means the part that is inside.
+/// Of a region that is partly outside the image, the part inside counts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Roi {
     /// Pixels left of the region.
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_come_without_their_padding() {
+    fn rows_have_no_padding() {
         let data = [1, 2, 3, 9, 4, 5, 6];
         let view = View::new(3, 2, 4, Encoding::Mono8, false, &data).unwrap();
         assert_eq!(view.row(0), [1, 2, 3]);
@@ -187,16 +187,16 @@ mod tests {
     fn an_image_without_pixels_is_refused() {
         assert_eq!(
             refusal(0, 480, 0, Encoding::Rgb8, 9),
-            "image says it is 0x480; each side must be 1 to 65535"
+            "image size is 0x480; each side must be 1 to 65535"
         );
         assert!(View::new(3, 0, 9, Encoding::Rgb8, false, &[0; 9]).is_err());
     }
 
     #[test]
-    fn an_absurd_size_is_refused_whatever_the_data() {
+    fn an_excessive_size_is_refused() {
         assert_eq!(
             refusal(65_536, 1, 65_536, Encoding::Mono8, 65_536),
-            "image says it is 65536x1; each side must be 1 to 65535"
+            "image size is 65536x1; each side must be 1 to 65535"
         );
         assert!(View::new(1, u32::MAX, 1, Encoding::Mono8, false, &[0; 9]).is_err());
     }
@@ -205,12 +205,12 @@ mod tests {
     fn rows_that_overlap_are_refused() {
         assert_eq!(
             refusal(2, 2, 5, Encoding::Rgb8, 100),
-            "image of 2x2 rgb8 says a row has 5 bytes; it needs 6"
+            "image of 2x2 rgb8 has a step of 5 bytes; a row needs 6"
         );
     }
 
     #[test]
-    fn missing_bytes_are_refused_but_not_those_behind_the_last_row() {
+    fn missing_bytes_are_refused_except_after_the_last_row() {
         assert_eq!(
             refusal(2, 2, 8, Encoding::Rgb8, 13),
             "image of 2x2 rgb8 with 8 bytes per row needs 14 bytes; it has 13"

@@ -1,4 +1,4 @@
-//! What a lambda may cause, say and keep.
+//! Cases of triggers, log lines, scratch and frames.
 
 use gleaner_rules::frames::Budget;
 use gleaner_rules::log::{Rate, line};
@@ -86,7 +86,7 @@ fn log_lines() {
                 if rate.keeps(ns(&given[0]), line) { json!([line.len()]) } else { json!([]) }
             }
             "note" => {
-                // The host's own texts are constants.
+                // The host's texts are constants.
                 let note = text(&given[1]).to_owned().leak();
                 if rate.notes(ns(&given[0]), note) { json!([note.len()]) } else { json!([]) }
             }

@@ -1,4 +1,4 @@
-//! What frames are, and what is computed on them.
+//! Cases of operations on pixels.
 
 use gleaner_rules::pixels::{Encoding, PixelError, PixelErrorKind, Roi, View, ops};
 use serde_json::{Value, json};
@@ -23,16 +23,16 @@ fn roi(given: &Value) -> Option<Roi> {
     Some(Roi { x, y, width, height })
 }
 
-/// What a lambda is told of it.
-fn told(result: Result<Value, PixelError>) -> Value {
+/// Returns the result, or kind and message of the error.
+fn reply(result: Result<Value, PixelError>) -> Value {
     result.unwrap_or_else(|error| {
         let kind = match error.kind() {
             PixelErrorKind::OutOfRange => "out-of-range",
             PixelErrorKind::Unreadable => "not-a-frame",
-            PixelErrorKind::Stopped => unreachable!("nobody stops it"),
+            PixelErrorKind::Stopped => unreachable!("there is no stop check"),
         };
         let message = error.to_string();
-        // Which encodings there are, each side lists in its own order.
+        // Each side lists the supported encodings in its own order.
         json!([kind, message.split("; supported are").next()])
     })
 }
@@ -46,7 +46,7 @@ fn pixels() {
             let view = Encoding::from_ros(text(&given["encoding"])).and_then(|encoding| {
                 View::new(width, height, step, encoding, given["big_endian"] == true, &data)
             });
-            told(view.and_then(|view| match call {
+            reply(view.and_then(|view| match call {
                 "mean luma" => ops::mean_luma(&view, roi(&arguments[0])).map(Value::from),
                 "histogram" => {
                     let counts = ops::histogram(&view, roi(&arguments[0]))?;

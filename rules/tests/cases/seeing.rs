@@ -1,4 +1,4 @@
-//! What a lambda sees of an input, how much at once, and how it is asked for.
+//! Cases of rings, limits per call, paths, names and units.
 
 use std::collections::BTreeMap;
 
@@ -18,7 +18,7 @@ fn rings() {
         let mut held = BTreeMap::new();
         Box::new(move |call, given| match call {
             "push" => {
-                // A sample is its own time.
+                // The value of a sample is its time.
                 let at_ns = ring.counts().received as i64;
                 json!(ring.push(at_ns, whole(&given[0])))
             }
@@ -111,13 +111,13 @@ fn paths() {
 fn names() {
     replay("names", include_str!("../../cases/names.json"), |_| {
         Box::new(|call, given| {
-            let is_right = match call {
+            let is_valid = match call {
                 "lambda" => names::is_lambda,
                 "item" => names::is_item,
                 "topic" => names::is_topic,
                 _ => names::is_type,
             };
-            json!(is_right(text(&given[0])))
+            json!(is_valid(text(&given[0])))
         })
     });
 }

@@ -1,4 +1,4 @@
-//! When a lambda runs, and when it rests.
+//! Cases of schedules and of the back-off.
 
 use std::cell::Cell;
 use std::rc::Rc;
@@ -9,9 +9,9 @@ use gleaner_rules::ring::Ring;
 use gleaner_rules::schedule::{self, Backlog, Schedule};
 use serde_json::{Value, json};
 
-use crate::{Answers, ns, replay, whole};
+use crate::{CaseReplies, ns, replay, whole};
 
-/// A ring, and how many samples a schedule has skipped.
+/// A ring, and the number of samples that a schedule skipped.
 #[derive(Clone)]
 struct Shown(Rc<(std::cell::RefCell<Ring<()>>, Cell<u64>)>);
 
@@ -52,7 +52,7 @@ fn schedules() {
             Some(_) => Schedule::event(shown.clone(), Backlog::Latest),
         };
         let live = given["live"] == true;
-        let answers: Answers<'static> = Box::new(move |call, given| match call {
+        let replies: CaseReplies<'static> = Box::new(move |call, given| match call {
             "begin" if live => json!(schedule.begin_live(ns(&given[0]))),
             "begin" => json!(schedule.begin(ns(&given[0]))),
             "ticks" => {
@@ -68,22 +68,24 @@ fn schedules() {
             "finish" => json!(schedule.finish()),
             other => panic!("{other}"),
         });
-        answers
+        replies
     });
 }
 
 #[test]
-fn rests_after_faults() {
+fn backs_off_after_faults() {
     replay("faults", include_str!("../../cases/faults.json"), |_| {
         let (mut faults, mut log) = (Faults::default(), Rate::new(0, 0));
         Box::new(move |_, given| {
             let at_ns = ns(&given[0]) * 1_000_000;
             if faults.is_backing_off(at_ns) {
-                return json!("rests");
+                return json!("backs off");
             }
             let notes = [faults.begin(), faults.end(at_ns, given[1] == true)];
             let notes = notes.into_iter().flatten().filter(|note| log.notes(at_ns, note));
-            notes.map(|note| if note == REINITIALISED { "made anew" } else { "rests" }).collect()
+            notes
+                .map(|note| if note == REINITIALISED { "re-initialised" } else { "backs off" })
+                .collect()
         })
     });
 }

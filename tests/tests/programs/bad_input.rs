@@ -375,7 +375,7 @@ fn an_image_whose_rows_overlap_is_refused_with_the_numbers() {
 #[test]
 fn an_image_of_no_size_or_unknown_encoding_is_refused() {
     for run in pixels_of(image(0, 10, "mono8", 0, &[])) {
-        assert!(run.first_fault().expect("a fault").1.contains("image says it is 0x10"));
+        assert!(run.first_fault().expect("a fault").1.contains("image has a size of 0x10"));
     }
     for run in pixels_of(image(1, 1, "rgb565", 2, &[0; 2])) {
         assert!(

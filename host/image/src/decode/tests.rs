@@ -107,7 +107,7 @@ fn a_bomb_is_refused_before_memory_is_touched() {
     let header = probe(&bomb).unwrap();
     assert_eq!(
         decode_rgb8(&bomb, &header, 8 << 20, &mut []).unwrap_err().to_string(),
-        "image says it is 65500x65500 (12274.6 MiB as rgb8); this input's decoded_size is 8 MiB"
+        "image has a size of 65500x65500 (12274.6 MiB as rgb8); this input's decoded_size is 8 MiB"
     );
 }
 
@@ -131,7 +131,7 @@ fn a_limit_of_exactly_the_size_is_sufficient() {
     assert!(decode(len).is_ok());
     assert_eq!(
         decode(len - 1).unwrap_err().to_string(),
-        "image says it is 24x16 (1152 bytes as rgb8); this input's decoded_size is 1151 bytes"
+        "image has a size of 24x16 (1152 bytes as rgb8); this input's decoded_size is 1151 bytes"
     );
 }
 
@@ -145,7 +145,7 @@ fn the_header_must_match_the_data_and_the_output_length_the_header() {
     );
     assert_eq!(
         decode_rgb8(&samples::GREY, &header, 9_999, &mut [0; 1151]).unwrap_err().to_string(),
-        "decoding makes 1152 bytes; the place for them has 1151"
+        "decoding needs 1152 bytes; the output has 1151"
     );
 }
 

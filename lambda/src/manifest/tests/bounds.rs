@@ -232,7 +232,7 @@ fn config_items_agree_with_their_own_limits() {
         "`config.x.min` is a text",
         "give a number, as `default` is one",
     );
-    let problem = "`config.x.default` is `nan`, which is no finite number";
+    let problem = "`config.x.default` is `nan`, which is not a finite number";
     out_of_bounds(
         &item("default = nan"),
         9,

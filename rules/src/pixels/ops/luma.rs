@@ -1,19 +1,20 @@
-//! How bright an image is.
+//! Brightness: mean luma, histogram and grey image.
 
 use super::pixels::PixelFormat;
 use crate::pixels::{PixelError, Roi, View};
 
-/// Byte positions that are summed side by side. 48 bytes are whole pixels of 1, 2, 3 and 4 bytes
-/// and whole vector registers of 16 bytes, so that one loop serves every encoding and vectorises.
+/// Number of byte positions that are summed in parallel. 48 bytes are whole pixels of 1, 2, 3 and 4
+/// bytes and whole vector registers of 16 bytes, so that one loop serves every encoding and
+/// vectorises.
 const LANES: usize = 48;
 
-/// Groups of [`LANES`] bytes after which 16 bit sums must be emptied: 257 * 255 = 65,535.
+/// Groups of [`LANES`] bytes after which 16 bit sums must be reset: 257 * 255 = 65,535.
 const GROUPS: usize = 257;
 
-/// Mean luma of `roi`, or of the whole image, from 0 to 255.
+/// Returns the mean luma of `roi`, or of the whole image, from 0 to 255.
 ///
 /// Luma is (299 R + 587 G + 114 B) / 1000; the value itself for mono8; the value / 257 for mono16;
-/// Y as it is for yuv422, which is taken to be of full range. Alpha is ignored. The sums are exact
+/// Y for yuv422, which is assumed to be of full range. Alpha is ignored. The sums are exact
 /// and are divided once, so the result is the `f64` nearest to the true mean.
 ///
 /// # Errors
@@ -69,7 +70,7 @@ fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
     }
 }
 
-/// How many pixels of `roi`, or of the whole image, have each grey level: that of [`to_gray`].
+/// Counts the pixels of each grey level, as of [`to_gray`], in `roi` or the whole image.
 ///
 /// # Errors
 ///
@@ -78,7 +79,7 @@ fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
 pub fn histogram(view: &View<'_>, roi: Option<Roi>) -> Result<[u32; 256], PixelError> {
     let pixels = PixelFormat::of(view, "histogram")?;
     let roi = view.clip(roi)?;
-    // 65,535^2 pixels of one level still fit a `u32`.
+    // 65,535^2 pixels of one level fit a `u32`.
     let mut counts = [0; 256];
     let mut levels = [0; 512];
     for row in view.rows_of(roi) {
@@ -128,7 +129,7 @@ mod tests {
 
     const WHOLE: Option<Roi> = None;
 
-    /// Bytes that look like noise and are the same in every run.
+    /// Returns pseudo-random bytes, the same in every run.
     fn noise(len: usize) -> Vec<u8> {
         let mut state = 1_u32;
         std::iter::repeat_with(|| {
@@ -139,7 +140,7 @@ mod tests {
         .collect()
     }
 
-    /// Luma of a pixel in floating point, by the definition of its encoding.
+    /// Returns the luma of a pixel in floating point, by the definition of its encoding.
     fn reference(encoding: &str, big_endian: bool, p: &[u8]) -> f64 {
         let f = |at: usize| f64::from(p[at]);
         match encoding {
@@ -157,7 +158,7 @@ mod tests {
         ["mono8", "mono16", "rgb8", "bgr8", "rgba8", "bgra8", "uyvy", "yuyv"];
 
     #[test]
-    fn the_mean_is_that_of_every_pixel_in_floating_point() {
+    fn the_mean_equals_the_mean_in_floating_point() {
         for name in READABLE {
             for big_endian in [false, true] {
                 let encoding = Encoding::from_ros(name).unwrap();
@@ -179,8 +180,8 @@ mod tests {
                         }
                     }
                     let mean = sum / f64::from(roi.width * roi.height);
-                    let ours = mean_luma(&view, Some(roi)).unwrap();
-                    assert!((ours - mean).abs() < 1e-9, "{name}: {ours} is not {mean}");
+                    let result = mean_luma(&view, Some(roi)).unwrap();
+                    assert!((result - mean).abs() < 1e-9, "{name}: {result} is not {mean}");
                 }
             }
         }
@@ -259,7 +260,8 @@ mod tests {
             assert_eq!(
                 mean_luma(&view, WHOLE).unwrap_err().to_string(),
                 format!(
-                    "mean luma of a raw image ({name}): its pixels have no colour until it is debayered"
+                    "mean luma of a raw image ({name}): \
+                     its pixels have no colour until it is debayered"
                 )
             );
             assert!(histogram(&view, WHOLE).is_err());
@@ -268,12 +270,12 @@ mod tests {
     }
 
     #[test]
-    fn a_place_of_another_size_is_refused() {
+    fn an_output_of_another_length_is_refused() {
         let view = View::new(2, 2, 2, Encoding::Mono8, false, &[0; 4]).unwrap();
         for len in [0, 3, 5] {
             assert_eq!(
                 to_gray(&view, &mut vec![0; len]).unwrap_err().to_string(),
-                format!("grey image makes 4 bytes; the place for them has {len}")
+                format!("grey image needs 4 bytes; the output has {len}")
             );
         }
     }

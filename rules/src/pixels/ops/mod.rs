@@ -1,12 +1,12 @@
-//! What the host computes on frames for lambdas.
+//! Operations on frames that the host computes for lambdas.
 //!
-//! Inside: grey levels (`luma`), size (`resize`), and how a pixel of each encoding is read
-//! (`pixels`). Every operation asks the view between rows whether it may go on ([`View::with_stop_check`]).
-//! All of it is exact integer arithmetic on a checked [`View`], so that every CPU and every call
-//! gives the same result, however the compiler arranges the loops.
+//! Inside: grey levels (`luma`), size (`resize`), and conversion of pixels of each encoding
+//! (`pixels`). Every operation can be stopped between rows ([`View::with_stop_check`]). All of it
+//! is exact integer arithmetic on a validated [`View`], so that every CPU and every call gives the
+//! same result, regardless of optimisations.
 //!
 //! Never: memory that grows with anything but the width of the image; a result for raw (Bayer)
-//! images, whose pixels have no colour until someone has chosen how to debayer them.
+//! images, whose pixels have no colour until they are debayered.
 
 mod luma;
 mod pixels;
@@ -18,7 +18,7 @@ pub use resize::{MAX_RESIZED_SIDE, resize, resize_work, resized};
 
 use super::{PixelError, Roi, View};
 
-/// Bytes that [`mean_luma`], [`histogram`] or [`to_gray`] reads, the measure of its cost.
+/// Returns the number of bytes that [`mean_luma`], [`histogram`] or [`to_gray`] reads, as its cost.
 ///
 /// # Errors
 ///

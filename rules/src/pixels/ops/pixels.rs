@@ -1,8 +1,8 @@
-//! How a pixel of each encoding is read as grey or as red, green and blue.
+//! Converts pixels of each encoding to grey or to red, green and blue.
 
 use crate::pixels::{Encoding, PixelError, View};
 
-/// The pixels of an image that are not raw: every encoding that has a grey level.
+/// The format of pixels that are not raw: every encoding with a grey level.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum PixelFormat {
     Grey8,
@@ -19,7 +19,7 @@ pub(super) enum PixelFormat {
 }
 
 impl PixelFormat {
-    /// The pixels of `view`, or why `operation` cannot read them.
+    /// Returns the format of `view`, or the reason why `operation` does not support it.
     pub(super) fn of(view: &View<'_>, operation: &'static str) -> Result<Self, PixelError> {
         Ok(match view.encoding() {
             Encoding::Mono8 => Self::Grey8,
@@ -53,19 +53,20 @@ impl PixelFormat {
         }
     }
 
-    /// `CHANNELS` numbers of each pixel in `row`, a whole row: grey, or red, green and blue. They
-    /// are in `row` itself or, if they have to be rearranged, in `place`, which has room for them.
+    /// Returns `CHANNELS` values of each pixel in `row`, a whole row: grey, or red, green and blue.
+    /// They are in `row` itself or, if they have to be rearranged, in `buffer`, which must be long
+    /// enough.
     pub(super) fn row<'a, const CHANNELS: usize>(
         self,
         row: &'a [u8],
-        place: &'a mut [u8],
+        buffer: &'a mut [u8],
     ) -> &'a [u8] {
         match (self, CHANNELS) {
             (Self::Grey8, 1) | (Self::Rgb, 3) => return row,
-            (_, 1) => self.grey(row, place),
-            _ => self.rgb(row, place),
+            (_, 1) => self.grey(row, buffer),
+            _ => self.rgb(row, buffer),
         }
-        place
+        buffer
     }
 
     /// Writes red, green and blue of each pixel in `row`, a whole row, to `rgb`, which has three
@@ -85,26 +86,26 @@ impl PixelFormat {
     }
 }
 
-/// Luma of a colour, rounded down. Source: ITU-R BT.601, weights in thousandths.
+/// Returns the luma of a colour, rounded down. Source: ITU-R BT.601, weights in thousandths.
 fn luma_of(red: u8, green: u8, blue: u8) -> u8 {
     ((299 * u32::from(red) + 587 * u32::from(green) + 114 * u32::from(blue)) / 1000) as u8
 }
 
-/// Byte `AT` of each pixel of two bytes.
+/// Writes byte `AT` of each pixel of two bytes.
 fn pick<const AT: usize>(row: &[u8], grey: &mut [u8]) {
     for (grey, pixel) in grey.iter_mut().zip(row.as_chunks::<2>().0) {
         *grey = pixel[AT];
     }
 }
 
-/// Luma of each pixel of `BYTES` bytes, with green in the middle of red and blue.
+/// Writes the luma of each pixel of `BYTES` bytes, with green between red and blue.
 fn luma<const BYTES: usize, const RED: usize, const BLUE: usize>(row: &[u8], grey: &mut [u8]) {
     for (grey, pixel) in grey.iter_mut().zip(row.as_chunks::<BYTES>().0) {
         *grey = luma_of(pixel[RED], pixel[1], pixel[BLUE]);
     }
 }
 
-/// Three bytes of each pixel of `BYTES` bytes.
+/// Writes three bytes of each pixel of `BYTES` bytes.
 fn spread<const BYTES: usize, const RED: usize, const GREEN: usize, const BLUE: usize>(
     row: &[u8],
     rgb: &mut [u8],
@@ -114,7 +115,7 @@ fn spread<const BYTES: usize, const RED: usize, const GREEN: usize, const BLUE: 
     }
 }
 
-/// Two colours of each pair, whose U, left Y, V and right Y lie at the given offsets.
+/// Writes the two colours of each pair, whose U, left Y, V and right Y are at the given offsets.
 fn pairs<const U: usize, const LEFT: usize, const V: usize, const RIGHT: usize>(
     row: &[u8],
     rgb: &mut [u8],
@@ -126,7 +127,7 @@ fn pairs<const U: usize, const LEFT: usize, const V: usize, const RIGHT: usize>(
     }
 }
 
-/// A colour from luma and chroma of full range (Y, U and V from 0 to 255, as in JPEG).
+/// Converts luma and chroma of full range to a colour (Y, U and V from 0 to 255, as in JPEG).
 ///
 /// Source: the inverse of ITU-R BT.601 as in JFIF 1.02, with factors in 1/65536, rounded to
 /// nearest.
@@ -151,15 +152,15 @@ mod tests {
     }
 
     #[test]
-    fn yuv_becomes_the_nearest_colour_that_the_real_formula_gives() {
+    fn yuv_becomes_the_nearest_colour_of_the_exact_formula() {
         for y in (0..=255).step_by(5) {
             for u in (0..=255).step_by(5) {
                 for v in (0..=255).step_by(5) {
                     let (yf, uf, vf) = (f64::from(y), f64::from(u) - 128.0, f64::from(v) - 128.0);
                     let real =
                         [yf + 1.402 * vf, yf - 0.344_136 * uf - 0.714_136 * vf, yf + 1.772 * uf];
-                    for (ours, real) in from_yuv(y as u8, u as u8, v as u8).iter().zip(real) {
-                        let off = (f64::from(*ours) - real.clamp(0.0, 255.0)).abs();
+                    for (result, real) in from_yuv(y as u8, u as u8, v as u8).iter().zip(real) {
+                        let off = (f64::from(*result) - real.clamp(0.0, 255.0)).abs();
                         assert!(off < 0.502, "({y}, {u}, {v}) is off by {off}");
                     }
                 }

@@ -1,17 +1,18 @@
-//! An image in another size.
+//! Resizes images.
 //!
-//! Each axis is resampled by weights that are whole numbers, so that a result is an exact fraction,
-//! rounded once:
+//! Each axis is resampled with integer weights, so that a result is an exact fraction, rounded
+//! once:
 //!
-//! - smaller or equal: the mean of the area that a new pixel covers. Cut the axis of `from` pixels
-//!   into `from * to` pieces: an old pixel is `to` of them, a new one is `from`, and the weight of
-//!   an old pixel is the number of pieces that they share.
-//! - larger: linear between the two old pixels around the middle of the new one, with the middle
-//!   measured in 1 / (2 `to`) of an old pixel. Beyond the outermost middles the edge is repeated.
+//! - smaller or equal: the mean of the area that a new pixel covers. With the axis of `from` pixels
+//!   divided into `from * to` pieces, an old pixel has `to` of them, a new one `from`, and the
+//!   weight of an old pixel is the number of pieces that they share.
+//! - larger: linear interpolation between the two old pixels around the centre of the new one, with
+//!   the centre in units of 1 / (2 `to`) of an old pixel. Beyond the outermost centres the edge is
+//!   repeated.
 //!
-//! The axis along which less is left to do goes first: rows are added up before they get narrower
-//! or wider, but where the image grows downwards each old row gets its new width once, and serves
-//! several new rows. Sums are exact, so both give the same bytes.
+//! The cheaper order of the axes is used: rows are added up before their width changes, but if the
+//! height grows, the width of each old row is changed once, for several new rows. Sums are exact,
+//! so both orders give the same bytes.
 
 use super::pixels::PixelFormat;
 use super::rounded::RoundedDivision;
@@ -20,8 +21,8 @@ use crate::pixels::{Encoding, PixelError, View};
 /// Largest width and height of a resized image, in pixels.
 pub const MAX_RESIZED_SIDE: u32 = 16_384;
 
-/// What [`resize`] of `view` to `width` x `height` makes: rgb8 of a colour image and mono8 of a
-/// grey one, and how many bytes.
+/// Returns encoding and length of [`resize`] of `view` to `width` x `height`: rgb8 for a colour
+/// image and mono8 for a grey one.
 ///
 /// # Errors
 ///
@@ -38,9 +39,9 @@ pub fn resized(view: &View<'_>, width: u32, height: u32) -> Result<(Encoding, us
     Ok((encoding, width as usize * height as usize * encoding.bytes_per_pixel()))
 }
 
-/// Work of [`resize`], in bytes that are copied in the same time: a byte of the old image takes as
-/// long as 3, of yuv422 as 64, and a byte of the new one as 16. Where the image does not grow
-/// downwards, each new row goes over sums as wide as the old one, each as long as 8.
+/// Returns the cost of [`resize`], in bytes that could be copied in the same time: a byte of the
+/// old image counts 3, of yuv422 64, and a byte of the new one 16. If the height does not grow,
+/// each new row processes sums as wide as the old one, which count 8 each.
 ///
 /// # Errors
 ///
@@ -56,10 +57,11 @@ pub fn resize_work(view: &View<'_>, width: u32, height: u32) -> Result<u64, Pixe
 /// Writes the image in `width` x `height` pixels to `out`, without padding, in the encoding that
 /// [`resized`] names and this returns.
 ///
-/// Each axis on its own: the mean of the covered area where the image shrinks, linear interpolation
-/// where it grows, both exact and rounded to nearest (a half goes up). mono16 counts by its high
-/// byte, yuv422 is taken to be BT.601 of full range, alpha is ignored. It allocates 5 bytes per
-/// number in one row of the old image, 8 in one of the new one, and 16 for each of its columns.
+/// Each axis is resampled by itself: the mean of the covered area if it shrinks, linear
+/// interpolation if it grows, both exact and rounded to nearest (half up). Of mono16 the high byte
+/// is used, yuv422 is assumed to be BT.601 of full range, alpha is ignored. It allocates 5 bytes
+/// per value of one row of the old image, 8 per value of one row of the new image, and 16 for each
+/// of its columns.
 ///
 /// # Errors
 ///
@@ -88,10 +90,10 @@ pub fn resize(
 struct Resize<const CHANNELS: usize> {
     pixels: PixelFormat,
     down: Axis,
-    /// Of each new column.
+    /// Weights of each new column.
     across: Vec<Taps>,
     rounded: RoundedDivision,
-    /// An old row, where its pixels have to be rearranged.
+    /// Buffer for an old row whose pixels have to be rearranged.
     row: Vec<u8>,
 }
 
@@ -142,7 +144,7 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
     /// Blends each old row across, then two of them into each new row.
     fn grow_down(mut self, view: &View<'_>, out: &mut [u8]) -> Result<(), PixelError> {
         let width = self.across.len() * CHANNELS;
-        // The two rows that were blended last, the upper one first.
+        // The last two blended rows, the upper one first.
         let mut blended = [vec![0_u32; width], vec![0_u32; width]];
         let mut next = 0;
         for (y, line) in (0..).zip(out.chunks_exact_mut(width)) {
@@ -161,7 +163,7 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
                 next += 1;
             }
             view.check_stop(width)?;
-            // An old row at the edge is alone, and the lower one.
+            // At the edge there is only one old row, the lower one.
             let upper = if taps.first == taps.last { &blended[1] } else { &blended[0] };
             let (head, tail) = (u64::from(taps.head), u64::from(taps.tail));
             for ((byte, upper), lower) in line.iter_mut().zip(upper).zip(&blended[1]) {
@@ -177,9 +179,9 @@ impl<const CHANNELS: usize> Resize<CHANNELS> {
 }
 
 /// Adds `row`, times `weight`, to `columns`. Weights of a column add up to less than 2^16, so no
-/// sum reaches 2^24; checked arithmetic would not become a vector's.
+/// sum reaches 2^24; checked arithmetic would not vectorise.
 fn add_weighted(row: &[u8], weight: u32, columns: &mut [u32]) {
-    // A product of 16 bits is what vectors have at hand.
+    // Vector instructions have products of 16 bits.
     let weight = weight as u16;
     for (sum, value) in columns.iter_mut().zip(row) {
         *sum = sum.wrapping_add(u32::from(weight).wrapping_mul(u32::from(*value)));
@@ -214,7 +216,7 @@ impl Taps {
         }
     }
 
-    /// Weighted sum of old pixels. Values below 2^24 make sums below 2^40.
+    /// Returns the weighted sum of old pixels. Values below 2^24 give sums below 2^40.
     fn blend<T: Copy + Into<u64>, const CHANNELS: usize>(
         &self,
         old: &[[T; CHANNELS]],
@@ -242,13 +244,13 @@ impl Taps {
 }
 
 impl Axis {
-    /// The sum of the weights of any new pixel: at most 65,535.
+    /// Returns the sum of the weights of any new pixel: at most 65,535.
     fn total(self) -> u32 {
         if self.to <= self.from { self.from } else { 2 * self.to }
     }
 
-    /// What new pixel `at` is made of. All products stay below 65,535 * 16,384 or 2 * 16,384^2, so
-    /// they fit a `u32`.
+    /// Returns the weights of the old pixels in new pixel `at`. All products are below 65,535 *
+    /// 16,384 or 2 * 16,384^2, so they fit a `u32`.
     fn taps(self, at: u32) -> Taps {
         let Self { from, to } = self;
         if to <= from {
@@ -290,8 +292,8 @@ mod tests {
         out
     }
 
-    /// Weight of old pixel `i` in new pixel `o`, in floating point and without sharing a line with
-    /// the code above: the overlap of two intervals, or the distance to the middle.
+    /// Returns the weight of old pixel `i` in new pixel `o`, computed independently in floating
+    /// point: the overlap of two intervals, or the distance to the centre.
     fn reference_weight(from: u32, to: u32, i: u32, o: u32) -> f64 {
         let scale = f64::from(from) / f64::from(to);
         let i = f64::from(i);
@@ -310,7 +312,7 @@ mod tests {
         let view = mono(7, 5, &data);
         for (width, height) in [(3, 2), (7, 5), (1, 1), (6, 4), (14, 10), (20, 3), (2, 17), (8, 6)]
         {
-            let ours = resized_to(&view, width, height);
+            let result = resized_to(&view, width, height);
             for y in 0..height {
                 for x in 0..width {
                     let mut value = 0.0;
@@ -321,7 +323,7 @@ mod tests {
                                 * f64::from(*level);
                         }
                     }
-                    let got = f64::from(ours[(y * width + x) as usize]);
+                    let got = f64::from(result[(y * width + x) as usize]);
                     assert!((got - value).abs() <= 0.5 + 1e-9, "{width}x{height}: {got}, {value}");
                 }
             }
@@ -350,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn every_encoding_comes_out_as_rgb8_or_mono8() {
+    fn every_encoding_becomes_rgb8_or_mono8() {
         for (name, data, encoding, expected) in [
             ("rgb8", &[1, 2, 3, 1, 2, 3][..], Encoding::Rgb8, &[1, 2, 3][..]),
             ("bgr8", &[1, 2, 3, 1, 2, 3], Encoding::Rgb8, &[3, 2, 1]),
@@ -382,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn absurd_sizes_raw_images_and_wrong_places_are_refused() {
+    fn excessive_sizes_raw_images_and_wrong_outputs_are_refused() {
         let view = mono(2, 2, &[0; 4]);
         for (width, height) in [(0, 1), (1, 0), (16_385, 1), (1, u32::MAX)] {
             assert_eq!(
@@ -393,7 +395,7 @@ mod tests {
         }
         assert_eq!(
             resize(&view, 3, 1, &mut [0; 9]).unwrap_err().to_string(),
-            "resize makes 3 bytes; the place for them has 9"
+            "resize needs 3 bytes; the output has 9"
         );
         let bayer = Encoding::from_ros("bayer_bggr8").unwrap();
         let raw = View::new(2, 2, 2, bayer, false, &[0; 4]).unwrap();

@@ -1,6 +1,6 @@
-//! Division by a number that stays the same, without dividing.
+//! Division by a constant, by multiplication.
 
-/// Division by a divisor below 2^32, rounded to nearest; a half goes up.
+/// Division by a divisor below 2^32, rounded to nearest, half up.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RoundedDivision {
     half: u64,
@@ -11,14 +11,14 @@ pub(super) struct RoundedDivision {
 }
 
 impl RoundedDivision {
-    /// Division by `divisor`, 1 to 2^32 - 1.
+    /// Creates the division by `divisor`, 1 to 2^32 - 1.
     pub(super) fn to(divisor: u64) -> Self {
         let shift = divisor.ilog2();
         let reciprocal = (1_u128 << (63 + shift)).div_ceil(u128::from(divisor)) as u64;
         Self { half: divisor / 2, reciprocal, shift }
     }
 
-    /// `sum` divided, which is at most 255 times the divisor.
+    /// Divides `sum`, which is at most 255 times the divisor.
     ///
     /// The reciprocal is too large by less than `divisor` / 2^(63 + shift), so the quotient is by
     /// less than 1 / `divisor`, and none that is not whole reaches the next whole number: `sum` *
@@ -38,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_is_a_division_right_at_the_steps() {
+    fn it_equals_division_around_every_step() {
         let small = 1..=300;
         let powers = (0..32).flat_map(|power| [(1 << power) - 1, 1 << power, (1 << power) + 1]);
         let large =
