@@ -79,7 +79,8 @@ class FramePool:
         """Creates the frame of a message. Raises DataError."""
         if declared.type_name not in ("sensor_msgs/msg/Image", COMPRESSED_IMAGE):
             raise DataError(
-                f"a sample of `{declared.topic}` is not an image: its type is `{declared.type_name}`",
+                f"a sample of `{declared.topic}` is not an image: its type is "
+                f"`{declared.type_name}`",
                 "not-a-frame",
             )
         given = message()

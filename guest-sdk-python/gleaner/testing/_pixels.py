@@ -82,9 +82,7 @@ def picture(
     ros_name = IN_ROS.get(name, name)
     for side in (width, height):
         if not 1 <= side <= MAX_SIDE:
-            raise ImageError(
-                f"image size is {width}x{height}; each side must be 1 to {MAX_SIDE}"
-            )
+            raise ImageError(f"image size is {width}x{height}; each side must be 1 to {MAX_SIDE}")
     if name in PAIRS and width % 2:
         raise ImageError(
             f"image of {ros_name} is {width} pixels wide; two pixels share a colour, so the width "

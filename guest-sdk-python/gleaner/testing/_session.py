@@ -161,8 +161,8 @@ class Scratch:
         there = self._entries.get(name)
         if there is None and len(self._entries) >= ENTRIES:
             raise ScratchError(
-                f"cannot add `{name}`: scratch has {ENTRIES} entries, the maximum; remove some, or append "
-                "to one of them",
+                f"cannot add `{name}`: scratch has {ENTRIES} entries, the maximum; remove some, or "
+                "append to one of them",
                 "no-room",
             )
         given_back = len(there) if there is not None and in_place else 0
@@ -171,9 +171,7 @@ class Scratch:
             why = (
                 f"`{name}` needs {needed - given_back} bytes of scratch and {self.free()} are free"
             )
-            raise ScratchError(
-                f"{why}; remove entries, or raise `scratch` in [limits]", "no-room"
-            )
+            raise ScratchError(f"{why}; remove entries, or raise `scratch` in [limits]", "no-room")
         self._entries[name] = given if in_place or there is None else there + given
         self._used += needed - given_back
 
