@@ -1,3 +1,5 @@
+//! Decodes the wakes of a journal.
+
 use serde_json::{Map, Value};
 
 use super::entry::{InputView, JournalEntry, LogDigest, WakeSource};
@@ -8,16 +10,16 @@ use super::previous::{
 use super::{ATTRIBUTES_MAX, FAULTS, TRIGGERS_MAX};
 use gleaner_lambda::{Fault, Trigger, TriggerKind};
 
-/// The reason why some bytes are not a wake.
+/// The reason why bytes cannot be decoded as a wake.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MalformedWake {
-    /// They end within a wake.
+    /// The bytes end within a wake.
     #[error("a wake continues beyond the end of its block")]
     Short,
     /// A number is longer than 64 bits, or out of range.
     #[error("a number in a wake is too large")]
     Number,
-    /// A bit or a kind has no meaning.
+    /// A bit is reserved, or a kind is unknown.
     #[error("a wake has the unknown {what} {value}")]
     Unknown {
         /// The field.
@@ -34,16 +36,16 @@ pub enum MalformedWake {
     /// A wake has too many triggers.
     #[error("a wake has {found} triggers, above the maximum of {TRIGGERS_MAX}")]
     Triggers {
-        /// Their number.
+        /// The number of triggers.
         found: u64,
     },
-    /// Attributes are too long.
+    /// The attributes of a trigger are too long.
     #[error("a trigger has {found} bytes of attributes, above the maximum of {ATTRIBUTES_MAX}")]
     LongAttributes {
-        /// Their length.
+        /// The length of the attributes as JSON, in bytes.
         found: u64,
     },
-    /// Attributes are not a JSON object.
+    /// The attributes of a trigger are not a JSON object.
     #[error("the attributes of a trigger are not a JSON object")]
     Attributes,
 }
@@ -57,12 +59,13 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// Creates a decoder for a lambda with so many inputs.
+    /// Creates a decoder for a lambda with `inputs` inputs.
     pub fn new(inputs: usize) -> Decoder {
         Decoder { previous: PreviousWake::none(inputs) }
     }
 
-    /// Expects the next wake to be encoded without reference to the previous one.
+    /// Forgets the previous wake: the next one begins a block, and is encoded without reference to
+    /// it.
     pub fn reset(&mut self) {
         self.previous.reset();
     }
@@ -71,8 +74,8 @@ impl Decoder {
     ///
     /// # Errors
     ///
-    /// [`MalformedWake`]; then the rest of `bytes` has no meaning, nor have wakes that were encoded
-    /// relative to this one.
+    /// [`MalformedWake`]. Then neither the rest of `bytes` can be decoded, nor any wake that is
+    /// encoded relative to this one.
     pub fn decode(&mut self, bytes: &mut &[u8]) -> Result<JournalEntry> {
         let previous = &self.previous;
         let [flags] = array(bytes)?;
@@ -85,7 +88,7 @@ impl Decoder {
             true => Some(difference(bytes, previous.fuel)?),
             false => None,
         };
-        // Each input has at least one byte.
+        // Each input is encoded in at least one byte: checked before memory is allocated for them.
         if bytes.len() < previous.inputs.len() {
             return Err(MalformedWake::Short);
         }
@@ -100,18 +103,21 @@ impl Decoder {
     }
 }
 
+/// Removes and returns `N` bytes.
 fn array<const N: usize>(bytes: &mut &[u8]) -> Result<[u8; N]> {
     let (array, rest) = bytes.split_first_chunk().ok_or(MalformedWake::Short)?;
     *bytes = rest;
     Ok(*array)
 }
 
+/// Removes and returns a number.
 fn number(bytes: &mut &[u8]) -> Result<u64> {
     let ends = bytes.iter().take(super::number::NUMBER_MAX).any(|byte| byte & 0x80 == 0);
     let short = !ends && bytes.len() < super::number::NUMBER_MAX;
     take(bytes).ok_or(if short { MalformedWake::Short } else { MalformedWake::Number })
 }
 
+/// Removes a difference from `expected`, and returns the value.
 fn difference(bytes: &mut &[u8], expected: u64) -> Result<u64> {
     number(bytes).map(|folded| expected.wrapping_add(unfold(folded)))
 }
@@ -147,14 +153,14 @@ fn cause(flags: u8, previous: &PreviousWake, bytes: &mut &[u8]) -> Result<WakeSo
 }
 
 fn input(previous: &PreviousInput, bytes: &mut &[u8]) -> Result<InputView> {
-    let [set] = array(bytes)?;
-    let mut new = u64::from(set & seen::NEW);
-    if set & seen::NEW == seen::NEW {
+    let [bits] = array(bytes)?;
+    let mut new = u64::from(bits & seen::NEW);
+    if bits & seen::NEW == seen::NEW {
         new = new.checked_add(number(bytes)?).ok_or(MalformedWake::Number)?;
     }
-    let digest = if set & seen::DIGEST != 0 { u32::from_le_bytes(array(bytes)?) } else { 0 };
+    let digest = if bits & seen::DIGEST != 0 { u32::from_le_bytes(array(bytes)?) } else { 0 };
     let expected = previous.expected_newest(new);
-    let newest = match set & seen::NEWEST != 0 {
+    let newest = match bits & seen::NEWEST != 0 {
         false => expected,
         true => match (array(bytes)?, expected) {
             ([newest::NONE], _) => None,
@@ -167,7 +173,7 @@ fn input(previous: &PreviousInput, bytes: &mut &[u8]) -> Result<InputView> {
             }
         },
     };
-    let reach = if set & seen::REACH != 0 { number(bytes)? } else { previous.reach };
+    let reach = if bits & seen::REACH != 0 { number(bytes)? } else { previous.reach };
     Ok(InputView { new, digest, newest, reach })
 }
 

@@ -14,7 +14,7 @@ pub struct Encoder {
 }
 
 impl Encoder {
-    /// Creates an encoder for a lambda with so many inputs.
+    /// Creates an encoder for a lambda with `inputs` inputs.
     pub fn new(inputs: usize) -> Encoder {
         Encoder { previous: PreviousWake::none(inputs), json: Vec::new() }
     }

@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn twins_agree_whatever_their_fuel_time_and_attributes() {
+    fn twins_agree_regardless_of_fuel_time_and_attributes() {
         let difference = changed(|twin| {
             twin.fuel = None;
             twin.run_ns = 1;

@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn an_entry_is_a_source_wherever_it_lies() {
+    fn an_entry_is_a_source_in_any_folder() {
         let [copied, _] = sources(&folder(), "python", "tests/test.py");
         assert!(copied.contains(&"tests/test.py".to_owned()), "{copied:?}");
     }

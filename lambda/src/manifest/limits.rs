@@ -93,7 +93,7 @@ limits! {
     }
 
     /// Memory that the lambda may allocate, and as much again for pixels of frames that it makes.
-    // The rings are beside it.
+    // The memory of the rings comes on top.
     memory: ByteSize { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(1) }
 
     /// Elements of all tables of a component.

@@ -21,7 +21,7 @@ const SOURCES: [&str; 2] = [include_str!("types.rs"), include_str!("config.rs")]
 const BEGIN: &str = r##"# The manifest
 
 `lambda.toml` declares when a lambda wakes, which topics it reads, what its clips contain, what it may use,
-and its settings. It lies in the lambda's folder. Only `[lambda]` and `[schedule]` are required.
+and its settings. It is in the lambda's folder. Only `[lambda]` and `[schedule]` are required.
 
 ```toml
 [lambda]
