@@ -1,8 +1,8 @@
 //! Measures Gleaner against its performance goals, with the programs that users run.
-//! `cargo xtask bench` builds what it needs first.
+//! `cargo xtask bench` builds these programs first.
 //!
-//! Variants are measured in alternating runs on one core; each row gives the median and the spread
-//! of its runs.
+//! Variants of a replay are measured in alternating runs on one core. Each row gives the median,
+//! the lowest and the highest value of its runs.
 
 mod answers;
 mod drives;
@@ -21,7 +21,7 @@ use measure::{Figure, ReplayBench, Twin, quantile};
 /// Measures Gleaner against its performance goals and prints a table in Markdown.
 #[derive(Parser)]
 struct Args {
-    /// Fewer rounds: shows that the benches run; the values are not meaningful.
+    /// Fewer and shorter rounds: tests the benches themselves; the values are not meaningful.
     #[arg(long)]
     quick: bool,
     /// Live topics instead of drives, in a private network; needs gleaner-player.
@@ -31,11 +31,11 @@ struct Args {
     /// instead of drives.
     #[arg(long, conflicts_with = "live")]
     kernels: bool,
-    /// Drives of 2 GB in each storage, instead of short ones; takes 5 GB of disk.
+    /// Drives of 2 GB in each storage format, instead of short ones; takes 5 GB of disk.
     #[arg(long, conflicts_with_all = ["live", "kernels", "isolation"])]
     drives: bool,
-    /// Effect of a misbehaving lambda on others, in a private network, and costs of a process,
-    /// instead of drives; needs gleaner-player.
+    /// Effect of a misbehaving lambda on others, in a private network, and the cost of a process
+    /// for each lambda, instead of drives; needs gleaner-player.
     #[arg(long, conflicts_with_all = ["live", "kernels"])]
     isolation: bool,
 }
@@ -112,30 +112,30 @@ fn main() -> ExitCode {
         &arrays,
     ));
 
-    let what = || [("", Vec::new()), ("journal", Vec::new()), ("clips", Vec::new())];
+    let outputs = || [("", Vec::new()), ("journal", Vec::new()), ("clips", Vec::new())];
     let [imu, sample] = [
-        alternate(rounds, what(), |what| bench.imu_rounds(what)),
-        alternate(rounds, what(), |what| bench.sample_rounds(what)),
+        alternate(rounds, outputs(), |output| bench.imu_rounds(output)),
+        alternate(rounds, outputs(), |output| bench.sample_rounds(output)),
     ];
-    let slower = |replays: &[(&str, Vec<f64>); 3], with: usize| {
-        let pairs = replays[0].1.iter().zip(&replays[with].1);
-        pairs.map(|(a, b)| 100.0 * (a / b - 1.0)).collect::<Vec<_>>()
+    let slowdown_percent = |replays: &[(&str, Vec<f64>); 3], output: usize| {
+        let rates = replays[0].1.iter().zip(&replays[output].1);
+        rates.map(|(without, with)| 100.0 * (without / with - 1.0)).collect::<Vec<_>>()
     };
     figures.push(Figure::at_most(
         "replay slowdown by a journal, 200 s of IMU, wasm",
         "%",
         5.0,
-        &slower(&imu, 1),
+        &slowdown_percent(&imu, 1),
     ));
     figures.push(Figure::without_goal(
         "replay slowdown by a journal, sample drive with camera, wasm",
         "%",
-        &slower(&sample, 1),
+        &slowdown_percent(&sample, 1),
     ));
     figures.push(Figure::without_goal(
         "replay slowdown by clips, sample drive with camera, wasm",
         "%",
-        &slower(&sample, 2),
+        &slowdown_percent(&sample, 2),
     ));
     let sizes = [("hello", 14.0), ("brake-dark", 20.0)];
     for (example, goal) in sizes {
@@ -160,7 +160,7 @@ fn main() -> ExitCode {
         add("arrived", "MB/s", load.megabytes_per_s);
         add("share of time in clips", "%", load.recorded_percent);
         add("share of a core", "%", load.cpu_percent);
-        // On top of the preroll: a chunk and its compression.
+        // 64 MiB for a preroll in memory, and 16 MiB for a chunk of a clip and its compression.
         let bound = if store == Store::Ram { 64.0 + 16.0 } else { 16.0 };
         let memory = format!("recorder at 20 MB/s, preroll in {name}: memory");
         figures.push(Figure::at_most(&memory, "MiB", bound, &[load.memory_mib]));
@@ -169,17 +169,17 @@ fn main() -> ExitCode {
     }
 
     let live = record::record_live(if quick { 4 } else { 60 });
-    let opened = |share| quantile(&live.opened_ms, share);
+    let opened_ms = |share| quantile(&live.opened_ms, share);
     figures.push(Figure::without_goal(
         "trigger to window open, at 20 MB/s: p50",
         "ms",
-        &[opened(0.5)],
+        &[opened_ms(0.5)],
     ));
     figures.push(Figure::at_most(
         "trigger to window open, at 20 MB/s: p99",
         "ms",
         1.0,
-        &[opened(0.99)],
+        &[opened_ms(0.99)],
     ));
     figures.push(Figure::without_goal(
         "trigger to window open, at 20 MB/s: max",
@@ -211,12 +211,12 @@ fn report(figures: &[Figure], quick: bool) -> ExitCode {
     for figure in figures {
         println!("{figure}");
     }
-    // Two rounds on a busy machine are not significant.
+    // The goals do not count in a quick run: one round on a busy machine is not significant.
     if quick || figures.iter().all(Figure::is_met) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// Runs `measure` for each of `series` in turn, `rounds` times, so that drift of the machine
-/// affects all of them alike.
+/// Runs `measure` for each of `series` in turn, `rounds` times, so that changes of the machine's
+/// speed affect all of them alike.
 fn alternate<K: Copy, const N: usize>(
     rounds: usize,
     mut series: [(K, Vec<f64>); N],

@@ -66,8 +66,8 @@ impl Invoker {
     }
 
     /// Peak resident memory of the lambda's process, in bytes.
-    pub fn most_resident_bytes(&self) -> u64 {
-        self.guest.most_resident_bytes()
+    pub fn peak_resident_bytes(&self) -> u64 {
+        self.guest.peak_resident_bytes()
     }
 
     /// Total time spent in the lambda so far.

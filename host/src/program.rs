@@ -192,7 +192,7 @@ impl Cli {
         let Self { unpacked, command, .. } = self;
         let mut job = command.job()?;
         if let Ok(RuntimeJob::Replay(job)) = &mut job {
-            job.take(unpacked)?;
+            job.use_unpacked(unpacked)?;
         }
         Ok(job)
     }

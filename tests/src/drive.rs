@@ -23,8 +23,8 @@ MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n\
 ================================================================================\n\
 MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
 
-/// Writes a drive with one topic; a message is its log time in nanoseconds and its CDR without
-/// encapsulation.
+/// Writes a drive with one topic. Each of `messages` has a log time in nanoseconds and the CDR
+/// without its encapsulation header.
 pub fn one_topic(
     folder: &TempFolder,
     topic: &str,
@@ -55,7 +55,7 @@ pub fn one_topic(
     folder.write("made.mcap", file.into_inner())
 }
 
-/// Writes a drive with only the IMU of the sample drive, `times` times in a row, 40 s each.
+/// Writes a drive with only the IMU of the sample drive, `times` times in a row, 40.1 s apart.
 pub fn imu_only(folder: &TempFolder, times: u64) -> PathBuf {
     let bytes = std::fs::read(sample_drive()).expect("the sample drive exists");
     let messages = mcap::MessageStream::new(&bytes)
@@ -72,8 +72,8 @@ pub fn imu_only(folder: &TempFolder, times: u64) -> PathBuf {
     one_topic(folder, "/imu/data", "sensor_msgs/msg/Imu", &schema, &rounds.collect::<Vec<_>>())
 }
 
-/// Writes a drive with the IMU of the sample drive and `topics` further topics: `/many/0` and so
-/// on, each with ten of its messages.
+/// Writes a drive with the IMU of the sample drive and `topics` further topics, `/many/0` and so
+/// on, each with ten of the IMU messages.
 pub fn with_topics(folder: &TempFolder, topics: u16) -> PathBuf {
     let bytes = std::fs::read(sample_drive()).expect("the sample drive exists");
     let mut file = Cursor::new(Vec::new());
@@ -112,19 +112,19 @@ pub fn with_topics(folder: &TempFolder, topics: u16) -> PathBuf {
 /// A message of the sample drive that a test may change.
 #[derive(Clone, Debug)]
 pub struct DriveMessage {
-    /// Its topic.
+    /// Topic of the message.
     pub topic: String,
-    /// Seconds after the drive's first message.
+    /// Time in seconds after the drive's first message.
     pub at_s: f64,
-    /// Its log time in nanoseconds.
+    /// Log time in nanoseconds.
     pub log_time: u64,
-    /// Its CDR, with the encapsulation header.
+    /// CDR of the message, with the encapsulation header.
     pub data: Vec<u8>,
 }
 
 impl DriveMessage {
-    /// Offset of the first field after its header, for types of 64-bit floats: after the stamp and
-    /// `frame_id`.
+    /// Offset in `data` of the first field after `header`, for types whose other fields are 64-bit
+    /// floats.
     fn body(&self) -> usize {
         let length =
             u32::from_le_bytes(self.data[12..16].try_into().expect("a header has a frame_id"));
@@ -132,7 +132,8 @@ impl DriveMessage {
         (12 + length as usize).next_multiple_of(8) + 4
     }
 
-    /// Replaces the float with the given index, from 0, after its header.
+    /// Sets the float with this index, from 0, after `header`, for types whose other fields are
+    /// 64-bit floats.
     pub fn set(&mut self, index: usize, value: f64) {
         let at = self.body() + 8 * index;
         self.data[at..at + 8].copy_from_slice(&value.to_le_bytes());
@@ -145,8 +146,8 @@ impl DriveMessage {
     }
 }
 
-/// Writes the sample drive with each message changed by `change`, without those for which it
-/// returns `false`.
+/// Writes the sample drive with each message changed by `change`, which returns `false` to leave a
+/// message out.
 pub fn changed(folder: &TempFolder, mut change: impl FnMut(&mut DriveMessage) -> bool) -> PathBuf {
     let bytes = std::fs::read(sample_drive()).expect("the sample drive exists");
     let mut file = Cursor::new(Vec::new());
@@ -176,67 +177,67 @@ pub fn changed(folder: &TempFolder, mut change: impl FnMut(&mut DriveMessage) ->
     folder.write("changed.mcap", file.into_inner())
 }
 
-/// Little-endian CDR, field by field.
+/// Encodes a message as little-endian CDR, field by field.
 #[derive(Default)]
 pub struct CdrBuilder(Vec<u8>);
 
 impl CdrBuilder {
-    /// A `std_msgs/msg/Header` with stamp 0 and no frame.
+    /// Begins with a `std_msgs/msg/Header` with stamp 0 and an empty `frame_id`.
     pub fn header() -> Self {
         Self::default().u32(0).u32(0).text("")
     }
 
-    /// A 32-bit number.
+    /// Appends a 32-bit number.
     pub fn u32(mut self, value: u32) -> Self {
         self.0.resize(self.0.len().next_multiple_of(4), 0);
         self.0.extend(value.to_le_bytes());
         self
     }
 
-    /// A byte.
+    /// Appends a byte.
     pub fn u8(mut self, value: u8) -> Self {
         self.0.push(value);
         self
     }
 
-    /// A string.
+    /// Appends a string.
     pub fn text(self, text: &str) -> Self {
         let mut cdr = self.u32(text.len() as u32 + 1);
         cdr.0.extend(text.as_bytes());
         cdr.u8(0)
     }
 
-    /// A sequence of bytes.
+    /// Appends a sequence of bytes.
     pub fn bytes(self, bytes: &[u8]) -> Self {
         let mut cdr = self.u32(bytes.len() as u32);
         cdr.0.extend(bytes);
         cdr
     }
 
-    /// The message.
+    /// Returns the CDR, without an encapsulation header.
     pub fn done(self) -> Vec<u8> {
         self.0
     }
 }
 
-/// An image message with the given fields, consistent or not.
+/// Encodes an image message with the given fields, which may contradict each other.
 pub fn image(width: u32, height: u32, encoding: &str, step: u32, data: &[u8]) -> Vec<u8> {
     CdrBuilder::header().u32(height).u32(width).text(encoding).u8(0).u32(step).bytes(data).done()
 }
 
-/// A compressed image message.
+/// Encodes a compressed image message of format `jpeg`.
 pub fn compressed(data: &[u8]) -> Vec<u8> {
     CdrBuilder::header().text("jpeg").bytes(data).done()
 }
 
-/// The sample drive, truncated to the share `part` of its bytes.
+/// Writes the sample drive, truncated to the fraction `part` of its bytes.
 pub fn truncated(folder: &TempFolder, part: f64) -> PathBuf {
     let whole = std::fs::read(sample_drive()).expect("the sample drive exists");
     let len = (whole.len() as f64 * part) as usize;
     folder.write("truncated.mcap", &whole[..len])
 }
 
-/// The sample drive with one byte changed in the middle of its data.
+/// Writes the sample drive with the byte in its middle changed.
 pub fn corrupted(folder: &TempFolder) -> PathBuf {
     let mut whole = std::fs::read(sample_drive()).expect("the sample drive exists");
     let middle = whole.len() / 2;

@@ -1,7 +1,6 @@
-//! A private network for a test: only `lo`, with multicast, and no other processes.
-//!
-//! Linux gives a process and its children a network namespace of their own. Without it a DDS peer
-//! could talk to other programs on this machine or its network.
+//! A private network for a test: a network namespace for one process and its children, with only
+//! `lo` and multicast. In the network of the machine, a DDS participant of a test would discover
+//! those of other programs.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -9,24 +8,25 @@ use std::sync::OnceLock;
 
 use libtest_mimic::Failed;
 
-/// Prepares a network for DDS, then runs the program in `$0` with its arguments.
+/// Shell script that prepares the network for DDS, then becomes the program in `$0` with its
+/// arguments.
 const SET_UP: &str = "ip link set lo up && ip link set lo multicast on && \
                       ip route add 224.0.0.0/4 dev lo && exec \"$0\" \"$@\"";
 
-/// The reason why there is no private network; `None` if there is.
+/// Returns the reason why no private network can be created; `None` if one can.
 pub fn unavailable() -> Option<&'static str> {
     if unshare_options().is_some() {
         None
     } else {
-        Some("cannot create a private network: unshare -n and ip are needed")
+        Some("cannot create a private network: `unshare -n` or `ip` is missing or not permitted")
     }
 }
 
-/// A command that runs `program` in a private network, which ends with it.
+/// Returns a command that runs `program` in a new private network, which ends with it.
 ///
 /// # Panics
 ///
-/// If there is none; see [`unavailable`].
+/// If no private network can be created; see [`unavailable`].
 pub fn command(program: &Path) -> Command {
     let mut command =
         shell(unshare_options().expect("the caller has checked `unavailable`"), SET_UP);
@@ -34,30 +34,30 @@ pub fn command(program: &Path) -> Command {
     command
 }
 
-/// A command that runs this program again in a private network, with the variable `name` set to
-/// `value` to select its work.
+/// Returns a command that runs this program again in a private network, with the environment
+/// variable `name` set to `value` to select its work.
 ///
 /// # Panics
 ///
 /// As [`command`].
-pub fn again(name: &str, value: &str) -> Command {
+pub fn rerun(name: &str, value: &str) -> Command {
     let mut command = command(&std::env::current_exe().expect("a program has a path"));
     command.env(name, value);
     command
 }
 
-/// Runs a case of a suite in a private network: this program again, with the variable `name` set to
-/// `case`. Prints its output.
+/// Runs a case of a test suite in a private network: runs this program again with the environment
+/// variable `name` set to `case`, and prints its output.
 ///
 /// # Errors
 ///
-/// Its exit status and its standard error, if it failed.
+/// The exit status and standard error of the case, if it failed.
 ///
 /// # Panics
 ///
 /// As [`command`].
 pub fn case(name: &str, case: &str) -> Result<(), Failed> {
-    let output = again(name, case).stdin(Stdio::null()).output()?;
+    let output = rerun(name, case).stdin(Stdio::null()).output()?;
     print!("{}", String::from_utf8_lossy(&output.stdout));
     if output.status.success() {
         return Ok(());
@@ -65,8 +65,8 @@ pub fn case(name: &str, case: &str) -> Result<(), Failed> {
     Err(format!("{}; stderr:\n{}", output.status, String::from_utf8_lossy(&output.stderr)).into())
 }
 
-/// The options of `unshare` that work here: root needs only `-n`; other users become root of a user
-/// namespace, where that is permitted.
+/// Returns the options of `unshare` that work here: root needs only `-n`; other users become root
+/// of a user namespace, where that is permitted.
 fn unshare_options() -> Option<&'static [&'static str]> {
     static OPTIONS: OnceLock<Option<&[&str]>> = OnceLock::new();
     *OPTIONS.get_or_init(|| {

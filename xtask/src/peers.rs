@@ -67,7 +67,7 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     }
     let help =
         format!("as root: cargo xtask peers --install, or: apt-get install {}", missing.join(" "));
-    Err(Failure::new(Exit::Unreachable, "packages are missing").with_help(help))
+    Err(Failure::new(Exit::Unreachable, "packages for the DDS peers are missing").with_help(help))
 }
 
 /// Marks a failed download.

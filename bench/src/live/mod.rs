@@ -41,7 +41,7 @@ fn start_in_private_network() -> Result<bool, String> {
     let before = std::fs::read_to_string(BUFFER_LIMIT).unwrap_or_default();
     let is_small = before.trim().parse::<u64>().is_ok_and(|bytes| bytes < BUFFER_BYTES);
     let raised = is_small && std::fs::write(BUFFER_LIMIT, BUFFER_BYTES.to_string()).is_ok();
-    let status = namespace::again(ALONE, "1").args(std::env::args_os().skip(1)).status();
+    let status = namespace::rerun(ALONE, "1").args(std::env::args_os().skip(1)).status();
     if raised {
         // Restored for the other users of this machine.
         let _ = std::fs::write(BUFFER_LIMIT, before.trim());

@@ -1,4 +1,4 @@
-//! Writes a topic.
+//! Publishes messages on a topic.
 
 use bytes::Bytes;
 use rustdds::dds::{CreateError, WriteError};
@@ -12,10 +12,10 @@ use super::raw::RawWriter;
 use super::receive::{ReceiverCommand, ReceiverHandle};
 use super::state::ParticipantState;
 
-/// Time that a write waits for room: the caller is about to process the next sample, and one
-/// stalled reader must not delay that.
+/// Maximum time that a write waits for room in the history. The caller processes the next sample
+/// after the write, and one stalled reader must not delay that.
 const MAX_BLOCKING: Duration = Duration::ZERO;
-/// Samples that are kept for retransmission.
+/// Allowed number of samples that are kept for retransmission.
 const DEPTH: std::ops::RangeInclusive<usize> = 1..=65_536;
 
 /// A writer of one topic.
@@ -46,16 +46,16 @@ impl TopicWriter {
             .durability(policy::Durability::Volatile)
             .history(policy::History::KeepLast { depth })
             .build();
-        // Locked, so that no match is missed before the writer is followed.
+        // Locked until the matches of the writer are counted, so that none is missed.
         let mut peers = state.peers();
-        let made = (|| {
+        let created = (|| {
             let topic =
                 participant.create_topic(dds_topic, dds_type, &policies, TopicKind::NoKey)?;
             participant
                 .create_publisher(&policies)?
                 .create_datawriter_no_key(&topic, Some(policies.clone()))
         })();
-        let writer: RawWriter = made.map_err(|error: CreateError| DdsError::Advertise {
+        let writer: RawWriter = created.map_err(|error: CreateError| DdsError::Advertise {
             topic: topic.to_owned(),
             source: error.into(),
         })?;
@@ -74,8 +74,8 @@ impl TopicWriter {
     ///
     /// # Errors
     ///
-    /// [`DdsError`] if DDS refuses it, as it does while a reader has not confirmed the last 8,192
-    /// messages. It never waits for one.
+    /// [`DdsError::Write`] if DDS refuses the message, for example because a reader has not
+    /// acknowledged 8,192 earlier messages. The call does not wait for readers.
     pub fn write(&self, cdr: &[u8]) -> Result<(), DdsError> {
         let why = |error: WriteError<Bytes>| match error {
             WriteError::WouldBlock { .. } => "readers do not keep up".to_owned(),
@@ -85,7 +85,7 @@ impl TopicWriter {
         sent.map_err(|error| DdsError::Write { topic: self.topic.clone(), why: why(error) })
     }
 
-    /// Number of matched readers.
+    /// Returns the number of matched readers.
     pub fn readers(&self) -> usize {
         self.state.peers().connected(self.guid())
     }

@@ -43,7 +43,7 @@ unsafe impl GlobalAlloc for CountingAllocator {
 /// Counts `memory`, or reports to the shim that none is left; returns `memory`.
 fn counted(memory: *mut u8, bytes: usize) -> *mut u8 {
     if memory.is_null() {
-        Pulse::report_full();
+        Pulse::report_refused_memory();
     } else {
         own::allocated(bytes);
     }

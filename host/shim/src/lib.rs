@@ -229,7 +229,7 @@ fn exit_like(record: &ExitRecord) -> ExitCode {
     // If the user can make the lambda fit, explain it, whichever process ended it.
     let help = match &record.killed {
         Some(killed) => Some(killed.help()),
-        None => record.out_of_memory.then_some("keep less, or raise `memory` in [limits]"),
+        None => record.out_of_memory.then_some("keep less data, or raise `memory` in [limits]"),
     };
     if let Some((help, why)) = help.zip(record.sentence()) {
         let mut failure = Failure::new(Exit::LambdaFaulted, "the lambda was killed");

@@ -20,38 +20,39 @@ const FORWARDED: [(i32, Signal); 4] = [
 
 /// Signals received and not yet forwarded.
 pub(crate) struct Signals {
-    bell: UnixStream,
+    /// Becomes readable when a signal is received.
+    notified: UnixStream,
     received: [Arc<AtomicBool>; FORWARDED.len()],
 }
 
 impl Signals {
     /// Registers for the signals; they no longer end this process.
     pub(crate) fn register() -> io::Result<Self> {
-        let (bell, ring) = UnixStream::pair()?;
-        bell.set_nonblocking(true)?;
+        let (notified, notifier) = UnixStream::pair()?;
+        notified.set_nonblocking(true)?;
         let received = std::array::from_fn(|_| Arc::new(AtomicBool::new(false)));
         for ((number, _), received) in FORWARDED.iter().zip(&received) {
-            // The flag first: it must be set when `bell` becomes readable.
+            // The flag first: it must be set when `notified` becomes readable.
             signal_hook::flag::register(*number, Arc::clone(received))?;
-            signal_hook::low_level::pipe::register(*number, ring.try_clone()?)?;
+            signal_hook::low_level::pipe::register(*number, notifier.try_clone()?)?;
         }
-        Ok(Self { bell, received })
+        Ok(Self { notified, received })
     }
 
-    /// File descriptor that becomes readable when a signal is received.
-    pub(crate) fn bell(&self) -> BorrowedFd<'_> {
-        self.bell.as_fd()
+    /// Returns the file descriptor that becomes readable when a signal is received.
+    pub(crate) fn as_fd(&self) -> BorrowedFd<'_> {
+        self.notified.as_fd()
     }
 
     /// Returns the signals received since the last call.
     pub(crate) fn take(&mut self) -> impl Iterator<Item = Signal> + '_ {
         let mut buffer = [0; 64];
-        while matches!(self.bell.read(&mut buffer), Ok(1..)) {}
+        while matches!(self.notified.read(&mut buffer), Ok(1..)) {}
         FORWARDED
             .iter()
             .zip(&self.received)
             .filter(|(_, received)| received.swap(false, Ordering::Relaxed))
-            .map(|((_, it), _)| *it)
+            .map(|((_, signal), _)| *signal)
     }
 }
 

@@ -1,4 +1,4 @@
-//! Watches a runtime from its start to its end.
+//! Watches a child process, a runtime or a compiler, from its start to its end.
 
 use std::io;
 use std::os::unix::process::ExitStatusExt;
@@ -17,9 +17,9 @@ use crate::health_check::HealthCheck;
 use crate::signals::{Signals, time_of_day_ns};
 
 /// Time to wait for the end of a killed process before it is killed again.
-const UNTIL_GONE: Duration = Duration::from_millis(100);
+const KILL_INTERVAL: Duration = Duration::from_millis(100);
 
-/// A runtime that has been started.
+/// A child process that has been started, with what it takes to watch it.
 pub(crate) struct RunningProcess {
     pub(crate) child: Child,
     pub(crate) pulse: Pulse,
@@ -27,36 +27,37 @@ pub(crate) struct RunningProcess {
     pub(crate) group: Option<Group>,
 }
 
-/// The end of a runtime, and its circumstances.
+/// The end of a child process, and its cause.
 pub(crate) struct ProcessEnd {
     pid: u32,
     status: ExitStatus,
     killed: Option<Killed>,
     out_of_memory: bool,
-    asked: bool,
+    end_requested: bool,
     phase: Option<Phase>,
-    /// Dropped last: orphans are still in the group.
+    /// Kept until the caller has killed the orphans, which are in the group: dropping removes it.
     _group: Option<Group>,
 }
 
 impl RunningProcess {
-    /// Waits for the end, forwards signals, and kills an overdue runtime.
+    /// Waits for the end. Meanwhile forwards signals, and kills the process if [`HealthCheck`]
+    /// finds a reason, or if it has not ended [`SHUTDOWN_TIMEOUT`] after the first signal.
     pub(crate) fn wait(mut self) -> io::Result<ProcessEnd> {
         let pid = Pid::from_child(&self.child);
         let process = pidfd_open(pid, PidfdFlags::empty())?;
         let mut killed = None;
         let mut health = HealthCheck::of(self.child.id());
-        let mut asked: Option<Instant> = None;
+        let mut end_requested_at: Option<Instant> = None;
         loop {
             let timeout = match health.check(&self.pulse) {
                 Ok(why) => {
                     killed = killed.or(Some(why));
                     kill_process(pid, Signal::KILL)?;
-                    UNTIL_GONE
+                    KILL_INTERVAL
                 }
                 Err(timeout) => timeout,
             };
-            if asked.is_some_and(|asked| asked.elapsed() >= SHUTDOWN_TIMEOUT) {
+            if end_requested_at.is_some_and(|at| at.elapsed() >= SHUTDOWN_TIMEOUT) {
                 kill_process(pid, Signal::KILL)?;
             }
             let timeout = Timespec {
@@ -65,7 +66,7 @@ impl RunningProcess {
             };
             let mut ready = [
                 PollFd::new(&process, PollFlags::IN),
-                PollFd::from_borrowed_fd(self.signals.bell(), PollFlags::IN),
+                PollFd::from_borrowed_fd(self.signals.as_fd(), PollFlags::IN),
             ];
             match poll(&mut ready, Some(&timeout)) {
                 Ok(_) | Err(rustix::io::Errno::INTR) => {}
@@ -74,23 +75,21 @@ impl RunningProcess {
             for signal in self.signals.take() {
                 // The process may just have ended, which makes no difference.
                 let _ = kill_process(pid, signal);
-                asked = asked.or(Some(Instant::now()));
+                end_requested_at = end_requested_at.or(Some(Instant::now()));
             }
             if let Some(status) = self.child.try_wait()? {
-                let full = status.signal() == Some(Signal::ABORT.as_raw()) && self.pulse.was_full();
-                let out_of_memory =
-                    full || self.group.as_ref().is_some_and(|group| group.killed_for_memory() > 0);
-                // It may have returned, or ended by itself, just before it was killed.
+                let has_aborted = status.signal() == Some(Signal::ABORT.as_raw());
+                let out_of_memory = has_aborted && self.pulse.was_refused_memory()
+                    || self.group.as_ref().is_some_and(|group| group.killed_for_memory() > 0);
+                // It may have ended by itself just before the kill.
                 let killed = killed.filter(|_| status.signal() == Some(Signal::KILL.as_raw()));
-                let pid = self.child.id();
-                let (asked, phase) = (asked.is_some(), Some(self.pulse.phase()));
                 return Ok(ProcessEnd {
-                    pid,
+                    pid: self.child.id(),
                     status,
                     killed,
                     out_of_memory,
-                    asked,
-                    phase,
+                    end_requested: end_requested_at.is_some(),
+                    phase: Some(self.pulse.phase()),
                     _group: self.group,
                 });
             }
@@ -99,8 +98,10 @@ impl RunningProcess {
 }
 
 impl ProcessEnd {
+    /// Returns the record of the end, now. `orphans` processes outlived the child and were killed.
     pub(crate) fn record(&self, started_ns: i64, orphans: u32) -> ExitRecord {
-        // It was the only child that was waited for, but for its own orphans.
+        // The shim has waited for this child and its orphans only, so the sum of all children that
+        // it has waited for is theirs.
         let usage = getrusage(UsageWho::RUSAGE_CHILDREN).ok();
         let cpu =
             usage.map_or(0, |usage| (usage.user_time() + usage.system_time()).num_microseconds());
@@ -116,7 +117,7 @@ impl ProcessEnd {
                 .map_or(0, |usage| u64::try_from(usage.max_rss()).unwrap_or(0) * 1024),
             cpu_ns: u64::try_from(cpu).unwrap_or(0) * 1000,
             orphans,
-            end_requested: self.asked,
+            end_requested: self.end_requested,
             phase: self.phase,
         }
     }

@@ -1,14 +1,15 @@
-//! Models that run on the host. This build has no model runtime: every call returns that error.
+//! Models that run on the host. This build has no model runtime: every call returns
+//! [`InferenceError::NoRuntime`].
 
 use super::fuel::{Fuel, OutOfFuel};
 
-/// A model that could not be opened or run.
+/// The reason why a call failed that creates a tensor, or opens or runs a model.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InferenceError {
     /// The host was built without a model runtime.
     #[error("no model runtime in this build")]
     NoRuntime,
-    /// The lambda cannot pay for the call.
+    /// The lambda has less fuel than the call costs.
     #[error(transparent)]
     OutOfFuel(#[from] OutOfFuel),
 }
@@ -21,7 +22,7 @@ pub enum InferenceErrorKind {
 }
 
 impl InferenceErrorKind {
-    /// The name in the WIT.
+    /// Returns the name of the case in the WIT.
     pub fn name(self) -> &'static str {
         match self {
             Self::NoRuntime => "no-runtime",
@@ -30,16 +31,16 @@ impl InferenceErrorKind {
 }
 
 impl InferenceError {
-    /// The case that the lambda receives.
+    /// Returns the case that the lambda receives.
     pub fn kind(&self) -> InferenceErrorKind {
         match self {
-            // A guest with a fuel allowance is ended instead.
+            // A lambda that runs out of fuel is ended and receives no error.
             Self::NoRuntime | Self::OutOfFuel(_) => InferenceErrorKind::NoRuntime,
         }
     }
 }
 
-/// Numbers on the host. Cannot be created in this build.
+/// A tensor in host memory. Cannot be created in this build.
 #[derive(Debug)]
 pub enum Tensor {}
 
@@ -48,11 +49,12 @@ pub enum Tensor {}
 pub enum Model {}
 
 impl Tensor {
-    /// Creates a tensor from numbers that take `bytes` bytes with its shape.
+    /// Creates a tensor from numbers. `bytes` is the size of the numbers and of the shape.
     ///
     /// # Errors
     ///
-    /// [`InferenceError::NoRuntime`]; [`InferenceError::OutOfFuel`].
+    /// [`InferenceError::OutOfFuel`] if too little fuel is left; otherwise
+    /// [`InferenceError::NoRuntime`].
     pub fn from_values(bytes: usize, fuel: &Fuel) -> Result<Self, InferenceError> {
         fuel.charge(|| bytes)?;
         Self::new(fuel)
@@ -74,11 +76,11 @@ impl Tensor {
 }
 
 impl Model {
-    /// Opens the `[[model]]` of that name.
+    /// Opens the `[[model]]` of the manifest with this name.
     ///
     /// # Errors
     ///
-    /// [`InferenceError::NoRuntime`]; [`InferenceError::OutOfFuel`].
+    /// As [`Tensor::from_values`].
     pub fn open(name: &str, fuel: &Fuel) -> Result<Self, InferenceError> {
         fuel.charge(|| name.len())?;
         fuel.charge_call()?;

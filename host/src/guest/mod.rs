@@ -1,7 +1,8 @@
-//! Guests, which run lambdas. One thread owns a guest; nothing outside this room depends on its
-//! kind.
+//! Guests, which run the code of lambdas: as WebAssembly or Python, in this process or in another.
+//! Callers use the trait [`Guest`] and do not depend on the kind. One thread owns a guest.
 //!
-//! A guest that faults is never entered again: the next wake runs a fresh one, after its `init`.
+//! After a fault, a guest discards its instance of the lambda. The next wake creates a new one and
+//! runs its `init` first.
 
 #[cfg(feature = "wasm")]
 pub mod wasm;
@@ -25,8 +26,8 @@ use gleaner_vitals::usage;
 use crate::api::curves::Curves;
 use crate::api::data::{Counts, Topic, Wake};
 
-/// Returns whether a call that returned after `elapsed` is a fault, though it was not interrupted
-/// after `allowed`. All time counts, also that of other processes.
+/// Returns whether a call that took `elapsed` exceeded its deadline `allowed`, although it returned
+/// before it was interrupted. The time is wall time, so it includes the time of other processes.
 pub fn is_late(elapsed: Duration, allowed: Duration) -> bool {
     /// Delay with which an interruption may take effect.
     const TOLERANCE: Duration = Duration::from_millis(2);
@@ -35,12 +36,12 @@ pub fn is_late(elapsed: Duration, allowed: Duration) -> bool {
 
 /// A lambda that can be woken.
 pub trait Guest {
-    /// Runs untrusted start-up code (site packages, numpy) before `init`. Called once, before the
-    /// first `init`, or by that.
+    /// Runs untrusted start-up code (site packages, numpy) before `init`. Called at most once; if
+    /// it was not, the first `init` calls it.
     ///
     /// # Errors
     ///
-    /// The fault that ended it.
+    /// The fault that ended the start-up code.
     fn prepare(&mut self) -> Result<(), Fault> {
         Ok(())
     }
@@ -52,8 +53,8 @@ pub trait Guest {
     /// The fault that ended `init`.
     fn init(&mut self) -> Result<(), Fault>;
 
-    /// Returns whether the lambda runs at `wake`: in another process, the ring may have had no slot
-    /// for the sample that causes it.
+    /// Returns whether the lambda runs in this wake. A guest in another process skips a wake if the
+    /// ring of that process had no slot for the sample.
     fn expects(&mut self, _wake: &Wake) -> bool {
         true
     }
@@ -61,15 +62,15 @@ pub trait Guest {
     /// Runs one wake to its end.
     fn wake(&mut self, wake: Wake) -> WakeOutcome;
 
-    /// Discards the lambda after a wake without a fault of its own: the next wake begins with a
-    /// fresh one, as after a fault.
+    /// Discards the instance of the lambda, as after a fault. Called if a call returned without a
+    /// fault but the lambda uses too much memory.
     fn discard(&mut self) {}
 
     /// The engine that runs the lambda, with its version: a decision is only reproducible on the
     /// same engine.
     fn engine(&self) -> String;
 
-    /// The layers around the process that runs the lambda. Called before the first `init`.
+    /// The sandbox layers of the process that runs the lambda. Called before the first `init`.
     ///
     /// # Errors
     ///
@@ -78,18 +79,18 @@ pub trait Guest {
         Ok(Vec::new())
     }
 
-    /// Resident memory of that process, in bytes.
+    /// Resident memory of the process that runs the lambda, in bytes.
     fn resident_bytes(&self) -> u64 {
         usage::resident()
     }
 
-    /// Peak resident memory of that process, in bytes.
-    fn most_resident_bytes(&self) -> u64 {
+    /// Peak resident memory of the process that runs the lambda, in bytes.
+    fn peak_resident_bytes(&self) -> u64 {
         usage::peak_resident()
     }
 
-    /// Ends a lambda that runs in another process, after its last wake; returns the totals that
-    /// only that process has.
+    /// Ends a lambda that runs in another process, after its last wake. Returns the totals, which
+    /// only that process has; `None` for a lambda in this process.
     ///
     /// # Errors
     ///
@@ -99,7 +100,7 @@ pub trait Guest {
     }
 }
 
-/// Totals of a replay, beside its decisions.
+/// Totals of a replay that its decisions do not contain.
 pub struct Totals {
     /// Counts of the samples of each input, in the manifest's order.
     pub counts: Vec<Counts>,
@@ -107,12 +108,12 @@ pub struct Totals {
     pub decode_ns: u64,
     /// Curves of the values that the lambda read.
     pub curves: Vec<Curve>,
-    /// Number of fields that it read and that have no curve.
+    /// Number of fields that the lambda read beyond the maximum number of curves.
     pub curves_omitted: u64,
 }
 
 impl Totals {
-    /// Totals of a lambda over `inputs` in this process, with the curves of what it read.
+    /// Totals of a lambda in this process: of its `inputs`, and the curves of the values it read.
     pub fn of(inputs: &[Arc<Topic>], curves: &Curves) -> Self {
         let (curves, curves_omitted) = curves.take();
         Self {
@@ -128,8 +129,8 @@ impl Totals {
 pub struct WakeOutcome {
     /// The fault that ended it, if any.
     pub result: Result<(), Fault>,
-    /// Fuel used, where the kind counts it and it is the same on every machine.
+    /// Fuel used. `None` for Python, which has none, and where it depends on the machine.
     pub fuel: Option<u64>,
-    /// Time in the lambda, if another process measured it.
+    /// Run time of the lambda, if it runs in another process, which measures it.
     pub run_ns: Option<u64>,
 }

@@ -10,12 +10,12 @@ use gleaner_drives::{ContentName, Unpacked, unpack};
 use super::open::DriveError;
 use super::{ReplayJob, ReplayOptions};
 
-/// The argument of a worker that gives a packed file and the name of its content.
+/// Option of a worker with two values: a packed file, and the path of its unpacked content.
 const UNPACKED: &str = "--unpacked";
-/// The argument that gives a packed file whose content is incomplete, and the reason.
+/// Option of a worker with two values: a packed file whose content is incomplete, and the reason.
 const BROKEN: &str = "--unpacked-in-part";
 
-/// Contents of packed drives, as arguments of a worker.
+/// Arguments with which a worker receives the contents of packed drives.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct UnpackedArgs {
     #[arg(long, hide = true, num_args = 2, allow_hyphen_values = true)]
@@ -24,7 +24,7 @@ pub struct UnpackedArgs {
     unpacked_in_part: Vec<OsString>,
 }
 
-/// Drives of a job, of which a worker needs the packed ones unpacked.
+/// The drives of a job, to unpack the packed ones among them for a worker.
 pub struct Packed {
     named: Vec<PathBuf>,
     options: replay::DriveOptions,
@@ -39,7 +39,7 @@ pub struct WorkerContents {
 }
 
 impl ReplayJob {
-    /// The packed files among the drives.
+    /// Returns the drives of the job, to unpack the packed ones for a worker.
     pub fn packed(&self) -> Packed {
         let ReplayOptions { drives, unpack_in, .. } = &self.options;
         let options = replay::DriveOptions {
@@ -49,12 +49,13 @@ impl ReplayJob {
         Packed { named: drives.named.clone(), options }
     }
 
-    /// Makes this process, a worker, read the contents that its arguments name.
+    /// Opens the contents that the arguments of this process, a worker, name. The replay then reads
+    /// them instead of the packed files.
     ///
     /// # Errors
     ///
-    /// A failure that names the content that cannot be opened.
-    pub fn take(&mut self, args: UnpackedArgs) -> Result<(), Failure> {
+    /// A failure with the packed file whose content cannot be opened.
+    pub fn use_unpacked(&mut self, args: UnpackedArgs) -> Result<(), Failure> {
         let UnpackedArgs { unpacked, unpacked_in_part } = args;
         let broken = |path: &PathBuf| {
             let mut pairs = unpacked_in_part.chunks_exact(2);
@@ -62,27 +63,27 @@ impl ReplayJob {
         };
         for pair in unpacked.chunks_exact(2) {
             let [path, name] = pair else { continue };
-            let named =
+            let content =
                 Unpacked::named(path.clone(), name.clone(), broken(path)).map_err(|error| {
                     Failure::caused_by(
                         Exit::Internal,
-                        format!("cannot open the content of `{}`", path.display()),
+                        format!("cannot open the unpacked content of `{}`", path.display()),
                         &error,
                     )
                 })?;
-            self.options.unpacked.push(named);
+            self.options.unpacked.push(content);
         }
         Ok(())
     }
 }
 
 impl Packed {
-    /// Unpacks the files again for a worker: the content that this process reads has lost its name,
-    /// and cannot get another.
+    /// Unpacks the packed files for a worker. This process has unpacked them already, but into
+    /// files whose names are removed and cannot be restored: a worker cannot open those.
     ///
     /// # Errors
     ///
-    /// A failure that names the file.
+    /// A failure with the file that cannot be unpacked.
     pub fn unpack_for_worker(&self) -> Result<WorkerContents, Failure> {
         let (mut arguments, mut names) = (Vec::new(), Vec::new());
         for unpacked in unpack(&self.named, &self.options).map_err(DriveError)? {

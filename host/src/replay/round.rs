@@ -296,7 +296,7 @@ pub(super) fn replay(
         run_s: replay_loop.invoker.run().as_secs_f64(),
         decode_s: totals.decode_ns as f64 / 1e9,
         wakes_per_s: if wall_s > 0.0 { replay_loop.wakes as f64 / wall_s } else { 0.0 },
-        peak_rss_bytes: replay_loop.invoker.most_resident_bytes(),
+        peak_rss_bytes: replay_loop.invoker.peak_resident_bytes(),
         topics: inputs.iter().zip(&totals.counts).map(topic_report).collect(),
         recording: recorded,
         clips_replaced,

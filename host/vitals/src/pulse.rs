@@ -147,14 +147,14 @@ impl Pulse {
 
     /// Reports to the shim that Gleaner's code in this process was refused memory, in case the
     /// process dies of it. Does not allocate.
-    pub fn report_full() {
+    pub fn report_refused_memory() {
         if let Some(pulse) = PROCESS_PULSE.get() {
             pulse.page().full.store(1, Ordering::Release);
         }
     }
 
     /// For the shim: returns whether the runtime was refused memory.
-    pub fn was_full(&self) -> bool {
+    pub fn was_refused_memory(&self) -> bool {
         self.page().full.load(Ordering::Acquire) != 0
     }
 

@@ -1,3 +1,5 @@
+//! The record of a runtime's end: `gleaner-shim` writes it, the supervisor reads it.
+
 use std::io::{self, Read, Write};
 use std::path::Path;
 use std::time::Duration;
@@ -6,61 +8,61 @@ use serde::{Deserialize, Serialize};
 
 use gleaner_base::{Exit, safe_file, write_atomically};
 
-/// Time for a runtime to end after a request; then `gleaner-shim` kills it. The program that
-/// started both waits longer.
+/// Time from the request to end a runtime until `gleaner-shim` kills it. The supervisor waits
+/// longer before it kills `gleaner-shim`.
 pub const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// The end of a runtime, written by `gleaner-shim` for the supervisor, even if that was not running
-/// at the time.
+/// The end of a runtime. `gleaner-shim` writes it for the supervisor, even if the supervisor has
+/// ended before.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ExitRecord {
-    /// Its process id.
+    /// Process id of the runtime.
     pub pid: u32,
     /// Start time, in ns of `CLOCK_REALTIME`.
     pub started_ns: i64,
-    /// End time, likewise.
+    /// End time, in ns of `CLOCK_REALTIME`.
     pub ended_ns: i64,
-    /// Its exit code; `None` if a signal ended it.
+    /// Exit code; `None` if a signal ended the runtime.
     pub code: Option<i32>,
-    /// The signal that ended it.
+    /// Signal that ended the runtime, if one did.
     pub signal: Option<i32>,
-    /// Set if `gleaner-shim` killed it.
+    /// The reason, if `gleaner-shim` killed the runtime because it exceeded a limit.
     pub killed: Option<Killed>,
-    /// True if it ran out of memory: the kernel killed a process of its control group, or, for an
-    /// end by SIGABRT, an allocation exceeded its own limit.
+    /// True if the runtime ran out of memory: the kernel killed a process of its control group, or
+    /// it aborted after it was refused memory.
     pub out_of_memory: bool,
     /// Peak resident memory, in bytes.
     pub max_rss_bytes: u64,
-    /// CPU time of it and its children, in ns.
+    /// CPU time of the runtime and its children, in ns.
     pub cpu_ns: u64,
-    /// Number of processes that outlived it and were killed.
+    /// Number of processes that outlived the runtime and were killed.
     pub orphans: u32,
-    /// True if the shim was requested to end it. A lambda can signal its own process only, not the
-    /// shim.
+    /// True if `gleaner-shim` received a signal to end the runtime. A lambda cannot forge this: it
+    /// can signal its own process only.
     #[serde(default)]
     pub end_requested: bool,
-    /// Its phase at the end, if it reported one.
+    /// Phase of the runtime at its end, if known.
     #[serde(default)]
     pub phase: Option<Phase>,
 }
 
-/// The reason why `gleaner-shim` killed a runtime, and its phase.
+/// The reason why `gleaner-shim` killed a runtime, and the phase of the runtime.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Killed {
-    /// Its phase.
+    /// Phase in which the runtime was killed.
     pub phase: Phase,
-    /// Time in that phase, or time stopped, in ns.
+    /// Time in that phase, or time stopped by a signal, in ns.
     pub ran_ns: u64,
-    /// Allowed time, in ns.
+    /// Maximum of that time, in ns.
     pub allowed_ns: u64,
-    /// Time of the wake, in ns of the lambda's clock; 0 if there was none.
+    /// Time of the wake, in ns of the lambda's clock; 0 outside of a wake.
     pub at_ns: i64,
-    /// The limit that it exceeded.
+    /// The limit that the runtime exceeded.
     #[serde(default)]
     pub reason: KillReason,
 }
 
-/// The limit of a process that was killed.
+/// The limit that a killed runtime had exceeded.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum KillReason {
@@ -99,7 +101,7 @@ pub enum Phase {
 }
 
 impl Phase {
-    /// Parses its number; unknown numbers count as `Housekeeping`.
+    /// Returns the phase with this number; `Housekeeping` for an unknown number.
     pub fn from_number(number: u32) -> Self {
         match number {
             1 => Self::Init,
@@ -110,7 +112,7 @@ impl Phase {
 }
 
 impl Killed {
-    /// Returns a sentence for the user, without its subject.
+    /// Returns the reason as a sentence for the user, without its subject, the process.
     pub fn sentence(&self) -> String {
         let (ran, allowed) = (self.ran_ns as f64 / 1e9, self.allowed_ns as f64 / 1e9);
         let what = match (self.reason, self.phase) {
@@ -121,9 +123,7 @@ impl Killed {
             (KillReason::Memory { used, allowed }, _) => {
                 let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
                 let (used, allowed) = (mib(used), mib(allowed));
-                return format!(
-                    "needed more memory than allowed: {used:.1} MiB of {allowed:.1} MiB"
-                );
+                return format!("used {used:.1} MiB of memory; the limit is {allowed:.1} MiB");
             }
             (KillReason::Threads { used, allowed }, _) => {
                 return format!("had {used} threads; the limit is {allowed}");
@@ -132,30 +132,30 @@ impl Killed {
         format!("{what} for {ran:.2} s; the limit is {allowed:.2} s")
     }
 
-    /// Returns help for the user.
+    /// Returns what the author of the lambda can do about it.
     pub fn help(&self) -> &'static str {
         match (self.reason, self.phase) {
             (KillReason::Overdue, Phase::Wake) => {
                 "do less in one wake, or raise `deadline` in [limits]: a process is killed after \
-                 twice that and 0.35 s; in a replay, after 100 times that, or a minute if that is \
-                 longer"
+                 twice the deadline plus 0.35 s; in a replay, after 100 times the deadline, but at \
+                 least a minute"
             }
             (KillReason::Overdue, Phase::Init) => {
-                "do less in `init`, or raise `init_deadline` in [limits]: a process is killed after \
-                 twice that and 0.35 s; in a replay, after 10 times that, or a minute if that is \
-                 longer"
+                "do less in `init`, or raise `init_deadline` in [limits]: a process is killed \
+                 after twice the deadline plus 0.35 s; in a replay, after 10 times the deadline, \
+                 but at least a minute"
             }
             (KillReason::Overdue, Phase::Housekeeping) => {
                 "no wake ran, so no deadline is too short: look for threads or native code of the \
                  lambda that keep its process busy, and for a disk that does not respond"
             }
             (KillReason::Stopped, _) => {
-                "a lambda must not stop its own process, for example with SIGSTOP; nothing is wrong \
-                 if a user stopped it"
+                "a lambda must not stop its own process, for example with SIGSTOP; nothing is \
+                 wrong if a user stopped it"
             }
             (KillReason::Memory { .. }, _) => {
-                "keep less, or raise `memory` in [limits]; memory that native code does not free stays \
-                 allocated when the lambda is re-initialised"
+                "keep less data, or raise `memory` in [limits]; memory that native code does not \
+                 free stays allocated when the lambda is re-initialised"
             }
             (KillReason::Threads { .. }, _) => {
                 "start fewer threads, and join those that have ended"
@@ -177,16 +177,16 @@ impl Killed {
 /// The signal of `abort`, on all Linux platforms.
 const SIGABRT: i32 = 6;
 
-/// Longest accepted record. One has some 300 bytes.
+/// Maximum length of a record, in bytes. A usual one has about 300.
 const RECORD_MAX: u64 = 16 << 10;
 
 impl ExitRecord {
-    /// Name of its file in the folder of results.
+    /// Name of the record's file in the output folder.
     pub const FILE: &'static str = "exit.json";
 
-    /// Returns whether the lambda caused the end. Without a request, an end within a call into the
-    /// lambda counts as caused by it, and so does an exit code of success: our own failures come
-    /// between two calls and have their own exit codes.
+    /// Returns whether the lambda caused the end: always if the runtime was killed for a limit or
+    /// ran out of memory. Otherwise, an end that was not requested counts as caused by the lambda
+    /// unless it came between two calls into the lambda with the exit code of a Gleaner failure.
     pub fn is_caused_by_lambda(&self) -> bool {
         let is_internal = |code| {
             Exit::from_code(code)
@@ -198,14 +198,14 @@ impl ExitRecord {
             || !self.end_requested && (is_within || !self.code.is_some_and(is_internal))
     }
 
-    /// Returns whether it exited by itself with the exit code of a complete run.
+    /// Returns whether the runtime exited by itself with the exit code of a complete run.
     pub fn is_complete(&self) -> bool {
         let exit = self.code.and_then(Exit::from_code);
         self.killed.is_none() && matches!(exit, Some(Exit::Ok | Exit::LambdaFaulted))
     }
 
-    /// Returns the cause of an abnormal end, as a sentence without its subject, the process; `None`
-    /// for a normal end.
+    /// Returns the cause of the end as a sentence without its subject, the process; `None` for exit
+    /// code 0.
     pub fn sentence(&self) -> Option<String> {
         match (self.killed, self.out_of_memory, self.signal, self.code) {
             (Some(killed), ..) => Some(killed.sentence()),
@@ -223,7 +223,7 @@ impl ExitRecord {
         }
     }
 
-    /// Writes it to `path`, atomically.
+    /// Writes the record to `path`, atomically.
     ///
     /// # Errors
     ///
@@ -234,8 +234,8 @@ impl ExitRecord {
         write_atomically(path, &text)
     }
 
-    /// Prints it as the last line of standard output, after a line break: its process may have left
-    /// a partial line.
+    /// Prints the record as the last line of standard output, after a line break: the runtime may
+    /// have printed a partial line.
     ///
     /// # Errors
     ///
@@ -319,7 +319,7 @@ mod tests {
     fn help_fits_the_limit_that_was_exceeded() {
         let killed = |reason, phase| Killed { reason, phase, ..record().killed.unwrap() };
         let memory = killed(KillReason::Memory { used: 96 << 20, allowed: 64 << 20 }, Phase::Wake);
-        assert_eq!(memory.sentence(), "needed more memory than allowed: 96.0 MiB of 64.0 MiB");
+        assert_eq!(memory.sentence(), "used 96.0 MiB of memory; the limit is 64.0 MiB");
         assert_eq!(memory.used_and_allowed(), (96 << 20, 64 << 20));
         for (reason, phase, word) in [
             (KillReason::Overdue, Phase::Wake, "raise `deadline`"),
@@ -357,13 +357,19 @@ mod tests {
         assert_eq!(record().sentence().unwrap(), "was in one wake for 0.35 s; the limit is 0.35 s");
         let crashed = ExitRecord { killed: None, signal: Some(11), ..record() };
         assert_eq!(crashed.sentence().unwrap(), "was ended by signal 11");
-        let full = |signal| {
+        let out_of_memory = |signal| {
             ExitRecord { out_of_memory: true, signal: Some(signal), ..crashed.clone() }
                 .sentence()
                 .unwrap()
         };
-        assert_eq!(full(6), "ended itself: it needed more memory than `memory` in [limits] allows");
-        assert_eq!(full(9), "was killed by the kernel: its control group had no memory left");
+        assert_eq!(
+            out_of_memory(6),
+            "ended itself: it needed more memory than `memory` in [limits] allows"
+        );
+        assert_eq!(
+            out_of_memory(9),
+            "was killed by the kernel: its control group had no memory left"
+        );
         assert_eq!(ExitRecord { code: Some(0), signal: None, ..crashed }.sentence(), None);
     }
 }

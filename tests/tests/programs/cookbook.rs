@@ -1,5 +1,6 @@
-//! The recipes of the cookbook in the real host: on the sample drive, as `expected.txt` documents,
-//! and, for events that it does not contain, on the sample drive with such an event inserted.
+//! Tests of the cookbook's recipes, replayed by `gleaner`. On the sample drive, each must trigger
+//! as its `expected.txt` documents. For events that the sample drive does not contain, a test
+//! replays a changed copy.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -14,10 +15,10 @@ const IMU: &str = "/imu/data";
 const SPEED: &str = "/vehicle/speed";
 const CAMERA: &str = "/camera/front/compressed";
 
-/// Index of `linear_acceleration.y` in an IMU message: after orientation, angular velocity and
-/// their covariances.
+/// Index of `linear_acceleration.y` among the floats of an IMU message: after orientation, angular
+/// velocity and their covariances.
 const LATERAL: usize = 4 + 9 + 3 + 9 + 1;
-/// Index of `twist.linear.x`.
+/// Index of `twist.linear.x` among the floats of a speed message.
 const FORWARD: usize = 0;
 
 fn recipes() -> Vec<PathBuf> {
@@ -29,8 +30,9 @@ fn recipes() -> Vec<PathBuf> {
     recipes
 }
 
-/// Runs a recipe on the sample drive with each message changed by `change`.
-fn on(recipe: &str, change: impl FnMut(&mut DriveMessage) -> bool) -> ReplayRun {
+/// Replays a recipe on the sample drive with each message changed by `change`, which returns
+/// `false` to leave it out.
+fn replay_changed(recipe: &str, change: impl FnMut(&mut DriveMessage) -> bool) -> ReplayRun {
     let folder = TempFolder::new();
     let drive = changed(&folder, change);
     let run = replay(&root().join("examples/cookbook").join(recipe), &[drive], &[]);
@@ -38,15 +40,16 @@ fn on(recipe: &str, change: impl FnMut(&mut DriveMessage) -> bool) -> ReplayRun 
     run
 }
 
-/// Labels and times of a run; seconds are rounded down to tenths.
-fn found(run: &ReplayRun) -> Vec<(String, f64)> {
+/// Returns the label and the time of each trigger; seconds are rounded down to tenths.
+fn triggers(run: &ReplayRun) -> Vec<(String, f64)> {
     run.labels()
         .into_iter()
         .zip(run.seconds().into_iter().map(|second| (second * 10.0).floor() / 10.0))
         .collect()
 }
 
-fn is(message: &DriveMessage, topic: &str, from_s: f64, to_s: f64) -> bool {
+/// Returns whether `message` is of `topic` and within these seconds of the drive.
+fn is_within(message: &DriveMessage, topic: &str, from_s: f64, to_s: f64) -> bool {
     message.topic == topic && (from_s..to_s).contains(&message.at_s)
 }
 
@@ -62,7 +65,7 @@ fn there_are_ten_recipes_five_in_each_language() {
 
 #[test]
 fn every_recipe_decides_as_expected_on_the_sample_drive() {
-    let mut with_moments = BTreeSet::new();
+    let mut with_triggers = BTreeSet::new();
     for recipe in recipes() {
         let name = recipe.file_name().unwrap().to_string_lossy().into_owned();
         let expected = fs::read_to_string(recipe.join("expected.txt")).unwrap();
@@ -78,60 +81,61 @@ fn every_recipe_decides_as_expected_on_the_sample_drive() {
         run.must_exit(0);
         assert_eq!(run.rows(), rows, "{name}");
         if !rows.is_empty() {
-            with_moments.insert(name);
+            with_triggers.insert(name);
         }
     }
-    // The others have tests of their own.
+    // The events of the other recipes are not in the sample drive: the tests below insert them.
     let expected = ["dark-to-bright", "every-kilometre", "novelty", "pothole", "stopped"];
-    assert_eq!(with_moments, expected.map(str::to_owned).into());
+    assert_eq!(with_triggers, expected.map(str::to_owned).into());
 }
 
 #[test]
 fn a_push_to_both_sides_is_a_swerve_and_a_bend_is_not() {
-    let swerve = on("swerve", |message| {
-        if is(message, IMU, 20.0, 21.0) {
+    let swerve = replay_changed("swerve", |message| {
+        if is_within(message, IMU, 20.0, 21.0) {
             message.set(LATERAL, if message.at_s < 20.5 { 4.0 } else { -4.0 });
         }
         true
     });
-    assert_eq!(found(&swerve), [("swerve".to_owned(), 20.9)]);
-    let bend = on("swerve", |message| {
-        if is(message, IMU, 20.0, 23.0) {
+    assert_eq!(triggers(&swerve), [("swerve".to_owned(), 20.9)]);
+    let bend = replay_changed("swerve", |message| {
+        if is_within(message, IMU, 20.0, 23.0) {
             message.set(LATERAL, 4.0);
         }
         true
     });
-    assert_eq!(found(&bend), []);
+    assert_eq!(triggers(&bend), []);
 }
 
 #[test]
 fn a_stop_is_recorded_from_its_third_second_until_the_car_moves() {
-    let run = on("stopped", |message| {
-        if is(message, SPEED, 12.0, 20.0) {
+    let run = replay_changed("stopped", |message| {
+        if is_within(message, SPEED, 12.0, 20.0) {
             message.set(FORWARD, 0.0);
         }
         true
     });
-    assert_eq!(found(&run), [("stopped".to_owned(), 15.0), ("stopped".to_owned(), 20.0)]);
+    assert_eq!(triggers(&run), [("stopped".to_owned(), 15.0), ("stopped".to_owned(), 20.0)]);
     let [clip] = &run.clips[..] else { panic!("{:?}", run.clips) };
     assert!((11.9..12.1).contains(&((clip.to_ns - clip.from_ns) as f64 / 1e9)), "{clip:?}");
 }
 
 #[test]
 fn a_jump_of_speed_without_acceleration_is_a_mismatch() {
-    let run = on("speed-mismatch", |message| {
-        if is(message, SPEED, 20.0, 60.0) {
+    let run = replay_changed("speed-mismatch", |message| {
+        if is_within(message, SPEED, 20.0, 60.0) {
             message.set(FORWARD, 25.0);
         }
         true
     });
-    assert_eq!(found(&run), [("speed-mismatch".to_owned(), 20.1)]);
+    assert_eq!(triggers(&run), [("speed-mismatch".to_owned(), 20.1)]);
 }
 
 #[test]
 fn a_silent_sensor_is_reported_once_and_its_return_is_logged() {
-    let run = on("sensor-silent", |message| !is(message, IMU, 10.0, 13.0));
-    let [(label, at_s)] = &found(&run)[..] else { panic!("{:?}", found(&run)) };
+    let run = replay_changed("sensor-silent", |message| !is_within(message, IMU, 10.0, 13.0));
+    let found = triggers(&run);
+    let [(label, at_s)] = &found[..] else { panic!("{found:?}") };
     assert!(label == "sensor-silent" && (10.9..=11.2).contains(at_s), "{at_s}");
     let trigger = run.decisions.iter().flat_map(|decision| &decision.triggers).next().unwrap();
     assert_eq!(trigger.attributes["topic"], IMU);
@@ -144,32 +148,32 @@ fn a_silent_sensor_is_reported_once_and_its_return_is_logged() {
 
 #[test]
 fn a_clock_jump_is_reported_once_and_a_late_sample_is_not() {
-    let jumped = on("time-jump", |message| {
-        if is(message, IMU, 20.0, 60.0) {
+    let jumped = replay_changed("time-jump", |message| {
+        if is_within(message, IMU, 20.0, 60.0) {
             message.shift_stamp(-2);
         }
         true
     });
-    assert_eq!(found(&jumped), [("time-jump".to_owned(), 20.5)]);
+    assert_eq!(triggers(&jumped), [("time-jump".to_owned(), 20.5)]);
     let trigger = jumped.decisions.iter().flat_map(|decision| &decision.triggers).next().unwrap();
     assert_eq!((trigger.score, trigger.attributes["jump_s"].as_f64()), (Some(2.0), Some(-2.0)));
     let mut late = 0;
-    let run = on("time-jump", |message| {
-        if is(message, IMU, 20.0, 20.03) {
+    let run = replay_changed("time-jump", |message| {
+        if is_within(message, IMU, 20.0, 20.03) {
             message.shift_stamp(-2);
             late += 1;
         }
         true
     });
-    assert_eq!((late, found(&run)), (3, Vec::new()));
+    assert_eq!((late, triggers(&run)), (3, Vec::new()));
 }
 
 #[test]
 fn a_frozen_image_is_reported_once_if_the_car_moves() {
     let freeze = |speed: Option<f64>| {
         let mut kept = Vec::new();
-        on("frozen-image", move |message| {
-            if is(message, CAMERA, 20.0, 22.0) {
+        replay_changed("frozen-image", move |message| {
+            if is_within(message, CAMERA, 20.0, 22.0) {
                 if kept.is_empty() {
                     kept.clone_from(&message.data);
                 }
@@ -181,6 +185,6 @@ fn a_frozen_image_is_reported_once_if_the_car_moves() {
             true
         })
     };
-    assert_eq!(found(&freeze(None)), [("frozen-image".to_owned(), 20.5)]);
-    assert_eq!(found(&freeze(Some(0.0))), []);
+    assert_eq!(triggers(&freeze(None)), [("frozen-image".to_owned(), 20.5)]);
+    assert_eq!(triggers(&freeze(Some(0.0))), []);
 }

@@ -8,43 +8,46 @@ use std::path::{Path, PathBuf};
 use gleaner_base::{Exit, Failure};
 use serde_json::{Map, Value};
 
-/// The results of a replay, without run times.
+/// The results of a replay, and its duration, which is not compared.
 pub(super) struct ReplayResults {
-    /// One decision for each wake.
+    /// One decision for each wake, without its run time.
     pub(super) decisions: Vec<Map<String, Value>>,
+    /// Duration of the replay.
     pub(super) seconds: f64,
-    /// Other files that have to be equal, by name.
+    /// Contents of the other files that have to be equal, by path in the folder.
     files: BTreeMap<PathBuf, Vec<u8>>,
 }
 
-/// Reads the results in `folder`, which must have `wakes` decisions.
+/// Reads the results in `folder` of a replay that had `wakes` wakes and took `seconds`.
 pub(super) fn read(folder: &Path, wakes: u64, seconds: f64) -> Result<ReplayResults, Failure> {
-    let cannot = |what: &Path, error: &dyn std::error::Error| {
-        Failure::caused_by(Exit::Internal, format!("cannot read `{}`", what.display()), error)
+    let cannot_read = |path: &Path, error: &dyn std::error::Error| {
+        Failure::caused_by(Exit::Internal, format!("cannot read `{}`", path.display()), error)
     };
     let path = folder.join("decisions.jsonl");
-    let text = fs::read_to_string(&path).map_err(|error| cannot(&path, &error))?;
+    let text = fs::read_to_string(&path).map_err(|error| cannot_read(&path, &error))?;
     let decisions = text
         .lines()
-        .map(decision)
+        .map(parse_decision)
         .collect::<Result<Vec<_>, _>>()
-        .map_err(|error| cannot(&path, &error))?;
+        .map_err(|error| cannot_read(&path, &error))?;
     if decisions.len() as u64 != wakes {
         let message =
-            format!("`{}` has {} decisions of {wakes} wakes", path.display(), decisions.len());
+            format!("`{}` has {} decisions for {wakes} wakes", path.display(), decisions.len());
         return Err(Failure::new(Exit::Internal, message));
     }
-    let files = others(folder).map_err(|error| cannot(folder, &error))?;
+    let files = other_files(folder).map_err(|error| cannot_read(folder, &error))?;
     Ok(ReplayResults { decisions, seconds, files })
 }
 
-fn decision(line: &str) -> Result<Map<String, Value>, serde_json::Error> {
+/// Parses a line of `decisions.jsonl`, without the run time.
+fn parse_decision(line: &str) -> Result<Map<String, Value>, serde_json::Error> {
     let mut decision: Map<String, Value> = serde_json::from_str(line)?;
     decision.remove("run_ns");
     Ok(decision)
 }
 
-fn others(folder: &Path) -> io::Result<BTreeMap<PathBuf, Vec<u8>>> {
+/// Reads the log and the thumbnails.
+fn other_files(folder: &Path) -> io::Result<BTreeMap<PathBuf, Vec<u8>>> {
     let mut files =
         BTreeMap::from([(PathBuf::from("log.jsonl"), fs::read(folder.join("log.jsonl"))?)]);
     let clips = folder.join("clips");
@@ -74,7 +77,7 @@ pub(super) fn counts(decisions: &[Map<String, Value>]) -> String {
     format!("{} wakes, {triggers} triggers, {faults} faults, {fuel} fuel", decisions.len())
 }
 
-/// The first difference, as text; `None` if the results are equal.
+/// Returns the first difference, as text; `None` if the results are equal.
 pub(super) fn difference(a: &ReplayResults, b: &ReplayResults) -> Option<String> {
     let pairs = a.decisions.iter().zip(&b.decisions).enumerate();
     let decision =
@@ -90,7 +93,8 @@ pub(super) fn difference(a: &ReplayResults, b: &ReplayResults) -> Option<String>
         .or_else(|| file_that_differs(&a.files, &b.files))
 }
 
-/// Compares the texts of the values, so that signed zeros and last bits differ.
+/// Returns the first key with different values. Their texts are compared, so that a signed zero or
+/// the last bit of a number makes a difference.
 fn key_that_differs(a: &Map<String, Value>, b: &Map<String, Value>) -> Option<String> {
     let written = |of: &Map<String, Value>, key: &str| {
         of.get(key).map_or("nothing".to_owned(), Value::to_string)
@@ -114,13 +118,13 @@ mod tests {
     use super::*;
 
     fn replayed(lines: &[&str], thumbnail: &[u8]) -> ReplayResults {
-        let decisions = lines.iter().map(|line| decision(line).unwrap()).collect();
+        let decisions = lines.iter().map(|line| parse_decision(line).unwrap()).collect();
         let files = BTreeMap::from([(PathBuf::from("clips/1.jpg"), thumbnail.to_vec())]);
         ReplayResults { decisions, seconds: 0.0, files }
     }
 
     #[test]
-    fn run_time_is_no_difference() {
+    fn run_times_are_not_compared() {
         let [a, b] = [r#"{"at_ns":1,"fuel":7,"run_ns":5}"#, r#"{"at_ns":1,"fuel":7,"run_ns":50}"#];
         assert_eq!(difference(&replayed(&[a], b"x"), &replayed(&[b], b"x")), None);
     }

@@ -75,7 +75,7 @@ fn build(checkout: &Checkout, tools: &Tools) -> Result<PathBuf, Failure> {
         checkout.target().join(TARGET).join("release"),
         checkout.target().join(TARGET).join("emulated"),
     );
-    let here = (SHIM, Tools::script_here(&checkout.program(SHIM)));
+    let here = (SHIM, Tools::native_script(&checkout.program(SHIM)));
     for (name, script) in
         PROGRAMS.map(|name| (name, tools.script(&built.join(name)))).into_iter().chain([here])
     {

@@ -1,5 +1,5 @@
-//! Finds the tools to build for the other processor and to run the programs: a C compiler, a C
-//! library and an emulator.
+//! Finds the tools to build for aarch64 and to run the programs here: a C compiler, a C library and
+//! an emulator.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -10,18 +10,18 @@ use crate::checkout::Checkout;
 use crate::setup;
 use crate::steps;
 
-/// Its target name in rustup and cargo.
+/// Name of the compilation target in rustup and cargo.
 pub(super) const TARGET: &str = "aarch64-unknown-linux-gnu";
 
 const COMPILER: &str = "aarch64-linux-gnu-gcc";
-/// Names of the emulator; packages of distributions have one or both.
+/// Names of the emulator's program; a distribution installs one or both.
 const EMULATORS: [&str; 2] = ["qemu-aarch64-static", "qemu-aarch64"];
 const LOADER: &str = "ld-linux-aarch64.so.1";
 
 /// The tools of this machine.
 pub(super) struct Tools {
     emulator: &'static str,
-    /// The folder with `lib/` of the other processor's C library.
+    /// The folder above `lib/` of the C library for aarch64.
     libraries: PathBuf,
 }
 
@@ -39,13 +39,15 @@ impl Tools {
         ];
         let missing = packages
             .iter()
-            .filter(|(there, _)| !there)
+            .filter(|(is_installed, _)| !is_installed)
             .map(|(_, package)| *package)
             .collect::<Vec<_>>();
         let (Some(emulator), Some(libraries), true) = (emulator, libraries, compiler) else {
             let help =
-                format!("as root, on Debian and Ubuntu: apt-get install {}", missing.join(" "));
-            return Err(Failure::new(Exit::Unreachable, "packages are missing").with_help(help));
+                format!("on Debian and Ubuntu, as root: apt-get install {}", missing.join(" "));
+            return Err(
+                Failure::new(Exit::Unreachable, "tools for aarch64 are missing").with_help(help)
+            );
         };
         // A failed download is reported as unreachable, unlike a compile error.
         setup::target(checkout, TARGET)
@@ -53,7 +55,7 @@ impl Tools {
         Ok(Tools { emulator, libraries })
     }
 
-    /// The command cargo, set up for builds with [`TARGET`].
+    /// Returns the command cargo, with the environment for builds with [`TARGET`].
     pub(super) fn cargo(&self, checkout: &Checkout) -> Command {
         let name = TARGET.replace('-', "_");
         let mut cargo = checkout.cargo();
@@ -61,12 +63,12 @@ impl Tools {
             .env(format!("CARGO_TARGET_{}_LINKER", name.to_uppercase()), COMPILER)
             .env(format!("CC_{name}"), COMPILER);
         // The extension module uses the stable ABI of 3.9, with symbols of the interpreter that
-        // loads it, so no Python of the other processor is needed to build it.
+        // loads it, so no Python for aarch64 is needed to build it.
         cargo.env("PYO3_NO_PYTHON", "1");
         cargo
     }
 
-    /// A shell script that runs `program` emulated.
+    /// Returns a shell script that runs `program`, built for aarch64, in the emulator.
     pub(super) fn script(&self, program: &Path) -> String {
         format!(
             "#!/bin/sh\nexec {} -L {} {} \"$@\"\n",
@@ -76,13 +78,14 @@ impl Tools {
         )
     }
 
-    /// A shell script that runs `program` of this machine.
-    pub(super) fn script_here(program: &Path) -> String {
+    /// Returns a shell script that runs `program`, built for this machine.
+    pub(super) fn native_script(program: &Path) -> String {
         format!("#!/bin/sh\nexec {} \"$@\"\n", quoted(program))
     }
 }
 
-/// Finds the C library by the C compiler.
+/// Returns the folder above `lib/` of the C library that the C compiler uses; `None` if it has
+/// none.
 fn libraries(checkout: &Checkout) -> Result<Option<PathBuf>, Failure> {
     let mut compiler = checkout.command(COMPILER);
     let loader =

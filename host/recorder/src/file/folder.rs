@@ -19,8 +19,9 @@ use super::unfinished::UnfinishedClip;
 use super::{ClipHeader, replaced};
 use crate::error::RecordError;
 
-/// The clips that are listed in a [`RecordingFolder`], which stays locked. A replay replaces them
-/// once nothing else can fail, when its recorder already has the folder.
+/// The listed clips of a [`RecordingFolder`], which stays locked. A replay replaces them once
+/// nothing else can fail. At that time its recorder owns the [`RecordingFolder`], so the replay
+/// keeps this second handle.
 pub struct EarlierClips {
     dir: Arc<ClipDir>,
 }
@@ -34,21 +35,21 @@ pub struct RecordingFolder {
 }
 
 impl RecordingFolder {
-    /// Opens and locks the folder `out`, which is created if it does not exist. Unfinished clips of
-    /// an earlier process are completed first: the recovered clips are returned, and listed
-    /// already. A clip that cannot be completed, for example because the disk is full, is logged,
-    /// and left unchanged for a later process.
+    /// Opens and locks the folder `out`, which is created if it does not exist. Then completes and
+    /// lists the unfinished clips of an earlier process, and returns them. A clip that cannot be
+    /// completed, for example because the disk is full, is logged and left unchanged for a later
+    /// process.
     ///
     /// # Errors
     ///
     /// [`RecordError::Busy`] if another process records into it; other [`RecordError`]s if the
     /// folder cannot be created, locked or read.
     pub fn open(out: &Path) -> Result<(Self, Vec<Clip>), RecordError> {
-        let mut folder = Self::hold(out)?;
+        let mut folder = Self::open_without_recovery(out)?;
         let mut recovery = folder.take_unfinished();
         let mut found = Vec::new();
-        while let Some(came) = recovery.next(&mut || true) {
-            match came {
+        while let Some(recovered) = recovery.next(&mut || true) {
+            match recovered {
                 Ok(clip) => found.push(clip),
                 Err(error) => {
                     warn!(
@@ -61,13 +62,13 @@ impl RecordingFolder {
         Ok((folder, found))
     }
 
-    /// As [`RecordingFolder::open`], but unfinished clips are not completed yet: the thread of
-    /// [`crate::Recorder::live`] does that while it records.
+    /// As [`RecordingFolder::open`], but does not complete unfinished clips: the writer thread of
+    /// [`crate::Recorder::live`] completes them while it records.
     ///
     /// # Errors
     ///
     /// As for [`RecordingFolder::open`].
-    pub fn hold(out: &Path) -> Result<Self, RecordError> {
+    pub fn open_without_recovery(out: &Path) -> Result<Self, RecordError> {
         let clips = out.join(CLIPS);
         safe_file::folder(&clips)
             .map_err(|source| RecordError::Create { path: clips.clone(), source })?;
@@ -80,7 +81,8 @@ impl RecordingFolder {
         Ok(Self { dir, retention: None, losses: Arc::new(LossList::of(out)), unfinished })
     }
 
-    /// Takes the unfinished clips of an earlier process, to complete them.
+    /// Takes the unfinished clips of an earlier process out of this handle. The caller completes
+    /// them.
     pub(crate) fn take_unfinished(&mut self) -> Recovery {
         std::mem::take(&mut self.unfinished)
     }
@@ -89,20 +91,19 @@ impl RecordingFolder {
     ///
     /// # Errors
     ///
-    /// As there.
+    /// As for [`EarlierClips::replace`].
     pub fn replace(&mut self, keep: &[Clip]) -> Result<u64, RecordError> {
         self.earlier().replace(keep)
     }
 
-    /// The listed clips.
+    /// Returns a handle of the listed clips.
     pub fn earlier(&self) -> EarlierClips {
         EarlierClips { dir: Arc::clone(&self.dir) }
     }
 
-    /// Limits the number of clips, or their bytes, from now on. Over the limit, the oldest clips
-    /// that were not fetched are deleted, including existing ones. Each is first noted in
-    /// `losses.jsonl`; those that are deleted now are returned, with those that should be deleted
-    /// and cannot.
+    /// Limits the number of clips, or their bytes, from now on. Above the limit, the oldest clips
+    /// that were not fetched are deleted, after each is noted in `losses.jsonl`. Existing clips
+    /// count: returns those that were deleted now, and those that could not be deleted.
     ///
     /// # Errors
     ///
@@ -117,14 +118,14 @@ impl RecordingFolder {
         Ok(self.retention.insert(retention).make_room(&self.dir))
     }
 
-    /// `losses.jsonl`.
+    /// Returns the list of losses, `losses.jsonl`.
     pub fn losses(&self) -> Arc<LossList> {
         Arc::clone(&self.losses)
     }
 
     /// Makes room for a finished clip, if there is a limit. Returns the deleted clips, and those
     /// that could not be deleted.
-    pub(crate) fn added(&mut self, clip: &Clip) -> Vec<Loss> {
+    pub(crate) fn make_room(&mut self, clip: &Clip) -> Vec<Loss> {
         self.retention.as_mut().map_or(Vec::new(), |retention| retention.add(&self.dir, clip))
     }
 
@@ -144,9 +145,8 @@ impl RecordingFolder {
 }
 
 impl EarlierClips {
-    /// Replaces the list by the clips in `keep`: deletes the other listed clips with their
-    /// thumbnails, and returns their number. Lines of the list that name no clip of this program
-    /// stay.
+    /// Reduces the list to the clips in `keep`. Deletes the other listed clips with their
+    /// thumbnails, and returns their number. Lines that name no clip of this program stay.
     ///
     /// Only plain files in the folder of clips are deleted, whatever the list names.
     ///
@@ -159,9 +159,9 @@ impl EarlierClips {
         let is_kept =
             |listed: &ListedClip| kept.contains(Path::new(CLIPS).join(&listed.file).as_path());
         let (listed, doomed): (Vec<_>, Vec<_>) = dir.list().read()?.into_iter().partition(is_kept);
-        // The list never names a deleted clip, and clips are noted before they leave the list.
-        // Otherwise the next start would find complete clips that are not listed, and list them as
-        // results of another replay.
+        // Clips leave the list before they are deleted, so that it never names a deleted clip. They
+        // are noted before that: otherwise, after a death of this process, the next start would
+        // find complete clips that are not listed, and list them as results of another replay.
         replaced::note(dir.folder(), &doomed)?;
         dir.list().replace(keep)?;
         let deleted = replaced::complete(dir.folder(), dir.list())?;

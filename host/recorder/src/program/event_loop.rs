@@ -64,7 +64,7 @@ pub fn run(
 ) -> Result<(), Failure> {
     let internal =
         |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
-    let mut folder = RecordingFolder::hold(&options.out)?;
+    let mut folder = RecordingFolder::open_without_recovery(&options.out)?;
     let mut reports = ReportWriter::start(reports, folder.losses()).map_err(internal)?;
     // Before recovery, which takes disk space.
     let mut deleted = Vec::new();

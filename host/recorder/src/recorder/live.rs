@@ -33,8 +33,8 @@ pub(crate) fn counted(losses: &[Loss]) -> (u64, u64) {
 impl Recorder {
     /// A live recorder without topics and lambdas. A thread writes its clips; at most 16 MiB and
     /// one message are queued for it, and the preroll holds the rest. Gaps in sequence numbers are
-    /// losses. Unfinished clips of an earlier process in a folder of [`RecordingFolder::hold`] are
-    /// recovered by that thread, between its jobs.
+    /// losses. If `folder` comes from [`RecordingFolder::open_without_recovery`], that thread also
+    /// recovers the unfinished clips of an earlier process, between its jobs.
     ///
     /// # Errors
     ///

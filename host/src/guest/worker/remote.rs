@@ -36,7 +36,7 @@ pub struct RemoteGuest {
     lines_max: u64,
     is_prepared: bool,
     resident_bytes: u64,
-    most_resident_bytes: u64,
+    peak_resident_bytes: u64,
 }
 
 /// The message that ends a call, and the log lines of the call.
@@ -80,7 +80,7 @@ impl RemoteGuest {
             lines_max: log_lines,
             is_prepared: false,
             resident_bytes: 0,
-            most_resident_bytes: 0,
+            peak_resident_bytes: 0,
         })
     }
 
@@ -176,7 +176,7 @@ impl RemoteGuest {
         let ended = ended
             .map_err(|error| tracing::warn!(%error, "cannot wait for the lambda's process"))
             .ok()?;
-        self.most_resident_bytes = ended.record.as_ref().map_or(0, |record| record.max_rss_bytes);
+        self.peak_resident_bytes = ended.record.as_ref().map_or(0, |record| record.max_rss_bytes);
         Some(ended)
     }
 
@@ -308,8 +308,8 @@ impl Guest for RemoteGuest {
         self.resident_bytes
     }
 
-    fn most_resident_bytes(&self) -> u64 {
-        self.most_resident_bytes
+    fn peak_resident_bytes(&self) -> u64 {
+        self.peak_resident_bytes
     }
 
     fn finish(&mut self) -> Result<Option<Totals>, Fault> {

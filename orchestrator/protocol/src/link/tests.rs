@@ -1,4 +1,5 @@
-//! Two ends that talk to each other, and ends that talk nonsense.
+//! Tests of both connections: valid exchanges, invalid frames, and peers that end, do not respond
+//! or do not read.
 
 use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
@@ -14,7 +15,7 @@ use gleaner_journal::{
 use gleaner_lambda::manifest::{LambdaKind, Limits};
 use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 fn header(lambda: &str) -> JournalHeader {
     let input = JournalInput {
@@ -62,11 +63,11 @@ fn entry(at_ns: i64, label: Option<&str>) -> JournalEntry {
     }
 }
 
-/// Returns a lambda's end of a connection, and the recorder's.
+/// Returns the lambda's end of a connection, and both halves of the recorder's end.
 fn connected() -> (RecorderLink, LambdaLink, LambdaReplies) {
-    let (ours, theirs) = UnixStream::pair().unwrap();
-    let (link, replies) = LambdaLink::new(theirs.into()).unwrap();
-    (RecorderLink::new(ours.into()), link, replies)
+    let (lambda_end, recorder_end) = UnixStream::pair().unwrap();
+    let (link, replies) = LambdaLink::new(recorder_end.into()).unwrap();
+    (RecorderLink::new(lambda_end.into()), link, replies)
 }
 
 fn add(lambda: &str) -> AddLambda {
@@ -84,13 +85,15 @@ fn each_lambda_is_added_with_a_socket_of_its_own() {
     let lambdas = ["first", "second", "third"].map(|name| (name, client.add(&add(name)).unwrap()));
     client.stop().unwrap();
     drop(client);
-    for (name, theirs) in lambdas {
-        let Some(ControlMessage::Add(added, ours)) = server.receive().unwrap() else { panic!() };
+    for (name, lambda_end) in lambdas {
+        let Some(ControlMessage::Add(added, recorder_end)) = server.receive().unwrap() else {
+            panic!()
+        };
         assert_eq!(added, add(name));
-        // Bytes written at one end arrive at its other end.
-        UnixStream::from(theirs).write_all(name.as_bytes()).unwrap();
+        // Bytes written at the lambda's end arrive at the recorder's.
+        UnixStream::from(lambda_end).write_all(name.as_bytes()).unwrap();
         let mut read = String::new();
-        UnixStream::from(ours).read_to_string(&mut read).unwrap();
+        UnixStream::from(recorder_end).read_to_string(&mut read).unwrap();
         assert_eq!(read, name);
     }
     assert!(matches!(server.receive(), Ok(Some(ControlMessage::Stop))));
@@ -105,7 +108,7 @@ fn a_recorder_that_has_ended_is_an_error_not_a_signal() {
     assert!(matches!(client.stop(), Err(LinkError::Gone { .. })));
     let (mut lambda, link, replies) = connected();
     drop((link, replies));
-    assert!(matches!(lambda.hello(&header("x"), PATIENCE), Err(LinkError::Gone { .. })));
+    assert!(matches!(lambda.hello(&header("x"), TIMEOUT), Err(LinkError::Gone { .. })));
     assert!(matches!(lambda.poll(), Err(LinkError::Gone { .. })));
 }
 
@@ -128,7 +131,7 @@ fn wakes_arrive_as_they_were_sent() {
         assert!(matches!(link.receive(), Ok(None)));
         received
     });
-    lambda.hello(&header("hello"), PATIENCE).unwrap();
+    lambda.hello(&header("hello"), TIMEOUT).unwrap();
     let sent: Vec<_> =
         (0..1000).map(|at| (entry(at, (at % 10 == 0).then_some("here")), at * 3)).collect();
     let mut messages = Vec::new();
@@ -141,21 +144,21 @@ fn wakes_arrive_as_they_were_sent() {
         thread::yield_now();
     }
     assert_eq!(messages[3], RecorderMessage::Opened { wait_ns: 91 });
-    assert_eq!(lambda.bye(PATIENCE), crate::LinkLosses::default());
+    assert_eq!(lambda.bye(TIMEOUT), crate::LinkLosses::default());
     assert_eq!(recorder.join().unwrap(), sent);
 }
 
 #[test]
-fn only_urgent_wakes_are_sent_at_once_and_in_order() {
-    let (ours, theirs) = UnixStream::pair().unwrap();
-    let (mut lambda, mut theirs) = (RecorderLink::new(ours.into()), theirs);
-    theirs.write_all(&frame::encode(tag::READY, &[])).unwrap();
-    lambda.hello(&header("hello"), PATIENCE).unwrap();
-    theirs.set_nonblocking(true).unwrap();
+fn urgent_wakes_are_sent_at_once_and_all_wakes_in_order() {
+    let (lambda_end, mut recorder_end) = UnixStream::pair().unwrap();
+    let mut lambda = RecorderLink::new(lambda_end.into());
+    recorder_end.write_all(&frame::encode(tag::READY, &[])).unwrap();
+    lambda.hello(&header("hello"), TIMEOUT).unwrap();
+    recorder_end.set_nonblocking(true).unwrap();
     let mut received = Vec::new();
     let mut new_bytes = || {
         let before = received.len();
-        let _ = theirs.read_to_end(&mut received);
+        let _ = recorder_end.read_to_end(&mut received);
         received.len() - before
     };
     assert!(new_bytes() > 0, "hello");
@@ -168,7 +171,7 @@ fn only_urgent_wakes_are_sent_at_once_and_in_order() {
     for _ in 0..3 {
         wake(&mut lambda, next(None));
     }
-    assert_eq!(new_bytes(), 0, "they are queued");
+    assert_eq!(new_bytes(), 0, "wakes without a trigger are queued");
     lambda.poll().unwrap();
     assert!(new_bytes() > 0, "`poll` sends them");
     wake(&mut lambda, next(None));
@@ -186,7 +189,7 @@ fn only_urgent_wakes_are_sent_at_once_and_in_order() {
     assert!((100..1000).contains(&waited), "16 KiB are sent together: {waited}");
     wake(&mut lambda, next(None));
     assert_eq!(new_bytes(), 0);
-    assert_eq!(lambda.bye(PATIENCE), crate::LinkLosses::default());
+    assert_eq!(lambda.bye(TIMEOUT), crate::LinkLosses::default());
     assert!(new_bytes() > 0);
     // All wakes in order, and then the end.
     let (mut writer, reader) = UnixStream::pair().unwrap();
@@ -208,17 +211,17 @@ fn only_urgent_wakes_are_sent_at_once_and_in_order() {
 }
 
 #[test]
-fn a_recorder_that_does_not_read_costs_wakes_but_no_time() {
+fn a_recorder_that_does_not_read_loses_wakes_but_does_not_block_the_lambda() {
     let (mut lambda, mut link, mut replies) = connected();
     replies.ready();
-    lambda.hello(&header("hello"), PATIENCE).unwrap();
+    lambda.hello(&header("hello"), TIMEOUT).unwrap();
     let all = 200_000_i64;
     for at in 0..all {
         lambda.wake(&entry(at, (at % 1000 == 999).then_some("here")), at).unwrap();
     }
     let dropped = lambda.dropped();
     assert!(dropped.wakes_dropped > 0 && dropped.triggers_lost == 0, "{dropped:?}");
-    let lambda = thread::spawn(move || lambda.bye(PATIENCE));
+    let lambda = thread::spawn(move || lambda.bye(TIMEOUT));
     assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
     let (mut next, mut triggers, mut lost) = (0, 0, 0);
     while let Some(LambdaMessage::Wake { entry, missing, .. }) = link.receive().unwrap() {
@@ -233,10 +236,10 @@ fn a_recorder_that_does_not_read_costs_wakes_but_no_time() {
 }
 
 #[test]
-fn a_refusal_has_its_reason_and_silence_a_timeout() {
+fn a_refusal_states_its_reason_and_a_silent_recorder_is_a_timeout() {
     let (mut lambda, _link, mut replies) = connected();
     replies.refused("it is another \u{1b}[2J");
-    let refused = lambda.hello(&header("x"), PATIENCE).unwrap_err();
+    let refused = lambda.hello(&header("x"), TIMEOUT).unwrap_err();
     assert!(
         matches!(&refused, LinkError::Refused { reason } if reason == "it is another \\u{1b}[2J"),
         "{refused}"
@@ -248,17 +251,17 @@ fn a_refusal_has_its_reason_and_silence_a_timeout() {
     ));
     let (mut lambda, _link, mut replies) = connected();
     replies.refused(&"é".repeat(5000));
-    assert!(matches!(lambda.hello(&header("x"), PATIENCE), Err(LinkError::Refused { .. })));
+    assert!(matches!(lambda.hello(&header("x"), TIMEOUT), Err(LinkError::Refused { .. })));
 }
 
 /// Receives `frames` as the recorder; returns the number of messages.
 fn receive_all(frames: &[Vec<u8>]) -> Result<usize, LinkError> {
-    let (mut ours, theirs) = UnixStream::pair().unwrap();
+    let (mut lambda_end, recorder_end) = UnixStream::pair().unwrap();
     let bytes = frames.concat();
     let writer = thread::spawn(move || {
-        let _ = ours.write_all(&bytes);
+        let _ = lambda_end.write_all(&bytes);
     });
-    let (mut link, _replies) = LambdaLink::new(theirs.into()).unwrap();
+    let (mut link, replies) = LambdaLink::new(recorder_end.into()).unwrap();
     let mut count = 0;
     let result = loop {
         match link.receive() {
@@ -267,7 +270,7 @@ fn receive_all(frames: &[Vec<u8>]) -> Result<usize, LinkError> {
             Err(error) => break Err(error),
         }
     };
-    drop((link, _replies));
+    drop((link, replies));
     writer.join().unwrap();
     result
 }
@@ -300,15 +303,15 @@ fn invalid_frames_of_a_lambda_are_refused_by_name() {
         refusal(&[frame::encode(tag::HELLO, b"{}")])
             .starts_with("frame `hello` from the lambda is invalid")
     );
-    let claims = [&u32::MAX.to_le_bytes()[..], &[tag::HELLO]].concat();
-    assert!(refusal(&[claims]).contains("has 4294967295 bytes, above the maximum of 2097152"));
+    let too_long = [&u32::MAX.to_le_bytes()[..], &[tag::HELLO]].concat();
+    assert!(refusal(&[too_long]).contains("has 4294967295 bytes, above the maximum of 2097152"));
     assert_eq!(
         refusal(&[hello()[..20].to_vec()]),
         "the lambda has ended, or closed the connection"
     );
-    let outside = JournalHeader { event_input: Some(1), ..header("x") };
-    let outside = frame::encode(tag::HELLO, &serde_json::to_vec(&outside).unwrap());
-    assert!(refusal(&[outside]).contains("inputs"));
+    let no_such_input = JournalHeader { event_input: Some(1), ..header("x") };
+    let hello = frame::encode(tag::HELLO, &serde_json::to_vec(&no_such_input).unwrap());
+    assert!(refusal(&[hello]).contains("inputs"));
 }
 
 #[test]
@@ -333,10 +336,10 @@ fn random_bytes_are_an_error_or_an_end() {
 #[test]
 fn invalid_frames_of_a_starter_are_refused_by_name() {
     let refusal = |bytes: &[u8]| {
-        let (mut ours, theirs) = UnixStream::pair().unwrap();
-        ours.write_all(bytes).unwrap();
-        drop(ours);
-        ControlServer::new(OwnedFd::from(theirs)).receive().unwrap_err().to_string()
+        let (mut starter_end, recorder_end) = UnixStream::pair().unwrap();
+        starter_end.write_all(bytes).unwrap();
+        drop(starter_end);
+        ControlServer::new(OwnedFd::from(recorder_end)).receive().unwrap_err().to_string()
     };
     let add = serde_json::to_vec(&add("x")).unwrap();
     assert_eq!(refusal(&frame::encode(tag::ADD, &add)), "frame `add` came without a socket");
@@ -375,9 +378,9 @@ fn reports_are_lines_with_their_kind() {
 #[test]
 fn invalid_frames_of_a_recorder_are_refused_by_name() {
     let refusal = |bytes: &[u8]| {
-        let (mut ours, theirs) = UnixStream::pair().unwrap();
-        ours.write_all(bytes).unwrap();
-        RecorderLink::new(theirs.into()).poll().unwrap_err().to_string()
+        let (mut recorder_end, lambda_end) = UnixStream::pair().unwrap();
+        recorder_end.write_all(bytes).unwrap();
+        RecorderLink::new(lambda_end.into()).poll().unwrap_err().to_string()
     };
     assert_eq!(refusal(&frame::encode(99, &[])), "frame 99 from the recorder is unknown");
     assert_eq!(
@@ -389,14 +392,14 @@ fn invalid_frames_of_a_recorder_are_refused_by_name() {
         refusal(&short),
         "frame `opened` from the recorder is invalid: it has 7 bytes instead of 8"
     );
-    let claims = [&5000_u32.to_le_bytes()[..], &[tag::REFUSED]].concat();
+    let too_long = [&5000_u32.to_le_bytes()[..], &[tag::REFUSED]].concat();
     assert_eq!(
-        refusal(&claims),
+        refusal(&too_long),
         "frame `refused` from the recorder is invalid: \
          it has 5000 bytes, above the maximum of 4096"
     );
-    let claims = [&u32::MAX.to_le_bytes()[..], &[tag::READY]].concat();
-    assert!(refusal(&claims).contains("has 4294967295 bytes, above the maximum of 2097152"));
+    let too_long = [&u32::MAX.to_le_bytes()[..], &[tag::READY]].concat();
+    assert!(refusal(&too_long).contains("has 4294967295 bytes, above the maximum of 2097152"));
 }
 
 #[test]

@@ -305,7 +305,7 @@ fn a_clip_that_cannot_be_deleted_is_reported_once_and_the_next_one_is_deleted() 
     assert!(folder.keep_at_most(Some(2), None).unwrap().is_empty());
     let mut added = |base: &str| {
         let clip = record(&mut folder, base);
-        folder.added(&clip)
+        folder.make_room(&clip)
     };
     assert!(added("a").is_empty() && added("b").is_empty());
     // A folder cannot be removed like a file.

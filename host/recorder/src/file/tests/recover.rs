@@ -1,3 +1,5 @@
+//! Tests of recovery: unfinished clips torn at every byte, and recoveries that die at every step.
+
 use std::fs;
 use std::path::Path;
 
@@ -17,7 +19,7 @@ fn part(messages: u64) -> Vec<u8> {
     fs::read(scratch.path("clips/a.mcap.part")).unwrap()
 }
 
-/// A folder in which a recorder died that had written `part`.
+/// The folder of a recorder that died after it had written `part` of a clip.
 fn died(part: &[u8]) -> TestDir {
     let scratch = TestDir::new();
     fs::create_dir(scratch.path("clips")).unwrap();
@@ -31,7 +33,8 @@ fn closed(messages: u64) -> u64 {
     messages.saturating_sub(1) / 5 * 5
 }
 
-fn is_begin(numbers: &[u64]) -> bool {
+/// Returns whether `numbers` are those of the first messages, without a gap.
+fn is_prefix(numbers: &[u64]) -> bool {
     numbers.iter().enumerate().all(|(at, number)| at as u64 == *number)
 }
 
@@ -80,29 +83,29 @@ fn a_recovered_clip_describes_itself_and_what_is_missing() {
 #[test]
 fn a_file_torn_at_any_byte_becomes_a_valid_clip_or_nothing() {
     let whole = part(14);
-    let mut most = 0;
+    let mut longest = 0;
     for len in 0..=whole.len() {
         let scratch = died(&whole[..len]);
         let (folder, found) = scratch.open();
         assert_eq!(scratch.listed(), found, "{len} bytes");
         if found.is_empty() {
             assert!(scratch.files().is_empty(), "{len} bytes: {:?}", scratch.files());
-            assert_eq!(most, 0, "{len} bytes");
+            assert_eq!(longest, 0, "{len} bytes");
             continue;
         }
         assert_eq!(scratch.files(), ["a.mcap"], "{len} bytes");
         let numbers = numbers(&scratch.path("clips/a.mcap"));
-        assert!(is_begin(&numbers) && numbers.len() >= most, "{len} bytes: {numbers:?}");
-        most = numbers.len();
+        assert!(is_prefix(&numbers) && numbers.len() >= longest, "{len} bytes: {numbers:?}");
+        longest = numbers.len();
         drop(folder);
         let (_, again) = scratch.open();
         assert!(again.is_empty(), "{len} bytes");
     }
-    assert_eq!(most, 10);
+    assert_eq!(longest, 10);
 }
 
 #[test]
-fn a_byte_flipped_anywhere_never_gives_a_broken_clip() {
+fn a_flipped_byte_never_gives_a_broken_clip() {
     let whole = part(11);
     for at in 0..whole.len() {
         let mut flipped = whole.clone();
@@ -111,13 +114,13 @@ fn a_byte_flipped_anywhere_never_gives_a_broken_clip() {
         let (_, found) = scratch.open();
         for clip in &found {
             let numbers = numbers(&scratch.path(clip.file.to_str().unwrap()));
-            assert!(is_begin(&numbers), "byte {at}: {numbers:?}");
+            assert!(is_prefix(&numbers), "byte {at}: {numbers:?}");
         }
         assert_eq!(scratch.listed(), found, "byte {at}");
     }
 }
 
-/// A finished file, torn at every byte as after a power failure: with its footer it is adopted
+/// A power failure may tear a finished file at any byte. A file with its footer becomes the clip
 /// unchanged.
 #[test]
 fn a_finished_file_that_was_not_renamed_is_recovered_completely() {
@@ -136,7 +139,7 @@ fn a_finished_file_that_was_not_renamed_is_recovered_completely() {
         match found.as_slice() {
             [] => assert!(scratch.files().is_empty(), "{len} bytes"),
             [clip] => {
-                assert!(is_begin(&numbers(&scratch.path("clips/a.mcap"))), "{len} bytes");
+                assert!(is_prefix(&numbers(&scratch.path("clips/a.mcap"))), "{len} bytes");
                 assert_eq!(clip.thumbnail, finished.thumbnail);
                 assert_eq!(*clip == unlisted(&finished), len == whole.len(), "{len} bytes");
                 assert!(!scratch.path("clips/a.mcap.part").exists(), "{len} bytes");
@@ -146,9 +149,9 @@ fn a_finished_file_that_was_not_renamed_is_recovered_completely() {
     }
 }
 
-/// A folder in which a recorder died after it had finished a clip and before the rename; the clip
-/// as it is then listed, and its bytes.
-fn died_before_the_name() -> (TestDir, Clip, Vec<u8>) {
+/// Returns the folder of a recorder that died after it had finished a clip, before the rename; the
+/// clip as the next start lists it; and the bytes of its file.
+fn died_before_the_rename() -> (TestDir, Clip, Vec<u8>) {
     let source = TestDir::new();
     let (mut folder, _) = source.open();
     let mut clip = folder.begin("a", &clip_header()).unwrap();
@@ -161,11 +164,12 @@ fn died_before_the_name() -> (TestDir, Clip, Vec<u8>) {
     (scratch, unlisted(&finished), whole)
 }
 
-/// It is unknown whether the bytes of the original are on the disk; those of a copy are.
+/// The dead recorder may not have synced the original. The copy is synced before the rename.
 #[test]
 fn a_finished_file_is_copied_before_it_is_renamed() {
-    let (scratch, _, _) = died_before_the_name();
-    let nothing = ["remove a.mcap.part2"];
+    let (scratch, _, _) = died_before_the_rename();
+    // There is no earlier copy, but its removal is tried.
+    let cleanup = ["remove a.mcap.part2"];
     let expected = [
         "copy a.mcap.part2",
         "sync a.mcap.part2",
@@ -181,20 +185,22 @@ fn a_finished_file_is_copied_before_it_is_renamed() {
     let taken = steps::taken()
         .into_iter()
         .map(|step| if step.contains("gleaner-") { "sync gleaner".into() } else { step });
-    assert_eq!(taken.collect::<Vec<_>>(), [&nothing[..], &expected[..]].concat());
+    assert_eq!(taken.collect::<Vec<_>>(), [&cleanup[..], &expected[..]].concat());
 }
 
 #[test]
 fn a_finished_file_is_recovered_once_even_if_its_recovery_dies_at_every_step() {
-    let mut deaths = 0;
+    let mut died_at_steps = 0;
     for last in 0.. {
-        let (scratch, finished, whole) = died_before_the_name();
-        // A second death at the same step of the second attempt, and then none.
+        let (scratch, finished, whole) = died_before_the_rename();
+        // Both attempts die at the same step; the last one, below, does not.
         let mut is_done = false;
         for _ in 0..2 {
             steps::restart(last);
-            let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_unfinished();
-            is_done = std::iter::from_fn(|| recovery.next(&mut || true)).all(|came| came.is_ok());
+            let mut recovery =
+                RecordingFolder::open_without_recovery(&scratch.0).unwrap().take_unfinished();
+            is_done =
+                std::iter::from_fn(|| recovery.next(&mut || true)).all(|result| result.is_ok());
         }
         steps::restart(usize::MAX);
         scratch.open();
@@ -202,17 +208,17 @@ fn a_finished_file_is_recovered_once_even_if_its_recovery_dies_at_every_step() {
         assert_eq!(scratch.files(), ["a.jpg", "a.mcap"], "after {last} steps");
         assert_eq!(fs::read(scratch.path("clips/a.mcap")).unwrap(), whole, "after {last} steps");
         assert!(scratch.open().1.is_empty());
-        deaths += u64::from(!is_done);
+        died_at_steps += u64::from(!is_done);
         if is_done && last > 12 {
             break;
         }
     }
-    assert!(deaths >= 3, "{deaths}");
+    assert!(died_at_steps >= 3, "{died_at_steps}");
 }
 
 #[test]
 fn a_complete_clip_is_synced_before_it_is_listed() {
-    let (scratch, finished, whole) = died_before_the_name();
+    let (scratch, finished, whole) = died_before_the_rename();
     fs::remove_file(scratch.path("clips/a.mcap.part")).unwrap();
     fs::write(scratch.path("clips/a.mcap"), whole).unwrap();
     steps::restart(usize::MAX);
@@ -220,7 +226,7 @@ fn a_complete_clip_is_synced_before_it_is_listed() {
     assert_eq!(steps::taken()[..3], ["sync a.mcap", "sync clips", "append clips.jsonl"]);
 }
 
-/// The folder as it is after each step of a recovery that dies there.
+/// Each folder is one that a recovery leaves if it dies after some step.
 #[test]
 fn a_recovery_that_dies_at_any_step_is_repeated_without_duplicates() {
     let part = part(14);
@@ -228,7 +234,7 @@ fn a_recovery_that_dies_at_any_step_is_repeated_without_duplicates() {
     let (_, found) = done.open();
     let saved = fs::read(done.path("clips/a.mcap")).unwrap();
 
-    // While it copies: the copy is cut off anywhere.
+    // During the copy: it is truncated anywhere.
     for len in (0..saved.len()).step_by(11) {
         let scratch = died(&part);
         fs::write(scratch.path(&format!("clips/a{AGAIN}")), &saved[..len]).unwrap();
@@ -236,7 +242,7 @@ fn a_recovery_that_dies_at_any_step_is_repeated_without_duplicates() {
         assert_eq!((again, scratch.listed()), (found.clone(), found.clone()));
         assert_eq!(scratch.files(), ["a.mcap"]);
     }
-    // After the rename, before the list; then after the list.
+    // After the rename, before the clip is listed; then after it is listed.
     for is_listed in [false, true] {
         let scratch = died(&part);
         fs::write(scratch.path(&format!("clips/a{CLIP}")), &saved).unwrap();
@@ -251,7 +257,7 @@ fn a_recovery_that_dies_at_any_step_is_repeated_without_duplicates() {
 }
 
 #[test]
-fn a_file_that_has_taken_the_name_of_the_clip_stays() {
+fn another_file_with_the_name_of_the_clip_stays() {
     let scratch = died(&part(14));
     fs::write(scratch.path("clips/a.mcap"), b"not a clip").unwrap();
     let (_, found) = scratch.open();
@@ -300,7 +306,8 @@ fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_does_not_stop_r
     // A folder cannot be removed like a file.
     fs::create_dir(scratch.path(&format!("clips/a{AGAIN}"))).unwrap();
     for _ in 0..2 {
-        let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_unfinished();
+        let mut recovery =
+            RecordingFolder::open_without_recovery(&scratch.0).unwrap().take_unfinished();
         let why = recovery.next(&mut || true).unwrap().unwrap_err();
         assert!(
             matches!(
@@ -331,47 +338,48 @@ fn a_clip_that_cannot_be_recovered_is_left_for_a_later_start_and_does_not_stop_r
 #[test]
 fn a_recovery_that_is_aborted_at_any_time_leaves_the_unfinished_clip() {
     let part = part(14);
-    let (_, _, whole) = died_before_the_name();
+    let (_, _, whole) = died_before_the_rename();
     for left in [part, whole] {
-        let mut ended = 0;
-        for moments in 0.. {
+        let mut aborted = 0;
+        for allowed in 0.. {
             let scratch = died(&left);
-            let mut recovery = RecordingFolder::hold(&scratch.0).unwrap().take_unfinished();
-            let mut asked = 0;
-            let came = recovery.next(&mut || {
-                asked += 1;
-                asked <= moments
+            let mut recovery =
+                RecordingFolder::open_without_recovery(&scratch.0).unwrap().take_unfinished();
+            let mut checks = 0;
+            let recovered = recovery.next(&mut || {
+                checks += 1;
+                checks <= allowed
             });
-            if let Some(came) = came {
-                assert_eq!(scratch.listed(), [came.unwrap()]);
+            if let Some(recovered) = recovered {
+                assert_eq!(scratch.listed(), [recovered.unwrap()]);
                 break;
             }
             drop(recovery);
-            assert_eq!(scratch.files(), ["a.mcap.part"], "after {moments} moments");
+            assert_eq!(scratch.files(), ["a.mcap.part"], "after {allowed} checks");
             assert_eq!(fs::read(scratch.path("clips/a.mcap.part")).unwrap(), left);
             assert_eq!(scratch.open().1.len(), 1);
-            ended += 1;
+            aborted += 1;
         }
-        assert!(ended > 6, "{ended}");
+        assert!(aborted > 6, "{aborted}");
     }
 }
 
 #[test]
 fn clips_are_begun_and_finished_while_another_is_recovered() {
     let scratch = died(&part(14));
-    let mut folder = RecordingFolder::hold(&scratch.0).unwrap();
+    let mut folder = RecordingFolder::open_without_recovery(&scratch.0).unwrap();
     // Another file has the name of the recovered clip.
     fs::write(scratch.path("clips/a.mcap"), b"not a clip").unwrap();
     let mut recovery = folder.take_unfinished();
     let mut clips = 0;
-    let came = recovery.next(&mut || {
+    let result = recovery.next(&mut || {
         let mut clip = folder.begin("a", &clip_header()).unwrap();
         add(&mut clip, 0, 6);
         clip.finish(trailer()).unwrap();
         clips += 1;
         true
     });
-    let recovered = came.unwrap().unwrap();
+    let recovered = result.unwrap().unwrap();
     assert!(clips > 6, "{clips}");
     let mut files: Vec<_> = scratch.listed().into_iter().map(|clip| clip.file).collect();
     assert_eq!(files.pop(), Some(recovered.file.clone()));

@@ -1,4 +1,5 @@
-//! The open clip files: messages, thumbnails, journals. All slow work is here.
+//! The open clip files: messages, thumbnails, journals. All slow work of a clip is here: writing to
+//! the disk, and decoding images.
 
 use std::sync::Arc;
 
@@ -14,18 +15,18 @@ use crate::file::{
 };
 use crate::thumbnail::thumbnail;
 
-/// Images that are tried until one can be decoded. Each costs some milliseconds.
-const TRIES: u32 = 8;
+/// Maximum number of images that are tried until one can be decoded. Each costs some milliseconds.
+const IMAGE_TRIES: u32 = 8;
 
 /// The data that completes a clip.
 pub(in crate::recorder) struct ClipCompletion {
     pub(in crate::recorder) clip: u64,
-    /// The name and header of its file, if it has no message.
+    /// The name and header of its file, if the file is not created yet: no message came.
     pub(in crate::recorder) begin: Option<(String, ClipHeader)>,
     pub(in crate::recorder) trailer: ClipTrailer,
     /// Topics that have a channel even if no message came.
     pub(in crate::recorder) topics: Vec<Arc<TopicSchema>>,
-    /// For each lambda: the name of its journal, and its part.
+    /// For each lambda: its name, and the header and the part of its journal.
     pub(in crate::recorder) journals: Vec<(String, Arc<JournalHeader>, JournalPart)>,
 }
 
@@ -35,27 +36,29 @@ pub(in crate::recorder) struct ClipFiles {
     open: Vec<OpenFile>,
 }
 
-/// An open clip.
+/// An open clip, with the state of its thumbnail.
 #[derive(Default)]
 struct OpenFile {
     clip: u64,
     file: Option<UnfinishedClip>,
-    /// The topic of its thumbnail, once it has one with images.
+    /// The topic whose images are tried for the thumbnail, once it is set.
     images: Option<usize>,
+    /// The thumbnail, once an image was decoded.
     jpeg: Option<Vec<u8>>,
+    /// Number of images that were tried.
     tried: u32,
 }
 
 impl OpenFile {
-    fn try_image(&mut self, topic: &TopicSchema, meta: &SampleMeta, cdr: &[u8]) {
-        if self.jpeg.is_none() && self.tried < TRIES {
+    fn try_image(&mut self, schema: &TopicSchema, meta: &SampleMeta, cdr: &[u8]) {
+        if self.jpeg.is_none() && self.tried < IMAGE_TRIES {
             self.tried += 1;
-            self.jpeg = thumbnail(&topic.type_name, cdr, meta.endian);
+            self.jpeg = thumbnail(&schema.type_name, cdr, meta.endian);
         }
     }
 
     fn file(&mut self) -> &mut UnfinishedClip {
-        self.file.as_mut().expect("a clip is begun before anything is written to it")
+        self.file.as_mut().expect("`begin` is called before anything is written to a clip")
     }
 }
 
@@ -64,7 +67,7 @@ impl ClipFiles {
         ClipFiles { folder, open: Vec::new() }
     }
 
-    /// Takes the unfinished clips of an earlier process.
+    /// Takes the unfinished clips of an earlier process, to complete them.
     pub(super) fn take_unfinished(&mut self) -> Recovery {
         self.folder.take_unfinished()
     }
@@ -90,14 +93,14 @@ impl ClipFiles {
         Ok(())
     }
 
-    /// Makes the thumbnail from the messages of this topic from now on.
+    /// Tries the further messages of this topic for the thumbnail.
     pub(super) fn images(&mut self, clip: u64, topic: usize) {
         self.open_file(clip).images = Some(topic);
     }
 
-    /// Makes the thumbnail from this message, if possible.
-    pub(super) fn image(&mut self, clip: u64, of: &TopicSchema, meta: &SampleMeta, cdr: &[u8]) {
-        self.open_file(clip).try_image(of, meta, cdr);
+    /// Makes the thumbnail from this message, if there is none yet and the message can be decoded.
+    pub(super) fn image(&mut self, clip: u64, schema: &TopicSchema, meta: &SampleMeta, cdr: &[u8]) {
+        self.open_file(clip).try_image(schema, meta, cdr);
     }
 
     /// Writes a message.
@@ -105,18 +108,18 @@ impl ClipFiles {
         &mut self,
         clip: u64,
         topic: usize,
-        of: &TopicSchema,
+        schema: &TopicSchema,
         meta: &SampleMeta,
         cdr: &[u8],
     ) -> Result<(), RecordError> {
         let open_file = self.open_file(clip);
         if open_file.images == Some(topic) {
-            open_file.try_image(of, meta, cdr);
+            open_file.try_image(schema, meta, cdr);
         }
-        open_file.file().message(of, meta, cdr)
+        open_file.file().message(schema, meta, cdr)
     }
 
-    /// Drops a clip. Its file, if any, stays for recovery.
+    /// Drops the state of a clip. Its unfinished file, if any, stays for recovery.
     pub(super) fn forget(&mut self, clip: u64) {
         self.open.retain(|open_file| open_file.clip != clip);
     }
@@ -146,16 +149,19 @@ impl ClipFiles {
                 }
             }
         }
-        let index =
-            self.open.iter().position(|open_file| open_file.clip == clip).expect("it was begun");
+        let index = self
+            .open
+            .iter()
+            .position(|open_file| open_file.clip == clip)
+            .expect("its file was created");
         let open_file = self.open.swap_remove(index);
         trailer.thumbnail = open_file.jpeg;
-        open_file.file.expect("it was begun").finish(trailer)
+        open_file.file.expect("its file was created").finish(trailer)
     }
 
-    /// Makes room for a finished clip, if there is a limit. A clip that cannot be deleted stays,
-    /// and is retried with the next one.
+    /// Deletes old clips to make room for a finished one, if there is a limit. If one cannot be
+    /// deleted, that is retried after the next finished clip. Returns the losses.
     pub(super) fn make_room(&mut self, clip: &Clip) -> Vec<Loss> {
-        self.folder.added(clip)
+        self.folder.make_room(clip)
     }
 }
