@@ -100,8 +100,8 @@ impl RunningProcess {
 impl ProcessEnd {
     /// Returns the record of the end, now. `orphans` processes outlived the child and were killed.
     pub(crate) fn record(&self, started_ns: i64, orphans: u32) -> ExitRecord {
-        // The shim has waited for this child and its orphans only, so the sum of all children that
-        // it has waited for is theirs.
+        // The shim has waited for no other processes than this child and its orphans, so the usage
+        // of all its children is the usage of these.
         let usage = getrusage(UsageWho::RUSAGE_CHILDREN).ok();
         let cpu =
             usage.map_or(0, |usage| (usage.user_time() + usage.system_time()).num_microseconds());

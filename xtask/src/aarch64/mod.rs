@@ -53,7 +53,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     steps.begin(&format!("programs for {TARGET} (the first time this takes minutes)"));
     let emulated = build(checkout, &tools)?;
     println!("built {}", checkout.target().join(TARGET).join("release").display());
-    steps.begin("code of the other processor is refused");
+    steps.begin("native code of the other processor must be refused");
     let (here, there) = (Machine::here(checkout), Machine::emulated(checkout, emulated));
     println!("{}", cases::foreign_code(&here, &there)?);
     steps.begin(&format!("{} replays, each on both processors", CASES.len()));
