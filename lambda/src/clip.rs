@@ -197,11 +197,16 @@ mod tests {
         assert_eq!(
             line,
             concat!(
-                r#"{"file":"clips/hello-20180802T083451.136Z.mcap","thumbnail":null,"bytes":4096,"from_ns":1000,"#,
-                r#""to_ns":11000,"first_ns":1001,"last_ns":null,"lambdas":[{"name":"hello","version":"0.1.0","#,
-                r#""kind":"wasm","digest":"00ff","windows":2}],"triggers":3,"moments":[{"lambda":"hello","#,
-                r#""kind":"event","label":"hard-brake","score":0.5,"attributes":{},"at_ns":6000}],"topics":[{"topic":"/imu/data","#,
-                r#""type_name":"sensor_msgs/msg/Imu","messages":7,"received":8,"lost":null,"overwritten":1,"#,
+                r#"{"file":"clips/hello-20180802T083451.136Z.mcap","thumbnail":null,"#,
+                r#""bytes":4096,"from_ns":1000,"#,
+                r#""to_ns":11000,"first_ns":1001,"last_ns":null,"lambdas":[{"name":"hello","#,
+                r#""version":"0.1.0","#,
+                r#""kind":"wasm","digest":"00ff","windows":2}],"triggers":3,"#,
+                r#""moments":[{"lambda":"hello","#,
+                r#""kind":"event","label":"hard-brake","score":0.5,"attributes":{},"#,
+                r#""at_ns":6000}],"topics":[{"topic":"/imu/data","#,
+                r#""type_name":"sensor_msgs/msg/Imu","messages":7,"received":8,"lost":null,"#,
+                r#""overwritten":1,"#,
                 r#""too_big":0}],"incomplete":["the drive ended 2.1 s before the window did"],"#,
                 r#""recovered":{"lost_bytes":5,"note":"the recorder died"}}"#
             )

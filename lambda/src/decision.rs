@@ -203,8 +203,10 @@ mod tests {
         assert_eq!(
             line,
             concat!(
-                r#"{"at_ns":1700000000000000000,"cause":"event","input":"camera","topic":"/camera/front","#,
-                r#""writer":"0123456789abcdef0123456789abcdef","seq":7,"triggers":[{"kind":"event","#,
+                r#"{"at_ns":1700000000000000000,"cause":"event","input":"camera","#,
+                r#""topic":"/camera/front","#,
+                r#""writer":"0123456789abcdef0123456789abcdef","seq":7,"#,
+                r#""triggers":[{"kind":"event","#,
                 r#""label":"hard-brake","score":0.5,"attributes":{"mps2":-4.5,"luma":12}}],"#,
                 r#""fault":null,"fuel":1234,"run_ns":5600}"#
             )
@@ -235,9 +237,10 @@ mod tests {
         assert!(line.contains(
             r#""cause":"tick","input":null,"topic":null,"writer":null,"seq":null,"triggers":[]"#
         ));
-        assert!(line.contains(
-            r#""fault":{"kind":"host_call","message":"offset 9 is beyond the frame","used":null,"allowed":8}"#
-        ));
+        assert!(line.contains(concat!(
+            r#""fault":{"kind":"host_call","message":"offset 9 is beyond the frame","used":null,"#,
+            r#""allowed":8}"#
+        )));
         assert_eq!(serde_json::from_str::<Decision>(&line).unwrap(), tick);
     }
 

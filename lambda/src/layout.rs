@@ -263,7 +263,8 @@ mod tests {
     fn lambda(kind: &str, files: &[&str]) -> TestFolder {
         let entry = if kind == "python" { "main.py" } else { "x.wasm" };
         let manifest = format!(
-            "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = '{entry}' }}\nschedule.period = '1s'\n\
+            "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = '{entry}' }}\n\
+             schedule.period = '1s'\n\
              [[model]]\nname = 'm'\nfile = 'models/m.onnx'\nsha256 = '{}'\n",
             "0".repeat(64)
         );
@@ -300,7 +301,9 @@ mod tests {
 
     #[test]
     fn the_entry_lies_in_the_build_folder() {
-        let text = "lambda = { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\nschedule.period = '1s'";
+        let text = "lambda = \
+                    { name = 'x', version = '0.1.0', kind = 'python', entry = 'main.py' }\n\
+                    schedule.period = '1s'";
         let manifest = Manifest::parse(text, "lambda.toml").unwrap();
         assert_eq!(BuildDir::of("x").entry_path(&manifest), Path::new("x/build/main.py"));
     }

@@ -126,7 +126,8 @@ mod tests {
 
     fn sources(dir: &TestFolder, kind: &str, entry: &str) -> [Vec<String>; 2] {
         let manifest = format!(
-            "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = '{entry}' }}\nschedule.period = '1s'\n\
+            "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = '{entry}' }}\n\
+             schedule.period = '1s'\n\
              [[model]]\nname = 'm'\nfile = 'models/m.onnx'\nsha256 = '{}'\n",
             "0".repeat(64)
         );
@@ -194,7 +195,8 @@ mod tests {
         for (name, kind) in [("msg", "python"), ("src", "wasm")] {
             std::os::unix::fs::symlink(elsewhere.root(), dir.path(name)).unwrap();
             let manifest = format!(
-                "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = 'x' }}\nschedule.period = '1s'\n"
+                "lambda = {{ name = 'x', version = '0.1.0', kind = '{kind}', entry = 'x' }}\n\
+                 schedule.period = '1s'\n"
             );
             let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
             let error = failure_text(Sources::of(dir.root(), &manifest).unwrap_err());

@@ -233,13 +233,12 @@ impl Explain for ManifestError {
             }
             Read { source, .. } => return NotPlain::of(source).map(NotPlain::help),
             TooLong { .. } => {
-                "check that this is a manifest; data of a lambda belongs in files of its own".to_owned()
-            }
-            Syntax { .. } => {
-                "write `key = value` with texts in quotes, and tables as [name], or as [[name]] where there \
-                 can be several"
+                "check that this is a manifest; data of a lambda belongs in files of its own"
                     .to_owned()
             }
+            Syntax { .. } => "write `key = value` with texts in quotes, and tables as [name], \
+                 or as [[name]] where there can be several"
+                .to_owned(),
             MissingTable { example, .. } | MissingKey { example, .. } => format!("add {example}"),
             UnknownKey { near: Some(near), .. } | NoChoice { near: Some(near), .. } => {
                 format!("did you mean `{near}`?")
@@ -264,11 +263,10 @@ impl Explain for ManifestError {
                     None => inputs,
                 }
             }
-            TooMuchMemory { .. } => {
-                "lower `depth`, `hold` or `max_size`: an input takes (depth + hold + 1) x max_size, \
+            TooMuchMemory { .. } => "lower `depth`, `hold` or `max_size`: \
+                 an input takes (depth + hold + 1) x max_size, \
                  and (hold + 1) x decoded_size for compressed images"
-                    .to_owned()
-            }
+                .to_owned(),
             Misplaced { help, .. } => help.clone(),
         })
     }

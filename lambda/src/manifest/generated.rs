@@ -88,7 +88,8 @@ fn for_python() -> String {
     let mut text = format!(
         "\"\"\"`[limits]`: key, unit, and minimum, default and maximum; \
          sizes in bytes, durations in ns.\n\n{ORIGIN}\"\"\"\n\n\
-         from typing import Tuple\n\nLIMITS: Tuple[Tuple[str, str, Tuple[int, int, int]], ...] = (\n"
+         from typing import Tuple\n\n\
+         LIMITS: Tuple[Tuple[str, str, Tuple[int, int, int]], ...] = (\n"
     );
     rows(&mut text);
     text + ")\n"

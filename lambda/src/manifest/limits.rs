@@ -18,7 +18,10 @@ use super::{ByteSize, ManifestError};
 /// Generates the code of the table. `as` gives the JSON key of a limit, if it differs from the
 /// file's.
 macro_rules! limits {
-    ($($(#[doc = $meaning:literal])+ $key:ident $(as $json:literal)?: $unit:ty { $($bounds:tt)+ })+) => {
+    ($(
+        $(#[doc = $meaning:literal])+
+        $key:ident $(as $json:literal)?: $unit:ty { $($bounds:tt)+ }
+    )+) => {
         /// The resources that a lambda may use. `docs/limits.md` describes what happens beyond
         /// them.
         ///
@@ -28,14 +31,20 @@ macro_rules! limits {
         #[serde(default)]
         #[non_exhaustive]
         pub struct Limits {
-            $($(#[doc = $meaning])+ $(#[serde(rename = $json)])? #[serde(with = "plain")] pub $key: $unit,)+
+            $(
+                $(#[doc = $meaning])+
+                $(#[serde(rename = $json)])?
+                #[serde(with = "plain")]
+                pub $key: $unit,
+            )+
         }
 
         impl Limits {
             /// Every limit at its minimum.
             pub const MIN: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.min),+ };
             /// Every limit at its default.
-            pub const DEFAULT: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.default),+ };
+            pub const DEFAULT: Limits =
+                Limits { $($key: Bounds::<$unit> { $($bounds)+ }.default),+ };
             /// Every limit at its maximum.
             pub const MAX: Limits = Limits { $($key: Bounds::<$unit> { $($bounds)+ }.max),+ };
 
@@ -44,11 +53,18 @@ macro_rules! limits {
 
             /// The table itself.
             pub(super) fn table() -> [Limit; Limits::KEYS.len()] {
-                [$(Limit::new(stringify!($key), concat!($($meaning),+), Bounds::<$unit> { $($bounds)+ })),+]
+                [$(Limit::new(
+                    stringify!($key),
+                    concat!($($meaning),+),
+                    Bounds::<$unit> { $($bounds)+ },
+                )),+]
             }
 
             /// Parses the limits in `table`; the others are those of `missing`.
-            pub(super) fn read(table: &TomlTable, missing: Limits) -> Result<Limits, ManifestError> {
+            pub(super) fn read(
+                table: &TomlTable,
+                missing: Limits,
+            ) -> Result<Limits, ManifestError> {
                 let (min, max) = (Limits::MIN, Limits::MAX);
                 Ok(Limits {
                     $($key: Unit::read(
@@ -83,13 +99,17 @@ limits! {
     /// Time after which a wake ends with a fault. Live only: in a replay, decisions would depend on
     /// the machine.
     deadline as "deadline_ns": Duration {
-        min: Duration::from_millis(1), default: Duration::from_millis(50), max: Duration::from_secs(60)
+        min: Duration::from_millis(1),
+        default: Duration::from_millis(50),
+        max: Duration::from_secs(60)
     }
 
     /// Time after which `init` ends with a fault. Live only.
     // Importing numpy and loading a model take seconds; five minutes are enough for any start.
     init_deadline as "init_deadline_ns": Duration {
-        min: Duration::from_millis(1), default: Duration::from_secs(10), max: Duration::from_secs(300)
+        min: Duration::from_millis(1),
+        default: Duration::from_secs(10),
+        max: Duration::from_secs(300)
     }
 
     /// Memory that the lambda may allocate, and as much again for pixels of frames that it makes.
@@ -118,7 +138,9 @@ limits! {
     /// Bytes that one call takes or returns.
     // A deadline cannot end a call half-way, and copying a mebibyte takes 0.1 ms. The SDK reads
     // frames in pieces of 64 KiB.
-    call_bytes: ByteSize { min: ByteSize::kib(64), default: ByteSize::mib(1), max: ByteSize::mib(1) }
+    call_bytes: ByteSize {
+        min: ByteSize::kib(64), default: ByteSize::mib(1), max: ByteSize::mib(1)
+    }
 
     /// Samples, values or texts that one call returns.
     // The size of the deepest ring.
@@ -134,7 +156,9 @@ limits! {
 
     /// Bytes of log lines per second of the lambda's time.
     // The default is a hundred of the longest lines.
-    log_bytes: ByteSize { min: ByteSize::kib(4), default: ByteSize::kib(400), max: ByteSize::mib(16) }
+    log_bytes: ByteSize {
+        min: ByteSize::kib(4), default: ByteSize::kib(400), max: ByteSize::mib(16)
+    }
 
     /// Triggers per minute of the lambda's time.
     // Of all kinds. The default is 200 a second, the sustained rate that a recorder accepts from

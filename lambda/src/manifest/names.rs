@@ -112,8 +112,8 @@ checked_text! {
     /// Source: the topic and service names page of the ROS 2 design; the length is rmw's
     /// `RMW_TOPIC_MAX_NAME_LENGTH`, the 255 bytes of DDS less 8 for prefixes.
     TopicName, "topic name",
-    "a topic begins with `/` and has parts of letters, digits and `_`, none beginning with a digit, \
-     for example `/camera/front`",
+    "a topic begins with `/` and has parts of letters, digits and `_`, none beginning with a \
+     digit, for example `/camera/front`",
     names::is_topic
 }
 

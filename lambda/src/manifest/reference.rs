@@ -259,7 +259,8 @@ fn config() -> Section {
         Key::new("unit", "ConfigItem", "unit", "text"),
         Key::new("description", "ConfigItem", "description", "text"),
     ];
-    let note = "Settings that the code reads by name and `--set` changes. The author chooses the names:\n\
+    let note = "Settings that the code reads by name and `--set` changes. \
+                The author chooses the names:\n\
                 `key = value`, or `key = { ... }` with these keys.";
     Section { title: "[config]", note: note.to_owned(), keys }
 }

@@ -6,7 +6,10 @@ use gleaner_base::grouped;
 ///
 /// A count of missing data has its text after `=>`: singular, plural, and the cause.
 macro_rules! recording {
-    ($($(#[doc = $meaning:literal])+ $key:ident $(=> $outcome:ident $one:literal, $many:literal, $why:literal)?;)+) => {
+    ($(
+        $(#[doc = $meaning:literal])+
+        $key:ident $(=> $outcome:ident $one:literal, $many:literal, $why:literal)?;
+    )+) => {
         /// Counts of a recorder since its start; each count has one cause.
         ///
         /// They are part of a replay's summary, and of the reports of a live recorder. Counts that

@@ -216,7 +216,10 @@ mod tests {
             Round { n: 2, wakes: 100, faults: 0, wall_s: 0.5, wakes_per_s: 200.0, rss_bytes: 4096 };
         reads_back(
             &Report::Round(round),
-            r#"{"report":"round","n":2,"wakes":100,"faults":0,"wall_s":0.5,"wakes_per_s":200.0,"rss_bytes":4096}"#,
+            concat!(
+                r#"{"report":"round","n":2,"wakes":100,"faults":0,"wall_s":0.5,"#,
+                r#""wakes_per_s":200.0,"rss_bytes":4096}"#
+            ),
         );
     }
 
@@ -271,11 +274,16 @@ mod tests {
         reads_back(
             &Report::Summary(Box::new(summary)),
             &concat!(
-                r#"{"report":"summary","lambda":"brake-dark","version":"0.1.0","kind":"wasm","drive":["a.mcap","b"],"#,
-                r#""out":"out","wakes":50,"triggers":2,"faults":0,"skipped":0,"missed_ticks":0,"out_of_order":4,"log_lines":3,"#,
-                r#""log_dropped":0,"triggers_refused":5,"backed_off":6,"start_ns":1,"end_ns":2,"wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
-                r#""wakes_per_s":200.0,"peak_rss_bytes":1048576,"topics":[{"name":"imu","topic":"/imu/data","#,
-                r#""type_name":"sensor_msgs/msg/Imu","received":50,"lost":null,"overwritten":1,"no_slot":0,"too_big":0}],"#,
+                r#"{"report":"summary","lambda":"brake-dark","version":"0.1.0","kind":"wasm","#,
+                r#""drive":["a.mcap","b"],"#,
+                r#""out":"out","wakes":50,"triggers":2,"faults":0,"skipped":0,"missed_ticks":0,"#,
+                r#""out_of_order":4,"log_lines":3,"#,
+                r#""log_dropped":0,"triggers_refused":5,"backed_off":6,"start_ns":1,"end_ns":2,"#,
+                r#""wall_s":0.25,"run_s":0.125,"decode_s":0.0,"#,
+                r#""wakes_per_s":200.0,"peak_rss_bytes":1048576,"topics":[{"name":"imu","#,
+                r#""topic":"/imu/data","#,
+                r#""type_name":"sensor_msgs/msg/Imu","received":50,"lost":null,"overwritten":1,"#,
+                r#""no_slot":0,"too_big":0}],"#,
                 "COUNTS,",
                 r#""clips_replaced":1,"damaged":null}"#
             )

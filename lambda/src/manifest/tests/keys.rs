@@ -19,7 +19,8 @@ fn unknown_keys_are_refused_at_every_level() {
         "depth = 512",
         "colour = 1",
         "lambda.toml, line 21: unknown key `colour` in [[input]]",
-        "the known keys are `name`, `topic`, `type`, `depth`, `max_size`, `decoded_size`, `hold` and `qos`",
+        "the known keys are `name`, `topic`, `type`, `depth`, `max_size`, `decoded_size`, `hold` \
+         and `qos`",
     );
     refused_with(
         "qos = \"auto\"",
@@ -117,7 +118,8 @@ fn values_of_another_type_are_refused() {
         "qos = \"auto\"",
         "qos = true",
         "lambda.toml, line 16: `input.qos` is true or false",
-        "give \"auto\", or a table such as { reliability = \"reliable\", durability = \"volatile\", depth = 10 }",
+        "give \"auto\", or a table such as { reliability = \"reliable\", \
+         durability = \"volatile\", depth = 10 }",
     );
     refused_below(
         "[input]\nname = \"imu\"",
@@ -143,13 +145,16 @@ fn names_of_another_form_are_refused() {
         "name = \"brake-dark\"",
         "name = \"Brake Dark\"",
         "lambda.toml, line 2: `lambda.name` is `Brake Dark`, which is not a lambda name",
-        "a lambda name has 1 to 63 lower-case letters, digits and hyphens and begins with a letter, for example `brake-dark`",
+        "a lambda name has 1 to 63 lower-case letters, digits and hyphens and begins with a \
+         letter, for example `brake-dark`",
     );
     refused_with(
         "entry = \"brake_dark.wasm\"",
         "entry = \"../brake_dark.wasm\"",
-        "lambda.toml, line 5: `lambda.entry` is `../brake_dark.wasm`, which is not a path inside the lambda's folder",
-        "give a path relative to the lambda's folder, without `..`, for example `models/detector.onnx`",
+        "lambda.toml, line 5: `lambda.entry` is `../brake_dark.wasm`, which is not a path inside \
+         the lambda's folder",
+        "give a path relative to the lambda's folder, without `..`, for example \
+         `models/detector.onnx`",
     );
     refused_with(
         "type = \"sensor_msgs/msg/Imu\"",
@@ -161,7 +166,8 @@ fn names_of_another_form_are_refused() {
         "topic = \"/imu/data\"",
         "topic = \"imu/data\"",
         "lambda.toml, line 19: `input.topic` is `imu/data`, which is not a topic name",
-        "a topic begins with `/` and has parts of letters, digits and `_`, none beginning with a digit, for example `/camera/front`",
+        "a topic begins with `/` and has parts of letters, digits and `_`, none beginning with a \
+         digit, for example `/camera/front`",
     );
     refused_with(
         "version = \"0.1.0\"",
@@ -172,12 +178,14 @@ fn names_of_another_form_are_refused() {
     refused_below(
         "[[model]]\nname = \"m\"\nfile = \"m.onnx\"\nsha256 = \"abc\"",
         "lambda.toml, line 11: `model.sha256` is `abc`, which is not a sha256",
-        "a sha256 has 64 lower-case hexadecimal digits: the first column that `sha256sum FILE` prints",
+        "a sha256 has 64 lower-case hexadecimal digits: the first column that `sha256sum FILE` \
+         prints",
     );
     refused_below(
         "[config]\n\"a=b\" = 1",
         "lambda.toml, line 9: `config.a=b` is `a=b`, which is not a name",
-        "a name has 1 to 63 lower-case letters, digits, `_` and `-` and begins with a letter, for example `front_camera`",
+        "a name has 1 to 63 lower-case letters, digits, `_` and `-` and begins with a letter, for \
+         example `front_camera`",
     );
     refused_with(
         "preroll = \"5s\"",

@@ -77,7 +77,8 @@ fn refused_with(line: &str, instead: &str, message: &str, help: &str) {
 /// Returns an `[[input]]` of IMU samples; `more` is its fifth line.
 fn input(name: &str, topic: &str, more: &str) -> String {
     format!(
-        "[[input]]\nname = \"{name}\"\ntopic = \"{topic}\"\ntype = \"sensor_msgs/msg/Imu\"\n{more}\n"
+        "[[input]]\nname = \"{name}\"\ntopic = \"{topic}\"\n\
+         type = \"sensor_msgs/msg/Imu\"\n{more}\n"
     )
 }
 
@@ -203,7 +204,8 @@ fn a_fixed_qos_has_missing_keys_of_the_default_profile_of_ros() {
 fn a_model_is_parsed_with_all_its_keys() {
     let digest = "0123456789abcdef".repeat(4);
     let more = format!(
-        "[[model]]\nname = \"detector\"\nfile = \"models/d.onnx\"\nsha256 = \"{digest}\"\nlayout = \"yolov8\"\n\
+        "[[model]]\nname = \"detector\"\nfile = \"models/d.onnx\"\nsha256 = \"{digest}\"\n\
+         layout = \"yolov8\"\n\
          providers = [\"cuda\", \"cpu\"]\nthreads = 2"
     );
     let manifest = Manifest::parse(&format!("{TICKER}{more}"), "lambda.toml").unwrap();
@@ -216,19 +218,27 @@ fn a_model_is_parsed_with_all_its_keys() {
 #[test]
 fn as_json_a_manifest_has_the_keys_of_the_file_and_its_defaults() {
     let text = format!(
-        "{TICKER}[[input]]\nname = \"imu\"\ntopic = \"/imu\"\ntype = \"sensor_msgs/msg/Imu\"\n[config]\ngain = 2"
+        "{TICKER}[[input]]\nname = \"imu\"\ntopic = \"/imu\"\n\
+         type = \"sensor_msgs/msg/Imu\"\n[config]\ngain = 2"
     );
     let manifest = Manifest::parse(&text, "lambda.toml").unwrap();
     assert_eq!(
         manifest.to_json().to_string(),
         concat!(
-            r#"{"lambda":{"name":"ticker","version":"1.2.3","kind":"python","entry":"main.py","description":null},"#,
-            r#""schedule":{"period_ns":100000000},"input":[{"name":"imu","topic":"/imu","type":"sensor_msgs/msg/Imu","#,
-            r#""depth":64,"max_size":4096,"decoded_size":null,"hold":8,"qos":"auto"}],"model":[],"record":null,"#,
-            r#""limits":{"fuel":50000000,"init_fuel":1000000000,"deadline_ns":50000000,"init_deadline_ns":10000000000,"#,
-            r#""memory":67108864,"tables":20000,"stack":524288,"handles":4096,"frames":256,"call_bytes":1048576,"#,
-            r#""call_items":65536,"scratch":0,"log_lines":100,"log_bytes":409600,"events_per_minute":12000},"#,
-            r#""config":[{"name":"gain","default":2,"min":null,"max":null,"unit":null,"description":null}]}"#
+            r#"{"lambda":{"name":"ticker","version":"1.2.3","kind":"python","entry":"main.py","#,
+            r#""description":null},"#,
+            r#""schedule":{"period_ns":100000000},"input":[{"name":"imu","topic":"/imu","#,
+            r#""type":"sensor_msgs/msg/Imu","#,
+            r#""depth":64,"max_size":4096,"decoded_size":null,"hold":8,"qos":"auto"}],"#,
+            r#""model":[],"record":null,"#,
+            r#""limits":{"fuel":50000000,"init_fuel":1000000000,"deadline_ns":50000000,"#,
+            r#""init_deadline_ns":10000000000,"#,
+            r#""memory":67108864,"tables":20000,"stack":524288,"handles":4096,"frames":256,"#,
+            r#""call_bytes":1048576,"#,
+            r#""call_items":65536,"scratch":0,"log_lines":100,"log_bytes":409600,"#,
+            r#""events_per_minute":12000},"#,
+            r#""config":[{"name":"gain","default":2,"min":null,"max":null,"unit":null,"#,
+            r#""description":null}]}"#
         )
     );
 }

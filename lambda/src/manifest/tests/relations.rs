@@ -100,7 +100,8 @@ fn keys_without_meaning_where_they_stand_are_refused() {
 
 #[test]
 fn invalid_toml_is_refused_with_its_line() {
-    let help = "write `key = value` with texts in quotes, and tables as [name], or as [[name]] where there can be several";
+    let help = "write `key = value` with texts in quotes, and tables as [name], \
+                or as [[name]] where there can be several";
     refused_below(
         "[limits]\nfuel 3",
         "lambda.toml, line 9: invalid TOML: key with no value, expected `=`",
