@@ -79,7 +79,7 @@ fn spare(input: &InputSpec) -> usize {
 /// written, and partial messages of the network.
 pub fn unfinished_bytes(manifest: &Manifest) -> u64 {
     const LINES: u64 = 48 << 20;
-    // RustDDS keeps up to 130 partial messages per writer, and ends the process if an allocation
+    // RustDDS keeps up to 128 partial messages per writer, and ends the process if an allocation
     // fails.
     const MESSAGES: u64 = 130;
     let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes().saturating_mul(MESSAGES));

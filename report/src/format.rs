@@ -8,8 +8,8 @@ pub use gleaner_base::grouped;
 /// Returns a line of `expected.txt` for each trigger of `decision`:
 /// `<seconds %.3f> <label> <score %.3g>`; no score is `-`.
 ///
-/// `start_ns` is [`ReplaySummary::start_ns`](gleaner_protocol::ReplaySummary::start_ns): seconds count
-/// from the first message of the drive on any topic.
+/// `start_ns` is [`ReplaySummary::start_ns`](gleaner_protocol::ReplaySummary::start_ns): seconds
+/// count from the first message of the drive on any topic.
 pub fn trigger_lines(decision: &Decision, start_ns: i64) -> impl Iterator<Item = String> {
     let seconds = seconds(decision.at_ns, start_ns);
     decision

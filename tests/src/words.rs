@@ -1,11 +1,13 @@
-//! Counts openings without a subject and discouraged words in comments and pages. See CONTRIBUTING.md.
+//! Counts openings without a subject and discouraged words in comments and pages. See
+//! CONTRIBUTING.md.
 
 /// The kind of text that a finding lies in. Each kind has an allowance of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// The `//!` lines of a module open with a clause instead of a noun or a verb.
     ModuleOpening,
-    /// The documentation of a public item opens so; items of WIT files and of Python modules count as public.
+    /// The documentation of a public item opens so; items of WIT files and of Python modules count
+    /// as public.
     PublicOpening,
     /// The documentation of another item opens so.
     PrivateOpening,
@@ -80,8 +82,9 @@ const WORDS: &[&str] = &[
 
 /// The places of a file that should be worded in another way, in the order of its lines.
 ///
-/// Rust and WIT files are read for comments, Python files for docstrings and comments, and pages (`md`) as a whole but
-/// for their blocks of code. Words between backquotes or double quotes are quotations and do not count.
+/// Rust and WIT files are read for comments, Python files for docstrings and comments, and pages
+/// (`md`) as a whole but for their blocks of code. Words between backquotes or double quotes are
+/// quotations and do not count.
 pub fn findings(path: &str, text: &str) -> Vec<Finding> {
     let language = path.rsplit_once('.').map_or("", |(_, extension)| extension);
     let mut found = Vec::new();
@@ -142,14 +145,14 @@ fn words(text: &str) -> Vec<&'static str> {
     found
 }
 
-/// Whether the item below the documentation at the start of `lines` is public.
+/// Returns whether the item below the documentation at the start of `lines` is public.
 fn is_public(lines: &[&str]) -> bool {
     let mut code = lines.iter().map(|line| line.trim()).filter(|line| !line.starts_with("//"));
     code.find(|line| !line.is_empty() && !line.starts_with("#["))
         .is_some_and(|line| line.starts_with("pub "))
 }
 
-/// What a piece of documentation describes.
+/// The subject of a piece of documentation.
 #[derive(Clone, Copy)]
 enum Doc {
     Module,
@@ -228,4 +231,49 @@ impl<'a> Prose<'a> {
         }
         (!self.fenced).then_some(text)
     }
+}
+
+/// Names of types that several crates share, as they are one concept seen from several sides: the
+/// resources and values of `wit/`, which the host, both skins, the SDK and its fake host declare
+/// each for itself.
+pub const SHARED_TYPES: &[&str] = &[
+    "Args",
+    "CallResult",
+    "Column",
+    "ConfigValue",
+    "Counts",
+    "Field",
+    "Frame",
+    "Model",
+    "Result",
+    "Sample",
+    "ScratchError",
+    "Tensor",
+    "Topic",
+    "TriggerError",
+];
+
+/// The names of all types that a Rust file defines; associated types do not count.
+pub fn type_names(text: &str) -> Vec<&str> {
+    let defined = |line: &'_ str| -> Option<usize> {
+        let code = line.trim_start();
+        let visible = match code.strip_prefix("pub") {
+            Some(rest) if rest.starts_with('(') => {
+                rest.split_once(") ").map_or("", |(_, rest)| rest)
+            }
+            Some(rest) => rest.trim_start(),
+            None => code,
+        };
+        let kinds = ["struct ", "enum ", "trait ", "union ", "type "];
+        let kind = kinds.into_iter().find(|kind| visible.starts_with(kind))?;
+        let is_associated = kind == "type " && line.starts_with(' ');
+        (!is_associated).then(|| line.len() - visible.len() + kind.len())
+    };
+    let name = |line: &'_ str, at: usize| {
+        line[at..]
+            .find(|c: char| !c.is_alphanumeric() && c != '_')
+            .map_or(line.len(), |end| at + end)
+    };
+    let names = text.lines().filter_map(|line| defined(line).map(|at| &line[at..name(line, at)]));
+    names.filter(|name| name.starts_with(char::is_uppercase)).collect()
 }

@@ -15,7 +15,8 @@ use crate::steps::{self, Steps};
 const MDBOOK: &str = "0.5.4";
 
 /// Names and extensions of files that pages link to.
-const LINKED: [&str; 9] = ["md", "rs", "py", "toml", "txt", "wit", "ipynb", "LICENSE", "json"];
+const LINKED: [&str; 10] =
+    ["md", "png", "rs", "py", "toml", "txt", "wit", "ipynb", "LICENSE", "json"];
 
 /// Folders without pages, and those that tools make.
 const SKIPPED: [&str; 5] = ["target", "out", "build", "fuzz", "__pycache__"];

@@ -288,7 +288,7 @@ fn after_a_killed_shim_the_next_one_appends_whole_lines() {
     let folder = ResultsFolder::of("killed-shim");
     let mut killed =
         start(&folder, "woken; (while :; do log 1; tick 2; done) & echo; read -r line");
-    while fs::metadata(folder.out().join("log.jsonl")).is_ok_and(|log| log.len() < 10_000) {
+    while !fs::metadata(folder.out().join("log.jsonl")).is_ok_and(|log| log.len() >= 10_000) {
         std::thread::yield_now();
     }
     killed.kill().unwrap();

@@ -1,4 +1,4 @@
-// Details of the chosen trigger, fault, clip or difference, beside the time line.
+// Details of the chosen trigger, fault, clip or difference, beside the timeline.
 
 const AROUND_S = 2;
 const AROUND_LINES = 30;
@@ -18,7 +18,7 @@ function nothingChosen(page) {
   return [
     make("h2", { text: has ? `Choose a ${kind}` : "Nothing to choose" }),
     make("p", { class: "dim", text: has
-      ? `Click a mark on the time line, or press → for the first ${kind}.`
+      ? `Click a mark on the timeline, or press → for the first ${kind}.`
       : page.diff ? "The decisions of both runs are identical." : "This lambda did not trigger." }),
   ];
 }

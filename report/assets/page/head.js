@@ -87,7 +87,7 @@ function banners(page) {
     if (run.stopped) all.push(banner("banner bad", `${name}The lambda's process ended before the drive did; the results end there. `, run.stopped));
     run.notes.forEach((note) => all.push(banner("banner", "", name + note)));
     const { shown, total } = { shown: run.triggers.length, total: run.totals.triggers };
-    if (shown < total) all.push(banner("banner", "", `${name}${count(shown)} of ${count(total)} triggers are on this page with details; bars on the time line show where the others are. All are in decisions.jsonl.`));
+    if (shown < total) all.push(banner("banner", "", `${name}${count(shown)} of ${count(total)} triggers are on this page with details; bars on the timeline show where the others are. All are in decisions.jsonl.`));
   });
   return all;
 }

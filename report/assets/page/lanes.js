@@ -5,7 +5,7 @@ const LANE_PX = 24;
 const LANES_MAX = 8;
 const HIT_PX = 7;
 
-/** The lanes of all runs, top to bottom: `{ name, items, dense }`, where items are entries of the time line. */
+/** The lanes of all runs, top to bottom: `{ name, items, dense }`, where items are entries of the timeline. */
 function lanesOf(page, entries) {
   const lanes = [];
   const several = page.runs.length > 1;

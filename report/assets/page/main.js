@@ -1,6 +1,6 @@
 // Reads the data, draws the page and handles keys.
 
-/** All entries of the time line, by time. */
+/** All entries of the timeline, by time. */
 function entriesOf(page) {
   const several = page.runs.length > 1;
   const entries = page.runs.flatMap((run, index) => [
@@ -31,7 +31,7 @@ function timelineCard(page, entries) {
   show(null);
   const has = timeline.entries.length > 0;
   const button = (text, title, handler) => make("button", { text, title, disabled: !has, on: { click: handler } });
-  const bar = make("div", { class: "bar" }, make("b", { text: "Time line" }), readout,
+  const bar = make("div", { class: "bar" }, make("b", { text: "Timeline" }), readout,
     button("←", "previous", () => step(-1)), button("→", "next", () => step(1)),
     make("button", { text: "All", title: "show the whole drive", on: { click: zoomOut } }));
   const [lanes, curves] = [make("div"), make("div")];

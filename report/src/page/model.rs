@@ -24,7 +24,7 @@ pub(crate) struct PageRun {
     pub(crate) start_ns: i64,
     /// The same in ms since 1970, for dates on the page.
     pub(crate) start_ms: f64,
-    /// Start and end of the time line, in s.
+    /// Start and end of the timeline, in s.
     pub(crate) from: f64,
     pub(crate) to: f64,
     /// True if only a part of the drive was replayed.

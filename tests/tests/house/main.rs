@@ -1,5 +1,6 @@
-//! The house is in order, and its pages are true.
+//! The repository's structure, its pages and its language follow the rules.
 
 mod docs;
 mod rooms;
 mod wit;
+mod words;

@@ -23,8 +23,8 @@
 //! 3. If W precedes R in the order of SeqCst fences, the reader's second load sees the 0 or a later
 //!    value, and the reader gives up. Otherwise the writer's scan sees the hazard, and leaves the
 //!    slot alone, or it sees a later value of that word.
-//! 4. That later value was stored with Release after the reader's last access, so the scan's Acquire
-//!    load orders these accesses before our writes to the slot.
+//! 4. That later value was stored with Release after the reader's last access, so the scan's
+//!    Acquire load orders these accesses before our writes to the slot.
 //! 5. A place is not torn: a field of a later sample is written after W, which follows `seq = 0`,
 //!    so a reader that saw such a field sees the 0 or a later value in its second load.
 //! 6. Payload reads are plain. Only a reader that breaks these rules sees torn bytes.
