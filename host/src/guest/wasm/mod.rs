@@ -147,7 +147,7 @@ impl Guest for WasmGuest {
         let deadline = self.deadline.as_ref().map(|deadline| (deadline, self.limits.deadline));
         let mut call = GuestCall::begin(&mut live.store, self.limits.fuel, deadline);
         let result =
-            call.to_wit(wake).and_then(|wake| live.lambda.call_on_wake(call.store(), wake));
+            call.lower_wake(wake).and_then(|wake| live.lambda.call_on_wake(call.store(), wake));
         let (fuel, result) = call.end(result);
         let result = result.and_then(|answer| answer.map_err(exception));
         if result.is_ok() {
@@ -208,7 +208,7 @@ impl<'a> GuestCall<'a> {
         self.store
     }
 
-    fn to_wit(&mut self, wake: Wake) -> wasmtime::Result<wit::Wake> {
+    fn lower_wake(&mut self, wake: Wake) -> wasmtime::Result<wit::Wake> {
         Ok(match wake {
             Wake::Event(sample) => wit::Wake::Event(self.store.data_mut().handles.push(sample)?),
             Wake::Tick(tick) => {
