@@ -18,7 +18,7 @@ const PAGE: usize = 4096;
 ///
 /// For as long as the value lives, even if it is moved: both methods return the same value each
 /// time; the `len` bytes from `base` are initialised and valid for reads and writes from any
-/// thread; and only the pool reads or writes them.
+/// thread; and only the pool or topic that owns it writes them.
 #[expect(
     clippy::len_without_is_empty,
     reason = "a pool only checks that the region is large enough"

@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
 
 use gleaner_buffers::shared::{
-    ControlPage, HAZARDS, HeldSample, META_WORDS, ReadError, ReaderId, SharedLayout, SharedMemory,
-    SharedReader, SharedWriter, WriteError,
+    ControlMemory, ControlPage, HAZARDS, HeldSample, META_WORDS, ReadError, ReaderId, SharedLayout,
+    SharedMemory, SharedReader, SharedWriter, WriteError,
 };
 
 /// Returns a writer with readers, each with so many hazard words and so large a quota.
@@ -130,7 +130,7 @@ fn a_sample_larger_than_a_slot_is_refused() {
 }
 
 /// Writes garbage over the hazard words of a control page.
-fn garbage(control: &ControlPage, state: &mut u64) {
+fn garbage(control: &impl ControlMemory, state: &mut u64) {
     for word in 0..HAZARDS {
         *state ^= *state << 13;
         *state ^= *state >> 7;

@@ -42,15 +42,6 @@ impl ControlPage {
             hazards: std::array::from_fn(|_| AtomicU64::new(0)),
         }
     }
-
-    /// Stores `value` in a hazard word, as every process that maps the page can.
-    ///
-    /// # Panics
-    ///
-    /// If the page has no such word.
-    pub fn overwrite(&self, word: usize, value: u64) {
-        self.hazards[word].store(value, Ordering::Relaxed);
-    }
 }
 
 impl Default for ControlPage {
@@ -63,12 +54,22 @@ impl Default for ControlPage {
 ///
 /// # Safety
 ///
-/// For as long as the value lives, `page` points to 4,096 mapped bytes, aligned to a
+/// For as long as the value lives, [`page`](Self::page) points to 4,096 mapped bytes, aligned to a
 /// cache line, that are valid for atomic reads and writes from any thread. Other processes may
 /// write them.
 pub unsafe trait ControlMemory: Send + Sync + 'static {
     /// The first byte of the page.
     fn page(&self) -> NonNull<ControlPage>;
+
+    /// Stores `value` in a hazard word, as every process that maps the page can.
+    ///
+    /// # Panics
+    ///
+    /// If the page has no such word.
+    fn overwrite(&self, word: usize, value: u64) {
+        // SAFETY: the promise of the trait; hazards are atomics.
+        unsafe { self.page().as_ref() }.hazards[word].store(value, Ordering::Relaxed);
+    }
 }
 
 // SAFETY: a boxed page stays where it is.

@@ -1,0 +1,65 @@
+//! The control page of a reader, mapped by the reader and the writer.
+#![allow(unsafe_code)]
+
+use std::fs::File;
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd};
+use std::ptr::NonNull;
+use std::sync::Arc;
+
+use gleaner_buffers::shared::{ControlMemory, ControlPage};
+use rustix::fs::{MemfdFlags, SealFlags, fcntl_get_seals, memfd_create};
+use rustix::mm::{MapFlags, ProtFlags};
+
+use crate::topic::{FileMapping, seal};
+
+/// Seals of a control page: its size stays.
+const CONTROL_SEALS: SealFlags = SealFlags::SHRINK.union(SealFlags::GROW).union(SealFlags::SEAL);
+
+/// A mapped control page; clones share the mapping.
+#[derive(Clone)]
+pub struct ControlRegion(Arc<FileMapping>);
+
+impl ControlRegion {
+    /// Creates a page without hazards, and the file to pass to its reader.
+    ///
+    /// # Errors
+    ///
+    /// The kernel's error, such as out of memory.
+    pub fn create() -> io::Result<(Self, File)> {
+        let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
+        let file = File::from(memfd_create("gleaner-control", flags)?);
+        file.set_len(size_of::<ControlPage>() as u64)?;
+        seal(&file, CONTROL_SEALS)?;
+        Ok((Self::map(file.as_fd())?, file))
+    }
+
+    /// Maps the page that another process created.
+    ///
+    /// # Errors
+    ///
+    /// [`io::ErrorKind::InvalidData`] if the file has another size or is not sealed; otherwise the
+    /// kernel's error.
+    pub fn open(file: impl AsFd) -> io::Result<Self> {
+        let is_page = rustix::fs::fstat(&file)?.st_size == size_of::<ControlPage>() as i64;
+        if !is_page || !fcntl_get_seals(&file)?.contains(CONTROL_SEALS) {
+            return Err(io::Error::new(io::ErrorKind::InvalidData, "this is not a control page"));
+        }
+        Self::map(file.as_fd())
+    }
+
+    fn map(file: BorrowedFd<'_>) -> io::Result<Self> {
+        let access = ProtFlags::READ | ProtFlags::WRITE;
+        let len = size_of::<ControlPage>();
+        FileMapping::shared(&file, len, access, MapFlags::POPULATE)
+            .map(|mapping| Self(Arc::new(mapping)))
+    }
+}
+
+// SAFETY: the mapping has the size of a page, is aligned to a page, and lives as long as the value;
+// its file cannot shrink. Its fields are atomics.
+unsafe impl ControlMemory for ControlRegion {
+    fn page(&self) -> NonNull<ControlPage> {
+        self.0.base().cast()
+    }
+}

@@ -1,0 +1,218 @@
+//! The memory of a topic: mapped once for writing, then sealed.
+#![allow(unsafe_code)]
+
+use std::ffi::c_void;
+use std::fs::File;
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd};
+use std::ptr::{self, NonNull};
+
+use gleaner_buffers::Region;
+use gleaner_buffers::shared::ReadRegion;
+use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, fcntl_get_seals, memfd_create};
+use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
+
+/// Seals of a topic's file: its size stays, and no further mapping can write it.
+const TOPIC_SEALS: SealFlags =
+    SealFlags::SHRINK.union(SealFlags::GROW).union(SealFlags::FUTURE_WRITE).union(SealFlags::SEAL);
+
+/// A mapping of a whole file, unmapped when it is dropped.
+pub(crate) struct FileMapping {
+    base: NonNull<u8>,
+    len: usize,
+}
+
+impl FileMapping {
+    /// Maps the first `len` bytes of `file`, shared with other processes.
+    pub(crate) fn shared(
+        file: &impl AsFd,
+        len: usize,
+        access: ProtFlags,
+        populate: MapFlags,
+    ) -> io::Result<Self> {
+        // SAFETY: a null hint lets the kernel choose addresses that nothing else uses.
+        let base =
+            unsafe { mmap(ptr::null_mut(), len, access, MapFlags::SHARED | populate, file, 0) }?;
+        let base = NonNull::new(base.cast()).ok_or(io::ErrorKind::OutOfMemory)?;
+        Ok(Self { base, len })
+    }
+
+    pub(crate) fn base(&self) -> NonNull<u8> {
+        self.base
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.len
+    }
+
+    fn address(&self) -> *mut c_void {
+        self.base.as_ptr().cast()
+    }
+}
+
+impl Drop for FileMapping {
+    fn drop(&mut self) {
+        // SAFETY: `shared` mapped exactly these bytes, and their owner drops the mapping last. It
+        // fails only for arguments that no mapping has.
+        let _ = unsafe { munmap(self.address(), self.len) };
+    }
+}
+
+// SAFETY: bytes have no thread; the types that own a mapping control access to it.
+unsafe impl Send for FileMapping {}
+// SAFETY: as above; a shared mapping exposes only its address and length.
+unsafe impl Sync for FileMapping {}
+
+/// The memory of a topic, for its writer.
+pub struct TopicRegion {
+    mapping: FileMapping,
+    file: File,
+}
+
+impl TopicRegion {
+    /// Creates zeroed memory of `len` bytes, every page of which is present, and seals it. `name`
+    /// appears in `/proc/PID/maps`.
+    ///
+    /// Children of this process do not inherit the mapping.
+    ///
+    /// # Errors
+    ///
+    /// [`io::ErrorKind::Unsupported`] if the kernel cannot seal it; otherwise the kernel's error,
+    /// such as out of memory.
+    pub fn create(name: &str, len: usize) -> io::Result<Self> {
+        let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
+        let file = File::from(memfd_create(name, flags)?);
+        file.set_len(len as u64)?;
+        let access = ProtFlags::READ | ProtFlags::WRITE;
+        let mapping = FileMapping::shared(&file, len, access, MapFlags::POPULATE)?;
+        // SAFETY: the bytes are those of the mapping above; the advice changes nothing in this
+        // process.
+        unsafe { madvise(mapping.address(), len, Advice::LinuxDontFork) }?;
+        seal(&file, TOPIC_SEALS)?;
+        Ok(Self { mapping, file })
+    }
+
+    /// Returns the file to pass to readers.
+    pub fn file(&self) -> BorrowedFd<'_> {
+        self.file.as_fd()
+    }
+}
+
+/// Seals `file`, and checks that the seals hold.
+pub(crate) fn seal(file: &File, seals: SealFlags) -> io::Result<()> {
+    let unsupported = || {
+        io::Error::new(io::ErrorKind::Unsupported, "this kernel cannot seal memory: use Linux 5.1")
+    };
+    match fcntl_add_seals(file, seals) {
+        Err(rustix::io::Errno::INVAL) => return Err(unsupported()),
+        sealed => sealed?,
+    }
+    if fcntl_get_seals(file)?.contains(seals) { Ok(()) } else { Err(unsupported()) }
+}
+
+// SAFETY: the mapping is owned, stays where it is until drop, and is initialised by the kernel. No
+// other process can write it, as its file is sealed; readers in other processes only read.
+unsafe impl Region for TopicRegion {
+    fn base(&self) -> NonNull<u8> {
+        self.mapping.base()
+    }
+
+    fn len(&self) -> usize {
+        self.mapping.len()
+    }
+}
+
+/// The memory of a topic, for a reader.
+pub struct MappedTopic(FileMapping);
+
+impl MappedTopic {
+    /// Maps the file of a [`TopicRegion`] of `len` bytes.
+    ///
+    /// # Errors
+    ///
+    /// [`io::ErrorKind::InvalidData`] if the file has another size or is not sealed; otherwise the
+    /// kernel's error.
+    pub fn open(file: impl AsFd, len: usize) -> io::Result<Self> {
+        let wrong = |why| io::Error::new(io::ErrorKind::InvalidData, why);
+        if u64::try_from(rustix::fs::fstat(&file)?.st_size) != Ok(len as u64) {
+            return Err(wrong("the memory of the topic has another size"));
+        }
+        // A file that can shrink would end this process by SIGBUS.
+        if !fcntl_get_seals(&file)?.contains(TOPIC_SEALS) {
+            return Err(wrong("the memory of the topic is not sealed"));
+        }
+        FileMapping::shared(&file, len, ProtFlags::READ, MapFlags::empty()).map(Self)
+    }
+}
+
+// SAFETY: the mapping is owned, stays where it is until drop, and cannot shrink, as its file is
+// sealed.
+unsafe impl ReadRegion for MappedTopic {
+    fn base(&self) -> NonNull<u8> {
+        self.0.base()
+    }
+
+    fn len(&self) -> usize {
+        self.0.len()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rustix::fs::{FallocateFlags, fallocate, ftruncate};
+    use rustix::io::{Errno, pwrite};
+    use rustix::mm::{MprotectFlags, mprotect};
+
+    use super::*;
+
+    const LEN: usize = 3 * 4096;
+
+    #[test]
+    fn a_sealed_topic_cannot_be_changed_through_its_file() {
+        let region = TopicRegion::create("test", LEN).unwrap();
+        let file = region.file();
+        let writable =
+            FileMapping::shared(&file, LEN, ProtFlags::READ | ProtFlags::WRITE, MapFlags::empty());
+        assert_eq!(writable.err().unwrap().raw_os_error(), Some(Errno::PERM.raw_os_error()));
+        assert_eq!(pwrite(file, b"x", 0), Err(Errno::PERM));
+        assert_eq!(ftruncate(file, 0), Err(Errno::PERM));
+        assert_eq!(ftruncate(file, 2 * LEN as u64), Err(Errno::PERM));
+        let hole = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
+        assert_eq!(fallocate(file, hole, 0, 4096), Err(Errno::PERM));
+        assert_eq!(fallocate(file, FallocateFlags::empty(), 0, 2 * LEN as u64), Err(Errno::PERM));
+        assert_eq!(fcntl_add_seals(file, SealFlags::WRITE), Err(Errno::PERM));
+    }
+
+    #[test]
+    fn a_reader_cannot_make_its_mapping_writable() {
+        let region = TopicRegion::create("test", LEN).unwrap();
+        let mapped = MappedTopic::open(region.file(), LEN).unwrap();
+        // SAFETY: the bytes are those of the mapping, and the call is refused.
+        let refused = unsafe {
+            mprotect(mapped.0.address(), LEN, MprotectFlags::READ | MprotectFlags::WRITE)
+        };
+        assert_eq!(refused, Err(Errno::ACCESS));
+    }
+
+    #[test]
+    fn a_reader_sees_what_the_writer_wrote() {
+        let region = TopicRegion::create("test", LEN).unwrap();
+        let mapped = MappedTopic::open(region.file(), LEN).unwrap();
+        // SAFETY: both mappings have `LEN` bytes, and this thread is the only one.
+        unsafe {
+            Region::base(&region).as_ptr().add(5000).write(7);
+            assert_eq!(ReadRegion::base(&mapped).as_ptr().add(5000).read_volatile(), 7);
+        }
+    }
+
+    #[test]
+    fn a_file_of_another_size_or_without_seals_is_refused() {
+        let region = TopicRegion::create("test", LEN).unwrap();
+        let refused = MappedTopic::open(region.file(), LEN + 4096).err().unwrap();
+        assert_eq!(refused.to_string(), "the memory of the topic has another size");
+        let file = File::from(memfd_create("test", MemfdFlags::ALLOW_SEALING).unwrap());
+        file.set_len(LEN as u64).unwrap();
+        let refused = MappedTopic::open(&file, LEN).err().unwrap();
+        assert_eq!(refused.to_string(), "the memory of the topic is not sealed");
+    }
+}

@@ -1,0 +1,224 @@
+//! A writer and readers in separate processes: what readers see, and what hostile and killed
+//! readers cannot do.
+
+use std::env;
+use std::fs::{File, OpenOptions};
+use std::io::{BufRead, BufReader, Read};
+use std::process::{Child, ChildStdout, Command, ExitCode, Stdio};
+use std::sync::Arc;
+use std::time::Duration;
+
+use gleaner_buffers::shared::{
+    Bell, ControlMemory, HAZARDS, META_WORDS, ReaderId, SharedLayout, SharedMemory, SharedReader,
+    SharedWriter,
+};
+use gleaner_regions::{ControlRegion, KernelFutex, MappedTopic, TopicRegion};
+use libtest_mimic::{Arguments, Trial};
+
+const LAYOUT: SharedLayout = SharedLayout { depth: 8, slots: 64, slot_bytes: 4096 };
+/// Hazard words of a reader.
+const WORDS: u16 = 8;
+const QUOTA: u32 = 12;
+
+/// The variable with the role of a child of this program.
+const ROLE: &str = "GLEANER_TEST_ROLE";
+
+/// The word of each sample after the last one.
+const END: u64 = u64::MAX;
+
+fn main() -> ExitCode {
+    match env::var(ROLE).as_deref() {
+        Ok("verify") => verify(),
+        Ok("garbage") => garbage(),
+        Ok("hold") => hold(),
+        _ => {
+            let trial = |name: &str, test: fn()| {
+                Trial::test(name, move || {
+                    test();
+                    Ok(())
+                })
+            };
+            let trials = vec![
+                trial(
+                    "honest_readers_see_whole_samples_beside_hostile_ones",
+                    beside_hostile_readers,
+                ),
+                trial("a_reader_killed_while_it_holds_samples_frees_them", killed_readers),
+            ];
+            return libtest_mimic::run(&Arguments::from_args(), trials).exit_code();
+        }
+    }
+    ExitCode::SUCCESS
+}
+
+/// A topic and the processes that read it.
+struct Topic {
+    region: File,
+    writer: SharedWriter,
+    bells: Vec<Bell>,
+}
+
+/// A child that reads the topic.
+struct ReaderProcess {
+    child: Child,
+    stdout: BufReader<ChildStdout>,
+    id: ReaderId,
+}
+
+impl Drop for ReaderProcess {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Topic {
+    fn new() -> Self {
+        let region = TopicRegion::create("test", LAYOUT.bytes_needed().unwrap()).unwrap();
+        let file = region.file().try_clone_to_owned().unwrap().into();
+        let memory = SharedMemory::for_writing(region, LAYOUT).unwrap();
+        Self { region: file, writer: SharedWriter::new(memory), bells: Vec::new() }
+    }
+
+    /// Starts a reader, and waits for its first line.
+    fn start(&mut self, role: &str) -> ReaderProcess {
+        let (control, file) = ControlRegion::create().unwrap();
+        let id = self.writer.attach(control.clone(), 0..WORDS, QUOTA).unwrap();
+        self.bells.push(Bell::of(control));
+        let mut child = Command::new(env::current_exe().unwrap())
+            .env(ROLE, role)
+            .stdin(self.region.try_clone().unwrap())
+            .stderr(file)
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut stdout = BufReader::new(child.stdout.take().unwrap());
+        let mut line = String::new();
+        stdout.read_line(&mut line).unwrap();
+        assert_eq!(line, "ready\n", "{role}");
+        ReaderProcess { child, stdout, id }
+    }
+
+    /// Publishes a sample each word of which is `word`.
+    fn publish(&mut self, word: u64) {
+        let len = 8 * (1 + self.writer.head() as usize % 512);
+        let mut draft = self.writer.draft(len).unwrap();
+        draft.chunks_exact_mut(8).for_each(|bytes| bytes.copy_from_slice(&word.to_le_bytes()));
+        self.writer.publish(&[word; META_WORDS]).unwrap();
+        for bell in &self.bells {
+            bell.ring(&KernelFutex);
+        }
+    }
+}
+
+fn beside_hostile_readers() {
+    let samples = if env::var_os("GLEANER_LONG").is_some() { 1_000_000 } else { 50_000 };
+    let mut topic = Topic::new();
+    let hostile = [topic.start("garbage"), topic.start("garbage")];
+    let mut honest = topic.start("verify");
+    for word in 0..samples {
+        topic.publish(word);
+    }
+    topic.publish(END);
+    let mut report = String::new();
+    honest.stdout.read_to_string(&mut report).unwrap();
+    let verified: u64 = report.trim().parse().unwrap();
+    assert!(verified > 0);
+    assert!(honest.child.wait().unwrap().success());
+    println!("{verified} of {samples} samples verified");
+    drop(hostile);
+}
+
+fn killed_readers() {
+    let kills = if env::var_os("GLEANER_LONG").is_some() { 400 } else { 20 };
+    let mut topic = Topic::new();
+    let mut honest = topic.start("verify");
+    topic.publish(0);
+    for round in 1..=kills {
+        let mut holder = topic.start("hold");
+        let mut line = String::new();
+        while line != "holds\n" {
+            topic.publish(round);
+            line.clear();
+            holder.stdout.read_line(&mut line).unwrap();
+        }
+        // More samples than slots: those of the holder stay, all others are used again.
+        (0..2 * u64::from(LAYOUT.slots)).for_each(|_| topic.publish(round));
+        holder.child.kill().unwrap();
+        holder.child.wait().unwrap();
+        topic.writer.detach(holder.id);
+        topic.bells.truncate(1);
+        (0..2 * u64::from(LAYOUT.slots)).for_each(|_| topic.publish(round));
+    }
+    topic.publish(END);
+    assert!(honest.child.wait().unwrap().success());
+}
+
+/// Maps the topic and the control page that the parent passed.
+fn attached() -> (SharedReader, ControlRegion) {
+    let topic = File::open("/proc/self/fd/0").unwrap();
+    let topic = MappedTopic::open(topic, LAYOUT.bytes_needed().unwrap()).unwrap();
+    let memory = SharedMemory::for_reading(topic, LAYOUT).unwrap();
+    let control = OpenOptions::new().read(true).write(true).open("/proc/self/fd/2").unwrap();
+    let control = ControlRegion::open(control).unwrap();
+    let reader = SharedReader::new(Arc::new(memory), control.clone(), 0..WORDS, QUOTA).unwrap();
+    println!("ready");
+    (reader, control)
+}
+
+/// Verifies the newest samples until the last one; exits by a panic if one is torn.
+fn verify() {
+    let (reader, control) = attached();
+    let bell = Bell::of(control);
+    let mut verified = 0;
+    loop {
+        let seen = bell.value();
+        if let Some(window) = reader.last_before(u64::MAX, 4).unwrap() {
+            for sample in window.iter() {
+                let word = sample.meta()[0];
+                assert!(sample.chunks_exact(8).all(|bytes| bytes == word.to_le_bytes()), "torn");
+                if word == END {
+                    println!("{verified}");
+                    return;
+                }
+                verified += 1;
+            }
+        }
+        bell.wait(seen, Duration::from_secs(10), &KernelFutex);
+    }
+}
+
+/// Writes garbage over its hazards until it is killed.
+fn garbage() {
+    let (reader, control) = attached();
+    let mut state = 0x9e37_79b9_7f4a_7c15_u64.wrapping_mul(u64::from(std::process::id()));
+    loop {
+        for word in 0..HAZARDS {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            // Half of the words name positions that are shown.
+            let near = reader.head().saturating_sub(state % 16) << 16 | 0xffff;
+            control.overwrite(word, if state % 2 == 0 { state } else { near });
+        }
+    }
+}
+
+/// Holds the newest samples until it is killed.
+fn hold() {
+    let (reader, _) = attached();
+    let window = loop {
+        if let Some(window) = reader.last_before(u64::MAX, QUOTA).unwrap() {
+            break window;
+        }
+        std::thread::yield_now();
+    };
+    println!("holds");
+    let words: Vec<u64> = window.iter().map(|sample| sample.meta()[0]).collect();
+    loop {
+        for (sample, word) in window.iter().zip(&words) {
+            assert!(sample.chunks_exact(8).all(|bytes| bytes == word.to_le_bytes()), "torn");
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
