@@ -28,11 +28,11 @@ mod tests {
         let layers = [
             Layer::yes("files", "a"),
             Layer::yes("sockets", "b"),
-            Layer::no("control group", "none was delegated"),
+            Layer::no("control group", "not delegated"),
         ];
         assert_eq!(
             isolation(&layers),
-            "isolation: files, sockets active; missing: control group (none was delegated)\n"
+            "isolation: files, sockets active; missing: control group (not delegated)\n"
         );
     }
 }

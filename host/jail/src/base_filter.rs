@@ -144,7 +144,7 @@ fn drop_capabilities() -> Layer {
     match given_up {
         Ok(left) if left.is_empty() => Layer::yes(NAME, "none"),
         Ok(left) if KEPT.contains(left) => {
-            Layer::yes(NAME, "given up, but for reading and writing files of other users")
+            Layer::yes(NAME, "dropped, except to read and write files of other users")
         }
         Ok(_) => Layer::no(NAME, "could not be given up"),
         Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
@@ -154,7 +154,7 @@ fn drop_capabilities() -> Layer {
 fn no_new_privileges() -> Layer {
     const NAME: &str = "new privileges";
     match rustix::thread::set_no_new_privs(true) {
-        Ok(()) => Layer::yes(NAME, "no_new_privs: programs with the setuid bit give none"),
+        Ok(()) => Layer::yes(NAME, "no_new_privs: setuid programs gain nothing"),
         Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
     }
 }
@@ -163,7 +163,7 @@ fn no_new_privileges() -> Layer {
 fn no_core_files() -> Layer {
     const NAME: &str = "core files";
     match setrlimit(Resource::Core, Rlimit { current: Some(0), maximum: Some(0) }) {
-        Ok(()) => Layer::yes(NAME, "none are written"),
+        Ok(()) => Layer::yes(NAME, "disabled"),
         Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
     }
 }
@@ -173,7 +173,7 @@ fn limit_open_files() -> Layer {
     const NAME: &str = "open files";
     const MOST: u64 = 4096;
     match limit_files(MOST) {
-        Ok(most) => Layer::yes(NAME, format!("{most} at most, and fewer once a lambda is in")),
+        Ok(most) => Layer::yes(NAME, format!("at most {most}; fewer while a lambda runs")),
         Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
     }
 }
@@ -202,7 +202,7 @@ fn deny_calls() -> Layer {
     match install_both() {
         Ok(()) => Layer::yes(
             NAME,
-            "seccomp: other processes' memory, namespaces, mounts, keys, modules, time, users",
+            "seccomp denies other processes' memory, namespaces, mounts, keys, modules, time, users",
         ),
         Err(error) => Layer::no(NAME, error.chain()),
     }

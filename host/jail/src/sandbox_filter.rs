@@ -162,7 +162,7 @@ pub fn apply(only_counted_memory: bool) -> Result<Vec<Layer>, JailError> {
             Layer::yes(SOCKETS, "seccomp: no new sockets, no connections"),
             Layer::yes(
                 SHARED_RESOURCES,
-                "seccomp: no priorities, no cores, no shared memory, no owners or dates of files",
+                "seccomp: no change of priority, CPU affinity, shared memory, file owners or dates",
             ),
         ],
         Err(error @ JailError::ExistingThread(_)) => return Err(error),

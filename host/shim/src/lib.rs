@@ -250,7 +250,7 @@ fn hard_deadline() -> Layer {
 /// Creates the control group that was requested; returns its layer, too.
 fn create_cgroup(args: &Args) -> (Option<Group>, Layer) {
     let Some(tree) = &args.cgroup else {
-        return (None, Layer::no(cgroup::NAME, "none was delegated: --cgroup DIR"));
+        return (None, Layer::no(cgroup::NAME, "not delegated: --cgroup DIR"));
     };
     let bounds = CgroupLimits { memory: args.cgroup_memory, tasks: args.cgroup_tasks };
     match Group::create(tree, &format!("gleaner-{}", std::process::id()), bounds) {
