@@ -22,7 +22,7 @@ fresh instance of the class, or calls ``init`` again; the globals of the module 
 
 The classes here describe the objects that the host passes to a lambda. Importing them needs no
 host, so a lambda can be type-checked locally, and run locally with `gleaner.testing`. The names are
-those of the WIT package ``gleaner:lambda``, with ``_`` for ``-``.
+those of the WIT package ``gleaner:lambda``, with ``_`` in place of ``-``.
 """
 
 from .context import Context

@@ -1,6 +1,6 @@
 """Interrupts wakes that take too long: a signal raises an exception wherever the lambda is at that
 moment, for example in a loop, in ``time.sleep``, or in numpy when its operation ends.
-`gleaner-shim` kills a process that goes on in spite of it."""
+`gleaner-shim` kills a process that continues in spite of it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Optional
 
 from .error import DeadlineExceeded
 
-# Interval in seconds at which the exception is raised again if the lambda catches it and goes on.
+# Interval in seconds at which the exception is raised again if the lambda catches it and continues.
 REPEAT_S = 0.01
 
 _is_armed = False
@@ -33,7 +33,8 @@ def arm(seconds: float) -> None:
 
 
 def disarm() -> bool:
-    """Ends the deadline. Returns whether it was exceeded, which the lambda may have caught."""
+    """Ends the deadline. Returns whether it was exceeded, also if the lambda caught the
+    exception."""
     global _is_armed
     if _is_armed:
         # Before the timer stops: a pending signal must not raise any more.

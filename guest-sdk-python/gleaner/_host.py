@@ -1,6 +1,6 @@
-"""Hosts a lambda, as far as that is written in Python: loads it from its file, formats its
-exceptions, logs the text that it prints, and keeps the garbage collector out of its wakes.
-`_gleaner` and `gleaner.testing` call it; no lambda imports it."""
+"""The Python part of the host of a lambda. Loads the lambda from its file, formats its exceptions,
+logs the text that it prints, and keeps the garbage collector out of its wakes. `_gleaner` and
+`gleaner.testing` call it; no lambda imports it."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ __all__ = [
 
 Handler = Callable[..., object]
 
-# About as many entries of a traceback fit into a message. Without a limit, formatting the traceback
-# of an endless recursion, a thousand entries deep, would take 16 ms.
+# Maximum number of entries of a traceback: about as many fit into a message. Without a limit,
+# formatting the traceback of an endless recursion, a thousand entries deep, would take 16 ms.
 TRACE_ENTRIES = 40
 
 # Folder of this package, whose code is left out of tracebacks.
@@ -70,7 +70,8 @@ def enter_environment() -> None:
 
 
 def numpy_version() -> str:
-    """Version of the environment's numpy, read from its file names: its code must not run yet."""
+    """Returns the version of the environment's numpy, read from its file names: its code must not
+    run yet."""
     if "numpy" in sys.modules:
         return str(sys.modules["numpy"].__version__)
     # Without `site` this interpreter does not find its virtual environment.
@@ -98,7 +99,7 @@ def load(entry: str, handler: str) -> Callable[[Context], Handler]:
 
 
 def maker(found: Any, handler: str, where: str) -> Callable[[Context], Handler]:
-    """Does the same as `load` for an imported module or the class of a lambda. ``where`` is its
+    """Returns the same as `load`, for an imported module or the class of a lambda. ``where`` is its
     name.
 
     Raises LambdaError."""
@@ -145,8 +146,8 @@ def _import(entry: str) -> ModuleType:
 
 
 def own_modules(folder: str) -> List[str]:
-    """Names of the imported modules that belong to the lambda: those below its folder, also through
-    links.
+    """Returns the names of the imported modules that belong to the lambda: those below its folder,
+    also through links.
 
     An environment or an SDK in the folder, and hidden folders, do not belong to the lambda."""
     names: Dict[str, List[str]] = {}
@@ -156,7 +157,7 @@ def own_modules(folder: str) -> List[str]:
 
 
 def _place(module: object) -> str:
-    """Folder of a module; for a package without a file, its own folder."""
+    """Returns the folder of a module; for a package without a file, its own folder."""
     about: Dict[str, Any] = getattr(module, "__dict__", {})
     file = about.get("__file__")
     try:
@@ -200,7 +201,7 @@ def attempt(
     try:
         return _attempt(seconds, call, *arguments)
     except DeadlineExceeded as late:
-        # It was raised again while the first one was handled.
+        # The exception was raised again while the first one was handled.
         _deadline.disarm()
         return None, explain(late), "deadline"
     finally:
@@ -228,7 +229,7 @@ def _kind(error: BaseException) -> str:
 
 
 def explain(error: BaseException) -> str:
-    """The traceback of an exception: its last entries, without those of this package."""
+    """Returns the traceback of an exception: its last entries, without those of this package."""
     if isinstance(error, LambdaError):
         return str(error)
     trace = error.__traceback__

@@ -35,7 +35,7 @@ class LogWriter(io.RawIOBase):
         return True
 
     def fileno(self) -> int:
-        """File descriptor for writers outside of Python, such as faulthandler and child
+        """Returns the file descriptor for writers outside of Python, such as faulthandler and child
         processes."""
         return STDERR
 
@@ -64,8 +64,8 @@ class LogWriter(io.RawIOBase):
             self._log = log
 
     def forked(self) -> None:
-        """Resets the state in the child of a fork: the log has no reader there, and a thread that
-        does not exist there may hold the lock."""
+        """Resets the state in the child of a fork: the child has no log, and the lock may be held
+        by a thread that does not exist in the child."""
         self._lock, self._log, self._pending = threading.RLock(), None, b""
 
     def _write_line(self, line: bytes) -> None:
@@ -97,8 +97,8 @@ class Stream:
             return False
 
 
-# They are kept across instances of a lambda: `logging`, for example, keeps the stream with which it
-# was configured.
+# These streams are kept across instances of a lambda: `logging`, for example, keeps the stream with
+# which it was configured.
 _streams = (Stream("<stdout>", "info"), Stream("<stderr>", "warn"))
 
 

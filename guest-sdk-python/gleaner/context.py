@@ -19,8 +19,8 @@ class Context(Data, Trigger, Log, Protocol):
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """Values of ``[config]`` by key: the one that the deployment sets, or else the default in
-        the manifest. Each has the type of the default: bool, int, float or str."""
+        """Values of ``[config]`` by key: those that the deployment sets, or else the defaults in
+        the manifest. Each value has the type of its default: bool, int, float or str."""
 
     @property
     def scratch(self) -> Scratch:
@@ -28,5 +28,5 @@ class Context(Data, Trigger, Log, Protocol):
 
     @property
     def missed(self) -> int:
-        """Number of ticks that were due since the previous wake and did not happen; 0 if samples
-        wake the lambda."""
+        """Number of ticks that were due since the previous wake and did not run; 0 if samples wake
+        the lambda."""

@@ -2,13 +2,14 @@
 ``types``.
 
 The objects of the host implement the protocols here; plain values are named tuples. A property is
-constant and costs nothing; a method calls the host.
+constant and needs no call of the host; a method calls the host.
 
 A handle keeps its sample in memory until the handle is dropped: a held sample cannot be
-overwritten. If a lambda holds too many, the ring refuses new samples (``Counts.no_slot``).
+overwritten. If a lambda holds too many, the ring refuses new samples, and ``Counts.no_slot`` counts
+them.
 
-The maximum numbers of bytes and items below are the defaults of ``call_bytes`` and ``call_items``
-in ``[limits]``. A vehicle may set lower ones.
+The maximum numbers of bytes (1 MiB) and values (65,536) below are the defaults of ``call_bytes``
+and ``call_items`` in ``[limits]``. The manifest and the vehicle can lower them.
 """
 
 from __future__ import annotations
@@ -75,14 +76,14 @@ class DataError(Error):
 
 
 class Guid(NamedTuple):
-    """Sender of a sample: the 16 bytes of the DDS writer's GUID, as two big-endian halves. In
-    replay it is derived from the file and the channel, and is the same in every replay."""
+    """GUID of the DDS writer that sent a sample: 16 bytes, as two big-endian halves. In replay it
+    is derived from the file and the channel, and is the same in every replay."""
 
     high: int
     low: int
 
     def __str__(self) -> str:
-        """32 hexadecimal digits, as in ``decisions.jsonl``."""
+        """Returns 32 hexadecimal digits, as in ``decisions.jsonl``."""
         return f"{self.high:016x}{self.low:016x}"
 
 
@@ -101,8 +102,8 @@ class Stamps(NamedTuple):
     only stamps of the same clock."""
 
     at_ns: int
-    """Time of reception on the vehicle; in replay, the log time. Samples, wakes and clips are
-    ordered by this clock."""
+    """Time of reception since 1970 (UTC), on the vehicle's clock, which never goes back; in replay,
+    the log time. Samples, wakes and clips are ordered by this clock."""
     publish_ns: int
     """Time of publication, on the writer's clock."""
     header_ns: Optional[int]
@@ -155,7 +156,8 @@ class FrameInfo(NamedTuple):
 
 
 class Roi(NamedTuple):
-    """Region of interest in pixels. It is clipped to the frame, and refused if no pixel is left."""
+    """Region of interest in pixels, from the upper left corner of the frame. It is clipped to the
+    frame, and refused if no pixel is left."""
 
     x: int
     y: int
@@ -164,7 +166,7 @@ class Roi(NamedTuple):
 
 
 class Data(Protocol):
-    """Part of :class:`gleaner.Context`."""
+    """The functions of the interface ``data``; part of :class:`gleaner.Context`."""
 
     def input(self, name: str) -> Topic:
         """Returns the input ``name`` of the manifest.
@@ -172,11 +174,11 @@ class Data(Protocol):
         Raises DataError: ``no-such-input``, which lists the inputs."""
 
     def inputs(self) -> list[str]:
-        """Names of all inputs, in the order of the manifest."""
+        """Returns the names of all inputs, in the order of the manifest."""
 
     def now_ns(self) -> int:
-        """Time of the current wake in nanoseconds: ``at_ns`` of its sample or tick. The recorded
-        time in replay; 0 in the first ``init``."""
+        """Returns the time of the current wake in nanoseconds: ``at_ns`` of its sample or tick. In
+        replay it is the recorded time; in the first ``init`` it is 0."""
 
 
 class Topic(Protocol):
@@ -188,7 +190,7 @@ class Topic(Protocol):
 
     @property
     def name(self) -> str:
-        """``name`` of the input."""
+        """Name of the input in the manifest."""
 
     @property
     def ros_topic(self) -> str:
@@ -199,17 +201,19 @@ class Topic(Protocol):
         """ROS message type, such as ``sensor_msgs/msg/Imu``."""
 
     def newest(self) -> Sample | None:
-        """Newest sample; None before the first one."""
+        """Returns the newest sample; None before the first one."""
 
     def last(self, n: int) -> list[Sample]:
-        """The ``n`` newest samples, oldest first; fewer if the ring holds fewer. ``n`` is clamped
-        to 256."""
+        """Returns the ``n`` newest samples, oldest first; fewer if the ring holds fewer. ``n`` is
+        clamped to 256."""
 
     def since(self, since_ns: int) -> list[Sample]:
-        """Samples with ``at_ns`` later than ``since_ns``, oldest first; at most the newest 256."""
+        """Returns the samples with ``at_ns`` later than ``since_ns``, oldest first; at most the
+        newest 256."""
 
     def counts(self) -> Counts:
-        """Numbers of received and lost samples of this topic since the lambda's process started."""
+        """Returns the numbers of received and lost samples of this topic since the lambda's process
+        started."""
 
     def field(self, path: str) -> Field:
         """Compiles the path of a field, such as ``linear_acceleration.x``, ``cov[3]`` or
@@ -219,15 +223,15 @@ class Topic(Protocol):
         one; ``wrong-field`` for a path of more than 1,024 bytes."""
 
     def column(self, field: Field | str, n: int) -> Column:
-        """Values of ``field`` in the ``n`` newest samples, oldest first. ``n`` is clamped to
-        65,536.
+        """Returns the values of ``field`` in the ``n`` newest samples, oldest first. ``n`` is
+        clamped to 65,536.
 
         Raises DataError: ``wrong-field`` if the field is not a number or belongs to another topic;
         ``malformed``."""
 
     def column_since(self, field: Field | str, since_ns: int) -> Column:
-        """Values of ``field`` in all samples of the ring with ``at_ns`` later than ``since_ns``,
-        oldest first; at most the newest 65,536.
+        """Returns the values of ``field`` in all samples of the ring with ``at_ns`` later than
+        ``since_ns``, oldest first; at most the newest 65,536.
 
         Raises as :meth:`column`."""
 
@@ -237,7 +241,7 @@ class Field(Protocol):
 
     @property
     def path(self) -> str:
-        """The path, as the lambda wrote it."""
+        """The path, as it was compiled."""
 
 
 class Sample(Protocol):
@@ -252,14 +256,14 @@ class Sample(Protocol):
         """Timestamps of the sample, on three clocks."""
 
     def get(self, field: Field | str) -> Value:
-        """Value of a field, of any type.
+        """Returns the value of a field, of any type.
 
         Raises DataError: ``wrong-field`` if the field belongs to another topic or exceeds the
         length that one call can return (see ``Value``; read such a field in pieces with ``cdr``);
         ``malformed``."""
 
     def number(self, field: Field | str) -> float:
-        """Value of a numeric or boolean field, as a 64-bit float; true is 1.
+        """Returns the value of a numeric or boolean field, as a 64-bit float; true is 1.
 
         Raises DataError: ``wrong-field`` if the field is not a number or belongs to another topic;
         ``malformed``."""
@@ -273,13 +277,13 @@ class Sample(Protocol):
         """True if the message is big-endian CDR."""
 
     def cdr(self, offset: int = 0, len: int | None = None) -> bytes:
-        """Raw CDR bytes without the encapsulation header: at most ``len``, from ``offset``. Clamped
-        to the message and to 1 MiB."""
+        """Returns raw CDR bytes without the encapsulation header: at most ``len``, from ``offset``,
+        clamped to the message and to 1 MiB."""
 
     def as_frame(self) -> Frame:
-        """The message as an image. Accepts ``sensor_msgs/msg/Image``, and
-        ``sensor_msgs/msg/CompressedImage`` in JPEG or PNG, which this call decodes to rgb8, once
-        for each sample.
+        """Returns the message as an image. The type must be ``sensor_msgs/msg/Image`` or
+        ``sensor_msgs/msg/CompressedImage``. This call decodes a JPEG or PNG to rgb8, once for each
+        sample.
 
         Raises DataError: ``not-a-frame``; ``no-room`` if the decoded image exceeds
         ``decoded_size``, all slots for decoded images are held, or the lambda holds as many frames
@@ -289,8 +293,8 @@ class Sample(Protocol):
 class Frame(Protocol):
     """A sample as an image. ``numpy.asarray`` and ``torch.from_dlpack`` accept it without a copy.
 
-    The pixels are read-only, which DLPack can express since version 1.0 and numpy supports since
-    2.1; older versions refuse.
+    The pixels are read-only. DLPack can express that since version 1.0, and numpy supports it since
+    2.1; older versions raise an exception.
     """
 
     @property
@@ -307,8 +311,8 @@ class Frame(Protocol):
         """Timestamps of the sample that the frame comes from."""
 
     def mean_luma(self, roi: Roi | tuple[int, int, int, int] | None = None) -> float:
-        """Mean luma (ITU-R BT.601), 0 to 255, of the whole frame or of ``roi``. Computed with
-        integers, so the result is the same on every CPU.
+        """Returns the mean luma (ITU-R BT.601), 0 to 255, of the whole frame or of ``roi``. It is
+        computed with integers, so it is the same on every CPU.
 
         Raises DataError: ``out-of-range`` if ``roi`` has no pixel in the frame; ``not-a-frame`` for
         Bayer encodings."""
@@ -316,42 +320,42 @@ class Frame(Protocol):
     def histogram(
         self, roi: Roi | tuple[int, int, int, int] | None = None
     ) -> npt.NDArray[np.uint32]:
-        """Number of pixels at each of the 256 luma levels, luma rounded down; the luma of a 16-bit
-        pixel is its high byte.
+        """Returns the number of pixels at each of the 256 luma levels. Luma is rounded down; that
+        of a 16-bit pixel is its high byte.
 
         Raises as :meth:`mean_luma`."""
 
     def resize(self, width: int, height: int) -> Frame:
-        """A new frame of ``width`` by ``height`` pixels, each 1 to 16,384: rgb8, or mono8 if the
-        encoding is grey. A new pixel is the mean of the area that it covers where the frame
-        shrinks, and a linear interpolation where it grows.
+        """Creates a frame of ``width`` by ``height`` pixels, each side 1 to 16,384. Its encoding is
+        rgb8, or mono8 if this frame is grey. A new pixel is the mean of the area that it covers
+        where the frame shrinks, and a linear interpolation where it grows.
 
         Raises DataError: ``out-of-range``; ``no-room`` if the frames that the lambda created would
         together exceed ``memory`` in ``[limits]``, or the lambda holds as many frames as ``frames``
         allows; ``not-a-frame`` for Bayer encodings."""
 
     def to_gray(self) -> Frame:
-        """A new mono8 frame of the same size.
+        """Creates a mono8 frame of the same size.
 
         Raises DataError: ``no-room``, as :meth:`resize`; ``not-a-frame`` for Bayer encodings."""
 
     def read(self, offset: int = 0, len: int | None = None) -> bytes:
-        """A copy of pixel bytes: at most ``len``, from ``offset``. Clamped to the frame and to 1
-        MiB. :meth:`array` needs no copy."""
+        """Returns a copy of pixel bytes: at most ``len``, from ``offset``, clamped to the frame and
+        to 1 MiB. :meth:`array` needs no copy."""
 
     def array(self) -> npt.NDArray[Any]:
-        """The pixels as a read-only array, without a copy, whatever their size.
+        """Returns the pixels as a read-only array, without a copy, whatever their size.
 
         Shape (height, width, 3) or (height, width, 4) for colour; (height, width) for grey and
         Bayer; (height, width, 2) for yuv422, with U or V before Y, and for yuy2, with U or V after
-        Y. uint8, or uint16 in the byte order of the frame. The slot is held until the last view of
-        the array is dropped, so copy pixels that are kept longer."""
+        Y. The type is uint8, or uint16 in the byte order of the frame. The slot of the image is
+        held until the last view of the array is dropped, so copy pixels that are kept for long."""
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
-        """The array of :meth:`array`, for ``numpy.asarray``."""
+        """Returns the array of :meth:`array`, for ``numpy.asarray``."""
 
     def __dlpack__(self, **options: Any) -> Any:
-        """The array of :meth:`array`, for ``from_dlpack`` of numpy and torch."""
+        """Returns the array of :meth:`array`, for ``from_dlpack`` of numpy and torch."""
 
     def __dlpack_device__(self) -> tuple[int, int]:
-        """Device of the pixels: the CPU, (1, 0)."""
+        """Returns the device of the pixels: the CPU, (1, 0)."""

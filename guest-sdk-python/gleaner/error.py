@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class DeadlineExceeded(BaseException):
-    """The wake, or ``init``, has taken longer than ``[limits]`` allows, and is ended.
+    """Raised in a wake or an ``init`` that takes longer than ``[limits]`` allows, to end it.
 
     ``except Exception`` does not catch it. Code that catches it should clean up and raise it again:
     the wake is a fault in any case, and a process that stays in the wake is killed."""
@@ -13,7 +13,8 @@ class DeadlineExceeded(BaseException):
 class Error(ValueError):
     """A refused call. The text names the object, the cause and the way out.
 
-    ``kind`` is the case of the WIT variant, such as ``"no-such-field"``, for programs to check.
+    ``kind`` is the case of the WIT variant, such as ``"no-such-field"``. Programs check it instead
+    of the text.
     """
 
     kind: str

@@ -1,6 +1,6 @@
-"""Models that run on the host: interface ``inference`` of the WIT package.
+"""Models that run in the host: interface ``inference`` of the WIT package.
 
-Current hosts have no model runtime: every call raises InferenceError (``no-runtime``).
+No current host has a model runtime: every call raises InferenceError (``no-runtime``).
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ class Preprocess(NamedTuple):
 
 
 class Detection(NamedTuple):
-    """An object that ``detect`` found, in pixels of the frame."""
+    """An object that ``detect`` found; its box is in pixels of the frame."""
 
     class_: int
-    """Class index of the model: ``class`` of the WIT, which is a keyword of Python."""
+    """Class index of the model. It is ``class`` in the WIT, which is a keyword of Python."""
     score: float
     """Confidence, 0 to 1."""
     x: float
@@ -71,7 +71,7 @@ class DetectOptions(NamedTuple):
     classes: Sequence[int] = ()
     """Classes to return; empty for all."""
     min_score: float = 0.25
-    """Detections with a lower score are dropped, 0 to 1."""
+    """Minimum score, 0 to 1; detections with a lower one are dropped."""
     max_iou: float = 0.45
     """Overlap (intersection over union), 0 to 1, above which the detection with the lower score is
     dropped."""
@@ -107,7 +107,8 @@ class Tensor(Protocol):
         """Length of each dimension."""
 
     def read(self, offset: int = 0, len: int | None = None) -> npt.NDArray[np.float32]:
-        """Values: at most ``len``, from ``offset``. Clamped to the tensor and to 262,144 values."""
+        """Returns values: at most ``len``, from ``offset``, clamped to the tensor and to 262,144
+        values."""
 
 
 class Model(Protocol):

@@ -5,14 +5,15 @@ from __future__ import annotations
 from typing import Literal, Protocol
 
 Level = Literal["error", "warn", "info", "debug", "trace"]
-"""Severity of a log line. ``error``: someone must act. ``warn``: data or time was lost. ``info``: a
-state changed. ``debug``, ``trace``: for the lambda's author."""
+"""Severity of a log line. ``error``: the operator must act. ``warn``: data or time was lost.
+``info``: a state changed. ``debug``: for the lambda's author. ``trace``: for the lambda's author,
+in detail."""
 
 
 class Log(Protocol):
-    """Part of :class:`gleaner.Context`.
+    """The function of the interface ``log``; part of :class:`gleaner.Context`.
 
-    Text that a lambda prints becomes log lines, too, from its import on: ``info`` from
+    Text that a lambda prints, from its import on, becomes log lines, too: ``info`` from
     ``sys.stdout``, ``warn`` from ``sys.stderr``. A line is written at its newline, or at the end of
     the call that began it. Output of other processes and of code that is not Python goes to
     standard error and is not kept."""

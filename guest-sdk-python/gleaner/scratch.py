@@ -25,15 +25,16 @@ class Entry(NamedTuple):
 
     name: str
     bytes: int
-    """Length of the value."""
+    """Length of the value in bytes."""
 
 
 class Scratch(Protocol):
-    """``ctx.scratch``: data that is too large for the lambda's own memory, or that must survive a
-    fault.
+    """``ctx.scratch``: named byte strings that the host keeps for the lambda. Use them for data
+    that is too large for the lambda's own memory, or that must survive a fault.
 
-    Its size is ``scratch`` in ``[limits]``, 0 by default. It is empty when the lambda's process
-    starts. A fault of the lambda does not change it, and ``init`` may read it.
+    The size of this scratch memory is ``scratch`` in ``[limits]``, 0 bytes by default. It is empty
+    when the lambda's process starts. A fault of the lambda does not change it, and ``init`` may
+    read and write it.
     """
 
     def put(self, name: str, bytes: Union[bytes, bytearray, memoryview]) -> None:
@@ -48,7 +49,7 @@ class Scratch(Protocol):
         Raises ScratchError: ``no-room``; ``wrong-name``."""
 
     def get(self, name: str, offset: int = 0, len: Optional[int] = None) -> bytes:
-        """Bytes of an entry: at most ``len``, from ``offset``. Clamped to the entry and to
+        """Returns bytes of an entry: at most ``len``, from ``offset``, clamped to the entry and to
         ``call_bytes`` in ``[limits]``, 1 MiB by default.
 
         Raises ScratchError: ``no-such-entry``."""
@@ -59,8 +60,8 @@ class Scratch(Protocol):
         Raises ScratchError: ``no-such-entry``."""
 
     def entries(self) -> list[Entry]:
-        """All entries, sorted by the bytes of their names."""
+        """Returns all entries, sorted by the bytes of their names."""
 
     def free(self) -> int:
-        """Free space in bytes. An entry takes the length of its value and of its name, and 64
-        bytes."""
+        """Returns the free space in bytes. An entry takes the lengths of its value and its name,
+        plus 64 bytes."""

@@ -1,4 +1,5 @@
-"""Actions that a lambda takes in a wake: interface ``trigger`` of the WIT package.
+"""Triggers: events, and the start and stop of recordings, that a lambda reports in a wake:
+interface ``trigger`` of the WIT package.
 
 A trigger is effective from the moment of the call, even if the same wake faults later. Outside of a
 wake all triggers are refused: in ``init``, which is ``__init__`` of a class, and in threads between
@@ -23,15 +24,16 @@ class TriggerError(Error):
 
     ``invalid``: called outside of a wake; label empty or over 128 bytes; score or value not finite;
     key empty or over 64 bytes; text over 1,024 bytes; more than 16 attributes. ``too-many``: more
-    than 16 triggers in one wake, or more in a minute than ``events_per_minute`` in ``[limits]``.
+    than 16 triggers in one wake, or more in a minute than ``events_per_minute`` in ``[limits]``,
+    which does not apply to ``stop``.
     """
 
     kind: TriggerErrorKind
 
 
 class Trigger(Protocol):
-    """Part of :class:`gleaner.Context`. Keyword arguments become attributes: named values that are
-    stored with the trigger in the clip."""
+    """The functions of the interface ``trigger``; part of :class:`gleaner.Context`. Keyword
+    arguments become attributes: named values that are stored with the trigger in the clip."""
 
     def event(self, label: str, score: float, /, **attributes: AttributeValue) -> None:
         """Reports an event: opens the ``[record]`` window around the sample or tick of this wake.
@@ -40,7 +42,8 @@ class Trigger(Protocol):
         Raises TriggerError; TypeError for an attribute of another type."""
 
     def start(self, label: str, /, **attributes: AttributeValue) -> None:
-        """Starts a recording that lasts until :meth:`stop` is called with the same label.
+        """Starts a recording that lasts until :meth:`stop` is called with the same label. At most
+        64 labels of a lambda can be recorded at once.
 
         Raises as :meth:`event`."""
 

@@ -14,7 +14,8 @@ sys.path.insert(0, str(SDK))
 
 
 def extension_path() -> str:
-    """Path of the extension `_gleaner`, from GLEANER_EXTENSION; skips the test if it is not set."""
+    """Returns the path of the extension `_gleaner`, from GLEANER_EXTENSION; skips the test if it is
+    not set."""
     path = os.environ.get("GLEANER_EXTENSION")
     if not path:
         raise unittest.SkipTest("GLEANER_EXTENSION does not name lib_gleaner.so")
@@ -22,7 +23,7 @@ def extension_path() -> str:
 
 
 def extension() -> ModuleType:
-    """The module `_gleaner`; skips the test if it is not built."""
+    """Returns the module `_gleaner`; skips the test if it is not built."""
     if "_gleaner" not in sys.modules:
         import start
 

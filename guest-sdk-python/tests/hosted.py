@@ -88,8 +88,8 @@ class Hosted(unittest.TestCase):
     def replay(
         self, source: str, images: List[Image], wakes: Optional[int] = None, **how: Any
     ) -> List[Dict[str, Any]]:
-        """The decision of each wake. Checks that none faulted, and that there is one for each
-        image, or that there are `wakes`: assertions of a lambda only run if it is woken."""
+        """Returns the decision of each wake. Checks that none faulted, and that there is one for
+        each image, or that there are `wakes`: assertions of a lambda only run if it is woken."""
         ended = self.start(source, images, **how)
         decisions = self.decisions()
         faults = [decision["fault"]["message"] for decision in decisions if decision["fault"]]
@@ -98,8 +98,8 @@ class Hosted(unittest.TestCase):
         return decisions
 
     def fault(self, source: str, wake: int = 0) -> str:
-        """Message of the fault of a wake. There are two wakes; the replay continues after the
-        first."""
+        """Returns the message of the fault of a wake. There are two wakes; the replay continues
+        after the first."""
         ended = self.start(source, [GREY, GREY])
         decisions = self.decisions()
         self.assertEqual((ended.returncode, len(decisions)), (6, 2), ended.stderr)
@@ -112,7 +112,7 @@ class Hosted(unittest.TestCase):
         return self.lines("decisions.jsonl")
 
     def log(self) -> List[Tuple[str, str]]:
-        """Level and text of each line of the log."""
+        """Returns the level and text of each line of the log."""
         return [(line["level"], line["message"]) for line in self.lines("log.jsonl")]
 
     def lines(self, name: str) -> List[Dict[str, Any]]:

@@ -44,7 +44,7 @@ def plain(given: Any) -> Any:
 
 
 def refusal(call: Callable[[], Any]) -> Any:
-    """Result of a call, or kind and text of its error."""
+    """Returns the result of a call, or kind and text of its error."""
     try:
         return call()
     except REFUSALS as error:
@@ -52,7 +52,7 @@ def refusal(call: Callable[[], Any]) -> Any:
 
 
 def refused(call: Callable[[], object]) -> Any:
-    """Text of the error of a call, if there is one."""
+    """Returns the text of the error of a call, if there is one."""
     try:
         call()
     except DataError as error:

@@ -75,7 +75,7 @@ def camel(name: str) -> str:
 
 
 def wanted() -> Dict[str, Dict[str, wit.Function]]:
-    """The functions of each class, by their names in Python."""
+    """Returns the functions of each class, by their names in Python."""
     functions = {
         name: function for of in OF_CONTEXT for name, function in INTERFACES[of].functions.items()
     }
@@ -88,13 +88,13 @@ def wanted() -> Dict[str, Dict[str, wit.Function]]:
 
 
 def members(cls: type) -> Set[str]:
-    """Public names of a class, and the special methods listed above."""
+    """Returns the public names of a class, and the special methods listed above."""
     special = ONLY_PYTHON.get(cls.__name__, set())
     return {name for name in dir(cls) if not name.startswith("_") or name in special}
 
 
 def parameters(cls: type, name: str) -> List[Tuple[str, Any, bool]]:
-    """Name and kind of each parameter except `self`, and whether it has a default."""
+    """Returns the name and kind of each parameter except `self`, and whether it has a default."""
     given = inspect.signature(getattr(cls, name)).parameters.values()
     return [
         (parameter.name, parameter.kind, parameter.default is not parameter.empty)

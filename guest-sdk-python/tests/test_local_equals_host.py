@@ -198,7 +198,7 @@ class Operations(unittest.TestCase):
 
 
 def pictures() -> List[Image]:
-    """An image of each layout, with random pixels, with and without padding of rows."""
+    """Returns an image of each layout, with random pixels, with and without padding of rows."""
     noise = random.Random(6)
     images = []
     for encoding, pixel in [

@@ -25,7 +25,7 @@ Cases = List[Tuple[Dict[str, Any], str]]
 
 
 def manifest(**tables: Any) -> Dict[str, Any]:
-    """A manifest as a dict, with these tables in place of the defaults."""
+    """Returns a manifest as a dict, with these tables in place of the defaults."""
     given: Dict[str, Any] = {
         "lambda": {"name": "probe", "version": "0.1.0", "kind": "python", "entry": "main.py"},
         "schedule": {"event": "imu"},
@@ -45,7 +45,7 @@ def encoded(form: str, size: Tuple[int, int], mode: str) -> bytes:
 
 
 def chunk(kind_and_data: bytes) -> bytes:
-    """A chunk of a PNG."""
+    """Returns a chunk of a PNG."""
     return (
         (len(kind_and_data) - 4).to_bytes(4, "big")
         + kind_and_data

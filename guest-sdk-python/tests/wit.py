@@ -30,8 +30,8 @@ class Interface:
 
 
 def read(folder: Path) -> Dict[str, Interface]:
-    """All interfaces of the `.wit` files in `folder`, by name. Names are as in the WIT, with
-    `-`."""
+    """Returns all interfaces of the `.wit` files in `folder`, by name. Names are as in the WIT,
+    with `-`."""
     interfaces = {}
     for path in sorted(folder.glob("*.wit")):
         text = re.sub(r"//.*", "", path.read_text(encoding="utf-8"))
@@ -71,15 +71,15 @@ def _pairs(parameters: str) -> List[Tuple[str, str]]:
 
 
 def _parameter(name: str, kind: str) -> str:
-    """Name of a parameter. In the WIT a parameter cannot have the name of a type, so a handle is
-    `f: borrow<field>`; in Python it is `field`."""
+    """Returns the name of a parameter. In the WIT a parameter cannot have the name of a type, so a
+    handle is `f: borrow<field>`; in Python it is `field`."""
     handle = ONE_LETTER.fullmatch(kind.strip())
     return handle.group(1) if handle and len(name) == 1 else name
 
 
 def _block(text: str, start: int) -> Tuple[str, int]:
-    """Text up to the brace that closes the one before `start`, and the position after that
-    brace."""
+    """Returns the text up to the brace that closes the one before `start`, and the position after
+    that brace."""
     depth = 1
     for at in range(start, len(text)):
         depth += {"{": 1, "}": -1}.get(text[at], 0)

@@ -1,4 +1,4 @@
-//! The `[config]` of the lambda, with the values of the deployment.
+//! Values of `[config]` of the lambda, as the deployment sets them.
 
 use crate::bindings;
 use crate::{Error, Result};

@@ -1,4 +1,6 @@
-//! Samples, fields and frames: `gleaner:lambda/data`.
+//! Samples, fields and frames: `gleaner:lambda/data`. The maximum numbers of bytes (1 MiB) and
+//! values (65,536) below are the defaults of `call_bytes` and `call_items` in `[limits]`. The
+//! manifest and the vehicle can lower them.
 
 use crate::bindings::gleaner::lambda::data as wit;
 pub use crate::bindings::gleaner::lambda::data::Tick;
@@ -17,8 +19,8 @@ pub struct Topic(wit::Topic);
 /// A compiled path into the messages of one topic.
 pub struct Field(wit::Field);
 
-/// One message. The ring cannot overwrite it until it is dropped; if a lambda holds too many, the
-/// ring refuses new samples ([`Counts::no_slot`]).
+/// One message. The ring cannot overwrite it until it is dropped. If a lambda holds too many
+/// samples, the ring refuses new ones ([`Counts::no_slot`]).
 pub struct Sample(wit::Sample);
 
 /// A sample as an image. Its pixels stay in the host until the lambda reads them.
@@ -42,44 +44,46 @@ pub fn input(name: &str) -> Result<Topic> {
     Ok(Topic(into_result(wit::input(name))?))
 }
 
-/// Names of all inputs, in the order of the manifest.
+/// Returns the names of all inputs, in the order of the manifest.
 pub fn inputs() -> Vec<String> {
     wit::inputs()
 }
 
-/// Time of the current wake in nanoseconds: `at_ns` of its sample or tick. The recorded time in
-/// replay; 0 in the first `init`.
+/// Returns the time of the current wake in nanoseconds: `at_ns` of its sample or tick. In replay it
+/// is the recorded time; in the first `init` it is 0.
 pub fn now_ns() -> i64 {
     wit::now_ns()
 }
 
 impl Topic {
-    /// `name` of the input.
+    /// Returns the name of the input in the manifest.
     pub fn name(&self) -> String {
         self.0.name()
     }
 
-    /// Name of the ROS topic, such as `/imu/data`.
+    /// Returns the name of the ROS topic, such as `/imu/data`.
     pub fn ros_topic(&self) -> String {
         self.0.ros_topic()
     }
 
-    /// ROS message type, such as `sensor_msgs/msg/Imu`.
+    /// Returns the ROS message type, such as `sensor_msgs/msg/Imu`.
     pub fn type_name(&self) -> String {
         self.0.type_name()
     }
 
-    /// Newest sample; none before the first one.
+    /// Returns the newest sample; none before the first one.
     pub fn newest(&self) -> Option<Sample> {
         self.0.newest().map(Sample)
     }
 
-    /// The `n` newest samples, oldest first; fewer if the ring holds fewer. `n` is clamped to 256.
+    /// Returns the `n` newest samples, oldest first; fewer if the ring holds fewer. `n` is clamped
+    /// to 256.
     pub fn last(&self, n: u32) -> impl DoubleEndedIterator<Item = Sample> + ExactSizeIterator {
         self.0.last(n).into_iter().map(Sample)
     }
 
-    /// Samples with [`Stamps::at_ns`] later than `since_ns`, oldest first; at most the newest 256.
+    /// Returns the samples with [`Stamps::at_ns`] later than `since_ns`, oldest first; at most the
+    /// newest 256.
     pub fn since(
         &self,
         since_ns: i64,
@@ -87,7 +91,8 @@ impl Topic {
         self.0.since(since_ns).into_iter().map(Sample)
     }
 
-    /// Numbers of received and lost samples of this topic since the lambda's process started.
+    /// Returns the numbers of received and lost samples of this topic since the lambda's process
+    /// started.
     pub fn counts(&self) -> Counts {
         self.0.counts()
     }
@@ -104,7 +109,8 @@ impl Topic {
         Ok(Field(into_result(self.0.field(path))?))
     }
 
-    /// Values of `field` in the `n` newest samples, oldest first. `n` is clamped to 65,536.
+    /// Returns the values of `field` in the `n` newest samples, oldest first. `n` is clamped to
+    /// 65,536.
     ///
     /// # Errors
     ///
@@ -113,8 +119,8 @@ impl Topic {
         Ok(into_result(self.0.column(&field.0, n))?.into())
     }
 
-    /// Values of `field` in all samples of the ring with [`Stamps::at_ns`] later than `since_ns`,
-    /// oldest first; at most the newest 65,536.
+    /// Returns the values of `field` in all samples of the ring with [`Stamps::at_ns`] later than
+    /// `since_ns`, oldest first; at most the newest 65,536.
     ///
     /// # Errors
     ///
@@ -125,24 +131,24 @@ impl Topic {
 }
 
 impl Field {
-    /// The path, as the lambda wrote it.
+    /// Returns the path, as it was compiled.
     pub fn path(&self) -> String {
         self.0.path()
     }
 }
 
 impl Sample {
-    /// Unique identity of the sample: topic, writer and sequence number.
+    /// Returns the unique identity of the sample: topic, writer and sequence number.
     pub fn identity(&self) -> Identity {
         self.0.identity()
     }
 
-    /// Timestamps of the sample, on three clocks.
+    /// Returns the timestamps of the sample, on three clocks.
     pub fn stamps(&self) -> Stamps {
         self.0.stamps()
     }
 
-    /// Value of a field, of any type.
+    /// Returns the value of a field, of any type.
     ///
     /// # Errors
     ///
@@ -152,7 +158,7 @@ impl Sample {
         into_result(self.0.get(&field.0))
     }
 
-    /// Value of a numeric or boolean field, as a 64-bit float; true is 1.
+    /// Returns the value of a numeric or boolean field, as a 64-bit float; true is 1.
     ///
     /// # Errors
     ///
@@ -161,25 +167,25 @@ impl Sample {
         into_result(self.0.number(&field.0))
     }
 
-    /// Size of the message in bytes, without the CDR encapsulation header.
+    /// Returns the size of the message in bytes, without the CDR encapsulation header.
     pub fn size(&self) -> u64 {
         self.0.size()
     }
 
-    /// True if the message is big-endian CDR.
+    /// Returns whether the message is big-endian CDR.
     pub fn big_endian(&self) -> bool {
         self.0.big_endian()
     }
 
-    /// Raw CDR bytes without the encapsulation header: at most `len`, from `offset`. Clamped to the
-    /// message and to 1 MiB.
+    /// Returns raw CDR bytes without the encapsulation header: at most `len`, from `offset`,
+    /// clamped to the message and to 1 MiB.
     pub fn cdr(&self, offset: u64, len: u32) -> Vec<u8> {
         self.0.cdr(offset, len)
     }
 
-    /// The message as an image. Accepts `sensor_msgs/msg/Image`, and
-    /// `sensor_msgs/msg/CompressedImage` in JPEG or PNG, which this call decodes to rgb8, once for
-    /// each sample.
+    /// Returns the message as an image. The type must be `sensor_msgs/msg/Image` or
+    /// `sensor_msgs/msg/CompressedImage`. This call decodes a JPEG or PNG to rgb8, once for each
+    /// sample.
     ///
     /// # Errors
     ///
@@ -192,24 +198,24 @@ impl Sample {
 }
 
 impl Frame {
-    /// Size and pixel layout of the frame.
+    /// Returns the size and pixel layout of the frame.
     pub fn info(&self) -> FrameInfo {
         self.0.info()
     }
 
-    /// Identity of the sample that the frame comes from, also after [`resize`](Self::resize) and
-    /// [`to_gray`](Self::to_gray).
+    /// Returns the identity of the sample that the frame comes from, also after
+    /// [`resize`](Self::resize) and [`to_gray`](Self::to_gray).
     pub fn identity(&self) -> Identity {
         self.0.identity()
     }
 
-    /// Timestamps of the sample that the frame comes from.
+    /// Returns the timestamps of the sample that the frame comes from.
     pub fn stamps(&self) -> Stamps {
         self.0.stamps()
     }
 
-    /// Mean luma (ITU-R BT.601), 0 to 255, of the whole frame or of `roi`. Computed with integers,
-    /// so the result is the same on every CPU.
+    /// Returns the mean luma (ITU-R BT.601), 0 to 255, of the whole frame or of `roi`. It is
+    /// computed with integers, so it is the same on every CPU.
     ///
     /// # Errors
     ///
@@ -218,8 +224,8 @@ impl Frame {
         into_result(self.0.mean_luma(roi))
     }
 
-    /// Number of pixels at each of the 256 luma levels, luma rounded down; the luma of a 16-bit
-    /// pixel is its high byte.
+    /// Returns the number of pixels at each of the 256 luma levels. Luma is rounded down; that of a
+    /// 16-bit pixel is its high byte.
     ///
     /// # Errors
     ///
@@ -228,9 +234,9 @@ impl Frame {
         into_result(self.0.histogram(roi))
     }
 
-    /// A new frame of `width` by `height` pixels, each 1 to 16,384: rgb8, or mono8 if the encoding
-    /// is grey. A new pixel is the mean of the area that it covers where the frame shrinks, and a
-    /// linear interpolation where it grows.
+    /// Creates a frame of `width` by `height` pixels, each side 1 to 16,384. Its encoding is rgb8,
+    /// or mono8 if this frame is grey. A new pixel is the mean of the area that it covers where the
+    /// frame shrinks, and a linear interpolation where it grows.
     ///
     /// # Errors
     ///
@@ -241,7 +247,7 @@ impl Frame {
         Ok(Frame(into_result(self.0.resize(width, height))?))
     }
 
-    /// A new mono8 frame of the same size.
+    /// Creates a mono8 frame of the same size.
     ///
     /// # Errors
     ///
@@ -250,8 +256,8 @@ impl Frame {
         Ok(Frame(into_result(self.0.to_gray())?))
     }
 
-    /// Pixel bytes: at most `len`, from `offset`. Clamped to the frame and to 1 MiB. Reading in
-    /// pieces of 64 KiB is fastest.
+    /// Returns pixel bytes: at most `len`, from `offset`, clamped to the frame and to 1 MiB.
+    /// Reading in pieces of 64 KiB is fastest.
     pub fn read(&self, offset: u64, len: u32) -> Vec<u8> {
         self.0.read(offset, len)
     }
@@ -277,7 +283,7 @@ impl Frame {
         Ok(())
     }
 
-    /// Pixel bytes of each row from top to bottom, without padding.
+    /// Returns the pixel bytes of each row from top to bottom, without padding.
     pub fn rows(&self) -> impl Iterator<Item = Vec<u8>> {
         let FrameInfo { width, height, step, encoding, .. } = self.info();
         let row_bytes = width * bytes_per_pixel(encoding);
@@ -285,7 +291,7 @@ impl Frame {
     }
 }
 
-/// ROS name of an encoding.
+/// Returns the ROS name of an encoding.
 ///
 /// ```
 /// use gleaner_sdk::data::{Encoding, encoding_name};
@@ -312,7 +318,7 @@ pub fn encoding_name(encoding: Encoding) -> &'static str {
     }
 }
 
-/// Number of bytes per pixel.
+/// Returns the number of bytes per pixel.
 pub fn bytes_per_pixel(encoding: Encoding) -> u32 {
     match encoding {
         Encoding::Rgb8 | Encoding::Bgr8 => 3,
@@ -333,7 +339,7 @@ pub fn bytes_per_pixel(encoding: Encoding) -> u32 {
 }
 
 impl Column {
-    /// Number of values.
+    /// Returns the number of values.
     pub fn len(&self) -> usize {
         self.values.len()
     }
@@ -343,7 +349,7 @@ impl Column {
         self.values.is_empty()
     }
 
-    /// Arithmetic mean; none if there are no values.
+    /// Returns the arithmetic mean; none if there are no values.
     ///
     /// ```
     /// # use gleaner_sdk::Column;
@@ -355,7 +361,7 @@ impl Column {
         (!self.is_empty()).then(|| self.values.iter().sum::<f64>() / self.len() as f64)
     }
 
-    /// Pairs of stamp (in nanoseconds) and value, oldest first.
+    /// Returns pairs of stamp, in nanoseconds, and value, oldest first.
     pub fn iter(&self) -> impl DoubleEndedIterator<Item = (i64, f64)> + '_ {
         self.at_ns.iter().copied().zip(self.values.iter().copied())
     }

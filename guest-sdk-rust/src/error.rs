@@ -1,4 +1,4 @@
-//! The error type of all calls in a lambda.
+//! The error type of all calls to the host, and of the methods of a lambda.
 
 use std::fmt;
 
@@ -7,8 +7,8 @@ use crate::bindings::gleaner::lambda::scratch::ScratchError;
 use crate::bindings::gleaner::lambda::trigger::TriggerError;
 use crate::bindings::gleaner::lambda::types::DataError;
 
-/// An error message. Returned from a handler, it makes the wake a fault; returned from the first
-/// `init`, it ends the start.
+/// An error message. If a handler returns it, the wake is a fault. If the first `init` returns it,
+/// the lambda does not start.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Error {
     kind: Option<&'static str>,
@@ -24,8 +24,8 @@ impl Error {
         Self { kind: None, message: message.into() }
     }
 
-    /// Case of the WIT variant with which the host refused a call, such as `no-room`; none for
-    /// other errors.
+    /// Returns the case of the WIT variant with which the host refused a call, such as `no-room`;
+    /// none for other errors.
     pub fn kind(&self) -> Option<&'static str> {
         self.kind
     }
@@ -51,7 +51,7 @@ impl<E: std::error::Error> From<E> for Error {
     }
 }
 
-/// An error of the bindings: the name of its case in the WIT, and its message.
+/// An error of the bindings, which has the name of its case in the WIT and a message.
 pub(crate) trait HostError {
     fn into_parts(self) -> (&'static str, String);
 }

@@ -1,4 +1,5 @@
-//! Models that run in the host: `gleaner:lambda/inference`.
+//! Models that run in the host: `gleaner:lambda/inference`. No current host has a model runtime:
+//! every call returns `no-runtime`.
 
 use crate::Result;
 use crate::bindings::gleaner::lambda::inference as wit;
@@ -32,12 +33,12 @@ impl Tensor {
         Ok(Self(into_result(wit::Tensor::from_frame(frame.handle(), how))?))
     }
 
-    /// Length of each dimension.
+    /// Returns the length of each dimension.
     pub fn shape(&self) -> Vec<u32> {
         self.0.shape()
     }
 
-    /// Values: at most `len`, from `offset`. Clamped to the tensor and to 262,144 values.
+    /// Returns values: at most `len`, from `offset`, clamped to the tensor and to 262,144 values.
     pub fn read(&self, offset: u64, len: u32) -> Vec<f32> {
         self.0.read(offset, len)
     }

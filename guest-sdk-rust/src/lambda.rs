@@ -12,8 +12,8 @@ use crate::{Config, Error, Result};
 /// An `Err` or a panic is a fault of that wake. The decision contains it, and before the next wake
 /// the host calls [`Lambda::init`] of a fresh instance.
 pub trait Lambda: Sized + 'static {
-    /// Creates the lambda, before the first wake and again after a fault. Look up inputs and
-    /// compile fields here.
+    /// Creates the lambda: before the first wake, and again before the next wake after a fault.
+    /// Look up inputs and compile fields here.
     ///
     /// # Errors
     ///

@@ -36,11 +36,11 @@
 //! detection rules in plain functions over plain numbers: they need no host, and any unit test can
 //! call them.
 //!
-//! [`kernels`] has such functions, for pixels and signals.
+//! [`kernels`] has such functions for pixels and signals.
 //!
-//! The WIT package `gleaner:lambda` documents each call with its cost, limits and errors, in five
-//! interfaces with the names of the modules here. The errors are the names of its cases, which
-//! [`Error::kind`] returns.
+//! The modules [`data`], [`inference`], [`log`], [`scratch`] and [`trigger`] are the interfaces of
+//! the WIT package `gleaner:lambda`. An error in their docs, such as `no-room`, is a case of a WIT
+//! variant; [`Error::kind`] returns its name.
 
 #[cfg(target_family = "wasm")]
 #[doc(hidden)]

@@ -10,7 +10,7 @@ pub fn log(level: Level, message: &str) {
     wit::log(level, message);
 }
 
-/// Logs a line that requires action.
+/// Logs a problem on which the operator must act.
 pub fn error(message: &str) {
     log(Level::Error, message);
 }

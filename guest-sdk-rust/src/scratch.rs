@@ -1,8 +1,9 @@
 //! Named byte strings that the host keeps for the lambda, also across its faults:
 //! `gleaner:lambda/scratch`.
 //!
-//! The size is `scratch` in `[limits]`, 0 by default. The scratch memory is empty when the lambda's
-//! process starts.
+//! The size of this scratch memory is `scratch` in `[limits]`, 0 bytes by default. It is empty when
+//! the lambda's process starts. A fault of the lambda does not change it, and `init` may read and
+//! write it.
 
 use crate::Result;
 use crate::bindings::gleaner::lambda::scratch as wit;
@@ -29,8 +30,8 @@ pub fn append(name: &str, bytes: &[u8]) -> Result<()> {
     into_result(wit::append(name, bytes))
 }
 
-/// Bytes of an entry: at most `len`, from `offset`. Clamped to the entry and to `call_bytes` in
-/// `[limits]`, 1 MiB by default.
+/// Returns bytes of an entry: at most `len`, from `offset`, clamped to the entry and to
+/// `call_bytes` in `[limits]`, 1 MiB by default.
 ///
 /// # Errors
 ///
@@ -48,12 +49,13 @@ pub fn remove(name: &str) -> Result<()> {
     into_result(wit::remove(name))
 }
 
-/// All entries, sorted by the bytes of their names.
+/// Returns all entries, sorted by the bytes of their names.
 pub fn entries() -> Vec<Entry> {
     wit::entries()
 }
 
-/// Free space in bytes. An entry takes the length of its value and of its name, and 64 bytes.
+/// Returns the free space in bytes. An entry takes the lengths of its value and its name, plus 64
+/// bytes.
 pub fn free() -> u64 {
     wit::free()
 }

@@ -1,4 +1,5 @@
-//! Actions that a lambda takes in a wake: `gleaner:lambda/trigger`.
+//! Triggers: events, and the start and stop of recordings, that a lambda reports in a wake:
+//! `gleaner:lambda/trigger`.
 //!
 //! A trigger is effective from the moment of the call, even if the same wake faults later. In
 //! `init` all triggers are refused.
@@ -8,18 +9,16 @@ use crate::bindings::gleaner::lambda::trigger as wit;
 pub use crate::bindings::gleaner::lambda::trigger::TriggerError;
 use crate::error::into_result;
 
-/// Builds an event, which opens the `[record]` window around the sample or tick of this wake.
-/// `score` is the strength of the event, in a unit that the lambda documents.
-///
-/// [`EventBuilder::send`] reports it.
+/// Builds an event, which [`EventBuilder::send`] reports. An event opens the `[record]` window
+/// around the sample or tick of this wake. `score` is the strength of the event, in a unit that the
+/// lambda documents.
 #[must_use = "an event has no effect until `send`"]
 pub fn event(label: &str, score: f64) -> EventBuilder<'_> {
     EventBuilder { label, score, attributes: Vec::new() }
 }
 
-/// Builds the start of a recording that lasts until [`stop`] is called with the same label.
-///
-/// [`StartBuilder::send`] starts it.
+/// Builds the start of a recording, which [`StartBuilder::send`] starts. The recording lasts until
+/// [`stop`] is called with the same label. At most 64 labels of a lambda can be recorded at once.
 #[must_use = "a recording does not start until `send`"]
 pub fn start(label: &str) -> StartBuilder<'_> {
     StartBuilder { label, attributes: Vec::new() }
@@ -29,7 +28,8 @@ pub fn start(label: &str) -> StartBuilder<'_> {
 ///
 /// # Errors
 ///
-/// As [`StartBuilder::send`].
+/// `invalid` outside of a wake, or if the label is empty or over 128 bytes; `too-many` for more
+/// than 16 triggers in one wake.
 pub fn stop(label: &str) -> Result<()> {
     into_result(wit::stop(label))
 }
@@ -42,7 +42,7 @@ pub struct EventBuilder<'a> {
 }
 
 impl EventBuilder<'_> {
-    /// Adds a named value that is stored with the trigger in the clip; at most 16.
+    /// Adds a named value that is stored with the trigger in the clip; at most 16 per trigger.
     pub fn with(mut self, key: &str, value: impl Into<AttributeValue>) -> Self {
         self.attributes.push(attribute(key, value));
         self
@@ -52,11 +52,10 @@ impl EventBuilder<'_> {
     ///
     /// # Errors
     ///
-    /// `invalid` outside of a wake, as in `init`; if the label is empty or over 128 bytes; if the
-    /// score or a value is not finite; if a key is empty, over 64 bytes or given twice; for a text
-    /// of over 1,024 bytes; for more than 16 attributes. `too-many` for more than 16 triggers in
-    /// one wake, or more in a minute than `events_per_minute` in `[limits]`. The call has no effect
-    /// then.
+    /// `invalid`: called outside of a wake, as in `init`; label empty or over 128 bytes; score or
+    /// value not finite; key empty, over 64 bytes or given twice; text over 1,024 bytes; more than
+    /// 16 attributes. `too-many`: more than 16 triggers in one wake, or more in a minute than
+    /// `events_per_minute` in `[limits]`. The call has no effect then.
     pub fn send(self) -> Result<()> {
         into_result(wit::event(self.label, self.score, &self.attributes))
     }
@@ -69,7 +68,7 @@ pub struct StartBuilder<'a> {
 }
 
 impl StartBuilder<'_> {
-    /// Adds a named value that is stored with the trigger in the clip; at most 16.
+    /// Adds a named value that is stored with the trigger in the clip; at most 16 per trigger.
     pub fn with(mut self, key: &str, value: impl Into<AttributeValue>) -> Self {
         self.attributes.push(attribute(key, value));
         self

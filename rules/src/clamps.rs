@@ -12,7 +12,7 @@ pub const TEXTS_PER_FIELD: usize = 4096;
 /// Longest path of a field, in bytes.
 pub const PATH_BYTES: usize = 1024;
 
-/// Limits of `[limits]` for the result of one call.
+/// The limits `call_bytes` and `call_items` of one call, from `[limits]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PerCall {
     /// Maximum number of bytes.
@@ -37,7 +37,7 @@ pub enum Length {
 }
 
 impl PerCall {
-    /// Returns the maximum number of samples.
+    /// Returns the maximum number of samples that one call returns.
     pub fn samples(self) -> usize {
         self.items.min(SAMPLES_PER_CALL)
     }
@@ -46,7 +46,7 @@ impl PerCall {
     ///
     /// # Errors
     ///
-    /// [`WrongField`], with its length.
+    /// [`WrongField`], with the length.
     pub fn value(self, path: &str, length: Length) -> Result<(), WrongField> {
         let (len, most) = match length {
             Length::One => return Ok(()),
@@ -91,12 +91,12 @@ impl WrongField {
         Self { path: path.to_owned(), why: why.into() }
     }
 
-    /// The error for a field of `type_name` that is read as a number and is not one.
+    /// Returns the error for a field of `type_name` that is read as a number and is not one.
     pub fn no_number(path: &str, type_name: &str) -> Self {
         Self::new(path, format!("of `{type_name}` is not a number"))
     }
 
-    /// The error for a field of the input `belongs`, used on the input `used`.
+    /// Returns the error for a field of the input `belongs`, used on the input `used`.
     pub fn elsewhere(path: &str, belongs: &str, used: &str) -> Self {
         Self::new(path, format!("belongs to input `{belongs}`, not to `{used}`"))
     }
@@ -114,7 +114,7 @@ impl std::error::Error for WrongField {}
 ///
 /// # Errors
 ///
-/// [`WrongField`], with its length.
+/// [`WrongField`], with the length.
 pub fn path(path: &str) -> Result<(), WrongField> {
     let len = path.len();
     if len <= PATH_BYTES {

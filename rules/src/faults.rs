@@ -4,8 +4,9 @@
 /// of a sensor.
 pub const FAULTS_IN_A_ROW: u32 = 8;
 
-/// The first back-off; each further fault doubles it. It counts from the time of the wake, so that
-/// a wake that takes longer than its back-off, for example by a long `init`, has none.
+/// The first back-off; each further fault doubles it. It counts from the time of the wake, so a
+/// wake that takes longer than its back-off, for example because of a long `init`, has no effective
+/// back-off.
 const MIN_BACKOFF_NS: i64 = 100_000_000;
 
 /// The longest back-off, and so the longest time until a lambda runs again after the cause of its

@@ -1,4 +1,4 @@
-//! Limits the number of frames that a lambda holds, and the memory of those that it makes.
+//! Limits the number of frames that a lambda holds, and the memory of those that it creates.
 
 use std::fmt;
 use std::sync::Arc;
@@ -15,7 +15,7 @@ struct Remaining {
     bytes: AtomicUsize,
 }
 
-/// The share of one frame; returned to the budget when dropped.
+/// The share of one frame in the budget. Dropping it returns the share.
 #[derive(Debug)]
 pub struct FrameLease {
     budget: Budget,
@@ -30,11 +30,11 @@ pub enum NoRoom {
         /// The maximum.
         allowed: usize,
     },
-    /// The frames that it made use too much memory.
+    /// The frames that the lambda created use too much memory.
     Bytes {
         /// Bytes of the new frame.
         needed: usize,
-        /// Remaining bytes.
+        /// Remaining bytes of `memory` in `[limits]`.
         left: usize,
     },
 }
@@ -58,13 +58,13 @@ impl fmt::Display for NoRoom {
 impl std::error::Error for NoRoom {}
 
 impl Budget {
-    /// Creates a budget of so many frames and bytes.
+    /// Creates a budget of `frames` frames and `bytes` bytes.
     pub fn new(frames: usize, bytes: usize) -> Self {
         let (left, bytes) = (AtomicUsize::new(frames), AtomicUsize::new(bytes));
         Self(Arc::new(Remaining { frames: left, frames_allowed: frames, bytes }))
     }
 
-    /// Returns whether so many bytes are left, regardless of the number of frames.
+    /// Returns whether `bytes` bytes are left, regardless of the number of frames.
     pub fn has(&self, bytes: usize) -> bool {
         bytes <= self.0.bytes.load(Ordering::Relaxed)
     }

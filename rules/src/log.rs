@@ -1,4 +1,4 @@
-//! Rate limits of a lambda's log.
+//! Limits the rate of a lambda's log.
 
 use crate::text::cut;
 
@@ -14,7 +14,7 @@ pub struct Rate {
     bytes_per_second: u64,
     /// The second of the last line, with its number of lines and bytes.
     window: (i64, u64, u64),
-    /// Texts that the host noted in one second.
+    /// The second of the last note of the host, with the texts noted in it.
     notes: (i64, Vec<&'static str>),
     dropped: u64,
 }
@@ -26,7 +26,8 @@ impl Rate {
         Self { lines_per_second, bytes_per_second, window, notes, dropped: 0 }
     }
 
-    /// Counts a line, which was cut before. Returns whether it is kept; otherwise it is dropped.
+    /// Counts a line, which [`line`] has cut to its maximum length. Returns whether it is kept;
+    /// otherwise it is dropped.
     pub fn keeps(&mut self, at_ns: i64, line: &str) -> bool {
         let second = at_ns.div_euclid(SECOND_NS);
         if self.window.0 != second {

@@ -12,7 +12,7 @@ pub enum PathSegment<'p> {
     Index(usize),
 }
 
-/// A text that is not a path.
+/// A text that is not a valid path.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MalformedPath {
     /// The text.
@@ -29,7 +29,8 @@ impl fmt::Display for MalformedPath {
 
 impl std::error::Error for MalformedPath {}
 
-/// Returns the steps of `path`, at least one; the first is a name, and so is each after a dot.
+/// Returns the steps of `path`, at least one. The first one is a name, and so is each one after a
+/// dot.
 ///
 /// # Errors
 ///

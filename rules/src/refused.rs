@@ -1,26 +1,27 @@
-//! Error texts of refused reads, for the lambda's author. The other rules have their own texts.
+//! Error texts of refused reads, for the lambda's author. The errors of the other modules have
+//! their own texts.
 
 use std::fmt::Display;
 
 use crate::text::{RoundedBytes, quoted};
 
-/// The text for an unknown input.
+/// Returns the text for an unknown input.
 pub fn no_such_input<S: AsRef<str>>(name: &str, known: impl IntoIterator<Item = S>) -> String {
     let name = name.chars().take(64).collect::<String>();
     format!("no input `{name}`; the manifest has {}", quoted(known))
 }
 
-/// The text for a message whose bytes do not match its type.
+/// Returns the text for a message whose bytes do not match its type.
 pub fn malformed(topic: &str, type_name: &str, why: impl Display) -> String {
     format!("a sample of `{topic}` contradicts its type `{type_name}`: {why}")
 }
 
-/// The text for a message whose type is not an image.
+/// Returns the text for a message whose type is not an image.
 pub fn no_image_type(topic: &str, type_name: &str) -> String {
     format!("a sample of `{topic}` is not an image: its type is `{type_name}`")
 }
 
-/// The text for too many handles, by `handles` of `[limits]`.
+/// Returns the text for too many handles, by `handles` of `[limits]`.
 pub fn too_many_handles(allowed: u64) -> String {
     format!(
         "the lambda holds {allowed} handles; \
@@ -28,17 +29,17 @@ pub fn too_many_handles(allowed: u64) -> String {
     )
 }
 
-/// The text for an invalid image, or one that cannot be decoded.
+/// Returns the text for an invalid image, or one that cannot be decoded.
 pub fn not_a_frame(topic: &str, why: impl Display) -> String {
     format!("a sample of `{topic}` is not a readable image: {why}")
 }
 
-/// The text for an image that is too large for a slot.
+/// Returns the text for an image that is too large for a slot.
 pub fn too_large(topic: &str, why: impl Display) -> String {
     format!("an image of `{topic}` is too large: {why}")
 }
 
-/// The text for an image without a free slot.
+/// Returns the text for an image without a free slot.
 pub fn no_slot(topic: &str, input: &str) -> String {
     format!(
         "every slot for decoded images of `{topic}` is held; \
@@ -46,7 +47,8 @@ pub fn no_slot(topic: &str, input: &str) -> String {
     )
 }
 
-/// The reason why a JPEG or PNG is too large: the needed size, and that of its input's slots.
+/// Returns the reason why a JPEG or PNG is too large: the needed size, and that of its input's
+/// slots.
 pub fn too_many_pixels((width, height): (u32, u32), needed: u64, allowed: u64) -> String {
     let (needed, allowed) = (RoundedBytes::up(needed), RoundedBytes::down(allowed));
     format!(

@@ -1,13 +1,13 @@
 //! A ring of the newest samples of one input, in a fixed number of cells. Samples that the lambda
 //! holds keep their cells, and may displace others.
 //!
-//! This is a simple version for one thread. The host's ring, in `host/buffers`, behaves alike
-//! without a lock.
+//! This is a simple version for one thread. The host's ring, in `host/buffers`, behaves in the same
+//! way without a lock.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// A cell with a sample. It is held while there is a second `Arc` of it.
+/// A cell with a sample. The lambda holds it while there is a second `Arc` of it.
 #[derive(Debug)]
 pub struct Cell<T> {
     /// The sample.
@@ -29,7 +29,7 @@ pub struct Counts {
     pub too_big: u64,
 }
 
-/// Shows `depth` samples, over `depth + hold + 1` cells of `max_size` bytes.
+/// A ring that shows `depth` samples, with `depth + hold + 1` cells of `max_size` bytes.
 #[derive(Debug)]
 pub struct Ring<T> {
     depth: usize,

@@ -8,7 +8,7 @@
 /// years.
 const CATCH_UP_TICKS: u64 = 100_000;
 
-/// The view of a schedule on the ring of one input.
+/// A ring of one input, as a schedule reads it.
 pub trait RingView {
     /// One sample in the ring.
     type Sample;
@@ -37,9 +37,9 @@ pub enum Backlog {
 /// A periodic wake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tick {
-    /// Its due time, in nanoseconds.
+    /// Time at which the tick was due, in nanoseconds.
     pub at_ns: i64,
-    /// Ticks that were due since the previous wake and did not happen.
+    /// Number of ticks that were due since the previous wake and did not run.
     pub missed: u64,
 }
 
@@ -114,7 +114,7 @@ impl<R: RingView> Schedule<R> {
         }
     }
 
-    /// Returns the next arrived sample that wakes the lambda.
+    /// Returns the next received sample that wakes the lambda.
     pub fn next_event(&mut self) -> Option<R::Sample> {
         match self {
             Self::Event(event) => event.next(),
@@ -131,7 +131,7 @@ impl<R: RingView> Schedule<R> {
         }
     }
 
-    /// Counts samples that arrived and woke no lambda as skipped, at the end.
+    /// Counts the received samples that have not woken the lambda as skipped, at the end of a run.
     pub fn finish(&mut self) {
         if let Self::Event(event) = self {
             let head = event.ring.head();

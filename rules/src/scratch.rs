@@ -14,7 +14,7 @@ const ENTRY_BYTES: u64 = 64;
 /// Length of the pieces in which bytes are kept, so that no call moves more than that.
 const PIECE_BYTES: usize = 1 << 20;
 
-/// The reason why an entry was not kept or not found.
+/// The reason why a call was refused.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ScratchError {
     /// The entry exceeds the free bytes.
@@ -61,12 +61,12 @@ impl fmt::Display for ScratchError {
 
 impl std::error::Error for ScratchError {}
 
-/// An entry of scratch.
+/// Name and length of one entry.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Entry {
-    /// Its name.
+    /// Name of the entry.
     pub name: String,
-    /// Its length in bytes.
+    /// Length of the value in bytes.
     pub bytes: u64,
 }
 
@@ -97,7 +97,7 @@ impl Scratch {
             .collect()
     }
 
-    /// Keeps `bytes` under a name, and replaces an earlier entry.
+    /// Stores `bytes` under a name; replaces an existing entry.
     ///
     /// # Errors
     ///

@@ -31,9 +31,9 @@ pub enum TriggerKind {
 /// A named value of a trigger.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Attribute {
-    /// 1 to [`KEY_BYTES`] bytes, unique for each trigger.
+    /// Key of 1 to [`KEY_BYTES`] bytes, unique in its trigger.
     pub key: String,
-    /// Its value.
+    /// Value of the attribute.
     pub value: AttributeValue,
 }
 
@@ -64,7 +64,8 @@ pub enum TriggerError {
 }
 
 impl TriggerError {
-    /// Returns whether it was one trigger too many, rather than an invalid one.
+    /// Returns whether a limit on the number of triggers was exceeded; otherwise the trigger was
+    /// invalid.
     pub const fn is_too_many(&self) -> bool {
         matches!(self, Self::TooMany | Self::TooOften { .. })
     }
@@ -161,7 +162,7 @@ impl<T> Triggers<T> {
         self.refused = self.refused.saturating_add(refused);
     }
 
-    /// Adds a trigger at `now_ns`, which `make` creates.
+    /// Adds a trigger, which `make` creates, at the time `now_ns` in nanoseconds.
     ///
     /// # Errors
     ///

@@ -13,10 +13,10 @@ const TIMES: [(&str, u64); 6] = [
     ("ns", 1),
 ];
 
-/// Help on the form of a size.
+/// Help text on the form of a size.
 pub const SIZE_RULE: &str =
     "write a whole number and its unit, B, KiB, MiB or GiB, for example \"2 MiB\"";
-/// Help on the form of a duration.
+/// Help text on the form of a duration.
 pub const TIME_RULE: &str =
     "write a number and its unit, us, ms, s, min or h, for example \"50ms\" or \"1.5s\"";
 

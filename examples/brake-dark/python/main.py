@@ -23,7 +23,7 @@ class Lambda:
         rested = self.last_ns is None or now - self.last_ns >= REFRACTORY_NS
         if mean is None or not rested:
             return
-        # The image is decoded only here, so most frames cost nothing.
+        # The image is decoded only here, so most frames are never decoded.
         luma = event.as_frame().mean_luma()
         if luma < self.dark_luma:
             self.last_ns = now
@@ -31,7 +31,7 @@ class Lambda:
 
 
 def braking(window: Column, now: int, brake_mps2: float) -> float | None:
-    """Mean of the window in m/s²; None unless the window is full and its mean is below
+    """Returns the mean of the window in m/s²; None unless the window is full and its mean is below
     `brake_mps2`."""
     if len(window.at_ns) == 0 or now - window.at_ns[0] < FULL_NS:
         return None

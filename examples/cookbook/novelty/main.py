@@ -36,7 +36,7 @@ class Lambda:
         distances = hellinger(self.known, seen)
         nearest = int(distances.argmin()) if len(distances) else None
         if nearest is not None and distances[nearest] < self.distance:
-            # Known: move it to the end, since the first one is forgotten first.
+            # A known image: move its histogram to the end, since the first one is forgotten first.
             self.known = np.vstack([np.delete(self.known, nearest, axis=0), self.known[nearest]])
             return
         if nearest is not None:
@@ -46,6 +46,6 @@ class Lambda:
 
 
 def hellinger(known: Any, seen: Any) -> Any:
-    """Hellinger distance of `seen`, shape (BINS,), to each row of `known`: 0 if equal, 1 if
-    disjoint."""
+    """Returns the Hellinger distance of `seen`, shape (BINS,), to each row of `known`: 0 if equal,
+    1 if disjoint."""
     return np.sqrt(np.clip(1.0 - np.sqrt(known * seen).sum(axis=1), 0.0, 1.0))

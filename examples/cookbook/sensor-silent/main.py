@@ -1,5 +1,5 @@
-"""Sensor silent: no sample of an input for too long. Reports it once, and logs when the sensor is
-back.
+"""Sensor silent: no sample of an input for too long. Reports each silence once, and logs when the
+sensor is back.
 
 Missing samples cannot wake a lambda, so a period does, and the lambda checks the newest sample of
 each input.
@@ -16,7 +16,7 @@ class Lambda:
         self.first_ns = int(ctx.config["first_s"] * 1e9)
         self.inputs = [ctx.input(name) for name in ctx.inputs()]
         self.began_ns: int | None = None
-        # The silent inputs, by name, with the time of the last sample.
+        # Time in ns of the last sample of each silent input, by the name of the input.
         self.silent: dict[str, int] = {}
 
     def on_tick(self, ctx: Context) -> None:

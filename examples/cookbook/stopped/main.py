@@ -1,8 +1,8 @@
 """Stopped in traffic: records from the time when the car has stood for a while until it moves
 again.
 
-`start` and `stop` record a period of any length. There are two thresholds, one to stand and one to
-go: with one, a creeping car would start a new recording every metre.
+`start` and `stop` record a period of any length. There are two thresholds, one for standing and one
+for moving. With only one, a creeping car would start a new recording every metre.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 from gleaner import Context, Sample
 
 LABEL = "stopped"
-# Entry in `scratch` during a recording, so that a fresh instance after a fault ends it.
+# Entry in `scratch` during a recording, so that after a fault a fresh instance can end the
+# recording.
 NAME = "recording"
 
 

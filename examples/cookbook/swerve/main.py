@@ -31,7 +31,8 @@ class Lambda:
         now = ctx.now_ns()
         if now < self.rest_until_ns:
             return
-        # A mean over half a second: bumps of the road are faster, the driver is slower.
+        # A mean over half a second: bumps of the road are shorter, and a manoeuvre of the driver is
+        # longer.
         window = self.imu.column_since(self.lateral, now - WINDOW_NS)
         if now - window.at_ns[0] < FULL_NS:
             return

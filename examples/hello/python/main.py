@@ -26,7 +26,7 @@ class Lambda:
 
 
 def braking(window: Column, now: int, brake_mps2: float) -> float | None:
-    """Mean of the window in m/s²; None unless the window is full and its mean is below
+    """Returns the mean of the window in m/s²; None unless the window is full and its mean is below
     `brake_mps2`."""
     if len(window.at_ns) == 0 or now - window.at_ns[0] < FULL_NS:
         return None

@@ -1,7 +1,8 @@
 """Road roughness: the power of the vertical acceleration at the frequencies at which a road shakes
 a car.
 
-The rules, which every twin follows exactly. All arithmetic is in 64-bit floats.
+These are the rules of the lambda, which its Rust twin follows exactly, too. All arithmetic is in
+64-bit floats.
 
 1. *Stamps* are ``at_ns``, by which the host orders samples. Every sample of the input wakes the
    lambda.
@@ -108,7 +109,7 @@ def follows(interval_ns: int, period_ns: int) -> bool:
 
 
 def samples(wanted: float) -> int:
-    """The power of two nearest to `wanted`; the larger one if two are equally near."""
+    """Returns the power of two nearest to `wanted`; the larger one if two are equally near."""
     n = SMALLEST
     while n < LARGEST and wanted >= 1.5 * n:
         n *= 2
@@ -116,8 +117,8 @@ def samples(wanted: float) -> int:
 
 
 def roughness(signal: Floats, rate: float, weights: Floats) -> tuple[float, float]:
-    """Score in (m/s^2)^2 and peak in Hz of one window. `signal` is in m/s^2, shape (n,), oldest
-    first."""
+    """Returns the score in (m/s^2)^2 and the peak in Hz of one window. `signal` is in m/s^2, shape
+    (n,), oldest first."""
     n = len(signal)
     bin_hz = rate / n
     risen = signal - signal[0]

@@ -45,7 +45,7 @@ def sine(hz: float, amplitude: float, n: int = 200, rate_hz: float = 50.0) -> An
 
 
 def ends(run: Run, rate_hz: float = 50.0) -> list[int]:
-    """The index of the last sample of each window."""
+    """Returns the index of the last sample of each window."""
     return [round(trigger.at_s * rate_hz) for trigger in run.triggers]
 
 
@@ -158,7 +158,7 @@ def test_the_peak_of_a_walk_is_the_frequency_of_its_steps() -> None:
 
 
 def nearest(triggers: list[Trigger], at_s: float) -> Trigger:
-    """The window that ends nearest to an instant."""
+    """Returns the window that ends nearest to an instant."""
     return min(triggers, key=lambda trigger: abs(trigger.at_s - at_s))
 
 
@@ -167,7 +167,7 @@ def ranks(values: Any) -> Any:
 
 
 def lambda_file() -> Any:
-    """The file of the lambda as a module."""
+    """Returns the file of the lambda as a module."""
     spec = importlib.util.spec_from_file_location("imu_fft", PYTHON / "main.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

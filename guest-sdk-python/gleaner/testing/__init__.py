@@ -12,9 +12,9 @@ notebook.
         assert [round(trigger.at_s, 2) for trigger in run.triggers] == [4.14, 10.81]
 
 Rings with depth and held samples, schedules, fields, limits of triggers, log and scratch, faults
-and back-off follow the rules of a replay by the host. Not included: deadlines and ``memory``,
-except for frames that the lambda creates; the jail; clips, except for their windows; models. See
-``docs/python.md``. Requires Python 3.10.
+and back-off follow the rules of a replay by the host. Not included: deadlines; the limit
+``memory``, except of frames that the lambda creates; the sandbox; clips, except their windows;
+models. See ``docs/python.md``. Requires Python 3.10.
 """
 
 import sys

@@ -21,14 +21,14 @@ Table = Mapping[str, Any]
 
 
 class Arrays:
-    """A drive from ``tables`` by topic: ``t`` in seconds or ``t_ns`` in ns, and an array for each
-    field by its path."""
+    """A drive from ``tables``, by topic. A table has the times, as ``t`` in seconds or ``t_ns`` in
+    ns, and an array for each field, by its path."""
 
     def __init__(
         self, tables: Mapping[str, Table], more: Definitions, type_names: Mapping[str, str]
     ) -> None:
-        """``type_names`` is the type of each topic, from the lambda's inputs. Raises
-        ReplayError."""
+        """Creates a drive. ``type_names`` is the type of each topic, from the lambda's inputs.
+        Raises ReplayError."""
         types = gathered(none(), type_names.values(), more)
         self._types = types
         self.topics = dict(type_names)
@@ -57,14 +57,15 @@ class Arrays:
         return True
 
     def types(self, wanted: Iterable[str], more: Definitions) -> Types:
-        """Types of the drive, which were collected at its creation."""
+        """Returns the types of the drive, which were collected at its creation."""
         return self._types
 
     def type_of(self, topic: str) -> str:
         return self.topics[topic]
 
     def deliveries(self, topics: Iterable[str]) -> Iterator[Delivery]:
-        """Messages by stamp; those with equal stamps in the order of the topics in ``tables``."""
+        """Returns the messages by stamp; those with equal stamps in the order of the topics in
+        ``tables``."""
         chosen = set(topics)
         numbered = [
             (n, table) for n, (topic, table) in enumerate(self._tables.items()) if topic in chosen

@@ -31,7 +31,7 @@ class InputState:
         self.is_stamped = types.is_stamped(declared.type_name)
 
     def message(self, cell: Cell) -> Any:
-        """The decoded message of a sample. Raises DataError (``malformed``)."""
+        """Returns the decoded message of a sample. Raises DataError (``malformed``)."""
         if cell.message is None:
             try:
                 cell.message = self.types.decode(cell.arrival.cdr, self.declared.type_name)
@@ -91,8 +91,8 @@ class Field:
 
 
 def _path(field: Field, source: InputState) -> FieldPath:
-    """The path of a field. Raises DataError (``wrong-field``) if the field belongs to another
-    input."""
+    """Returns the path of a field. Raises DataError (``wrong-field``) if the field belongs to
+    another input."""
     if source is not field._source:
         belongs, asked = field._source.declared.name, source.declared.name
         raise DataError(

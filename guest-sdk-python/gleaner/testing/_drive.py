@@ -62,7 +62,7 @@ class Drive:
         return False
 
     def type_of(self, topic: str) -> str:
-        """Type of a topic. Raises ReplayError, which names the most similar topic."""
+        """Returns the type of a topic. Raises ReplayError, which names the most similar topic."""
         if topic not in self.topics:
             near = nearest(topic, self.topics)
             help = "pass remap={FROM: TO} if the lambda uses another name"
@@ -78,8 +78,8 @@ class Drive:
         return gathered(self._own, wanted, more)
 
     def deliveries(self, topics: Iterable[str]) -> Iterator[Delivery]:
-        """The messages of these topics by stamp; those with equal stamps in the order of the files,
-        then of the channels."""
+        """Returns the messages of these topics by stamp; those with equal stamps in the order of
+        the files, then of the channels."""
         wanted = set(topics)
         counted: Dict[Tuple[str, Guid], int] = {}
         with _opened(self.paths) as reader:
@@ -107,8 +107,8 @@ class Drive:
                     yield Delivery(connection.topic, Arrival(at_ns, at_ns, writer, seq, data))
 
     def column(self, topic: str, path: str) -> Column:
-        """Values of a numeric field in all messages of a topic: two arrays, ``at_ns`` and
-        ``values``.
+        """Returns the values of a numeric field in all messages of a topic: two arrays, ``at_ns``
+        and ``values``.
 
         Raises ReplayError for a topic that the drive does not have, DataError for a field that does
         not exist."""
@@ -195,6 +195,6 @@ def _checked(shown: str, topic: str, raw: Any) -> bytes:
 
 
 def _writer(file: int, channel: int) -> Guid:
-    """The writer that the host derives for a channel: `mcap`, the index of the file in the drive,
-    the id of the channel."""
+    """Returns the writer that the host derives for a channel: `mcap`, the index of the file in the
+    drive, the id of the channel."""
     return Guid(int.from_bytes(b"mcap", "big") << 32 | file, (channel & 0xFFFF_FFFF) << 32)

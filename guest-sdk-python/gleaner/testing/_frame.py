@@ -65,7 +65,7 @@ class DecodedImage:
 
 
 class FramePool:
-    """Limits and decoded images of one input."""
+    """Decoded images of one input, up to the number of its slots."""
 
     def __init__(self, declared: Input, budget: Budget) -> None:
         self._slots, self._slot_bytes = declared.hold + 1, declared.decoded_size
@@ -189,7 +189,7 @@ class View:
 
 
 class Frame:
-    """A sample as an image. Keeps its pixels."""
+    """A sample as an image. The frame keeps its pixels in memory."""
 
     def __init__(self, about: About, shown: Picture, taken: Reservation, holds: Any) -> None:
         self._about, self._picture, self._taken, self._holds = about, shown, taken, holds

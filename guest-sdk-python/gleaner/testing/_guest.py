@@ -106,7 +106,7 @@ class Guest:
                 stopped = error
                 raise
             except BaseException as error:
-                # A traceback keeps the frames of a call, and these the sample. Keep only the
+                # A traceback keeps the stack frames of a call, which keep the sample. Keep only the
                 # exception that ends the replay.
                 self._raised = error if when else None
                 raise
@@ -121,17 +121,17 @@ class Guest:
 
 
 def _ending(text: str, most: int) -> str:
-    """The end of a text, at most ``most`` bytes: a traceback ends with the exception."""
+    """Returns the end of a text, at most ``most`` bytes: a traceback ends with the exception."""
     return text.encode(errors="replace")[-most:].decode(errors="ignore")
 
 
 def _name(given: Any) -> str:
-    """Name of the module of a class, or of the module."""
+    """Returns the name of the module of a class, or of the module."""
     return str(getattr(given, "__module__", None) or getattr(given, "__name__", "lambda"))
 
 
 def folder(given: Union[str, "os.PathLike[str]"]) -> Path:
-    """Folder of a lambda, from the path of its folder, entry or manifest."""
+    """Returns the folder of a lambda, from the path of its folder, entry or manifest."""
     path = Path(given)
     if not path.exists():
         raise ReplayError(
@@ -141,7 +141,8 @@ def folder(given: Union[str, "os.PathLike[str]"]) -> Path:
 
 
 def home(given: LambdaSource) -> Optional[Path]:
-    """Folder of a lambda; None if it has no file, as a class in a notebook. Raises ReplayError."""
+    """Returns the folder of a lambda; None if it has no file, such as a class in a notebook. Raises
+    ReplayError."""
     if isinstance(given, (str, os.PathLike)):
         return folder(given)
     try:
@@ -151,7 +152,7 @@ def home(given: LambdaSource) -> Optional[Path]:
 
 
 def manifest_beside(given: LambdaSource) -> Path:
-    """Path of the manifest in the folder of the lambda. Raises ReplayError."""
+    """Returns the path of the manifest in the folder of the lambda. Raises ReplayError."""
     if isinstance(given, (str, os.PathLike)):
         return folder(given) / "lambda.toml"
     beside = home(given)

@@ -41,7 +41,7 @@ class FieldPath:
         return not self.is_array and self.leaf.element != "string"
 
     def find(self, message: Any) -> Any:
-        """The element in ``message``, as `rosbags` decodes it. Raises MissingElement."""
+        """Returns the element in ``message``, as `rosbags` decodes it. Raises MissingElement."""
         found = message
         for step in self.steps:
             if isinstance(step, str):
@@ -55,7 +55,7 @@ class FieldPath:
         return found
 
     def value(self, message: Any) -> Any:
-        """The value that a lambda gets. Raises MissingElement."""
+        """Returns the value that a lambda gets. Raises MissingElement."""
         found, element = self.find(message), self.leaf.element
         if not self.is_array:
             return _scalar(element, found)
@@ -66,7 +66,7 @@ class FieldPath:
         return np.asarray(found).astype(np.float64)
 
     def number(self, message: Any) -> float:
-        """The value as a float. Raises NotANumber and MissingElement."""
+        """Returns the value as a float. Raises NotANumber and MissingElement."""
         if not self.is_number:
             raise NotANumber
         return float(_scalar(self.leaf.element, self.find(message)))

@@ -1,8 +1,8 @@
 """Implements the host's operations on frames in numpy, with integers only, so that results equal
 those of the host bit for bit.
 
-Sources: ITU-R BT.601 for luma; JFIF 1.02 for colours of yuv422, both as in the crate
-`gleaner-image`."""
+Sources: ITU-R BT.601 for luma; JFIF 1.02 for colours of yuv422, both as in `pixels` of the crate
+`gleaner-rules`."""
 
 from __future__ import annotations
 
@@ -103,14 +103,15 @@ def picture(
 
 
 def rows(shown: Picture) -> Bytes:
-    """All pixels without a copy, of shape (height, width, bytes per pixel)."""
+    """Returns all pixels without a copy, of shape (height, width, bytes per pixel)."""
     pixel = LAYOUTS[shown.encoding][0]
     shape, strides = (shown.height, shown.width, pixel), (shown.step, pixel, 1)
     return np.lib.stride_tricks.as_strided(shown.data, shape, strides, writeable=False)
 
 
 def region(shown: Picture, roi: Optional[Tuple[int, int, int, int]]) -> Bytes:
-    """The pixels of a region, or all. Raises RangeError if the region has no pixel in the image."""
+    """Returns the pixels of a region, or all. Raises RangeError if the region has no pixel in the
+    image."""
     if roi is None:
         return rows(shown)
     x, y, width, height = roi
@@ -149,7 +150,7 @@ def mean_luma(shown: Picture, roi: Optional[Tuple[int, int, int, int]]) -> float
 
 
 def grey(shown: Picture, pixels: Bytes) -> Bytes:
-    """Grey level of each pixel, of shape (height, width)."""
+    """Returns the grey level of each pixel, of shape (height, width)."""
     if shown.encoding in COLOURS:
         red, green, blue = (pixels[..., at].astype(np.uint32) for at in COLOURS[shown.encoding])
         return ((299 * red + 587 * green + 114 * blue) // 1000).astype(np.uint8)
@@ -169,14 +170,15 @@ def to_gray(shown: Picture) -> Picture:
 
 
 def tight(pixels: Bytes, encoding: str) -> Picture:
-    """A picture without padding, from an array of shape (height, width) or (height, width, 3)."""
+    """Returns a picture without padding, from an array of shape (height, width) or (height, width,
+    3)."""
     height, width = pixels.shape[:2]
     data = np.ascontiguousarray(pixels, dtype=np.uint8).reshape(-1)
     return Picture(width, height, encoding, width * LAYOUTS[encoding][0], False, data)
 
 
 def colours(shown: Picture) -> Bytes:
-    """Red, green and blue of each pixel, of shape (height, width, 3)."""
+    """Returns red, green and blue of each pixel, of shape (height, width, 3)."""
     pixels = rows(shown)
     if shown.encoding in COLOURS:
         return pixels[..., COLOURS[shown.encoding]]
@@ -215,7 +217,8 @@ def resize(shown: Picture, width: int, height: int) -> Picture:
 
 
 def _weights(old: int, new: int) -> Tuple[npt.NDArray[np.float64], int]:
-    """Integer weights of old pixels (columns) in new ones (rows), and the sum of each row."""
+    """Returns the integer weights of old pixels (columns) in new ones (rows), and the sum of each
+    row."""
     at = np.arange(new, dtype=np.int64)
     if new <= old:
         # The axis is divided into old * new pieces; the weight is the number of pieces that both

@@ -1,4 +1,4 @@
-"""Replays a drive: delivers every sample and runs every wake of the schedule, in the time of the
+"""Replays a drive: delivers every sample and runs every wake of the schedule. Time is that of the
 drive."""
 
 from __future__ import annotations

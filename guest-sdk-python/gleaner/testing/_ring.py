@@ -98,8 +98,8 @@ class Ring:
         return cells[0] if cells else None
 
     def newest_while(self, most: int, keep: Callable[[Arrival], bool]) -> List[Cell]:
-        """The newest samples back to the first one that ``keep`` rejects, at most ``most``; oldest
-        first."""
+        """Returns the newest samples back to the first one that ``keep`` rejects, at most ``most``;
+        oldest first."""
         found: List[Cell] = []
         # The dict is in the order of positions, since they only increase.
         for cell in reversed(self._shown.values()):

@@ -35,14 +35,15 @@ class Decision:
     topic: Optional[str]
     writer: Optional[str]
     seq: Optional[int]
-    """Sequence number, counted from 1. In the host it is that of the recording, if it has one."""
+    """Sequence number of the waking sample, counted from 1; None for a tick. In the host it is that
+    of the recording, if it has one."""
     triggers: List[Trigger]
     fault: Optional[Fault]
     run_ns: int
     """Run time of the wake on this machine, in ns."""
 
     def as_json(self) -> Dict[str, Any]:
-        """The JSON object of this decision in ``decisions.jsonl``."""
+        """Returns the JSON object of this decision in ``decisions.jsonl``."""
         triggers = [
             {"kind": t.kind, "label": t.label, "score": t.score, "attributes": t.attributes}
             for t in self.triggers
@@ -56,7 +57,7 @@ class Run:
     """The decisions of a lambda, with its log and counts."""
 
     decisions: List[Decision]
-    """One for each wake."""
+    """Decisions of all wakes, in the order of time."""
     log: List[LogLine]
     """Log lines and printed text of the lambda, and log lines of the host."""
     counts: Dict[str, Counts]
@@ -66,16 +67,16 @@ class Run:
     end_ns: int
     """Stamp of the drive's last message, in ns."""
     log_dropped: int
-    """Number of log lines dropped by the limits."""
+    """Number of log lines dropped by the limits per second."""
     triggers_refused: int
     """Number of triggers refused by ``events_per_minute``."""
     backed_off: int
     """Number of wakes skipped during back-off, after repeated faults."""
     missed_ticks: int
-    """Number of ticks that were due and did not happen."""
+    """Number of ticks that were due and did not run."""
     windows: List[Window]
     """The windows that ``[record]`` keeps, by time; overlapping ones are merged. Empty without
-    it."""
+    ``[record]``."""
 
     @property
     def triggers(self) -> List[Trigger]:
@@ -88,7 +89,7 @@ class Run:
         return [decision for decision in self.decisions if decision.fault is not None]
 
     def series(self, label: str) -> Tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Times in s and scores of the events with this label, as arrays."""
+        """Returns the times in s and scores of the events with this label, as arrays."""
         events = [
             trigger
             for trigger in self.triggers

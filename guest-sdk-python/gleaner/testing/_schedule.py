@@ -7,7 +7,8 @@ from typing import Iterator, NamedTuple, Tuple, Union
 from ._data import InputState
 from ._ring import Cell
 
-# A longer gap between two samples (a clock that jumped, two drives far apart) is counted as missed.
+# Maximum number of ticks that run in one gap between two samples. Those of a longer gap (a clock
+# that jumped, two drives far apart) are counted as missed.
 CATCH_UP_TICKS = 100_000
 
 
@@ -19,8 +20,8 @@ class Tick(NamedTuple):
 
 
 class Event:
-    """Wakes on new samples of one input. The replay waits for the lambda, so the backlogs `latest`
-    and `each` are the same here."""
+    """Wakes on new samples of one input. The replay waits until the lambda is free, so the backlogs
+    `latest` and `each` are the same here."""
 
     def __init__(self, source: InputState) -> None:
         self._source = source
@@ -31,7 +32,7 @@ class Event:
         """Sets the start time; it has no effect on events."""
 
     def events(self) -> Iterator[Tuple[InputState, Cell]]:
-        """The wakes caused by samples that have arrived."""
+        """Returns the wakes caused by samples that have arrived."""
         ring = self._source.ring
         while self._next < ring.head:
             cell = ring.get(self._next)
@@ -62,7 +63,7 @@ class Periodic:
         return iter(())
 
     def ticks(self, now_ns: int) -> Iterator[Tick]:
-        """The ticks that are due before ``now_ns``: a tick follows all samples of the same
+        """Returns the ticks that are due before ``now_ns``: a tick follows all samples of the same
         instant."""
         while self._due_ns < now_ns:
             behind = (now_ns - self._due_ns - 1) // self._period_ns + 1

@@ -40,7 +40,7 @@ class PendingTrigger:
 
 
 class Session:
-    """State for the whole replay. It survives faults: a fresh instance of the lambda finds it
+    """State of the whole replay. It survives faults: a fresh instance of the lambda finds it
     unchanged."""
 
     def __init__(self, limits: Mapping[str, int]) -> None:
@@ -127,7 +127,7 @@ class Session:
         self.lines.append(LogLine(self.now_ns, level, message))
 
     def note(self, text: str) -> None:
-        """Writes a line of the host, the same text at most once a second."""
+        """Writes a log line of the host, each text at most once a second."""
         second = self.now_ns // SECOND_NS
         if self._notes[0] != second:
             self._notes = (second, [])
@@ -202,7 +202,7 @@ class Scratch:
 
 
 def piece(data: bytes, offset: int, length: Optional[int], most: int) -> bytes:
-    """``length`` bytes from ``offset``, clamped to ``data`` and to ``most``."""
+    """Returns ``length`` bytes from ``offset``, clamped to ``data`` and to ``most``."""
     start = min(u64(offset), len(data))
     wanted = most if length is None else min(length, most)
     return data[start : start + wanted]
@@ -233,7 +233,7 @@ def i64(number: Any) -> int:
 
 
 def cut(text: str, most: int) -> str:
-    """The longest prefix of ``text`` with at most ``most`` bytes."""
+    """Returns the longest prefix of ``text`` with at most ``most`` bytes."""
     return text.encode()[:most].decode(errors="ignore")
 
 

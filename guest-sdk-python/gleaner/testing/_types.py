@@ -45,7 +45,7 @@ class Types:
         self._members: Dict[str, List[Member]] = {}
 
     def members(self, type_name: str) -> List[Member]:
-        """The fields of a type, in the order of the message."""
+        """Returns the fields of a type, in the order of the message."""
         known = self._members.get(type_name)
         if known is None:
             known = [
@@ -72,7 +72,7 @@ class Types:
         return bytes(self._store.serialize_cdr(message, type_name))
 
     def blank(self, type_name: str) -> Any:
-        """A message with all numbers 0, and all texts and sequences empty."""
+        """Returns a message with all numbers 0, and all texts and sequences empty."""
         members = self.members(type_name)
         return self._store.types[type_name](
             **{member.name: self._blank(member) for member in members}
@@ -94,7 +94,7 @@ class Types:
 
 
 def dtype(element: str) -> Any:
-    """numpy type of the elements of an array; `byte` and `char` as in `rosbags`."""
+    """Returns the numpy type of the elements of an array; `byte` and `char` as in `rosbags`."""
     return np.dtype({"bool": np.bool_, "byte": np.int8, "char": np.uint8}.get(element, element))
 
 
@@ -111,8 +111,8 @@ class Definitions:
             self._given.update(_parsed(type_name, text, "pass the text of its .msg"))
 
     def find(self, type_name: str) -> Any:
-        """Returns the definition of a type, or None. Texts come before files of the folder, and
-        both before ROS 2.
+        """Returns the definition of a type, or None. Texts take precedence over files in folders of
+        packages, these over the types of ROS 2, and those over files without a folder.
 
         Raises ReplayError."""
         package, _, leaf = type_name.partition("/msg/")
@@ -178,13 +178,13 @@ def gathered(own: Typestore, wanted: Iterable[str], more: Definitions) -> Types:
 
 
 def none() -> Typestore:
-    """The type store of a drive without definitions."""
+    """Returns the type store of a drive without definitions."""
     return get_typestore(Stores.EMPTY)
 
 
 @functools.lru_cache(maxsize=None)
 def _humble() -> Typestore:
-    """The types of ROS 2 Humble; cached, since the store compiles its codecs."""
+    """Returns the types of ROS 2 Humble; cached, since the store compiles its codecs."""
     return get_typestore(Stores.ROS2_HUMBLE)
 
 

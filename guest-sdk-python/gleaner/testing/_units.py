@@ -23,7 +23,7 @@ TIME = re.compile(r"\s*([0-9]{1,19}(?:\.[0-9]{1,19})?) ?([a-z]+)\s*", re.ASCII)
 
 
 def size(text: str) -> int:
-    """Parses a size in bytes. Raises ValueError with the syntax of a size."""
+    """Parses a size into bytes. Raises ValueError with the syntax of a size."""
     found = SIZE.fullmatch(text)
     if found is None or found.group(2) not in SIZES:
         raise ValueError(SIZE_RULE)
@@ -31,7 +31,7 @@ def size(text: str) -> int:
 
 
 def duration(text: str) -> int:
-    """Parses a duration in nanoseconds. Raises ValueError with the syntax of a duration."""
+    """Parses a duration into nanoseconds. Raises ValueError with the syntax of a duration."""
     found = TIME.fullmatch(text)
     if found is None or found.group(2) not in TIMES:
         raise ValueError(TIME_RULE)

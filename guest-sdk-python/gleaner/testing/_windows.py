@@ -17,7 +17,8 @@ class Trigger:
     """A trigger, with the time of its wake."""
 
     at_s: float
-    """Seconds since the start of the drive; for arrays, the time in the array."""
+    """Time of the wake in seconds since the start of the drive; for arrays, the time in the
+    array."""
     at_ns: int
     kind: str
     """``event``, ``start`` or ``stop``."""
@@ -28,7 +29,7 @@ class Trigger:
 
 
 class Window(NamedTuple):
-    """A time range that clips would cover, both ends included."""
+    """A time range that clips would cover, both ends inclusive."""
 
     from_s: float
     """Start in seconds, as in :class:`Trigger`."""
@@ -40,8 +41,8 @@ class Window(NamedTuple):
 def windows(
     record: Optional[Record], triggers: Iterable[Trigger], start_ns: int, end_ns: int
 ) -> List[Window]:
-    """The windows by time; overlapping ones are merged. A recording without a ``stop`` ends with
-    the drive. A window is one clip here, also where the recorder would split it by length."""
+    """Returns the windows by time; overlapping ones are merged. A recording without a ``stop`` ends
+    with the drive. A window is one clip here, also where the recorder would split it by length."""
     if record is None:
         return []
     stretches, started, started_from, opened_at = list[Tuple[int, int]](), set[str](), 0, None

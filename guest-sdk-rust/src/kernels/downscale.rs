@@ -9,8 +9,8 @@ use super::{Colours, Image, ImageError};
 /// Bytes of a row that one iteration of the loop weights.
 const TURN: usize = 64;
 
-/// Number of bytes that [`downscale`] of `image` to `width` x `height` writes: three per pixel of a
-/// coloured image, one per pixel of a grey one.
+/// Returns the number of bytes that [`downscale`] of `image` to `width` x `height` writes: three
+/// per pixel of a coloured image, one per pixel of a grey one.
 ///
 /// # Errors
 ///

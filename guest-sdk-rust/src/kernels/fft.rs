@@ -1,4 +1,4 @@
-//! Power spectral density of signals. Needs the feature `fft`.
+//! Computes the power spectral density of signals. Needs the feature `fft`.
 
 use std::f64::consts::TAU;
 use std::fmt;
@@ -14,7 +14,8 @@ pub const MAX_SAMPLES: usize = 65_536;
 /// Complex numbers that one iteration of a loop handles.
 const TURN: usize = 8;
 
-/// `f32` or `f64`. `f32` takes half the bytes and time; `f64` has sixteen digits.
+/// The type of samples: `f32` or `f64`. `f32` takes half the bytes and time; `f64` has sixteen
+/// digits.
 pub trait Real: FftNum + Float {}
 
 impl Real for f32 {}
@@ -103,24 +104,24 @@ impl<T: Real> Spectrum<T> {
         })
     }
 
-    /// Number of samples of a signal.
+    /// Returns the number of samples of a signal.
     pub fn samples(&self) -> usize {
         self.window.len()
     }
 
-    /// Number of bins of a density: half the number of samples, plus one.
+    /// Returns the number of bins of a density: half the number of samples, plus one.
     pub fn bins(&self) -> usize {
         self.packed.len() + 1
     }
 
-    /// Distance between bins in Hz; bin `k` lies at `k` times this.
+    /// Returns the distance between bins in Hz; bin `k` lies at `k` times this.
     pub fn bin_hz(&self) -> f64 {
         self.bin_hz
     }
 
     /// Writes the density of `signal`, which has [`samples`](Self::samples) values, oldest first,
-    /// to `density`, which has [`bins`](Self::bins) values. Allocates no memory. A NaN or an
-    /// infinity in the signal makes bins NaN.
+    /// to `density`, which has [`bins`](Self::bins) values. Allocates no memory. If the signal has
+    /// a NaN or an infinity, bins of the result are NaN.
     ///
     /// # Errors
     ///
@@ -206,9 +207,10 @@ impl<T: Real> Spectrum<T> {
     }
 }
 
-/// Power between `low_hz` and `high_hz`: the sum of the bins of `density` from `low_hz` (inclusive)
-/// to `high_hz` (exclusive), times their distance `bin_hz`. The unit is that of the signal,
-/// squared: a sine of amplitude a well inside the band has a² / 2. Adjacent bands share no bin.
+/// Returns the power between `low_hz` and `high_hz`: the sum of the bins of `density` from `low_hz`
+/// (inclusive) to `high_hz` (exclusive), times their distance `bin_hz`. The unit is that of the
+/// signal, squared: a sine of amplitude a well inside the band has a² / 2. Adjacent bands share no
+/// bin.
 ///
 /// Source: Parseval's theorem.
 pub fn band_power<T: Real>(density: &[T], bin_hz: f64, low_hz: f64, high_hz: f64) -> T {

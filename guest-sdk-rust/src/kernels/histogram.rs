@@ -1,4 +1,4 @@
-//! Histograms of grey levels.
+//! Counts the pixels of each grey level.
 
 use super::luma::grey;
 use super::{Colours, Image};
@@ -12,8 +12,8 @@ const TURN: usize = 32;
 /// Number of tables, which are used in turn: reading a counter right after writing it is slow.
 const TABLES: usize = 4;
 
-/// Number of pixels at each grey level of [`to_gray`](super::luma::to_gray). Equal to
-/// [`Frame::histogram`](crate::Frame::histogram).
+/// Returns the number of pixels at each grey level of [`to_gray`](super::luma::to_gray). The result
+/// equals that of [`Frame::histogram`](crate::Frame::histogram).
 pub fn histogram(image: &Image<'_>) -> [u32; 256] {
     // 65,535^2 pixels of one level still fit a `u32`.
     let mut tables = [[0_u32; 256]; TABLES];

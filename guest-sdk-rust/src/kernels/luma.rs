@@ -1,4 +1,4 @@
-//! Luma of pixels.
+//! Computes the luma of pixels: mean luma and grey images.
 
 use std::hint::black_box;
 
@@ -18,7 +18,8 @@ const TURNS: usize = 64;
 /// Pixels of one iteration in [`grey`].
 const PIXELS: usize = 32;
 
-/// Mean luma, 0 to 255. Equal to [`Frame::mean_luma`](crate::Frame::mean_luma), bit for bit.
+/// Returns the mean luma, 0 to 255. The result equals that of
+/// [`Frame::mean_luma`](crate::Frame::mean_luma), bit for bit.
 ///
 /// Luma is (299 R + 587 G + 114 B) / 1000, or the value itself for mono8. The sums are exact, and
 /// divided once.
@@ -35,8 +36,8 @@ pub fn mean_luma(image: &Image<'_>) -> f64 {
     sum as f64 / (scale * image.width as u64 * image.height as u64) as f64
 }
 
-/// Sum of each byte of a pixel over the image, in the order of the bytes; for a grey image only the
-/// first is used.
+/// Returns the sum of each byte of a pixel over the image, in the order of the bytes; for a grey
+/// image only the first is used.
 pub(super) fn sums(image: &Image<'_>) -> [u64; 3] {
     let mut lanes = [0; LANES];
     if image.step == image.width * image.pixel() {
@@ -66,8 +67,8 @@ fn add_bytes(row: &[u8], lanes: &mut [u64; LANES]) {
     }
 }
 
-/// Sums of at most [`TURNS`] blocks. Not inlined, since the compiler does not vectorise it inside
-/// of its caller.
+/// Returns the sums of at most [`TURNS`] blocks. Not inlined, since the compiler does not vectorise
+/// it inside of its caller.
 ///
 /// Two bytes at a time are read as a 16-bit number. The upper bytes and the whole numbers are
 /// summed; at the end the share of the upper bytes is subtracted from the latter, modulo 2^16,
@@ -94,9 +95,9 @@ fn short_sums(turns: &[Turn]) -> [u16; LANES] {
     })
 }
 
-/// Writes the image as mono8 to `out`, width * height bytes without padding. Equal to
-/// [`Frame::to_gray`](crate::Frame::to_gray), byte for byte. A grey level is the luma of
-/// [`mean_luma`], rounded down.
+/// Writes the image as mono8 to `out`, width * height bytes without padding. The bytes equal those
+/// of [`Frame::to_gray`](crate::Frame::to_gray). A grey level is the luma of [`mean_luma`], rounded
+/// down.
 ///
 /// # Errors
 ///
@@ -134,7 +135,7 @@ fn weigh<const RED: usize, const BLUE: usize>(row: &[u8], levels: &mut [u8]) {
     }
 }
 
-/// (299 R + 587 G + 114 B) / 1000, rounded down.
+/// Returns (299 R + 587 G + 114 B) / 1000, rounded down.
 fn luma_of(red: u8, green: u8, blue: u8) -> u8 {
     let thousandths = 299 * u32::from(red) + 587 * u32::from(green) + 114 * u32::from(blue);
     // Divides by 8 and then by 125, without the division that vectors lack: 33,555 / 2^22 exceeds

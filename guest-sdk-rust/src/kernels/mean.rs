@@ -1,4 +1,4 @@
-//! Mean values.
+//! Computes mean values of numbers and of the colours of an image.
 
 use super::luma::sums;
 use super::{Colours, Image};
@@ -10,8 +10,8 @@ const LANES: usize = 16;
 /// takes as long as 16 additions.
 const TURN: usize = 8 * LANES;
 
-/// Arithmetic mean of `values`, of any number type that fits an `f64`, in the unit of the values;
-/// none if there are none.
+/// Returns the arithmetic mean of `values`, of any number type that fits an `f64`, in the unit of
+/// the values; none if there are none.
 ///
 /// Sixteen parallel sums are added up in a fixed order, so the result is the same on every machine.
 /// It may differ in its last bits from a sum from left to right, such as
@@ -27,8 +27,8 @@ pub fn mean<T: Copy + Into<f64>>(values: &[T]) -> Option<f64> {
     (!values.is_empty()).then(|| lanes.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// Sums of every sixteenth value. Not inlined, since the compiler does not vectorise it inside of
-/// its caller.
+/// Returns the sums of every sixteenth value. Not inlined, since the compiler does not vectorise it
+/// inside of its caller.
 #[inline(never)]
 fn long_sums<T: Copy + Into<f64>>(turns: &[[T; TURN]]) -> [f64; LANES] {
     let mut lanes = [0.0_f64; LANES];
@@ -42,8 +42,8 @@ fn long_sums<T: Copy + Into<f64>>(turns: &[[T; TURN]]) -> [f64; LANES] {
     lanes
 }
 
-/// Means of red, green and blue, each 0 to 255; for a mono8 image, three times the mean grey level.
-/// The sums are exact.
+/// Returns the means of red, green and blue, each 0 to 255; for a mono8 image, three times the mean
+/// grey level. The sums are exact.
 pub fn mean_rgb(image: &Image<'_>) -> [f64; 3] {
     let count = (image.width * image.height) as f64;
     let [first, second, third] = sums(image).map(|sum| sum as f64 / count);

@@ -10,8 +10,8 @@
 //! reads the pixels in place, while a kernel needs a copy of them in the lambda. Use kernels for
 //! pixels that the lambda has copied anyway, or has changed. `docs/kernels.md` compares the costs.
 //!
-//! Kernels never call the host, and allocate memory only where documented. They read rgb8, bgr8 and
-//! mono8 only.
+//! Kernels never call the host, and allocate memory only where documented. Kernels on pixels read
+//! rgb8, bgr8 and mono8 only.
 
 pub mod downscale;
 #[cfg(feature = "fft")]
@@ -101,7 +101,7 @@ impl<'a> Image<'a> {
         Self::new(info.width, info.height, info.step, info.encoding, data)
     }
 
-    /// The part of the image in `roi`, which is clipped to the image, as in the host.
+    /// Returns the part of the image in `roi`, which is clipped to the image, as in the host.
     ///
     /// # Errors
     ///
@@ -124,27 +124,27 @@ impl<'a> Image<'a> {
         })
     }
 
-    /// Width in pixels, 1 to [`MAX_SIDE`].
+    /// Returns the width in pixels, 1 to [`MAX_SIDE`].
     pub fn width(&self) -> u32 {
         self.width as u32
     }
 
-    /// Height in pixels, 1 to [`MAX_SIDE`].
+    /// Returns the height in pixels, 1 to [`MAX_SIDE`].
     pub fn height(&self) -> u32 {
         self.height as u32
     }
 
-    /// Bytes per pixel: 1 or 3.
+    /// Returns the bytes per pixel: 1 or 3.
     fn pixel(&self) -> usize {
         if self.colours == Colours::Grey { 1 } else { 3 }
     }
 
-    /// The rows from top to bottom, without padding.
+    /// Returns the rows from top to bottom, without padding.
     fn rows(&self) -> impl Iterator<Item = &'a [u8]> + use<'a> {
         self.rows_from(0)
     }
 
-    /// The rows from row `first` to the last, without padding.
+    /// Returns the rows from row `first` to the last, without padding.
     fn rows_from(&self, first: usize) -> impl Iterator<Item = &'a [u8]> + use<'a> {
         let row = self.width * self.pixel();
         self.data.chunks(self.step).take(self.height).skip(first).map(move |whole| &whole[..row])

@@ -22,7 +22,7 @@ type CallResult<T> = Result<T, DataError>;
 pub enum Wake {
     /// A new sample on the input that `[schedule] event` names.
     Event(Sample),
-    /// The end of a `[schedule] period`.
+    /// A tick of the `[schedule] period`.
     Tick(Tick),
 }
 
@@ -302,7 +302,7 @@ impl Sample {
         &self.encapsulated()[ENCAPSULATION..]
     }
 
-    /// The message as CDR.
+    /// Returns the message as CDR.
     ///
     /// # Panics
     ///
@@ -317,7 +317,7 @@ impl Sample {
         })
     }
 
-    /// A field of an image.
+    /// Returns a field that an image must have.
     pub(super) fn need<'a>(&'a self, path: &str) -> CallResult<&'a Value> {
         let fields = &self.cell.sample.message.fields;
         let why = || {

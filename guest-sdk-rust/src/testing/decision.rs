@@ -1,9 +1,9 @@
-//! The outcome of a wake.
+//! Decisions of wakes, with their triggers and faults.
 
 pub use gleaner_rules::triggers::{AttributeValue, TriggerKind};
 
-/// The outcome of one wake: the fields of a line of `decisions.jsonl`, without the writer, fuel and
-/// time.
+/// The outcome of one wake: the fields of a line of `decisions.jsonl`, except the writer, the fuel
+/// and the run time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Decision {
     /// Time of the sample or tick that woke the lambda, in nanoseconds.
@@ -28,16 +28,16 @@ pub struct Decision {
 pub enum Cause {
     /// A sample on the input that `[schedule] event` names.
     Event,
-    /// The clock, by `[schedule] period`.
+    /// A tick of the `[schedule] period`.
     Tick,
 }
 
-/// An action that a lambda took.
+/// A trigger: an event, or the start or stop of a recording.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trigger {
-    /// Time of its wake, in nanoseconds.
+    /// Time of the wake, in nanoseconds.
     pub at_ns: i64,
-    /// Kind of action: an event, or the start or stop of a recording.
+    /// Kind of the trigger: an event, or the start or stop of a recording.
     pub kind: TriggerKind,
     /// Label that the lambda gave.
     pub label: String,

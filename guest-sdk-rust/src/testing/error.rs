@@ -1,4 +1,4 @@
-//! The error of the fake host: invalid input of a test.
+//! The error of the fake host, for an invalid input of a test.
 
 use std::fmt;
 
@@ -57,8 +57,8 @@ pub(super) fn nearest<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) 
     near.map(|(_, candidate)| candidate)
 }
 
-/// Number of letters to insert, remove or change. Source: Wagner and Fischer, The String-to-String
-/// Correction Problem, 1974.
+/// Returns the number of letters to insert, remove or change. Source: Wagner and Fischer, The
+/// String-to-String Correction Problem, 1974.
 fn distance(from: &str, to: &str) -> usize {
     let to = to.chars().collect::<Vec<_>>();
     let mut row = (0..=to.len()).collect::<Vec<_>>();

@@ -246,7 +246,7 @@ fn tight(width: u32, height: u32, encoding: Encoding) -> FrameInfo {
     FrameInfo { width, height, encoding, step, big_endian: false, size }
 }
 
-/// Layout of a `sensor_msgs/msg/Image`, from its fields.
+/// Returns the layout of a `sensor_msgs/msg/Image`, from its fields.
 fn raw(sample: &Sample) -> CallResult<FrameInfo> {
     let number = |path: &str| {
         let number = match sample.need(path)? {
@@ -270,7 +270,7 @@ fn raw(sample: &Sample) -> CallResult<FrameInfo> {
     Ok(FrameInfo { width, height, encoding, step, big_endian, size })
 }
 
-/// Pixels that the test set in place of a JPEG or PNG.
+/// Returns the pixels that the test set in place of a JPEG or PNG.
 fn decoded(sample: &Sample) -> CallResult<(FrameInfo, PixelData)> {
     let source = &sample.source;
     let Some(picture) = &sample.cell.sample.message.picture else {

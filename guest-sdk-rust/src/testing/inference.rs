@@ -20,7 +20,7 @@ pub enum InferenceError {
 
 refusal!(InferenceError);
 
-/// An object that `detect` found, in pixels of the frame.
+/// An object that `detect` found; its box is in pixels of the frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Detection {
     /// Class index of the model.
@@ -42,7 +42,7 @@ pub struct Detection {
 pub struct DetectOptions {
     /// Classes to return; empty for all.
     pub classes: Vec<u32>,
-    /// Detections with a lower score are dropped, 0 to 1.
+    /// Minimum score, 0 to 1; detections with a lower one are dropped.
     pub min_score: f32,
     /// Overlap (intersection over union), 0 to 1, above which the detection with the lower score is
     /// dropped.

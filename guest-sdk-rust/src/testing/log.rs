@@ -9,7 +9,7 @@ use super::session::current;
 /// Severity of a log line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Level {
-    /// Someone must act.
+    /// The operator must act.
     Error,
     /// Data or time was lost.
     Warn,

@@ -19,8 +19,8 @@ use crate::data::{bytes_per_pixel, encoding_name};
 ///     .stamped(1_500_000_000);
 /// ```
 ///
-/// A lambda can read only the fields that the test sets: message types are not known here. Default
-/// values of all messages of an input can be set with [`Host::blank`](super::Host::blank).
+/// A lambda can read only the fields that the test sets, since the fake host does not know message
+/// types. [`Host::blank`](super::Host::blank) sets default values for all messages of an input.
 #[derive(Clone, Default)]
 pub struct Message {
     pub(super) fields: BTreeMap<String, Value>,
@@ -123,7 +123,7 @@ impl Message {
         }
     }
 
-    /// Lower bound of the message size: the length of its CDR, or of its texts and bytes.
+    /// Returns a lower bound of the message size: the length of its CDR, or of its texts and bytes.
     pub(super) fn bytes_at_least(&self) -> usize {
         let bytes = |value: &Value| match value {
             Value::Text(text) => text.len(),

@@ -49,12 +49,12 @@
 //! faults with a fresh instance after each, and back-off. Most of these rules are the host's own
 //! code, in `gleaner-rules`.
 //!
-//! Not included: fuel, time and memory, except for pixels of frames that the lambda creates;
-//! decoders of JPEG and PNG; message definitions, so a message has only the fields that the test
-//! sets; clips; models. See `docs/rust.md` for the consequences.
+//! Not included: limits of fuel, time and memory, except of the memory of frames that the lambda
+//! creates; decoders of JPEG and PNG; message definitions, so a message has only the fields that
+//! the test sets; clips; models. See `docs/rust.md` for the consequences.
 //!
-//! The module exists natively only, so use it in `#[cfg(test)]`. A call of the SDK while no lambda
-//! runs panics with a message that names the way out.
+//! The module exists only in native builds, so use it in `#[cfg(test)]`. A function of the SDK that
+//! is called while no lambda runs panics with a message that names the way out.
 
 #[doc(hidden)]
 pub mod bindings;

@@ -82,7 +82,7 @@ impl FieldRef<'_> {
         }
     }
 
-    /// The value as a 64-bit float; true is 1. None if it is not a number.
+    /// Returns the value as a 64-bit float; true is 1. None if it is not a number.
     pub(super) fn number(&self) -> Option<f64> {
         match self.value() {
             Value::Boolean(value) => Some(f64::from(u8::from(*value))),
@@ -94,7 +94,7 @@ impl FieldRef<'_> {
     }
 }
 
-/// End of an error message: the most similar field, and all fields.
+/// Returns the end of an error message: the most similar field, and all fields.
 pub(super) fn known(path: &str, fields: &BTreeMap<String, Value>) -> String {
     let near = nearest(path, fields.keys().map(String::as_str));
     let hint = near.map_or(String::new(), |near| format!("; did you mean `{near}`?"));

@@ -21,7 +21,8 @@ use crate::{Config, Lambda};
 
 /// A loaded lambda with its decisions, log and counts so far.
 ///
-/// The test sets the time: that of the messages, in nanoseconds.
+/// Time is that of the messages, in nanoseconds: it advances only with [`Run::deliver`] and
+/// [`Run::pass_to`].
 pub struct Run<L: Lambda> {
     config: Config,
     session: Arc<Session>,
@@ -56,9 +57,9 @@ impl<L: Lambda> Run<L> {
         }
     }
 
-    /// Delivers a message to an input at `at_ns`, and runs the lambda by its schedule: first the
-    /// ticks that were due before, then once for the message, if it wakes the lambda. Returns the
-    /// decisions of these wakes.
+    /// Delivers a message to an input at the time `at_ns`, in nanoseconds, and runs the lambda by
+    /// its schedule: first the ticks that were due before, then once for the message, if it wakes
+    /// the lambda. Returns the decisions of these wakes.
     ///
     /// # Errors
     ///
@@ -114,9 +115,9 @@ impl<L: Lambda> Run<L> {
         Ok(&self.decisions[decided..])
     }
 
-    /// Advances time to `at_ns` without a message, and runs the ticks that are due up to and
-    /// including that instant. Returns their decisions. The first tick is due a period after the
-    /// first message or the first call of this method.
+    /// Advances time to `at_ns`, in nanoseconds, without a message, and runs the ticks that are due
+    /// up to and including that instant. Returns their decisions. The first tick is due a period
+    /// after the first message or the first call of this method.
     ///
     /// # Errors
     ///
@@ -131,29 +132,30 @@ impl<L: Lambda> Run<L> {
         Ok(&self.decisions[decided..])
     }
 
-    /// The decisions so far, one for each wake.
+    /// Returns the decisions so far, one for each wake.
     pub fn decisions(&self) -> &[Decision] {
         &self.decisions
     }
 
-    /// The triggers so far, of all wakes.
+    /// Returns the triggers so far, of all wakes.
     pub fn triggers(&self) -> impl Iterator<Item = &Trigger> {
         self.decisions.iter().flat_map(|decision| &decision.triggers)
     }
 
-    /// The faults so far. Check it in every test that expects none: without the check, a lambda
-    /// that faults in each wake passes.
+    /// Returns the faults so far. Check them in every test that expects none: without the check, a
+    /// lambda that faults in each wake passes.
     pub fn faults(&self) -> impl Iterator<Item = &Fault> {
         self.decisions.iter().filter_map(|decision| decision.fault.as_ref())
     }
 
-    /// The log lines so far, of the lambda and of the host. Printed text is not included: it goes
-    /// to the output of the test.
+    /// Returns the log lines so far, of the lambda and of the host. Text that the lambda prints is
+    /// not included: it goes to the output of the test.
     pub fn log(&self) -> Vec<LogLine> {
         self.session.lock().log.lines.clone()
     }
 
-    /// Numbers of received and lost samples of an input; none if there is no such input.
+    /// Returns the numbers of received and lost samples of an input; none if there is no such
+    /// input.
     pub fn counts(&self, input: &str) -> Option<Counts> {
         self.session
             .inputs
@@ -162,27 +164,27 @@ impl<L: Lambda> Run<L> {
             .map(|source| source.counts())
     }
 
-    /// The lambda; none after a fault, until the next wake creates a fresh instance.
+    /// Returns the lambda; none after a fault, until the next wake creates a fresh instance.
     pub fn lambda(&self) -> Option<&L> {
         self.lambda.as_ref()
     }
 
-    /// Number of log lines dropped by the limits per second.
+    /// Returns the number of log lines dropped by the limits per second.
     pub fn log_dropped(&self) -> u64 {
         self.session.lock().log.dropped()
     }
 
-    /// Number of triggers refused by `events_per_minute`.
+    /// Returns the number of triggers refused by `events_per_minute`.
     pub fn triggers_refused(&self) -> u64 {
         self.session.lock().triggers.refused()
     }
 
-    /// Number of wakes skipped during back-off, after repeated faults.
+    /// Returns the number of wakes skipped during back-off, after repeated faults.
     pub fn backed_off(&self) -> u64 {
         self.session.lock().backed_off
     }
 
-    /// Number of ticks that were due and did not happen.
+    /// Returns the number of ticks that were due and did not run.
     pub fn missed_ticks(&self) -> u64 {
         self.schedule.missed()
     }

@@ -9,8 +9,8 @@ use super::ring::Cell;
 
 pub(super) type Schedule = rules::Schedule<EventInput>;
 
-/// The input whose messages wake the lambda. Each message waits for the lambda, so the backlogs
-/// `latest` and `each` are the same here.
+/// The input whose messages wake the lambda. Each message waits until the lambda is free, so the
+/// backlogs `latest` and `each` are the same here.
 pub(super) struct EventInput(pub(super) Arc<InputState>);
 
 impl RingView for EventInput {

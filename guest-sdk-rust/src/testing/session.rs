@@ -62,8 +62,8 @@ impl Session {
         }
     }
 
-    /// Runs `init` or drops a lambda, possibly in the middle of a wake, of which it is not a part:
-    /// triggers are refused.
+    /// Runs code that is not part of a wake, though it may run in the middle of one: `init`, or the
+    /// `drop` of a lambda. Triggers are refused meanwhile.
     pub(super) fn without_triggers<R>(&self, run: impl FnOnce() -> R) -> R {
         let triggers = self.lock().triggers.suspend();
         let result = run();
@@ -77,7 +77,7 @@ thread_local! {
     static CURRENT: RefCell<Option<Arc<Session>>> = const { RefCell::new(None) };
 }
 
-/// The session of the calling lambda.
+/// Returns the session of the calling lambda.
 ///
 /// # Panics
 ///

@@ -1,5 +1,5 @@
-//! Implements `gleaner:lambda/trigger`: actions of a lambda, checked and counted by
-//! `gleaner_rules::triggers`.
+//! Implements `gleaner:lambda/trigger`: events, and the start and stop of recordings, checked and
+//! counted by `gleaner_rules::triggers`.
 
 pub use gleaner_rules::triggers::{Attribute, AttributeValue};
 use gleaner_rules::triggers::{TriggerError as Refused, TriggerKind};
@@ -15,7 +15,7 @@ pub enum TriggerError {
     /// empty, over 64 bytes or given twice; text over 1,024 bytes; more than 16 attributes.
     Invalid(String),
     /// More than 16 triggers in one wake, or more in a minute than `events_per_minute` in
-    /// `[limits]`.
+    /// `[limits]`, which does not apply to `stop`.
     TooMany(String),
 }
 

@@ -1,6 +1,6 @@
 //! Data types of `gleaner:lambda/types`, with the fields and derives that wit-bindgen generates.
 
-/// Sender of a sample: the 16 bytes of the DDS writer's GUID, as two big-endian halves.
+/// GUID of the DDS writer that sent a sample: 16 bytes, as two big-endian halves.
 #[derive(Clone, Copy, Debug)]
 #[allow(missing_docs)]
 pub struct Guid {
@@ -23,12 +23,12 @@ pub struct Identity {
 /// stamps of the same clock.
 #[derive(Clone, Copy, Debug)]
 pub struct Stamps {
-    /// Time of reception on the vehicle; in replay, the log time. Samples, wakes and clips are
-    /// ordered by this clock.
+    /// Time of reception since 1970 (UTC), on the vehicle's clock, which never goes back; in
+    /// replay, the log time. Samples, wakes and clips are ordered by this clock.
     pub at_ns: i64,
     /// Time of publication, on the writer's clock.
     pub publish_ns: i64,
-    /// `header.stamp` of the message; none unless it has one.
+    /// `header.stamp` of the message; none unless the test set it.
     pub header_ns: Option<i64>,
 }
 
@@ -117,7 +117,8 @@ pub struct FrameInfo {
     pub size: u64,
 }
 
-/// Region of interest in pixels. It is clipped to the frame, and refused if no pixel is left.
+/// Region of interest in pixels, from the upper left corner of the frame. It is clipped to the
+/// frame, and refused if no pixel is left.
 #[derive(Clone, Copy, Debug)]
 #[allow(missing_docs)]
 pub struct Roi {

@@ -1,3 +1,5 @@
+//! Frames in the fake host: pixels, slots and limits.
+
 use gleaner_sdk::data::{Encoding, Roi};
 use gleaner_sdk::testing::Message;
 use gleaner_sdk::{Error, Frame, Result};

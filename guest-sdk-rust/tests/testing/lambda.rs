@@ -55,21 +55,23 @@ pub fn on_event(
     load(host, move |_| Ok(Handler::Event(Box::new(handler)))).unwrap()
 }
 
-/// A manifest with a valid `[lambda]`, followed by `rest`.
+/// Returns a manifest with a valid `[lambda]`, followed by `rest`.
 pub fn manifest(rest: &str) -> String {
     let lambda = "[lambda]\nname = \"probe\"\nversion = \"0.1.0\"\nkind = \"wasm\"\n\
                   entry = \"probe.wasm\"\n";
     format!("{lambda}{rest}")
 }
 
-/// A host whose lambda is woken by an IMU; `keys` are further keys of the input, `rest` follows it.
+/// Returns a host whose lambda is woken by an IMU; `keys` are further keys of the input, `rest`
+/// follows it.
 pub fn imu(keys: &str, rest: &str) -> Host {
     let input =
         "[[input]]\nname = \"imu\"\ntopic = \"/imu/data\"\ntype = \"sensor_msgs/msg/Imu\"\n";
     Host::from_manifest(&manifest(&format!("[schedule]\nevent = \"imu\"\n{input}{keys}\n{rest}")))
 }
 
-/// A host whose lambda is woken by a camera with raw images or, if `compressed`, compressed ones.
+/// Returns a host whose lambda is woken by a camera with raw images or, if `compressed`, compressed
+/// ones.
 pub fn camera(compressed: bool, rest: &str) -> Host {
     let kind = if compressed { "CompressedImage" } else { "Image" };
     let input = format!(

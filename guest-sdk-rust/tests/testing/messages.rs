@@ -1,3 +1,5 @@
+//! Messages and their fields, as a lambda reads them in the fake host.
+
 use gleaner_sdk::data::Value;
 use gleaner_sdk::testing::{FaultKind, Message};
 use gleaner_sdk::{Error, Result, Sample, input};

@@ -1,3 +1,5 @@
+//! Errors and faults of the fake host, with their texts.
+
 use gleaner_sdk::testing::{FaultKind, Host, Message};
 use gleaner_sdk::{Error, event, input, log, scratch, stop};
 

@@ -1,3 +1,5 @@
+//! Rings of the fake host: depth, held samples and counts.
+
 use gleaner_sdk::testing::Message;
 use gleaner_sdk::{Error, input};
 

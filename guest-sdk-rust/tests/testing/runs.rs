@@ -1,3 +1,5 @@
+//! Runs of the fake host: schedules, faults, back-off and time.
+
 use std::rc::Rc;
 
 use gleaner_sdk::testing::{Cause, FaultKind, Host, Message, Run};

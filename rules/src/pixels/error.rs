@@ -16,14 +16,14 @@ pub enum PixelError {
         /// The supported names.
         supported: String,
     },
-    /// No pixels, or too many.
+    /// A side of the image is 0 or too long.
     Size {
         /// Pixels per row.
         width: u32,
         /// Rows.
         height: u32,
     },
-    /// The rows overlap.
+    /// The step is too small, so the rows would overlap.
     Step {
         /// Pixels per row.
         width: u32,

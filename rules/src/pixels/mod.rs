@@ -4,8 +4,8 @@
 //! All code works on slices of the caller, and all arithmetic on pixels is in integers, so that a
 //! result is equal on every CPU and in every replay.
 //!
-//! Never: use of a number from a message before it is checked against the available bytes; floating
-//! point, except for one last division.
+//! No number from a message is used before it is checked against the available bytes. There is no
+//! floating point, except for one last division.
 
 mod encoding;
 mod error;

@@ -17,13 +17,13 @@ pub struct StopCheck<'a> {
 }
 
 impl<'a> StopCheck<'a> {
-    /// Creates it from a callback, which is called at the start of an operation and before each
-    /// further part.
+    /// Creates a check with a callback, which is called at the start of an operation and before
+    /// each further part.
     pub fn new(may_continue: &'a dyn Fn() -> bool) -> Self {
         Self { may_continue, left: Cell::new(0) }
     }
 
-    /// Calls the callback, if due, before so many bytes are processed.
+    /// Calls the callback, if due, before `bytes` bytes are processed.
     pub fn check(&self, bytes: usize) -> Result<(), PixelError> {
         if let Some(left) = self.left.get().checked_sub(bytes) {
             self.left.set(left);

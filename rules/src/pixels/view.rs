@@ -22,7 +22,7 @@ pub struct View<'a> {
 impl<'a> View<'a> {
     /// Creates a view of the image of `width` x `height` pixels in `data`, where a row starts every
     /// `step` bytes, as in `sensor_msgs/msg/Image`. `big_endian` is the order of 16 bit values, and
-    /// ignored for other encodings. Bytes after each row and after the image are ignored; those
+    /// ignored for other encodings. Bytes after each row and after the image are ignored; padding
     /// after the last row may be missing.
     ///
     /// # Errors
@@ -73,7 +73,7 @@ impl<'a> View<'a> {
         Self { stop_check: Some(stop_check), ..self }
     }
 
-    /// Checks whether an operation may process so many further bytes.
+    /// Checks whether an operation may process `bytes` further bytes.
     pub(super) fn check_stop(&self, bytes: usize) -> Result<(), PixelError> {
         self.stop_check.map_or(Ok(()), |stop_check| stop_check.check(bytes))
     }

@@ -1,4 +1,4 @@
-"""Tests of the lambda with made-up drives. Run them with: python -m pytest"""
+"""Tests of the lambda on synthetic drives. Run them with: python -m pytest"""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ impl Lambda for BrakeDark {
         let Some(mean) = braking(&window, now, self.brake_mps2).filter(|_| rested) else {
             return Ok(());
         };
-        // The image is decoded only here, so most frames cost nothing.
+        // The image is decoded only here, so most frames are never decoded.
         let luma = camera.as_frame()?.mean_luma(None)?;
         if luma < self.dark_luma {
             self.last_ns = Some(now);
@@ -40,7 +40,8 @@ impl Lambda for BrakeDark {
     }
 }
 
-/// Mean of the window in m/s²; none unless the window is full and its mean is below `brake_mps2`.
+/// Returns the mean of the window in m/s²; none unless the window is full and its mean is below
+/// `brake_mps2`.
 fn braking(window: &Column, now: i64, brake_mps2: f64) -> Option<f64> {
     let full = window.at_ns.first().is_some_and(|oldest| now - oldest >= FULL_NS);
     window.mean().filter(|mean| full && *mean < brake_mps2)

@@ -80,7 +80,7 @@ mod tests {
 
     const SECOND: i64 = 1_000_000_000;
 
-    /// The changes in images with these mean grey levels, one per second.
+    /// Returns the changes in images with these mean grey levels, one per second.
     fn changes(lumas: &[f64]) -> Vec<Change> {
         let mut light =
             Light { dark: 50.0, bright: 80.0, dark_ns: SECOND, within_ns: 3 * SECOND, seen: None };

@@ -70,7 +70,7 @@ gleaner_sdk::lambda!(EveryKilometre);
 mod tests {
     use super::*;
 
-    /// The marks passed at a speed in m/s, ten samples a second, and the metres driven.
+    /// Returns the marks passed at a speed in m/s, ten samples a second, and the metres driven.
     fn marks(mps: f64, seconds: std::ops::Range<i64>, odometer: &mut Odometer) -> Vec<i64> {
         (seconds.start * 10..seconds.end * 10)
             .filter_map(|tick| odometer.add(tick * 100_000_000, mps))

@@ -68,7 +68,7 @@ impl FreezeDetector {
     }
 }
 
-/// Mean absolute difference of two grey images of the same size.
+/// Returns the mean absolute difference of two grey images of the same size.
 fn difference(a: &[u8], b: &[u8]) -> f64 {
     let sum: u64 = a.iter().zip(b).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
     sum as f64 / a.len() as f64
@@ -80,7 +80,8 @@ gleaner_sdk::lambda!(FrozenImage);
 mod tests {
     use super::*;
 
-    /// Indices of the images, each of one grey level, at which the camera is reported as frozen.
+    /// Returns the indices of the images, each of one grey level, at which the camera is reported
+    /// as frozen.
     fn frozen(greys: &[u8], moves: bool) -> Vec<usize> {
         let mut detector = FreezeDetector {
             limit: 0.1,

@@ -1,7 +1,7 @@
 //! Pothole: one hard jolt in the vertical acceleration, far above the usual roughness of the road.
 //!
-//! Most wakes only compute the span of a seventh of a second. The roughness of the road is computed
-//! only when a jolt has ended.
+//! Most wakes only compute the span of the last 0.15 s. The roughness of the road over the last two
+//! seconds is computed only when a jolt has ended.
 
 use gleaner_sdk::{Config, Field, Lambda, Result, Sample, Topic, event, input, now_ns};
 
@@ -59,7 +59,7 @@ impl Jolts {
     }
 }
 
-/// Largest minus smallest value, in their unit; minus infinity if there are none.
+/// Returns the largest minus the smallest value, in their unit; minus infinity if there are none.
 fn span(values: &[f64]) -> f64 {
     let (low, high) = values
         .iter()
@@ -67,8 +67,8 @@ fn span(values: &[f64]) -> f64 {
     high - low
 }
 
-/// Median absolute deviation from the median. Unlike a standard deviation, it hardly changes with a
-/// jolt of a few samples.
+/// Returns the median absolute deviation from the median. Unlike a standard deviation, it hardly
+/// changes with a jolt of a few samples.
 fn spread(values: Vec<f64>) -> f64 {
     let centre = median(values.clone());
     median(values.into_iter().map(|value| (value - centre).abs()).collect())

@@ -2,7 +2,7 @@
 //!
 //! The offset is `header.stamp` minus the time of reception. One late sample is not a jump, so
 //! several in a row must have the new offset. They must also be received over some time, since a
-//! burst of delayed samples arrives at once. The usual offset follows a drifting clock, so only
+//! burst of delayed samples arrives at once. The usual offset follows a clock that drifts, so only
 //! sudden changes count.
 
 use gleaner_sdk::{Config, Error, Lambda, Result, Sample, event};
@@ -60,7 +60,7 @@ impl OffsetMonitor {
         Self { jump_ns, usual: None, candidate: None }
     }
 
-    /// Adds a sample. Returns the size of the jump once enough samples agree.
+    /// Adds a sample. Returns the jump in nanoseconds once enough samples agree.
     fn note(&mut self, at_ns: i64, offset: i64) -> Option<i64> {
         let near = |other: i64| offset.abs_diff(other) < self.jump_ns.unsigned_abs();
         let usual = *self.usual.get_or_insert(offset);
@@ -86,7 +86,7 @@ gleaner_sdk::lambda!(TimeJump);
 mod tests {
     use super::*;
 
-    /// The jumps in samples with these offsets, received `apart_ms` milliseconds apart.
+    /// Returns the jumps in samples with these offsets, received `apart_ms` milliseconds apart.
     fn jumps_of(apart_ms: i64, offsets: &[i64]) -> Vec<(usize, i64)> {
         let mut monitor = OffsetMonitor::new(100);
         let times = (0..).map(|index| index * apart_ms * 1_000_000);

@@ -33,7 +33,8 @@ impl Lambda for Hello {
     }
 }
 
-/// Mean of the window in m/s²; none unless the window is full and its mean is below `brake_mps2`.
+/// Returns the mean of the window in m/s²; none unless the window is full and its mean is below
+/// `brake_mps2`.
 fn braking(window: &Column, now: i64, brake_mps2: f64) -> Option<f64> {
     let full = window.at_ns.first().is_some_and(|oldest| now - oldest >= FULL_NS);
     window.mean().filter(|mean| full && *mean < brake_mps2)

@@ -2,16 +2,16 @@
 
 use gleaner_sdk::kernels::fft::{Spectrum, SpectrumError, band_power};
 
-/// Rule 2.
+/// Number of stamps from which the period is learnt; rule 2.
 const LEARN: usize = 33;
-/// Rule 3.
+/// Minimum and maximum length of a window in samples; rule 3.
 const SMALLEST: usize = 16;
 const LARGEST: usize = 4096;
-/// Rule 4.
+/// Longest interval without a gap, in periods; rule 4.
 const GAP_PERIODS: f64 = 2.5;
 /// Lower and upper edge in Hz, and weight; rule 8.
 const BANDS: [(f64, f64, f64); 3] = [(0.5, 2.0, 0.2), (2.0, 8.0, 0.5), (8.0, 20.0, 1.0)];
-/// Rule 9.
+/// Lowest and highest frequency of the peak in Hz; rule 9.
 const PEAK_HZ: (f64, f64) = (1.0, 6.0);
 
 /// State of the rules after the samples so far.
@@ -131,7 +131,7 @@ impl Road {
     }
 }
 
-/// Frequency of the largest bin within [`PEAK_HZ`], the lowest of equal ones.
+/// Returns the frequency of the largest bin within [`PEAK_HZ`], the lowest of equal ones.
 fn peak(density: &[f64], bin_hz: f64) -> f64 {
     let bins = density.iter().enumerate().map(|(bin, power)| (bin as f64 * bin_hz, *power));
     let within = bins.filter(|(at_hz, _)| (PEAK_HZ.0..=PEAK_HZ.1).contains(at_hz));
@@ -157,7 +157,8 @@ mod tests {
 
     use super::*;
 
-    /// Index of the last sample of each window, and its roughness; sample `i` is at `i / rate_hz`.
+    /// Returns the index of the last sample of each window, and its roughness. The sampling rate is
+    /// `rate_hz`.
     fn windows(road: &mut Road, rate_hz: f64, signal: &[f64]) -> Vec<(usize, Roughness)> {
         let at_ns: Vec<i64> =
             (0..signal.len()).map(|i| (i as f64 / rate_hz * 1e9).round() as i64).collect();

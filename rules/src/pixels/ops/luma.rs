@@ -1,4 +1,4 @@
-//! Brightness: mean luma, histogram and grey image.
+//! Computes the brightness of an image: mean luma, histogram and grey image.
 
 use super::pixels::PixelFormat;
 use crate::pixels::{PixelError, Roi, View};

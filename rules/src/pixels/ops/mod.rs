@@ -1,12 +1,12 @@
 //! Operations on frames that the host computes for lambdas.
 //!
-//! Inside: grey levels (`luma`), size (`resize`), and conversion of pixels of each encoding
-//! (`pixels`). Every operation can be stopped between rows ([`View::with_stop_check`]). All of it
-//! is exact integer arithmetic on a validated [`View`], so that every CPU and every call gives the
-//! same result, regardless of optimisations.
+//! The modules compute grey levels (`luma`) and sizes (`resize`), and convert pixels of each
+//! encoding (`pixels`). Every operation can be stopped between rows ([`View::with_stop_check`]).
+//! All of it is exact integer arithmetic on a validated [`View`], so that every CPU and every call
+//! gives the same result, regardless of optimisations.
 //!
-//! Never: memory that grows with anything but the width of the image; a result for raw (Bayer)
-//! images, whose pixels have no colour until they are debayered.
+//! Memory grows only with the width of the image. There is no result for raw (Bayer) images, whose
+//! pixels have no colour until they are debayered.
 
 mod luma;
 mod pixels;

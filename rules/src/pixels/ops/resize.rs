@@ -21,8 +21,8 @@ use crate::pixels::{Encoding, PixelError, View};
 /// Largest width and height of a resized image, in pixels.
 pub const MAX_RESIZED_SIDE: u32 = 16_384;
 
-/// Returns encoding and length of [`resize`] of `view` to `width` x `height`: rgb8 for a colour
-/// image and mono8 for a grey one.
+/// Returns the encoding and the length in bytes of the result of [`resize`] of `view` to `width` x
+/// `height`: rgb8 for a colour image and mono8 for a grey one.
 ///
 /// # Errors
 ///
@@ -55,7 +55,7 @@ pub fn resize_work(view: &View<'_>, width: u32, height: u32) -> Result<u64, Pixe
 }
 
 /// Writes the image in `width` x `height` pixels to `out`, without padding, in the encoding that
-/// [`resized`] names and this returns.
+/// [`resized`] returns, which this function returns, too.
 ///
 /// Each axis is resampled by itself: the mean of the covered area if it shrinks, linear
 /// interpolation if it grows, both exact and rounded to nearest (half up). Of mono16 the high byte

@@ -1,4 +1,4 @@
-//! Division by a constant, by multiplication.
+//! Divides by a constant with a multiplication and a shift.
 
 /// Division by a divisor below 2^32, rounded to nearest, half up.
 #[derive(Clone, Copy, Debug)]
