@@ -18,7 +18,7 @@ A lambda is a class, or plain functions, in the file that ``entry`` of its ``lam
     # and optionally  def init(ctx)
 
 An exception that leaves a handler is a fault of that wake. Before the next wake the host creates a
-fresh instance of the class, or calls ``init`` again; the globals of the module stay.
+fresh instance of the class, or calls ``init`` again; the globals of the module keep their values.
 
 The classes here describe the objects that the host passes to a lambda. Importing them needs no
 host, so a lambda can be type-checked locally, and run locally with `gleaner.testing`. The names are

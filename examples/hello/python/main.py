@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from gleaner import Column, Context, Sample
 
+# Length of the window.
 WINDOW_NS = 500_000_000
+# Minimum age of the oldest sample in a full window.
 FULL_NS = 450_000_000
+# Pause after a trigger.
 REFRACTORY_NS = 3_000_000_000
 
 

@@ -30,8 +30,8 @@ class Drive:
     """A recorded drive: MCAP files, or rosbag2 directories of either storage. Several files are
     read as one drive.
 
-    ``path`` is a path or a list of paths. ``topics`` is the type of each topic. Raises ReplayError
-    for files that cannot be read."""
+    ``path`` is a path or a list of paths. The attribute ``topics`` maps each topic to its type.
+    Raises ReplayError for files that cannot be read."""
 
     def __init__(self, path: Union[Name, Sequence[Name]]) -> None:
         self.paths = _paths(path)

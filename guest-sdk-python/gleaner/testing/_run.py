@@ -21,7 +21,9 @@ class Fault:
     """``exception`` or ``memory``; the host has more kinds."""
     message: str
     used: Optional[int] = None
+    """Amount that the lambda used, in the unit of the exceeded limit; always None here."""
     allowed: Optional[int] = None
+    """The exceeded limit: bytes for ``memory``, else None."""
 
 
 @dataclass(frozen=True)
@@ -29,16 +31,22 @@ class Decision:
     """The outcome of one wake: a line of ``decisions.jsonl``."""
 
     at_ns: int
+    """Time of the sample or tick that woke the lambda, in ns."""
     cause: str
     """``event`` or ``tick``."""
     input: Optional[str]
+    """Name of the input whose sample woke the lambda; None for a tick."""
     topic: Optional[str]
+    """Topic of the waking sample; None for a tick."""
     writer: Optional[str]
+    """Writer of the waking sample, 32 hexadecimal digits; None for a tick."""
     seq: Optional[int]
     """Sequence number of the waking sample, counted from 1; None for a tick. In the host it is that
     of the recording, if it has one."""
     triggers: List[Trigger]
+    """Triggers of the wake, in the order of the calls."""
     fault: Optional[Fault]
+    """The fault that ended the wake early; None if it completed."""
     run_ns: int
     """Run time of the wake on this machine, in ns."""
 
@@ -89,7 +97,7 @@ class Run:
         return [decision for decision in self.decisions if decision.fault is not None]
 
     def series(self, label: str) -> Tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Returns the times in s and scores of the events with this label, as arrays."""
+        """Returns the times in s and the scores of the events with this label, as arrays."""
         events = [
             trigger
             for trigger in self.triggers

@@ -20,6 +20,7 @@ class Trigger:
     """Time of the wake in seconds since the start of the drive; for arrays, the time in the
     array."""
     at_ns: int
+    """Time of the wake, in ns."""
     kind: str
     """``event``, ``start`` or ``stop``."""
     label: str
@@ -34,8 +35,11 @@ class Window(NamedTuple):
     from_s: float
     """Start in seconds, as in :class:`Trigger`."""
     to_s: float
+    """End in seconds."""
     from_ns: int
+    """Start in ns."""
     to_ns: int
+    """End in ns."""
 
 
 def windows(

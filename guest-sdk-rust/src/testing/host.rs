@@ -35,7 +35,8 @@ impl Host {
     }
 
     /// Sets a value of `[config]`, as `gleaner replay --set` does. It must have the type of the
-    /// default and be within the range.
+    /// default and be within `min` and `max` of the manifest; an integer is accepted for a real
+    /// number.
     pub fn set(mut self, key: &str, value: impl Into<Setting>) -> Self {
         self.set.push((key.to_owned(), value.into().0));
         self

@@ -106,7 +106,8 @@ impl Encoding {
         }
     }
 
-    /// Returns the bytes per pixel. For the yuv422 encodings, half of a pair.
+    /// Returns the number of bytes per pixel. For the yuv422 encodings it is half of the four bytes
+    /// of a pair.
     pub const fn bytes_per_pixel(self) -> usize {
         match self {
             Self::Mono8 | Self::Bayer8(_) => 1,
@@ -116,8 +117,8 @@ impl Encoding {
         }
     }
 
-    /// Returns the channels per pixel: 1 for grey and raw, 3 for colour, 4 with alpha; 2 for the
-    /// yuv422 encodings, where a pixel has its own Y and half of a U, V pair.
+    /// Returns the number of channels per pixel: 1 for grey and raw, 3 for colour, 4 with alpha; 2
+    /// for the yuv422 encodings, where a pixel has its own Y and half of a U, V pair.
     pub const fn channels(self) -> usize {
         match self {
             Self::Mono8 | Self::Mono16 | Self::Bayer8(_) | Self::Bayer16(_) => 1,
@@ -127,7 +128,7 @@ impl Encoding {
         }
     }
 
-    /// Returns whether two neighbours share their colour, so that a row needs an even width.
+    /// Returns whether two neighbouring pixels share their colour, so that the width must be even.
     pub const fn is_paired(self) -> bool {
         matches!(self, Self::Yuv422Uyvy | Self::Yuv422Yuyv)
     }

@@ -2,8 +2,11 @@
 
 use gleaner_sdk::{Column, Config, Field, Lambda, Result, Sample, Topic, event, input, now_ns};
 
+/// Length of the window.
 const WINDOW_NS: i64 = 500_000_000;
+/// Minimum age of the oldest sample in a full window.
 const FULL_NS: i64 = 450_000_000;
+/// Pause after a trigger.
 const REFRACTORY_NS: i64 = 3_000_000_000;
 
 /// The lambda and its state between wakes.
