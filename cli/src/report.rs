@@ -12,7 +12,7 @@ use crate::stdout::print;
 /// File name of the page in the result folder.
 pub(crate) const NAME: &str = "report.html";
 
-/// `gleaner report OUT`.
+/// Runs `gleaner report OUT`.
 pub(crate) fn run(args: &ReportArgs) -> Result<Exit, Failure> {
     let path = write(&args.out)?;
     print(&format!("{}\n", path.display()))?;
@@ -38,7 +38,9 @@ fn save(page: &ReportPage, path: PathBuf) -> Result<PathBuf, Failure> {
                 format!("cannot write the report `{}`", path.display()),
                 &error,
             );
-            Err(failure.with_help("make room on the disk, or make the folder writable"))
+            Err(failure.with_help(
+                "check that the folder exists and is writable, and that its disk has room",
+            ))
         }
     }
 }

@@ -179,7 +179,7 @@ fn needs(lambda: &ConfiguredLambda, manifest: &Manifest) -> Vec<Need> {
         need(
             NeedPlace::Memory,
             false,
-            "frames that the lambda creates (`memory` again)".to_owned(),
+            "frames that the lambda creates (also up to `memory`)".to_owned(),
             Some(limits.memory.bytes()),
         );
     }
@@ -219,7 +219,7 @@ fn needs(lambda: &ConfiguredLambda, manifest: &Manifest) -> Vec<Need> {
         need(
             NeedPlace::Disk,
             false,
-            "clips; `gleaner run --clips-max --bytes-max` bounds them".to_owned(),
+            "clips; limit them by `gleaner run --clips-max` or `--bytes-max`".to_owned(),
             None,
         );
     }

@@ -3,7 +3,7 @@
 //!
 //! It is complete: manifest, entry, models, and the message definitions in `msg/`, for transports
 //! that do not provide them. Nothing here builds, and no reader of a build folder writes into it.
-//! Its files are untrusted, and are checked before one of them is used.
+//! The files are untrusted: all are checked before one of them is used.
 
 use std::fs;
 use std::io;
@@ -206,11 +206,14 @@ pub enum LayoutError {
     },
 }
 
+/// Help for a name that is not the name of a folder.
+const FOLDER_FIRST: &str = "name the lambda's folder, which has a lambda.toml; `replay` and `dev` take it before the drives";
+
 impl Explain for LayoutError {
     fn help(&self) -> Option<String> {
         match self {
             LayoutError::NoFolder { .. } | LayoutError::File { .. } => {
-                Some("name the lambda's folder; it comes before the drives".to_owned())
+                Some(FOLDER_FIRST.to_owned())
             }
             LayoutError::IsBuild { dir, .. } => Some(format!("did you mean `{}`?", dir.display())),
             LayoutError::Missing { dir } | LayoutError::Older { dir, .. } => {
@@ -321,7 +324,7 @@ mod tests {
     fn a_folder_that_is_not_a_lambdas_is_distinguished_from_one_that_is_not_built() {
         let dir = lambda("wasm", &["lambda.toml", "build/lambda.toml"]);
         let root = dir.root().display();
-        let folder_first = "name the lambda's folder; it comes before the drives".to_owned();
+        let folder_first = FOLDER_FIRST.to_owned();
         for (name, message, help) in [
             ("nowhere", format!("there is no folder `{root}/nowhere`"), folder_first.clone()),
             ("lambda.toml", format!("`{root}/lambda.toml` is not a folder"), folder_first),

@@ -86,6 +86,9 @@ mod tests {
     fn a_missing_vehicle_file_has_help_of_its_own() {
         let error = Vehicle::load("no/such/vehicle.toml").unwrap_err();
         assert_eq!(error.to_string(), "cannot read `no/such/vehicle.toml`");
-        assert_eq!(error.help().as_deref(), Some("name the configuration of a vehicle"));
+        assert_eq!(
+            error.help().as_deref(),
+            Some("name the vehicle's configuration file; see docs/limits.md")
+        );
     }
 }

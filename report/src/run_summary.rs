@@ -30,7 +30,7 @@ const WHY_CHARS: usize = 2_000;
 /// Errors of reading a result folder.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
-    /// It has no `summary.json`.
+    /// The folder has no `summary.json`.
     #[error("`{}` does not hold results", out.display())]
     None {
         /// The folder.
@@ -40,7 +40,7 @@ pub enum OutputError {
         /// The cause.
         source: FileError,
     },
-    /// Its `summary.json` or `signals.json` is not valid.
+    /// The `summary.json` or `signals.json` of the folder is not valid.
     #[error("`{}` is not a result file of this gleaner", path.display())]
     Invalid {
         /// The file.
@@ -59,7 +59,7 @@ pub enum FileError {
     /// It cannot be opened or read.
     #[error("cannot read `{name}`")]
     Read {
-        /// Its name in the folder.
+        /// Name of the file in the folder.
         name: &'static str,
         /// The cause.
         source: io::Error,
@@ -67,7 +67,7 @@ pub enum FileError {
     /// It is not JSON, or lacks keys.
     #[error("cannot parse `{name}`")]
     Json {
-        /// Its name in the folder.
+        /// Name of the file in the folder.
         name: &'static str,
         /// The cause.
         source: serde_json::Error,
@@ -162,7 +162,7 @@ impl RunSummary {
         summary.map_err(|source| OutputError::Invalid { path: out.join("summary.json"), source })
     }
 
-    /// As `of`, cut to what fits on a page. Adds to `notes` what is omitted.
+    /// Reads the summary as `of`, cut to what fits on a page. Adds to `notes` what is omitted.
     pub(crate) fn bounded(out: &Path, notes: &mut Vec<String>) -> Result<Self, OutputError> {
         let mut run = Self::of(out)?;
         let mut note_omitted = |what: &str, found: usize, max: usize| {
@@ -202,7 +202,7 @@ impl RunSummary {
         Ok(run)
     }
 
-    /// Name, version and kind of the lambda.
+    /// Returns name, version and kind of the lambda.
     pub(crate) fn lambda(&self) -> (&str, &str, LambdaKind) {
         match self {
             Self::Replay(summary) => (&summary.lambda, &summary.version, summary.kind),
@@ -210,7 +210,7 @@ impl RunSummary {
         }
     }
 
-    /// Wakes, triggers and faults.
+    /// Returns the numbers of wakes, triggers and faults.
     pub(crate) fn wakes(&self) -> [(&'static str, u64); 3] {
         let [wakes, triggers, faults] = match self {
             Self::Replay(summary) => [summary.wakes, summary.triggers, summary.faults],
@@ -219,7 +219,7 @@ impl RunSummary {
         [("wakes", wakes), ("triggers", triggers), ("faults", faults)]
     }
 
-    /// Counts of losses and omissions, except samples of topics.
+    /// Returns the counts of losses and omissions, except samples of topics.
     pub(crate) fn missed(&self) -> Vec<(&'static str, u64)> {
         let shared = |skipped, ticks, log, refused, backed_off| {
             vec![
@@ -227,7 +227,7 @@ impl RunSummary {
                 ("ticks missed", ticks),
                 ("log lines over the rate limit", log),
                 ("triggers refused, over `events_per_minute`", refused),
-                ("wakes backed off after repeated faults", backed_off),
+                ("wakes skipped in the pauses after repeated faults", backed_off),
             ]
         };
         match self {
@@ -267,7 +267,7 @@ impl RunSummary {
         }
     }
 
-    /// Sample counts of each input.
+    /// Returns the sample counts of each input.
     pub(crate) fn topics(&self) -> Vec<TopicCounts> {
         match self {
             Self::Replay(summary) => summary.topics.iter().map(TopicCounts::from).collect(),
@@ -276,12 +276,12 @@ impl RunSummary {
     }
 }
 
-/// Counts of what a recorder did not record, by cause.
+/// Returns the counts of what a recorder did not record, by cause.
 fn by_cause(recording: &RecordingCounts) -> impl Iterator<Item = (&'static str, u64)> {
     recording.by_cause().into_iter().map(|counted| (counted.label, counted.count))
 }
 
-/// The same for a live run, with the losses of the network.
+/// Returns the counts of what a live recorder did not record, with the losses of the network.
 fn recorded(status: &RecorderStatus) -> Vec<(&'static str, u64)> {
     let sum = |count: fn(&RecordedTopic) -> u64| {
         status.topics.iter().map(count).fold(0, u64::saturating_add)
@@ -393,7 +393,7 @@ pub(crate) fn shown_config(
         ConfigValue::Text(text) => ConfigValue::Text(cut(text, NAME_CHARS)),
         other => other.clone(),
     };
-    config.iter().take(CONFIG_MAX).map(|(key, of)| (cut(key, NAME_CHARS), value(of))).collect()
+    config.iter().take(CONFIG_MAX).map(|(key, set)| (cut(key, NAME_CHARS), value(set))).collect()
 }
 
 fn is_consistent(curve: &Curve) -> bool {
@@ -401,7 +401,7 @@ fn is_consistent(curve: &Curve) -> bool {
     points <= Signals::POINTS_MAX && curve.min.len() == points && curve.max.len() == points
 }
 
-/// An error and its causes in one line.
+/// Formats an error and its causes in one line.
 pub(crate) fn in_words(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut source = error.source();
@@ -422,7 +422,7 @@ fn read_bounded(out: &Path, name: &'static str, max: ByteSize) -> Result<Vec<u8>
     read.map_err(|source| FileError::Read { name, source })
 }
 
-/// Subfolders of `out` that hold results: a vehicle has one for each lambda.
+/// Returns the subfolders of `out` that hold results: a vehicle has one for each lambda.
 fn outputs_in(out: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(out).into_iter().flatten().flatten();
     let mut folders: Vec<_> = entries

@@ -80,7 +80,7 @@ pub enum CliCommand {
 /// A lambda and its settings.
 #[derive(Args, Debug, Clone)]
 pub struct LambdaArgs {
-    /// The lambda's folder, built by `gleaner build DIR`
+    /// The lambda's folder, built by `gleaner build DIR` (`gleaner dev` builds it itself)
     #[arg(value_name = "DIR")]
     pub lambda: PathBuf,
     /// Override a key of the config table, as in brake_mps2=-1.4
@@ -96,7 +96,7 @@ pub struct LambdaArgs {
 }
 
 impl LambdaArgs {
-    /// The settings as arguments of the other programs.
+    /// Returns the settings as arguments of the other programs.
     pub(crate) fn settings(&self) -> Vec<OsString> {
         let settings = [("--set", &self.set), ("--remap", &self.remap)];
         let vehicle =
@@ -118,12 +118,12 @@ pub struct NetworkArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=232))]
     pub domain: Option<u16>,
     /// Address of a network interface to use; may be repeated [default: all]
-    #[arg(long, value_name = "ADDRESS")]
+    #[arg(long, value_name = "ADDRESS", value_parser = address)]
     pub interface: Vec<IpAddr>,
 }
 
 impl NetworkArgs {
-    /// The same as arguments of the other programs.
+    /// Returns the network as arguments of the other programs.
     pub(crate) fn to_args(&self) -> impl Iterator<Item = OsString> {
         let domain = self.domain.map(|domain| format!("--domain={domain}"));
         let interfaces = self.interface.iter().map(|address| format!("--interface={address}"));
@@ -150,7 +150,7 @@ pub struct RunArgs {
     #[arg(long)]
     pub stats: bool,
     /// Stop after this many seconds
-    #[arg(long = "for", value_name = "SECONDS", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long = "for", value_name = "SECONDS", value_parser = whole_seconds)]
     pub last: Option<u32>,
     /// Publish the stamps of input and decision of each wake on this topic, as
     /// sensor_msgs/msg/TimeReference
@@ -163,13 +163,13 @@ pub struct RunArgs {
     #[arg(long, value_name = "TOPIC")]
     pub commands: Option<String>,
     /// Start no clip if the disk has fewer free bytes [default: 1 GiB]
-    #[arg(long, value_name = "BYTES")]
+    #[arg(long, value_name = "BYTES", value_parser = bytes)]
     pub disk_floor: Option<u64>,
     /// Maximum number of clips to keep; the oldest ones are deleted and counted
     #[arg(long, value_name = "N")]
     pub clips_max: Option<u64>,
     /// Maximum total size of clips to keep; the oldest ones are deleted and counted
-    #[arg(long, value_name = "BYTES")]
+    #[arg(long, value_name = "BYTES", value_parser = bytes)]
     pub bytes_max: Option<u64>,
     /// Create a control group for the lambda's process in this cgroup v2 folder, which must be
     /// delegated to this user
@@ -201,7 +201,7 @@ pub struct InspectArgs {
 #[derive(Args, Debug)]
 pub struct TopicsArgs {
     /// Time to wait for topics, in seconds [default: 2]
-    #[arg(long, value_name = "SECONDS")]
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub wait: Option<f64>,
     /// Print the topics as one JSON object
     #[arg(long)]
@@ -403,6 +403,25 @@ fn remap(text: &str) -> Result<String, String> {
 
 pub(crate) fn drive_time(text: &str) -> Result<String, String> {
     text.parse::<DriveTime>().map(|_| text.to_owned()).map_err(|error| error.to_string())
+}
+
+fn address(text: &str) -> Result<IpAddr, String> {
+    text.parse().map_err(|_| "write the IP address of the interface, as in 192.168.1.10".to_owned())
+}
+
+fn bytes(text: &str) -> Result<u64, String> {
+    text.parse().map_err(|_| "write a number of bytes without a unit, as in 1073741824".to_owned())
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    text.parse().map_err(|_| "write a number of seconds without a unit, as in 2.5".to_owned())
+}
+
+fn whole_seconds(text: &str) -> Result<u32, String> {
+    text.parse()
+        .ok()
+        .filter(|seconds| *seconds > 0)
+        .ok_or_else(|| "write a whole number of seconds, 1 or more, as in 60".to_owned())
 }
 
 #[cfg(test)]

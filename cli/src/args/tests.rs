@@ -38,3 +38,18 @@ fn bad_arguments_are_refused_with_an_example() {
     }
     assert!(replay(&["dir"]).unwrap_err().contains("<DRIVE>"));
 }
+
+#[test]
+fn numbers_and_addresses_are_refused_with_an_example() {
+    for (arguments, message) in [
+        (["run", "dir", "--for", "0"], "as in 60"),
+        (["run", "dir", "--for", "2s"], "as in 60"),
+        (["run", "dir", "--bytes-max", "1k"], "as in 1073741824"),
+        (["run", "dir", "--disk-floor", "1GiB"], "as in 1073741824"),
+        (["run", "dir", "--interface", "eth0"], "as in 192.168.1.10"),
+        (["topics", "--json", "--wait", "2s"], "as in 2.5"),
+    ] {
+        let error = Cli::try_parse_from(["gleaner"].iter().chain(&arguments)).unwrap_err();
+        assert!(error.to_string().contains(message), "{error}");
+    }
+}

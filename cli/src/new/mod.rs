@@ -121,7 +121,7 @@ impl Explain for NewError {
                 Some("name the folder of a lambda that `gleaner new` created".to_owned())
             }
             Self::CrateName { .. } => Some("Rust reserves it; choose another name".to_owned()),
-            Self::File { .. } => None,
+            Self::File { .. } => Some("choose a writable folder, on a disk with room".to_owned()),
         }
     }
 
@@ -169,18 +169,18 @@ fn make(dir: &Path, name: &LambdaName, kind: LambdaKind) -> Result<(), NewError>
         return Err(NewError::NotEmpty { path: dir.to_owned() });
     }
     if let Some(parent) = dir.parent() {
-        fs::create_dir_all(parent).map_err(failed("make", parent))?;
+        fs::create_dir_all(parent).map_err(failed("create", parent))?;
     }
     // The process id makes the name unique.
     let partial = dir.with_file_name(format!(".{name}.partial-{}", std::process::id()));
-    fs::create_dir(&partial).map_err(failed("make", &partial))?;
-    let made = fill(&partial, name, kind)
-        .and_then(|()| fs::rename(&partial, dir).map_err(failed("make", dir)));
-    if made.is_err() {
+    fs::create_dir(&partial).map_err(failed("create", &partial))?;
+    let result = fill(&partial, name, kind)
+        .and_then(|()| fs::rename(&partial, dir).map_err(failed("create", dir)));
+    if result.is_err() {
         // The first error matters more than a failed clean-up.
         let _ = fs::remove_dir_all(&partial);
     }
-    made
+    result
 }
 
 fn fill(dir: &Path, name: &LambdaName, kind: LambdaKind) -> Result<(), NewError> {
@@ -226,7 +226,7 @@ fn update(dir: &Path) -> Result<(), Failure> {
     unpack_sdk(&partial, kind)?;
     match fs::rename(&sdk, &old) {
         Err(error) => return Err(failed("replace", &sdk)(error).into()),
-        Ok(()) => fs::rename(&partial, &sdk).map_err(failed("make", &sdk))?,
+        Ok(()) => fs::rename(&partial, &sdk).map_err(failed("create", &sdk))?,
     }
     Ok(remove(&old)?)
 }
@@ -255,7 +255,7 @@ fn copy(file: &str, to: &Path) -> Result<(), NewError> {
         .try_for_each(|(path, bytes)| write(to, Path::new(path), bytes))
 }
 
-/// The embedded files below `folder`, by their path in it.
+/// Returns the embedded files below `folder`, by their path in it.
 fn below(folder: &str) -> impl Iterator<Item = (&'static Path, &'static [u8])> {
     PACKED.iter().filter_map(move |(path, bytes)| {
         Some((Path::new(*path).strip_prefix(folder).ok()?, *bytes))
@@ -279,7 +279,7 @@ fn source(kind: LambdaKind) -> &'static str {
 fn write(folder: &Path, path: &Path, bytes: &[u8]) -> Result<(), NewError> {
     let path = folder.join(path);
     if let Some(parent) = path.parent() {
-        fs::create_dir_all(parent).map_err(failed("make", parent))?;
+        fs::create_dir_all(parent).map_err(failed("create", parent))?;
     }
     fs::write(&path, bytes).map_err(failed("write", &path))
 }

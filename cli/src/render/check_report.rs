@@ -1,6 +1,9 @@
+//! Formats the report of `gleaner check`.
+
 use std::fmt::{self, Write};
 
 use gleaner_base::visible;
+use gleaner_lambda::manifest::LambdaKind;
 use gleaner_protocol::{CheckReport, Need, NeedPlace};
 use gleaner_report::format::size;
 
@@ -20,7 +23,12 @@ fn write(text: &mut String, report: &CheckReport, paint: Paint) -> fmt::Result {
         Some(ms) => paint.green(&format!("loaded, init took {ms:.1} ms")),
         None => paint.yellow("loaded, init not run"),
     };
-    writeln!(text, "{} ({}): {init}", paint.bold(&name), visible(&report.engine))?;
+    // The settings behind a version of wasmtime matter to journals, not to readers.
+    let engine = match report.kind {
+        LambdaKind::Wasm => report.engine.split(',').next().unwrap_or_default(),
+        LambdaKind::Python => &report.engine,
+    };
+    writeln!(text, "{} ({}): {init}", paint.bold(&name), visible(engine))?;
     for note in &report.notes {
         writeln!(text, "  {}", paint.yellow(&visible(note)))?;
     }
@@ -42,13 +50,13 @@ fn write(text: &mut String, report: &CheckReport, paint: Paint) -> fmt::Result {
         let (preallocated, later) = (sum(true), sum(false));
         let max = size(preallocated.saturating_add(later));
         let beyond = if needs.iter().any(|need| need.bytes.is_none()) {
-            ", plus unbounded needs"
+            ", plus items without a limit"
         } else {
             ""
         };
         writeln!(text, "{word}: {} preallocated, up to {max}{beyond}", size(preallocated))?;
         for need in needs {
-            let bytes = need.bytes.map_or_else(|| "unbounded".to_owned(), size);
+            let bytes = need.bytes.map_or_else(|| "no limit".to_owned(), size);
             let is_exact = need.preallocated || need.bytes.is_none();
             let bytes = if is_exact { bytes } else { format!("up to {bytes}") };
             writeln!(text, "{bytes:>16}  {}", visible(&need.purpose))?;
@@ -56,15 +64,13 @@ fn write(text: &mut String, report: &CheckReport, paint: Paint) -> fmt::Result {
     }
     writeln!(
         text,
-        "resident memory: {}, with rings, before any sample",
+        "resident memory after loading, with the buffers of the inputs: {}",
         size(report.resident_bytes)
     )
 }
 
 #[cfg(test)]
 mod tests {
-    use gleaner_lambda::manifest::LambdaKind;
-
     use super::*;
 
     #[test]
@@ -77,7 +83,7 @@ mod tests {
             lambda: "dip".to_owned(),
             version: "0.1.0".to_owned(),
             kind: LambdaKind::Wasm,
-            engine: "wasmtime 48".to_owned(),
+            engine: "wasmtime 48, fuel, 1".to_owned(),
             init_ms: Some(0.25),
             resident_bytes: 30 << 20,
             needs: vec![
@@ -94,10 +100,10 @@ mod tests {
 memory: 3.0 MiB preallocated, up to 67.0 MiB
          3.0 MiB  input `imu`
   up to 64.0 MiB  preroll
-disk: 4.0 MiB preallocated, up to 4.0 MiB, plus unbounded needs
+disk: 4.0 MiB preallocated, up to 4.0 MiB, plus items without a limit
          4.0 MiB  model `m`
-       unbounded  clips
-resident memory: 30.0 MiB, with rings, before any sample
+        no limit  clips
+resident memory after loading, with the buffers of the inputs: 30.0 MiB
 ";
         assert_eq!(check_report(&found, Paint::new(false)), expected);
         let noted = CheckReport { init_ms: None, notes: vec!["no \u{1b}type".to_owned()], ..found };

@@ -13,10 +13,16 @@ use super::live::table;
 const EMPTY_WORDS: [&str; 7] =
     ["data", "raw", "image", "image_raw", "image_color", "compressed", "msg"];
 
+/// Help for a damaged drive.
+const COPY_AGAIN: &str = "copy the file again if you can";
+
 /// Formats the length of the drive, a table of its topics, and `[[input]]` tables.
 pub(crate) fn drive(drive: &DriveInfo) -> String {
     let (Some(start), Some(end)) = (drive.start_ns, drive.end_ns) else {
-        return "no messages\n".to_owned();
+        return match &drive.damaged {
+            Some(damaged) => format!("no messages: {}; {COPY_AGAIN}\n", visible(damaged)),
+            None => "no messages\n".to_owned(),
+        };
     };
     let (whole, rest) = (start.div_euclid(1_000_000_000), start.rem_euclid(1_000_000_000));
     let mut text = format!("{:.3} s, starts at @{whole}.{rest:09}\n", seconds(end, start));
@@ -30,7 +36,7 @@ pub(crate) fn drive(drive: &DriveInfo) -> String {
             writeln!(text, "rates, gaps and sizes are from {parts}; --all reads the whole drive");
     }
     if let Some(damaged) = &drive.damaged {
-        let _ = writeln!(text, "damaged: {}", visible(damaged));
+        let _ = writeln!(text, "{}; {COPY_AGAIN}", visible(damaged));
     }
     if drive.out_of_order > 0 {
         let _ =
@@ -74,7 +80,7 @@ fn picture_text(picture: &PictureInfo) -> String {
     format!("{} {}x{}", visible(&picture.encoding), picture.width, picture.height)
 }
 
-/// Rate from the median interval, which gaps do not change.
+/// Returns the rate by the median interval, which gaps do not change.
 fn rate_hz(topic: &DriveTopicInfo) -> Option<f64> {
     topic
         .interval
@@ -107,7 +113,7 @@ fn inputs(topics: &[DriveTopicInfo]) -> String {
     if text.is_empty() { text } else { format!("\nfor lambda.toml:\n{text}") }
 }
 
-/// Keys of an `[[input]]` table that differ from the defaults, with reserves.
+/// Returns the keys of an `[[input]]` table that differ from the defaults, with reserves.
 fn sizes(topic: &DriveTopicInfo) -> String {
     let kib = |bytes: u64| format!("{} KiB", bytes.div_ceil(1024));
     if let Some(PictureInfo { width, height, is_compressed, .. }) = &topic.picture {
@@ -219,6 +225,11 @@ depth = 128                 # 1.3 s
 ";
         assert_eq!(drive(&seen(vec![topic("/imu/data"), unknown])), expected);
         assert_eq!(drive(&DriveInfo { start_ns: None, ..seen(Vec::new()) }), "no messages\n");
+        let damaged = Some("cut off".to_owned());
+        assert_eq!(
+            drive(&DriveInfo { start_ns: None, damaged, ..seen(Vec::new()) }),
+            "no messages: cut off; copy the file again if you can\n"
+        );
     }
 
     #[test]
@@ -276,7 +287,12 @@ depth = 128                 # 1.3 s
         };
         let text = drive(&drive_of_parts);
         assert!(text.contains("from 0.0 to 0.5 s; --all reads the whole drive\n"), "{text}");
-        assert!(text.contains("damaged: cut\\u{1b} off\n2 messages out of order"), "{text}");
+        assert!(
+            text.contains(
+                "cut\\u{1b} off; copy the file again if you can\n2 messages out of order"
+            ),
+            "{text}"
+        );
         assert!(text.ends_with("\nand 61,439 more topics, not read\n"), "{text}");
     }
 }

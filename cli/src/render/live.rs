@@ -29,7 +29,8 @@ pub(crate) fn recorder(status: &RecorderStatus, paint: Paint) -> String {
 /// Formats the live topics as a table.
 pub(crate) fn topics(topics: &[TopicInfo]) -> String {
     if topics.is_empty() {
-        return "no topics\n".to_owned();
+        return "no topics; compare ROS_DOMAIN_ID with that of the nodes, and run `gleaner doctor`\n"
+            .to_owned();
     }
     let rows = topics.iter().map(|topic| {
         [
@@ -130,7 +131,7 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
         (live.missed_ticks, "tick", "missed"),
         (live.log_dropped, "log line", "over the rate limit"),
         (live.triggers_refused, "trigger", "refused: over `events_per_minute`"),
-        (live.backed_off, "wake", "backed off after repeated faults"),
+        (live.backed_off, "wake", "skipped in the pauses after repeated faults"),
         (live.unwritten, "decision or log line", "not written"),
         (live.unsent, "message", "not sent: a reader of `--rtt` or `--decisions` is too slow"),
         (
@@ -173,7 +174,7 @@ fn write_network(
         writeln!(text, "  {}", paint.yellow(&visible(why)))?;
     }
     let line = format!(
-        "{}, socket buffer {:.1} of {:.1} MiB, {:.1} MiB resident, {:.1} s of CPU time",
+        "{}, socket buffer {:.1} of {:.1} MiB requested, {:.1} MiB resident, {:.1} s of CPU time",
         counted(network.participants as u64, "participant"),
         mib(network.buffer_granted as u64),
         mib(network.buffer_requested as u64),
@@ -281,7 +282,7 @@ pub(super) fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -
     text
 }
 
-/// Time of day in UTC.
+/// Formats the time of day, in UTC.
 fn time_of_day(at_ns: i64) -> String {
     let ms = at_ns.div_euclid(1_000_000).rem_euclid(86_400_000);
     let (hours, minutes, seconds) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60);
@@ -333,7 +334,7 @@ mod tests {
         assert_eq!(
             lines,
             [
-                "  2 participants, socket buffer 1.0 of 8.0 MiB, 5.0 MiB resident, 1.0 s of CPU time",
+                "  2 participants, socket buffer 1.0 of 8.0 MiB requested, 5.0 MiB resident, 1.0 s of CPU time",
                 "  no filter here",
                 "  lost: 1 datagram, dropped: too large fragments, or fragments of unknown participants",
                 "  lost: 3 datagrams, dropped: socket buffer full",

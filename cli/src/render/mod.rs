@@ -136,7 +136,7 @@ impl Burst {
         if first == last { format!("{first:>10} s") } else { format!("{first:>10} to {last} s") }
     }
 
-    /// The score of a single trigger; of several, their number and highest score.
+    /// Returns the score of a single trigger; of several, their number and highest score.
     fn extent(&self) -> String {
         let score = self.highest_score.map(three_digits);
         match (self.count, score) {
@@ -147,7 +147,7 @@ impl Burst {
     }
 }
 
-/// A fault's message, escaped and cut to [`MESSAGE_CHARS`].
+/// Returns a fault's message, escaped and cut to [`MESSAGE_CHARS`].
 pub(crate) fn shown(message: &str) -> String {
     // Escaping makes the text longer.
     let text = visible(&message.chars().take(MESSAGE_CHARS + 1).collect::<String>());
@@ -302,7 +302,7 @@ fn write_summary(
     writeln!(text, "  {}", paint.dim(&files))
 }
 
-/// Counts of what a recorder did not record, by cause.
+/// Writes a line for each cause of data that the recorder did not record.
 fn write_counted(text: &mut String, recording: &RecordingCounts, paint: Paint) -> fmt::Result {
     for counted in recording.by_cause().into_iter().filter(|counted| counted.count > 0) {
         let line = counted.in_words();
@@ -326,7 +326,8 @@ fn more(text: &mut String, count: u64) -> fmt::Result {
     Ok(())
 }
 
-/// Losses by cause. Samples that newer ones overwrote in a ring do not count as lost.
+/// Returns a line for each loss, with its cause. Samples that newer ones overwrote in a ring do not
+/// count as lost.
 fn losses(summary: &ReplaySummary) -> Vec<String> {
     let of_topic = |topic: &TopicReport| {
         let causes = [
@@ -353,7 +354,10 @@ fn losses(summary: &ReplaySummary) -> Vec<String> {
         ),
         (
             summary.backed_off,
-            format!("{}, backed off after repeated faults", counted(summary.backed_off, "wake")),
+            format!(
+                "{}, skipped in the pauses after repeated faults",
+                counted(summary.backed_off, "wake")
+            ),
         ),
     ];
     let all = summary.topics.iter().flat_map(of_topic).chain(overall);

@@ -207,7 +207,7 @@ fn losses_have_causes_and_overwritten_samples_are_no_loss() {
             "1 event sample, skipped",
             "3,000 log lines, over the rate limit",
             "1 trigger, refused: over `events_per_minute`",
-            "2 wakes, backed off after repeated faults",
+            "2 wakes, skipped in the pauses after repeated faults",
         ]
     );
 }
@@ -241,7 +241,7 @@ fn colours_are_used_only_if_enabled() {
     assert!(!Paint::new(false).on);
 }
 
-/// A clip from 5.8 to 9.0 s of a window up to 15.8 s.
+/// Returns a clip from 5.8 to 9.0 s of a window up to 15.8 s.
 fn clip() -> Clip {
     let at = |seconds: f64| START_NS + (seconds * 1e9) as i64;
     let line = format!(

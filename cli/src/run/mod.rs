@@ -44,7 +44,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     let allowed = || {
         vehicle.map_or(Ok(Limits::MAX), |file| Vehicle::load(file).map(|vehicle| vehicle.limits))
     };
-    let mut most = allowed()?;
+    let mut limits = allowed()?;
     let stop = stop_flag()?;
     let mut screen = Screen::new(args.stats, args.json);
     let offset_ns = clock_offset();
@@ -55,14 +55,22 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     let mut earlier = EarlierCounts::default();
     let is_over = || args.last.is_some_and(|seconds| started.elapsed().as_secs() >= seconds.into());
     loop {
-        let left = args
+        let time_left = args
             .last
             .map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
         let attempt_started = Instant::now();
         // The runtime reads the same file at each start and reports if it cannot be used. That does
         // not end the run.
-        most = allowed().unwrap_or(most);
-        let mut group = ProcessGroup::start(args, most, largest, offset_ns, left, restarts)?;
+        limits = allowed().unwrap_or(limits);
+        let mut group = ProcessGroup::start(
+            args,
+            &mut screen,
+            limits,
+            largest,
+            offset_ns,
+            time_left,
+            restarts,
+        )?;
         match group.supervise(&mut screen, &stop)? {
             RunEnd::Complete(exit) => {
                 earlier.complete(
@@ -116,7 +124,7 @@ impl Failures {
         self.faulted |= faulted;
     }
 
-    /// The result of the run if its last process ended with `exit`.
+    /// Returns the result of the run if its last process ended with `exit`.
     fn end(self, exit: Exit) -> Result<Exit, Failure> {
         match self.reason {
             _ if exit != Exit::Ok => Ok(exit),
@@ -138,7 +146,7 @@ impl Failures {
     }
 }
 
-/// A flag that is set by Ctrl-C, SIGTERM, and the end of the terminal.
+/// Returns a flag that is set by Ctrl-C, SIGTERM, and the end of the terminal.
 fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM, SIGHUP] {
@@ -148,8 +156,8 @@ fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
     Ok(stop)
 }
 
-/// Offset of the vehicle's clock to CLOCK_MONOTONIC, in ns. The vehicle's clock shows the current
-/// time of day, and never jumps afterwards.
+/// Returns the offset of the vehicle's clock to CLOCK_MONOTONIC, in ns. The vehicle's clock shows
+/// the current time of day, and never jumps afterwards.
 fn clock_offset() -> i64 {
     use rustix::time::{ClockId, clock_gettime};
     let ns = |clock| {
@@ -163,7 +171,8 @@ fn clock_offset() -> i64 {
 mod tests {
     use super::*;
 
-    /// The exit code of a run with these failures, true for a fault, and this last exit code.
+    /// Returns the exit code of a run with these failures, true for a fault, and this last exit
+    /// code.
     fn end(faults: &[bool], exit: Exit) -> Exit {
         let mut failures = Failures::default();
         faults.iter().for_each(|faulted| failures.add("it ended".to_owned(), *faulted));

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use gleaner_base::{Exit, Failure, safe_file};
 use gleaner_lambda::manifest::Limits;
 use gleaner_parts::Parts;
-use gleaner_protocol::link::{AddLambda, ControlClient, RecorderStatus};
+use gleaner_protocol::link::{AddLambda, ControlClient, LinkError, RecorderStatus};
 use gleaner_protocol::{ExitRecord, LiveStatus};
 
 use super::process::ChildProcess;
@@ -18,8 +18,8 @@ use super::screen::Screen;
 use super::{POLL_INTERVAL, arguments};
 use crate::args::RunArgs;
 
-/// Time to read the pipes after the end of all processes; processes that they time_left running may
-/// hold the pipes open.
+/// Time to read the pipes after the end of all processes: processes that they left running may hold
+/// the pipes open.
 const DRAIN_TIMEOUT: Duration = Duration::from_millis(300);
 
 /// Maximum number of queued outputs. Further reports stay in their pipe, and the writer counts
@@ -52,11 +52,13 @@ pub(super) struct ProcessGroup {
 }
 
 impl ProcessGroup {
-    /// Starts the processes. `most` are the limits of this vehicle; `largest` is the largest
-    /// recorded sample in bytes, `None` if nothing is recorded.
+    /// Starts the processes. `limits` are the limits of this vehicle; `largest` is the largest
+    /// recorded sample in bytes, `None` if nothing is recorded. `screen` shows why a recorder ended
+    /// at its start.
     pub(super) fn start(
         args: &RunArgs,
-        most: Limits,
+        screen: &mut Screen,
+        limits: Limits,
         largest: Option<u64>,
         offset_ns: i64,
         time_left: Option<Duration>,
@@ -86,9 +88,16 @@ impl ProcessGroup {
             let add = AddLambda {
                 lambda: args.target.lambda.clone(),
                 remaps: arguments::remaps(args),
-                most,
+                most: limits,
             };
-            socket = Some(control.add(&add).map_err(|error| failed(&error))?);
+            match control.add(&add) {
+                Ok(lambda_end) => socket = Some(lambda_end),
+                Err(LinkError::Gone { .. }) => {
+                    drop(sender);
+                    return recorder_not_started(process, ReportStream::new(output), screen);
+                }
+                Err(error) => return Err(failed(&error)),
+            }
             recorder = Some((process, control));
         }
         let line = arguments::runtime(args, socket.is_some(), offset_ns, restarts);
@@ -192,6 +201,19 @@ impl ProcessGroup {
             }
         })
     }
+}
+
+/// Shows why the recorder ended before it knew the lambda: it prints the cause.
+fn recorder_not_started<T>(
+    mut recorder: ChildProcess,
+    mut stream: ReportStream,
+    screen: &mut Screen,
+) -> Result<T, Failure> {
+    let status = recorder.wait(&mut stream, screen)?;
+    stream.drain(screen, DRAIN_TIMEOUT);
+    let exit = status.code().and_then(Exit::from_code).filter(|exit| *exit != Exit::Ok);
+    let failure = Failure::new(exit.unwrap_or(Exit::Internal), ended("the recorder", status));
+    Err(failure.with_help("see its message above; to run without clips: --no-record"))
 }
 
 fn ended(process: &str, status: ExitStatus) -> String {

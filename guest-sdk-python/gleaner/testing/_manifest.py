@@ -226,7 +226,7 @@ def _item(file: str, name: str, entry: Any, overrides: Mapping[str, Any]) -> Con
     entry = entry if isinstance(entry, Mapping) else {"default": entry}
     table = Table(file, f"`config.{name}`", entry, ["default", "min", "max", "unit", "description"])
     default = table.need(
-        "default", "default = 1.0, or another value, whose type is that of the item"
+        "default", "default = 1.0, or another value of the type that the lambda expects"
     )
     if not isinstance(default, (bool, int, float, str)) or not _is_finite(default):
         raise table.refusal(

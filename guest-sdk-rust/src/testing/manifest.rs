@@ -215,7 +215,7 @@ fn item(name: &str, value: &Value) -> Result<ConfigItem> {
     let entries = value.as_table().unwrap_or(&plain);
     let table = Table::of(&title, entries, &["default", "min", "max", "unit", "description"])?;
     let default = match table
-        .need("default", "default = 1.0, or another value, whose type is that of the item")?
+        .need("default", "default = 1.0, or another value of the type that the lambda expects")?
     {
         Value::Boolean(value) => ConfigValue::Boolean(*value),
         Value::Integer(value) => ConfigValue::Integer(*value),
@@ -290,7 +290,7 @@ impl ConfigItem {
 }
 
 impl Manifest {
-    /// `[config]` with the values that the test sets in place of the defaults.
+    /// Returns `[config]` with the values that the test sets in place of the defaults.
     pub(super) fn config(&self, set: &[(String, ConfigValue)]) -> Result<Vec<ConfigEntry>> {
         let names = || self.items.iter().map(|item| item.name.as_str());
         if let Some((key, _)) = set.iter().find(|(key, _)| names().all(|name| name != key)) {

@@ -64,6 +64,7 @@ impl Explain for JournalLockError {
 pub(super) fn read(path: &Path) -> Result<File, Failure> {
     let file = safe_file::read_named(path).map_err(|error| {
         Failure::caused_by(Exit::Usage, format!("cannot open journal `{}`", path.display()), &error)
+            .with_help("name a file that `gleaner replay --journal FILE` wrote")
     })?;
     match file.try_lock_shared() {
         Err(TryLockError::WouldBlock) => {

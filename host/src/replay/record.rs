@@ -119,7 +119,7 @@ impl ReplayRecorder {
             if found.is_none() {
                 tracing::warn!(
                     topic = %name,
-                    "clips are made without this topic of [record]: the drive lacks it"
+                    "the drive has no such topic of [record]: clips are made without it"
                 );
             }
             let camera = found.filter(|found| !is_seen && is_image(&found.type_name));
@@ -153,10 +153,13 @@ impl ReplayRecorder {
                 "[record] has `{}`",
                 list(topics.iter().map(|recorded| recorded.topic.name.as_str()).collect())
             )];
-            let help = format!(
-                "the drive has {}; pass --remap FROM:=TO, or replay without clips: --no-record",
-                topic_filter::list(&known)
-            );
+            let help = match known.is_empty() {
+                true => "the drive has no messages; copy it again if it is damaged".to_owned(),
+                false => format!(
+                    "the drive has {}; pass --remap FROM:=TO, or replay without clips: --no-record",
+                    topic_filter::list(&known)
+                ),
+            };
             return Err(failure.with_help(help));
         }
         Ok(Some(Self { shared, topics, rules: rules.clone(), earlier: None, lambda: None }))

@@ -328,7 +328,7 @@ fn read_so_far(drive: &Replay, at_ns: i64) -> String {
         None if done > 0 => {
             format!("read: {done} messages, up to {seconds:.3} s; later messages are lost")
         }
-        _ => "read: no message of these topics".to_owned(),
+        _ => "read: no message of the inputs".to_owned(),
     }
 }
 

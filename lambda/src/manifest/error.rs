@@ -1,3 +1,5 @@
+//! Errors of a manifest, with the line of each and help for the user.
+
 use std::fmt;
 use std::io;
 use std::path::PathBuf;
@@ -97,7 +99,7 @@ pub enum ManifestError {
         line: usize,
         /// The key.
         key: String,
-        /// Its table, for example `in [schedule]`.
+        /// Table of the key, for example `in [schedule]`.
         within: String,
         /// A known key that is similar.
         near: Option<&'static str>,
@@ -109,7 +111,7 @@ pub enum ManifestError {
     WrongType {
         /// The key.
         at: Box<KeyLocation>,
-        /// Its type.
+        /// Type of the value.
         found: &'static str,
         /// The expected value.
         wanted: String,
@@ -119,7 +121,7 @@ pub enum ManifestError {
     WrongForm {
         /// The key.
         at: Box<KeyLocation>,
-        /// Its value.
+        /// Value of the key.
         text: String,
         /// The expected kind of text.
         what: &'static str,
@@ -131,7 +133,7 @@ pub enum ManifestError {
     NoChoice {
         /// The key.
         at: Box<KeyLocation>,
-        /// Its value.
+        /// Value of the key.
         text: String,
         /// The words.
         choices: Vec<&'static str>,
@@ -143,7 +145,7 @@ pub enum ManifestError {
     TooSmall {
         /// The key.
         at: Box<KeyLocation>,
-        /// Its value.
+        /// Value of the key.
         value: String,
         /// The smallest value.
         min: String,
@@ -155,7 +157,7 @@ pub enum ManifestError {
     TooLarge {
         /// The key.
         at: Box<KeyLocation>,
-        /// Its value.
+        /// Value of the key.
         value: String,
         /// The smallest value, if there is one.
         min: Option<String>,
@@ -167,7 +169,7 @@ pub enum ManifestError {
     Twice {
         /// `topic`, `input`, `key` or the like.
         what: &'static str,
-        /// Its name.
+        /// Name, topic or key that is listed twice.
         name: String,
         /// The path of the manifest, as given.
         file: String,
@@ -224,7 +226,7 @@ impl Explain for ManifestError {
                 let is_manifest = path.ends_with("lambda.toml");
                 let wanted = match is_manifest {
                     true => "a folder that has a lambda.toml",
-                    false => "the configuration of a vehicle",
+                    false => "the vehicle's configuration file; see docs/limits.md",
                 };
                 format!("name {wanted}")
             }

@@ -38,8 +38,8 @@ fn item(entry: &TomlValue) -> Result<ConfigItem> {
     }
     let title = format!("`{}`", entry.location().key);
     let table = entry.table(&title, &["default", "min", "max", "unit", "description"])?;
-    let given =
-        table.need("default", "default = 1.0, or another value, whose type is that of the item")?;
+    let given = table
+        .need("default", "default = 1.0, or another value of the type that the lambda expects")?;
     let default = scalar(&given, "a number, a text, or true or false")?;
     let min = limit(&table, "min", &default)?;
     let max = limit(&table, "max", &default)?;

@@ -97,7 +97,7 @@ function logAround(run, entry, name) {
   const end = (entry.to ?? entry.t) + AROUND_S;
   const near = run.log.filter((line) => line.t >= entry.t - AROUND_S && line.t <= end).slice(0, AROUND_LINES);
   if (near.length === 0) return [];
-  return [make("h2", { text: `Log around it${name}` }), logLines(near, "lines narrow")];
+  return [make("h2", { text: `Log lines at this time${name}` }), logLines(near, "lines narrow")];
 }
 
 /** Lines of a log. */

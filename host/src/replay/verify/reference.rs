@@ -73,7 +73,7 @@ impl ReferenceJournal {
             let others =
                 names.filter(|name| name.starts_with("journal/")).map(excerpt).collect::<Vec<_>>();
             let help = if others.is_empty() {
-                "the clip was recovered after its recorder had died, or is no clip of Gleaner"
+                "name a clip that Gleaner recorded; a clip has no journal if its recorder was killed"
                     .to_owned()
             } else {
                 format!("it holds `{}`: name that lambda with --lambda", others.join("`, `"))
@@ -258,7 +258,8 @@ fn unusable(path: &Path, error: &JournalError) -> Failure {
 
 /// The failure of a clip that is unreadable or damaged.
 pub(super) fn unreadable_clip(error: ReplayError) -> Failure {
-    Failure::from(DriveError(error)).with_help("copy the clip again if you can")
+    Failure::from(DriveError(error))
+        .with_help("name a clip that Gleaner recorded, or copy the clip again")
 }
 
 fn begins_as_mcap(path: &Path) -> bool {

@@ -66,7 +66,7 @@ fn missing_keys_and_tables_are_refused_with_an_example() {
     refused_below(
         "[config]\ngain = { min = 1 }",
         "lambda.toml, line 9: `config.gain` has no `default`",
-        "add default = 1.0, or another value, whose type is that of the item",
+        "add default = 1.0, or another value of the type that the lambda expects",
     );
 }
 
