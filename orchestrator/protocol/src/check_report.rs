@@ -1,3 +1,5 @@
+//! The report of `gleaner check`: the result, and the resources that the lambda needs.
+
 use serde::{Deserialize, Serialize};
 
 use gleaner_lambda::manifest::LambdaKind;
@@ -12,7 +14,7 @@ pub struct CheckReport {
     pub version: String,
     /// Kind of the lambda.
     pub kind: LambdaKind,
-    /// Its engine, with the version.
+    /// Engine of the lambda, with the version.
     pub engine: String,
     /// Duration of `init`, in ms; `None` if it was not run.
     pub init_ms: Option<f64>,
@@ -29,7 +31,7 @@ pub struct CheckReport {
 /// Memory or disk for one purpose.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Need {
-    /// Its purpose, for example ``input `imu`, 1,025 slots``.
+    /// Purpose of the memory or disk, for example ``input `imu`, 1,025 slots``.
     pub purpose: String,
     /// Bytes; `None` if the lambda's manifest sets no limit.
     pub bytes: Option<u64>,

@@ -1,3 +1,5 @@
+//! The content of a recorded drive, as `gleaner inspect` shows it.
+
 use serde::{Deserialize, Serialize};
 
 use crate::DurationStats;
@@ -16,7 +18,7 @@ pub struct DriveInfo {
     pub out_of_order: u64,
     /// The damage that ended reading, if any.
     pub damaged: Option<String>,
-    /// Its topics, sorted by name.
+    /// Topics of the drive, sorted by name.
     pub topics: Vec<DriveTopicInfo>,
     /// Number of further topics, which were not read.
     #[serde(default)]

@@ -1,3 +1,5 @@
+//! Parses a time in a drive, as a user writes it.
+
 use std::str::FromStr;
 use std::time::Duration;
 

@@ -1,9 +1,11 @@
+//! Makes the decision of a wake in which the process of a lambda ended.
+
 use crate::{ExitRecord, Phase, WokenBy};
 use gleaner_lambda::{Decision, Fault, FaultKind};
 
 impl ExitRecord {
     /// Returns the decision of the wake in which the process of a lambda ended: a fault of kind
-    /// `killed`. None if the end was requested, or if something around the lambda failed.
+    /// `killed`. `None` if the lambda did not cause the end: it was requested, or Gleaner failed.
     pub fn interrupted_wake(&self, woken_by: WokenBy) -> Option<Decision> {
         if !self.is_caused_by_lambda() {
             return None;

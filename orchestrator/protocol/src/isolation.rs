@@ -1,3 +1,5 @@
+//! The layers of isolation around a lambda, and the results of their tests.
+
 use std::fmt;
 
 use serde::{Deserialize, Serialize};

@@ -1,3 +1,5 @@
+//! The status of a live lambda: counts, durations, topics and network.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -30,7 +32,7 @@ pub struct LiveStatus {
     /// Number of event samples that did not wake the lambda, by `backlog = "latest"` or because the
     /// ring was full.
     pub skipped: u64,
-    /// Number of ticks during a wake.
+    /// Number of ticks that came during a wake, and were skipped.
     pub missed_ticks: u64,
     /// Number of log lines of the lambda that were kept.
     pub log_lines: u64,
@@ -141,7 +143,7 @@ pub struct DurationStats {
 pub struct LiveTopic {
     /// Name of the input.
     pub name: String,
-    /// Its topic, after remapping.
+    /// Topic of the input, after remapping.
     pub topic: String,
     /// Message type, for example `sensor_msgs/msg/Imu`.
     pub type_name: String,

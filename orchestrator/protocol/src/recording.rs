@@ -1,3 +1,5 @@
+//! The counts of a recorder: clips, windows, and missing data by cause.
+
 use serde::{Deserialize, Serialize};
 
 use gleaner_base::grouped;

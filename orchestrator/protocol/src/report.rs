@@ -1,3 +1,5 @@
+//! The reports of `gleaner-runtime` to its starter: progress, decisions, results.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -131,7 +133,7 @@ pub struct ReplaySummary {
     /// Number of event samples that did not wake the lambda, by `backlog = "latest"` or because the
     /// ring was full.
     pub skipped: u64,
-    /// Number of ticks of a periodic lambda during a wake.
+    /// Number of ticks of a periodic lambda that came during a wake, and were skipped.
     pub missed_ticks: u64,
     /// Number of messages after one with a later log time, as the index of a file is wrong or
     /// missing.
@@ -181,7 +183,7 @@ pub struct ReplaySummary {
 pub struct TopicReport {
     /// Name of the input.
     pub name: String,
-    /// Its topic, after remapping.
+    /// Topic of the input, after remapping.
     pub topic: String,
     /// Message type, for example `sensor_msgs/msg/Imu`.
     pub type_name: String,

@@ -1,3 +1,5 @@
+//! The messages from the process of a live lambda to `gleaner-shim`.
+
 use serde::{Deserialize, Serialize};
 
 use crate::LiveStatus;
@@ -30,7 +32,7 @@ pub struct WokenBy {
     pub cause: Cause,
     /// Name of the input; `None` for the clock.
     pub input: Option<String>,
-    /// Its topic.
+    /// Topic of the input; `None` for the clock.
     pub topic: Option<String>,
 }
 

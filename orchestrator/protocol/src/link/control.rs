@@ -27,13 +27,13 @@ const SOCKETS: usize = 16;
 /// Adds a lambda to the recorder.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AddLambda {
-    /// Its folder. Its name and `[record]` are those of the manifest in its `build/`; the lambda's
-    /// process cannot change them.
+    /// Folder of the lambda. Its `build/` has the manifest, from which the recorder takes the name
+    /// and `[record]`: the lambda's process cannot change them.
     pub lambda: PathBuf,
     /// Remapped topics, from and to.
     pub remaps: Vec<(String, String)>,
-    /// The limits of this vehicle: of each limit, the smaller value of this and the manifest's
-    /// counts.
+    /// The limits of this vehicle. Of each limit, the smaller of this value and the one in the
+    /// manifest applies.
     pub most: Limits,
 }
 
@@ -50,8 +50,8 @@ impl ControlClient {
     ///
     /// Those of the system: too many open files.
     pub fn pair() -> io::Result<(ControlClient, OwnedFd)> {
-        let (ours, theirs) = UnixStream::pair()?;
-        Ok((ControlClient { socket: ours }, theirs.into()))
+        let (starter_end, recorder_end) = UnixStream::pair()?;
+        Ok((ControlClient { socket: starter_end }, recorder_end.into()))
     }
 
     /// Adds a lambda to the recorder; returns the socket for the lambda's process.
@@ -62,7 +62,7 @@ impl ControlClient {
     /// open files.
     pub fn add(&mut self, add: &AddLambda) -> Result<OwnedFd, LinkError> {
         let failed = |source| LinkError::Socket { peer: RECORDER, source };
-        let (ours, theirs) = UnixStream::pair().map_err(failed)?;
+        let (lambda_end, recorder_end) = UnixStream::pair().map_err(failed)?;
         let payload = serde_json::to_vec(add).map_err(|error| failed(error.into()))?;
         let bytes = frame::encode(tag::ADD, &payload);
         if payload.len() > super::FRAME_MAX {
@@ -73,7 +73,7 @@ impl ControlClient {
             });
         }
         // The socket is sent with the first bytes, so that it arrives before the frame is complete.
-        let fds = [theirs.as_fd()];
+        let fds = [recorder_end.as_fd()];
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
         let mut with = SendAncillaryBuffer::new(&mut space);
         with.push(SendAncillaryMessage::ScmRights(&fds));
@@ -85,7 +85,7 @@ impl ControlClient {
             }
         };
         self.send(&bytes[sent..])?;
-        Ok(ours.into())
+        Ok(lambda_end.into())
     }
 
     /// Requests the recorder to complete open clips and exit.

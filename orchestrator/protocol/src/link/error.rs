@@ -1,3 +1,5 @@
+//! Errors of a connection between two programs.
+
 use std::io;
 
 use rustix::io::Errno;
@@ -30,9 +32,9 @@ pub enum LinkError {
     /// A frame is too long.
     #[error("frame `{frame}` from {peer} has {bytes} bytes, above the maximum of {FRAME_MAX}")]
     TooLong {
-        /// Its sender.
+        /// Sender of the frame.
         peer: &'static str,
-        /// Its name.
+        /// Name of the frame.
         frame: &'static str,
         /// The length in its head.
         bytes: u64,
@@ -40,17 +42,17 @@ pub enum LinkError {
     /// A frame has an unknown tag, or one for another connection.
     #[error("frame {tag} from {peer} is unknown")]
     Unknown {
-        /// Its sender.
+        /// Sender of the frame.
         peer: &'static str,
-        /// Its tag.
+        /// Tag of the frame.
         tag: u8,
     },
     /// A frame is out of order.
     #[error("received frame `{frame}` from {peer} instead of `{expected}`")]
     Unexpected {
-        /// Its sender.
+        /// Sender of the frame.
         peer: &'static str,
-        /// Its name.
+        /// Name of the frame.
         frame: &'static str,
         /// The expected frame.
         expected: &'static str,
@@ -58,9 +60,9 @@ pub enum LinkError {
     /// The payload of a frame is invalid.
     #[error("frame `{frame}` from {peer} is invalid: {reason}")]
     Malformed {
-        /// Its sender.
+        /// Sender of the frame.
         peer: &'static str,
-        /// Its name.
+        /// Name of the frame.
         frame: &'static str,
         /// The reason.
         reason: String,
@@ -68,7 +70,7 @@ pub enum LinkError {
     /// The wake in a frame cannot be decoded.
     #[error("frame `wake` from {peer} cannot be decoded")]
     Wake {
-        /// Its sender.
+        /// Sender of the frame.
         peer: &'static str,
         /// The cause.
         source: MalformedWake,

@@ -15,7 +15,7 @@ const BATCH: usize = 64;
 pub(super) struct Queue {
     frames: VecDeque<QueuedFrame>,
     bytes: usize,
-    most: usize,
+    max_bytes: usize,
     /// Number of bytes of the first frame that are sent.
     sent: usize,
     /// Number of wakes dropped since the last frame.
@@ -33,11 +33,11 @@ struct QueuedFrame {
 }
 
 impl Queue {
-    pub(super) fn new(most: usize) -> Queue {
+    pub(super) fn new(max_bytes: usize) -> Queue {
         Queue {
             frames: VecDeque::new(),
             bytes: 0,
-            most,
+            max_bytes,
             sent: 0,
             missing: 0,
             wakes_dropped: 0,
@@ -49,7 +49,7 @@ impl Queue {
     /// one with triggers, the oldest first; otherwise the new wake is dropped. Returns `false` if
     /// triggers are lost.
     pub(super) fn push(&mut self, bytes: &[u8], triggers: usize) -> bool {
-        while self.bytes + bytes.len() > self.most {
+        while self.bytes + bytes.len() > self.max_bytes {
             if triggers == 0 || !self.drop_oldest() {
                 self.count_dropped(triggers);
                 return triggers == 0;

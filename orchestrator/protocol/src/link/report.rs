@@ -1,3 +1,5 @@
+//! The reports of `gleaner-recorder` to its starter: clips, losses, status.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -78,7 +80,7 @@ pub enum Loss {
 pub struct RecorderStatus {
     /// Number of connected lambdas.
     pub lambdas: usize,
-    /// Its counts.
+    /// Counts of the recorder.
     #[serde(flatten)]
     pub recording: RecordingCounts,
     /// True if a clip is open.
@@ -149,7 +151,7 @@ impl RecorderStatus {
 /// Counts of commands.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CommandStatus {
-    /// Their topic.
+    /// Topic of the commands.
     pub topic: String,
     /// Number of accepted commands.
     pub accepted: u64,

@@ -19,7 +19,7 @@ const REASON_MAX: usize = 2 << 10;
 /// A message from a lambda's process.
 #[derive(Debug)]
 pub enum LambdaMessage {
-    /// Its identity. Sent once, first.
+    /// Identity of the lambda. Sent once, first.
     Hello(Box<JournalHeader>),
     /// A wake.
     Wake {
