@@ -24,7 +24,7 @@ pub enum MalformedWake {
     Unknown {
         /// The field.
         what: &'static str,
-        /// Its value.
+        /// Value of the field.
         value: u8,
     },
     /// A text is not UTF-8.

@@ -1,3 +1,5 @@
+//! Encodes the wakes of a journal.
+
 use super::entry::{InputView, JournalEntry, WakeSource};
 use super::fault_code;
 use super::number::{fold, put};

@@ -1,3 +1,5 @@
+//! One wake in a journal, and its comparison with a repetition.
+
 use serde_json::Value;
 
 use super::header::{Difference, JournalInput};
@@ -20,7 +22,7 @@ pub struct JournalEntry {
     pub fault: Option<Fault>,
     /// Fuel that the wake burnt; `None` for Python, which has none.
     pub fuel: Option<u64>,
-    /// Its log lines, as a digest.
+    /// Digest of the log lines of the wake.
     pub log: LogDigest,
 }
 
@@ -31,7 +33,7 @@ pub enum WakeSource {
     Sample {
         /// GUID of the sample's writer.
         writer: [u8; 16],
-        /// Its sequence number among those of its writer.
+        /// Sequence number of the sample, which its writer counts.
         seq: u64,
     },
     /// The clock.

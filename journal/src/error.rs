@@ -1,3 +1,5 @@
+//! Errors of reading a journal.
+
 use std::io;
 
 use super::block::PAYLOAD_MAX;
@@ -13,13 +15,13 @@ pub enum JournalError {
     /// The journal ends within its header.
     #[error("the journal ends after {bytes} bytes, within its header")]
     NoHeader {
-        /// Its length in bytes.
+        /// Length of the file, in bytes.
         bytes: u64,
     },
     /// The journal has another version of the format.
     #[error("the journal has format version {found}; this gleaner reads version {VERSION}")]
     Version {
-        /// Its version.
+        /// Version of the journal.
         found: u16,
     },
     /// The file or stream cannot be read.
@@ -33,9 +35,9 @@ pub enum JournalError {
     Damaged {
         /// Offset of the block.
         offset: u64,
-        /// Its number, from 0; block 0 is the header.
+        /// Number of the block, from 0; block 0 is the header.
         block: u64,
-        /// Index of its first wake, from 0.
+        /// Index of the first wake in the block, from 0.
         wake: u64,
         /// The damage.
         #[source]
@@ -64,7 +66,7 @@ pub enum Damage {
     /// The first block is not a header.
     #[error("the first block has kind {kind} and is not a header")]
     NotAHeader {
-        /// Its kind.
+        /// Kind of the block.
         kind: u8,
     },
     /// There is a second header.
@@ -76,7 +78,7 @@ pub enum Damage {
     /// The header has more inputs than a lambda may have.
     #[error("it has {found} inputs, above the maximum of {INPUTS_MAX}")]
     Inputs {
-        /// Their number.
+        /// Number of inputs.
         found: usize,
     },
     /// The header lacks the input that wakes the lambda.

@@ -1,3 +1,5 @@
+//! The first and the last block of a journal: its origin and its end.
+
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
@@ -23,22 +25,23 @@ pub struct JournalHeader {
     pub version: String,
     /// Kind of the lambda.
     pub kind: LambdaKind,
-    /// The files of its build folder, by path.
+    /// The files of the lambda's build folder, by path.
     pub files: Vec<FileDigest>,
-    /// Its models.
+    /// The models of the lambda.
     pub models: Vec<FileDigest>,
-    /// SHA-256 of the parts of its manifest on which a decision can depend, in hexadecimal digits:
+    /// SHA-256 of the parts of the manifest on which a decision can depend, in hexadecimal digits:
     /// without `[record]` and descriptions, so that a clip can be verified after its preroll was
     /// tuned, and without `[limits]`, which are below.
     pub manifest: String,
-    /// Its effective limits: those of its manifest, as far as the vehicle did not reduce them.
+    /// Effective limits of the lambda: those of the manifest, where the vehicle did not reduce
+    /// them.
     #[serde(default)]
     pub limits: Limits,
-    /// Its inputs, in the order of the manifest.
+    /// Inputs of the lambda, in the order of the manifest.
     pub inputs: Vec<JournalInput>,
-    /// Index of the input that wakes it; `None` for a periodic lambda.
+    /// Index of the input that wakes the lambda; `None` for a periodic lambda.
     pub event_input: Option<usize>,
-    /// Its effective config, in the order of the manifest.
+    /// Effective config of the lambda, in the order of the manifest.
     pub config: Map<String, Value>,
     /// Remapped topics, from and to.
     pub remaps: Vec<(String, String)>,
@@ -80,14 +83,14 @@ pub struct FileDigest {
     pub path: String,
     /// Length in bytes.
     pub bytes: u64,
-    /// Its SHA-256, in hexadecimal digits.
+    /// SHA-256 of the file, in hexadecimal digits.
     pub sha256: String,
 }
 
 /// An input of the lambda.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct JournalInput {
-    /// Its name in the lambda's code.
+    /// Name of the input in the lambda's code.
     pub name: String,
     /// The topic, as the manifest names it.
     pub topic: String,
@@ -125,9 +128,9 @@ pub struct DriveDigest {
 pub struct Difference {
     /// The compared item, for example ``build file `main.py` ``.
     pub what: String,
-    /// Its value in the journal.
+    /// Value of the item in the journal.
     pub journal: String,
-    /// Its value now.
+    /// Value of the item now.
     pub now: String,
 }
 

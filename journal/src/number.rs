@@ -38,7 +38,7 @@ pub(super) fn fold(difference: u64) -> u64 {
     (difference << 1) ^ (((difference as i64) >> 63) as u64)
 }
 
-/// The inverse of [`fold`].
+/// Reverses [`fold`].
 pub(super) fn unfold(folded: u64) -> u64 {
     (folded >> 1) ^ (folded & 1).wrapping_neg()
 }
@@ -74,10 +74,10 @@ mod tests {
         for bytes in [&[][..], &[0x80], &[0xff; 9], &[0xff; 10], &[0x80; 20]] {
             assert_eq!(take(&mut &*bytes), None, "{bytes:?}");
         }
-        let mut most = vec![0xff; 9];
-        most.push(1);
-        assert_eq!(take(&mut most.as_slice()), Some(u64::MAX));
-        most[9] = 2;
-        assert_eq!(take(&mut most.as_slice()), None);
+        let mut largest = vec![0xff; 9];
+        largest.push(1);
+        assert_eq!(take(&mut largest.as_slice()), Some(u64::MAX));
+        largest[9] = 2;
+        assert_eq!(take(&mut largest.as_slice()), None);
     }
 }

@@ -1,3 +1,5 @@
+//! Reads a journal, and finds and locates damage in it.
+
 use std::io::{self, Read};
 
 use serde::de::DeserializeOwned;

@@ -1,3 +1,5 @@
+//! Writes a journal, block by block.
+
 use std::io::{self, Write};
 
 use serde::Serialize;

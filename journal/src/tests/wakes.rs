@@ -36,7 +36,7 @@ fn after_a_reset_a_wake_is_decoded_alone() {
 
 #[test]
 fn a_usual_wake_takes_few_bytes() {
-    for (inputs, most) in [(1, 14), (2, 20)] {
+    for (inputs, max_bytes) in [(1, 14), (2, 20)] {
         let entries = usual_entries(inputs, 1000);
         let (mut encoder, mut bytes) = (Encoder::new(inputs), Vec::new());
         let mut longest = 0;
@@ -46,10 +46,10 @@ fn a_usual_wake_takes_few_bytes() {
             // The first one has no previous wake, and the second no rate.
             longest = if index < 2 { 0 } else { longest.max(bytes.len() - before) };
         }
-        assert!(longest <= most, "{longest} bytes for a wake with {inputs} inputs");
+        assert!(longest <= max_bytes, "{longest} bytes for a wake with {inputs} inputs");
         let file = journal(&header(inputs), &entries, usize::MAX).len();
         let without = journal(&header(inputs), &[], usize::MAX).len();
-        assert!(file - without <= most * entries.len(), "{} bytes of wakes", file - without);
+        assert!(file - without <= max_bytes * entries.len(), "{} bytes of wakes", file - without);
     }
 }
 
