@@ -111,8 +111,8 @@ fn by_name(folder: &Path) -> Result<Bag, ReplayError> {
     Ok(Bag { files, remark, ..Bag::default() })
 }
 
-/// Returns the files in `folder` with names as in a bag, in the order of their names; of a file
-/// that is there packed and unpacked, the unpacked one.
+/// Returns the files in `folder` with names as in a bag, in the order of their names. Of a file
+/// that exists both packed and unpacked, only the unpacked one is returned.
 fn of_a_bag(folder: &Path) -> Result<Vec<PathBuf>, ReplayError> {
     let failed = |source| ReplayError::Open { path: folder.to_owned(), source };
     let mut names = Vec::new();

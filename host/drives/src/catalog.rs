@@ -24,7 +24,7 @@ struct DriveTopic {
     foreign: Option<String>,
     /// The unsupported encoding of definitions, if there is one.
     foreign_text: Option<String>,
-    /// That of the first channel that has it.
+    /// The QoS of the first channel that states one.
     offered_qos: Option<String>,
     /// Definitions found elsewhere, since the files have none.
     found: OnceLock<Option<Arc<str>>>,

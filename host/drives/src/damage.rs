@@ -41,11 +41,11 @@ pub enum Damage {
     Redefined {
         /// "schema" or "channel".
         what: &'static str,
-        /// Its id.
+        /// Id of the schema or channel.
         id: u16,
         /// The first field that differs.
         field: &'static str,
-        /// Its first and second value, if they are names; long ones are truncated.
+        /// First and second value of the field, if they are names; long ones are truncated.
         values: Option<Box<[String; 2]>>,
     },
     /// A message has a log time beyond the range of the clocks.
@@ -56,7 +56,7 @@ pub enum Damage {
         "a message has log time {found} ns; by its index, the chunk holds {first} to {last} ns"
     )]
     OutsideChunk {
-        /// That of the message.
+        /// Log time of the message.
         found: u64,
         /// First log time by the index.
         first: u64,
@@ -164,7 +164,7 @@ pub enum Damage {
     Encapsulation {
         /// The topic.
         topic: String,
-        /// Its first bytes, at most four.
+        /// First bytes of the message, at most four.
         found: Vec<u8>,
     },
     /// The file has another number of messages of a topic than its summary.

@@ -43,7 +43,7 @@ const ROW_BYTES: usize = 128;
 /// Location of a database.
 #[derive(Copy, Clone)]
 pub(super) struct DatabaseFile<'a> {
-    /// Its name in messages.
+    /// Path of the database in messages.
     shown: &'a Path,
     real: &'a Path,
     /// Set if there may be a journal beside it.

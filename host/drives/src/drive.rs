@@ -35,18 +35,19 @@ use gleaner_transport::{
 ///
 /// - In a finished file with a usable summary, a damaged chunk is reported when its turn comes.
 ///   Every message of every file whose log time is before that chunk's start time was delivered.
-/// - In a file without (truncated, never finished, summary damaged), opening finds the damage, and
-///   the readable part ends where it begins. Every message in that part was delivered, in log-time
-///   order, and every message of the other files up to the last log time in it.
+/// - In a file without a usable summary (truncated, never finished, summary damaged), opening finds
+///   the damage, and the readable part ends where the damage begins. Every message in that part was
+///   delivered, in log-time order, and every message of the other files up to the last log time in
+///   that part.
 /// - A message that is not CDR is damage at its position: every earlier message in the order of
 ///   delivery was delivered.
 ///
 /// A file that is readable to its end is replayed as a whole and then reported as damaged if it has
 /// no footer, a damaged summary, or another number of messages of a subscribed topic than in its
-/// summary; so is one whose index has other times of a chunk than the chunk itself, which is read
-/// as one without an index. Messages outside chunks have no checksum of their own; if the one of
-/// the whole data section is wrong, that too is reported after them. A writer may leave out any
-/// checksum; then only contradictions are noticed.
+/// summary. If the index states other times of a chunk than the chunk itself, the file is read as
+/// one without an index, and is then reported as damaged as well. Messages outside chunks have no
+/// checksum of their own; if the checksum of the whole data section is wrong, that is reported
+/// after these messages. A writer may leave out any checksum; then only contradictions are noticed.
 ///
 /// A database has no checksums: a contradiction of its pages is noticed when its turn comes, and
 /// every message before was delivered. The same holds for a packed file that can be unpacked only
@@ -74,7 +75,7 @@ pub struct Replay {
     started: bool,
     ended: bool,
     /// Number of subscriptions that the top message was already delivered to.
-    fan: usize,
+    delivered: usize,
     last_at_ns: i64,
     out_of_order: u64,
     progress: Progress,
@@ -145,7 +146,7 @@ impl Replay {
             damage: None,
             started: false,
             ended: false,
-            fan: 0,
+            delivered: 0,
             last_at_ns: i64::MIN,
             out_of_order: 0,
             progress: Progress { done: 0, total: Some(0) },
@@ -179,7 +180,7 @@ impl Replay {
         let routed = segment
             .head()
             .ok_or(Damage::Malformed("a chunk has no current message"))
-            .and_then(|entry| track.route(segment.body(entry), self.fan, &mut self.inflate));
+            .and_then(|entry| track.route(segment.body(entry), self.delivered, &mut self.inflate));
         let Routed { subscription, is_last, meta, is_too_big, cdr } = match routed {
             Ok(routed) => routed,
             Err(what) => {
@@ -196,15 +197,15 @@ impl Replay {
         };
         let step = ReplayStep { at_ns: meta.at_ns, subscription, delivery, meta, bytes: cdr.len() };
         if meta.at_ns < self.last_at_ns {
-            self.out_of_order += u64::from(self.fan == 0);
+            self.out_of_order += u64::from(self.delivered == 0);
         }
         self.last_at_ns = self.last_at_ns.max(meta.at_ns);
         self.progress.done += 1;
         if is_last {
-            self.fan = 0;
+            self.delivered = 0;
             self.pop();
         } else {
-            self.fan += 1;
+            self.delivered += 1;
         }
         Ok(Some(step))
     }
@@ -265,7 +266,7 @@ impl Replay {
             return Ok(false);
         }
         // No other message comes between two deliveries of one message.
-        if self.fan > 0 {
+        if self.delivered > 0 {
             return Ok(true);
         }
         if !self.started {

@@ -126,7 +126,7 @@ pub enum ReplayError {
     NotClosed {
         /// The file.
         path: PathBuf,
-        /// Its journal.
+        /// Journal of the database.
         beside: PathBuf,
     },
     /// Without an index, each search for the next message would read the whole database.
@@ -140,7 +140,7 @@ pub enum ReplayError {
     NotBuiltIn {
         /// The file or directory.
         path: PathBuf,
-        /// Its kind.
+        /// Kind of the file or directory.
         what: &'static str,
     },
     /// Two files, or two channels of a file, disagree on the type of a topic.
@@ -152,11 +152,11 @@ pub enum ReplayError {
         topic: String,
         /// One file.
         first: PathBuf,
-        /// Its type there.
+        /// Type of the topic in the first file.
         first_type: String,
         /// The other file.
         second: PathBuf,
-        /// Its type there.
+        /// Type of the topic in the second file.
         second_type: String,
     },
     /// The system failed to read the file; the file itself may be intact.

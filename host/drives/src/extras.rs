@@ -38,11 +38,11 @@ pub struct Extras {
 /// A file within a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Attachment {
-    /// Its name. It is not a safe path: check it before writing to a disk.
+    /// Name of the attachment. It is not a safe path: check it before writing to a disk.
     pub name: String,
-    /// Its media type, for example `image/jpeg`; empty if unknown.
+    /// Media type of the data, for example `image/jpeg`; empty if unknown.
     pub media_type: String,
-    /// Its content.
+    /// Content of the attachment.
     pub data: Vec<u8>,
 }
 

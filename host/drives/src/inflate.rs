@@ -37,9 +37,9 @@ impl Inflate {
         &self.bytes[..self.len]
     }
 
-    /// Unpacks the first `most` bytes of `packed`, or all if there are fewer.
-    pub(super) fn unpack(&mut self, mut packed: &[u8], most: usize) -> io::Result<()> {
-        let most = most.min(usize::try_from(self.allowed).unwrap_or(usize::MAX));
+    /// Unpacks the first `max_bytes` bytes of `packed`, or all if there are fewer.
+    pub(super) fn unpack(&mut self, mut packed: &[u8], max_bytes: usize) -> io::Result<()> {
+        let max_bytes = max_bytes.min(usize::try_from(self.allowed).unwrap_or(usize::MAX));
         let decoder = match &mut self.decoder {
             Some(decoder) => {
                 decoder.reinit()?;
@@ -49,13 +49,13 @@ impl Inflate {
         };
         self.len = 0;
         let mut is_whole = false;
-        while self.len < most && !(is_whole && packed.is_empty()) {
+        while self.len < max_bytes && !(is_whole && packed.is_empty()) {
             if self.len == self.bytes.len() {
                 // Memory grows with the actual data: the size that a frame claims is ignored.
                 let room = (self.len * 2).max(packed.len().saturating_mul(4)).max(SMALL);
-                self.bytes.resize(room.min(most), 0);
+                self.bytes.resize(room.min(max_bytes), 0);
             }
-            let end = self.bytes.len().min(most);
+            let end = self.bytes.len().min(max_bytes);
             let status = decoder.run_on_buffers(packed, &mut self.bytes[self.len..end])?;
             packed = &packed[status.bytes_read..];
             self.len += status.bytes_written;

@@ -39,8 +39,8 @@ pub struct DriveLimits {
 }
 
 impl Default for DriveLimits {
-    /// 256 MiB for a chunk, 512 MiB for all open ones; usual chunks have 1 to 4 MiB. 64 GiB for the
-    /// content of all packed files.
+    /// Allows 256 MiB for a chunk, 512 MiB for all open ones; usual chunks have 1 to 4 MiB. 64 GiB
+    /// for the content of all packed files.
     fn default() -> Self {
         Self { chunk_bytes: 256 << 20, open_bytes: 512 << 20, unpacked_bytes: 64 << 30 }
     }

@@ -16,7 +16,7 @@ pub(super) const MESSAGE_HEAD: usize = 22;
 /// Footer record and closing magic.
 pub(super) const FOOTER: u64 = HEAD + 20 + 8;
 
-/// McapRecord kinds.
+/// Kinds of records, by their opcode.
 pub(super) mod op {
     pub(in super::super) const HEADER: u8 = 0x01;
     pub(in super::super) const FOOTER: u8 = 0x02;

@@ -47,7 +47,7 @@ pub(super) struct MessageRows {
     /// The first time, if it is valid.
     first: Result<Option<u64>, Damage>,
     /// Known damage, reported after all messages.
-    last_words: Option<Damage>,
+    known_damage: Option<Damage>,
     span: Span,
     /// The subscribed topics, sorted.
     wanted: Vec<i64>,
@@ -83,7 +83,7 @@ impl MessageRows {
             index,
             channels,
             first,
-            last_words: None,
+            known_damage: None,
             span: Span::ALL,
             wanted: Vec::new(),
             after: None,
@@ -109,11 +109,11 @@ impl MessageRows {
         ReplayError::Damaged { path: self.path.clone(), at, what }
     }
 
-    /// Begins with the first message of `span`. `last_words` is the damage that is already known.
+    /// Begins with the first message of `span`. `known_damage` is the damage that is already known.
     pub(super) fn start(
         &mut self,
         span: Span,
-        last_words: Option<Damage>,
+        known_damage: Option<Damage>,
         is_wanted: impl Fn(u16) -> bool,
     ) {
         self.wanted = self
@@ -123,13 +123,13 @@ impl MessageRows {
             .map(|(topic, _)| *topic)
             .collect();
         self.wanted.sort_unstable();
-        (self.span, self.last_words) = (span, last_words);
+        (self.span, self.known_damage) = (span, known_damage);
         match std::mem::replace(&mut self.first, Ok(None)) {
             Ok(Some(first)) => {
                 self.next = Some(first.max(span.from)).filter(|next| !span.ends_before(*next))
             }
             // No message at all, perhaps because of the damage.
-            Ok(None) => self.next = self.last_words.is_some().then_some(span.from),
+            Ok(None) => self.next = self.known_damage.is_some().then_some(span.from),
             // The first time is invalid; later ones may be valid.
             Err(_) if span.from > 0 => self.next = Some(span.from),
             Err(what) => (self.broken, self.next) = (Some(what), Some(0)),
@@ -155,10 +155,10 @@ impl MessageRows {
                 return Ok(self.pieces);
             }
             Ok(PieceEnd::Span) => None,
-            Ok(PieceEnd::Table) => self.last_words.take(),
+            Ok(PieceEnd::Table) => self.known_damage.take(),
             // In a truncated file, a missing page is explained by the truncation.
             Err(Damage::Database(error)) if !is_of_system(&*error) => {
-                self.last_words.take().or(Some(Damage::Database(error)))
+                self.known_damage.take().or(Some(Damage::Database(error)))
             }
             Err(what) => Some(what),
         };

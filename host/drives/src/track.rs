@@ -66,7 +66,7 @@ struct Route {
     writer: Option<ChannelWriter>,
     subscriptions: Vec<ChannelSubscription>,
     /// The largest message that a subscription takes, in bytes of CDR.
-    most: usize,
+    max_bytes: usize,
     seen: u64,
 }
 
@@ -75,7 +75,7 @@ struct Route {
 struct ChannelSubscription {
     by: Subscription,
     /// The largest message that it takes, in bytes of CDR.
-    most: usize,
+    max_bytes: usize,
 }
 
 /// A message on its way to a sink.
@@ -119,11 +119,11 @@ impl Track {
         self.store.damaged(offset, what)
     }
 
-    /// Subscribes a channel. `most` is the largest message to deliver, in bytes of CDR.
-    pub(super) fn subscribe(&mut self, channel: u16, subscription: Subscription, most: usize) {
+    /// Subscribes a channel. `max_bytes` is the largest message to deliver, in bytes of CDR.
+    pub(super) fn subscribe(&mut self, channel: u16, subscription: Subscription, max_bytes: usize) {
         if let Some(channel) = self.routes.get_mut(usize::from(channel)) {
-            channel.subscriptions.push(ChannelSubscription { by: subscription, most });
-            channel.most = channel.most.max(most);
+            channel.subscriptions.push(ChannelSubscription { by: subscription, max_bytes });
+            channel.max_bytes = channel.max_bytes.max(max_bytes);
         }
     }
 
@@ -198,13 +198,13 @@ impl Track {
         }
     }
 
-    /// Parses the message record in `body`; `fan` is the number of subscriptions that already
+    /// Parses the message record in `body`; `delivered` is the number of subscriptions that already
     /// received it. Packed messages are unpacked into `inflate`, and stay there until the next.
     #[inline]
     pub(super) fn route<'a>(
         &mut self,
         body: &'a [u8],
-        fan: usize,
+        delivered: usize,
         inflate: &'a mut Inflate,
     ) -> Result<Routed<'a>, Damage> {
         let head = message_head(body)?;
@@ -212,15 +212,16 @@ impl Track {
             .routes
             .get_mut(usize::from(head.channel))
             .ok_or(Damage::UnknownChannel(head.channel))?;
-        let &wanted = channel.subscriptions.get(fan).ok_or(Damage::UnknownChannel(head.channel))?;
+        let &wanted =
+            channel.subscriptions.get(delivered).ok_or(Damage::UnknownChannel(head.channel))?;
         let writer = channel.writer.as_ref().ok_or(Damage::UnknownChannel(head.channel))?;
         let mut message = &body[MESSAGE_HEAD..];
         let is_packed = message.starts_with(&ZSTD);
         if is_packed {
-            if fan == 0 {
+            if delivered == 0 {
                 let topic = || topic_of(&self.contents, head.channel);
                 let unpacked =
-                    inflate.unpack(message, channel.most.saturating_add(ENCAPSULATION + 1));
+                    inflate.unpack(message, channel.max_bytes.saturating_add(ENCAPSULATION + 1));
                 unpacked.map_err(|source| Damage::Unpack { topic: topic(), source })?;
                 if inflate.is_full() {
                     return Err(Damage::MessageTooLarge {
@@ -242,13 +243,13 @@ impl Track {
                 });
             }
         };
-        if fan == 0 {
+        if delivered == 0 {
             writer.count(head.sequence);
             channel.seen += 1;
         }
         Ok(Routed {
             subscription: wanted.by,
-            is_last: fan + 1 == channel.subscriptions.len(),
+            is_last: delivered + 1 == channel.subscriptions.len(),
             meta: SampleMeta {
                 at_ns: nanoseconds(head.log_time),
                 publish_ns: nanoseconds(head.publish_time),
@@ -257,7 +258,7 @@ impl Track {
                 endian,
                 options,
             },
-            is_too_big: is_packed && cdr.len() > wanted.most,
+            is_too_big: is_packed && cdr.len() > wanted.max_bytes,
             cdr,
         })
     }

@@ -44,7 +44,7 @@ pub struct Unpacked {
     pub(super) content: Arc<File>,
     /// The reason why the content is incomplete, if it is.
     pub(super) broken: Option<String>,
-    /// Its current name, if it has one.
+    /// Current name of the content, if it has one.
     name: Option<ContentName>,
 }
 
@@ -79,9 +79,9 @@ enum SizeLimit {
 
 impl SizeLimit {
     /// Returns the smallest limit for a file of `packed` bytes, where all files may take `room` of
-    /// `most` bytes in all, on a disk with `free` bytes.
-    fn smallest(packed: u64, room: u64, most: u64, free: u64) -> Self {
-        let by_size = packed.saturating_mul(RATIO).max(most / SHARE);
+    /// `total` bytes in all, on a disk with `free` bytes.
+    fn smallest(packed: u64, room: u64, total: u64, free: u64) -> Self {
+        let by_size = packed.saturating_mul(RATIO).max(total / SHARE);
         // The rest is for the results, and for other programs.
         let bounds = [Self::Disk(free / 10 * 9), Self::Ratio(by_size), Self::Drive(room)];
         bounds.into_iter().min_by_key(|bound| bound.bytes()).expect("there are three")
@@ -283,15 +283,15 @@ mod tests {
     #[test]
     fn the_content_of_a_file_is_limited_by_its_size_the_disk_and_other_files() {
         const GIB: u64 = 1 << 30;
-        let most = 64 * GIB;
+        let total = 64 * GIB;
         for (packed, room, free, expected) in [
-            (2_000_000, most, 1000 * GIB, SizeLimit::Ratio(GIB)),
-            (GIB / 10, most, 1000 * GIB, SizeLimit::Ratio(GIB / 10 * RATIO)),
-            (GIB, most, 1000 * GIB, SizeLimit::Drive(most)),
-            (GIB, most, 10 * GIB, SizeLimit::Disk(9 * GIB)),
+            (2_000_000, total, 1000 * GIB, SizeLimit::Ratio(GIB)),
+            (GIB / 10, total, 1000 * GIB, SizeLimit::Ratio(GIB / 10 * RATIO)),
+            (GIB, total, 1000 * GIB, SizeLimit::Drive(total)),
+            (GIB, total, 10 * GIB, SizeLimit::Disk(9 * GIB)),
             (u64::MAX, 7, u64::MAX, SizeLimit::Drive(7)),
         ] {
-            assert_eq!(SizeLimit::smallest(packed, room, most, free), expected);
+            assert_eq!(SizeLimit::smallest(packed, room, total, free), expected);
         }
     }
 }
