@@ -190,12 +190,12 @@ pub(crate) fn limit_open_files_beyond(more: u64) {
     }
 }
 
-fn limit_files(most: u64) -> rustix::io::Result<u64> {
+fn limit_files(max_files: u64) -> rustix::io::Result<u64> {
     let now = getrlimit(Resource::Nofile);
-    let most = now.maximum.map_or(most, |maximum| maximum.min(most));
-    let current = now.current.map_or(most, |current| current.min(most));
-    setrlimit(Resource::Nofile, Rlimit { current: Some(current), maximum: Some(most) })?;
-    Ok(most)
+    let max_files = now.maximum.map_or(max_files, |maximum| maximum.min(max_files));
+    let current = now.current.map_or(max_files, |current| current.min(max_files));
+    setrlimit(Resource::Nofile, Rlimit { current: Some(current), maximum: Some(max_files) })?;
+    Ok(max_files)
 }
 
 fn deny_calls() -> Layer {

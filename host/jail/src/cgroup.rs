@@ -109,12 +109,13 @@ impl Group {
         Ok(())
     }
 
-    /// Number of processes of the group that the kernel killed because the group was out of memory.
+    /// Returns the number of processes of the group that the kernel killed because the group was
+    /// out of memory.
     pub fn killed_for_memory(&self) -> u64 {
         killed_for_memory(&self.folder).saturating_sub(self.killed_before)
     }
 
-    /// The state of the layer, as text for users.
+    /// Returns the state of the layer, as text for users.
     pub fn layer(&self) -> Layer {
         layer(&self.folder)
     }

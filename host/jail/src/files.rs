@@ -93,8 +93,8 @@ fn parts_of(program: &Path) -> Vec<(PathBuf, PathBuf)> {
     real.map(|part| (prefix.clone(), part)).collect()
 }
 
-/// Restricts this thread and its descendants to opening `paths` and the system's programs and
-/// libraries.
+/// Restricts this thread and its descendants: they can open only `paths` and the system's programs
+/// and libraries.
 pub fn confine(paths: &Paths) -> Layer {
     match restrict(paths) {
         Ok(layer) => layer,
@@ -102,8 +102,8 @@ pub fn confine(paths: &Paths) -> Layer {
     }
 }
 
-/// Restricts this thread and its descendants to changing `paths`; what they can read stays as it
-/// is. Returns a layer only if that failed.
+/// Restricts this thread and its descendants: they can change only `paths`. Reading is not
+/// restricted. Returns a layer only if that failed.
 pub fn confine_writes(paths: &[PathBuf]) -> Option<Layer> {
     let restricted = restrict_writes(paths);
     restricted.err().map(|error| {
@@ -187,14 +187,14 @@ mod tests {
         fs::create_dir_all(&folder).unwrap();
         let folder = folder.canonicalize().unwrap();
         let (venv, real) = (folder.join("lambda/.venv"), folder.join("python"));
-        for made in [
+        for created in [
             venv.join("bin"),
             venv.join("lib"),
             real.join("bin"),
             real.join("lib"),
             folder.join("secret"),
         ] {
-            fs::create_dir_all(made).unwrap();
+            fs::create_dir_all(created).unwrap();
         }
         fs::write(folder.join("secret/key"), "").unwrap();
         fs::write(real.join("bin/python3"), "").unwrap();
@@ -211,7 +211,7 @@ mod tests {
         symlink("lib", venv.join("lib64")).unwrap();
         assert_eq!(paths(), [&in_venv[..], &[venv.join("lib")], &in_base].concat());
         fs::remove_file(venv.join("lib64")).unwrap();
-        // As an author makes it who wants to read other files.
+        // As made by an author who tries to read other files.
         symlink("/", venv.join("lib64")).unwrap();
         symlink(folder.join("secret/key"), venv.join("pyvenv.cfg")).unwrap();
         assert_eq!(paths(), [&in_venv[..], &in_base].concat());

@@ -49,7 +49,7 @@ pub enum JailError {
 }
 
 impl JailError {
-    /// The error and its causes, in one line.
+    /// Formats the error and its causes, in one line.
     pub fn chain(&self) -> String {
         let mut text = self.to_string();
         let mut source = std::error::Error::source(self);

@@ -46,8 +46,8 @@ fn set(used: Option<u64>, more: u64) -> Result<(), JailError> {
         .map_err(|error| failed(io::Error::from(error)))
 }
 
-/// Address range of the main thread's stack, including the part that it may grow into under its
-/// limit.
+/// Returns the address range of the main thread's stack, including the part that it may grow into
+/// under its limit.
 pub(crate) fn stack() -> Option<Range<u64>> {
     let maps = std::fs::read_to_string("/proc/self/maps").ok()?;
     let line = maps.lines().find(|line| line.ends_with("[stack]"))?;
@@ -58,7 +58,7 @@ pub(crate) fn stack() -> Option<Range<u64>> {
     Some(begin.min(end.checked_sub(2 * STACK_BYTES)?)..end)
 }
 
-/// Private writable memory of this process, in bytes: the amount that [`limit`] counts.
+/// Returns the private writable memory of this process, in bytes: the amount that [`limit`] counts.
 pub fn used() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmData:"))?;
