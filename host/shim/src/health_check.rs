@@ -56,7 +56,7 @@ impl HealthCheck {
         match overdue {
             Ok(late) if late_for >= Some(INTERVAL) => Ok(late),
             Ok(_) => Err(INTERVAL),
-            Err(patience) => Err(patience.min(INTERVAL)),
+            Err(remaining) => Err(remaining.min(INTERVAL)),
         }
     }
 
@@ -77,10 +77,10 @@ impl HealthCheck {
         }
         // The kernel's number, which the process cannot raise. Pages that it no longer counts, such
         // as those made read-only, are still in memory.
-        if let Some(most) = data_limit(self.pid)
-            && seen.held > most.saturating_add(UNCOUNTED)
+        if let Some(limit) = data_limit(self.pid)
+            && seen.held > limit.saturating_add(UNCOUNTED)
         {
-            return Some(pulse.killed(KillReason::Memory { used: seen.held, allowed: most }));
+            return Some(pulse.killed(KillReason::Memory { used: seen.held, allowed: limit }));
         }
         let (share, used) = pulse.share(seen.held)?;
         let lasts =
@@ -88,9 +88,9 @@ impl HealthCheck {
         let killed = pulse.killed(KillReason::Memory { used, allowed: share.most });
         // A wake that began before the excess is not over: when it ends, its own process frees the
         // memory.
-        let came_back =
+        let wake_has_ended =
             killed.phase == Phase::Housekeeping || killed.ran_ns < lasts.as_nanos() as u64;
-        came_back.then_some(killed)
+        wake_has_ended.then_some(killed)
     }
 }
 

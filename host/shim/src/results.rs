@@ -57,9 +57,9 @@ impl Results {
         if again {
             writer.output = Some(open_output(folder, again)?);
         } else {
-            let made =
+            let created =
                 fs::create_dir_all(folder).and_then(|()| Ok(access(folder, Access::WRITE_OK)?));
-            made.map_err(|source| OutputError { path: folder.to_owned(), source })?;
+            created.map_err(|source| OutputError { path: folder.to_owned(), source })?;
         }
         let (items, runtimes) = io::pipe().map_err(cannot)?;
         // Neither side blocks: a runtime counts the items that do not fit.
@@ -89,11 +89,11 @@ pub(crate) struct ItemWriter {
     pulse: Pulse,
     woken_by: Option<WokenBy>,
     last: Option<Box<LiveStatus>>,
-    /// Number of lines that were no valid items.
+    /// Number of lines that were not valid items.
     refused: u64,
     /// Number of items that came while no files were open.
     without_file: u64,
-    /// Time since when lines wait to be flushed; `None` if none do.
+    /// Time since which lines wait to be flushed; `None` if none do.
     behind_since: Option<Instant>,
     /// Set if a decision with a trigger or a fault waits to be flushed.
     is_urgent: bool,
@@ -129,8 +129,8 @@ impl ItemWriter {
             if left.is_none() && wait(Some(items.as_fd()), ended, self.timeout()) {
                 left = Some(LEFT);
             }
-            let most = left.map_or(PIECE, |left| left.min(PIECE));
-            match items.read(&mut piece[..most]) {
+            let max_bytes = left.map_or(PIECE, |left| left.min(PIECE));
+            match items.read(&mut piece[..max_bytes]) {
                 // All writers have closed the pipe, or as much was read as it can hold.
                 Ok(0) => break,
                 Ok(read) => {
@@ -195,12 +195,12 @@ impl ItemWriter {
         Ok(self.first.map_or(finished, Err)?)
     }
 
-    /// Number of items that were not written, for any reason.
+    /// Returns the number of items that were not written, for any reason.
     fn unwritten(&self) -> u64 {
         self.output.as_ref().map_or(0, Output::lost) + self.refused + self.without_file
     }
 
-    /// Remaining time until the files must be flushed; `None` while no line waits.
+    /// Returns the remaining time until the files must be flushed; `None` while no line waits.
     fn timeout(&self) -> Option<Duration> {
         self.behind_since.map(|since| FLUSH.saturating_sub(since.elapsed()))
     }
