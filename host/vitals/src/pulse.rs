@@ -1,5 +1,5 @@
-//! The page through which `gleaner-shim` sees, without messages, the current activity of its
-//! runtime and its start.
+//! The shared page in which a runtime states its current activity, and the start of that activity,
+//! for `gleaner-shim`.
 //!
 //! The shim creates it and passes it on as an inherited file; [`PULSE_ENV`] has its number. Before
 //! the runtime enters foreign code, it writes the deadline of its return. A runtime without a shim
@@ -34,7 +34,7 @@ struct PulsePage {
     allowed_ns: AtomicU64,
     at_ns: AtomicI64,
     phase: AtomicU32,
-    /// Not 0 once Gleaner's code in the runtime was refused memory.
+    /// Not 0 if Gleaner's code was refused memory since the runtime last began an activity.
     full: AtomicU32,
     /// The lambda's share of the process, in bytes: memory before it was entered, without that of
     /// Gleaner's code.
@@ -90,7 +90,7 @@ unsafe impl Sync for MappedPage {}
 /// The page of this process, for code that has run out of memory and cannot allocate.
 static PROCESS_PULSE: OnceLock<Pulse> = OnceLock::new();
 
-/// Time allowed between the end of a call into a lambda and the next sign of life, for example to
+/// Time allowed between the end of a call into a lambda and the next report, for example to
 /// write results to a slow disk, or to read on in a drive.
 const BETWEEN_CALLS: Duration = Duration::from_secs(300);
 
