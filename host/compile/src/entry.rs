@@ -39,7 +39,7 @@ pub enum CacheLookup {
 }
 
 impl CacheEntry {
-    /// The entry of `component`, compiled with `nans`, in the folder `cache`:
+    /// Returns the entry of `component`, compiled with `nans`, in the folder `cache`:
     /// `<cache>/<key>.cwasm`.
     pub fn of(cache: &Path, component: &[u8], nans: Nans) -> Self {
         let mut key = Sha256::new();
@@ -52,7 +52,7 @@ impl CacheEntry {
         Self { path: cache.join(hex(&key) + ".cwasm"), key }
     }
 
-    /// Path of the file.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -112,7 +112,7 @@ impl CacheEntry {
         }
     }
 
-    /// The header before `code` in the file.
+    /// Returns the header before `code` in the file.
     pub(super) fn head(&self, code: &[u8]) -> [u8; HEAD_BYTES] {
         let digest = Sha256::new().chain_update(self.key).chain_update(code).finalize();
         let mut head = [0; HEAD_BYTES];
@@ -122,8 +122,8 @@ impl CacheEntry {
     }
 }
 
-/// CPU features of this machine, as the kernel names them, since a cache in a home folder may be
-/// shared by several machines. Wasmtime checks them again when it loads code.
+/// Returns the CPU features of this machine, as the kernel names them, since a cache in a home
+/// folder may be shared by several machines. Wasmtime checks them again when it loads code.
 fn cpu_features() -> String {
     let cpus = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let features =
@@ -193,7 +193,7 @@ mod tests {
 
     const CODE: &[u8] = b"native code";
 
-    /// A new cache with an entry, and the bytes of the entry.
+    /// Creates a cache with an entry. Returns the cache, the entry, and the bytes of the entry.
     fn cache(name: &str) -> (PathBuf, CacheEntry, Vec<u8>) {
         let cache =
             std::env::temp_dir().join(format!("gleaner-entry-{name}-{}", std::process::id()));

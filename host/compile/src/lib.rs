@@ -38,7 +38,8 @@ pub enum Nans {
 }
 
 impl Nans {
-    /// Wasmtime's version and the settings of [`engine`]. A change of either invalidates the cache.
+    /// Returns wasmtime's version and the settings of [`engine`], as text. A change of either
+    /// invalidates the cache.
     pub const fn settings(self) -> &'static str {
         match self {
             Self::Native => "wasmtime 48.0.8, fuel, epochs, speed, 1",
@@ -172,8 +173,8 @@ pub fn engine(stack_bytes: usize, nans: Nans) -> Result<Engine, CompileError> {
     Engine::new(&settings).map_err(|source| CompileError::Engine { source: source.into() })
 }
 
-/// Settings of [`engine`], named by [`Nans::settings`]. Benches change some of them to measure
-/// their cost.
+/// Returns the settings of [`engine`], which [`Nans::settings`] names. Benches change some of them
+/// to measure their cost.
 pub fn settings(nans: Nans) -> Config {
     let mut config = Config::new();
     config
