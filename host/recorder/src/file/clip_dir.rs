@@ -23,7 +23,7 @@ pub(super) const JPG: &str = ".jpg";
 /// Suffix of an unfinished thumbnail.
 pub(super) const JPG_PART: &str = ".jpg.part";
 
-/// Most bytes of a name without its suffix; file systems allow 255 with it.
+/// Maximum length of a name without its suffix, in bytes; file systems allow 255 with it.
 const BASE_MAX: usize = 160;
 
 /// The folder, shared with unfinished clips. Its lock is held as long as one of them lives.
@@ -41,7 +41,7 @@ impl ClipDir {
         Self { folder, list, taken: Mutex::new(taken), _lock: lock }
     }
 
-    /// `OUT/clips`.
+    /// Returns the folder, `OUT/clips`.
     pub(super) fn folder(&self) -> &Path {
         &self.folder
     }
@@ -79,7 +79,8 @@ impl ClipDir {
         *self.taken() = files;
     }
 
-    /// A free name: `base`, or the first of `base-2`, `base-3` and so on.
+    /// Returns a free name, without reserving it: `base`, or the first of `base-2`, `base-3` and so
+    /// on.
     pub(super) fn free_name(&self, base: &str) -> String {
         let base = sanitized(base);
         names(&base)
@@ -96,7 +97,7 @@ impl ClipDir {
     }
 }
 
-/// `base`, `base-2`, `base-3` and so on.
+/// Returns `base`, `base-2`, `base-3` and so on.
 pub(crate) fn names(base: &str) -> impl Iterator<Item = String> + '_ {
     (1_u64..).map(move |n| if n == 1 { base.to_owned() } else { format!("{base}-{n}") })
 }

@@ -39,7 +39,7 @@ const UNKNOWN: &str = "unknown";
 /// A metadata record.
 pub(super) type MetadataRecord = (String, BTreeMap<String, String>);
 
-/// The line of a clip, except for its length.
+/// Returns the line of a clip, except for its length.
 pub(super) fn clip(
     trailer: &ClipTrailer,
     written: &Written,
@@ -63,8 +63,8 @@ pub(super) fn clip(
     }
 }
 
-/// The topics that the recorder names, then those that it forgot but whose messages are in the
-/// file.
+/// Returns the topics that the recorder names, then those that it forgot but whose messages are in
+/// the file.
 fn topics(trailer: &ClipTrailer, written: &Written) -> Vec<ClipTopic> {
     let mut topics = Vec::new();
     for counts in &trailer.topics {
@@ -97,7 +97,7 @@ fn topics(trailer: &ClipTrailer, written: &Written) -> Vec<ClipTopic> {
     topics
 }
 
-/// The record before the messages, of a clip that `library` writes.
+/// Returns the record before the messages, of a clip that `library` writes.
 pub(super) fn begin(clip_header: &ClipHeader, library: &str) -> MetadataRecord {
     let metadata = pairs([
         ("clock", clip_header.clock.clone()),
@@ -119,17 +119,17 @@ pub(super) fn read_begin(metadata: &BTreeMap<String, String>) -> Result<ClipHead
     })
 }
 
-/// The line of a complete clip, from its record [`CLIP_RECORD`].
+/// Returns the line of a complete clip, from its record [`CLIP_RECORD`].
 pub(super) fn read_line(metadata: &BTreeMap<String, String>) -> Option<Clip> {
     serde_json::from_str(metadata.get(LINE)?).ok()
 }
 
-/// The unfinished file that a clip was recovered from, from its record [`CLIP_RECORD`].
+/// Returns the unfinished file that a clip was recovered from, from its record [`CLIP_RECORD`].
 pub(super) fn read_recovered_from(metadata: &BTreeMap<String, String>) -> Option<&str> {
     metadata.get(RECOVERED_FROM).map(String::as_str)
 }
 
-/// The records after the messages.
+/// Returns the records after the messages.
 pub(super) fn records<'a>(
     trailer: &'a ClipTrailer,
     clip: &'a Clip,
@@ -138,14 +138,15 @@ pub(super) fn records<'a>(
     recovered_from: Option<&str>,
 ) -> impl Iterator<Item = MetadataRecord> + 'a {
     let header = |index: usize| trailer.headers.get(index).map(Arc::as_ref);
-    let lambdas = clip.lambdas.iter().enumerate().map(move |(index, of)| lambda(of, header(index)));
+    let lambdas =
+        clip.lambdas.iter().enumerate().map(move |(index, entry)| lambda(entry, header(index)));
     std::iter::once(about_clip(clip, clock, LIBRARY, trailer.thumbnail.as_deref(), recovered_from))
-        .chain(clip.topics.iter().map(|of| topic(of, written.topic(&of.topic))))
+        .chain(clip.topics.iter().map(|entry| topic(entry, written.topic(&entry.topic))))
         .chain(lambdas)
         .chain(trailer.moments.iter().map(decision))
 }
 
-/// The record of the clip as a whole.
+/// Returns the record of the clip as a whole.
 pub(super) fn about_clip(
     clip: &Clip,
     clock: &str,
@@ -176,7 +177,7 @@ pub(super) fn about_clip(
     (CLIP_RECORD.to_owned(), metadata)
 }
 
-/// The record of a topic; `found` is its content.
+/// Returns the record of a topic; `found` is its content.
 pub(super) fn topic(topic: &ClipTopic, found: Option<&WrittenTopic>) -> MetadataRecord {
     let metadata = pairs([
         (
@@ -195,7 +196,7 @@ pub(super) fn topic(topic: &ClipTopic, found: Option<&WrittenTopic>) -> Metadata
     (TOPIC_RECORD.to_owned(), metadata)
 }
 
-/// The record of a lambda, with the header of its journal.
+/// Returns the record of a lambda, with the header of its journal.
 pub(super) fn lambda(lambda: &ClipLambda, header: Option<&JournalHeader>) -> MetadataRecord {
     let model = |model: &FileDigest| format!("{}={}", model.path, model.sha256);
     let metadata = pairs([
@@ -217,7 +218,7 @@ pub(super) fn lambda(lambda: &ClipLambda, header: Option<&JournalHeader>) -> Met
     (LAMBDA_RECORD.to_owned(), metadata)
 }
 
-/// The record of a trigger or a command.
+/// Returns the record of a trigger or a command.
 pub(super) fn decision(moment: &Moment) -> MetadataRecord {
     let mut metadata = pairs([
         ("at_ns", moment.at_ns.to_string()),

@@ -79,7 +79,8 @@ pub(super) fn remove(path: &Path) -> Result<bool, RecordError> {
     }
 }
 
-/// Called before each step: a test records their order, and can fail any of them.
+/// Called before each step; does nothing. In tests, another function replaces this one: it records
+/// the steps, and can fail any of them.
 #[cfg(not(test))]
 pub(super) fn step(_: &str, _: &Path) -> io::Result<()> {
     Ok(())
@@ -104,7 +105,7 @@ pub(super) mod steps {
         STEPS.set((Vec::new(), last));
     }
 
-    /// The steps so far.
+    /// Returns the steps so far.
     pub fn taken() -> Vec<String> {
         STEPS.with_borrow(|(taken, _)| taken.clone())
     }

@@ -158,11 +158,11 @@ impl EarlierClips {
         let kept: HashSet<PathBuf> = keep.iter().map(|clip| clip.file.clone()).collect();
         let is_kept =
             |listed: &ListedClip| kept.contains(Path::new(CLIPS).join(&listed.file).as_path());
-        let (listed, doomed): (Vec<_>, Vec<_>) = dir.list().read()?.into_iter().partition(is_kept);
+        let (listed, removed): (Vec<_>, Vec<_>) = dir.list().read()?.into_iter().partition(is_kept);
         // Clips leave the list before they are deleted, so that it never names a deleted clip. They
         // are noted before that: otherwise, after a death of this process, the next start would
         // find complete clips that are not listed, and list them as results of another replay.
-        replaced::note(dir.folder(), &doomed)?;
+        replaced::note(dir.folder(), &removed)?;
         dir.list().replace(keep)?;
         let deleted = replaced::complete(dir.folder(), dir.list())?;
         dir.take_only(listed.into_iter().map(|listed| listed.file).collect());

@@ -38,12 +38,12 @@ pub(super) struct ListedClip {
 }
 
 impl ClipList {
-    /// The list in `folder`, which may not exist yet.
+    /// Returns the list in `folder`, which may not exist yet.
     pub(super) fn of(folder: &Path) -> Self {
         Self { path: folder.join("clips.jsonl"), folder: folder.to_owned() }
     }
 
-    /// The listed clips. A last line that was torn when its writer died is truncated.
+    /// Returns the listed clips. A last line that was torn when its writer died is truncated.
     pub(super) fn read(&self) -> Result<Vec<ListedClip>, RecordError> {
         let failed = |source| RecordError::List { path: self.path.clone(), source };
         let file = match safe_file::edit(&self.path) {
@@ -153,8 +153,8 @@ fn names(line: ListLine) -> Option<ListedClip> {
     Some(ListedClip { file: plain_name(&line.file, CLIP)?, thumbnail })
 }
 
-/// The file name of `path` if it is `clips/NAME` with that suffix and nothing else: listed files
-/// get deleted, so the list must not name others.
+/// Returns the file name of `path` if it is `clips/NAME` with that suffix and nothing else: listed
+/// files get deleted, so the list must not name others.
 pub(super) fn plain_name(path: &Path, suffix: &str) -> Option<String> {
     let mut components = path.components();
     let (folder, name) = (components.next()?, components.next()?);

@@ -18,7 +18,7 @@ pub struct LossList {
 }
 
 impl LossList {
-    /// The list in `folder`.
+    /// Returns the list of losses in `folder`, which may not exist yet.
     pub(super) fn of(folder: &Path) -> LossList {
         LossList { path: folder.join("losses.jsonl"), turn: Mutex::default() }
     }

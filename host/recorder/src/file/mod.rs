@@ -17,8 +17,8 @@
 //! `Recovery` completes an interrupted clip at any stage, and a crash during recovery changes
 //! nothing; a clip that it cannot complete stays for the next start.
 //!
-//! Never here: a file touched that this program did not write; an acknowledged clip deleted other
-//! than by [`EarlierClips::replace`], or, if it was not fetched, by
+//! Nothing here changes a file that this program did not write. Acknowledged clips are deleted only
+//! by [`EarlierClips::replace`] and, before they are fetched, by
 //! [`RecordingFolder::keep_at_most`].
 
 mod clip_dir;
@@ -55,11 +55,11 @@ pub(crate) use unfinished::UnfinishedClip;
 
 use crate::error::RecordError;
 
-/// Most bytes of a topic's name, and of its type's; ROS 2 allows 255. Both are in a line of the
-/// list.
+/// Maximum length of a topic's name, and of its type's name, in bytes; ROS 2 allows 255. Both are
+/// in a line of the list.
 const NAME_MAX: usize = 1 << 10;
-/// Most bytes of a topic's definitions and quality of service together: every reader of a clip
-/// holds them in memory.
+/// Maximum size of a topic's definitions and quality of service together, in bytes: every reader of
+/// a clip holds them in memory.
 const DEFINITIONS_MAX: usize = 8 << 20;
 
 /// The data of a clip that is known when it begins. It is written before the messages, so that a

@@ -42,7 +42,7 @@ pub(super) fn origin(path: &Path) -> io::Result<Origin> {
     Ok(Origin::Foreign)
 }
 
-/// The first bytes of our files, up to the version; `None` for bytes that depend on it.
+/// Returns the first bytes of our files, up to the version; `None` for bytes that depend on it.
 ///
 /// Source: the MCAP specification, version 0: magic, header record, its length, profile and
 /// library.

@@ -16,7 +16,7 @@ use crate::error::RecordError;
 /// The largest chunk: one message of any size that a lambda may request.
 const LIMITS: DriveLimits =
     DriveLimits { chunk_bytes: 1 << 30, open_bytes: 1 << 30, unpacked_bytes: 0 };
-/// Most bytes of the metadata and attachments of a clip: the journals of 16 lambdas.
+/// Maximum size of the metadata and attachments of a clip, in bytes: the journals of 16 lambdas.
 const EXTRAS_BYTES: u64 = 1 << 30;
 
 /// The end of an incomplete file, and the reason.
@@ -126,8 +126,8 @@ impl gleaner_transport::Sink for LastMessage {
     }
 }
 
-/// The list entry of the clip `path` if the file is complete, which is checked by reading all of
-/// it.
+/// Returns the list entry of the clip `path` if the file is complete, which is checked by reading
+/// all of it.
 pub(super) fn complete_clip(path: &Path, pause: &mut Pause) -> Result<Option<Clip>, RecordError> {
     if each_message(path, |_, _, _| pause())?.is_some() {
         return Ok(None);
@@ -140,7 +140,7 @@ pub(super) fn complete_clip(path: &Path, pause: &mut Pause) -> Result<Option<Cli
         .and_then(|(_, metadata)| read_line(metadata)))
 }
 
-/// The header of the clip `path`; `None` if it cannot be read.
+/// Returns the header of the clip `path`; `None` if it cannot be read.
 pub(super) fn clip_header(path: &Path) -> Option<ClipHeader> {
     let extras = read_extras(path, EXTRAS_BYTES).ok()?;
     extras
@@ -150,7 +150,7 @@ pub(super) fn clip_header(path: &Path) -> Option<ClipHeader> {
         .and_then(|(_, metadata)| read_begin(metadata).ok())
 }
 
-/// The file that the clip `path` was recovered from, if it was.
+/// Returns the file that the clip `path` was recovered from, if it was.
 pub(super) fn recovered_from(path: &Path) -> Option<String> {
     let extras = read_extras(path, EXTRAS_BYTES).ok()?;
     let (_, metadata) = extras.metadata.iter().find(|(name, _)| name == CLIP_RECORD)?;

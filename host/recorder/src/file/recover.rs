@@ -62,13 +62,13 @@ impl Recovery {
                     source: io::ErrorKind::Interrupted.into(),
                 }),
             };
-            let came = match suffix {
+            let result = match suffix {
                 AGAIN => discard_copy(dir, &name).map(|()| None),
                 PART => recover(dir, &name, &mut pause),
                 _ if dir.is_taken(&format!("{name}{CLIP}")) => Ok(None),
                 _ => list(dir, &name, &mut pause),
             };
-            match came {
+            match result {
                 Ok(None) => {}
                 Ok(Some(clip)) => return Some(Ok(clip)),
                 Err(error) => return go_on().then_some(Err(error)),
@@ -78,7 +78,7 @@ impl Recovery {
     }
 }
 
-/// The regular files in `folder` with this suffix, without the suffix, sorted.
+/// Returns the regular files in `folder` with this suffix, without the suffix, sorted.
 fn files(folder: &Path, suffix: &str) -> Result<Vec<String>, RecordError> {
     let cannot_read = |source| RecordError::Read { path: folder.to_owned(), source };
     let mut names = Vec::new();
@@ -233,8 +233,8 @@ fn is_same(one: &Path, other: &Path) -> io::Result<bool> {
     }
 }
 
-/// The name for the clip of the unfinished file `name`: its own, which was free when the file was
-/// begun, unless another file has taken it since. The name is reserved.
+/// Returns the name for the clip of the unfinished file `name`: its own, which was free when the
+/// file was begun, unless another file has taken it since. The name is reserved.
 fn name_for(dir: &ClipDir, name: &str) -> String {
     let is_free =
         |name: &String| !dir.exists(name, CLIP) && !dir.is_taken(&format!("{name}{CLIP}"));
@@ -245,9 +245,9 @@ fn name_for(dir: &ClipDir, name: &str) -> String {
 
 /// Turns an unfinished file that is complete into a clip.
 ///
-/// Its recorder may have died because the file could not be synced. The system then takes its pages
-/// for written, and another sync would prove nothing: only bytes that are written again are known
-/// to arrive.
+/// The recorder may have died because the file could not be synced. The system then treats the
+/// pages of the file as written, and another sync would prove nothing: only bytes that are written
+/// again are known to reach the disk.
 fn adopt(
     dir: &ClipDir,
     name: &str,
@@ -374,12 +374,12 @@ fn copy(
 /// Describes for a user what happened and what is missing.
 fn note(end: Option<&EarlyEnd>, kept_ns: i64, has_thumbnail: bool) -> String {
     let kept = kept_ns.max(0) as f64 / 1e9;
-    let most = CHUNK_SPAN_NS / 1_000_000_000;
+    let max_s = CHUNK_SPAN_NS / 1_000_000_000;
     let also = if has_thumbnail { "so is the journal" } else { "so are journal and thumbnail" };
     match end.map(|end| &end.why) {
         None | Some(Damage::Truncated(_) | Damage::NoFooter) => format!(
             "the recorder died; messages after {kept:.3} s of the window are lost, \
-             at most {most} s of them unless the power failed; {also}"
+             at most {max_s} s of them unless the power failed; {also}"
         ),
         Some(why) => format!(
             "the recorder died and its file is damaged ({why}); messages after \

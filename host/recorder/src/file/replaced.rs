@@ -15,19 +15,19 @@ use super::list::{ClipList, ListedClip, read_lines};
 use crate::error::RecordError;
 
 const NOTE: &str = ".replaced";
-/// Its temporary name.
+/// Name of the file while it is written.
 const NOTE_PART: &str = ".replaced.part";
 
 /// Notes that these clips will be deleted.
-pub(super) fn note(folder: &Path, doomed: &[ListedClip]) -> Result<(), RecordError> {
-    if doomed.is_empty() {
+pub(super) fn note(folder: &Path, clips: &[ListedClip]) -> Result<(), RecordError> {
+    if clips.is_empty() {
         return Ok(());
     }
-    let lines: Vec<u8> = doomed.iter().flat_map(line).collect();
+    let lines: Vec<u8> = clips.iter().flat_map(line).collect();
     durable::write(&folder.join(NOTE_PART), &folder.join(NOTE), folder, &lines)
 }
 
-/// A line in the format of the list, with file names only.
+/// Formats a line of the list, with file names only.
 fn line(ListedClip { file, thumbnail }: &ListedClip) -> Vec<u8> {
     let path = |name: &String| format!("{CLIPS}/{name}");
     let line = serde_json::json!({ "file": path(file), "thumbnail": thumbnail.as_ref().map(path) });
@@ -46,11 +46,11 @@ pub(super) fn complete(folder: &Path, list: &ClipList) -> Result<u64, RecordErro
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(0),
         Err(error) => return Err(cannot_read(error)),
     };
-    let (doomed, _, _) = read_lines(&noted, |_| Ok(())).map_err(cannot_read)?;
+    let (clips, _, _) = read_lines(&noted, |_| Ok(())).map_err(cannot_read)?;
     let listed: HashSet<String> = list.read()?.into_iter().map(|listed| listed.file).collect();
     let (mut deleted, mut left) = (0, Vec::new());
-    for doomed in doomed.into_iter().filter(|doomed| !listed.contains(&doomed.file)) {
-        let ListedClip { file, thumbnail } = &doomed;
+    for clip in clips.into_iter().filter(|clip| !listed.contains(&clip.file)) {
+        let ListedClip { file, thumbnail } = &clip;
         // The thumbnail first, so that none is left without its clip.
         let thumbnail = thumbnail
             .as_ref()
@@ -64,7 +64,7 @@ pub(super) fn complete(folder: &Path, list: &ClipList) -> Result<u64, RecordErro
                     error = &error as &dyn std::error::Error,
                     "cannot delete a clip; retried at the next start"
                 );
-                left.push(doomed);
+                left.push(clip);
             }
         }
     }

@@ -18,7 +18,7 @@ pub(super) struct FileSink {
 }
 
 impl FileSink {
-    /// A sink that writes to the new file `file`.
+    /// Creates a sink that writes to the new file `file`.
     pub(super) fn new(file: File) -> Self {
         Self { file, buffer: Vec::with_capacity(BUFFER), position: Arc::default(), failed: false }
     }
@@ -29,7 +29,7 @@ impl FileSink {
         Ok(self.file)
     }
 
-    /// Number of bytes written so far, readable while an MCAP writer owns the sink.
+    /// Returns the number of bytes written so far, readable while an MCAP writer owns the sink.
     pub(super) fn position(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.position)
     }
@@ -79,7 +79,7 @@ impl Write for FileSink {
 }
 
 impl Seek for FileSink {
-    /// The writer only queries its position.
+    /// Returns the position. The MCAP writer requests nothing else, so every other seek is refused.
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         match to {
             SeekFrom::Current(0) => Ok(self.position.load(Ordering::Relaxed)),

@@ -92,12 +92,12 @@ impl ClipStatements {
                 "not written by recorders",
             ));
         }
-        let records = |of: &'static str| {
-            extras.metadata.iter().filter(move |(name, _)| name == of).map(|(_, values)| values)
+        let records = |kind: &'static str| {
+            extras.metadata.iter().filter(move |(name, _)| name == kind).map(|(_, values)| values)
         };
-        let only = |of: &'static str| match records(of).collect::<Vec<_>>()[..] {
+        let only = |kind: &'static str| match records(kind).collect::<Vec<_>>()[..] {
             [values] => Ok(values),
-            ref found => Err(FalseStatement::count(format!("record {of}"), found.len(), 1)),
+            ref found => Err(FalseStatement::count(format!("record {kind}"), found.len(), 1)),
         };
         let clip = clip(only(CLIP_RECORD)?, &extras.attachments, header)?;
         lambdas(&records(LAMBDA_RECORD).collect::<Vec<_>>(), &clip, header)?;
@@ -109,17 +109,18 @@ impl ClipStatements {
         Ok(Self { clip, moments, topics })
     }
 
-    /// The clip as described by its line.
+    /// Returns the clip as described by its line.
     pub fn clip(&self) -> &Clip {
         &self.clip
     }
 
-    /// Its triggers and commands, or as many as were kept.
+    /// Returns the triggers and commands of the clip, or as many as were kept.
     pub fn moments(&self) -> &[Moment] {
         &self.moments
     }
 
-    /// The first statement that the messages of the clip, which is the file `path`, contradict.
+    /// Returns the first statement that the messages of the clip, which is the file `path`,
+    /// contradict.
     ///
     /// # Errors
     ///
@@ -196,14 +197,14 @@ fn in_clip(key: &str) -> String {
     format!("`{key}` of record {CLIP_RECORD}")
 }
 
-/// The program that wrote a clip, from the header of a journal by the same program.
+/// Returns the program that wrote a clip, from the header of a journal by the same program.
 fn library(header: &JournalHeader) -> String {
     format!("gleaner {}", header.gleaner)
 }
 
 /// Rejects a record whose values differ from `expected`.
 fn same(record: &str, stated: &Values, expected: &Values) -> Result<(), FalseStatement> {
-    let value = |of: &Values, key: &str| of.get(key).cloned();
+    let value = |values: &Values, key: &str| values.get(key).cloned();
     let keys = stated.keys().chain(expected.keys().filter(|key| !stated.contains_key(*key)));
     for key in keys {
         let (stated, expected) = (value(stated, key), value(expected, key));
@@ -305,19 +306,20 @@ fn lambdas(records: &[&Values], clip: &Clip, header: &JournalHeader) -> Result<(
             &format!("{LAMBDAS_MAX} at most"),
         ));
     }
-    if !clip.lambdas.iter().any(|of| of.name == header.lambda) {
-        let stated = clip.lambdas.iter().map(|of| of.name.as_str()).collect::<Vec<_>>().join(", ");
+    if !clip.lambdas.iter().any(|lambda| lambda.name == header.lambda) {
+        let stated =
+            clip.lambdas.iter().map(|lambda| lambda.name.as_str()).collect::<Vec<_>>().join(", ");
         return Err(FalseStatement::new(
             format!("lambdas in {LINE} of record {CLIP_RECORD}"),
             &stated,
             &header.lambda,
         ));
     }
-    for (values, of) in records.iter().zip(&clip.lambdas) {
-        let record = format!("record {LAMBDA_RECORD} of `{}`", excerpt(&of.name));
-        let (is, header) = match of.name == header.lambda {
-            true => (by_header(of, header), Some(header)),
-            false => (of.clone(), None),
+    for (values, lambda) in records.iter().zip(&clip.lambdas) {
+        let record = format!("record {LAMBDA_RECORD} of `{}`", excerpt(&lambda.name));
+        let (is, header) = match lambda.name == header.lambda {
+            true => (by_header(lambda, header), Some(header)),
+            false => (lambda.clone(), None),
         };
         let (_, mut expected) = clip_records::lambda(&is, header);
         if header.is_none() {
@@ -330,15 +332,15 @@ fn lambdas(records: &[&Values], clip: &Clip, header: &JournalHeader) -> Result<(
             }
         }
         same(&record, values, &expected)?;
-        let what = format!("{LINE} of record {CLIP_RECORD}, lambda `{}`", excerpt(&of.name));
-        same(&what, &clip_records::lambda(of, header).1, &clip_records::lambda(&is, header).1)?;
+        let what = format!("{LINE} of record {CLIP_RECORD}, lambda `{}`", excerpt(&lambda.name));
+        same(&what, &clip_records::lambda(lambda, header).1, &clip_records::lambda(&is, header).1)?;
     }
     Ok(())
 }
 
-fn by_header(of: &ClipLambda, header: &JournalHeader) -> ClipLambda {
+fn by_header(lambda: &ClipLambda, header: &JournalHeader) -> ClipLambda {
     let digest = lambda_digest(&header.files);
-    ClipLambda { version: header.version.clone(), kind: header.kind, digest, ..of.clone() }
+    ClipLambda { version: header.version.clone(), kind: header.kind, digest, ..lambda.clone() }
 }
 
 fn moment(values: &Values) -> Result<Moment, FalseStatement> {
@@ -401,21 +403,22 @@ fn begin(
         clip_records::read_begin(values).map_err(|key| malformed(BEGIN, key, values))?;
     let is = ClipHeader { clock: header.clock.clone(), from_ns: clip.from_ns, ..clip_header };
     same(&format!("record {BEGIN}"), values, &clip_records::begin(&is, &library(header)).1)?;
-    let was_there = |of: &ClipLambda| {
+    let was_there = |lambda: &ClipLambda| {
         clip.lambdas.iter().any(|now| {
-            of.windows <= now.windows && *of == ClipLambda { windows: of.windows, ..now.clone() }
+            lambda.windows <= now.windows
+                && *lambda == ClipLambda { windows: lambda.windows, ..now.clone() }
         })
     };
-    let most = clip.lambdas.len();
-    if let Some(of) = is
+    let max_count = clip.lambdas.len();
+    if let Some(lambda) = is
         .lambdas
         .iter()
         .enumerate()
-        .find_map(|(n, of)| (n >= most || !was_there(of)).then_some(of))
+        .find_map(|(n, lambda)| (n >= max_count || !was_there(lambda)).then_some(lambda))
     {
         return Err(FalseStatement::new(
             format!("`lambdas` of record {BEGIN}"),
-            &json(of),
+            &json(lambda),
             &json(&clip.lambdas),
         ));
     }
@@ -443,13 +446,14 @@ fn topics<'a>(
         }
     }
     let mut named = BTreeSet::new();
-    for of in &clip.topics {
-        if !named.insert(of.topic.as_str()) {
-            let what = format!("topic `{}` in {LINE} of record {CLIP_RECORD}", excerpt(&of.topic));
+    for topic in &clip.topics {
+        if !named.insert(topic.topic.as_str()) {
+            let what =
+                format!("topic `{}` in {LINE} of record {CLIP_RECORD}", excerpt(&topic.topic));
             return Err(FalseStatement::count(what, 2, 1));
         }
-        if !topics.contains_key(&of.topic) {
-            return Err(FalseStatement::count(what(&of.topic), 0, 1));
+        if !topics.contains_key(&topic.topic) {
+            return Err(FalseStatement::count(what(&topic.topic), 0, 1));
         }
     }
     match topics.keys().find(|topic| !named.contains(topic.as_str())) {

@@ -27,13 +27,16 @@ const COMPRESSION: Option<Compression> = Some(Compression::Zstd);
 const CHUNK_BYTES: u64 = 1 << 20;
 /// A chunk is closed before it spans more time: the most that a crash of the recorder costs.
 pub(super) const CHUNK_SPAN_NS: i64 = 1_000_000_000;
-/// Most channels of a clip. Further writers share one channel of their topic, without a writer.
+/// Maximum number of channels of a clip. Further writers share one channel of their topic, without
+/// a writer.
 pub(super) const CHANNELS_MAX: usize = 16 << 10;
 
-/// Most bytes of a message. The fields of the file allow more, but every reader of a clip holds a
-/// chunk of it in memory, and our reader no more than 1 GiB: a message and the rest of its chunk.
+/// Maximum length of a message, in bytes. The fields of the file allow more, but every reader of a
+/// clip holds a chunk of it in memory, and our reader no more than 1 GiB: a message and the rest of
+/// its chunk.
 pub const MESSAGE_MAX: usize = 960 << 20;
-/// Most bytes of a metadata record; usual ones have some KB, with the config of a lambda.
+/// Maximum length of a metadata record, in bytes; usual ones have some KB, with the config of a
+/// lambda.
 pub(super) const METADATA_MAX: usize = 64 << 20;
 
 /// A clip that is being written. Unless it is finished, its file stays unfinished, for
@@ -268,12 +271,12 @@ impl UnfinishedClip {
         Ok(clip)
     }
 
-    /// Number of messages written.
+    /// Returns the number of messages written.
     pub(super) fn messages(&self) -> u64 {
         self.written.messages()
     }
 
-    /// Stamps of the first and the last message.
+    /// Returns the stamps of the first and the last message.
     pub(super) fn span(&self) -> Option<(i64, i64)> {
         self.written.span
     }
@@ -316,7 +319,7 @@ impl UnfinishedClip {
         }
     }
 
-    /// The channel for messages of the topic by this writer, or by an unnamed one.
+    /// Returns the channel for messages of the topic by this writer, or by an unnamed one.
     fn channel(
         &mut self,
         topic: &TopicSchema,

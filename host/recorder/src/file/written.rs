@@ -20,7 +20,7 @@ pub(super) struct WrittenTopic {
 }
 
 impl WrittenTopic {
-    /// The checksum over all messages, in hexadecimal digits.
+    /// Returns the checksum over all messages, in hexadecimal digits.
     pub(super) fn checksum(&self) -> String {
         format!("{:016x}", self.checksum)
     }
@@ -66,7 +66,7 @@ impl Written {
         self.span = Some((first.min(meta.at_ns), last.max(meta.at_ns)));
     }
 
-    /// The topic of this name.
+    /// Returns the topic of this name.
     pub(super) fn topic(&self, name: &str) -> Option<&WrittenTopic> {
         self.by_name.get(name).map(|index| &self.topics[*index])
     }
@@ -80,23 +80,23 @@ impl Written {
     }
 }
 
-/// The stamp in the file: MCAP has no time before the epoch.
+/// Returns the stamp in the file: MCAP has no time before the epoch.
 pub(super) fn stamp(ns: i64) -> u64 {
     u64::try_from(ns).unwrap_or(0)
 }
 
-/// The four bytes before a payload.
+/// Returns the four bytes before a payload.
 pub(super) fn encapsulation(meta: &SampleMeta) -> [u8; 4] {
     let endian = u8::from(matches!(meta.endian, Endian::Little));
     [0, endian, meta.options[0], meta.options[1]]
 }
 
-/// CRC-32 of `bytes`, in hexadecimal digits.
+/// Returns the CRC-32 of `bytes`, in hexadecimal digits.
 pub(super) fn crc32(bytes: &[u8]) -> String {
     format!("{:08x}", crc32fast::hash(bytes))
 }
 
-/// CRC-32 of a message in the file: stamps, number, encapsulation and payload.
+/// Returns the CRC-32 of a message in the file: stamps, number, encapsulation and payload.
 fn checksum(meta: &SampleMeta, cdr: &[u8]) -> u32 {
     let mut crc = crc32fast::Hasher::new();
     crc.update(&stamp(meta.at_ns).to_le_bytes());

@@ -20,8 +20,8 @@ use crate::RecordError;
 /// Cost of an entry in the index.
 const INDEXED: u64 = size_of::<Indexed>() as u64;
 
-/// Most entries in the index, so that small samples in a large store do not fill the memory: 72
-/// MiB.
+/// Maximum number of entries in the index, so that small samples in a large store do not fill the
+/// memory: 72 MiB.
 const INDEX_MAX: usize = 1 << 20;
 
 /// A chunk is a sixteenth of the store, within these bounds.
@@ -93,8 +93,8 @@ impl Disk {
         Ok(disk)
     }
 
-    /// On a full disk, drops the oldest entries for it as well; if that does not help, drops the
-    /// new one.
+    /// Adds an entry. On a full disk, drops the oldest entries for it as well; if that does not
+    /// help, drops the new one.
     pub(super) fn push(
         &mut self,
         held: &EntryMeta,
@@ -303,7 +303,7 @@ impl Disk {
 }
 
 impl Drop for Disk {
-    /// A later process would delete the preroll.
+    /// Deletes the preroll: it is of no use to a later process, which would delete it.
     fn drop(&mut self) {
         for chunk in &self.chunks {
             let _ = fs::remove_file(self.path(chunk.number));

@@ -2,8 +2,8 @@
 
 use std::collections::VecDeque;
 
-/// Most stamps kept for each source and cause. The losses of a window that reaches further back are
-/// unknown.
+/// Maximum number of stamps kept for each source and cause. The losses of a window that reaches
+/// further back are unknown.
 const MOST_STAMPS: usize = 4096;
 
 /// The losses of one source.

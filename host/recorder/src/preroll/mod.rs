@@ -31,23 +31,23 @@ pub struct EntrySource(u32);
 const WAKES: u32 = 1 << 31;
 
 impl EntrySource {
-    /// A topic, by its number.
+    /// Creates the source of the samples of a topic, by its number.
     pub fn topic(index: usize) -> EntrySource {
         // Topics and lambdas are counted in hundreds.
         EntrySource(u32::try_from(index).unwrap_or(WAKES - 1) & !WAKES)
     }
 
-    /// The wakes of a lambda, by its number.
+    /// Creates the source of the wakes of a lambda, by its number.
     pub fn wakes(lambda: usize) -> EntrySource {
         EntrySource(EntrySource::topic(lambda).0 | WAKES)
     }
 
-    /// The number of the lambda, if these are wakes.
+    /// Returns the number of the lambda, if these are wakes.
     pub fn lambda(self) -> Option<usize> {
         (self.0 & WAKES != 0).then_some((self.0 & !WAKES) as usize)
     }
 
-    /// The number of the topic, if it is one.
+    /// Returns the number of the topic, if it is one.
     pub fn as_topic(self) -> Option<usize> {
         (self.0 & WAKES == 0).then_some(self.0 as usize)
     }
@@ -56,9 +56,9 @@ impl EntrySource {
 /// The metadata of an entry.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct EntryMeta {
-    /// Its source.
+    /// Source of the entry.
     pub source: EntrySource,
-    /// Length of its bytes.
+    /// Length of the entry, in bytes.
     pub len: u32,
     /// The stamp that windows are compared with.
     pub at_ns: i64,
@@ -77,7 +77,7 @@ pub struct EntryMeta {
 }
 
 impl EntryMeta {
-    /// A sample of a topic.
+    /// Creates the metadata of a sample of a topic.
     pub fn sample(topic: usize, meta: &SampleMeta, group: u64) -> EntryMeta {
         EntryMeta {
             source: EntrySource::topic(topic),
@@ -92,7 +92,7 @@ impl EntryMeta {
         }
     }
 
-    /// A wake of a lambda, the `number`-th from 0.
+    /// Creates the metadata of a wake of a lambda, the `number`-th from 0.
     pub fn wake(lambda: usize, number: u64, at_ns: i64, group: u64) -> EntryMeta {
         EntryMeta {
             source: EntrySource::wakes(lambda),
@@ -107,7 +107,7 @@ impl EntryMeta {
         }
     }
 
-    /// The metadata of the sample.
+    /// Returns the metadata of the sample.
     pub fn meta(&self) -> SampleMeta {
         SampleMeta {
             at_ns: self.at_ns,
@@ -134,7 +134,7 @@ pub struct Walked {
 }
 
 impl Walked {
-    /// Its ID, until the store changes.
+    /// Returns the ID of the entry, which is valid until the store changes.
     pub fn place(self) -> EntryId {
         self.place
     }
@@ -154,8 +154,8 @@ enum PrerollStore {
 }
 
 impl Preroll {
-    /// An empty store of at most `bytes`. On disk it is in `folder`, where files of an earlier
-    /// process are deleted. In memory, `prefault` allocates it at once.
+    /// Creates an empty store of at most `bytes`. On disk it is in `folder`, where files of an
+    /// earlier process are deleted. In memory, `prefault` allocates it at once.
     ///
     /// # Errors
     ///
@@ -271,7 +271,7 @@ impl Preroll {
         }
     }
 
-    /// The entry after `last`, or the oldest if `last` was dropped or is `None`.
+    /// Returns the entry after `last`, or the oldest if `last` was dropped or is `None`.
     pub fn next(&self, last: Option<Walked>) -> Option<Walked> {
         match last {
             Some(Walked { place, number }) if number >= self.gone => {
@@ -281,7 +281,7 @@ impl Preroll {
         }
     }
 
-    /// The newest entry.
+    /// Returns the newest entry.
     pub fn newest(&self) -> Option<Walked> {
         let (place, entries) = match &self.kind {
             PrerollStore::Ram(ram) => (ram.newest()?, ram.entries()),
@@ -290,7 +290,7 @@ impl Preroll {
         Some(Walked { place, number: (self.gone + entries).saturating_sub(1) })
     }
 
-    /// The ID of an entry, unless it was dropped.
+    /// Returns the ID of an entry, unless it was dropped.
     pub fn find(&self, walked: Walked) -> Option<EntryId> {
         (walked.number >= self.gone).then_some(walked.place)
     }
@@ -303,7 +303,7 @@ impl Preroll {
         }
     }
 
-    /// The oldest entry.
+    /// Returns the oldest entry.
     fn oldest(&self) -> Option<EntryId> {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.oldest(),
@@ -311,7 +311,7 @@ impl Preroll {
         }
     }
 
-    /// The entry after this one.
+    /// Returns the entry after this one.
     fn after(&self, place: EntryId) -> Option<EntryId> {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.after(place),
@@ -319,7 +319,7 @@ impl Preroll {
         }
     }
 
-    /// The metadata of an entry.
+    /// Returns the metadata of an entry.
     pub fn held(&self, place: EntryId) -> EntryMeta {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.held(place),
@@ -327,7 +327,7 @@ impl Preroll {
         }
     }
 
-    /// The bytes of an entry.
+    /// Returns the bytes of an entry.
     ///
     /// # Errors
     ///
@@ -347,7 +347,7 @@ impl Preroll {
         }
     }
 
-    /// Bytes in use, including the overhead of entries.
+    /// Returns the bytes in use, including the overhead of entries.
     pub fn bytes_held(&self) -> u64 {
         match &self.kind {
             PrerollStore::Ram(ram) => ram.bytes_held(),
@@ -355,7 +355,7 @@ impl Preroll {
         }
     }
 
-    /// Peak of the bytes in use.
+    /// Returns the peak of the bytes in use.
     pub fn bytes_highest(&self) -> u64 {
         self.highest
     }

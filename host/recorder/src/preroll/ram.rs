@@ -26,6 +26,8 @@ pub(super) struct Ram {
 }
 
 impl Ram {
+    /// Creates a store of `bytes`. With `prefault`, the system allocates its memory at once.
+    ///
     /// # Errors
     ///
     /// If the memory cannot be allocated.
@@ -67,7 +69,7 @@ impl Ram {
         true
     }
 
-    /// Offset of `need` free bytes, if no entry has to be dropped.
+    /// Returns the offset of `need` free bytes, if no entry has to be dropped.
     fn room(&mut self, need: usize) -> Option<usize> {
         if self.entries == 0 {
             (self.head, self.tail, self.wrapped) = (0, 0, None);
@@ -152,7 +154,7 @@ impl Ram {
     }
 }
 
-/// Bytes that an entry of `len` bytes takes.
+/// Returns the size of an entry of `len` bytes with its overhead, in bytes.
 fn size(len: usize) -> usize {
     OVERHEAD + len.next_multiple_of(ALIGN)
 }

@@ -16,9 +16,9 @@ fn held(topic: usize, at: i64) -> EntryMeta {
     EntryMeta::sample(topic, &meta, 0)
 }
 
-/// Distinct bytes, of a length that differs from sample to sample.
-fn payload(at: i64, most: u64) -> Vec<u8> {
-    let len = (at as u64).wrapping_mul(2_654_435_761) % (most + 1);
+/// Returns distinct bytes, of a length that differs from sample to sample.
+fn payload(at: i64, max_len: u64) -> Vec<u8> {
+    let len = (at as u64).wrapping_mul(2_654_435_761) % (max_len + 1);
     (0..len).map(|n| (n as i64 * 7 + at) as u8).collect()
 }
 
@@ -39,7 +39,7 @@ fn scratch(name: &str) -> PathBuf {
     path
 }
 
-/// Each store, with the most that it may hold.
+/// Opens one store of each kind, for at most `bytes`.
 fn stores(name: &str, bytes: u64) -> [Preroll; 2] {
     [Store::Ram, Store::Disk]
         .map(|store| Preroll::open(store, bytes, scratch(name), false).unwrap())
@@ -47,11 +47,11 @@ fn stores(name: &str, bytes: u64) -> [Preroll; 2] {
 
 #[test]
 fn entries_come_out_in_order_and_the_bound_holds() {
-    for (bound, most) in [(4_096, 300), (1_000, 900), (100_000, 4_000), (2 << 20, 300_000)] {
+    for (bound, max_len) in [(4_096, 300), (1_000, 900), (100_000, 4_000), (2 << 20, 300_000)] {
         for mut preroll in stores("bound", bound) {
             let mut first = 0;
             for at in 0..3_000 {
-                let bytes = payload(at, most);
+                let bytes = payload(at, max_len);
                 let taken = preroll.push(held(3, at), &bytes, &mut |gone| {
                     assert_eq!(gone.at_ns, first, "the oldest goes first");
                     first += 1;
@@ -62,7 +62,7 @@ fn entries_come_out_in_order_and_the_bound_holds() {
                     let stamps: Vec<_> = all.iter().map(|(held, _)| held.at_ns).collect();
                     assert_eq!(stamps, (first..=at).collect::<Vec<_>>());
                     for (found, bytes) in all {
-                        assert_eq!(bytes, payload(found.at_ns, most));
+                        assert_eq!(bytes, payload(found.at_ns, max_len));
                         assert_eq!(
                             found,
                             EntryMeta { len: bytes.len() as u32, ..held(3, found.at_ns) }

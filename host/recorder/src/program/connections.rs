@@ -17,8 +17,8 @@ use tracing::warn;
 
 use super::topic_watch::WatchEvent;
 
-/// Most messages of one lambda that are queued for the loop; then its socket fills, and then the
-/// lambda's own queue.
+/// Maximum number of messages of one lambda that are queued for the loop; then its socket fills,
+/// and then the lambda's own queue.
 const INBOX: usize = 64;
 
 /// An event for the loop, other than samples and messages of lambdas.
@@ -43,9 +43,9 @@ pub(super) struct Registration {
 
 /// A message of a lambda.
 pub(super) enum LambdaEvent {
-    /// Its header matches the announcement.
+    /// The header of the lambda matches the announcement.
     Hello(Box<JournalHeader>),
-    /// Its header differs from the announcement in this way.
+    /// The header of the lambda differs from the announcement in this way.
     Mismatch(String),
     Wake {
         entry: Box<JournalEntry>,
@@ -186,7 +186,7 @@ impl ExpectedLambda {
     }
 }
 
-/// The manifest of a build with the limits of this vehicle, and the digest of its bytes.
+/// Returns the manifest of a build with the limits of this vehicle, and the digest of its bytes.
 fn load(add: &AddLambda) -> Result<(Manifest, String), Failure> {
     let build = BuildDir::of(&add.lambda);
     let text = Manifest::read(build.path())?;

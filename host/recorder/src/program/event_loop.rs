@@ -29,9 +29,9 @@ use super::topic_watch::{RequestKind, SystemHealth, TopicRequest, TopicWatch, Wa
 use crate::recorder::counted;
 use crate::{Recorder, RecordingFolder, Settings, TopicId, Work};
 
-/// Most events that are queued for the loop.
+/// Maximum number of events that are queued for the loop.
 const EVENTS: usize = 256;
-/// Most samples and bytes that are taken before the loop checks for triggers again.
+/// Maximum numbers of samples and bytes that are taken before the loop checks for triggers again.
 const SAMPLES_TURN: usize = 64;
 const BYTES_TURN: usize = 256 << 10;
 /// Longest wait before samples are checked, if nothing else happens.
@@ -225,9 +225,9 @@ impl RecorderLoop {
                 LoopEvent::Registered(registration) => self.register(*registration)?,
                 LoopEvent::Refused => self.counted.lambdas_refused += 1,
                 LoopEvent::Stop => self.is_ending = true,
-                LoopEvent::Watch(WatchEvent::Found { topic, of }) => {
-                    let type_name = of.type_name.clone();
-                    match (self.recorder.found_topic(topic, of), self.topics.get_mut(&topic)) {
+                LoopEvent::Watch(WatchEvent::Found { topic, schema }) => {
+                    let type_name = schema.type_name.clone();
+                    match (self.recorder.found_topic(topic, schema), self.topics.get_mut(&topic)) {
                         (Ok(()), Some(recorded)) => recorded.type_name = Some(type_name),
                         (Ok(()), None) => {}
                         (Err(error), _) => {
@@ -291,10 +291,10 @@ impl RecorderLoop {
     }
 
     /// Takes some of the staged samples.
-    fn samples(&mut self, most: usize) -> Result<SampleTurn, Failure> {
+    fn samples(&mut self, max_samples: usize) -> Result<SampleTurn, Failure> {
         let (mut samples, mut bytes) = (0, 0);
         while let Some((staged, cdr)) = self.block.get(self.at) {
-            if samples == most || bytes >= BYTES_TURN {
+            if samples == max_samples || bytes >= BYTES_TURN {
                 return Ok(SampleTurn::More);
             }
             match staged.bytes {

@@ -14,7 +14,7 @@ use super::connections::LambdaEvent;
 use super::rate_limit::RateLimit;
 use crate::{LambdaId, LambdaSpec, RecordError, Recorder, TopicId, lambda_digest};
 
-/// Most messages of one lambda before the next one's turn.
+/// Maximum number of messages of one lambda before the next one's turn.
 const MOST_PER_TURN: usize = 16;
 
 /// Triggers of a lambda per second, and in a burst.

@@ -13,7 +13,8 @@
 //! - `status`, `report_writer`: reports to the starter, and the thread that writes them, as the
 //!   starter may be slow to read.
 //!
-//! Never here: code of a lambda; a lambda that acts as another; a sample that waits for a file.
+//! Nothing here runs code of a lambda, accepts one lambda in the place of another, or lets a sample
+//! wait for a file.
 
 mod args;
 mod commands;
@@ -53,15 +54,15 @@ pub struct RecorderOptions {
     pub preroll_bytes: Option<u64>,
     /// Bytes of the disk to keep free.
     pub disk_floor: u64,
-    /// Most clips to keep.
+    /// Maximum number of clips to keep.
     pub clips_max: Option<u64>,
-    /// Most bytes of clips to keep.
+    /// Maximum total size of clips to keep, in bytes.
     pub bytes_max: Option<u64>,
     /// The topic of commands; `None`: commands are off.
     pub commands: Option<String>,
 }
 
-/// `main` of `gleaner-recorder`.
+/// Runs the program `gleaner-recorder`.
 pub fn main() -> ExitCode {
     gleaner_vitals::log::init();
     match start(Args::parse()) {
@@ -91,7 +92,7 @@ fn start(args: Args) -> Result<(), Failure> {
     run(options, || network.open(), control, reports, stop)
 }
 
-/// Standard input, which has to be the socket of the starter.
+/// Returns standard input, which has to be the socket of the starter.
 fn control() -> Result<OwnedFd, Failure> {
     let stdin = rustix::io::fcntl_dupfd_cloexec(rustix::stdio::stdin(), 3);
     let is_socket = |fd: &OwnedFd| rustix::net::sockopt::socket_type(fd).is_ok();

@@ -13,7 +13,7 @@ use super::staging::TopicSink;
 use super::topic_watch::{LargestSample, RequestKind, TopicRequest};
 use crate::{RecordError, TopicId};
 
-/// Most lambdas at a time. Each has a thread.
+/// Maximum number of lambdas at a time. Each has a thread.
 const LAMBDAS: usize = 256;
 /// Bytes of the largest sample of a topic whose size no manifest states, for the size of the
 /// staging area.

@@ -13,8 +13,8 @@ use tracing::{error, warn};
 
 use crate::LossList;
 
-/// Most reports and losses in a queue. Those of clips are few, and a status more or less does not
-/// matter.
+/// Maximum number of reports and losses in a queue. Those of clips are few, and a status more or
+/// less does not matter.
 const WAITING: usize = 1024;
 
 /// Time to wait for a starter that does not read, and a disk that does not write.

@@ -18,7 +18,7 @@ use gleaner_transport::{Delivery, SampleMeta, Sink};
 
 use crate::TopicId;
 
-/// Most samples in a block.
+/// Maximum number of samples in a block.
 const SAMPLES: usize = 64 << 10;
 
 /// Distance at which memory is touched, so that the system allocates it; no page is smaller.
@@ -41,7 +41,7 @@ pub(super) struct Block {
 }
 
 impl Block {
-    /// A block for this many bytes, all of them allocated at once.
+    /// Creates a block for this many bytes, all of them allocated at once.
     pub(super) fn new(bytes: usize) -> Block {
         let mut memory = vec![0_u8; bytes];
         memory.iter_mut().step_by(PAGE).for_each(|byte| *black_box(byte) = 0);
@@ -118,7 +118,7 @@ impl Staging {
         Ok(std::mem::replace(block, empty))
     }
 
-    /// The one copy.
+    /// Copies a sample into the block: the only copy that is made of it.
     fn fill(&self, topic: TopicId, cdr: &[u8]) -> Delivery {
         let mut filling = self.filling();
         let unaccepted = filling.copied.take();
@@ -144,7 +144,8 @@ impl Staging {
         delivery
     }
 
-    /// Accepts the last copy as this sample of `topic`; returns whether it was taken.
+    /// Accepts the last copy as this sample of `topic`. Returns the delivery that was decided when
+    /// it was copied; `None` if there is no copy for `topic`.
     fn accept(&self, topic: TopicId, meta: &SampleMeta) -> Option<Delivery> {
         let mut filling = self.filling();
         let copied = filling.copied.take_if(|copied| copied.topic == topic)?;
@@ -211,7 +212,7 @@ mod tests {
     use super::*;
     use crate::support::{TestDir, meta, topic};
 
-    /// Room for 100 bytes, and the sinks of two topics.
+    /// Creates a staging area for 100 bytes, and the sinks of two topics.
     fn sinks() -> (Arc<Staging>, [TopicSink; 2]) {
         let scratch = TestDir::new();
         let mut recorder = scratch.recorder(|_| {});

@@ -70,13 +70,13 @@ impl RecorderLoop {
     }
 
     fn status(&self, counts: &RecorderCounts) -> RecorderStatus {
-        let topic = |(id, of): (&TopicId, &TopicEntry)| {
+        let topic = |(id, entry): (&TopicId, &TopicEntry)| {
             let known = self.health.topics.iter().find(|(known, _)| known == id);
             let status = known.map(|(_, status)| status.clone()).unwrap_or_default();
-            let arrivals = &of.sink.arrivals;
+            let arrivals = &entry.sink.arrivals;
             RecordedTopic {
-                topic: of.name.clone(),
-                type_name: of.type_name.clone(),
+                topic: entry.name.clone(),
+                type_name: entry.type_name.clone(),
                 writers: status.writers,
                 received: arrivals.received.load(Ordering::Relaxed),
                 lost: status.lost,
@@ -109,7 +109,7 @@ impl RecorderLoop {
         }
     }
 
-    /// The last status.
+    /// Returns the last status.
     pub(super) fn final_status(&mut self) -> RecorderStatus {
         let counts = self.recorder.counts();
         RecorderStatus { trigger_to_open: self.spreads.all(), ..self.status(&counts) }

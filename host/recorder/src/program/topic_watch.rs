@@ -30,7 +30,7 @@ const RETRY_AFTER: u32 = 100;
 pub(super) struct TopicRequest {
     pub(super) what: RequestKind,
     pub(super) name: String,
-    /// Its type, if a manifest states it; else the one with most writers.
+    /// Message type, if a manifest states it; `None` for the type with most writers.
     pub(super) type_name: Option<String>,
     pub(super) sink: Arc<dyn Sink>,
 }
@@ -63,12 +63,12 @@ pub(super) struct LargestSample {
 }
 
 impl LargestSample {
-    /// The size in one manifest.
+    /// Creates the size from that in one manifest, `None` if it states none.
     pub(super) fn of(max_bytes: Option<usize>) -> LargestSample {
         LargestSample { largest_bytes: max_bytes.unwrap_or(0), is_usual: max_bytes.is_none() }
     }
 
-    /// The larger of two.
+    /// Returns the larger of two.
     fn and(self, other: LargestSample) -> LargestSample {
         LargestSample {
             largest_bytes: self.largest_bytes.max(other.largest_bytes),
@@ -84,7 +84,7 @@ impl LargestSample {
 /// An event of the watch thread.
 pub(super) enum WatchEvent {
     /// A topic was found, and will be subscribed.
-    Found { topic: TopicId, of: TopicSchema },
+    Found { topic: TopicId, schema: TopicSchema },
     /// The checks of each second.
     Health(Box<SystemHealth>),
 }
@@ -131,9 +131,9 @@ fn add(
             );
         }
     };
-    if let Some(of) = subscribed.iter().find(|of| of.topic == topic) {
-        is_other(&of.type_name);
-        let (max_bytes, requested) = (of.max_bytes, largest.bytes(&of.type_name));
+    if let Some(known) = subscribed.iter().find(|known| known.topic == topic) {
+        is_other(&known.type_name);
+        let (max_bytes, requested) = (known.max_bytes, largest.bytes(&known.type_name));
         if requested > max_bytes {
             let topic = visible(&request.name);
             warn!(
@@ -147,7 +147,9 @@ fn add(
     }
     for (known, _) in requested.iter_mut() {
         match &mut known.what {
-            RequestKind::Recorded { topic: of, largest: known_largest } if *of == topic => {
+            RequestKind::Recorded { topic: known_topic, largest: known_largest }
+                if *known_topic == topic =>
+            {
                 *known_largest = known_largest.and(largest);
                 match &known.type_name {
                     Some(known) => is_other(known),
@@ -212,7 +214,7 @@ impl TopicWatch {
                         }
                         (RequestKind::Recorded { topic, largest }, Some(found)) => {
                             match self.record(request, topic, largest, found) {
-                                Some(of) => subscribed.push(of),
+                                Some(topic) => subscribed.push(topic),
                                 None => *wait = RETRY_AFTER,
                             }
                         }
@@ -229,11 +231,11 @@ impl TopicWatch {
                 health_at = Instant::now();
                 let topics = subscribed
                     .iter()
-                    .map(|of| (of.topic, self.source.status(of.subscription)))
+                    .map(|known| (known.topic, self.source.status(known.subscription)))
                     .collect();
                 let (rss_bytes, cpu_s) = (usage::resident(), usage::cpu_seconds());
                 let disk_free = free(&self.out);
-                let commands = commands.map(|of| self.source.status(of));
+                let commands = commands.map(|subscription| self.source.status(subscription));
                 let health = SystemHealth {
                     source: self.source.health(),
                     topics,
@@ -267,7 +269,7 @@ impl TopicWatch {
                 "no definitions of this type; recording its messages without"
             );
         }
-        let of = TopicSchema {
+        let schema = TopicSchema {
             name: request.name.clone(),
             type_name: found.type_name.clone(),
             definitions: found.definitions_text.clone(),
@@ -282,7 +284,7 @@ impl TopicWatch {
             qos: Qos::Auto,
         };
         // Before its first sample.
-        self.events.send(LoopEvent::Watch(WatchEvent::Found { topic, of })).ok()?;
+        self.events.send(LoopEvent::Watch(WatchEvent::Found { topic, schema })).ok()?;
         match self.source.subscribe(&spec, Arc::clone(&request.sink)) {
             Ok(subscription) => {
                 Some(SubscribedTopic { topic, subscription, type_name: spec.type_name, max_bytes })
@@ -365,9 +367,9 @@ fn choose<'a>(
     found
 }
 
-/// Bytes of the largest sample of a topic whose size no manifest states. Larger samples may be
-/// dropped before they can be counted, so this is generous; the staging area, which counts samples
-/// without room, is not.
+/// Returns the size, in bytes, of the largest sample of a topic whose size no manifest states.
+/// Larger samples may be dropped before they can be counted, so this is generous; the staging area,
+/// which counts samples without room, is not.
 fn usual_bytes(type_name: &str) -> usize {
     match type_name.rsplit('/').next() {
         Some("Image" | "PointCloud2") => 32 << 20,
@@ -375,7 +377,7 @@ fn usual_bytes(type_name: &str) -> usize {
     }
 }
 
-/// Free bytes on the disk of `folder`.
+/// Returns the free bytes on the disk of `folder`.
 fn free(folder: &Path) -> Option<u64> {
     rustix::fs::statvfs(folder).ok().map(|disk| disk.f_bavail.saturating_mul(disk.f_frsize))
 }

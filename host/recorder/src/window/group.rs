@@ -39,7 +39,8 @@ impl Share {
 }
 
 impl Group {
-    /// A group of at least one window. Instants before `horizon` will not be queried.
+    /// Creates a group of at least one window; `None` without windows. Instants before `horizon`
+    /// will not be queried.
     pub(super) fn new(windows: &[Window], horizon: i64) -> Option<Group> {
         let first = windows.iter().min_by_key(|window| (window.anchor, window.lambda))?;
         let from = windows.iter().map(|window| window.from).min()?;
@@ -108,7 +109,7 @@ impl Group {
         self.shares.get(lambda).is_some_and(|share| share.covers(at))
     }
 
-    /// The first instant of `from..=to` that no window of `lambda` contains.
+    /// Returns the first instant of `from..=to` that no window of `lambda` contains.
     pub(super) fn first_uncovered(&self, lambda: usize, from: i64, to: i64) -> Option<i64> {
         if from > to {
             return None;
@@ -120,8 +121,8 @@ impl Group {
         }
     }
 
-    /// Number of windows of `lambda` in the current clip. In a clip that continues another,
-    /// overlapping windows count as one.
+    /// Returns the number of windows of `lambda` in the current clip. In a clip that continues
+    /// another, overlapping windows count as one.
     pub fn windows(&self, lambda: usize) -> u64 {
         self.shares.get(lambda).map_or(0, |share| share.windows)
     }

@@ -30,7 +30,7 @@ impl Intervals {
             .is_some_and(|(begin, _)| *begin <= at)
     }
 
-    /// The first instant of `from..=to` that is not in the set.
+    /// Returns the first instant of `from..=to` that is not in the set.
     pub fn first_outside(&self, from: i64, to: i64) -> Option<i64> {
         match self.0.get(self.0.partition_point(|(_, end)| *end < from)) {
             Some((begin, end)) if *begin <= from => (*end < to).then(|| end.saturating_add(1)),
@@ -38,12 +38,12 @@ impl Intervals {
         }
     }
 
-    /// The latest instant.
+    /// Returns the latest instant.
     pub fn end(&self) -> Option<i64> {
         self.0.last().map(|(_, end)| *end)
     }
 
-    /// Number of intervals that end after `at`.
+    /// Returns the number of intervals that end after `at`.
     pub fn beyond(&self, at: i64) -> u64 {
         (self.0.len() - self.0.partition_point(|(_, end)| *end <= at)) as u64
     }

@@ -84,18 +84,18 @@ struct WindowLambda {
     started: BTreeSet<(TriggeredBy, String)>,
 }
 
-/// Most recordings of one lambda at a time; and as many that commands started.
+/// Maximum number of running recordings of one lambda. Commands may start as many again.
 pub const STARTED_MAX: usize = 64;
 
-/// Most windows that wait for an open clip to end. Otherwise a lambda with windows that do not
-/// touch could fill the memory while a disk is slow.
+/// Maximum number of windows that wait for an open clip to end. Otherwise a lambda with windows
+/// that do not touch could fill the memory while a disk is slow.
 const WAITING_MAX: usize = 4096;
 
 /// Greatest lag of a late trigger behind the samples even if no window has a preroll.
 const LATE_NS: i64 = 1_000_000_000;
 
 impl Windows {
-    /// A state without lambdas and windows. A clip covers `max_length_ns` at most.
+    /// Creates a state without lambdas and windows. A clip covers `max_length_ns` at most.
     pub fn new(max_length_ns: i64) -> Windows {
         Windows {
             lambdas: Vec::new(),
@@ -115,14 +115,17 @@ impl Windows {
         self.lambdas.len() - 1
     }
 
-    /// Time from now back to which samples have to be kept.
+    /// Returns the time from now back to which samples have to be kept.
     ///
     /// Let P be the longest preroll. A trigger whose anchor is now covers nothing before `now - P`.
-    /// A window that waits, because it lies behind the end `to` of the open clip, begins after
-    /// `to`; and it waits no longer than until `now > to + P + grace`, when that clip is finished:
-    /// till then its begin is after `now - P - grace`. (A step that does both at once is made
-    /// before samples are given up, see `Recorder::pass`.) So P and the grace are enough for
-    /// triggers that come at once. Another P and a second let a trigger be late by as much.
+    ///
+    /// A window that lies behind the end `to` of the open clip waits, and begins after `to`. It
+    /// waits until that clip is finished, which is once `now > to + P + grace`. Until then it
+    /// begins after `now - P - grace`. (If time jumps past both limits, `Recorder::pass` takes the
+    /// pending steps before it drops samples.)
+    ///
+    /// So P and the grace are enough for triggers that come at once. Another P and a second let a
+    /// trigger be late by as much.
     pub fn retention_ns(&self) -> i64 {
         self.longest_preroll_ns
             .saturating_mul(2)
@@ -130,12 +133,12 @@ impl Windows {
             .saturating_add(self.grace_ns)
     }
 
-    /// Earlier instants will not be queried.
+    /// Returns the instant before which nothing will be queried.
     pub fn horizon(&self) -> i64 {
         self.now.saturating_sub(self.retention_ns())
     }
 
-    /// The group of the open clip.
+    /// Returns the group of the open clip.
     pub fn open(&self) -> Option<&Group> {
         self.open.as_ref()
     }
@@ -149,7 +152,7 @@ impl Windows {
             || self.pending.iter().any(waits)
     }
 
-    /// Last instant that fits into the open clip.
+    /// Returns the last instant that fits into the open clip.
     pub fn limit(&self) -> i64 {
         self.open.as_ref().map_or(i64::MAX, |open| open.from.saturating_add(self.max_length_ns))
     }

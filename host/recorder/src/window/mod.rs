@@ -8,7 +8,7 @@
 //!   it; a window that does not touch it waits meanwhile. So the groups do not depend on how soon a
 //!   trigger comes after its anchor, as long as it comes before the next sample.
 //!
-//! Pure bookkeeping: samples and files are unknown here, and time is given by the caller.
+//! Nothing here accesses samples or files, or reads a clock: the caller passes the time.
 
 mod group;
 mod intervals;
@@ -30,16 +30,16 @@ pub struct WindowRules {
     pub cooldown_ns: i64,
 }
 
-/// An interval that one lambda wants to keep.
+/// An interval to keep for one lambda.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Window {
     /// The lambda.
     pub lambda: usize,
     /// Stamp of the trigger.
     pub anchor: i64,
-    /// Its first instant.
+    /// First instant of the interval.
     pub from: i64,
-    /// Its last instant; `None` until the stop.
+    /// Last instant of the interval; `None` until the stop.
     pub to: Option<i64>,
     /// Number of merged windows: overlapping ones of one lambda wait as one.
     pub windows: u64,

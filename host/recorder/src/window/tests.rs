@@ -43,7 +43,7 @@ fn drain(windows: &mut Windows) -> Vec<Group> {
     finished
 }
 
-/// The begins and ends of the groups of triggers of lambda 0, each at its anchor.
+/// Returns the begins and ends of the groups of triggers of lambda 0, each at its anchor.
 fn groups(windows: &mut Windows, triggers: &[(i64, TriggerKind)]) -> Vec<(i64, i64)> {
     let mut finished = Vec::new();
     for (at, kind) in triggers {
@@ -196,7 +196,8 @@ fn extreme_times_do_not_overflow() {
 /// A window of the model: lambda, first and last instant.
 type Plain = (usize, i64, i64);
 
-/// The model: all windows at once, then the connected ones. No state, no order of arrival.
+/// Computes the groups by a simple model: all windows at once, then the connected ones. It has no
+/// state, no order of arrival.
 fn model(rules: &[WindowRules], triggers: &[(i64, usize, TriggerKind)]) -> Vec<Vec<Plain>> {
     let mut windows: Vec<Plain> = Vec::new();
     for (lambda, rules) in rules.iter().enumerate() {

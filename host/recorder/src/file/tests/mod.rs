@@ -41,13 +41,13 @@ impl TestDir {
         RecordingFolder::open(&self.0).unwrap()
     }
 
-    /// The listed clips.
+    /// Returns the listed clips.
     fn listed(&self) -> Vec<Clip> {
         let text = fs::read_to_string(self.path("clips.jsonl")).unwrap_or_default();
         text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
     }
 
-    /// Names in the folder of clips, sorted, without the lock.
+    /// Returns the names in the folder of clips, sorted, without the lock.
     fn files(&self) -> Vec<String> {
         let entries = fs::read_dir(self.path("clips")).unwrap();
         let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
@@ -114,7 +114,7 @@ fn meta(at_ns: i64, seq: u64) -> SampleMeta {
     }
 }
 
-/// The payload of message `n`; no two are equal.
+/// Returns the payload of message `n`; no two are equal.
 fn payload(n: u64) -> Vec<u8> {
     [&n.to_le_bytes()[..], &[n as u8; 13]].concat()
 }
@@ -148,7 +148,7 @@ fn trailer() -> ClipTrailer {
     }
 }
 
-/// The clip as the next start lists it, if its recorder died before listing it.
+/// Returns the clip as the next start lists it, if its recorder died before listing it.
 fn unlisted(clip: &Clip) -> Clip {
     let note = "the recorder died before it listed this clip; nothing of it is lost".to_owned();
     Clip { recovered: Some(Recovered { lost_bytes: 0, note }), ..clip.clone() }
@@ -165,7 +165,7 @@ fn stamp(n: u64) -> i64 {
     10 * SECOND + n as i64 * SECOND / 4
 }
 
-/// The messages of a replay of `path`, in order; the file must be complete.
+/// Returns the messages of a replay of `path`, in order; the file must be complete.
 fn replayed(path: &Path) -> Vec<(TopicSchema, SampleMeta, Vec<u8>)> {
     let mut all = Vec::new();
     let end = super::read::each_message(path, |topic, meta, cdr| {
@@ -176,7 +176,7 @@ fn replayed(path: &Path) -> Vec<(TopicSchema, SampleMeta, Vec<u8>)> {
     all
 }
 
-/// The numbers of the messages in `path`, as [`add`] wrote them.
+/// Returns the numbers of the messages in `path`, as [`add`] wrote them.
 fn numbers(path: &Path) -> Vec<u64> {
     let number = |(_, meta, cdr): (TopicSchema, SampleMeta, Vec<u8>)| {
         let n = u64::from_le_bytes(*cdr.first_chunk().unwrap());

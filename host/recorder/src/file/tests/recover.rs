@@ -9,7 +9,7 @@ use super::super::durable::steps;
 use super::*;
 use crate::error::RecordError;
 
-/// The bytes of an unfinished clip of `messages` messages, some of them in an open chunk.
+/// Returns the bytes of an unfinished clip of `messages` messages, some of them in an open chunk.
 fn part(messages: u64) -> Vec<u8> {
     let scratch = TestDir::new();
     let (mut folder, _) = scratch.open();
@@ -19,7 +19,7 @@ fn part(messages: u64) -> Vec<u8> {
     fs::read(scratch.path("clips/a.mcap.part")).unwrap()
 }
 
-/// The folder of a recorder that died after it had written `part` of a clip.
+/// Returns the folder of a recorder that died after it had written `part` of a clip.
 fn died(part: &[u8]) -> TestDir {
     let scratch = TestDir::new();
     fs::create_dir(scratch.path("clips")).unwrap();
@@ -27,8 +27,8 @@ fn died(part: &[u8]) -> TestDir {
     scratch
 }
 
-/// Number of messages in the closed chunks of an unfinished clip of `messages` messages: five per
-/// second.
+/// Returns the number of messages in the closed chunks of an unfinished clip of `messages`
+/// messages: five per second.
 fn closed(messages: u64) -> u64 {
     messages.saturating_sub(1) / 5 * 5
 }

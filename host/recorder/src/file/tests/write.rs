@@ -14,7 +14,7 @@ use super::super::{ClipTrailer, MESSAGE_MAX, UnfinishedClip};
 use super::*;
 use crate::error::RecordError;
 
-/// All metadata records of a finished clip, read by the `mcap` crate.
+/// Returns all metadata records of a finished clip, read by the `mcap` crate.
 fn metadata(file: &[u8]) -> Vec<(String, BTreeMap<String, String>)> {
     let records = mcap::read::LinearReader::new(file).unwrap();
     let metadata = records.filter_map(|record| match record.unwrap() {
@@ -178,15 +178,15 @@ fn a_clip_describes_a_lambda_by_its_journal() {
         .finish(ClipTrailer { headers: vec![header.into()], ..trailer() })
         .unwrap();
     folder.begin("b", &clip_header()).unwrap().finish(trailer()).unwrap();
-    let of = |name: &str| {
+    let values = |name: &str| {
         let records = metadata(&fs::read(scratch.path(name)).unwrap());
-        let of: Vec<_> = named(&records, "gleaner.lambda").cloned().collect();
-        let [of] = &of[..] else { panic!("{of:?}") };
-        ["config", "engine", "gleaner", "models", "kind", "windows"].map(|key| of[key].clone())
+        let lambdas: Vec<_> = named(&records, "gleaner.lambda").cloned().collect();
+        let [lambda] = &lambdas[..] else { panic!("{lambdas:?}") };
+        ["config", "engine", "gleaner", "models", "kind", "windows"].map(|key| lambda[key].clone())
     };
     let known = [r#"{"limit":3}"#, "Python", "0.1.0", "a.onnx=ff, b.onnx=ff", "wasm", "1"];
-    assert_eq!(of("clips/a.mcap"), known);
-    assert_eq!(of("clips/b.mcap"), ["unknown", "unknown", "unknown", "unknown", "wasm", "1"]);
+    assert_eq!(values("clips/a.mcap"), known);
+    assert_eq!(values("clips/b.mcap"), ["unknown", "unknown", "unknown", "unknown", "wasm", "1"]);
 }
 
 #[test]

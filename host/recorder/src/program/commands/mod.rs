@@ -30,13 +30,13 @@ use request::{CommandError, CommandRequest};
 pub(super) const TYPE: &str = "std_msgs/msg/String";
 /// Messages that are read per second, and in a burst.
 const ALLOWED: RateLimit = RateLimit::of(1.0, 5.0);
-/// Most messages that are queued for the loop: more than a burst.
+/// Maximum number of messages that are queued for the loop: more than a burst.
 const WAITING: usize = 8;
 /// Messages that the network keeps until they are taken.
 pub(super) const QUEUE: usize = 16;
 /// Interval of the log line on unread messages.
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
-/// Most characters of a logged refusal: a message may contain any text.
+/// Maximum number of characters of a logged refusal: a message may contain any text.
 const WHY_MAX: usize = 200;
 
 /// A message to be read.
@@ -127,7 +127,7 @@ impl Commands {
         (commands, Arc::new(sink))
     }
 
-    /// Adds a lambda.
+    /// Adds a lambda that commands may name.
     pub(super) fn add(&mut self, name: &str, lambda: LambdaId) {
         self.lambdas.insert(name.to_owned(), lambda);
     }
@@ -231,7 +231,7 @@ impl Commands {
         warn!(topic = %self.topic, too_many, too_long, "commands refused unread");
     }
 
-    /// The counts of commands.
+    /// Returns the counts of commands.
     pub(super) fn status(&self, network: Option<&ReceptionStatus>) -> CommandStatus {
         let (too_many, too_long) = self.unread.counts();
         CommandStatus {

@@ -74,7 +74,7 @@ impl CommandRequest {
     }
 }
 
-/// The text of a `std_msgs/msg/String`.
+/// Returns the text of a `std_msgs/msg/String`.
 fn text(cdr: &[u8], endian: Endian) -> Result<&str, CommandError> {
     let found = || {
         let (len, rest) = cdr.split_first_chunk::<4>()?;
@@ -101,7 +101,7 @@ mod tests {
         CommandRequest::read(&message(text), Endian::Little)
     }
 
-    /// The error of a text, with the error of the JSON parser.
+    /// Returns the error of a text, with the error of the JSON parser.
     fn refused(text: &str) -> String {
         let error = read(text).unwrap_err();
         match &error {
