@@ -1,3 +1,5 @@
+//! A recorded clip, as `clips.jsonl` lists it.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -51,11 +53,11 @@ impl Clip {
 /// A lambda with windows in a clip.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClipLambda {
-    /// Its name.
+    /// Name of the lambda.
     pub name: String,
-    /// Its version.
+    /// Version of the lambda.
     pub version: String,
-    /// Its kind.
+    /// Kind of the lambda.
     pub kind: LambdaKind,
     /// SHA-256 of the digests of its files, in hexadecimal digits.
     pub digest: String,
@@ -79,7 +81,7 @@ pub struct Moment {
     pub attributes: Option<Map<String, Value>>,
     /// Stamp of the wake, in ns since the epoch of the drive.
     pub at_ns: i64,
-    /// Its origin, if not the lambda itself: then no journal has it.
+    /// Origin of a moment that the lambda did not cause; no journal has such a moment.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub source: Option<String>,
 }
@@ -126,7 +128,7 @@ fn fits(attributes: &Map<String, Value>) -> bool {
 pub struct ClipTopic {
     /// The topic.
     pub topic: String,
-    /// Its message type; `None` if it was requested and never appeared.
+    /// Message type of the topic; `None` if it was requested and never appeared.
     pub type_name: Option<String>,
     /// Number of its messages in the clip.
     pub messages: u64,

@@ -1,3 +1,5 @@
+//! The decision of a lambda in one wake: triggers, fault and cost.
+
 use serde::{Deserialize, Serialize};
 
 /// The outcome of one wake of a lambda: one line of `decisions.jsonl`.

@@ -1,3 +1,5 @@
+//! A log line of a lambda, with its severity.
+
 use serde::{Deserialize, Serialize};
 
 /// The severity of a log line.
@@ -17,7 +19,7 @@ pub enum LogLevel {
 pub struct LogLine {
     /// Time of the wake that logged it, in ns.
     pub at_ns: i64,
-    /// Its severity.
+    /// Severity of the line.
     pub level: LogLevel,
     /// The text, cut by the host to a maximum length.
     pub message: String,

@@ -251,9 +251,9 @@ impl LineWriter {
 
     /// Moves the file and opens a new one, if it has reached the length of rotation.
     fn rotate(&mut self) -> io::Result<()> {
-        let Some((most, moved)) = &self.rotation else { return Ok(()) };
-        if self.file.metadata().is_ok_and(|metadata| metadata.len() >= *most) {
-            match fs::rename(&self.path, moved) {
+        let Some((max_bytes, previous)) = &self.rotation else { return Ok(()) };
+        if self.file.metadata().is_ok_and(|metadata| metadata.len() >= *max_bytes) {
+            match fs::rename(&self.path, previous) {
                 // It was moved before, and a new one could not be opened.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 renamed => renamed?,

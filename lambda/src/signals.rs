@@ -10,8 +10,8 @@ use crate::manifest::ConfigValue;
 /// The values that a replayed lambda read, and the cost of its wakes: the file `signals.json`, from
 /// which the report is drawn.
 ///
-/// Its size is bounded: a curve has up to [`Signals::POINTS_MAX`] points, a lambda up to
-/// [`Signals::CURVES_MAX`] curves.
+/// The size of the file is bounded: a curve has up to [`Signals::POINTS_MAX`] points, a lambda up
+/// to [`Signals::CURVES_MAX`] curves.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Signals {
     /// The effective configuration, by key.
@@ -44,7 +44,7 @@ impl Signals {
 pub struct Curve {
     /// Name of the input.
     pub input: String,
-    /// Its topic, after remapping.
+    /// Topic of the input, after remapping.
     pub topic: String,
     /// The path of the field, such as `linear_acceleration.x`, or a value that the host computed
     /// from a picture: `mean luma`.

@@ -1,3 +1,5 @@
+//! Finds the sources of a build: the files to copy and the files to compile.
+
 use std::collections::BTreeSet;
 use std::fs;
 use std::io;
@@ -137,7 +139,7 @@ mod tests {
             .map(|files| files.iter().map(|file| file.display().to_string()).collect())
     }
 
-    /// A folder that could belong to a lambda of either kind.
+    /// Creates a folder that could belong to a lambda of either kind.
     fn folder() -> TestFolder {
         let dir = TestFolder::new();
         for file in [

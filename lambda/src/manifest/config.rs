@@ -1,3 +1,5 @@
+//! The table `[config]`: its items, and the values that a lambda starts with.
+
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
@@ -10,7 +12,7 @@ use gleaner_base::{Exit, Explain};
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct ConfigItem {
-    /// Its name.
+    /// Name of the setting.
     pub name: ItemName,
     /// Default value. Its type is the type of the key.
     pub default: ConfigValue,

@@ -11,7 +11,7 @@ use gleaner_base::grouped;
 /// A file that is generated from this crate.
 #[derive(Debug, Clone, Copy)]
 pub struct Generated {
-    /// Its path in the checkout.
+    /// Path of the file in the checkout.
     pub path: &'static str,
     text: fn(&str) -> Result<String, String>,
 }

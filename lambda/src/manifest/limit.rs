@@ -21,7 +21,7 @@ pub(super) trait Unit: Copy + Ord {
     /// Returns the value as in JSON and the SDKs: a number, bytes, or nanoseconds.
     fn plain(self) -> u64;
 
-    /// Inverse of [`plain`](Self::plain).
+    /// Converts a number of [`plain`](Self::plain) back.
     fn of_plain(plain: u64) -> Self;
 }
 
@@ -98,7 +98,7 @@ impl Unit for Duration {
 pub(super) struct Limit {
     pub(super) key: &'static str,
     pub(super) unit: &'static str,
-    /// Its doc comment, which begins with a space.
+    /// Doc comment of the limit, which begins with a space.
     pub(super) meaning: &'static str,
     /// Minimum, default and maximum, plain.
     pub(super) plain: [u64; 3],

@@ -51,7 +51,7 @@ macro_rules! limits {
             /// The keys, in the order of the table.
             pub(super) const KEYS: &[&str] = &[$(stringify!($key)),+];
 
-            /// The table itself.
+            /// Returns the table itself.
             pub(super) fn table() -> [Limit; Limits::KEYS.len()] {
                 [$(Limit::new(
                     stringify!($key),
@@ -75,8 +75,8 @@ macro_rules! limits {
                 })
             }
 
-            fn smaller(&self, most: &Limits) -> Limits {
-                Limits { $($key: self.$key.min(most.$key)),+ }
+            fn smaller(&self, max: &Limits) -> Limits {
+                Limits { $($key: self.$key.min(max.$key)),+ }
             }
 
             /// Returns each key with its value, as written in the file.
@@ -169,7 +169,7 @@ limits! {
 /// A limit that a vehicle reduced.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Tightened {
-    /// Its key.
+    /// Key of the limit.
     pub key: &'static str,
     /// The value in the manifest.
     pub from: String,
@@ -184,9 +184,9 @@ impl fmt::Display for Tightened {
 }
 
 impl Limits {
-    /// Returns the smaller value of each pair, and the limits that `most` reduced.
-    pub fn tightened_by(&self, most: &Limits) -> (Limits, Vec<Tightened>) {
-        let tight = self.smaller(most);
+    /// Returns the smaller value of each pair, and the limits that `max` reduced.
+    pub fn tightened_by(&self, max: &Limits) -> (Limits, Vec<Tightened>) {
+        let tight = self.smaller(max);
         let pairs = self.in_words().into_iter().zip(tight.in_words());
         let tightened = pairs.filter(|(before, after)| before != after);
         (tight, tightened.map(|((key, from), (_, to))| Tightened { key, from, to }).collect())

@@ -71,7 +71,7 @@ dark_luma = { default = 50.0, min = 0, max = 255, description = "mean grey below
 
 /// A table of the manifest.
 pub(super) struct Section {
-    /// Its header, such as `[lambda]`.
+    /// Header of the table, such as `[lambda]`.
     pub(super) title: &'static str,
     note: String,
     pub(super) keys: Vec<Key>,
@@ -87,10 +87,10 @@ pub(super) struct Key {
 }
 
 impl Key {
-    /// Creates the key `name`, which is `field` of the type `of`.
-    fn new(name: &'static str, of: &str, field: &str, form: impl Into<String>) -> Key {
-        let meaning =
-            meaning(of, field).unwrap_or_else(|| panic!("`{field}` of `{of}` has a comment"));
+    /// Creates the key `name`, which is `field` of the type `type_name`.
+    fn new(name: &'static str, type_name: &str, field: &str, form: impl Into<String>) -> Key {
+        let meaning = meaning(type_name, field)
+            .unwrap_or_else(|| panic!("`{field}` of `{type_name}` has a comment"));
         Key { name, form: form.into(), default: "none".to_owned(), range: String::new(), meaning }
     }
 
@@ -298,12 +298,12 @@ fn duration(duration: Duration) -> String {
     format!("`\"{}\"`", format_duration(duration))
 }
 
-/// Returns the doc comment of `field` of the struct or enum `of`, in one line.
-fn meaning(of: &str, field: &str) -> Option<String> {
+/// Returns the doc comment of `field` of the struct or enum `type_name`, in one line.
+fn meaning(type_name: &str, field: &str) -> Option<String> {
     let body = SOURCES.iter().find_map(|source| {
         let at = ["struct", "enum"]
             .iter()
-            .find_map(|kind| source.find(&format!("pub {kind} {of} {{")))?;
+            .find_map(|kind| source.find(&format!("pub {kind} {type_name} {{")))?;
         source[at..].split("\n}").next()
     })?;
     let mut comment = String::new();

@@ -1,3 +1,5 @@
+//! Converts errors of the TOML parser to errors for the user.
+
 use toml::de::Error as TomlError;
 
 use super::error::ManifestError;

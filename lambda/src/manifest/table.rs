@@ -33,7 +33,7 @@ pub(super) struct TomlTable<'a> {
     pub(super) document: &'a Document<'a>,
     /// The path of its keys, for example `schedule`; empty at the top.
     pub(super) path: String,
-    /// Its header in the file, for example `[schedule]` or `[[input]]`.
+    /// Header of the table in the file, for example `[schedule]` or `[[input]]`.
     pub(super) title: String,
     pub(super) offset: usize,
     pub(super) entries: &'a DeTable<'a>,

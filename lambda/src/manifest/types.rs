@@ -1,3 +1,5 @@
+//! The content of a validated manifest.
+
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize, Serializer};
@@ -255,7 +257,7 @@ impl Manifest {
     }
 }
 
-/// No duration in a manifest exceeds an hour, so that its nanoseconds fit.
+/// Serializes a duration as nanoseconds. No duration in a manifest exceeds an hour, so they fit.
 fn nanoseconds<S: Serializer>(duration: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_u64(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX))
 }

@@ -19,7 +19,7 @@ type Result<T> = std::result::Result<T, ManifestError>;
 #[derive(Clone)]
 pub(super) struct TomlValue<'a> {
     pub(super) document: &'a Document<'a>,
-    /// Its key, the last part of `path`, as it is in the file.
+    /// Key of the value, the last part of `path`, as it is in the file.
     pub(super) name: &'a str,
     pub(super) path: String,
     pub(super) offset: usize,
@@ -209,17 +209,17 @@ impl<'a> TomlValue<'a> {
         show: impl Fn(&T) -> String,
     ) -> Result<()> {
         match (min, max) {
-            (Some(least), _) if value < least => Err(ManifestError::TooSmall {
+            (Some(min), _) if value < min => Err(ManifestError::TooSmall {
                 at: self.location(),
                 value: show(value),
-                min: show(least),
+                min: show(min),
                 max: max.map(show),
             }),
-            (_, Some(most)) if value > most => Err(ManifestError::TooLarge {
+            (_, Some(max)) if value > max => Err(ManifestError::TooLarge {
                 at: self.location(),
                 value: show(value),
                 min: min.map(&show),
-                max: show(most),
+                max: show(max),
             }),
             _ => Ok(()),
         }
