@@ -18,12 +18,12 @@ pub fn trigger_lines(decision: &Decision, start_ns: i64) -> impl Iterator<Item =
         .map(move |trigger| format!("{seconds:.3} {} {}", visible(&trigger.label), score(trigger)))
 }
 
-/// Score of `trigger` in three significant digits, `-` if it has none.
+/// Formats the score of `trigger` in three significant digits, `-` if it has none.
 pub fn score(trigger: &Trigger) -> String {
     trigger.score.map_or("-".to_owned(), three_digits)
 }
 
-/// `bytes` with a unit: `205 KiB`, `1.3 MiB`.
+/// Formats `bytes` with a unit: `205 KiB`, `1.3 MiB`.
 pub fn size(bytes: u64) -> String {
     match bytes {
         0..1024 => format!("{bytes} B"),
@@ -32,7 +32,7 @@ pub fn size(bytes: u64) -> String {
     }
 }
 
-/// Contents of a clip: `9.1 s, 205 KiB: messages /imu/data 950, /vehicle/speed 757`.
+/// Formats the contents of a clip: `9.1 s, 205 KiB: messages /imu/data 950, /vehicle/speed 757`.
 pub fn clip_contents(clip: &Clip) -> String {
     let [from, to] = clip_span(clip);
     let topics = clip
@@ -47,12 +47,12 @@ pub fn clip_contents(clip: &Clip) -> String {
     )
 }
 
-/// Log times of a clip's first and last message; of its window, if it has no messages.
+/// Returns the log times of a clip's first and last message; of its window, if it has no messages.
 pub fn clip_span(clip: &Clip) -> [i64; 2] {
     [clip.first_ns.unwrap_or(clip.from_ns), clip.last_ns.unwrap_or(clip.to_ns)]
 }
 
-/// Log time `at_ns` in s after `start_ns`.
+/// Converts log time `at_ns` to s after `start_ns`.
 pub fn seconds(at_ns: i64, start_ns: i64) -> f64 {
     at_ns.saturating_sub(start_ns) as f64 / 1e9
 }
@@ -86,18 +86,19 @@ pub fn three_digits(value: f64) -> String {
     }
 }
 
-/// `1 wake`, `2,000 wakes`.
+/// Formats a count with its noun: `1 wake`, `2,000 wakes`.
 pub fn counted(count: u64, thing: &str) -> String {
     format!("{} {thing}{}", grouped(count), if count == 1 { "" } else { "s" })
 }
 
-/// Name of `kind` in `decisions.jsonl`.
+/// Returns the name of `kind` in `decisions.jsonl`.
 pub fn fault_kind(kind: FaultKind) -> String {
     let word = serde_json::to_value(kind).ok();
     word.as_ref().and_then(|word| word.as_str()).unwrap_or("fault").to_owned()
 }
 
-/// Most informative line of a fault's message: the first, but of a Python traceback the last.
+/// Returns the most informative line of a fault's message: the first, or the last of a Python
+/// traceback.
 pub fn gist(message: &str) -> &str {
     let mut lines = message.lines().map(str::trim).filter(|line| !line.is_empty());
     let traceback = message.contains("Traceback (most recent call last)");

@@ -58,7 +58,7 @@ pub struct Diff {
 /// One of the two runs.
 #[derive(Debug, Serialize)]
 pub struct ComparedRun {
-    /// Its folder.
+    /// Result folder of the run.
     pub out: String,
     /// The name of its lambda.
     pub lambda: String,
@@ -75,7 +75,7 @@ pub struct ComparedRun {
 /// A value that differs; `None` where it is missing or unknown.
 #[derive(Debug, PartialEq, Eq, Serialize)]
 pub struct ValueChange {
-    /// Its name, in words or as a key of the config.
+    /// Name of the value, in words or as a key of the config.
     pub what: String,
     /// In the first run.
     pub a: Option<String>,

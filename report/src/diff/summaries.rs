@@ -96,8 +96,8 @@ fn config(a: Option<&Signals>, b: Option<&Signals>, notes: &mut Vec<String>) -> 
             .push("config not compared: it is unknown for a run without `signals.json`".to_owned());
         return Vec::new();
     };
-    let word = |of: &BTreeMap<String, ConfigValue>, key: &str| {
-        of.get(key).map(|value| serde_json::to_string(value).unwrap_or_default())
+    let word = |values: &BTreeMap<String, ConfigValue>, key: &str| {
+        values.get(key).map(|value| serde_json::to_string(value).unwrap_or_default())
     };
     let keys: BTreeSet<_> = a.config.keys().chain(b.config.keys()).collect();
     let both = keys.into_iter().map(|key| (key, word(&a.config, key), word(&b.config, key)));
@@ -178,7 +178,8 @@ fn counts(a: &RunSummary, b: &RunSummary, clips: [[u64; 2]; 2]) -> Vec<ValueChan
     changes
 }
 
-/// Median costs; of a run without `signals.json`, those of its summary.
+/// Compares the median costs of a wake. A live run has no `signals.json`: its run time is that of
+/// its summary, and its fuel is unknown.
 fn cost(a: (&RunSummary, Option<&Signals>), b: (&RunSummary, Option<&Signals>)) -> Vec<Cost> {
     let time = |(summary, signals): (&RunSummary, Option<&Signals>)| match (signals, summary) {
         (Some(signals), _) => Some(signals.run_ns.p50).filter(|_| signals.run_ns.count > 0),

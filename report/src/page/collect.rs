@@ -218,7 +218,8 @@ fn each<T: DeserializeOwned>(
     Ok(())
 }
 
-/// Time of the first decision, log line or clip of a live run, whose start is not recorded.
+/// Returns the time of the first decision, log line or clip of a live run, whose start is not
+/// recorded.
 fn first_ns(out: &Path) -> Option<i64> {
     #[derive(Deserialize)]
     struct At {
@@ -360,7 +361,7 @@ pub(super) fn positions<K: std::hash::Hash + Eq>(
     positions
 }
 
-/// `value` in backquotes, for a note.
+/// Returns `value` in backquotes, for a note.
 pub(super) fn named(value: impl Display) -> String {
     format!("`{}`", visible(&value.to_string()))
 }

@@ -76,8 +76,8 @@ pub(super) struct Events {
 }
 
 impl Events {
-    /// An empty collection for a run that starts at `start_ns`. Texts of triggers may take `budget`
-    /// bytes, those of faults half of it.
+    /// Creates an empty collection for a run that starts at `start_ns`. Texts of triggers may take
+    /// `budget` bytes, those of faults half of it.
     pub(super) fn new(start_ns: i64, budget: usize) -> Self {
         Self {
             start_ns,
@@ -202,7 +202,7 @@ impl Events {
     }
 }
 
-/// Used and allowed amounts, in the unit of the limit.
+/// Formats the used and the allowed amount, in the unit of the limit.
 fn amounts(fault: &Fault) -> Amounts {
     let words = |amount: u64| match fault.kind {
         FaultKind::Memory => size(amount),

@@ -59,12 +59,12 @@ pub(super) fn html(page: &ReportPage) -> String {
     text
 }
 
-/// The script as one function, so that it adds no global names.
+/// Returns the script as one function, so that it adds no global names.
 fn script() -> String {
     format!("\n{PLOTS}\n(() => {{\n\"use strict\";\n{}\n}})();\n", SCRIPTS.join("\n"))
 }
 
-/// `value` as JSON without characters that could end an HTML element or a line of a script.
+/// Returns `value` as JSON without characters that could end an HTML element or a line of a script.
 pub(super) fn json(value: &impl Serialize) -> String {
     let plain = serde_json::to_string(value).expect("page data has only text keys");
     let mut text = String::with_capacity(plain.len());
@@ -80,7 +80,7 @@ pub(super) fn json(value: &impl Serialize) -> String {
     text
 }
 
-/// The `data:` URL of a JPEG.
+/// Returns the `data:` URL of a JPEG.
 pub(super) fn jpeg_address(jpeg: &[u8]) -> String {
     format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg))
 }

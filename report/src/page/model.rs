@@ -138,7 +138,7 @@ pub(crate) struct PageClip {
     pub(crate) span_ns: [i64; 2],
     pub(crate) bytes: u64,
     pub(crate) triggers: u64,
-    /// Its contents, as text.
+    /// Contents of the clip, as text.
     pub(crate) contents: String,
     /// Reasons why it lacks data of its window.
     pub(crate) incomplete: Vec<String>,

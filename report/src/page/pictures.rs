@@ -1,6 +1,6 @@
 //! Collects the pictures of the page: camera pictures at triggers, else the thumbnails of clips.
 //!
-//! Their paths come from untrusted files: only small JPEG files inside the result folder are read.
+//! The paths come from untrusted files: only small JPEG files inside the result folder are read.
 
 use std::io;
 use std::path::{Component, Path, PathBuf};
@@ -114,7 +114,7 @@ impl<'a> Pictures<'a> {
         Some(self.shown.len() - 1)
     }
 
-    /// Note on pictures that cannot be read.
+    /// Returns a note on pictures that cannot be read.
     pub(super) fn note(&self) -> Option<String> {
         let (first, count) = self.refused.as_ref()?;
         Some(match count {

@@ -19,7 +19,7 @@ pub(crate) struct Out(PathBuf);
 pub(crate) const START_NS: i64 = 1_700_000_000_000_000_000;
 
 impl Out {
-    /// Results without decisions.
+    /// Creates results without decisions.
     pub(crate) fn new() -> Out {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let name = format!(
@@ -65,7 +65,7 @@ impl Drop for Out {
     }
 }
 
-/// The summary of a replay over 40 s.
+/// Returns the summary of a replay over 40 s.
 pub(crate) fn summary() -> Value {
     json!({
         "lambda": "hello", "version": "0.1.0", "kind": "wasm", "drive": ["a.mcap"], "out": "out", "wakes": 400, "triggers": 2, "faults": 1,
@@ -79,7 +79,7 @@ pub(crate) fn summary() -> Value {
     })
 }
 
-/// A wake `ms` after the start, with these triggers and this fault.
+/// Returns a wake `ms` after the start, with these triggers and this fault.
 pub(crate) fn wake(ms: i64, triggers: Value, fault: Value) -> Value {
     json!({
         "at_ns": START_NS + ms * 1_000_000, "cause": "event", "input": "imu", "topic": "/imu", "writer": null, "seq": ms, "triggers": triggers,
