@@ -12,7 +12,7 @@ use crate::args::{InspectArgs, TopicsArgs};
 use crate::render;
 use crate::stdout::print;
 
-/// The argument that makes `gleaner-shim` end its runtime when this process dies.
+/// Returns the argument that makes `gleaner-shim` end its runtime when this process dies.
 pub(crate) fn starter() -> OsString {
     format!("--starter={}", std::process::id()).into()
 }

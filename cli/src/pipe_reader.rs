@@ -56,7 +56,7 @@ mod tests {
 
     use super::*;
 
-    /// A reader that returns the whole text at the end of the pipe.
+    /// Starts a reader that returns the whole text at the end of the pipe.
     fn text_reader(mut stream: impl Read + Send + 'static) -> PipeReader<String> {
         PipeReader::start(move || {
             let mut text = String::new();

@@ -100,7 +100,7 @@ fn summary_text(summary: &ReplaySummary) -> Result<String, Failure> {
     Ok(render::summary(summary, &digest, &clips, Paint::of_stdout()))
 }
 
-/// The arguments of the runtime: those of the command, except the ones about output.
+/// Returns the arguments of the runtime: those of the command, except the ones about output.
 fn arguments(args: &ReplayArgs) -> Vec<OsString> {
     let mut line: Vec<OsString> = vec!["replay".into()];
     line.extend(args.target.settings());

@@ -96,11 +96,11 @@ pub(crate) fn run(
     bar.finish_and_clear();
     let result = reported.unwrap_or(Ok(None));
     if result.is_err() {
-        // Its reports are no longer read. Killing fails if it has ended meanwhile.
+        // The reports of the runtime are no longer read. Killing fails if it has ended meanwhile.
         let _ = child.kill();
     }
     let status = child.wait().map_err(|source| RuntimeError::Read { source })?;
-    // Its last message is the cause of a failure.
+    // The last message of the runtime is the cause of a failure.
     errors.and_then(PipeReader::drain);
     let result = result?;
     match (result, status.code().and_then(Exit::from_code)) {

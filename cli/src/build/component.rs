@@ -110,7 +110,8 @@ fn with_simd(cargo: &mut Command, variable: impl Fn(&str) -> Option<OsString>) -
     cargo.arg("--config").arg(format!("target.{TARGET}.rustflags=['{SIMD}']"))
 }
 
-/// Path of the component in this message of cargo, if it is about the component of `package`.
+/// Returns the path of the component in this message of cargo, if it is about the component of
+/// `package`.
 fn component_in(message: &str, package: &Path) -> Option<PathBuf> {
     let message: Value = serde_json::from_str(message).ok()?;
     let of_package =

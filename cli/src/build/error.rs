@@ -1,3 +1,5 @@
+//! Errors of building a lambda, with help for the user.
+
 use std::io;
 use std::path::PathBuf;
 use std::process::ExitStatus;

@@ -79,13 +79,13 @@ fn build(
     }
 }
 
-/// Maximum size of a file that a build copies.
+/// Returns the maximum size of a file that a build copies.
 fn max_size(manifest: &Manifest, source: &Path) -> ByteSize {
     let is_model = manifest.models.iter().any(|model| model.file.as_path() == source);
     if is_model { FILE_MAX } else { SOURCE_MAX }
 }
 
-/// A note if clips of this lambda cannot be verified alone.
+/// Returns a note if clips of this lambda cannot be verified alone; else an empty text.
 fn note(manifest: &Manifest) -> String {
     let Some(record) = &manifest.record else { return String::new() };
     let unrecorded = manifest

@@ -84,12 +84,12 @@ impl Sandbox {
         Ok(Self { shim, sysroot, cargo_home, workspace: workspace_root, target })
     }
 
-    /// The folder that the build writes to.
+    /// Returns the folder that the build writes to.
     pub(super) fn target(&self) -> &Path {
         &self.target
     }
 
-    /// The command `cargo build` in the jail.
+    /// Returns the command `cargo build` in the jail.
     pub(super) fn cargo(&self) -> Command {
         let mut command = Command::new(&self.shim);
         command.arg("--compiler").arg("--write").arg(&self.target);
@@ -111,8 +111,8 @@ impl Sandbox {
     }
 }
 
-/// The sysroot of the compiler that the user has chosen. Only a toolchain that rustup installed is
-/// started, since a toolchain file may name any folder.
+/// Returns the sysroot of the compiler that the user has chosen. Only a toolchain that rustup
+/// installed is started, since a toolchain file may name any folder.
 fn sysroot(home: &Path) -> Result<PathBuf, BuildError> {
     let chosen = env::var_os("CARGO").map(PathBuf::from).filter(|cargo| cargo.is_absolute());
     let rustc = match chosen {

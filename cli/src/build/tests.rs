@@ -36,7 +36,7 @@ impl LambdaFolder {
         fs::read_to_string(self.0.join(relative)).ok()
     }
 
-    /// All files in the folder `relative`, sorted.
+    /// Returns all files in the folder `relative`, sorted.
     fn files(&self, relative: &str) -> Vec<String> {
         fn walk(root: &Path, folder: &Path, found: &mut Vec<String>) {
             for entry in fs::read_dir(folder).unwrap().map(Result::unwrap) {

@@ -20,7 +20,8 @@ const POLL_INTERVAL: Duration = Duration::from_millis(200);
 pub(super) struct SourceSnapshot(BTreeMap<PathBuf, Option<(u64, SystemTime)>>);
 
 impl SourceSnapshot {
-    /// The current state of `dir`. If the manifest cannot be read, it is the only known source.
+    /// Returns the current state of `dir`. If the manifest cannot be read, it is the only known
+    /// source.
     pub(super) fn of(dir: &Path) -> Self {
         let sources =
             Manifest::load(dir).ok().and_then(|manifest| Sources::of(dir, &manifest).ok());

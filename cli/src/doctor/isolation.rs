@@ -7,7 +7,7 @@ use gleaner_protocol::{Holds, Layer};
 
 use super::{Finding, Severity};
 
-/// A finding for each layer.
+/// Returns a finding for each layer.
 pub(super) fn findings(parts: &Parts) -> Vec<Finding> {
     match layers(parts) {
         Ok(layers) => layers.iter().map(finding).collect(),

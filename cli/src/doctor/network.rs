@@ -136,7 +136,7 @@ fn domain(id: Option<&str>) -> Finding {
     }
 }
 
-/// The interfaces in the network namespace of this process, each once.
+/// Returns the interfaces in the network namespace of this process, each once.
 fn interfaces() -> Vec<Interface> {
     let mut interfaces: Vec<Interface> = Vec::new();
     for address in getifaddrs().into_iter().flatten() {

@@ -51,7 +51,8 @@ pub(super) fn one(text: &mut String, clip: &Clip, when: &str, paint: Paint) -> f
     Ok(())
 }
 
-/// Messages lost upstream. Losses of the recorder itself are in `incomplete`.
+/// Returns a line for each topic with messages lost upstream. Losses of the recorder itself are in
+/// `incomplete`.
 fn losses(clip: &Clip) -> Vec<String> {
     let lost =
         clip.topics.iter().filter_map(|topic| Some((topic, topic.lost.filter(|lost| *lost > 0)?)));

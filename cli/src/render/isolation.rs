@@ -1,3 +1,5 @@
+//! Formats the isolation layers of a lambda.
+
 use gleaner_base::visible;
 use gleaner_protocol::{Holds, Layer};
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::args::RunArgs;
 use crate::delegate::starter;
 
-/// The runtime's arguments.
+/// Returns the runtime's arguments.
 pub(super) fn runtime(
     args: &RunArgs,
     has_recorder: bool,
@@ -34,7 +34,7 @@ pub(super) fn runtime(
     line
 }
 
-/// The arguments of the runtime's shim.
+/// Returns the arguments of the runtime's shim.
 pub(super) fn shim(args: &RunArgs, exit_record: &Path, restarts: u32) -> Vec<OsString> {
     let mut line =
         vec![option("--exit-record", exit_record), option("--results", out(args)), starter()];
@@ -43,7 +43,8 @@ pub(super) fn shim(args: &RunArgs, exit_record: &Path, restarts: u32) -> Vec<OsS
     line
 }
 
-/// The recorder's arguments. `largest` is the largest sample that it will receive, in bytes.
+/// Returns the recorder's arguments. `largest` is the largest sample that it will receive, in
+/// bytes.
 pub(super) fn recorder(args: &RunArgs, largest: u64, offset_ns: i64) -> Vec<OsString> {
     let mut line = vec![
         option("--out", out(args)),
@@ -66,7 +67,7 @@ pub(super) fn recorder(args: &RunArgs, largest: u64, offset_ns: i64) -> Vec<OsSt
     line
 }
 
-/// The result folder.
+/// Returns the result folder.
 pub(super) fn out(args: &RunArgs) -> PathBuf {
     args.out.clone().unwrap_or_else(|| args.target.lambda.join("live"))
 }
@@ -78,7 +79,7 @@ fn option(flag: &str, value: impl AsRef<OsStr>) -> OsString {
     argument
 }
 
-/// The renamed topics for the recorder. The command line has checked their form.
+/// Returns the renamed topics for the recorder. The command line has checked their form.
 pub(super) fn remaps(args: &RunArgs) -> Vec<(String, String)> {
     let pairs = args.target.remap.iter().filter_map(|remap| remap.split_once(":="));
     pairs.map(|(from, to)| (from.trim().to_owned(), to.trim().to_owned())).collect()

@@ -75,7 +75,7 @@ impl ChildProcess {
         Ok(Self { name, child })
     }
 
-    /// Its exit status, if it has ended.
+    /// Returns the exit status of the process; `None` while it runs.
     pub(super) fn status(&mut self) -> Result<Option<ExitStatus>, Failure> {
         let failed = |error| {
             Failure::caused_by(Exit::Internal, format!("cannot wait for {}", self.name), &error)
@@ -83,7 +83,7 @@ impl ChildProcess {
         self.child.try_wait().map_err(failed)
     }
 
-    /// Sends SIGTERM, and waits for its end.
+    /// Sends SIGTERM, and waits for the end of the process.
     pub(super) fn end(
         &mut self,
         stream: &mut ReportStream,
@@ -93,7 +93,7 @@ impl ChildProcess {
         self.wait(stream, screen)
     }
 
-    /// Waits for its end, and kills it after [`END_TIMEOUT`].
+    /// Waits for the end of the process, and kills it after [`END_TIMEOUT`].
     pub(super) fn wait(
         &mut self,
         stream: &mut ReportStream,
@@ -131,7 +131,7 @@ impl Drop for ChildProcess {
     }
 }
 
-/// The program to start and its arguments: `name`, or the shim that starts it.
+/// Returns the program to start and its arguments: `name`, or the shim that starts it.
 fn command_line(
     parts: &Parts,
     name: &str,

@@ -93,7 +93,8 @@ impl EarlierCounts {
     }
 }
 
-/// Number of lines that the shim could not write. Only the shim knows those after the last report.
+/// Returns the number of lines that the shim could not write. Only the shim counts those after the
+/// last report.
 fn unwritten(summary: &Path) -> u64 {
     let text = PlainFile::result(summary, SUMMARY_MAX).and_then(PlainFile::read_whole).ok();
     text.and_then(|text| serde_json::from_slice::<LiveStatus>(&text).ok())
@@ -123,7 +124,7 @@ mod tests {
         Some(Box::new(RecorderStatus { recording, ..RecorderStatus::default() }))
     }
 
-    /// `summary.json` after `complete`, if the shim has written `before`.
+    /// Returns `summary.json` after `complete`, if the shim has written `before`.
     fn completed(before: &LiveStatus, complete: impl FnOnce(&Path)) -> LiveStatus {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("summary.json");
