@@ -1,3 +1,5 @@
+//! Tests of `gleaner new`.
+
 use gleaner_lambda::Manifest;
 use toml::{Table, Value};
 
@@ -97,8 +99,8 @@ fn a_folder_needs_a_name_that_a_lambda_can_have() {
     assert_eq!(name_of(Path::new("some/where/pot-hole/")).unwrap().as_str(), "pot-hole");
     let scratch = TempFolder::new("names");
     for name in ["test", "gleaner-rules", "gleaner-sdk", "type"] {
-        let made = make(&scratch.0.join(name), &name.parse().unwrap(), LambdaKind::Wasm);
-        assert!(matches!(made, Err(NewError::CrateName { .. })), "{name}");
+        let result = make(&scratch.0.join(name), &name.parse().unwrap(), LambdaKind::Wasm);
+        assert!(matches!(result, Err(NewError::CrateName { .. })), "{name}");
     }
 }
 

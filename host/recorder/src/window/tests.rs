@@ -197,7 +197,7 @@ fn extreme_times_do_not_overflow() {
 type Plain = (usize, i64, i64);
 
 /// Computes the groups by a simple model: all windows at once, then the connected ones. It has no
-/// state, no order of arrival.
+/// state, and ignores the order of arrival.
 fn model(rules: &[WindowRules], triggers: &[(i64, usize, TriggerKind)]) -> Vec<Vec<Plain>> {
     let mut windows: Vec<Plain> = Vec::new();
     for (lambda, rules) in rules.iter().enumerate() {
