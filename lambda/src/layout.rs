@@ -207,7 +207,8 @@ pub enum LayoutError {
 }
 
 /// Help for a name that is not the name of a folder.
-const FOLDER_FIRST: &str = "name the lambda's folder, which has a lambda.toml; `replay` and `dev` take it before the drives";
+const FOLDER_FIRST: &str = "name the lambda's folder, which has a lambda.toml; \
+                            `replay` and `dev` take it before the drives";
 
 impl Explain for LayoutError {
     fn help(&self) -> Option<String> {
