@@ -77,13 +77,13 @@ pub struct TopicInfo {
 pub struct Verified {
     /// Name of the lambda.
     pub lambda: String,
-    /// Wakes in the journal.
+    /// Number of wakes in the journal.
     pub wakes: u64,
-    /// Triggers in them.
+    /// Number of triggers in the journal.
     pub triggers: u64,
-    /// Wakes that were not compared, as the lambda had read samples from before the clip.
+    /// Number of wakes that were not compared, as the lambda had read samples from before the clip.
     pub uncovered: u64,
-    /// Triggers in those.
+    /// Number of triggers in these wakes.
     pub uncovered_triggers: u64,
     /// True if the journal has no end, as its writer died or its drive was damaged. All of its
     /// wakes were compared.
@@ -150,7 +150,7 @@ pub struct ReplaySummary {
     pub start_ns: i64,
     /// Log time of the drive's last message, in ns since the epoch.
     pub end_ns: i64,
-    /// The replayed part of it.
+    /// The replayed part of the drive.
     #[serde(default, skip_serializing_if = "TimeRange::is_all")]
     pub part: TimeRange,
     /// Duration of the replay, in s.

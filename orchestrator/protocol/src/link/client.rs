@@ -105,11 +105,11 @@ impl RecorderLink {
             };
         }
         loop {
-            let rest = until.saturating_duration_since(Instant::now());
-            if rest.is_zero() {
+            let remaining = until.saturating_duration_since(Instant::now());
+            if remaining.is_zero() {
                 return Err(LinkError::Silent { seconds: timeout.as_secs() });
             }
-            self.socket.set_read_timeout(Some(rest)).map_err(failed)?;
+            self.socket.set_read_timeout(Some(remaining)).map_err(failed)?;
             self.read(RecvFlags::empty())?;
             match self.next_message()? {
                 Some(RecorderMessage::Ready) => return Ok(()),
@@ -213,12 +213,12 @@ impl RecorderLink {
         timeout: Duration,
     ) -> Result<(), LinkError> {
         while !bytes.is_empty() {
-            let rest = until.saturating_duration_since(Instant::now());
-            if rest.is_zero() {
+            let remaining = until.saturating_duration_since(Instant::now());
+            if remaining.is_zero() {
                 return Err(LinkError::Silent { seconds: timeout.as_secs() });
             }
             self.socket
-                .set_write_timeout(Some(rest))
+                .set_write_timeout(Some(remaining))
                 .map_err(|source| LinkError::Socket { peer: RECORDER, source })?;
             match send(&self.socket, bytes, SendFlags::NOSIGNAL) {
                 Ok(sent) => bytes = &bytes[sent..],

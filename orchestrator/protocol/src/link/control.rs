@@ -75,10 +75,15 @@ impl ControlClient {
         // The socket is sent with the first bytes, so that it arrives before the frame is complete.
         let fds = [recorder_end.as_fd()];
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
-        let mut with = SendAncillaryBuffer::new(&mut space);
-        with.push(SendAncillaryMessage::ScmRights(&fds));
+        let mut ancillary = SendAncillaryBuffer::new(&mut space);
+        ancillary.push(SendAncillaryMessage::ScmRights(&fds));
         let sent = loop {
-            match sendmsg(&self.socket, &[IoSlice::new(&bytes)], &mut with, SendFlags::NOSIGNAL) {
+            match sendmsg(
+                &self.socket,
+                &[IoSlice::new(&bytes)],
+                &mut ancillary,
+                SendFlags::NOSIGNAL,
+            ) {
                 Ok(sent) => break sent,
                 Err(Errno::INTR) => {}
                 Err(error) => return Err(LinkError::of(RECORDER, error)),
@@ -164,10 +169,11 @@ struct Receiver {
 impl Read for Receiver {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
-        let mut with = RecvAncillaryBuffer::new(&mut space);
+        let mut ancillary = RecvAncillaryBuffer::new(&mut space);
         let flags = RecvFlags::CMSG_CLOEXEC;
-        let bytes = recvmsg(&self.socket, &mut [IoSliceMut::new(buffer)], &mut with, flags)?.bytes;
-        for message in with.drain() {
+        let bytes =
+            recvmsg(&self.socket, &mut [IoSliceMut::new(buffer)], &mut ancillary, flags)?.bytes;
+        for message in ancillary.drain() {
             if let RecvAncillaryMessage::ScmRights(sockets) = message {
                 // Excess sockets are closed.
                 let room = SOCKETS.saturating_sub(self.received.len());

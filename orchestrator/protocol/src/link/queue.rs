@@ -112,7 +112,7 @@ impl Queue {
         }
     }
 
-    /// Removes so many bytes, which were sent.
+    /// Removes the first `bytes` bytes, which were sent.
     pub(super) fn sent(&mut self, bytes: usize) {
         self.sent += bytes;
         while let Some(frame) = self.frames.pop_front_if(|frame| frame.bytes.len() <= self.sent) {
