@@ -52,7 +52,7 @@ enum ReadState {
     Truncated {
         torn_bytes: u64,
     },
-    /// Every further call fails likewise; no location if reading itself failed.
+    /// Every further call fails with the same damage; `None` if reading itself failed.
     Failed(Option<(BlockLocation, Damage)>),
 }
 
@@ -252,7 +252,7 @@ struct BlockSource<R> {
 enum NextBlock {
     /// The bytes end here.
     Nothing,
-    /// The bytes end within the next block, after so many bytes of it.
+    /// The bytes end within the next block, after this many bytes of the block.
     Torn(u64),
     /// A complete block: its kind and its payload.
     Block(u8, Vec<u8>),

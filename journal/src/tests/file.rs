@@ -123,7 +123,7 @@ fn a_long_journal_is_written_in_blocks_of_256_wakes() {
     assert!(wakes.iter().all(|len| (256..32_000).contains(len)), "{lengths:?}");
 }
 
-/// Accepts so many bytes, then fails in the middle of a write.
+/// Accepts `room` bytes, then fails in the middle of a write.
 struct FullDisk {
     room: usize,
     bytes: Vec<u8>,

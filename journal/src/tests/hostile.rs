@@ -77,21 +77,21 @@ fn a_missing_duplicate_or_moved_block_is_found() {
         cuts.push(at + HEAD_LEN + len);
     }
     let block = |n: usize| &bytes[cuts[n]..cuts[n + 1]];
-    let of = |blocks: &[usize]| {
+    let read = |blocks: &[usize]| {
         let mut all = bytes[..PREAMBLE_LEN].to_vec();
         blocks.iter().for_each(|n| all.extend_from_slice(block(*n)));
         outcome(&all)
     };
-    assert_eq!(of(&[0, 1, 2, 3, 4]).unwrap(), (entries, false));
+    assert_eq!(read(&[0, 1, 2, 3, 4]).unwrap(), (entries, false));
     for order in
         [&[0, 2, 3, 4][..], &[0, 1, 1, 2, 3, 4], &[0, 2, 1, 3, 4], &[0, 1, 3, 4], &[1, 2, 3, 4]]
     {
         assert!(
-            matches!(of(order), Err(JournalError::Damaged { why: Damage::Head, .. })),
+            matches!(read(order), Err(JournalError::Damaged { why: Damage::Head, .. })),
             "{order:?}"
         );
     }
-    let why = |blocks| match of(blocks) {
+    let why = |blocks| match read(blocks) {
         Err(JournalError::Damaged { why, .. }) => why,
         other => panic!("{other:?}"),
     };
