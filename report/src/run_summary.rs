@@ -111,9 +111,9 @@ impl Explain for OutputError {
 /// `summary.json` of a run.
 #[derive(Debug)]
 pub(crate) enum RunSummary {
-    /// Of a replay.
+    /// The summary of a replay.
     Replay(Box<ReplaySummary>),
-    /// Of a live run.
+    /// The summary of a live run.
     Live(Box<LiveStatus>),
 }
 

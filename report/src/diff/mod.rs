@@ -77,9 +77,9 @@ pub struct ComparedRun {
 pub struct ValueChange {
     /// Name of the value, in words or as a key of the config.
     pub what: String,
-    /// In the first run.
+    /// Value in the first run.
     pub a: Option<String>,
-    /// In the second run.
+    /// Value in the second run.
     pub b: Option<String>,
 }
 
@@ -90,9 +90,9 @@ pub struct Cost {
     pub what: &'static str,
     /// `ns` or `fuel`.
     pub unit: &'static str,
-    /// In the first run.
+    /// Value in the first run.
     pub a: Option<u64>,
-    /// In the second run.
+    /// Value in the second run.
     pub b: Option<u64>,
     /// `b / a`.
     pub ratio: Option<f64>,
@@ -101,13 +101,13 @@ pub struct Cost {
 /// Numbers of triggers or faults by change.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct ChangeCounts {
-    /// Identical in both runs.
+    /// Number of those that are identical in both runs.
     pub identical: u64,
-    /// Only in the first run.
+    /// Number of those that only the first run has.
     pub removed: u64,
-    /// Only in the second run.
+    /// Number of those that only the second run has.
     pub added: u64,
-    /// In both runs, with different values.
+    /// Number of those that both runs have, with different values.
     pub changed: u64,
 }
 

@@ -152,11 +152,11 @@ fn counts(a: &RunSummary, b: &RunSummary, clips: [[u64; 2]; 2]) -> Vec<ValueChan
     add("size of the clips".to_owned(), Some(size(bytes_a)), Some(size(bytes_b)));
 
     let (of_a, of_b) = (a.topics(), b.topics());
-    let of =
+    let counts =
         |list: &[TopicCounts], input: &str| list.iter().find(|topic| topic.input == input).cloned();
-    let only_b = of_b.iter().filter(|topic| of(&of_a, &topic.input).is_none());
+    let only_b = of_b.iter().filter(|topic| counts(&of_a, &topic.input).is_none());
     for TopicCounts { input, .. } in of_a.iter().chain(only_b) {
-        let (a, b) = (of(&of_a, input), of(&of_b, input));
+        let (a, b) = (counts(&of_a, input), counts(&of_b, input));
         type Number = fn(&TopicCounts) -> Option<u64>;
         let numbers: [(&str, Number); 5] = [
             ("received", |topic| Some(topic.received)),
