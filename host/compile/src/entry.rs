@@ -211,11 +211,11 @@ mod tests {
 
     #[test]
     fn another_component_has_another_entry() {
-        let of = |component: &[u8], nans| CacheEntry::of(Path::new("/c"), component, nans).path;
-        assert_eq!(of(b"a", Nans::Native), of(b"a", Nans::Native));
-        assert_ne!(of(b"a", Nans::Native), of(b"b", Nans::Native));
-        assert_ne!(of(b"a", Nans::Native), of(b"a", Nans::Canonical));
-        assert_eq!(of(b"a", Nans::Native).file_name().unwrap().len(), 64 + ".cwasm".len());
+        let path = |component: &[u8], nans| CacheEntry::of(Path::new("/c"), component, nans).path;
+        assert_eq!(path(b"a", Nans::Native), path(b"a", Nans::Native));
+        assert_ne!(path(b"a", Nans::Native), path(b"b", Nans::Native));
+        assert_ne!(path(b"a", Nans::Native), path(b"a", Nans::Canonical));
+        assert_eq!(path(b"a", Nans::Native).file_name().unwrap().len(), 64 + ".cwasm".len());
     }
 
     #[test]

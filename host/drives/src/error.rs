@@ -129,7 +129,8 @@ pub enum ReplayError {
         /// Journal of the database.
         beside: PathBuf,
     },
-    /// Without an index, each search for the next message would read the whole database.
+    /// A database has no index of message times. Without one, each search for the next message
+    /// would read the whole database.
     #[error("database `{path}` has no index of message times")]
     NoTimes {
         /// The file.

@@ -63,26 +63,26 @@ impl HealthCheck {
     /// Checks the process in `/proc`, which the runtime cannot forge.
     fn check_proc(&mut self, pulse: &Pulse) -> Option<Killed> {
         // A process that has just ended has no memory.
-        let seen = ProcessUsage::of(Some(self.pid))?;
+        let usage = ProcessUsage::of(Some(self.pid))?;
         if let Some(stopped) =
-            self.stopped.seen(seen.is_stopped).filter(|stopped| *stopped >= MAX_STOPPED)
+            self.stopped.seen(usage.is_stopped).filter(|stopped| *stopped >= MAX_STOPPED)
         {
             let [ran_ns, allowed_ns] = [stopped, MAX_STOPPED].map(|time| time.as_nanos() as u64);
             return Some(Killed { ran_ns, allowed_ns, ..pulse.killed(KillReason::Stopped) });
         }
-        if seen.threads > MAX_THREADS {
+        if usage.threads > MAX_THREADS {
             return Some(
-                pulse.killed(KillReason::Threads { used: seen.threads, allowed: MAX_THREADS }),
+                pulse.killed(KillReason::Threads { used: usage.threads, allowed: MAX_THREADS }),
             );
         }
         // The kernel's number, which the process cannot raise. Pages that it no longer counts, such
         // as those made read-only, are still in memory.
         if let Some(limit) = data_limit(self.pid)
-            && seen.held > limit.saturating_add(UNCOUNTED)
+            && usage.held > limit.saturating_add(UNCOUNTED)
         {
-            return Some(pulse.killed(KillReason::Memory { used: seen.held, allowed: limit }));
+            return Some(pulse.killed(KillReason::Memory { used: usage.held, allowed: limit }));
         }
-        let (share, used) = pulse.share(seen.held)?;
+        let (share, used) = pulse.share(usage.held)?;
         let lasts =
             self.excess.seen(share.is_exceeded_by(used)).filter(|lasts| *lasts >= EXCESS)?;
         let killed = pulse.killed(KillReason::Memory { used, allowed: share.most });

@@ -268,7 +268,7 @@ impl Pulse {
     }
 
     /// For the shim: returns a record of the current activity, killed for `reason`. If the runtime
-    /// writes at the same time, the record has one of both states.
+    /// begins another activity at the same time, the record may have values of both.
     pub fn killed(&self, reason: KillReason) -> Killed {
         let page = self.page();
         let since_ns = page.since_ns.load(Ordering::Acquire);
