@@ -30,7 +30,7 @@ type Values = BTreeMap<String, String>;
 /// The records of a clip.
 const RECORDS: [&str; 5] = [BEGIN, CLIP_RECORD, TOPIC_RECORD, LAMBDA_RECORD, DECISION_RECORD];
 
-/// Of two long texts, bytes to show of the common part before the first difference.
+/// Number of bytes to show of the common part of two long texts, before their first difference.
 const IN_COMMON: usize = 24;
 
 /// A statement of a clip that the rest of the clip contradicts.
@@ -148,13 +148,13 @@ impl ClipStatements {
                     messages.saturating_add(topic.overwritten?).saturating_add(topic.too_big?),
                 ))
             };
-            let is = ClipTopic {
+            let expected = ClipTopic {
                 type_name: found.map(|found| found.type_name.clone()),
                 messages,
                 received: received(),
                 ..topic.clone()
             };
-            let (_, expected) = clip_records::topic(&is, found);
+            let (_, expected) = clip_records::topic(&expected, found);
             let name = excerpt(&topic.topic);
             same(
                 &format!("record {TOPIC_RECORD} of `{name}`"),
@@ -317,11 +317,11 @@ fn lambdas(records: &[&Values], clip: &Clip, header: &JournalHeader) -> Result<(
     }
     for (values, lambda) in records.iter().zip(&clip.lambdas) {
         let record = format!("record {LAMBDA_RECORD} of `{}`", excerpt(&lambda.name));
-        let (is, header) = match lambda.name == header.lambda {
+        let (expected_lambda, header) = match lambda.name == header.lambda {
             true => (by_header(lambda, header), Some(header)),
             false => (lambda.clone(), None),
         };
-        let (_, mut expected) = clip_records::lambda(&is, header);
+        let (_, mut expected) = clip_records::lambda(&expected_lambda, header);
         if header.is_none() {
             // The journal of this lambda has no other source.
             for (key, value) in &mut expected {
@@ -333,7 +333,11 @@ fn lambdas(records: &[&Values], clip: &Clip, header: &JournalHeader) -> Result<(
         }
         same(&record, values, &expected)?;
         let what = format!("{LINE} of record {CLIP_RECORD}, lambda `{}`", excerpt(&lambda.name));
-        same(&what, &clip_records::lambda(lambda, header).1, &clip_records::lambda(&is, header).1)?;
+        same(
+            &what,
+            &clip_records::lambda(lambda, header).1,
+            &clip_records::lambda(&expected_lambda, header).1,
+        )?;
     }
     Ok(())
 }
@@ -401,8 +405,8 @@ fn begin(
 ) -> Result<(), FalseStatement> {
     let clip_header =
         clip_records::read_begin(values).map_err(|key| malformed(BEGIN, key, values))?;
-    let is = ClipHeader { clock: header.clock.clone(), from_ns: clip.from_ns, ..clip_header };
-    same(&format!("record {BEGIN}"), values, &clip_records::begin(&is, &library(header)).1)?;
+    let expected = ClipHeader { clock: header.clock.clone(), from_ns: clip.from_ns, ..clip_header };
+    same(&format!("record {BEGIN}"), values, &clip_records::begin(&expected, &library(header)).1)?;
     let was_there = |lambda: &ClipLambda| {
         clip.lambdas.iter().any(|now| {
             lambda.windows <= now.windows
@@ -410,7 +414,7 @@ fn begin(
         })
     };
     let max_count = clip.lambdas.len();
-    if let Some(lambda) = is
+    if let Some(lambda) = expected
         .lambdas
         .iter()
         .enumerate()
@@ -422,7 +426,7 @@ fn begin(
             &json(&clip.lambdas),
         ));
     }
-    let opening = json(&is.moment);
+    let opening = json(&expected.moment);
     let is_of_another_clip = clip.incomplete.iter().any(|why| why == CONTINUES);
     let is_among_them = || moments.iter().any(|moment| json(moment) == opening);
     if is_of_another_clip || (moments.len() as u64) < clip.triggers || is_among_them() {

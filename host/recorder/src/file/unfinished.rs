@@ -19,13 +19,14 @@ use super::written::{Written, encapsulation, stamp};
 use super::{ClipHeader, ClipTrailer, TopicSchema};
 use crate::error::RecordError;
 
-/// On the example drive (JPEG, IMU, speed) zstd at level 1 leaves 0.74 of the bytes at 590 MB/s,
-/// lz4 0.77 at 650 MB/s, and no compression 1.06 at 1760 MB/s; without the camera 0.23, 0.28 and
-/// 1.25. Every MCAP reader supports zstd.
+/// Compression of chunks. On the example drive (JPEG, IMU, speed) zstd at level 1 leaves 0.74 of
+/// the bytes at 590 MB/s, lz4 0.77 at 650 MB/s, and no compression 1.06 at 1760 MB/s; without the
+/// camera 0.23, 0.28 and 1.25. Every MCAP reader supports zstd.
 const COMPRESSION: Option<Compression> = Some(Compression::Zstd);
 /// A chunk is closed when it has this many bytes, before compression.
 const CHUNK_BYTES: u64 = 1 << 20;
-/// A chunk is closed before it spans more time: the most that a crash of the recorder costs.
+/// A chunk is closed before it spans more time than this, in ns: a crash of the recorder costs at
+/// most this much of a clip.
 pub(super) const CHUNK_SPAN_NS: i64 = 1_000_000_000;
 /// Maximum number of channels of a clip. Further writers share one channel of their topic, without
 /// a writer.
@@ -328,19 +329,19 @@ impl UnfinishedClip {
         let is_full = self.channels.count >= CHANNELS_MAX;
         let mut key = writer;
         if let Some(known) = self.channels.by_topic.get(&topic.name) {
-            let of = |key| {
+            let channel_of = |key| {
                 known.by_writer.get(&key).map(|id| ClipChannel {
                     index: known.index,
                     id: *id,
                     new_bytes: 0,
                 })
             };
-            if let Some(found) = of(key) {
+            if let Some(found) = channel_of(key) {
                 return Ok(found);
             }
             if is_full {
                 key = None;
-                if let Some(found) = of(key) {
+                if let Some(found) = channel_of(key) {
                     return Ok(found);
                 }
             }

@@ -28,7 +28,7 @@ pub struct Gone {
 }
 
 impl Gone {
-    /// Adds a loss of stamp `at`; it is in the clips of group `group`, 0 for none.
+    /// Adds a loss with the stamp `at`; it is in the clips of group `group`, 0 for none.
     pub fn add(&mut self, at: i64, group: u64) {
         self.add_some(at, group, 1);
     }
@@ -65,7 +65,8 @@ impl Gone {
             .fold(0, u64::saturating_add)
     }
 
-    /// Returns whether there may be more losses, from `from` on, than are kept.
+    /// Returns whether losses from `from` on may be missing here, because their stamps were
+    /// dropped.
     pub fn is_unknown(&self, from: i64, group: u64) -> bool {
         self.forgotten.hides(from, group)
     }
@@ -87,7 +88,7 @@ impl Default for Horizon {
 }
 
 impl Horizon {
-    /// Adds a lost entry of stamp `at`; it is in the clips of group `group`, 0 for none.
+    /// Adds a lost entry with the stamp `at`; it is in the clips of group `group`, 0 for none.
     pub fn add(&mut self, at: i64, group: u64) {
         if group == 0 {
             self.unwritten = self.unwritten.max(at);

@@ -175,7 +175,8 @@ pub(super) struct RecorderLoop {
     pub(super) commands: Option<Commands>,
     pub(super) lambdas: Vec<ConnectedLambda>,
     pub(super) topics: BTreeMap<TopicId, TopicEntry>,
-    /// By lambda: the requested kind and bytes of preroll, and its expected bytes per second.
+    /// For each lambda: the requested store and bytes of the preroll, and the expected bytes per
+    /// second.
     pub(super) shares: BTreeMap<String, (Store, u64, usize)>,
     pub(super) reported: LastReported,
     pub(super) health: SystemHealth,

@@ -49,7 +49,7 @@ pub(super) struct PollResult {
     pub(super) is_busy: bool,
     /// Set if its header was received and it was added.
     pub(super) is_new: Option<LambdaId>,
-    /// True if it is refused, which it was sent and is logged.
+    /// True if it is refused. The reason was sent to it and logged.
     pub(super) is_refused: bool,
     /// True if its connection is closed.
     pub(super) is_gone: bool,

@@ -36,13 +36,13 @@ impl CommandedRun {
     fn join(&mut self, scratch: &TestDir, name: &str, rolls_ms: (u32, u32)) -> RecorderLink {
         let (folder, header) = lambda(scratch, name, rolls_ms);
         let mut link = RecorderLink::new(self.running.control.add(&add(&folder)).unwrap());
-        link.hello(&header, PATIENCE).unwrap();
+        link.hello(&header, TIMEOUT).unwrap();
         link
     }
 
     /// Publishes a command once there is a reader.
     fn publish(&self, text: impl AsRef<[u8]>) -> (i64, Delivery) {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + TIMEOUT;
         loop {
             let at = self.running.clock.now();
             match self.network.publish_text(TOPIC, at, text.as_ref()) {
@@ -123,8 +123,8 @@ fn a_stop_ends_what_a_command_started_and_nothing_else() {
     commanded.publish(r#"{"command": "start", "label": "here", "lambda": "second"}"#);
     commanded.accepted_and_refused(1, 1);
     // Nor does the end of the lambda end what was commanded in its name.
-    second.bye(PATIENCE);
-    first.bye(PATIENCE);
+    second.bye(TIMEOUT);
+    first.bye(TIMEOUT);
     let status = commanded.running.status(|status| status.lambdas == 0);
     assert!(status.is_recording);
     commanded.publish(r#"{"command": "stop", "label": "here"}"#);
@@ -184,7 +184,7 @@ fn without_the_option_there_are_no_commands() {
     let _sensor = Sensor::start(&network, running.clock);
     let (folder, header) = lambda(&scratch, "first", (0, 0));
     let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
-    link.hello(&header, PATIENCE).unwrap();
+    link.hello(&header, TIMEOUT).unwrap();
     received(&mut running, 50);
     let text = br#"{"command": "event", "label": "x"}"#;
     assert_eq!(network.publish_text(TOPIC, running.clock.now(), text), None);

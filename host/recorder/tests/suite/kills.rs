@@ -39,10 +39,10 @@ fn child() {
     });
     let (folder, header) = lambda(&scratch, "first", (300, 1500));
     let mut link = RecorderLink::new(control.add(&add(&folder)).unwrap());
-    link.hello(&header, PATIENCE).unwrap();
+    link.hello(&header, TIMEOUT).unwrap();
     let (short, short_header) = lambda(&scratch, "short", (30, 30));
     let mut short = RecorderLink::new(control.add(&add(&short)).unwrap());
-    short.hello(&short_header, PATIENCE).unwrap();
+    short.hello(&short_header, TIMEOUT).unwrap();
     let _sensor = Sensor::start(&network, clock);
     // Small clips one after the other, and one of several chunks every three seconds.
     for round in 0_u64.. {
@@ -98,7 +98,7 @@ fn reported_clips_are_complete_and_open_ones_are_recovered_after_any_kill() {
             .stdout(Stdio::null())
             .spawn()
             .unwrap();
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + TIMEOUT;
         while reports(&scratch.0).is_empty() {
             assert!(
                 Instant::now() < deadline && child.try_wait().unwrap().is_none(),

@@ -31,19 +31,19 @@ fn two_lambdas_record_and_neither_can_act_as_the_other() {
     let [mut one, mut two] = sockets.map(RecorderLink::new);
     // Each link can only act as the lambda of its own socket.
     let refused = RecorderLink::new(running.control.add(&add(&first)).unwrap())
-        .hello(&second_header, PATIENCE);
+        .hello(&second_header, TIMEOUT);
     assert!(
         matches!(&refused, Err(LinkError::Refused { reason }) if reason.contains("`second`")),
         "{refused:?}"
     );
-    one.hello(&first_header, PATIENCE).unwrap();
-    two.hello(&second_header, PATIENCE).unwrap();
+    one.hello(&first_header, TIMEOUT).unwrap();
+    two.hello(&second_header, TIMEOUT).unwrap();
     let sensor = Sensor::start(&network, clock);
     received(&mut running, 300);
     let anchor = clock.now();
     one.wake(&entry(anchor, &[Event]), monotonic(clock)).unwrap();
     two.wake(&entry(anchor, &[]), monotonic(clock)).unwrap();
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TIMEOUT;
     let mut opened = Vec::new();
     while opened.is_empty() && Instant::now() < deadline {
         opened = one.poll().unwrap();
@@ -73,7 +73,7 @@ fn two_lambdas_record_and_neither_can_act_as_the_other() {
     assert_eq!((counts[0].0, counts[0].1, counts[0].2), ("/a", Some(0), true));
     assert_eq!((counts[1].0, counts[1].2), ("/b", false), "a topic without a writer");
     assert_eq!(scratch.journal(&clip, "first").1, [anchor]);
-    assert_eq!(two.bye(PATIENCE), one.bye(PATIENCE));
+    assert_eq!(two.bye(TIMEOUT), one.bye(TIMEOUT));
     // A lambda that was never built.
     let _unbuilt = running.control.add(&add(&scratch.0.join("third"))).unwrap();
     running.status(|status| status.lambdas == 0 && status.recording.lambdas_refused == 2);
@@ -95,7 +95,7 @@ fn a_stopped_recording_keeps_its_clips() {
         let mut running = Running::start(&scratch, &network, |_| {});
         let (folder, header) = lambda(&scratch, "first", (100, 60_000));
         let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
-        link.hello(&header, PATIENCE).unwrap();
+        link.hello(&header, TIMEOUT).unwrap();
         // A topic that appears later is found.
         network.add("/a");
         let _sensor = Sensor::start(&network, running.clock);
@@ -129,9 +129,9 @@ fn messages_of_a_hostile_lambda_do_not_affect_others() {
     let (honest, honest_header) = lambda(&scratch, "honest", (100, 50));
     let (hostile, hostile_header) = lambda(&scratch, "hostile", (0, 0));
     let mut honest = RecorderLink::new(running.control.add(&add(&honest)).unwrap());
-    honest.hello(&honest_header, PATIENCE).unwrap();
+    honest.hello(&honest_header, TIMEOUT).unwrap();
     let mut noisy = RecorderLink::new(running.control.add(&add(&hostile)).unwrap());
-    noisy.hello(&hostile_header, PATIENCE).unwrap();
+    noisy.hello(&hostile_header, TIMEOUT).unwrap();
     let nonsense = running.control.add(&add(&scratch.0.join("hostile"))).unwrap();
     rustix::net::send(nonsense.as_fd(), &[255; 4096], rustix::net::SendFlags::NOSIGNAL).unwrap();
     let _sensor = Sensor::start(&network, clock);
@@ -143,7 +143,7 @@ fn messages_of_a_hostile_lambda_do_not_affect_others() {
     for _ in 0..20_000 {
         noisy.wake(&entry(clock.now(), &[Event]), monotonic(clock)).unwrap();
     }
-    noisy.bye(PATIENCE);
+    noisy.bye(TIMEOUT);
     let status = running.status(|status| status.recording.triggers_over_rate > 10_000);
     assert_eq!((status.recording.wakes_misstamped, status.recording.triggers_misstamped), (4, 8));
     assert_eq!(
@@ -175,15 +175,15 @@ fn the_limits_of_a_vehicle_apply_to_the_manifest_in_the_recorder() {
     let mut announced = add(&folder);
     announced.most.fuel = 10_000;
     // A process with higher limits than the vehicle's is not the one that was announced.
-    let refused = RecorderLink::new(running.control.add(&announced).unwrap())
-        .hello(&as_in_manifest, PATIENCE);
+    let refused =
+        RecorderLink::new(running.control.add(&announced).unwrap()).hello(&as_in_manifest, TIMEOUT);
     let limit = "its limit `fuel` is `50000000`; the starter announced `10000`";
     assert!(
         matches!(&refused, Err(LinkError::Refused { reason }) if reason.contains(limit)),
         "{refused:?}"
     );
     let mut link = RecorderLink::new(running.control.add(&announced).unwrap());
-    link.hello(&on_vehicle, PATIENCE).unwrap();
+    link.hello(&on_vehicle, TIMEOUT).unwrap();
     running.control.stop().unwrap();
     let (last, ended) = running.ended();
     assert_eq!((last.recording.lambdas_refused, ended), (1, Ok(())));
@@ -197,7 +197,7 @@ fn a_full_disk_is_reported_and_no_clip_is_begun() {
     let mut running = Running::start(&scratch, &network, |options| options.disk_floor = u64::MAX);
     let (folder, header) = lambda(&scratch, "first", (10, 10));
     let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
-    link.hello(&header, PATIENCE).unwrap();
+    link.hello(&header, TIMEOUT).unwrap();
     let _sensor = Sensor::start(&network, running.clock);
     running.status(|status| status.disk_free.is_some());
     link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
@@ -250,7 +250,7 @@ fn a_recorder_is_ready_before_it_recovers_and_reports_what_it_cannot_recover() {
     );
     let (folder, header) = lambda(&scratch, "first", (10, 10));
     let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
-    link.hello(&header, PATIENCE).unwrap();
+    link.hello(&header, TIMEOUT).unwrap();
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 10);
     link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
@@ -286,7 +286,7 @@ fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
     let mut running = Running::start(&scratch, &network, |_| {});
     let (folder, header) = lambda(&scratch, "first", (100, 60_000));
     let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
-    link.hello(&header, PATIENCE).unwrap();
+    link.hello(&header, TIMEOUT).unwrap();
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 10);
     link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
@@ -314,7 +314,7 @@ fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_of_all() {
         let text = format!("{before}max_size = \"{max_size}\"\n[record]{record}");
         fs::write(&path, &text).unwrap();
         let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
-        link.hello(&with_manifest(header, &text), PATIENCE).unwrap();
+        link.hello(&with_manifest(header, &text), TIMEOUT).unwrap();
         links.push(link);
     }
     // All have announced their topics before there is a writer.
@@ -337,7 +337,7 @@ fn a_topic_is_recorded_with_the_type_of_the_input_whichever_writer_came_first() 
     let mut running = Running::start(&scratch, &network, |_| {});
     let (folder, header) = lambda(&scratch, "first", (10, 10));
     let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
-    link.hello(&header, PATIENCE).unwrap();
+    link.hello(&header, TIMEOUT).unwrap();
     // `/b` is no input, so any type is accepted: once it is found, `/a` was searched as well.
     let type_of = |status: &RecorderStatus, name: &str| {
         status
@@ -367,20 +367,18 @@ fn one_lambda_too_many_is_refused_with_a_reason_and_the_others_work() {
     let (folder, header) = lambda(&scratch, "one", (10, 10));
     let sockets: Vec<_> = (0..256).map(|_| running.control.add(&add(&folder)).unwrap()).collect();
     let mut last = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
-    let refused = last.hello(&header, PATIENCE).unwrap_err();
+    let refused = last.hello(&header, TIMEOUT).unwrap_err();
     assert_eq!(
         refused.to_string(),
         "the recorder refuses the lambda: it records for at most 256 lambdas at a time"
     );
     running.status(|status| (status.lambdas, status.recording.lambdas_refused) == (256, 1));
     let mut links = sockets.into_iter().map(RecorderLink::new);
-    links.next_back().unwrap().hello(&header, PATIENCE).unwrap();
+    links.next_back().unwrap().hello(&header, TIMEOUT).unwrap();
     // When one leaves, there is room for another.
     drop(links.next());
     running.status(|status| status.lambdas < 256);
-    RecorderLink::new(running.control.add(&add(&folder)).unwrap())
-        .hello(&header, PATIENCE)
-        .unwrap();
+    RecorderLink::new(running.control.add(&add(&folder)).unwrap()).hello(&header, TIMEOUT).unwrap();
 }
 
 #[test]

@@ -27,7 +27,7 @@ use sha2::{Digest, Sha256};
 
 use crate::support::{TestDir, member, meta};
 
-pub const PATIENCE: Duration = Duration::from_secs(60);
+pub const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A loopback that the test feeds while the process listens.
 #[derive(Clone, Default)]
