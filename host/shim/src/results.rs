@@ -33,7 +33,7 @@ const TURN_BYTES: usize = 1600 << 10;
 const TURN: Duration = Duration::from_millis(100);
 /// Bytes that are still read after the runtime has ended. A pipe holds 1 MiB, unless root allowed
 /// more.
-const LEFT: usize = 4 << 20;
+const DRAIN_BYTES: usize = 4 << 20;
 
 /// A running thread that writes results.
 pub(crate) struct Results {
@@ -127,7 +127,7 @@ impl ItemWriter {
         let mut left: Option<usize> = None;
         loop {
             if left.is_none() && wait(Some(items.as_fd()), ended, self.timeout()) {
-                left = Some(LEFT);
+                left = Some(DRAIN_BYTES);
             }
             let max_bytes = left.map_or(PIECE, |left| left.min(PIECE));
             match items.read(&mut piece[..max_bytes]) {

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 /// Maximum number of stamps kept for each source and cause. The losses of a window that reaches
 /// further back are unknown.
-const MOST_STAMPS: usize = 4096;
+const STAMPS_MAX: usize = 4096;
 
 /// The losses of one source.
 #[derive(Debug, Default)]
@@ -35,7 +35,7 @@ impl Gone {
 
     /// As [`add`](Self::add), for `count` at once.
     pub fn add_some(&mut self, at: i64, group: u64, count: u64) {
-        if self.stamps.len() == MOST_STAMPS
+        if self.stamps.len() == STAMPS_MAX
             && let Some((at, group, _)) = self.stamps.pop_front()
         {
             self.forgotten.add(at, group);
@@ -127,7 +127,7 @@ mod tests {
     #[test]
     fn losses_beyond_the_kept_stamps_are_unknown() {
         let mut gone = Gone::default();
-        for at in 0..MOST_STAMPS as i64 + 10 {
+        for at in 0..STAMPS_MAX as i64 + 10 {
             gone.add(at, 0);
         }
         assert!(gone.is_unknown(9, 1) && !gone.is_unknown(10, 1));

@@ -15,7 +15,7 @@ use super::rate_limit::RateLimit;
 use crate::{LambdaId, LambdaSpec, RecordError, Recorder, TopicId, lambda_digest};
 
 /// Maximum number of messages of one lambda before the next one's turn.
-const MOST_PER_TURN: usize = 16;
+const MESSAGES_PER_TURN: usize = 16;
 
 /// Triggers of a lambda per second, and in a burst.
 const TRIGGERS: RateLimit = RateLimit::of(200.0, 1000.0);
@@ -87,7 +87,7 @@ impl ConnectedLambda {
         spreads: &mut IntervalDurations,
     ) -> Result<PollResult, RecordError> {
         let mut polled = PollResult::default();
-        for _ in 0..MOST_PER_TURN {
+        for _ in 0..MESSAGES_PER_TURN {
             let event = match self.inbox.try_recv() {
                 Ok(event) => event,
                 Err(TryRecvError::Empty) => break,

@@ -5,13 +5,13 @@
 pub struct Intervals(Vec<(i64, i64)>);
 
 /// Beyond this number of intervals, those before the horizon are dropped.
-const MANY: usize = 4096;
+const PRUNE_ABOVE: usize = 4096;
 
 impl Intervals {
     /// Adds `from..=to`, merged with the intervals that it touches. Instants before `horizon` will
     /// not be queried.
     pub fn insert(&mut self, from: i64, to: i64, horizon: i64) {
-        if self.0.len() >= MANY {
+        if self.0.len() >= PRUNE_ABOVE {
             let old = self.0.partition_point(|(_, end)| *end < horizon);
             self.0.drain(..old);
         }
@@ -86,7 +86,7 @@ mod tests {
         for at in 0..100_000 {
             intervals.insert(at * 10, at * 10, at * 10 - 1000);
         }
-        assert!(intervals.0.len() <= MANY, "{}", intervals.0.len());
+        assert!(intervals.0.len() <= PRUNE_ABOVE, "{}", intervals.0.len());
         assert!(intervals.contains(999_990) && intervals.contains(999_000));
     }
 }

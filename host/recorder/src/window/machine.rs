@@ -9,7 +9,7 @@ use super::{Group, Window, WindowRules};
 /// The outcome of a trigger.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum TriggerOutcome {
-    /// It opened a window.
+    /// It opened a window, or began a recording within the window of another recording.
     Opened,
     /// It ended the window that a start had opened.
     Stopped,
@@ -329,7 +329,7 @@ impl Windows {
     }
 
     /// Ends a lambda at `at`, and the recordings that it started, but not those of commands.
-    /// Returns `false` if there were none.
+    /// Returns whether it had started any.
     pub fn end(&mut self, lambda: usize, at: i64) -> bool {
         let Some(state) =
             self.lambdas.get_mut(lambda).filter(|state| state.started_by(TriggeredBy::Lambda) > 0)
@@ -349,7 +349,7 @@ impl Windows {
         self.grace_ns = grace_ns;
     }
 
-    /// Raises the length of clips.
+    /// Sets the maximum length of a clip, in ns.
     pub fn grow_length(&mut self, max_length_ns: i64) {
         self.max_length_ns = max_length_ns;
     }
@@ -359,7 +359,7 @@ impl Windows {
         self.pending.drain(..).map(|window| window.windows).sum()
     }
 
-    /// Closes the open group at the end of the recording. All starts are ended.
+    /// Closes the open group at the end of the recording, and ends all recordings that were started.
     pub fn close(&mut self) -> Option<Group> {
         self.lambdas.iter_mut().for_each(|lambda| lambda.started.clear());
         self.open.take()
