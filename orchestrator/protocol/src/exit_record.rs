@@ -69,16 +69,16 @@ pub enum KillReason {
     /// A call into the lambda, or the runtime, did not return in time.
     #[default]
     Overdue,
-    /// A signal stopped it.
+    /// A signal stopped the runtime.
     Stopped,
-    /// It used more memory than allowed, in bytes.
+    /// The runtime used more memory than allowed, in bytes.
     Memory {
         /// Used memory.
         used: u64,
         /// Allowed memory.
         allowed: u64,
     },
-    /// It had more threads than allowed.
+    /// The runtime had more threads than allowed.
     Threads {
         /// Number of threads.
         used: u64,
@@ -227,7 +227,7 @@ impl ExitRecord {
     ///
     /// # Errors
     ///
-    /// Those of the file system.
+    /// Errors of the file system.
     pub fn write(&self, path: &Path) -> io::Result<()> {
         let mut text = serde_json::to_vec_pretty(self).expect("a record is plain data");
         text.push(b'\n');
@@ -239,7 +239,7 @@ impl ExitRecord {
     ///
     /// # Errors
     ///
-    /// Those of writing.
+    /// Errors of writing.
     pub fn print(&self) -> io::Result<()> {
         let text = serde_json::to_string(self).expect("a record is plain data");
         writeln!(io::stdout(), "\n{text}")
@@ -249,7 +249,7 @@ impl ExitRecord {
     ///
     /// # Errors
     ///
-    /// Those of the file system; [`io::ErrorKind::InvalidData`] if it is not a record.
+    /// Errors of the file system; [`io::ErrorKind::InvalidData`] if it is not a record.
     pub fn read(path: &Path) -> io::Result<Self> {
         let mut text = Vec::new();
         safe_file::read(path)?.take(RECORD_MAX).read_to_end(&mut text)?;

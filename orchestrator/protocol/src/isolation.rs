@@ -23,11 +23,11 @@ pub struct Layer {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Holds {
-    /// It was tested, and holds.
+    /// The layer was tested, and holds.
     Yes,
-    /// A part of it is missing on this system.
+    /// A part of the layer is missing on this system.
     Partly,
-    /// It is missing.
+    /// The layer is missing.
     No,
 }
 

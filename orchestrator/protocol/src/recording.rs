@@ -117,11 +117,11 @@ recording! {
 /// The outcome of counted data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LossOutcome {
-    /// It opened no window, as the manifest requires.
+    /// The data opened no window, as the manifest requires.
     NoWindow,
-    /// It is lost.
+    /// The data is lost.
     Lost,
-    /// It was kept, and should not be.
+    /// The data was kept, and should not have been.
     Kept,
 }
 

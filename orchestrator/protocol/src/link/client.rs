@@ -29,9 +29,9 @@ const READ: usize = 4 << 10;
 /// A message from the recorder.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum RecorderMessage {
-    /// It accepts the lambda.
+    /// The recorder accepts the lambda.
     Ready,
-    /// It refuses the lambda, from the start or later.
+    /// The recorder refuses the lambda, from the start or later.
     Refused(String),
     /// The windows of a decision with triggers are open: data that they cover is no longer dropped
     /// for its age.
@@ -65,7 +65,7 @@ impl std::fmt::Debug for OpaqueEncoder {
 }
 
 impl RecorderLink {
-    /// Creates it from the socket that the starter passed.
+    /// Creates the link from the socket that the starter passed.
     pub fn new(socket: OwnedFd) -> RecorderLink {
         RecorderLink {
             socket: socket.into(),

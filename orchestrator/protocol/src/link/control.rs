@@ -48,7 +48,7 @@ impl ControlClient {
     ///
     /// # Errors
     ///
-    /// Those of the system: too many open files.
+    /// Errors of the system, such as too many open files.
     pub fn pair() -> io::Result<(ControlClient, OwnedFd)> {
         let (starter_end, recorder_end) = UnixStream::pair()?;
         Ok((ControlClient { socket: starter_end }, recorder_end.into()))
@@ -132,7 +132,7 @@ pub struct ControlServer {
 }
 
 impl ControlServer {
-    /// Creates it from the socket that is the recorder's standard input.
+    /// Creates the server from the socket that is the recorder's standard input.
     pub fn new(socket: OwnedFd) -> ControlServer {
         let receiver = Receiver { socket, received: VecDeque::new() };
         ControlServer { from: BufReader::new(receiver), payload: Vec::new() }

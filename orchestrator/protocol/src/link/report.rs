@@ -15,7 +15,7 @@ use gleaner_lambda::Clip;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "recorder", rename_all = "snake_case")]
 pub enum RecorderReport {
-    /// It accepts lambdas from now on.
+    /// The recorder accepts lambdas from now on.
     Ready,
     /// A clip of an earlier recorder, which died, was recovered.
     Recovered(Box<Clip>),

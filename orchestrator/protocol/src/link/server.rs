@@ -57,7 +57,7 @@ impl LambdaLink {
     ///
     /// # Errors
     ///
-    /// Those of the system: too many open files.
+    /// Errors of the system, such as too many open files.
     pub fn new(socket: OwnedFd) -> io::Result<(LambdaLink, LambdaReplies)> {
         let socket = UnixStream::from(socket);
         let replies = LambdaReplies { socket: socket.try_clone()?, rest: Vec::new() };
