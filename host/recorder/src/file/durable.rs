@@ -42,7 +42,7 @@ pub(super) fn write(
     write_with(part, to, folder, |file| file.write_all(content))
 }
 
-/// As [`write`], with the content that `fill` writes.
+/// Writes `to` as [`write`] does, with the content that `fill` writes.
 pub(super) fn write_with(
     part: &Path,
     to: &Path,

@@ -62,8 +62,8 @@ impl RecordingFolder {
         Ok((folder, found))
     }
 
-    /// As [`RecordingFolder::open`], but does not complete unfinished clips: the writer thread of
-    /// [`crate::Recorder::live`] completes them while it records.
+    /// Opens the folder as [`RecordingFolder::open`] does, but does not complete unfinished clips:
+    /// the writer thread of [`crate::Recorder::live`] completes them while it records.
     ///
     /// # Errors
     ///
@@ -87,7 +87,7 @@ impl RecordingFolder {
         std::mem::take(&mut self.unfinished)
     }
 
-    /// As [`EarlierClips::replace`].
+    /// Replaces the listed clips as [`EarlierClips::replace`] does.
     ///
     /// # Errors
     ///

@@ -112,7 +112,7 @@ impl StoredClip {
         PathBuf::from(CLIPS).join(&self.file)
     }
 
-    /// Deletes it, because of `reason`. The loss is noted before the deletion.
+    /// Deletes the clip, because of `reason`. The loss is noted before the deletion.
     fn delete(
         &self,
         dir: &ClipDir,

@@ -218,7 +218,7 @@ impl UnfinishedClip {
         self.close(trailer, &name, None)
     }
 
-    /// As [`UnfinishedClip::finish`], under the name `name`.
+    /// Finishes the clip as [`UnfinishedClip::finish`] does, under the name `name`.
     pub(super) fn close(
         mut self,
         trailer: ClipTrailer,

@@ -120,7 +120,8 @@ impl Disk {
         }
     }
 
-    /// As [`push`](Self::push), but a full disk is an error, after which nothing has changed.
+    /// Adds an entry as [`push`](Self::push) does, but a full disk is an error, after which nothing
+    /// has changed.
     pub(super) fn add(
         &mut self,
         held: &EntryMeta,

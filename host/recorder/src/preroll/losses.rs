@@ -33,7 +33,7 @@ impl Gone {
         self.add_some(at, group, 1);
     }
 
-    /// As [`add`](Self::add), for `count` at once.
+    /// Adds `count` losses at once, as [`add`](Self::add) does for one.
     pub fn add_some(&mut self, at: i64, group: u64, count: u64) {
         if self.stamps.len() == STAMPS_MAX
             && let Some((at, group, _)) = self.stamps.pop_front()

@@ -36,7 +36,7 @@ const SAMPLES_TURN: usize = 64;
 const BYTES_TURN: usize = 256 << 10;
 /// Longest wait before samples are checked, if nothing else happens.
 const IDLE_WAIT: Duration = Duration::from_millis(5);
-/// The same while the thread that writes clips is behind.
+/// Longest wait while the thread that writes clips is behind.
 const WRITER_WAIT: Duration = Duration::from_millis(1);
 /// A sample is stamped before it is staged: the recorder's time advances only when all samples up
 /// to then must have arrived.

@@ -78,7 +78,7 @@ impl ConnectedLambda {
         }
     }
 
-    /// Handles its queued messages, up to its turn.
+    /// Handles queued messages of the lambda, at most [`MESSAGES_PER_TURN`].
     pub(super) fn poll(
         &mut self,
         recorder: &mut Recorder,

@@ -9,11 +9,11 @@ use super::{Group, Window, WindowRules};
 /// The outcome of a trigger.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum TriggerOutcome {
-    /// It opened a window, or began a recording within the window of another recording.
+    /// The trigger opened a window, or began a recording within the window of another recording.
     Opened,
-    /// It ended the window that a start had opened.
+    /// The trigger ended a recording that was started.
     Stopped,
-    /// It came too soon after the last one that opened a window.
+    /// The trigger came too soon after the last one that opened a window.
     InCooldown,
     /// A start while one of its label is open; a stop while none of its label is.
     Ignored,
@@ -359,7 +359,8 @@ impl Windows {
         self.pending.drain(..).map(|window| window.windows).sum()
     }
 
-    /// Closes the open group at the end of the recording, and ends all recordings that were started.
+    /// Closes the open group at the end of the recording, and ends all recordings that were
+    /// started.
     pub fn close(&mut self) -> Option<Group> {
         self.lambdas.iter_mut().for_each(|lambda| lambda.started.clear());
         self.open.take()
