@@ -108,7 +108,7 @@ impl Replay {
         Self::open_as(paths, &DriveOptions::default())
     }
 
-    /// As [`Replay::open`], with other limits.
+    /// Opens a drive as [`Replay::open`] does, with other limits.
     ///
     /// # Errors
     ///
@@ -117,7 +117,7 @@ impl Replay {
         Self::open_as(paths, &DriveOptions { limits, ..DriveOptions::default() })
     }
 
-    /// As [`Replay::open`], with all options.
+    /// Opens a drive as [`Replay::open`] does, with all options.
     ///
     /// # Errors
     ///
@@ -243,7 +243,7 @@ impl Replay {
     ///
     /// # Errors
     ///
-    /// That of [`Transport::subscribe`].
+    /// The error of [`Transport::subscribe`].
     pub fn can_subscribe(&self, spec: &TopicSpec) -> Result<(), TransportError> {
         self.catalog.select(spec).map(drop)
     }

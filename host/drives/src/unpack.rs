@@ -180,7 +180,7 @@ impl Unpacked {
     ///
     /// # Errors
     ///
-    /// Those of opening `name`.
+    /// Errors of opening `name`.
     pub fn named(path: PathBuf, name: PathBuf, broken: Option<String>) -> io::Result<Self> {
         Ok(Self {
             path,

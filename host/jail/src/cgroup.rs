@@ -102,7 +102,7 @@ impl Group {
     ///
     /// # Errors
     ///
-    /// Those of opening the group's list of processes.
+    /// Errors of opening the group's list of processes.
     pub fn attach(&self, command: &mut Command) -> io::Result<()> {
         let processes = OpenOptions::new().write(true).open(self.folder.join("cgroup.procs"))?;
         cgroup_join::before_exec(command.env(CGROUP_ENV, &self.folder), processes);

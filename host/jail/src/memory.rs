@@ -24,7 +24,7 @@ pub fn limit(more: u64) -> Layer {
     limit_beyond(used(), more)
 }
 
-/// As [`limit`], beyond what [`used`] returned earlier.
+/// Limits the memory as [`limit`] does, beyond what [`used`] returned earlier.
 pub fn limit_beyond(used: Option<u64>, more: u64) -> Layer {
     match set(used, more) {
         Ok(()) => Layer::yes(NAME, format!("a data limit of {} MiB above the start", more >> 20)),

@@ -19,7 +19,7 @@ impl Default for IntervalDurations {
 }
 
 impl IntervalDurations {
-    /// Creates an empty one.
+    /// Creates empty statistics.
     pub fn new() -> Self {
         let empty =
             || Histogram::new_with_max(MAX_NS, 2).expect("two digits up to a day are valid bounds");
@@ -57,7 +57,7 @@ impl Default for Durations {
 }
 
 impl Durations {
-    /// Creates an empty one.
+    /// Creates empty statistics.
     pub fn new() -> Self {
         Self(Histogram::new(2).expect("two digits are valid"))
     }

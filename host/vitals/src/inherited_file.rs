@@ -11,7 +11,7 @@ use rustix::io::{FdFlags, fcntl_getfd, fcntl_setfd};
 ///
 /// # Errors
 ///
-/// Those of `fcntl`.
+/// Errors of `fcntl`.
 pub fn make_inheritable(file: impl AsFd) -> io::Result<String> {
     fcntl_setfd(&file, fcntl_getfd(&file)? - FdFlags::CLOEXEC)?;
     Ok(file.as_fd().as_raw_fd().to_string())

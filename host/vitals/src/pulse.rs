@@ -106,7 +106,7 @@ impl Pulse {
     ///
     /// # Errors
     ///
-    /// Those of `memfd_create` and `mmap`.
+    /// Errors of `memfd_create` and `mmap`.
     pub fn create() -> io::Result<(Self, OwnedFd)> {
         let file = File::from(memfd_create(
             "gleaner-pulse",
@@ -123,7 +123,7 @@ impl Pulse {
     ///
     /// # Errors
     ///
-    /// Those of `fcntl`.
+    /// Errors of `fcntl`.
     pub fn make_inheritable(file: &OwnedFd) -> io::Result<String> {
         make_inheritable(file)
     }

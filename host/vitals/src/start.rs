@@ -14,7 +14,7 @@ use signal_hook::consts::SIGTERM;
 ///
 /// # Errors
 ///
-/// Those of the system.
+/// Errors of the system.
 pub fn reports() -> io::Result<File> {
     // Processes that a lambda starts must not inherit it: the reader of the reports waits until all
     // copies are closed.
@@ -27,7 +27,7 @@ pub fn reports() -> io::Result<File> {
 ///
 /// # Errors
 ///
-/// Those of the system.
+/// Errors of the system.
 pub fn stop_flag() -> io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(SIGTERM, Arc::clone(&stop))?;

@@ -74,13 +74,13 @@ impl PrivatePages {
     ///
     /// # Errors
     ///
-    /// Those of opening a file of `/proc`.
+    /// Errors of opening a file of `/proc`.
     pub fn open() -> io::Result<Self> {
         File::open("/proc/self/statm").map(Self)
     }
 
-    /// Returns their size, in bytes. `None` if the file cannot be read any more: a lambda in this
-    /// process may have closed it.
+    /// Returns the size of these pages, in bytes. `None` if the file cannot be read any more: a
+    /// lambda in this process may have closed it.
     pub fn bytes(&self) -> Option<u64> {
         let mut text = [0; 128];
         let length = self.0.read_at(&mut text, 0).ok()?;
