@@ -43,7 +43,7 @@ impl<W: Write> JournalWriter<W> {
     ///
     /// # Errors
     ///
-    /// Those of `out`, and [`io::ErrorKind::InvalidInput`] for a header that readers refuse.
+    /// Errors of `out`, and [`io::ErrorKind::InvalidInput`] for a header that readers refuse.
     pub fn begin(out: W, header: &JournalHeader) -> io::Result<JournalWriter<W>> {
         let inputs = header.inputs.len();
         if inputs > INPUTS_MAX || header.event_input.is_some_and(|event| event >= inputs) {
@@ -68,7 +68,7 @@ impl<W: Write> JournalWriter<W> {
     ///
     /// # Errors
     ///
-    /// Those of `out`; after one, every further call fails, since the last block may be torn.
+    /// Errors of `out`; after one, every further call fails, since the last block may be torn.
     /// [`io::ErrorKind::InvalidInput`] for a wake that readers refuse: it is omitted, and further
     /// wakes may follow.
     pub fn wake(&mut self, entry: &JournalEntry) -> io::Result<()> {
@@ -94,7 +94,7 @@ impl<W: Write> JournalWriter<W> {
     ///
     /// # Errors
     ///
-    /// Those of `out`; after one, every further call fails.
+    /// Errors of `out`; after one, every further call fails.
     pub fn flush(&mut self) -> io::Result<()> {
         self.usable()?;
         self.write_wakes()?;
@@ -107,7 +107,7 @@ impl<W: Write> JournalWriter<W> {
     ///
     /// # Errors
     ///
-    /// Those of `out`.
+    /// Errors of `out`.
     pub fn finish(mut self, end: &JournalEnd) -> io::Result<W> {
         self.usable()?;
         self.write_wakes()?;

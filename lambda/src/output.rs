@@ -84,7 +84,8 @@ impl Output {
         Self::begin(folder, all, false)
     }
 
-    /// As [`Output::create`]; with `append`, lines are appended to existing files.
+    /// Creates the files as [`Output::create`] does; with `append`, lines are appended to existing
+    /// files.
     ///
     /// # Errors
     ///

@@ -56,7 +56,7 @@ pub enum OutputError {
 /// Errors of reading `summary.json` or `signals.json`.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
-    /// It cannot be opened or read.
+    /// The file cannot be opened or read.
     #[error("cannot read `{name}`")]
     Read {
         /// Name of the file in the folder.
@@ -64,7 +64,7 @@ pub enum FileError {
         /// The cause.
         source: io::Error,
     },
-    /// It is not JSON, or lacks keys.
+    /// The file is not JSON, or lacks keys.
     #[error("cannot parse `{name}`")]
     Json {
         /// Name of the file in the folder.

@@ -28,9 +28,9 @@ const QUEUE_LENGTH: usize = 16;
 
 /// The end of a run.
 pub(super) enum RunEnd {
-    /// It ended on request, or its time was over.
+    /// The run ended on request, or its time was over.
     Complete(Exit),
-    /// It could not start, and has printed the cause.
+    /// The run could not start; a program has printed the cause.
     NotStarted(Exit),
     /// A process failed after the start.
     Broken {

@@ -36,7 +36,7 @@ pub enum ChangeKind {
 pub struct Difference {
     /// Time of the wake, in ns since the epoch of the drive.
     pub at_ns: i64,
-    /// The same, in s after the start of the first run's drive.
+    /// Time of the wake, in s after the start of the first run's drive.
     pub t: f64,
     /// A trigger or a fault.
     pub kind: DifferenceKind,

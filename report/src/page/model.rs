@@ -22,7 +22,7 @@ pub(crate) struct PageRun {
     /// Origin of the times, in ns.
     #[serde(skip)]
     pub(crate) start_ns: i64,
-    /// The same in ms since 1970, for dates on the page.
+    /// `start_ns` in ms since 1970, for dates on the page.
     pub(crate) start_ms: f64,
     /// Start and end of the timeline, in s.
     pub(crate) from: f64,
