@@ -21,6 +21,13 @@ impl Explain for NetworkError {
             DdsError::Join { .. } => {
                 Some("`gleaner doctor` looks at the network of this machine".to_owned())
             }
+            DdsError::Interface { .. } => {
+                Some("`ip address` lists the addresses of this machine".to_owned())
+            }
+            DdsError::Name { .. } => Some(
+                "write a name that begins with `/`, of letters, digits and `_`, as in `/gleaner/decisions`"
+                    .to_owned(),
+            ),
             _ => None,
         }
     }

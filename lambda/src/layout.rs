@@ -46,8 +46,8 @@ impl BuildDir {
     ///
     /// # Errors
     ///
-    /// [`LayoutError::NoFolder`], [`LayoutError::File`] or [`LayoutError::IsBuild`] if `lambda_dir`
-    /// is not a lambda's folder, [`LayoutError::Missing`], [`LayoutError::Older`],
+    /// [`LayoutError::NoFolder`], [`LayoutError::File`], [`LayoutError::NoManifest`] or
+    /// [`LayoutError::IsBuild`] if `lambda_dir` is not a lambda's folder, [`LayoutError::Missing`], [`LayoutError::Older`],
     /// [`LayoutError::Manifest`] if the build's manifest is refused, or [`LayoutError::Read`],
     /// [`LayoutError::TooMany`] and [`LayoutError::TooLarge`] as for [`files`](Self::files).
     pub fn check_fresh(lambda_dir: impl AsRef<Path>) -> Result<BuildDir, LayoutError> {
@@ -163,6 +163,12 @@ pub enum LayoutError {
         /// The lambda's folder.
         dir: PathBuf,
     },
+    /// The folder has no manifest.
+    #[error("folder `{}` has no lambda.toml", dir.display())]
+    NoManifest {
+        /// The folder.
+        dir: PathBuf,
+    },
     /// The lambda has no build folder.
     #[error("lambda `{}` is not built", dir.display())]
     Missing {
@@ -216,6 +222,9 @@ impl Explain for LayoutError {
             LayoutError::NoFolder { .. } | LayoutError::File { .. } => {
                 Some(FOLDER_FIRST.to_owned())
             }
+            LayoutError::NoManifest { .. } => Some(
+                "name the lambda's folder; `gleaner new DIR` makes one with a lambda".to_owned(),
+            ),
             LayoutError::IsBuild { dir, .. } => Some(format!("did you mean `{}`?", dir.display())),
             LayoutError::Missing { dir } | LayoutError::Older { dir, .. } => {
                 Some(format!("run `gleaner build {}`", shell_word(dir)))
@@ -247,6 +256,9 @@ fn missing(dir: &Path) -> LayoutError {
         if [dir, parent].iter().all(|folder| folder.join("lambda.toml").is_file()) {
             return LayoutError::IsBuild { build: dir.to_owned(), dir: parent.to_owned() };
         }
+    }
+    if !dir.join("lambda.toml").exists() {
+        return LayoutError::NoManifest { dir: dir.to_owned() };
     }
     LayoutError::Missing { dir: dir.to_owned() }
 }
@@ -319,6 +331,10 @@ mod tests {
         assert_eq!(error.to_string(), format!("lambda `{}` is not built", dir.root().display()));
         assert_eq!(error.help(), Some(format!("run `gleaner build {}`", dir.root().display())));
         assert_eq!(error.exit(), Exit::Usage);
+        let empty = TestFolder::new();
+        let error = BuildDir::check_fresh(empty.root()).unwrap_err();
+        let message = format!("folder `{}` has no lambda.toml", empty.root().display());
+        assert_eq!(error.to_string(), message);
     }
 
     #[test]

@@ -26,7 +26,7 @@ impl Rate {
         Self { lines_per_second, bytes_per_second, window, notes, dropped: 0 }
     }
 
-    /// Counts a line, which [`line`] has cut to its maximum length. Returns whether it is kept;
+    /// Counts a line, which [`line()`] has cut to its maximum length. Returns whether it is kept;
     /// otherwise it is dropped.
     pub fn keeps(&mut self, at_ns: i64, line: &str) -> bool {
         let second = at_ns.div_euclid(SECOND_NS);

@@ -1,6 +1,7 @@
 //! Options for joining a domain.
 
 use std::error::Error;
+use std::io;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 
@@ -76,6 +77,14 @@ pub enum DdsError {
         name: String,
         /// The expected kind of name.
         what: &'static str,
+    },
+    /// No interface of this machine has an address.
+    #[error("no network interface has the address {address}")]
+    Interface {
+        /// The address.
+        address: IpAddr,
+        /// The reason why no socket can use it.
+        source: io::Error,
     },
     /// The writer cannot be created.
     #[error("cannot write topic `{topic}`")]
