@@ -47,9 +47,10 @@ impl BuildDir {
     /// # Errors
     ///
     /// [`LayoutError::NoFolder`], [`LayoutError::File`], [`LayoutError::NoManifest`] or
-    /// [`LayoutError::IsBuild`] if `lambda_dir` is not a lambda's folder, [`LayoutError::Missing`], [`LayoutError::Older`],
-    /// [`LayoutError::Manifest`] if the build's manifest is refused, or [`LayoutError::Read`],
-    /// [`LayoutError::TooMany`] and [`LayoutError::TooLarge`] as for [`files`](Self::files).
+    /// [`LayoutError::IsBuild`] if `lambda_dir` is not a lambda's folder, [`LayoutError::Missing`],
+    /// [`LayoutError::Older`], [`LayoutError::Manifest`] if the build's manifest is refused, or
+    /// [`LayoutError::Read`], [`LayoutError::TooMany`] and [`LayoutError::TooLarge`] as for
+    /// [`files`](Self::files).
     pub fn check_fresh(lambda_dir: impl AsRef<Path>) -> Result<BuildDir, LayoutError> {
         let dir = lambda_dir.as_ref();
         let build = BuildDir::of(dir);

@@ -16,7 +16,8 @@ pub struct NetworkArgs {
 }
 
 impl NetworkArgs {
-    /// Returns the options of the node `node`: those of the environment, overridden by the arguments.
+    /// Returns the options of the node `node`: those of the environment, overridden by the
+    /// arguments.
     ///
     /// # Errors
     ///

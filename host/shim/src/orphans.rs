@@ -12,8 +12,8 @@ pub(crate) fn adopt() -> io::Result<()> {
     Ok(set_child_subreaper(Some(getpid()))?)
 }
 
-/// Kills all descendants of this process, repeatedly, as they may leave children. Returns the number
-/// of processes that ended.
+/// Kills all descendants of this process, repeatedly, as they may leave children. Returns the
+/// number of processes that ended.
 pub(crate) fn kill_all() -> u32 {
     // A process that forks faster than it is killed must not keep the shim for ever.
     let until = Instant::now() + Duration::from_secs(5);
