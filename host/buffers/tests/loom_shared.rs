@@ -2,24 +2,26 @@
 //!
 //! `tests/loom.rs` has the command, with `--test loom_shared`.
 #![cfg(loom)]
+#![allow(unsafe_code)]
 
 use std::time::Duration;
 
 use gleaner_buffers::shared::{
-    Bell, ControlPage, Futex, HeldSample, META_WORDS, SharedLayout, SharedMemory, SharedReader,
-    SharedWriter, fences,
+    Bell, ControlPage, Futex, HeldSample, HoldLimits, META_WORDS, SharedLayout, SharedReader,
+    SharedWriter, fences, in_process,
 };
 use loom::sync::Arc;
 use loom::sync::atomic::{AtomicU32, Ordering};
 use loom::thread;
 
-fn topic(depth: u32, slots: u32, quota: u32) -> (SharedWriter, SharedReader) {
-    let layout = SharedLayout { depth, slots, slot_bytes: 8 };
-    let (memory, seen) = SharedMemory::in_process(layout).unwrap();
+fn topic(depth: u32, slots: u32, windows: u16, singles: u16) -> (SharedWriter, SharedReader) {
+    let (memory, reading) = in_process(SharedLayout { depth, slots, slot_bytes: 8 }).unwrap();
     let control = Arc::new(ControlPage::new());
     let mut writer = SharedWriter::new(memory);
-    writer.attach(control.clone(), 0..2, quota).unwrap();
-    (writer, SharedReader::new(Arc::new(seen), control, 0..2, quota).unwrap())
+    let limits = HoldLimits { first_word: 0, windows, window: 2, singles };
+    writer.attach(control.clone(), limits).unwrap();
+    // SAFETY: the page is attached with these limits, and nothing else stores to it.
+    (writer, unsafe { SharedReader::new(&reading, control, limits) }.unwrap())
 }
 
 fn publish(writer: &mut SharedWriter, value: u64) {
@@ -41,7 +43,7 @@ static MODEL: std::sync::Mutex<()> = std::sync::Mutex::new(());
 /// One sample under a hazard, while the writer takes slots.
 fn one() {
     loom::model(|| {
-        let (mut writer, reader) = topic(1, 3, 1);
+        let (mut writer, reader) = topic(1, 3, 0, 1);
         publish(&mut writer, 0);
         let reading = thread::spawn(move || {
             if let Some(hold) = reader.get(0).unwrap() {
@@ -69,7 +71,7 @@ fn a_held_sample_does_not_change() {
 fn a_held_window_does_not_change() {
     let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     loom::model(|| {
-        let (mut writer, reader) = topic(2, 5, 2);
+        let (mut writer, reader) = topic(2, 5, 1, 0);
         publish(&mut writer, 0);
         publish(&mut writer, 1);
         let reading = thread::spawn(move || {
@@ -77,9 +79,65 @@ fn a_held_window_does_not_change() {
                 window.iter().for_each(check);
             }
         });
-        for value in 2..5 {
+        for value in 2..6 {
             publish(&mut writer, value);
         }
+        reading.join().unwrap();
+    });
+}
+
+#[test]
+fn a_held_sample_stays_while_other_words_move() {
+    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    loom::model(|| {
+        let (mut writer, reader) = topic(3, 8, 1, 2);
+        for value in 0..3 {
+            publish(&mut writer, value);
+        }
+        let steady = reader.get(0).unwrap().unwrap();
+        let window = reader.window(1, 2).unwrap().unwrap();
+        // All slots are used, and 0 to 4 have left.
+        for value in 3..8 {
+            publish(&mut writer, value);
+        }
+        let reading = thread::spawn(move || {
+            drop(window);
+            let one = reader.get(6).unwrap();
+            check(&steady);
+            drop(one);
+            check(&steady);
+        });
+        publish(&mut writer, 8);
+        reading.join().unwrap();
+    });
+}
+
+#[test]
+fn the_newest_sample_is_never_missing() {
+    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    loom::model(|| {
+        let (mut writer, reader) = topic(1, 3, 0, 1);
+        publish(&mut writer, 0);
+        let reading = thread::spawn(move || {
+            assert!(reader.newest_before(u64::MAX).unwrap().is_some());
+        });
+        publish(&mut writer, 1);
+        publish(&mut writer, 2);
+        reading.join().unwrap();
+    });
+}
+
+#[test]
+fn the_newest_window_is_never_missing() {
+    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    loom::model(|| {
+        let (mut writer, reader) = topic(2, 5, 1, 0);
+        publish(&mut writer, 0);
+        publish(&mut writer, 1);
+        let reading = thread::spawn(move || {
+            assert!(reader.last_before(u64::MAX, 2).unwrap().is_some());
+        });
+        publish(&mut writer, 2);
         reading.join().unwrap();
     });
 }
@@ -155,7 +213,7 @@ fn rings() {
         let bell = Bell::of(control.clone());
         let (seen_by_reader, kernel) = (published.clone(), Kernel(sleeper.clone()));
         let waiting = thread::spawn(move || {
-            let bell = Bell::of(control);
+            let mut bell = Bell::of(control);
             let seen = bell.value();
             if seen_by_reader.load(Ordering::Acquire) == 0 {
                 bell.wait(seen, Duration::from_secs(1), &kernel);

@@ -1,4 +1,5 @@
 #![cfg(not(loom))]
+#![allow(unsafe_code)]
 //! A topic in shared memory: what readers see, what they may hold, and what hostile ones cannot do.
 
 use std::sync::Arc;
@@ -6,23 +7,24 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
 
 use gleaner_buffers::shared::{
-    ControlMemory, ControlPage, HAZARDS, HeldSample, META_WORDS, ReadError, ReaderId, SharedLayout,
-    SharedMemory, SharedReader, SharedWriter, WriteError,
+    ControlMemory, ControlPage, HAZARDS, HeldSample, HoldLimits, META_WORDS, ReadError, ReaderId,
+    SharedLayout, SharedReader, SharedWriter, WriteError, in_process,
 };
 
-/// Returns a writer with readers, each with so many hazard words and so large a quota.
+/// Returns a writer with readers: windows, positions of a window, and single positions of each.
 fn topic<const N: usize>(
     (depth, slots, slot_bytes): (u32, u32, u64),
-    readers: [(u16, u32); N],
+    readers: [(u16, u16, u16); N],
 ) -> (SharedWriter, [(SharedReader, Arc<ControlPage>, ReaderId); N]) {
-    let layout = SharedLayout { depth, slots, slot_bytes };
-    let (memory, reading) = SharedMemory::in_process(layout).unwrap();
+    let (memory, reading) = in_process(SharedLayout { depth, slots, slot_bytes }).unwrap();
     let mut writer = SharedWriter::new(memory);
-    let reading = Arc::new(reading);
-    let attach = |(words, quota)| {
+    let attach = |(windows, window, singles)| {
         let control = Arc::new(ControlPage::new());
-        let id = writer.attach(control.clone(), 0..words, quota).unwrap();
-        let reader = SharedReader::new(reading.clone(), control.clone(), 0..words, quota).unwrap();
+        let limits = HoldLimits { first_word: 0, windows, window, singles };
+        let id = writer.attach(control.clone(), limits).unwrap();
+        // SAFETY: the page is attached with these limits, and the tests store to pages of readers
+        // only that hold nothing.
+        let reader = unsafe { SharedReader::new(&reading, control.clone(), limits) }.unwrap();
         (reader, control, id)
     };
     let readers = readers.map(attach);
@@ -55,7 +57,7 @@ fn positions(window: &[HeldSample]) -> Vec<u64> {
 
 #[test]
 fn readers_see_the_newest_samples() {
-    let (mut writer, [(reader, ..)]) = topic((4, 16, 256), [(4, 8)]);
+    let (mut writer, [(reader, ..)]) = topic((4, 16, 256), [(1, 4, 3)]);
     assert!(reader.newest_before(u64::MAX).unwrap().is_none());
     for _ in 0..6 {
         publish(&mut writer);
@@ -70,7 +72,7 @@ fn readers_see_the_newest_samples() {
 
 #[test]
 fn a_held_sample_stays_until_its_last_handle_is_dropped() {
-    let (mut writer, [(reader, ..)]) = topic((2, 6, 256), [(2, 3)]);
+    let (mut writer, [(reader, ..)]) = topic((2, 6, 256), [(1, 2, 1)]);
     publish(&mut writer);
     let held = reader.get(0).unwrap().unwrap();
     let again = held.clone();
@@ -90,7 +92,7 @@ fn a_held_sample_stays_until_its_last_handle_is_dropped() {
 
 #[test]
 fn a_reader_that_holds_its_quota_gets_no_more_and_stops_nobody() {
-    let (mut writer, [(reader, ..)]) = topic((2, 6, 256), [(4, 2)]);
+    let (mut writer, [(reader, ..)]) = topic((2, 6, 256), [(1, 2, 0)]);
     publish(&mut writer);
     publish(&mut writer);
     let window = reader.window(0, 2).unwrap().unwrap();
@@ -105,13 +107,66 @@ fn a_reader_that_holds_its_quota_gets_no_more_and_stops_nobody() {
 
 #[test]
 fn quotas_beyond_the_slots_are_refused() {
-    let (mut writer, [(_, _, id)]) = topic((2, 6, 256), [(1, 2)]);
+    let (mut writer, [(_, _, id)]) = topic((2, 6, 256), [(1, 2, 0)]);
     let control = Arc::new(ControlPage::new());
-    let refused = writer.attach(control.clone(), 0..1, 2).unwrap_err();
+    let limits = |first_word, singles| HoldLimits { first_word, windows: 0, window: 0, singles };
+    let refused = writer.attach(control.clone(), limits(0, 2)).unwrap_err();
     assert_eq!(refused, WriteError::Quota { asked: 2, left: 1 });
-    assert_eq!(writer.attach(control.clone(), 0..9999, 1).unwrap_err(), WriteError::Hazards);
+    for limits in [limits(0, 0), limits(HAZARDS as u16, 1), limits(u16::MAX, u16::MAX)] {
+        assert_eq!(writer.attach(control.clone(), limits).unwrap_err(), WriteError::Hazards);
+    }
     writer.detach(id);
-    writer.attach(control, 0..1, 3).unwrap();
+    writer.attach(control, limits(0, 3)).unwrap();
+}
+
+#[test]
+fn layouts_that_no_region_can_have_are_refused() {
+    let layout = SharedLayout { depth: 1, slots: 3, slot_bytes: 100 };
+    assert!(layout.bytes_needed().is_some());
+    for impossible in [
+        SharedLayout { depth: 0, ..layout },
+        SharedLayout { slots: 1, ..layout },
+        SharedLayout { slots: u32::MAX, ..layout },
+        SharedLayout { slot_bytes: 1 << 32, ..layout },
+        SharedLayout { slot_bytes: u64::MAX, ..layout },
+    ] {
+        assert_eq!(impossible.bytes_needed(), None, "{impossible:?}");
+    }
+}
+
+#[test]
+fn positions_beyond_the_last_are_not_shown() {
+    let (mut writer, [(reader, ..)]) = topic((2, 6, 256), [(1, 2, 1)]);
+    publish(&mut writer);
+    assert!(reader.get(u64::MAX).unwrap().is_none());
+    assert!(reader.window(u64::MAX, 2).unwrap().is_none());
+}
+
+/// The sum of the positions that words name, each read once, may exceed what the reader ever held.
+#[test]
+fn a_steady_hold_stays_while_other_words_move() {
+    let samples = if cfg!(miri) { 30 } else { 200_000 };
+    let (mut writer, [(reader, ..)]) = topic((3, 12, 256), [(1, 2, 3)]);
+    publish(&mut writer);
+    let done = AtomicBool::new(false);
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            while !done.load(Ordering::Relaxed) {
+                let steady = reader.newest_before(u64::MAX).unwrap().unwrap();
+                for _ in 0..8 {
+                    drop(reader.last_before(u64::MAX, 2).unwrap());
+                    let one = reader.newest_before(u64::MAX).unwrap();
+                    let two = reader.newest_before(u64::MAX).unwrap();
+                    assert!(is_whole(&steady), "torn");
+                    drop((one, two));
+                }
+            }
+        });
+        for _ in 0..samples {
+            publish(&mut writer);
+        }
+        done.store(true, Ordering::Relaxed);
+    });
 }
 
 #[test]
@@ -135,7 +190,8 @@ fn garbage(control: &impl ControlMemory, state: &mut u64) {
         *state ^= *state << 13;
         *state ^= *state >> 7;
         *state ^= *state << 17;
-        control.overwrite(word, *state);
+        // SAFETY: this reader holds nothing.
+        unsafe { control.overwrite(word, *state) };
     }
 }
 
@@ -144,7 +200,7 @@ fn hostile_readers_neither_tear_samples_of_others_nor_stop_the_writer() {
     let long = std::env::var_os("GLEANER_LONG").is_some();
     let samples = if cfg!(miri) { 30 } else { 300_000 * if long { 20 } else { 1 } };
     let (mut writer, [honest, other, words, word, follower]) =
-        topic((8, 64, 256), [(8, 12), (8, 12), (400, 8), (1, 8), (2, 8)]);
+        topic((8, 64, 256), [(3, 4, 1), (3, 4, 1), (0, 0, 8), (1, 8, 0), (2, 4, 0)]);
     let stop = AtomicBool::new(false);
     let verified = AtomicU64::new(0);
     thread::scope(|scope| {
@@ -187,8 +243,11 @@ fn hostile_readers_neither_tear_samples_of_others_nor_stop_the_writer() {
         scope.spawn(move || {
             while !stop_it.load(Ordering::Relaxed) {
                 let head = reader.head();
-                control.overwrite(0, head.saturating_sub(3) << 16 | 0xffff);
-                control.overwrite(1, head << 16 | 0xffff);
+                // SAFETY: this reader holds nothing.
+                unsafe {
+                    control.overwrite(0, head.saturating_sub(3) << 16 | 0xffff);
+                    control.overwrite(1, head << 16 | 0xffff);
+                }
                 thread::yield_now();
             }
         });

@@ -51,8 +51,10 @@ impl ControlRegion {
     fn map(file: BorrowedFd<'_>) -> io::Result<Self> {
         let access = ProtFlags::READ | ProtFlags::WRITE;
         let len = size_of::<ControlPage>();
-        FileMapping::shared(&file, len, access, MapFlags::POPULATE)
-            .map(|mapping| Self(Arc::new(mapping)))
+        let mapping = FileMapping::shared(&file, len, access, MapFlags::POPULATE)?;
+        // A forked process that drops a sample would clear a hazard of this one.
+        mapping.keep_from_children()?;
+        Ok(Self(Arc::new(mapping)))
     }
 }
 

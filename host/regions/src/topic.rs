@@ -37,6 +37,12 @@ impl FileMapping {
         Ok(Self { base, len })
     }
 
+    /// Keeps the mapping out of forked processes.
+    pub(crate) fn keep_from_children(&self) -> io::Result<()> {
+        // SAFETY: the bytes are those of this mapping; the advice changes nothing in this process.
+        Ok(unsafe { madvise(self.address(), self.len, Advice::LinuxDontFork) }?)
+    }
+
     pub(crate) fn base(&self) -> NonNull<u8> {
         self.base
     }
@@ -85,9 +91,7 @@ impl TopicRegion {
         file.set_len(len as u64)?;
         let access = ProtFlags::READ | ProtFlags::WRITE;
         let mapping = FileMapping::shared(&file, len, access, MapFlags::POPULATE)?;
-        // SAFETY: the bytes are those of the mapping above; the advice changes nothing in this
-        // process.
-        unsafe { madvise(mapping.address(), len, Advice::LinuxDontFork) }?;
+        mapping.keep_from_children()?;
         seal(&file, TOPIC_SEALS)?;
         Ok(Self { mapping, file })
     }

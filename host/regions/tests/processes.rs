@@ -1,24 +1,22 @@
 //! A writer and readers in separate processes: what readers see, and what hostile and killed
 //! readers cannot do.
+#![allow(unsafe_code)]
 
 use std::env;
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, ChildStdout, Command, ExitCode, Stdio};
-use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_buffers::shared::{
-    Bell, ControlMemory, HAZARDS, META_WORDS, ReaderId, SharedLayout, SharedMemory, SharedReader,
-    SharedWriter,
+    Bell, ControlMemory, HAZARDS, HoldLimits, META_WORDS, ReaderId, ReaderMemory, SharedLayout,
+    SharedReader, SharedWriter, WriterMemory,
 };
 use gleaner_regions::{ControlRegion, KernelFutex, MappedTopic, TopicRegion};
 use libtest_mimic::{Arguments, Trial};
 
 const LAYOUT: SharedLayout = SharedLayout { depth: 8, slots: 64, slot_bytes: 4096 };
-/// Hazard words of a reader.
-const WORDS: u16 = 8;
-const QUOTA: u32 = 12;
+const LIMITS: HoldLimits = HoldLimits { first_word: 0, windows: 2, window: 4, singles: 4 };
 
 /// The variable with the role of a child of this program.
 const ROLE: &str = "GLEANER_TEST_ROLE";
@@ -76,14 +74,14 @@ impl Topic {
     fn new() -> Self {
         let region = TopicRegion::create("test", LAYOUT.bytes_needed().unwrap()).unwrap();
         let file = region.file().try_clone_to_owned().unwrap().into();
-        let memory = SharedMemory::for_writing(region, LAYOUT).unwrap();
+        let memory = WriterMemory::new(region, LAYOUT).unwrap();
         Self { region: file, writer: SharedWriter::new(memory), bells: Vec::new() }
     }
 
     /// Starts a reader, and waits for its first line.
     fn start(&mut self, role: &str) -> ReaderProcess {
         let (control, file) = ControlRegion::create().unwrap();
-        let id = self.writer.attach(control.clone(), 0..WORDS, QUOTA).unwrap();
+        let id = self.writer.attach(control.clone(), LIMITS).unwrap();
         self.bells.push(Bell::of(control));
         let mut child = Command::new(env::current_exe().unwrap())
             .env(ROLE, role)
@@ -158,10 +156,12 @@ fn killed_readers() {
 fn attached() -> (SharedReader, ControlRegion) {
     let topic = File::open("/proc/self/fd/0").unwrap();
     let topic = MappedTopic::open(topic, LAYOUT.bytes_needed().unwrap()).unwrap();
-    let memory = SharedMemory::for_reading(topic, LAYOUT).unwrap();
+    let memory = ReaderMemory::new(topic, LAYOUT).unwrap();
     let control = OpenOptions::new().read(true).write(true).open("/proc/self/fd/2").unwrap();
     let control = ControlRegion::open(control).unwrap();
-    let reader = SharedReader::new(Arc::new(memory), control.clone(), 0..WORDS, QUOTA).unwrap();
+    // SAFETY: the parent attached this page with these limits; the roles that store garbage hold
+    // nothing.
+    let reader = unsafe { SharedReader::new(&memory, control.clone(), LIMITS) }.unwrap();
     println!("ready");
     (reader, control)
 }
@@ -169,7 +169,7 @@ fn attached() -> (SharedReader, ControlRegion) {
 /// Verifies the newest samples until the last one; exits by a panic if one is torn.
 fn verify() {
     let (reader, control) = attached();
-    let bell = Bell::of(control);
+    let mut bell = Bell::of(control);
     let mut verified = 0;
     loop {
         let seen = bell.value();
@@ -199,7 +199,8 @@ fn garbage() {
             state ^= state << 17;
             // Half of the words name positions that are shown.
             let near = reader.head().saturating_sub(state % 16) << 16 | 0xffff;
-            control.overwrite(word, if state % 2 == 0 { state } else { near });
+            // SAFETY: this process holds nothing.
+            unsafe { control.overwrite(word, if state % 2 == 0 { state } else { near }) };
         }
     }
 }
@@ -208,7 +209,7 @@ fn garbage() {
 fn hold() {
     let (reader, _) = attached();
     let window = loop {
-        if let Some(window) = reader.last_before(u64::MAX, QUOTA).unwrap() {
+        if let Some(window) = reader.last_before(u64::MAX, 4).unwrap() {
             break window;
         }
         std::thread::yield_now();

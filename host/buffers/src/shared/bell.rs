@@ -10,11 +10,12 @@ use crate::sync::{AtomicU32, Ordering};
 pub trait Futex {
     /// Sleeps while `word` is `seen`, until a wake, `timeout` or, at times, for no reason.
     fn wait(&self, word: &AtomicU32, seen: u32, timeout: Duration);
-    /// Wakes all threads that sleep on `word`. Never blocks.
+    /// Wakes one thread that sleeps on `word`. Never blocks: a hostile reader could let thousands
+    /// of threads sleep there.
     fn wake(&self, word: &AtomicU32);
 }
 
-/// The bell of one reader. The reader waits for it; the writer rings it.
+/// The bell of one reader. One thread of the reader waits for it; the writer rings it.
 ///
 /// A ring between the reader's look at its topics and its sleep is not missed: the reader stores
 /// `waiting`, fences, and sleeps only while the bell has the value from before its look; the writer
@@ -44,7 +45,7 @@ impl Bell {
     }
 
     /// Sleeps until the bell differs from `seen`, for `timeout` at most.
-    pub fn wait(&self, seen: u32, timeout: Duration, futex: &impl Futex) {
+    pub fn wait(&mut self, seen: u32, timeout: Duration, futex: &impl Futex) {
         let control = self.0.control();
         control.waiting.store(1, Ordering::Relaxed);
         bell_fence();

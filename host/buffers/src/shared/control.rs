@@ -1,19 +1,18 @@
 //! The control page of a reader: its hazards and its bell.
 #![allow(unsafe_code)]
 
-use std::ops::Range;
 use std::ptr::NonNull;
 
 use crate::sync::{AtomicU32, AtomicU64, Ordering};
+
+#[cfg(not(loom))]
+const _: () = assert!(size_of::<ControlPage>() == CONTROL_BYTES);
 
 /// Bytes of a control page.
 const CONTROL_BYTES: usize = 4096;
 
 /// Hazard words of a control page.
 pub const HAZARDS: usize = (CONTROL_BYTES - 64) / 8;
-
-/// Positions that one hazard names at most.
-pub(super) const WINDOW_MAX: u32 = u16::MAX as u32;
 
 /// The words of a control page.
 ///
@@ -24,13 +23,49 @@ pub struct ControlPage {
     pub(super) bell: AtomicU32,
     /// Set while the reader waits for the bell.
     pub(super) waiting: AtomicU32,
-    _padding: [u64; 7],
+    _padding: [AtomicU64; 7],
     /// First position in the upper 48 bits, number of positions in the lower 16; 0 names none.
     pub(super) hazards: [AtomicU64; HAZARDS],
 }
 
-/// The hazard words of a control page that belong to one topic.
-pub type HazardRange = Range<u16>;
+/// The hazard words of one topic on a control page, and the positions that each may name.
+///
+/// Each word has a limit of its own, and their sum has none: the writer reads the words one after
+/// another, so an old value of one and a new value of another may add up to more than the reader
+/// held at any time. A limit of the sum would then ignore a word that is in use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct HoldLimits {
+    /// The first word. Words for windows come first, then words for single positions.
+    pub first_word: u16,
+    /// Words that name a window.
+    pub windows: u16,
+    /// Positions that a window has at most.
+    pub window: u16,
+    /// Words that name a single position.
+    pub singles: u16,
+}
+
+impl HoldLimits {
+    /// Returns the number of positions that a reader can hold.
+    pub fn quota(&self) -> u32 {
+        u32::from(self.windows) * u32::from(self.window) + u32::from(self.singles)
+    }
+
+    pub(super) fn words(&self) -> usize {
+        usize::from(self.windows) + usize::from(self.singles)
+    }
+
+    /// Returns the number of positions that word `index` of the topic may name.
+    pub(super) fn of_word(&self, index: usize) -> u32 {
+        if index < usize::from(self.windows) { self.window.into() } else { 1 }
+    }
+
+    /// Returns the words of the topic; `None` if there are none, or the page lacks some.
+    pub(super) fn of_page<'a>(&self, page: &'a ControlPage) -> Option<&'a [AtomicU64]> {
+        let first = usize::from(self.first_word);
+        page.hazards.get(first..first + self.words()).filter(|words| !words.is_empty())
+    }
+}
 
 impl ControlPage {
     /// A page without hazards.
@@ -38,7 +73,7 @@ impl ControlPage {
         Self {
             bell: AtomicU32::new(0),
             waiting: AtomicU32::new(0),
-            _padding: [0; 7],
+            _padding: std::array::from_fn(|_| AtomicU64::new(0)),
             hazards: std::array::from_fn(|_| AtomicU64::new(0)),
         }
     }
@@ -54,9 +89,9 @@ impl Default for ControlPage {
 ///
 /// # Safety
 ///
-/// For as long as the value lives, [`page`](Self::page) points to 4,096 mapped bytes, aligned to a
-/// cache line, that are valid for atomic reads and writes from any thread. Other processes may
-/// write them.
+/// For as long as the value lives, [`page`](Self::page) returns the same address, which points to
+/// 4,096 mapped bytes, aligned to a cache line, that are valid for atomic reads and writes from any
+/// thread. Other processes may write them.
 pub unsafe trait ControlMemory: Send + Sync + 'static {
     /// The first byte of the page.
     fn page(&self) -> NonNull<ControlPage>;
@@ -66,7 +101,11 @@ pub unsafe trait ControlMemory: Send + Sync + 'static {
     /// # Panics
     ///
     /// If the page has no such word.
-    fn overwrite(&self, word: usize, value: u64) {
+    ///
+    /// # Safety
+    ///
+    /// No [`HeldSample`](super::HeldSample) of this page is used any more.
+    unsafe fn overwrite(&self, word: usize, value: u64) {
         // SAFETY: the promise of the trait; hazards are atomics.
         unsafe { self.page().as_ref() }.hazards[word].store(value, Ordering::Relaxed);
     }
@@ -102,7 +141,6 @@ pub(super) struct HazardWindow {
 
 impl HazardWindow {
     pub(super) fn word(self) -> u64 {
-        debug_assert!(self.count <= WINDOW_MAX);
         self.first << 16 | u64::from(self.count)
     }
 

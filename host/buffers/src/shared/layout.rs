@@ -36,7 +36,9 @@ pub struct SharedLayout {
 impl SharedLayout {
     /// Size of the region in bytes; `None` if a number is 0 or no region can be that large.
     pub fn bytes_needed(&self) -> Option<usize> {
-        if self.depth == 0 || self.slots <= self.depth || self.slots > 0x7fff_ffff {
+        // A place has 32 bits for the length of a sample.
+        let is_small = self.slot_bytes <= u64::from(u32::MAX);
+        if self.depth == 0 || self.slots <= self.depth || self.slots > 0x7fff_ffff || !is_small {
             return None;
         }
         let slots = self.stride()?.checked_mul(self.slots as usize)?.checked_add(LINE)?;
@@ -96,8 +98,52 @@ pub unsafe trait ReadRegion: Send + Sync + 'static {
     fn len(&self) -> usize;
 }
 
+/// Memory of a topic for its one writer.
+pub struct WriterMemory(pub(super) SharedMemory);
+
+/// Memory of a topic for readers; clones are the same mapping.
+#[derive(Clone)]
+pub struct ReaderMemory(pub(super) crate::sync::Arc<SharedMemory>);
+
+impl WriterMemory {
+    /// Returns the memory of a writer; `None` if the region is too small, not aligned to a page, or
+    /// the layout impossible.
+    pub fn new(region: impl Region, layout: SharedLayout) -> Option<Self> {
+        let region = Box::new(region);
+        let (base, len) = (region.base(), region.len());
+        SharedMemory::over(region, base, len, layout).map(Self)
+    }
+}
+
+impl ReaderMemory {
+    /// Returns the memory of readers, as above.
+    pub fn new(region: impl ReadRegion, layout: SharedLayout) -> Option<Self> {
+        let region = Box::new(region);
+        let (base, len) = (region.base(), region.len());
+        let memory = SharedMemory::over(region, base, len, layout)?;
+        Some(Self(crate::sync::Arc::new(memory)))
+    }
+}
+
+/// Returns memory of a writer and of readers in the same process, over the heap.
+///
+/// # Errors
+///
+/// [`PoolError::OutOfMemory`] if the allocator refuses, or the layout is impossible.
+pub fn in_process(layout: SharedLayout) -> Result<(WriterMemory, ReaderMemory), PoolError> {
+    let bytes = layout.bytes_needed().unwrap_or(usize::MAX);
+    let region = crate::sync::Arc::new(HeapRegion::zeroed(bytes)?);
+    let (base, len) = (region.base(), region.len());
+    let refused = PoolError::OutOfMemory { bytes };
+    let over = || SharedMemory::over(Box::new(region.clone()), base, len, layout).ok_or(refused);
+    let (writing, reading) = (over()?, over()?);
+    #[cfg(loom)]
+    let reading = SharedMemory { model: crate::sync::Arc::clone(&writing.model), ..reading };
+    Ok((WriterMemory(writing), ReaderMemory(crate::sync::Arc::new(reading))))
+}
+
 /// A mapped region and its layout.
-pub struct SharedMemory {
+pub(super) struct SharedMemory {
     layout: SharedLayout,
     stride: usize,
     #[cfg_attr(loom, allow(dead_code))]
@@ -124,21 +170,6 @@ unsafe impl Send for SharedMemory {}
 unsafe impl Sync for SharedMemory {}
 
 impl SharedMemory {
-    /// Memory of a writer; `None` if the region is too small, not aligned to a page, or the layout
-    /// impossible.
-    pub fn for_writing(region: impl Region, layout: SharedLayout) -> Option<Self> {
-        let region = Box::new(region);
-        let (base, len) = (region.base(), region.len());
-        Self::over(region, base, len, layout)
-    }
-
-    /// Memory of a reader, as above.
-    pub fn for_reading(region: impl ReadRegion, layout: SharedLayout) -> Option<Self> {
-        let region = Box::new(region);
-        let (base, len) = (region.base(), region.len());
-        Self::over(region, base, len, layout)
-    }
-
     fn over(
         region: Box<dyn std::any::Any + Send + Sync>,
         base: NonNull<u8>,
@@ -159,23 +190,6 @@ impl SharedMemory {
             model: crate::sync::Arc::new(ModelMemory::new(&layout)),
             _region: region,
         })
-    }
-
-    /// Memory of a writer and of a reader in the same process, over the heap.
-    ///
-    /// # Errors
-    ///
-    /// [`PoolError::OutOfMemory`] if the allocator refuses, or the layout is impossible.
-    pub fn in_process(layout: SharedLayout) -> Result<(Self, Self), PoolError> {
-        let bytes = layout.bytes_needed().unwrap_or(usize::MAX);
-        let region = crate::sync::Arc::new(HeapRegion::zeroed(bytes)?);
-        let (base, len) = (region.base(), region.len());
-        let refused = PoolError::OutOfMemory { bytes };
-        let over = || Self::over(Box::new(region.clone()), base, len, layout).ok_or(refused);
-        let (writing, reading) = (over()?, over()?);
-        #[cfg(loom)]
-        let reading = Self { model: crate::sync::Arc::clone(&writing.model), ..reading };
-        Ok((writing, reading))
     }
 
     pub(super) fn layout(&self) -> &SharedLayout {

@@ -3,10 +3,11 @@
 //! A [`SharedWriter`] owns a region: a header, places that name the newest samples, and slots that
 //! hold their bytes. A [`SharedReader`] in another process maps the same region read-only. A reader
 //! protects what it reads by *hazards*: words on its own control page that name windows of
-//! positions. The writer reads them before it takes a slot, and trusts nothing else of that page:
-//! a reader that writes garbage there loses its own protection only, and can pin no more positions
-//! than its quota, which the writer alone knows. So a writer with `depth + quotas + 1` slots always
-//! finds a free one, never waits, and no reader can change what another one sees.
+//! positions. The writer reads them before it takes a slot, and trusts nothing else of that page: a
+//! reader that writes garbage there loses its own protection only, and can pin no more positions
+//! than its limits ([`HoldLimits`]), which the writer keeps to itself. So a writer with `depth +
+//! quotas + 1` slots always finds a free one, never waits, and no reader can change what another
+//! one sees.
 //!
 //! # Order of memory accesses
 //!
@@ -28,8 +29,8 @@
 //! 5. A place is not torn: a field of a later sample is written after W, which follows `seq = 0`,
 //!    so a reader that saw such a field sees the 0 or a later value in its second load.
 //! 6. Payload reads are plain. Only a reader that breaks these rules sees torn bytes.
-//! 7. The writer never starves: it reads each word once per draft, and counts at most the quota of
-//!    positions for each reader.
+//! 7. The writer never starves: it reads each word once per draft, and counts at most the limit of
+//!    that word. The limits of all words of all readers fit into the region.
 //!
 //! One window is held by one word, as positions leave in order: the check of its oldest position
 //! holds all of it. The places have to be read before the fence, because they are written again
@@ -42,8 +43,8 @@ mod reader;
 mod writer;
 
 pub use bell::{Bell, Futex};
-pub use control::{ControlMemory, ControlPage, HAZARDS, HazardRange};
-pub use layout::{META_WORDS, ReadRegion, SharedLayout, SharedMemory};
+pub use control::{ControlMemory, ControlPage, HAZARDS, HoldLimits};
+pub use layout::{META_WORDS, ReadRegion, ReaderMemory, SharedLayout, WriterMemory, in_process};
 pub use reader::{HeldSample, HeldWindow, ReadError, SharedReader};
 pub use writer::{ReaderId, SharedDraft, SharedWriter, WriteError};
 

@@ -4,10 +4,8 @@
 use std::ops::Deref;
 use std::slice;
 
-use super::control::{
-    ControlMemory, HAZARDS, HazardRange, HazardWindow, MappedControl, WINDOW_MAX, clear, set,
-};
-use super::layout::{COUNTER_WORDS, META_WORDS, SharedMemory};
+use super::control::{ControlMemory, HazardWindow, HoldLimits, MappedControl, clear, set};
+use super::layout::{COUNTER_WORDS, META_WORDS, ReaderMemory, SharedMemory};
 use super::reader_fence;
 use crate::HEADROOM;
 use crate::sync::{Arc, Mutex, MutexGuard, Ordering};
@@ -15,7 +13,8 @@ use crate::sync::{Arc, Mutex, MutexGuard, Ordering};
 /// A reading end that cannot be used, or has no hold left.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ReadError {
-    /// This process holds as many samples as it may, or uses all its hazard words.
+    /// All hazard words for so many positions are in use, also while another thread looks for a
+    /// sample.
     OutOfHolds,
     /// The words are not on the control page.
     Hazards,
@@ -28,21 +27,19 @@ pub struct SharedReader(Arc<ReaderState>);
 struct ReaderState {
     memory: Arc<SharedMemory>,
     page: MappedControl,
-    hazards: HazardRange,
+    limits: HoldLimits,
     holds: Mutex<HoldTable>,
 }
 
 /// The holds of this process.
 struct HoldTable {
-    /// For each hazard word: positions it holds, and handles on them.
+    /// For each hazard word, in the order of the page.
     words: Box<[HazardUse]>,
-    /// Positions that may be held beyond those that are.
-    left: u32,
 }
 
 #[derive(Clone, Copy, Default)]
 struct HazardUse {
-    count: u32,
+    /// Handles on its samples; 0 if the word is free.
     handles: u32,
 }
 
@@ -56,28 +53,30 @@ struct FoundSample {
 }
 
 impl SharedReader {
-    /// A reader that may hold up to `quota` positions through `hazards` of its control page.
+    /// Creates a reader that holds positions through its control page, within `limits`.
     ///
     /// # Errors
     ///
     /// [`ReadError::Hazards`].
-    pub fn new(
-        memory: Arc<SharedMemory>,
+    ///
+    /// # Safety
+    ///
+    /// Until the last [`HeldSample`] is dropped: the writer of this memory is a [`SharedWriter`],
+    /// it has this page attached with limits that are at least these, and nothing else stores to
+    /// these words of the page, for example another reader or a forked process. Otherwise the bytes
+    /// of held samples may change.
+    ///
+    /// [`SharedWriter`]: super::SharedWriter
+    pub unsafe fn new(
+        memory: &ReaderMemory,
         control: impl ControlMemory,
-        hazards: HazardRange,
-        quota: u32,
+        limits: HoldLimits,
     ) -> Result<Self, ReadError> {
-        if hazards.end as usize > HAZARDS || hazards.is_empty() {
-            return Err(ReadError::Hazards);
-        }
-        let words = vec![HazardUse::default(); hazards.len()].into();
-        let holds = Mutex::new(HoldTable { words, left: quota });
-        Ok(Self(Arc::new(ReaderState {
-            memory,
-            page: MappedControl::new(control),
-            hazards,
-            holds,
-        })))
+        let page = MappedControl::new(control);
+        let words = limits.of_page(page.control()).ok_or(ReadError::Hazards)?;
+        let words = vec![HazardUse::default(); words.len()].into();
+        let holds = Mutex::new(HoldTable { words });
+        Ok(Self(Arc::new(ReaderState { memory: Arc::clone(&memory.0), page, limits, holds })))
     }
 
     /// Number of samples published so far: the position that the next one will have.
@@ -115,7 +114,7 @@ impl SharedReader {
         let mut head = self.head();
         loop {
             let Some(position) = head.min(end).checked_sub(1) else { return Ok(None) };
-            if position + u64::from(self.depth()) < head {
+            if head - position > u64::from(self.depth()) {
                 return Ok(None);
             }
             if let Some(hold) = self.get(position)? {
@@ -137,9 +136,9 @@ impl SharedReader {
     ///
     /// [`ReadError::OutOfHolds`].
     pub fn window(&self, first: u64, count: u32) -> Result<Option<HeldWindow>, ReadError> {
-        let count = count.min(WINDOW_MAX).min(self.depth());
-        let mut found = Vec::with_capacity(count as usize);
-        found.extend((first..).take(count as usize).map_while(|position| self.look(position)));
+        let end = first.saturating_add(count.min(self.depth()).into());
+        let mut found = Vec::with_capacity((end - first) as usize);
+        found.extend((first..end).map_while(|position| self.look(position)));
         if found.is_empty() {
             return Ok(None);
         }
@@ -149,7 +148,8 @@ impl SharedReader {
         reader_fence();
         // Positions leave in order: the oldest one stands for all.
         let place = self.0.memory.place(first);
-        if place.seq.load(Ordering::Relaxed) != first + 1 {
+        // Acquire: if it left, the `head` that the writer raised before is visible.
+        if place.seq.load(Ordering::Acquire) != first + 1 {
             clear(hazard);
             self.0.unreserve(word);
             return Ok(None);
@@ -207,36 +207,40 @@ impl ReaderState {
     }
 
     fn hazard(&self, word: u16) -> &crate::sync::AtomicU64 {
-        &self.page.control().hazards[(self.hazards.start + word) as usize]
+        let words = self.limits.of_page(self.page.control()).unwrap_or_default();
+        &words[usize::from(word)]
     }
 
     /// Reserves a hazard word for `count` positions, with a handle on each.
     fn reserve(&self, count: u32) -> Result<u16, ReadError> {
         let mut holds = self.holds();
-        let word = holds.words.iter().position(|word| word.handles == 0);
-        let Some(word) = word.filter(|_| count <= holds.left) else {
-            return Err(ReadError::OutOfHolds);
+        // Words for single positions come last, and are taken first.
+        let is_free = |(index, word): &(usize, &HazardUse)| {
+            word.handles == 0 && count <= self.limits.of_word(*index)
         };
-        holds.left -= count;
-        holds.words[word] = HazardUse { count, handles: count };
+        let free = holds.words.iter().enumerate().rfind(is_free);
+        let (word, _) = free.ok_or(ReadError::OutOfHolds)?;
+        holds.words[word] = HazardUse { handles: count };
         Ok(word as u16)
     }
 
     /// Gives back a word whose hazard is cleared.
     fn unreserve(&self, word: u16) {
-        let mut holds = self.holds();
-        let count = std::mem::take(&mut holds.words[word as usize]).count;
-        holds.left += count;
+        self.holds().words[usize::from(word)].handles = 0;
+    }
+
+    /// Adds a handle to a word that has one.
+    fn share(&self, word: u16) {
+        let handles = &mut self.holds().words[usize::from(word)].handles;
+        *handles = handles.checked_add(1).expect("2^32 handles do not fit into memory");
     }
 
     /// Gives up one handle; the last one clears the hazard.
     fn release(&self, word: u16) {
         let mut holds = self.holds();
-        let entry = &mut holds.words[word as usize];
-        entry.handles -= 1;
-        if entry.handles == 0 {
-            let count = std::mem::take(entry).count;
-            holds.left += count;
+        let handles = &mut holds.words[usize::from(word)].handles;
+        *handles -= 1;
+        if *handles == 0 {
             clear(self.hazard(word));
         }
     }
@@ -303,7 +307,7 @@ impl Deref for HeldSample {
 
 impl Clone for HeldSample {
     fn clone(&self) -> Self {
-        self.shared.holds().words[self.word as usize].handles += 1;
+        self.shared.share(self.word);
         Self { shared: Arc::clone(&self.shared), word: self.word, found: self.found }
     }
 }

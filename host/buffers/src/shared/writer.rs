@@ -5,8 +5,8 @@ use std::collections::VecDeque;
 use std::ops::{Deref, DerefMut};
 use std::slice;
 
-use super::control::{ControlMemory, HAZARDS, HazardRange, HazardWindow, MappedControl};
-use super::layout::{COUNTER_WORDS, META_WORDS, SharedMemory};
+use super::control::{ControlMemory, HazardWindow, HoldLimits, MappedControl};
+use super::layout::{COUNTER_WORDS, META_WORDS, SharedMemory, WriterMemory};
 use super::writer_fence;
 use crate::HEADROOM;
 use crate::sync::Ordering;
@@ -54,8 +54,7 @@ pub struct SharedWriter {
 struct AttachedReader {
     id: ReaderId,
     page: MappedControl,
-    hazards: HazardRange,
-    quota: u32,
+    limits: HoldLimits,
 }
 
 /// The slot of the next sample, until it is published.
@@ -72,12 +71,12 @@ pub struct SharedDraft<'a>(&'a mut SharedWriter);
 
 impl SharedWriter {
     /// A writer of an empty topic.
-    pub fn new(memory: SharedMemory) -> Self {
+    pub fn new(WriterMemory(memory): WriterMemory) -> Self {
         let slots = memory.layout().slots;
         Self {
             head: 0,
             filled: VecDeque::with_capacity(slots as usize),
-            // The lowest slot is taken first, so that few slots stay in the caches.
+            // The lowest slot is taken first. All slots are used once before one is used again.
             empty: (0..slots).rev().collect(),
             held: vec![false; slots as usize].into(),
             pending: None,
@@ -87,7 +86,7 @@ impl SharedWriter {
         }
     }
 
-    /// Lets a reader hold up to `quota` positions through `hazards` of its control page.
+    /// Lets a reader hold positions through its control page, within `limits`.
     ///
     /// # Errors
     ///
@@ -95,26 +94,28 @@ impl SharedWriter {
     pub fn attach(
         &mut self,
         control: impl ControlMemory,
-        hazards: HazardRange,
-        quota: u32,
+        limits: HoldLimits,
     ) -> Result<ReaderId, WriteError> {
-        if hazards.end as usize > HAZARDS || hazards.is_empty() {
+        let page = MappedControl::new(control);
+        if limits.of_page(page.control()).is_none() {
             return Err(WriteError::Hazards);
         }
         let layout = self.memory.layout();
-        let given: u32 = self.readers.iter().map(|reader| reader.quota).sum();
+        let given: u32 = self.readers.iter().map(|reader| reader.limits.quota()).sum();
         // One slot is drafted while all others are shown or held.
         let left = (layout.slots - layout.depth - 1).saturating_sub(given);
-        if quota > left {
-            return Err(WriteError::Quota { asked: quota, left });
+        let asked = limits.quota();
+        if asked > left {
+            return Err(WriteError::Quota { asked, left });
         }
         let id = ReaderId(self.next_reader);
         self.next_reader += 1;
-        self.readers.push(AttachedReader { id, page: MappedControl::new(control), hazards, quota });
+        self.readers.push(AttachedReader { id, page, limits });
         Ok(id)
     }
 
-    /// Forgets a reader: what it held may be written again.
+    /// Forgets a reader: the slots that it held may be written again. Call it once the reader has
+    /// ended: if it still reads, it sees other bytes.
     pub fn detach(&mut self, id: ReaderId) {
         self.readers.retain(|reader| reader.id != id);
     }
@@ -144,15 +145,14 @@ impl SharedWriter {
         writer_fence();
         self.held.fill(false);
         for reader in &self.readers {
-            let control = reader.page.control();
-            let mut left = reader.quota;
-            let words =
-                &control.hazards[reader.hazards.start as usize..reader.hazards.end as usize];
-            for word in words {
+            let words = reader.limits.of_page(reader.page.control()).unwrap_or_default();
+            for (index, word) in words.iter().enumerate() {
                 // Once: a second load could see another value.
                 let window = HazardWindow::of(word.load(Ordering::Acquire));
-                let count = window.count.min(left);
-                left -= count;
+                let count = window.count.min(reader.limits.of_word(index));
+                if count == 0 {
+                    continue;
+                }
                 let from = self.filled.partition_point(|(position, _)| *position < window.first);
                 let end = window.first + u64::from(count);
                 for (position, slot) in self.filled.range(from..) {
@@ -198,8 +198,9 @@ impl SharedWriter {
         let header = self.memory.header();
         header.head.store(self.head, Ordering::Release);
         if let Some(leaving) = position.checked_sub(u64::from(self.memory.layout().depth)) {
-            // The next draft's fence comes after it.
-            self.memory.place(leaving).seq.store(0, Ordering::Relaxed);
+            // The next draft's fence comes after it. Release: a reader that sees the 0 also sees
+            // the `head` above, so it knows that a newer sample is shown.
+            self.memory.place(leaving).seq.store(0, Ordering::Release);
         }
         Some(position)
     }
