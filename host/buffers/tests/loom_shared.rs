@@ -40,6 +40,11 @@ fn check(hold: &HeldSample) {
 /// Held by each model: one of them leaves out a fence for all threads of the process.
 static MODEL: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
+/// Waits until no other model runs.
+fn alone() -> std::sync::MutexGuard<'static, ()> {
+    MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+}
+
 /// One sample under a hazard, while the writer takes slots.
 fn one() {
     loom::model(|| {
@@ -63,13 +68,13 @@ fn one() {
 
 #[test]
 fn a_held_sample_does_not_change() {
-    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let _alone = alone();
     one();
 }
 
 #[test]
 fn a_held_window_does_not_change() {
-    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let _alone = alone();
     loom::model(|| {
         let (mut writer, reader) = topic(2, 5, 1, 0);
         publish(&mut writer, 0);
@@ -88,7 +93,7 @@ fn a_held_window_does_not_change() {
 
 #[test]
 fn a_held_sample_stays_while_other_words_move() {
-    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let _alone = alone();
     loom::model(|| {
         let (mut writer, reader) = topic(3, 8, 1, 2);
         for value in 0..3 {
@@ -114,7 +119,7 @@ fn a_held_sample_stays_while_other_words_move() {
 
 #[test]
 fn the_newest_sample_is_never_missing() {
-    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let _alone = alone();
     loom::model(|| {
         let (mut writer, reader) = topic(1, 3, 0, 1);
         publish(&mut writer, 0);
@@ -129,7 +134,7 @@ fn the_newest_sample_is_never_missing() {
 
 #[test]
 fn the_newest_window_is_never_missing() {
-    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let _alone = alone();
     loom::model(|| {
         let (mut writer, reader) = topic(2, 5, 1, 0);
         publish(&mut writer, 0);
@@ -144,7 +149,7 @@ fn the_newest_window_is_never_missing() {
 
 /// Runs `model` without a fence, and expects that it fails.
 fn fails(without: &std::sync::atomic::AtomicBool, model: fn()) {
-    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let _alone = alone();
     without.store(true, std::sync::atomic::Ordering::Relaxed);
     let found = std::panic::catch_unwind(model);
     without.store(false, std::sync::atomic::Ordering::Relaxed);
@@ -199,7 +204,7 @@ impl Futex for Kernel {
 
 #[test]
 fn no_ring_is_missed() {
-    let _alone = MODEL.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let _alone = alone();
     rings();
 }
 

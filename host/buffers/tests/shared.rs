@@ -67,6 +67,8 @@ fn readers_see_the_newest_samples() {
     assert!(reader.newest_before(2).unwrap().is_none(), "0 and 1 have left");
     assert_eq!(positions(&reader.last_before(u64::MAX, 3).unwrap().unwrap()), [3, 4, 5]);
     assert_eq!(positions(&reader.last_before(4, 9).unwrap().unwrap()), [2, 3]);
+    writer.set_counters(&[1, 2, 3, 4, 5, 6, 7, 8]);
+    assert_eq!(reader.counters(), [1, 2, 3, 4, 5, 6, 7, 8]);
     assert!(reader.get(1).unwrap().is_none() && reader.get(6).unwrap().is_none());
 }
 

@@ -65,3 +65,22 @@ unsafe impl ControlMemory for ControlRegion {
         self.0.base().cast()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::TopicRegion;
+
+    #[test]
+    fn a_file_that_is_not_a_sealed_page_is_refused() {
+        let (_, page) = ControlRegion::create().unwrap();
+        assert!(ControlRegion::open(&page).is_ok());
+        let unsealed = File::from(memfd_create("test", MemfdFlags::ALLOW_SEALING).unwrap());
+        unsealed.set_len(size_of::<ControlPage>() as u64).unwrap();
+        let larger = TopicRegion::create("test", 2 * size_of::<ControlPage>()).unwrap();
+        for file in [unsealed.as_fd(), larger.file()] {
+            let refused = ControlRegion::open(file).err().unwrap();
+            assert_eq!(refused.to_string(), "this is not a control page");
+        }
+    }
+}

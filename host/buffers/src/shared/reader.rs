@@ -111,22 +111,7 @@ impl SharedReader {
     ///
     /// [`ReadError::OutOfHolds`].
     pub fn newest_before(&self, end: u64) -> Result<Option<HeldSample>, ReadError> {
-        let mut head = self.head();
-        loop {
-            let Some(position) = head.min(end).checked_sub(1) else { return Ok(None) };
-            if head - position > u64::from(self.depth()) {
-                return Ok(None);
-            }
-            if let Some(hold) = self.get(position)? {
-                return Ok(Some(hold));
-            }
-            // It left, so `head` moved: the writer raised it before it took the sample away.
-            let now = self.head();
-            if now == head {
-                return Ok(None);
-            }
-            head = now;
-        }
+        Ok(self.last_before(end, 1)?.and_then(|window| window.samples.into_iter().next()))
     }
 
     /// Holds the samples at `count` positions from `first`, in place; `None` if the first of
@@ -175,6 +160,8 @@ impl SharedReader {
             if let Some(window) = self.window(first, (end - first) as u32)? {
                 return Ok(Some(window));
             }
+            // Its oldest sample left, so `head` moved: the writer raised it before it took the
+            // sample away.
             let now = self.head();
             if now == head {
                 return Ok(None);

@@ -143,6 +143,10 @@ impl SharedWriter {
     /// Takes a slot that is neither shown nor held.
     fn take(&mut self) -> u32 {
         writer_fence();
+        // No position is in these, so no reader holds one.
+        if let Some(slot) = self.empty.pop() {
+            return slot;
+        }
         self.held.fill(false);
         for reader in &self.readers {
             let words = reader.limits.of_page(reader.page.control()).unwrap_or_default();
@@ -162,9 +166,6 @@ impl SharedWriter {
                     self.held[*slot as usize] = true;
                 }
             }
-        }
-        if let Some(slot) = self.empty.pop() {
-            return slot;
         }
         let shown_from = self.head.saturating_sub(u64::from(self.memory.layout().depth));
         let free = self
