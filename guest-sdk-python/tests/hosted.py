@@ -46,10 +46,14 @@ GREY = Image(2, 1, "mono8", 2, b"\x07\x09")
 
 class Hosted(unittest.TestCase):
     def setUp(self) -> None:
-        self.extension = home.extension_path()
+        self.extension = self.find_extension()
         folder = tempfile.TemporaryDirectory()
         self.addCleanup(folder.cleanup)
         self.folder = Path(folder.name).resolve()
+
+    def find_extension(self) -> str:
+        """Returns the extension module; skips the test without one."""
+        return home.extension_path()
 
     def start(
         self,
@@ -68,6 +72,10 @@ class Hosted(unittest.TestCase):
         )
         self.assertLessEqual(len(images), len(at_ms))
         drive.write(self.folder / "drive.mcap", images, at_ms)
+        return self.run_built()
+
+    def run_built(self) -> "subprocess.CompletedProcess[str]":
+        """Replays the drive in the folder through the build in it."""
         arguments = [
             "gleaner-runtime",
             "replay",

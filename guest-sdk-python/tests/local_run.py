@@ -8,43 +8,24 @@ from __future__ import annotations
 
 import json
 import subprocess
-import tempfile
-import textwrap
 from pathlib import Path
-from typing import Any, Dict, List, Sequence
+from typing import Any, Dict, List
 
-import drive
 import home  # noqa: F401
-from drive import Image
-from hosted import EACH, MANIFEST, Hosted
+from hosted import Hosted
 
 from gleaner.testing import Run, StartError, replay
 
 
 class LocalRun(Hosted):
-    def setUp(self) -> None:
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = Path(folder.name).resolve()
+    def find_extension(self) -> str:
+        """Returns no extension: a local run needs none."""
+        return ""
 
-    def start(
-        self,
-        source: str,
-        images: List[Image],
-        schedule: str = EACH,
-        depth: int = 4,
-        at_ms: Sequence[int] = range(1000, 10_000, 100),
-    ) -> "subprocess.CompletedProcess[str]":
+    def run_built(self) -> "subprocess.CompletedProcess[str]":
         """Replays as the host does, and writes the same result files."""
-        build = self.folder / "build"
-        build.mkdir(exist_ok=True)
-        (build / "main.py").write_text(textwrap.dedent(source), encoding="utf-8")
-        (build / "lambda.toml").write_text(
-            MANIFEST.format(schedule=schedule, depth=depth), encoding="utf-8"
-        )
-        drive.write(self.folder / "drive.mcap", images, at_ms)
         try:
-            run = replay(build, self.folder / "drive.mcap")
+            run = replay(self.folder / "build", self.folder / "drive.mcap")
         except StartError as error:
             return subprocess.CompletedProcess([], 6, "", f"error: {error}")
         self.keep(run)
