@@ -1,11 +1,11 @@
 //! Builds a Rust lambda in a sandbox (`--sandboxed`), since build scripts and macros are code of
 //! its author.
 //!
-//! That code can read the toolchain, fetched crates and the workspace of the lambda, can write into
-//! one folder, and has no sockets. Dependencies are fetched before, which runs none of that code.
-//! Cargo starts in the root folder, so that it does not read a configuration or toolchain file
-//! beside the lambda, which could name programs to run. The jail itself is `gleaner-shim
-//! --compiler`.
+//! The sandbox lets this code read the toolchain, fetched crates and the workspace of the lambda,
+//! and write into one folder; it denies sockets. Dependencies are fetched before, which runs none
+//! of that code. Cargo starts in the root folder, so that it does not read a configuration or
+//! toolchain file beside the lambda, which could name programs to run. The jail itself is
+//! `gleaner-shim --compiler`.
 
 use std::env;
 use std::io;

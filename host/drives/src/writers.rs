@@ -14,8 +14,8 @@ use gleaner_transport::Guid;
 #[derive(Default)]
 pub(super) struct Writers {
     files: u32,
-    /// By topic and writer. Two clips of one drive name the same writer, whose numbers must
-    /// continue from one to the other.
+    /// Sequence numbers, by topic and writer. Two clips of one drive name the same writer, whose
+    /// numbers must continue from one to the other.
     counters: HashMap<(String, Guid), Arc<AtomicU64>>,
 }
 

@@ -80,18 +80,18 @@ pub(super) struct OpenClip {
     /// True if its file is begun.
     is_begun: bool,
     messages: u64,
-    /// By topic.
+    /// Counts of messages, by topic.
     tallies: Vec<TopicTally>,
     moments: Vec<Moment>,
-    /// By lambda; those without windows in the clip are dropped at its end.
+    /// Parts of journals, by lambda; those without windows in the clip are dropped at its end.
     parts: Vec<JournalPart>,
-    /// Their approximate size together.
+    /// Approximate size of all parts.
     parts_bytes: usize,
     /// Lambdas whose part is short because there was no room for all together.
     crowded: Vec<usize>,
-    /// By lambda: wakes that the preroll evicted.
+    /// Wakes that the preroll evicted, by lambda.
     wakes_lost: Vec<u64>,
-    /// By lambda: wakes that did not reach the recorder.
+    /// Wakes that did not reach the recorder, by lambda.
     wakes_undelivered: Vec<u64>,
 }
 

@@ -125,9 +125,9 @@ pub(super) struct Settled {
 /// The state that clips are made from.
 pub(super) struct RecorderState {
     pub(super) preroll: Preroll,
-    /// By topic.
+    /// Losses of samples, by topic.
     pub(super) losses: Vec<Losses>,
-    /// By lambda.
+    /// Losses of wakes, by lambda.
     pub(super) wake_losses: Vec<Losses>,
     pub(super) waiting: WaitingTriggers,
     pub(super) context: ClipContext,

@@ -11,7 +11,7 @@ use crate::window::{Group, Windows};
 #[derive(Debug, Default)]
 pub(super) struct WaitingTriggers {
     moments: VecDeque<(usize, Moment)>,
-    /// By lambda: triggers without room, which are only counted.
+    /// Triggers without room, which are only counted, by lambda.
     counted: BTreeMap<usize, CountedTriggers>,
 }
 
