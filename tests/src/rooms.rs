@@ -55,6 +55,16 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-dds", &["gleaner-base", "gleaner-messages", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-drives", &["gleaner-base", "gleaner-messages", "gleaner-transport"]),
     (
+        "gleaner-feed",
+        &[
+            "gleaner-base",
+            "gleaner-buffers",
+            "gleaner-protocol",
+            "gleaner-regions",
+            "gleaner-transport",
+        ],
+    ),
+    (
         "gleaner-host",
         &[
             "gleaner-base",
@@ -62,6 +72,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-compile",
             "gleaner-dds",
             "gleaner-drives",
+            "gleaner-feed",
             "gleaner-image",
             "gleaner-jail",
             "gleaner-journal",
@@ -76,6 +87,20 @@ pub const CRATES: &[(&str, &[&str])] = &[
         ],
     ),
     ("gleaner-image", &["gleaner-rules"]),
+    (
+        "gleaner-ingress",
+        &[
+            "gleaner-base",
+            "gleaner-buffers",
+            "gleaner-dds",
+            "gleaner-drives",
+            "gleaner-jail",
+            "gleaner-protocol",
+            "gleaner-regions",
+            "gleaner-transport",
+            "gleaner-vitals",
+        ],
+    ),
     ("gleaner-jail", &["gleaner-protocol"]),
     ("gleaner-journal", &["gleaner-base", "gleaner-lambda"]),
     ("gleaner-lambda", &["gleaner-base", "gleaner-rules"]),
@@ -110,6 +135,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-base",
             "gleaner-dds",
             "gleaner-drives",
+            "gleaner-feed",
             "gleaner-image",
             "gleaner-journal",
             "gleaner-lambda",

@@ -293,6 +293,8 @@ impl LiveSource for Dds {
         Health { network: Some(network), dead }
     }
 
+    fn unsubscribe(&mut self, _: Subscription) {}
+
     fn publisher(
         &self,
         topic: &str,

@@ -8,12 +8,15 @@ pub mod clock;
 mod gaps;
 mod live;
 pub mod loopback;
+mod stored;
 mod transport;
 
 pub use clock::Clock;
 pub use gaps::Gaps;
-pub use live::{Health, LiveSource, PublishError, Publisher};
+pub use gleaner_protocol::ingress::{Health, Qos, ReceptionStatus};
+pub use live::{LiveSource, PublishError, Publisher};
+pub use stored::{ArrivalSums, STORED_WORDS, StoredMeta, TopicCounters};
 pub use transport::{
-    Delivery, DiscoveredTopic, Guid, Qos, ReceptionStatus, SampleMeta, Sink, Subscription,
-    TopicSpec, Transport, TransportError, same_type,
+    Delivery, DiscoveredTopic, Guid, SampleMeta, Sink, Subscription, TopicSpec, Transport,
+    TransportError, same_type,
 };

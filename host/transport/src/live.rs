@@ -2,14 +2,18 @@
 //! publishes.
 
 use gleaner_base::{Exit, Explain};
-use gleaner_protocol::NetworkStatus;
+use gleaner_protocol::ingress::Health;
 
-use crate::Transport;
+use crate::{Subscription, Transport};
 
 /// A source whose samples arrive in real time.
 pub trait LiveSource: Transport + Send {
     /// Returns the state of the source. It is called once a second, and must be cheap.
     fn health(&self) -> Health;
+
+    /// Ends a subscription: its sink gets no further samples, once calls in progress have returned.
+    /// The numbers of other subscriptions stay.
+    fn unsubscribe(&mut self, subscription: Subscription);
 
     /// Opens `topic` of type `type_name` for publishing. Slow readers find the `depth` newest
     /// messages.
@@ -45,14 +49,4 @@ impl Explain for PublishError {
     fn exit(&self) -> Exit {
         Exit::Usage
     }
-}
-
-/// The state of a live source.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Health {
-    /// State of the network below; `None` without one.
-    pub network: Option<NetworkStatus>,
-    /// The reason why the source, or one of its topics, delivers no further samples; `None` while
-    /// it works.
-    pub dead: Option<String>,
 }

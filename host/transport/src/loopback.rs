@@ -10,8 +10,9 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use gleaner_base::text::nearest;
 use gleaner_messages::{Definitions, Endian};
 
+use crate::Health;
 use crate::clock::Clock;
-use crate::live::{Health, LiveSource, PublishError, Publisher};
+use crate::live::{LiveSource, PublishError, Publisher};
 use crate::transport::{
     Delivery, DiscoveredTopic, Guid, SampleMeta, Sink, Subscription, TopicSpec, Transport,
     TransportError, same_type,
@@ -31,7 +32,7 @@ struct LoopbackState {
 struct LoopbackTopic {
     type_name: String,
     text: Option<Arc<str>>,
-    sinks: Vec<Arc<dyn Sink>>,
+    sinks: Vec<(Subscription, Arc<dyn Sink>)>,
     messages: u64,
     definitions: OnceLock<Arc<Definitions>>,
 }
@@ -79,7 +80,7 @@ impl Loopback {
             }
         };
         let mut delivery = None;
-        for sink in sinks {
+        for (_, sink) in sinks {
             delivery = Some(sink.deliver(meta, cdr));
         }
         Ok(delivery)
@@ -135,10 +136,10 @@ impl Transport for Loopback {
                 found: found.type_name.clone(),
             });
         }
-        if let Some(found) = topics.topics.get_mut(&spec.topic) {
-            found.sinks.push(sink);
-        }
         let subscription = Subscription(topics.subscriptions);
+        if let Some(found) = topics.topics.get_mut(&spec.topic) {
+            found.sinks.push((subscription, sink));
+        }
         topics.subscriptions += 1;
         Ok(subscription)
     }
@@ -163,6 +164,12 @@ impl Transport for Loopback {
 impl LiveSource for Loopback {
     fn health(&self) -> Health {
         Health { network: None, dead: self.lock().dead.clone() }
+    }
+
+    fn unsubscribe(&mut self, subscription: Subscription) {
+        for topic in self.lock().topics.values_mut() {
+            topic.sinks.retain(|(known, _)| *known != subscription);
+        }
     }
 
     fn publisher(

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use gleaner_base::text::hint;
 use gleaner_messages::{Definitions, Endian, MessageError, SourcesError};
+use gleaner_protocol::ingress::{Qos, ReceptionStatus};
 
 /// A topic that a caller wants to receive.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -22,40 +23,6 @@ pub struct TopicSpec {
     pub max_bytes: usize,
     /// The QoS that a live transport requests.
     pub qos: Qos,
-}
-
-/// The quality of service that a subscription requests. A replay delivers what it has.
-#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
-pub enum Qos {
-    /// The QoS that the writers offer.
-    #[default]
-    Auto,
-    /// Exactly this QoS.
-    Fixed {
-        /// Set if lost samples are to be sent again.
-        reliable: bool,
-        /// Set if samples from before the subscription are requested, as far as writers keep them.
-        transient_local: bool,
-        /// Number of samples that DDS keeps until they are taken.
-        depth: usize,
-    },
-}
-
-/// State of a subscription.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct ReceptionStatus {
-    /// Number of connected writers; `None` where there are none, as in a replay. A killed writer
-    /// counts until its lease expires, with ROS 2 often after 10 to 20 s.
-    pub writers: Option<usize>,
-    /// Number of samples lost in transit, according to gaps in their sequence numbers; `None` if
-    /// unknown.
-    pub lost: Option<u64>,
-    /// Number of samples that could not be parsed.
-    pub malformed: u64,
-    /// The requested QoS, as text: `reliable, volatile`.
-    pub qos: Option<String>,
-    /// Reasons why samples of writers are not received, in whole sentences, at most 16.
-    pub qos_warnings: Vec<String>,
 }
 
 /// The identity of a writer: 16 bytes, equal for all of its samples.

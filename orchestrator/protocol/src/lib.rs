@@ -1,5 +1,5 @@
 //! Messages between Gleaner programs: reports of a runtime, result items, exit records, frames to
-//! and from the recorder.
+//! and from the recorder and the ingress.
 //!
 //! Nothing here runs a lambda or listens on a socket. Programs share these types; they never link
 //! each other.
@@ -8,6 +8,7 @@ mod check_report;
 mod drive_info;
 mod drive_time;
 mod exit_record;
+pub mod ingress;
 mod interrupted_wake;
 mod isolation;
 pub mod link;

@@ -94,6 +94,8 @@ impl Transport for FakeNetwork {
 }
 
 impl LiveSource for FakeNetwork {
+    fn unsubscribe(&mut self, _: Subscription) {}
+
     fn health(&self) -> Health {
         self.loopback.health()
     }

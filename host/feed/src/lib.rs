@@ -1,0 +1,2 @@
+//! The reader's end of the ingress: attaches granted topics in shared memory, and waits for their
+//! samples.

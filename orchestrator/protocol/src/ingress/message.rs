@@ -1,0 +1,140 @@
+//! Messages between the ingress and one reader, and reports to the starter.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Health, HoldGrant, ReceptionStatus};
+
+/// A message from the ingress to a reader.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ReaderMessage {
+    /// The first message. With the descriptor of the reader's control page.
+    Welcome,
+    /// A granted topic is subscribed. With the descriptor of its memory.
+    Attached(Box<AttachedTopic>),
+    /// A granted topic cannot be read.
+    Refused {
+        /// Its id.
+        id: u32,
+        /// The reason.
+        reason: RefusedTopic,
+    },
+    /// The answer to a request for definitions. `None`: there are none.
+    Definitions {
+        /// Id of the topic.
+        id: u32,
+        /// ros2msg text of its type and of all types it refers to.
+        text: Option<String>,
+    },
+    /// The state of the source, once a second.
+    Status(Box<SourceStatus>),
+}
+
+/// A topic in shared memory.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AttachedTopic {
+    /// Its id, from the grant.
+    pub id: u32,
+    /// Its type, as the source spells it.
+    pub type_name: String,
+    /// Sizes of its memory.
+    pub layout: RegionLayout,
+    /// First of its hazard words on the control page.
+    pub first_word: u16,
+    /// Samples that the reader may hold at a time.
+    pub holds: HoldGrant,
+    /// Position of the first sample that this reader receives.
+    pub first: u64,
+    /// ros2msg text of the type and all types it refers to, if the source carries it.
+    pub definitions: Option<String>,
+    /// The QoS that the topic's writers offer, as rosbag2 writes it.
+    pub offered_qos: Option<String>,
+}
+
+/// Sizes of the memory of a topic.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RegionLayout {
+    /// Samples that the topic shows at most.
+    pub depth: u32,
+    /// Slots for samples.
+    pub slots: u32,
+    /// Bytes of the largest sample.
+    pub slot_bytes: u64,
+}
+
+/// The reason why a topic cannot be read.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RefusedTopic {
+    /// The source has no topic of this name.
+    NoSuchTopic {
+        /// The topics of the source, sorted.
+        known: Vec<String>,
+        /// The most similar name, if one is similar.
+        nearest: Option<String>,
+    },
+    /// The topic carries another type.
+    WrongType {
+        /// Its type.
+        found: String,
+    },
+    /// Any other reason, as text: the error, then its causes.
+    Other(Vec<String>),
+}
+
+/// The state of a source and of its granted topics.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SourceStatus {
+    /// State of the source.
+    pub health: Health,
+    /// Id and state of each attached topic.
+    pub topics: Vec<(u32, ReceptionStatus)>,
+}
+
+/// A report of the ingress to its starter: a line of JSON on its standard output.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum IngressReport {
+    /// It has joined the network, or opened the drive.
+    Ready,
+    /// Its status, once a second.
+    Status(Box<IngressStatus>),
+    /// The drive that it plays is over.
+    DriveEnded,
+    /// It has ended on request. Its last status.
+    Ended(Box<IngressStatus>),
+}
+
+/// The status of the ingress.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct IngressStatus {
+    /// State of the source.
+    pub health: Health,
+    /// Each subscribed topic.
+    pub topics: Vec<IngressTopic>,
+    /// Number of connected readers.
+    pub readers: usize,
+    /// Memory of this process, in bytes. Shared memory of topics is part of it.
+    pub rss_bytes: u64,
+    /// CPU time of this process, in s.
+    pub cpu_s: f64,
+}
+
+/// A topic that the ingress has subscribed.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct IngressTopic {
+    /// Its name on the network.
+    pub topic: String,
+    /// Its type.
+    pub type_name: String,
+    /// Number of readers.
+    pub readers: usize,
+    /// Number of samples received.
+    pub received: u64,
+    /// Number of samples that were larger than a reader accepts.
+    pub too_big: u64,
+    /// Reserved memory of its regions, in bytes.
+    pub reserved_bytes: u64,
+    /// State of its subscription.
+    pub reception: ReceptionStatus,
+}
