@@ -92,8 +92,10 @@ pub struct SourceStatus {
 }
 
 /// A report of the ingress to its starter: a line of JSON on its standard output.
+///
+/// The key `ingress` has the kind.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[serde(tag = "ingress", rename_all = "snake_case")]
 pub enum IngressReport {
     /// It has joined the network, or opened the drive.
     Ready,
