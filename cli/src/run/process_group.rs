@@ -89,6 +89,7 @@ impl ProcessGroup {
                 lambda: args.target.lambda.clone(),
                 remaps: arguments::remaps(args),
                 most: limits,
+                grants: Vec::new(),
             };
             match control.add(&add) {
                 Ok(lambda_end) => socket = Some(lambda_end),

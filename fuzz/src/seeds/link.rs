@@ -17,7 +17,8 @@ pub fn all() -> Vec<Vec<u8>> {
     });
     let lambda = [(16, hello)].into_iter().chain(wakes).chain([(18, Vec::new())]).collect();
     let remaps = vec![("/imu".to_owned(), "/car/imu".to_owned())];
-    let add = AddLambda { lambda: "/lambdas/brake".into(), remaps, most: Limits::MAX };
+    let grants = vec![("/car/imu".to_owned(), 1)];
+    let add = AddLambda { lambda: "/lambdas/brake".into(), remaps, most: Limits::MAX, grants };
     let add = serde_json::to_vec(&add).expect("it is JSON");
     let starter = vec![(1, add), (2, Vec::new())];
     let recorder =

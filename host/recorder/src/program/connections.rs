@@ -51,7 +51,7 @@ pub(super) enum LambdaEvent {
         entry: Box<JournalEntry>,
         decided_ns: i64,
         missing: u32,
-        bytes: usize,
+        encoded: Vec<u8>,
     },
     /// The connection is closed.
     Closed(Option<LinkError>),
@@ -134,8 +134,8 @@ fn read_link(
                 None => LambdaEvent::Hello(header),
                 Some(why) => LambdaEvent::Mismatch(why),
             },
-            Ok(Some(LambdaMessage::Wake { entry, decided_ns, missing, bytes })) => {
-                LambdaEvent::Wake { entry, decided_ns, missing, bytes }
+            Ok(Some(LambdaMessage::Wake { entry, decided_ns, missing, encoded })) => {
+                LambdaEvent::Wake { entry, decided_ns, missing, encoded }
             }
             Ok(Some(LambdaMessage::Bye) | None) => LambdaEvent::Closed(None),
             Err(error) => LambdaEvent::Closed(Some(error)),

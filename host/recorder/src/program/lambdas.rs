@@ -122,13 +122,13 @@ impl ConnectedLambda {
                     self.replies.refused(&why);
                     (polled.is_refused, polled.is_gone) = (true, true);
                 }
-                LambdaEvent::Wake { entry, decided_ns, missing, bytes } => {
+                LambdaEvent::Wake { entry, decided_ns, missing, encoded } => {
                     let Some(id) = self.id else { continue };
                     if missing > 0 {
                         recorder.lost_wakes(id, entry.at_ns, missing.into());
                         polled.counted.wakes_lost += u64::from(missing);
                     }
-                    if let Some(refused) = self.refused(&entry, bytes, now_ns) {
+                    if let Some(refused) = self.refused(&entry, encoded.len(), now_ns) {
                         recorder.lost_wakes(id, entry.at_ns.clamp(0, now_ns.max(0)), 1);
                         polled.counted.add(&refused);
                         continue;

@@ -35,6 +35,10 @@ pub struct AddLambda {
     /// The limits of this vehicle. Of each limit, the smaller of this value and the one in the
     /// manifest applies.
     pub most: Limits,
+    /// Topics of its `[record]`, by their names on the network, and the ids under which the ingress
+    /// grants them to the recorder. A topic has one id for as long as the recorder lives.
+    #[serde(default)]
+    pub grants: Vec<(String, u32)>,
 }
 
 /// The starter's end of the control connection.

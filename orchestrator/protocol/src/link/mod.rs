@@ -9,12 +9,14 @@
 //! - `control`: from the starter to the recorder: [`ControlClient`] and [`ControlServer`].
 //! - `client`: from a lambda's process to the recorder, without blocking: [`RecorderLink`].
 //! - `server`: the recorder's end of that: [`LambdaLink`].
+//! - `grants`: the topics that the recorder reads from the ingress.
 //! - `report`: from the recorder to its starter, as lines of JSON on its standard output.
 
 mod client;
 mod control;
 mod error;
 mod frame;
+mod grants;
 mod queue;
 mod report;
 mod server;
@@ -25,5 +27,6 @@ pub use client::{RecorderLink, RecorderMessage};
 pub use control::{AddLambda, ControlClient, ControlMessage, ControlServer};
 pub use error::LinkError;
 pub use frame::FRAME_MAX;
+pub use grants::{COMMANDS_ID, commands_grant, recorded_grant};
 pub use report::{CommandStatus, Loss, RecordedTopic, RecorderReport, RecorderStatus};
 pub use server::{LambdaLink, LambdaMessage, LambdaReplies};

@@ -29,8 +29,9 @@ pub enum LambdaMessage {
         decided_ns: i64,
         /// Number of missing wakes before it.
         missing: u32,
-        /// Length of the frame.
-        bytes: usize,
+        /// The same wake as it was received, encoded without reference to another one. It decodes
+        /// to `entry`, and nothing follows it.
+        encoded: Vec<u8>,
     },
     /// The end of the connection.
     Bye,
@@ -96,9 +97,10 @@ impl LambdaLink {
                 let parts = self.payload.split_first_chunk::<8>().and_then(|(decided, rest)| {
                     rest.split_first_chunk::<4>().map(|(missing, rest)| (decided, missing, rest))
                 });
-                let Some((decided, missing, mut rest)) = parts else {
+                let Some((decided, missing, encoded)) = parts else {
                     return Err(malformed("wake", format!("it has {bytes} bytes")));
                 };
+                let mut rest = encoded;
                 decoder.reset();
                 let entry = decoder
                     .decode(&mut rest)
@@ -110,7 +112,7 @@ impl LambdaLink {
                     entry: Box::new(entry),
                     decided_ns: i64::from_le_bytes(*decided),
                     missing: u32::from_le_bytes(*missing),
-                    bytes,
+                    encoded: encoded.to_vec(),
                 }))
             }
             (tag::BYE, Some(_)) => Ok(Some(LambdaMessage::Bye)),

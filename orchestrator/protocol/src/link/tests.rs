@@ -75,6 +75,7 @@ fn add(lambda: &str) -> AddLambda {
         lambda: lambda.into(),
         remaps: vec![("/imu".to_owned(), "/imu/data".to_owned())],
         most: Limits::DEFAULT,
+        grants: vec![("/imu/data".to_owned(), 7)],
     }
 }
 
@@ -405,8 +406,7 @@ fn invalid_frames_of_a_recorder_are_refused_by_name() {
 #[test]
 fn a_request_that_is_too_long_is_not_sent() {
     let (mut client, stdin) = ControlClient::pair().unwrap();
-    let long =
-        AddLambda { lambda: "x".repeat(FRAME_MAX).into(), remaps: Vec::new(), most: Limits::MAX };
+    let long = AddLambda { lambda: "x".repeat(FRAME_MAX).into(), ..add("x") };
     let refused = client.add(&long).unwrap_err();
     assert!(
         matches!(

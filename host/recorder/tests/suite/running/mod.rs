@@ -222,7 +222,12 @@ pub fn cdr(text: &[u8]) -> Vec<u8> {
 }
 
 pub fn add(folder: &Path) -> AddLambda {
-    AddLambda { lambda: folder.to_owned(), remaps: Vec::new(), most: Limits::MAX }
+    AddLambda {
+        lambda: folder.to_owned(),
+        remaps: Vec::new(),
+        most: Limits::MAX,
+        grants: Vec::new(),
+    }
 }
 
 pub fn monotonic(clock: Clock) -> i64 {
