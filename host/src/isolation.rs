@@ -104,12 +104,12 @@ impl Isolation {
             let SandboxPermissions { paths, memory: allowed, all } = &self.permissions;
             let mut layers = layers_of_starter();
             limit_cgroup(&mut layers, *all);
-            if layers.iter().any(|layer| layer.name == files::NAME) {
+            if let Some(files) = layers.iter_mut().find(|layer| layer.name == files::NAME) {
                 // The process that started the interpreter has confined its reads.
                 let writes = files::confine_writes(&paths.write);
-                if let Some(layer) = writes {
-                    layers.retain(|layer| layer.name != files::NAME);
-                    layers.push(layer);
+                if writes.holds == Holds::No && files.holds != Holds::No {
+                    let why = format!("the results can still be changed: {}", writes.note);
+                    *files = Layer::partly(files::NAME, why);
                 }
             } else if allowed.is_some() {
                 // The files that an interpreter reads are known only to the process that starts it.
@@ -124,7 +124,9 @@ impl Isolation {
                 allowed.map(|more| format!("a data limit of {} MiB above the start", more >> 20));
             let counted = "the component's memories are counted as they grow";
             layers.push(Layer::yes(memory::NAME, bound.as_deref().unwrap_or(counted)));
-            layers.extend(sandbox_filter::apply(allowed.is_some())?);
+            let denied = sandbox_filter::apply(allowed.is_some())?;
+            layers.retain(|layer| denied.iter().all(|denied| denied.name != layer.name));
+            layers.extend(denied);
             self.used_at_close.get_or_init(memory::used);
             Ok(self_test::verify(layers))
         });

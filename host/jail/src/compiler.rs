@@ -7,8 +7,7 @@
 use gleaner_protocol::{Holds, Layer};
 
 use crate::filter::{DeniedCalls, install};
-use crate::sandbox_filter::{NEW_SOCKETS, SOCKETS, pairs_only};
-use crate::{JailError, Paths, base_filter, files, self_test};
+use crate::{JailError, Paths, base_filter, files, self_test, sockets};
 
 /// Calls on files of other processes, on owners and attributes of files, which Landlock does not
 /// restrict, and on memory that outlives a process.
@@ -61,8 +60,8 @@ pub fn enter(paths: &Paths) -> Result<(), Layer> {
     let mut layers = base_filter::apply();
     layers.push(files::confine(paths));
     layers.push(match filter() {
-        Ok(()) => Layer::yes(SOCKETS, "seccomp: no new sockets, no connections"),
-        Err(error) => Layer::no(SOCKETS, error.chain()),
+        Ok(()) => Layer::yes(sockets::NAME, "seccomp: no new sockets, no connections"),
+        Err(error) => Layer::no(sockets::NAME, error.chain()),
     });
     self_test::verify(layers)
         .into_iter()
@@ -71,8 +70,7 @@ pub fn enter(paths: &Paths) -> Result<(), Layer> {
 }
 
 fn filter() -> Result<(), JailError> {
-    let mut refused =
-        pairs_only(DeniedCalls::default()).calls(NEW_SOCKETS).calls(CALLS).calls(CALLS_HERE);
+    let mut refused = sockets::none(DeniedCalls::default()).calls(CALLS).calls(CALLS_HERE);
     for call in OF_PROCESSES {
         refused = refused.unless(*call, 0, 0);
     }

@@ -5,14 +5,16 @@ use std::path::{Path, PathBuf};
 
 use gleaner_protocol::Layer;
 use landlock::{
-    ABI, Access, AccessFs, AccessNet, CompatLevel, Compatible, LandlockStatus, Ruleset,
-    RulesetAttr, RulesetCreatedAttr, RulesetStatus, Scope, path_beneath_rules,
+    ABI, Access, AccessFs, AccessNet, CompatLevel, Compatible, LandlockStatus, RestrictionStatus,
+    Ruleset, RulesetAttr, RulesetCreatedAttr, RulesetStatus, Scope, path_beneath_rules,
 };
 
 use crate::JailError;
 
 /// The name of this layer.
 pub const NAME: &str = "files";
+/// The name of the layer that restricts changes only.
+pub const WRITTEN: &str = "changes of files";
 
 /// The newest version of the rules in use. Older kernels lack some, and the layer names these.
 const RULES: ABI = ABI::V6;
@@ -96,36 +98,34 @@ fn parts_of(program: &Path) -> Vec<(PathBuf, PathBuf)> {
 /// Restricts this thread and its descendants: they can open only `paths` and the system's programs
 /// and libraries.
 pub fn confine(paths: &Paths) -> Layer {
-    match restrict(paths) {
-        Ok(layer) => layer,
-        Err(error) => Layer::no(NAME, error.chain()),
-    }
+    layer(NAME, "only the lambda's files; no TCP, no signals to others", restrict(paths))
+}
+
+/// Restricts a program of Gleaner as [`confine`] does.
+pub(crate) fn confine_program(paths: &Paths) -> Layer {
+    layer(NAME, "only the files that it needs; no TCP, no signals to others", restrict(paths))
 }
 
 /// Restricts this thread and its descendants: they can change only `paths`. Reading is not
-/// restricted. Returns a layer only if that failed.
-pub fn confine_writes(paths: &[PathBuf]) -> Option<Layer> {
-    let restricted = restrict_writes(paths);
-    restricted.err().map(|error| {
-        Layer::partly(NAME, format!("the results can still be changed: {}", error.chain()))
-    })
+/// restricted.
+pub fn confine_writes(paths: &[PathBuf]) -> Layer {
+    layer(WRITTEN, "files are changed only in the folder of results", restrict_writes(paths))
 }
 
-fn restrict_writes(paths: &[PathBuf]) -> Result<(), JailError> {
+fn restrict_writes(paths: &[PathBuf]) -> Result<RestrictionStatus, JailError> {
     let write = AccessFs::from_write(RULES);
-    Ruleset::default()
+    Ok(Ruleset::default()
         .set_compatibility(CompatLevel::BestEffort)
         .handle_access(write)?
         .create()?
         .add_rules(path_beneath_rules(NOTHING, write))?
         .add_rules(path_beneath_rules(paths, write))?
-        .restrict_self()?;
-    Ok(())
+        .restrict_self()?)
 }
 
-fn restrict(paths: &Paths) -> Result<Layer, JailError> {
+fn restrict(paths: &Paths) -> Result<RestrictionStatus, JailError> {
     let (read, all) = (AccessFs::from_read(RULES), AccessFs::from_all(RULES));
-    let status = Ruleset::default()
+    Ok(Ruleset::default()
         .set_compatibility(CompatLevel::BestEffort)
         .handle_access(all)?
         // Without a rule that allows a port, none is.
@@ -137,17 +137,23 @@ fn restrict(paths: &Paths) -> Result<Layer, JailError> {
         .add_rules(path_beneath_rules(NOTHING, all))?
         .add_rules(path_beneath_rules(&paths.read, read))?
         .add_rules(path_beneath_rules(&paths.write, all))?
-        .restrict_self()?;
-    Ok(match (status.ruleset, status.landlock) {
+        .restrict_self()?)
+}
+
+/// Describes the layer `name` that allows `what`.
+fn layer(name: &str, what: &str, restricted: Result<RestrictionStatus, JailError>) -> Layer {
+    let status = match restricted {
+        Ok(status) => status,
+        Err(error) => return Layer::no(name, error.chain()),
+    };
+    match (status.ruleset, status.landlock) {
         (RulesetStatus::NotEnforced, LandlockStatus::NotImplemented) => {
-            Layer::no(NAME, "this kernel has no Landlock; it came with Linux 5.13")
+            Layer::no(name, "this kernel has no Landlock; it came with Linux 5.13")
         }
         (RulesetStatus::NotEnforced, _) => {
-            Layer::no(NAME, "Landlock is not switched on; add it to the kernel's parameter lsm=")
+            Layer::no(name, "Landlock is not switched on; add it to the kernel's parameter lsm=")
         }
-        (RulesetStatus::FullyEnforced, _) => {
-            Layer::yes(NAME, "Landlock: only the lambda's files; no TCP, no signals to others")
-        }
+        (RulesetStatus::FullyEnforced, _) => Layer::yes(name, format!("Landlock: {what}")),
         (RulesetStatus::PartiallyEnforced, LandlockStatus::Available { effective_abi, .. }) => {
             let abi = effective_abi as i32;
             let lacks = [
@@ -159,18 +165,13 @@ fn restrict(paths: &Paths) -> Result<Layer, JailError> {
             ];
             let lacks: Vec<_> =
                 lacks.iter().filter(|(since, _)| *since > abi).map(|(_, what)| *what).collect();
-            Layer::partly(
-                NAME,
-                format!(
-                    "Landlock {abi}: only the lambda's files; not restricted: {}",
-                    lacks.join(", ")
-                ),
-            )
+            let lacks = lacks.join(", ");
+            Layer::partly(name, format!("Landlock {abi}: {what}; not restricted: {lacks}"))
         }
         (RulesetStatus::PartiallyEnforced, _) => {
-            Layer::partly(NAME, "Landlock: this kernel lacks some rules")
+            Layer::partly(name, "Landlock: this kernel lacks some rules")
         }
-    })
+    }
 }
 
 #[cfg(test)]

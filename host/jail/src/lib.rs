@@ -3,14 +3,14 @@
 //! Nothing here can be undone, and all of it holds for descendants of the process. In the order in
 //! which a runtime gets it:
 //!
-//! 1. [`base_filter`], by `gleaner-shim`, before the runtime exists: no new privileges, no calls
-//!    that no lambda's process ever needs.
+//! 1. [`base_filter`] and [`sockets`], by `gleaner-shim`, before the runtime exists: no new
+//!    privileges, no calls that no lambda's process ever needs, no new sockets.
 //! 2. [`files`], before untrusted code is loaded: only named files can be opened; no TCP.
-//! 3. [`sandbox_filter`], once sockets and files are open: no further ones, no new processes, no
-//!    signals to other processes.
+//! 3. [`sandbox_filter`], once files are open: no new processes, no signals to other processes.
 //! 4. [`memory`], with it: a cap on further memory growth.
 //!
-//! A compiler of a lambda whose author is not trusted enters [`compiler`] instead.
+//! A compiler of a lambda whose author is not trusted enters [`compiler`] instead. [`ingress`] and
+//! [`recorder`] are the sandboxes of the two processes that serve all lambdas.
 //!
 //! [`self_test`] then tries what should be denied: a layer counts only if it was seen to deny it.
 //! [`cgroup`] is the supervisor's side, for memory and processes that a lambda starts. A layer that
@@ -24,9 +24,13 @@ mod cgroup_join;
 pub mod compiler;
 pub mod files;
 mod filter;
+pub mod ingress;
 pub mod memory;
+mod own_memory;
+pub mod recorder;
 pub mod sandbox_filter;
 pub mod self_test;
+pub mod sockets;
 
 pub use files::Paths;
 

@@ -1,37 +1,20 @@
 //! Sandboxes a process for its lambda: no new processes, no new sockets, no signals to other
 //! processes, no more than its share of the machine.
 //!
-//! Open files and sockets stay usable. So a runtime applies this once its topics are open, and
-//! before the lambda is loaded.
+//! Open files and sockets stay usable, and files can be received over these. So a runtime applies
+//! this once its topics are open, and before the lambda is loaded.
 
 use gleaner_protocol::Layer;
 
 use crate::filter::{DeniedCalls, install, install_everywhere};
-use crate::{JailError, base_filter, memory};
+use crate::{JailError, base_filter, memory, sockets};
 
 /// The name of the layer for processes.
 pub const PROCESSES: &str = "processes";
-/// The name of the layer for sockets.
-pub const SOCKETS: &str = "sockets";
 /// The name of the layer for resources that a process shares with others.
 pub const SHARED_RESOURCES: &str = "shared resources";
 /// The name of the layer of [`apply_before_interpreter`].
 pub const START: &str = "interpreter start";
-
-/// Calls that create or connect sockets. A pair of connected streams, which no other process can
-/// reach, is still allowed.
-pub(crate) const NEW_SOCKETS: &[i64] = &[
-    libc::SYS_socket,
-    libc::SYS_bind,
-    libc::SYS_listen,
-    libc::SYS_accept,
-    libc::SYS_accept4,
-    // The open ones belong to the transport.
-    libc::SYS_connect,
-    // A message can send files, and the kernel counts those in flight for all processes of a user.
-    libc::SYS_sendmsg,
-    libc::SYS_sendmmsg,
-];
 
 const NEW_PROGRAMS: &[i64] = &[libc::SYS_execve, libc::SYS_execveat];
 #[cfg(target_arch = "x86_64")]
@@ -46,7 +29,7 @@ const SIGNALS: &[i64] = &[
     libc::SYS_rt_tgsigqueueinfo,
     libc::SYS_pidfd_send_signal,
 ];
-/// Calls that the transport needs first, to find its own sockets.
+/// Calls that open handles of processes.
 const PIDFDS: &[i64] = &[libc::SYS_pidfd_open, libc::SYS_pidfd_getfd];
 
 /// Calls that take more than a share of the machine, memory that outlives a process, and the owners
@@ -118,10 +101,22 @@ const SHARED_HERE: &[i64] = &[];
 
 // Newer than the lists of `libc`; the numbers are the same on every architecture.
 const MEMFD_SECRET: i64 = 447;
+const FUTEX_REQUEUE: i64 = 456;
 const FCHMODAT2: i64 = 452;
 const SETXATTRAT: i64 = 463;
 const REMOVEXATTRAT: i64 = 466;
 const FILE_SETATTR: i64 = 469;
+
+/// Requests of `futex` that act on a second word, for memory that processes share.
+const FUTEX_REQUESTS: [i32; 5] = [
+    libc::FUTEX_REQUEUE,
+    libc::FUTEX_CMP_REQUEUE,
+    libc::FUTEX_WAKE_OP,
+    libc::FUTEX_WAIT_REQUEUE_PI,
+    libc::FUTEX_CMP_REQUEUE_PI,
+];
+/// The bits of a request of `futex`, and the one that limits it to a process.
+const FUTEX_REQUEST: u64 = 0xff;
 
 /// Requests of `fcntl` for signals to other processes, for leases and watches, for which others
 /// wait, and for larger pipes, of which a user has few.
@@ -129,20 +124,12 @@ const REQUESTS_OF_FILES: [u64; 6] = [8, 10, 15, 1024, 1026, 1031];
 /// Requests of `ioctl`: the same for sockets, and input into another user's terminal.
 const REQUESTS: [u64; 4] = [0x8901, 0x8902, libc::TIOCSTI, 0x541C];
 
-/// Socket types that DDS does not use: streams above all, which may connect.
-const TYPES: [u64; 5] = [1, 4, 5, 6, 10];
-
 /// Number of descriptors that a process may still open: files of a drive opened again, modules, and
-/// those of the transport for a new writer.
+/// those that the ingress or the starter sends.
 const MORE_FILES: u64 = 512;
-
-/// Number of socket families: those of Linux, and some to come.
-const FAMILIES: i32 = 64;
 
 /// All bits of an argument.
 const ALL: u64 = u32::MAX as u64;
-/// The bits of a socket's type that are not flags.
-const TYPE: u64 = 0xf;
 
 /// Sandboxes all threads of this process. With `only_counted_memory` it can take no memory that
 /// [`memory::limit`] does not count. Returns the layers with what they deny;
@@ -159,36 +146,21 @@ pub fn apply(only_counted_memory: bool) -> Result<Vec<Layer>, JailError> {
     Ok(match install_all(only_counted_memory) {
         Ok(()) => vec![
             Layer::yes(PROCESSES, "seccomp: no new processes, no programs, no signals to others"),
-            Layer::yes(SOCKETS, "seccomp: no new sockets, no connections"),
+            Layer::yes(sockets::NAME, "seccomp: no new sockets, no connections"),
             Layer::yes(
                 SHARED_RESOURCES,
                 "seccomp: no change of priority, CPU affinity, shared memory, file owners or dates",
             ),
         ],
         Err(error @ JailError::ExistingThread(_)) => return Err(error),
-        Err(error) => [PROCESSES, SOCKETS, SHARED_RESOURCES]
+        Err(error) => [PROCESSES, sockets::NAME, SHARED_RESOURCES]
             .map(|name| Layer::no(name, error.chain()))
             .to_vec(),
     })
 }
 
 fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
-    let mut refused = no_signals(no_processes(pairs_only(DeniedCalls::default())))
-        .calls(NEW_SOCKETS)
-        .calls(NEW_PROGRAMS)
-        .calls(PIDFDS)
-        .calls(SHARED)
-        .calls(SHARED_HERE)
-        // Limits of other processes. A process can only lower its own.
-        .unless(libc::SYS_prlimit64, 0, 0)
-        // The process must not outlive `gleaner-shim`, which watches it.
-        .bits(libc::SYS_prctl, 0, ALL, libc::PR_SET_PDEATHSIG as u64);
-    for request in REQUESTS_OF_FILES {
-        refused = refused.bits(libc::SYS_fcntl, 1, ALL, request);
-    }
-    for request in REQUESTS {
-        refused = refused.bits(libc::SYS_ioctl, 1, ALL, request);
-    }
+    let mut refused = own_process_only(sockets::none(DeniedCalls::default())).calls(PIDFDS);
     if only_counted_memory {
         // Other processes would wait for a locked file, and a file that is open for reading only
         // can be locked.
@@ -205,45 +177,66 @@ fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
     install_everywhere(&refused.filter(libc::EPERM)?)
 }
 
+/// Denies new processes and programs, signals to other processes, and what would take more than a
+/// share of the machine.
+pub(crate) fn own_process_only(refused: DeniedCalls) -> DeniedCalls {
+    let mut refused = no_foreign_queues(no_signals(no_processes(refused)))
+        .calls(SHARED)
+        .calls(SHARED_HERE)
+        // Limits of other processes. A process can only lower its own.
+        .unless(libc::SYS_prlimit64, 0, 0)
+        // The process must not outlive its parent, which watches it.
+        .bits(libc::SYS_prctl, 0, ALL, libc::PR_SET_PDEATHSIG as u64);
+    for request in REQUESTS_OF_FILES {
+        refused = refused.bits(libc::SYS_fcntl, 1, ALL, request);
+    }
+    for request in REQUESTS {
+        refused = refused.bits(libc::SYS_ioctl, 1, ALL, request);
+    }
+    refused
+}
+
 /// Denies what a process does not need any more when it is about to become an interpreter: other
-/// processes and signals to them, sockets but those of DDS, and, with `only_counted_memory`, memory
-/// as in [`apply`]. The lambda's code does not run until [`apply`], but the interpreter may be any
-/// program that calls itself Python.
+/// processes and signals to them, sockets, and, with `only_counted_memory`, memory as in [`apply`].
+/// The lambda's code does not run until [`apply`], but the interpreter may be any program that
+/// calls itself Python.
 #[must_use]
 pub fn apply_before_interpreter(only_counted_memory: bool) -> Layer {
     match install_before(only_counted_memory) {
-        Ok(()) => Layer::yes(
-            START,
-            "seccomp: no processes, no signals to others, no sockets but those of DDS",
-        ),
+        Ok(()) => Layer::yes(START, "seccomp: no processes, no signals to others, no sockets"),
         Err(error) => Layer::no(START, error.chain()),
     }
 }
 
 fn install_before(only_counted_memory: bool) -> Result<(), JailError> {
-    let mut refused = no_signals(no_processes(pairs_only(DeniedCalls::default())));
+    let mut refused = no_new_processes(no_signals(sockets::none(DeniedCalls::default())));
     if only_counted_memory {
         refused = counted_only(refused);
-    }
-    for family in 0..FAMILIES {
-        if ![libc::AF_INET, libc::AF_INET6, libc::AF_NETLINK].contains(&family) {
-            refused = refused.bits(libc::SYS_socket, 0, ALL, u64::from(family.unsigned_abs()));
-        }
-    }
-    for kind in TYPES {
-        refused = refused.bits(libc::SYS_socket, 1, TYPE, kind);
     }
     install(&DeniedCalls::no_clone3()?)?;
     install(&refused.filter(libc::EPERM)?)
 }
 
-fn no_processes(refused: DeniedCalls) -> DeniedCalls {
+/// Denies new processes and other programs.
+pub(crate) fn no_processes(refused: DeniedCalls) -> DeniedCalls {
+    no_new_processes(refused.calls(NEW_PROGRAMS))
+}
+
+fn no_new_processes(refused: DeniedCalls) -> DeniedCalls {
     let clone = |refused: DeniedCalls, flag: i32| refused.bits(libc::SYS_clone, 0, flag as u64, 0);
     // A thread with its own table of files would have as many as a process.
     clone(clone(refused.calls(NEW_PROCESSES), libc::CLONE_THREAD), libc::CLONE_FILES)
 }
 
-fn no_signals(refused: DeniedCalls) -> DeniedCalls {
+/// Denies requests that move or wake sleeping threads of other processes, through memory that is
+/// shared with them for reading. Libraries use these requests within a process only.
+fn no_foreign_queues(refused: DeniedCalls) -> DeniedCalls {
+    FUTEX_REQUESTS.iter().fold(refused.calls(&[FUTEX_REQUEUE]), |refused, request| {
+        refused.bits(libc::SYS_futex, 1, FUTEX_REQUEST, *request as u64)
+    })
+}
+
+pub(crate) fn no_signals(refused: DeniedCalls) -> DeniedCalls {
     let me = u64::from(std::process::id());
     refused.calls(SIGNALS).unless(libc::SYS_kill, 0, me).unless(libc::SYS_tgkill, 0, me)
 }
@@ -256,12 +249,4 @@ fn counted_only(refused: DeniedCalls) -> DeniedCalls {
         .bits(libc::SYS_mmap, 3, shared, shared)
         .bits(libc::SYS_mmap, 3, down, down)
         .calls(&[libc::SYS_memfd_create, MEMFD_SECRET])
-}
-
-/// Limits pairs of sockets to streams: other kinds can send to any named socket.
-pub(crate) fn pairs_only(refused: DeniedCalls) -> DeniedCalls {
-    refused
-        .unless(libc::SYS_socketpair, 0, libc::AF_UNIX as u64)
-        .bits(libc::SYS_socketpair, 1, TYPE, libc::SOCK_DGRAM as u64)
-        .bits(libc::SYS_socketpair, 1, TYPE, libc::SOCK_RAW as u64)
 }

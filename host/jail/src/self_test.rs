@@ -2,13 +2,13 @@
 
 use std::fs::File;
 use std::io;
-use std::net::UdpSocket;
+use std::net::{TcpListener, UdpSocket};
 use std::os::fd::AsFd;
 use std::process::Command;
 
 use gleaner_protocol::{Holds, Layer};
 
-use crate::{base_filter, files, sandbox_filter};
+use crate::{base_filter, files, sandbox_filter, sockets};
 
 /// Tries in this process what each of `layers` should deny, and marks those that do not as not
 /// holding.
@@ -19,7 +19,9 @@ pub fn verify(mut layers: Vec<Layer>) -> Vec<Layer> {
         }
         let refused = match layer.name.as_str() {
             files::NAME => refused(&File::open("/etc/passwd")),
-            sandbox_filter::SOCKETS => refused(&UdpSocket::bind("127.0.0.1:0")),
+            files::WRITTEN => refused(&File::options().write(true).open("/dev/full")),
+            sockets::NAME => refused(&UdpSocket::bind("127.0.0.1:0")),
+            sockets::UDP_ONLY => refused(&TcpListener::bind("127.0.0.1:0")),
             sandbox_filter::PROCESSES => refused(&Command::new("/bin/true").spawn()),
             base_filter::NAME => refused(&enter_no_namespace()),
             _ => continue,

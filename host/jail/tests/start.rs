@@ -1,12 +1,17 @@
 //! Tests the effects of code that runs before the lambda. Each test sandboxes a process of its own.
 
+use std::fs::{self, File};
 use std::hint::black_box;
+use std::io::{ErrorKind, Write};
+use std::net::{TcpStream, UdpSocket};
+use std::os::unix::net::UnixStream;
 use std::process::Command;
 use std::sync::mpsc;
 use std::thread;
 
-use gleaner_jail::{JailError, base_filter, memory, sandbox_filter};
-use gleaner_protocol::Holds;
+use gleaner_jail::ingress::{self, NewSockets};
+use gleaner_jail::{JailError, Paths, base_filter, memory, recorder, sandbox_filter, sockets};
+use gleaner_protocol::{Holds, Layer};
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::io::Errno;
 use rustix::process::{Resource, getpid, getppid, getrlimit, test_kill_process};
@@ -81,4 +86,101 @@ fn memory_in_use_does_not_raise_a_limit_above_an_earlier_one() {
         assert_eq!(bound(), second);
         drop(taken);
     });
+}
+
+/// Checks that each layer holds; those of Landlock, as far as this kernel has it.
+#[track_caller]
+fn hold(layers: &[Layer]) {
+    let missing = |layer: &&Layer| match layer.holds {
+        Holds::Yes => false,
+        Holds::Partly | Holds::No => !layer.note.contains("Landlock"),
+    };
+    assert_eq!(layers.iter().find(missing), None);
+}
+
+#[track_caller]
+fn refused<T>(result: std::io::Result<T>) {
+    assert_eq!(result.err().map(|error| error.kind()), Some(ErrorKind::PermissionDenied));
+}
+
+#[test]
+fn a_process_without_sockets_still_has_its_own_and_pairs() {
+    in_own_process("a_process_without_sockets_still_has_its_own_and_pairs", || {
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        hold(&[sockets::deny()]);
+        refused(UdpSocket::bind("127.0.0.1:0"));
+        refused(TcpStream::connect("127.0.0.1:9"));
+        refused(UnixStream::connect("/nowhere"));
+        let address = socket.local_addr().unwrap();
+        socket.send_to(b"x", address).unwrap();
+        assert_eq!(socket.recv(&mut [0; 2]).unwrap(), 1);
+        let (mut near, _far) = UnixStream::pair().unwrap();
+        near.write_all(b"x").unwrap();
+    });
+}
+
+#[test]
+fn the_ingress_has_datagrams_memory_and_threads_but_no_programs_and_streams() {
+    in_own_process(
+        "the_ingress_has_datagrams_memory_and_threads_but_no_programs_and_streams",
+        || {
+            let drive = std::env::current_exe().unwrap();
+            let paths = Paths { read: vec![drive.clone()], write: Vec::new() };
+            let layers = ingress::start(&paths);
+            // A thread from before, as those of DDS.
+            let (go, goes) = mpsc::channel::<()>();
+            let earlier = thread::spawn(move || {
+                goes.recv().unwrap();
+                refused(Command::new("/bin/true").spawn());
+                refused(TcpStream::connect("127.0.0.1:9"));
+            });
+            let layers = ingress::close(layers, NewSockets::Udp).unwrap();
+            hold(&layers);
+            go.send(()).unwrap();
+            earlier.join().unwrap();
+            thread::spawn(|| ()).join().unwrap();
+            UdpSocket::bind("127.0.0.1:0").unwrap();
+            memfd_create("topic", MemfdFlags::CLOEXEC).unwrap();
+            refused(UnixStream::connect("/nowhere"));
+            assert_eq!(test_kill_process(getppid().unwrap()), Err(Errno::PERM));
+            if files_hold(&layers) {
+                File::open(drive).unwrap();
+                refused(File::open("/etc/passwd"));
+                refused(File::create(std::env::temp_dir().join("gleaner-ingress-escaped")));
+            }
+        },
+    );
+}
+
+#[test]
+fn an_ingress_that_plays_a_drive_has_no_sockets() {
+    in_own_process("an_ingress_that_plays_a_drive_has_no_sockets", || {
+        let layers = ingress::start(&Paths::default());
+        hold(&ingress::close(layers, NewSockets::None).unwrap());
+        refused(UdpSocket::bind("127.0.0.1:0"));
+    });
+}
+
+#[test]
+fn the_recorder_writes_into_its_folder_only() {
+    in_own_process("the_recorder_writes_into_its_folder_only", || {
+        let folder = std::env::temp_dir().join(format!("gleaner-jail-{}", std::process::id()));
+        fs::create_dir_all(folder.join("clips")).unwrap();
+        let layers = recorder::enter(std::slice::from_ref(&folder));
+        hold(&layers);
+        fs::write(folder.join("clips/a.partial"), "x").unwrap();
+        fs::rename(folder.join("clips/a.partial"), folder.join("a")).unwrap();
+        refused(UdpSocket::bind("127.0.0.1:0"));
+        refused(Command::new("/bin/true").spawn());
+        thread::spawn(|| ()).join().unwrap();
+        if files_hold(&layers) {
+            refused(File::create(std::env::temp_dir().join("gleaner-recorder-escaped")));
+        }
+        fs::remove_dir_all(folder.join("clips")).unwrap();
+        fs::remove_file(folder.join("a")).unwrap();
+    });
+}
+
+fn files_hold(layers: &[Layer]) -> bool {
+    layers.iter().any(|layer| layer.name.contains("files") && layer.note.contains("Landlock:"))
 }

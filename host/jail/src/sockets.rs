@@ -1,0 +1,70 @@
+//! Denies sockets: new ones to a lambda's process, from its first instruction on, and all but UDP
+//! to the ingress. Open sockets stay usable, and a process can still receive files over them.
+
+use gleaner_protocol::Layer;
+
+use crate::filter::{DeniedCalls, install};
+
+/// The name of the layer of a process that creates no sockets.
+pub const NAME: &str = "sockets";
+/// The name of the layer of a process that creates UDP sockets only.
+pub const UDP_ONLY: &str = "stream sockets";
+
+/// Calls that accept connections.
+const ACCEPTING: &[i64] = &[libc::SYS_listen, libc::SYS_accept, libc::SYS_accept4];
+/// Calls that create or connect sockets.
+const CREATING: &[i64] = &[libc::SYS_socket, libc::SYS_bind, libc::SYS_connect];
+/// Calls that send files, and the kernel counts those in flight for all processes of a user.
+const SENDING_FILES: &[i64] = &[libc::SYS_sendmsg, libc::SYS_sendmmsg];
+
+/// Families of sockets that DDS needs: the last one lists the interfaces of the network.
+const FAMILIES: [i32; 3] = [libc::AF_INET, libc::AF_INET6, libc::AF_NETLINK];
+/// Number of socket families: those of Linux, and some to come.
+const ALL_FAMILIES: i32 = 64;
+/// Socket types that DDS does not use: streams above all, which may connect.
+const OTHER_TYPES: [u64; 5] = [1, 4, 5, 6, 10];
+
+/// All bits of an argument.
+const ALL: u64 = u32::MAX as u64;
+/// The bits of a socket's type that are not flags.
+const TYPE: u64 = 0xf;
+
+/// Denies new sockets, connections and the sending of files to this process and its descendants. A
+/// pair of connected streams, which no other process can reach, is still allowed.
+pub fn deny() -> Layer {
+    let denied = none(DeniedCalls::default()).filter(libc::EPERM);
+    match denied.and_then(|filter| install(&filter)) {
+        Ok(()) => Layer::yes(NAME, "seccomp: no new sockets, no connections, from the start"),
+        Err(error) => Layer::no(NAME, error.chain()),
+    }
+}
+
+/// Denies the calls of [`deny`].
+pub(crate) fn none(refused: DeniedCalls) -> DeniedCalls {
+    no_new(refused).calls(SENDING_FILES)
+}
+
+/// Denies new sockets and connections. Files can be sent.
+pub(crate) fn no_new(refused: DeniedCalls) -> DeniedCalls {
+    pairs_only(refused).calls(CREATING).calls(ACCEPTING)
+}
+
+/// Denies all new sockets but UDP, and those that list the interfaces of the network.
+pub(crate) fn udp_only(refused: DeniedCalls) -> DeniedCalls {
+    let mut refused = pairs_only(refused).calls(ACCEPTING);
+    for family in (0..ALL_FAMILIES).filter(|family| !FAMILIES.contains(family)) {
+        refused = refused.bits(libc::SYS_socket, 0, ALL, u64::from(family.unsigned_abs()));
+    }
+    for kind in OTHER_TYPES {
+        refused = refused.bits(libc::SYS_socket, 1, TYPE, kind);
+    }
+    refused
+}
+
+/// Limits pairs of sockets to streams: other kinds can send to any named socket.
+fn pairs_only(refused: DeniedCalls) -> DeniedCalls {
+    refused
+        .unless(libc::SYS_socketpair, 0, libc::AF_UNIX as u64)
+        .bits(libc::SYS_socketpair, 1, TYPE, libc::SOCK_DGRAM as u64)
+        .bits(libc::SYS_socketpair, 1, TYPE, libc::SOCK_RAW as u64)
+}
