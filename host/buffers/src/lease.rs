@@ -11,6 +11,7 @@ use std::{
 use crate::{
     HEADROOM,
     pool::{MAX_HOLDS, RingStamp, Seal, Slots},
+    shared::HeldSample,
     sync::{Arc, Ordering},
 };
 
@@ -119,9 +120,11 @@ impl<M> fmt::Debug for Draft<M> {
 ///
 /// Clones are further holds; dropping the last one frees the slot. More than 2^31 holds at once,
 /// which takes leaked leases, abort the process, as for `Arc`.
-pub struct Lease<M> {
-    slots: Arc<Slots<M>>,
-    index: u32,
+pub struct Lease<M>(Held<M>);
+
+enum Held<M> {
+    Slot(SlotHold<M>),
+    Shared { sample: HeldSample, position: u64, meta: M },
 }
 
 impl<M> Lease<M> {
@@ -129,25 +132,83 @@ impl<M> Lease<M> {
     ///
     /// The caller owns a hold on the slot, and passes it on.
     pub(crate) unsafe fn new(slots: Arc<Slots<M>>, index: u32) -> Self {
-        Self { slots, index }
+        Self(Held::Slot(SlotHold { slots, index }))
+    }
+
+    /// A lease on a sample in shared memory, at `position` of a ring.
+    pub(crate) fn shared(sample: HeldSample, position: u64, meta: M) -> Self {
+        Self(Held::Shared { sample, position, meta })
     }
 
     /// Returns the metadata of the sample.
     pub fn meta(&self) -> &M {
-        &self.seal().meta
+        match &self.0 {
+            Held::Slot(hold) => &hold.seal().meta,
+            Held::Shared { meta, .. } => meta,
+        }
     }
 
     /// Returns the sample's position in the ring that published it; `None` without a ring.
     pub fn position(&self) -> Option<u64> {
-        self.stamp().map(|stamp| stamp.position)
+        match &self.0 {
+            Held::Slot(_) => self.stamp().map(|stamp| stamp.position),
+            Held::Shared { position, .. } => Some(*position),
+        }
     }
 
+    /// The stamp of the ring over a pool that published the sample.
     pub(crate) fn stamp(&self) -> Option<RingStamp> {
-        self.seal().stamp
+        match &self.0 {
+            Held::Slot(hold) => hold.seal().stamp,
+            Held::Shared { .. } => None,
+        }
     }
 
     /// Returns the [`HEADROOM`] bytes and the sample as one slice.
     pub fn with_headroom(&self) -> &[u8] {
+        match &self.0 {
+            Held::Slot(hold) => hold.with_headroom(),
+            Held::Shared { sample, .. } => sample.with_headroom(),
+        }
+    }
+}
+
+impl<M> Deref for Lease<M> {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.with_headroom()[HEADROOM..]
+    }
+}
+
+impl<M: Clone> Clone for Lease<M> {
+    fn clone(&self) -> Self {
+        Self(match &self.0 {
+            Held::Slot(hold) => Held::Slot(hold.clone()),
+            Held::Shared { sample, position, meta } => {
+                Held::Shared { sample: sample.clone(), position: *position, meta: meta.clone() }
+            }
+        })
+    }
+}
+
+impl<M> fmt::Debug for Lease<M> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Lease")
+            .field("len", &self.len())
+            .field("position", &self.position())
+            .finish_non_exhaustive()
+    }
+}
+
+/// One hold on a slot of a pool.
+struct SlotHold<M> {
+    slots: Arc<Slots<M>>,
+    index: u32,
+}
+
+impl<M> SlotHold<M> {
+    fn with_headroom(&self) -> &[u8] {
         let payload = self.slots.payload(self.index);
         // SAFETY: the headroom and the `len` bytes after it are one initialised part of the region,
         // and the hold of `self` keeps writers away until it is dropped.
@@ -162,15 +223,7 @@ impl<M> Lease<M> {
     }
 }
 
-impl<M> Deref for Lease<M> {
-    type Target = [u8];
-
-    fn deref(&self) -> &[u8] {
-        &self.with_headroom()[HEADROOM..]
-    }
-}
-
-impl<M> Clone for Lease<M> {
+impl<M> Clone for SlotHold<M> {
     fn clone(&self) -> Self {
         // Relaxed: the hold of `self` keeps the slot as it is, and its view of it is passed on.
         let before = self.slots.slot(self.index).count.fetch_add(1, Ordering::Relaxed);
@@ -181,18 +234,9 @@ impl<M> Clone for Lease<M> {
     }
 }
 
-impl<M> Drop for Lease<M> {
+impl<M> Drop for SlotHold<M> {
     fn drop(&mut self) {
-        // SAFETY: a lease owns one hold, which ends here.
+        // SAFETY: it owns one hold, which ends here.
         unsafe { self.slots.release(self.index) }
-    }
-}
-
-impl<M> fmt::Debug for Lease<M> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Lease")
-            .field("len", &self.len())
-            .field("position", &self.position())
-            .finish_non_exhaustive()
     }
 }

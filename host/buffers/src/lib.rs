@@ -5,6 +5,9 @@
 //! none may change. A ring over a pool ([`ring`]) numbers the samples of its one [`RingWriter`] 0,
 //! 1, 2, ... and shows the newest `depth` of them to any number of [`RingReader`]s on any thread.
 //!
+//! In [`shared`], one process writes such rings and others read them in place; [`RingReader::shared`]
+//! reads them like a ring over a pool.
+//!
 //! A sample that a reader holds keeps its bytes until the last lease on it is dropped, even after
 //! it has left the ring, and after the ring and the pool are gone. Every sample that a ring loses
 //! is counted by cause ([`RingCounts`]).
@@ -40,7 +43,8 @@
 //! another thread drafted from the same 64 slots in the meantime, so it is wait-free too where one
 //! ring has the pool to itself. Finding a sample is lock-free: a pin is repeated only if another
 //! thread pinned or dropped the same sample in the meantime, and [`RingReader::newest`] starts over
-//! only if a sample was published in the meantime.
+//! only if a sample was published in the meantime. In shared memory the writer never waits either;
+//! the readers of one process take turns for the few instructions that set a hazard.
 //!
 //! The atomics are loom's under `--cfg loom` (`tests/loom.rs`), and std's otherwise.
 
@@ -50,6 +54,7 @@ mod lease;
 mod pool;
 mod region;
 mod ring;
+mod ring_reader;
 pub mod shared;
 mod sync;
 
@@ -57,4 +62,5 @@ pub use error::{DraftError, PoolError};
 pub use lease::{Draft, Lease};
 pub use pool::{HEADROOM, Pool};
 pub use region::{HeapRegion, Region};
-pub use ring::{ForeignDraft, RingCounts, RingReader, RingWriter, ring};
+pub use ring::{ForeignDraft, RingCounts, RingWriter, ring};
+pub use ring_reader::RingReader;

@@ -9,7 +9,7 @@
 use std::{error::Error, fmt};
 
 use crate::{
-    Draft, DraftError, Lease, Pool, PoolError,
+    Draft, DraftError, Lease, Pool, PoolError, RingReader,
     pool::RingStamp,
     sync::{Arc, AtomicU32, AtomicU64, Ordering},
 };
@@ -40,7 +40,7 @@ pub fn ring<M>(pool: Pool<M>, depth: usize) -> Result<(RingWriter<M>, RingReader
         too_big: AtomicU64::new(0),
     });
     let writer = RingWriter { shared: Arc::clone(&shared), head: 0 };
-    Ok((writer, RingReader(shared)))
+    Ok((writer, RingReader::heap(shared)))
 }
 
 /// Numbers of samples that a ring has received and lost since it was built. They never decrease.
@@ -74,7 +74,8 @@ impl<M> fmt::Display for ForeignDraft<M> {
 
 impl<M> Error for ForeignDraft<M> {}
 
-struct RingState<M> {
+/// A ring over a pool.
+pub(crate) struct RingState<M> {
     id: u64,
     pool: Pool<M>,
     /// Changed by the one writer only, and on drop.
@@ -87,7 +88,11 @@ struct RingState<M> {
 }
 
 impl<M> RingState<M> {
-    fn depth(&self) -> u64 {
+    pub(crate) fn head(&self) -> u64 {
+        self.head.load(Ordering::Acquire)
+    }
+
+    pub(crate) fn depth(&self) -> u64 {
         self.places.len() as u64 - 1
     }
 
@@ -97,12 +102,69 @@ impl<M> RingState<M> {
 
     /// Returns the sample at a position below a `head` that the caller has loaded, if it is still
     /// there.
-    fn at(&self, position: u64) -> Option<Lease<M>> {
+    pub(crate) fn at(&self, position: u64) -> Option<Lease<M>> {
         // That load of `head` shows the place as it was filled, or later. Acquire shows why the
         // sample left: see `newest_at`.
         let index = self.place(position).load(Ordering::Acquire);
         let stamp = RingStamp { ring: self.id, position };
         (index != EMPTY).then(|| self.pool.pin(index, stamp))?
+    }
+
+    /// Returns the newest sample below position `end`, and its position.
+    ///
+    /// A sample that leaves during the call either was evicted, and then the one before it is the
+    /// newest, or was followed by others; then `head` is higher and the search restarts there. Each
+    /// restart takes a sample that was published during the call, and between two restarts there
+    /// are at most `depth` steps. So the call ends unless the writer is forever as fast as the few
+    /// instructions of a step.
+    pub(crate) fn newest_at(&self, end: u64) -> Option<(Lease<M>, u64)> {
+        let mut head = self.head().min(end);
+        let mut back = 1;
+        while back <= head.min(self.depth()) {
+            let position = head - back;
+            if let Some(lease) = self.at(position) {
+                return Some((lease, position));
+            }
+            // The place or the count showed, by an Acquire load, that the sample is gone. So all
+            // that the writer did before is visible: a publication that replaced the sample, or
+            // preceded its eviction, raised `head`, and this load sees it.
+            let now = self.head().min(end);
+            back = if now == head { back + 1 } else { 1 };
+            head = now;
+        }
+        None
+    }
+
+    pub(crate) fn newest_while(
+        &self,
+        end: u64,
+        max: usize,
+        mut keep: impl FnMut(&M) -> bool,
+        out: &mut Vec<Lease<M>>,
+    ) {
+        if max == 0 {
+            return;
+        }
+        let Some((newest, position)) = self.newest_at(end) else {
+            return;
+        };
+        let oldest = (position + 1).saturating_sub(self.depth());
+        let older = (oldest..position).rev().filter_map(|older| self.at(older));
+        out.extend(
+            std::iter::once(newest).chain(older).take_while(|lease| keep(lease.meta())).take(max),
+        );
+        out.reverse();
+    }
+
+    pub(crate) fn counts(&self) -> RingCounts {
+        // First `overwritten`, then `received`, so that the difference is never negative.
+        let overwritten = self.overwritten.load(Ordering::Acquire);
+        RingCounts {
+            received: self.head(),
+            overwritten,
+            no_slot: self.no_slot.load(Ordering::Relaxed),
+            too_big: self.too_big.load(Ordering::Relaxed),
+        }
     }
 
     /// Counts a sample that has left. Release: a thread that sees the count also sees the matching
@@ -220,131 +282,6 @@ impl<M> fmt::Debug for RingWriter<M> {
         f.debug_struct("RingWriter")
             .field("depth", &self.shared.depth())
             .field("head", &self.head)
-            .finish_non_exhaustive()
-    }
-}
-
-/// A reading end of a ring; clones read the same ring, each from any thread.
-pub struct RingReader<M>(Arc<RingState<M>>);
-
-impl<M> RingReader<M> {
-    /// Returns the number of samples published so far: the position of the next one.
-    pub fn head(&self) -> u64 {
-        self.0.head.load(Ordering::Acquire)
-    }
-
-    /// Returns the maximum number of samples in the ring.
-    pub fn depth(&self) -> usize {
-        self.0.places.len() - 1
-    }
-
-    /// Returns the sample at `position`; `None` if it has left the ring, or is not published yet.
-    pub fn get(&self, position: u64) -> Option<Lease<M>> {
-        let age = self.head().checked_sub(position)?;
-        (1..=self.0.depth()).contains(&age).then(|| self.0.at(position))?
-    }
-
-    /// Returns the newest sample; `None` only if the ring was empty at some moment during the call.
-    ///
-    /// A sample that leaves during the call either was evicted, and then the one before it is the
-    /// newest, or was followed by others; then `head` is higher and the search restarts there. Each
-    /// restart takes a sample that was published during the call, and between two restarts there
-    /// are at most `depth` steps. So the call ends unless the writer is forever as fast as the few
-    /// instructions of a step.
-    pub fn newest(&self) -> Option<Lease<M>> {
-        self.newest_before(u64::MAX)
-    }
-
-    /// As [`RingReader::newest`], among the samples at positions below `end`.
-    pub fn newest_before(&self, end: u64) -> Option<Lease<M>> {
-        self.newest_at(end).map(|(lease, _)| lease)
-    }
-
-    fn newest_at(&self, end: u64) -> Option<(Lease<M>, u64)> {
-        let mut head = self.head().min(end);
-        let mut back = 1;
-        while back <= head.min(self.0.depth()) {
-            let position = head - back;
-            if let Some(lease) = self.0.at(position) {
-                return Some((lease, position));
-            }
-            // The place or the count showed, by an Acquire load, that the sample is gone. So all
-            // that the writer did before is visible: a publication that replaced the sample, or
-            // preceded its eviction, raised `head`, and this load sees it.
-            let now = self.head().min(end);
-            back = if now == head { back + 1 } else { 1 };
-            head = now;
-        }
-        None
-    }
-
-    /// Fills `out` with the newest `n` samples, fewer if the ring has fewer, oldest first.
-    ///
-    /// Samples that leave the ring during the call may be missing, but never the newest one.
-    pub fn last(&self, n: usize, out: &mut Vec<Lease<M>>) {
-        self.newest_while(n, |_| true, out);
-    }
-
-    /// As [`RingReader::last`], among the samples at positions below `end`.
-    pub fn last_before(&self, end: u64, n: usize, out: &mut Vec<Lease<M>>) {
-        self.newest_while_before(end, n, |_| true, out);
-    }
-
-    /// Fills `out` with the newest samples, at most `max`, back to the first one that `keep`
-    /// refuses; oldest first.
-    ///
-    /// Evicted positions are skipped. `keep` is called newest first.
-    pub fn newest_while(&self, max: usize, keep: impl FnMut(&M) -> bool, out: &mut Vec<Lease<M>>) {
-        self.newest_while_before(u64::MAX, max, keep, out);
-    }
-
-    /// As [`RingReader::newest_while`], among the samples at positions below `end`.
-    pub fn newest_while_before(
-        &self,
-        end: u64,
-        max: usize,
-        mut keep: impl FnMut(&M) -> bool,
-        out: &mut Vec<Lease<M>>,
-    ) {
-        out.clear();
-        if max == 0 {
-            return;
-        }
-        let Some((newest, position)) = self.newest_at(end) else {
-            return;
-        };
-        let oldest = (position + 1).saturating_sub(self.0.depth());
-        let older = (oldest..position).rev().filter_map(|older| self.0.at(older));
-        out.extend(
-            std::iter::once(newest).chain(older).take_while(|lease| keep(lease.meta())).take(max),
-        );
-        out.reverse();
-    }
-
-    /// Returns the counts of received and lost samples.
-    pub fn counts(&self) -> RingCounts {
-        // First `overwritten`, then `received`, so that the difference is never negative.
-        let overwritten = self.0.overwritten.load(Ordering::Acquire);
-        RingCounts {
-            received: self.head(),
-            overwritten,
-            no_slot: self.0.no_slot.load(Ordering::Relaxed),
-            too_big: self.0.too_big.load(Ordering::Relaxed),
-        }
-    }
-}
-
-impl<M> Clone for RingReader<M> {
-    fn clone(&self) -> Self {
-        Self(Arc::clone(&self.0))
-    }
-}
-
-impl<M> fmt::Debug for RingReader<M> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("RingReader")
-            .field("depth", &self.depth())
-            .field("counts", &self.counts())
             .finish_non_exhaustive()
     }
 }

@@ -12,15 +12,15 @@
 //! # Order of memory accesses
 //!
 //! `seq[place]` is position + 1 while the sample is shown, else 0; positions never repeat. W is the
-//! writer's SeqCst fence in [`SharedWriter::draft`]; R is the reader's, between storing a hazard
-//! and checking it.
+//! writer's SeqCst fence in each [`SharedWriter::draft`]; R is the reader's, between storing a
+//! hazard and checking it.
 //!
 //! 1. A reader loads `seq` (Acquire), reads slot, length and meta (relaxed), stores the hazard
 //!    (Release), fences (R), and loads `seq` again. If it changed, the reader clears the hazard and
 //!    gives up. When it is done with the sample, it clears the hazard (Release).
-//! 2. When a position leaves, the writer stores `seq = 0`. The next draft fences (W), reads each
-//!    hazard once (Acquire), and takes a slot that is neither shown nor held. It fills the slot,
-//!    then writes the place, `seq` and `head` (Release).
+//! 2. When a position leaves, the writer stores `seq = 0`. The next draft fences (W). If it knows of
+//!    no free slot, it reads each hazard once (Acquire), and frees all slots that are neither shown
+//!    nor held. It fills one of them, then writes the place, `seq` and `head` (Release).
 //! 3. If W precedes R in the order of SeqCst fences, the reader's second load sees the 0 or a later
 //!    value, and the reader gives up. Otherwise the writer's scan sees the hazard, and leaves the
 //!    slot alone, or it sees a later value of that word.
@@ -29,8 +29,10 @@
 //! 5. A place is not torn: a field of a later sample is written after W, which follows `seq = 0`,
 //!    so a reader that saw such a field sees the 0 or a later value in its second load.
 //! 6. Payload reads are plain. Only a reader that breaks these rules sees torn bytes.
-//! 7. The writer never starves: it reads each word once per draft, and counts at most the limit of
-//!    that word. The limits of all words of all readers fit into the region.
+//! 7. A slot that was freed stays free until it is filled again: 3 holds for every later hazard that
+//!    names its old position, as that position is not shown any more.
+//! 8. The writer never starves: it reads each word once per W, and counts at most the limit of that
+//!    word. The limits of all words of all readers fit into the region.
 //!
 //! One window is held by one word, as positions leave in order: the check of its oldest position
 //! holds all of it. The places have to be read before the fence, because they are written again
@@ -38,14 +40,18 @@
 
 mod bell;
 mod control;
+mod hold;
 mod layout;
 mod reader;
+mod ring;
 mod writer;
 
 pub use bell::{Bell, Futex};
 pub use control::{ControlMemory, ControlPage, HAZARDS, HoldLimits};
+pub use hold::{HeldSample, HeldWindow};
 pub use layout::{META_WORDS, ReadRegion, ReaderMemory, SharedLayout, WriterMemory, in_process};
-pub use reader::{HeldSample, HeldWindow, ReadError, SharedReader};
+pub use reader::{ReadError, SharedReader};
+pub(crate) use ring::SharedRing;
 pub use writer::{ReaderId, SharedDraft, SharedWriter, WriteError};
 
 #[cfg(loom)]

@@ -1,14 +1,15 @@
-//! The reading end of a topic: finds samples and holds them in place.
+//! The reading end of a topic: finds samples, and holds them in place.
 #![allow(unsafe_code)]
 
-use std::ops::Deref;
-use std::slice;
-
-use super::control::{ControlMemory, HazardWindow, HoldLimits, MappedControl, clear, set};
+use super::control::{ControlMemory, HoldLimits};
+use super::hold::{HoldTable, WindowHold};
 use super::layout::{COUNTER_WORDS, META_WORDS, ReaderMemory, SharedMemory};
-use super::reader_fence;
-use crate::HEADROOM;
-use crate::sync::{Arc, Mutex, MutexGuard, Ordering};
+use super::{HeldSample, HeldWindow};
+use crate::sync::{Arc, Ordering, fence};
+
+/// Attempts to find samples while the writer publishes: far more than an honest writer can
+/// interrupt.
+const ATTEMPTS: u32 = 1000;
 
 /// A reading end that cannot be used, or has no hold left.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,35 +22,23 @@ pub enum ReadError {
 }
 
 /// The reading end of a topic; clones read the same topic, each from any thread.
+///
+/// Samples that are held already take no further word: their holds are shared.
 #[derive(Clone)]
 pub struct SharedReader(Arc<ReaderState>);
 
-struct ReaderState {
-    memory: Arc<SharedMemory>,
-    page: MappedControl,
-    limits: HoldLimits,
-    holds: Mutex<HoldTable>,
+pub(super) struct ReaderState {
+    pub(super) memory: Arc<SharedMemory>,
+    pub(super) holds: HoldTable,
 }
 
-/// The holds of this process.
-struct HoldTable {
-    /// For each hazard word, in the order of the page.
-    words: Box<[HazardUse]>,
-}
-
-#[derive(Clone, Copy, Default)]
-struct HazardUse {
-    /// Handles on its samples; 0 if the word is free.
-    handles: u32,
-}
-
-/// A sample as its place describes it.
+/// A sample as its place describes it. Slot and length are within the region.
 #[derive(Debug, Clone, Copy)]
-struct FoundSample {
-    position: u64,
-    slot: u32,
-    len: u32,
-    meta: [u64; META_WORDS],
+pub(super) struct FoundSample {
+    pub(super) position: u64,
+    pub(super) slot: u32,
+    pub(super) len: u32,
+    pub(super) meta: [u64; META_WORDS],
 }
 
 impl SharedReader {
@@ -72,11 +61,8 @@ impl SharedReader {
         control: impl ControlMemory,
         limits: HoldLimits,
     ) -> Result<Self, ReadError> {
-        let page = MappedControl::new(control);
-        let words = limits.of_page(page.control()).ok_or(ReadError::Hazards)?;
-        let words = vec![HazardUse::default(); words.len()].into();
-        let holds = Mutex::new(HoldTable { words });
-        Ok(Self(Arc::new(ReaderState { memory: Arc::clone(&memory.0), page, limits, holds })))
+        let holds = HoldTable::new(control, limits).ok_or(ReadError::Hazards)?;
+        Ok(Self(Arc::new(ReaderState { memory: Arc::clone(&memory.0), holds })))
     }
 
     /// Number of samples published so far: the position that the next one will have.
@@ -95,13 +81,21 @@ impl SharedReader {
         std::array::from_fn(|index| counters[index].load(Ordering::Relaxed))
     }
 
+    /// Meta data of the sample at `position`, without a hold; `None` if it is not shown (any more).
+    pub fn meta(&self, position: u64) -> Option<[u64; META_WORDS]> {
+        let found = self.look(position)?;
+        // Acquire: a word of a later sample was stored after `seq` was cleared (rule 5).
+        fence(Ordering::Acquire);
+        self.is_shown(position).then_some(found.meta)
+    }
+
     /// Holds the sample at `position`; `None` if it is not shown (any more).
     ///
     /// # Errors
     ///
     /// [`ReadError::OutOfHolds`].
     pub fn get(&self, position: u64) -> Result<Option<HeldSample>, ReadError> {
-        Ok(self.window(position, 1)?.and_then(|window| window.samples.into_iter().next()))
+        Ok(self.window(position, 1)?.map(|window| window.newest()))
     }
 
     /// Holds the newest sample below position `end`; `None` if there was a moment during the
@@ -111,7 +105,7 @@ impl SharedReader {
     ///
     /// [`ReadError::OutOfHolds`].
     pub fn newest_before(&self, end: u64) -> Result<Option<HeldSample>, ReadError> {
-        Ok(self.last_before(end, 1)?.and_then(|window| window.samples.into_iter().next()))
+        Ok(self.last_before(end, 1)?.map(|window| window.newest()))
     }
 
     /// Holds the samples at `count` positions from `first`, in place; `None` if the first of
@@ -122,61 +116,90 @@ impl SharedReader {
     /// [`ReadError::OutOfHolds`].
     pub fn window(&self, first: u64, count: u32) -> Result<Option<HeldWindow>, ReadError> {
         let end = first.saturating_add(count.min(self.depth()).into());
-        let mut found = Vec::with_capacity((end - first) as usize);
-        found.extend((first..end).map_while(|position| self.look(position)));
-        if found.is_empty() {
-            return Ok(None);
-        }
-        let word = self.0.reserve(found.len() as u32)?;
-        let hazard = self.0.hazard(word);
-        set(hazard, HazardWindow { first, count: found.len() as u32 });
-        reader_fence();
-        // Positions leave in order: the oldest one stands for all.
-        let place = self.0.memory.place(first);
-        // Acquire: if it left, the `head` that the writer raised before is visible.
-        if place.seq.load(Ordering::Acquire) != first + 1 {
-            clear(hazard);
-            self.0.unreserve(word);
-            return Ok(None);
-        }
-        let hold = |found: FoundSample| HeldSample { shared: Arc::clone(&self.0), word, found };
-        Ok(Some(HeldWindow { samples: found.into_iter().map(hold).collect() }))
+        let found: Vec<_> = (first..end).map_while(|position| self.look(position)).collect();
+        self.hold(found)
     }
 
     /// Holds the newest samples below position `end`, `count` of them or fewer, oldest first.
+    ///
+    /// Samples that leave during the call may be missing, but not the newest one.
     ///
     /// # Errors
     ///
     /// [`ReadError::OutOfHolds`].
     pub fn last_before(&self, end: u64, count: u32) -> Result<Option<HeldWindow>, ReadError> {
+        self.newest_while(end, count, |_| true)
+    }
+
+    /// Holds the newest samples below position `end`, at most `max`, back to the first one whose
+    /// meta data `keep` refuses; oldest first. `keep` is called newest first, and more than once
+    /// for a sample if samples leave during the call.
+    ///
+    /// # Errors
+    ///
+    /// [`ReadError::OutOfHolds`].
+    pub fn newest_while(
+        &self,
+        end: u64,
+        max: u32,
+        mut keep: impl FnMut(&[u64; META_WORDS]) -> bool,
+    ) -> Result<Option<HeldWindow>, ReadError> {
         let mut head = self.head();
-        loop {
+        for _ in 0..ATTEMPTS {
             let end = head.min(end);
-            let oldest = head.saturating_sub(u64::from(self.depth()));
-            let first = end.saturating_sub(u64::from(count)).max(oldest);
-            if first >= end {
+            let oldest = head.saturating_sub(self.depth().into());
+            let oldest = end.saturating_sub(max.into()).max(oldest);
+            let mut refused = false;
+            let mut found: Vec<FoundSample> = Vec::new();
+            for position in (oldest..end).rev() {
+                let Some(sample) = self.look(position) else { break };
+                refused = !keep(&sample.meta);
+                if refused {
+                    break;
+                }
+                found.push(sample);
+            }
+            if oldest >= end || refused && found.is_empty() {
                 return Ok(None);
             }
-            if let Some(window) = self.window(first, (end - first) as u32)? {
+            found.reverse();
+            if let Some(window) = self.hold(found)? {
                 return Ok(Some(window));
             }
-            // Its oldest sample left, so `head` moved: the writer raised it before it took the
-            // sample away.
+            // A sample left, so `head` moved: the writer raised it before it took the sample away.
             let now = self.head();
             if now == head {
                 return Ok(None);
             }
             head = now;
         }
+        Ok(None)
     }
 
-    /// Reads the place of a position, if its sample is shown.
+    /// Holds samples at neighbouring positions, oldest first; `None` if there is none, or the
+    /// oldest has left.
+    fn hold(&self, found: Vec<FoundSample>) -> Result<Option<HeldWindow>, ReadError> {
+        let Some(oldest) = found.first().map(|oldest| oldest.position) else { return Ok(None) };
+        // Positions leave in order: the oldest one stands for all.
+        let is_shown = || self.is_shown(oldest);
+        let word = self.0.holds.hold(oldest, found.len() as u32, is_shown)?;
+        Ok(word.map(|word| HeldWindow::new(WindowHold::new(Arc::clone(&self.0), word, found))))
+    }
+
+    /// Returns whether the sample at `position` is shown. Acquire: if it left, the `head` that the
+    /// writer raised before is visible.
+    fn is_shown(&self, position: u64) -> bool {
+        let place = self.0.memory.place(position);
+        position.checked_add(1) == Some(place.seq.load(Ordering::Acquire))
+    }
+
+    /// Reads the place of a position, if its sample is shown and lies in the region.
     fn look(&self, position: u64) -> Option<FoundSample> {
-        let memory = &self.0.memory;
-        let place = memory.place(position);
-        if place.seq.load(Ordering::Acquire) != position + 1 {
+        if !self.is_shown(position) {
             return None;
         }
+        let memory = &self.0.memory;
+        let place = memory.place(position);
         let slot = place.slot.load(Ordering::Relaxed);
         let (slot, len) = ((slot >> 32) as u32, slot as u32);
         let layout = memory.layout();
@@ -188,119 +211,68 @@ impl SharedReader {
     }
 }
 
-impl ReaderState {
-    fn holds(&self) -> MutexGuard<'_, HoldTable> {
-        self.holds.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
-    }
+#[cfg(all(test, not(loom)))]
+mod tests {
+    use super::*;
+    use crate::shared::{ControlPage, SharedLayout, SharedWriter, in_process};
 
-    fn hazard(&self, word: u16) -> &crate::sync::AtomicU64 {
-        let words = self.limits.of_page(self.page.control()).unwrap_or_default();
-        &words[usize::from(word)]
-    }
-
-    /// Reserves a hazard word for `count` positions, with a handle on each.
-    fn reserve(&self, count: u32) -> Result<u16, ReadError> {
-        let mut holds = self.holds();
-        // Words for single positions come last, and are taken first.
-        let is_free = |(index, word): &(usize, &HazardUse)| {
-            word.handles == 0 && count <= self.limits.of_word(*index)
-        };
-        let free = holds.words.iter().enumerate().rfind(is_free);
-        let (word, _) = free.ok_or(ReadError::OutOfHolds)?;
-        holds.words[word] = HazardUse { handles: count };
-        Ok(word as u16)
-    }
-
-    /// Gives back a word whose hazard is cleared.
-    fn unreserve(&self, word: u16) {
-        self.holds().words[usize::from(word)].handles = 0;
-    }
-
-    /// Adds a handle to a word that has one.
-    fn share(&self, word: u16) {
-        let handles = &mut self.holds().words[usize::from(word)].handles;
-        *handles = handles.checked_add(1).expect("2^32 handles do not fit into memory");
-    }
-
-    /// Gives up one handle; the last one clears the hazard.
-    fn release(&self, word: u16) {
-        let mut holds = self.holds();
-        let handles = &mut holds.words[usize::from(word)].handles;
-        *handles -= 1;
-        if *handles == 0 {
-            clear(self.hazard(word));
+    fn topic() -> (SharedWriter, SharedReader) {
+        let layout = SharedLayout { depth: 4, slots: 16, slot_bytes: 64 };
+        let (memory, reading) = in_process(layout).unwrap();
+        let (mut writer, control) = (SharedWriter::new(memory), Arc::new(ControlPage::new()));
+        let limits = HoldLimits { first_word: 0, windows: 2, window: 4, singles: 2 };
+        writer.attach(control.clone(), limits).unwrap();
+        // SAFETY: the page is attached with these limits, and nothing else stores to it.
+        let reader = unsafe { SharedReader::new(&reading, control, limits) }.unwrap();
+        for value in 0..6 {
+            writer.draft(8).unwrap().fill(value);
+            writer.publish(&[value.into(); META_WORDS]).unwrap();
         }
-    }
-}
-
-/// Samples at neighbouring positions, held by one hazard until the last of them is dropped.
-pub struct HeldWindow {
-    samples: Vec<HeldSample>,
-}
-
-impl HeldWindow {
-    /// The samples, oldest first.
-    pub fn into_samples(self) -> Vec<HeldSample> {
-        self.samples
-    }
-}
-
-impl Deref for HeldWindow {
-    type Target = [HeldSample];
-
-    fn deref(&self) -> &[HeldSample] {
-        &self.samples
-    }
-}
-
-/// A sample that is held in place: its bytes do not change while a handle on it lives.
-pub struct HeldSample {
-    shared: Arc<ReaderState>,
-    word: u16,
-    found: FoundSample,
-}
-
-impl HeldSample {
-    /// Position of the sample.
-    pub fn position(&self) -> u64 {
-        self.found.position
+        (writer, reader)
     }
 
-    /// Words that the sample carries beside its bytes.
-    pub fn meta(&self) -> &[u64; META_WORDS] {
-        &self.found.meta
+    /// Reads in every way; no number that the writer stored may end the process or the search.
+    fn read_all(reader: &SharedReader) -> usize {
+        let mut found = 0;
+        for position in [0, 1, 5, 6, 1 << 48, u64::MAX - 1, u64::MAX] {
+            found += usize::from(reader.meta(position).is_some());
+            found += reader.get(position).unwrap().map_or(0, |held| held.len());
+            for end in [position, u64::MAX] {
+                found += reader.newest_before(end).unwrap().map_or(0, |held| held.len());
+                let windows = [reader.window(position, 4), reader.last_before(end, u32::MAX)];
+                found += windows.map(|window| window.unwrap().map_or(0, |held| held.len()))[0];
+            }
+        }
+        found
     }
 
-    /// The [`HEADROOM`] bytes and the sample as one slice.
-    pub fn with_headroom(&self) -> &[u8] {
-        let memory = &self.shared.memory;
-        memory.reads(self.found.slot);
-        let payload = memory.payload(self.found.slot);
-        let len = self.found.len as usize;
-        // SAFETY: `look` checked slot and length. The writer leaves the
-        // slot alone while our hazard names its position, and it filled the slot before it stored
-        // the `seq` that `look` loaded.
-        unsafe { slice::from_raw_parts(payload.sub(HEADROOM).as_ptr(), HEADROOM + len) }
+    #[test]
+    fn a_slot_or_length_outside_of_the_region_is_no_sample() {
+        let (_writer, reader) = topic();
+        let place = reader.0.memory.place(5);
+        for slot in [16_u64 << 32 | 8, u64::from(u32::MAX) << 32, 65, u64::MAX] {
+            place.slot.store(slot, Ordering::Relaxed);
+            assert!(reader.get(5).unwrap().is_none() && reader.meta(5).is_none());
+            assert!(reader.newest_before(u64::MAX).unwrap().is_none());
+            assert_eq!(reader.newest_before(5).unwrap().unwrap().position(), 4);
+        }
+        place.slot.store(15 << 32 | 64, Ordering::Relaxed);
+        assert_eq!(reader.get(5).unwrap().unwrap().len(), 64);
     }
-}
 
-impl Deref for HeldSample {
-    type Target = [u8];
-
-    fn deref(&self) -> &[u8] {
-        &self.with_headroom()[HEADROOM..]
-    }
-}
-
-impl Clone for HeldSample {
-    fn clone(&self) -> Self {
-        self.shared.share(self.word);
-        Self { shared: Arc::clone(&self.shared), word: self.word, found: self.found }
-    }
-}
-
-impl Drop for HeldSample {
-    fn drop(&mut self) {
-        self.shared.release(self.word);
+    #[test]
+    fn any_number_of_a_hostile_writer_ends_no_search() {
+        let (_writer, reader) = topic();
+        assert!(read_all(&reader) > 0);
+        let header = reader.0.memory.header();
+        for head in [0, 5, 7, 1 << 48, u64::MAX - 1, u64::MAX] {
+            header.head.store(head, Ordering::Relaxed);
+            for seq in [0, 6, 1 << 48, u64::MAX] {
+                for position in 0..5 {
+                    reader.0.memory.place(position).seq.store(seq, Ordering::Relaxed);
+                }
+                read_all(&reader);
+            }
+        }
     }
 }

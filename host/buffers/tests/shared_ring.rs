@@ -1,0 +1,146 @@
+#![cfg(not(loom))]
+#![allow(unsafe_code)]
+//! A ring over shared memory, through the interface of rings, and the words that its samples take.
+
+use std::sync::Arc;
+
+use gleaner_buffers::shared::{
+    ControlPage, HoldLimits, META_WORDS, SharedLayout, SharedReader, SharedWriter, in_process,
+};
+use gleaner_buffers::{Lease, RingCounts, RingReader};
+
+const LIMITS: HoldLimits = HoldLimits { first_word: 0, windows: 2, window: 3, singles: 2 };
+
+fn topic() -> (SharedWriter, SharedReader) {
+    let layout = SharedLayout { depth: 4, slots: 4 + LIMITS.quota() + 1, slot_bytes: 64 };
+    let (memory, reading) = in_process(layout).unwrap();
+    let (mut writer, control) = (SharedWriter::new(memory), Arc::new(ControlPage::new()));
+    writer.attach(control.clone(), LIMITS).unwrap();
+    // SAFETY: the page is attached with these limits, and nothing else stores to it.
+    let reader = unsafe { SharedReader::new(&reading, control, LIMITS) }.unwrap();
+    (writer, reader)
+}
+
+/// The ring from position `first` on; its metadata is the value of the sample.
+fn ring(reader: &SharedReader, first: u64, depth: usize) -> RingReader<u64> {
+    RingReader::shared(reader.clone(), first, depth, |words| words[0], |it| it.counters()[0])
+}
+
+/// Publishes samples whose bytes and metadata are the next values.
+fn publish(writer: &mut SharedWriter, count: u64) {
+    for _ in 0..count {
+        let value = writer.head();
+        writer.draft(8).unwrap().copy_from_slice(&value.to_le_bytes());
+        writer.publish(&[value; META_WORDS]).unwrap();
+    }
+}
+
+fn value(lease: &Lease<u64>) -> u64 {
+    assert_eq!(**lease, lease.meta().to_le_bytes());
+    *lease.meta()
+}
+
+fn values(leases: &[Lease<u64>]) -> Vec<u64> {
+    leases.iter().map(value).collect()
+}
+
+#[test]
+fn positions_count_from_the_first_sample_of_the_reader() {
+    let (mut writer, reader) = topic();
+    publish(&mut writer, 10);
+    let ring = ring(&reader, 10, 3);
+    assert_eq!((ring.head(), ring.depth()), (0, 3));
+    assert!(ring.newest().is_none() && ring.get(0).is_none() && ring.meta(0).is_none());
+    publish(&mut writer, 2);
+    let newest = ring.newest().unwrap();
+    assert_eq!((value(&newest), newest.position()), (11, Some(1)));
+    assert_eq!((ring.get(0).map(|it| value(&it)), ring.meta(0)), (Some(10), Some(10)));
+    let mut all = Vec::new();
+    ring.last(9, &mut all);
+    assert_eq!(values(&all), [10, 11], "samples from before it are hidden");
+    assert!(ring.get(2).is_none() && ring.get(u64::MAX).is_none());
+}
+
+#[test]
+fn a_ring_shows_its_own_depth_of_a_deeper_topic() {
+    let (mut writer, reader) = topic();
+    let ring = ring(&reader, 0, 3);
+    publish(&mut writer, 5);
+    let mut all = Vec::new();
+    ring.last(9, &mut all);
+    assert_eq!(values(&all), [2, 3, 4]);
+    assert!(ring.get(1).is_none() && ring.meta(1).is_none(), "the topic still shows it");
+    ring.last_before(4, 9, &mut all);
+    assert_eq!(values(&all), [2, 3]);
+    ring.last_before(2, 9, &mut all);
+    assert!(all.is_empty() && ring.newest_before(2).is_none());
+    assert_eq!(ring.newest_before(4).map(|it| value(&it)), Some(3));
+    ring.newest_while(2, |_| true, &mut all);
+    assert_eq!(values(&all), [3, 4]);
+    ring.newest_while(9, |value| *value > 3, &mut all);
+    assert_eq!(values(&all), [4]);
+    ring.newest_while(9, |value| *value < 4, &mut all);
+    assert!(all.is_empty(), "the newest one is refused");
+    ring.last(0, &mut all);
+    assert!(all.is_empty());
+}
+
+#[test]
+fn counts_begin_with_the_ring() {
+    let (mut writer, reader) = topic();
+    publish(&mut writer, 3);
+    writer.set_counters(&[5; 8]);
+    let ring = ring(&reader, 3, 4);
+    assert_eq!(ring.counts(), RingCounts::default());
+    publish(&mut writer, 6);
+    writer.set_counters(&[7; 8]);
+    let counts = RingCounts { received: 6, overwritten: 2, no_slot: 0, too_big: 2 };
+    assert_eq!(ring.counts(), counts);
+}
+
+#[test]
+fn a_lease_keeps_its_bytes_as_long_as_any_clone_lives() {
+    let (mut writer, reader) = topic();
+    let ring = ring(&reader, 0, 4);
+    publish(&mut writer, 3);
+    let mut window = Vec::new();
+    ring.last(3, &mut window);
+    let one = window[1].clone();
+    drop((window, ring, reader));
+    publish(&mut writer, 100);
+    assert_eq!((value(&one), one.with_headroom()[..4].to_vec()), (1, vec![0; 4]));
+}
+
+#[test]
+fn reads_of_held_samples_take_no_further_word() {
+    let (mut writer, reader) = topic();
+    let ring = ring(&reader, 0, 4);
+    publish(&mut writer, 3);
+    let mut window = Vec::new();
+    ring.last(3, &mut window);
+    let more: Vec<_> = (0..50).flat_map(|_| [ring.newest(), ring.get(1), ring.get(0)]).collect();
+    assert_eq!((more.iter().flatten().count(), ring.refused_holds()), (150, 0));
+    // The word is in use until the last of them is dropped.
+    drop(window);
+    publish(&mut writer, 100);
+    assert!(more.iter().flatten().all(|lease| value(lease) < 3));
+}
+
+#[test]
+fn reads_without_a_free_word_are_counted_and_words_return() {
+    let (mut writer, reader) = topic();
+    let ring = ring(&reader, 0, 4);
+    let mut kept = Vec::new();
+    for _ in 0..4 {
+        publish(&mut writer, 1);
+        kept.extend(ring.newest());
+    }
+    publish(&mut writer, 1);
+    assert_eq!((kept.len(), ring.refused_holds()), (4, 0));
+    let mut all = Vec::new();
+    ring.last(1, &mut all);
+    assert!(ring.newest().is_none() && ring.get(4).is_none() && all.is_empty());
+    assert_eq!((ring.refused_holds(), ring.meta(4)), (3, Some(4)));
+    kept.pop();
+    assert_eq!((ring.newest().map(|it| value(&it)), ring.refused_holds()), (Some(4), 3));
+}
