@@ -4,13 +4,22 @@
 //! sockets to the ingress, and passes the other end to the reader. The reader requests no topics;
 //! it receives descriptors of exactly those that were granted.
 
+mod client;
+mod control;
 mod grant;
+mod grant_check;
+mod grant_rules;
 mod message;
+mod reader;
 mod source;
 
+pub use client::{IngressLink, IngressRequests, ReaderDelivery};
+pub use control::{IngressControl, IngressRequest, IngressServer};
 pub use grant::{AddReader, AddTopics, HoldGrant, PublishGrant, TopicGrant};
+pub use grant_check::GrantError;
 pub use message::{
     AttachedTopic, IngressReport, IngressStatus, IngressTopic, ReaderMessage, RefusedTopic,
     RegionLayout, SourceStatus,
 };
+pub use reader::{PUBLISH_MAX, ReaderLink, ReaderRequest};
 pub use source::{Health, Qos, ReceptionStatus};

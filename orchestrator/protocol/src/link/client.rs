@@ -92,6 +92,7 @@ impl RecorderLink {
                 peer: "the lambda",
                 frame: "hello",
                 bytes: payload.len() as u64,
+                max: super::FRAME_MAX,
             });
         }
         self.encoder = OpaqueEncoder(Encoder::new(header.inputs.len()));

@@ -1,28 +1,18 @@
 //! The control connection, from the program that starts the recorder to the recorder.
 
-use std::collections::VecDeque;
-use std::io::{self, BufReader, IoSlice, IoSliceMut, Read};
-use std::mem::MaybeUninit;
+use std::io;
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
 
-use rustix::io::Errno;
-use rustix::net::{
-    RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer,
-    SendAncillaryMessage, SendFlags, recvmsg, send, sendmsg,
-};
 use serde::{Deserialize, Serialize};
 
-use super::LinkError;
 use super::frame::{self, tag};
+use super::{FrameReceiver, LinkError, outgoing};
 use gleaner_lambda::manifest::Limits;
 
 const STARTER: &str = "the starter";
 const RECORDER: &str = "the recorder";
-
-/// Maximum number of received sockets that wait for their frame. Each frame has one.
-const SOCKETS: usize = 16;
 
 /// Adds a lambda to the recorder.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -74,26 +64,10 @@ impl ControlClient {
                 peer: STARTER,
                 frame: "add",
                 bytes: payload.len() as u64,
+                max: super::FRAME_MAX,
             });
         }
-        // The socket is sent with the first bytes, so that it arrives before the frame is complete.
-        let fds = [recorder_end.as_fd()];
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
-        let mut ancillary = SendAncillaryBuffer::new(&mut space);
-        ancillary.push(SendAncillaryMessage::ScmRights(&fds));
-        let sent = loop {
-            match sendmsg(
-                &self.socket,
-                &[IoSlice::new(&bytes)],
-                &mut ancillary,
-                SendFlags::NOSIGNAL,
-            ) {
-                Ok(sent) => break sent,
-                Err(Errno::INTR) => {}
-                Err(error) => return Err(LinkError::of(RECORDER, error)),
-            }
-        };
-        self.send(&bytes[sent..])?;
+        outgoing::send_frame(&self.socket, &bytes, &[recorder_end.as_fd()], RECORDER)?;
         Ok(lambda_end.into())
     }
 
@@ -103,19 +77,7 @@ impl ControlClient {
     ///
     /// [`LinkError::Gone`] if it has ended.
     pub fn stop(&mut self) -> Result<(), LinkError> {
-        self.send(&frame::encode(tag::STOP, &[]))
-    }
-
-    /// Sends all of `bytes`. A recorder that has ended is an error, not a signal.
-    fn send(&self, mut bytes: &[u8]) -> Result<(), LinkError> {
-        while !bytes.is_empty() {
-            match send(&self.socket, bytes, SendFlags::NOSIGNAL) {
-                Ok(sent) => bytes = &bytes[sent..],
-                Err(Errno::INTR) => {}
-                Err(error) => return Err(LinkError::of(RECORDER, error)),
-            }
-        }
-        Ok(())
+        outgoing::send_frame(&self.socket, &frame::encode(tag::STOP, &[]), &[], RECORDER)
     }
 }
 
@@ -131,15 +93,14 @@ pub enum ControlMessage {
 /// The recorder's end of the control connection.
 #[derive(Debug)]
 pub struct ControlServer {
-    from: BufReader<Receiver>,
-    payload: Vec<u8>,
+    socket: OwnedFd,
+    frames: FrameReceiver,
 }
 
 impl ControlServer {
     /// Creates the server from the socket that is the recorder's standard input.
     pub fn new(socket: OwnedFd) -> ControlServer {
-        let receiver = Receiver { socket, received: VecDeque::new() };
-        ControlServer { from: BufReader::new(receiver), payload: Vec::new() }
+        ControlServer { socket, frames: FrameReceiver::new(STARTER, 1) }
     }
 
     /// Waits for the next request. `None` when the starter has ended.
@@ -148,42 +109,14 @@ impl ControlServer {
     ///
     /// [`LinkError`] names the invalid frame; nothing can be read after it.
     pub fn receive(&mut self) -> Result<Option<ControlMessage>, LinkError> {
-        match frame::read(&mut self.from, &mut self.payload, STARTER)? {
-            None => Ok(None),
-            Some(tag::STOP) => Ok(Some(ControlMessage::Stop)),
-            Some(tag::ADD) => {
-                let add = serde_json::from_slice(&self.payload).map_err(|error| {
-                    LinkError::Malformed { peer: STARTER, frame: "add", reason: error.to_string() }
-                })?;
-                let socket = self.from.get_mut().received.pop_front().ok_or(LinkError::NoSocket)?;
-                Ok(Some(ControlMessage::Add(add, socket)))
+        let Some(mut received) = self.frames.wait(&self.socket)? else { return Ok(None) };
+        match received.tag {
+            tag::STOP => Ok(Some(ControlMessage::Stop)),
+            tag::ADD => {
+                let add = received.json(STARTER)?;
+                Ok(Some(ControlMessage::Add(add, received.descriptor()?)))
             }
-            Some(tag) => Err(LinkError::Unknown { peer: STARTER, tag }),
+            tag => Err(LinkError::Unknown { peer: STARTER, tag }),
         }
-    }
-}
-
-/// Reads bytes, and keeps the sockets that come with them.
-#[derive(Debug)]
-struct Receiver {
-    socket: OwnedFd,
-    received: VecDeque<OwnedFd>,
-}
-
-impl Read for Receiver {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
-        let mut ancillary = RecvAncillaryBuffer::new(&mut space);
-        let flags = RecvFlags::CMSG_CLOEXEC;
-        let bytes =
-            recvmsg(&self.socket, &mut [IoSliceMut::new(buffer)], &mut ancillary, flags)?.bytes;
-        for message in ancillary.drain() {
-            if let RecvAncillaryMessage::ScmRights(sockets) = message {
-                // Excess sockets are closed.
-                let room = SOCKETS.saturating_sub(self.received.len());
-                self.received.extend(sockets.take(room));
-            }
-        }
-        Ok(bytes)
     }
 }

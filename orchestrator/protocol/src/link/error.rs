@@ -4,7 +4,7 @@ use std::io;
 
 use rustix::io::Errno;
 
-use super::FRAME_MAX;
+use crate::ingress::GrantError;
 use gleaner_base::{Exit, Explain};
 use gleaner_journal::MalformedWake;
 
@@ -14,7 +14,7 @@ pub enum LinkError {
     /// The other side has ended, or closed the connection.
     #[error("{peer} has ended, or closed the connection")]
     Gone {
-        /// "the recorder", "the lambda" or "the starter".
+        /// Its name in messages, such as "the recorder".
         peer: &'static str,
     },
     /// The recorder refuses the lambda.
@@ -30,7 +30,7 @@ pub enum LinkError {
         seconds: u64,
     },
     /// A frame is too long.
-    #[error("frame `{frame}` from {peer} has {bytes} bytes, above the maximum of {FRAME_MAX}")]
+    #[error("frame `{frame}` from {peer} has {bytes} bytes, above the maximum of {max}")]
     TooLong {
         /// Sender of the frame.
         peer: &'static str,
@@ -38,6 +38,8 @@ pub enum LinkError {
         frame: &'static str,
         /// The length in its head.
         bytes: u64,
+        /// The maximum.
+        max: usize,
     },
     /// A frame has an unknown tag, or one for another connection.
     #[error("frame {tag} from {peer} is unknown")]
@@ -75,9 +77,33 @@ pub enum LinkError {
         /// The cause.
         source: MalformedWake,
     },
-    /// A lambda was added without its socket.
-    #[error("frame `add` came without a socket")]
-    NoSocket,
+    /// A frame lacks the descriptor that belongs to it.
+    #[error("frame `{frame}` came without its descriptor")]
+    NoDescriptor {
+        /// Name of the frame.
+        frame: &'static str,
+    },
+    /// The starter did not pass a connection that the program needs.
+    #[error("the starter passed no connection `{name}`")]
+    NoConnection {
+        /// Its name.
+        name: &'static str,
+    },
+    /// The standard input of a program is no connection to a starter.
+    #[error("the standard input is no socket of a program that starts this one")]
+    NoStarter,
+    /// A grant to a reader is invalid.
+    #[error("cannot grant topics to a reader")]
+    Grant {
+        /// The cause.
+        source: GrantError,
+    },
+    /// The other side does not read, and the queue of messages to it is full.
+    #[error("{peer} does not read its messages")]
+    Full {
+        /// Its name in messages.
+        peer: &'static str,
+    },
     /// The socket failed.
     #[error("the connection to {peer} failed")]
     Socket {
@@ -90,7 +116,7 @@ pub enum LinkError {
 
 impl LinkError {
     /// Converts the error of a socket to `peer`.
-    pub(super) fn of(peer: &'static str, error: Errno) -> LinkError {
+    pub(crate) fn of(peer: &'static str, error: Errno) -> LinkError {
         match error {
             Errno::PIPE | Errno::CONNRESET => LinkError::Gone { peer },
             error => LinkError::Socket { peer, source: error.into() },
@@ -105,8 +131,12 @@ impl Explain for LinkError {
                 Some("build the lambda again, and restart recorder and lambda".to_owned())
             }
             LinkError::Unknown { .. } => {
-                Some("use recorder and runtime of the same version".to_owned())
+                Some("use programs of the same version of Gleaner".to_owned())
             }
+            LinkError::NoStarter => {
+                Some("start it with `gleaner run`, which passes it its connections".to_owned())
+            }
+            LinkError::Grant { source } => source.help(),
             _ => None,
         }
     }
@@ -116,7 +146,8 @@ impl Explain for LinkError {
             LinkError::Gone { .. } | LinkError::Silent { .. } | LinkError::Socket { .. } => {
                 Exit::Unreachable
             }
-            LinkError::Refused { .. } => Exit::Usage,
+            LinkError::Refused { .. } | LinkError::NoStarter => Exit::Usage,
+            LinkError::Grant { source } => source.exit(),
             _ => Exit::Internal,
         }
     }

@@ -9,14 +9,22 @@ use super::LinkError;
 pub const FRAME_MAX: usize = 2 << 20;
 
 /// Length of the head, before the payload.
-pub(super) const HEAD: usize = 5;
+pub(crate) const HEAD: usize = 5;
 
 /// Tags of frames.
-pub(super) mod tag {
+pub(crate) mod tag {
     /// Starter to recorder: a lambda, as JSON, with its socket.
     pub(crate) const ADD: u8 = 1;
-    /// Starter to recorder: complete open clips and exit.
+    /// Starter to recorder: complete open clips and exit. Starter to ingress: exit.
     pub(crate) const STOP: u8 = 2;
+    /// Starter to ingress: a reader, as JSON, with its socket.
+    pub(crate) const ADD_READER: u8 = 3;
+    /// Starter to ingress: further topics for a reader, as JSON.
+    pub(crate) const ADD_TOPICS: u8 = 4;
+    /// Starter to ingress: play the drive.
+    pub(crate) const BEGIN: u8 = 5;
+    /// Starter to a program that it starts: names of connections as JSON, with their sockets.
+    pub(crate) const HANDOVER: u8 = 6;
     /// Lambda to recorder: the header of its journal, as JSON. Sent once, first.
     pub(crate) const HELLO: u8 = 16;
     /// Lambda to recorder: `i64` time of the decision, `u32` number of missing wakes before it, and
@@ -30,10 +38,16 @@ pub(super) mod tag {
     pub(crate) const REFUSED: u8 = 33;
     /// Recorder to lambda: `u64` ns from a decision with triggers to the opening of its windows.
     pub(crate) const OPENED: u8 = 34;
+    /// Ingress to reader: a message as JSON; some with a descriptor.
+    pub(crate) const READER: u8 = 48;
+    /// Reader to ingress: `u32` id of the topic whose definitions it needs.
+    pub(crate) const DEFINITIONS: u8 = 64;
+    /// Reader to ingress: `u32` index of the topic to publish, and a message.
+    pub(crate) const PUBLISH: u8 = 65;
 }
 
 /// Returns the name of a tag for messages.
-pub(super) fn name(tag: u8) -> &'static str {
+pub(crate) fn name(tag: u8) -> &'static str {
     match tag {
         tag::ADD => "add",
         tag::STOP => "stop",
@@ -43,18 +57,25 @@ pub(super) fn name(tag: u8) -> &'static str {
         tag::READY => "ready",
         tag::REFUSED => "refused",
         tag::OPENED => "opened",
+        tag::ADD_READER => "add reader",
+        tag::ADD_TOPICS => "add topics",
+        tag::BEGIN => "begin",
+        tag::HANDOVER => "handover",
+        tag::READER => "message",
+        tag::DEFINITIONS => "definitions",
+        tag::PUBLISH => "publish",
         _ => "unknown",
     }
 }
 
 /// Begins a frame in `out`; [`close`] completes it.
-pub(super) fn open(tag: u8, out: &mut Vec<u8>) {
+pub(crate) fn open(tag: u8, out: &mut Vec<u8>) {
     out.clear();
     out.extend_from_slice(&[0, 0, 0, 0, tag]);
 }
 
 /// Completes the frame in `out` with its length. Returns `false` if it is too long.
-pub(super) fn close(out: &mut [u8]) -> bool {
+pub(crate) fn close(out: &mut [u8]) -> bool {
     let len = out.len() - HEAD;
     if let (true, Ok(len)) = (len <= FRAME_MAX, u32::try_from(len)) {
         out[..4].copy_from_slice(&len.to_le_bytes());
@@ -64,7 +85,7 @@ pub(super) fn close(out: &mut [u8]) -> bool {
 }
 
 /// Returns a complete frame.
-pub(super) fn encode(tag: u8, payload: &[u8]) -> Vec<u8> {
+pub(crate) fn encode(tag: u8, payload: &[u8]) -> Vec<u8> {
     let mut out = Vec::with_capacity(HEAD + payload.len());
     open(tag, &mut out);
     out.extend_from_slice(payload);
@@ -73,18 +94,18 @@ pub(super) fn encode(tag: u8, payload: &[u8]) -> Vec<u8> {
 }
 
 /// Parses a head: tag and length.
-pub(super) fn head(bytes: [u8; HEAD], peer: &'static str) -> Result<(u8, usize), LinkError> {
+pub(crate) fn head(bytes: [u8; HEAD], peer: &'static str) -> Result<(u8, usize), LinkError> {
     let [a, b, c, d, tag] = bytes;
     let len = u32::from_le_bytes([a, b, c, d]);
     match usize::try_from(len) {
         Ok(len) if len <= FRAME_MAX => Ok((tag, len)),
-        _ => Err(LinkError::TooLong { peer, frame: name(tag), bytes: len.into() }),
+        _ => Err(LinkError::TooLong { peer, frame: name(tag), bytes: len.into(), max: FRAME_MAX }),
     }
 }
 
 /// Reads the next frame from `peer` into `payload`; returns its tag, `None` at the end. Memory is
 /// allocated as bytes arrive, not by the length in the head.
-pub(super) fn read(
+pub(crate) fn read(
     from: &mut impl Read,
     payload: &mut Vec<u8>,
     peer: &'static str,

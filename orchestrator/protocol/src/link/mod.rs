@@ -6,6 +6,7 @@
 //! a lambda cannot send for another.
 //!
 //! - `frame`: a length, a tag, a payload; never longer than [`FRAME_MAX`].
+//! - `incoming` and `outgoing`: frames with descriptors, of any connection between programs.
 //! - `control`: from the starter to the recorder: [`ControlClient`] and [`ControlServer`].
 //! - `client`: from a lambda's process to the recorder, without blocking: [`RecorderLink`].
 //! - `server`: the recorder's end of that: [`LambdaLink`].
@@ -15,8 +16,10 @@
 mod client;
 mod control;
 mod error;
-mod frame;
+pub(crate) mod frame;
 mod grants;
+mod incoming;
+mod outgoing;
 mod queue;
 mod report;
 mod server;
@@ -28,5 +31,8 @@ pub use control::{AddLambda, ControlClient, ControlMessage, ControlServer};
 pub use error::LinkError;
 pub use frame::FRAME_MAX;
 pub use grants::{COMMANDS_ID, commands_grant, recorded_grant};
+pub use incoming::Incoming;
+pub(crate) use incoming::{FrameReceiver, ReceivedFrame};
+pub(crate) use outgoing::{FrameQueue, send_frame};
 pub use report::{CommandStatus, Loss, RecordedTopic, RecorderReport, RecorderStatus};
 pub use server::{LambdaLink, LambdaMessage, LambdaReplies};

@@ -4,11 +4,8 @@ use std::io::{self, BufReader};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 
-use rustix::io::Errno;
-use rustix::net::{SendFlags, send};
-
-use super::LinkError;
 use super::frame::{self, tag};
+use super::{FrameQueue, LinkError};
 use gleaner_journal::{Decoder, INPUTS_MAX, JournalEntry, JournalHeader};
 
 const LAMBDA: &str = "the lambda";
@@ -49,8 +46,8 @@ pub struct LambdaLink {
 #[derive(Debug)]
 pub struct LambdaReplies {
     socket: UnixStream,
-    /// The rest of a partly sent frame.
-    rest: Vec<u8>,
+    /// A frame that is not sent completely.
+    pending: FrameQueue,
 }
 
 impl LambdaLink {
@@ -61,7 +58,7 @@ impl LambdaLink {
     /// Errors of the system, such as too many open files.
     pub fn new(socket: OwnedFd) -> io::Result<(LambdaLink, LambdaReplies)> {
         let socket = UnixStream::from(socket);
-        let replies = LambdaReplies { socket: socket.try_clone()?, rest: Vec::new() };
+        let replies = LambdaReplies { socket: socket.try_clone()?, pending: FrameQueue::default() };
         Ok((
             LambdaLink { from: BufReader::new(socket), payload: Vec::new(), decoder: None },
             replies,
@@ -158,24 +155,13 @@ impl LambdaReplies {
     /// Sends a frame, or drops it if the other side does not read. Only times can be lost, as the
     /// first replies always fit.
     fn send(&mut self, tag: u8, payload: &[u8]) {
-        let pending = std::mem::take(&mut self.rest);
-        self.rest = self.try_send(pending);
-        if self.rest.is_empty() {
-            self.rest = self.try_send(frame::encode(tag, payload));
+        // The reader of the connection will notice an error.
+        if self.pending.flush(&self.socket, LAMBDA).is_err() {
+            self.pending = FrameQueue::default();
         }
-    }
-
-    /// Sends `bytes`; returns the rest that could not be sent.
-    fn try_send(&self, mut bytes: Vec<u8>) -> Vec<u8> {
-        while !bytes.is_empty() {
-            match send(&self.socket, &bytes, SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
-                Ok(sent) => drop(bytes.drain(..sent)),
-                Err(Errno::INTR) => {}
-                Err(Errno::AGAIN) => break,
-                // The reader of the connection will notice.
-                Err(_) => bytes.clear(),
-            }
+        if self.pending.is_empty() {
+            self.pending.push(frame::encode(tag, payload), None);
+            let _ = self.pending.flush(&self.socket, LAMBDA);
         }
-        bytes
     }
 }

@@ -343,7 +343,7 @@ fn invalid_frames_of_a_starter_are_refused_by_name() {
         ControlServer::new(OwnedFd::from(recorder_end)).receive().unwrap_err().to_string()
     };
     let add = serde_json::to_vec(&add("x")).unwrap();
-    assert_eq!(refusal(&frame::encode(tag::ADD, &add)), "frame `add` came without a socket");
+    assert_eq!(refusal(&frame::encode(tag::ADD, &add)), "frame `add` came without its descriptor");
     assert!(
         refusal(&frame::encode(tag::ADD, b"[]"))
             .starts_with("frame `add` from the starter is invalid")
@@ -411,7 +411,7 @@ fn a_request_that_is_too_long_is_not_sent() {
     assert!(
         matches!(
             refused,
-            LinkError::TooLong { peer: "the starter", frame: "add", bytes }
+            LinkError::TooLong { peer: "the starter", frame: "add", bytes, .. }
                 if bytes > FRAME_MAX as u64
         ),
         "{refused}"

@@ -1,0 +1,115 @@
+//! Sends frames and their descriptors over a socket.
+
+use std::collections::VecDeque;
+use std::io::IoSlice;
+use std::mem::MaybeUninit;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+
+use rustix::io::Errno;
+use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, send, sendmsg};
+
+use super::LinkError;
+
+/// Largest number of descriptors with a frame of any connection.
+const DESCRIPTORS: usize = 4;
+
+/// Sends a frame and its descriptors, and waits until the other side has room for all of it. A peer
+/// that has ended is an error, not a signal.
+pub(crate) fn send_frame(
+    socket: &impl AsFd,
+    mut bytes: &[u8],
+    mut descriptors: &[BorrowedFd<'_>],
+    peer: &'static str,
+) -> Result<(), LinkError> {
+    while !bytes.is_empty() {
+        match send_some(socket, bytes, descriptors, SendFlags::empty()) {
+            Ok(sent) => {
+                bytes = &bytes[sent..];
+                descriptors = &[];
+            }
+            Err(Errno::INTR) => {}
+            Err(error) => return Err(LinkError::of(peer, error)),
+        }
+    }
+    Ok(())
+}
+
+/// Sends the first of `bytes`. Descriptors go with the first byte, so that they arrive before the
+/// frame is complete.
+fn send_some(
+    socket: &impl AsFd,
+    bytes: &[u8],
+    descriptors: &[BorrowedFd<'_>],
+    flags: SendFlags,
+) -> Result<usize, Errno> {
+    let flags = flags | SendFlags::NOSIGNAL;
+    if descriptors.is_empty() {
+        // A lambda's process must not call `sendmsg`, which can also send files.
+        return send(socket, bytes, flags);
+    }
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(DESCRIPTORS))];
+    let mut ancillary = SendAncillaryBuffer::new(&mut space);
+    if !ancillary.push(SendAncillaryMessage::ScmRights(descriptors)) {
+        return Err(Errno::INVAL);
+    }
+    sendmsg(socket, &[IoSlice::new(bytes)], &mut ancillary, flags)
+}
+
+/// Frames that wait until the other side reads.
+#[derive(Debug, Default)]
+pub(crate) struct FrameQueue {
+    frames: VecDeque<OutgoingFrame>,
+    /// Number of bytes of all frames.
+    bytes: usize,
+    /// Number of bytes of the first frame that are sent.
+    sent: usize,
+}
+
+#[derive(Debug)]
+struct OutgoingFrame {
+    bytes: Vec<u8>,
+    descriptor: Option<OwnedFd>,
+}
+
+impl FrameQueue {
+    /// Adds a frame.
+    pub(crate) fn push(&mut self, bytes: Vec<u8>, descriptor: Option<OwnedFd>) {
+        self.bytes += bytes.len();
+        self.frames.push_back(OutgoingFrame { bytes, descriptor });
+    }
+
+    /// Sends what the other side has room for. Never waits.
+    pub(crate) fn flush(
+        &mut self,
+        socket: &impl AsFd,
+        peer: &'static str,
+    ) -> Result<(), LinkError> {
+        while let Some(first) = self.frames.front_mut() {
+            let descriptors: Vec<_> = first.descriptor.iter().map(AsFd::as_fd).collect();
+            match send_some(socket, &first.bytes[self.sent..], &descriptors, SendFlags::DONTWAIT) {
+                Ok(sent) => {
+                    first.descriptor = None;
+                    self.sent += sent;
+                }
+                Err(Errno::INTR) => {}
+                Err(Errno::AGAIN) => return Ok(()),
+                Err(error) => return Err(LinkError::of(peer, error)),
+            }
+            if let Some(frame) = self.frames.pop_front_if(|frame| frame.bytes.len() <= self.sent) {
+                self.bytes -= frame.bytes.len();
+                self.sent = 0;
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns true if all frames are sent.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+
+    /// Returns the number of bytes of frames that are not sent completely.
+    pub(crate) fn bytes(&self) -> usize {
+        self.bytes
+    }
+}
