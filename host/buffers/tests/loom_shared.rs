@@ -15,9 +15,18 @@ use loom::sync::atomic::{AtomicU32, Ordering};
 use loom::thread;
 
 fn topic(depth: u32, slots: u32, windows: u16, singles: u16) -> (SharedWriter, SharedReader) {
+    warm_topic(depth, slots, 0, (windows, singles))
+}
+
+fn warm_topic(
+    depth: u32,
+    slots: u32,
+    warm: u32,
+    (windows, singles): (u16, u16),
+) -> (SharedWriter, SharedReader) {
     let (memory, reading) = in_process(SharedLayout { depth, slots, slot_bytes: 8 }).unwrap();
     let control = Arc::new(ControlPage::new());
-    let mut writer = SharedWriter::new(memory);
+    let mut writer = SharedWriter::with_warm_slots(memory, warm);
     let limits = HoldLimits { first_word: 0, windows, window: 2, singles };
     writer.attach(control.clone(), limits).unwrap();
     // SAFETY: the page is attached with these limits, and nothing else stores to it.
@@ -72,6 +81,31 @@ fn a_held_sample_does_not_change() {
     one();
 }
 
+/// Slots that one look at the hazards frees are used by later drafts, without another look.
+#[test]
+fn a_sample_in_a_slot_that_was_freed_before_does_not_change() {
+    let _alone = alone();
+    loom::model(|| {
+        let (mut writer, reader) = warm_topic(1, 4, 4, (0, 1));
+        for value in 0..4 {
+            publish(&mut writer, value);
+        }
+        let reading = thread::spawn(move || {
+            if let Some(hold) = reader.get(3).unwrap() {
+                check(&hold);
+            }
+            if let Some(hold) = reader.get(4).unwrap() {
+                check(&hold);
+            }
+        });
+        // The first frees three slots, the last two of them again.
+        for value in 4..8 {
+            publish(&mut writer, value);
+        }
+        reading.join().unwrap();
+    });
+}
+
 #[test]
 fn a_held_window_does_not_change() {
     let _alone = alone();
@@ -113,6 +147,47 @@ fn a_held_sample_stays_while_other_words_move() {
             check(&steady);
         });
         publish(&mut writer, 8);
+        reading.join().unwrap();
+    });
+}
+
+#[test]
+fn meta_data_without_a_hold_is_that_of_its_position() {
+    let _alone = alone();
+    loom::model(|| {
+        let (mut writer, reader) = topic(1, 3, 0, 1);
+        publish(&mut writer, 0);
+        let reading = thread::spawn(move || {
+            for position in 0..2 {
+                assert!(reader.meta(position).is_none_or(|meta| meta[0] == position));
+            }
+        });
+        publish(&mut writer, 1);
+        publish(&mut writer, 2);
+        publish(&mut writer, 3);
+        reading.join().unwrap();
+    });
+}
+
+#[test]
+fn a_shared_hold_protects_until_both_threads_are_done() {
+    let _alone = alone();
+    loom::model(|| {
+        let (mut writer, reader) = topic(1, 3, 0, 1);
+        publish(&mut writer, 0);
+        let other = reader.clone();
+        let reading = thread::spawn(move || {
+            if let Some(hold) = other.get(0).unwrap() {
+                check(&hold);
+            }
+        });
+        // The one word of both threads.
+        if let Some(hold) = reader.get(0).unwrap() {
+            publish(&mut writer, 1);
+            publish(&mut writer, 2);
+            check(&hold);
+        }
+        publish(&mut writer, 3);
         reading.join().unwrap();
     });
 }

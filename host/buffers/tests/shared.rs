@@ -67,6 +67,11 @@ fn readers_see_the_newest_samples() {
     assert!(reader.newest_before(2).unwrap().is_none(), "0 and 1 have left");
     assert_eq!(positions(&reader.last_before(u64::MAX, 3).unwrap().unwrap()), [3, 4, 5]);
     assert_eq!(positions(&reader.last_before(4, 9).unwrap().unwrap()), [2, 3]);
+    assert!(writer.shown(1).is_none() && writer.shown(6).is_none());
+    assert_eq!(
+        writer.shown(2).unwrap(),
+        (&*reader.get(2).unwrap().unwrap(), [2, 80, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2])
+    );
     writer.set_counters(&[1, 2, 3, 4, 5, 6, 7, 8]);
     assert_eq!(reader.counters(), [1, 2, 3, 4, 5, 6, 7, 8]);
     assert!(reader.get(1).unwrap().is_none() && reader.get(6).unwrap().is_none());
@@ -90,6 +95,43 @@ fn a_held_sample_stays_until_its_last_handle_is_dropped() {
         reader.get(position).unwrap().unwrap().with_headroom().as_ptr() == bytes
     });
     assert!(later, "the slot is used again");
+}
+
+#[test]
+fn further_slots_are_used_only_while_samples_are_held() {
+    let (memory, reading) =
+        in_process(SharedLayout { depth: 2, slots: 32, slot_bytes: 256 }).unwrap();
+    let mut writer = SharedWriter::with_warm_slots(memory, 6);
+    let control = Arc::new(ControlPage::new());
+    let limits = HoldLimits { first_word: 0, windows: 0, window: 0, singles: 9 };
+    writer.attach(control.clone(), limits).unwrap();
+    // SAFETY: the page is attached with these limits, and nothing else stores to it.
+    let reader = unsafe { SharedReader::new(&reading, control, limits) }.unwrap();
+    let mut used = std::collections::BTreeSet::new();
+    let mut publish_some = |writer: &mut SharedWriter, samples: usize| {
+        let publish_one = |_| {
+            publish(writer);
+            let newest = reader.newest_before(u64::MAX).unwrap().unwrap();
+            used.insert(newest.as_ptr() as usize);
+            newest
+        };
+        let newest: Vec<HeldSample> = (0..samples).map(publish_one).collect();
+        (used.len(), newest)
+    };
+    for _ in 0..100 {
+        publish_some(&mut writer, 1);
+    }
+    assert_eq!(publish_some(&mut writer, 1).0, 6);
+    let held = publish_some(&mut writer, 8).1;
+    for _ in 0..100 {
+        publish_some(&mut writer, 1);
+    }
+    let most = publish_some(&mut writer, 1).0;
+    assert_eq!(most, 8 + 2 + 1, "held, shown and drafted");
+    drop(held);
+    for _ in 0..100 {
+        assert_eq!(publish_some(&mut writer, 1).0, most, "those are used again");
+    }
 }
 
 #[test]
@@ -125,6 +167,9 @@ fn quotas_beyond_the_slots_are_refused() {
 fn layouts_that_no_region_can_have_are_refused() {
     let layout = SharedLayout { depth: 1, slots: 3, slot_bytes: 100 };
     assert!(layout.bytes_needed().is_some());
+    assert_eq!(Some(layout.bytes_of_first(3)), layout.bytes_needed());
+    assert_eq!(Some(layout.bytes_of_first(u32::MAX)), layout.bytes_needed());
+    assert!(layout.bytes_of_first(2) < layout.bytes_of_first(3));
     for impossible in [
         SharedLayout { depth: 0, ..layout },
         SharedLayout { slots: 1, ..layout },
@@ -176,8 +221,10 @@ fn a_sample_larger_than_a_slot_is_refused() {
     let (mut writer, []) = topic((1, 3, 100), []);
     let refused = writer.draft(101).err();
     assert_eq!(refused, Some(WriteError::TooBig { len: 101, max: 100 }));
-    writer.draft(100).unwrap();
+    writer.draft(100).unwrap().fill(7);
+    assert_eq!(writer.drafted(), Some(&[7; 100][..]));
     writer.discard();
+    assert_eq!(writer.drafted(), None);
     assert_eq!(writer.publish(&[0; META_WORDS]), None);
     for _ in 0..100 {
         writer.draft(100).unwrap();

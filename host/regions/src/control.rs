@@ -77,7 +77,7 @@ mod tests {
         assert!(ControlRegion::open(&page).is_ok());
         let unsealed = File::from(memfd_create("test", MemfdFlags::ALLOW_SEALING).unwrap());
         unsealed.set_len(size_of::<ControlPage>() as u64).unwrap();
-        let larger = TopicRegion::create("test", 2 * size_of::<ControlPage>()).unwrap();
+        let larger = TopicRegion::create("test", 2 * size_of::<ControlPage>(), 0).unwrap();
         for file in [unsealed.as_fd(), larger.file()] {
             let refused = ControlRegion::open(file).err().unwrap();
             assert_eq!(refused.to_string(), "this is not a control page");

@@ -9,7 +9,11 @@ use std::ptr::{self, NonNull};
 
 use gleaner_buffers::Region;
 use gleaner_buffers::shared::ReadRegion;
-use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, fcntl_get_seals, memfd_create};
+use rustix::fs::{
+    FallocateFlags, MemfdFlags, SealFlags, fallocate, fcntl_add_seals, fcntl_get_seals,
+    memfd_create,
+};
+use rustix::io::Errno;
 use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
 
 /// Seals of a topic's file: its size stays, and no further mapping can write it.
@@ -41,6 +45,29 @@ impl FileMapping {
     pub(crate) fn keep_from_children(&self) -> io::Result<()> {
         // SAFETY: the bytes are those of this mapping; the advice changes nothing in this process.
         Ok(unsafe { madvise(self.address(), self.len, Advice::LinuxDontFork) }?)
+    }
+
+    /// Makes the pages of the first `len` bytes of a writable mapping present.
+    ///
+    /// `MAP_POPULATE` would not report that memory ran out; then the first access would end the
+    /// process.
+    fn populate(&self, file: &File, len: usize) -> io::Result<()> {
+        if len == 0 {
+            return Ok(());
+        }
+        // SAFETY: the bytes are those of this mapping, and the advice keeps their content.
+        match unsafe { madvise(self.address(), len, Advice::LinuxPopulateWrite) } {
+            Err(Errno::INVAL) => {}
+            done => return Ok(done?),
+        }
+        // Before Linux 5.14: the allocation reports an error, and then each page is touched.
+        fallocate(file, FallocateFlags::empty(), 0, len as u64)?;
+        for page in (0..len).step_by(rustix::param::page_size()) {
+            // SAFETY: `page` is below the size of the mapping, which is new, all zeros, and not
+            // shared yet.
+            unsafe { self.base.add(page).write_volatile(0) };
+        }
+        Ok(())
     }
 
     pub(crate) fn base(&self) -> NonNull<u8> {
@@ -76,8 +103,9 @@ pub struct TopicRegion {
 }
 
 impl TopicRegion {
-    /// Creates zeroed memory of `len` bytes, every page of which is present, and seals it. `name`
-    /// appears in `/proc/PID/maps`.
+    /// Creates zeroed memory of `len` bytes, and seals it. The pages of the first `present` bytes
+    /// are present; the kernel adds each of the others when it is first written to. `name` appears
+    /// in `/proc/PID/maps`.
     ///
     /// Children of this process do not inherit the mapping.
     ///
@@ -85,13 +113,14 @@ impl TopicRegion {
     ///
     /// [`io::ErrorKind::Unsupported`] if the kernel cannot seal it; otherwise the kernel's error,
     /// such as out of memory.
-    pub fn create(name: &str, len: usize) -> io::Result<Self> {
+    pub fn create(name: &str, len: usize, present: usize) -> io::Result<Self> {
         let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
         let file = File::from(memfd_create(name, flags)?);
         file.set_len(len as u64)?;
         let access = ProtFlags::READ | ProtFlags::WRITE;
-        let mapping = FileMapping::shared(&file, len, access, MapFlags::POPULATE)?;
+        let mapping = FileMapping::shared(&file, len, access, MapFlags::empty())?;
         mapping.keep_from_children()?;
+        mapping.populate(&file, present.min(len))?;
         seal(&file, TOPIC_SEALS)?;
         Ok(Self { mapping, file })
     }
@@ -108,7 +137,7 @@ pub(crate) fn seal(file: &File, seals: SealFlags) -> io::Result<()> {
         io::Error::new(io::ErrorKind::Unsupported, "this kernel cannot seal memory: use Linux 5.1")
     };
     match fcntl_add_seals(file, seals) {
-        Err(rustix::io::Errno::INVAL) => return Err(unsupported()),
+        Err(Errno::INVAL) => return Err(unsupported()),
         sealed => sealed?,
     }
     if fcntl_get_seals(file)?.contains(seals) { Ok(()) } else { Err(unsupported()) }
@@ -163,8 +192,8 @@ unsafe impl ReadRegion for MappedTopic {
 
 #[cfg(test)]
 mod tests {
-    use rustix::fs::{FallocateFlags, fallocate, ftruncate};
-    use rustix::io::{Errno, pwrite};
+    use rustix::fs::ftruncate;
+    use rustix::io::pwrite;
     use rustix::mm::{MprotectFlags, mprotect};
 
     use super::*;
@@ -173,7 +202,7 @@ mod tests {
 
     #[test]
     fn a_sealed_topic_cannot_be_changed_through_its_file() {
-        let region = TopicRegion::create("test", LEN).unwrap();
+        let region = TopicRegion::create("test", LEN, 0).unwrap();
         let file = region.file();
         let writable =
             FileMapping::shared(&file, LEN, ProtFlags::READ | ProtFlags::WRITE, MapFlags::empty());
@@ -187,9 +216,25 @@ mod tests {
         assert_eq!(fcntl_add_seals(file, SealFlags::WRITE), Err(Errno::PERM));
     }
 
+    /// Bytes of the file that are in memory.
+    fn present(region: &TopicRegion) -> i64 {
+        rustix::fs::fstat(region.file()).unwrap().st_blocks * 512
+    }
+
+    #[test]
+    fn only_the_first_pages_are_present_at_the_start() {
+        let region = TopicRegion::create("test", 1 << 30, 10_000).unwrap();
+        assert_eq!(present(&region), 3 * 4096);
+        // SAFETY: the region is that large, and this thread is the only one.
+        unsafe { Region::base(&region).add(1 << 20).write(7) };
+        assert_eq!(present(&region), 4 * 4096);
+        let whole = TopicRegion::create("test", LEN, usize::MAX).unwrap();
+        assert_eq!(present(&whole), LEN as i64);
+    }
+
     #[test]
     fn a_reader_cannot_make_its_mapping_writable() {
-        let region = TopicRegion::create("test", LEN).unwrap();
+        let region = TopicRegion::create("test", LEN, 0).unwrap();
         let mapped = MappedTopic::open(region.file(), LEN).unwrap();
         // SAFETY: the bytes are those of the mapping, and the call is refused.
         let refused = unsafe {
@@ -200,7 +245,7 @@ mod tests {
 
     #[test]
     fn a_reader_sees_what_the_writer_wrote() {
-        let region = TopicRegion::create("test", LEN).unwrap();
+        let region = TopicRegion::create("test", LEN, 0).unwrap();
         let mapped = MappedTopic::open(region.file(), LEN).unwrap();
         // SAFETY: both mappings have `LEN` bytes, and this thread is the only one.
         unsafe {
@@ -211,7 +256,7 @@ mod tests {
 
     #[test]
     fn a_file_of_another_size_or_without_seals_is_refused() {
-        let region = TopicRegion::create("test", LEN).unwrap();
+        let region = TopicRegion::create("test", LEN, 0).unwrap();
         let refused = MappedTopic::open(region.file(), LEN + 4096).err().unwrap();
         assert_eq!(refused.to_string(), "the memory of the topic has another size");
         let file = File::from(memfd_create("test", MemfdFlags::ALLOW_SEALING).unwrap());

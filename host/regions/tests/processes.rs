@@ -72,7 +72,7 @@ impl Drop for ReaderProcess {
 
 impl Topic {
     fn new() -> Self {
-        let region = TopicRegion::create("test", LAYOUT.bytes_needed().unwrap()).unwrap();
+        let region = TopicRegion::create("test", LAYOUT.bytes_needed().unwrap(), 4096).unwrap();
         let file = region.file().try_clone_to_owned().unwrap().into();
         let memory = WriterMemory::new(region, LAYOUT).unwrap();
         Self { region: file, writer: SharedWriter::new(memory), bells: Vec::new() }

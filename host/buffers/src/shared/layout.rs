@@ -46,6 +46,14 @@ impl SharedLayout {
         (bytes <= isize::MAX as usize).then_some(bytes)
     }
 
+    /// Bytes from the start of the region to the end of slot `slots - 1`, or to the end of the
+    /// region if it has fewer.
+    pub fn bytes_of_first(&self, slots: u32) -> usize {
+        let all = self.bytes_needed().unwrap_or(0);
+        let part = |slots| self.slots_at()?.checked_add(self.stride()?.checked_mul(slots)?);
+        part(slots as usize).and_then(|bytes| bytes.checked_add(LINE)).unwrap_or(all).min(all)
+    }
+
     /// Offset of the first slot's line.
     fn slots_at(&self) -> Option<usize> {
         let places = size_of::<PlaceWords>().checked_mul(self.places())?;

@@ -40,12 +40,17 @@ pub struct ReaderId(u64);
 pub struct SharedWriter {
     memory: SharedMemory,
     head: u64,
-    /// Position in each slot that has one, in order of positions.
+    /// Position and slot of each sample that is shown or may be held, in order of positions.
     filled: VecDeque<(u64, u32)>,
-    /// Slots that no sample is in.
-    empty: Vec<u32>,
+    /// Slots that had a sample, which is neither shown nor held, and will not be: no position is in
+    /// them.
+    free: Vec<u32>,
+    /// The first slot that was never used; all after it were not, either.
+    untouched: u32,
+    /// Number of slots to use before one is used again.
+    warm: u32,
     pending: Option<Pending>,
-    /// Set for each slot that a reader holds; computed for each draft.
+    /// Set for each slot that a reader holds; computed by each look at the hazards.
     held: Box<[bool]>,
     readers: Vec<AttachedReader>,
     next_reader: u64,
@@ -71,13 +76,24 @@ pub struct SharedDraft<'a>(&'a mut SharedWriter);
 
 impl SharedWriter {
     /// A writer of an empty topic.
-    pub fn new(WriterMemory(memory): WriterMemory) -> Self {
+    pub fn new(memory: WriterMemory) -> Self {
+        Self::with_warm_slots(memory, 0)
+    }
+
+    /// A writer of an empty topic that uses `warm` slots, or one more than are shown, before it
+    /// uses one again.
+    ///
+    /// It uses a further slot only when all of these are shown or held, so that memory beyond them
+    /// is touched only for readers that hold samples. The hazards are read once for all slots that
+    /// are free at that time: with `s` slots more than are shown, about once in `s` drafts.
+    pub fn with_warm_slots(WriterMemory(memory): WriterMemory, warm: u32) -> Self {
         let slots = memory.layout().slots;
         Self {
             head: 0,
             filled: VecDeque::with_capacity(slots as usize),
-            // The lowest slot is taken first. All slots are used once before one is used again.
-            empty: (0..slots).rev().collect(),
+            free: Vec::with_capacity(slots as usize),
+            untouched: 0,
+            warm: warm.max(memory.layout().depth + 1).min(slots),
             held: vec![false; slots as usize].into(),
             pending: None,
             readers: Vec::new(),
@@ -142,12 +158,25 @@ impl SharedWriter {
 
     /// Takes a slot that is neither shown nor held.
     fn take(&mut self) -> u32 {
+        // Also where no hazard is read: the place of the next sample was that of an earlier one.
         writer_fence();
-        // No position is in these, so no reader holds one.
-        if let Some(slot) = self.empty.pop() {
+        if self.free.is_empty() && self.untouched >= self.warm {
+            self.reclaim();
+        }
+        if let Some(slot) = self.free.pop() {
             return slot;
         }
-        self.held.fill(false);
+        assert!(self.untouched < self.memory.layout().slots, "more slots than are shown and held");
+        self.untouched += 1;
+        self.untouched - 1
+    }
+
+    /// Frees all slots whose samples are neither shown nor held.
+    ///
+    /// They stay free until they are used again: a sample that was not shown before the fence of
+    /// this draft cannot be held by a later hazard, as its reader checks that after its own fence.
+    fn reclaim(&mut self) {
+        self.held[..self.untouched as usize].fill(false);
         for reader in &self.readers {
             let words = reader.limits.of_page(reader.page.control()).unwrap_or_default();
             for (index, word) in words.iter().enumerate() {
@@ -168,17 +197,18 @@ impl SharedWriter {
             }
         }
         let shown_from = self.head.saturating_sub(u64::from(self.memory.layout().depth));
-        let free = self
-            .filled
-            .iter()
-            .position(|(position, slot)| *position < shown_from && !self.held[*slot as usize]);
-        let index = free.expect("there are more slots than are shown and held");
-        self.filled.remove(index).expect("the index was just found").1
+        self.filled.retain(|(position, slot)| {
+            let stays = *position >= shown_from || self.held[*slot as usize];
+            if !stays {
+                self.free.push(*slot);
+            }
+            stays
+        });
     }
 
     /// Gives up a draft that was not published.
     pub fn discard(&mut self) {
-        self.empty.extend(self.pending.take().map(|pending| pending.slot));
+        self.free.extend(self.pending.take().map(|pending| pending.slot));
     }
 
     /// Shows the drafted sample to the readers, and returns its position: 0, 1, 2, ...
@@ -204,6 +234,30 @@ impl SharedWriter {
             self.memory.place(leaving).seq.store(0, Ordering::Release);
         }
         Some(position)
+    }
+
+    /// Returns the bytes of the draft, if there is one.
+    pub fn drafted(&self) -> Option<&[u8]> {
+        let Pending { slot, len } = self.pending?;
+        let payload = self.memory.payload(slot);
+        // SAFETY: a slot has `slot_bytes >= len` bytes, and only this writer writes to it.
+        Some(unsafe { slice::from_raw_parts(payload.as_ptr(), len) })
+    }
+
+    /// Returns the bytes and the words of the sample at `position`, if it is shown.
+    pub fn shown(&self, position: u64) -> Option<(&[u8], [u64; META_WORDS])> {
+        let depth = u64::from(self.memory.layout().depth);
+        if position >= self.head || position < self.head.saturating_sub(depth) {
+            return None;
+        }
+        let place = self.memory.place(position);
+        let slot = place.slot.load(Ordering::Relaxed);
+        let payload = self.memory.payload((slot >> 32) as u32);
+        let len = slot as u32 as usize;
+        // SAFETY: `publish` stored slot and length of a draft; its slot is not written while the
+        // sample is shown, and only this writer writes to it.
+        let bytes = unsafe { slice::from_raw_parts(payload.as_ptr(), len) };
+        Some((bytes, std::array::from_fn(|index| place.meta[index].load(Ordering::Relaxed))))
     }
 
     /// Stores counters for the readers to show.
