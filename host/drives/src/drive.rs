@@ -54,7 +54,7 @@ use gleaner_transport::{
 /// in part.
 pub struct Replay {
     tracks: Vec<Track>,
-    catalog: Catalog,
+    catalog: Arc<Catalog>,
     sinks: Vec<Arc<dyn Sink>>,
     opener: Opener,
     /// Unpacks messages that are packed one by one.
@@ -129,7 +129,7 @@ impl Replay {
         let mut opener = Opener::new(options.limits);
         let tracks = storage::open(paths, options, &mut opener)?;
         let files: Vec<_> = tracks.iter().map(Track::path_and_contents).collect();
-        let catalog = Catalog::build(&files, options.sources.clone())?;
+        let catalog = Arc::new(Catalog::build(&files, options.sources.clone())?);
         Ok(Self {
             tracks,
             catalog,
@@ -237,6 +237,11 @@ impl Replay {
         }
         let ends = self.tracks.iter().filter_map(|track| track.times().map(|times| times.1));
         ends.max().map(nanoseconds)
+    }
+
+    /// Returns the topics of the drive.
+    pub(super) fn catalog(&self) -> Arc<Catalog> {
+        Arc::clone(&self.catalog)
     }
 
     /// Checks whether a topic can be subscribed with `spec`.

@@ -3,7 +3,8 @@
 //! [`Replay`] opens MCAP files, databases of rosbag2 (SQLite, `.db3`) and the directories that
 //! rosbag2 writes, each packed with zstd or not, merges them by log time and passes the next
 //! message of a subscribed topic to its sink each time [`Replay::step`] is called. Nothing runs on
-//! its own: the caller's loop is the clock. The first bytes of a file choose its reader
+//! its own: the caller's loop is the clock. A [`DrivePlayer`] is such a loop: it plays a drive in
+//! real time, as a live source. The first bytes of a file choose its reader
 //! (`storage`); after that all files are alike. Directories, databases and packed files need the
 //! feature `bags`.
 //!
@@ -30,6 +31,7 @@ mod inflate;
 #[cfg(feature = "bags")]
 mod metadata;
 mod options;
+mod player;
 mod records;
 #[cfg(feature = "bags")]
 mod rows;
@@ -48,6 +50,7 @@ pub use drive::Replay;
 pub use error::ReplayError;
 pub use extras::{Attachment, Extras, read_extras};
 pub use options::{DriveLimits, DriveOptions};
+pub use player::DrivePlayer;
 pub use step::{Progress, ReplayStep};
 pub use storage::{files_of, journals_of};
 #[cfg(feature = "bags")]

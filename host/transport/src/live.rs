@@ -15,6 +15,20 @@ pub trait LiveSource: Transport + Send {
     /// The numbers of other subscriptions stay.
     fn unsubscribe(&mut self, subscription: Subscription);
 
+    /// Starts a source that waits until all of its readers are ready, as a drive does.
+    fn begin(&mut self) {}
+
+    /// Returns whether the source has delivered its last sample. A network never ends.
+    fn has_ended(&self) -> bool {
+        false
+    }
+
+    /// Returns whether [`topics`](Transport::topics) is complete from the start. On a network,
+    /// further topics may appear.
+    fn knows_all_topics(&self) -> bool {
+        false
+    }
+
     /// Opens `topic` of type `type_name` for publishing. Slow readers find the `depth` newest
     /// messages.
     ///
