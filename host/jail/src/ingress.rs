@@ -8,6 +8,9 @@ use crate::filter::{DeniedCalls, install_everywhere};
 use crate::sandbox_filter::{PROCESSES, SHARED_RESOURCES};
 use crate::{JailError, Paths, base_filter, files, own_memory, sandbox_filter, self_test, sockets};
 
+/// The devices of network interfaces, which `/sys/class/net` links to.
+const NETWORK_DEVICES: &str = "/sys/devices";
+
 /// Sockets that the ingress may create after [`close`].
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum NewSockets {
@@ -23,7 +26,9 @@ pub enum NewSockets {
 pub fn start(paths: &Paths) -> Vec<Layer> {
     let mut layers = base_filter::apply();
     layers.push(own_memory::hide());
-    layers.push(files::confine_program(paths));
+    let mut paths = paths.clone();
+    paths.read.push(NETWORK_DEVICES.into());
+    layers.push(files::confine_program(&paths));
     layers
 }
 

@@ -4,14 +4,22 @@ use std::fs::{self, File};
 use std::io;
 use std::os::unix::fs::FileExt;
 
-/// Returns the resident memory of this process, in bytes; 0 if unknown.
+/// Returns the resident memory of this process, in bytes, without shared memory: topics that the
+/// ingress provides belong to all processes that map them. 0 if unknown.
 pub fn resident() -> u64 {
-    status_bytes("VmRSS:")
+    let status = own_status();
+    value(&status, "VmRSS:").saturating_sub(value(&status, "RssShmem:"))
 }
 
-/// Returns the peak of the resident memory of this process, in bytes; 0 if unknown.
+/// Returns the shared memory of which this process has used pages, in bytes; 0 if unknown.
+pub fn resident_shared() -> u64 {
+    value(&own_status(), "RssShmem:")
+}
+
+/// Returns the peak of the resident memory of this process with shared memory, in bytes; 0 if
+/// unknown.
 pub fn peak_resident() -> u64 {
-    status_bytes("VmHWM:")
+    value(&own_status(), "VmHWM:")
 }
 
 /// Returns the CPU time of all threads of this process, in s.
@@ -27,8 +35,8 @@ pub struct ProcessUsage {
     pub is_stopped: bool,
     /// Number of threads.
     pub threads: u64,
-    /// Private memory: pages in RAM or swapped out, and page tables, in bytes. Pages of files are
-    /// not counted, and shared memory is denied to a lambda.
+    /// Private memory: pages in RAM or swapped out, and page tables, in bytes. Pages of files and
+    /// shared memory are not counted: a lambda can create none, and that of its topics exists once.
     pub held: u64,
 }
 
@@ -96,9 +104,13 @@ fn proc_path(pid: Option<u32>, file: &str) -> String {
     pid.map_or_else(|| format!("/proc/self/{file}"), |pid| format!("/proc/{pid}/{file}"))
 }
 
-/// Returns a value of `/proc/self/status`, in bytes.
-fn status_bytes(name: &str) -> u64 {
-    let status = fs::read_to_string(proc_path(None, "status")).unwrap_or_default();
+/// Returns the file `/proc/self/status`; empty if it cannot be read.
+fn own_status() -> String {
+    fs::read_to_string(proc_path(None, "status")).unwrap_or_default()
+}
+
+/// Returns a value of the file `status` of a process, in bytes; 0 if it is missing.
+fn value(status: &str, name: &str) -> u64 {
     status.lines().find_map(|line| line.strip_prefix(name)).and_then(kib).unwrap_or(0)
 }
 
@@ -137,6 +149,14 @@ mod tests {
         );
         assert_eq!(data_limit(std::process::id()), None);
         drop(taken);
+    }
+
+    #[test]
+    fn shared_memory_is_not_counted_as_memory_of_a_process() {
+        let status = "VmHWM:\t 90 kB\nVmRSS:\t 80 kB\nRssAnon:\t 10 kB\nRssShmem:\t 50 kB\n";
+        assert_eq!(value(status, "VmRSS:") - value(status, "RssShmem:"), 30 * 1024);
+        assert_eq!(ProcessUsage::parse(status).unwrap().held, 10 * 1024);
+        assert!(resident() + resident_shared() <= peak_resident());
     }
 
     #[test]

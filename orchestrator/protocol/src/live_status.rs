@@ -66,7 +66,7 @@ pub struct LiveStatus {
     /// them. `None` without a recorder.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recording: Option<Box<RecorderStatus>>,
-    /// Resident memory, in bytes.
+    /// Resident memory of the process alone, in bytes: topics in shared memory are not part of it.
     pub rss_bytes: u64,
     /// CPU time of the process, in s.
     pub cpu_s: f64,
