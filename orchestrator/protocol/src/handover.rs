@@ -119,3 +119,78 @@ impl Handover {
         self.ingress.take().ok_or(LinkError::NoConnection { name: "ingress" })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs::File;
+    use std::io::{Read, Write};
+    use std::os::unix::net::UnixStream;
+
+    use super::*;
+
+    fn message(bytes: &[u8]) -> Result<Handover, LinkError> {
+        let (mut starter_end, program_end) = UnixStream::pair().unwrap();
+        starter_end.write_all(bytes).unwrap();
+        drop(starter_end);
+        Handover::receive(program_end)
+    }
+
+    /// A connection to pass: what is written to it arrives at the second stream.
+    fn connection() -> (Option<OwnedFd>, UnixStream) {
+        let (passed, own) = UnixStream::pair().unwrap();
+        (Some(passed.into()), own)
+    }
+
+    fn is_connected(passed: OwnedFd, mut own: UnixStream) {
+        UnixStream::from(passed).write_all(b"here").unwrap();
+        let mut read = String::new();
+        own.read_to_string(&mut read).unwrap();
+        assert_eq!(read, "here");
+    }
+
+    #[test]
+    fn each_connection_arrives_under_its_name_and_can_be_replaced_later() {
+        let (starter_end, program_end) = UnixStream::pair().unwrap();
+        let ((control, control_end), (ingress, ingress_end)) = (connection(), connection());
+        Handover { control, ingress, recorder: None }.send(&starter_end).unwrap();
+        let (ingress, later_end) = connection();
+        Handover { ingress, ..Handover::default() }.send(&starter_end).unwrap();
+
+        let mut first = Handover::receive(&program_end).unwrap();
+        is_connected(first.take_control().unwrap(), control_end);
+        is_connected(first.take_ingress().unwrap(), ingress_end);
+        assert!(first.recorder.is_none());
+        assert_eq!(
+            first.take_control().unwrap_err().to_string(),
+            "the starter passed no connection `control`"
+        );
+        let mut later = Handover::receive(&program_end).unwrap();
+        is_connected(later.take_ingress().unwrap(), later_end);
+        drop(starter_end);
+        assert!(matches!(Handover::receive(&program_end), Err(LinkError::Gone { .. })));
+    }
+
+    #[test]
+    fn invalid_messages_and_other_inputs_are_refused() {
+        let refusal = |bytes: &[u8]| message(bytes).unwrap_err().to_string();
+        let named = |names: &[u8]| frame::encode(tag::HANDOVER, names);
+        assert_eq!(
+            refusal(&named(br#"["control","ingress"]"#)),
+            "frame `handover` from the starter is invalid: \
+             it names 2 connections and has 0 descriptors"
+        );
+        assert!(refusal(&named(br#"["network"]"#)).contains("unknown variant `network`"));
+        assert_eq!(refusal(&frame::encode(tag::STOP, &[])), "frame 2 from the starter is unknown");
+        assert_eq!(refusal(b"gle"), "the starter has ended, or closed the connection");
+        let no_socket = Handover::receive(File::open("/dev/null").unwrap()).unwrap_err();
+        assert!(matches!(no_socket, LinkError::NoStarter), "{no_socket}");
+
+        let (starter_end, program_end) = UnixStream::pair().unwrap();
+        let (passed, _own) = connection();
+        let passed = passed.unwrap();
+        let twice = named(br#"["ingress","ingress"]"#);
+        send_frame(&starter_end, &twice, &[passed.as_fd(), passed.as_fd()], PROGRAM).unwrap();
+        let refused = Handover::receive(&program_end).unwrap_err().to_string();
+        assert!(refused.ends_with("it names ingress twice"), "{refused}");
+    }
+}

@@ -9,7 +9,8 @@ use super::{AddReader, AddTopics, HoldGrant, PublishGrant, Qos, TopicGrant};
 
 /// Largest number of topics that a message grants.
 const TOPICS_MAX: usize = 1024;
-/// Longest name of a reader, a topic or a type, in bytes. DDS has 255 at most; drives may have more.
+/// Longest name of a reader, a topic or a type, in bytes. DDS has 255 at most, a drive may have
+/// more.
 const NAME_MAX: usize = 1024;
 /// Samples that a subscription or a publisher may queue: the longest history of a manifest.
 const QUEUE: RangeInclusive<u64> = 1..=65_536;

@@ -65,3 +65,65 @@ fn requested(qos: manifest::Qos) -> Qos {
 fn bounded(count: usize) -> u16 {
     u16::try_from(count).unwrap_or(u16::MAX)
 }
+
+#[cfg(test)]
+mod tests {
+    use gleaner_lambda::manifest::Manifest;
+
+    use super::*;
+
+    /// Grants of a small input, of a large one, and of the largest that a manifest can have.
+    fn grants() -> Vec<TopicGrant> {
+        let text = r#"
+            [lambda]
+            name = "brake"
+            version = "0.1.0"
+            kind = "python"
+            entry = "main.py"
+            [schedule]
+            event = "imu"
+            [[input]]
+            name = "imu"
+            topic = "/imu"
+            type = "sensor_msgs/msg/Imu"
+            depth = 100
+            hold = 8
+            qos = { reliability = "reliable", durability = "volatile", depth = 7 }
+            [[input]]
+            name = "camera"
+            topic = "/camera"
+            type = "sensor_msgs/msg/Image"
+            depth = 5
+            hold = 2
+            max_size = "4 MiB"
+            [[input]]
+            name = "longest"
+            topic = "/longest"
+            type = "sensor_msgs/msg/Imu"
+            depth = 65536
+            hold = 1024
+            max_size = "1 KiB"
+        "#;
+        let manifest = Manifest::parse(text, "lambda.toml").unwrap();
+        (0..)
+            .zip(&manifest.inputs)
+            .map(|(n, input)| TopicGrant::for_input(n, input, "/remapped", n == 0, true))
+            .collect()
+    }
+
+    #[test]
+    fn an_input_is_granted_its_depth_and_spare_samples() {
+        let [small, large, longest] = <[TopicGrant; 3]>::try_from(grants()).unwrap();
+        assert_eq!((small.depth, small.queue, small.max_bytes), (200, 100, Some(4096)));
+        assert_eq!(small.holds, HoldGrant { windows: 4, window: 200, singles: 12 });
+        assert_eq!(small.qos, Qos::Fixed { reliable: true, transient_local: false, depth: 7 });
+        assert_eq!((small.topic.as_str(), small.wakes, small.digests), ("/remapped", true, true));
+        // Each held sample takes memory of its own: few are spare, and few are held.
+        assert_eq!((large.depth, large.wakes, large.qos), (7, false, Qos::Auto));
+        assert_eq!(large.holds, HoldGrant { windows: 2, window: 7, singles: 6 });
+        assert_eq!((longest.depth, longest.holds.window), (131_072, u16::MAX));
+        for grant in [small, large, longest] {
+            assert_eq!(grant.check(), Ok(()), "every manifest gives a valid grant");
+        }
+    }
+}

@@ -12,6 +12,8 @@ mod grant_rules;
 mod message;
 mod reader;
 mod source;
+#[cfg(test)]
+mod tests;
 
 pub use client::{IngressLink, IngressRequests, ReaderDelivery};
 pub use control::{IngressControl, IngressRequest, IngressServer};
