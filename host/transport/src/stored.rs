@@ -77,12 +77,27 @@ impl ArrivalSums {
         self.digests.get_or_insert(0);
     }
 
+    /// Adds no further digests. The sum begins at 0 when they are enabled again.
+    pub fn disable_digests(&mut self) {
+        self.digests = None;
+    }
+
+    /// Returns the sum of the digests so far; 0 while they are off.
+    pub fn digests(&self) -> u32 {
+        self.digests.unwrap_or(0)
+    }
+
+    /// Returns the number of refused samples so far.
+    pub fn refused(&self) -> u64 {
+        self.refused
+    }
+
     /// Adds a sample that is about to enter the ring.
     pub fn add(&mut self, sample: &SampleMeta, cdr: &[u8]) -> StoredMeta {
         if let Some(digests) = &mut self.digests {
             *digests = digests.wrapping_add(sample_digest(sample, cdr));
         }
-        StoredMeta { sample: *sample, digests: self.digests.unwrap_or(0), refused: self.refused }
+        StoredMeta { sample: *sample, digests: self.digests(), refused: self.refused }
     }
 
     /// Counts a refused sample.

@@ -45,6 +45,12 @@ pub struct AttachedTopic {
     pub holds: HoldGrant,
     /// Position of the first sample that this reader receives.
     pub first: u64,
+    /// Sum of the digests of all samples before the reader was attached, modulo 2^32.
+    #[serde(default)]
+    pub digests: u32,
+    /// Number of samples refused before the reader was attached.
+    #[serde(default)]
+    pub refused: u64,
     /// ros2msg text of the type and all types it refers to, if the source carries it.
     pub definitions: Option<String>,
     /// The QoS that the topic's writers offer, as rosbag2 writes it.
@@ -89,6 +95,9 @@ pub struct SourceStatus {
     pub health: Health,
     /// Id and state of each attached topic.
     pub topics: Vec<(u32, ReceptionStatus)>,
+    /// Number of messages of this reader that the source refused to publish.
+    #[serde(default)]
+    pub unsent: u64,
 }
 
 /// A report of the ingress to its starter: a line of JSON on its standard output.

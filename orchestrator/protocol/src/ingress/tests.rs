@@ -223,6 +223,8 @@ fn attached(definitions: usize) -> ReaderMessage {
         first_word: 3,
         holds: HoldGrant { windows: 1, window: 4, singles: 2 },
         first: 12,
+        digests: 3,
+        refused: 4,
         definitions: Some("x".repeat(definitions)),
         offered_qos: None,
     }))
@@ -233,6 +235,7 @@ fn status(received: u64) -> ReaderMessage {
     ReaderMessage::Status(Box::new(SourceStatus {
         health: Health::default(),
         topics: vec![(7, reception)],
+        unsent: 5,
     }))
 }
 
