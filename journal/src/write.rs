@@ -90,6 +90,23 @@ impl<W: Write> JournalWriter<W> {
         }
     }
 
+    /// Adds a wake that is encoded already, without reference to another one, as
+    /// [`Encoder::reset`] allows: as a block of its own. It is not checked.
+    ///
+    /// # Errors
+    ///
+    /// As for [`wake`](Self::wake).
+    pub fn encoded_wake(&mut self, encoded: &[u8]) -> io::Result<()> {
+        self.usable()?;
+        if encoded.len() + NUMBER_MAX > PAYLOAD_MAX {
+            return Err(refused("a wake is too large for a block of a journal"));
+        }
+        self.write_wakes()?;
+        self.block.extend_from_slice(encoded);
+        self.wakes = 1;
+        self.write_wakes()
+    }
+
     /// Writes buffered wakes, and flushes `out`.
     ///
     /// # Errors

@@ -168,3 +168,26 @@ fn a_fraction_keeps_its_last_bit() {
 fn a_wake_with_another_number_of_inputs_panics() {
     Encoder::new(1).encode(&any_entry(&mut Xorshift(4), 2), &mut Vec::new());
 }
+
+#[test]
+fn wakes_that_were_encoded_elsewhere_are_read_like_any_other() {
+    let entries = usual_entries(2, 10);
+    let mut encoder = Encoder::new(2);
+    let mut writer = JournalWriter::begin(Vec::new(), &header(2)).unwrap();
+    for (index, entry) in entries.iter().enumerate() {
+        if index % 3 == 0 {
+            writer.wake(entry).unwrap();
+            continue;
+        }
+        let mut encoded = Vec::new();
+        encoder.reset();
+        encoder.encode(entry, &mut encoded);
+        writer.encoded_wake(&encoded).unwrap();
+    }
+    let too_long = writer.encoded_wake(&vec![0; 2 << 20]).unwrap_err();
+    assert_eq!(too_long.to_string(), "a wake is too large for a block of a journal");
+    let bytes = writer.finish(&end(entries.len())).unwrap();
+    let mut reader = JournalReader::open(bytes.as_slice()).unwrap();
+    assert_eq!(read_all(&mut reader).0, entries);
+    assert_eq!(reader.end().unwrap().wakes, 10);
+}

@@ -48,7 +48,6 @@ pub(crate) use clip_dir::names;
 pub(crate) use clip_records::CONTINUES;
 pub use folder::{EarlierClips, RecordingFolder};
 pub use losses::LossList;
-pub(crate) use recover::Recovery;
 pub use stated::{ClipStatements, FalseStatement};
 pub use unfinished::MESSAGE_MAX;
 pub(crate) use unfinished::UnfinishedClip;

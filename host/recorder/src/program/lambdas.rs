@@ -133,7 +133,7 @@ impl ConnectedLambda {
                         polled.counted.add(&refused);
                         continue;
                     }
-                    recorder.wake(id, &entry)?;
+                    recorder.encoded_wake(id, &entry, &encoded)?;
                     if !entry.triggers.is_empty() {
                         let wait_ns = monotonic_ns().saturating_sub(decided_ns);
                         spreads.add(wait_ns);

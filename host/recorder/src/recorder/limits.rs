@@ -4,18 +4,18 @@ use crate::file::MESSAGE_MAX;
 
 /// Limits that only tests change.
 #[derive(Copy, Clone, Debug)]
-pub(super) struct RecorderLimits {
+pub struct RecorderLimits {
     /// The longest message.
-    pub(super) message_bytes: usize,
+    pub message_bytes: usize,
     /// Most triggers that a clip lists; it counts all.
-    pub(super) moments: usize,
+    pub moments: usize,
     /// Most memory for one lambda's part of a journal.
-    pub(super) part_bytes: usize,
+    pub part_bytes: usize,
     /// Most memory for the parts of all lambdas in one clip.
-    pub(super) parts_bytes: usize,
+    pub parts_bytes: usize,
     /// Most triggers that wait for their clip. A lambda can trigger often, and windows wait for
     /// minutes.
-    pub(super) waiting: usize,
+    pub waiting: usize,
 }
 
 impl Default for RecorderLimits {

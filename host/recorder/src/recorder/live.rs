@@ -1,6 +1,5 @@
 //! The live part of a recorder: no call waits for a disk.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_base::nanoseconds;
@@ -9,9 +8,8 @@ use gleaner_lambda::{Clip, Moment, Trigger};
 use gleaner_protocol::link::Loss;
 use gleaner_transport::SampleMeta;
 
-use super::backfill::Budget;
-use super::clip_writer::{ClipOutcome, ClipWriter};
-use super::finished::KEPT;
+use super::clips::Budget;
+use super::writer::ClipDisk;
 use super::{Commanded, LambdaId, Recorder, Settings, TopicId, Work};
 use crate::RecordError;
 use crate::file::{RecordingFolder, TopicSchema};
@@ -40,8 +38,8 @@ impl Recorder {
     ///
     /// [`RecordError::Preroll`] as for [`Recorder::new`], and [`RecordError::Thread`].
     pub fn live(folder: RecordingFolder, settings: Settings) -> Result<Recorder, RecordError> {
-        let mut recorder = Recorder::with(ClipWriter::background(folder)?, settings, true)?;
-        recorder.windows.set_grace(nanoseconds(GRACE));
+        let mut recorder = Recorder::with(ClipDisk::background(folder)?, settings, true)?;
+        recorder.clips.set_grace(nanoseconds(GRACE));
         Ok(recorder)
     }
 
@@ -54,36 +52,34 @@ impl Recorder {
     /// [`RecordError`] if the preroll is on disk and that fails, or if the writer thread has ended.
     /// A clip that could not be written is no such error: see [`Recorder::take_failures`].
     pub fn work(&mut self) -> Result<Work, RecordError> {
-        let mut outcomes = Vec::new();
-        self.state.context.writer.poll(&mut outcomes)?;
-        self.note(outcomes);
-        self.run_within(Budget::STEP)?;
-        if self.is_settled() {
+        self.clips.poll()?;
+        self.clips.run_within(Budget::STEP, &mut self.history, &self.sources)?;
+        if self.clips.is_settled() {
             return Ok(Work::Done);
         }
-        Ok(if self.state.context.writer.has_room() { Work::More } else { Work::Wait })
+        Ok(if self.clips.has_room() { Work::More } else { Work::Wait })
     }
 
     /// Takes the errors of clips that could not be written since the last call; the first 16.
     pub fn take_failures(&mut self) -> Vec<RecordError> {
-        std::mem::take(&mut self.finished.failures)
+        self.clips.finished_mut().take_failures()
     }
 
     /// Takes the clips of an earlier process that were recovered since the last call. One that
     /// cannot be recovered is among the failures.
     pub fn take_recovered(&mut self) -> Vec<Clip> {
-        std::mem::take(&mut self.finished.recovered)
+        self.clips.finished_mut().take_recovered()
     }
 
     /// Takes the clips that were deleted to make room, or could not be deleted, since the last
     /// call; the first of them.
     pub fn take_deleted(&mut self) -> Vec<Loss> {
-        std::mem::take(&mut self.finished.deleted)
+        self.clips.finished_mut().take_deleted()
     }
 
     /// Returns whether a clip is open.
     pub fn is_recording(&self) -> bool {
-        self.open_clip.is_some()
+        self.clips.is_open()
     }
 
     /// Adds the description of a topic that was missing until now.
@@ -92,29 +88,19 @@ impl Recorder {
     ///
     /// [`RecordError::LongTopic`] if a clip has no room for its description: it stays missing.
     pub fn found_topic(&mut self, id: TopicId, topic: TopicSchema) -> Result<(), RecordError> {
-        topic.check()?;
-        let now = self.now;
-        let topic_state = &mut self.state.context.topics[id.0];
-        if topic_state.is_missing {
-            // Messages and windows use the name with which it was requested.
-            topic_state.topic =
-                Arc::new(TopicSchema { name: topic_state.topic.name.clone(), ..topic });
-            (topic_state.is_missing, topic_state.found_at) = (false, now);
-        }
-        Ok(())
+        self.sources.found_topic(id.index(), topic, self.history.now())
     }
 
     /// Counts wakes of a lambda that did not arrive; `at_ns` is the stamp of the next one that
     /// does.
     pub fn lost_wakes(&mut self, lambda: LambdaId, at_ns: i64, count: u64) {
-        self.state.context.lambdas[lambda.0].wakes += count;
-        self.state.wake_losses[lambda.0].lost.add_some(at_ns, 0, count);
+        self.sources.count_wakes(lambda.index(), count);
+        self.history.lost_wakes(lambda.index(), at_ns, count);
     }
 
     /// Counts a sample that arrived without room for it.
     pub fn lost_sample(&mut self, topic: TopicId, meta: &SampleMeta) {
-        self.state.note_gap(topic.0, meta);
-        self.state.losses[topic.0].lost.add(meta.at_ns, 0);
+        self.history.lost_sample(topic.index(), meta);
     }
 
     /// Executes a command in the name of `lambda`; `source` describes who gave it. It is not a
@@ -131,11 +117,12 @@ impl Recorder {
         at_ns: i64,
         source: String,
     ) -> Result<Commanded, RecordError> {
-        if self.held.is_some() {
-            self.counts.recording.disk_suppressed += 1;
+        if self.clips.is_held() {
+            self.clips.count_suppressed(1);
             return Ok(Commanded::DiskSuppressed);
         }
-        let commanded = match self.windows.command(lambda.0, trigger.kind, &trigger.label, at_ns) {
+        let (kind, label) = (trigger.kind, &trigger.label);
+        let commanded = match self.clips.command(lambda.index(), kind, label, at_ns) {
             TriggerOutcome::Opened => {
                 self.counts.recording.windows += 1;
                 Commanded::Opened
@@ -148,10 +135,10 @@ impl Recorder {
                 return Ok(Commanded::Ignored);
             }
         };
-        let moment =
-            Moment { source: Some(source), ..Moment::of(self.name_of(lambda), trigger, at_ns) };
-        self.await_clip(lambda, moment);
-        self.act()?;
+        let name = self.sources.name(lambda.index());
+        let moment = Moment { source: Some(source), ..Moment::of(name, trigger, at_ns) };
+        self.clips.await_clip(lambda.index(), moment);
+        self.clips.act(&mut self.history, &self.sources)?;
         Ok(commanded)
     }
 
@@ -161,13 +148,7 @@ impl Recorder {
     ///
     /// [`RecordError`] if the disk fails.
     pub fn end_lambda(&mut self, lambda: LambdaId, at_ns: i64) -> Result<(), RecordError> {
-        if self.windows.end(lambda.0, at_ns)
-            && let Some(open_clip) = &mut self.open_clip
-            && !open_clip.ended.contains(&lambda.0)
-        {
-            open_clip.ended.push(lambda.0);
-        }
-        self.run()
+        self.clips.end_lambda(lambda.index(), at_ns, &mut self.history, &self.sources)
     }
 
     /// Suspends recording: no clip is begun, and the open one ends with the reason `why`. A preroll
@@ -177,16 +158,15 @@ impl Recorder {
     ///
     /// [`RecordError`] if the disk fails.
     pub fn hold(&mut self, why: Option<&str>) -> Result<(), RecordError> {
-        self.held = why.map(Arc::from);
-        self.state.preroll.shrink(why.is_some());
+        self.history.preroll_mut().shrink(why.is_some());
         // The open clip ends at once.
-        self.windows.set_grace(if why.is_some() { 0 } else { nanoseconds(GRACE) });
-        self.run()
+        self.clips.hold(why, if why.is_some() { 0 } else { nanoseconds(GRACE) });
+        self.clips.run(&mut self.history, &self.sources)
     }
 
     /// Returns whether recording is suspended.
     pub fn is_held(&self) -> bool {
-        self.held.is_some()
+        self.clips.is_held()
     }
 
     /// Raises the bound of the preroll to `bytes`, and moves it to disk if `store` is the disk. It
@@ -201,16 +181,9 @@ impl Recorder {
             return Ok(());
         }
         let bytes = bytes.max(self.counts.preroll_bound);
-        if self.state.preroll.grow(store, bytes, folder.join("preroll"), *prefault)? {
-            if let Some(backfill) = &mut self.backfill {
-                backfill.restart();
-            }
-            if let Some(behind) = &mut self.behind {
-                *behind = None;
-            }
-            if let Some(open_clip) = &mut self.open_clip {
-                open_clip.settled = None;
-            }
+        let folder = folder.join("preroll");
+        if self.history.preroll_mut().grow(store, bytes, folder, *prefault)? {
+            self.clips.preroll_moved();
         }
         self.counts.preroll_bound = bytes;
         Ok(())
@@ -218,60 +191,6 @@ impl Recorder {
 
     /// Raises the length of the longest clip.
     pub fn grow_length(&mut self, most: Duration) {
-        self.max_length_ns = self.max_length_ns.max(nanoseconds(most));
-        self.windows.grow_length(self.max_length_ns);
-    }
-
-    /// Does all pending work, however long it takes.
-    pub(super) fn settle_all(&mut self) -> Result<(), RecordError> {
-        loop {
-            self.run_within(Budget::ALL)?;
-            if self.is_settled() {
-                return Ok(());
-            }
-            self.wait()?;
-        }
-    }
-
-    /// Waits until everything is written.
-    pub(super) fn drain(&mut self) -> Result<(), RecordError> {
-        while !self.state.context.writer.is_idle() {
-            self.wait()?;
-        }
-        Ok(())
-    }
-
-    fn wait(&mut self) -> Result<(), RecordError> {
-        let mut outcomes = Vec::new();
-        self.state.context.writer.wait(&mut outcomes)?;
-        self.note(outcomes);
-        Ok(())
-    }
-
-    fn note_deleted(&mut self, deleted: Vec<Loss>) {
-        let (gone, stuck) = counted(&deleted);
-        self.counts.recording.deleted += gone;
-        self.counts.recording.not_deleted += stuck;
-        self.finished.deleted.extend(deleted);
-        self.finished.deleted.truncate(KEPT);
-    }
-
-    fn note(&mut self, outcomes: Vec<ClipOutcome>) {
-        for outcome in outcomes {
-            match outcome {
-                ClipOutcome::Finished(clip, deleted) => {
-                    self.finished.add(Some(*clip));
-                    self.note_deleted(deleted);
-                }
-                ClipOutcome::Recovered(clip, deleted) => {
-                    self.finished.recovered.push(*clip);
-                    self.note_deleted(deleted);
-                }
-                ClipOutcome::Failed(error) => {
-                    self.counts.recording.failed += 1;
-                    self.finished.fail(error);
-                }
-            }
-        }
+        self.clips.grow_length(nanoseconds(most));
     }
 }

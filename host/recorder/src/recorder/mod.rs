@@ -1,52 +1,40 @@
 //! The recorder: turns samples and wakes into clips.
+//!
+//! - `sources`: the topics and lambdas.
+//! - `history`: the preroll, and what it has lost.
+//! - `clips`: windows, open clips, finished clips.
+//! - `writer`: the files of clips, inline or on a thread.
+//! - `live`: the calls of a live recorder only.
 
-mod backfill;
-mod clip_name;
-mod clip_writer;
-mod finished;
+mod clips;
+mod history;
 mod limits;
 mod live;
-mod open_clip;
 mod settings;
-mod state;
-mod steps;
+mod sources;
 #[cfg(test)]
 mod tests;
-mod waiting;
-
-use std::sync::Arc;
+mod writer;
 
 use gleaner_base::nanoseconds;
-use gleaner_journal::{Encoder, JournalEntry};
+use gleaner_journal::JournalEntry;
 use gleaner_lambda::{Clip, Moment, TriggerKind};
 use gleaner_protocol::RecordingCounts;
-use gleaner_transport::{Gaps, SampleMeta};
+use gleaner_transport::SampleMeta;
 
+use crate::RecordError;
 use crate::file::{RecordingFolder, TopicSchema};
-use crate::preroll::{EntryMeta, Losses, Preroll, Walked};
-use crate::window::{TriggerOutcome, WindowRules, Windows};
-use crate::{LAMBDAS_MAX, RecordError};
-use backfill::Backfill;
-use clip_writer::ClipWriter;
-use finished::Finished;
+use crate::preroll::{EntryMeta, Preroll};
+use crate::window::{TriggerOutcome, WindowRules};
+use clips::Clips;
+use history::History;
 use limits::RecorderLimits;
-use open_clip::OpenClip;
-use state::{ClipContext, RecordedLambda, RecorderState, TopicState};
-use steps::LateClip;
-use waiting::WaitingTriggers;
+use sources::Sources;
+use writer::ClipDisk;
 
-#[cfg(feature = "program")]
 pub(crate) use live::counted;
 pub use settings::{Commanded, LambdaId, RecorderCounts, Settings, TopicId, Work};
-pub use state::LambdaSpec;
-
-/// Most topics of one recorder. A vehicle has some hundreds. For each, the stamps of some thousand
-/// lost samples are kept: 100 KiB.
-pub const TOPICS_MAX: usize = 1024;
-
-/// Most bytes of the names of all topics of one recorder, and of their types: they are in a line of
-/// the list of clips, up to seven times and with six bytes for one, and a line has at most 16 MiB.
-const NAMES_MAX: usize = 256 << 10;
+pub use sources::{LambdaSpec, TOPICS_MAX};
 
 /// Cuts clips out of the stream of samples. Time is given by stamps and [`Recorder::advance`], and
 /// never goes back.
@@ -58,22 +46,9 @@ const NAMES_MAX: usize = 256 << 10;
 /// After an error, drop the recorder. Its written data is recovered by the next
 /// [`RecordingFolder::open`].
 pub struct Recorder {
-    windows: Windows,
-    state: RecorderState,
-    open_clip: Option<OpenClip>,
-    /// A clip of windows before those of `open_clip`.
-    late_clip: Option<LateClip>,
-    /// The backfill of `late_clip`, or else of `open_clip`. Nothing is decided while it runs.
-    backfill: Option<Backfill>,
-    /// The last entry before the messages that could not be written to `open_clip` when they came.
-    behind: Option<Option<Walked>>,
-    /// The reason why recording is suspended.
-    held: Option<Arc<str>>,
-    /// Number of groups of windows so far.
-    groups: u64,
-    now: Option<i64>,
-    max_length_ns: i64,
-    finished: Finished,
+    sources: Sources,
+    history: History,
+    clips: Clips,
     counts: RecorderCounts,
     /// Buffer for an encoded wake.
     encoded: Vec<u8>,
@@ -87,45 +62,18 @@ impl Recorder {
     ///
     /// [`RecordError::Preroll`] if the preroll is on disk and there is no room.
     pub fn new(folder: RecordingFolder, settings: Settings) -> Result<Recorder, RecordError> {
-        Recorder::with(ClipWriter::inline(folder), settings, false)
+        Recorder::with(ClipDisk::inline(folder), settings, false)
     }
 
-    fn with(
-        writer: ClipWriter,
-        settings: Settings,
-        is_live: bool,
-    ) -> Result<Recorder, RecordError> {
+    fn with(disk: ClipDisk, settings: Settings, is_live: bool) -> Result<Recorder, RecordError> {
         let Settings { store, preroll_bytes, prefault, .. } = settings;
         let preroll =
             Preroll::open(store, preroll_bytes, settings.folder.join("preroll"), prefault)?;
         let max_length_ns = nanoseconds(settings.max_length).max(1);
         Ok(Recorder {
-            windows: Windows::new(max_length_ns),
-            state: RecorderState {
-                preroll,
-                losses: Vec::new(),
-                wake_losses: Vec::new(),
-                waiting: WaitingTriggers::default(),
-                context: ClipContext {
-                    writer,
-                    clips: 0,
-                    clock: settings.clock.clone(),
-                    limits: RecorderLimits::default(),
-                    is_live,
-                    topics: Vec::new(),
-                    lambdas: Vec::new(),
-                },
-                began_at: 0,
-            },
-            open_clip: None,
-            late_clip: None,
-            backfill: None,
-            behind: None,
-            held: None,
-            groups: 0,
-            now: None,
-            max_length_ns,
-            finished: Finished::default(),
+            sources: Sources::new(settings.clock.clone()),
+            history: History::new(preroll, RecorderLimits::default().message_bytes),
+            clips: Clips::new(disk, max_length_ns, is_live),
             counts: RecorderCounts { preroll_bound: preroll_bytes, ..RecorderCounts::default() },
             encoded: Vec::new(),
             settings,
@@ -164,26 +112,9 @@ impl Recorder {
         topic: TopicSchema,
         is_missing: bool,
     ) -> Result<TopicId, RecordError> {
-        let topics = &mut self.state.context.topics;
-        if let Some(found) =
-            topics.iter().position(|topic_state| topic_state.topic.name == topic.name)
-        {
-            return Ok(TopicId(found));
-        }
-        if topics.len() == TOPICS_MAX {
-            return Err(RecordError::TooManyTopics { most: TOPICS_MAX });
-        }
-        topic.check()?;
-        let names = |topic: &TopicSchema| topic.name.len() + topic.type_name.len();
-        if topics.iter().map(|topic_state| names(&topic_state.topic)).sum::<usize>() + names(&topic)
-            > NAMES_MAX
-        {
-            return Err(RecordError::LongNames { most: NAMES_MAX });
-        }
-        let (topic, lambdas, gaps) = (Arc::new(topic), Vec::new(), Gaps::default());
-        topics.push(TopicState { topic, is_missing, found_at: None, lambdas, gaps });
-        self.state.losses.push(Losses::default());
-        Ok(TopicId(topics.len() - 1))
+        let topic = self.sources.add_topic(topic, is_missing)?;
+        self.history.grow(topic + 1, 0);
+        Ok(TopicId::new(topic))
     }
 
     /// Adds a lambda that records, before its first wake.
@@ -202,31 +133,15 @@ impl Recorder {
     ///
     /// [`RecordError::TooManyLambdas`] beyond 1024.
     pub fn try_add_lambda(&mut self, member: LambdaSpec) -> Result<LambdaId, RecordError> {
-        if self.state.context.lambdas.len() == LAMBDAS_MAX {
-            return Err(RecordError::TooManyLambdas { most: LAMBDAS_MAX });
-        }
-        let lambda = self.windows.add(WindowRules {
+        self.sources.check_room()?;
+        let lambda = self.clips.add_lambda(WindowRules {
             preroll_ns: nanoseconds(member.rules.preroll),
             postroll_ns: nanoseconds(member.rules.postroll),
             cooldown_ns: nanoseconds(member.rules.cooldown),
         });
-        for topic in &member.topics {
-            let lambdas = &mut self.state.context.topics[topic.0].lambdas;
-            if !lambdas.contains(&lambda) {
-                lambdas.push(lambda);
-            }
-        }
-        let LambdaSpec { header, digest, topics, .. } = member;
-        let encoder = Encoder::new(header.inputs.len());
-        self.state.context.lambdas.push(RecordedLambda {
-            header: Arc::new(header),
-            digest,
-            topics,
-            encoder,
-            wakes: 0,
-        });
-        self.state.wake_losses.push(Losses::default());
-        Ok(LambdaId(lambda))
+        self.sources.add_lambda(lambda, member);
+        self.history.grow(0, lambda + 1);
+        Ok(LambdaId::new(lambda))
     }
 
     /// Takes a sample.
@@ -240,49 +155,25 @@ impl Recorder {
         meta: &SampleMeta,
         cdr: &[u8],
     ) -> Result<(), RecordError> {
+        let topic = topic.index();
         if meta.at_ns < 0 {
             self.counts.recording.before_1970 += 1;
             return Ok(());
         }
-        if self.state.context.topics[topic.0].is_missing {
+        if self.sources.is_missing(topic) {
             self.counts.recording.topic_unknown += 1;
             return Ok(());
         }
-        self.counts.out_of_order += u64::from(self.now.is_some_and(|now| meta.at_ns < now));
-        if self.state.context.is_live {
-            self.state.note_gap(topic.0, meta);
+        let is_late = self.history.now().is_some_and(|now| meta.at_ns < now);
+        self.counts.out_of_order += u64::from(is_late);
+        if self.clips.is_live() {
+            self.history.note_gap(topic, meta);
         }
         self.pass(meta.at_ns)?;
         // MCAP has no room for times before 1970.
         let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), ..*meta };
-        let in_group = self.write(topic.0, &meta, cdr)?;
-        let RecordingCounts { evicted_early, too_big, .. } = &mut self.counts.recording;
-        self.state.keep(EntryMeta::sample(topic.0, &meta, in_group), cdr, evicted_early, too_big)
-    }
-
-    /// Writes a sample to the open clip, if it belongs there. Returns the group whose clip then has
-    /// it, or 0.
-    fn write(&mut self, topic: usize, meta: &SampleMeta, cdr: &[u8]) -> Result<u64, RecordError> {
-        let is_prompt = self.is_prompt(meta.at_ns);
-        let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open()) else {
-            return Ok(0);
-        };
-        let RecorderState { preroll, context, .. } = &mut self.state;
-        if !context.covers(group, topic, meta.at_ns) {
-            return Ok(0);
-        }
-        if cdr.len() > context.limits.message_bytes {
-            open_clip.refuse(topic);
-        } else if is_prompt || !preroll.fits(cdr.len()) && context.writer.has_room() {
-            open_clip.message(context, group, topic, meta, cdr)?;
-        } else {
-            // It is counted as too big if it cannot be kept; else a backfill writes it later.
-            if self.backfill.is_none() || self.late_clip.is_some() {
-                self.behind.get_or_insert_with(|| preroll.newest());
-            }
-            return Ok(0);
-        }
-        Ok(open_clip.group)
+        let in_group = self.clips.write(topic, &meta, cdr, &self.history, &self.sources)?;
+        self.history.keep(EntryMeta::sample(topic, &meta, in_group), cdr)
     }
 
     /// Takes a wake of a lambda for its journal, and applies its triggers.
@@ -294,44 +185,47 @@ impl Recorder {
     ///
     /// [`RecordError`] if the disk fails.
     pub fn wake(&mut self, lambda: LambdaId, entry: &JournalEntry) -> Result<(), RecordError> {
-        let recorded = &mut self.state.context.lambdas[lambda.0];
-        let number = recorded.wakes;
-        recorded.wakes += 1;
+        let mut encoded = std::mem::take(&mut self.encoded);
+        self.sources.encode(lambda.index(), entry, &mut encoded);
+        let taken = self.encoded_wake(lambda, entry, &encoded);
+        self.encoded = encoded;
+        taken
+    }
+
+    /// As [`Recorder::wake`], for a wake that its lambda has encoded without reference to another
+    /// one: preroll and clip keep these bytes. They decode to `entry`.
+    ///
+    /// # Errors
+    ///
+    /// As [`Recorder::wake`].
+    pub fn encoded_wake(
+        &mut self,
+        lambda: LambdaId,
+        entry: &JournalEntry,
+        encoded: &[u8],
+    ) -> Result<(), RecordError> {
+        let number = self.sources.count_wakes(lambda.index(), 1);
         if entry.at_ns < 0 {
             self.counts.recording.before_1970 += 1;
             return Ok(());
         }
-        self.encoded.clear();
-        recorded.encoder.reset();
-        recorded.encoder.encode(entry, &mut self.encoded);
-        if !self.state.context.is_live {
+        if !self.clips.is_live() {
             self.pass(entry.at_ns)?;
         }
-        let mut in_group = 0;
-        if let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open())
-            && (group.begin..=group.to.min(self.windows.limit())).contains(&entry.at_ns)
-        {
-            open_clip.wake(lambda.0, number, &self.encoded);
-            in_group = open_clip.group;
-        }
-        let RecordingCounts { evicted_early, too_big, .. } = &mut self.counts.recording;
-        self.state.keep(
-            EntryMeta::wake(lambda.0, number, entry.at_ns, in_group),
-            &self.encoded,
-            evicted_early,
-            too_big,
-        )?;
+        let in_group = self.clips.wake(lambda.index(), number, entry.at_ns, encoded);
+        let held = EntryMeta::wake(lambda.index(), number, entry.at_ns, in_group);
+        self.history.keep(held, encoded)?;
         if entry.triggers.is_empty() {
             return Ok(());
         }
-        if self.held.is_some() {
-            self.counts.recording.disk_suppressed +=
-                entry.triggers.iter().filter(|trigger| trigger.kind != TriggerKind::Stop).count()
-                    as u64;
+        if self.clips.is_held() {
+            let starts = entry.triggers.iter().filter(|trigger| trigger.kind != TriggerKind::Stop);
+            self.clips.count_suppressed(starts.count() as u64);
             return Ok(());
         }
         for trigger in &entry.triggers {
-            match self.windows.trigger(lambda.0, trigger.kind, &trigger.label, entry.at_ns) {
+            let (kind, label) = (trigger.kind, &trigger.label);
+            match self.clips.trigger(lambda.index(), kind, label, entry.at_ns) {
                 TriggerOutcome::Opened => self.counts.recording.windows += 1,
                 TriggerOutcome::InCooldown => self.counts.recording.in_cooldown += 1,
                 TriggerOutcome::Ignored => self.counts.recording.ignored += 1,
@@ -339,28 +233,10 @@ impl Recorder {
                 TriggerOutcome::TooManyWaiting => self.counts.recording.too_many_waiting += 1,
                 TriggerOutcome::Stopped => {}
             }
-            self.await_clip(lambda, Moment::of(self.name_of(lambda), trigger, entry.at_ns));
+            let moment = Moment::of(self.sources.name(lambda.index()), trigger, entry.at_ns);
+            self.clips.await_clip(lambda.index(), moment);
         }
-        self.act()
-    }
-
-    fn name_of(&self, lambda: LambdaId) -> &str {
-        &self.state.context.lambdas[lambda.0].header.lambda
-    }
-
-    /// Queues a moment for the clip that it belongs to.
-    fn await_clip(&mut self, lambda: LambdaId, moment: Moment) {
-        let most = self.state.context.limits.waiting;
-        self.state.waiting.push(lambda.0, moment, &self.windows, most);
-    }
-
-    /// Applies the effects of triggers.
-    fn act(&mut self) -> Result<(), RecordError> {
-        self.run()?;
-        if let (Some(open_clip), Some(group)) = (&mut self.open_clip, self.windows.open()) {
-            self.state.gather(open_clip, group, self.windows.limit());
-        }
-        Ok(())
+        self.clips.act(&mut self.history, &self.sources)
     }
 
     /// Advances time without samples.
@@ -372,20 +248,50 @@ impl Recorder {
         self.pass(now_ns.max(0))
     }
 
+    fn pass(&mut self, now: i64) -> Result<(), RecordError> {
+        self.history.pass(now);
+        self.clips.pass(now, &mut self.history, &self.sources)
+    }
+
+    /// Ends the recording: completes open clips. A clip whose window had not ended notes that.
+    /// Live, this waits for the disk.
+    ///
+    /// # Errors
+    ///
+    /// [`RecordError`] if the disk fails.
+    pub fn finish(&mut self, end_ns: i64) -> Result<(), RecordError> {
+        self.clips.end_recovery();
+        self.clips.set_grace(0);
+        self.pass(end_ns.max(0))?;
+        let end = self.history.now().unwrap_or(end_ns);
+        self.clips.finish(end, &mut self.history, &self.sources)
+    }
+
     /// The newest finished clips, in order; `clips.jsonl` has all.
     pub fn clips(&self) -> &[Clip] {
-        self.finished.newest()
+        self.clips.finished().newest()
     }
 
     /// The counts so far.
     pub fn counts(&self) -> RecorderCounts {
-        let preroll = &self.state.preroll;
+        let preroll = self.history.preroll();
+        let (evicted_early, too_big) = self.history.counts();
+        let disk_suppressed = self.clips.disk_suppressed();
+        let mut recording =
+            RecordingCounts { evicted_early, too_big, disk_suppressed, ..self.counts.recording };
+        recording.add(self.clips.finished().counts());
         RecorderCounts {
-            recording: RecordingCounts { clips: self.finished.count, ..self.counts.recording },
+            recording,
             preroll_bytes: preroll.bytes_held(),
             preroll_highest: preroll.bytes_highest(),
-            in_flight: self.state.context.writer.in_flight() as u64,
+            in_flight: self.clips.in_flight(),
             ..self.counts
         }
+    }
+
+    #[cfg(test)]
+    fn set_limits(&mut self, limits: RecorderLimits) {
+        self.history.set_message_bytes(limits.message_bytes);
+        self.clips.set_limits(limits);
     }
 }

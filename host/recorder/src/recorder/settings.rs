@@ -25,11 +25,31 @@ pub struct Settings {
 
 /// A topic of a recorder.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct TopicId(pub(super) usize);
+pub struct TopicId(usize);
+
+impl TopicId {
+    pub(super) fn new(index: usize) -> TopicId {
+        TopicId(index)
+    }
+
+    pub(super) fn index(self) -> usize {
+        self.0
+    }
+}
 
 /// A lambda of a recorder.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct LambdaId(pub(super) usize);
+pub struct LambdaId(usize);
+
+impl LambdaId {
+    pub(super) fn new(index: usize) -> LambdaId {
+        LambdaId(index)
+    }
+
+    pub(super) fn index(self) -> usize {
+        self.0
+    }
+}
 
 /// Counts of a recorder.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]

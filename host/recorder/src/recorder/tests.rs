@@ -12,7 +12,7 @@ fn recorder(
     limits: RecorderLimits,
 ) -> (Recorder, TopicId, LambdaId) {
     let mut recorder = scratch.recorder(|_| {});
-    recorder.state.context.limits = limits;
+    recorder.set_limits(limits);
     let a = recorder.add_topic(topic("/a")).unwrap();
     let lambda = recorder.add_lambda(member("hello", rolls_ms, &[a]));
     (recorder, a, lambda)
@@ -55,8 +55,7 @@ fn the_journals_of_a_clip_are_bounded_together_and_each_states_what_is_missing()
     (100..140).for_each(|ms| {
         [first, second].into_iter().for_each(|lambda| wake(&mut recorder, lambda, ms))
     });
-    let open_clip = recorder.open_clip.as_ref().unwrap();
-    assert!(open_clip.journal_bytes() <= 3 << 10);
+    assert!(recorder.clips.open_clip().unwrap().journals().bytes() <= 3 << 10);
     recorder.finish(T0 + S).unwrap();
     let clip = &recorder.clips()[0];
     let mut lacking = 0;
@@ -103,7 +102,7 @@ fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
 fn triggers_beyond_the_waiting_limit_are_counted_in_their_clip() {
     let scratch = TestDir::new();
     let mut recorder = scratch.recorder(|_| {});
-    recorder.state.context.limits.waiting = 20;
+    recorder.set_limits(RecorderLimits { waiting: 20, ..RecorderLimits::default() });
     let a = recorder.add_topic(topic("/a")).unwrap();
     let noisy = recorder.add_lambda(member("noisy", (5, 0, 0), &[a]));
     // Its preroll holds each clip open for long, so that the windows of the other wait.
@@ -178,15 +177,15 @@ fn a_lambda_that_triggers_in_every_wake_visits_only_new_entries() {
             recorder.sample(a, &meta(T0 + ms * MS, ms as u64), &ms.to_le_bytes()).unwrap();
             wake(&mut recorder, lambda, ms - late_ms);
             // If it were visited again, it would be written again.
-            let oldest = recorder.state.preroll.next(None).unwrap().place();
-            recorder.state.preroll.mark(oldest, 0);
-            let settled = recorder.open_clip.as_ref().unwrap().settled.unwrap();
+            let oldest = recorder.history.preroll().next(None).unwrap().place();
+            recorder.history.preroll_mut().mark(oldest, 0);
+            let settled = recorder.clips.open_clip().unwrap().settled().unwrap();
             assert_eq!(settled.newest, T0 + (ms - late_ms) * MS);
             let mut left = 0;
-            let mut next = recorder.state.preroll.next(Some(settled.last));
+            let mut next = recorder.history.preroll().next(Some(settled.last));
             while let Some(walked) = next {
                 left += 1;
-                next = recorder.state.preroll.next(Some(walked));
+                next = recorder.history.preroll().next(Some(walked));
             }
             assert!(left <= 3 * late_ms, "{left} entries are visited again");
         }
@@ -211,8 +210,8 @@ fn random_drive(seed: u64, forgets: bool) -> Vec<Vec<(String, i64, u32)>> {
         let at = ms - random.below(3) * random.below(5);
         recorder.sample(a, &meta(T0 + at * MS, ms as u64), b"x").unwrap();
         for (lambda, rarely) in lambdas.iter().zip([6, 40]) {
-            if let (true, Some(open_clip)) = (forgets, &mut recorder.open_clip) {
-                open_clip.settled = None;
+            if let (true, Some(open_clip)) = (forgets, recorder.clips.open_clip()) {
+                open_clip.unsettle();
             }
             if random.below(rarely) == 0 {
                 wake(&mut recorder, *lambda, ms - random.below(2) * random.below(20));

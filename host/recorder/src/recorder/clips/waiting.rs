@@ -9,7 +9,7 @@ use crate::window::{Group, Windows};
 
 /// Triggers in order of their wakes.
 #[derive(Debug, Default)]
-pub(super) struct WaitingTriggers {
+pub struct WaitingTriggers {
     moments: VecDeque<(usize, Moment)>,
     /// Triggers without room, which are only counted, by lambda.
     counted: BTreeMap<usize, CountedTriggers>,
@@ -26,7 +26,7 @@ struct CountedTriggers {
 impl WaitingTriggers {
     /// Adds a trigger. At most `most` wait: beyond it, the oldest that no window covers is dropped,
     /// or else the new one.
-    pub(super) fn push(&mut self, lambda: usize, moment: Moment, windows: &Windows, most: usize) {
+    pub fn push(&mut self, lambda: usize, moment: Moment, windows: &Windows, most: usize) {
         let horizon = windows.horizon();
         while self.moments.front().is_some_and(|(_, moment)| moment.at_ns < horizon) {
             self.moments.pop_front();
@@ -61,7 +61,7 @@ impl WaitingTriggers {
     }
 
     /// The trigger of `lambda` at `at_ns`, if it waits.
-    pub(super) fn find(&self, lambda: usize, at_ns: i64) -> Option<&Moment> {
+    pub fn find(&self, lambda: usize, at_ns: i64) -> Option<&Moment> {
         self.moments
             .iter()
             .find(|(owner, moment)| *owner == lambda && moment.at_ns == at_ns)
@@ -70,7 +70,7 @@ impl WaitingTriggers {
 
     /// Takes the triggers within `group` and not after `limit`; returns the number of further ones
     /// that were only counted.
-    pub(super) fn take(&mut self, group: &Group, limit: i64, mut each: impl FnMut(Moment)) -> u64 {
+    pub fn take(&mut self, group: &Group, limit: i64, mut each: impl FnMut(Moment)) -> u64 {
         let inside = inside(group, limit);
         for _ in 0..self.moments.len() {
             let Some((lambda, moment)) = self.moments.pop_front() else { break };
@@ -93,7 +93,7 @@ impl WaitingTriggers {
 
     /// The lambdas with possibly more triggers within `group` and not after `limit` than were
     /// taken: they were only counted, and some of them lie outside.
-    pub(super) fn uncertain(&self, group: &Group, limit: i64) -> Vec<usize> {
+    pub fn uncertain(&self, group: &Group, limit: i64) -> Vec<usize> {
         let inside = inside(group, limit);
         let overlaps = |counted: &CountedTriggers| {
             counted.from <= *inside.end() && *inside.start() <= counted.to

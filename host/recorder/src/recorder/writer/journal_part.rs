@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::io;
 
-use gleaner_journal::{Decoder, JournalEnd, JournalHeader, JournalWriter};
+use gleaner_journal::{JournalEnd, JournalHeader, JournalWriter};
 
 /// Approximate overhead of a wake in memory.
 const OVERHEAD: usize = 64;
@@ -13,7 +13,7 @@ const OVERHEAD: usize = 64;
 /// If there is no room for all, the last ones are dropped: the wakes of a journal are consecutive,
 /// so that it can be replayed wake by wake.
 #[derive(Debug, Default)]
-pub(in crate::recorder) struct JournalPart {
+pub struct JournalPart {
     /// By their numbers.
     wakes: BTreeMap<u64, Box<[u8]>>,
     bytes: usize,
@@ -25,7 +25,7 @@ pub(in crate::recorder) struct JournalPart {
 impl JournalPart {
     /// Adds a wake, of which there is none with this number, if all of them take at most `most`
     /// bytes.
-    pub(in crate::recorder) fn push(&mut self, number: u64, encoded: &[u8], most: usize) {
+    pub fn push(&mut self, number: u64, encoded: &[u8], most: usize) {
         if self.end.is_some_and(|end| number >= end) {
             self.cut += 1;
             return;
@@ -42,18 +42,18 @@ impl JournalPart {
     }
 
     /// Number of wakes without room.
-    pub(in crate::recorder) fn cut(&self) -> u64 {
+    pub fn cut(&self) -> u64 {
         self.cut
     }
 
     /// Approximate size in memory.
-    pub(in crate::recorder) fn bytes(&self) -> usize {
+    pub fn bytes(&self) -> usize {
         self.bytes
     }
 
     /// Keeps the longest run of consecutive wakes, and returns the number of others: some in
     /// between did not reach the recorder.
-    pub(in crate::recorder) fn keep_run(&mut self) -> u64 {
+    pub fn keep_run(&mut self) -> u64 {
         let (mut longest, mut run) = (0..0, 0..0);
         for number in self.wakes.keys() {
             run = if *number == run.end && !run.is_empty() {
@@ -71,18 +71,16 @@ impl JournalPart {
     }
 
     /// A journal of these wakes; `None` if there are none.
-    pub(in crate::recorder) fn write(self, header: &JournalHeader) -> Option<io::Result<Vec<u8>>> {
+    pub fn write(self, header: &JournalHeader) -> Option<io::Result<Vec<u8>>> {
         let (first, _) = self.wakes.first_key_value()?;
         let header = JournalHeader { wakes_before: *first, ..header.clone() };
         Some(self.journal(&header))
     }
 
     fn journal(&self, header: &JournalHeader) -> io::Result<Vec<u8>> {
-        let mut decoder = Decoder::new(header.inputs.len());
         let mut writer = JournalWriter::begin(Vec::new(), header)?;
         for encoded in self.wakes.values() {
-            decoder.reset();
-            writer.wake(&decoder.decode(&mut &encoded[..]).map_err(io::Error::other)?)?;
+            writer.encoded_wake(encoded)?;
         }
         writer.finish(&JournalEnd {
             wakes: self.wakes.len() as u64,

@@ -3,7 +3,7 @@
 const DAY_S: i64 = 86_400;
 
 /// The lambda that triggered, and the time in UTC with milliseconds.
-pub(super) fn clip_name(lambda: &str, at_ns: i64) -> String {
+pub fn clip_name(lambda: &str, at_ns: i64) -> String {
     let (seconds, nanoseconds) = (at_ns.div_euclid(1_000_000_000), at_ns.rem_euclid(1_000_000_000));
     let (year, month, day) = date(seconds.div_euclid(DAY_S));
     let second = seconds.rem_euclid(DAY_S);

@@ -1,0 +1,220 @@
+//! The recent samples and wakes of a recorder, and what of them was lost.
+
+use gleaner_transport::{Gaps, SampleMeta};
+
+use super::clips::OpenClip;
+use super::sources::Sources;
+use crate::RecordError;
+use crate::preroll::{EntryMeta, Losses, Preroll};
+use crate::window::{Group, Window};
+
+/// The preroll, with the losses of each source. Time never goes back.
+pub struct History {
+    preroll: Preroll,
+    /// The longest message that any clip can hold.
+    message_bytes: usize,
+    /// By topic.
+    topics: Vec<TopicLosses>,
+    /// Losses of wakes, by lambda.
+    wakes: Vec<Losses>,
+    /// The first stamp or time.
+    began_at: i64,
+    now: Option<i64>,
+    /// Samples evicted before they were old enough.
+    evicted_early: u64,
+    /// Samples that do not fit.
+    too_big: u64,
+}
+
+/// Losses of the samples of a topic.
+#[derive(Default)]
+struct TopicLosses {
+    losses: Losses,
+    /// Losses upstream, from gaps in sequence numbers.
+    gaps: Gaps,
+}
+
+impl History {
+    pub fn new(preroll: Preroll, message_bytes: usize) -> History {
+        History {
+            preroll,
+            message_bytes,
+            topics: Vec::new(),
+            wakes: Vec::new(),
+            began_at: 0,
+            now: None,
+            evicted_early: 0,
+            too_big: 0,
+        }
+    }
+
+    pub fn preroll(&self) -> &Preroll {
+        &self.preroll
+    }
+
+    pub fn preroll_mut(&mut self) -> &mut Preroll {
+        &mut self.preroll
+    }
+
+    /// The latest time so far.
+    pub fn now(&self) -> Option<i64> {
+        self.now
+    }
+
+    /// Samples evicted early, and samples that did not fit.
+    pub fn counts(&self) -> (u64, u64) {
+        (self.evicted_early, self.too_big)
+    }
+
+    #[cfg(test)]
+    pub fn set_message_bytes(&mut self, most: usize) {
+        self.message_bytes = most;
+    }
+
+    /// Grows to `topics` topics and `lambdas` lambdas.
+    pub fn grow(&mut self, topics: usize, lambdas: usize) {
+        self.topics.resize_with(self.topics.len().max(topics), TopicLosses::default);
+        self.wakes.resize_with(self.wakes.len().max(lambdas), Losses::default);
+    }
+
+    /// Advances time.
+    pub fn pass(&mut self, now: i64) {
+        if self.now.is_none() {
+            self.began_at = now;
+        }
+        self.now = self.now.max(Some(now));
+    }
+
+    /// Keeps an entry.
+    pub fn keep(&mut self, held: EntryMeta, bytes: &[u8]) -> Result<(), RecordError> {
+        let is_sample = held.source.as_topic().is_some();
+        let History { preroll, topics, wakes, evicted_early, .. } = self;
+        let mut gone = |gone: &EntryMeta| {
+            *evicted_early += u64::from(gone.source.as_topic().is_some());
+            if let Some(losses) = losses_of(topics, wakes, gone) {
+                losses.overwritten.add(gone.at_ns, gone.group);
+            }
+        };
+        // A message that is too large for any clip is not kept.
+        let fits = !is_sample || bytes.len() <= self.message_bytes;
+        if fits && preroll.push(held, bytes, &mut gone)? {
+            return Ok(());
+        }
+        self.too_big += u64::from(is_sample);
+        if let Some(losses) = losses_of(topics, wakes, &held) {
+            losses.too_big.add(held.at_ns, held.group);
+        }
+        Ok(())
+    }
+
+    /// Drops entries older than `before`.
+    pub fn trim(&mut self, before: i64) -> Result<(), RecordError> {
+        let History { preroll, topics, wakes, .. } = self;
+        preroll.trim(before, &mut |held| {
+            if let Some(losses) = losses_of(topics, wakes, held) {
+                losses.aged.add(held.at_ns, held.group);
+            }
+        })
+    }
+
+    /// Counts losses before a sample, from its sequence number.
+    pub fn note_gap(&mut self, topic: usize, meta: &SampleMeta) {
+        let TopicLosses { losses, gaps } = &mut self.topics[topic];
+        let before = gaps.lost();
+        let missing = gaps.note(meta.writer, meta.seq);
+        if missing > 0 {
+            losses.lost.add_some(meta.at_ns, 0, missing);
+        } else if gaps.lost() < before {
+            losses.lost.take_back();
+        }
+    }
+
+    /// Counts a sample that arrived without room for it.
+    pub fn lost_sample(&mut self, topic: usize, meta: &SampleMeta) {
+        self.note_gap(topic, meta);
+        self.topics[topic].losses.lost.add(meta.at_ns, 0);
+    }
+
+    /// Counts wakes that did not arrive.
+    pub fn lost_wakes(&mut self, lambda: usize, at_ns: i64, count: u64) {
+        self.wakes[lambda].lost.add_some(at_ns, 0, count);
+    }
+
+    /// Notes data that a window covers but that is no longer available.
+    pub fn reach_back(&self, clip: &mut OpenClip, window: &Window, sources: &Sources) {
+        clip.begins_late(self.began_at.saturating_sub(window.from));
+        let number = clip.group();
+        for topic in sources.topics(window.lambda) {
+            let losses = &self.topics[*topic].losses;
+            let tally = clip.tally(*topic);
+            tally.is_aged |= losses.aged.hides(window.from, number);
+            if losses.overwritten.is_unknown(window.from, number) {
+                tally.overwritten = None;
+            }
+            if losses.too_big.is_unknown(window.from, number) {
+                tally.too_big = None;
+            }
+        }
+    }
+
+    /// Counts samples and wakes that the preroll has lost.
+    pub fn count_losses(
+        &mut self,
+        clip: &mut OpenClip,
+        group: &Group,
+        sources: &Sources,
+        limit: i64,
+    ) {
+        let number = clip.group();
+        for topic in sources.topics_of(group) {
+            let covered = |at: i64| at <= limit && sources.covers(group, topic, at);
+            let losses = &mut self.topics[topic].losses;
+            let (overwritten, too_big) =
+                (losses.overwritten.count(number, covered), losses.too_big.count(number, covered));
+            let tally = clip.tally(topic);
+            tally.overwritten = tally.overwritten.map(|count| count + overwritten);
+            tally.too_big = tally.too_big.map(|count| count + too_big);
+        }
+        let inside = group.begin..=group.to.min(limit);
+        for (lambda, losses) in self.wakes.iter_mut().enumerate() {
+            let covered = |at: i64| inside.contains(&at);
+            let lost =
+                losses.overwritten.count(number, covered) + losses.too_big.count(number, covered);
+            clip.journals().evicted(lambda, lost);
+        }
+    }
+
+    /// Counts samples and wakes that did not reach the recorder.
+    pub fn count_lost(
+        &mut self,
+        clip: &mut OpenClip,
+        group: &Group,
+        sources: &Sources,
+        limit: i64,
+    ) {
+        let (number, from) = (clip.group(), clip.from(group));
+        for topic in sources.topics_of(group) {
+            let lost = &mut self.topics[topic].losses.lost;
+            let is_known = !lost.is_unknown(from, number)
+                && sources.found_at(topic).is_none_or(|at| at <= from);
+            let count = lost.count(number, |at| at <= limit && sources.covers(group, topic, at));
+            clip.tally(topic).lost = is_known.then_some(count);
+        }
+        let inside = group.begin..=group.to.min(limit);
+        for lambda in &group.lambdas {
+            let count = self.wakes[*lambda].lost.count(number, |at| inside.contains(&at));
+            clip.journals().undelivered(*lambda, count);
+        }
+    }
+}
+
+fn losses_of<'a>(
+    topics: &'a mut [TopicLosses],
+    wakes: &'a mut [Losses],
+    held: &EntryMeta,
+) -> Option<&'a mut Losses> {
+    match held.source.lambda() {
+        Some(lambda) => wakes.get_mut(lambda),
+        None => topics.get_mut(held.source.as_topic()?).map(|topic| &mut topic.losses),
+    }
+}
