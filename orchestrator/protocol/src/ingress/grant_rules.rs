@@ -2,7 +2,7 @@
 
 use gleaner_lambda::manifest::{self, Durability, InputSpec, Reliability};
 
-use super::{HoldGrant, Qos, TopicGrant};
+use super::{HoldGrant, PublishGrant, Qos, TopicGrant};
 
 /// Samples up to this size are small. Memory for twice as many as a lambda reads costs little.
 const SMALL_BYTES: u64 = 64 << 10;
@@ -17,6 +17,29 @@ const WINDOWS_LARGE: u16 = 2;
 /// Single samples that a lambda holds beyond its own `hold`: the one that woke it, the newest one
 /// that a wake sees, and those that two threads look up.
 const SINGLES: usize = 4;
+
+/// Type of the answers to wakes.
+const ROUND_TRIP_TYPE: &str = "sensor_msgs/msg/TimeReference";
+/// Answers of one second at 1 kHz; older ones are dropped.
+const ROUND_TRIP_DEPTH: usize = 1024;
+/// Type of published decisions.
+const DECISIONS_TYPE: &str = "std_msgs/msg/String";
+/// Decisions that wait for slow readers.
+const DECISIONS_DEPTH: usize = 256;
+
+impl PublishGrant {
+    /// The grants of a lambda's process: the topic on which it answers each wake, then the topic on
+    /// which it publishes decisions, if there are any.
+    pub fn of_lambda(round_trip: Option<&str>, decisions: Option<&str>) -> Vec<PublishGrant> {
+        let grant = |topic: &str, type_name: &str, depth| {
+            let (topic, type_name) = (topic.to_owned(), type_name.to_owned());
+            PublishGrant { topic, type_name, depth }
+        };
+        let round_trip = round_trip.map(|topic| grant(topic, ROUND_TRIP_TYPE, ROUND_TRIP_DEPTH));
+        let decisions = decisions.map(|topic| grant(topic, DECISIONS_TYPE, DECISIONS_DEPTH));
+        round_trip.into_iter().chain(decisions).collect()
+    }
+}
 
 impl TopicGrant {
     /// The grant of an input to a lambda's process. `index` is that of the input in its manifest.
