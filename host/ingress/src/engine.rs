@@ -1,0 +1,452 @@
+//! The loop of the ingress: one thread that owns the source, the topics and the readers.
+
+use std::os::fd::{AsFd, OwnedFd};
+use std::time::{Duration, Instant};
+
+use gleaner_buffers::shared::SharedLayout;
+use gleaner_protocol::ingress::{
+    AddReader, AddTopics, AttachedTopic, IngressReport, IngressRequest, IngressServer,
+    IngressStatus, ReaderMessage, RefusedTopic, RegionLayout, SourceStatus, TopicGrant,
+};
+use gleaner_protocol::link::{Incoming, LinkError};
+use gleaner_transport::{DiscoveredTopic, Health, LiveSource, same_type};
+use gleaner_vitals::usage;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use tracing::{error, info, warn};
+
+use crate::reader::{Attachment, ConnectedReader, DefinitionsWait};
+use crate::topic::SharedTopic;
+use crate::topics::TopicTable;
+
+/// Interval of checks for what no descriptor announces: writers of a topic, definitions, the end of
+/// a drive.
+const TICK: Duration = Duration::from_millis(100);
+/// Interval of the status.
+const STATUS_INTERVAL: Duration = Duration::from_secs(1);
+/// Time that a reader waits for definitions at most.
+const DEFINITIONS_TIMEOUT: Duration = Duration::from_secs(6);
+/// Most readers at a time. Each has a socket and a control page.
+const READERS: usize = 512;
+
+/// Receives reports of the ingress. It must not block.
+pub type Reports = Box<dyn FnMut(IngressReport) + Send>;
+
+/// The ingress: shares the samples of one source with its readers.
+pub struct Ingress {
+    source: Box<dyn LiveSource>,
+    reports: Reports,
+    topics: TopicTable,
+    readers: Vec<ConnectedReader>,
+    health: Health,
+    /// True from the start of a drive to its end.
+    plays: bool,
+    status_at: Instant,
+    tick_at: Instant,
+}
+
+/// The reason why the loop ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum LoopEnd {
+    Stopped,
+    StarterEnded,
+}
+
+impl Ingress {
+    /// Creates an ingress without readers.
+    pub fn new(source: Box<dyn LiveSource>, reports: Reports) -> Self {
+        let now = Instant::now();
+        Self {
+            health: source.health(),
+            source,
+            reports,
+            topics: TopicTable::default(),
+            readers: Vec::new(),
+            plays: false,
+            status_at: now,
+            tick_at: now,
+        }
+    }
+
+    /// Serves readers until the starter sends stop or ends, or until `stop` is readable. Readers
+    /// then see the end of their connections.
+    ///
+    /// # Errors
+    ///
+    /// Errors of waiting for sockets, which need a kernel without memory.
+    pub fn run(mut self, control: IngressServer, stop: Option<OwnedFd>) -> std::io::Result<()> {
+        (self.reports)(IngressReport::Ready);
+        let mut control = control;
+        let end = self.serve(&mut control, stop.as_ref())?;
+        info!(reason = ?end, "the ingress ends");
+        self.update_status(Instant::now());
+        let status = self.status();
+        (self.reports)(IngressReport::Ended(Box::new(status)));
+        Ok(())
+    }
+
+    fn serve(
+        &mut self,
+        control: &mut IngressServer,
+        stop: Option<&OwnedFd>,
+    ) -> std::io::Result<LoopEnd> {
+        loop {
+            let now = Instant::now();
+            self.tick(now);
+            let ready = self.wait(control, stop, now)?;
+            if ready.stop {
+                return Ok(LoopEnd::Stopped);
+            }
+            // Before new readers: one that is restarted has the name of one that has ended.
+            self.handle_readers(&ready.readers, Instant::now());
+            if ready.control
+                && let Some(end) = self.handle_control(control)
+            {
+                return Ok(end);
+            }
+        }
+    }
+
+    /// Waits until something has to be done.
+    fn wait(
+        &mut self,
+        control: &IngressServer,
+        stop: Option<&OwnedFd>,
+        now: Instant,
+    ) -> std::io::Result<Ready> {
+        let mut timeout = self.tick_at.min(self.status_at).saturating_duration_since(now);
+        let mut events = Vec::with_capacity(self.readers.len());
+        for reader in &mut self.readers {
+            let wait = reader.wait(now);
+            // While it may make no request, only its end is of interest.
+            let reads = if wait.is_zero() { PollFlags::IN } else { PollFlags::empty() };
+            let writes = if reader.is_pending() { PollFlags::OUT } else { PollFlags::empty() };
+            if reader.has_more() {
+                timeout = timeout.min(wait);
+            }
+            events.push(reads | writes);
+        }
+        let mut polled = vec![PollFd::new(control, PollFlags::IN)];
+        let with_events = self.readers.iter().zip(events);
+        polled.extend(with_events.map(|(reader, events)| PollFd::new(reader, events)));
+        polled.extend(stop.map(|stop| PollFd::new(stop, PollFlags::IN)));
+        let timeout = Timespec {
+            tv_sec: timeout.as_secs().try_into().unwrap_or(i64::MAX),
+            tv_nsec: timeout.subsec_nanos().into(),
+        };
+        match poll(&mut polled, Some(&timeout)) {
+            Ok(_) | Err(Errno::INTR) => {}
+            Err(error) => return Err(error.into()),
+        }
+        let mut found = polled.iter().map(PollFd::revents);
+        Ok(Ready {
+            control: found.next().is_some_and(|events| !events.is_empty()),
+            readers: found.by_ref().take(self.readers.len()).collect(),
+            stop: found.next().is_some_and(|events| !events.is_empty()),
+        })
+    }
+
+    fn handle_readers(&mut self, ready: &[PollFlags], now: Instant) {
+        for (index, events) in ready.iter().enumerate() {
+            let reader = &mut self.readers[index];
+            if events.contains(PollFlags::OUT) {
+                reader.flush();
+            }
+            let ended = PollFlags::HUP | PollFlags::ERR;
+            if !reader.wait(now).is_zero() {
+                // What it published beyond its rate is lost with it.
+                reader.is_gone |= events.intersects(ended);
+            } else if reader.has_more() || events.intersects(ended | PollFlags::IN) {
+                for id in reader.handle_requests(now) {
+                    self.need_definitions(index, id, now);
+                }
+            }
+        }
+        self.remove_gone();
+    }
+
+    /// Handles all requests of the starter that have arrived.
+    fn handle_control(&mut self, control: &mut IngressServer) -> Option<LoopEnd> {
+        loop {
+            match control.poll() {
+                Ok(Incoming::Message(IngressRequest::AddReader(add, socket))) => {
+                    self.add_reader(&add, socket);
+                }
+                Ok(Incoming::Message(IngressRequest::AddTopics(add))) => self.add_topics(add),
+                Ok(Incoming::Message(IngressRequest::Begin)) => {
+                    self.plays = true;
+                    self.source.begin();
+                    self.tick_soon();
+                }
+                Ok(Incoming::Message(IngressRequest::Stop)) => return Some(LoopEnd::Stopped),
+                Ok(Incoming::Nothing) => return None,
+                Ok(Incoming::Ended) => return Some(LoopEnd::StarterEnded),
+                Err(why @ LinkError::Grant { .. }) => {
+                    let error = &why as &dyn std::error::Error;
+                    error!(error, "a request of the starter is refused");
+                }
+                Err(why) => {
+                    let error = &why as &dyn std::error::Error;
+                    error!(error, "protocol error on the control connection");
+                    return Some(LoopEnd::StarterEnded);
+                }
+            }
+        }
+    }
+
+    fn add_reader(&mut self, add: &AddReader, socket: OwnedFd) {
+        if self.readers.len() == READERS {
+            error!(reader = add.name, most = READERS, "too many readers: one is refused");
+            return;
+        }
+        if self.readers.iter().any(|reader| reader.name == add.name) {
+            warn!(reader = add.name, "a second reader of this name");
+        }
+        match ConnectedReader::welcome(add, socket, &*self.source, Instant::now()) {
+            Ok(reader) => self.readers.push(reader),
+            Err(why) => {
+                let error = &why as &dyn std::error::Error;
+                error!(reader = add.name, error, "cannot serve a reader");
+                return;
+            }
+        }
+        self.grant(self.readers.len() - 1, &add.topics);
+        self.remove_gone();
+    }
+
+    fn add_topics(&mut self, add: AddTopics) {
+        match self.readers.iter().rposition(|reader| reader.name == add.reader) {
+            Some(index) => self.grant(index, &add.topics),
+            None => warn!(reader = add.reader, "further topics for a reader that has ended"),
+        }
+        self.remove_gone();
+    }
+
+    /// Attaches granted topics, as far as they are known.
+    fn grant(&mut self, index: usize, grants: &[TopicGrant]) {
+        let topics = self.source.topics();
+        for grant in grants {
+            let id = grant.id;
+            let reader = &mut self.readers[index];
+            let is_used = reader.topics.iter().any(|known| known.id == id)
+                || reader.waiting.iter().any(|known| known.id == id);
+            if is_used {
+                let reason = vec![format!("id {id} is granted twice")];
+                reader.refuse(id, RefusedTopic::Other(reason));
+            } else if let Some(type_name) = &grant.type_name {
+                let is_it = |topic: &&DiscoveredTopic| {
+                    topic.topic == grant.topic && same_type(&topic.type_name, type_name)
+                };
+                let found = topics.iter().find(is_it);
+                self.attach(index, grant, &type_name.clone(), found);
+            } else if !self.attach_found(index, grant, &topics) {
+                self.readers[index].waiting.push(grant.clone());
+                self.tick_soon();
+            }
+        }
+    }
+
+    /// Attaches a topic with the type of its writers. Returns false if there is none yet.
+    fn attach_found(
+        &mut self,
+        index: usize,
+        grant: &TopicGrant,
+        topics: &[DiscoveredTopic],
+    ) -> bool {
+        // The type with most writers comes first.
+        if let Some(found) = topics.iter().find(|topic| topic.topic == grant.topic) {
+            self.attach(index, grant, &found.type_name, Some(found));
+            return true;
+        }
+        if !self.source.knows_all_topics() {
+            return false;
+        }
+        let known: Vec<String> = topics.iter().map(|topic| topic.topic.clone()).collect();
+        let nearest = gleaner_base::text::nearest(&grant.topic, known.iter().map(String::as_str));
+        let nearest = nearest.map(str::to_owned);
+        self.readers[index].refuse(grant.id, RefusedTopic::NoSuchTopic { known, nearest });
+        true
+    }
+
+    /// Attaches a topic of a known type.
+    fn attach(
+        &mut self,
+        index: usize,
+        grant: &TopicGrant,
+        type_name: &str,
+        found: Option<&DiscoveredTopic>,
+    ) {
+        if let Err(reason) = self.try_attach(index, grant, type_name, found) {
+            self.readers[index].refuse(grant.id, reason);
+        }
+    }
+
+    fn try_attach(
+        &mut self,
+        index: usize,
+        grant: &TopicGrant,
+        type_name: &str,
+        found: Option<&DiscoveredTopic>,
+    ) -> Result<(), RefusedTopic> {
+        let reader = &mut self.readers[index];
+        let Some(limits) = reader.take_words(grant.holds) else {
+            let why = "its holds, and those of the other topics, do not fit on the control page";
+            return Err(RefusedTopic::Other(vec![why.to_owned()]));
+        };
+        let source = &mut *self.source;
+        let attaching = self.topics.attach(source, grant, type_name, (&reader.control, limits));
+        let (topic, attached) = match attaching {
+            Ok(done) => done,
+            Err(reason) => {
+                reader.give_back(limits);
+                return Err(reason);
+            }
+        };
+        reader.topics.push(Attachment { id: grant.id, topic, attached });
+        let SharedLayout { depth, slots, slot_bytes } = attached.sizes.layout;
+        let definitions = found.and_then(|found| found.definitions_text.as_deref());
+        let message = AttachedTopic {
+            id: grant.id,
+            type_name: found.map_or(type_name, |found| &found.type_name).to_owned(),
+            layout: RegionLayout { depth, slots, slot_bytes },
+            first_word: limits.first_word,
+            holds: grant.holds,
+            first: attached.first,
+            digests: attached.digests,
+            refused: attached.refused,
+            definitions: definitions.map(str::to_owned),
+            offered_qos: found.and_then(|found| found.offered_qos.clone()),
+        };
+        let file = self.topics.file(topic, &attached).map(OwnedFd::as_fd);
+        reader.send(&ReaderMessage::Attached(Box::new(message)), file);
+        self.tick_soon();
+        Ok(())
+    }
+
+    /// Detaches readers whose connections have ended: what they held is free.
+    fn remove_gone(&mut self) {
+        while let Some(index) = self.readers.iter().position(|reader| reader.is_gone) {
+            let reader = self.readers.swap_remove(index);
+            for attachment in &reader.topics {
+                self.topics.detach(&mut *self.source, attachment.topic, &attachment.attached);
+            }
+            info!(reader = reader.name, "a reader has ended");
+        }
+    }
+
+    /// Answers a reader that has no definitions of a topic, at once or when they come.
+    fn need_definitions(&mut self, index: usize, id: u32, now: Instant) {
+        let reader = &mut self.readers[index];
+        if !reader.topics.iter().any(|known| known.id == id) {
+            reader.send(&ReaderMessage::Definitions { id, text: None }, None);
+        } else if !reader.definitions.iter().any(|wait| wait.id == id) {
+            reader.definitions.push(DefinitionsWait { id, until: now + DEFINITIONS_TIMEOUT });
+            self.tick_soon();
+        }
+    }
+
+    /// Looks for what no descriptor announces, if it is time.
+    fn tick(&mut self, now: Instant) {
+        if now >= self.status_at {
+            self.update_status(now);
+            self.report_status();
+        }
+        if now < self.tick_at {
+            return;
+        }
+        let waits =
+            |reader: &ConnectedReader| !reader.waiting.is_empty() || !reader.definitions.is_empty();
+        let some_wait = self.readers.iter().any(waits);
+        if some_wait {
+            let topics = self.source.topics();
+            for index in 0..self.readers.len() {
+                self.attach_waiting(index, &topics);
+                self.answer_definitions(index, &topics, now);
+            }
+            self.remove_gone();
+        }
+        self.topics.take_over(&mut *self.source, now);
+        if self.plays && self.source.has_ended() {
+            self.plays = false;
+            self.update_status(now);
+            self.report_status();
+            (self.reports)(IngressReport::DriveEnded);
+        }
+        let again = some_wait || self.plays || self.topics.has_two_subscriptions();
+        self.tick_at = now + if again { TICK } else { STATUS_INTERVAL };
+    }
+
+    fn tick_soon(&mut self) {
+        self.tick_at = self.tick_at.min(Instant::now() + TICK);
+    }
+
+    fn attach_waiting(&mut self, index: usize, topics: &[DiscoveredTopic]) {
+        let waiting = std::mem::take(&mut self.readers[index].waiting);
+        for grant in waiting {
+            if !self.attach_found(index, &grant, topics) {
+                self.readers[index].waiting.push(grant);
+            }
+        }
+    }
+
+    fn answer_definitions(&mut self, index: usize, topics: &[DiscoveredTopic], now: Instant) {
+        let reader = &mut self.readers[index];
+        for wait in std::mem::take(&mut reader.definitions) {
+            let attached = reader.topics.iter().find(|known| known.id == wait.id);
+            let topic = attached.and_then(|known| self.topics.get(known.topic));
+            let text = topic.and_then(|topic| {
+                let of_it = topics.iter().filter(|found| found.topic == topic.name());
+                let mut same = of_it.filter(|found| same_type(&found.type_name, topic.type_name()));
+                same.find_map(|found| found.definitions_text.clone())
+            });
+            let may_come = |topic: &SharedTopic| self.source.definitions_may_come(topic.name());
+            if text.is_none() && now < wait.until && topic.is_some_and(may_come) {
+                reader.definitions.push(wait);
+            } else {
+                let text = text.map(|text| text.to_string());
+                reader.send(&ReaderMessage::Definitions { id: wait.id, text }, None);
+            }
+        }
+    }
+
+    fn update_status(&mut self, now: Instant) {
+        self.status_at = now + STATUS_INTERVAL;
+        self.health = self.source.health();
+        self.topics.update_status(&*self.source);
+    }
+
+    /// Reports the status to the readers and the starter.
+    fn report_status(&mut self) {
+        for reader in &mut self.readers {
+            let status =
+                |known: &Attachment| Some((known.id, self.topics.get(known.topic)?.status.clone()));
+            let status = SourceStatus {
+                health: self.health.clone(),
+                topics: reader.topics.iter().filter_map(status).collect(),
+                unsent: reader.unsent,
+            };
+            reader.send(&ReaderMessage::Status(Box::new(status)), None);
+        }
+        self.remove_gone();
+        let status = self.status();
+        (self.reports)(IngressReport::Status(Box::new(status)));
+    }
+
+    fn status(&self) -> IngressStatus {
+        IngressStatus {
+            health: self.health.clone(),
+            topics: self.topics.all().map(SharedTopic::report).collect(),
+            readers: self.readers.len(),
+            rss_bytes: usage::resident(),
+            cpu_s: usage::cpu_seconds(),
+        }
+    }
+}
+
+/// What a wait has found.
+struct Ready {
+    control: bool,
+    stop: bool,
+    /// The events of each reader.
+    readers: Vec<PollFlags>,
+}

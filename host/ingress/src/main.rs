@@ -1,0 +1,8 @@
+//! `gleaner-ingress`: the process that receives topics for all lambdas of a vehicle. `gleaner`
+//! starts it; see `gleaner-ingress --help`.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    gleaner_ingress::program::main()
+}

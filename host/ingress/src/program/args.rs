@@ -1,0 +1,63 @@
+//! Parses the command line.
+
+use std::path::PathBuf;
+
+use clap::Parser;
+use gleaner_dds::NetworkArgs;
+use gleaner_jail::Paths;
+use gleaner_jail::ingress::NewSockets;
+use gleaner_transport::Clock;
+
+/// Receives topics for lambdas and the recorder, and shares each sample with them in memory.
+/// Standard input is the socket of a starter; reports, one JSON object per line, go to standard
+/// output.
+#[derive(Parser)]
+#[command(name = "gleaner-ingress", version)]
+pub(super) struct Args {
+    #[command(flatten)]
+    pub(super) network: NetworkArgs,
+    /// Name of the node in the ROS 2 graph.
+    #[arg(long, value_name = "NAME", default_value = "/gleaner/ingress")]
+    pub(super) node: String,
+    /// Offset of the sample clock from CLOCK_MONOTONIC, in ns; default: the time of day.
+    #[arg(long, value_name = "NS", allow_negative_numbers = true)]
+    clock_offset: Option<i64>,
+    /// Bytes of the largest sample, which sets the size of socket buffers.
+    #[arg(long, value_name = "BYTES")]
+    pub(super) largest: Option<usize>,
+    /// MCAP file, rosbag2 database or directory to play instead of the network; several are played
+    /// as one.
+    #[arg(long, value_name = "FILE|DIR")]
+    pub(super) drive: Vec<PathBuf>,
+    /// Speed of the drive: 2 plays it twice as fast as it was recorded.
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = rate)]
+    pub(super) rate: f64,
+    /// Folder for the content of packed files; default: the system's folder for temporary files.
+    #[arg(long, value_name = "FOLDER")]
+    pub(super) unpack_in: Option<PathBuf>,
+}
+
+impl Args {
+    pub(super) fn clock(&self) -> Clock {
+        self.clock_offset.map_or_else(Clock::from_time_of_day, Clock::new)
+    }
+
+    /// Returns the files that the process needs.
+    pub(super) fn paths(&self) -> Paths {
+        if self.drive.is_empty() {
+            return Paths::default();
+        }
+        let unpack_in = self.unpack_in.clone().unwrap_or_else(std::env::temp_dir);
+        Paths { read: self.drive.clone(), write: vec![unpack_in] }
+    }
+
+    /// Returns the sockets that the process may create once it has a source.
+    pub(super) fn new_sockets(&self) -> NewSockets {
+        if self.drive.is_empty() { NewSockets::Udp } else { NewSockets::None }
+    }
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    let rate = text.parse().ok().filter(|rate: &f64| rate.is_finite() && *rate > 0.0);
+    rate.ok_or_else(|| "it is not a number above 0".to_owned())
+}

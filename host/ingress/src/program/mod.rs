@@ -1,0 +1,92 @@
+//! The program `gleaner-ingress`: one process receives the samples of all lambdas.
+//!
+//! - `args`: the command line.
+//! - `source`: the network or a drive.
+//! - `report_writer`: reports to the starter, and the thread that writes them, as the starter may be
+//!   slow to read.
+
+mod args;
+mod report_writer;
+mod source;
+
+use std::io;
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixStream;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use clap::Parser;
+use gleaner_base::{Exit, Failure};
+use gleaner_jail::ingress as sandbox;
+use gleaner_protocol::Handover;
+use gleaner_protocol::ingress::IngressServer;
+use gleaner_regions::TopicRegion;
+use gleaner_vitals::start::reports;
+use rustix::process::{Signal, set_parent_process_death_signal};
+use signal_hook::consts::{SIGINT, SIGTERM};
+use tracing::debug;
+
+use crate::Ingress;
+use args::Args;
+use report_writer::ReportWriter;
+
+/// Runs the program `gleaner-ingress`.
+pub fn main() -> ExitCode {
+    gleaner_vitals::log::init();
+    match start(Args::parse()) {
+        Ok(()) => Exit::Ok.into(),
+        Err(failure) => {
+            eprintln!("{failure}");
+            failure.exit.into()
+        }
+    }
+}
+
+fn start(args: Args) -> Result<(), Failure> {
+    let internal = |what: &'static str| {
+        move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
+    };
+    // First: threads that exist already would keep their privileges.
+    let layers = sandbox::start(&args.paths());
+    // A starter that dies also closes the control connection.
+    set_parent_process_death_signal(Some(Signal::TERM))
+        .map_err(io::Error::from)
+        .map_err(internal("cannot watch for the starter's death"))?;
+    let stop = stop_socket().map_err(internal("cannot handle SIGTERM"))?;
+    let control = control()?;
+    let reports = reports().map_err(internal("cannot set up the report stream"))?;
+    // Not without seals: a reader could change what others read.
+    TopicRegion::create("gleaner-test", 1, 1).map_err(internal("cannot share samples"))?;
+    let new_sockets = args.new_sockets();
+    let source = source::open(args)?;
+    let layers = sandbox::close(layers, new_sockets).map_err(|error| {
+        Failure::caused_by(Exit::Internal, "cannot close the sandbox of the ingress", &error)
+    })?;
+    for layer in layers {
+        debug!(?layer, "sandbox");
+    }
+    let writer = ReportWriter::start(reports).map_err(internal("cannot start a thread"))?;
+    let sender = writer.sender();
+    let ingress = Ingress::new(source, Box::new(move |report| sender.send(report)));
+    let ended = ingress.run(control, Some(stop));
+    writer.end();
+    ended.map_err(internal("cannot wait for readers"))
+}
+
+/// Returns a socket that becomes readable at SIGTERM.
+fn stop_socket() -> io::Result<OwnedFd> {
+    let (stop, notifier) = UnixStream::pair()?;
+    signal_hook::low_level::pipe::register(SIGTERM, notifier)?;
+    // Ctrl-C in a terminal reaches all processes; the starter decides when this one ends.
+    signal_hook::flag::register(SIGINT, Arc::default())?;
+    Ok(stop.into())
+}
+
+/// Receives the control connection over standard input, the socket of the starter.
+fn control() -> Result<IngressServer, Failure> {
+    let failed = |error: gleaner_protocol::link::LinkError| {
+        Failure::from(error).with_help("start it with `gleaner run LAMBDA`")
+    };
+    let mut handover = Handover::receive(rustix::stdio::stdin()).map_err(failed)?;
+    handover.take_control().map(IngressServer::new).map_err(failed)
+}

@@ -1,0 +1,43 @@
+//! Opens the source of samples: the network or a drive.
+
+use gleaner_base::{Exit, Failure};
+use gleaner_dds::{Dds, DdsError};
+use gleaner_drives::{DriveOptions, DrivePlayer, ReplayError};
+use gleaner_transport::LiveSource;
+
+use super::args::Args;
+
+pub(super) fn open(args: Args) -> Result<Box<dyn LiveSource>, Failure> {
+    let clock = args.clock();
+    if !args.drive.is_empty() {
+        let options = DriveOptions { unpack_in: args.unpack_in, ..DriveOptions::default() };
+        let drive = DrivePlayer::open(&args.drive, &options, clock, args.rate);
+        return Ok(Box::new(drive.map_err(|error| unplayable(&error))?));
+    }
+    let usage = |error: DdsError| Failure::caused_by(Exit::Usage, "cannot use the network", &error);
+    let mut network = args.network.options(args.node).map_err(usage)?;
+    network.largest = args.largest.unwrap_or(network.largest);
+    network.clock = clock;
+    // Readers search their own files for definitions.
+    network.messages = Vec::new();
+    network.prefixes = Vec::new();
+    let dds = Dds::open(network).map_err(|error| {
+        Failure::caused_by(Exit::Unreachable, "cannot join the network", &error)
+    })?;
+    Ok(Box::new(dds))
+}
+
+fn unplayable(error: &ReplayError) -> Failure {
+    let exit = match error {
+        ReplayError::Damaged { .. } => Exit::DriveDamaged,
+        ReplayError::Read { .. } | ReplayError::Unpack { .. } | ReplayError::NoRoom { .. } => {
+            Exit::Internal
+        }
+        _ => Exit::Usage,
+    };
+    let failure = Failure::caused_by(exit, "cannot play the drive", error);
+    match error.help() {
+        Some(help) => failure.with_help(help),
+        None => failure,
+    }
+}

@@ -1,0 +1,234 @@
+//! A connected reader: its socket, its control page, and what it was granted.
+
+use std::fs::File;
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::time::{Duration, Instant};
+
+use gleaner_buffers::shared::{HAZARDS, HoldLimits};
+use gleaner_protocol::ingress::{
+    AddReader, HoldGrant, PublishGrant, ReaderLink, ReaderMessage, ReaderRequest, RefusedTopic,
+    TopicGrant,
+};
+use gleaner_protocol::link::{Incoming, LinkError};
+use gleaner_regions::ControlRegion;
+use gleaner_transport::{LiveSource, Publisher};
+use tracing::warn;
+
+use crate::publish_rate::PublishRate;
+use crate::sink::AttachedReader;
+
+/// Requests of a reader that are handled before others have their turn.
+const TURN: usize = 64;
+
+/// A topic of a reader.
+pub(crate) struct Attachment {
+    /// Id of the grant.
+    pub(crate) id: u32,
+    /// Key in the table of topics.
+    pub(crate) topic: u64,
+    pub(crate) attached: AttachedReader,
+}
+
+/// A wait for the definitions of an attached topic.
+pub(crate) struct DefinitionsWait {
+    pub(crate) id: u32,
+    pub(crate) until: Instant,
+}
+
+/// A reader of granted topics.
+pub(crate) struct ConnectedReader {
+    pub(crate) name: String,
+    link: ReaderLink,
+    pub(crate) control: ControlRegion,
+    /// Number of hazard words that are given out.
+    words: u16,
+    pub(crate) topics: Vec<Attachment>,
+    /// Grants that wait for a writer, whose type they take.
+    pub(crate) waiting: Vec<TopicGrant>,
+    pub(crate) definitions: Vec<DefinitionsWait>,
+    publishers: Vec<Option<Box<dyn Publisher>>>,
+    rate: PublishRate,
+    /// True if requests may have been received that are not handled yet.
+    has_more: bool,
+    /// Number of messages that were not published.
+    pub(crate) unsent: u64,
+    /// Set once the connection has ended, or has to.
+    pub(crate) is_gone: bool,
+}
+
+impl ConnectedReader {
+    /// Welcomes a reader, and opens the topics that it may publish.
+    pub(crate) fn welcome(
+        add: &AddReader,
+        socket: OwnedFd,
+        source: &dyn LiveSource,
+        now: Instant,
+    ) -> io::Result<Self> {
+        let (control, page) = ControlRegion::create()?;
+        let mut reader = Self {
+            name: add.name.clone(),
+            link: ReaderLink::new(socket),
+            control,
+            words: 0,
+            topics: Vec::new(),
+            waiting: Vec::new(),
+            definitions: Vec::new(),
+            publishers: add.publishes.iter().map(|grant| open(&add.name, grant, source)).collect(),
+            rate: PublishRate::new(now),
+            has_more: false,
+            unsent: 0,
+            is_gone: false,
+        };
+        reader.send(&ReaderMessage::Welcome, Some(File::as_fd(&page)));
+        Ok(reader)
+    }
+
+    /// Gives out the hazard words of a topic; `None` if the control page lacks so many.
+    pub(crate) fn take_words(&mut self, holds: HoldGrant) -> Option<HoldLimits> {
+        let HoldGrant { windows, window, singles } = holds;
+        let end = self.words.checked_add(windows)?.checked_add(singles)?;
+        if usize::from(end) > HAZARDS {
+            return None;
+        }
+        let first_word = std::mem::replace(&mut self.words, end);
+        Some(HoldLimits { first_word, windows, window, singles })
+    }
+
+    /// Gives back the last words that were given out.
+    pub(crate) fn give_back(&mut self, limits: HoldLimits) {
+        self.words = limits.first_word;
+    }
+
+    /// Sends a message. A reader that does not read for long is disconnected.
+    pub(crate) fn send(&mut self, message: &ReaderMessage, descriptor: Option<BorrowedFd<'_>>) {
+        if self.is_gone {
+            return;
+        }
+        match self.link.send(message, descriptor) {
+            Ok(()) => {}
+            Err(LinkError::TooLong { .. }) => self.send_shortened(message, descriptor),
+            Err(error) => self.disconnect(&error),
+        }
+    }
+
+    /// Sends a message without the part that makes it too long: definitions, or a list of topics.
+    fn send_shortened(&mut self, message: &ReaderMessage, descriptor: Option<BorrowedFd<'_>>) {
+        warn!(reader = self.name, "a message to a reader is too long: sent in part");
+        let mut message = message.clone();
+        match &mut message {
+            ReaderMessage::Attached(topic) => topic.definitions = None,
+            ReaderMessage::Definitions { text, .. } => *text = None,
+            ReaderMessage::Refused { reason: RefusedTopic::NoSuchTopic { known, .. }, .. } => {
+                known.clear();
+            }
+            ReaderMessage::Refused { reason, .. } => *reason = RefusedTopic::Other(Vec::new()),
+            ReaderMessage::Status(status) => status.topics.clear(),
+            ReaderMessage::Welcome => {}
+        }
+        if let Err(error) = self.link.send(&message, descriptor) {
+            self.disconnect(&error);
+        }
+    }
+
+    pub(crate) fn refuse(&mut self, id: u32, reason: RefusedTopic) {
+        self.send(&ReaderMessage::Refused { id, reason }, None);
+    }
+
+    /// Sends what waits for the reader.
+    pub(crate) fn flush(&mut self) {
+        if let Err(error) = self.link.flush() {
+            self.disconnect(&error);
+        }
+    }
+
+    pub(crate) fn is_pending(&self) -> bool {
+        self.link.is_pending()
+    }
+
+    /// Returns the time until a request may be read: 0 for now.
+    pub(crate) fn wait(&mut self, now: Instant) -> Duration {
+        self.rate.wait(now)
+    }
+
+    /// Returns whether there are requests that were received before.
+    pub(crate) fn has_more(&self) -> bool {
+        self.has_more
+    }
+
+    /// Handles some requests; returns the ids of topics whose definitions are requested. Published
+    /// messages are passed to the source.
+    pub(crate) fn handle_requests(&mut self, now: Instant) -> Vec<u32> {
+        let mut definitions = Vec::new();
+        self.has_more = true;
+        for _ in 0..TURN {
+            if self.is_gone || self.rate.wait(now) > Duration::ZERO {
+                break;
+            }
+            match self.link.poll() {
+                Ok(Incoming::Message(ReaderRequest::NeedDefinitions { id })) => {
+                    self.rate.count(0);
+                    definitions.push(id);
+                }
+                Ok(Incoming::Message(ReaderRequest::Publish { index, cdr })) => {
+                    self.rate.count(cdr.len());
+                    self.publish(index, &cdr);
+                }
+                Ok(Incoming::Nothing) => {
+                    self.has_more = false;
+                    break;
+                }
+                Ok(Incoming::Ended) => self.is_gone = true,
+                Err(error) => self.disconnect(&error),
+            }
+        }
+        definitions
+    }
+
+    fn publish(&mut self, index: u32, cdr: &[u8]) {
+        match self.publishers.get(index as usize) {
+            None => {
+                warn!(reader = self.name, index, "a reader publishes a topic that was not granted");
+                self.is_gone = true;
+            }
+            Some(None) => self.unsent += 1,
+            Some(Some(publisher)) => {
+                if let Err(error) = publisher.publish(cdr) {
+                    if self.unsent == 0 {
+                        let error = &error as &dyn std::error::Error;
+                        let reader = &self.name;
+                        warn!(
+                            reader,
+                            error, "a message was not published; further ones are counted"
+                        );
+                    }
+                    self.unsent += 1;
+                }
+            }
+        }
+    }
+
+    fn disconnect(&mut self, error: &LinkError) {
+        if !std::mem::replace(&mut self.is_gone, true) && !matches!(error, LinkError::Gone { .. }) {
+            let error = error as &dyn std::error::Error;
+            warn!(reader = self.name, error, "a reader is disconnected");
+        }
+    }
+}
+
+impl AsFd for ConnectedReader {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.link.as_fd()
+    }
+}
+
+fn open(reader: &str, grant: &PublishGrant, source: &dyn LiveSource) -> Option<Box<dyn Publisher>> {
+    match source.publisher(&grant.topic, &grant.type_name, grant.depth) {
+        Ok(publisher) => Some(publisher),
+        Err(error) => {
+            let (topic, error) = (&grant.topic, &error as &dyn std::error::Error);
+            warn!(reader, topic, error, "a topic cannot be published; its messages are counted");
+            None
+        }
+    }
+}

@@ -1,0 +1,317 @@
+//! The receiving end of a topic: writes each sample once into each region, and wakes the readers.
+//!
+//! It runs on the thread of the source. The engine takes the same lock to attach and detach
+//! readers, which takes microseconds; readers take no lock.
+
+use std::os::fd::OwnedFd;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use gleaner_buffers::shared::{Bell, HoldLimits, ReaderId, SharedWriter, WriteError, WriterMemory};
+use gleaner_regions::{ControlRegion, KernelFutex, TopicRegion};
+use gleaner_transport::{ArrivalSums, Delivery, Gaps, SampleMeta, Sink, StoredMeta, TopicCounters};
+
+use crate::sizes::RegionSizes;
+
+/// Numbers of a topic, for its status.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct ReceivedCounts {
+    pub(crate) received: u64,
+    pub(crate) too_big: u64,
+}
+
+/// Identifies a region of a topic.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct RegionId(u64);
+
+/// The memory of a topic for samples up to one size, and its readers.
+pub(crate) struct RegionWriter {
+    id: RegionId,
+    sizes: RegionSizes,
+    writer: SharedWriter,
+    sums: ArrivalSums,
+    counters: TopicCounters,
+    readers: Vec<RegionReader>,
+}
+
+struct RegionReader {
+    id: ReaderId,
+    bell: Option<Bell>,
+    digests: bool,
+}
+
+/// A reader of a region, as it begins.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct AttachedReader {
+    pub(crate) region: RegionId,
+    pub(crate) id: ReaderId,
+    /// Position of the first sample that it receives.
+    pub(crate) first: u64,
+    pub(crate) sizes: RegionSizes,
+    /// Sum of the digests, and number of refused samples, before the first sample.
+    pub(crate) digests: u32,
+    pub(crate) refused: u64,
+}
+
+/// What a reader asks of a region.
+pub(crate) struct AttachRequest<'a> {
+    pub(crate) control: &'a ControlRegion,
+    pub(crate) limits: HoldLimits,
+    pub(crate) depth: u32,
+    pub(crate) wakes: bool,
+    pub(crate) digests: bool,
+    /// True if it receives the samples that are shown already.
+    pub(crate) is_latched: bool,
+}
+
+impl RegionWriter {
+    /// Creates a region, and the file to pass to its readers.
+    pub(crate) fn create(sizes: RegionSizes) -> std::io::Result<(Self, OwnedFd)> {
+        let too_large = || std::io::Error::other("no region can be so large");
+        let bytes = sizes.layout.bytes_needed().ok_or_else(too_large)?;
+        let region = TopicRegion::create("gleaner-topic", bytes, sizes.present)?;
+        let file = region.file().try_clone_to_owned()?;
+        let memory = WriterMemory::new(region, sizes.layout).ok_or_else(too_large)?;
+        let writer = SharedWriter::with_warm_slots(memory, sizes.warm);
+        let region = Self {
+            id: RegionId(0),
+            sizes,
+            writer,
+            sums: ArrivalSums::default(),
+            counters: TopicCounters::default(),
+            readers: Vec::new(),
+        };
+        Ok((region, file))
+    }
+
+    fn attach(&mut self, request: &AttachRequest<'_>) -> Result<AttachedReader, WriteError> {
+        let id = self.writer.attach(request.control.clone(), request.limits)?;
+        let head = self.writer.head();
+        let shown = head.min(self.sizes.layout.depth.min(request.depth).into());
+        if request.digests {
+            self.sums.enable_digests();
+        }
+        let bell = request.wakes.then(|| Bell::of(request.control.clone()));
+        self.readers.push(RegionReader { id, bell, digests: request.digests });
+        Ok(AttachedReader {
+            region: self.id,
+            id,
+            first: if request.is_latched { head - shown } else { head },
+            sizes: self.sizes,
+            digests: self.sums.digests(),
+            refused: self.sums.refused(),
+        })
+    }
+
+    fn detach(&mut self, id: ReaderId) {
+        self.writer.detach(id);
+        self.readers.retain(|reader| reader.id != id);
+        if !self.readers.iter().any(|reader| reader.digests) {
+            self.sums.disable_digests();
+        }
+    }
+
+    /// Copies the samples that `other` shows.
+    fn copy_shown(&mut self, other: &RegionWriter) {
+        let head = other.writer.head();
+        for position in head.saturating_sub(other.sizes.layout.depth.into())..head {
+            if let Some((cdr, words)) = other.writer.shown(position) {
+                self.copy(cdr);
+                self.accept(&StoredMeta::of_words(&words).sample);
+            }
+        }
+    }
+
+    /// Copies a sample into a free slot, if it fits.
+    fn copy(&mut self, cdr: &[u8]) -> bool {
+        match self.writer.draft(cdr.len()) {
+            Ok(mut draft) => {
+                draft.copy_from_slice(cdr);
+                true
+            }
+            Err(_) => false,
+        }
+    }
+
+    /// Shows the copied sample and wakes the readers, or counts a sample that did not fit.
+    fn accept(&mut self, meta: &SampleMeta) -> bool {
+        let Some(cdr) = self.writer.drafted() else {
+            self.refuse();
+            return false;
+        };
+        let stored = self.sums.add(meta, cdr);
+        self.writer.publish(&stored.words());
+        for bell in self.readers.iter().filter_map(|reader| reader.bell.as_ref()) {
+            bell.ring(&KernelFutex);
+        }
+        true
+    }
+
+    fn refuse(&mut self) {
+        self.sums.refuse();
+        self.counters.too_big += 1;
+        self.writer.set_counters(&self.counters.words());
+    }
+}
+
+/// The regions of a topic, shared by the engine and the subscriptions of the topic.
+#[derive(Default)]
+pub(crate) struct TopicSink(Mutex<SinkState>);
+
+#[derive(Default)]
+struct SinkState {
+    regions: Vec<RegionWriter>,
+    next_region: u64,
+    counts: ReceivedCounts,
+    /// The subscription of the last copy, until its sample is accepted.
+    copied: Option<u64>,
+    /// The samples received so far.
+    seen: Gaps,
+    /// Set once there was a second subscription: a sample may come over both.
+    checks_doubles: bool,
+    /// The last subscription that has received a sample.
+    newest: u64,
+}
+
+impl TopicSink {
+    /// Attaches a reader to a region for samples of exactly `max_bytes` with enough depth and room
+    /// for its holds; `None` if there is none.
+    pub(crate) fn attach(
+        &self,
+        max_bytes: u64,
+        request: &AttachRequest<'_>,
+    ) -> Option<AttachedReader> {
+        let mut state = self.lock();
+        let mut fitting = state.regions.iter_mut().filter(|region| {
+            let layout = region.sizes.layout;
+            layout.slot_bytes == max_bytes && layout.depth >= request.depth
+        });
+        fitting.find_map(|region| region.attach(request).ok())
+    }
+
+    /// Adds a region, and attaches its first reader.
+    pub(crate) fn attach_to(
+        &self,
+        mut region: RegionWriter,
+        request: &AttachRequest<'_>,
+    ) -> Result<AttachedReader, WriteError> {
+        let mut state = self.lock();
+        region.id = RegionId(state.next_region);
+        if request.is_latched {
+            let largest = state.regions.iter().max_by_key(|known| known.sizes.layout.slot_bytes);
+            if let Some(known) = largest {
+                region.copy_shown(known);
+            }
+        }
+        let attached = region.attach(request)?;
+        state.next_region += 1;
+        state.regions.push(region);
+        Ok(attached)
+    }
+
+    /// Detaches a reader. Returns its region if that has no reader any more, to be dropped after
+    /// the lock.
+    pub(crate) fn detach(&self, region: RegionId, reader: ReaderId) -> Option<RegionWriter> {
+        let mut state = self.lock();
+        let index = state.regions.iter().position(|known| known.id == region)?;
+        state.regions[index].detach(reader);
+        state.regions[index].readers.is_empty().then(|| state.regions.swap_remove(index))
+    }
+
+    /// Stores the number of lost samples for readers to show.
+    pub(crate) fn set_lost(&self, lost: Option<u64>) {
+        for region in &mut self.lock().regions {
+            region.counters.lost = lost;
+            region.writer.set_counters(&region.counters.words());
+        }
+    }
+
+    /// Drops samples that come a second time, from now on: there will be a second subscription.
+    pub(crate) fn check_doubles(&self) {
+        self.lock().checks_doubles = true;
+    }
+
+    pub(crate) fn counts(&self) -> ReceivedCounts {
+        self.lock().counts
+    }
+
+    /// Returns the last subscription that has received a sample.
+    pub(crate) fn newest_subscription(&self) -> u64 {
+        self.lock().newest
+    }
+
+    fn lock(&self) -> MutexGuard<'_, SinkState> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl SinkState {
+    fn copy(&mut self, subscription: u64, cdr: &[u8]) -> Delivery {
+        self.copied = Some(subscription);
+        let mut delivery = Delivery::Taken;
+        for region in &mut self.regions {
+            if !region.copy(cdr) {
+                delivery = Delivery::TooBig;
+            }
+        }
+        delivery
+    }
+
+    fn is_double(&self, meta: &SampleMeta) -> bool {
+        self.checks_doubles && self.seen.has(meta.writer, meta.seq)
+    }
+
+    fn accept(&mut self, subscription: u64, meta: &SampleMeta) {
+        if self.copied.take() != Some(subscription) {
+            return;
+        }
+        self.newest = self.newest.max(subscription);
+        if self.is_double(meta) {
+            self.regions.iter_mut().for_each(|region| region.writer.discard());
+            return;
+        }
+        let mut taken = 0;
+        for region in &mut self.regions {
+            taken += usize::from(region.accept(meta));
+        }
+        // A sample that was too big for all may come again, for a new region of larger samples.
+        if taken > 0 || self.regions.is_empty() {
+            self.seen.note(meta.writer, meta.seq);
+        }
+        self.counts.received += 1;
+        self.counts.too_big += u64::from(taken < self.regions.len());
+    }
+}
+
+/// One subscription of a topic.
+pub(crate) struct SubscriptionSink {
+    pub(crate) topic: Arc<TopicSink>,
+    /// Number of the subscription: 0, 1, ...
+    pub(crate) number: u64,
+}
+
+impl Sink for SubscriptionSink {
+    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
+        let mut state = self.topic.lock();
+        let delivery = state.copy(self.number, cdr);
+        state.accept(self.number, meta);
+        delivery
+    }
+
+    fn too_big(&self, meta: &SampleMeta, _: usize) {
+        let mut state = self.topic.lock();
+        if state.is_double(meta) {
+            return;
+        }
+        state.regions.iter_mut().for_each(RegionWriter::refuse);
+        state.counts.received += 1;
+        state.counts.too_big += 1;
+    }
+
+    fn copy(&self, cdr: &[u8]) -> Option<Delivery> {
+        Some(self.topic.lock().copy(self.number, cdr))
+    }
+
+    fn accept(&self, meta: &SampleMeta) {
+        self.topic.lock().accept(self.number, meta);
+    }
+}
