@@ -1,2 +1,55 @@
-//! The reader's end of the ingress: attaches granted topics in shared memory, and waits for their
-//! samples.
+//! The reader's end of the ingress: attaches granted topics in shared memory, waits for their
+//! samples, and publishes.
+//!
+//! A process has one [`Feed`], over the socket that its starter passed to it. The starter granted
+//! the topics; the process receives each of them as a [`FedTopic`], whose samples it reads in
+//! place. [`FeedBell`] wakes it for samples of topics that are granted with `wakes`.
+//!
+//! ```no_run
+//! # fn run(socket: std::os::fd::OwnedFd) -> Result<(), gleaner_feed::FeedError> {
+//! use std::time::Duration;
+//!
+//! use gleaner_feed::Feed;
+//!
+//! let mut feed = Feed::connect(socket)?;
+//! let imu = feed.topic(0, Duration::from_secs(10))?;
+//! let mut bell = feed.bell();
+//! let mut next = imu.info.first;
+//! loop {
+//!     // Before the look at the topics, so that a sample after it ends the wait.
+//!     let seen = bell.value();
+//!     while let Ok(Some(sample)) = imu.reader.get(next) {
+//!         println!("{} bytes", sample.len());
+//!         next += 1;
+//!     }
+//!     // It fails once the ingress has ended.
+//!     feed.poll()?;
+//!     bell.wait(seen, Duration::from_millis(100));
+//! }
+//! # }
+//! ```
+//!
+//! # Trust
+//!
+//! The ingress parses what strangers send, so a reader checks what it receives: sizes and seals of
+//! memory, and that no two topics share words of the control page. An ingress that breaks the rules
+//! can still change the bytes of samples; it cannot make this process read outside of its mappings.
+//! It also sends no more than one descriptor with a message; further ones are closed.
+//!
+//! # Sandboxes
+//!
+//! Nothing here opens a file or a socket. After [`Feed::connect`], a process needs these calls:
+//! `recvmsg`, `send` and `poll` of the open socket, `futex` for the bell, and for each topic that
+//! is attached later `fstat`, `fcntl(F_GET_SEALS)`, `mmap` of the received file, and `close`. It
+//! never calls `sendmsg`.
+
+mod bell;
+mod error;
+mod feed;
+mod publisher;
+mod topic;
+
+pub use bell::FeedBell;
+pub use error::FeedError;
+pub use feed::{Feed, FeedEvent};
+pub use topic::FedTopic;
