@@ -35,7 +35,7 @@ impl CommandedRun {
 
     fn join(&mut self, scratch: &TestDir, name: &str, rolls_ms: (u32, u32)) -> RecorderLink {
         let (folder, header) = lambda(scratch, name, rolls_ms);
-        let mut link = RecorderLink::new(self.running.control.add(&add(&folder)).unwrap());
+        let mut link = RecorderLink::new(self.running.add(&add(&folder)).unwrap());
         link.hello(&header, TIMEOUT).unwrap();
         link
     }
@@ -65,7 +65,7 @@ impl CommandedRun {
     }
 
     fn end(mut self) {
-        self.running.control.stop().unwrap();
+        self.running.starter.control.stop().unwrap();
         assert_eq!(self.running.ended().1, Ok(()));
     }
 }
@@ -168,7 +168,7 @@ fn too_many_too_long_and_invalid_commands_are_counted_and_do_nothing() {
     assert!(taken < 100, "at most five at once, and one each second: {taken}");
     commanded.accepted_and_refused(0, 5 + 10_000);
     let last = {
-        commanded.running.control.stop().unwrap();
+        commanded.running.starter.control.stop().unwrap();
         commanded.running.ended().0
     };
     assert_eq!(last.recording, RecordingCounts::default());
@@ -183,7 +183,7 @@ fn without_the_option_there_are_no_commands() {
     let mut running = Running::start(&scratch, &network, |_| {});
     let _sensor = Sensor::start(&network, running.clock);
     let (folder, header) = lambda(&scratch, "first", (0, 0));
-    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
     link.hello(&header, TIMEOUT).unwrap();
     received(&mut running, 50);
     let text = br#"{"command": "event", "label": "x"}"#;
