@@ -312,3 +312,94 @@ fn in_words(reason: &RefusedTopic) -> String {
         RefusedTopic::Other(lines) => visible(&lines.join(": ")),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc::channel;
+
+    use gleaner_ingress::Ingress;
+    use gleaner_protocol::ingress::{AddReader, IngressControl};
+    use gleaner_protocol::link::recorded_grant;
+    use gleaner_transport::loopback::Loopback;
+
+    use super::*;
+    use crate::support::{TestDir, meta};
+
+    const TYPE: &str = "test_msgs/msg/Number";
+    const TIMEOUT: Duration = Duration::from_secs(60);
+
+    /// A source with topics that are granted from id 1 on, for samples of `max_bytes`.
+    fn fed(names: &[&str], max_bytes: u64) -> (Loopback, IngressControl, Feed) {
+        let source = Loopback::default();
+        let (mut control, _) = Ingress::start_in_thread(Box::new(source.clone()));
+        let topics = names.iter().zip(1..).map(|(name, id)| {
+            source.add_topic(name, TYPE, "int64 value\n");
+            recorded_grant(id, name, Some(TYPE.to_owned()), Some(max_bytes))
+        });
+        let topics = topics.collect();
+        let add = AddReader { name: "recorder".to_owned(), topics, publishes: Vec::new() };
+        let socket = control.add_reader(&add).unwrap();
+        (source, control, Feed::connect(socket).unwrap())
+    }
+
+    #[test]
+    fn samples_of_several_topics_are_taken_in_the_order_of_their_stamps() {
+        let scratch = TestDir::new();
+        let mut recorder = scratch.recorder(|_| {});
+        let (source, _control, feed) = fed(&["/a", "/b"], 100);
+        let (searches, searched) = channel();
+        let mut topics = Topics::new(feed, searches);
+        for (name, id) in [("/a", 1), ("/b", 2)] {
+            let topic = recorder.add_missing_topic(name).unwrap();
+            topics.add(id, name, topic, 0);
+        }
+        let mut left = 2;
+        let deadline = Instant::now() + TIMEOUT;
+        while left > 0 {
+            assert!(Instant::now() < deadline, "the topics are not attached");
+            assert!(topics.poll(0).unwrap().is_none());
+            while let Ok(DefinitionsRequest { id, .. }) = searched.try_recv() {
+                topics.found_locally(id, None);
+                left -= 1;
+            }
+            std::thread::yield_now();
+        }
+        let publish = |name: &str, at: i64| {
+            source.publish(name, &meta(at, at as u64), &[7; 8]).unwrap();
+        };
+        (0..100).for_each(|n| publish("/a", 2 * n + 1));
+        (0..100).for_each(|n| publish("/b", 2 * n + 2));
+        assert!(topics.take(50, 20, &mut recorder).unwrap(), "there are more than 20");
+        let received = |topics: &Topics| {
+            topics.statuses().iter().map(|topic| topic.received).collect::<Vec<_>>()
+        };
+        assert_eq!(received(&topics), [10, 10]);
+        assert!(!topics.take(50, usize::MAX, &mut recorder).unwrap());
+        assert_eq!(received(&topics), [25, 25], "later ones wait");
+        publish("/a", 201);
+        assert!(!topics.take(1000, usize::MAX, &mut recorder).unwrap());
+        assert_eq!(received(&topics), [101, 100]);
+        let counts = recorder.counts();
+        assert_eq!((counts.out_of_order, counts.recording.topic_unknown), (0, 0));
+    }
+
+    #[test]
+    fn samples_that_leave_before_they_are_read_are_counted() {
+        let (source, _control, mut feed) = fed(&["/a"], 16 << 20);
+        let mut samples = FedSamples::new(feed.topic(1, TIMEOUT).unwrap());
+        for seq in 1..=100 {
+            source.publish("/a", &meta(seq as i64, seq), &[7; 8]).unwrap();
+        }
+        let mut read = Vec::new();
+        while samples.look().is_some() {
+            let keep = |meta: &gleaner_transport::SampleMeta, _: &[u8]| {
+                read.push(meta.seq);
+                Ok::<(), RecordError>(())
+            };
+            samples.read(i64::MAX, usize::MAX, keep).unwrap();
+        }
+        assert!(samples.missed() > 0 && samples.received() > 0);
+        assert_eq!(samples.missed() + samples.received(), 100);
+        assert_eq!(read, (samples.missed() + 1..=100).collect::<Vec<_>>());
+    }
+}
