@@ -75,7 +75,7 @@ pub fn run(
         preroll_bytes: options.preroll_bytes.unwrap_or(1 << 20),
         max_length: Duration::from_secs(1),
         folder: options.out.clone(),
-        clock: format!("CLOCK_MONOTONIC, {} ns ahead", options.clock.offset_ns()),
+        clock: options.clock.to_string(),
         prefault: true,
     };
     let mut recorder = Recorder::live(folder, settings)?;
