@@ -14,6 +14,7 @@ pub mod budget;
 pub mod calls;
 pub mod drive;
 pub mod image;
+pub mod ingress;
 mod input;
 pub mod journal;
 pub mod link;
@@ -37,7 +38,7 @@ pub struct Target {
 }
 
 /// All targets.
-pub const TARGETS: [Target; 8] = [
+pub const TARGETS: [Target; 9] = [
     Target {
         name: "message",
         check: Some(message::check),
@@ -79,6 +80,13 @@ pub const TARGETS: [Target; 8] = [
         longest: 4 << 10,
         seeds: seeds::link::all,
         words: seeds::journal::WORDS,
+    },
+    Target {
+        name: "ingress",
+        check: Some(ingress::check),
+        longest: 4 << 10,
+        seeds: seeds::ingress::all,
+        words: seeds::ingress::WORDS,
     },
     Target {
         name: "manifest",

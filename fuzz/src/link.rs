@@ -40,29 +40,43 @@ pub mod mode {
 const BYTES_MAX: usize = 64 << 10;
 
 /// Memory budget of one frame. JSON takes a multiple of its text.
-const MEMORY: usize = 8 << 20;
+pub(crate) const MEMORY: usize = 8 << 20;
 
 /// Sends the input and receives it to the end. Returns whether any message was valid.
 pub fn check(data: &[u8]) -> bool {
     let mut input = FuzzInput(data);
     let mode = input.u8();
-    let mut bytes = if mode & mode::FRAMES == 0 { input.0.to_vec() } else { framed(input) };
-    if bytes.len() > BYTES_MAX {
+    let with_socket = mode & mode::PEERS == mode::STARTER;
+    let Some((local, bytes)) = sent(input, mode & mode::FRAMES != 0, with_socket) else {
         return false;
+    };
+    match mode & mode::PEERS {
+        mode::STARTER => orders(local, bytes),
+        mode::RECORDER => answers(local, bytes),
+        _ => wakes(local, bytes),
+    }
+}
+
+/// Sends the rest of an input, as frames or raw, and then the end. A socket goes with the first byte
+/// if `has_socket`. Returns the other end and the number of bytes; `None` if they are too many.
+pub(crate) fn sent(
+    input: FuzzInput,
+    is_framed: bool,
+    has_socket: bool,
+) -> Option<(UnixStream, usize)> {
+    let bytes = if is_framed { framed(input) } else { input.0.to_vec() };
+    if bytes.len() > BYTES_MAX {
+        return None;
     }
     let (mut remote, local) = UnixStream::pair().expect("the system has sockets");
-    if mode & mode::PEERS == mode::STARTER && !bytes.is_empty() {
-        let (first, rest) = bytes.split_at(1);
+    let mut rest = bytes.as_slice();
+    if has_socket && let Some((first, others)) = bytes.split_first_chunk::<1>() {
         with_socket(&remote, first);
-        bytes = rest.to_vec();
+        rest = others;
     }
-    remote.write_all(&bytes).expect("a socket buffer takes this much in one write");
+    remote.write_all(rest).expect("a socket buffer takes this much in one write");
     remote.shutdown(Shutdown::Write).expect("the socket is open");
-    match mode & mode::PEERS {
-        mode::STARTER => orders(local, bytes.len()),
-        mode::RECORDER => answers(local, bytes.len()),
-        _ => wakes(local, bytes.len()),
-    }
+    Some((local, bytes.len()))
 }
 
 /// Sends `bytes` and a socket, as a starter does with the first bytes of a command.

@@ -20,8 +20,8 @@ use crate::steps::{self, Steps};
 
 /// The fuzz targets. Their other properties are in `gleaner-fuzz`, which would take too long to
 /// build for this list.
-const TARGETS: [&str; 8] =
-    ["message", "drive", "bag", "image", "journal", "link", "manifest", CALLS];
+const TARGETS: [&str; 9] =
+    ["message", "drive", "bag", "image", "journal", "link", "ingress", "manifest", CALLS];
 
 /// The target that runs a lambda. It needs that lambda compiled, and the host, which takes minutes
 /// to build.

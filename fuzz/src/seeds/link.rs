@@ -29,7 +29,7 @@ pub fn all() -> Vec<Vec<u8>> {
         .collect()
 }
 
-fn as_frames(peers: u8, frames: &[(u8, Vec<u8>)]) -> Vec<u8> {
+pub(super) fn as_frames(peers: u8, frames: &[(u8, Vec<u8>)]) -> Vec<u8> {
     let mut seed = vec![peers | mode::FRAMES];
     for (tag, payload) in frames {
         seed.push(*tag);
@@ -39,7 +39,7 @@ fn as_frames(peers: u8, frames: &[(u8, Vec<u8>)]) -> Vec<u8> {
     seed
 }
 
-fn as_bytes(peers: u8, frames: &[(u8, Vec<u8>)]) -> Vec<u8> {
+pub(super) fn as_bytes(peers: u8, frames: &[(u8, Vec<u8>)]) -> Vec<u8> {
     let mut seed = vec![peers];
     for (tag, payload) in frames {
         seed.extend((payload.len() as u32).to_le_bytes());

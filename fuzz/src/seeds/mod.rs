@@ -5,6 +5,7 @@ pub mod bag;
 pub mod calls;
 pub mod drive;
 pub mod image;
+pub mod ingress;
 pub mod journal;
 pub mod link;
 pub mod manifest;
