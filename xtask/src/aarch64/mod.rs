@@ -25,10 +25,11 @@ use cases::{CASES, Machine, ReplayCase};
 use tools::{TARGET, Tools};
 
 /// Packages with the programs of a vehicle.
-const PACKAGES: [&str; 6] = [
+const PACKAGES: [&str; 7] = [
     "gleaner-cli",
     "gleaner-compile",
     "gleaner-host",
+    "gleaner-ingress",
     "gleaner-python",
     "gleaner-recorder",
     "gleaner-shim",
