@@ -152,9 +152,9 @@ pub struct RunArgs {
     #[arg(long)]
     pub out: Option<PathBuf>,
     /// Play this recorded drive once instead of joining the network: an MCAP file, a rosbag2 .db3
-    /// file or a directory
-    #[arg(long, value_name = "DRIVE", conflicts_with_all = ["domain", "interface", "rtt", "decisions"])]
-    pub drive: Option<PathBuf>,
+    /// file or a directory; several are merged by time
+    #[arg(long, value_name = "DRIVE", conflicts_with_all = ["domain", "interface"])]
+    pub drive: Vec<PathBuf>,
     /// Play the drive this many times as fast as it was recorded [default: 1]
     #[arg(long, value_name = "X", value_parser = rate, requires = "drive")]
     pub rate: Option<f64>,

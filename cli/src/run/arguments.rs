@@ -10,7 +10,7 @@ use crate::delegate::starter;
 pub(super) fn ingress(args: &RunArgs, largest: u64, offset_ns: i64) -> Vec<OsString> {
     let mut line =
         vec![format!("--clock-offset={offset_ns}").into(), format!("--largest={largest}").into()];
-    line.extend(args.drive.as_ref().map(|drive| option("--drive", drive)));
+    line.extend(args.drive.iter().map(|drive| option("--drive", drive)));
     line.extend(args.rate.map(|rate| format!("--rate={rate}").into()));
     line.extend(args.network.to_args());
     line

@@ -1,6 +1,5 @@
 //! A drive that the ingress plays: its start, and the end of the run after it.
 
-use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
@@ -8,6 +7,7 @@ use gleaner_base::visible;
 use super::screen::Screen;
 use super::services::IngressProcess;
 use super::supervised::SupervisedLambda;
+use crate::args::RunArgs;
 
 /// Time after the end of a drive without a wake, after which the run ends even if a lambda has not
 /// handled all samples: longer than the longest wake.
@@ -15,15 +15,19 @@ const DRAIN_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// The progress of a drive.
 pub(super) struct DriveProgress {
-    path: PathBuf,
+    /// The files, as text.
+    files: String,
     has_begun: bool,
     /// Time of the last wake after the end of the drive, and the number of wakes then.
     last_wake: Option<(Instant, u64)>,
 }
 
 impl DriveProgress {
-    pub(super) fn new(path: &Path) -> Self {
-        Self { path: path.to_owned(), has_begun: false, last_wake: None }
+    /// Returns the progress of the drive of a run; `None` without one.
+    pub(super) fn of(args: &RunArgs) -> Option<Self> {
+        let names = args.drive.iter().map(|file| visible(&file.to_string_lossy()));
+        let files = names.collect::<Vec<_>>().join(", ");
+        (!files.is_empty()).then_some(Self { files, has_begun: false, last_wake: None })
     }
 
     /// Starts the drive, once: all lambdas must be ready.
@@ -31,7 +35,7 @@ impl DriveProgress {
         if !self.has_begun {
             // An error means that the ingress has ended, which the caller notices.
             self.has_begun = ingress.control.begin().is_ok();
-            screen.print(&format!("playing {}\n", visible(&self.path.to_string_lossy())));
+            screen.print(&format!("playing {}\n", self.files));
         }
     }
 

@@ -120,7 +120,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
             GroupEnd::Broken(reason) => reason,
         };
         // It would be played again from its start, to lambdas that have seen a part of it.
-        if args.drive.is_some() {
+        if !args.drive.is_empty() {
             let mut failure = Failure::new(Exit::Internal, "the drive was not played to its end");
             failure.causes = vec![reason];
             cut_short = Some(failure);

@@ -85,7 +85,7 @@ impl<'a> ProcessGroup<'a> {
     }
 
     fn supervise(&mut self, time: &mut RunTime, stop: &AtomicBool) -> Result<GroupEnd, Failure> {
-        let mut drive = self.context.args.drive.as_deref().map(DriveProgress::new);
+        let mut drive = DriveProgress::of(self.context.args);
         loop {
             self.poll(POLL_INTERVAL);
             if stop.load(Ordering::Relaxed) || time.is_over() {
