@@ -3,12 +3,10 @@
 
 use std::io;
 use std::os::fd::OwnedFd;
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::thread::Builder;
+use std::thread::{Builder, Thread};
 
 use gleaner_base::{Exit, Failure, hex};
-use gleaner_feed::FeedBell;
 use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::link::{
@@ -17,37 +15,34 @@ use gleaner_protocol::link::{
 use sha2::{Digest, Sha256};
 use tracing::warn;
 
-use super::background::SystemHealth;
+use super::topic_watch::WatchEvent;
 
 /// Maximum number of messages of one lambda that are queued for the loop; then its socket fills,
 /// and then the lambda's own queue.
 const INBOX: usize = 64;
 
 /// An event for the loop, other than samples and messages of lambdas.
-pub enum LoopEvent {
+pub(super) enum LoopEvent {
     /// A lambda was announced.
     Registered(Box<Registration>),
     /// A lambda was announced and refused; the reason was sent to it.
     Refused,
     /// The loop has to end: the starter sent stop, has ended, or made a protocol error.
     Stop,
-    /// Definitions of a topic on this machine, by the id of its grant.
-    Definitions { id: u32, text: Option<Arc<str>> },
-    /// The checks of each second.
-    Health(SystemHealth),
+    /// An event of the watch thread.
+    Watch(WatchEvent),
 }
 
 /// An announced lambda, and its connection.
-pub struct Registration {
-    pub manifest: Manifest,
-    pub remaps: Vec<(String, String)>,
-    pub grants: Vec<(String, u32)>,
-    pub inbox: Receiver<LambdaEvent>,
-    pub replies: LambdaReplies,
+pub(super) struct Registration {
+    pub(super) manifest: Manifest,
+    pub(super) remaps: Vec<(String, String)>,
+    pub(super) inbox: Receiver<LambdaEvent>,
+    pub(super) replies: LambdaReplies,
 }
 
 /// A message of a lambda.
-pub enum LambdaEvent {
+pub(super) enum LambdaEvent {
     /// The header of the lambda matches the announcement.
     Hello(Box<JournalHeader>),
     /// The header of the lambda differs from the announcement in this way.
@@ -63,12 +58,16 @@ pub enum LambdaEvent {
 }
 
 /// Receives messages of the starter until it ends.
-pub fn starter(control: OwnedFd, events: SyncSender<LoopEvent>, bell: FeedBell) -> io::Result<()> {
+pub(super) fn starter(
+    control: OwnedFd,
+    events: SyncSender<LoopEvent>,
+    reader: Thread,
+) -> io::Result<()> {
     Builder::new().name("starter".to_owned()).spawn(move || {
         let mut control = ControlServer::new(control);
         loop {
             let event = match control.receive() {
-                Ok(Some(ControlMessage::Add(add, socket))) => register(add, socket, &bell)
+                Ok(Some(ControlMessage::Add(add, socket))) => register(add, socket, &reader)
                     .map_or(LoopEvent::Refused, |registration| {
                         LoopEvent::Registered(Box::new(registration))
                     }),
@@ -83,15 +82,15 @@ pub fn starter(control: OwnedFd, events: SyncSender<LoopEvent>, bell: FeedBell) 
             };
             let is_last = matches!(event, LoopEvent::Stop);
             if events.send(event).is_err() || is_last {
-                return bell.ring();
+                return reader.unpark();
             }
-            bell.ring();
+            reader.unpark();
         }
     })?;
     Ok(())
 }
 
-fn register(add: AddLambda, socket: OwnedFd, bell: &FeedBell) -> Option<Registration> {
+fn register(add: AddLambda, socket: OwnedFd, reader: &Thread) -> Option<Registration> {
     let lambda = add.lambda.display().to_string();
     let (link, mut replies) = match LambdaLink::new(socket) {
         Ok(both) => both,
@@ -111,23 +110,23 @@ fn register(add: AddLambda, socket: OwnedFd, bell: &FeedBell) -> Option<Registra
     let expected =
         ExpectedLambda { manifest: manifest.clone(), digest, remaps: add.remaps.clone() };
     let (sender, inbox) = sync_channel(INBOX);
-    let bell = bell.clone();
+    let reader = reader.clone();
     let name = format!("link {}", manifest.lambda.name);
     let started =
-        Builder::new().name(name).spawn(move || read_link(link, &expected, &sender, &bell));
+        Builder::new().name(name).spawn(move || read_link(link, &expected, &sender, &reader));
     if let Err(error) = started {
         warn!(%lambda, %error, "cannot start the thread of a lambda");
         replies.refused("the recorder cannot start a thread for it");
         return None;
     }
-    Some(Registration { manifest, remaps: add.remaps, grants: add.grants, inbox, replies })
+    Some(Registration { manifest, remaps: add.remaps, inbox, replies })
 }
 
 fn read_link(
     mut link: LambdaLink,
     expected: &ExpectedLambda,
     inbox: &SyncSender<LambdaEvent>,
-    bell: &FeedBell,
+    reader: &Thread,
 ) {
     loop {
         let event = match link.receive() {
@@ -143,9 +142,9 @@ fn read_link(
         };
         let is_last = matches!(event, LambdaEvent::Closed(_) | LambdaEvent::Mismatch(_));
         if inbox.send(event).is_err() || is_last {
-            return bell.ring();
+            return reader.unpark();
         }
-        bell.ring();
+        reader.unpark();
     }
 }
 

@@ -28,8 +28,8 @@ const BEHIND_NS: i64 = 60_000_000_000;
 const AHEAD_NS: i64 = 1_000_000_000;
 
 /// A lambda that is connected, or will be.
-pub struct ConnectedLambda {
-    name: String,
+pub(super) struct ConnectedLambda {
+    pub(super) name: String,
     rules: RecordSpec,
     topics: Vec<TopicId>,
     inbox: Receiver<LambdaEvent>,
@@ -44,21 +44,21 @@ pub struct ConnectedLambda {
 
 /// The result of [`ConnectedLambda::poll`].
 #[derive(Copy, Clone, Debug, Default)]
-pub struct PollResult {
+pub(super) struct PollResult {
     /// True if there was a message.
-    pub is_busy: bool,
+    pub(super) is_busy: bool,
     /// Set if its header was received and it was added.
-    pub is_new: Option<LambdaId>,
+    pub(super) is_new: Option<LambdaId>,
     /// True if it is refused. The reason was sent to it and logged.
-    pub is_refused: bool,
+    pub(super) is_refused: bool,
     /// True if its connection is closed.
-    pub is_gone: bool,
+    pub(super) is_gone: bool,
     /// Counts of wakes that are not recorded, and their triggers.
-    pub counted: RecordingCounts,
+    pub(super) counted: RecordingCounts,
 }
 
 impl ConnectedLambda {
-    pub fn new(
+    pub(super) fn new(
         name: String,
         rules: RecordSpec,
         topics: Vec<TopicId>,
@@ -78,12 +78,8 @@ impl ConnectedLambda {
         }
     }
 
-    pub fn name(&self) -> &str {
-        &self.name
-    }
-
     /// Handles queued messages of the lambda, at most [`MESSAGES_PER_TURN`].
-    pub fn poll(
+    pub(super) fn poll(
         &mut self,
         recorder: &mut Recorder,
         now_ns: i64,

@@ -82,18 +82,13 @@ impl Recorder {
         self.clips.is_open()
     }
 
-    /// Adds the description of a topic that was missing; its samples arrive since `since_ns`.
+    /// Adds the description of a topic that was missing until now.
     ///
     /// # Errors
     ///
     /// [`RecordError::LongTopic`] if a clip has no room for its description: it stays missing.
-    pub fn found_topic(
-        &mut self,
-        id: TopicId,
-        topic: TopicSchema,
-        since_ns: i64,
-    ) -> Result<(), RecordError> {
-        self.sources.found_topic(id.index(), topic, since_ns)
+    pub fn found_topic(&mut self, id: TopicId, topic: TopicSchema) -> Result<(), RecordError> {
+        self.sources.found_topic(id.index(), topic, self.history.now())
     }
 
     /// Counts wakes of a lambda that did not arrive; `at_ns` is the stamp of the next one that

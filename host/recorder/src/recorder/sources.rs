@@ -94,19 +94,19 @@ impl Sources {
         Ok(self.topics.len() - 1)
     }
 
-    /// Adds the description of a topic that was missing until `since_ns`.
+    /// Adds the description of a topic that was missing until `now`.
     pub fn found_topic(
         &mut self,
         topic: usize,
         schema: TopicSchema,
-        since_ns: i64,
+        now: Option<i64>,
     ) -> Result<(), RecordError> {
         schema.check()?;
         let topic = &mut self.topics[topic];
         if topic.is_missing {
             // Messages and windows use the name with which it was requested.
             topic.schema = Arc::new(TopicSchema { name: topic.schema.name.clone(), ..schema });
-            (topic.is_missing, topic.found_at) = (false, Some(since_ns));
+            (topic.is_missing, topic.found_at) = (false, now);
         }
         Ok(())
     }
