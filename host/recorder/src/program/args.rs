@@ -16,7 +16,7 @@ use super::RecorderOptions;
 pub struct Args {
     /// Output folder: `clips.jsonl`, `clips/`.
     #[arg(long, value_name = "FOLDER")]
-    out: PathBuf,
+    pub(super) out: PathBuf,
     /// Offset of the sample clock from CLOCK_MONOTONIC, in ns; default: the time of day.
     #[arg(long, value_name = "NS", allow_negative_numbers = true)]
     clock_offset: Option<i64>,

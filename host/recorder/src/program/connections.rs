@@ -68,7 +68,7 @@ pub fn starter(control: OwnedFd, events: SyncSender<LoopEvent>, bell: FeedBell) 
         let mut control = ControlServer::new(control);
         loop {
             let event = match control.receive() {
-                Ok(Some(ControlMessage::Add(add, socket))) => register(add, socket, &bell)
+                Ok(Some(ControlMessage::Add(add, socket))) => register(*add, socket, &bell)
                     .map_or(LoopEvent::Refused, |registration| {
                         LoopEvent::Registered(Box::new(registration))
                     }),

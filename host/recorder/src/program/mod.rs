@@ -34,14 +34,17 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use clap::Parser;
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, safe_file};
+use gleaner_jail::recorder as sandbox;
 use gleaner_messages::Sources;
 use gleaner_protocol::Handover;
 use gleaner_protocol::link::LinkError;
 use gleaner_transport::Clock;
 use gleaner_vitals::start::{reports, stop_flag};
 use rustix::process::{Signal, set_parent_process_death_signal};
+use tracing::debug;
 
+use crate::RecordError;
 use args::Args;
 pub use event_loop::run;
 
@@ -82,6 +85,12 @@ fn start(args: Args) -> Result<(), Failure> {
     let internal = |what: &'static str| {
         move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
     };
+    // First: threads that exist already would keep their privileges. Rules need a folder that exists.
+    safe_file::folder(&args.out)
+        .map_err(|source| RecordError::Create { path: args.out.clone(), source })?;
+    for layer in sandbox::enter(std::slice::from_ref(&args.out)) {
+        debug!(?layer, "sandbox");
+    }
     // A starter that dies also closes our standard input. In either case, open clips are completed.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)

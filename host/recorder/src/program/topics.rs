@@ -35,7 +35,7 @@ enum Description {
     Settled,
 }
 
-/// What a granted topic has.
+/// The samples of a granted topic.
 enum Supply {
     /// Not attached yet.
     Awaited,
