@@ -136,10 +136,10 @@ pub const CRATES: &[(&str, &[&str])] = &[
         "gleaner-recorder",
         &[
             "gleaner-base",
-            "gleaner-dds",
             "gleaner-drives",
             "gleaner-feed",
             "gleaner-image",
+            "gleaner-jail",
             "gleaner-journal",
             "gleaner-lambda",
             "gleaner-messages",

@@ -2,7 +2,7 @@
 
 use gleaner_protocol::ingress::{
     AddReader, AddTopics, AttachedTopic, HoldGrant, PublishGrant, Qos, ReaderMessage, RefusedTopic,
-    RegionLayout, SourceStatus, TopicGrant,
+    RegionLayout, TopicGrant,
 };
 
 use serde_json::to_vec;
@@ -72,7 +72,7 @@ pub fn all() -> Vec<Vec<u8>> {
         ReaderMessage::Attached(Box::new(attached())),
         ReaderMessage::Refused { id: 2, reason: refused },
         ReaderMessage::Definitions { id: 1, text: Some("float64 x".to_owned()) },
-        ReaderMessage::Status(Box::new(SourceStatus::default())),
+        ReaderMessage::Status(Box::default()),
     ];
     let ingress = ingress.iter().map(|message| (48, json(to_vec(message)))).collect();
     let handover = vec![(6, br#"["ingress"]"#.to_vec()), (6, b"[]".to_vec())];

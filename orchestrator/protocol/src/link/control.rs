@@ -85,7 +85,7 @@ impl ControlClient {
 #[derive(Debug)]
 pub enum ControlMessage {
     /// Add a lambda, with its socket.
-    Add(AddLambda, OwnedFd),
+    Add(Box<AddLambda>, OwnedFd),
     /// Complete open clips and exit.
     Stop,
 }

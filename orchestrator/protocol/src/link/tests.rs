@@ -90,7 +90,7 @@ fn each_lambda_is_added_with_a_socket_of_its_own() {
         let Some(ControlMessage::Add(added, recorder_end)) = server.receive().unwrap() else {
             panic!()
         };
-        assert_eq!(added, add(name));
+        assert_eq!(added, Box::new(add(name)));
         // Bytes written at the lambda's end arrive at the recorder's.
         UnixStream::from(lambda_end).write_all(name.as_bytes()).unwrap();
         let mut read = String::new();
