@@ -443,7 +443,7 @@ impl Ingress {
     }
 }
 
-/// What a wait has found.
+/// Result of a wait.
 struct Ready {
     control: bool,
     stop: bool,

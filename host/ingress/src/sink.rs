@@ -52,7 +52,7 @@ pub(crate) struct AttachedReader {
     pub(crate) refused: u64,
 }
 
-/// What a reader asks of a region.
+/// Request of a reader to a region.
 pub(crate) struct AttachRequest<'a> {
     pub(crate) control: &'a ControlRegion,
     pub(crate) limits: HoldLimits,

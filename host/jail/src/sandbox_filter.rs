@@ -197,9 +197,9 @@ pub(crate) fn own_process_only(refused: DeniedCalls) -> DeniedCalls {
 }
 
 /// Denies what a process does not need any more when it is about to become an interpreter: other
-/// processes and signals to them, sockets but UDP, and, with `only_counted_memory`, memory as in [`apply`].
-/// The lambda's code does not run until [`apply`], but the interpreter may be any program that
-/// calls itself Python.
+/// processes and signals to them, sockets but UDP, and, with `only_counted_memory`, memory as in
+/// [`apply`]. The lambda's code does not run until [`apply`], but the interpreter may be any
+/// program that calls itself Python.
 #[must_use]
 pub fn apply_before_interpreter(only_counted_memory: bool) -> Layer {
     match install_before(only_counted_memory) {

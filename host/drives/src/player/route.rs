@@ -60,11 +60,8 @@ impl Sink for TopicRoute {
         // Locked meanwhile: a sink that was removed gets nothing more.
         let subscribers = self.lock();
         let meta = self.stamped(meta);
-        subscribers
-            .iter()
-            .map(|known| known.sink.deliver(&meta, cdr))
-            .last()
-            .unwrap_or(Delivery::Taken)
+        let each = |_, known: &Subscriber| known.sink.deliver(&meta, cdr);
+        subscribers.iter().fold(Delivery::Taken, each)
     }
 
     fn too_big(&self, meta: &SampleMeta, len: usize) {

@@ -67,7 +67,7 @@ pub(super) fn starter(
         let mut control = ControlServer::new(control);
         loop {
             let event = match control.receive() {
-                Ok(Some(ControlMessage::Add(add, socket))) => register(add, socket, &reader)
+                Ok(Some(ControlMessage::Add(add, socket))) => register(*add, socket, &reader)
                     .map_or(LoopEvent::Refused, |registration| {
                         LoopEvent::Registered(Box::new(registration))
                     }),

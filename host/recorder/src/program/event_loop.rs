@@ -228,7 +228,10 @@ impl RecorderLoop {
                 LoopEvent::Stop => self.is_ending = true,
                 LoopEvent::Watch(WatchEvent::Found { topic, schema }) => {
                     let type_name = schema.type_name.clone();
-                    match (self.recorder.found_topic(topic, schema), self.topics.get_mut(&topic)) {
+                    match (
+                        self.recorder.found_topic(topic, schema, self.clock.now()),
+                        self.topics.get_mut(&topic),
+                    ) {
                         (Ok(()), Some(recorded)) => recorded.type_name = Some(type_name),
                         (Ok(()), None) => {}
                         (Err(error), _) => {

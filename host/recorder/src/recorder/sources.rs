@@ -55,16 +55,16 @@ struct SourceLambda {
 }
 
 /// The topics and lambdas, by their numbers.
-pub struct Sources {
+pub struct RecordedSources {
     /// The clock of the stamps.
     clock: String,
     topics: Vec<SourceTopic>,
     lambdas: Vec<SourceLambda>,
 }
 
-impl Sources {
-    pub fn new(clock: String) -> Sources {
-        Sources { clock, topics: Vec::new(), lambdas: Vec::new() }
+impl RecordedSources {
+    pub fn new(clock: String) -> RecordedSources {
+        RecordedSources { clock, topics: Vec::new(), lambdas: Vec::new() }
     }
 
     pub fn clock(&self) -> &str {
@@ -94,19 +94,19 @@ impl Sources {
         Ok(self.topics.len() - 1)
     }
 
-    /// Adds the description of a topic that was missing until `now`.
+    /// Adds the description of a topic that was missing until `since_ns`.
     pub fn found_topic(
         &mut self,
         topic: usize,
         schema: TopicSchema,
-        now: Option<i64>,
+        since_ns: i64,
     ) -> Result<(), RecordError> {
         schema.check()?;
         let topic = &mut self.topics[topic];
         if topic.is_missing {
             // Messages and windows use the name with which it was requested.
             topic.schema = Arc::new(TopicSchema { name: topic.schema.name.clone(), ..schema });
-            (topic.is_missing, topic.found_at) = (false, now);
+            (topic.is_missing, topic.found_at) = (false, Some(since_ns));
         }
         Ok(())
     }

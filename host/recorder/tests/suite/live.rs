@@ -194,7 +194,7 @@ fn gaps_in_sequence_numbers_are_losses_of_their_clip() {
             }
         }
         match ms {
-            480 => recorder.found_topic(late, topic("/late")).unwrap(),
+            480 => recorder.found_topic(late, topic("/late"), at).unwrap(),
             500 => {
                 recorder.lost_wakes(lambda, at, 3);
                 recorder.wake(lambda, &entry(at, EVENT)).unwrap();

@@ -133,8 +133,8 @@ fn check_statements(path: &Path, stated: &ClipStatements) -> Result<(), Failure>
     }
 }
 
-/// Describes the losses that the clip states; `None` if there are none. In a live clip, messages may
-/// also be lost before the recorder. The lambda may have received those.
+/// Describes the losses that the clip states; `None` if there are none. In a live clip, messages
+/// may also be lost before the recorder. The lambda may have received those.
 fn losses(stated: &ClipStatements, is_live: bool) -> Option<String> {
     let count = |count: Option<u64>| count.map_or("unknown".to_owned(), |count| count.to_string());
     let lost = stated.clip().topics.iter().flat_map(|topic| {

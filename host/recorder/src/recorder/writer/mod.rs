@@ -68,7 +68,8 @@ impl ClipDisk {
     pub fn new_clip(&mut self) -> ClipWriter {
         match self {
             ClipDisk::Inline(folder) => {
-                ClipWriter::Inline(InlineClip { folder: folder.clone(), file: ClipFile::default() })
+                let (folder, file) = (Arc::clone(folder), ClipFile::default());
+                ClipWriter::Inline(Box::new(InlineClip { folder, file }))
             }
             ClipDisk::Background(thread) => ClipWriter::Queued(thread.new_clip()),
         }
@@ -128,7 +129,7 @@ impl ClipDisk {
 /// Writes one clip. A clip whose writer is dropped stays unfinished: its file, if any, is recovered
 /// later.
 pub enum ClipWriter {
-    Inline(InlineClip),
+    Inline(Box<InlineClip>),
     Queued(QueuedClip),
 }
 
@@ -148,8 +149,8 @@ impl ClipWriter {
     /// Creates the file, before anything is written to it.
     pub fn begin(&mut self, name: String, header: ClipHeader) -> Result<(), RecordError> {
         match self {
-            ClipWriter::Inline(InlineClip { folder, file }) => {
-                file.begin(&mut InlineClip::folder(folder), &name, &header)
+            ClipWriter::Inline(inline) => {
+                inline.file.begin(&mut InlineClip::folder(&inline.folder), &name, &header)
             }
             ClipWriter::Queued(queued) => queued.begin(name, header),
         }
@@ -196,7 +197,8 @@ impl ClipWriter {
     /// Completes the clip; returns it if that is done already.
     pub fn finish(self, completion: ClipCompletion) -> Result<Option<Clip>, RecordError> {
         match self {
-            ClipWriter::Inline(InlineClip { folder, file }) => {
+            ClipWriter::Inline(inline) => {
+                let InlineClip { folder, file } = *inline;
                 let clip = file.finish(completion)?;
                 // If one cannot be deleted, that is retried after the next finished clip.
                 InlineClip::folder(&folder).make_room(&clip);
