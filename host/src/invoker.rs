@@ -56,11 +56,6 @@ impl Invoker {
         decision
     }
 
-    /// Discards the instance of the lambda, as after a wake with a fault.
-    pub fn discard(&mut self) {
-        self.guest.discard();
-    }
-
     /// Ends a lambda that runs in another process, after its last wake.
     ///
     /// # Errors

@@ -131,11 +131,6 @@ impl Guest for SandboxedGuest {
         outcome
     }
 
-    fn discard(&mut self) {
-        self.guest.discard();
-        self.needs_init = true;
-    }
-
     fn engine(&self) -> String {
         self.guest.engine()
     }

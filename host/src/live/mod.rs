@@ -40,7 +40,7 @@ use self::round_trip::RoundTrip;
 use self::status::{Around, StatusReporter};
 use crate::input::{InputWaker, LiveInputs};
 use crate::invoker::Invoker;
-use crate::journal::LambdaIdentity;
+use crate::journal::{CLOCK_OF_VEHICLE, LambdaIdentity};
 use crate::schedule::WakeSchedule;
 use crate::session_setup::{ConfiguredLambda, Load, RunMode, SessionSetup, not_started};
 
@@ -126,7 +126,7 @@ impl LiveRun<'_> {
                     config,
                     remaps,
                     engine,
-                    clock: &clock.to_string(),
+                    clock: CLOCK_OF_VEHICLE,
                     part: TimeRange::default(),
                 };
                 Some(RecorderSender::join(socket, &identity.header()?, &inputs)?)

@@ -171,10 +171,6 @@ impl Guest for SendingGuest {
         outcome
     }
 
-    fn discard(&mut self) {
-        self.guest.discard();
-    }
-
     fn engine(&self) -> String {
         self.guest.engine()
     }
