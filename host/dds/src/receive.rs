@@ -2,7 +2,6 @@
 //! writers.
 
 use std::cell::RefCell;
-use std::collections::BTreeMap;
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -12,12 +11,8 @@ use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 
 use mio::{Events, Interest, Poll, Token, Waker};
-use rustdds::{
-    DomainParticipant, DomainParticipantStatusEvent, DomainParticipantStatusListener, GUID,
-    StatusEvented,
-};
+use rustdds::{DomainParticipant, DomainParticipantStatusListener, GUID, StatusEvented};
 
-use super::announcer::Announcer;
 use super::clock_watch::ClockWatch;
 use super::graph::GraphNode;
 use super::packet_filter::PacketFilter;
@@ -35,8 +30,7 @@ const ANSWER: Token = Token(3);
 
 /// Most samples of one topic before the next one's turn.
 const MOST_PER_TURN: usize = 64;
-/// Interval of updates: after a change, and in any case. At 5 ms, RustDDS missed a writer in a
-/// test, which appeared as a reader was created again.
+/// Interval of updates: after a change, and in any case.
 const UPDATE_MIN: Duration = Duration::from_millis(100);
 const UPDATE_MAX: Duration = Duration::from_secs(1);
 /// Shared memory for samples that is always kept.
@@ -45,8 +39,6 @@ const SHARED_BYTES: usize = 1 << 20;
 /// A command to the receive thread.
 pub(super) enum ReceiverCommand {
     Subscribe(Box<TopicReader>),
-    /// Ends the subscription with this number.
-    Unsubscribe(usize),
     Writer(GUID),
     WriterGone(GUID),
     Query(TypeQuery),
@@ -74,13 +66,11 @@ struct Receiver {
     commands: mpsc::Receiver<ReceiverCommand>,
     participant: DomainParticipant,
     listener: DomainParticipantStatusListener,
-    /// Subscriptions, by their number.
-    readers: BTreeMap<usize, TopicReader>,
+    readers: Vec<TopicReader>,
     writers: Vec<GUID>,
     graph: GraphNode,
     querier: TypeQuerier,
     filter: PacketFilter,
-    announcer: Announcer,
     state: Arc<ParticipantState>,
     memory: RefCell<Vec<u8>>,
     clock: Clock,
@@ -97,7 +87,7 @@ pub(super) fn start(
     options: &DdsOptions,
     node: (String, String),
     participant: &DomainParticipant,
-    (filter, announcer): (PacketFilter, Announcer),
+    filter: PacketFilter,
     state: &Arc<ParticipantState>,
 ) -> Result<(ReceiverHandle, JoinHandle<()>), DdsError> {
     let join = |source: io::Error| DdsError::Join { domain: options.domain, source: source.into() };
@@ -112,12 +102,11 @@ pub(super) fn start(
         commands: receiver,
         participant: participant.clone(),
         listener,
-        readers: BTreeMap::new(),
+        readers: Vec::new(),
         writers: Vec::new(),
         graph,
         querier: TypeQuerier::default(),
         filter,
-        announcer,
         state: state.clone(),
         memory: RefCell::new(Vec::with_capacity(SHARED_BYTES)),
         clock: options.clock,
@@ -153,8 +142,8 @@ impl Receiver {
                     STATUS => self.note_events(),
                     GRAPH | ANSWER => self.changed = true,
                     token => {
-                        if let Some(reader) = topic_reader::index(token)
-                            .and_then(|index| self.readers.get_mut(&index))
+                        if let Some(reader) =
+                            topic_reader::index(token).and_then(|index| self.readers.get_mut(index))
                         {
                             reader.ready = true;
                         }
@@ -165,7 +154,6 @@ impl Receiver {
                 break;
             }
             self.take();
-            self.announcer.poll();
             if self.due() {
                 self.update();
             }
@@ -182,27 +170,20 @@ impl Receiver {
 
     /// Time until the next update is due.
     fn poll_timeout(&self) -> Duration {
-        if self.readers.values().any(|reader| reader.ready) {
+        if self.readers.iter().any(|reader| reader.ready) {
             return Duration::ZERO;
         }
         let every = if self.changed { UPDATE_MIN } else { UPDATE_MAX };
-        let update =
-            self.updated.map_or(Duration::ZERO, |updated| every.saturating_sub(updated.elapsed()));
-        self.announcer.until_due(Instant::now()).map_or(update, |due| update.min(due))
+        self.updated.map_or(Duration::ZERO, |updated| every.saturating_sub(updated.elapsed()))
     }
 
     fn handle_commands(&mut self) -> bool {
         while let Ok(command) = self.commands.try_recv() {
             match command {
                 ReceiverCommand::Subscribe(reader) => {
-                    self.readers.insert(reader.index(), *reader);
+                    self.readers.push(*reader);
                     // Its reader is created at once, not at the next change in the domain.
                     self.updated = None;
-                }
-                ReceiverCommand::Unsubscribe(index) => {
-                    if let Some(mut reader) = self.readers.remove(&index) {
-                        reader.remove_reader(self.poll.registry(), &self.state);
-                    }
                 }
                 ReceiverCommand::Writer(guid) => self.writers.push(guid),
                 ReceiverCommand::WriterGone(guid) => self.writers.retain(|writer| *writer != guid),
@@ -217,9 +198,6 @@ impl Receiver {
     fn note_events(&mut self) {
         while let Some(event) = self.listener.try_recv_status() {
             self.changed |= self.state.peers().note(&event);
-            if matches!(event, DomainParticipantStatusEvent::ParticipantDiscovered { .. }) {
-                self.announcer.restart();
-            }
             self.state.handled.fetch_add(1, Relaxed);
         }
     }
@@ -232,7 +210,7 @@ impl Receiver {
             memory: &self.memory,
             clock: self.clock,
         };
-        for reader in self.readers.values_mut().filter(|reader| reader.ready) {
+        for reader in self.readers.iter_mut().filter(|reader| reader.ready) {
             reader.take(&context, MOST_PER_TURN);
         }
     }
@@ -250,7 +228,7 @@ impl Receiver {
         let writers = self.participant.discovered_writers();
         let offers: Vec<Offer> = writers.iter().map(discovery::offer).collect();
         self.note_events();
-        let largest = self.readers.values().map(TopicReader::largest).max().unwrap_or(0);
+        let largest = self.readers.iter().map(TopicReader::largest).max().unwrap_or(0);
         let largest = largest.max(self.largest).max(self.querier.largest());
         // Before readers are created: fragments of the first sample have to pass. Each participant
         // is announced once; a known writer stands in for a participant that was missed.
@@ -268,7 +246,7 @@ impl Receiver {
             memory: &self.memory,
             clock: self.clock,
         };
-        for reader in self.readers.values_mut() {
+        for reader in &mut self.readers {
             reader.update(&context, &offers);
             // RustDDS stops at a change that is not a sample, such as a writer's leave; samples
             // after it are found here.
@@ -280,7 +258,7 @@ impl Receiver {
         self.querier.poll(&context, ANSWER, &writers, self.graph.nodes());
         // An open query is polled again soon.
         self.changed |= self.querier.is_open();
-        let readers = self.readers.values().filter_map(TopicReader::guid).collect();
+        let readers = self.readers.iter().filter_map(TopicReader::guid).collect();
         self.graph.update(&context, readers, &self.writers);
         // One unexpectedly large sample must not keep its memory for ever.
         let mut memory = self.memory.borrow_mut();

@@ -1,5 +1,7 @@
 //! The clock that orders all samples of a vehicle.
 
+use std::fmt;
+
 /// `CLOCK_MONOTONIC` with an offset that is set once from the time of day. It never goes back, and
 /// its time stamps can be read as dates.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -32,6 +34,12 @@ impl Clock {
     /// Returns the value of `CLOCK_MONOTONIC` at the time `at_ns` of this clock.
     pub fn monotonic(&self, at_ns: i64) -> i64 {
         at_ns.saturating_sub(self.offset_ns)
+    }
+}
+
+impl fmt::Display for Clock {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "CLOCK_MONOTONIC, {} ns ahead", self.offset_ns)
     }
 }
 
