@@ -302,7 +302,8 @@ impl Ingress {
                 return Err(reason);
             }
         };
-        reader.topics.push(Attachment { id: grant.id, topic, attached });
+        let before = self.topics.get(topic).map_or_else(Default::default, |it| it.status.clone());
+        reader.topics.push(Attachment { id: grant.id, topic, attached, before });
         let SharedLayout { depth, slots, slot_bytes } = attached.sizes.layout;
         let definitions = found.and_then(|found| found.definitions_text.as_deref());
         let message = AttachedTopic {
@@ -418,8 +419,9 @@ impl Ingress {
     /// Reports the status to the readers and the starter.
     fn report_status(&mut self) {
         for reader in &mut self.readers {
-            let status =
-                |known: &Attachment| Some((known.id, self.topics.get(known.topic)?.status.clone()));
+            let status = |known: &Attachment| {
+                Some((known.id, known.reception(&self.topics.get(known.topic)?.status)))
+            };
             let status = SourceStatus {
                 health: self.health.clone(),
                 topics: reader.topics.iter().filter_map(status).collect(),

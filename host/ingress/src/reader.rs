@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use gleaner_buffers::shared::{HAZARDS, HoldLimits};
 use gleaner_protocol::ingress::{
-    AddReader, HoldGrant, PublishGrant, ReaderLink, ReaderMessage, ReaderRequest, RefusedTopic,
-    TopicGrant,
+    AddReader, HoldGrant, PublishGrant, ReaderLink, ReaderMessage, ReaderRequest, ReceptionStatus,
+    RefusedTopic, TopicGrant,
 };
 use gleaner_protocol::link::{Incoming, LinkError};
 use gleaner_regions::ControlRegion;
@@ -28,6 +28,19 @@ pub(crate) struct Attachment {
     /// Key in the table of topics.
     pub(crate) topic: u64,
     pub(crate) attached: AttachedReader,
+    /// State of the subscription when the reader was attached.
+    pub(crate) before: ReceptionStatus,
+}
+
+impl Attachment {
+    /// Returns the state of the subscription for this reader: without what was lost before it.
+    pub(crate) fn reception(&self, status: &ReceptionStatus) -> ReceptionStatus {
+        let mut status = status.clone();
+        let lost_before = self.before.lost.unwrap_or(0);
+        status.lost = status.lost.map(|lost| lost.saturating_sub(lost_before));
+        status.malformed = status.malformed.saturating_sub(self.before.malformed);
+        status
+    }
 }
 
 /// A wait for the definitions of an attached topic.
