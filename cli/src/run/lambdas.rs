@@ -175,7 +175,7 @@ pub(super) mod tests {
     /// Returns a lambda with an input, if any: its topic and maximum size. It records `topics`.
     pub(crate) fn recording(name: &str, input: Option<(&str, &str)>, topics: &[&str]) -> RunLambda {
         let mut text = format!(
-            "lambda = {{ name = '{name}', version = '0.1.0', kind = 'python', entry = 'main.py' }}\n\
+            "lambda = {{ name = '{name}', version = '0.1.0', kind = 'python', entry = 'x.py' }}\n\
              schedule.period = '1s'\n"
         );
         if let Some((topic, max_size)) = input {

@@ -1,4 +1,4 @@
-//! Completes `summary.json` of a lambda with the counts of ingress, recorder and restarted processes.
+//! Completes `summary.json` of a lambda with the counts of ingress, recorder and earlier processes.
 //!
 //! Each process counts only its own events, and `gleaner-shim` writes only those of one process.
 
