@@ -85,7 +85,7 @@ fn start(args: Args) -> Result<(), Failure> {
     let internal = |what: &'static str| {
         move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
     };
-    // First: threads that exist already would keep their privileges. Rules need a folder that exists.
+    // First: threads that exist already would keep their privileges. The folder must exist.
     safe_file::folder(&args.out)
         .map_err(|source| RecordError::Create { path: args.out.clone(), source })?;
     for layer in sandbox::enter(std::slice::from_ref(&args.out)) {
