@@ -3,7 +3,7 @@
 use gleaner_transport::{Gaps, SampleMeta};
 
 use super::clips::OpenClip;
-use super::sources::Sources;
+use super::sources::RecordedSources;
 use crate::RecordError;
 use crate::preroll::{EntryMeta, Losses, Preroll};
 use crate::window::{Group, Window};
@@ -141,7 +141,7 @@ impl History {
     }
 
     /// Notes data that a window covers but that is no longer available.
-    pub fn reach_back(&self, clip: &mut OpenClip, window: &Window, sources: &Sources) {
+    pub fn reach_back(&self, clip: &mut OpenClip, window: &Window, sources: &RecordedSources) {
         clip.begins_late(self.began_at.saturating_sub(window.from));
         let number = clip.group();
         for topic in sources.topics(window.lambda) {
@@ -162,7 +162,7 @@ impl History {
         &mut self,
         clip: &mut OpenClip,
         group: &Group,
-        sources: &Sources,
+        sources: &RecordedSources,
         limit: i64,
     ) {
         let number = clip.group();
@@ -189,7 +189,7 @@ impl History {
         &mut self,
         clip: &mut OpenClip,
         group: &Group,
-        sources: &Sources,
+        sources: &RecordedSources,
         limit: i64,
     ) {
         let (number, from) = (clip.group(), clip.from(group));

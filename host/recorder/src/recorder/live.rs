@@ -52,34 +52,34 @@ impl Recorder {
     /// [`RecordError`] if the preroll is on disk and that fails, or if the writer thread has ended.
     /// A clip that could not be written is no such error: see [`Recorder::take_failures`].
     pub fn work(&mut self) -> Result<Work, RecordError> {
-        self.clips.poll()?;
-        self.clips.run_within(Budget::STEP, &mut self.history, &self.sources)?;
-        if self.clips.is_settled() {
+        self.clips.progress_mut().poll()?;
+        self.clips.run_within(Budget::STEP, &mut self.material)?;
+        if self.clips.progress().is_settled() {
             return Ok(Work::Done);
         }
-        Ok(if self.clips.has_room() { Work::More } else { Work::Wait })
+        Ok(if self.clips.progress().has_room() { Work::More } else { Work::Wait })
     }
 
     /// Takes the errors of clips that could not be written since the last call; the first 16.
     pub fn take_failures(&mut self) -> Vec<RecordError> {
-        self.clips.finished_mut().take_failures()
+        self.clips.progress_mut().finished_mut().take_failures()
     }
 
     /// Takes the clips of an earlier process that were recovered since the last call. One that
     /// cannot be recovered is among the failures.
     pub fn take_recovered(&mut self) -> Vec<Clip> {
-        self.clips.finished_mut().take_recovered()
+        self.clips.progress_mut().finished_mut().take_recovered()
     }
 
     /// Takes the clips that were deleted to make room, or could not be deleted, since the last
     /// call; the first of them.
     pub fn take_deleted(&mut self) -> Vec<Loss> {
-        self.clips.finished_mut().take_deleted()
+        self.clips.progress_mut().finished_mut().take_deleted()
     }
 
     /// Returns whether a clip is open.
     pub fn is_recording(&self) -> bool {
-        self.clips.is_open()
+        self.clips.progress().is_open()
     }
 
     /// Adds the description of a topic that was missing; its samples arrive since `since_ns`.
@@ -93,19 +93,19 @@ impl Recorder {
         topic: TopicSchema,
         since_ns: i64,
     ) -> Result<(), RecordError> {
-        self.sources.found_topic(id.index(), topic, since_ns)
+        self.material.sources.found_topic(id.index(), topic, since_ns)
     }
 
     /// Counts wakes of a lambda that did not arrive; `at_ns` is the stamp of the next one that
     /// does.
     pub fn lost_wakes(&mut self, lambda: LambdaId, at_ns: i64, count: u64) {
-        self.sources.count_wakes(lambda.index(), count);
-        self.history.lost_wakes(lambda.index(), at_ns, count);
+        self.material.sources.count_wakes(lambda.index(), count);
+        self.material.history.lost_wakes(lambda.index(), at_ns, count);
     }
 
     /// Counts a sample that arrived without room for it.
     pub fn lost_sample(&mut self, topic: TopicId, meta: &SampleMeta) {
-        self.history.lost_sample(topic.index(), meta);
+        self.material.history.lost_sample(topic.index(), meta);
     }
 
     /// Executes a command in the name of `lambda`; `source` describes who gave it. It is not a
@@ -140,10 +140,10 @@ impl Recorder {
                 return Ok(Commanded::Ignored);
             }
         };
-        let name = self.sources.name(lambda.index());
+        let name = self.material.sources.name(lambda.index());
         let moment = Moment { source: Some(source), ..Moment::of(name, trigger, at_ns) };
         self.clips.await_clip(lambda.index(), moment);
-        self.clips.act(&mut self.history, &self.sources)?;
+        self.clips.act(&mut self.material)?;
         Ok(commanded)
     }
 
@@ -153,7 +153,7 @@ impl Recorder {
     ///
     /// [`RecordError`] if the disk fails.
     pub fn end_lambda(&mut self, lambda: LambdaId, at_ns: i64) -> Result<(), RecordError> {
-        self.clips.end_lambda(lambda.index(), at_ns, &mut self.history, &self.sources)
+        self.clips.end_lambda(lambda.index(), at_ns, &mut self.material)
     }
 
     /// Suspends recording: no clip is begun, and the open one ends with the reason `why`. A preroll
@@ -163,10 +163,10 @@ impl Recorder {
     ///
     /// [`RecordError`] if the disk fails.
     pub fn hold(&mut self, why: Option<&str>) -> Result<(), RecordError> {
-        self.history.preroll_mut().shrink(why.is_some());
+        self.material.history.preroll_mut().shrink(why.is_some());
         // The open clip ends at once.
         self.clips.hold(why, if why.is_some() { 0 } else { nanoseconds(GRACE) });
-        self.clips.run(&mut self.history, &self.sources)
+        self.clips.run(&mut self.material)
     }
 
     /// Returns whether recording is suspended.
@@ -187,8 +187,8 @@ impl Recorder {
         }
         let bytes = bytes.max(self.counts.preroll_bound);
         let folder = folder.join("preroll");
-        if self.history.preroll_mut().grow(store, bytes, folder, *prefault)? {
-            self.clips.preroll_moved();
+        if self.material.history.preroll_mut().grow(store, bytes, folder, *prefault)? {
+            self.clips.progress_mut().preroll_moved();
         }
         self.counts.preroll_bound = bytes;
         Ok(())

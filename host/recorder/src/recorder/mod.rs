@@ -29,12 +29,18 @@ use crate::window::{TriggerOutcome, WindowRules};
 use clips::Clips;
 use history::History;
 use limits::RecorderLimits;
-use sources::Sources;
+use sources::RecordedSources;
 use writer::ClipDisk;
 
 pub(crate) use live::counted;
 pub use settings::{Commanded, LambdaId, RecorderCounts, Settings, TopicId, Work};
 pub use sources::{LambdaSpec, TOPICS_MAX};
+
+/// The data that clips are made of.
+struct Material {
+    sources: RecordedSources,
+    history: History,
+}
 
 /// Cuts clips out of the stream of samples. Time is given by stamps and [`Recorder::advance`], and
 /// never goes back.
@@ -46,8 +52,7 @@ pub use sources::{LambdaSpec, TOPICS_MAX};
 /// After an error, drop the recorder. Its written data is recovered by the next
 /// [`RecordingFolder::open`].
 pub struct Recorder {
-    sources: Sources,
-    history: History,
+    material: Material,
     clips: Clips,
     counts: RecorderCounts,
     /// Buffer for an encoded wake.
@@ -71,8 +76,10 @@ impl Recorder {
             Preroll::open(store, preroll_bytes, settings.folder.join("preroll"), prefault)?;
         let max_length_ns = nanoseconds(settings.max_length).max(1);
         Ok(Recorder {
-            sources: Sources::new(settings.clock.clone()),
-            history: History::new(preroll, RecorderLimits::default().message_bytes),
+            material: Material {
+                sources: RecordedSources::new(settings.clock.clone()),
+                history: History::new(preroll, RecorderLimits::default().message_bytes),
+            },
             clips: Clips::new(disk, max_length_ns, is_live),
             counts: RecorderCounts { preroll_bound: preroll_bytes, ..RecorderCounts::default() },
             encoded: Vec::new(),
@@ -112,8 +119,8 @@ impl Recorder {
         topic: TopicSchema,
         is_missing: bool,
     ) -> Result<TopicId, RecordError> {
-        let topic = self.sources.add_topic(topic, is_missing)?;
-        self.history.grow(topic + 1, 0);
+        let topic = self.material.sources.add_topic(topic, is_missing)?;
+        self.material.history.grow(topic + 1, 0);
         Ok(TopicId::new(topic))
     }
 
@@ -133,14 +140,14 @@ impl Recorder {
     ///
     /// [`RecordError::TooManyLambdas`] beyond 1024.
     pub fn try_add_lambda(&mut self, member: LambdaSpec) -> Result<LambdaId, RecordError> {
-        self.sources.check_room()?;
+        self.material.sources.check_room()?;
         let lambda = self.clips.add_lambda(WindowRules {
             preroll_ns: nanoseconds(member.rules.preroll),
             postroll_ns: nanoseconds(member.rules.postroll),
             cooldown_ns: nanoseconds(member.rules.cooldown),
         });
-        self.sources.add_lambda(lambda, member);
-        self.history.grow(0, lambda + 1);
+        self.material.sources.add_lambda(lambda, member);
+        self.material.history.grow(0, lambda + 1);
         Ok(LambdaId::new(lambda))
     }
 
@@ -160,20 +167,20 @@ impl Recorder {
             self.counts.recording.before_1970 += 1;
             return Ok(());
         }
-        if self.sources.is_missing(topic) {
+        if self.material.sources.is_missing(topic) {
             self.counts.recording.topic_unknown += 1;
             return Ok(());
         }
-        let is_late = self.history.now().is_some_and(|now| meta.at_ns < now);
+        let is_late = self.material.history.now().is_some_and(|now| meta.at_ns < now);
         self.counts.out_of_order += u64::from(is_late);
-        if self.clips.is_live() {
-            self.history.note_gap(topic, meta);
+        if self.clips.progress().is_live() {
+            self.material.history.note_gap(topic, meta);
         }
         self.pass(meta.at_ns)?;
         // MCAP has no room for times before 1970.
         let meta = SampleMeta { publish_ns: meta.publish_ns.max(0), ..*meta };
-        let in_group = self.clips.write(topic, &meta, cdr, &self.history, &self.sources)?;
-        self.history.keep(EntryMeta::sample(topic, &meta, in_group), cdr)
+        let in_group = self.clips.write(topic, &meta, cdr, &self.material)?;
+        self.material.history.keep(EntryMeta::sample(topic, &meta, in_group), cdr)
     }
 
     /// Takes a wake of a lambda for its journal, and applies its triggers.
@@ -186,7 +193,7 @@ impl Recorder {
     /// [`RecordError`] if the disk fails.
     pub fn wake(&mut self, lambda: LambdaId, entry: &JournalEntry) -> Result<(), RecordError> {
         let mut encoded = std::mem::take(&mut self.encoded);
-        self.sources.encode(lambda.index(), entry, &mut encoded);
+        self.material.sources.encode(lambda.index(), entry, &mut encoded);
         let taken = self.encoded_wake(lambda, entry, &encoded);
         self.encoded = encoded;
         taken
@@ -204,17 +211,17 @@ impl Recorder {
         entry: &JournalEntry,
         encoded: &[u8],
     ) -> Result<(), RecordError> {
-        let number = self.sources.count_wakes(lambda.index(), 1);
+        let number = self.material.sources.count_wakes(lambda.index(), 1);
         if entry.at_ns < 0 {
             self.counts.recording.before_1970 += 1;
             return Ok(());
         }
-        if !self.clips.is_live() {
+        if !self.clips.progress().is_live() {
             self.pass(entry.at_ns)?;
         }
         let in_group = self.clips.wake(lambda.index(), number, entry.at_ns, encoded);
         let held = EntryMeta::wake(lambda.index(), number, entry.at_ns, in_group);
-        self.history.keep(held, encoded)?;
+        self.material.history.keep(held, encoded)?;
         if entry.triggers.is_empty() {
             return Ok(());
         }
@@ -233,10 +240,11 @@ impl Recorder {
                 TriggerOutcome::TooManyWaiting => self.counts.recording.too_many_waiting += 1,
                 TriggerOutcome::Stopped => {}
             }
-            let moment = Moment::of(self.sources.name(lambda.index()), trigger, entry.at_ns);
+            let moment =
+                Moment::of(self.material.sources.name(lambda.index()), trigger, entry.at_ns);
             self.clips.await_clip(lambda.index(), moment);
         }
-        self.clips.act(&mut self.history, &self.sources)
+        self.clips.act(&mut self.material)
     }
 
     /// Advances time without samples.
@@ -249,8 +257,8 @@ impl Recorder {
     }
 
     fn pass(&mut self, now: i64) -> Result<(), RecordError> {
-        self.history.pass(now);
-        self.clips.pass(now, &mut self.history, &self.sources)
+        self.material.history.pass(now);
+        self.clips.pass(now, &mut self.material)
     }
 
     /// Ends the recording: completes open clips. A clip whose window had not ended notes that.
@@ -260,38 +268,38 @@ impl Recorder {
     ///
     /// [`RecordError`] if the disk fails.
     pub fn finish(&mut self, end_ns: i64) -> Result<(), RecordError> {
-        self.clips.end_recovery();
+        self.clips.progress().disk().end_recovery();
         self.clips.set_grace(0);
         self.pass(end_ns.max(0))?;
-        let end = self.history.now().unwrap_or(end_ns);
-        self.clips.finish(end, &mut self.history, &self.sources)
+        let end = self.material.history.now().unwrap_or(end_ns);
+        self.clips.finish(end, &mut self.material)
     }
 
     /// The newest finished clips, in order; `clips.jsonl` has all.
     pub fn clips(&self) -> &[Clip] {
-        self.clips.finished().newest()
+        self.clips.progress().finished().newest()
     }
 
     /// The counts so far.
     pub fn counts(&self) -> RecorderCounts {
-        let preroll = self.history.preroll();
-        let (evicted_early, too_big) = self.history.counts();
+        let preroll = self.material.history.preroll();
+        let (evicted_early, too_big) = self.material.history.counts();
         let disk_suppressed = self.clips.disk_suppressed();
         let mut recording =
             RecordingCounts { evicted_early, too_big, disk_suppressed, ..self.counts.recording };
-        recording.add(self.clips.finished().counts());
+        recording.add(self.clips.progress().finished().counts());
         RecorderCounts {
             recording,
             preroll_bytes: preroll.bytes_held(),
             preroll_highest: preroll.bytes_highest(),
-            in_flight: self.clips.in_flight(),
+            in_flight: self.clips.progress().in_flight(),
             ..self.counts
         }
     }
 
     #[cfg(test)]
     fn set_limits(&mut self, limits: RecorderLimits) {
-        self.history.set_message_bytes(limits.message_bytes);
-        self.clips.set_limits(limits);
+        self.material.history.set_message_bytes(limits.message_bytes);
+        self.clips.progress_mut().set_limits(limits);
     }
 }

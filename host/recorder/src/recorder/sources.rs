@@ -55,16 +55,16 @@ struct SourceLambda {
 }
 
 /// The topics and lambdas, by their numbers.
-pub struct Sources {
+pub struct RecordedSources {
     /// The clock of the stamps.
     clock: String,
     topics: Vec<SourceTopic>,
     lambdas: Vec<SourceLambda>,
 }
 
-impl Sources {
-    pub fn new(clock: String) -> Sources {
-        Sources { clock, topics: Vec::new(), lambdas: Vec::new() }
+impl RecordedSources {
+    pub fn new(clock: String) -> RecordedSources {
+        RecordedSources { clock, topics: Vec::new(), lambdas: Vec::new() }
     }
 
     pub fn clock(&self) -> &str {

@@ -55,7 +55,7 @@ fn the_journals_of_a_clip_are_bounded_together_and_each_states_what_is_missing()
     (100..140).for_each(|ms| {
         [first, second].into_iter().for_each(|lambda| wake(&mut recorder, lambda, ms))
     });
-    assert!(recorder.clips.open_clip().unwrap().journals().bytes() <= 3 << 10);
+    assert!(recorder.clips.progress_mut().open().unwrap().journals().bytes() <= 3 << 10);
     recorder.finish(T0 + S).unwrap();
     let clip = &recorder.clips()[0];
     let mut lacking = 0;
@@ -177,15 +177,15 @@ fn a_lambda_that_triggers_in_every_wake_visits_only_new_entries() {
             recorder.sample(a, &meta(T0 + ms * MS, ms as u64), &ms.to_le_bytes()).unwrap();
             wake(&mut recorder, lambda, ms - late_ms);
             // If it were visited again, it would be written again.
-            let oldest = recorder.history.preroll().next(None).unwrap().place();
-            recorder.history.preroll_mut().mark(oldest, 0);
-            let settled = recorder.clips.open_clip().unwrap().settled().unwrap();
+            let oldest = recorder.material.history.preroll().next(None).unwrap().place();
+            recorder.material.history.preroll_mut().mark(oldest, 0);
+            let settled = recorder.clips.progress_mut().open().unwrap().settled().unwrap();
             assert_eq!(settled.newest, T0 + (ms - late_ms) * MS);
             let mut left = 0;
-            let mut next = recorder.history.preroll().next(Some(settled.last));
+            let mut next = recorder.material.history.preroll().next(Some(settled.last));
             while let Some(walked) = next {
                 left += 1;
-                next = recorder.history.preroll().next(Some(walked));
+                next = recorder.material.history.preroll().next(Some(walked));
             }
             assert!(left <= 3 * late_ms, "{left} entries are visited again");
         }
@@ -210,7 +210,7 @@ fn random_drive(seed: u64, forgets: bool) -> Vec<Vec<(String, i64, u32)>> {
         let at = ms - random.below(3) * random.below(5);
         recorder.sample(a, &meta(T0 + at * MS, ms as u64), b"x").unwrap();
         for (lambda, rarely) in lambdas.iter().zip([6, 40]) {
-            if let (true, Some(open_clip)) = (forgets, recorder.clips.open_clip()) {
+            if let (true, Some(open_clip)) = (forgets, recorder.clips.progress_mut().open()) {
                 open_clip.unsettle();
             }
             if random.below(rarely) == 0 {

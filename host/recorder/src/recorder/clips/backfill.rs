@@ -4,7 +4,7 @@
 use super::open_clip::OpenClip;
 use crate::RecordError;
 use crate::preroll::{EntrySource, Preroll, Walked};
-use crate::recorder::sources::Sources;
+use crate::recorder::sources::RecordedSources;
 use crate::recorder::writer::ClipDisk;
 use crate::window::{Group, Window};
 
@@ -60,7 +60,7 @@ impl Backfill {
         windows: Vec<Window>,
         limit: i64,
         fresh_from: i64,
-        sources: &Sources,
+        sources: &RecordedSources,
     ) -> Result<Backfill, RecordError> {
         let until = group.first.1.min(limit);
         let search = |topic| ThumbnailSearch { topic, until, last: None, newest: None };
@@ -100,7 +100,7 @@ impl Backfill {
         &mut self,
         clip: &mut OpenClip,
         group: &Group,
-        sources: &Sources,
+        sources: &RecordedSources,
         preroll: &mut Preroll,
         disk: &ClipDisk,
         budget: &mut Budget,
@@ -149,7 +149,7 @@ impl ThumbnailSearch {
     fn step(
         &mut self,
         group: &Group,
-        sources: &Sources,
+        sources: &RecordedSources,
         preroll: &Preroll,
         budget: &mut Budget,
     ) -> bool {

@@ -16,7 +16,7 @@ use crate::RecordError;
 use crate::file::{CONTINUES, ClipHeader, ClipTrailer, names};
 use crate::preroll::{EntryMeta, Walked};
 use crate::recorder::limits::RecorderLimits;
-use crate::recorder::sources::Sources;
+use crate::recorder::sources::RecordedSources;
 use crate::recorder::writer::{ClipCompletion, ClipSample, ClipWriter};
 use crate::window::Group;
 
@@ -162,7 +162,13 @@ impl OpenClip {
 
     /// Returns whether an entry belongs into the clip, if it ends at `limit` at the latest, and is
     /// not in it yet.
-    pub fn lacks(&self, held: &EntryMeta, group: &Group, limit: i64, sources: &Sources) -> bool {
+    pub fn lacks(
+        &self,
+        held: &EntryMeta,
+        group: &Group,
+        limit: i64,
+        sources: &RecordedSources,
+    ) -> bool {
         if held.group == self.group || held.at_ns > limit {
             return false;
         }
@@ -201,7 +207,7 @@ impl OpenClip {
     pub fn choose_thumbnail(
         &mut self,
         group: &Group,
-        sources: &Sources,
+        sources: &RecordedSources,
     ) -> Result<Option<usize>, RecordError> {
         if self.has_images {
             return Ok(None);
@@ -220,7 +226,7 @@ impl OpenClip {
         topic: usize,
         meta: &SampleMeta,
         cdr: &[u8],
-        sources: &Sources,
+        sources: &RecordedSources,
     ) -> Result<(), RecordError> {
         let schema = sources.schema(topic);
         self.writer.thumbnail(ClipSample { topic, schema, meta, cdr })
@@ -233,7 +239,7 @@ impl OpenClip {
         meta: &SampleMeta,
         cdr: &[u8],
         group: &Group,
-        sources: &Sources,
+        sources: &RecordedSources,
     ) -> Result<(), RecordError> {
         self.begin(group, sources)?;
         self.writer.write(ClipSample { topic, schema: sources.schema(topic), meta, cdr })?;
@@ -248,7 +254,7 @@ impl OpenClip {
     }
 
     /// Creates its file, once.
-    fn begin(&mut self, group: &Group, sources: &Sources) -> Result<(), RecordError> {
+    fn begin(&mut self, group: &Group, sources: &RecordedSources) -> Result<(), RecordError> {
         if std::mem::replace(&mut self.is_begun, true) {
             return Ok(());
         }
@@ -268,7 +274,7 @@ impl OpenClip {
         group: &Group,
         close: &CloseReason,
         uncertain: &[usize],
-        sources: &Sources,
+        sources: &RecordedSources,
     ) -> Result<Option<Clip>, RecordError> {
         let topics = self.topics(group, sources);
         self.begin(group, sources)?;
@@ -325,7 +331,7 @@ impl OpenClip {
 
     /// The topics of its lambdas, and those of which it has late messages, for a lambda whose
     /// windows ended earlier.
-    fn topics(&self, group: &Group, sources: &Sources) -> Vec<usize> {
+    fn topics(&self, group: &Group, sources: &RecordedSources) -> Vec<usize> {
         let mut topics = sources.topics_of(group);
         let written = self
             .tallies

@@ -2,7 +2,7 @@
 
 use super::{plural, seconds};
 use crate::file::ClipTopicCounts;
-use crate::recorder::sources::Sources;
+use crate::recorder::sources::RecordedSources;
 
 /// The counts of one topic in a clip.
 #[derive(Clone, Debug)]
@@ -44,7 +44,7 @@ impl TopicTally {
     pub fn counts(
         &self,
         topic: usize,
-        sources: &Sources,
+        sources: &RecordedSources,
         from: i64,
         most: usize,
         short: &mut Vec<String>,
