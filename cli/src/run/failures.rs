@@ -12,6 +12,8 @@ pub(super) struct Failures {
     faulted: bool,
     /// Exit code of the first lambda that could not start.
     not_started: Option<Exit>,
+    /// True if the drive is damaged.
+    damaged: bool,
 }
 
 impl Failures {
@@ -31,10 +33,18 @@ impl Failures {
         self.not_started.get_or_insert(exit);
     }
 
+    /// Notes that the drive ended early, as it is damaged.
+    pub(super) fn drive_is_damaged(&mut self) {
+        self.damaged = true;
+    }
+
     /// Returns the result of the run if its last processes ended with `exit`.
     pub(super) fn end(self, exit: Exit) -> Result<Exit, Failure> {
         if let Some(exit) = self.not_started {
             return Ok(exit);
+        }
+        if self.damaged {
+            return Ok(Exit::DriveDamaged);
         }
         match self.reason {
             _ if exit != Exit::Ok => Ok(exit),
@@ -88,6 +98,14 @@ mod tests {
             failure.contains("a process failed 2 times") && failure.contains("a network"),
             "{failure}"
         );
+    }
+
+    #[test]
+    fn a_damaged_drive_outweighs_faults() {
+        let mut failures = Failures::default();
+        failures.add("it ended".to_owned(), true);
+        failures.drive_is_damaged();
+        assert_eq!(failures.end(Exit::LambdaFaulted).unwrap(), Exit::DriveDamaged);
     }
 
     #[test]

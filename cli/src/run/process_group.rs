@@ -115,6 +115,11 @@ impl<'a> ProcessGroup<'a> {
                 && self.ingress.drive_ended
                 && drive.is_over(self.lambdas, self.screen)
             {
+                if let Some(why) = self.ingress.dead() {
+                    let kept = "the results up to the damage are kept";
+                    self.screen.warn(&format!("the drive is damaged: {why}; {kept}"));
+                    self.failures.drive_is_damaged();
+                }
                 return Ok(GroupEnd::Complete);
             }
         }
@@ -204,8 +209,13 @@ impl<'a> ProcessGroup<'a> {
         Ok(ended)
     }
 
-    /// Returns the end of the group if the ingress or the recorder has ended.
+    /// Returns the end of the group if the ingress or the recorder has ended, or receives nothing
+    /// more.
     fn ended_service(&mut self) -> Result<Option<GroupEnd>, Failure> {
+        // A damaged drive ends as another one does.
+        if let Some(why) = self.ingress.dead().filter(|_| self.context.args.drive.is_empty()) {
+            return Ok(Some(GroupEnd::Broken(format!("the ingress does not receive: {why}"))));
+        }
         let status = match self.ingress.child.status()? {
             Some(status) => Some(("the ingress", self.ingress.is_ready, status)),
             None => match &mut self.recorder {

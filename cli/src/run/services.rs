@@ -49,6 +49,11 @@ impl IngressProcess {
         Ok(Self { child, control, open_pipes: PIPES, is_ready, drive_ended, status: None })
     }
 
+    /// Returns the reason why it receives no further samples; of a drive, why it ended early.
+    pub(super) fn dead(&self) -> Option<&str> {
+        self.status.as_ref().and_then(|status| status.health.dead.as_deref())
+    }
+
     pub(super) fn show(&mut self, report: IngressReport, screen: &mut Screen) {
         screen.report(&report);
         match report {

@@ -418,12 +418,17 @@ impl Ingress {
 
     /// Reports the status to the readers and the starter.
     fn report_status(&mut self) {
+        let mut health = self.health.clone();
+        if self.source.knows_all_topics() {
+            // A damaged drive ends early. Readers handle what it has delivered.
+            health.dead = None;
+        }
         for reader in &mut self.readers {
             let status = |known: &Attachment| {
                 Some((known.id, known.reception(&self.topics.get(known.topic)?.status)))
             };
             let status = SourceStatus {
-                health: self.health.clone(),
+                health: health.clone(),
                 topics: reader.topics.iter().filter_map(status).collect(),
                 unsent: reader.unsent,
             };
