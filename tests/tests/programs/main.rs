@@ -19,6 +19,7 @@ mod native;
 mod new;
 mod python_faults;
 mod report;
+mod run_drive;
 mod schedule;
 mod scratch;
 mod signals;
