@@ -2,10 +2,11 @@
 //! reader was matched.
 //!
 //! A volatile reader gets nothing from before its match, and no gap shows it: a writer's first
-//! received sample may have any number. That number is an upper limit, and exact for a writer that
-//! is younger than the subscription. Of an older writer, only the time since the subscription
-//! counts, divided by the interval of its samples. RustDDS does not expose HEARTBEATs; the first
-//! one after the match would give about the same number.
+//! received sample may have any number. That number is an upper limit. A writer may also be older
+//! than the subscription: so the time since the subscription, divided by the interval of the
+//! writer's samples, is another limit. The lower one counts, which is exact for a writer with a
+//! constant rate. RustDDS does not expose HEARTBEATs; the first one after the match would give
+//! about the same number.
 
 use std::collections::HashMap;
 

@@ -32,8 +32,8 @@ pub struct ReceptionStatus {
     /// unknown.
     pub lost: Option<u64>,
     /// Number of samples that writers sent after the subscription and before they were matched with
-    /// it, so that they were sent to others only; `None` if unknown. For writers that are older
-    /// than the subscription it is an estimate, by the interval of their samples.
+    /// it, so that they were sent to others only; `None` if unknown. It is an estimate, by the
+    /// interval of their samples, and at most the number of the first received one.
     #[serde(default)]
     pub before_match: Option<u64>,
     /// Number of samples that could not be parsed.
