@@ -15,7 +15,7 @@ use gleaner_lambda::manifest::{Manifest, Store};
 use gleaner_lambda::{BuildDir, Fault};
 use gleaner_messages::Sources;
 use gleaner_protocol::{CheckReport, Need, NeedPlace, Report};
-use gleaner_transport::SampleMeta;
+use gleaner_transport::StoredMeta;
 use gleaner_transport::loopback::Loopback;
 
 use crate::api::frame::Info;
@@ -159,7 +159,7 @@ fn needs(lambda: &ConfiguredLambda, manifest: &Manifest) -> Vec<Need> {
     };
     for input in &manifest.inputs {
         let (name, slots) = (&input.name, live_slots(input));
-        let bytes = Pool::<SampleMeta>::bytes_needed(slots, input.max_size.as_usize());
+        let bytes = Pool::<StoredMeta>::bytes_needed(slots, input.max_size.as_usize());
         let purpose = format!("input `{name}`: {slots} slots of {}", input.max_size);
         need(NeedPlace::Memory, true, purpose, bytes.map(|bytes| bytes as u64));
         if let Some(decoded) = input.decoded_size {

@@ -5,19 +5,22 @@
 //! once and never waits for a lambda.
 
 use std::io;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::Thread;
 use std::time::{Duration, Instant};
 
 use gleaner_buffers::{Draft, DraftError, Pool, PoolError, RingWriter, ring};
 use gleaner_lambda::manifest::{self, Durability, InputSpec, Manifest, Reliability};
-use gleaner_transport::{Delivery, Qos, SampleMeta, Sink, TopicSpec, Transport, TransportError};
+use gleaner_transport::{
+    ArrivalSums, Delivery, Qos, SampleMeta, Sink, StoredMeta, TopicSpec, Transport, TransportError,
+};
 
 use tracing::warn;
 
-use crate::api::data::{PerCall, Topic};
+use crate::api::data::{InputRing, PerCall, Topic};
 use crate::api::frame::{Budget, Images};
-use crate::api::trace::Arrivals;
+use crate::api::trace::SumsBefore;
 use crate::memory::Mapping;
 
 /// An input that could not be set up.
@@ -154,10 +157,10 @@ fn open_input(
         None => None,
     };
     let images = (Images::new(decoded, shared.budget.clone()), shared.per_call.clone());
-    let arrivals = Arc::new(Arrivals::new(input.depth + spare));
+    let sums_digests = Arc::<AtomicBool>::default();
     let ingest = Arc::new(Ingest {
-        fill: Mutex::new(RingFill { ring: writer, copied: None }),
-        arrivals: arrivals.clone(),
+        fill: Mutex::new(RingFill { ring: writer, copied: None, sums: ArrivalSums::default() }),
+        sums_digests: sums_digests.clone(),
         input: input.name.to_string(),
         topic: spec.topic.clone(),
         refusals: Default::default(),
@@ -191,8 +194,7 @@ fn open_input(
         input.name.as_str(),
         topic,
         &spec.type_name,
-        (reader, input.depth),
-        arrivals,
+        InputRing { reader, depth: input.depth, sums_digests, sums_before: SumsBefore::default() },
         definitions,
         images,
     ))
@@ -238,7 +240,7 @@ const LOG_INTERVAL: Duration = Duration::from_secs(10);
 /// The transport's end of a ring. Only the transport's own thread takes the lock.
 struct Ingest {
     fill: Mutex<RingFill>,
-    arrivals: Arc<Arrivals>,
+    sums_digests: Arc<AtomicBool>,
     input: String,
     /// Name of the topic after remapping.
     topic: String,
@@ -248,9 +250,10 @@ struct Ingest {
 }
 
 struct RingFill {
-    ring: RingWriter<SampleMeta>,
+    ring: RingWriter<StoredMeta>,
     /// The last copy, until its sample is accepted.
-    copied: Option<Result<Draft<SampleMeta>, DraftError>>,
+    copied: Option<Result<Draft<StoredMeta>, DraftError>>,
+    sums: ArrivalSums,
 }
 
 #[derive(Default)]
@@ -269,8 +272,10 @@ impl Sink for Ingest {
 
     fn too_big(&self, _: &SampleMeta, len: usize) {
         // The ring refuses such a length, and counts it.
-        let refused = self.fill().ring.draft(len).err();
-        self.arrivals.refuse();
+        let mut fill = self.fill();
+        let refused = fill.ring.draft(len).err();
+        fill.sums.refuse();
+        drop(fill);
         if let Some(refusal) = refused {
             self.log(refusal);
         }
@@ -284,8 +289,11 @@ impl Sink for Ingest {
         let mut fill = self.fill();
         match fill.copied.take() {
             Some(Ok(draft)) => {
-                self.arrivals.add(meta, &draft);
-                let published = fill.ring.publish(draft, *meta);
+                if self.sums_digests.load(Ordering::Relaxed) {
+                    fill.sums.enable_digests();
+                }
+                let stored = fill.sums.add(meta, &draft);
+                let published = fill.ring.publish(draft, stored);
                 drop(fill);
                 published.map(drop).expect("the draft is this ring's own");
                 if let Some(waker) = &self.waker {
@@ -293,8 +301,8 @@ impl Sink for Ingest {
                 }
             }
             Some(Err(refusal)) => {
+                fill.sums.refuse();
                 drop(fill);
-                self.arrivals.refuse();
                 self.log(refusal);
             }
             None => {}
@@ -373,16 +381,22 @@ mod tests {
 
     use super::*;
 
-    fn ingest() -> (Ingest, RingReader<SampleMeta>) {
+    fn ingest() -> (Ingest, RingReader<StoredMeta>) {
         let (slots, slot_bytes) = (3, 8);
         let region =
-            HeapRegion::zeroed(Pool::<SampleMeta>::bytes_needed(slots, slot_bytes).unwrap())
+            HeapRegion::zeroed(Pool::<StoredMeta>::bytes_needed(slots, slot_bytes).unwrap())
                 .unwrap();
         let (ring, reader) = ring(Pool::new(region, slots, slot_bytes).unwrap(), 2).unwrap();
-        let (fill, arrivals) =
-            (Mutex::new(RingFill { ring, copied: None }), Arc::new(Arrivals::new(2)));
-        let (input, topic) = ("camera".to_owned(), "/camera".to_owned());
-        (Ingest { fill, arrivals, input, topic, refusals: Default::default(), waker: None }, reader)
+        let fill = RingFill { ring, copied: None, sums: ArrivalSums::default() };
+        let ingest = Ingest {
+            fill: Mutex::new(fill),
+            sums_digests: Arc::default(),
+            input: "camera".to_owned(),
+            topic: "/camera".to_owned(),
+            refusals: Default::default(),
+            waker: None,
+        };
+        (ingest, reader)
     }
 
     fn meta(seq: u64) -> SampleMeta {
@@ -397,7 +411,7 @@ mod tests {
         assert!(reader.newest().is_none());
         ingest.accept(&meta(1));
         let newest = reader.newest().unwrap();
-        assert_eq!((&*newest, newest.meta().seq), (b"first".as_slice(), 1));
+        assert_eq!((&*newest, newest.meta().sample.seq), (b"first".as_slice(), 1));
         ingest.accept(&meta(2));
         assert_eq!(reader.counts().received, 1, "nothing was copied before this call");
     }
@@ -434,6 +448,6 @@ mod tests {
         ingest.accept(&meta(1));
         assert!(reader.newest().is_none());
         assert_eq!(ingest.deliver(&meta(2), b"new"), Delivery::Taken);
-        assert_eq!((reader.counts().too_big, reader.newest().unwrap().meta().seq), (1, 2));
+        assert_eq!((reader.counts().too_big, reader.newest().unwrap().meta().sample.seq), (1, 2));
     }
 }

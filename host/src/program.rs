@@ -13,7 +13,7 @@ use gleaner_buffers::Pool;
 #[cfg(feature = "python")]
 use gleaner_jail::cgroup;
 use gleaner_lambda::manifest::{LambdaKind, Manifest};
-use gleaner_transport::SampleMeta;
+use gleaner_transport::StoredMeta;
 #[cfg(feature = "python")]
 use rustix::process::Signal;
 
@@ -181,7 +181,7 @@ fn at_start(manifest: &Manifest) -> u64 {
     let rings = manifest.inputs.iter().flat_map(|input| {
         let decoded = input.decoded_size.map(|bytes| (input.decoded_slots(), bytes.as_usize()));
         let decoded = decoded.and_then(|(slots, bytes)| Pool::<Info>::bytes_needed(slots, bytes));
-        [Pool::<SampleMeta>::bytes_needed(live_slots(input), input.max_size.as_usize()), decoded]
+        [Pool::<StoredMeta>::bytes_needed(live_slots(input), input.max_size.as_usize()), decoded]
     });
     rings.flatten().fold(INTERPRETER, |sum, bytes| sum.saturating_add(bytes as u64))
 }

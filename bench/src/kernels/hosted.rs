@@ -81,7 +81,7 @@ impl HostedKernel {
 
     /// A wake by the frame.
     pub fn frame(&mut self) {
-        let sample = self.topic.newest().expect("the frame was published");
+        let sample = self.topic.newest().unwrap().expect("the frame was published");
         self.wake(Wake::Event(sample));
     }
 

@@ -183,7 +183,7 @@ impl DriverInstance {
         self.session.begin(at_ns);
         // The instance may hold all samples: then there is no slot for the program, and the
         // previous program runs again.
-        let newest = self.inputs[0].newest();
+        let newest = self.inputs[0].newest().expect("a ring of this process");
         let ran = newest.as_ref().is_some_and(|sample| sample.identity().seq == self.sent);
         let outcome = newest.map(|sample| self.guest.wake(Wake::Event(sample)));
         let (log, digest) = self.session.take_log();

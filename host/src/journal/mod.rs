@@ -60,7 +60,7 @@ impl EntryBuilder {
         {
             let woken_by =
                 self.woken_by.filter(|(input, _)| *input == index).map(|(_, position)| position);
-            let sample = if let Wake::Event(sample) = wake { Some(sample.meta()) } else { None };
+            let sample = if let Wake::Event(sample) = wake { Some(sample.stored()) } else { None };
             trace.begin(topic, woken_by.zip(sample), seen);
         }
     }

@@ -71,7 +71,7 @@ impl HostedData {
         session.begin(1);
         let [topic, coded, many] = [0, 1, 2].map(|input| Arc::clone(&inputs[input]));
         let (field, x) = (topic.field("width").unwrap(), many.field("x").unwrap());
-        let (sample, coded) = (topic.newest().unwrap(), coded.newest().unwrap());
+        let (sample, coded) = (topic.newest().unwrap().unwrap(), coded.newest().unwrap().unwrap());
         let frame = sample.as_frame().unwrap();
         Self { session, topic, field, sample, coded, frame, many, x }
     }
@@ -88,7 +88,7 @@ impl HostedData {
             Operation::TypeName => answered(topic.type_name()),
             Operation::TopicCounts => answered(topic.counts()),
             Operation::Newest => answered(topic.newest()),
-            Operation::Last => topic.last(9).map(drop).map_err(DataError::from),
+            Operation::Last => topic.last(9).map(drop),
             Operation::Since => topic.since(0).map(drop).map_err(DataError::from),
             Operation::Field => topic.field("encoding").map(drop),
             Operation::Column => many.column(x, usize::MAX).map(drop),

@@ -136,7 +136,7 @@ impl TestGuest {
         self.sent += 1;
         publish(&mut self.transport, CAMERA, self.sent, &self.picture);
         self.session.begin(at_ns);
-        self.guest.wake(Wake::Event(self.topic.newest().expect("a picture")))
+        self.guest.wake(Wake::Event(self.topic.newest().unwrap().expect("a picture")))
     }
 
     /// Runs a wake, and returns its fault.

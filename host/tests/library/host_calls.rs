@@ -135,7 +135,7 @@ impl DriverGuest {
         self.session.begin(self.sent as i64 * 1_000_000);
         // It may hold all slots: then there is no room for the program, and the previous one runs
         // again.
-        let Some(sample) = self.inputs[0].newest() else { return (Ok(()), None, Vec::new()) };
+        let Ok(Some(sample)) = self.inputs[0].newest() else { return (Ok(()), None, Vec::new()) };
         let outcome = self.guest.wake(Wake::Event(sample));
         self.session.take_log();
         (outcome.result, outcome.fuel, self.session.end())

@@ -80,7 +80,7 @@ impl MisbehavingGuest {
         };
         self.transport.publish("/imu/data", &meta, &[0; 24]).unwrap();
         self.session.begin(at_ns);
-        let sample = self.topic.newest().unwrap();
+        let sample = self.topic.newest().unwrap().unwrap();
         self.guest.wake(Wake::Event(sample))
     }
 

@@ -133,8 +133,8 @@ fn check_statements(path: &Path, stated: &ClipStatements) -> Result<(), Failure>
     }
 }
 
-/// Describes the losses that the clip states; `None` if there are none. In a live clip, messages may
-/// also be lost before the recorder. The lambda may have received those.
+/// Describes the losses that the clip states; `None` if there are none. In a live clip, messages
+/// may also be lost before the recorder. The lambda may have received those.
 fn losses(stated: &ClipStatements, is_live: bool) -> Option<String> {
     let count = |count: Option<u64>| count.map_or("unknown".to_owned(), |count| count.to_string());
     let lost = stated.clip().topics.iter().flat_map(|topic| {
@@ -259,7 +259,7 @@ impl ClipVerifyLoop<'_> {
         let until_ns = entry.at_ns.saturating_add(SLACK_NS);
         let mut owed = Vec::new();
         for (input, seen) in entry.seen.iter().enumerate() {
-            let known = self.inputs[input].newest();
+            let known = self.inputs[input].newest().ok().flatten();
             let wanted = seen
                 .newest
                 .filter(|newest| !known.is_some_and(|known| is_sample(known.meta(), *newest)));
@@ -310,7 +310,7 @@ impl ClipVerifyLoop<'_> {
             let oldest = head.saturating_sub(reader.depth() as u64);
             let mut leases = (oldest..head).rev().filter_map(|position| reader.get(position));
             Some(Wake::Event(
-                topic.sample(leases.find(|lease| is_sample(lease.meta(), (writer, seq)))?),
+                topic.sample(leases.find(|lease| is_sample(&lease.meta().sample, (writer, seq)))?),
             ))
         });
         found.ok_or_else(|| {
