@@ -63,8 +63,8 @@ impl Ingress {
             topics: TopicTable::default(),
             readers: Vec::new(),
             plays: false,
-            status_at: now,
-            tick_at: now,
+            status_at: now + STATUS_INTERVAL,
+            tick_at: now + TICK,
         }
     }
 

@@ -3,14 +3,20 @@
 //! It runs on the thread of the source. The engine takes the same lock to attach and detach
 //! readers, which takes microseconds; readers take no lock.
 
+use std::collections::VecDeque;
 use std::os::fd::OwnedFd;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use gleaner_buffers::shared::{Bell, HoldLimits, ReaderId, SharedWriter, WriteError, WriterMemory};
 use gleaner_regions::{ControlRegion, KernelFutex, TopicRegion};
-use gleaner_transport::{ArrivalSums, Delivery, Gaps, SampleMeta, Sink, StoredMeta, TopicCounters};
+use gleaner_transport::{
+    ArrivalSums, Delivery, Gaps, Guid, SampleMeta, Sink, StoredMeta, TopicCounters,
+};
 
 use crate::sizes::RegionSizes;
+
+/// Number of samples that were too big for all regions, and are remembered.
+const REFUSED: usize = 64;
 
 /// Numbers of a topic, for its status.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -168,6 +174,9 @@ struct SinkState {
     seen: Gaps,
     /// Set once there was a second subscription: a sample may come over both.
     checks_doubles: bool,
+    /// The last samples that were too big for all regions. A second subscription, made for a region
+    /// of larger samples, may deliver them again.
+    refused: VecDeque<(Guid, u64)>,
     /// The last subscription that has received a sample.
     newest: u64,
 }
@@ -266,19 +275,36 @@ impl SinkState {
         }
         self.newest = self.newest.max(subscription);
         if self.is_double(meta) {
-            self.regions.iter_mut().for_each(|region| region.writer.discard());
-            return;
+            return self.accept_double(meta);
         }
+        self.seen.note(meta.writer, meta.seq);
         let mut taken = 0;
         for region in &mut self.regions {
             taken += usize::from(region.accept(meta));
         }
-        // A sample that was too big for all may come again, for a new region of larger samples.
-        if taken > 0 || self.regions.is_empty() {
-            self.seen.note(meta.writer, meta.seq);
-        }
         self.counts.received += 1;
         self.counts.too_big += u64::from(taken < self.regions.len());
+        if taken == 0 {
+            if self.refused.len() == REFUSED {
+                self.refused.pop_front();
+            }
+            self.refused.push_back((meta.writer, meta.seq));
+        }
+    }
+
+    /// Drops a sample that has come before, but for regions that it was not too big for, if it was
+    /// for all that there were.
+    fn accept_double(&mut self, meta: &SampleMeta) {
+        let known = self.refused.iter().position(|known| *known == (meta.writer, meta.seq));
+        let fitting = self.regions.iter_mut().filter(|it| it.writer.drafted().is_some());
+        match known {
+            None => fitting.for_each(|region| region.writer.discard()),
+            Some(index) => {
+                if fitting.fold(false, |taken, region| region.accept(meta) || taken) {
+                    self.refused.remove(index);
+                }
+            }
+        }
     }
 }
 
@@ -302,6 +328,7 @@ impl Sink for SubscriptionSink {
         if state.is_double(meta) {
             return;
         }
+        state.seen.note(meta.writer, meta.seq);
         state.regions.iter_mut().for_each(RegionWriter::refuse);
         state.counts.received += 1;
         state.counts.too_big += 1;
