@@ -35,8 +35,7 @@ const ANSWER: Token = Token(3);
 
 /// Most samples of one topic before the next one's turn.
 const MOST_PER_TURN: usize = 64;
-/// Interval of updates: after a change, and in any case. At 5 ms, RustDDS missed a writer in a
-/// test, which appeared as a reader was created again.
+/// Interval of updates: after a change, and in any case.
 const UPDATE_MIN: Duration = Duration::from_millis(100);
 const UPDATE_MAX: Duration = Duration::from_secs(1);
 /// Shared memory for samples that is always kept.
