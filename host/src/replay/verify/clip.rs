@@ -187,10 +187,16 @@ impl ClipVerifyLoop<'_> {
         for ((topic, before), (now, journal)) in
             self.inputs.iter().zip(before).zip(now.seen.iter_mut().zip(&entry.seen))
         {
-            // Some samples before the first wake may lie before the clip.
-            if self.wakes == 0 && offered(topic) - before < journal.new {
+            // Some samples before the first wake may lie before the clip. A live clip may have a
+            // topic later than its wakes.
+            let is_first = self.wakes == 0 || self.is_live && before == 0;
+            if is_first && offered(topic) - before < journal.new {
                 (now.new, now.digest) = (journal.new, journal.digest);
                 now.newest = now.newest.or(journal.newest);
+            }
+            if offered(topic) == 0 {
+                // The newest sample lies before the clip.
+                now.newest = journal.newest;
             }
             if self.is_live {
                 self.without_refused(now, journal);
@@ -201,7 +207,7 @@ impl ClipVerifyLoop<'_> {
             let JournalEntry { triggers, fault, log, .. } = entry.clone();
             now = JournalEntry { triggers, fault, log, ..now };
         }
-        if !is_covered || self.header.wakes_before > 0 {
+        if !is_covered || self.unknown_state().is_some() {
             // State from before the clip may change the lambda's fuel and the samples that it
             // reads.
             now.fuel = entry.fuel;
@@ -268,7 +274,8 @@ impl ClipVerifyLoop<'_> {
                 None => 0,
                 Some(newest) => {
                     let found = self.clip.ahead(input, until_ns, |meta| is_sample(meta, newest));
-                    found.map_err(unreadable)?.unwrap_or(seen.new)
+                    let is_later = offered(&self.inputs[input]) == 0;
+                    found.map_err(unreadable)?.unwrap_or(if is_later { 0 } else { seen.new })
                 }
             });
         }
@@ -370,6 +377,13 @@ impl ClipVerifyLoop<'_> {
                 "the lambda had run {times} times before the clip begins, and its variables from \
                  then are not in the clip"
             ));
+        }
+        if self.uncovered > 0 {
+            return Some(
+                "in earlier wakes the lambda had read samples from before the clip, and what it \
+                 kept from them is not in the clip"
+                    .to_owned(),
+            );
         }
         (self.interrupted > 0).then(|| {
             "an earlier wake exceeded the deadline, and what the lambda kept from it is not in the \
