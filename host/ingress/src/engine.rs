@@ -450,7 +450,7 @@ impl Ingress {
     }
 }
 
-/// What a wait has found.
+/// Events found by a wait.
 struct Ready {
     control: bool,
     stop: bool,

@@ -58,7 +58,7 @@ pub(crate) struct AttachedReader {
     pub(crate) refused: u64,
 }
 
-/// What a reader asks of a region.
+/// A request of a reader for a region.
 pub(crate) struct AttachRequest<'a> {
     pub(crate) control: &'a ControlRegion,
     pub(crate) limits: HoldLimits,

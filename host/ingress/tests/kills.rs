@@ -1,7 +1,7 @@
 //! An ingress with readers in other processes: honest ones, killed ones, and ones that break the
 //! rules, while samples flow.
 //!
-//! `GLEANER_LONG=1` kills 200 readers instead of ten, `GLEANER_KILLS` as many as it says.
+//! `GLEANER_LONG=1` kills 200 readers instead of ten; `GLEANER_KILLS` is another number.
 #![allow(unsafe_code)]
 
 use std::env;

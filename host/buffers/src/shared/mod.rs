@@ -18,8 +18,8 @@
 //! 1. A reader loads `seq` (Acquire), reads slot, length and meta (relaxed), stores the hazard
 //!    (Release), fences (R), and loads `seq` again. If it changed, the reader clears the hazard and
 //!    gives up. When it is done with the sample, it clears the hazard (Release).
-//! 2. When a position leaves, the writer stores `seq = 0`. The next draft fences (W). If it knows of
-//!    no free slot, it reads each hazard once (Acquire), and frees all slots that are neither shown
+//! 2. When a position leaves, the writer stores `seq = 0`. The next draft fences (W). If it has no
+//!    free slot, it reads each hazard once (Acquire), and frees all slots that are neither shown
 //!    nor held. It fills one of them, then writes the place, `seq` and `head` (Release).
 //! 3. If W precedes R in the order of SeqCst fences, the reader's second load sees the 0 or a later
 //!    value, and the reader gives up. Otherwise the writer's scan sees the hazard, and leaves the
@@ -29,8 +29,8 @@
 //! 5. A place is not torn: a field of a later sample is written after W, which follows `seq = 0`,
 //!    so a reader that saw such a field sees the 0 or a later value in its second load.
 //! 6. Payload reads are plain. Only a reader that breaks these rules sees torn bytes.
-//! 7. A slot that was freed stays free until it is filled again: 3 holds for every later hazard that
-//!    names its old position, as that position is not shown any more.
+//! 7. A slot that was freed stays free until it is filled again: 3 holds for every later hazard
+//!    that names its old position, as that position is not shown any more.
 //! 8. The writer never starves: it reads each word once per W, and counts at most the limit of that
 //!    word. The limits of all words of all readers fit into the region.
 //!

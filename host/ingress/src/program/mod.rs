@@ -2,8 +2,8 @@
 //!
 //! - `args`: the command line.
 //! - `source`: the network or a drive.
-//! - `report_writer`: reports to the starter, and the thread that writes them, as the starter may be
-//!   slow to read.
+//! - `report_writer`: reports to the starter, and the thread that writes them, as the starter may
+//!   be slow to read.
 
 mod args;
 mod report_writer;

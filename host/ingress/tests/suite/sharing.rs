@@ -211,6 +211,24 @@ fn a_later_reader_of_a_latched_topic_receives_what_is_shown() {
 }
 
 #[test]
+fn a_sample_that_was_too_big_for_all_comes_again_for_a_larger_reader() {
+    let mut numbers = Numbers::on("/map");
+    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let mut small = ingress.reading("small", grant(0, "/map"));
+    numbers.publish(1000);
+    let larger = TopicGrant { max_bytes: Some(1000), ..grant(0, "/map") };
+    let mut large = ingress.reading("large", larger);
+    // As a writer that is transient local sends it again to the second subscription.
+    numbers.seq -= 1;
+    numbers.publish(1000);
+    numbers.publish(8);
+    assert_eq!(large.new_numbers(), [1, 2]);
+    assert_eq!(small.new_numbers(), [2]);
+    let too_big = TopicCounters::of_words(&small.topic.reader.counters()).too_big;
+    assert_eq!(too_big, 1, "it is counted once");
+}
+
+#[test]
 fn a_topic_without_readers_is_unsubscribed() {
     let mut numbers = Numbers::on("/number");
     let mut ingress = RunningIngress::over(numbers.source.clone());
