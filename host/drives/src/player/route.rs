@@ -60,11 +60,11 @@ impl Sink for TopicRoute {
         // Locked meanwhile: a sink that was removed gets nothing more.
         let subscribers = self.lock();
         let meta = self.stamped(meta);
-        subscribers
-            .iter()
-            .map(|known| known.sink.deliver(&meta, cdr))
-            .last()
-            .unwrap_or(Delivery::Taken)
+        let mut delivery = Delivery::Taken;
+        for known in &*subscribers {
+            delivery = known.sink.deliver(&meta, cdr);
+        }
+        delivery
     }
 
     fn too_big(&self, meta: &SampleMeta, len: usize) {
