@@ -5,7 +5,7 @@ use std::sync::mpsc::SyncSender;
 
 use gleaner_base::{Exit, Failure};
 use gleaner_protocol::Handover;
-use gleaner_protocol::ingress::{IngressControl, IngressReport, IngressStatus};
+use gleaner_protocol::ingress::{IngressControl, IngressReport, IngressStatus, IngressTopic};
 use gleaner_protocol::link::{ControlClient, Loss, RecorderReport, RecorderStatus};
 
 use super::grants::RecordedTopics;
@@ -25,6 +25,8 @@ pub(super) struct IngressProcess {
     /// Set at the end of the drive.
     pub(super) drive_ended: bool,
     pub(super) status: Option<Box<IngressStatus>>,
+    /// Last status of each topic that had a reader.
+    topics: Vec<IngressTopic>,
 }
 
 impl IngressProcess {
@@ -45,8 +47,15 @@ impl IngressProcess {
             Handover { control: Some(ingress_end), ..Handover::default() },
             sender,
         )?;
-        let (is_ready, drive_ended) = (false, false);
-        Ok(Self { child, control, open_pipes: PIPES, is_ready, drive_ended, status: None })
+        Ok(Self {
+            child,
+            control,
+            open_pipes: PIPES,
+            is_ready: false,
+            drive_ended: false,
+            status: None,
+            topics: Vec::new(),
+        })
     }
 
     /// Returns the reason why it receives no further samples; of a drive, why it ended early.
@@ -61,11 +70,27 @@ impl IngressProcess {
             IngressReport::DriveEnded => self.drive_ended = true,
             IngressReport::Status(status) => {
                 screen.ingress(&status);
+                self.keep_topics(&status);
                 self.status = Some(status);
             }
-            IngressReport::Ended(status) => {
+            IngressReport::Ended(mut status) => {
+                self.keep_topics(&status);
+                // Its readers have ended before it, and with them their topics.
+                status.topics = self.topics.clone();
                 screen.ingress_ended(&status);
                 self.status = Some(status);
+            }
+        }
+    }
+
+    fn keep_topics(&mut self, status: &IngressStatus) {
+        for topic in &status.topics {
+            let is_it = |known: &&mut IngressTopic| {
+                (&known.topic, &known.type_name) == (&topic.topic, &topic.type_name)
+            };
+            match self.topics.iter_mut().find(is_it) {
+                Some(known) => *known = topic.clone(),
+                None => self.topics.push(topic.clone()),
             }
         }
     }
