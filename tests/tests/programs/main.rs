@@ -22,6 +22,7 @@ mod report;
 mod run_drive;
 mod schedule;
 mod scratch;
+mod shared_topics;
 mod signals;
 mod topics;
 mod transcripts;
