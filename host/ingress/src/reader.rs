@@ -33,11 +33,14 @@ pub(crate) struct Attachment {
 }
 
 impl Attachment {
-    /// Returns the state of the subscription for this reader: without what was lost before it.
+    /// Returns the state of the subscription for this reader: without what was missing before it.
     pub(crate) fn reception(&self, status: &ReceptionStatus) -> ReceptionStatus {
+        let since = |all: Option<u64>, before: Option<u64>| {
+            all.map(|all| all.saturating_sub(before.unwrap_or(0)))
+        };
         let mut status = status.clone();
-        let lost_before = self.before.lost.unwrap_or(0);
-        status.lost = status.lost.map(|lost| lost.saturating_sub(lost_before));
+        status.lost = since(status.lost, self.before.lost);
+        status.before_match = since(status.before_match, self.before.before_match);
         status.malformed = status.malformed.saturating_sub(self.before.malformed);
         status
     }
