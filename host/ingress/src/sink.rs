@@ -37,7 +37,7 @@ pub(crate) struct RegionWriter {
     sums: ArrivalSums,
     counters: TopicCounters,
     readers: Vec<RegionReader>,
-    /// Whether the last copy fits; `None` if it was made before this region, or is accepted.
+    /// True if the last copy fits; `None` if it was made before this region, or is accepted.
     copied: Option<bool>,
 }
 
