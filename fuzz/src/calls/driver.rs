@@ -140,7 +140,7 @@ impl DriverInstance {
             transport.add_topic(topic, name, text);
         }
         let inputs =
-            open_inputs(manifest, &[], &mut transport, None).expect("the inputs fit into memory");
+            open_inputs(manifest, &[], &mut transport).expect("the inputs fit into memory");
         let session = Session::new(inputs.clone(), Vec::new(), &manifest.limits);
         let guest = WasmGuest::new(loaded.clone(), session.clone(), &manifest.limits, None)
             .expect("descriptors are left");

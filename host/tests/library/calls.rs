@@ -59,7 +59,7 @@ impl HostedData {
         for (input, definition) in manifest.inputs.iter().zip([IMAGE, COMPRESSED, "uint8 x\n"]) {
             transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
         }
-        let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
+        let inputs = open_inputs(&manifest, &[], &mut transport).unwrap();
         let mut jpeg = Vec::new();
         jpeg_encoder::Encoder::new(&mut jpeg, 80)
             .encode(&[7; 64 * 48 * 3], 64, 48, jpeg_encoder::ColorType::Rgb)

@@ -181,7 +181,7 @@ fn config(behaviour: &str, bytes: u32) -> Vec<(String, ConfigValue)> {
 pub fn subscribed(manifest: &Manifest, definition: &str) -> (Loopback, Arc<Topic>) {
     let (mut transport, input) = (Loopback::new(), &manifest.inputs[0]);
     transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
-    let topic = open_inputs(manifest, &[], &mut transport, None).expect("an input").remove(0);
+    let topic = open_inputs(manifest, &[], &mut transport).expect("an input").remove(0);
     (transport, topic)
 }
 

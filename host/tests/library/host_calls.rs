@@ -95,7 +95,7 @@ impl DriverGuest {
         {
             transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
         }
-        let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
+        let inputs = open_inputs(&manifest, &[], &mut transport).unwrap();
         let limits: &Limits = &manifest.limits;
         let session = Session::new(inputs.clone(), Vec::new(), limits);
         let cache = root().join("target/test-cache/gleaner");

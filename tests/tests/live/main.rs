@@ -326,7 +326,7 @@ fn shared() {
     });
     let drive = sample_drive();
     let path = drive.to_str().expect("the checkout has a plain path");
-    let played = play(&[path, "--wait", "2", "--start", "8", "--duration", "5"]).finish();
+    let played = play(&[path, "--wait", "1", "--start", "8", "--duration", "5"]).finish();
     assert!(played.status.success(), "{}", played.stderr);
     let ingresses = descendants(started.pid(), "gleaner-ingress");
     assert_eq!(ingresses.len(), 1, "{ingresses:?}");

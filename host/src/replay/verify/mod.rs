@@ -95,7 +95,7 @@ impl Rerun {
         load: Load<'_>,
     ) -> Result<(Self, T, Vec<Arc<Topic>>), Failure> {
         let SessionSetup { inputs, session, mut guest } =
-            SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, None, load)?;
+            SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
         let lambda = manifest.lambda.name.to_string();
         let engine = guest.engine();
         let initialised = guest.init();
