@@ -14,13 +14,14 @@ use gleaner_jail::Paths;
 use gleaner_lambda::manifest::{Manifest, Store};
 use gleaner_lambda::{BuildDir, Fault};
 use gleaner_messages::Sources;
+use gleaner_protocol::ingress::TopicGrant;
 use gleaner_protocol::{CheckReport, Need, NeedPlace, Report};
-use gleaner_transport::SampleMeta;
 use gleaner_transport::loopback::Loopback;
 
 use crate::api::frame::Info;
-use crate::input::{LiveInputs, Remap, live_slots, unfinished_bytes};
+use crate::input::Remap;
 use crate::isolation::{code_cache_dir, definition_dirs};
+use crate::live::UNWRITTEN;
 use crate::session_setup::{
     ConfiguredLambda, LambdaArgs, Load, RunMode, SessionSetup, not_started,
 };
@@ -75,14 +76,7 @@ impl CheckJob {
         let Self { lambda, manifest } = self;
         let (mut topics, notes) = topics(&lambda, &manifest)?;
         let mode = RunMode::Live(manifest.limits.deadline);
-        let mut setup = SessionSetup::load(
-            &mut topics,
-            &lambda,
-            &manifest,
-            mode,
-            Some(&LiveInputs { waker: None }),
-            load,
-        )?;
+        let mut setup = SessionSetup::load(&mut topics, &lambda, &manifest, mode, load)?;
         // `init` is skipped if a type is unknown: its fields would seem to be missing.
         let mut log = Vec::new();
         let mut started = |outcome: Result<(), Fault>| {
@@ -158,10 +152,17 @@ fn needs(lambda: &ConfiguredLambda, manifest: &Manifest) -> Vec<Need> {
         needs.push(Need { purpose, bytes, place, preallocated })
     };
     for input in &manifest.inputs {
-        let (name, slots) = (&input.name, live_slots(input));
-        let bytes = Pool::<SampleMeta>::bytes_needed(slots, input.max_size.as_usize());
-        let purpose = format!("input `{name}`: {slots} slots of {}", input.max_size);
-        need(NeedPlace::Memory, true, purpose, bytes.map(|bytes| bytes as u64));
+        let name = &input.name;
+        let TopicGrant { depth, holds, .. } = TopicGrant::for_input(0, input, "", false, false);
+        let held = u64::from(holds.windows) * u64::from(holds.window) + u64::from(holds.singles);
+        let size = input.max_size;
+        let bytes = |samples: u64| Some(samples.saturating_mul(size.bytes()));
+        // One sample is written while the others are shown.
+        let shown = u64::from(depth) + 1;
+        let purpose = format!("input `{name}`: {shown} samples of {size}, shared by all lambdas");
+        need(NeedPlace::Memory, true, purpose, bytes(shown));
+        let purpose = format!("input `{name}`: {held} samples that the lambda holds");
+        need(NeedPlace::Memory, false, purpose, bytes(held));
         if let Some(decoded) = input.decoded_size {
             let slots = input.decoded_slots();
             let bytes = Pool::<Info>::bytes_needed(slots, decoded.as_usize());
@@ -192,13 +193,7 @@ fn needs(lambda: &ConfiguredLambda, manifest: &Manifest) -> Vec<Need> {
             Some(bytes),
         );
     }
-    let unfinished = Some(unfinished_bytes(manifest));
-    need(
-        NeedPlace::Memory,
-        false,
-        "queued decisions, and partial messages while the network loses packets".to_owned(),
-        unfinished,
-    );
+    need(NeedPlace::Memory, false, "queued decisions".to_owned(), Some(UNWRITTEN));
     if let Some(record) = &manifest.record {
         let (place, preallocated) = match record.store {
             Store::Ram => (NeedPlace::Memory, true),

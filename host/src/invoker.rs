@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use gleaner_lambda::{Cause, Decision, Fault};
+use gleaner_lambda::{Cause, Decision, Fault, FaultKind};
 use gleaner_rules::faults::Faults;
 
 use crate::api::Session;
@@ -16,12 +16,14 @@ pub struct Invoker {
     guest: Box<dyn Guest>,
     run: Duration,
     faults: Faults,
+    /// The fault of the next wake, for samples that were kept before it.
+    held_too_many: Option<Fault>,
 }
 
 impl Invoker {
     /// An invoker of `guest`, whose `init` has succeeded, with the session that the guest uses.
     pub fn new(session: Session, guest: Box<dyn Guest>) -> Self {
-        Self { session, guest, run: Duration::ZERO, faults: Faults::default() }
+        Self { session, guest, run: Duration::ZERO, faults: Faults::default(), held_too_many: None }
     }
 
     /// Returns whether to skip this wake: the lambda backs off after faults, which is counted here,
@@ -43,10 +45,15 @@ impl Invoker {
             self.session.note(note);
         }
         let started = Instant::now();
-        let outcome = self.guest.wake(wake);
+        let mut outcome = self.guest.wake(wake);
         let run = outcome.run_ns.map_or_else(|| started.elapsed(), Duration::from_nanos);
         self.run += run;
         decision.run_ns = run.as_nanos() as u64;
+        if let Some(fault) = self.fault_of_holds().or(self.held_too_many.take())
+            && outcome.result.is_ok()
+        {
+            outcome.result = Err(fault);
+        }
         decision.fuel = outcome.fuel;
         decision.triggers = self.session.end();
         decision.fault = outcome.result.err();
@@ -54,6 +61,25 @@ impl Invoker {
             self.session.note(note);
         }
         decision
+    }
+
+    /// Discards the instance of the lambda, as after a wake with a fault.
+    pub fn discard(&mut self) {
+        self.guest.discard();
+    }
+
+    /// Frees the samples of a lambda that keeps so many that it could not be woken. Its next wake
+    /// ends in a fault that says so.
+    pub fn free_holds(&mut self) {
+        self.held_too_many = self.fault_of_holds().or(self.held_too_many.take());
+    }
+
+    /// Returns the fault of a lambda that keeps too many samples, and frees them.
+    fn fault_of_holds(&mut self) -> Option<Fault> {
+        let error = self.session.take_refused_holds()?;
+        self.guest.discard();
+        let kind = FaultKind::HostCall;
+        Some(Fault { kind, message: error.to_string(), used: None, allowed: None })
     }
 
     /// Ends a lambda that runs in another process, after its last wake.
@@ -103,7 +129,6 @@ fn cause(wake: &Wake) -> Decision {
 #[cfg(test)]
 mod tests {
     use gleaner_lambda::manifest::Limits;
-    use gleaner_lambda::{Fault, FaultKind};
     use gleaner_rules::faults::{BACKING_OFF, REINITIALISED};
 
     use super::*;

@@ -13,7 +13,7 @@ use gleaner_buffers::Pool;
 #[cfg(feature = "python")]
 use gleaner_jail::cgroup;
 use gleaner_lambda::manifest::{LambdaKind, Manifest};
-use gleaner_transport::SampleMeta;
+use gleaner_transport::StoredMeta;
 #[cfg(feature = "python")]
 use rustix::process::Signal;
 
@@ -25,11 +25,9 @@ use crate::guest::sandboxed::{KillTimeouts, SandboxedGuest};
 use crate::guest::worker::{MessageSender, SendingGuest};
 #[cfg(feature = "python")]
 use crate::guest::worker::{RemoteGuest, WorkerStartError};
-use crate::input::live_slots;
 #[cfg(feature = "python")]
 use crate::isolation;
 use crate::isolation::{Isolation, SandboxPermissions, create_results_dir};
-#[cfg(feature = "dds")]
 use crate::live;
 #[cfg(feature = "python")]
 use crate::replay::Packed;
@@ -63,7 +61,6 @@ enum RuntimeCommand {
     /// Reports the content of recorded drives.
     Inspect(InspectArgs),
     /// Runs a built lambda on live topics, until SIGTERM.
-    #[cfg(feature = "dds")]
     Run(live::RunArgs),
     /// Reports the topics of the network.
     #[cfg(feature = "dds")]
@@ -75,7 +72,6 @@ enum RuntimeCommand {
 enum RuntimeJob {
     Replay(replay::ReplayJob),
     Check(check::CheckJob),
-    #[cfg(feature = "dds")]
     Live(live::LiveJob),
 }
 
@@ -84,7 +80,6 @@ impl RuntimeJob {
         match self {
             Self::Replay(job) => (&job.options.lambda, &job.manifest),
             Self::Check(job) => (&job.lambda, &job.manifest),
-            #[cfg(feature = "dds")]
             Self::Live(job) => (&job.lambda, &job.manifest),
         }
     }
@@ -100,15 +95,15 @@ impl RuntimeJob {
             }
             Self::Check(_) => None,
             // Another process writes them.
-            #[cfg(feature = "dds")]
             Self::Live(_) => None,
         };
         let mut permissions = self.permissions(is_worker);
         if let Some(folder) = results {
             permissions.paths.write.push(create_results_dir(folder, &self.lambda().0.folder)?);
         }
-        permissions.memory =
-            permissions.memory.map(|more| more.saturating_add(at_start(self.lambda().1)));
+        permissions.memory = permissions
+            .memory
+            .map(|more| more.saturating_add(at_start(self.lambda().1, self.is_live())));
         Ok(permissions)
     }
 
@@ -117,7 +112,6 @@ impl RuntimeJob {
         let (mut paths, own_memory) = match self {
             Self::Replay(job) => (job.paths(), job.own_memory()),
             Self::Check(job) => (job.paths(), 0),
-            #[cfg(feature = "dds")]
             Self::Live(job) => (job.paths(), job.own_memory()),
         };
         if is_worker {
@@ -130,7 +124,7 @@ impl RuntimeJob {
         // Frames that a lambda creates may take `memory` again.
         let all = memory
             .saturating_add(manifest.limits.memory.bytes())
-            .saturating_add(at_start(manifest));
+            .saturating_add(at_start(manifest, self.is_live()));
         SandboxPermissions {
             paths,
             memory: (manifest.lambda.kind == LambdaKind::Python).then_some(memory),
@@ -139,11 +133,9 @@ impl RuntimeJob {
     }
 
     /// Returns whether the job is a live run. If not, a Python lambda runs in a worker.
-    #[cfg(feature = "python")]
     fn is_live(&self) -> bool {
         match self {
             Self::Replay(_) | Self::Check(_) => false,
-            #[cfg(feature = "dds")]
             Self::Live(_) => true,
         }
     }
@@ -153,7 +145,6 @@ impl RuntimeJob {
         match self {
             Self::Replay(job) => job.run(load, reports),
             Self::Check(job) => job.run(load, reports),
-            #[cfg(feature = "dds")]
             Self::Live(_) => Err(no_worker()),
         }
     }
@@ -162,26 +153,26 @@ impl RuntimeJob {
         match self {
             Self::Replay(job) => job.work(load, reports),
             Self::Check(job) => job.run(load, reports),
-            #[cfg(feature = "dds")]
             Self::Live(_) => Err(no_worker()),
         }
     }
 }
 
-#[cfg(feature = "dds")]
 fn no_worker() -> Failure {
     Failure::new(Exit::Usage, "a live run has no worker").with_help("leave `--worker` out")
 }
 
-/// Upper bound of the memory in bytes that a process uses before the lambda is loaded: the rings,
-/// and an interpreter with numpy and Gleaner's own code, which take some 100 MB, or more if the
-/// user requests many threads of numpy.
-fn at_start(manifest: &Manifest) -> u64 {
+/// Upper bound of the memory in bytes that a process uses before the lambda is loaded: the rings
+/// that it fills itself, decoded images, and an interpreter with numpy and Gleaner's own code, which
+/// take some 100 MB, or more if the user requests many threads of numpy.
+fn at_start(manifest: &Manifest, is_live: bool) -> u64 {
     const INTERPRETER: u64 = 1 << 30;
     let rings = manifest.inputs.iter().flat_map(|input| {
         let decoded = input.decoded_size.map(|bytes| (input.decoded_slots(), bytes.as_usize()));
         let decoded = decoded.and_then(|(slots, bytes)| Pool::<Info>::bytes_needed(slots, bytes));
-        [Pool::<SampleMeta>::bytes_needed(live_slots(input), input.max_size.as_usize()), decoded]
+        let bytes = input.max_size.as_usize();
+        let samples = (!is_live).then(|| Pool::<StoredMeta>::bytes_needed(input.slots(), bytes));
+        [samples.flatten(), decoded]
     });
     rings.flatten().fold(INTERPRETER, |sum, bytes| sum.saturating_add(bytes as u64))
 }
@@ -206,7 +197,6 @@ impl RuntimeCommand {
             Self::Verify(args) => Ok(RuntimeJob::Replay(replay::ReplayJob::verify(args)?)),
             Self::Check(args) => Ok(RuntimeJob::Check(check::CheckJob::new(args)?)),
             Self::Inspect(args) => Err(replay::inspect(&args, &mut reports()?)?),
-            #[cfg(feature = "dds")]
             Self::Run(args) => Ok(RuntimeJob::Live(live::LiveJob::new(args)?)),
             #[cfg(feature = "dds")]
             Self::Topics(args) => Err(crate::topics::run(args, &mut reports()?)?),
@@ -293,7 +283,6 @@ fn run(job: RuntimeJob, load: Load<'_>) -> Result<Exit, Failure> {
     let isolation = Arc::new(Isolation::of_this_process(job.permissions(false))?);
     let mut sandboxed = sandboxed(load, &isolation);
     match job {
-        #[cfg(feature = "dds")]
         RuntimeJob::Live(job) => job.run(&mut sandboxed, &isolation, reports()?),
         job => job.run_offline(&mut sandboxed, &mut reports()?),
     }

@@ -8,6 +8,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_lambda::Decision;
+use gleaner_protocol::ingress::IngressReport;
 use gleaner_protocol::link::RecorderReport;
 use gleaner_protocol::{LiveStatus, Report};
 
@@ -23,6 +24,8 @@ pub enum JsonReport {
     Lambda(Report),
     /// A report of the recorder.
     Recorder(RecorderReport),
+    /// A report of the ingress.
+    Ingress(IngressReport),
 }
 
 /// A running program, stopped on drop.
@@ -44,9 +47,14 @@ fn player() -> Option<PathBuf> {
 
 /// Starts `gleaner run` with a built lambda, reporting as JSON.
 pub fn run(lambda: &Path, out: &Path, args: &[&str]) -> RunningProgram {
+    run_all(&[lambda], out, args)
+}
+
+/// Starts `gleaner run` with built lambdas, reporting as JSON.
+pub fn run_all(lambdas: &[&Path], out: &Path, args: &[&str]) -> RunningProgram {
     let mut gleaner = Command::new(program("gleaner"));
     gleaner.env("XDG_CACHE_HOME", root().join("target/test-cache"));
-    gleaner.arg("run").arg(lambda).arg("--json").arg("--out").arg(out).args(args);
+    gleaner.arg("run").args(lambdas).arg("--json").arg("--out").arg(out).args(args);
     RunningProgram::start(gleaner)
 }
 
@@ -87,12 +95,27 @@ impl RunningProgram {
     ///
     /// If it ends earlier, or takes longer than [`PATIENCE`].
     pub fn until<T>(&self, what: &str, mut wanted: impl FnMut(JsonReport) -> Option<T>) -> T {
+        self.until_line(what, |line| parsed(line).and_then(&mut wanted))
+    }
+
+    /// As [`until`](Self::until), for reports of several lambdas, with the name of each.
+    pub fn until_named<T>(
+        &self,
+        what: &str,
+        mut wanted: impl FnMut(String, Report) -> Option<T>,
+    ) -> T {
+        self.until_line(what, |line| {
+            named(line).and_then(|(lambda, report)| wanted(lambda, report))
+        })
+    }
+
+    fn until_line<T>(&self, what: &str, mut wanted: impl FnMut(&str) -> Option<T>) -> T {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
             match self.lines.recv_timeout(left) {
                 Ok(line) => {
-                    if let Some(found) = parsed(&line).and_then(&mut wanted) {
+                    if let Some(found) = wanted(&line) {
                         return found;
                     }
                 }
@@ -190,6 +213,15 @@ impl Finished {
         ended
             .unwrap_or_else(|| panic!("no final report; {}, stderr:\n{}", self.status, self.stderr))
     }
+
+    /// The final status of the lambda `name`, if there is one.
+    pub fn ended_of(&self, name: &str) -> Option<LiveStatus> {
+        let reports = self.lines.iter().filter_map(|line| named(line));
+        reports.filter(|(lambda, _)| lambda == name).find_map(|(_, report)| match report {
+            Report::Ended(live) => Some(*live),
+            _ => None,
+        })
+    }
 }
 
 /// Sends a signal to one process.
@@ -227,9 +259,27 @@ pub fn decisions(out: &Path) -> Vec<Decision> {
     text.lines().map(|line| serde_json::from_str(line).expect("a line is a decision")).collect()
 }
 
+/// The summary in a folder of results.
+///
+/// # Panics
+///
+/// If there is none.
+pub fn summary(out: &Path) -> LiveStatus {
+    let text = std::fs::read(out.join("summary.json")).expect("the run has ended");
+    serde_json::from_slice(&text).expect("a summary is a status")
+}
+
 fn parsed(line: &str) -> Option<JsonReport> {
     let lambda = serde_json::from_str(line).map(JsonReport::Lambda);
-    lambda.or_else(|_| serde_json::from_str(line).map(JsonReport::Recorder)).ok()
+    let recorder = |_| serde_json::from_str(line).map(JsonReport::Recorder);
+    lambda.or_else(recorder).or_else(|_| serde_json::from_str(line).map(JsonReport::Ingress)).ok()
+}
+
+/// A report of a lambda's process, with the name that it is printed with.
+fn named(line: &str) -> Option<(String, Report)> {
+    let value: serde_json::Value = serde_json::from_str(line).ok()?;
+    let lambda = value.get("lambda")?.as_str()?.to_owned();
+    Some((lambda, serde_json::from_str(line).ok()?))
 }
 
 fn lines_of(stream: impl std::io::Read + Send + 'static) -> Receiver<String> {

@@ -25,6 +25,8 @@ pub const UNSAFE_FILES: &[&str] = &[
     "host/buffers/tests/shared_ring.rs",
     "host/dds/src/joins.rs",
     "host/feed/src/topic.rs",
+    "host/ingress/tests/kills.rs",
+    "host/ingress/tests/suite/hostile.rs",
     "host/jail/src/cgroup_join.rs",
     "host/python/src/array.rs",
     "host/python/src/memory.rs",
@@ -136,7 +138,6 @@ pub const CRATES: &[(&str, &[&str])] = &[
         "gleaner-recorder",
         &[
             "gleaner-base",
-            "gleaner-dds",
             "gleaner-drives",
             "gleaner-feed",
             "gleaner-image",

@@ -94,6 +94,11 @@ const ATTACKS: &[(&str, Option<AttackOutcome>, Option<AttackOutcome>)] = &[
     ("abort", Some(Fault(Trap)), Some(Killed("ended by signal 6"))),
     ("descriptors_closed", None, Some(Broken)),
     ("corrupt", None, Some(Killed("ended by signal"))),
+    // On the memory that all lambdas read; another is in `tests/tests/programs/shared_topics.rs`.
+    ("shared_write", None, Some(Killed("ended by signal 11"))),
+    ("shared_protect", None, Some(Refused("Permission denied"))),
+    ("shared_file", None, Some(Refused("not permitted"))),
+    ("shared_wait", None, Some(Refused("Operation not permitted"))),
 ];
 
 fn main() -> ExitCode {

@@ -37,7 +37,7 @@ const FLAGS: &str = "-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-leve
                      -Cllvm-args=-sanitizer-coverage-trace-compares -Cdebug-assertions -Coverflow-checks --cfg fuzzing";
 
 const USAGE: &str = "usage: cargo xtask fuzz [TARGET...] [--seconds N] [--seed N]
-targets: message, drive, bag, image, journal, link, manifest, calls [default: all]
+targets: message, drive, bag, image, journal, link, ingress, manifest, calls [default: all]
 --seconds N  time for each target [default: 60]; targets run in parallel, one per core
 --seed N     makes runs of the same programs with the same inputs reproducible";
 

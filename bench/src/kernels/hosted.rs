@@ -38,8 +38,7 @@ impl HostedKernel {
             Manifest::load(&lambda).expect("the lambda is built; run: cargo xtask bench");
         let mut transport = Loopback::new();
         transport.add_topic(TOPIC, "sensor_msgs/msg/Image", IMAGE);
-        let inputs =
-            open_inputs(&manifest, &[], &mut transport, None).expect("memory for the frame");
+        let inputs = open_inputs(&manifest, &[], &mut transport).expect("memory for the frame");
         let topic = Arc::clone(&inputs[0]);
         let meta = SampleMeta {
             at_ns: 1,
@@ -81,7 +80,7 @@ impl HostedKernel {
 
     /// A wake by the frame.
     pub fn frame(&mut self) {
-        let sample = self.topic.newest().expect("the frame was published");
+        let sample = self.topic.newest().unwrap().expect("the frame was published");
         self.wake(Wake::Event(sample));
     }
 

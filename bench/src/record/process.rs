@@ -87,12 +87,7 @@ fn measure(seconds: u64) -> RecorderLatency {
     });
     let reports = thread::spawn(move || last(reports));
     let socket = control
-        .add(&AddLambda {
-            lambda: folder,
-            remaps: Vec::new(),
-            most: Limits::MAX,
-            grants: Vec::new(),
-        })
+        .add(&AddLambda { lambda: folder, remaps: Vec::new(), most: Limits::MAX })
         .expect("the program runs");
     let mut link = RecorderLink::new(socket);
     link.hello(&header, PATIENCE).expect("the lambda was added");

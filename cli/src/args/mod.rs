@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::net::IpAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
@@ -48,10 +48,10 @@ pub enum CliCommand {
     ///
     /// Exits with 0 if all are identical, and with 4 at the first difference.
     Verify(VerifyArgs),
-    /// Run a built lambda on the live topics of this vehicle, until Ctrl-C
+    /// Run built lambdas on the live topics of this vehicle, until Ctrl-C
     ///
-    /// Records the clips of the manifest's table `record`, and writes OUT/decisions.jsonl,
-    /// OUT/log.jsonl and OUT/summary.json.
+    /// Records the clips of the manifests' tables `record`, and writes decisions.jsonl, log.jsonl
+    /// and summary.json: of one lambda into OUT, of several into OUT/NAME.
     Run(RunArgs),
     /// List the live topics
     Topics(TopicsArgs),
@@ -98,17 +98,17 @@ pub struct LambdaArgs {
 impl LambdaArgs {
     /// Returns the settings as arguments of the other programs.
     pub(crate) fn settings(&self) -> Vec<OsString> {
-        let settings = [("--set", &self.set), ("--remap", &self.remap)];
-        let vehicle =
-            self.vehicle.iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]);
-        settings
-            .iter()
-            .flat_map(|(flag, values)| {
-                values.iter().flat_map(move |value| [OsString::from(*flag), value.into()])
-            })
-            .chain(vehicle)
-            .collect()
+        settings(&self.set, &self.remap, self.vehicle.as_deref())
     }
+}
+
+/// Returns the settings of a lambda as arguments of the other programs.
+pub(crate) fn settings(set: &[String], remap: &[String], vehicle: Option<&Path>) -> Vec<OsString> {
+    let pairs = |flag: &'static str, values: &[String]| {
+        values.iter().flat_map(|value| [flag.into(), value.into()]).collect::<Vec<OsString>>()
+    };
+    let vehicle = vehicle.into_iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]);
+    pairs("--set", set).into_iter().chain(pairs("--remap", remap)).chain(vehicle).collect()
 }
 
 /// The network to join.
@@ -134,19 +134,37 @@ impl NetworkArgs {
 /// Arguments of `gleaner run`.
 #[derive(Args, Debug)]
 pub struct RunArgs {
-    #[command(flatten)]
-    #[allow(missing_docs)]
-    pub target: LambdaArgs,
-    /// Result folder [default: DIR/live]
+    /// Folders of lambdas, built by `gleaner build DIR`
+    #[arg(value_name = "DIR", required = true)]
+    pub lambdas: Vec<PathBuf>,
+    /// Override a key of the config table, as in brake_mps2=-1.4; with several lambdas, of the
+    /// lambda NAME: NAME.KEY=VALUE
+    #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
+    pub set: Vec<String>,
+    /// Rename a topic in every manifest that has it, as in /imu/data:=/car/imu
+    #[arg(long, value_name = "FROM:=TO", value_parser = remap)]
+    pub remap: Vec<String>,
+    /// Configuration file of the vehicle. Its limits apply where they are smaller than those of the
+    /// manifest; see docs/limits.md
+    #[arg(long, value_name = "FILE")]
+    pub vehicle: Option<PathBuf>,
+    /// Result folder [default: DIR/live; with several lambdas, ./live with a folder for each]
     #[arg(long)]
     pub out: Option<PathBuf>,
+    /// Play this recorded drive once instead of joining the network: an MCAP file, a rosbag2 .db3
+    /// file or a directory; several are merged by time
+    #[arg(long, value_name = "DRIVE", conflicts_with_all = ["domain", "interface"])]
+    pub drive: Vec<PathBuf>,
+    /// Play the drive this many times as fast as it was recorded [default: 1]
+    #[arg(long, value_name = "X", value_parser = rate, requires = "drive")]
+    pub rate: Option<f64>,
     /// Write every decision, not only those with a trigger or a fault
     #[arg(long)]
     pub all: bool,
     /// Do not record the clips of the manifest's table `record`
     #[arg(long)]
     pub no_record: bool,
-    /// Show statistics of the lambda and its topics every second
+    /// Show statistics of the lambdas and their topics every second
     #[arg(long)]
     pub stats: bool,
     /// Stop after this many seconds
@@ -171,7 +189,7 @@ pub struct RunArgs {
     /// Maximum total size of clips to keep; the oldest ones are deleted and counted
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
     pub bytes_max: Option<u64>,
-    /// Create a control group for the lambda's process in this cgroup v2 folder, which must be
+    /// Create a control group for each lambda's process in this cgroup v2 folder, which must be
     /// delegated to this user
     #[arg(long, value_name = "DIR")]
     pub cgroup: Option<PathBuf>,
@@ -385,6 +403,10 @@ pub struct VerifyArgs {
     pub json: bool,
 }
 
+/// Bounds of `--rate`: beyond, a drive of an hour takes longer than a day, or is over at once.
+const RATE_MIN: f64 = 0.01;
+const RATE_MAX: f64 = 1000.0;
+
 // Early checks only: the texts are passed on unchanged, and the runtime parses them.
 
 fn assignment(text: &str) -> Result<String, String> {
@@ -415,6 +437,13 @@ fn bytes(text: &str) -> Result<u64, String> {
 
 fn seconds(text: &str) -> Result<f64, String> {
     text.parse().map_err(|_| "write a number of seconds without a unit, as in 2.5".to_owned())
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    text.parse()
+        .ok()
+        .filter(|rate| (RATE_MIN..=RATE_MAX).contains(rate))
+        .ok_or_else(|| format!("write a number from {RATE_MIN} to {RATE_MAX}, as in 2"))
 }
 
 fn whole_seconds(text: &str) -> Result<u32, String> {

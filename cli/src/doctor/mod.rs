@@ -50,9 +50,9 @@ impl Finding {
 /// Runs all checks and prints their results. Returns [`Exit::Internal`] if one is an error.
 pub(crate) fn run(args: &DoctorArgs) -> Result<Exit, Failure> {
     let parts = Parts::find()?;
-    let mut findings =
-        vec![program(&parts, "gleaner-runtime"), program(&parts, "gleaner-recorder")];
-    findings.push(program(&parts, "gleaner-shim"));
+    let mut findings = ["gleaner-runtime", "gleaner-ingress", "gleaner-recorder", "gleaner-shim"]
+        .map(|name| program(&parts, name))
+        .to_vec();
     findings.push(optional(&parts, "gleaner-player", "needed by `gleaner play`"));
     findings.push(python(&parts));
     findings.extend(isolation::findings(&parts));

@@ -1,12 +1,13 @@
-//! Formats the status of a live lambda and its recorder, and the list of live topics.
+//! Formats the status of a live lambda and of the recorder, and the list of live topics.
 
 use std::fmt::{self, Write};
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, TriggerKind};
 use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
-use gleaner_protocol::{DurationStats, LiveStatus, LiveTopic, NetworkStatus, TopicInfo};
+use gleaner_protocol::{DurationStats, LiveStatus, LiveTopic, Report, TopicInfo};
 use gleaner_report::format::{clip_span, counted, fault_kind, grouped, three_digits};
+use serde_json::Value;
 
 use super::{Paint, mib};
 
@@ -24,6 +25,17 @@ pub(crate) fn recorder(status: &RecorderStatus, paint: Paint) -> String {
     // Writing to a string cannot fail.
     let _ = write_recorder(&mut text, status, paint);
     text
+}
+
+/// Returns a report as JSON, with the name of its lambda first. The name that its process reports
+/// is not used.
+pub(crate) fn named_report(lambda: &str, report: &Report) -> Value {
+    let report = serde_json::to_value(report).expect("a report has only text keys");
+    let mut named = serde_json::Map::from_iter([("lambda".to_owned(), lambda.into())]);
+    if let Value::Object(fields) = report {
+        named.extend(fields.into_iter().filter(|(key, _)| key != "lambda"));
+    }
+    named.into()
 }
 
 /// Formats the live topics as a table.
@@ -54,19 +66,19 @@ pub(crate) fn clip_line(clip: &Clip, paint: Paint) -> String {
     text
 }
 
-/// Formats a decision: a line for each trigger and fault.
-pub(crate) fn decision(decision: &gleaner_lambda::Decision, paint: Paint) -> String {
-    let time = time_of_day(decision.at_ns);
+/// Formats a decision: a line for each trigger and fault, with `prefix` after the time.
+pub(crate) fn decision(decision: &gleaner_lambda::Decision, prefix: &str, paint: Paint) -> String {
+    let time = format!("{}  {prefix}", time_of_day(decision.at_ns));
     let mut text = String::new();
     for trigger in &decision.triggers {
         let kind = if trigger.kind == TriggerKind::Event { "" } else { trigger.kind.as_str() };
         let score = trigger.score.map(three_digits).unwrap_or_default();
-        let line = format!("{time}  {}  {kind}{score}", visible(&trigger.label));
+        let line = format!("{time}{}  {kind}{score}", visible(&trigger.label));
         text += &format!("{}\n", paint.green(line.trim_end()));
     }
     if let Some(fault) = &decision.fault {
         let line = format!(
-            "{time}  {}: {}",
+            "{time}{}: {}",
             fault_kind(fault.kind),
             super::shown(super::gist(&fault.message))
         );
@@ -78,10 +90,9 @@ pub(crate) fn decision(decision: &gleaner_lambda::Decision, paint: Paint) -> Str
 fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result {
     writeln!(
         text,
-        "{} ({}), domain {}, {:.0} s: {}, {}, {}",
+        "{} ({}), {:.0} s: {}, {}, {}",
         paint.bold(&format!("{} {}", visible(&live.lambda), visible(&live.version))),
         live.kind.as_str(),
-        live.network.domain,
         live.up_s,
         counted(live.wakes, "wake"),
         counted(live.triggers, "trigger"),
@@ -106,26 +117,18 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
     let head = [
         "input",
         "topic",
-        "writers",
         "Hz",
         "received",
-        "lost",
         "no slot",
         "too big",
-        "malformed",
         "overwritten",
         "skipped",
         "newest",
     ];
     let rows =
         std::iter::once(head.map(str::to_owned)).chain(live.topics.iter().map(row)).collect();
-    for line in table(rows, &[2, 3, 4, 5, 6, 7, 8, 9, 10, 11]).lines() {
+    for line in table(rows, &[2, 3, 4, 5, 6, 7, 8]).lines() {
         writeln!(text, "  {line}")?;
-    }
-    for topic in &live.topics {
-        for qos_warnings in &topic.qos_warnings {
-            writeln!(text, "  {}", paint.yellow(&visible(qos_warnings)))?;
-        }
     }
     let losses = [
         (live.missed_ticks, "tick", "missed"),
@@ -148,39 +151,12 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
     for (count, thing, why) in losses.into_iter().filter(|(count, ..)| *count > 0) {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
     }
-    write_network(text, &live.network, (live.rss_bytes, live.cpu_s), paint)
+    write_usage(text, live.rss_bytes, live.cpu_s, paint)
 }
 
-/// Writes the losses of the network, and the resources of a process: bytes of memory and seconds of
-/// CPU time.
-fn write_network(
-    text: &mut String,
-    network: &NetworkStatus,
-    (rss_bytes, cpu_s): (u64, f64),
-    paint: Paint,
-) -> fmt::Result {
-    let losses = [
-        (network.socket_drops, "dropped: socket buffer full"),
-        (network.filtered, "dropped: too large fragments, or fragments of unknown participants"),
-    ];
-    for (count, why) in losses.into_iter().filter(|(count, _)| *count > 0) {
-        writeln!(
-            text,
-            "  {}",
-            paint.yellow(&format!("lost: {}, {why}", counted(count, "datagram")))
-        )?;
-    }
-    if let Some(why) = &network.unfiltered {
-        writeln!(text, "  {}", paint.yellow(&visible(why)))?;
-    }
-    let line = format!(
-        "{}, socket buffer {:.1} of {:.1} MiB requested, {:.1} MiB resident, {:.1} s of CPU time",
-        counted(network.participants as u64, "participant"),
-        mib(network.buffer_granted as u64),
-        mib(network.buffer_requested as u64),
-        mib(rss_bytes),
-        cpu_s,
-    );
+/// Writes the memory of a process in bytes, and its CPU time in s.
+fn write_usage(text: &mut String, rss_bytes: u64, cpu_s: f64, paint: Paint) -> fmt::Result {
+    let line = format!("{:.1} MiB resident, {cpu_s:.1} s of CPU time", mib(rss_bytes));
     writeln!(text, "  {}", paint.dim(&line))
 }
 
@@ -198,10 +174,9 @@ fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> f
         mib(status.preroll_bound),
         opened.unwrap_or_default(),
     )?;
-    let head = ["topic", "writers", "received", "lost", "no slot", "too big", "malformed"]
-        .map(str::to_owned);
+    let head = ["topic", "received", "no slot", "too big"].map(str::to_owned);
     let rows = std::iter::once(head).chain(status.topics.iter().map(recorded)).collect();
-    for line in table(rows, &[1, 2, 3, 4, 5, 6]).lines() {
+    for line in table(rows, &[1, 2, 3]).lines() {
         writeln!(text, "  {line}")?;
     }
     if let Some(commands) = &status.commands {
@@ -213,41 +188,22 @@ fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> f
         );
         writeln!(text, "  {}", if commands.refused > 0 { paint.yellow(&line) } else { line })?;
     }
-    for qos_warnings in status.topics.iter().flat_map(|topic| &topic.qos_warnings) {
-        writeln!(text, "  {}", paint.yellow(&visible(qos_warnings)))?;
-    }
     super::write_counted(text, &status.recording, paint)?;
-    match &status.network {
-        Some(network) => write_network(text, network, (status.rss_bytes, status.cpu_s), paint),
-        None => Ok(()),
-    }
+    write_usage(text, status.rss_bytes, status.cpu_s, paint)
 }
 
-fn recorded(topic: &RecordedTopic) -> [String; 7] {
-    let unknown = || "?".to_owned();
-    [
-        visible(&topic.topic),
-        topic.writers.map_or_else(unknown, |writers| writers.to_string()),
-        grouped(topic.received),
-        topic.lost.map_or_else(unknown, grouped),
-        grouped(topic.no_slot),
-        grouped(topic.too_big),
-        grouped(topic.malformed),
-    ]
+fn recorded(topic: &RecordedTopic) -> [String; 4] {
+    [visible(&topic.topic), grouped(topic.received), grouped(topic.no_slot), grouped(topic.too_big)]
 }
 
-fn row(topic: &LiveTopic) -> [String; 12] {
-    let unknown = || "?".to_owned();
+fn row(topic: &LiveTopic) -> [String; 9] {
     [
         visible(&topic.name),
         visible(&topic.topic),
-        topic.writers.map_or_else(unknown, |writers| writers.to_string()),
         format!("{:.1}", topic.rate_hz),
         grouped(topic.received),
-        topic.lost.map_or_else(unknown, grouped),
         grouped(topic.no_slot),
         grouped(topic.too_big),
-        grouped(topic.malformed),
         grouped(topic.overwritten),
         grouped(topic.skipped),
         topic
@@ -313,33 +269,14 @@ mod tests {
     }
 
     #[test]
-    fn network_losses_of_a_recorder_are_shown() {
-        let network = NetworkStatus {
-            domain: 7,
-            participants: 2,
-            buffer_requested: 8 << 20,
-            buffer_granted: 1 << 20,
-            socket_drops: 3,
-            filtered: 1,
-            unfiltered: Some("no filter here".to_owned()),
-        };
-        let status = RecorderStatus {
-            network: Some(network),
-            rss_bytes: 5 << 20,
-            cpu_s: 1.0,
-            ..RecorderStatus::default()
-        };
-        let text = recorder(&status, Paint { on: false });
-        let lines: Vec<_> = text.lines().rev().take(4).collect();
-        assert_eq!(
-            lines,
-            [
-                "  2 participants, socket buffer 1.0 of 8.0 MiB requested, 5.0 MiB resident, 1.0 s of CPU time",
-                "  no filter here",
-                "  lost: 1 datagram, dropped: too large fragments, or fragments of unknown participants",
-                "  lost: 3 datagrams, dropped: socket buffer full",
-            ]
-        );
+    fn a_report_names_its_lambda_once() {
+        let named = named_report("hello", &Report::Ready);
+        assert_eq!(named.to_string(), r#"{"lambda":"hello","report":"ready"}"#);
+        let text = r#"{"report":"topics","topics":[],"lambda":"other"}"#;
+        let report: Report = serde_json::from_str(text).unwrap();
+        let named = named_report("hello", &report).to_string();
+        assert_eq!(named, r#"{"lambda":"hello","report":"topics","topics":[]}"#);
+        assert_eq!(serde_json::from_str::<Report>(&named).unwrap(), report);
     }
 
     #[test]

@@ -13,14 +13,16 @@ mod check_report;
 mod clips;
 mod diff;
 mod drive;
+mod ingress;
 mod isolation;
 mod live;
 
 pub(crate) use check_report::check_report;
 pub(crate) use diff::diff;
 pub(crate) use drive::drive;
+pub(crate) use ingress::ingress;
 pub(crate) use isolation::isolation;
-pub(crate) use live::{clip_line, decision, live, recorder, topics};
+pub(crate) use live::{clip_line, decision, live, named_report, recorder, topics};
 
 /// Formats a report as one line of JSON.
 pub(crate) fn json_line<T: serde::Serialize>(result: &T) -> String {

@@ -1,13 +1,32 @@
-//! `gleaner run DIR`: supervises a lambda and its recorder until Ctrl-C, and prints their reports.
+//! `gleaner run DIR...`: supervises lambdas, an ingress and a recorder until Ctrl-C or the end of a
+//! drive, and prints their reports.
 //!
-//! A failed process is restarted with a growing delay. A first start that fails ends the run.
+//! - `lambdas`: the lambdas of the command line, and their settings.
+//! - `grants`, `arguments`: topics and arguments of the processes.
+//! - `process`, `output`: one process, and the threads that read its output.
+//! - `services`: the processes that all lambdas share: ingress and recorder.
+//! - `supervised`: one lambda over all its restarts, with `backoff` and `summary`.
+//! - `process_group`: all processes, and `drive`: a drive that the ingress plays.
+//! - `failures`: the result of a run in which processes failed.
+//! - `screen`: the terminal.
+//!
+//! A failed process is restarted with a growing delay: that of a lambda alone, the ingress and the
+//! recorder with all others. A first start that fails ends the run, unless it is that of one lambda
+//! of several.
 
 mod arguments;
+mod backoff;
+mod drive;
+mod failures;
+mod grants;
+mod lambdas;
+mod output;
 mod process;
 mod process_group;
-mod report_stream;
 mod screen;
+mod services;
 mod summary;
+mod supervised;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,135 +34,117 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
+use gleaner_lambda::Vehicle;
 use gleaner_lambda::manifest::Limits;
-use gleaner_lambda::{BuildDir, Manifest, Vehicle};
+use gleaner_parts::Parts;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-use self::process_group::{ProcessGroup, RunEnd};
+use self::backoff::RestartDelay;
+use self::failures::Failures;
+use self::lambdas::RunLambda;
+use self::process_group::{GroupEnd, ProcessGroup};
 use self::screen::Screen;
-use self::summary::EarlierCounts;
+use self::summary::RunCounts;
+use self::supervised::SupervisedLambda;
 use crate::args::RunArgs;
 
-/// Delay before the first restart; it doubles with each further one.
-const DELAY: Duration = Duration::from_secs(1);
-/// Maximum delay, so that a broken deployment does not occupy a core with restarts.
-const DELAY_MAX: Duration = Duration::from_secs(30);
-/// Run time after which the delay is reset.
-const HEALTHY: Duration = Duration::from_secs(60);
 /// Interval of checks whether to stop.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Runs until a signal, or until the time is over.
+/// The unchanging context of a run.
+struct RunContext<'a> {
+    args: &'a RunArgs,
+    parts: Parts,
+    /// Offset of the vehicle's clock to CLOCK_MONOTONIC, in ns.
+    offset_ns: i64,
+}
+
+/// The time of a run, which may be limited.
+struct RunTime {
+    limit: Option<Duration>,
+    started: Instant,
+    /// Set once all lambdas are ready for the first time.
+    ready: Option<Instant>,
+}
+
+impl RunTime {
+    fn begin(&mut self) {
+        self.ready.get_or_insert_with(Instant::now);
+    }
+
+    /// Returns whether the time since the lambdas were ready is over.
+    fn is_over(&self) -> bool {
+        self.ready.zip(self.limit).is_some_and(|(ready, limit)| ready.elapsed() >= limit)
+    }
+
+    /// Returns whether the time since the start of the run is over.
+    fn is_over_since_start(&self) -> bool {
+        self.limit.is_some_and(|limit| self.started.elapsed() >= limit)
+    }
+}
+
+/// Runs until a signal, until the time is over, or until the end of the drive.
 pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
-    let build = BuildDir::check_fresh(&args.target.lambda)?;
-    let manifest = Manifest::load(build.path())?;
-    // Recorded topics need not be inputs, but only inputs state a maximum size.
-    let sizes = manifest.inputs.iter().map(|input| input.max_size.bytes());
-    let largest = (manifest.record.is_some() && !args.no_record).then(|| sizes.max().unwrap_or(0));
-    let vehicle = args.target.vehicle.as_ref();
+    let mut lambdas: Vec<_> =
+        RunLambda::load(args)?.into_iter().map(SupervisedLambda::new).collect();
     let allowed = || {
+        let vehicle = args.vehicle.as_ref();
         vehicle.map_or(Ok(Limits::MAX), |file| Vehicle::load(file).map(|vehicle| vehicle.limits))
     };
     let mut limits = allowed()?;
     let stop = stop_flag()?;
     let mut screen = Screen::new(args.stats, args.json);
-    let offset_ns = clock_offset();
-    let started = Instant::now();
-    let mut delay = DELAY;
+    let context = RunContext { args, parts: Parts::find()?, offset_ns: clock_offset() };
+    let limit = args.last.map(|seconds| Duration::from_secs(seconds.into()));
+    let mut time = RunTime { limit, started: Instant::now(), ready: None };
+    let mut delay = RestartDelay::new();
     let mut restarts = 0;
     let mut failures = Failures::default();
-    let mut earlier = EarlierCounts::default();
-    let is_over = || args.last.is_some_and(|seconds| started.elapsed().as_secs() >= seconds.into());
+    let mut counts = RunCounts::default();
+    let mut cut_short = None;
     loop {
-        let time_left = args
-            .last
-            .map(|seconds| Duration::from_secs(seconds.into()).saturating_sub(started.elapsed()));
         let attempt_started = Instant::now();
-        // The runtime reads the same file at each start and reports if it cannot be used. That does
+        // The runtimes read the same file at each start and report if it cannot be used. That does
         // not end the run.
         limits = allowed().unwrap_or(limits);
-        let mut group = ProcessGroup::start(
-            args,
-            &mut screen,
-            limits,
-            largest,
-            offset_ns,
-            time_left,
-            restarts,
-        )?;
-        match group.supervise(&mut screen, &stop)? {
-            RunEnd::Complete(exit) => {
-                earlier.complete(
-                    group.last_status(),
-                    group.recorder_status(),
-                    &arguments::out(args),
-                )?;
-                return failures.end(exit);
-            }
+        let mut group =
+            ProcessGroup::start(&context, &mut lambdas, &mut screen, &mut failures, limits)?;
+        let ended = group.run(&mut time, &stop);
+        group.add_counts(&mut counts);
+        let reason = match ended? {
+            GroupEnd::Complete => break,
             // It has printed the cause. After a successful start it is restarted, since the cause
             // may be temporary, such as a network that is down.
-            RunEnd::NotStarted(exit) if restarts == 0 => return Ok(exit),
-            RunEnd::NotStarted(exit) => {
-                failures.add("it could not start".to_owned(), exit == Exit::LambdaFaulted)
-            }
-            RunEnd::Broken { reason, faulted } => failures.add(reason, faulted),
+            GroupEnd::NotStarted(exit) if restarts == 0 => return Ok(exit),
+            GroupEnd::NotStarted(_) => "it could not start".to_owned(),
+            GroupEnd::Broken(reason) => reason,
+        };
+        // It would be played again from its start, to lambdas that have seen a part of it.
+        if !args.drive.is_empty() {
+            let mut failure = Failure::new(Exit::Internal, "the drive was not played to its end");
+            failure.causes = vec![reason];
+            cut_short = Some(failure);
+            break;
         }
-        earlier.add(group.last_status(), group.recorder_status(), group.has_lost_wake());
+        failures.add(reason.clone(), false);
         restarts += 1;
-        delay = if attempt_started.elapsed() >= HEALTHY { DELAY } else { delay };
-        let reason = failures.reason.as_deref().unwrap_or_default();
+        let delay = delay.after(attempt_started.elapsed());
         screen.warn(&format!("{reason}; restarting in {} s (restart {restarts})", delay.as_secs()));
         let until = Instant::now() + delay;
-        let ends = || stop.load(Ordering::Relaxed) || is_over();
+        let ends = || stop.load(Ordering::Relaxed) || time.is_over_since_start();
         while Instant::now() < until && !ends() {
             thread::sleep(POLL_INTERVAL);
         }
         if ends() {
-            earlier.complete(None, None, &arguments::out(args))?;
-            return failures.end(Exit::Ok);
-        }
-        delay = (delay * 2).min(DELAY_MAX);
-    }
-}
-
-/// Failed processes of a run. A run with failures does not end with success, even if its last
-/// process does.
-#[derive(Default)]
-struct Failures {
-    /// Reason of the last failure.
-    reason: Option<String>,
-    times: u32,
-    /// True if the lambda faulted in one of the processes.
-    faulted: bool,
-}
-
-impl Failures {
-    fn add(&mut self, reason: String, faulted: bool) {
-        self.reason = Some(reason);
-        self.times += 1;
-        self.faulted |= faulted;
-    }
-
-    /// Returns the result of the run if its last process ended with `exit`.
-    fn end(self, exit: Exit) -> Result<Exit, Failure> {
-        match self.reason {
-            _ if exit != Exit::Ok => Ok(exit),
-            None => Ok(Exit::Ok),
-            Some(_) if self.faulted => Ok(Exit::LambdaFaulted),
-            Some(reason) => {
-                let times = if self.times == 1 {
-                    "once".to_owned()
-                } else {
-                    format!("{} times", self.times)
-                };
-                let mut failure = Failure::new(Exit::Internal, format!("a process failed {times}"));
-                failure.causes = vec![reason];
-                Err(failure.with_help(
-                    "the results lack only the time between each failure and its restart",
-                ))
-            }
+            break;
         }
     }
+    let exits = lambdas.iter().map(|lambda| lambda.exit);
+    let exit = exits.reduce(|first, next| if first == Exit::Ok { next } else { first });
+    for lambda in lambdas {
+        lambda.complete(&counts)?;
+    }
+    cut_short.map_or_else(|| failures.end(exit.unwrap_or(Exit::Ok)), Err)
 }
 
 /// Returns a flag that is set by Ctrl-C, SIGTERM, and the end of the terminal.
@@ -165,39 +166,4 @@ fn clock_offset() -> i64 {
         now.tv_sec.saturating_mul(1_000_000_000).saturating_add(now.tv_nsec)
     };
     ns(ClockId::Realtime).saturating_sub(ns(ClockId::Monotonic))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Returns the exit code of a run with these failures, true for a fault, and this last exit
-    /// code.
-    fn end(faults: &[bool], exit: Exit) -> Exit {
-        let mut failures = Failures::default();
-        faults.iter().for_each(|faulted| failures.add("it ended".to_owned(), *faulted));
-        failures.end(exit).unwrap_or_else(|failure| failure.exit)
-    }
-
-    #[test]
-    fn a_run_with_failures_does_not_end_with_success() {
-        assert_eq!(end(&[], Exit::Ok), Exit::Ok);
-        assert_eq!(end(&[], Exit::LambdaFaulted), Exit::LambdaFaulted);
-        assert_eq!(end(&[false], Exit::Ok), Exit::Internal);
-        assert_eq!(end(&[true, false], Exit::Ok), Exit::LambdaFaulted);
-        assert_eq!(end(&[false, false], Exit::LambdaFaulted), Exit::LambdaFaulted);
-    }
-
-    #[test]
-    fn failures_are_counted_and_the_last_one_is_the_cause() {
-        let mut failures = Failures::default();
-        ["a disk", "a network"]
-            .into_iter()
-            .for_each(|reason| failures.add(reason.to_owned(), false));
-        let failure = failures.end(Exit::Ok).unwrap_err().to_string();
-        assert!(
-            failure.contains("a process failed 2 times") && failure.contains("a network"),
-            "{failure}"
-        );
-    }
 }

@@ -1,222 +1,366 @@
-//! Starts and supervises the processes of one run.
+//! Starts and supervises the processes of a run: an ingress, a recorder, and one for each lambda.
+//!
+//! A lambda whose process fails is started again, while the others run on. If the ingress or the
+//! recorder fails, all end.
 
-use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
+use std::sync::mpsc::{self, Receiver, SyncSender};
 use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure, safe_file};
+use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::Limits;
-use gleaner_parts::Parts;
-use gleaner_protocol::link::{AddLambda, ControlClient, LinkError, RecorderStatus};
-use gleaner_protocol::{ExitRecord, LiveStatus};
+use gleaner_protocol::Handover;
+use gleaner_protocol::ingress::AddTopics;
+use gleaner_protocol::link::{AddLambda, LinkError};
 
-use super::process::ChildProcess;
-use super::report_stream::{ChildOutput, ReportStream};
+use super::drive::DriveProgress;
+use super::failures::Failures;
+use super::output::{ChildId, ChildOutput, OutputPiece};
+use super::process::{ChildProcess, ended};
 use super::screen::Screen;
-use super::{POLL_INTERVAL, arguments};
-use crate::args::RunArgs;
+use super::services::{IngressProcess, RecorderProcess};
+use super::summary::RunCounts;
+use super::supervised::SupervisedLambda;
+use super::{POLL_INTERVAL, RunContext, RunTime, arguments, grants};
 
-/// Time to read the pipes after the end of all processes: processes that they left running may hold
-/// the pipes open.
+/// Time to read the pipes of a process after its end: processes that it left running may hold the
+/// pipes open.
 const DRAIN_TIMEOUT: Duration = Duration::from_millis(300);
 
 /// Maximum number of queued outputs. Further reports stay in their pipe, and the writer counts
 /// those that do not fit.
 const QUEUE_LENGTH: usize = 16;
 
-/// The end of a run.
-pub(super) enum RunEnd {
-    /// The run ended on request, or its time was over.
-    Complete(Exit),
-    /// The run could not start; a program has printed the cause.
+/// The end of a process group.
+pub(super) enum GroupEnd {
+    /// It ended on request, its time or its drive was over, or no lambda could start.
+    Complete,
+    /// The ingress or the recorder could not start; it has printed the cause.
     NotStarted(Exit),
-    /// A process failed after the start.
-    Broken {
-        /// The failure.
-        reason: String,
-        /// True if the lambda had faulted before.
-        faulted: bool,
-    },
+    /// The ingress or the recorder failed after the start, for this reason.
+    Broken(String),
 }
 
-/// The lambda's process and the recorder.
-pub(super) struct ProcessGroup {
-    runtime: ChildProcess,
-    exit_record: PathBuf,
-    recorder: Option<(ChildProcess, ControlClient)>,
-    stream: ReportStream,
-    /// Time to run after it is ready; `None` for no limit.
-    time_left: Option<Duration>,
+/// The processes of a run.
+pub(super) struct ProcessGroup<'a> {
+    context: &'a RunContext<'a>,
+    pub(super) lambdas: &'a mut [SupervisedLambda],
+    pub(super) screen: &'a mut Screen,
+    failures: &'a mut Failures,
+    pub(super) ingress: IngressProcess,
+    recorder: Option<RecorderProcess>,
+    sender: SyncSender<ChildOutput>,
+    output: Receiver<ChildOutput>,
+    limits: Limits,
 }
 
-impl ProcessGroup {
-    /// Starts the processes. `limits` are the limits of this vehicle; `largest` is the largest
-    /// recorded sample in bytes, `None` if nothing is recorded. `screen` shows why a recorder ended
-    /// at its start.
+impl<'a> ProcessGroup<'a> {
+    /// Starts the ingress; the others follow when it is ready.
     pub(super) fn start(
-        args: &RunArgs,
-        screen: &mut Screen,
+        context: &'a RunContext<'a>,
+        lambdas: &'a mut [SupervisedLambda],
+        screen: &'a mut Screen,
+        failures: &'a mut Failures,
         limits: Limits,
-        largest: Option<u64>,
-        offset_ns: i64,
-        time_left: Option<Duration>,
-        restarts: u32,
     ) -> Result<Self, Failure> {
-        // Recorder and shim write into the folder before the runtime checks it.
-        safe_file::refuse_linked(&arguments::out(args), &args.target.lambda)?;
-        let parts = Parts::find()?;
         let (sender, output) = mpsc::sync_channel(QUEUE_LENGTH);
-        let failed = |error: &dyn std::error::Error| {
-            Failure::caused_by(Exit::Internal, "cannot connect lambda and recorder", error)
-        };
-        let mut recorder = None;
-        let mut socket = None;
-        if let Some(largest) = largest {
-            let (mut control, stdin) = ControlClient::pair().map_err(|error| failed(&error))?;
-            let line = arguments::recorder(args, largest, offset_ns);
-            let process = ChildProcess::start(
-                &parts,
-                "gleaner-recorder",
-                line,
-                Some(stdin),
-                None,
-                ChildOutput::Recorder,
-                &sender,
-            )?;
-            let add = AddLambda {
-                lambda: args.target.lambda.clone(),
-                remaps: arguments::remaps(args),
-                most: limits,
-                grants: Vec::new(),
-            };
-            match control.add(&add) {
-                Ok(lambda_end) => socket = Some(lambda_end),
-                Err(LinkError::Gone { .. }) => {
-                    drop(sender);
-                    return recorder_not_started(process, ReportStream::new(output), screen);
-                }
-                Err(error) => return Err(failed(&error)),
-            }
-            recorder = Some((process, control));
-        }
-        let line = arguments::runtime(args, socket.is_some(), offset_ns, restarts);
-        let exit_record = arguments::out(args).join(ExitRecord::FILE);
-        let shim = Some(arguments::shim(args, &exit_record, restarts));
-        let runtime = ChildProcess::start(
-            &parts,
-            "gleaner-runtime",
-            line,
-            socket,
-            shim,
-            ChildOutput::Runtime,
-            &sender,
-        )?;
-        Ok(Self { runtime, exit_record, recorder, stream: ReportStream::new(output), time_left })
+        let inputs = lambdas.iter().flat_map(|supervised| &supervised.lambda.manifest.inputs);
+        let largest = inputs.map(|input| input.max_size.bytes()).max().unwrap_or(0);
+        let ingress = IngressProcess::start(context, largest, &sender)?;
+        let recorder = None;
+        Ok(Self { context, lambdas, screen, failures, ingress, recorder, sender, output, limits })
     }
 
-    /// Takes the last status of the lambda.
-    pub(super) fn last_status(&mut self) -> Option<LiveStatus> {
-        self.stream.last.take()
-    }
-
-    /// Takes the last status of the recorder.
-    pub(super) fn recorder_status(&mut self) -> Option<Box<RecorderStatus>> {
-        self.stream.recorder.take()
-    }
-
-    /// Returns whether the lambda's process ended during a wake.
-    pub(super) fn has_lost_wake(&self) -> bool {
-        self.stream.has_lost_wake
-    }
-
-    /// Shows the output of the processes until they end, and ends them when `stop` is set.
-    pub(super) fn supervise(
+    /// Runs the processes until the end of the run, or until the ingress or the recorder fails, and
+    /// ends them.
+    pub(super) fn run(
         &mut self,
-        screen: &mut Screen,
+        time: &mut RunTime,
         stop: &AtomicBool,
-    ) -> Result<RunEnd, Failure> {
-        let Self { runtime, exit_record, recorder, stream, time_left } = self;
-        let mut ready: Option<Instant> = None;
-        let mut requested = false;
-        let status = loop {
-            stream.poll(screen, POLL_INTERVAL);
-            ready = ready.or_else(|| stream.is_ready.then(Instant::now));
-            let is_over =
-                ready.zip(*time_left).is_some_and(|(ready, limit)| ready.elapsed() >= limit);
-            if stop.load(Ordering::Relaxed) || is_over {
-                requested = true;
-                break runtime.end(stream, screen)?;
+    ) -> Result<GroupEnd, Failure> {
+        let ended = self.supervise(time, stop);
+        self.end_all(matches!(ended, Ok(GroupEnd::Complete)))?;
+        ended
+    }
+
+    fn supervise(&mut self, time: &mut RunTime, stop: &AtomicBool) -> Result<GroupEnd, Failure> {
+        let mut drive = DriveProgress::of(self.context.args);
+        loop {
+            self.poll(POLL_INTERVAL);
+            if stop.load(Ordering::Relaxed) || time.is_over() {
+                return Ok(GroupEnd::Complete);
             }
-            if let Some(status) = runtime.status()? {
-                break status;
+            let ended = self.ended_lambdas()?;
+            // A lambda may end because one of these did.
+            if let Some(end) = self.ended_service()? {
+                return Ok(end);
             }
-            if let Some((recorder, _)) = recorder
-                && let Some(status) = recorder.status()?
+            for (index, status) in ended {
+                self.lambdas[index].ended(status, false, self.screen, self.failures);
+            }
+            if self.lambdas.iter().all(SupervisedLambda::has_not_started) {
+                return Ok(GroupEnd::Complete);
+            }
+            if self.ingress.is_ready {
+                self.start_due()?;
+            }
+            if self.lambdas.iter().all(SupervisedLambda::is_settled) {
+                time.begin();
+                if let Some(drive) = &mut drive {
+                    drive.begin(&mut self.ingress, self.screen);
+                }
+            }
+            if let Some(drive) = &mut drive
+                && self.ingress.drive_ended
+                && drive.is_over(self.lambdas, self.screen)
             {
-                runtime.end(stream, screen)?;
-                stream.drain(screen, DRAIN_TIMEOUT);
-                return Ok(match status.code().and_then(Exit::from_code) {
-                    // It has printed the cause.
-                    Some(exit) if !stream.is_ready && exit != Exit::Ok => RunEnd::NotStarted(exit),
-                    _ => RunEnd::Broken {
-                        reason: ended("the recorder", status),
-                        faulted: stream.has_faulted,
-                    },
-                });
+                if let Some(why) = self.ingress.dead() {
+                    let kept = "the results up to the damage are kept";
+                    self.screen.warn(&format!("the drive is damaged: {why}; {kept}"));
+                    self.failures.drive_is_damaged();
+                }
+                return Ok(GroupEnd::Complete);
             }
+        }
+    }
+
+    /// Adds the counts of ingress and recorder to those of the run.
+    pub(super) fn add_counts(self, counts: &mut RunCounts) {
+        counts.add(self.ingress.status, self.recorder.and_then(|recorder| recorder.status));
+    }
+
+    /// Starts the recorder, if it is needed and does not run yet, and all lambdas that are due.
+    fn start_due(&mut self) -> Result<(), Failure> {
+        let args = self.context.args;
+        let is_recorded = |supervised: &&SupervisedLambda| {
+            !args.no_record && supervised.lambda.manifest.record.is_some()
         };
-        if let Some((recorder, control)) = recorder {
-            // Fails if the recorder has ended meanwhile, and then has nothing to complete.
-            let _ = control.stop();
-            let status = recorder.wait(stream, screen)?;
-            if !status.success() {
-                screen.warn(&format!(
+        if self.recorder.is_none() && self.lambdas.iter().any(|it| is_recorded(&it)) {
+            let recorded = self.lambdas.iter().filter(is_recorded).map(|it| &it.lambda);
+            let Some(ingress) =
+                unless_gone(self.ingress.control.add_reader(&grants::recorder(args)))?
+            else {
+                return Ok(());
+            };
+            let started = RecorderProcess::start(self.context, recorded, ingress, &self.sender)?;
+            self.recorder = Some(started);
+        }
+        for index in 0..self.lambdas.len() {
+            if self.lambdas[index].is_due() {
+                self.start_lambda(index)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Starts the process of a lambda. Does nothing if the ingress or the recorder has ended, which
+    /// the caller notices.
+    fn start_lambda(&mut self, index: usize) -> Result<(), Failure> {
+        let Self { context, ingress, recorder, .. } = self;
+        let supervised = &mut self.lambdas[index];
+        let (lambda, start) = (&supervised.lambda, supervised.restarts);
+        let recorder = recorder.as_mut().filter(|_| lambda.manifest.record.is_some());
+        let reader = grants::lambda(lambda, context.args, recorder.is_some(), start);
+        let mut connections = Handover::default();
+        if let Some(recorder) = recorder {
+            let topics = recorder.topics.take_new(lambda);
+            if !topics.is_empty() {
+                let reader = grants::RECORDER.to_owned();
+                let added = ingress.control.add_topics(&AddTopics { reader, topics });
+                if unless_gone(added)?.is_none() {
+                    return Ok(());
+                }
+            }
+            let add = AddLambda {
+                lambda: lambda.folder.clone(),
+                remaps: lambda.remaps(),
+                most: self.limits,
+                grants: recorder.topics.ids(lambda),
+            };
+            let Some(socket) = unless_gone(recorder.control.add(&add))? else { return Ok(()) };
+            connections.recorder = Some(socket);
+        }
+        let Some(socket) = unless_gone(ingress.control.add_reader(&reader))? else {
+            return Ok(());
+        };
+        connections.ingress = Some(socket);
+        let child = ChildProcess::start(
+            &context.parts,
+            ("gleaner-runtime", ChildId::Lambda { index, start }),
+            arguments::runtime(context.args, lambda, context.offset_ns, start),
+            Some(arguments::shim(context.args, lambda, start)),
+            connections,
+            &self.sender,
+        )?;
+        supervised.started(child);
+        Ok(())
+    }
+
+    /// Returns the lambdas whose processes have ended, after showing the rest of their output.
+    fn ended_lambdas(&mut self) -> Result<Vec<(usize, ExitStatus)>, Failure> {
+        let mut ended = Vec::new();
+        for index in 0..self.lambdas.len() {
+            if let Some(status) = self.lambdas[index].status()? {
+                self.drain(|group| group.lambdas[index].has_output());
+                ended.push((index, status));
+            }
+        }
+        Ok(ended)
+    }
+
+    /// Returns the end of the group if the ingress or the recorder has ended, or receives nothing
+    /// more.
+    fn ended_service(&mut self) -> Result<Option<GroupEnd>, Failure> {
+        // A damaged drive ends as another one does.
+        if let Some(why) = self.ingress.dead().filter(|_| self.context.args.drive.is_empty()) {
+            return Ok(Some(GroupEnd::Broken(format!("the ingress does not receive: {why}"))));
+        }
+        let status = match self.ingress.child.status()? {
+            Some(status) => Some(("the ingress", self.ingress.is_ready, status)),
+            None => match &mut self.recorder {
+                Some(recorder) => {
+                    let status = recorder.child.status()?;
+                    status.map(|status| ("the recorder", recorder.is_ready, status))
+                }
+                None => None,
+            },
+        };
+        Ok(status.map(|(name, is_ready, status)| {
+            match status.code().and_then(Exit::from_code) {
+                // It has printed the cause.
+                Some(exit) if !is_ready && exit != Exit::Ok => GroupEnd::NotStarted(exit),
+                _ => GroupEnd::Broken(ended(name, status)),
+            }
+        }))
+    }
+
+    /// Ends all processes: those that read before those that they read from, so that nothing is
+    /// lost. `is_requested` is false if another process than a lambda's has failed.
+    fn end_all(&mut self, is_requested: bool) -> Result<(), Failure> {
+        self.lambdas.iter_mut().for_each(SupervisedLambda::terminate);
+        while self.lambdas.iter().any(SupervisedLambda::is_running) {
+            self.poll(POLL_INTERVAL);
+            for (index, status) in self.ended_lambdas()? {
+                let lambda = &mut self.lambdas[index];
+                if is_requested {
+                    lambda.ended(status, true, self.screen, self.failures);
+                } else {
+                    lambda.interrupted(self.screen, self.failures);
+                }
+            }
+            self.lambdas.iter_mut().for_each(|lambda| lambda.kill_if_late(self.screen));
+        }
+        if let Some(recorder) = &mut self.recorder {
+            // Fails if it has ended meanwhile, and then has nothing to complete.
+            let _ = recorder.control.stop();
+            let status = self.wait(|group| group.recorder.as_mut().map(|it| &mut it.child))?;
+            if let Some(status) = status.filter(|status| !status.success()) {
+                self.screen.warn(&format!(
                     "{}: clips may be unfinished, and are recovered by the next run",
                     ended("the recorder", status)
                 ));
             }
         }
-        stream.drain(screen, DRAIN_TIMEOUT);
-        let record = ExitRecord::read(exit_record).ok();
-        // A lambda can end its process as if that had been requested. The shim records whether it
-        // was requested, and in time.
-        let requested = record.as_ref().map_or(requested, |record| record.end_requested);
-        Ok(match status.code().and_then(Exit::from_code) {
-            // Ended before it could handle the signal.
-            None if requested && !stream.is_ready => RunEnd::Complete(Exit::Ok),
-            Some(exit @ (Exit::Ok | Exit::LambdaFaulted)) if requested && stream.has_ended => {
-                RunEnd::Complete(exit)
+        // Fails if it has ended meanwhile.
+        let _ = self.ingress.control.stop();
+        self.wait(|group| Some(&mut group.ingress.child))?;
+        self.drain(|group| {
+            let recorder = group.recorder.as_ref().map_or(0, |recorder| recorder.open_pipes);
+            group.ingress.open_pipes > 0 || recorder > 0
+        });
+        Ok(())
+    }
+
+    /// Waits for the end of a process, and shows output meanwhile.
+    fn wait(
+        &mut self,
+        child: impl Fn(&mut Self) -> Option<&mut ChildProcess>,
+    ) -> Result<Option<ExitStatus>, Failure> {
+        loop {
+            let Some(process) = child(self) else { return Ok(None) };
+            if let Some(status) = process.status()? {
+                return Ok(Some(status));
             }
-            Some(exit) if !stream.is_ready && exit != Exit::Ok => RunEnd::NotStarted(exit),
-            _ => {
-                let reason = record.as_ref().and_then(ExitRecord::sentence);
-                let faulted =
-                    stream.has_faulted || record.is_some_and(|record| record.is_caused_by_lambda());
-                let reason = reason.map_or_else(
-                    || ended("the lambda's process", status),
-                    |reason| format!("the lambda's process {reason}"),
-                );
-                RunEnd::Broken { reason, faulted }
+            if let Some(warning) = process.kill_if_late() {
+                self.screen.warn(&warning);
             }
-        })
+            self.poll(POLL_INTERVAL);
+        }
+    }
+
+    /// Shows output while `is_open`, for [`DRAIN_TIMEOUT`] at most.
+    fn drain(&mut self, is_open: impl Fn(&mut Self) -> bool) {
+        let until = Instant::now() + DRAIN_TIMEOUT;
+        while is_open(self) {
+            let left = until.saturating_duration_since(Instant::now());
+            match self.output.recv_timeout(left) {
+                Ok(output) => self.show(output),
+                Err(_) => return,
+            }
+        }
+    }
+
+    /// Waits for output and shows what is pending. Returns after `timeout` at the latest, so that a
+    /// flood of output does not block the caller.
+    fn poll(&mut self, timeout: Duration) {
+        let until = Instant::now() + timeout;
+        let mut wait = timeout;
+        while let Ok(output) = self.output.recv_timeout(wait) {
+            self.show(output);
+            if Instant::now() >= until {
+                return;
+            }
+            wait = Duration::ZERO;
+        }
+    }
+
+    fn show(&mut self, ChildOutput { from, piece }: ChildOutput) {
+        let Self { lambdas, ingress, recorder, screen, .. } = self;
+        let (prefix, mut current) = match from {
+            ChildId::Lambda { index, start } => {
+                let supervised = &mut lambdas[index];
+                let prefix = supervised.lambda.prefix.clone();
+                // Processes that an earlier one left running may still write into its pipes.
+                (prefix, Some(supervised).filter(|current| current.restarts == start))
+            }
+            ChildId::Ingress | ChildId::Recorder => (String::new(), None),
+        };
+        match piece {
+            OutputPiece::Stderr { text, begins_line } => {
+                let prefix = if begins_line { prefix.as_bytes() } else { b"" };
+                screen.err(&[prefix, &text].concat());
+            }
+            OutputPiece::Unparsable(line) => {
+                screen.warn(&format!("{prefix}cannot parse a report: {line}"));
+            }
+            OutputPiece::Runtime(report) => {
+                if let Some(current) = &mut current {
+                    current.show(report, ingress.drive_ended, screen);
+                }
+            }
+            OutputPiece::Ingress(report) => ingress.show(report, screen),
+            OutputPiece::Recorder(report) => {
+                if let Some(recorder) = recorder {
+                    recorder.show(report, screen);
+                }
+            }
+            OutputPiece::Closed => match (from, current, recorder) {
+                (ChildId::Ingress, ..) => ingress.open_pipes -= 1,
+                (ChildId::Recorder, _, Some(recorder)) => recorder.open_pipes -= 1,
+                (_, Some(current), _) => current.closed(),
+                _ => {}
+            },
+        }
     }
 }
 
-/// Shows why the recorder ended before it knew the lambda: it prints the cause.
-fn recorder_not_started<T>(
-    mut recorder: ChildProcess,
-    mut stream: ReportStream,
-    screen: &mut Screen,
-) -> Result<T, Failure> {
-    let status = recorder.wait(&mut stream, screen)?;
-    stream.drain(screen, DRAIN_TIMEOUT);
-    let exit = status.code().and_then(Exit::from_code).filter(|exit| *exit != Exit::Ok);
-    let failure = Failure::new(exit.unwrap_or(Exit::Internal), ended("the recorder", status));
-    Err(failure.with_help("see its message above; to run without clips: --no-record"))
-}
-
-fn ended(process: &str, status: ExitStatus) -> String {
-    format!("{process} ended by itself ({status})")
+/// Returns the result of a request to the ingress or the recorder; `None` if it has ended, which
+/// its exit status explains.
+fn unless_gone<T>(requested: Result<T, LinkError>) -> Result<Option<T>, Failure> {
+    match requested {
+        Ok(result) => Ok(Some(result)),
+        Err(LinkError::Gone { .. }) => Ok(None),
+        Err(error) => Err(Failure::because("cannot connect the processes of the run", &error)),
+    }
 }

@@ -1,12 +1,13 @@
 //! Prints the output of a live run: permanent lines, and below them the current statistics.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Write};
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision};
+use gleaner_protocol::ingress::IngressStatus;
 use gleaner_protocol::link::RecorderStatus;
-use gleaner_protocol::{LiveStatus, LiveTopic};
+use gleaner_protocol::{LiveStatus, LiveTopic, Report};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
@@ -22,6 +23,8 @@ pub(super) struct Screen {
     paint: Paint,
     /// Topics without a writer for which a warning was printed.
     warned: HashSet<String>,
+    /// Last status of each running lambda, formatted, by its name.
+    lambdas: BTreeMap<String, String>,
     /// Last status of the recorder, formatted.
     recorder: String,
     /// The statistics; indicatif hides them if standard error is not a terminal.
@@ -40,6 +43,7 @@ impl Screen {
             json,
             paint: Paint::of_stdout(),
             warned: HashSet::new(),
+            lambdas: BTreeMap::new(),
             recorder: String::new(),
             below: below.with_style(style),
         }
@@ -52,6 +56,13 @@ impl Screen {
         }
     }
 
+    /// Prints a report of a lambda's process with `--json`.
+    pub(super) fn lambda_report(&self, lambda: &str, report: &Report) {
+        if self.json {
+            self.out(&render::json_line(&render::named_report(lambda, report)));
+        }
+    }
+
     /// Prints permanent text, unless `--json` is set.
     pub(super) fn print(&self, text: &str) {
         if !self.json {
@@ -59,37 +70,62 @@ impl Screen {
         }
     }
 
-    pub(super) fn decision(&self, decision: &Decision) {
-        self.print(&render::decision(decision, self.paint));
+    /// Reports that a lambda is ready. `prefix` is its name before each line, if there are several.
+    pub(super) fn ready(&self, prefix: &str) {
+        let how_to_end = if prefix.is_empty() { "; Ctrl-C ends it" } else { "" };
+        self.print(&format!("{prefix}running{how_to_end}\n"));
+    }
+
+    pub(super) fn decision(&self, prefix: &str, decision: &Decision) {
+        self.print(&render::decision(decision, prefix, self.paint));
     }
 
     pub(super) fn clip(&self, clip: &Clip) {
         self.print(&render::clip_line(clip, self.paint));
     }
 
-    /// Updates the status of the recorder, which is shown below that of the lambda.
+    /// Updates the status of the recorder, which is shown below those of the lambdas.
     pub(super) fn recorder(&mut self, status: &RecorderStatus) {
         self.recorder = render::recorder(status, self.paint);
     }
 
     /// Prints the final status of the recorder.
     pub(super) fn recorder_ended(&mut self, status: &RecorderStatus) {
+        self.recorder.clear();
         self.print(&render::recorder(status, self.paint));
     }
 
-    /// Updates the status of the lambda.
-    pub(super) fn live(&mut self, live: &LiveStatus) {
+    /// Updates the status of a lambda.
+    pub(super) fn live(&mut self, lambda: &str, live: &LiveStatus) {
         self.warn_of_missing_writers(live);
+        self.lambdas.insert(lambda.to_owned(), render::live(live, self.paint));
+    }
+
+    /// Removes the status of a lambda whose process has ended.
+    pub(super) fn gone(&mut self, lambda: &str) {
+        self.lambdas.remove(lambda);
+    }
+
+    /// Shows the status of the ingress, and below it the last ones of all others. The ingress has
+    /// one each second.
+    pub(super) fn ingress(&mut self, status: &IngressStatus) {
         if !self.stats {
             return;
         }
-        let text = render::live(live, self.paint) + &self.recorder;
+        let lambdas: String = self.lambdas.values().map(String::as_str).collect();
+        let text = render::ingress(status, self.paint) + &lambdas + &self.recorder;
         if self.below.is_hidden() {
             self.out(&text);
         } else {
             self.below.set_message(text.trim_end().to_owned());
             self.below.tick();
         }
+    }
+
+    /// Prints the final status of the ingress.
+    pub(super) fn ingress_ended(&mut self, status: &IngressStatus) {
+        self.clear();
+        self.print(&render::ingress(status, self.paint));
     }
 
     /// Warns once about each topic without a writer.
@@ -109,16 +145,21 @@ impl Screen {
         }
     }
 
-    /// Prints the final status of the lambda.
-    pub(super) fn ended(&self, live: &LiveStatus) {
-        // Clears the statistics. After a restart they are shown again.
-        self.below.set_message("");
-        self.below.tick();
+    /// Prints the final status of a lambda.
+    pub(super) fn ended(&mut self, lambda: &str, live: &LiveStatus) {
+        self.gone(lambda);
+        self.clear();
         self.print(&render::live(live, self.paint));
         self.print(&format!(
             "  {}: decisions.jsonl, log.jsonl, summary.json\n",
             visible(&live.out.to_string_lossy())
         ));
+    }
+
+    /// Clears the statistics. The next status of the ingress shows them again.
+    fn clear(&self) {
+        self.below.set_message("");
+        self.below.tick();
     }
 
     pub(super) fn warn(&self, text: &str) {

@@ -1,4 +1,4 @@
-//! Completes `summary.json` of a run with the counts of the recorder and of restarted processes.
+//! Completes `summary.json` of a lambda with the counts of ingress, recorder and earlier processes.
 //!
 //! Each process counts only its own events, and `gleaner-shim` writes only those of one process.
 
@@ -6,38 +6,65 @@ use std::path::Path;
 
 use gleaner_base::{Exit, Failure, PlainFile, write_atomically};
 use gleaner_lambda::results::SUMMARY_MAX;
-use gleaner_protocol::LiveStatus;
+use gleaner_protocol::ingress::IngressStatus;
 use gleaner_protocol::link::RecorderStatus;
+use gleaner_protocol::{LiveStatus, NetworkStatus};
 
-/// Sum of the counts of ended processes of a run.
+/// Sums of the counts of all ingresses and all recorders of a run.
+#[derive(Default)]
+pub(super) struct RunCounts {
+    /// `None` without a network.
+    network: Option<NetworkStatus>,
+    /// `None` without a recorder.
+    recorder: Option<Box<RecorderStatus>>,
+}
+
+impl RunCounts {
+    /// Adds the last statuses of an ingress and of a recorder.
+    pub(super) fn add(
+        &mut self,
+        ingress: Option<Box<IngressStatus>>,
+        recorder: Option<Box<RecorderStatus>>,
+    ) {
+        let network = ingress.and_then(|ingress| ingress.health.network);
+        self.network = match (network, self.network.take()) {
+            (Some(last), Some(before)) => Some(NetworkStatus {
+                socket_drops: last.socket_drops.saturating_add(before.socket_drops),
+                filtered: last.filtered.saturating_add(before.filtered),
+                ..last
+            }),
+            (last, before) => last.or(before),
+        };
+        self.recorder = match (recorder, self.recorder.take()) {
+            (Some(last), Some(before)) => Some(Box::new(last.after(&before))),
+            (last, before) => last.or(before),
+        };
+    }
+
+    /// Returns the counts of the recorder for a summary. The network is counted once, with the
+    /// lambda, and warnings about a thousand topics could exceed the maximum size of a summary.
+    fn recorder(&self) -> Option<Box<RecorderStatus>> {
+        let mut recorder = self.recorder.clone()?;
+        recorder.network = None;
+        recorder.topics.iter_mut().for_each(|topic| topic.qos_warnings.clear());
+        Some(recorder)
+    }
+}
+
+/// Sum of the counts of ended processes of a lambda.
 #[derive(Default)]
 pub(super) struct EarlierCounts {
     live: Option<LiveStatus>,
-    recorder: Option<Box<RecorderStatus>>,
     /// Wakes during which their process ended, so that it did not count them.
     lost_wakes: u64,
 }
 
 impl EarlierCounts {
-    /// Adds the last statuses of an ended lambda process and recorder. If a process failed, up to a
-    /// second of counts is missing.
-    pub(super) fn add(
-        &mut self,
-        last: Option<LiveStatus>,
-        recorder: Option<Box<RecorderStatus>>,
-        has_lost_wake: bool,
-    ) {
+    /// Adds the last status of an ended process. If it failed, up to a second of counts is missing.
+    pub(super) fn add(&mut self, last: Option<LiveStatus>, has_lost_wake: bool) {
         self.lost_wakes += u64::from(has_lost_wake);
-        self.add_recorded(recorder);
         self.live = match (last, self.live.take()) {
             (Some(last), Some(before)) => Some(last.after(&before)),
-            (last, before) => last.or(before),
-        };
-    }
-
-    fn add_recorded(&mut self, recorder: Option<Box<RecorderStatus>>) {
-        self.recorder = match (recorder, self.recorder.take()) {
-            (Some(last), Some(before)) => Some(Box::new(last.after(&before))),
             (last, before) => last.or(before),
         };
     }
@@ -49,18 +76,13 @@ impl EarlierCounts {
     ///
     /// A failure that names the file.
     pub(super) fn complete(
-        mut self,
+        self,
         last: Option<LiveStatus>,
-        recorder: Option<Box<RecorderStatus>>,
+        counts: &RunCounts,
         out: &Path,
     ) -> Result<(), Failure> {
-        self.add_recorded(recorder);
-        let Self { live, mut recorder, lost_wakes } = self;
-        // Warnings about a thousand topics could exceed the maximum size of a summary.
-        recorder
-            .iter_mut()
-            .flat_map(|status| &mut status.topics)
-            .for_each(|topic| topic.qos_warnings.clear());
+        let Self { live, lost_wakes } = self;
+        let recording = counts.recorder();
         // Not the path in the report, which comes from the lambda's process.
         let path = out.join("summary.json");
         let last =
@@ -68,12 +90,14 @@ impl EarlierCounts {
         let sum = match (last, live) {
             (Some(last), Some(before)) => last.after(&before),
             (None, Some(before)) => before,
-            (Some(last), None) if lost_wakes > 0 || recorder.is_some() => last,
+            (Some(last), None) if lost_wakes > 0 || recording.is_some() => last,
             _ => return Ok(()),
         };
         let sum = LiveStatus {
             faults: sum.faults.saturating_add(lost_wakes),
-            recording: recorder,
+            // Each process reports the counts of the ingress since the start of the ingress.
+            network: counts.network.clone().unwrap_or(sum.network),
+            recording,
             ..sum
         };
         let mut text = serde_json::to_vec_pretty(&sum).expect("counts are plain data");
@@ -106,6 +130,7 @@ mod tests {
     use std::fs;
 
     use gleaner_protocol::RecordingCounts;
+    use gleaner_protocol::ingress::Health;
 
     use super::*;
 
@@ -121,7 +146,23 @@ mod tests {
 
     fn recorder(disk_suppressed: u64) -> Option<Box<RecorderStatus>> {
         let recording = RecordingCounts { disk_suppressed, ..RecordingCounts::default() };
-        Some(Box::new(RecorderStatus { recording, ..RecorderStatus::default() }))
+        let network = Some(NetworkStatus { socket_drops: 99, ..NetworkStatus::default() });
+        Some(Box::new(RecorderStatus { recording, network, ..RecorderStatus::default() }))
+    }
+
+    fn ingress(socket_drops: u64) -> Option<Box<IngressStatus>> {
+        let network = Some(NetworkStatus { socket_drops, ..NetworkStatus::default() });
+        let health = Health { network, dead: None };
+        Some(Box::new(IngressStatus { health, ..IngressStatus::default() }))
+    }
+
+    /// Returns the sum of the statuses of these processes.
+    fn counts(
+        all: impl IntoIterator<Item = (Option<Box<IngressStatus>>, Option<Box<RecorderStatus>>)>,
+    ) -> RunCounts {
+        let mut counts = RunCounts::default();
+        all.into_iter().for_each(|(ingress, recorder)| counts.add(ingress, recorder));
+        counts
     }
 
     /// Returns `summary.json` after `complete`, if the shim has written `before`.
@@ -136,7 +177,8 @@ mod tests {
     #[test]
     fn the_counts_of_the_recorder_are_added_to_those_of_the_shim() {
         let summary = completed(&live(5, 3), |out| {
-            EarlierCounts::default().complete(Some(live(5, 1)), recorder(7), out).unwrap();
+            let counts = counts([(None, recorder(7))]);
+            EarlierCounts::default().complete(Some(live(5, 1)), &counts, out).unwrap();
         });
         assert_eq!((summary.wakes, summary.unwritten), (5, 3));
         assert_eq!(summary.recording.unwrap().recording.disk_suppressed, 7);
@@ -145,7 +187,8 @@ mod tests {
     #[test]
     fn the_summary_of_the_shim_stays_if_there_is_nothing_to_add() {
         let summary = completed(&live(5, 3), |out| {
-            EarlierCounts::default().complete(Some(live(5, 1)), None, out).unwrap();
+            let counts = counts([(ingress(4), None)]);
+            EarlierCounts::default().complete(Some(live(5, 1)), &counts, out).unwrap();
         });
         assert_eq!(summary, live(5, 3));
     }
@@ -154,11 +197,29 @@ mod tests {
     fn recorders_are_summed_up_even_if_their_lambda_reported_nothing() {
         let summary = completed(&live(5, 3), |out| {
             let mut earlier = EarlierCounts::default();
-            earlier.add(Some(live(10, 0)), recorder(1), false);
-            earlier.add(None, recorder(20), true);
-            earlier.complete(Some(live(5, 1)), recorder(300), out).unwrap();
+            earlier.add(Some(live(10, 0)), false);
+            earlier.add(None, true);
+            let counts = counts([1, 20, 300].map(|count| (None, recorder(count))));
+            earlier.complete(Some(live(5, 1)), &counts, out).unwrap();
         });
         assert_eq!((summary.wakes, summary.faults, summary.unwritten), (15, 1, 3));
         assert_eq!(summary.recording.unwrap().recording.disk_suppressed, 321);
+    }
+
+    #[test]
+    fn losses_of_the_network_are_counted_once_for_several_processes_and_per_ingress() {
+        let summary = completed(&live(5, 0), |out| {
+            let with_drops = |wakes, socket_drops| {
+                let network = NetworkStatus { socket_drops, ..NetworkStatus::default() };
+                LiveStatus { network, ..live(wakes, 0) }
+            };
+            let mut earlier = EarlierCounts::default();
+            earlier.add(Some(with_drops(1, 3)), false);
+            earlier.add(Some(with_drops(1, 3)), false);
+            let counts = counts([(ingress(3), recorder(0)), (ingress(40), recorder(0))]);
+            earlier.complete(Some(with_drops(1, 40)), &counts, out).unwrap();
+        });
+        assert_eq!((summary.wakes, summary.network.socket_drops), (3, 43));
+        assert_eq!(summary.recording.unwrap().network, None);
     }
 }

@@ -140,7 +140,7 @@ impl DriverInstance {
             transport.add_topic(topic, name, text);
         }
         let inputs =
-            open_inputs(manifest, &[], &mut transport, None).expect("the inputs fit into memory");
+            open_inputs(manifest, &[], &mut transport).expect("the inputs fit into memory");
         let session = Session::new(inputs.clone(), Vec::new(), &manifest.limits);
         let guest = WasmGuest::new(loaded.clone(), session.clone(), &manifest.limits, None)
             .expect("descriptors are left");
@@ -183,7 +183,7 @@ impl DriverInstance {
         self.session.begin(at_ns);
         // The instance may hold all samples: then there is no slot for the program, and the
         // previous program runs again.
-        let newest = self.inputs[0].newest();
+        let newest = self.inputs[0].newest().expect("a ring of this process");
         let ran = newest.as_ref().is_some_and(|sample| sample.identity().seq == self.sent);
         let outcome = newest.map(|sample| self.guest.wake(Wake::Event(sample)));
         let (log, digest) = self.session.take_log();

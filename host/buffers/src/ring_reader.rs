@@ -68,7 +68,7 @@ impl<M> RingReader<M> {
     }
 
     /// Returns the metadata of the sample at `position`, as [`RingReader::get`], but without a
-    /// hold.
+    /// hold in shared memory.
     pub fn meta(&self, position: u64) -> Option<M>
     where
         M: Clone,
@@ -76,6 +76,19 @@ impl<M> RingReader<M> {
         match &self.0 {
             RingKind::Heap(_) => self.get(position).map(|lease| lease.meta().clone()),
             RingKind::Shared(ring) => ring.meta(position),
+        }
+    }
+
+    /// Returns position and metadata of the newest sample, without a hold in shared memory.
+    pub fn newest_meta(&self) -> Option<(u64, M)>
+    where
+        M: Clone,
+    {
+        match &self.0 {
+            RingKind::Heap(ring) => {
+                ring.newest_at(u64::MAX).map(|(lease, position)| (position, lease.meta().clone()))
+            }
+            RingKind::Shared(ring) => ring.newest_meta(),
         }
     }
 

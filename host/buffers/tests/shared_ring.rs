@@ -51,10 +51,12 @@ fn positions_count_from_the_first_sample_of_the_reader() {
     let ring = ring(&reader, 10, 3);
     assert_eq!((ring.head(), ring.depth()), (0, 3));
     assert!(ring.newest().is_none() && ring.get(0).is_none() && ring.meta(0).is_none());
+    assert_eq!(ring.newest_meta(), None);
     publish(&mut writer, 2);
     let newest = ring.newest().unwrap();
     assert_eq!((value(&newest), newest.position()), (11, Some(1)));
     assert_eq!((ring.get(0).map(|it| value(&it)), ring.meta(0)), (Some(10), Some(10)));
+    assert_eq!(ring.newest_meta(), Some((1, 11)));
     let mut all = Vec::new();
     ring.last(9, &mut all);
     assert_eq!(values(&all), [10, 11], "samples from before it are hidden");
@@ -143,4 +145,26 @@ fn reads_without_a_free_word_are_counted_and_words_return() {
     assert_eq!((ring.refused_holds(), ring.meta(4)), (3, Some(4)));
     kept.pop();
     assert_eq!((ring.newest().map(|it| value(&it)), ring.refused_holds()), (Some(4), 3));
+}
+
+#[test]
+fn without_a_word_for_a_window_its_samples_take_words_for_single_ones() {
+    let (mut writer, reader) = topic();
+    let ring = ring(&reader, 0, 4);
+    let mut kept = Vec::new();
+    for _ in 0..3 {
+        publish(&mut writer, 2);
+        let mut window = Vec::new();
+        ring.last(2, &mut window);
+        kept.push(window);
+    }
+    assert_eq!(ring.refused_holds(), 0);
+    publish(&mut writer, 100);
+    assert_eq!(kept.iter().map(|it| values(it)).collect::<Vec<_>>(), [[0, 1], [2, 3], [4, 5]]);
+    let mut more = Vec::new();
+    ring.last(2, &mut more);
+    assert_eq!((more.len(), ring.refused_holds()), (0, 1));
+    kept.pop();
+    ring.last(2, &mut more);
+    assert_eq!(values(&more), [104, 105]);
 }

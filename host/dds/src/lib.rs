@@ -11,15 +11,17 @@
 //!
 //! Never here: a sink that does more than copy while a lock of RustDDS is held; parsing of
 //! messages, other than those of the ROS 2 graph and type descriptions; a packet sent elsewhere
-//! than RustDDS sends it.
+//! than RustDDS sends it, and none with other bytes.
 //!
 //! RustDDS does not expose bytes 2 and 3 of a sample's encapsulation (they are given as zeros). It
 //! drops samples that are badly broken by itself; they show as lost.
 //!
 //! [`Qos::Auto`]: gleaner_transport::Qos::Auto
 
+mod announcer;
 #[cfg(feature = "clap")]
 mod arguments;
+mod before_match;
 mod bpf;
 mod clock_watch;
 mod definitions_cache;
@@ -45,7 +47,8 @@ mod type_query;
 mod watchdog;
 mod writer;
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -59,6 +62,7 @@ pub use discovery::DomainTopic;
 pub use options::{DdsError, DdsOptions, Distro};
 pub use writer::TopicWriter;
 
+use announcer::{Announcements, Announcer};
 use definitions_cache::DefinitionsCache;
 use gleaner_base::text::nearest;
 use gleaner_messages::{Definitions, Sources};
@@ -100,8 +104,10 @@ pub struct Dds {
     watchdog: Mutex<Watchdog>,
     domain: u16,
     buffer: (usize, usize),
-    /// Topic, type and status of each subscription.
-    subscriptions: Vec<(TopicSpec, Arc<SubscriptionStatus>)>,
+    /// Topic, type and status of each subscription, by its number.
+    subscriptions: BTreeMap<usize, (TopicSpec, Arc<SubscriptionStatus>)>,
+    /// Number of the next subscription.
+    next: usize,
     definitions: Mutex<DefinitionsCache>,
 }
 
@@ -128,6 +134,7 @@ impl Dds {
         };
         let signal_mask = SignalMask::block();
         let no_join = NoJoin::at(sockets::port_of_samples(options.domain));
+        let announcements = Announcements::of(options.domain);
         let participant = builder.build().map_err(join)?;
         drop(no_join);
         drop(signal_mask);
@@ -139,7 +146,10 @@ impl Dds {
         drop(opening);
         let state = Arc::new(ParticipantState::default());
         let filter = PacketFilter::new(&sockets, peers::prefix(&participant.guid()), &state);
-        let (receiver, thread) = receive::start(&options, node, &participant, filter, &state)?;
+        let own = peers::prefix(&participant.guid());
+        let announcer = Announcer::new(announcements, own, options.domain, &options.interfaces);
+        let (receiver, thread) =
+            receive::start(&options, node, &participant, (filter, announcer), &state)?;
         info!(domain = options.domain, node = options.node, "joined");
         Ok(Self {
             participant,
@@ -149,7 +159,8 @@ impl Dds {
             watchdog: Mutex::new(Watchdog::new(sockets, threads)),
             domain: options.domain,
             buffer: (asked, granted(asked, needed)),
-            subscriptions: Vec::new(),
+            subscriptions: BTreeMap::new(),
+            next: 0,
             definitions: Mutex::new(DefinitionsCache::new(Sources::new(
                 &options.messages,
                 &options.prefixes,
@@ -183,7 +194,7 @@ impl Dds {
 
     /// The type of a topic: as it is subscribed, else as others write or read it.
     fn type_of(&self, topic: &str) -> Result<String, TransportError> {
-        if let Some((spec, _)) = self.subscriptions.iter().find(|(spec, _)| spec.topic == topic) {
+        if let Some((spec, _)) = self.subscriptions.values().find(|(spec, _)| spec.topic == topic) {
             return Ok(spec.type_name.clone());
         }
         let known = self.discovered();
@@ -233,7 +244,7 @@ impl Transport for Dds {
         sink: Arc<dyn Sink>,
     ) -> Result<Subscription, TransportError> {
         let status = Arc::new(SubscriptionStatus::default());
-        let index = self.subscriptions.len();
+        let index = self.next;
         let Some(reader) = TopicReader::new(index, spec, sink, status.clone()) else {
             let (topic, type_name) = (names::visible(&spec.topic), names::visible(&spec.type_name));
             return Err(match names::dds_topic(&spec.topic) {
@@ -242,7 +253,8 @@ impl Transport for Dds {
             });
         };
         self.receiver.send(ReceiverCommand::Subscribe(Box::new(reader)));
-        self.subscriptions.push((spec.clone(), status));
+        self.subscriptions.insert(index, (spec.clone(), status));
+        self.next += 1;
         Ok(Subscription(index))
     }
 
@@ -264,7 +276,7 @@ impl Transport for Dds {
 
     fn status(&self, subscription: Subscription) -> ReceptionStatus {
         self.subscriptions
-            .get(subscription.0)
+            .get(&subscription.0)
             .map(|(_, status)| status.status(&self.state))
             .unwrap_or_default()
     }
@@ -273,9 +285,8 @@ impl Transport for Dds {
 impl LiveSource for Dds {
     /// A dead participant is detected after ten calls.
     fn health(&self) -> Health {
-        let topics: Vec<String> =
-            self.subscriptions.iter().map(|(spec, _)| spec.topic.clone()).collect();
-        let (queues, dead) = lock(&self.watchdog).check(&self.state, &topics);
+        let topic = |index: usize| self.subscriptions.get(&index).map(|(spec, _)| &*spec.topic);
+        let (queues, dead) = lock(&self.watchdog).check(&self.state, topic);
         let ended = self.thread.as_ref().is_none_or(JoinHandle::is_finished);
         let network = NetworkStatus {
             domain: self.domain,
@@ -293,7 +304,14 @@ impl LiveSource for Dds {
         Health { network: Some(network), dead }
     }
 
-    fn unsubscribe(&mut self, _: Subscription) {}
+    /// The reader, its entry in the graph and its status are gone as soon as the receive thread
+    /// handles the command. RustDDS keeps the newest samples of the topic for a later subscription.
+    fn unsubscribe(&mut self, subscription: Subscription) {
+        if let Some((_, status)) = self.subscriptions.remove(&subscription.0) {
+            status.ended.store(true, Ordering::Relaxed);
+            self.receiver.send(ReceiverCommand::Unsubscribe(subscription.0));
+        }
+    }
 
     fn publisher(
         &self,

@@ -2,6 +2,7 @@
 //! writers.
 
 use std::cell::RefCell;
+use std::collections::BTreeMap;
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -11,8 +12,12 @@ use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 
 use mio::{Events, Interest, Poll, Token, Waker};
-use rustdds::{DomainParticipant, DomainParticipantStatusListener, GUID, StatusEvented};
+use rustdds::{
+    DomainParticipant, DomainParticipantStatusEvent, DomainParticipantStatusListener, GUID,
+    StatusEvented,
+};
 
+use super::announcer::Announcer;
 use super::clock_watch::ClockWatch;
 use super::graph::GraphNode;
 use super::packet_filter::PacketFilter;
@@ -39,6 +44,8 @@ const SHARED_BYTES: usize = 1 << 20;
 /// A command to the receive thread.
 pub(super) enum ReceiverCommand {
     Subscribe(Box<TopicReader>),
+    /// Ends the subscription with this number.
+    Unsubscribe(usize),
     Writer(GUID),
     WriterGone(GUID),
     Query(TypeQuery),
@@ -66,11 +73,13 @@ struct Receiver {
     commands: mpsc::Receiver<ReceiverCommand>,
     participant: DomainParticipant,
     listener: DomainParticipantStatusListener,
-    readers: Vec<TopicReader>,
+    /// Subscriptions, by their number.
+    readers: BTreeMap<usize, TopicReader>,
     writers: Vec<GUID>,
     graph: GraphNode,
     querier: TypeQuerier,
     filter: PacketFilter,
+    announcer: Announcer,
     state: Arc<ParticipantState>,
     memory: RefCell<Vec<u8>>,
     clock: Clock,
@@ -87,7 +96,7 @@ pub(super) fn start(
     options: &DdsOptions,
     node: (String, String),
     participant: &DomainParticipant,
-    filter: PacketFilter,
+    (filter, announcer): (PacketFilter, Announcer),
     state: &Arc<ParticipantState>,
 ) -> Result<(ReceiverHandle, JoinHandle<()>), DdsError> {
     let join = |source: io::Error| DdsError::Join { domain: options.domain, source: source.into() };
@@ -102,11 +111,12 @@ pub(super) fn start(
         commands: receiver,
         participant: participant.clone(),
         listener,
-        readers: Vec::new(),
+        readers: BTreeMap::new(),
         writers: Vec::new(),
         graph,
         querier: TypeQuerier::default(),
         filter,
+        announcer,
         state: state.clone(),
         memory: RefCell::new(Vec::with_capacity(SHARED_BYTES)),
         clock: options.clock,
@@ -142,8 +152,8 @@ impl Receiver {
                     STATUS => self.note_events(),
                     GRAPH | ANSWER => self.changed = true,
                     token => {
-                        if let Some(reader) =
-                            topic_reader::index(token).and_then(|index| self.readers.get_mut(index))
+                        if let Some(reader) = topic_reader::index(token)
+                            .and_then(|index| self.readers.get_mut(&index))
                         {
                             reader.ready = true;
                         }
@@ -154,6 +164,7 @@ impl Receiver {
                 break;
             }
             self.take();
+            self.announcer.poll();
             if self.due() {
                 self.update();
             }
@@ -170,20 +181,27 @@ impl Receiver {
 
     /// Time until the next update is due.
     fn poll_timeout(&self) -> Duration {
-        if self.readers.iter().any(|reader| reader.ready) {
+        if self.readers.values().any(|reader| reader.ready) {
             return Duration::ZERO;
         }
         let every = if self.changed { UPDATE_MIN } else { UPDATE_MAX };
-        self.updated.map_or(Duration::ZERO, |updated| every.saturating_sub(updated.elapsed()))
+        let update =
+            self.updated.map_or(Duration::ZERO, |updated| every.saturating_sub(updated.elapsed()));
+        self.announcer.until_due(Instant::now()).map_or(update, |due| update.min(due))
     }
 
     fn handle_commands(&mut self) -> bool {
         while let Ok(command) = self.commands.try_recv() {
             match command {
                 ReceiverCommand::Subscribe(reader) => {
-                    self.readers.push(*reader);
+                    self.readers.insert(reader.index(), *reader);
                     // Its reader is created at once, not at the next change in the domain.
                     self.updated = None;
+                }
+                ReceiverCommand::Unsubscribe(index) => {
+                    if let Some(mut reader) = self.readers.remove(&index) {
+                        reader.remove_reader(self.poll.registry(), &self.state);
+                    }
                 }
                 ReceiverCommand::Writer(guid) => self.writers.push(guid),
                 ReceiverCommand::WriterGone(guid) => self.writers.retain(|writer| *writer != guid),
@@ -198,6 +216,9 @@ impl Receiver {
     fn note_events(&mut self) {
         while let Some(event) = self.listener.try_recv_status() {
             self.changed |= self.state.peers().note(&event);
+            if matches!(event, DomainParticipantStatusEvent::ParticipantDiscovered { .. }) {
+                self.announcer.restart();
+            }
             self.state.handled.fetch_add(1, Relaxed);
         }
     }
@@ -210,7 +231,7 @@ impl Receiver {
             memory: &self.memory,
             clock: self.clock,
         };
-        for reader in self.readers.iter_mut().filter(|reader| reader.ready) {
+        for reader in self.readers.values_mut().filter(|reader| reader.ready) {
             reader.take(&context, MOST_PER_TURN);
         }
     }
@@ -228,7 +249,7 @@ impl Receiver {
         let writers = self.participant.discovered_writers();
         let offers: Vec<Offer> = writers.iter().map(discovery::offer).collect();
         self.note_events();
-        let largest = self.readers.iter().map(TopicReader::largest).max().unwrap_or(0);
+        let largest = self.readers.values().map(TopicReader::largest).max().unwrap_or(0);
         let largest = largest.max(self.largest).max(self.querier.largest());
         // Before readers are created: fragments of the first sample have to pass. Each participant
         // is announced once; a known writer stands in for a participant that was missed.
@@ -246,7 +267,7 @@ impl Receiver {
             memory: &self.memory,
             clock: self.clock,
         };
-        for reader in &mut self.readers {
+        for reader in self.readers.values_mut() {
             reader.update(&context, &offers);
             // RustDDS stops at a change that is not a sample, such as a writer's leave; samples
             // after it are found here.
@@ -258,7 +279,7 @@ impl Receiver {
         self.querier.poll(&context, ANSWER, &writers, self.graph.nodes());
         // An open query is polled again soon.
         self.changed |= self.querier.is_open();
-        let readers = self.readers.iter().filter_map(TopicReader::guid).collect();
+        let readers = self.readers.values().filter_map(TopicReader::guid).collect();
         self.graph.update(&context, readers, &self.writers);
         // One unexpectedly large sample must not keep its memory for ever.
         let mut memory = self.memory.borrow_mut();

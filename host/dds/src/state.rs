@@ -1,7 +1,7 @@
 //! State that the receive thread shares with the callers of [`Dds`](super::Dds).
 
 use std::collections::{HashMap, HashSet};
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use rustdds::GUID;
@@ -11,6 +11,9 @@ use super::peers::Peers;
 use super::type_query::QueryOutcome;
 use super::{Distro, names};
 use gleaner_transport::ReceptionStatus;
+
+/// A count that is unknown.
+pub(super) const UNKNOWN: u64 = u64::MAX;
 
 /// State of the participant.
 #[derive(Debug, Default)]
@@ -32,7 +35,11 @@ pub(super) struct ParticipantState {
 /// Status of one subscription.
 #[derive(Debug, Default)]
 pub(super) struct SubscriptionStatus {
+    /// Set when the subscription has ended: its sink gets no further samples.
+    pub(super) ended: AtomicBool,
     pub(super) lost: AtomicU64,
+    /// [`UNKNOWN`] if it is unknown.
+    pub(super) before_match: AtomicU64,
     pub(super) malformed: AtomicU64,
     pub(super) text: Mutex<StatusText>,
 }
@@ -109,6 +116,8 @@ impl SubscriptionStatus {
         ReceptionStatus {
             writers: Some(text.reader.map_or(0, |reader| state.peers().connected(reader))),
             lost: Some(self.lost.load(Ordering::Relaxed)),
+            before_match: Some(self.before_match.load(Ordering::Relaxed))
+                .filter(|count| *count != UNKNOWN),
             malformed: self.malformed.load(Ordering::Relaxed),
             qos: text.qos.clone(),
             qos_warnings: text.qos_warnings.clone(),

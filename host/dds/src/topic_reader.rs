@@ -11,10 +11,11 @@ use rustdds::dds::ReadError;
 use rustdds::{DomainParticipant, GUID, RTPSEntity, Timestamp, TopicKind};
 use tracing::{info, warn};
 
+use super::before_match::BeforeMatch;
 use super::names::{dds_topic, dds_type, ros_type, visible};
 use super::qos::{Offer, Request, describe};
 use super::raw::{CopiedTo, CopyInto, CopyOrReport, Discard, Raw, RawReader};
-use super::state::{OnceLog, ParticipantState, SubscriptionStatus, lock, panic_text};
+use super::state::{OnceLog, ParticipantState, SubscriptionStatus, UNKNOWN, lock, panic_text};
 use super::type_check::TypeCheck;
 use gleaner_transport::{Clock, Gaps, Guid, Qos, SampleMeta, Sink, TopicSpec};
 
@@ -49,6 +50,10 @@ pub(super) struct TopicReader {
     /// RustDDS keeps for the topic again.
     read_before: Gaps,
     gaps: Gaps,
+    /// Samples that RustDDS received earlier were for an earlier subscription.
+    not_before: Timestamp,
+    /// `None` until the first update.
+    before_match: Option<BeforeMatch>,
     type_check: TypeCheck,
     resubscribed: Vec<String>,
     once: OnceLog,
@@ -107,11 +112,18 @@ impl TopicReader {
             without_writers: true,
             read_before: Gaps::default(),
             gaps: Gaps::default(),
+            not_before: Timestamp::ZERO,
+            before_match: None,
             type_check: TypeCheck::default(),
             resubscribed: Vec::new(),
             once: OnceLog::default(),
             ready: false,
         })
+    }
+
+    /// Number of the subscription.
+    pub(super) fn index(&self) -> usize {
+        self.index
     }
 
     /// Bytes of the largest sample that is expected.
@@ -136,6 +148,11 @@ impl TopicReader {
                 self.ready = true;
                 break;
             }
+            // Checked before each sample: no sample follows the return of `unsubscribe`, except one
+            // whose delivery is in progress.
+            if self.status.ended.load(Relaxed) {
+                break;
+            }
             context.state.deliver(self.index);
             let sink = self.sink.as_deref();
             let change = reader.try_take_one_with(CopyOrReport(CopyInto {
@@ -154,7 +171,9 @@ impl TopicReader {
                         writer,
                         &self.type_name,
                     );
-                    if !other && !self.read_before.has(writer, seq) {
+                    let is_new = change.receive_instant >= self.not_before
+                        && !self.read_before.has(writer, seq);
+                    if !other && is_new {
                         let publish_ns =
                             change.source_timestamp().map_or(change.sample.at_ns, nanoseconds);
                         self.deliver(context, writer, seq, publish_ns, change.sample);
@@ -172,6 +191,8 @@ impl TopicReader {
             }
         }
         self.status.lost.store(self.gaps.lost(), Relaxed);
+        let before = self.before_match.as_ref().and_then(BeforeMatch::count);
+        self.status.before_match.store(before.unwrap_or(UNKNOWN), Relaxed);
         self.reader = Some(reader);
     }
 
@@ -192,10 +213,6 @@ impl TopicReader {
                 "samples lost in transit (logged once, still counted)"
             );
         }
-        if let CopiedTo::Unreadable(why) = &raw.copied_to {
-            return self.note_malformed(why);
-        }
-        let Some(sink) = &self.sink else { return };
         let meta = SampleMeta {
             at_ns: raw.at_ns,
             publish_ns,
@@ -204,6 +221,13 @@ impl TopicReader {
             endian: raw.endian,
             options: [0; 2],
         };
+        if let Some(before) = &mut self.before_match {
+            before.note(&meta);
+        }
+        if let CopiedTo::Unreadable(why) = &raw.copied_to {
+            return self.note_malformed(why);
+        }
+        let Some(sink) = &self.sink else { return };
         context.state.deliver(self.index);
         let delivered = match raw.copied_to {
             CopiedTo::Sink => catch_unwind(AssertUnwindSafe(|| sink.accept(&meta))),
@@ -255,6 +279,9 @@ impl TopicReader {
         }
         self.without_writers = same.is_empty();
         self.type_check.note(&same, &others);
+        let clock = context.clock;
+        let before = self.before_match.get_or_insert_with(|| BeforeMatch::new(clock.now()));
+        before.make_room(|writer| same.iter().any(|offer| offer.guid == *writer));
         let qos_warnings = self.qos_warnings(&same, &others);
         for (cause, sentence) in &qos_warnings {
             if self.once.first(cause, sentence) {
@@ -342,6 +369,7 @@ impl TopicReader {
 
     /// Creates a reader, then removes the old one.
     fn subscribe(&mut self, context: &ReceiveContext<'_>, request: Request) {
+        let before = Timestamp::now();
         let mut reader = match self.create_reader(context, request) {
             Ok(reader) => reader,
             // Retried at the next update.
@@ -361,9 +389,11 @@ impl TopicReader {
         if self.reader.is_some() {
             self.take(context, MOST_KEPT);
             self.read_before = self.gaps.clone();
-            self.remove_reader(context);
+            self.remove_reader(context.registry, context.state);
         } else if !request.transient_local {
-            // Samples cached for an earlier subscription are skipped.
+            // Samples cached for an earlier subscription are skipped: here without a copy, and by
+            // their time those that the new reader gets later, as it has no writer yet.
+            self.not_before = before;
             let mut kept = (0..MOST_KEPT).map(|_| reader.try_take_one_with(Discard));
             kept.find(|passed| {
                 !matches!(passed, Ok(Some(_)) | Err(ReadError::Deserialization { .. }))
@@ -395,11 +425,11 @@ impl TopicReader {
         Ok(reader)
     }
 
-    fn remove_reader(&mut self, context: &ReceiveContext<'_>) {
+    pub(super) fn remove_reader(&mut self, registry: &Registry, state: &ParticipantState) {
         if let Some(mut reader) = self.reader.take() {
             // The reader is dropped anyway; an error of the poll does not matter.
-            drop(context.registry.deregister(&mut reader));
-            context.state.peers().forget(reader.guid());
+            drop(registry.deregister(&mut reader));
+            state.peers().forget(reader.guid());
         }
     }
 }

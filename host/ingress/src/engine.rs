@@ -63,8 +63,8 @@ impl Ingress {
             topics: TopicTable::default(),
             readers: Vec::new(),
             plays: false,
-            status_at: now,
-            tick_at: now,
+            status_at: now + STATUS_INTERVAL,
+            tick_at: now + TICK,
         }
     }
 
@@ -302,7 +302,8 @@ impl Ingress {
                 return Err(reason);
             }
         };
-        reader.topics.push(Attachment { id: grant.id, topic, attached });
+        let before = self.topics.get(topic).map_or_else(Default::default, |it| it.status.clone());
+        reader.topics.push(Attachment { id: grant.id, topic, attached, before });
         let SharedLayout { depth, slots, slot_bytes } = attached.sizes.layout;
         let definitions = found.and_then(|found| found.definitions_text.as_deref());
         let message = AttachedTopic {
@@ -417,11 +418,17 @@ impl Ingress {
 
     /// Reports the status to the readers and the starter.
     fn report_status(&mut self) {
+        let mut health = self.health.clone();
+        if self.source.knows_all_topics() {
+            // A damaged drive ends early. Readers handle what it has delivered.
+            health.dead = None;
+        }
         for reader in &mut self.readers {
-            let status =
-                |known: &Attachment| Some((known.id, self.topics.get(known.topic)?.status.clone()));
+            let status = |known: &Attachment| {
+                Some((known.id, known.reception(&self.topics.get(known.topic)?.status)))
+            };
             let status = SourceStatus {
-                health: self.health.clone(),
+                health: health.clone(),
                 topics: reader.topics.iter().filter_map(status).collect(),
                 unsent: reader.unsent,
             };
@@ -443,7 +450,7 @@ impl Ingress {
     }
 }
 
-/// Result of a wait.
+/// Events found by a wait.
 struct Ready {
     control: bool,
     stop: bool,

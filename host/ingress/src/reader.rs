@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use gleaner_buffers::shared::{HAZARDS, HoldLimits};
 use gleaner_protocol::ingress::{
-    AddReader, HoldGrant, PublishGrant, ReaderLink, ReaderMessage, ReaderRequest, RefusedTopic,
-    TopicGrant,
+    AddReader, HoldGrant, PublishGrant, ReaderLink, ReaderMessage, ReaderRequest, ReceptionStatus,
+    RefusedTopic, TopicGrant,
 };
 use gleaner_protocol::link::{Incoming, LinkError};
 use gleaner_regions::ControlRegion;
@@ -28,6 +28,22 @@ pub(crate) struct Attachment {
     /// Key in the table of topics.
     pub(crate) topic: u64,
     pub(crate) attached: AttachedReader,
+    /// State of the subscription when the reader was attached.
+    pub(crate) before: ReceptionStatus,
+}
+
+impl Attachment {
+    /// Returns the state of the subscription for this reader: without what was missing before it.
+    pub(crate) fn reception(&self, status: &ReceptionStatus) -> ReceptionStatus {
+        let since = |all: Option<u64>, before: Option<u64>| {
+            all.map(|all| all.saturating_sub(before.unwrap_or(0)))
+        };
+        let mut status = status.clone();
+        status.lost = since(status.lost, self.before.lost);
+        status.before_match = since(status.before_match, self.before.before_match);
+        status.malformed = status.malformed.saturating_sub(self.before.malformed);
+        status
+    }
 }
 
 /// A wait for the definitions of an attached topic.

@@ -3,14 +3,20 @@
 //! It runs on the thread of the source. The engine takes the same lock to attach and detach
 //! readers, which takes microseconds; readers take no lock.
 
+use std::collections::VecDeque;
 use std::os::fd::OwnedFd;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use gleaner_buffers::shared::{Bell, HoldLimits, ReaderId, SharedWriter, WriteError, WriterMemory};
 use gleaner_regions::{ControlRegion, KernelFutex, TopicRegion};
-use gleaner_transport::{ArrivalSums, Delivery, Gaps, SampleMeta, Sink, StoredMeta, TopicCounters};
+use gleaner_transport::{
+    ArrivalSums, Delivery, Gaps, Guid, SampleMeta, Sink, StoredMeta, TopicCounters,
+};
 
 use crate::sizes::RegionSizes;
+
+/// Number of samples that were too big for all regions, and are remembered.
+const REFUSED: usize = 64;
 
 /// Numbers of a topic, for its status.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -31,6 +37,8 @@ pub(crate) struct RegionWriter {
     sums: ArrivalSums,
     counters: TopicCounters,
     readers: Vec<RegionReader>,
+    /// True if the last copy fits; `None` if it was made before this region, or is accepted.
+    copied: Option<bool>,
 }
 
 struct RegionReader {
@@ -52,7 +60,7 @@ pub(crate) struct AttachedReader {
     pub(crate) refused: u64,
 }
 
-/// Request of a reader to a region.
+/// A request of a reader for a region.
 pub(crate) struct AttachRequest<'a> {
     pub(crate) control: &'a ControlRegion,
     pub(crate) limits: HoldLimits,
@@ -79,6 +87,7 @@ impl RegionWriter {
             sums: ArrivalSums::default(),
             counters: TopicCounters::default(),
             readers: Vec::new(),
+            copied: None,
         };
         Ok((region, file))
     }
@@ -121,29 +130,29 @@ impl RegionWriter {
         }
     }
 
-    /// Copies a sample into a free slot, if it fits.
+    /// Copies a sample into a free slot; returns whether it fits.
     fn copy(&mut self, cdr: &[u8]) -> bool {
-        match self.writer.draft(cdr.len()) {
-            Ok(mut draft) => {
-                draft.copy_from_slice(cdr);
-                true
-            }
-            Err(_) => false,
-        }
+        let draft = self.writer.draft(cdr.len());
+        let fits = draft.map(|mut draft| draft.copy_from_slice(cdr)).is_ok();
+        self.copied = Some(fits);
+        fits
     }
 
-    /// Shows the copied sample and wakes the readers, or counts a sample that did not fit.
-    fn accept(&mut self, meta: &SampleMeta) -> bool {
-        let Some(cdr) = self.writer.drafted() else {
-            self.refuse();
-            return false;
-        };
-        let stored = self.sums.add(meta, cdr);
-        self.writer.publish(&stored.words());
-        for bell in self.readers.iter().filter_map(|reader| reader.bell.as_ref()) {
-            bell.ring(&KernelFutex);
+    /// Shows the copied sample and wakes the readers, or counts it as too big. Returns whether it
+    /// fits; `None` if there is no copy of it.
+    fn accept(&mut self, meta: &SampleMeta) -> Option<bool> {
+        let fits = self.copied.take()?;
+        match self.writer.drafted().filter(|_| fits) {
+            Some(cdr) => {
+                let stored = self.sums.add(meta, cdr);
+                self.writer.publish(&stored.words());
+                for bell in self.readers.iter().filter_map(|reader| reader.bell.as_ref()) {
+                    bell.ring(&KernelFutex);
+                }
+            }
+            None => self.refuse(),
         }
-        true
+        Some(fits)
     }
 
     fn refuse(&mut self) {
@@ -168,6 +177,9 @@ struct SinkState {
     seen: Gaps,
     /// Set once there was a second subscription: a sample may come over both.
     checks_doubles: bool,
+    /// The last samples that were too big for all regions. A second subscription, made for a region
+    /// of larger samples, may deliver them again.
+    refused: VecDeque<(Guid, u64)>,
     /// The last subscription that has received a sample.
     newest: u64,
 }
@@ -266,19 +278,40 @@ impl SinkState {
         }
         self.newest = self.newest.max(subscription);
         if self.is_double(meta) {
-            self.regions.iter_mut().for_each(|region| region.writer.discard());
-            return;
+            return self.accept_double(meta);
         }
-        let mut taken = 0;
-        for region in &mut self.regions {
-            taken += usize::from(region.accept(meta));
-        }
-        // A sample that was too big for all may come again, for a new region of larger samples.
-        if taken > 0 || self.regions.is_empty() {
-            self.seen.note(meta.writer, meta.seq);
+        self.seen.note(meta.writer, meta.seq);
+        let (mut is_taken, mut is_refused) = (false, false);
+        for fits in self.regions.iter_mut().filter_map(|region| region.accept(meta)) {
+            is_taken |= fits;
+            is_refused |= !fits;
         }
         self.counts.received += 1;
-        self.counts.too_big += u64::from(taken < self.regions.len());
+        self.counts.too_big += u64::from(is_refused);
+        if is_refused && !is_taken {
+            if self.refused.len() == REFUSED {
+                self.refused.pop_front();
+            }
+            self.refused.push_back((meta.writer, meta.seq));
+        }
+    }
+
+    /// Drops a sample that has come before, but for regions that it was not too big for, if it was
+    /// for all that there were.
+    fn accept_double(&mut self, meta: &SampleMeta) {
+        let known = self.refused.iter().position(|known| *known == (meta.writer, meta.seq));
+        let mut is_taken = false;
+        for region in &mut self.regions {
+            if known.is_some() && region.copied == Some(true) {
+                is_taken |= region.accept(meta).is_some();
+            } else {
+                region.copied = None;
+                region.writer.discard();
+            }
+        }
+        if is_taken && let Some(index) = known {
+            self.refused.remove(index);
+        }
     }
 }
 
@@ -302,6 +335,7 @@ impl Sink for SubscriptionSink {
         if state.is_double(meta) {
             return;
         }
+        state.seen.note(meta.writer, meta.seq);
         state.regions.iter_mut().for_each(RegionWriter::refuse);
         state.counts.received += 1;
         state.counts.too_big += 1;
@@ -313,5 +347,52 @@ impl Sink for SubscriptionSink {
 
     fn accept(&self, meta: &SampleMeta) {
         self.topic.lock().accept(self.number, meta);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_messages::Endian;
+
+    use super::*;
+
+    fn meta(seq: u64) -> SampleMeta {
+        SampleMeta {
+            at_ns: 0,
+            publish_ns: 0,
+            writer: Guid::default(),
+            seq,
+            endian: Endian::Little,
+            options: [0; 2],
+        }
+    }
+
+    fn add(topic: &TopicSink, control: &ControlRegion, max_bytes: u64) {
+        let limits = HoldLimits { first_word: 0, windows: 0, window: 0, singles: 1 };
+        let (wakes, digests, is_latched) = (false, false, false);
+        let request = AttachRequest { control, limits, depth: 4, wakes, digests, is_latched };
+        let (region, _) = RegionWriter::create(RegionSizes::of(max_bytes, true, 4, 1)).unwrap();
+        topic.attach_to(region, &request).unwrap();
+    }
+
+    #[test]
+    fn a_region_between_copy_and_accept_of_a_sample_counts_nothing() {
+        let (control, _) = ControlRegion::create().unwrap();
+        let topic = Arc::new(TopicSink::default());
+        add(&topic, &control, 100);
+        let sink = SubscriptionSink { topic: Arc::clone(&topic), number: 0 };
+        assert_eq!(sink.copy(&[1; 50]), Some(Delivery::Taken));
+        add(&topic, &control, 10);
+        sink.accept(&meta(1));
+        assert_eq!(topic.counts(), ReceivedCounts { received: 1, too_big: 0 });
+        assert_eq!(sink.deliver(&meta(2), &[1; 50]), Delivery::TooBig);
+        assert_eq!(topic.counts(), ReceivedCounts { received: 2, too_big: 1 });
+        // A copy that is never accepted is replaced.
+        sink.copy(&[3; 5]);
+        sink.deliver(&meta(3), &[4; 5]);
+        let state = topic.lock();
+        let heads: Vec<u64> = state.regions.iter().map(|region| region.writer.head()).collect();
+        assert_eq!(heads, [3, 1]);
+        assert_eq!(state.regions[1].writer.shown(0).unwrap().0, [4; 5]);
     }
 }

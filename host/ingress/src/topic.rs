@@ -30,8 +30,9 @@ pub(crate) struct SharedTopic {
     number: u64,
     /// The subscription for smaller samples, which ends soon.
     previous: Option<PreviousSubscription>,
-    /// Lost and malformed samples of subscriptions that have ended.
+    /// Samples that subscriptions which have ended did not receive, by cause.
     earlier: ReceptionStatus,
+    has_earlier: bool,
     /// The file and the reserved bytes of each region.
     regions: Vec<(RegionId, OwnedFd, u64)>,
     readers: usize,
@@ -54,6 +55,7 @@ impl SharedTopic {
             number: 0,
             previous: None,
             earlier: ReceptionStatus::default(),
+            has_earlier: false,
             regions: Vec::new(),
             readers: 0,
             status: ReceptionStatus::default(),
@@ -157,6 +159,9 @@ impl SharedTopic {
         let status = source.status(subscription);
         self.earlier.malformed += status.malformed;
         self.earlier.lost = sum(self.earlier.lost, status.lost);
+        if !std::mem::replace(&mut self.has_earlier, true) {
+            self.earlier.before_match = status.before_match;
+        }
         source.unsubscribe(subscription);
     }
 
@@ -214,12 +219,16 @@ impl SharedTopic {
 
     /// Updates the status of the subscription, and the counters that readers see.
     pub(crate) fn update_status(&mut self, source: &dyn LiveSource) {
-        // Until the new subscription receives, the previous one shows what is missing.
-        let receives = self.previous.as_ref().filter(|previous| previous.since.is_none());
-        let subscription = receives.map(|previous| previous.subscription).or(self.subscription);
+        // The previous one shows what is missing until it ends.
+        let previous = self.previous.as_ref().map(|previous| previous.subscription);
+        let subscription = previous.or(self.subscription);
         let mut status = subscription.map(|known| source.status(known)).unwrap_or_default();
         status.malformed += self.earlier.malformed;
         status.lost = sum(status.lost, self.earlier.lost);
+        if self.has_earlier {
+            // What a later one did not receive before its match, an earlier one did.
+            status.before_match = self.earlier.before_match;
+        }
         self.sink.set_lost(status.lost);
         self.status = status;
     }

@@ -197,21 +197,19 @@ pub(crate) fn own_process_only(refused: DeniedCalls) -> DeniedCalls {
 }
 
 /// Denies what a process does not need any more when it is about to become an interpreter: other
-/// processes and signals to them, sockets but UDP, and, with `only_counted_memory`, memory as in
-/// [`apply`]. The lambda's code does not run until [`apply`], but the interpreter may be any
-/// program that calls itself Python.
+/// processes and signals to them, sockets, and, with `only_counted_memory`, memory as in [`apply`].
+/// The lambda's code does not run until [`apply`], but the interpreter may be any program that
+/// calls itself Python.
 #[must_use]
 pub fn apply_before_interpreter(only_counted_memory: bool) -> Layer {
     match install_before(only_counted_memory) {
-        Ok(()) => {
-            Layer::yes(START, "seccomp: no processes, no signals to others, no sockets but UDP")
-        }
+        Ok(()) => Layer::yes(START, "seccomp: no processes, no signals to others, no sockets"),
         Err(error) => Layer::no(START, error.chain()),
     }
 }
 
 fn install_before(only_counted_memory: bool) -> Result<(), JailError> {
-    let mut refused = no_new_processes(no_signals(sockets::udp_only(DeniedCalls::default())));
+    let mut refused = no_new_processes(no_signals(sockets::none(DeniedCalls::default())));
     if only_counted_memory {
         refused = counted_only(refused);
     }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use gleaner_host::api::data::{self, DataError, OutOfFuel};
+use gleaner_host::api::data::{self, DataError};
 use gleaner_messages::MessageValue;
 use numpy::PyArray1;
 use pyo3::IntoPyObjectExt;
@@ -60,9 +60,9 @@ impl Topic {
     fn samples(
         &self,
         py: Python<'_>,
-        samples: Result<Vec<data::Sample>, OutOfFuel>,
+        samples: Result<Vec<data::Sample>, DataError>,
     ) -> PyResult<Vec<Sample>> {
-        let samples = samples.map_err(|error| refused(py, error.into()))?;
+        let samples = samples.map_err(|error| refused(py, error))?;
         Ok(samples.into_iter().map(|sample| self.sample(py, sample)).collect())
     }
 }
@@ -84,8 +84,9 @@ impl Topic {
         self.inner.type_name()
     }
 
-    fn newest(&self, py: Python<'_>) -> Option<Sample> {
-        self.inner.newest().map(|sample| self.sample(py, sample))
+    fn newest(&self, py: Python<'_>) -> PyResult<Option<Sample>> {
+        let newest = self.inner.newest().map_err(|error| refused(py, error))?;
+        Ok(newest.map(|sample| self.sample(py, sample)))
     }
 
     fn last(&self, py: Python<'_>, n: usize) -> PyResult<Vec<Sample>> {

@@ -1,10 +1,11 @@
 //! `gleaner-shim [OPTIONS] -- PROGRAM ARGUMENTS...`: the parent of every runtime.
 //!
-//! It drops its own privileges, and so the runtime's, as far as no lambda's process needs them;
-//! passes on a small part of its environment; kills the runtime when it misses the deadline of a
-//! call, is stopped, or takes too much memory or too many threads; kills the processes that the
-//! runtime leaves behind; and writes the exit record. It exits as the runtime did. The thread that
-//! does this allocates next to nothing, and checks ten times a second.
+//! It drops its own privileges, and so the runtime's, as far as no lambda's process needs them: the
+//! runtime has no sockets but those that it inherits or receives. It passes on a small part of its
+//! environment; kills the runtime when it misses the deadline of a call, is stopped, or takes too
+//! much memory or too many threads; kills the processes that the runtime leaves behind; and writes
+//! the exit record. It exits as the runtime did. The thread that does this allocates next to
+//! nothing, and checks ten times a second.
 //!
 //! With `--results` a second thread writes the result files of the lambda, so that the lambda's
 //! process cannot write any.
@@ -29,7 +30,7 @@ use std::time::Duration;
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
 use gleaner_jail::cgroup::{CgroupLimits, Group};
-use gleaner_jail::{Paths, base_filter, cgroup, files, memory, sandbox_filter, self_test};
+use gleaner_jail::{Paths, base_filter, cgroup, files, memory, sandbox_filter, self_test, sockets};
 use gleaner_protocol::{ExitRecord, LAYERS_ENV, Layer, RESULTS_ENV};
 use gleaner_vitals::{PULSE_ENV, Pulse, make_inheritable};
 
@@ -134,7 +135,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     let number =
         make_inheritable(&page).map_err(|error| cannot("cannot pass on the pulse page", &error))?;
     let mut layers = base_filter::apply();
-    layers.push(hard_deadline());
+    layers.extend([sockets::deny(), hard_deadline()]);
     let (group, layer) = create_cgroup(args);
     layers.push(layer);
     let layers = serde_json::to_string(&layers).expect("layers are plain data");
@@ -265,6 +266,7 @@ fn create_cgroup(args: &Args) -> (Option<Group>, Layer) {
 /// Prints the layers that hold on this machine: each is set up in this process and verified.
 fn show_layers(args: &Args) -> Result<ExitCode, Failure> {
     let mut layers = base_filter::apply();
+    layers.push(sockets::deny());
     let cannot_watch =
         |error: std::io::Error| Layer::no(HARD_DEADLINE, format!("no pulse page: {error}"));
     layers.push(Pulse::create().map_or_else(cannot_watch, |_| hard_deadline()));
@@ -273,7 +275,8 @@ fn show_layers(args: &Args) -> Result<ExitCode, Failure> {
     layers.push(sandbox_filter::apply_before_interpreter(true));
     layers.push(memory::limit(64 << 20));
     let cannot = |error| Failure::caused_by(Exit::Internal, "cannot set up the layers", &error);
-    layers.extend(sandbox_filter::apply(true).map_err(cannot)?);
+    let denied = sandbox_filter::apply(true).map_err(cannot)?;
+    layers.extend(denied.into_iter().filter(|layer| layer.name != sockets::NAME));
     let layers = self_test::verify(layers);
     println!("{}", serde_json::to_string(&layers).expect("layers are plain data"));
     Ok(ExitCode::SUCCESS)

@@ -79,6 +79,15 @@ fn a_runtime_that_crashes_takes_its_shim_along_by_the_same_signal() {
 }
 
 #[test]
+fn a_runtime_has_no_sockets_from_its_first_instruction_on() {
+    let record = RecordFile::of("sockets");
+    let connects = "exec 3<>/dev/udp/127.0.0.1/9 && echo connected";
+    let output = shim(&record, &["bash", "-c", connects]).output().unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(output.stdout.is_empty() && error.contains("Operation not permitted"), "{error}");
+}
+
+#[test]
 fn a_signal_to_the_shim_reaches_the_runtime() {
     let record = RecordFile::of("term");
     let (mut shim, _) =

@@ -2,14 +2,14 @@
 //!
 //! Every number that a lambda passes is clamped here. No allocation exceeds the clamps.
 
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use gleaner_buffers::{Lease, RingCounts, RingReader};
 use gleaner_messages::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp};
 use gleaner_rules::clamps::{self, WrongField};
 pub use gleaner_rules::clamps::{PATH_BYTES, SAMPLES_PER_CALL, TEXTS_PER_FIELD};
-use gleaner_transport::SampleMeta;
+use gleaner_transport::StoredMeta;
 
 pub use super::call::{Due, PerCall};
 use super::curves::{CurveWriter, Curves};
@@ -20,7 +20,7 @@ use super::frame::Images;
 use super::fuel::Fuel;
 pub use super::fuel::OutOfFuel;
 pub use super::sample::Sample;
-use super::trace::{Arrivals, LookBack};
+use super::trace::{LookBack, SumsBefore};
 pub use super::values::{Column, Counts, Identity, Stamps, Tick};
 
 /// Samples of a column, and bytes of samples that are parsed, between two checks of the deadline.
@@ -35,7 +35,7 @@ pub struct Topic {
     input: String,
     pub(super) topic: String,
     pub(super) type_name: String,
-    reader: RingReader<SampleMeta>,
+    reader: RingReader<StoredMeta>,
     /// Number of samples that the lambda sees; the ring may be deeper.
     depth: usize,
     /// `None` if there are none: the lambda can then read bytes, but no fields.
@@ -48,26 +48,39 @@ pub struct Topic {
     /// see them.
     until: AtomicU64,
     /// The newest sample that it sees, pinned while it runs: however many arrive, this one stays.
-    newest: Mutex<Option<Lease<SampleMeta>>>,
+    newest: Mutex<Option<Lease<StoredMeta>>>,
     /// Samples lost before they reached this process, or [`UNKNOWN`].
     lost: AtomicU64,
-    pub(super) arrivals: Arc<Arrivals>,
+    sums_digests: Arc<AtomicBool>,
+    pub(super) sums_before: SumsBefore,
+    /// Refused holds that were reported as a fault.
+    reported_holds: AtomicU64,
     pub(super) look_back: LookBack,
     /// Reused between column reads, so that they allocate nothing but their result.
-    scratch: Mutex<Vec<Lease<SampleMeta>>>,
+    scratch: Mutex<Vec<Lease<StoredMeta>>>,
     /// Curves of the values that are read, if they are recorded.
     curves: OnceLock<Arc<Curves>>,
 }
 
+/// The ring of an input, before it is a [`Topic`].
+pub struct InputRing {
+    /// Its samples.
+    pub reader: RingReader<StoredMeta>,
+    /// Number of samples that the lambda sees; the ring may be deeper.
+    pub depth: usize,
+    /// Request of digests, to the thread of this process that fills the ring, if one does.
+    pub sums_digests: Arc<AtomicBool>,
+    /// Sums over the samples before its first one.
+    pub sums_before: SumsBefore,
+}
+
 impl Topic {
-    /// The topic behind input `input`, whose samples arrive through `reader` and are summed up in
-    /// `arrivals`.
+    /// The topic behind input `input`, whose samples arrive through `ring`.
     pub fn new(
         input: &str,
         topic: &str,
         type_name: &str,
-        (reader, depth): (RingReader<SampleMeta>, usize),
-        arrivals: Arc<Arrivals>,
+        InputRing { reader, depth, sums_digests, sums_before }: InputRing,
         definitions: Option<Arc<Definitions>>,
         (images, per_call): (Images, PerCall),
     ) -> Arc<Self> {
@@ -85,7 +98,9 @@ impl Topic {
             skipped: AtomicU64::new(0),
             until: AtomicU64::new(u64::MAX),
             lost: AtomicU64::new(UNKNOWN),
-            arrivals,
+            sums_digests,
+            sums_before,
+            reported_holds: AtomicU64::new(0),
             look_back: LookBack::default(),
             scratch: Mutex::default(),
             curves: OnceLock::new(),
@@ -108,10 +123,17 @@ impl Topic {
     }
 
     /// Returns the newest sample; `None` before the first.
-    pub fn newest(self: &Arc<Self>) -> Option<Sample> {
-        let newest = self.reader.newest_before(self.until()).or_else(|| self.pinned());
+    ///
+    /// # Errors
+    ///
+    /// [`DataError::OutOfHolds`].
+    pub fn newest(self: &Arc<Self>) -> Result<Option<Sample>, DataError> {
+        let newest = match self.pinned() {
+            Some(pinned) => Some(pinned),
+            None => self.held(|| self.reader.newest_before(self.until()))?,
+        };
         self.look_back.at(newest.as_ref());
-        newest.map(|lease| self.sample(lease))
+        Ok(newest.map(|lease| self.sample(lease)))
     }
 
     /// Returns the `n` newest samples, oldest first; at most [`SAMPLES_PER_CALL`], and as many as
@@ -119,14 +141,11 @@ impl Topic {
     ///
     /// # Errors
     ///
-    /// [`OutOfFuel`].
-    pub fn last(self: &Arc<Self>, n: usize) -> Result<Vec<Sample>, OutOfFuel> {
+    /// [`DataError::OutOfHolds`]; [`DataError::OutOfFuel`].
+    pub fn last(self: &Arc<Self>, n: usize) -> Result<Vec<Sample>, DataError> {
         let mut leases = Vec::new();
-        self.reader.last_before(
-            self.until(),
-            n.min(self.per_call.clamps().samples()).min(self.depth),
-            &mut leases,
-        );
+        let n = n.min(self.per_call.clamps().samples()).min(self.depth);
+        self.held(|| self.reader.last_before(self.until(), n, &mut leases))?;
         self.samples_of(leases)
     }
 
@@ -135,23 +154,19 @@ impl Topic {
     ///
     /// # Errors
     ///
-    /// [`OutOfFuel`].
-    pub fn since(self: &Arc<Self>, since_ns: i64) -> Result<Vec<Sample>, OutOfFuel> {
+    /// As [`Topic::last`].
+    pub fn since(self: &Arc<Self>, since_ns: i64) -> Result<Vec<Sample>, DataError> {
         let mut leases = Vec::new();
-        let until = self.until();
-        self.reader.newest_while_before(
-            until,
-            self.per_call.clamps().samples().min(self.depth),
-            |meta| meta.at_ns > since_ns,
-            &mut leases,
-        );
+        let most = self.per_call.clamps().samples().min(self.depth);
+        let is_since = |meta: &StoredMeta| meta.sample.at_ns > since_ns;
+        self.held(|| self.reader.newest_while_before(self.until(), most, is_since, &mut leases))?;
         self.samples_of(leases)
     }
 
     fn samples_of(
         self: &Arc<Self>,
-        leases: Vec<Lease<SampleMeta>>,
-    ) -> Result<Vec<Sample>, OutOfFuel> {
+        leases: Vec<Lease<StoredMeta>>,
+    ) -> Result<Vec<Sample>, DataError> {
         self.look_back.at(leases.first());
         self.per_call.charge(|| leases.len() * FIELD_BYTES)?;
         Ok(leases.into_iter().map(|lease| self.sample(lease)).collect())
@@ -193,7 +208,7 @@ impl Topic {
     /// # Errors
     ///
     /// [`DataError::WrongField`] if the field is no number or belongs to another topic;
-    /// [`DataError::Malformed`]; [`DataError::OutOfTime`].
+    /// [`DataError::Malformed`]; [`DataError::OutOfTime`]; [`DataError::OutOfHolds`].
     pub fn column(self: &Arc<Self>, field: &Field, n: usize) -> Result<Column, DataError> {
         self.per_call.charge(|| self.column_work(field, n))?;
         let until = self.until();
@@ -220,7 +235,7 @@ impl Topic {
             self.per_call.charge(whole_ring)?;
         }
         let until = self.until();
-        let is_since = |meta: &SampleMeta| meta.at_ns > since_ns;
+        let is_since = |meta: &StoredMeta| meta.sample.at_ns > since_ns;
         let column = self.read_column(field, |reader, out| {
             reader.newest_while_before(until, self.per_call.items.min(self.depth), is_since, out)
         });
@@ -234,11 +249,11 @@ impl Topic {
     fn read_column(
         self: &Arc<Self>,
         field: &Field,
-        select: impl FnOnce(&RingReader<SampleMeta>, &mut Vec<Lease<SampleMeta>>),
+        select: impl FnOnce(&RingReader<StoredMeta>, &mut Vec<Lease<StoredMeta>>),
     ) -> Result<Column, DataError> {
         field.must_belong_to(self)?;
         let mut leases = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
-        select(&self.reader, &mut leases);
+        self.held(|| select(&self.reader, &mut leases))?;
         self.look_back.at(leases.first());
         let mut unchecked = 0;
         let column =
@@ -249,7 +264,7 @@ impl Topic {
                     self.per_call.due.check()?;
                 }
                 column.values.push(self.number(&field.path, lease)?);
-                column.at_ns.push(lease.meta().at_ns);
+                column.at_ns.push(lease.meta().sample.at_ns);
                 Ok(column)
             });
         // No slot of the ring may stay pinned between two calls.
@@ -274,9 +289,9 @@ impl Topic {
     pub(super) fn number(
         &self,
         path: &FieldPath,
-        lease: &Lease<SampleMeta>,
+        lease: &Lease<StoredMeta>,
     ) -> Result<f64, DataError> {
-        path.number(lease, lease.meta().endian).map_err(|error| self.unreadable(path, error))
+        path.number(lease, lease.meta().sample.endian).map_err(|error| self.unreadable(path, error))
     }
 
     pub(super) fn unreadable(&self, path: &FieldPath, error: CdrError) -> DataError {
@@ -298,12 +313,36 @@ impl Topic {
         n.min(held).min(self.per_call.items).saturating_mul(field.work(message_bytes))
     }
 
+    /// Reads the ring of samples that another process writes.
+    fn held<T>(&self, read: impl FnOnce() -> T) -> Result<T, DataError> {
+        let refused = self.reader.refused_holds();
+        let found = read();
+        if self.reader.refused_holds() == refused {
+            return Ok(found);
+        }
+        Err(DataError::OutOfHolds { input: self.input.clone() })
+    }
+
+    /// Returns the error of a lambda that keeps too many samples, once for all samples that could
+    /// not be read since the last call.
+    pub(super) fn take_refused_holds(&self) -> Option<DataError> {
+        let refused = self.reader.refused_holds();
+        let is_new = self.reported_holds.swap(refused, Ordering::Relaxed) != refused;
+        is_new.then(|| DataError::OutOfHolds { input: self.input.clone() })
+    }
+
+    /// Sums the digests of samples from now on, if this process fills the ring.
+    pub(super) fn sum_digests(&self) {
+        self.sums_digests.store(true, Ordering::Relaxed);
+    }
+
     /// Position in the ring at which the lambda's view ends, exclusive.
     pub(crate) fn until(&self) -> u64 {
         self.until.load(Ordering::Relaxed)
     }
 
-    fn pinned(&self) -> Option<Lease<SampleMeta>> {
+    /// The newest sample that the lambda sees in a live run.
+    pub(super) fn pinned(&self) -> Option<Lease<StoredMeta>> {
         self.newest.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
@@ -322,11 +361,11 @@ impl Topic {
         self.depth
     }
 
-    pub(crate) fn reader(&self) -> &RingReader<SampleMeta> {
+    pub(crate) fn reader(&self) -> &RingReader<StoredMeta> {
         &self.reader
     }
 
-    pub(crate) fn sample(self: &Arc<Self>, lease: Lease<SampleMeta>) -> Sample {
+    pub(crate) fn sample(self: &Arc<Self>, lease: Lease<StoredMeta>) -> Sample {
         Sample::new(Arc::clone(self), lease)
     }
 
@@ -355,14 +394,14 @@ impl Topic {
         let head = self.reader.head();
         let oldest = head.saturating_sub(self.reader.depth() as u64);
         let is_later = |position: &u64| {
-            self.reader.get(*position).is_none_or(|lease| lease.meta().at_ns > at_ns)
+            self.reader.meta(*position).is_none_or(|meta| meta.sample.at_ns > at_ns)
         };
         head - (oldest..head).rev().take_while(is_later).count() as u64
     }
 
     /// Receive stamp of the newest sample.
     pub(crate) fn newest_at(&self) -> Option<i64> {
-        self.reader.newest().map(|lease| lease.meta().at_ns)
+        self.reader.newest_meta().map(|(_, meta)| meta.sample.at_ns)
     }
 
     /// Sets the number of samples that were lost before they reached this process.

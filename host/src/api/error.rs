@@ -32,6 +32,11 @@ pub enum DataError {
     NoRoom(#[from] NoRoom),
     #[error("{0}")]
     OutOfRange(ImageError),
+    #[error(
+        "the lambda keeps too many samples of input `{input}`: raise `hold` of this [[input]], or \
+         keep fewer"
+    )]
+    OutOfHolds { input: String },
     #[error("the deadline is over")]
     OutOfTime,
     #[error(transparent)]
@@ -78,7 +83,7 @@ impl DataError {
             Self::TooLarge { .. } | Self::NoSlot { .. } | Self::NoRoom(_) => DataErrorKind::NoRoom,
             Self::OutOfRange(_) => DataErrorKind::OutOfRange,
             // A guest that can be interrupted is ended instead.
-            Self::OutOfTime | Self::OutOfFuel(_) => DataErrorKind::NoRoom,
+            Self::OutOfHolds { .. } | Self::OutOfTime | Self::OutOfFuel(_) => DataErrorKind::NoRoom,
         }
     }
 }

@@ -121,6 +121,13 @@ impl Session {
         self.lock().backed_off
     }
 
+    /// Returns the error of a lambda that keeps too many samples, if samples could not be read since
+    /// the last call for that reason.
+    pub fn take_refused_holds(&self) -> Option<DataError> {
+        let state = self.lock();
+        state.inputs.iter().filter_map(|topic| topic.take_refused_holds()).last()
+    }
+
     /// Due time of the lambda's calls; `None` without inputs, where no call is long.
     pub fn due(&self) -> Option<Due> {
         self.lock().due.clone()

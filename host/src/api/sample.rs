@@ -5,7 +5,7 @@ use std::sync::Arc;
 use gleaner_buffers::Lease;
 use gleaner_messages::{Endian, MessageValue};
 use gleaner_rules::clamps::Length;
-use gleaner_transport::SampleMeta;
+use gleaner_transport::{SampleMeta, StoredMeta};
 
 use super::data::{DataError, Field, OutOfFuel, Topic};
 use super::frame::{Frame, ImageMessage};
@@ -16,24 +16,24 @@ use super::values::{Identity, Stamps};
 #[derive(Clone)]
 pub struct Sample {
     topic: Arc<Topic>,
-    lease: Lease<SampleMeta>,
+    lease: Lease<StoredMeta>,
 }
 
 impl Sample {
     /// The message of `topic` in this slot of its ring.
-    pub(super) fn new(topic: Arc<Topic>, lease: Lease<SampleMeta>) -> Self {
+    pub(super) fn new(topic: Arc<Topic>, lease: Lease<StoredMeta>) -> Self {
         Self { topic, lease }
     }
 
     /// Unique identity of the sample.
     pub fn identity(&self) -> Identity {
-        let meta = self.lease.meta();
+        let meta = self.meta();
         Identity { topic: self.topic.topic.clone(), writer: meta.writer, seq: meta.seq }
     }
 
     /// Timestamps of the sample.
     pub fn stamps(&self) -> Stamps {
-        let meta = self.lease.meta();
+        let meta = self.meta();
         let header_ns = self
             .topic
             .header
@@ -54,10 +54,10 @@ impl Sample {
         field.must_belong_to(&self.topic)?;
         let value = field
             .path
-            .read(&self.lease, self.lease.meta().endian)
+            .read(&self.lease, self.meta().endian)
             .map_err(|error| self.topic.unreadable(&field.path, error))?;
         if let Some(number) = number(&value) {
-            field.draw(self.lease.meta().at_ns, number);
+            field.draw(self.meta().at_ns, number);
         }
         let length = match &value {
             MessageValue::Text(text) => Length::Text(text.len()),
@@ -82,7 +82,7 @@ impl Sample {
         self.topic.per_call.charge(|| field.work(self.lease.len()))?;
         field.must_belong_to(&self.topic)?;
         let number = self.topic.number(&field.path, &self.lease)?;
-        field.draw(self.lease.meta().at_ns, number);
+        field.draw(self.meta().at_ns, number);
         Ok(number)
     }
 
@@ -93,7 +93,7 @@ impl Sample {
 
     /// Returns whether the message is big-endian.
     pub fn big_endian(&self) -> bool {
-        self.lease.meta().endian == Endian::Big
+        self.meta().endian == Endian::Big
     }
 
     /// Bytes from `offset`, `len` at most, clamped to the message and to `call_bytes` of
@@ -134,7 +134,7 @@ impl Sample {
 
     pub(super) fn picture(&self) -> Result<ImageMessage<'_>, DataError> {
         let Topic { topic, type_name, .. } = &*self.topic;
-        ImageMessage::of(type_name, &self.lease, self.lease.meta().endian)
+        ImageMessage::of(type_name, &self.lease, self.meta().endian)
             .map_err(|source| DataError::Malformed {
                 topic: topic.clone(),
                 type_name: type_name.clone(),
@@ -152,10 +152,15 @@ impl Sample {
     }
 
     pub(crate) fn meta(&self) -> &SampleMeta {
+        &self.lease.meta().sample
+    }
+
+    /// Its metadata, with the sums up to it.
+    pub(crate) fn stored(&self) -> &StoredMeta {
         self.lease.meta()
     }
 
-    pub(super) fn lease(&self) -> &Lease<SampleMeta> {
+    pub(super) fn lease(&self) -> &Lease<StoredMeta> {
         &self.lease
     }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use gleaner_buffers::Lease;
 use gleaner_rules::clamps;
-use gleaner_transport::SampleMeta;
+use gleaner_transport::StoredMeta;
 
 use super::frame::Info;
 
@@ -20,7 +20,7 @@ pub struct SharedBytes {
 #[derive(Clone)]
 enum BytesOwner {
     /// A slot of the ring.
-    Message(Lease<SampleMeta>),
+    Message(Lease<StoredMeta>),
     /// A slot for decoded pictures.
     Decoded(Lease<Info>),
     /// Own memory. Boxed twice, since an `Arc<[u8]>` would need a copy.
@@ -29,7 +29,7 @@ enum BytesOwner {
 
 impl SharedBytes {
     /// All bytes of a message.
-    pub(super) fn of_message(lease: &Lease<SampleMeta>) -> Self {
+    pub(super) fn of_message(lease: &Lease<StoredMeta>) -> Self {
         Self { len: lease.len(), start: 0, owner: BytesOwner::Message(lease.clone()) }
     }
 

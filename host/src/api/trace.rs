@@ -1,101 +1,16 @@
 //! Traces one topic for the journal: the samples since the previous wake, and how far back the
 //! lambda looked.
 
-use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use gleaner_buffers::{Lease, RingCounts};
 use gleaner_journal::InputView;
-use gleaner_transport::SampleMeta;
+use gleaner_transport::StoredMeta;
 
 use super::data::Topic;
 
 /// Value for a wake that looked at no sample.
 const NONE: u64 = u64::MAX;
-
-/// Sums over the samples that arrived at a ring, updated by the thread that fills it. They are kept
-/// per sample, so that those of a wake are known while further samples arrive.
-pub struct Arrivals {
-    is_enabled: AtomicBool,
-    /// Position of the next sample. Only the filling thread changes this and the fields below.
-    next: AtomicU64,
-    digest: AtomicU32,
-    refused: AtomicU64,
-    marks: Box<[ArrivalMark]>,
-}
-
-/// Sums up to and including a sample.
-#[derive(Default)]
-struct ArrivalMark {
-    /// The lower half of its position in the ring, and the sum of digests.
-    digest: AtomicU64,
-    /// Number of samples refused before it.
-    refused: AtomicU64,
-}
-
-/// Sums as of one sample.
-#[derive(Copy, Clone)]
-struct Sums {
-    digest: u32,
-    refused: u64,
-}
-
-impl Arrivals {
-    /// Creates the sums of a ring of `depth`, which must still be empty.
-    pub fn new(depth: usize) -> Self {
-        Self {
-            is_enabled: AtomicBool::new(false),
-            next: AtomicU64::new(0),
-            digest: AtomicU32::new(0),
-            refused: AtomicU64::new(0),
-            // Twice the visible samples: a requested mark belongs to a sample that was visible a
-            // moment ago.
-            marks: (0..2 * (depth + 1)).map(|_| ArrivalMark::default()).collect(),
-        }
-    }
-
-    /// Adds a sample that is about to enter the ring.
-    pub fn add(&self, meta: &SampleMeta, cdr: &[u8]) {
-        let position = self.next.load(Ordering::Relaxed);
-        self.next.store(position + 1, Ordering::Relaxed);
-        if self.is_enabled.load(Ordering::Relaxed) {
-            let digest = self.digest.load(Ordering::Relaxed).wrapping_add(sample_digest(meta, cdr));
-            self.digest.store(digest, Ordering::Relaxed);
-            let mark = &self.marks[(position % self.marks.len() as u64) as usize];
-            mark.refused.store(self.refused.load(Ordering::Relaxed), Ordering::Relaxed);
-            // The ring publishes the sample after this, so a reader of the sample sees its mark.
-            mark.digest.store(position << 32 | u64::from(digest), Ordering::Release);
-        }
-    }
-
-    /// Counts a refused sample.
-    pub fn refuse(&self) {
-        self.refused.fetch_add(1, Ordering::Relaxed);
-    }
-
-    /// The sums up to the sample at `position`; `None` if newer samples have overwritten them.
-    fn at(&self, position: u64) -> Option<Sums> {
-        let mark = &self.marks[(position % self.marks.len() as u64) as usize];
-        let digest = mark.digest.load(Ordering::Acquire);
-        let refused = mark.refused.load(Ordering::Relaxed);
-        (digest >> 32 == position & 0xffff_ffff).then_some(Sums { digest: digest as u32, refused })
-    }
-
-    fn now(&self) -> Sums {
-        Sums {
-            digest: self.digest.load(Ordering::Relaxed),
-            refused: self.refused.load(Ordering::Relaxed),
-        }
-    }
-}
-
-/// CRC-32 of a sample, plus its stamps: any changed byte changes it. A CRC of the stamps would cost
-/// as much as that of a small sample.
-fn sample_digest(meta: &SampleMeta, cdr: &[u8]) -> u32 {
-    let fold = |stamp: i64| stamp as u32 ^ (stamp >> 32) as u32;
-    let stamps =
-        fold(meta.at_ns).wrapping_mul(3).wrapping_add(fold(meta.publish_ns).wrapping_mul(5));
-    crc32fast::hash(cdr).wrapping_add(stamps)
-}
 
 /// Number of samples of `topic` so far, including refused ones.
 pub fn offered(topic: &Topic) -> u64 {
@@ -123,7 +38,7 @@ impl LookBack {
     }
 
     /// Notes the oldest of the samples that a call returns.
-    pub(super) fn at(&self, oldest: Option<&Lease<SampleMeta>>) {
+    pub(super) fn at(&self, oldest: Option<&Lease<StoredMeta>>) {
         if let Some(position) = oldest.and_then(Lease::position) {
             self.at_position(position);
         }
@@ -136,18 +51,36 @@ impl LookBack {
     }
 }
 
+/// Sums over the samples before the first one of a ring: another process may have filled it before.
+#[derive(Copy, Clone, Debug, Default)]
+pub struct SumsBefore {
+    /// Sum of their digests, modulo 2^32.
+    pub digest: u32,
+    /// Number of refused samples.
+    pub refused: u64,
+}
+
 /// Traces the visible samples of one topic from wake to wake.
 pub struct Trace {
+    /// Number of samples so far, including refused ones.
     offered: u64,
+    /// Position behind the newest visible sample, and the sums up to it.
     until: u64,
     digest: u32,
+    refused: u64,
 }
 
 impl Trace {
     /// Starts the trace: the samples of `topic` are summed up from now on.
     pub fn of(topic: &Topic) -> Self {
-        topic.arrivals.is_enabled.store(true, Ordering::Relaxed);
-        Self { offered: offered(topic), until: topic.reader().head(), digest: 0 }
+        topic.sum_digests();
+        let (until, SumsBefore { digest, refused }) = match topic.reader().newest_meta() {
+            Some((position, StoredMeta { digests: digest, refused, .. })) => {
+                (position + 1, SumsBefore { digest, refused })
+            }
+            None => (0, topic.sums_before),
+        };
+        Self { offered: until + refused, until, digest, refused }
     }
 
     /// Notes the samples since the previous wake; call it before each wake. If a sample of this
@@ -156,34 +89,34 @@ impl Trace {
     pub fn begin(
         &mut self,
         topic: &Topic,
-        woken_by: Option<(u64, &SampleMeta)>,
+        woken_by: Option<(u64, &StoredMeta)>,
         seen: &mut InputView,
     ) {
         let head = topic.reader().head();
         let until = topic.until().min(head);
-        // Where samples arrive during the wake, only the mark of the last visible one has the sums.
+        seen.digest = 0;
+        if until > self.until {
+            self.until = until;
+            let newest = match woken_by {
+                Some((position, meta)) if position + 1 == until => Some(*meta),
+                _ => newest_visible(topic, until),
+            };
+            if let Some(StoredMeta { digests, refused, .. }) = newest {
+                seen.digest = digests.wrapping_sub(self.digest);
+                self.digest = digests;
+                self.refused = self.refused.max(refused);
+            }
+            seen.newest = newest.map(|meta| (meta.sample.writer.0, meta.sample.seq));
+        }
+        // Where no sample arrives during the wake, those that were refused since the newest count.
         let is_still = topic.until() == u64::MAX;
-        let sums = if is_still {
-            None
-        } else {
-            until.checked_sub(1).and_then(|last| topic.arrivals.at(last))
-        };
-        let Sums { digest, refused } = sums.unwrap_or_else(|| topic.arrivals.now());
-        let offered = (until + refused).max(self.offered);
+        if is_still {
+            let RingCounts { no_slot, too_big, .. } = topic.reader().counts();
+            self.refused = no_slot + too_big;
+        }
+        let offered = (self.until + self.refused).max(self.offered);
         seen.new = offered - self.offered;
         self.offered = offered;
-        let arrived = until > self.until;
-        self.until = self.until.max(until);
-        seen.digest = 0;
-        if arrived {
-            seen.digest = digest.wrapping_sub(self.digest);
-            self.digest = digest;
-            let identity = |meta: &SampleMeta| (meta.writer.0, meta.seq);
-            seen.newest = match woken_by {
-                Some((position, meta)) if position + 1 == until => Some(identity(meta)),
-                _ => topic.reader().newest_before(until).map(|lease| identity(lease.meta())),
-            };
-        }
         topic.look_back.reset();
     }
 
@@ -193,4 +126,10 @@ impl Trace {
         let oldest = topic.look_back.0.load(Ordering::Relaxed).min(woken_by.unwrap_or(NONE));
         seen.reach = self.until.saturating_sub(oldest);
     }
+}
+
+/// Metadata of the newest sample below position `until`.
+fn newest_visible(topic: &Topic, until: u64) -> Option<StoredMeta> {
+    let newest = topic.pinned().or_else(|| topic.reader().newest_before(until));
+    newest.map(|lease| *lease.meta())
 }

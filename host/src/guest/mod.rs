@@ -63,7 +63,7 @@ pub trait Guest {
     fn wake(&mut self, wake: Wake) -> WakeOutcome;
 
     /// Discards the instance of the lambda, as after a fault. Called if a call returned without a
-    /// fault but the lambda uses too much memory.
+    /// fault but the lambda uses too much memory, and instead of a wake that cannot be repeated.
     fn discard(&mut self) {}
 
     /// The engine that runs the lambda, with its version: a decision is only reproducible on the

@@ -131,6 +131,11 @@ impl Guest for SandboxedGuest {
         outcome
     }
 
+    fn discard(&mut self) {
+        self.guest.discard();
+        self.needs_init = true;
+    }
+
     fn engine(&self) -> String {
         self.guest.engine()
     }

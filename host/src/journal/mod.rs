@@ -15,8 +15,6 @@ use crate::api::trace::Trace;
 
 /// Clock of a replay's journal.
 pub const CLOCK_OF_DRIVE: &str = "log time of the drive";
-/// Clock of a live journal.
-pub const CLOCK_OF_VEHICLE: &str = "CLOCK_MONOTONIC of the vehicle, set to the time of day once";
 
 /// Builds the entries of one lambda. It reuses its memory, so that a wake costs no allocation.
 pub struct EntryBuilder {
@@ -62,9 +60,14 @@ impl EntryBuilder {
         {
             let woken_by =
                 self.woken_by.filter(|(input, _)| *input == index).map(|(_, position)| position);
-            let sample = if let Wake::Event(sample) = wake { Some(sample.meta()) } else { None };
+            let sample = if let Wake::Event(sample) = wake { Some(sample.stored()) } else { None };
             trace.begin(topic, woken_by.zip(sample), seen);
         }
+    }
+
+    /// The inputs as of the last call of [`EntryBuilder::begin`].
+    pub fn seen(&self) -> &[InputView] {
+        &self.entry.seen
     }
 
     /// Skips the samples since the previous wake.

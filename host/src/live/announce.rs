@@ -3,16 +3,10 @@
 //! `std_msgs/msg/String`, a type that every ROS 2 has; its text is a line of `decisions.jsonl`,
 //! with the lambda's name before it: `{"lambda": "hello", "decision": {...}}`.
 
-use gleaner_base::Failure;
 use gleaner_lambda::Decision;
-use gleaner_transport::LiveSource;
 use serde::Serialize;
 
 use super::topic_publisher::TopicPublisher;
-
-const TYPE: &str = "std_msgs/msg/String";
-/// Queue length for a slow reader.
-const DEPTH: usize = 256;
 
 pub(super) struct Announcer {
     publisher: TopicPublisher,
@@ -26,16 +20,9 @@ struct Announced<'a> {
 }
 
 impl Announcer {
-    /// Publishes decisions of `lambda` on `topic`.
-    pub(super) fn open(
-        source: &dyn LiveSource,
-        topic: &str,
-        lambda: &str,
-    ) -> Result<Self, Failure> {
-        Ok(Self {
-            publisher: TopicPublisher::open(source, topic, TYPE, DEPTH)?,
-            lambda: lambda.to_owned(),
-        })
+    /// Publishes decisions of `lambda` through `publisher`.
+    pub(super) fn new(publisher: TopicPublisher, lambda: &str) -> Self {
+        Self { publisher, lambda: lambda.to_owned() }
     }
 
     /// Number of decisions that were not sent.

@@ -3,12 +3,12 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread;
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure, nanoseconds};
+use gleaner_feed::{Feed, FeedBell, FeedError};
 use gleaner_protocol::Report;
-use gleaner_transport::{Clock, LiveSource};
+use gleaner_transport::Clock;
 use gleaner_vitals::Pulse;
 
 use super::announce::Announcer;
@@ -38,7 +38,8 @@ pub(super) struct LiveEventLoop {
     pub(super) round_trip: Option<RoundTrip>,
     pub(super) announcer: Option<Announcer>,
     pub(super) watch: StatusReporter,
-    pub(super) source: Box<dyn LiveSource>,
+    pub(super) feed: Feed,
+    pub(super) bell: FeedBell,
     pub(super) clock: Clock,
     pub(super) pulse: Pulse,
 }
@@ -48,6 +49,8 @@ impl LiveEventLoop {
     pub(super) fn run(&mut self, stop: &AtomicBool) -> Result<(), Failure> {
         let mut last_round = self.clock.now();
         loop {
+            // Before the look at the schedule: a later sample ends the wait.
+            let seen = self.bell.value();
             let now = self.clock.now();
             if now.saturating_sub(last_round) >= nanoseconds(ROUND) {
                 last_round = now;
@@ -68,10 +71,10 @@ impl LiveEventLoop {
                 .next_due()
                 .unwrap_or(i64::MAX)
                 .min(last_round.saturating_add(nanoseconds(ROUND)));
-            // If this thread was unparked meanwhile, this returns at once.
-            thread::park_timeout(Duration::from_nanos(
-                u64::try_from(due.saturating_sub(now)).unwrap_or(0),
-            ));
+            // A lambda that keeps too many samples may have missed one just now.
+            self.invoker.free_holds();
+            let left = u64::try_from(due.saturating_sub(now)).unwrap_or(0);
+            self.bell.wait(seen, Duration::from_nanos(left));
         }
     }
 
@@ -116,27 +119,35 @@ impl LiveEventLoop {
     /// Number of messages that were not sent on requested topics.
     pub(super) fn unsent(&self) -> u64 {
         let answers = self.round_trip.as_ref().map_or(0, RoundTrip::unsent);
-        answers + self.announcer.as_ref().map_or(0, Announcer::unsent)
+        let decisions = self.announcer.as_ref().map_or(0, Announcer::unsent);
+        answers.saturating_add(decisions).saturating_add(self.feed.status().unsent)
     }
 
     fn housekeeping(&mut self, now: i64) -> Result<(), Failure> {
         if let Some(recorder) = &mut self.recorder {
             recorder.poll()?;
         }
-        if !self.watch.is_due(now) {
-            return Ok(());
-        }
-        let health = self.source.health();
-        if let Some(why) = &health.dead {
-            let mut failure = Failure::new(Exit::Unreachable, "the DDS receive thread has stopped");
+        let ended = self.feed.poll().err();
+        if let Some(why) = &self.feed.status().health.dead {
+            let mut failure = Failure::new(Exit::Unreachable, "the ingress receives no samples");
             failure.causes = vec![why.clone()];
             return Err(
                 failure.with_help("start again; if it happens often, report it with this text")
             );
         }
+        match ended {
+            None => {}
+            Some(FeedError::Gone) => {
+                return Err(Failure::new(Exit::Unreachable, "the ingress has ended")
+                    .with_help("`gleaner run` starts both again"));
+            }
+            Some(error) => return Err(Failure::because("cannot receive samples", &error)),
+        }
+        if !self.watch.is_due(now) {
+            return Ok(());
+        }
         let live = self.watch.report(&Around {
-            source: &*self.source,
-            health: &health,
+            source: self.feed.status(),
             inputs: &self.inputs,
             schedule: &self.schedule,
             session: &self.session,

@@ -1,13 +1,11 @@
 //! Runs a lambda on live topics: in real time, with deadlines, until SIGTERM.
 //!
-//! One thread owns the lambda and waits here; the transport's thread fills the rings and unparks
-//! it. Another process writes the result files, and a separate thread the reports to the parent.
-//! Nothing here depends on the kind of the lambda or on the network, except `process`, which sets
-//! up the process.
+//! One thread owns the lambda and waits here, for the bell that the ingress rings; samples are read
+//! in the ingress's memory. Another process writes the result files, and a separate thread the
+//! reports to the parent. Nothing here depends on the kind of the lambda, or knows a network.
 
 mod announce;
 mod event_loop;
-#[cfg(feature = "dds")]
 mod process;
 mod recorder;
 mod results_pipe;
@@ -16,7 +14,7 @@ mod round_trip;
 mod status;
 mod topic_publisher;
 
-#[cfg(feature = "dds")]
+pub(crate) use process::UNWRITTEN;
 pub use process::{LiveJob, RunArgs};
 pub use results_pipe::ResultsPipe;
 
@@ -26,10 +24,11 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use gleaner_base::{Exit, Failure};
+use gleaner_feed::Feed;
 use gleaner_journal::TimeRange;
-use gleaner_lambda::manifest::{Manifest, ScheduleSpec};
+use gleaner_lambda::manifest::Manifest;
 use gleaner_protocol::{Layer, Report, ResultItem, WokenBy};
-use gleaner_transport::{Clock, LiveSource};
+use gleaner_transport::Clock;
 use gleaner_vitals::Pulse;
 
 use self::announce::Announcer;
@@ -38,9 +37,9 @@ use self::recorder::RecorderSender;
 use self::results_writer::ResultsWriter;
 use self::round_trip::RoundTrip;
 use self::status::{Around, StatusReporter};
-use crate::input::{InputWaker, LiveInputs};
+use self::topic_publisher::TopicPublisher;
 use crate::invoker::Invoker;
-use crate::journal::{CLOCK_OF_VEHICLE, LambdaIdentity};
+use crate::journal::LambdaIdentity;
 use crate::schedule::WakeSchedule;
 use crate::session_setup::{ConfiguredLambda, Load, RunMode, SessionSetup, not_started};
 
@@ -52,8 +51,10 @@ pub struct LiveRun<'a> {
     pub manifest: Manifest,
     /// Its settings.
     pub settings: Settings,
-    /// The source of samples.
-    pub source: Box<dyn LiveSource>,
+    /// The connection to the ingress. It grants the inputs of the manifest, with their indexes as
+    /// ids, and then the topics of [`Settings::round_trip`] and [`Settings::announce`], as far as
+    /// they are set, to publish.
+    pub feed: Feed,
     /// The socket to the recorder, if there is one.
     pub recorder: Option<OwnedFd>,
     /// The pipe for results.
@@ -91,31 +92,19 @@ impl LiveRun<'_> {
     ///
     /// # Errors
     ///
-    /// A failure if it cannot start, if the network or the recorder fails, or if results could not
+    /// A failure if it cannot start, if the ingress or the recorder fails, or if results could not
     /// be sent.
     pub fn run(
         self,
         load: Load<'_>,
         reports: impl Write + Send + 'static,
     ) -> Result<Exit, Failure> {
-        let Self { lambda, manifest, settings, mut source, recorder, results, pulse, close, stop } =
+        let Self { lambda, manifest, settings, mut feed, recorder, results, pulse, close, stop } =
             self;
         let clock = settings.clock;
-        let waker = match &manifest.schedule {
-            ScheduleSpec::Event { input, .. } => {
-                Some(InputWaker { input: input.to_string(), thread: std::thread::current() })
-            }
-            ScheduleSpec::Periodic { .. } => None,
-        };
         let mode = RunMode::Live(manifest.limits.deadline);
-        let SessionSetup { inputs, session, mut guest } = SessionSetup::load(
-            &mut *source,
-            &lambda,
-            &manifest,
-            mode,
-            Some(&LiveInputs { waker }),
-            load,
-        )?;
+        let SessionSetup { inputs, session, mut guest } =
+            SessionSetup::load_fed(&mut feed, &lambda, &manifest, mode, load)?;
         let recorder = match recorder {
             Some(socket) => {
                 let (build, config, remaps) = (&lambda.build, &lambda.config, &lambda.remaps);
@@ -126,7 +115,7 @@ impl LiveRun<'_> {
                     config,
                     remaps,
                     engine,
-                    clock: CLOCK_OF_VEHICLE,
+                    clock: &clock.to_string(),
                     part: TimeRange::default(),
                 };
                 Some(RecorderSender::join(socket, &identity.header()?, &inputs)?)
@@ -134,12 +123,14 @@ impl LiveRun<'_> {
             None => None,
         };
         let name = manifest.lambda.name.as_str();
-        let round_trip = settings
-            .round_trip
-            .map(|topic| RoundTrip::open(&*source, &topic, clock, name))
-            .transpose()?;
-        let announcer =
-            settings.announce.map(|topic| Announcer::open(&*source, &topic, name)).transpose()?;
+        // In the order of the grants.
+        let mut publishers = (0..).map(|index| feed.publisher(index));
+        let mut publisher =
+            |topic: String| publishers.next().map(|it| TopicPublisher::new(topic, it));
+        let round_trip = settings.round_trip.and_then(&mut publisher);
+        let round_trip = round_trip.map(|publisher| RoundTrip::new(publisher, clock, name));
+        let announcer = settings.announce.and_then(&mut publisher);
+        let announcer = announcer.map(|publisher| Announcer::new(publisher, name));
         let mut results = ResultsWriter::start(results, settings.all, reports)?;
         results.page(&ResultItem::Woken(WokenBy::schedule_of(&manifest)));
         results.report(Report::Isolation { layers: close()? });
@@ -165,7 +156,8 @@ impl LiveRun<'_> {
             round_trip,
             announcer,
             watch,
-            source,
+            bell: feed.bell(),
+            feed,
             clock,
             pulse,
         };
@@ -173,12 +165,11 @@ impl LiveRun<'_> {
         let faults = event_loop.watch.faults();
         event_loop.schedule.finish();
         let unsent = event_loop.unsent();
-        let LiveEventLoop { results, watch, inputs, schedule, session, recorder, source, .. } =
+        let LiveEventLoop { results, watch, inputs, schedule, session, recorder, feed, .. } =
             event_loop;
         let dropped = recorder.map(RecorderSender::leave);
         let last = watch.ended(&Around {
-            source: &*source,
-            health: &source.health(),
+            source: feed.status(),
             inputs: &inputs,
             schedule: &schedule,
             session: &session,

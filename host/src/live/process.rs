@@ -1,4 +1,4 @@
-//! Sets up the process of a live run: arguments, network, socket to the recorder, signals.
+//! Sets up the process of a live run: arguments, connections, signals.
 
 use std::io::{self, Write};
 use std::os::fd::OwnedFd;
@@ -6,20 +6,23 @@ use std::path::PathBuf;
 
 use clap::Args;
 use gleaner_base::{Exit, Failure};
-use gleaner_dds::{Dds, DdsOptions, NetworkArgs};
+use gleaner_feed::Feed;
 use gleaner_jail::Paths;
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::Manifest;
+use gleaner_protocol::Handover;
 use gleaner_transport::Clock;
 use gleaner_vitals::start::stop_flag;
 
 use super::{LiveRun, ResultsPipe, Settings};
-use crate::input::unfinished_bytes;
 use crate::isolation::{Isolation, definition_dirs};
-use crate::network::NetworkError;
 use crate::session_setup::{ConfiguredLambda, LambdaArgs, Load};
 
-/// Arguments of `run`.
+/// Upper bound of the decisions that wait to be written, in bytes.
+pub(crate) const UNWRITTEN: u64 = 48 << 20;
+
+/// Arguments of `run`. Standard input is a socket of the starter, which passes the connections to
+/// the ingress and, if there is one, the recorder.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
     #[command(flatten)]
@@ -31,12 +34,6 @@ pub struct RunArgs {
     /// Write every decision, not only those with a trigger or a fault.
     #[arg(long)]
     pub all: bool,
-    /// Standard input is the socket to the recorder.
-    #[arg(long)]
-    pub recorder: bool,
-    #[command(flatten)]
-    #[allow(missing_docs)]
-    pub network: NetworkArgs,
     /// Offset of the vehicle's clock from CLOCK_MONOTONIC, in ns.
     #[arg(long, value_name = "NS", allow_hyphen_values = true)]
     pub clock_offset: Option<i64>,
@@ -58,8 +55,6 @@ pub struct LiveJob {
     /// Its manifest.
     pub manifest: Manifest,
     settings: Settings,
-    has_recorder: bool,
-    dds: DdsOptions,
 }
 
 impl LiveJob {
@@ -71,10 +66,9 @@ impl LiveJob {
         Paths { read, write: Vec::new() }
     }
 
-    /// Memory that Gleaner's own threads may still allocate, in bytes: partial messages of the
-    /// network, beside the rings.
+    /// Memory that Gleaner's own threads may still allocate, in bytes.
     pub fn own_memory(&self) -> u64 {
-        unfinished_bytes(&self.manifest)
+        UNWRITTEN
     }
 
     /// Checks the arguments against the build and its manifest.
@@ -85,55 +79,47 @@ impl LiveJob {
     pub fn new(args: RunArgs) -> Result<Self, Failure> {
         let build = BuildDir::check_fresh(&args.lambda_args.lambda)?;
         let mut manifest = Manifest::load(build.path())?;
-        let messages = vec![build.path().join("msg")];
         let lambda = ConfiguredLambda::new(args.lambda_args, build, &mut manifest)?;
-        let name: String = manifest
-            .lambda
-            .name
-            .as_str()
-            .chars()
-            .map(|c| if c.is_ascii_alphanumeric() { c } else { '_' })
-            .collect();
-        let mut dds =
-            args.network.options(format!("/gleaner/{name}")).map_err(NetworkError::failure)?;
-        dds.clock = args.clock_offset.map_or_else(Clock::from_time_of_day, Clock::new);
-        dds.largest =
-            manifest.inputs.iter().map(|input| input.max_size.as_usize()).max().unwrap_or(0);
-        dds.messages = messages;
         let settings = Settings {
             out: args.out,
             all: args.all,
             restarts: args.restarts,
-            clock: dds.clock,
+            clock: args.clock_offset.map_or_else(Clock::from_time_of_day, Clock::new),
             round_trip: args.rtt,
             announce: args.decisions,
         };
-        Ok(Self { lambda, manifest, settings, has_recorder: args.recorder, dds })
+        Ok(Self { lambda, manifest, settings })
     }
 
-    /// Joins the network and runs the lambda until SIGTERM, with reports to `reports`.
+    /// Connects to the ingress and runs the lambda until SIGTERM, with reports to `reports`.
     ///
     /// # Errors
     ///
-    /// As [`LiveRun::run`], and a failure if the network cannot be joined.
+    /// As [`LiveRun::run`], and a failure if there is no starter or no ingress.
     pub fn run(
         self,
         load: Load<'_>,
         isolation: &Isolation,
         reports: impl Write + Send + 'static,
     ) -> Result<Exit, Failure> {
-        let Self { lambda, manifest, settings, has_recorder, dds } = self;
+        let Self { lambda, manifest, settings } = self;
         let stop = stop_flag().map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error)
         })?;
-        let source = Dds::open(dds).map_err(NetworkError::failure)?;
+        // Open until the run is over: the starter sees its end.
+        let starter = take_stdin()?;
+        let unconnected = |error| Failure::because("cannot receive the connections", &error);
+        let mut connections = Handover::receive(&starter).map_err(unconnected)?;
+        let ingress = connections.take_ingress().map_err(unconnected)?;
+        let feed = Feed::connect(ingress)
+            .map_err(|error| Failure::because("cannot connect to the ingress", &error))?;
         let pulse = isolation.pulse().clone();
         let run = LiveRun {
             lambda,
             manifest,
             settings,
-            source: Box::new(source),
-            recorder: has_recorder.then(take_stdin).transpose()?,
+            feed,
+            recorder: connections.recorder.take(),
             results: ResultsPipe::open(pulse.clone())?,
             pulse,
             close: &mut || isolation.close().map(<[_]>::to_vec),
@@ -143,11 +129,11 @@ impl LiveJob {
     }
 }
 
-/// Takes the socket from standard input and replaces it by /dev/null: a lambda may read its
-/// standard input.
+/// Takes the starter's socket from standard input and replaces it by /dev/null: a lambda may read
+/// its standard input.
 fn take_stdin() -> Result<OwnedFd, Failure> {
     let failed = |error: io::Error| {
-        Failure::caused_by(Exit::Internal, "cannot take the socket to the recorder", &error)
+        Failure::caused_by(Exit::Internal, "cannot take the socket of the starter", &error)
     };
     let socket =
         rustix::io::fcntl_dupfd_cloexec(io::stdin(), 3).map_err(io::Error::from).map_err(failed)?;

@@ -7,16 +7,11 @@
 //! the triggers in between commas. Both stamps are of CLOCK_MONOTONIC if the message's is, as with
 //! `gleaner play --stamp monotonic`.
 
-use gleaner_base::Failure;
 use gleaner_lambda::Decision;
-use gleaner_transport::{Clock, LiveSource};
+use gleaner_transport::Clock;
 
 use super::topic_publisher::TopicPublisher;
 use crate::api::data::Wake;
-
-const TYPE: &str = "sensor_msgs/msg/TimeReference";
-/// Queue of one second at 1 kHz; older answers are dropped.
-const DEPTH: usize = 1024;
 
 pub(super) struct RoundTrip {
     publisher: TopicPublisher,
@@ -26,19 +21,9 @@ pub(super) struct RoundTrip {
 }
 
 impl RoundTrip {
-    /// Opens `topic` for the answers of `lambda`.
-    pub(super) fn open(
-        source: &dyn LiveSource,
-        topic: &str,
-        clock: Clock,
-        lambda: &str,
-    ) -> Result<Self, Failure> {
-        Ok(Self {
-            publisher: TopicPublisher::open(source, topic, TYPE, DEPTH)?,
-            clock,
-            lambda: lambda.to_owned(),
-            wakes: 0,
-        })
+    /// Answers the wakes of `lambda` through `publisher`.
+    pub(super) fn new(publisher: TopicPublisher, clock: Clock, lambda: &str) -> Self {
+        Self { publisher, clock, lambda: lambda.to_owned(), wakes: 0 }
     }
 
     /// Stamp of the cause of a wake, in ns.

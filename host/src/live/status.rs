@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use gleaner_lambda::Decision;
 use gleaner_lambda::manifest::Manifest;
+use gleaner_protocol::ingress::{ReceptionStatus, SourceStatus};
 use gleaner_protocol::{DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus};
-use gleaner_transport::{Clock, Health, LiveSource, Subscription};
+use gleaner_transport::Clock;
 use gleaner_vitals::{IntervalDurations, usage};
 
 use crate::api::Session;
@@ -31,8 +32,7 @@ pub(super) struct Times {
 
 /// Other sources of a report.
 pub(super) struct Around<'a> {
-    pub(super) source: &'a dyn LiveSource,
-    pub(super) health: &'a Health,
+    pub(super) source: &'a SourceStatus,
     pub(super) inputs: &'a [Arc<Topic>],
     pub(super) schedule: &'a WakeSchedule,
     pub(super) session: &'a Session,
@@ -153,15 +153,14 @@ impl StatusReporter {
         around: &Around,
         [wake_latency, run, decision_latency]: [Option<DurationStats>; 3],
     ) -> LiveStatus {
-        let Around { source, health, inputs, schedule, session, unwritten, unsent, recorder_link } =
+        let Around { source, inputs, schedule, session, unwritten, unsent, recorder_link } =
             *around;
         let now = self.clock.now();
         let seconds = now.saturating_sub(self.reported) as f64 / 1e9;
         self.reported = now;
         let mut topics = Vec::with_capacity(inputs.len());
         for (index, topic) in inputs.iter().enumerate() {
-            // The inputs were the first subscriptions of this transport, in their order.
-            let status = source.status(Subscription(index));
+            let status = reception(source, index);
             if let Some(lost) = status.lost {
                 topic.set_lost(lost);
             }
@@ -201,10 +200,16 @@ impl StatusReporter {
             run_time: run,
             decision_latency,
             topics,
-            network: health.network.clone().unwrap_or_default(),
+            network: source.health.network.clone().unwrap_or_default(),
             rss_bytes: usage::resident(),
             cpu_s: usage::cpu_seconds(),
             ..self.base.clone()
         }
     }
+}
+
+/// Returns the state of the subscription of an input, whose topic has the input's index as its id.
+fn reception(source: &SourceStatus, index: usize) -> ReceptionStatus {
+    let found = source.topics.iter().find(|(id, _)| usize::try_from(*id) == Ok(index));
+    found.map(|(_, status)| status.clone()).unwrap_or_default()
 }

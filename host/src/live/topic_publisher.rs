@@ -1,9 +1,8 @@
 //! Publishes a topic of a lambda's process, without blocking. Messages that cannot be sent are
 //! counted, and logged at increasing intervals.
 
-use gleaner_base::Failure;
 use gleaner_messages::CdrWriter;
-use gleaner_transport::{LiveSource, Publisher};
+use gleaner_transport::Publisher;
 
 pub(super) struct TopicPublisher {
     topic: String,
@@ -13,15 +12,9 @@ pub(super) struct TopicPublisher {
 }
 
 impl TopicPublisher {
-    /// Opens `topic`; its `depth` newest messages are kept for a slow reader.
-    pub(super) fn open(
-        source: &dyn LiveSource,
-        topic: &str,
-        type_name: &str,
-        depth: usize,
-    ) -> Result<Self, Failure> {
-        let publisher = source.publisher(topic, type_name, depth)?;
-        Ok(Self { topic: topic.to_owned(), publisher, unsent: 0, message: CdrWriter::new() })
+    /// Publishes `topic` through `publisher`.
+    pub(super) fn new(topic: String, publisher: Box<dyn Publisher>) -> Self {
+        Self { topic, publisher, unsent: 0, message: CdrWriter::new() }
     }
 
     /// Number of messages that were not sent.

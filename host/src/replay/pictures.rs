@@ -106,7 +106,7 @@ impl TriggerPictures {
         for topic in &self.inputs {
             // Not by the lambda's own calls: the journal notes how far the lambda looked back.
             let Some(lease) = topic.reader().newest() else { continue };
-            let meta = *lease.meta();
+            let meta = lease.meta().sample;
             let jpeg = self
                 .as_before(meta.at_ns)
                 .or_else(|| thumbnail(topic.type_name(), &lease, meta.endian));

@@ -189,7 +189,7 @@ pub(super) fn replay(
         None
     };
     let SessionSetup { inputs, session, mut guest } =
-        SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, None, load)?;
+        SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
     let started = Instant::now();
     let mut header = None;
     if results.journal.is_some() || recording.is_some() {

@@ -32,7 +32,7 @@ pub(super) fn run(
     let _recorded =
         if is_recorded { ReplayRecorder::subscribe(manifest, options, &mut drive)? } else { None };
     let SessionSetup { inputs, session, mut guest } =
-        SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, None, load)?;
+        SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
     let curves = Curves::of(&inputs);
     if guest.init().is_err() {
         // The guest has sent the fault.

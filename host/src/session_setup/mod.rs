@@ -1,15 +1,17 @@
-//! Sets up a lambda's session, over drives or live: its arguments, the rings that a transport
-//! fills, and the guest that reads them. Also re-exports the writer of its decisions.
+//! Sets up a lambda's session, over drives or live: its arguments, the rings of its inputs, and the
+//! guest that reads them. Also re-exports the writer of its decisions.
 
 mod lambda_args;
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use gleaner_base::{Exit, Explain, Failure, visible};
+use gleaner_base::{Exit, Failure, visible};
+use gleaner_feed::Feed;
 use gleaner_lambda::Fault;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_transport::{Transport, TransportError};
+use gleaner_messages::Sources;
+use gleaner_transport::Transport;
 
 pub use gleaner_lambda::{LOCK, Output, OutputError, RESULTS};
 pub use lambda_args::{ConfiguredLambda, LambdaArgs, tighten};
@@ -18,7 +20,8 @@ use crate::api::Session;
 use crate::api::data::Topic;
 use crate::api::log::LogLine;
 use crate::guest::Guest;
-use crate::input::{InputError, LiveInputs, open_inputs};
+use crate::input::{InputError, open_fed_inputs, open_inputs};
+use crate::isolation::definition_dirs;
 
 /// Creates the guest of a lambda; the caller can host its kind.
 pub type Load<'a> = &'a mut dyn FnMut(
@@ -48,7 +51,7 @@ pub struct SessionSetup {
 }
 
 impl SessionSetup {
-    /// Opens the inputs and loads the lambda. `live` is set where samples arrive while it runs.
+    /// Opens the inputs in rings that `transport` fills, and loads the lambda.
     ///
     /// # Errors
     ///
@@ -58,10 +61,37 @@ impl SessionSetup {
         lambda: &ConfiguredLambda,
         manifest: &Manifest,
         mode: RunMode,
-        live: Option<&LiveInputs>,
         load: Load<'_>,
     ) -> Result<Self, Failure> {
-        let inputs = open_inputs(manifest, &lambda.remaps, transport, live).map_err(|error| {
+        let inputs = open_inputs(manifest, &lambda.remaps, transport);
+        Self::of_inputs(inputs, lambda, manifest, mode, load)
+    }
+
+    /// Attaches the inputs in the memory of the ingress, and loads the lambda.
+    ///
+    /// # Errors
+    ///
+    /// A failure that explains why the lambda cannot start.
+    pub fn load_fed(
+        feed: &mut Feed,
+        lambda: &ConfiguredLambda,
+        manifest: &Manifest,
+        mode: RunMode,
+        load: Load<'_>,
+    ) -> Result<Self, Failure> {
+        let sources = Sources::new(&[lambda.build.path().join("msg")], &definition_dirs());
+        let inputs = open_fed_inputs(manifest, &lambda.remaps, feed, &sources);
+        Self::of_inputs(inputs, lambda, manifest, mode, load)
+    }
+
+    fn of_inputs(
+        inputs: Result<Vec<Arc<Topic>>, InputError>,
+        lambda: &ConfiguredLambda,
+        manifest: &Manifest,
+        mode: RunMode,
+        load: Load<'_>,
+    ) -> Result<Self, Failure> {
+        let inputs = inputs.map_err(|error| {
             Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error)
         })?;
         let session = Session::new(inputs.clone(), lambda.config.clone(), &manifest.limits);
@@ -77,33 +107,4 @@ pub fn not_started(lambda: &str, fault: Fault, log: &[LogLine]) -> Failure {
     let mut failure = Failure::new(Exit::LambdaFaulted, format!("cannot start lambda `{lambda}`"));
     failure.causes = vec![fault.message];
     failure
-}
-
-impl Explain for InputError {
-    fn help(&self) -> Option<String> {
-        let Self::Subscribe { source, .. } = self else {
-            return Some("lower depth, hold or max_size of this [[input]]".to_owned());
-        };
-        Some(match source {
-            TransportError::NoSuchTopic { .. } => {
-                "correct `topic` in lambda.toml, or pass --remap FROM:=TO".to_owned()
-            }
-            TransportError::WrongType { found, .. } => {
-                format!("write type = \"{found}\" in lambda.toml, or choose another topic")
-            }
-            TransportError::Encoding { what: "schema encoding", .. } => {
-                "put the .msg files of the type, and of those it refers to, into DIR/msg, and \
-                 build again"
-                    .to_owned()
-            }
-            _ => return None,
-        })
-    }
-
-    fn exit(&self) -> Exit {
-        match self {
-            Self::Subscribe { .. } => Exit::Usage,
-            Self::Layout { .. } | Self::Memory { .. } => Exit::Internal,
-        }
-    }
 }

@@ -59,7 +59,7 @@ impl HostedData {
         for (input, definition) in manifest.inputs.iter().zip([IMAGE, COMPRESSED, "uint8 x\n"]) {
             transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
         }
-        let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
+        let inputs = open_inputs(&manifest, &[], &mut transport).unwrap();
         let mut jpeg = Vec::new();
         jpeg_encoder::Encoder::new(&mut jpeg, 80)
             .encode(&[7; 64 * 48 * 3], 64, 48, jpeg_encoder::ColorType::Rgb)
@@ -71,7 +71,7 @@ impl HostedData {
         session.begin(1);
         let [topic, coded, many] = [0, 1, 2].map(|input| Arc::clone(&inputs[input]));
         let (field, x) = (topic.field("width").unwrap(), many.field("x").unwrap());
-        let (sample, coded) = (topic.newest().unwrap(), coded.newest().unwrap());
+        let (sample, coded) = (topic.newest().unwrap().unwrap(), coded.newest().unwrap().unwrap());
         let frame = sample.as_frame().unwrap();
         Self { session, topic, field, sample, coded, frame, many, x }
     }
@@ -88,7 +88,7 @@ impl HostedData {
             Operation::TypeName => answered(topic.type_name()),
             Operation::TopicCounts => answered(topic.counts()),
             Operation::Newest => answered(topic.newest()),
-            Operation::Last => topic.last(9).map(drop).map_err(DataError::from),
+            Operation::Last => topic.last(9).map(drop),
             Operation::Since => topic.since(0).map(drop).map_err(DataError::from),
             Operation::Field => topic.field("encoding").map(drop),
             Operation::Column => many.column(x, usize::MAX).map(drop),

@@ -78,8 +78,9 @@ fn repeated_faults_leave_memory_slots_and_handles_unchanged() {
         let counts = test.topic.counts();
         assert_eq!((counts.received, counts.no_slot), (u64::from(faults) + 500, 0), "{name}");
         // Its frames were released with it: all can be created again.
-        let frames: Vec<_> =
-            (0..small().frames).map(|_| test.topic.newest().unwrap().as_frame().unwrap()).collect();
+        let frames: Vec<_> = (0..small().frames)
+            .map(|_| test.topic.newest().unwrap().unwrap().as_frame().unwrap())
+            .collect();
         assert_eq!(frames.len() as u64, small().frames, "{name}");
     }
 }

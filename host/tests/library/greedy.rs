@@ -136,7 +136,7 @@ impl TestGuest {
         self.sent += 1;
         publish(&mut self.transport, CAMERA, self.sent, &self.picture);
         self.session.begin(at_ns);
-        self.guest.wake(Wake::Event(self.topic.newest().expect("a picture")))
+        self.guest.wake(Wake::Event(self.topic.newest().unwrap().expect("a picture")))
     }
 
     /// Runs a wake, and returns its fault.
@@ -181,7 +181,7 @@ fn config(behaviour: &str, bytes: u32) -> Vec<(String, ConfigValue)> {
 pub fn subscribed(manifest: &Manifest, definition: &str) -> (Loopback, Arc<Topic>) {
     let (mut transport, input) = (Loopback::new(), &manifest.inputs[0]);
     transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
-    let topic = open_inputs(manifest, &[], &mut transport, None).expect("an input").remove(0);
+    let topic = open_inputs(manifest, &[], &mut transport).expect("an input").remove(0);
     (transport, topic)
 }
 

@@ -95,7 +95,7 @@ impl DriverGuest {
         {
             transport.add_topic(input.topic.as_str(), input.type_name.as_str(), definition);
         }
-        let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
+        let inputs = open_inputs(&manifest, &[], &mut transport).unwrap();
         let limits: &Limits = &manifest.limits;
         let session = Session::new(inputs.clone(), Vec::new(), limits);
         let cache = root().join("target/test-cache/gleaner");
@@ -135,7 +135,7 @@ impl DriverGuest {
         self.session.begin(self.sent as i64 * 1_000_000);
         // It may hold all slots: then there is no room for the program, and the previous one runs
         // again.
-        let Some(sample) = self.inputs[0].newest() else { return (Ok(()), None, Vec::new()) };
+        let Ok(Some(sample)) = self.inputs[0].newest() else { return (Ok(()), None, Vec::new()) };
         let outcome = self.guest.wake(Wake::Event(sample));
         self.session.take_log();
         (outcome.result, outcome.fuel, self.session.end())

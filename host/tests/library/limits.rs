@@ -266,7 +266,7 @@ fn one_call_hands_out_one_mebibyte_of_a_message() {
     let bytes = vec![7; BYTES_PER_CALL + 1];
     let topic =
         topic(only("uint8[] x\n"), 1, "2 MiB", 1, &CdrBuilder::default().bytes(&bytes).done());
-    let sample = topic.newest().unwrap();
+    let sample = topic.newest().unwrap().unwrap();
     let size = sample.bytes().len() as u64;
     assert_eq!(sample.cdr(0, u32::MAX).unwrap().len(), BYTES_PER_CALL);
     for (offset, left) in [(size - 3, 3), (size, 0), (size + 1, 0), (u64::MAX, 0)] {
@@ -284,6 +284,7 @@ fn one_call_hands_out_one_mebibyte_of_a_frame() {
     let frame = topic(("sensor_msgs/msg/Image", IMAGE), 1, "2 MiB", 1, &cdr)
         .newest()
         .unwrap()
+        .unwrap()
         .as_frame()
         .unwrap();
     let size = 1_260_000;
@@ -300,7 +301,7 @@ fn a_list_that_is_longer_than_one_call_hands_out_is_refused_and_not_cut() {
     let numbers = |n: usize| [&(n as u32).to_le_bytes(), vec![0_u8; 2 * n].as_slice()].concat();
     let get = |definition, cdr: &[u8]| {
         let topic = topic(only(definition), 1, "1 MiB", 1, cdr);
-        let (field, sample) = (topic.field("x").unwrap(), topic.newest().unwrap());
+        let (field, sample) = (topic.field("x").unwrap(), topic.newest().unwrap().unwrap());
         sample.get(&field).map(drop)
     };
     get("string[] x\n", &texts(TEXTS_PER_FIELD)).unwrap();

@@ -1,5 +1,5 @@
-//! A complete live run over a loopback: time, results, reports and published decisions, without
-//! DDS, shim or sandbox.
+//! A complete live run over a loopback and an ingress in this process: time, results, reports and
+//! published decisions, without DDS, shim or sandbox.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, PipeReader, Read, pipe};
@@ -12,14 +12,17 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
+use gleaner_feed::Feed;
 use gleaner_host::api::Session;
-use gleaner_host::api::data::Wake;
+use gleaner_host::api::data::{Sample, Wake};
 use gleaner_host::guest::{Guest, WakeOutcome};
 use gleaner_host::live::{LiveRun, ResultsPipe, Settings};
 use gleaner_host::session_setup::ConfiguredLambda;
+use gleaner_ingress::Ingress;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_lambda::{BuildDir, Fault, FaultKind};
 use gleaner_messages::Endian;
+use gleaner_protocol::ingress::{AddReader, IngressControl, PublishGrant, TopicGrant};
 use gleaner_protocol::{Report, ResultItem};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Clock, Delivery, Guid, Qos, SampleMeta, Sink, TopicSpec, Transport};
@@ -29,8 +32,14 @@ const PATIENCE: Duration = Duration::from_secs(60);
 const NUMBERS: &str = "/numbers";
 const DECISIONS: &str = "/decisions";
 
+/// Numbers from this on: the lambda keeps the sample.
+const KEEPS: i64 = 1000;
+
 /// Triggers with the number of each sample; a negative one is a fault.
-struct NumbersGuest(Session);
+struct NumbersGuest {
+    session: Session,
+    kept: Vec<Sample>,
+}
 
 impl Guest for NumbersGuest {
     fn init(&mut self) -> Result<(), Fault> {
@@ -40,7 +49,10 @@ impl Guest for NumbersGuest {
     fn wake(&mut self, wake: Wake) -> WakeOutcome {
         let Wake::Event(sample) = wake else { panic!("samples wake this lambda") };
         let value = sample.number(&sample.topic().field("value").unwrap()).unwrap();
-        self.0.event("number", value, Vec::new()).unwrap();
+        self.session.event("number", value, Vec::new()).unwrap();
+        if value >= KEEPS as f64 {
+            self.kept.push(sample);
+        }
         let fault = Fault {
             kind: FaultKind::Exception,
             message: "negative".to_owned(),
@@ -54,6 +66,10 @@ impl Guest for NumbersGuest {
         }
     }
 
+    fn discard(&mut self) {
+        self.kept.clear();
+    }
+
     fn engine(&self) -> String {
         "a test".to_owned()
     }
@@ -62,6 +78,8 @@ impl Guest for NumbersGuest {
 /// A run in a thread of its own.
 struct Running {
     loopback: Loopback,
+    /// `None` once the ingress has ended.
+    ingress: Option<(IngressControl, JoinHandle<()>)>,
     clock: Clock,
     stop: Arc<AtomicBool>,
     reports: BufReader<PipeReader>,
@@ -83,8 +101,15 @@ impl Running {
         loopback.add_topic(DECISIONS, "std_msgs/msg/String", "string data\n");
         let (reports, to_reports) = pipe().unwrap();
         let (results, to_results) = pipe().unwrap();
-        let (source, stopped, announce) =
-            (loopback.clone(), Arc::clone(&stop), announce.map(str::to_owned));
+        let (mut control, ingress) = Ingress::start_in_thread(Box::new(loopback.clone()));
+        let input = &manifest.inputs[0];
+        let added = AddReader {
+            name: "numbers".to_owned(),
+            topics: vec![TopicGrant::for_input(0, input, NUMBERS, true, false)],
+            publishes: PublishGrant::of_lambda(None, announce),
+        };
+        let socket = control.add_reader(&added).unwrap();
+        let (stopped, announce) = (Arc::clone(&stop), announce.map(str::to_owned));
         let run = thread::spawn(move || {
             let pulse = Pulse::create().unwrap().0;
             let folder = PathBuf::from("numbers");
@@ -105,7 +130,7 @@ impl Running {
                     round_trip: None,
                     announce,
                 },
-                source: Box::new(source),
+                feed: Feed::connect(socket).unwrap(),
                 recorder: None,
                 results: ResultsPipe::over(File::from(OwnedFd::from(to_results)), pulse.clone()),
                 pulse,
@@ -113,12 +138,12 @@ impl Running {
                 stop: &stopped,
             };
             let mut load = |_: &ConfiguredLambda, _: &Manifest, session: Session, _| {
-                Ok(Box::new(NumbersGuest(session)) as Box<dyn Guest>)
+                Ok(Box::new(NumbersGuest { session, kept: Vec::new() }) as Box<dyn Guest>)
             };
             run.run(&mut load, File::from(OwnedFd::from(to_reports)))
         });
-        let mut running =
-            Self { loopback, clock, stop, reports: BufReader::new(reports), results, run, sent: 0 };
+        let (ingress, reports) = (Some((control, ingress)), BufReader::new(reports));
+        let mut running = Self { loopback, ingress, clock, stop, reports, results, run, sent: 0 };
         running.until(|report| matches!(report, Report::Ready).then_some(()));
         running
     }
@@ -218,6 +243,47 @@ fn a_source_that_dies_ends_the_run_with_its_reason_and_the_results_are_complete(
         (Exit::Unreachable, vec!["the cable is cut".to_owned()])
     );
     assert!(matches!(pages.last(), Some(ResultItem::Last(last)) if last.wakes == 1), "{pages:?}");
+}
+
+#[test]
+fn a_run_whose_ingress_ends_ends_too_and_says_so() {
+    let mut running = Running::start(None);
+    running.publish(4);
+    assert_eq!(running.decided(), 4.0);
+    let (control, ingress) = running.ingress.take().unwrap();
+    drop(control);
+    ingress.join().unwrap();
+    running.until(|report| matches!(report, Report::Ended(_)).then_some(()));
+    let (ended, pages) = running.stop();
+    let failure = ended.unwrap_err();
+    assert_eq!((failure.exit, &*failure.message), (Exit::Unreachable, "the ingress has ended"));
+    assert!(matches!(pages.last(), Some(ResultItem::Last(last)) if last.wakes == 1), "{pages:?}");
+}
+
+#[test]
+fn a_lambda_that_keeps_too_many_samples_faults_and_goes_on() {
+    let mut running = Running::start(None);
+    // Its manifest has `hold` = 8; some more are for the host.
+    let keeps = KEEPS..KEEPS + 30;
+    let mut faults = Vec::new();
+    for value in keeps {
+        running.publish(value);
+        let fault = running.until(|report| match report {
+            Report::Decision(decision) => Some(decision.fault),
+            _ => None,
+        });
+        faults.extend(fault);
+        if faults.len() == 1 {
+            break;
+        }
+    }
+    let [fault] = &faults[..] else { panic!("{faults:?}") };
+    assert_eq!(fault.kind, FaultKind::HostCall);
+    assert!(fault.message.contains("input `numbers`: raise `hold` of this [[input]]"), "{fault:?}");
+    running.publish(5);
+    assert_eq!(running.decided(), 5.0, "the samples are free again");
+    let (ended, _) = running.stop();
+    assert_eq!(ended.unwrap(), Exit::LambdaFaulted);
 }
 
 /// Forwards the messages of a topic.

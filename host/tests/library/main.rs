@@ -8,6 +8,7 @@ mod host_calls;
 mod host_time;
 mod limits;
 mod live;
+mod live_clips;
 mod misbehaving;
 mod own_process;
 mod schedule;

@@ -41,7 +41,7 @@ impl MisbehavingGuest {
         let manifest = Manifest::load(&lambda).expect("misbehave is built; run: cargo xtask test");
         let mut transport = Loopback::new();
         transport.add_topic("/imu/data", "sensor_msgs/msg/Imu", IMU);
-        let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
+        let inputs = open_inputs(&manifest, &[], &mut transport).unwrap();
         let topic = Arc::clone(&inputs[0]);
         let config = vec![("behaviour".to_owned(), ConfigValue::Text(behaviour.to_owned()))];
         let mut limits = Limits::default();
@@ -80,7 +80,7 @@ impl MisbehavingGuest {
         };
         self.transport.publish("/imu/data", &meta, &[0; 24]).unwrap();
         self.session.begin(at_ns);
-        let sample = self.topic.newest().unwrap();
+        let sample = self.topic.newest().unwrap().unwrap();
         self.guest.wake(Wake::Event(sample))
     }
 

@@ -45,7 +45,7 @@ impl EventFeed {
         let manifest = Manifest::parse(&manifest, "lambda.toml").unwrap();
         let mut transport = Loopback::new();
         transport.add_topic("/imu/data", "sensor_msgs/msg/Imu", IMU);
-        let inputs = open_inputs(&manifest, &[], &mut transport, None).unwrap();
+        let inputs = open_inputs(&manifest, &[], &mut transport).unwrap();
         Self {
             transport,
             topic: Arc::clone(&inputs[0]),

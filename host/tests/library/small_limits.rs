@@ -197,7 +197,7 @@ fn the_bytes_that_one_call_returns_are_limited() {
         1,
         &CdrBuilder::default().bytes(&bytes).done(),
     );
-    let sample = topic.newest().unwrap();
+    let sample = topic.newest().unwrap().unwrap();
     assert_eq!(sample.cdr(0, u32::MAX).unwrap().len(), 64 << 10);
     let error = sample.get(&topic.field("x").unwrap()).map(drop).unwrap_err();
     assert!(
@@ -219,7 +219,7 @@ fn the_items_that_one_call_returns_are_limited() {
     let numbers = |n: usize| [&(n as u32).to_le_bytes(), vec![0_u8; 2 * n].as_slice()].concat();
     let get = |definition, cdr: &[u8]| {
         let topic = topic(definition, few, 1, cdr);
-        topic.newest().unwrap().get(&topic.field("x").unwrap()).map(drop)
+        topic.newest().unwrap().unwrap().get(&topic.field("x").unwrap()).map(drop)
     };
     get("string[] x\n", &texts(20)).unwrap();
     get("uint16[] x\n", &numbers(20)).unwrap();

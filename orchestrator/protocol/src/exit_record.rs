@@ -31,7 +31,7 @@ pub struct ExitRecord {
     /// True if the runtime ran out of memory: the kernel killed a process of its control group, or
     /// it aborted after it was refused memory.
     pub out_of_memory: bool,
-    /// Peak resident memory, in bytes.
+    /// Peak resident memory, in bytes; live, samples in shared memory are part of it.
     pub max_rss_bytes: u64,
     /// CPU time of the runtime and its children, in ns.
     pub cpu_ns: u64,

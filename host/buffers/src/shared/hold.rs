@@ -108,7 +108,7 @@ pub(super) struct WindowHold {
 
 impl WindowHold {
     /// Takes over the hold of `word`, which protects `samples`.
-    pub(super) fn new(reader: Arc<ReaderState>, word: u16, samples: Vec<FoundSample>) -> Self {
+    pub(super) fn new(reader: Arc<ReaderState>, word: u16, samples: &[FoundSample]) -> Self {
         Self { reader, word, samples: samples.into() }
     }
 }
@@ -119,7 +119,8 @@ impl Drop for WindowHold {
     }
 }
 
-/// Samples at neighbouring positions, held by one hazard until the last of them is dropped.
+/// Samples at neighbouring positions, at least one. They are held by one hazard until the last of
+/// them is dropped, or by one hazard each.
 pub struct HeldWindow {
     samples: Vec<HeldSample>,
 }
@@ -130,6 +131,11 @@ impl HeldWindow {
         let hold = Arc::new(hold);
         let sample = |index| HeldSample { hold: Arc::clone(&hold), index: index as u32 };
         Self { samples: (0..hold.samples.len()).map(sample).collect() }
+    }
+
+    /// The samples of several holds.
+    pub(super) fn concat(windows: Vec<Self>) -> Self {
+        Self { samples: windows.into_iter().flat_map(Self::into_samples).collect() }
     }
 
     /// The samples, oldest first.

@@ -18,9 +18,9 @@
 //! 1. A reader loads `seq` (Acquire), reads slot, length and meta (relaxed), stores the hazard
 //!    (Release), fences (R), and loads `seq` again. If it changed, the reader clears the hazard and
 //!    gives up. When it is done with the sample, it clears the hazard (Release).
-//! 2. When a position leaves, the writer stores `seq = 0`. The next draft fences (W). If it knows
-//!    of no free slot, it reads each hazard once (Acquire), and frees all slots that are neither
-//!    shown nor held. It fills one of them, then writes the place, `seq` and `head` (Release).
+//! 2. When a position leaves, the writer stores `seq = 0`. The next draft fences (W). If it has no
+//!    free slot, it reads each hazard once (Acquire), and frees all slots that are neither shown
+//!    nor held. It fills one of them, then writes the place, `seq` and `head` (Release).
 //! 3. If W precedes R in the order of SeqCst fences, the reader's second load sees the 0 or a later
 //!    value, and the reader gives up. Otherwise the writer's scan sees the hazard, and leaves the
 //!    slot alone, or it sees a later value of that word.

@@ -1,6 +1,8 @@
 //! The reading end of a topic: finds samples, and holds them in place.
 #![allow(unsafe_code)]
 
+use std::slice;
+
 use super::control::{ControlMemory, HoldLimits};
 use super::hold::{HoldTable, WindowHold};
 use super::layout::{COUNTER_WORDS, META_WORDS, ReaderMemory, SharedMemory};
@@ -87,6 +89,24 @@ impl SharedReader {
         // Acquire: a word of a later sample was stored after `seq` was cleared (rule 5).
         fence(Ordering::Acquire);
         self.is_shown(position).then_some(found.meta)
+    }
+
+    /// Position and meta data of the newest sample, without a hold; `None` before the first one.
+    pub fn newest_meta(&self) -> Option<(u64, [u64; META_WORDS])> {
+        let mut head = self.head();
+        for _ in 0..ATTEMPTS {
+            let position = head.checked_sub(1)?;
+            if let Some(meta) = self.meta(position) {
+                return Some((position, meta));
+            }
+            // It left, so `head` moved.
+            let now = self.head();
+            if now == head {
+                return None;
+            }
+            head = now;
+        }
+        None
     }
 
     /// Holds the sample at `position`; `None` if it is not shown (any more).
@@ -176,9 +196,21 @@ impl SharedReader {
         Ok(None)
     }
 
-    /// Holds samples at neighbouring positions, oldest first; `None` if there is none, or the
-    /// oldest has left.
+    /// Holds samples at neighbouring positions, oldest first; `None` if there is none, or one has
+    /// left.
     fn hold(&self, found: Vec<FoundSample>) -> Result<Option<HeldWindow>, ReadError> {
+        match self.hold_by_one_word(&found) {
+            // Words for single samples may be left.
+            Err(ReadError::OutOfHolds) if found.len() > 1 => {
+                let alone = |sample| self.hold_by_one_word(slice::from_ref(sample)).transpose();
+                let held: Option<Result<Vec<_>, _>> = found.iter().map(alone).collect();
+                Ok(held.transpose()?.map(HeldWindow::concat))
+            }
+            held => held,
+        }
+    }
+
+    fn hold_by_one_word(&self, found: &[FoundSample]) -> Result<Option<HeldWindow>, ReadError> {
         let Some(oldest) = found.first().map(|oldest| oldest.position) else { return Ok(None) };
         // Positions leave in order: the oldest one stands for all.
         let is_shown = || self.is_shown(oldest);

@@ -54,6 +54,11 @@ impl<M> SharedRing<M> {
         words.map(|words| (self.decode)(&words))
     }
 
+    pub(crate) fn newest_meta(&self) -> Option<(u64, M)> {
+        let (position, words) = self.reader.newest_meta()?;
+        Some((position.checked_sub(self.first)?, (self.decode)(&words)))
+    }
+
     pub(crate) fn newest_before(&self, end: u64) -> Option<Lease<M>> {
         let mut newest = None;
         self.newest_while_into(end, 1, |_| true, |lease| newest = Some(lease));

@@ -13,6 +13,7 @@ mod peer;
 mod qos;
 mod receive;
 mod type_query;
+mod unsubscribe;
 mod write;
 
 use std::process::ExitCode;
@@ -44,6 +45,7 @@ fn main() -> ExitCode {
         write::TESTS,
         hostile::TESTS,
         life::TESTS,
+        unsubscribe::TESTS,
     ];
     let trial = |&(name, test): &Test| match &here {
         Ok(()) => Trial::test(name, move || -> Result<(), Failed> {

@@ -60,8 +60,11 @@ impl Sink for TopicRoute {
         // Locked meanwhile: a sink that was removed gets nothing more.
         let subscribers = self.lock();
         let meta = self.stamped(meta);
-        let each = |_, known: &Subscriber| known.sink.deliver(&meta, cdr);
-        subscribers.iter().fold(Delivery::Taken, each)
+        let mut delivery = Delivery::Taken;
+        for known in &*subscribers {
+            delivery = known.sink.deliver(&meta, cdr);
+        }
+        delivery
     }
 
     fn too_big(&self, meta: &SampleMeta, len: usize) {

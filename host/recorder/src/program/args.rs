@@ -3,33 +3,26 @@
 use std::path::PathBuf;
 
 use clap::Parser;
-use gleaner_base::{Exit, Failure};
-use gleaner_dds as dds;
-use gleaner_dds::{Dds, NetworkArgs};
 use gleaner_lambda::manifest::TopicName;
-use gleaner_transport::{Clock, LiveSource};
+use gleaner_messages::Sources;
+use gleaner_transport::Clock;
 
 use super::RecorderOptions;
 
-/// Records for lambdas from live ROS 2 topics. Lambdas connect over standard input, a socket of the
-/// starter; reports, one JSON object per line, go to standard output.
+/// Records for lambdas from live topics, which it reads from the ingress. Its standard input is a
+/// socket of the starter; reports, one JSON object per line, go to standard output.
 #[derive(Parser)]
 #[command(name = "gleaner-recorder", version)]
-pub(super) struct Args {
+pub struct Args {
     /// Output folder: `clips.jsonl`, `clips/`.
     #[arg(long, value_name = "FOLDER")]
-    out: PathBuf,
-    #[command(flatten)]
-    network: NetworkArgs,
+    pub(super) out: PathBuf,
     /// Offset of the sample clock from CLOCK_MONOTONIC, in ns; default: the time of day.
     #[arg(long, value_name = "NS", allow_negative_numbers = true)]
     clock_offset: Option<i64>,
     /// Folder with message definitions, searched first.
     #[arg(long, value_name = "FOLDER")]
     messages: Vec<PathBuf>,
-    /// Bytes of the largest sample, which sets the size of socket buffers.
-    #[arg(long, value_name = "BYTES")]
-    largest: Option<usize>,
     /// Bytes of the preroll; default: the sum of what the lambdas request.
     #[arg(long, value_name = "BYTES")]
     preroll_memory: Option<u64>,
@@ -48,37 +41,25 @@ pub(super) struct Args {
     commands: Option<TopicName>,
 }
 
-/// The options of the network.
-pub(super) struct NetworkOptions(dds::DdsOptions);
-
 impl Args {
-    pub(super) fn read(self) -> Result<(RecorderOptions, NetworkOptions), Failure> {
-        let usage = |error: &dds::DdsError| {
-            Failure::caused_by(Exit::Usage, "cannot use the network", error)
-        };
-        let mut network =
-            self.network.options("/gleaner/recorder").map_err(|error| usage(&error))?;
-        network.largest = self.largest.unwrap_or(network.largest);
-        network.messages = self.messages;
-        network.clock = self.clock_offset.map_or(network.clock, Clock::new);
-        let options = RecorderOptions {
+    pub fn read(self) -> RecorderOptions {
+        RecorderOptions {
             out: self.out,
-            clock: network.clock,
+            clock: self.clock_offset.map_or_else(Clock::from_time_of_day, Clock::new),
+            messages: Sources::new(&self.messages, &installed()),
             preroll_bytes: self.preroll_memory,
             disk_floor: self.disk_floor,
             clips_max: self.clips_max,
             bytes_max: self.bytes_max,
             commands: self.commands.map(|topic| topic.to_string()),
-        };
-        Ok((options, NetworkOptions(network)))
+        }
     }
 }
 
-impl NetworkOptions {
-    pub(super) fn open(self) -> Result<Box<dyn LiveSource>, Failure> {
-        let dds = Dds::open(self.0).map_err(|error| {
-            Failure::caused_by(Exit::Unreachable, "cannot join the network", &error)
-        })?;
-        Ok(Box::new(dds))
-    }
+/// Returns the prefixes of the installation of ROS 2.
+fn installed() -> Vec<PathBuf> {
+    let prefixes = std::env::var_os("AMENT_PREFIX_PATH").unwrap_or_default();
+    std::env::split_paths(&prefixes)
+        .filter(|path| path.is_absolute() && path.parent().is_some())
+        .collect()
 }

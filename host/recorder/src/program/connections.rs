@@ -3,10 +3,12 @@
 
 use std::io;
 use std::os::fd::OwnedFd;
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::thread::{Builder, Thread};
+use std::thread::Builder;
 
 use gleaner_base::{Exit, Failure, hex};
+use gleaner_feed::FeedBell;
 use gleaner_journal::{JournalEntry, JournalHeader};
 use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::link::{
@@ -15,34 +17,37 @@ use gleaner_protocol::link::{
 use sha2::{Digest, Sha256};
 use tracing::warn;
 
-use super::topic_watch::WatchEvent;
+use super::background::SystemHealth;
 
 /// Maximum number of messages of one lambda that are queued for the loop; then its socket fills,
 /// and then the lambda's own queue.
 const INBOX: usize = 64;
 
 /// An event for the loop, other than samples and messages of lambdas.
-pub(super) enum LoopEvent {
+pub enum LoopEvent {
     /// A lambda was announced.
     Registered(Box<Registration>),
     /// A lambda was announced and refused; the reason was sent to it.
     Refused,
     /// The loop has to end: the starter sent stop, has ended, or made a protocol error.
     Stop,
-    /// An event of the watch thread.
-    Watch(WatchEvent),
+    /// Definitions of a topic on this machine, by the id of its grant.
+    Definitions { id: u32, text: Option<Arc<str>> },
+    /// The checks of each second.
+    Health(SystemHealth),
 }
 
 /// An announced lambda, and its connection.
-pub(super) struct Registration {
-    pub(super) manifest: Manifest,
-    pub(super) remaps: Vec<(String, String)>,
-    pub(super) inbox: Receiver<LambdaEvent>,
-    pub(super) replies: LambdaReplies,
+pub struct Registration {
+    pub manifest: Manifest,
+    pub remaps: Vec<(String, String)>,
+    pub grants: Vec<(String, u32)>,
+    pub inbox: Receiver<LambdaEvent>,
+    pub replies: LambdaReplies,
 }
 
 /// A message of a lambda.
-pub(super) enum LambdaEvent {
+pub enum LambdaEvent {
     /// The header of the lambda matches the announcement.
     Hello(Box<JournalHeader>),
     /// The header of the lambda differs from the announcement in this way.
@@ -58,16 +63,12 @@ pub(super) enum LambdaEvent {
 }
 
 /// Receives messages of the starter until it ends.
-pub(super) fn starter(
-    control: OwnedFd,
-    events: SyncSender<LoopEvent>,
-    reader: Thread,
-) -> io::Result<()> {
+pub fn starter(control: OwnedFd, events: SyncSender<LoopEvent>, bell: FeedBell) -> io::Result<()> {
     Builder::new().name("starter".to_owned()).spawn(move || {
         let mut control = ControlServer::new(control);
         loop {
             let event = match control.receive() {
-                Ok(Some(ControlMessage::Add(add, socket))) => register(*add, socket, &reader)
+                Ok(Some(ControlMessage::Add(add, socket))) => register(*add, socket, &bell)
                     .map_or(LoopEvent::Refused, |registration| {
                         LoopEvent::Registered(Box::new(registration))
                     }),
@@ -82,15 +83,15 @@ pub(super) fn starter(
             };
             let is_last = matches!(event, LoopEvent::Stop);
             if events.send(event).is_err() || is_last {
-                return reader.unpark();
+                return bell.ring();
             }
-            reader.unpark();
+            bell.ring();
         }
     })?;
     Ok(())
 }
 
-fn register(add: AddLambda, socket: OwnedFd, reader: &Thread) -> Option<Registration> {
+fn register(add: AddLambda, socket: OwnedFd, bell: &FeedBell) -> Option<Registration> {
     let lambda = add.lambda.display().to_string();
     let (link, mut replies) = match LambdaLink::new(socket) {
         Ok(both) => both,
@@ -110,23 +111,23 @@ fn register(add: AddLambda, socket: OwnedFd, reader: &Thread) -> Option<Registra
     let expected =
         ExpectedLambda { manifest: manifest.clone(), digest, remaps: add.remaps.clone() };
     let (sender, inbox) = sync_channel(INBOX);
-    let reader = reader.clone();
+    let bell = bell.clone();
     let name = format!("link {}", manifest.lambda.name);
     let started =
-        Builder::new().name(name).spawn(move || read_link(link, &expected, &sender, &reader));
+        Builder::new().name(name).spawn(move || read_link(link, &expected, &sender, &bell));
     if let Err(error) = started {
         warn!(%lambda, %error, "cannot start the thread of a lambda");
         replies.refused("the recorder cannot start a thread for it");
         return None;
     }
-    Some(Registration { manifest, remaps: add.remaps, inbox, replies })
+    Some(Registration { manifest, remaps: add.remaps, grants: add.grants, inbox, replies })
 }
 
 fn read_link(
     mut link: LambdaLink,
     expected: &ExpectedLambda,
     inbox: &SyncSender<LambdaEvent>,
-    reader: &Thread,
+    bell: &FeedBell,
 ) {
     loop {
         let event = match link.receive() {
@@ -142,9 +143,9 @@ fn read_link(
         };
         let is_last = matches!(event, LambdaEvent::Closed(_) | LambdaEvent::Mismatch(_));
         if inbox.send(event).is_err() || is_last {
-            return reader.unpark();
+            return bell.ring();
         }
-        reader.unpark();
+        bell.ring();
     }
 }
 

@@ -28,8 +28,8 @@ const BEHIND_NS: i64 = 60_000_000_000;
 const AHEAD_NS: i64 = 1_000_000_000;
 
 /// A lambda that is connected, or will be.
-pub(super) struct ConnectedLambda {
-    pub(super) name: String,
+pub struct ConnectedLambda {
+    name: String,
     rules: RecordSpec,
     topics: Vec<TopicId>,
     inbox: Receiver<LambdaEvent>,
@@ -44,21 +44,21 @@ pub(super) struct ConnectedLambda {
 
 /// The result of [`ConnectedLambda::poll`].
 #[derive(Copy, Clone, Debug, Default)]
-pub(super) struct PollResult {
+pub struct PollResult {
     /// True if there was a message.
-    pub(super) is_busy: bool,
+    pub is_busy: bool,
     /// Set if its header was received and it was added.
-    pub(super) is_new: Option<LambdaId>,
+    pub is_new: Option<LambdaId>,
     /// True if it is refused. The reason was sent to it and logged.
-    pub(super) is_refused: bool,
+    pub is_refused: bool,
     /// True if its connection is closed.
-    pub(super) is_gone: bool,
+    pub is_gone: bool,
     /// Counts of wakes that are not recorded, and their triggers.
-    pub(super) counted: RecordingCounts,
+    pub counted: RecordingCounts,
 }
 
 impl ConnectedLambda {
-    pub(super) fn new(
+    pub fn new(
         name: String,
         rules: RecordSpec,
         topics: Vec<TopicId>,
@@ -78,8 +78,12 @@ impl ConnectedLambda {
         }
     }
 
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
     /// Handles queued messages of the lambda, at most [`MESSAGES_PER_TURN`].
-    pub(super) fn poll(
+    pub fn poll(
         &mut self,
         recorder: &mut Recorder,
         now_ns: i64,

@@ -3,11 +3,10 @@
 //! - `args`: the command line.
 //! - `connections`: a thread for the starter, and one for each lambda, which receive their
 //!   messages.
-//! - `staging`: samples in transit from the transport's thread to the loop, in memory that is
-//!   allocated before.
-//! - `topic_watch`: a thread that finds and subscribes topics, and checks the network and the disk.
-//! - `register`: requests the topics of an announced lambda, and makes room for it.
-//! - `lambdas`: the connected lambdas and their rate limits: `rate_limit`.
+//! - `topics`, `samples`: the recorded topics, which the ingress shares: descriptions, and samples
+//!   in the order of their stamps.
+//! - `background`: a thread that searches definitions, and checks the disk.
+//! - `roster`, `lambdas`: the announced and connected lambdas, and their rate limits: `rate_limit`.
 //! - `commands`: recordings requested over a topic.
 //! - `event_loop`: owns the recorder, and never blocks on a disk, a lambda or the network.
 //! - `status`, `report_writer`: reports to the starter, and the thread that writes them, as the
@@ -17,29 +16,35 @@
 //! wait for a file.
 
 mod args;
+mod background;
 mod commands;
 mod connections;
 mod event_loop;
 mod lambdas;
 mod rate_limit;
-mod register;
 mod report_writer;
-mod staging;
+mod roster;
+mod samples;
 mod status;
-mod topic_watch;
+mod topics;
 
 use std::io;
-use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 
 use clap::Parser;
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, safe_file};
+use gleaner_jail::recorder as sandbox;
+use gleaner_messages::Sources;
+use gleaner_protocol::Handover;
+use gleaner_protocol::link::LinkError;
 use gleaner_transport::Clock;
 use gleaner_vitals::start::{reports, stop_flag};
 use rustix::process::{Signal, set_parent_process_death_signal};
+use tracing::debug;
 
+use crate::RecordError;
 use args::Args;
 pub use event_loop::run;
 
@@ -50,6 +55,8 @@ pub struct RecorderOptions {
     pub out: PathBuf,
     /// The clock of samples and wakes.
     pub clock: Clock,
+    /// Places of message definitions, which are searched before those that the source carries.
+    pub messages: Sources,
     /// Bytes of the preroll; `None`: the sum of what the lambdas request.
     pub preroll_bytes: Option<u64>,
     /// Bytes of the disk to keep free.
@@ -58,7 +65,7 @@ pub struct RecorderOptions {
     pub clips_max: Option<u64>,
     /// Maximum total size of clips to keep, in bytes.
     pub bytes_max: Option<u64>,
-    /// The topic of commands; `None`: commands are off.
+    /// The topic of commands, for messages to users; `None`: commands are off.
     pub commands: Option<String>,
 }
 
@@ -78,6 +85,12 @@ fn start(args: Args) -> Result<(), Failure> {
     let internal = |what: &'static str| {
         move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
     };
+    // First: threads that exist already would keep their privileges. The folder must exist.
+    safe_file::folder(&args.out)
+        .map_err(|source| RecordError::Create { path: args.out.clone(), source })?;
+    for layer in sandbox::enter(std::slice::from_ref(&args.out)) {
+        debug!(?layer, "sandbox");
+    }
     // A starter that dies also closes our standard input. In either case, open clips are completed.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)
@@ -86,18 +99,13 @@ fn start(args: Args) -> Result<(), Failure> {
     // Ctrl-C in a terminal reaches all processes; the starter decides when this one ends.
     signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::default())
         .map_err(internal("cannot handle SIGINT"))?;
-    let control = control()?;
-    let reports = reports().map_err(internal("cannot set up the report stream"))?;
-    let (options, network) = args.read()?;
-    run(options, || network.open(), control, reports, stop)
-}
-
-/// Returns standard input, which has to be the socket of the starter.
-fn control() -> Result<OwnedFd, Failure> {
-    let stdin = rustix::io::fcntl_dupfd_cloexec(rustix::stdio::stdin(), 3);
-    let is_socket = |fd: &OwnedFd| rustix::net::sockopt::socket_type(fd).is_ok();
-    stdin.ok().filter(is_socket).ok_or_else(|| {
-        Failure::new(Exit::Usage, "standard input is not the socket of a starter")
+    let unusable = |error: LinkError| {
+        Failure::caused_by(Exit::Usage, "cannot use the connections of the starter", &error)
             .with_help("start it with `gleaner run LAMBDA`")
-    })
+    };
+    let mut handover = Handover::receive(rustix::stdio::stdin()).map_err(unusable)?;
+    let control = handover.take_control().map_err(unusable)?;
+    let ingress = handover.take_ingress().map_err(unusable)?;
+    let reports = reports().map_err(internal("cannot set up the report stream"))?;
+    run(args.read(), control, ingress, reports, stop)
 }

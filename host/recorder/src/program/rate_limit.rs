@@ -4,7 +4,7 @@ use std::time::Instant;
 
 /// A token bucket: a rate per second, and a burst.
 #[derive(Copy, Clone, Debug)]
-pub(super) struct RateLimit {
+pub struct RateLimit {
     per_s: f64,
     burst: f64,
     left: f64,
@@ -12,12 +12,12 @@ pub(super) struct RateLimit {
 }
 
 impl RateLimit {
-    pub(super) const fn of(per_s: f64, burst: f64) -> RateLimit {
+    pub const fn of(per_s: f64, burst: f64) -> RateLimit {
         RateLimit { per_s, burst, left: burst, since: None }
     }
 
     /// Takes `amount` and returns true, if that much is left.
-    pub(super) fn take(&mut self, amount: f64, now: Instant) -> bool {
+    pub fn take(&mut self, amount: f64, now: Instant) -> bool {
         let passed = self.since.map_or(0.0, |since| now.duration_since(since).as_secs_f64());
         self.left = (self.left + passed * self.per_s).min(self.burst);
         self.since = Some(now);

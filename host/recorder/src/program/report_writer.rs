@@ -21,7 +21,7 @@ const WAITING: usize = 1024;
 const END_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Queues reports without blocking.
-pub(super) struct ReportWriter {
+pub struct ReportWriter {
     reports: SyncSender<RecorderReport>,
     losses: SyncSender<Loss>,
     /// Nothing is sent over it; it closes when both threads have ended.
@@ -31,7 +31,7 @@ pub(super) struct ReportWriter {
 }
 
 impl ReportWriter {
-    pub(super) fn start(to: File, list: Arc<LossList>) -> std::io::Result<ReportWriter> {
+    pub fn start(to: File, list: Arc<LossList>) -> std::io::Result<ReportWriter> {
         let (reports, inbox) = sync_channel(WAITING);
         let (losses, lost) = sync_channel(WAITING);
         let (ends, ended) = sync_channel::<()>(1);
@@ -47,7 +47,7 @@ impl ReportWriter {
         Ok(ReportWriter { reports, losses, ended, dropped: 0 })
     }
 
-    pub(super) fn send(&mut self, report: RecorderReport) {
+    pub fn send(&mut self, report: RecorderReport) {
         if let RecorderReport::Loss(loss) = &report
             // Noted already, before the deletion.
             && !matches!(loss, Loss::Deleted { .. } | Loss::NotDeleted { .. })
@@ -67,7 +67,7 @@ impl ReportWriter {
     }
 
     /// Sends the last report, and waits until all is written; not for a starter that does not read.
-    pub(super) fn end(mut self, report: RecorderReport) {
+    pub fn end(mut self, report: RecorderReport) {
         self.send(report);
         let ReportWriter { reports, losses, ended, dropped } = self;
         drop((reports, losses));

@@ -35,7 +35,7 @@ impl CommandedRun {
 
     fn join(&mut self, scratch: &TestDir, name: &str, rolls_ms: (u32, u32)) -> RecorderLink {
         let (folder, header) = lambda(scratch, name, rolls_ms);
-        let mut link = RecorderLink::new(self.running.control.add(&add(&folder)).unwrap());
+        let mut link = RecorderLink::new(self.running.add(&add(&folder)).unwrap());
         link.hello(&header, TIMEOUT).unwrap();
         link
     }
@@ -65,7 +65,7 @@ impl CommandedRun {
     }
 
     fn end(mut self) {
-        self.running.control.stop().unwrap();
+        self.running.starter.control.stop().unwrap();
         assert_eq!(self.running.ended().1, Ok(()));
     }
 }
@@ -162,16 +162,30 @@ fn too_many_too_long_and_invalid_commands_are_counted_and_do_nothing() {
     }
     commanded.publish([0xff; 100]);
     commanded.accepted_and_refused(0, 5);
-    let deliveries: Vec<_> =
-        (0..10_000).map(|_| commanded.publish(r#"{"command":"event","label":"x"}"#).1).collect();
-    let taken = deliveries.iter().filter(|delivery| **delivery == Delivery::Taken).count();
-    assert!(taken < 100, "at most five at once, and one each second: {taken}");
+    for _ in 0..10_000 {
+        commanded.publish(r#"{"command":"event","label":"x"}"#);
+    }
     commanded.accepted_and_refused(0, 5 + 10_000);
     let last = {
-        commanded.running.control.stop().unwrap();
+        commanded.running.starter.control.stop().unwrap();
         commanded.running.ended().0
     };
     assert_eq!(last.recording, RecordingCounts::default());
+}
+
+#[test]
+fn commands_beyond_the_rate_limit_are_refused_unread() {
+    let scratch = TestDir::new();
+    let mut commanded = CommandedRun::start(&scratch);
+    let _link = commanded.join(&scratch, "first", (0, 0));
+    for _ in 0..10_000 {
+        commanded.publish(r#"{"command":"event","label":"x"}"#);
+    }
+    let status = commanded.command_status(|status| status.accepted + status.refused >= 10_000);
+    assert_eq!(status.accepted + status.refused, 10_000);
+    // Five at once, and one each second.
+    assert!((5..100).contains(&status.accepted), "{status:?}");
+    commanded.end();
 }
 
 #[test]
@@ -183,7 +197,7 @@ fn without_the_option_there_are_no_commands() {
     let mut running = Running::start(&scratch, &network, |_| {});
     let _sensor = Sensor::start(&network, running.clock);
     let (folder, header) = lambda(&scratch, "first", (0, 0));
-    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
     link.hello(&header, TIMEOUT).unwrap();
     received(&mut running, 50);
     let text = br#"{"command": "event", "label": "x"}"#;

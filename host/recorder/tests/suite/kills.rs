@@ -13,10 +13,9 @@ use crate::running::*;
 use crate::support::*;
 use gleaner_lambda::Clip;
 use gleaner_lambda::TriggerKind::Event;
-use gleaner_protocol::link::{ControlClient, RecorderLink, RecorderReport};
+use gleaner_protocol::link::{RecorderLink, RecorderReport};
 use gleaner_recorder::RecordingFolder;
-use gleaner_recorder::program::run;
-use gleaner_transport::{Clock, LiveSource};
+use gleaner_transport::Clock;
 
 /// Number of kills without `GLEANER_KILLS`, each after a second and a half on average; twenty times
 /// as many with `GLEANER_LONG=1`.
@@ -30,18 +29,15 @@ fn child() {
     let scratch = std::mem::ManuallyDrop::new(TestDir(out.into()));
     let (network, clock) = (FakeNetwork::default(), Clock::from_time_of_day());
     network.add("/a");
-    let (mut control, stdin) = ControlClient::pair().unwrap();
-    let (source, options) = (network.clone(), options(&scratch.0, clock));
     // Reports in a file are written, whenever the kill comes.
     let reports = File::create(scratch.0.join("reports.jsonl")).unwrap();
-    thread::spawn(move || {
-        run(options, || Ok(Box::new(source) as Box<dyn LiveSource>), stdin, reports, Arc::default())
-    });
+    let options = options(&scratch.0, clock);
+    let (mut starter, _) = FakeStarter::start(&network, options, reports, Arc::default());
     let (folder, header) = lambda(&scratch, "first", (300, 1500));
-    let mut link = RecorderLink::new(control.add(&add(&folder)).unwrap());
+    let mut link = RecorderLink::new(starter.add(&add(&folder)).unwrap());
     link.hello(&header, TIMEOUT).unwrap();
     let (short, short_header) = lambda(&scratch, "short", (30, 30));
-    let mut short = RecorderLink::new(control.add(&add(&short)).unwrap());
+    let mut short = RecorderLink::new(starter.add(&add(&short)).unwrap());
     short.hello(&short_header, TIMEOUT).unwrap();
     let _sensor = Sensor::start(&network, clock);
     // Small clips one after the other, and one of several chunks every three seconds.

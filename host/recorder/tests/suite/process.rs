@@ -3,19 +3,20 @@
 
 use std::fs::{self, File};
 use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::net::UnixStream;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use crate::running::*;
 use crate::support::*;
-use gleaner_base::{Exit, Failure};
+use gleaner_base::Exit;
 use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_protocol::link::{
-    ControlClient, LinkError, Loss, RecorderLink, RecorderMessage, RecorderReport, RecorderStatus,
+    ControlClient, LinkError, Loss, RecorderLink, RecorderMessage, RecorderReport,
 };
 use gleaner_recorder::program::{RecorderOptions, run};
-use gleaner_transport::{Clock, LiveSource};
+use gleaner_transport::Clock;
 
 #[test]
 fn two_lambdas_record_and_neither_can_act_as_the_other() {
@@ -26,12 +27,11 @@ fn two_lambdas_record_and_neither_can_act_as_the_other() {
     let clock = running.clock;
     let (first, first_header) = lambda(&scratch, "first", (200, 100));
     let (second, second_header) = lambda(&scratch, "second", (50, 300));
-    let sockets =
-        [running.control.add(&add(&first)).unwrap(), running.control.add(&add(&second)).unwrap()];
+    let sockets = [running.add(&add(&first)).unwrap(), running.add(&add(&second)).unwrap()];
     let [mut one, mut two] = sockets.map(RecorderLink::new);
     // Each link can only act as the lambda of its own socket.
-    let refused = RecorderLink::new(running.control.add(&add(&first)).unwrap())
-        .hello(&second_header, TIMEOUT);
+    let refused =
+        RecorderLink::new(running.add(&add(&first)).unwrap()).hello(&second_header, TIMEOUT);
     assert!(
         matches!(&refused, Err(LinkError::Refused { reason }) if reason.contains("`second`")),
         "{refused:?}"
@@ -75,9 +75,9 @@ fn two_lambdas_record_and_neither_can_act_as_the_other() {
     assert_eq!(scratch.journal(&clip, "first").1, [anchor]);
     assert_eq!(two.bye(TIMEOUT), one.bye(TIMEOUT));
     // A lambda that was never built.
-    let _unbuilt = running.control.add(&add(&scratch.0.join("third"))).unwrap();
+    let _unbuilt = running.add(&add(&scratch.0.join("third"))).unwrap();
     running.status(|status| status.lambdas == 0 && status.recording.lambdas_refused == 2);
-    running.control.stop().unwrap();
+    running.starter.control.stop().unwrap();
     let (last, ended) = running.ended();
     assert_eq!(ended, Ok(()));
     assert_eq!(
@@ -94,7 +94,7 @@ fn a_stopped_recording_keeps_its_clips() {
         let network = FakeNetwork::default();
         let mut running = Running::start(&scratch, &network, |_| {});
         let (folder, header) = lambda(&scratch, "first", (100, 60_000));
-        let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+        let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
         link.hello(&header, TIMEOUT).unwrap();
         // A topic that appears later is found.
         network.add("/a");
@@ -103,9 +103,9 @@ fn a_stopped_recording_keeps_its_clips() {
         link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
         running.status(|status| status.is_recording);
         match how {
-            "stop" => running.control.stop().unwrap(),
+            "stop" => running.starter.control.stop().unwrap(),
             "SIGTERM" => running.stop.store(true, Ordering::Relaxed),
-            _ => running.control = ControlClient::pair().unwrap().0,
+            _ => running.starter.control = ControlClient::pair().unwrap().0,
         }
         let clip = running.clip();
         assert!(
@@ -128,11 +128,11 @@ fn messages_of_a_hostile_lambda_do_not_affect_others() {
     let clock = running.clock;
     let (honest, honest_header) = lambda(&scratch, "honest", (100, 50));
     let (hostile, hostile_header) = lambda(&scratch, "hostile", (0, 0));
-    let mut honest = RecorderLink::new(running.control.add(&add(&honest)).unwrap());
+    let mut honest = RecorderLink::new(running.add(&add(&honest)).unwrap());
     honest.hello(&honest_header, TIMEOUT).unwrap();
-    let mut noisy = RecorderLink::new(running.control.add(&add(&hostile)).unwrap());
+    let mut noisy = RecorderLink::new(running.add(&add(&hostile)).unwrap());
     noisy.hello(&hostile_header, TIMEOUT).unwrap();
-    let nonsense = running.control.add(&add(&scratch.0.join("hostile"))).unwrap();
+    let nonsense = running.add(&add(&scratch.0.join("hostile"))).unwrap();
     rustix::net::send(nonsense.as_fd(), &[255; 4096], rustix::net::SendFlags::NOSIGNAL).unwrap();
     let _sensor = Sensor::start(&network, clock);
     received(&mut running, 200);
@@ -160,7 +160,7 @@ fn messages_of_a_hostile_lambda_do_not_affect_others() {
     });
     assert_eq!(clip.topics[0].lost, Some(0));
     assert_eq!(clip.topics[0].overwritten, Some(0));
-    running.control.stop().unwrap();
+    running.starter.control.stop().unwrap();
     assert_eq!(running.ended().1, Ok(()));
 }
 
@@ -176,15 +176,15 @@ fn the_limits_of_a_vehicle_apply_to_the_manifest_in_the_recorder() {
     announced.most.fuel = 10_000;
     // A process with higher limits than the vehicle's is not the one that was announced.
     let refused =
-        RecorderLink::new(running.control.add(&announced).unwrap()).hello(&as_in_manifest, TIMEOUT);
+        RecorderLink::new(running.add(&announced).unwrap()).hello(&as_in_manifest, TIMEOUT);
     let limit = "its limit `fuel` is `50000000`; the starter announced `10000`";
     assert!(
         matches!(&refused, Err(LinkError::Refused { reason }) if reason.contains(limit)),
         "{refused:?}"
     );
-    let mut link = RecorderLink::new(running.control.add(&announced).unwrap());
+    let mut link = RecorderLink::new(running.add(&announced).unwrap());
     link.hello(&on_vehicle, TIMEOUT).unwrap();
-    running.control.stop().unwrap();
+    running.starter.control.stop().unwrap();
     let (last, ended) = running.ended();
     assert_eq!((last.recording.lambdas_refused, ended), (1, Ok(())));
 }
@@ -196,7 +196,7 @@ fn a_full_disk_is_reported_and_no_clip_is_begun() {
     network.add("/a");
     let mut running = Running::start(&scratch, &network, |options| options.disk_floor = u64::MAX);
     let (folder, header) = lambda(&scratch, "first", (10, 10));
-    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
     link.hello(&header, TIMEOUT).unwrap();
     let _sensor = Sensor::start(&network, running.clock);
     running.status(|status| status.disk_free.is_some());
@@ -206,7 +206,7 @@ fn a_full_disk_is_reported_and_no_clip_is_begun() {
         _ => None,
     });
     assert_eq!(triggers, 1);
-    running.control.stop().unwrap();
+    running.starter.control.stop().unwrap();
     let (last, ended) = running.ended();
     assert_eq!((last.recording.disk_suppressed, last.recording.clips, ended), (1, 0, Ok(())));
     assert!(
@@ -249,13 +249,13 @@ fn a_recorder_is_ready_before_it_recovers_and_reports_what_it_cannot_recover() {
         "{why}"
     );
     let (folder, header) = lambda(&scratch, "first", (10, 10));
-    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
     link.hello(&header, TIMEOUT).unwrap();
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 10);
     link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
     assert!(!scratch.messages(&running.clip()).is_empty());
-    running.control.stop().unwrap();
+    running.starter.control.stop().unwrap();
     let (last, ended) = running.ended();
     assert_eq!((last.recording.clips, last.recording.failed, ended), (1, 1, Ok(())));
     assert!(fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap().contains("cannot recover"));
@@ -264,7 +264,7 @@ fn a_recorder_is_ready_before_it_recovers_and_reports_what_it_cannot_recover() {
     // recovery.
     fs::remove_dir(&in_the_way).unwrap();
     let mut running = Running::start(&scratch, &network, |options| options.clips_max = Some(1));
-    running.control.stop().unwrap();
+    running.starter.control.stop().unwrap();
     let recovered = running.until(|report| match report {
         RecorderReport::Recovered(clip) => Some(clip),
         _ => None,
@@ -285,7 +285,7 @@ fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
     network.add("/a");
     let mut running = Running::start(&scratch, &network, |_| {});
     let (folder, header) = lambda(&scratch, "first", (100, 60_000));
-    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
     link.hello(&header, TIMEOUT).unwrap();
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 10);
@@ -301,61 +301,19 @@ fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
 }
 
 #[test]
-fn a_topic_of_several_lambdas_has_room_for_the_largest_sample_of_all() {
-    let scratch = TestDir::new();
-    let network = FakeNetwork::default();
-    let mut running = Running::start(&scratch, &network, |_| {});
-    let mut links = Vec::new();
-    for (name, max_size) in [("first", "64 KiB"), ("second", "3 MiB"), ("third", "1 MiB")] {
-        let (folder, header) = lambda(&scratch, name, (10, 10));
-        let path = folder.join("build/lambda.toml");
-        let text = fs::read_to_string(&path).unwrap();
-        let (before, record) = text.split_once("[record]").unwrap();
-        let text = format!("{before}max_size = \"{max_size}\"\n[record]{record}");
-        fs::write(&path, &text).unwrap();
-        let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
-        link.hello(&with_manifest(header, &text), TIMEOUT).unwrap();
-        links.push(link);
-    }
-    // All have announced their topics before there is a writer.
-    network.add("/a");
-    let _sensor = Sensor::start(&network, running.clock);
-    received(&mut running, 1);
-    let specs = network.specs.lock().unwrap();
-    assert_eq!(
-        specs.iter().map(|spec| (spec.topic.as_str(), spec.max_bytes)).collect::<Vec<_>>(),
-        [("/a", 3 << 20)]
-    );
-}
-
-#[test]
 fn a_topic_is_recorded_with_the_type_of_the_input_whichever_writer_came_first() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();
     network.add_other("/a", "aaa/msg/X");
-    network.add_other("/b", "aaa/msg/X");
     let mut running = Running::start(&scratch, &network, |_| {});
     let (folder, header) = lambda(&scratch, "first", (10, 10));
-    let mut link = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
     link.hello(&header, TIMEOUT).unwrap();
-    // `/b` is no input, so any type is accepted: once it is found, `/a` was searched as well.
-    let type_of = |status: &RecorderStatus, name: &str| {
-        status
-            .topics
-            .iter()
-            .find(|topic| topic.topic == name)
-            .and_then(|topic| topic.type_name.clone())
-    };
-    let status = running.status(|status| type_of(status, "/b").is_some());
-    assert_eq!(
-        (type_of(&status, "/a"), type_of(&status, "/b").as_deref()),
-        (None, Some("aaa/msg/X"))
-    );
     network.add("/a");
     let _sensor = Sensor::start(&network, running.clock);
     received(&mut running, 10);
     let status = running.status(|_| true);
-    assert_eq!(type_of(&status, "/a").as_deref(), Some("test_msgs/msg/Number"));
+    assert_eq!(status.topics[0].type_name.as_deref(), Some("test_msgs/msg/Number"));
 }
 
 #[test]
@@ -365,8 +323,8 @@ fn one_lambda_too_many_is_refused_with_a_reason_and_the_others_work() {
     let mut running =
         Running::start(&scratch, &network, |options| options.preroll_bytes = Some(1 << 20));
     let (folder, header) = lambda(&scratch, "one", (10, 10));
-    let sockets: Vec<_> = (0..256).map(|_| running.control.add(&add(&folder)).unwrap()).collect();
-    let mut last = RecorderLink::new(running.control.add(&add(&folder)).unwrap());
+    let sockets: Vec<_> = (0..256).map(|_| running.add(&add(&folder)).unwrap()).collect();
+    let mut last = RecorderLink::new(running.add(&add(&folder)).unwrap());
     let refused = last.hello(&header, TIMEOUT).unwrap_err();
     assert_eq!(
         refused.to_string(),
@@ -378,7 +336,7 @@ fn one_lambda_too_many_is_refused_with_a_reason_and_the_others_work() {
     // When one leaves, there is room for another.
     drop(links.next());
     running.status(|status| status.lambdas < 256);
-    RecorderLink::new(running.control.add(&add(&folder)).unwrap()).hello(&header, TIMEOUT).unwrap();
+    RecorderLink::new(running.add(&add(&folder)).unwrap()).hello(&header, TIMEOUT).unwrap();
 }
 
 #[test]
@@ -391,10 +349,10 @@ fn a_preroll_that_cannot_be_allocated_is_an_error_with_help() {
         };
         let (_control, stdin) = ControlClient::pair().unwrap();
         let (_reader, writer) = std::io::pipe().unwrap();
-        let never =
-            || -> Result<Box<dyn LiveSource>, Failure> { panic!("the network is joined later") };
-        let failure = run(options, never, stdin, File::from(OwnedFd::from(writer)), Arc::default())
-            .unwrap_err();
+        // The ingress is joined later.
+        let (_silent, ingress) = UnixStream::pair().unwrap();
+        let reports = File::from(OwnedFd::from(writer));
+        let failure = run(options, stdin, ingress.into(), reports, Arc::default()).unwrap_err();
         assert_eq!(failure.exit, Exit::Usage);
         let text = failure.to_string();
         assert!(text.contains("cannot allocate") && text.contains("--preroll-memory"), "{text}");

@@ -51,7 +51,7 @@ impl HostTopic for Hosted {
     }
 
     fn newest(&mut self, topic: Resource<Topic>) -> wasmtime::Result<Option<Resource<Sample>>> {
-        let newest = self.resolve(&topic)?.newest();
+        let newest = self.resolve(&topic)?.newest()?;
         newest.map(|sample| Ok(self.handles.push(sample)?)).transpose()
     }
 
@@ -277,12 +277,14 @@ impl Hosted {
     }
 }
 
-/// Converts a result for the guest. Errors for lack of fuel or time end the guest.
+/// Converts a result for the guest. Errors for lack of fuel, time or holds end the guest.
 fn wit_result<T>(result: Result<T, data::DataError>) -> DataResult<T> {
     match result {
         Ok(value) => Ok(Ok(value)),
         Err(data::DataError::OutOfFuel(error)) => Err(error.into()),
-        Err(error @ data::DataError::OutOfTime) => Err(error.into()),
+        Err(error @ (data::DataError::OutOfTime | data::DataError::OutOfHolds { .. })) => {
+            Err(error.into())
+        }
         Err(error) => Ok(Err(refused(error))),
     }
 }

@@ -34,13 +34,16 @@ pub(super) fn from_error(
     time: Option<(u64, u64)>,
 ) -> Fault {
     let trap = error.downcast_ref::<Trap>();
-    if trap == Some(&Trap::OutOfFuel) || error.downcast_ref::<OutOfFuel>().is_some() {
+    let data = error.downcast_ref::<DataError>();
+    let host_calls =
+        error.is::<OutOfFuel>() || matches!(data, Some(DataError::OutOfFuel(OutOfFuel)));
+    if trap == Some(&Trap::OutOfFuel) || host_calls {
         return fuel(used, allowed);
     }
     if trap == Some(&Trap::Interrupt) {
         return deadline(time);
     }
-    if let Some(DataError::OutOfTime) = error.downcast_ref() {
+    if let Some(DataError::OutOfTime) = data {
         let (used, allowed) = time.unzip();
         let message =
             "a call into the host takes longer than is left until the deadline".to_owned();
@@ -57,6 +60,9 @@ pub(super) fn from_error(
         };
     }
     let plain = |kind, message| Fault { kind, message, used: None, allowed: None };
+    if let Some(error @ DataError::OutOfHolds { .. }) = data {
+        return plain(FaultKind::HostCall, error.to_string());
+    }
     if error.downcast_ref::<SleepError>().is_some() {
         return plain(FaultKind::HostCall, SleepError.to_string());
     }

@@ -159,6 +159,10 @@ impl Guest for WasmGuest {
         WakeOutcome { result, fuel: (!stacked).then_some(fuel), run_ns: None }
     }
 
+    fn discard(&mut self) {
+        self.live = None;
+    }
+
     fn engine(&self) -> String {
         self.loaded.settings().to_owned()
     }

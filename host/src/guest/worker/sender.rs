@@ -171,6 +171,10 @@ impl Guest for SendingGuest {
         outcome
     }
 
+    fn discard(&mut self) {
+        self.guest.discard();
+    }
+
     fn engine(&self) -> String {
         self.guest.engine()
     }

@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use gleaner_base::{Exit, Failure, excerpt};
 use gleaner_drives::Replay;
-use gleaner_journal::{Difference, JournalEntry, JournalHeader, WakeSource};
+use gleaner_journal::{Difference, InputView, JournalEntry, JournalHeader, WakeSource};
+use gleaner_lambda::FaultKind;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_recorder::{ClipStatements, RecordError};
 use gleaner_transport::{SampleMeta, Transport};
@@ -46,13 +47,16 @@ pub(super) fn verify(
         wakes: 0,
         uncovered: 0,
         uncovered_triggers: 0,
-        losses: losses(&stated),
+        interrupted: 0,
+        is_live: reference.is_live(),
+        losses: losses(&stated, reference.is_live()),
         triggers: JournalTriggers::of(&header.lambda),
     };
     while let Some(entry) = reference.next()? {
         verify_loop.wake(&entry)?;
     }
-    let ClipVerifyLoop { wakes, uncovered, uncovered_triggers, triggers, .. } = verify_loop;
+    let ClipVerifyLoop { wakes, uncovered, uncovered_triggers, interrupted, triggers, .. } =
+        verify_loop;
     if wakes == 0 {
         return Err(reference.empty());
     }
@@ -66,22 +70,40 @@ pub(super) fn verify(
             .with_help(CHANGED));
     }
     let triggers = triggers.count;
-    if uncovered == wakes || triggers > 0 && uncovered_triggers == triggers {
+    if uncovered + interrupted == wakes || triggers > 0 && uncovered_triggers == triggers {
         let message = format!("the clip alone proves no trigger of lambda `{}`", header.lambda);
         let mut failure = Failure::new(Exit::Usage, message);
         let what =
             "in each wake that could prove one, the lambda had read samples from before the clip";
         failure.causes = vec![format!("{what} ({uncovered} of {wakes} wakes)")];
-        return Err(failure.with_help(
-            "make `preroll` longer than the lambda looks back; this clip can be verified against \
-             its drive: \
-             gleaner replay DIR DRIVE --verify JOURNAL",
-        ));
+        failure.causes.extend(note_interrupted(interrupted));
+        let help = "make `preroll` longer than the lambda looks back";
+        return Err(match reference.is_live() {
+            true => failure.with_help(help),
+            false => failure
+                .with_help(format!("{help}; this clip can be verified against its drive: {DRIVE}")),
+        });
     }
-    Ok(VerifyOutcome { engine, wakes, triggers, uncovered, uncovered_triggers })
+    let notes = note_interrupted(interrupted).into_iter().collect();
+    Ok(VerifyOutcome { engine, wakes, triggers, uncovered, uncovered_triggers, notes })
 }
 
 const CHANGED: &str = "the clip, or its journal, was changed after it was written";
+/// The command that compares a whole journal.
+const DRIVE: &str = "gleaner replay DIR DRIVE --verify JOURNAL";
+
+/// The note on wakes that could not be repeated; `None` if there are none.
+fn note_interrupted(wakes: u64) -> Option<String> {
+    let wakes = match wakes {
+        0 => return None,
+        1 => "1 wake".to_owned(),
+        wakes => format!("{wakes} wakes"),
+    };
+    Some(format!(
+        "{wakes} that exceeded the deadline on the vehicle: not repeated, the lambda starts again \
+         after each"
+    ))
+}
 
 /// Refuses a clip that lacks the topic of an input.
 fn check_inputs(clip: &Replay, header: &JournalHeader) -> Result<(), Failure> {
@@ -111,11 +133,14 @@ fn check_statements(path: &Path, stated: &ClipStatements) -> Result<(), Failure>
     }
 }
 
-/// Describes the losses that the clip states; `None` if there are none.
-fn losses(stated: &ClipStatements) -> Option<String> {
+/// Describes the losses that the clip states; `None` if there are none. In a live clip, messages
+/// may also be lost before the recorder. The lambda may have received those.
+fn losses(stated: &ClipStatements, is_live: bool) -> Option<String> {
     let count = |count: Option<u64>| count.map_or("unknown".to_owned(), |count| count.to_string());
     let lost = stated.clip().topics.iter().flat_map(|topic| {
-        let causes = [(topic.overwritten, "overwritten"), (topic.too_big, "too big")];
+        let before = if is_live { topic.lost } else { Some(0) };
+        let causes =
+            [(topic.overwritten, "overwritten"), (topic.too_big, "too big"), (before, "lost")];
         let lost = causes.into_iter().filter(|(lost, _)| *lost != Some(0));
         lost.map(|(lost, why)| format!("{}: {} {why}", excerpt(&topic.topic), count(lost)))
     });
@@ -134,6 +159,10 @@ struct ClipVerifyLoop<'a> {
     /// Wakes in which the lambda had read samples from before the clip, and their triggers.
     uncovered: u64,
     uncovered_triggers: u64,
+    /// Wakes that ended because their time was over, which depends on the machine.
+    interrupted: u64,
+    /// Set if the journal was written live.
+    is_live: bool,
     /// Losses that the clip states.
     losses: Option<String>,
     /// The triggers of the journal.
@@ -146,17 +175,31 @@ impl ClipVerifyLoop<'_> {
         if self.wakes == 0 {
             self.join(entry)?
         } else {
-            self.deliver(entry.seen.iter().map(|seen| seen.new))?
+            let owed = self.owed(entry)?;
+            self.deliver(owed.into_iter())?
         }
         let wake = self.cause(entry)?;
-        let mut now = self.rerun.wake(wake).clone();
+        let is_interrupted = self.is_live && was_interrupted(entry);
+        let mut now = match is_interrupted {
+            true => self.rerun.skip(wake, entry),
+            false => self.rerun.wake(wake).clone(),
+        };
         for ((topic, before), (now, journal)) in
             self.inputs.iter().zip(before).zip(now.seen.iter_mut().zip(&entry.seen))
         {
-            // Some samples before the first wake may lie before the clip.
-            if self.wakes == 0 && offered(topic) - before < journal.new {
+            // Some samples before the first wake may lie before the clip. A live clip may have a
+            // topic later than its wakes.
+            let is_first = self.wakes == 0 || self.is_live && before == 0;
+            if is_first && offered(topic) - before < journal.new {
                 (now.new, now.digest) = (journal.new, journal.digest);
                 now.newest = now.newest.or(journal.newest);
+            }
+            if offered(topic) == 0 {
+                // The newest sample lies before the clip.
+                now.newest = journal.newest;
+            }
+            if self.is_live {
+                self.without_refused(now, journal);
             }
         }
         let is_covered = self.covers(entry);
@@ -164,7 +207,7 @@ impl ClipVerifyLoop<'_> {
             let JournalEntry { triggers, fault, log, .. } = entry.clone();
             now = JournalEntry { triggers, fault, log, ..now };
         }
-        if !is_covered || self.header.wakes_before > 0 {
+        if !is_covered || self.unknown_state().is_some() {
             // State from before the clip may change the lambda's fuel and the samples that it
             // reads.
             now.fuel = entry.fuel;
@@ -173,16 +216,23 @@ impl ClipVerifyLoop<'_> {
             }
         }
         if let Some(difference) = entry.differs_from(&now, &self.header.inputs, false) {
-            let saw_the_same = entry.at_ns == now.at_ns && entry.seen == now.seen;
-            return Err(if saw_the_same && self.header.wakes_before > 0 {
-                self.unsettled(entry, &difference)
-            } else {
-                self.differs(entry, &difference)
+            let saw_the_same = entry.at_ns == now.at_ns
+                && entry
+                    .seen
+                    .iter()
+                    .zip(&now.seen)
+                    .all(|(a, b)| InputView { reach: b.reach, ..*a } == *b);
+            return Err(match self.too_late(entry, &now).or_else(|| self.unknown_state()) {
+                Some(why) if saw_the_same => self.unsettled(entry, &difference, &why),
+                _ => self.differs(entry, &difference),
             });
         }
         self.wakes += 1;
-        self.uncovered += u64::from(!is_covered);
-        self.uncovered_triggers += if is_covered { 0 } else { entry.triggers.len() as u64 };
+        self.interrupted += u64::from(is_interrupted);
+        self.uncovered += u64::from(!is_covered && !is_interrupted);
+        if is_interrupted || !is_covered {
+            self.uncovered_triggers += entry.triggers.len() as u64;
+        }
         self.triggers.add(entry);
         Ok(())
     }
@@ -209,6 +259,41 @@ impl ClipVerifyLoop<'_> {
         self.deliver(new.into_iter())
     }
 
+    /// Returns how many samples each input receives before this wake. A live clip lacks samples
+    /// that were refused before they reached a reader, so there the newest one decides.
+    fn owed(&mut self, entry: &JournalEntry) -> Result<Vec<u64>, Failure> {
+        let until_ns = entry.at_ns.saturating_add(SLACK_NS);
+        let mut owed = Vec::new();
+        for (input, seen) in entry.seen.iter().enumerate() {
+            let known = self.inputs[input].newest().ok().flatten();
+            let wanted = seen
+                .newest
+                .filter(|newest| !known.is_some_and(|known| is_sample(known.meta(), *newest)));
+            owed.push(match wanted {
+                _ if !self.is_live => seen.new,
+                None => 0,
+                Some(newest) => {
+                    let found = self.clip.ahead(input, until_ns, |meta| is_sample(meta, newest));
+                    let is_later = offered(&self.inputs[input]) == 0;
+                    found.map_err(unreadable)?.unwrap_or(if is_later { 0 } else { seen.new })
+                }
+            });
+        }
+        Ok(owed)
+    }
+
+    /// Adds samples that were refused on the vehicle, as larger than `max_size`, to the view of an
+    /// input that is the same otherwise: the clip does not contain them. The first wake may also
+    /// have the refused samples of earlier ones in the place of its own.
+    fn without_refused(&self, now: &mut InputView, journal: &InputView) {
+        let is_same = now.newest == journal.newest && now.digest == journal.digest;
+        if is_same && now.new < journal.new {
+            now.new = journal.new;
+        } else if self.wakes == 0 && self.losses.is_some() && now.newest == journal.newest {
+            (now.new, now.digest) = (journal.new, journal.digest);
+        }
+    }
+
     fn deliver(&mut self, owed: impl Iterator<Item = u64>) -> Result<(), Failure> {
         self.clip.deliver(owed).map_err(unreadable)
     }
@@ -232,7 +317,7 @@ impl ClipVerifyLoop<'_> {
             let oldest = head.saturating_sub(reader.depth() as u64);
             let mut leases = (oldest..head).rev().filter_map(|position| reader.get(position));
             Some(Wake::Event(
-                topic.sample(leases.find(|lease| is_sample(lease.meta(), (writer, seq)))?),
+                topic.sample(leases.find(|lease| is_sample(&lease.meta().sample, (writer, seq)))?),
             ))
         });
         found.ok_or_else(|| {
@@ -262,25 +347,60 @@ impl ClipVerifyLoop<'_> {
                 let message =
                     format!("the clip alone does not settle {}", self.describe_wake(entry));
                 let failure = Failure { exit: Exit::Usage, ..different(message, difference) };
-                failure.with_help(format!(
-                    "the clip states that it lacks messages ({losses}): raise `preroll_size`; \
-                     gleaner replay DIR DRIVE --verify JOURNAL settles it"
-                ))
+                let help = format!("the clip states that it lacks messages ({losses})");
+                match self.is_live {
+                    true => failure.with_help(help),
+                    false => failure
+                        .with_help(format!("{help}: raise `preroll_size`; {DRIVE} settles it")),
+                }
             }
         }
     }
 
+    /// The reason why the lambda may have seen less on the vehicle than now, if it did.
+    fn too_late(&self, entry: &JournalEntry, now: &JournalEntry) -> Option<String> {
+        let mut inputs = self.header.inputs.iter().zip(entry.seen.iter().zip(&now.seen));
+        let (input, _) =
+            inputs.find(|(_, (journal, now))| self.is_live && now.reach > journal.reach)?;
+        Some(format!(
+            "newer samples of input `{}` may have replaced older ones before the lambda read them: \
+             raise its `depth`",
+            input.name
+        ))
+    }
+
+    /// The reason why the lambda may have state that is not in the clip, if any.
+    fn unknown_state(&self) -> Option<String> {
+        if self.header.wakes_before > 0 {
+            let times = self.header.wakes_before;
+            return Some(format!(
+                "the lambda had run {times} times before the clip begins, and its variables from \
+                 then are not in the clip"
+            ));
+        }
+        if self.uncovered > 0 {
+            return Some(
+                "in earlier wakes the lambda had read samples from before the clip, and what it \
+                 kept from them is not in the clip"
+                    .to_owned(),
+            );
+        }
+        (self.interrupted > 0).then(|| {
+            "an earlier wake exceeded the deadline, and what the lambda kept from it is not in the \
+             clip"
+                .to_owned()
+        })
+    }
+
     /// The failure of a wake with the same inputs and another decision, which may depend on state
-    /// from before the clip.
-    fn unsettled(&self, entry: &JournalEntry, difference: &Difference) -> Failure {
+    /// that is not in the clip.
+    fn unsettled(&self, entry: &JournalEntry, difference: &Difference, why: &str) -> Failure {
         let message = format!("the clip alone does not settle {}", self.describe_wake(entry));
         let failure = Failure { exit: Exit::Usage, ..different(message, difference) };
-        failure.with_help(format!(
-            "the lambda had run {} times before the clip begins, and its variables from then are \
-             not in the clip: \
-             gleaner replay DIR DRIVE --verify JOURNAL settles it",
-            self.header.wakes_before
-        ))
+        match self.is_live {
+            true => failure.with_help(why),
+            false => failure.with_help(format!("{why}: {DRIVE} settles it")),
+        }
     }
 
     fn describe_wake(&self, entry: &JournalEntry) -> String {
@@ -294,6 +414,12 @@ impl ClipVerifyLoop<'_> {
 /// lower 32 bits.
 fn is_sample(meta: &SampleMeta, (writer, seq): ([u8; 16], u64)) -> bool {
     meta.writer.0 == writer && meta.seq as u32 == seq as u32
+}
+
+/// Returns whether the wake ended because its time was over: another machine, or the same one with
+/// less load, completes it.
+fn was_interrupted(entry: &JournalEntry) -> bool {
+    entry.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Deadline)
 }
 
 fn unreadable(error: LockstepError) -> Failure {

@@ -63,7 +63,14 @@ pub(super) fn verify(
         None if wakes == 0 => return Err(reference.empty()),
         None => {}
     }
-    Ok(VerifyOutcome { engine: rerun.engine, wakes, triggers, uncovered: 0, uncovered_triggers: 0 })
+    Ok(VerifyOutcome {
+        engine: rerun.engine,
+        wakes,
+        triggers,
+        uncovered: 0,
+        uncovered_triggers: 0,
+        notes: Vec::new(),
+    })
 }
 
 struct VerifyLoop<'a> {

@@ -58,7 +58,12 @@ pub(super) fn run(
         uncovered_triggers: outcome.uncovered_triggers,
         truncated,
         wall_s: started.elapsed().as_secs_f64(),
-        notes: notes.into_iter().flatten().chain(reference.limits.iter().cloned()).collect(),
+        notes: notes
+            .into_iter()
+            .flatten()
+            .chain(reference.limits.iter().cloned())
+            .chain(outcome.notes)
+            .collect(),
     })
 }
 
@@ -69,6 +74,7 @@ struct VerifyOutcome {
     triggers: u64,
     uncovered: u64,
     uncovered_triggers: u64,
+    notes: Vec<String>,
 }
 
 /// A lambda that runs again, for comparison.
@@ -89,7 +95,7 @@ impl Rerun {
         load: Load<'_>,
     ) -> Result<(Self, T, Vec<Arc<Topic>>), Failure> {
         let SessionSetup { inputs, session, mut guest } =
-            SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, None, load)?;
+            SessionSetup::load(&mut drive, &options.lambda, manifest, RunMode::Replay, load)?;
         let lambda = manifest.lambda.name.to_string();
         let engine = guest.engine();
         let initialised = guest.init();
@@ -110,6 +116,20 @@ impl Rerun {
         let decision = self.invoker.invoke(wake);
         let (_, digest) = self.session.take_log();
         self.entry_builder.end(&decision, digest)
+    }
+
+    /// Passes over a wake that cannot be repeated: the lambda starts again, as it did then. Returns
+    /// the entry with the inputs of now and the decision of the journal.
+    fn skip(&mut self, wake: Wake, entry: &JournalEntry) -> JournalEntry {
+        self.entry_builder.begin(&wake);
+        let seen = self.entry_builder.seen().to_vec();
+        self.invoker.discard();
+        let mut now = JournalEntry { seen, ..entry.clone() };
+        // How far it looked back, until its time was over, depends on the machine, too.
+        for (now, journal) in now.seen.iter_mut().zip(&entry.seen) {
+            now.reach = journal.reach;
+        }
+        now
     }
 }
 

@@ -12,7 +12,7 @@ use gleaner_recorder::{ClipStatements, FalseStatement};
 use serde_json::Value;
 
 use crate::input::Remap;
-use crate::journal::{CLOCK_OF_VEHICLE, LambdaIdentity};
+use crate::journal::{CLOCK_OF_DRIVE, LambdaIdentity};
 use crate::replay::journal_file;
 use crate::replay::open::DriveError;
 use crate::replay::options::{Drives, ReplayOptions};
@@ -38,7 +38,18 @@ impl ReferenceJournal {
     /// Opens the journal of a replay.
     pub(in crate::replay) fn journal(path: &Path) -> Result<Self, Failure> {
         let file = journal_file::read(path)?;
-        Self::open(path, Box::new(BufReader::new(file)))
+        let reference = Self::open(path, Box::new(BufReader::new(file)))?;
+        if reference.is_live() {
+            let message = format!("the journal in `{}` is of a live run", path.display());
+            return Err(Failure::new(Exit::Usage, message)
+                .with_help("verify the clip that holds it: gleaner verify CLIP --lambda DIR"));
+        }
+        Ok(reference)
+    }
+
+    /// Returns whether the journal was written live.
+    pub(super) fn is_live(&self) -> bool {
+        self.header().clock != CLOCK_OF_DRIVE
     }
 
     /// The file that contains it.
@@ -90,19 +101,6 @@ impl ReferenceJournal {
 
     fn open(path: &Path, bytes: Box<dyn Read + Send>) -> Result<Self, Failure> {
         let reader = JournalReader::open(bytes).map_err(|error| unusable(path, &error))?;
-        if reader.header().clock == CLOCK_OF_VEHICLE {
-            let message =
-                format!("`{}` was recorded live, which cannot be verified yet", path.display());
-            let mut failure = Failure::new(Exit::Usage, message);
-            failure.causes = vec![
-                "lambda and recorder received the samples independently, and the clip has the \
-                 recorder's stamps"
-                    .to_owned(),
-            ];
-            return Err(
-                failure.with_help("replay the lambda over the clip: gleaner replay DIR CLIP")
-            );
-        }
         Ok(Self { path: path.to_owned(), reader, clip: None, limits: Vec::new() })
     }
 

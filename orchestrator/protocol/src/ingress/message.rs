@@ -125,7 +125,7 @@ pub struct IngressStatus {
     pub topics: Vec<IngressTopic>,
     /// Number of connected readers.
     pub readers: usize,
-    /// Memory of this process, in bytes. Shared memory of topics is part of it.
+    /// Resident memory of this process alone, in bytes: samples in shared memory are not part of it.
     pub rss_bytes: u64,
     /// CPU time of this process, in s.
     pub cpu_s: f64,

@@ -31,6 +31,11 @@ pub struct ReceptionStatus {
     /// Number of samples lost in transit, according to gaps in their sequence numbers; `None` if
     /// unknown.
     pub lost: Option<u64>,
+    /// Number of samples that writers sent after the subscription and before they were matched with
+    /// it, so that they were sent to others only; `None` if unknown. It is an estimate, by the
+    /// interval of their samples, and at most the number of the first received one.
+    #[serde(default)]
+    pub before_match: Option<u64>,
     /// Number of samples that could not be parsed.
     pub malformed: u64,
     /// The requested QoS, as text: `reliable, volatile`.

@@ -19,11 +19,26 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Callable, List
+from typing import Callable, List, Tuple
 
 from gleaner import Context
 
 KEPT: List[object] = []
+
+# Names of shared memory, in `/proc/self/maps`: a topic, and the page by which the ingress learns
+# which samples this process holds.
+TOPIC = "gleaner-topic"
+CONTROL = "gleaner-control"
+
+
+def mapped(access: str, name: str) -> Tuple[int, int]:
+    """Address and length of the first shared memory with this access and name."""
+    with open("/proc/self/maps") as maps:
+        for line in maps:
+            if access in line and name in line:
+                start, end = (int(address, 16) for address in line.split()[0].split("-"))
+                return start, end - start
+    raise LookupError(f"no memory {name} is mapped as {access}")
 
 
 class Lambda:
@@ -354,6 +369,63 @@ class Lambda:
 
     def abort(self, ctx: Context) -> None:
         os.abort()
+
+    def shared_write(self, ctx: Context) -> None:
+        """Writes into the samples that all lambdas read."""
+        start, _ = mapped("r--s", TOPIC)
+        ctypes.memset(start, 0, 64)
+
+    def shared_protect(self, ctx: Context) -> str:
+        """Makes the samples that all lambdas read writable."""
+        start, length = mapped("r--s", TOPIC)
+        libc = ctypes.CDLL(None, use_errno=True)
+        writable = 3
+        if libc.mprotect(ctypes.c_void_p(start), ctypes.c_size_t(length), writable) != 0:
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        return "writable"
+
+    def shared_file(self, ctx: Context) -> str:
+        """Opens the memory of a topic again, for writing."""
+        start, length = mapped("r--s", TOPIC)
+        links = [f"/proc/self/map_files/{start:x}-{start + length:x}"]
+        for number in os.listdir("/proc/self/fd"):
+            try:
+                if TOPIC in os.readlink(f"/proc/self/fd/{number}"):
+                    links.append(f"/proc/self/fd/{number}")
+            except OSError:
+                pass  # The descriptor of the listing.
+        refused = OSError()
+        for link in links:
+            try:
+                mmap.mmap(os.open(link, os.O_RDWR), length)
+                return link
+            except OSError as error:
+                refused = error
+        raise refused
+
+    def shared_wait(self, ctx: Context) -> int:
+        """Moves threads that wait on shared memory to another word, where none wakes them."""
+        (page, _), word = mapped("rw-s", CONTROL), ctypes.c_uint32()
+        futex = {"x86_64": 202, "aarch64": 98}[os.uname().machine]
+        libc = ctypes.CDLL(None, use_errno=True)
+        requeue, none, all_of_them = 3, ctypes.c_int(0), ctypes.c_long(2**31 - 1)
+        target = ctypes.byref(word)
+        moved = libc.syscall(futex, ctypes.c_void_p(page), requeue, none, all_of_them, target, 0)
+        if moved < 0:
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        return int(moved)
+
+    def control_garbage(self, ctx: Context) -> None:
+        """Overwrites its control page, which the ingress reads, as fast as possible."""
+        start, length = mapped("rw-s", CONTROL)
+        garbage = [os.urandom(length) for _ in range(64)]
+
+        def write() -> None:
+            while True:
+                for page in garbage:
+                    ctypes.memmove(start, page, length)
+
+        threading.Thread(target=write, daemon=True).start()
 
     def corrupt(self, ctx: Context) -> None:
         ctypes.memset(id(ctx), 0xFF, 1 << 16)

@@ -9,88 +9,37 @@
 mod request;
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
-use std::thread::Thread;
 use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
+use gleaner_feed::FedTopic;
 use gleaner_lambda::TriggerKind;
 use gleaner_protocol::link::CommandStatus;
-use gleaner_transport::{Delivery, ReceptionStatus, SampleMeta, Sink};
+use gleaner_transport::{ReceptionStatus, SampleMeta};
 use tracing::warn;
 
 use super::rate_limit::RateLimit;
+use super::samples::FedSamples;
 use crate::{Commanded, LambdaId, RecordError, Recorder};
-pub(super) use request::MESSAGE_MAX;
 use request::{CommandError, CommandRequest};
 
-/// The type of the topic.
-pub(super) const TYPE: &str = "std_msgs/msg/String";
 /// Messages that are read per second, and in a burst.
 const ALLOWED: RateLimit = RateLimit::of(1.0, 5.0);
-/// Maximum number of messages that are queued for the loop: more than a burst.
-const WAITING: usize = 8;
-/// Messages that the network keeps until they are taken.
-pub(super) const QUEUE: usize = 16;
+/// Maximum number of messages that are read in one turn of the loop.
+const TURN: usize = 64;
 /// Interval of the log line on unread messages.
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
 /// Maximum number of characters of a logged refusal: a message may contain any text.
 const WHY_MAX: usize = 200;
 
-/// A message to be read.
-struct CommandMessage {
-    meta: SampleMeta,
-    cdr: Vec<u8>,
-}
-
-/// Counts of messages that are not read.
-#[derive(Debug, Default)]
-struct Unread {
-    too_many: AtomicU64,
-    too_long: AtomicU64,
-}
-
-impl Unread {
-    fn counts(&self) -> (u64, u64) {
-        (self.too_many.load(Ordering::Relaxed), self.too_long.load(Ordering::Relaxed))
-    }
-}
-
-/// The sink of the topic.
-struct CommandSink {
-    allowed: Mutex<RateLimit>,
-    messages: SyncSender<CommandMessage>,
-    unread: Arc<Unread>,
-    reader: Thread,
-}
-
-impl Sink for CommandSink {
-    fn deliver(&self, meta: &SampleMeta, cdr: &[u8]) -> Delivery {
-        if cdr.len() > MESSAGE_MAX {
-            self.unread.too_long.fetch_add(1, Ordering::Relaxed);
-            return Delivery::TooBig;
-        }
-        // Only the transport's thread calls this.
-        let may =
-            self.allowed.lock().unwrap_or_else(PoisonError::into_inner).take(1.0, Instant::now());
-        if !may
-            || self.messages.try_send(CommandMessage { meta: *meta, cdr: cdr.to_vec() }).is_err()
-        {
-            self.unread.too_many.fetch_add(1, Ordering::Relaxed);
-            return Delivery::NoSlot;
-        }
-        self.reader.unpark();
-        Delivery::Taken
-    }
-}
-
 /// Executes commands.
-pub(super) struct Commands {
+pub struct Commands {
     topic: String,
-    messages: Receiver<CommandMessage>,
-    unread: Arc<Unread>,
+    /// The topic's messages, once it is attached.
+    messages: Option<FedSamples>,
+    allowed: RateLimit,
+    /// Messages beyond the rate limit.
+    too_many: u64,
     /// The newest lambda of each name, also after its end: an operator need not wait for a lambda
     /// that is being restarted.
     lambdas: BTreeMap<String, LambdaId>,
@@ -104,62 +53,84 @@ pub(super) struct Commands {
 }
 
 impl Commands {
-    /// Returns the commands over `topic`, and their sink.
-    pub(super) fn new(topic: String, reader: Thread) -> (Commands, Arc<dyn Sink>) {
-        let (sender, messages) = sync_channel(WAITING);
-        let unread = Arc::<Unread>::default();
-        let sink = CommandSink {
-            allowed: Mutex::new(ALLOWED),
-            messages: sender,
-            unread: Arc::clone(&unread),
-            reader,
-        };
-        let commands = Commands {
+    /// Returns the commands over `topic`.
+    pub fn new(topic: String) -> Commands {
+        Commands {
             topic,
-            messages,
-            unread,
+            messages: None,
+            allowed: ALLOWED,
+            too_many: 0,
             lambdas: BTreeMap::new(),
             running: BTreeMap::new(),
             accepted: 0,
             refused: 0,
             reported: ((0, 0), None),
-        };
-        (commands, Arc::new(sink))
+        }
+    }
+
+    /// Receives the messages of the topic from now on.
+    pub fn attach(&mut self, fed: FedTopic) {
+        self.messages = Some(FedSamples::new(fed));
     }
 
     /// Adds a lambda that commands may name.
-    pub(super) fn add(&mut self, name: &str, lambda: LambdaId) {
+    pub fn add(&mut self, name: &str, lambda: LambdaId) {
         self.lambdas.insert(name.to_owned(), lambda);
     }
 
     /// Forgets the running recordings, as all were ended.
-    pub(super) fn forget_running(&mut self) {
+    pub fn forget_running(&mut self) {
         self.running.clear();
     }
 
-    /// Executes the queued commands; returns whether there were any.
-    pub(super) fn handle(&mut self, recorder: &mut Recorder) -> Result<bool, RecordError> {
-        let mut any = false;
+    /// Executes the commands that came; returns whether there were any.
+    pub fn handle(&mut self, recorder: &mut Recorder) -> Result<bool, RecordError> {
+        let Some(mut messages) = self.messages.take() else { return Ok(false) };
+        let mut count = 0;
         // Later messages are for the next turn.
-        for _ in 0..WAITING {
-            let Ok(CommandMessage { meta, cdr }) = self.messages.try_recv() else { break };
-            any = true;
-            let source = format!("command on {} by {}", self.topic, meta.writer);
-            let refused = match CommandRequest::read(&cdr, meta.endian) {
-                Ok(request) => self.execute(request, meta.at_ns, source.clone(), recorder)?,
-                Err(why) => Some(why),
-            };
-            match refused {
-                None => self.accepted += 1,
-                Some(why) => {
-                    self.refused += 1;
-                    // Not more log lines than messages are read.
-                    warn!(%source, why = describe(&why), "command refused");
-                }
+        while count < TURN && messages.look().is_some() {
+            let read = |meta: &SampleMeta, cdr: &[u8]| self.message(meta, cdr, recorder);
+            let (read, _) = messages.read(i64::MAX, TURN, read)?;
+            count += read.max(1);
+        }
+        self.messages = Some(messages);
+        self.report_unread();
+        Ok(count > 0)
+    }
+
+    /// Executes the command of a message, within the rate limit.
+    fn message(
+        &mut self,
+        meta: &SampleMeta,
+        cdr: &[u8],
+        recorder: &mut Recorder,
+    ) -> Result<(), RecordError> {
+        if !self.allowed.take(1.0, Instant::now()) {
+            self.too_many += 1;
+            return Ok(());
+        }
+        let source = format!("command on {} by {}", self.topic, meta.writer);
+        let refused = match CommandRequest::read(cdr, meta.endian) {
+            Ok(request) => self.execute(request, meta.at_ns, source.clone(), recorder)?,
+            Err(why) => Some(why),
+        };
+        match refused {
+            None => self.accepted += 1,
+            Some(why) => {
+                self.refused += 1;
+                // Not more log lines than messages are read.
+                warn!(%source, why = describe(&why), "command refused");
             }
         }
-        self.report_unread();
-        Ok(any)
+        Ok(())
+    }
+
+    /// Numbers of messages that were not read: too many, and too long.
+    fn unread(&self) -> (u64, u64) {
+        let messages = self.messages.as_ref();
+        let (missed, too_long) =
+            messages.map_or((0, 0), |messages| (messages.missed(), messages.too_big()));
+        (self.too_many + missed, too_long)
     }
 
     /// Executes a command; returns the reason if it is refused.
@@ -222,7 +193,7 @@ impl Commands {
     }
 
     fn report_unread(&mut self) {
-        let (unread, reported) = (self.unread.counts(), self.reported);
+        let (unread, reported) = (self.unread(), self.reported);
         if unread == reported.0 || reported.1.is_some_and(|at| at.elapsed() < REPORT_INTERVAL) {
             return;
         }
@@ -232,8 +203,8 @@ impl Commands {
     }
 
     /// Returns the counts of commands.
-    pub(super) fn status(&self, network: Option<&ReceptionStatus>) -> CommandStatus {
-        let (too_many, too_long) = self.unread.counts();
+    pub fn status(&self, network: Option<&ReceptionStatus>) -> CommandStatus {
+        let (too_many, too_long) = self.unread();
         CommandStatus {
             topic: self.topic.clone(),
             accepted: self.accepted,

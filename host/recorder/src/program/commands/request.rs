@@ -4,16 +4,12 @@ use gleaner_lambda::{Trigger, TriggerKind};
 use gleaner_messages::Endian;
 use serde::Deserialize;
 
-/// Longest text, in bytes.
-const TEXT_MAX: usize = 4 << 10;
-/// Longest message: the length, the text, a zero, and padding of the last four bytes.
-pub(in crate::program) const MESSAGE_MAX: usize = 4 + TEXT_MAX + 4;
 /// Longest label, in bytes: that of a lambda's trigger.
 const LABEL_MAX: usize = 128;
 
 /// The reason why a command is refused.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum CommandError {
+pub enum CommandError {
     #[error("the message has no text")]
     NoText,
     #[error("the text is not a command")]
@@ -40,10 +36,10 @@ pub(super) enum CommandError {
 
 /// A parsed command.
 #[derive(Debug, PartialEq)]
-pub(super) struct CommandRequest {
+pub struct CommandRequest {
     /// The lambda in whose name it is given.
-    pub(super) lambda: Option<String>,
-    pub(super) trigger: Trigger,
+    pub lambda: Option<String>,
+    pub trigger: Trigger,
 }
 
 /// The object in the text.
@@ -57,8 +53,8 @@ struct CommandText {
 }
 
 impl CommandRequest {
-    /// Parses a message of [`MESSAGE_MAX`] bytes at most.
-    pub(super) fn read(cdr: &[u8], endian: Endian) -> Result<CommandRequest, CommandError> {
+    /// Parses a message. The grant of the topic bounds its length.
+    pub fn read(cdr: &[u8], endian: Endian) -> Result<CommandRequest, CommandError> {
         let CommandText { command: kind, label, lambda, score } =
             serde_json::from_str(text(cdr, endian)?)
                 .map_err(|source| CommandError::NoCommand { source })?;
@@ -159,7 +155,7 @@ mod tests {
             refused(&text(&format!("{label}x"))),
             "its label has 129 bytes; at most 128 are allowed"
         );
-        assert!(matches!(read(&"[".repeat(TEXT_MAX)), Err(CommandError::NoCommand { .. })));
+        assert!(matches!(read(&"[".repeat(4 << 10)), Err(CommandError::NoCommand { .. })));
     }
 
     #[test]

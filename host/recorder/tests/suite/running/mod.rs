@@ -1,4 +1,5 @@
-//! Runs the recorder process within a test: a network that the test feeds, lambdas, and reports.
+//! Runs the recorder process within a test: a network that the test feeds, an ingress over it,
+//! lambdas, and reports.
 // Each test program uses its own part.
 #![allow(dead_code)]
 
@@ -12,11 +13,16 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use gleaner_base::{Failure, hex};
+use gleaner_ingress::Ingress;
 use gleaner_journal::{FileDigest, JournalHeader};
 use gleaner_lambda::Clip;
 use gleaner_lambda::manifest::Limits;
-use gleaner_messages::Definitions;
-use gleaner_protocol::link::{AddLambda, ControlClient, RecorderReport, RecorderStatus};
+use gleaner_messages::{Definitions, Sources};
+use gleaner_protocol::ingress::{AddReader, AddTopics, IngressControl};
+use gleaner_protocol::link::{
+    AddLambda, ControlClient, LinkError, RecorderReport, RecorderStatus, commands_grant,
+    recorded_grant,
+};
 use gleaner_recorder::program::{RecorderOptions, run};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{
@@ -110,9 +116,60 @@ impl LiveSource for FakeNetwork {
     }
 }
 
-/// The recorder's main loop on a thread.
-pub struct Running {
+/// The recorder, as a reader of the ingress.
+const NAME: &str = "recorder";
+
+/// The starter of a recorder, and of the ingress that it reads.
+pub struct FakeStarter {
     pub control: ControlClient,
+    /// `None` once the ingress has ended.
+    pub ingress: Option<IngressControl>,
+    /// Topics that were granted, by their ids from 1 on.
+    granted: Vec<String>,
+}
+
+impl FakeStarter {
+    /// Starts both, on threads.
+    pub fn start(
+        network: &FakeNetwork,
+        options: RecorderOptions,
+        reports: File,
+        stop: Arc<AtomicBool>,
+    ) -> (FakeStarter, JoinHandle<Result<(), Failure>>) {
+        let (control, stdin) = ControlClient::pair().unwrap();
+        let (mut ingress, _) = Ingress::start_in_thread(Box::new(network.clone()));
+        let add = AddReader {
+            name: NAME.to_owned(),
+            topics: options.commands.iter().map(|topic| commands_grant(topic)).collect(),
+            publishes: Vec::new(),
+        };
+        let socket = ingress.add_reader(&add).unwrap();
+        let thread = thread::spawn(move || run(options, stdin, socket, reports, stop));
+        (FakeStarter { control, ingress: Some(ingress), granted: Vec::new() }, thread)
+    }
+
+    /// Adds a lambda, and grants the topics of [`lambda`] to the recorder.
+    pub fn add(&mut self, add: &AddLambda) -> Result<OwnedFd, LinkError> {
+        let mut add = add.clone();
+        for (topic, type_name) in [("/a", Some("test_msgs/msg/Number".to_owned())), ("/b", None)] {
+            let known = self.granted.iter().position(|granted| granted == topic);
+            let index = known.unwrap_or_else(|| {
+                self.granted.push(topic.to_owned());
+                let id = self.granted.len() as u32;
+                let topics = vec![recorded_grant(id, topic, type_name, Some(64 << 10))];
+                let ingress = self.ingress.as_mut().unwrap();
+                ingress.add_topics(&AddTopics { reader: NAME.to_owned(), topics }).unwrap();
+                self.granted.len() - 1
+            });
+            add.grants.push((topic.to_owned(), index as u32 + 1));
+        }
+        self.control.add(&add)
+    }
+}
+
+/// A recorder on a thread, with its reports.
+pub struct Running {
+    pub starter: FakeStarter,
     reports: BufReader<PipeReader>,
     thread: JoinHandle<Result<(), Failure>>,
     pub stop: Arc<AtomicBool>,
@@ -123,6 +180,7 @@ pub fn options(out: &Path, clock: Clock) -> RecorderOptions {
     RecorderOptions {
         out: out.to_owned(),
         clock,
+        messages: Sources::default(),
         preroll_bytes: None,
         disk_floor: 0,
         clips_max: None,
@@ -140,23 +198,19 @@ impl Running {
         let clock = Clock::from_time_of_day();
         let mut options = options(&scratch.0, clock);
         change(&mut options);
-        let (control, stdin) = ControlClient::pair().unwrap();
         let (reader, writer) = std::io::pipe().unwrap();
-        let (stop, network) = (Arc::<AtomicBool>::default(), network.clone());
-        let for_thread = Arc::clone(&stop);
-        let thread = thread::spawn(move || {
-            let reports = File::from(OwnedFd::from(writer));
-            run(
-                options,
-                || Ok(Box::new(network) as Box<dyn LiveSource>),
-                stdin,
-                reports,
-                for_thread,
-            )
-        });
-        let mut running = Running { control, reports: BufReader::new(reader), thread, stop, clock };
+        let stop = Arc::<AtomicBool>::default();
+        let reports = File::from(OwnedFd::from(writer));
+        let (starter, thread) = FakeStarter::start(network, options, reports, Arc::clone(&stop));
+        let reports = BufReader::new(reader);
+        let mut running = Running { starter, reports, thread, stop, clock };
         running.until(|report| matches!(report, RecorderReport::Ready).then_some(()));
         running
+    }
+
+    /// Adds a lambda as the starter does.
+    pub fn add(&mut self, add: &AddLambda) -> Result<OwnedFd, LinkError> {
+        self.starter.add(add)
     }
 
     /// Reads reports until one matches.

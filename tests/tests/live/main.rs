@@ -4,15 +4,17 @@
 //! `GLEANER_ROUNDS` sets how often a drive is played and compared with its replay; the default is
 //! once.
 
+mod alone;
+
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use gleaner_lambda::{Clip, Decision, FaultKind};
+use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::link::RecorderReport;
 use gleaner_protocol::{LiveStatus, Report};
 use gleaner_tests::live::{
-    self, JsonReport, RunningProgram, decisions, descendants, no_player, play, run, signal,
+    self, JsonReport, RunningProgram, decisions, descendants, no_player, play, run, run_all, signal,
 };
 use gleaner_tests::{LambdaCopy, TempFolder, namespace, replay_to, root, sample_drive, times};
 use libtest_mimic::{Arguments, Trial};
@@ -33,6 +35,7 @@ const PLAYED: &[LiveCase] = &[
         || slow("keep"),
     ),
     ("ctrl_c_stops_the_run_and_closes_open_clips", ctrl_c),
+    ("several_lambdas_and_the_recorder_share_what_one_process_receives", shared),
     ("a_lambda_whose_process_is_killed_is_started_again_and_loses_no_decision", || {
         killed("start.py")
     }),
@@ -43,12 +46,12 @@ const PLAYED: &[LiveCase] = &[
 
 /// Cases with lambdas only.
 const ALONE: &[LiveCase] = &[
-    ("a_topic_without_a_writer_is_reported", no_writer),
-    ("a_stopped_reader_of_decisions_does_not_block_the_lambda", stopped),
-    ("a_lambda_does_not_outlive_the_command_that_started_it", || ends_with(None)),
-    ("a_lambda_does_not_outlive_its_shim", || ends_with(Some("gleaner-shim"))),
-    ("every_wake_at_1_khz_is_written_with_all", every_wake),
-    ("reported_decisions_are_in_the_file_even_if_the_process_is_killed", killed_at_once),
+    ("a_topic_without_a_writer_is_reported", alone::no_writer),
+    ("a_stopped_reader_of_decisions_does_not_block_the_lambda", alone::stopped),
+    ("a_lambda_does_not_outlive_the_command_that_started_it", || alone::ends_with(None)),
+    ("a_lambda_does_not_outlive_its_shim", || alone::ends_with(Some("gleaner-shim"))),
+    ("every_wake_at_1_khz_is_written_with_all", alone::every_wake),
+    ("reported_decisions_are_in_the_file_even_if_the_process_is_killed", alone::killed_at_once),
 ];
 
 fn main() -> ExitCode {
@@ -310,6 +313,45 @@ fn ctrl_c() {
     assert!(out.path().join("summary.json").is_file());
 }
 
+fn shared() {
+    let lambdas = [("examples/hello/rust", "first"), ("examples/hello/python", "second")]
+        .map(|(of, name)| LambdaCopy::named(of, name));
+    let out = TempFolder::new();
+    let folders = [lambdas[0].path(), lambdas[1].path()];
+    let started = run_all(&folders, out.path(), &["--set", "first.brake_mps2=-1.4"]);
+    let mut ready = 0;
+    started.until_named("both lambdas to be ready", |_, report| {
+        ready += u32::from(matches!(report, Report::Ready));
+        (ready == 2).then_some(())
+    });
+    let drive = sample_drive();
+    let path = drive.to_str().expect("the checkout has a plain path");
+    let played = play(&[path, "--wait", "1", "--start", "8", "--duration", "5"]).finish();
+    assert!(played.status.success(), "{}", played.stderr);
+    let ingresses = descendants(started.pid(), "gleaner-ingress");
+    assert_eq!(ingresses.len(), 1, "{ingresses:?}");
+    let (mut received, mut writers) = ([0; 2], [None; 2]);
+    started.until_named("the end of the drive", |name, report| {
+        if let Report::Live(live) = report {
+            let index = usize::from(name == "second");
+            (received[index], writers[index]) = (live.topics[0].received, live.topics[0].writers);
+        }
+        let is_over = received[0] == received[1] && received[0] > 0 && writers == [Some(0); 2];
+        is_over.then_some(())
+    });
+    started.signal("INT");
+    let finished = started.finish();
+    assert!(finished.status.success(), "{}: {}", finished.status, finished.stderr);
+    let imu = [0, 1].map(|index| {
+        let name = ["first", "second"][index];
+        finished.ended_of(name).expect("it ended").topics[0].received
+    });
+    assert_eq!(imu, received, "{}", finished.stderr);
+    let recorder = live::summary(&out.path().join("second")).recording.expect("a recorder");
+    let recorded = recorder.topics.iter().find(|topic| topic.topic == "/imu/data");
+    assert_eq!(recorded.expect("it is recorded").received, imu[0], "{recorder:?}");
+}
+
 fn killed(name: &str) {
     let out = TempFolder::new();
     let set = ["--set", "brake_mps2=-1.4"];
@@ -358,128 +400,6 @@ fn killed(name: &str) {
     assert_eq!(clips.len(), 1, "{clips:?}");
     assert_eq!(clips[0].recovered.is_some(), name == "gleaner-recorder", "{clips:?}");
     assert!(clips[0].topics.iter().any(|topic| topic.messages > 0), "{clips:?}");
-}
-
-fn ends_with(parent: Option<&str>) {
-    let out = TempFolder::new();
-    let started = run(&lambda("examples/hello", "python"), out.path(), &["--no-record"]);
-    started.until_ready();
-    let left = descendants(started.pid(), "start.py");
-    assert_eq!(left.len(), 1);
-    let starter = parent.map_or(started.pid(), |name| descendants(started.pid(), name)[0]);
-    signal(starter, "KILL");
-    // A process that has ended has no command line, even before it is waited for.
-    let line = format!("/proc/{}/cmdline", left[0]);
-    wait_for("the end of the lambda's process", || {
-        std::fs::read(&line).unwrap_or_default().is_empty()
-    });
-}
-
-fn every_wake() {
-    for language in ["rust", "python"] {
-        let lambda = LambdaCopy::of(&format!("tests/lambdas/attack/{language}"), |manifest| {
-            manifest.replace("\"20ms\"", "\"1ms\"")
-        });
-        let out = TempFolder::new();
-        let started = run(lambda.path(), out.path(), &["--no-record", "--all"]);
-        started.until_live("some thousand wakes", |live| live.wakes >= 3000);
-        started.signal("INT");
-        let finished = started.finish();
-        let (ended, written) = (finished.ended(), decisions(out.path()));
-        assert_eq!(
-            (written.len() as u64, ended.unwritten),
-            (ended.wakes, 0),
-            "{}",
-            finished.stderr
-        );
-        assert!(written.is_sorted_by(|a, b| a.at_ns < b.at_ns));
-        let summary: LiveStatus =
-            serde_json::from_slice(&std::fs::read(out.path().join("summary.json")).unwrap())
-                .unwrap();
-        assert_eq!((summary.wakes, summary.unwritten), (ended.wakes, 0));
-    }
-}
-
-fn killed_at_once() {
-    let lambda = LambdaCopy::of("tests/lambdas/ticker/python", |manifest| {
-        manifest.replace("\"100ms\"", "\"1ms\"")
-    });
-    let out = TempFolder::new();
-    let started = run(lambda.path(), out.path(), &["--no-record"]);
-    started.until_ready();
-    let process = descendants(started.pid(), "start.py")[0];
-    let mut reported = Vec::new();
-    started.until("the end of the process", |line| {
-        let JsonReport::Lambda(Report::Decision(decision)) = line else { return None };
-        if reported.is_empty() {
-            signal(process, "KILL");
-        }
-        let is_killed =
-            decision.fault.as_ref().is_some_and(|fault| fault.kind == FaultKind::Killed);
-        reported.push(*decision);
-        is_killed.then_some(())
-    });
-    let written = decisions(out.path());
-    assert!(
-        reported.len() > 1 && reported.iter().all(|decision| written.contains(decision)),
-        "{reported:?}, written {written:?}"
-    );
-    started.until_live("the next process", |live| live.restarts == 1);
-    started.signal("INT");
-    let finished = started.finish();
-    assert!(finished.stderr.contains("was ended by signal 9"), "{}", finished.stderr);
-    // The killed process could not count its last wake.
-    let summary: LiveStatus =
-        serde_json::from_slice(&std::fs::read(out.path().join("summary.json")).unwrap()).unwrap();
-    assert_eq!(summary.faults, finished.ended().faults + 1);
-}
-
-fn stopped() {
-    const DECISIONS: &str = "/reported";
-    let writer = LambdaCopy::of("tests/lambdas/ticker/rust", |manifest| {
-        manifest.replace("\"100ms\"", "\"1ms\"")
-    });
-    let reader = LambdaCopy::of("bench/lambdas/imu/rust", |manifest| {
-        manifest
-            .replace("/imu/synthetic", DECISIONS)
-            .replace("sensor_msgs/msg/Imu", "std_msgs/msg/String")
-    });
-    let (reported, received) = (TempFolder::new(), TempFolder::new());
-    let writing = run(writer.path(), reported.path(), &["--no-record", "--decisions", DECISIONS]);
-    let reading = run(reader.path(), received.path(), &["--no-record"]);
-    reading.until_live("decisions", |live| live.topics[0].received > 0);
-    let stopped =
-        descendants(reading.pid(), "gleaner-runtime").into_iter().next_back().expect("its runtime");
-    // The shim first, because it would react.
-    let shim = descendants(reading.pid(), "gleaner-shim")[0];
-    [shim, stopped].into_iter().for_each(|pid| signal(pid, "STOP"));
-    let from = writing.until_live("unsent decisions", |live| live.unsent > 0);
-    let to = writing.until_live("another second", |live| live.up_s > from.up_s + 1.0);
-    [stopped, shim].into_iter().for_each(|pid| signal(pid, "CONT"));
-    // 1,000 a second are due; if the lambda waited for the reader, it would be 10.
-    let rate = (to.wakes - from.wakes) as f64 / (to.up_s - from.up_s);
-    assert!(
-        rate > 50.0 && to.unsent > from.unsent,
-        "{rate} wakes per second, {} not sent",
-        to.unsent
-    );
-    writing.signal("INT");
-    assert!(writing.finish().ended().unsent >= to.unsent);
-    reading.signal("INT");
-    reading.finish();
-}
-
-fn no_writer() {
-    let out = TempFolder::new();
-    let started = run(&lambda("examples/hello", "rust"), out.path(), &["--for", "5"]);
-    let finished = started.finish();
-    assert!(finished.status.success(), "{}", finished.stderr);
-    assert!(
-        finished.stderr.contains("no writer of `/imu/data` (sensor_msgs/msg/Imu) yet"),
-        "{}",
-        finished.stderr
-    );
-    assert_eq!(finished.ended().topics[0].received, 0);
 }
 
 fn clips(out: &Path) -> Vec<Clip> {

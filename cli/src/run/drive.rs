@@ -1,0 +1,58 @@
+//! A drive that the ingress plays: its start, and the end of the run after it.
+
+use std::time::{Duration, Instant};
+
+use gleaner_base::visible;
+
+use super::screen::Screen;
+use super::services::IngressProcess;
+use super::supervised::SupervisedLambda;
+use crate::args::RunArgs;
+
+/// Time after the end of a drive without a wake, after which the run ends even if a lambda has not
+/// handled all samples: longer than the longest wake.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(30);
+
+/// The progress of a drive.
+pub(super) struct DriveProgress {
+    /// The files, as text.
+    files: String,
+    has_begun: bool,
+    /// Time of the last wake after the end of the drive, and the number of wakes then.
+    last_wake: Option<(Instant, u64)>,
+}
+
+impl DriveProgress {
+    /// Returns the progress of the drive of a run; `None` without one.
+    pub(super) fn of(args: &RunArgs) -> Option<Self> {
+        let names = args.drive.iter().map(|file| visible(&file.to_string_lossy()));
+        let files = names.collect::<Vec<_>>().join(", ");
+        (!files.is_empty()).then_some(Self { files, has_begun: false, last_wake: None })
+    }
+
+    /// Starts the drive, once: all lambdas must be ready.
+    pub(super) fn begin(&mut self, ingress: &mut IngressProcess, screen: &Screen) {
+        if !self.has_begun {
+            // An error means that the ingress has ended, which the caller notices.
+            self.has_begun = ingress.control.begin().is_ok();
+            screen.print(&format!("playing {}\n", self.files));
+        }
+    }
+
+    /// Returns whether the lambdas have handled all samples of the drive, which has ended.
+    pub(super) fn is_over(&mut self, lambdas: &[SupervisedLambda], screen: &Screen) -> bool {
+        if lambdas.iter().all(SupervisedLambda::has_handled_drive) {
+            return true;
+        }
+        let wakes = lambdas.iter().map(SupervisedLambda::wakes).sum();
+        let (since, before) = self.last_wake.get_or_insert((Instant::now(), wakes));
+        if wakes != *before {
+            (*since, *before) = (Instant::now(), wakes);
+        }
+        let is_late = since.elapsed() >= DRAIN_TIMEOUT;
+        if is_late {
+            screen.warn("the drive is over, and a lambda did not handle its last samples");
+        }
+        is_late
+    }
+}

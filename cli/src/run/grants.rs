@@ -1,0 +1,170 @@
+//! Topics that the processes of a run may read and publish.
+
+use std::collections::HashSet;
+
+use gleaner_lambda::Manifest;
+use gleaner_protocol::ingress::{AddReader, PublishGrant, TopicGrant};
+use gleaner_protocol::link::{COMMANDS_ID, commands_grant, recorded_grant};
+
+use super::lambdas::RunLambda;
+use crate::args::RunArgs;
+
+/// Name of the recorder among the readers of the ingress.
+pub(super) const RECORDER: &str = "recorder";
+
+/// Largest of the sizes that the ingress expects of topics for which none is stated.
+const USUAL_BYTES: u64 = 32 << 20;
+
+/// Returns the lambda's process as a reader: it reads its inputs. `start` is the number of its
+/// earlier processes, of which the ingress may still know the last.
+pub(super) fn lambda(
+    lambda: &RunLambda,
+    args: &RunArgs,
+    is_recorded: bool,
+    start: u32,
+) -> AddReader {
+    let event = lambda.manifest.event_input().map(|input| &input.name);
+    let inputs = lambda.manifest.inputs.iter().zip(0..);
+    let topics = inputs.map(|(input, index)| {
+        let topic = lambda.on_network(input.topic.as_str());
+        TopicGrant::for_input(index, input, &topic, event == Some(&input.name), is_recorded)
+    });
+    AddReader {
+        name: format!("{} {start}", lambda.name()),
+        topics: topics.collect(),
+        publishes: PublishGrant::of_lambda(args.rtt.as_deref(), args.decisions.as_deref()),
+    }
+}
+
+/// Returns the recorder as a reader: it reads commands, and later what lambdas record.
+pub(super) fn recorder(args: &RunArgs) -> AddReader {
+    AddReader {
+        name: RECORDER.to_owned(),
+        topics: args.commands.iter().map(|topic| commands_grant(topic)).collect(),
+        publishes: Vec::new(),
+    }
+}
+
+/// The recorded topics of all lambdas of a run, each once.
+pub(super) struct RecordedTopics {
+    grants: Vec<TopicGrant>,
+    /// Ids of the topics that were granted to the recorder.
+    granted: HashSet<u32>,
+}
+
+impl RecordedTopics {
+    pub(super) fn of<'a>(lambdas: impl Iterator<Item = &'a RunLambda>) -> Self {
+        let mut topics: Vec<RecordedSamples> = Vec::new();
+        for lambda in lambdas {
+            for (topic, samples) in recorded(lambda) {
+                match topics.iter_mut().find(|known| known.topic == topic) {
+                    Some(known) => known.add(samples),
+                    None => topics.push(samples),
+                }
+            }
+        }
+        let grants = topics.into_iter().zip(COMMANDS_ID + 1..).map(|(samples, id)| {
+            let max_bytes = samples.max_bytes();
+            recorded_grant(id, &samples.topic, samples.type_name, max_bytes)
+        });
+        Self { grants: grants.collect(), granted: HashSet::new() }
+    }
+
+    /// Returns the recorded topics of a lambda, with their ids.
+    pub(super) fn ids(&self, lambda: &RunLambda) -> Vec<(String, u32)> {
+        let grants = self.grants_of(lambda);
+        grants.into_iter().map(|grant| (grant.topic.clone(), grant.id)).collect()
+    }
+
+    /// Returns the grants of a lambda's recorded topics that the recorder does not have yet.
+    pub(super) fn take_new(&mut self, lambda: &RunLambda) -> Vec<TopicGrant> {
+        let grants: Vec<TopicGrant> = self.grants_of(lambda).into_iter().cloned().collect();
+        grants.into_iter().filter(|grant| self.granted.insert(grant.id)).collect()
+    }
+
+    fn grants_of(&self, lambda: &RunLambda) -> Vec<&TopicGrant> {
+        let of_lambda: Vec<String> = recorded(lambda).map(|(topic, _)| topic).collect();
+        self.grants.iter().filter(|grant| of_lambda.contains(&grant.topic)).collect()
+    }
+}
+
+/// The samples of a recorded topic, as far as manifests state it.
+struct RecordedSamples {
+    topic: String,
+    /// The type that the first manifest states.
+    type_name: Option<String>,
+    /// The largest size that a manifest states, in bytes.
+    largest: u64,
+    /// True if a manifest states no size.
+    is_usual: bool,
+}
+
+impl RecordedSamples {
+    fn add(&mut self, other: RecordedSamples) {
+        self.type_name = self.type_name.take().or(other.type_name);
+        self.largest = self.largest.max(other.largest);
+        self.is_usual |= other.is_usual;
+    }
+
+    /// Returns the size to request; `None` for the usual size of the type.
+    fn max_bytes(&self) -> Option<u64> {
+        (!self.is_usual || self.largest > USUAL_BYTES).then_some(self.largest)
+    }
+}
+
+/// Returns the recorded topics of a lambda, by their names on the network.
+fn recorded(lambda: &RunLambda) -> impl Iterator<Item = (String, RecordedSamples)> {
+    let Manifest { inputs, record, .. } = &lambda.manifest;
+    record.iter().flat_map(|record| &record.topics).map(move |topic| {
+        let input = inputs.iter().find(|input| input.topic == *topic);
+        let topic = lambda.on_network(topic.as_str());
+        let samples = RecordedSamples {
+            topic: topic.clone(),
+            type_name: input.map(|input| input.type_name.to_string()),
+            largest: input.map_or(0, |input| input.max_size.bytes()),
+            is_usual: input.is_none(),
+        };
+        (topic, samples)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::lambdas::tests::recording;
+    use super::*;
+
+    #[test]
+    fn a_topic_that_two_lambdas_record_is_granted_once_for_the_larger_samples() {
+        let lambdas = [
+            recording("a", Some(("/imu", "64 KiB")), &["/imu", "/gps"]),
+            recording("b", Some(("/imu", "1 MiB")), &["/gps", "/imu"]),
+            recording("c", None, &["/odom"]),
+        ];
+        let mut topics = RecordedTopics::of(lambdas.iter());
+        let ids = [("/imu".to_owned(), 1), ("/gps".to_owned(), 2)];
+        assert_eq!(topics.ids(&lambdas[0]), ids);
+        assert_eq!(topics.ids(&lambdas[1]), ids);
+        let granted = |grants: Vec<TopicGrant>| {
+            grants.into_iter().map(|grant| (grant.topic, grant.max_bytes)).collect::<Vec<_>>()
+        };
+        assert_eq!(
+            granted(topics.take_new(&lambdas[1])),
+            [("/imu".to_owned(), Some(1 << 20)), ("/gps".to_owned(), None)]
+        );
+        assert_eq!(granted(topics.take_new(&lambdas[0])), []);
+        assert_eq!(granted(topics.take_new(&lambdas[2])), [("/odom".to_owned(), None)]);
+    }
+
+    #[test]
+    fn one_manifest_without_a_size_makes_the_usual_size_count() {
+        let lambdas = [
+            recording("a", Some(("/image", "1 MiB")), &["/image"]),
+            recording("b", None, &["/image"]),
+            recording("c", Some(("/large", "64 MiB")), &["/large"]),
+            recording("d", None, &["/large"]),
+        ];
+        let topics = RecordedTopics::of(lambdas.iter());
+        let sizes: Vec<_> = topics.grants.iter().map(|grant| grant.max_bytes).collect();
+        assert_eq!(sizes, [None, Some(64 << 20)]);
+    }
+}

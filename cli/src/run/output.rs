@@ -1,0 +1,105 @@
+//! The output of the processes of a run: reports on standard output, text on standard error.
+
+use std::io::{BufReader, Read};
+use std::process::Child;
+use std::sync::atomic::AtomicBool;
+use std::sync::mpsc::SyncSender;
+use std::thread;
+
+use gleaner_base::visible;
+use gleaner_protocol::Report;
+use gleaner_protocol::ingress::IngressReport;
+use gleaner_protocol::link::RecorderReport;
+use serde::de::DeserializeOwned;
+
+use crate::runtime::{next_report, pass_on};
+
+/// Number of pipes of a process.
+pub(super) const PIPES: u8 = 2;
+
+/// A process of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum ChildId {
+    Ingress,
+    Recorder,
+    /// The lambda at this index; `start` counts its restarts, so that output of an earlier process
+    /// is not taken for that of the current one.
+    Lambda {
+        index: usize,
+        start: u32,
+    },
+}
+
+/// Output of a process.
+pub(super) struct ChildOutput {
+    pub(super) from: ChildId,
+    pub(super) piece: OutputPiece,
+}
+
+pub(super) enum OutputPiece {
+    /// A report of the lambda's process.
+    Runtime(Report),
+    /// A report of the recorder.
+    Recorder(RecorderReport),
+    /// A report of the ingress.
+    Ingress(IngressReport),
+    /// The start of a line on standard output that cannot be parsed.
+    Unparsable(String),
+    /// A piece of standard error.
+    Stderr { text: Vec<u8>, begins_line: bool },
+    /// One of its [`PIPES`] is closed.
+    Closed,
+}
+
+/// Starts threads that send the output of `child` to `sender`, until its pipes are closed.
+pub(super) fn forward(child: &mut Child, from: ChildId, sender: &SyncSender<ChildOutput>) {
+    let send = |sender: SyncSender<ChildOutput>| {
+        // Sending fails if the run has ended.
+        move |piece| sender.send(ChildOutput { from, piece }).is_ok()
+    };
+    if let Some(reports) = child.stdout.take() {
+        let send = send(sender.clone());
+        thread::spawn(move || {
+            match from {
+                ChildId::Ingress => follow(reports, OutputPiece::Ingress, &send),
+                ChildId::Recorder => follow(reports, OutputPiece::Recorder, &send),
+                ChildId::Lambda { .. } => follow(reports, OutputPiece::Runtime, &send),
+            }
+            send(OutputPiece::Closed);
+        });
+    }
+    if let Some(stderr) = child.stderr.take() {
+        let send = send(sender.clone());
+        thread::spawn(move || {
+            let mut begins_line = true;
+            pass_on(stderr, &AtomicBool::new(false), |text| {
+                send(OutputPiece::Stderr { text: text.to_vec(), begins_line });
+                begins_line = text.ends_with(b"\n");
+            });
+            send(OutputPiece::Closed);
+        });
+    }
+}
+
+fn follow<T: DeserializeOwned>(
+    reports: impl Read,
+    wrap: fn(T) -> OutputPiece,
+    send: &impl Fn(OutputPiece) -> bool,
+) {
+    let mut reports = BufReader::new(reports);
+    let mut line = Vec::new();
+    while next_report(&mut reports, &mut line).unwrap_or(false) {
+        // A shim ends a line that its runtime left unfinished.
+        if line == b"\n" {
+            continue;
+        }
+        let unparsable = |_| {
+            OutputPiece::Unparsable(visible(
+                &String::from_utf8_lossy(&line).chars().take(200).collect::<String>(),
+            ))
+        };
+        if !send(serde_json::from_slice(&line).map_or_else(unparsable, wrap)) {
+            return;
+        }
+    }
+}

@@ -1,0 +1,167 @@
+//! The processes that all lambdas of a run share: the ingress and the recorder.
+
+use std::os::fd::OwnedFd;
+use std::sync::mpsc::SyncSender;
+
+use gleaner_base::{Exit, Failure};
+use gleaner_protocol::Handover;
+use gleaner_protocol::ingress::{IngressControl, IngressReport, IngressStatus, IngressTopic};
+use gleaner_protocol::link::{ControlClient, Loss, RecorderReport, RecorderStatus};
+
+use super::grants::RecordedTopics;
+use super::lambdas::RunLambda;
+use super::output::{ChildId, ChildOutput, PIPES};
+use super::process::ChildProcess;
+use super::screen::Screen;
+use super::{RunContext, arguments};
+
+/// The ingress of a run.
+pub(super) struct IngressProcess {
+    pub(super) child: ChildProcess,
+    pub(super) control: IngressControl,
+    pub(super) open_pipes: u8,
+    /// Set when it has joined the network, or opened the drive.
+    pub(super) is_ready: bool,
+    /// Set at the end of the drive.
+    pub(super) drive_ended: bool,
+    pub(super) status: Option<Box<IngressStatus>>,
+    /// Last status of each topic that had a reader.
+    topics: Vec<IngressTopic>,
+}
+
+impl IngressProcess {
+    /// Starts the ingress. `largest` is the largest sample of an input, in bytes.
+    pub(super) fn start(
+        context: &RunContext<'_>,
+        largest: u64,
+        sender: &SyncSender<ChildOutput>,
+    ) -> Result<Self, Failure> {
+        let (control, ingress_end) = IngressControl::pair().map_err(|error| {
+            Failure::caused_by(Exit::Internal, "cannot connect to the ingress", &error)
+        })?;
+        let child = ChildProcess::start(
+            &context.parts,
+            ("gleaner-ingress", ChildId::Ingress),
+            arguments::ingress(context.args, largest, context.offset_ns),
+            None,
+            Handover { control: Some(ingress_end), ..Handover::default() },
+            sender,
+        )?;
+        Ok(Self {
+            child,
+            control,
+            open_pipes: PIPES,
+            is_ready: false,
+            drive_ended: false,
+            status: None,
+            topics: Vec::new(),
+        })
+    }
+
+    /// Returns the reason why it receives no further samples; of a drive, why it ended early.
+    pub(super) fn dead(&self) -> Option<&str> {
+        self.status.as_ref().and_then(|status| status.health.dead.as_deref())
+    }
+
+    pub(super) fn show(&mut self, report: IngressReport, screen: &mut Screen) {
+        screen.report(&report);
+        match report {
+            IngressReport::Ready => self.is_ready = true,
+            IngressReport::DriveEnded => self.drive_ended = true,
+            IngressReport::Status(status) => {
+                screen.ingress(&status);
+                self.keep_topics(&status);
+                self.status = Some(status);
+            }
+            IngressReport::Ended(mut status) => {
+                self.keep_topics(&status);
+                // Its readers have ended before it, and with them their topics.
+                status.topics = self.topics.clone();
+                screen.ingress_ended(&status);
+                self.status = Some(status);
+            }
+        }
+    }
+
+    fn keep_topics(&mut self, status: &IngressStatus) {
+        for topic in &status.topics {
+            let is_it = |known: &&mut IngressTopic| {
+                (&known.topic, &known.type_name) == (&topic.topic, &topic.type_name)
+            };
+            match self.topics.iter_mut().find(is_it) {
+                Some(known) => *known = topic.clone(),
+                None => self.topics.push(topic.clone()),
+            }
+        }
+    }
+}
+
+/// The recorder of a run.
+pub(super) struct RecorderProcess {
+    pub(super) child: ChildProcess,
+    pub(super) control: ControlClient,
+    pub(super) open_pipes: u8,
+    /// Set when it accepts lambdas.
+    pub(super) is_ready: bool,
+    /// Topics that lambdas record.
+    pub(super) topics: RecordedTopics,
+    pub(super) status: Option<Box<RecorderStatus>>,
+}
+
+impl RecorderProcess {
+    /// Starts the recorder of the lambdas `recorded`. `ingress` is its connection to the ingress.
+    pub(super) fn start<'a>(
+        context: &RunContext<'_>,
+        recorded: impl Iterator<Item = &'a RunLambda> + Clone,
+        ingress: OwnedFd,
+        sender: &SyncSender<ChildOutput>,
+    ) -> Result<Self, Failure> {
+        let (control, recorder_end) = ControlClient::pair().map_err(|error| {
+            Failure::caused_by(Exit::Internal, "cannot connect to the recorder", &error)
+        })?;
+        let connections =
+            Handover { control: Some(recorder_end), ingress: Some(ingress), ..Handover::default() };
+        let child = ChildProcess::start(
+            &context.parts,
+            ("gleaner-recorder", ChildId::Recorder),
+            arguments::recorder(context.args, recorded.clone(), context.offset_ns),
+            None,
+            connections,
+            sender,
+        )?;
+        let topics = RecordedTopics::of(recorded);
+        Ok(Self { child, control, open_pipes: PIPES, is_ready: false, topics, status: None })
+    }
+
+    pub(super) fn show(&mut self, report: RecorderReport, screen: &mut Screen) {
+        screen.report(&report);
+        match report {
+            RecorderReport::Clip(clip) => screen.clip(&clip),
+            RecorderReport::Recovered(clip) => {
+                screen.warn("recovered a clip of an earlier recorder that crashed");
+                screen.clip(&clip);
+            }
+            RecorderReport::Loss(Loss::Deleted { file, reason, .. }) => {
+                screen.warn(&format!("deleted the clip `{}`: {reason}", file.display()));
+            }
+            RecorderReport::Loss(Loss::NotDeleted { file, reason, .. }) => {
+                screen.warn(&format!("cannot delete the clip `{}`: {reason}", file.display()));
+            }
+            RecorderReport::Loss(Loss::Failed { reason, .. }) => {
+                screen.warn(&format!("cannot write a clip: {reason}"))
+            }
+            RecorderReport::Loss(Loss::DiskSuppressed { triggers, reason, .. }) => {
+                screen.warn(&format!("{triggers} triggers without a window: {reason}"));
+            }
+            RecorderReport::Status(status) => {
+                screen.recorder(&status);
+                self.status = Some(status);
+            }
+            RecorderReport::Ended(status) => {
+                screen.recorder_ended(&status);
+                self.status = Some(status);
+            }
+            RecorderReport::Ready => self.is_ready = true,
+        }
+    }
+}

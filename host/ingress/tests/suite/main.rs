@@ -1,0 +1,8 @@
+//! An ingress over the loopback or a drive, with readers in the same process.
+
+mod drive;
+mod granting;
+mod hostile;
+mod publishing;
+mod sharing;
+mod support;

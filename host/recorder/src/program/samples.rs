@@ -1,0 +1,106 @@
+//! The samples of one topic, in the memory that the ingress shares.
+
+use gleaner_feed::FedTopic;
+use gleaner_transport::{SampleMeta, StoredMeta, TopicCounters};
+
+/// Attempts to find a sample that stays until it is looked at: the ingress publishes meanwhile.
+const ATTEMPTS: u32 = 8;
+
+/// The samples of one topic, read in order.
+pub struct FedSamples {
+    fed: FedTopic,
+    /// Position of the next sample.
+    next: u64,
+    /// Stamp of the next sample, once it is known.
+    ahead: Option<i64>,
+    received: u64,
+    missed: u64,
+}
+
+impl FedSamples {
+    pub fn new(fed: FedTopic) -> FedSamples {
+        FedSamples { next: fed.info.first, fed, ahead: None, received: 0, missed: 0 }
+    }
+
+    pub fn type_name(&self) -> &str {
+        &self.fed.info.type_name
+    }
+
+    /// Definitions that the source carries.
+    pub fn definitions(&self) -> Option<&str> {
+        self.fed.info.definitions.as_deref()
+    }
+
+    pub fn offered_qos(&self) -> Option<&str> {
+        self.fed.info.offered_qos.as_deref()
+    }
+
+    /// Number of samples read.
+    pub fn received(&self) -> u64 {
+        self.received
+    }
+
+    /// Number of samples that left before they were read.
+    pub fn missed(&self) -> u64 {
+        self.missed
+    }
+
+    /// Number of samples that were too large for the topic.
+    pub fn too_big(&self) -> u64 {
+        TopicCounters::of_words(&self.fed.reader.counters()).too_big
+    }
+
+    /// Returns the stamp of the next sample, if there is one.
+    pub fn look(&mut self) -> Option<i64> {
+        for _ in 0..ATTEMPTS {
+            let head = self.fed.reader.head();
+            if self.ahead.is_some() || head <= self.next {
+                return self.ahead;
+            }
+            match self.fed.reader.meta(self.next) {
+                Some(words) => self.ahead = Some(StoredMeta::of_words(&words).sample.at_ns),
+                None => self.skip(),
+            }
+        }
+        self.ahead
+    }
+
+    /// Reads samples in place from the next one on, up to the stamp `until_ns`, at most `most`.
+    /// Returns their number and bytes. It holds them for this time only.
+    pub fn read<E>(
+        &mut self,
+        until_ns: i64,
+        most: usize,
+        mut each: impl FnMut(&SampleMeta, &[u8]) -> Result<(), E>,
+    ) -> Result<(usize, usize), E> {
+        let window = u32::from(self.fed.info.holds.window.max(1));
+        let count = window.min(u32::try_from(most).unwrap_or(u32::MAX));
+        self.ahead = None;
+        // It has a hold for one window, which is not in use.
+        let Ok(Some(held)) = self.fed.reader.window(self.next, count) else {
+            self.skip();
+            return Ok((0, 0));
+        };
+        let (mut samples, mut bytes) = (0, 0);
+        for sample in held.iter() {
+            let meta = StoredMeta::of_words(sample.meta()).sample;
+            if meta.at_ns > until_ns {
+                self.ahead = Some(meta.at_ns);
+                break;
+            }
+            each(&meta, sample)?;
+            (samples, bytes) = (samples + 1, bytes + sample.len());
+            self.next += 1;
+            self.received += 1;
+        }
+        Ok((samples, bytes))
+    }
+
+    /// Skips samples that have left.
+    fn skip(&mut self) {
+        let reader = &self.fed.reader;
+        let oldest = reader.head().saturating_sub(reader.depth().into()).max(self.next + 1);
+        self.missed += oldest - self.next;
+        self.next = oldest;
+    }
+}

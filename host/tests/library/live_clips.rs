@@ -1,0 +1,387 @@
+//! Clips of a live run, verified: a run and a recorder in threads, which receive the same samples
+//! with the same stamps.
+
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader, PipeReader, pipe};
+use std::os::fd::OwnedFd;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use gleaner_base::{Exit, Failure};
+use gleaner_feed::Feed;
+use gleaner_host::api::Session;
+use gleaner_host::api::data::Wake;
+use gleaner_host::guest::{Guest, WakeOutcome};
+use gleaner_host::live::{LiveRun, ResultsPipe, Settings};
+use gleaner_host::replay::{ReplayJob, VerifyArgs};
+use gleaner_host::session_setup::{ConfiguredLambda, RunMode};
+use gleaner_ingress::Ingress;
+use gleaner_lambda::manifest::{Limits, Manifest};
+use gleaner_lambda::{BuildDir, Clip, Fault, FaultKind};
+use gleaner_messages::Endian;
+use gleaner_messages::Sources;
+use gleaner_protocol::ingress::{AddReader, AddTopics, IngressControl, TopicGrant};
+use gleaner_protocol::link::{
+    AddLambda, ControlClient, RecordedTopic, RecorderReport, recorded_grant,
+};
+use gleaner_protocol::{Report, Verified};
+use gleaner_recorder::program::{RecorderOptions, run as record};
+use gleaner_transport::loopback::Loopback;
+use gleaner_transport::{Clock, Guid, SampleMeta};
+use gleaner_vitals::Pulse;
+use tempfile::TempDir;
+
+const MANIFEST: &str = "[lambda]\nname = \"adder\"\nversion = \"0.1.0\"\nkind = \"wasm\"\n\
+                        entry = \"adder.wasm\"\n[schedule]\nevent = \"numbers\"\n\
+                        [[input]]\nname = \"numbers\"\ntopic = \"/numbers\"\n\
+                        type = \"test_msgs/msg/Number\"\ndepth = 8\n\
+                        [[input]]\nname = \"others\"\ntopic = \"/others\"\n\
+                        type = \"test_msgs/msg/Number\"\ndepth = 4\nmax_size = \"64 B\"\n\
+                        [record]\ntopics = [\"/numbers\", \"/others\"]\npreroll = \"4s\"\n\
+                        postroll = \"50ms\"\n";
+/// The recorded topics, with the ids of their grants.
+const TOPICS: [(&str, u32); 2] = [("/numbers", 1), ("/others", 2)];
+/// Value at which the lambda triggers.
+const TRIGGER: i64 = 1000;
+/// Value at which the lambda exceeds its deadline, if it has one.
+const SLOW: i64 = -1;
+
+/// Sums up what it sees, and what it has seen since its start.
+struct AddingGuest {
+    session: Session,
+    mode: RunMode,
+    sum: Option<f64>,
+    wakes: Arc<AtomicU64>,
+}
+
+impl Guest for AddingGuest {
+    fn init(&mut self) -> Result<(), Fault> {
+        self.sum = Some(0.0);
+        Ok(())
+    }
+
+    fn wake(&mut self, wake: Wake) -> WakeOutcome {
+        let Wake::Event(sample) = wake else { panic!("samples wake this lambda") };
+        self.wakes.fetch_add(1, Ordering::Relaxed);
+        let mut sum = self.sum.take().unwrap_or(0.0);
+        let inputs = self.session.inputs();
+        for topic in inputs.iter() {
+            let field = topic.field("value").unwrap();
+            sum += topic.column(&field, 5).unwrap().values.iter().sum::<f64>();
+        }
+        let value = sample.number(&sample.topic().field("value").unwrap()).unwrap() as i64;
+        if value >= TRIGGER {
+            self.session.event("sum", sum, Vec::new()).unwrap();
+        }
+        if value == SLOW && matches!(self.mode, RunMode::Live(_)) {
+            let (kind, message) = (FaultKind::Deadline, "too slow".to_owned());
+            let fault = Fault { kind, message, used: None, allowed: None };
+            return WakeOutcome { result: Err(fault), fuel: None, run_ns: None };
+        }
+        self.sum = Some(sum);
+        WakeOutcome { result: Ok(()), fuel: Some(7), run_ns: None }
+    }
+
+    fn discard(&mut self) {
+        self.sum = None;
+    }
+
+    fn engine(&self) -> String {
+        "a test".to_owned()
+    }
+}
+
+/// Loads the lambda, which counts its wakes in `wakes`.
+fn load(
+    wakes: Arc<AtomicU64>,
+) -> impl FnMut(&ConfiguredLambda, &Manifest, Session, RunMode) -> Result<Box<dyn Guest>, Failure> {
+    move |_, _, session, mode| {
+        Ok(Box::new(AddingGuest { session, mode, sum: None, wakes: Arc::clone(&wakes) }) as _)
+    }
+}
+
+/// A run with its recorder.
+struct RecordedRun {
+    folder: TempDir,
+    loopback: Loopback,
+    clock: Clock,
+    stop: Arc<AtomicBool>,
+    reports: BufReader<PipeReader>,
+    recorder_reports: BufReader<PipeReader>,
+    control: ControlClient,
+    run: JoinHandle<Result<Exit, Failure>>,
+    recorder: JoinHandle<Result<(), Failure>>,
+    ingress: IngressControl,
+    sent: [u64; 2],
+    wakes: Arc<AtomicU64>,
+}
+
+impl RecordedRun {
+    /// Starts both, and waits until the recorder receives the topic of numbers.
+    fn start() -> Self {
+        let folder = TempDir::new().unwrap();
+        let lambda = folder.path().join("adder");
+        fs::create_dir_all(lambda.join("build")).unwrap();
+        fs::write(lambda.join("build/lambda.toml"), MANIFEST).unwrap();
+        fs::write(lambda.join("build/adder.wasm"), "x").unwrap();
+        let (loopback, clock, stop) =
+            (Loopback::new(), Clock::from_time_of_day(), Arc::<AtomicBool>::default());
+        loopback.add_topic("/numbers", "test_msgs/msg/Number", "int64 value\n");
+        loopback.add_topic("/others", "test_msgs/msg/Number", "int64 value\n");
+        let (mut control, stdin) = ControlClient::pair().unwrap();
+        let (recorder_reports, to_reports) = pipe().unwrap();
+        let options = RecorderOptions {
+            out: folder.path().join("out"),
+            clock,
+            messages: Sources::default(),
+            preroll_bytes: None,
+            disk_floor: 0,
+            clips_max: None,
+            bytes_max: None,
+            commands: None,
+        };
+        let (mut ingress, _) = Ingress::start_in_thread(Box::new(loopback.clone()));
+        let reader = AddReader {
+            name: "recorder".to_owned(),
+            topics: vec![grant(TOPICS[0])],
+            publishes: Vec::new(),
+        };
+        let (socket, stopped) = (ingress.add_reader(&reader).unwrap(), Arc::clone(&stop));
+        let recorder = thread::spawn(move || {
+            record(options, stdin, socket, File::from(OwnedFd::from(to_reports)), stopped)
+        });
+        let add = AddLambda {
+            lambda: lambda.clone(),
+            remaps: Vec::new(),
+            most: Limits::MAX,
+            grants: TOPICS.map(|(topic, id)| (topic.to_owned(), id)).to_vec(),
+        };
+        let near = control.add(&add).unwrap();
+        let (reports, to_reports) = pipe().unwrap();
+        let manifest = Manifest::parse(MANIFEST, "lambda.toml").unwrap();
+        let inputs = manifest.inputs.iter().zip(0..);
+        let reader = AddReader {
+            name: "adder".to_owned(),
+            topics: inputs
+                .map(|(input, id)| {
+                    TopicGrant::for_input(id, input, input.topic.as_str(), id == 0, true)
+                })
+                .collect(),
+            publishes: Vec::new(),
+        };
+        let (socket, stopped) = (ingress.add_reader(&reader).unwrap(), Arc::clone(&stop));
+        let wakes = Arc::<AtomicU64>::default();
+        let counted = Arc::clone(&wakes);
+        let run = thread::spawn(move || {
+            let pulse = Pulse::create().unwrap().0;
+            let nowhere = File::options().write(true).open("/dev/null").unwrap();
+            let run = LiveRun {
+                lambda: configured(&lambda),
+                manifest,
+                settings: Settings {
+                    out: lambda,
+                    all: false,
+                    restarts: 0,
+                    clock,
+                    round_trip: None,
+                    announce: None,
+                },
+                feed: Feed::connect(socket).unwrap(),
+                recorder: Some(near),
+                results: ResultsPipe::over(nowhere, pulse.clone()),
+                pulse,
+                close: &mut || Ok(Vec::new()),
+                stop: &stopped,
+            };
+            run.run(&mut load(counted), File::from(OwnedFd::from(to_reports)))
+        });
+        let (reports, recorder_reports) =
+            (BufReader::new(reports), BufReader::new(recorder_reports));
+        let mut running = Self {
+            folder,
+            loopback,
+            clock,
+            stop,
+            reports,
+            recorder_reports,
+            control,
+            run,
+            recorder,
+            ingress,
+            sent: [0; 2],
+            wakes,
+        };
+        until(&mut running.reports, |report| matches!(report, Report::Ready).then_some(()));
+        running.recorder_has("/numbers");
+        running
+    }
+
+    /// Lets the recorder receive the other topic, too.
+    fn record_others(&mut self) {
+        let topics = vec![grant(TOPICS[1])];
+        let add = AddTopics { reader: "recorder".to_owned(), topics };
+        self.ingress.add_topics(&add).unwrap();
+        self.recorder_has("/others");
+    }
+
+    fn recorder_has(&mut self, topic: &str) {
+        until(&mut self.recorder_reports, |report| {
+            let RecorderReport::Status(status) = report else { return None };
+            let is_known =
+                |known: &RecordedTopic| known.topic == topic && known.type_name.is_some();
+            status.topics.iter().any(is_known).then_some(())
+        });
+    }
+
+    fn publish(&mut self, topic: &str, value: i64, len: usize) {
+        let sent = &mut self.sent[usize::from(topic == "/others")];
+        *sent += 1;
+        let at_ns = self.clock.now();
+        let meta = SampleMeta {
+            at_ns,
+            publish_ns: at_ns - 5,
+            writer: Guid([7; 16]),
+            seq: *sent,
+            endian: Endian::Little,
+            options: [0; 2],
+        };
+        let mut cdr = value.to_le_bytes().to_vec();
+        cdr.resize(len, 0);
+        self.loopback.publish(topic, &meta, &cdr).unwrap();
+    }
+
+    /// Publishes a number that wakes the lambda, and waits for the wake.
+    fn wake(&mut self, value: i64) {
+        let before = self.wakes.load(Ordering::Relaxed);
+        self.publish("/numbers", value, 8);
+        let until = Instant::now() + Duration::from_secs(60);
+        while self.wakes.load(Ordering::Relaxed) == before {
+            assert!(Instant::now() < until, "the lambda is not woken");
+            thread::yield_now();
+        }
+    }
+
+    /// Publishes a number on each topic, `n` times, and then one that triggers.
+    fn burst(&mut self, n: i64) {
+        for value in 1..=n {
+            self.publish("/others", value, 8);
+            self.wake(value);
+        }
+        self.wake(TRIGGER);
+    }
+
+    /// Waits for the clip, ends everything, and returns the clip's file.
+    fn clip(&mut self) -> PathBuf {
+        let clip: Clip = until(&mut self.recorder_reports, |report| match report {
+            RecorderReport::Clip(clip) => Some(*clip),
+            _ => None,
+        });
+        self.folder.path().join("out").join(clip.file)
+    }
+
+    fn verify(&self, clip: PathBuf) -> Result<Verified, Failure> {
+        let lambda = self.folder.path().join("adder");
+        let mut reports = Vec::new();
+        let job = ReplayJob::verify(VerifyArgs { clip, lambda, vehicle: None })?;
+        assert_eq!(job.run(&mut load(Arc::default()), &mut reports)?, Exit::Ok);
+        match serde_json::from_slice(&reports).unwrap() {
+            Report::Verified(verified) => Ok(verified),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn end(self) {
+        self.stop.store(true, Ordering::Relaxed);
+        drop(self.control);
+        self.run.join().unwrap().unwrap();
+        self.recorder.join().unwrap().unwrap();
+    }
+}
+
+fn grant((topic, id): (&str, u32)) -> TopicGrant {
+    recorded_grant(id, topic, Some("test_msgs/msg/Number".to_owned()), Some(64 << 10))
+}
+
+fn configured(lambda: &Path) -> ConfiguredLambda {
+    ConfiguredLambda {
+        build: BuildDir::of(lambda),
+        folder: lambda.to_owned(),
+        config: Vec::new(),
+        remaps: Vec::new(),
+        vehicle: None,
+    }
+}
+
+/// Reads reports until `looked_for` accepts one.
+fn until<R: serde::de::DeserializeOwned, T>(
+    reports: &mut BufReader<PipeReader>,
+    mut looked_for: impl FnMut(R) -> Option<T>,
+) -> T {
+    loop {
+        let mut line = String::new();
+        assert!(reports.read_line(&mut line).unwrap() > 0, "the reports end");
+        if let Some(found) = looked_for(serde_json::from_str(&line).unwrap()) {
+            return found;
+        }
+    }
+}
+
+#[test]
+fn a_live_clip_is_verified_with_all_of_its_wakes() {
+    let mut running = RecordedRun::start();
+    running.record_others();
+    running.burst(50);
+    let clip = running.clip();
+    let verified = running.verify(clip).unwrap();
+    assert_eq!((verified.uncovered, verified.triggers), (0, 1), "{verified:?}");
+    assert_eq!(verified.wakes, 51);
+    running.end();
+}
+
+#[test]
+fn a_wake_at_its_deadline_is_not_repeated_and_the_lambda_starts_again_after_it() {
+    let mut running = RecordedRun::start();
+    running.record_others();
+    running.burst(5);
+    running.wake(SLOW);
+    running.burst(5);
+    let clip = running.clip();
+    let verified = running.verify(clip).unwrap();
+    assert_eq!((verified.uncovered, verified.triggers, verified.wakes), (0, 2, 13), "{verified:?}");
+    assert_eq!(verified.notes.len(), 1, "{verified:?}");
+    assert!(verified.notes[0].starts_with("1 wake that exceeded the deadline"), "{verified:?}");
+    running.end();
+}
+
+#[test]
+fn samples_that_are_larger_than_the_lambda_accepts_do_not_disturb() {
+    let mut running = RecordedRun::start();
+    running.record_others();
+    for _ in 0..5 {
+        running.publish("/others", 1, 100);
+        running.burst(3);
+        running.publish("/others", 2, 8);
+    }
+    let clip = running.clip();
+    let verified = running.verify(clip).unwrap();
+    assert_eq!((verified.uncovered, verified.triggers), (0, 5), "{verified:?}");
+    running.end();
+}
+
+#[test]
+fn wakes_before_the_recorder_received_a_topic_are_not_compared_and_leave_later_ones_open() {
+    let mut running = RecordedRun::start();
+    running.burst(7);
+    running.record_others();
+    running.burst(7);
+    let clip = running.clip();
+    // The sum of the second trigger includes the first wakes.
+    let failure = running.verify(clip).unwrap_err();
+    assert_eq!(failure.exit, Exit::Usage, "{failure}");
+    assert!(failure.message.contains("does not settle wake 16"), "{failure}");
+    assert!(failure.to_string().contains("samples from before the clip"), "{failure}");
+    running.end();
+}
