@@ -58,7 +58,8 @@ pub fn check(data: &[u8]) -> bool {
 }
 
 /// Sends the rest of an input, as frames or raw, and then the end. A socket goes with the first
-/// byte if `has_socket`. Returns the other end and the number of bytes; `None` if they are too many.
+/// byte if `has_socket`. Returns the other end and the number of bytes; `None` if they are too
+/// many.
 pub(crate) fn sent(
     input: FuzzInput,
     is_framed: bool,

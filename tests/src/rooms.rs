@@ -138,6 +138,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         "gleaner-recorder",
         &[
             "gleaner-base",
+            "gleaner-dds",
             "gleaner-drives",
             "gleaner-feed",
             "gleaner-image",

@@ -5,8 +5,8 @@
 //! none may change. A ring over a pool ([`ring`]) numbers the samples of its one [`RingWriter`] 0,
 //! 1, 2, ... and shows the newest `depth` of them to any number of [`RingReader`]s on any thread.
 //!
-//! In [`shared`], one process writes such rings and others read them in place; [`RingReader::shared`]
-//! reads them like a ring over a pool.
+//! In [`shared`], one process writes such rings and others read them in place;
+//! [`RingReader::shared`] reads them like a ring over a pool.
 //!
 //! A sample that a reader holds keeps its bytes until the last lease on it is dropped, even after
 //! it has left the ring, and after the ring and the pool are gone. Every sample that a ring loses
