@@ -10,15 +10,19 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_base::hex;
+use gleaner_ingress::Ingress;
 use gleaner_journal::{FileDigest, JournalHeader};
 use gleaner_lambda::manifest::Limits;
+use gleaner_messages::Sources;
+use gleaner_protocol::ingress::AddReader;
 use gleaner_protocol::link::{
     AddLambda, ControlClient, RecorderLink, RecorderMessage, RecorderReport, RecorderStatus,
+    recorded_grant,
 };
 use gleaner_recorder::program::{RecorderOptions, run};
 use gleaner_tests::TempFolder;
+use gleaner_transport::Clock;
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Clock, LiveSource};
 use sha2::{Digest, Sha256};
 
 use super::{FRAMES_PER_S, TYPE, Traffic, header, wake};
@@ -71,6 +75,7 @@ fn measure(seconds: u64) -> RecorderLatency {
     let options = RecorderOptions {
         out: out.path().to_owned(),
         clock,
+        messages: Sources::default(),
         preroll_bytes: None,
         disk_floor: 0,
         clips_max: Some(2),
@@ -79,15 +84,21 @@ fn measure(seconds: u64) -> RecorderLatency {
     };
     let (mut control, stdin) = ControlClient::pair().expect("a socket");
     let (reports, to) = std::io::pipe().expect("a pipe");
-    let feed = network.clone();
+    let (mut ingress, _) = Ingress::start_in_thread(Box::new(network.clone()));
+    let grants: Vec<_> = traffic.topics().iter().cloned().zip(1..).collect();
+    let topics = grants
+        .iter()
+        .map(|(topic, id)| recorded_grant(*id, topic, Some(TYPE.to_owned()), Some(1 << 20)))
+        .collect();
+    let reader = AddReader { name: "recorder".to_owned(), topics, publishes: Vec::new() };
+    let samples = ingress.add_reader(&reader).expect("the ingress runs");
     let program = thread::spawn(move || {
-        let feed = || Ok(Box::new(feed) as Box<dyn LiveSource>);
-        run(options, feed, stdin, File::from(OwnedFd::from(to)), Arc::default())
+        run(options, stdin, samples, File::from(OwnedFd::from(to)), Arc::default())
             .expect("nothing fails");
     });
     let reports = thread::spawn(move || last(reports));
     let socket = control
-        .add(&AddLambda { lambda: folder, remaps: Vec::new(), most: Limits::MAX })
+        .add(&AddLambda { lambda: folder, remaps: Vec::new(), most: Limits::MAX, grants })
         .expect("the program runs");
     let mut link = RecorderLink::new(socket);
     link.hello(&header, PATIENCE).expect("the lambda was added");
