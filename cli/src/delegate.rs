@@ -7,6 +7,8 @@ use std::process::Command;
 use gleaner_base::{Exit, Failure};
 use gleaner_parts::Parts;
 use gleaner_protocol::Report;
+use gleaner_protocol::ingress::IngressReport;
+use serde::de::DeserializeOwned;
 
 use crate::args::{InspectArgs, TopicsArgs};
 use crate::render;
@@ -24,17 +26,17 @@ pub(crate) fn play(arguments: &[OsString]) -> Result<Exit, Failure> {
     Err(Failure::caused_by(Exit::Internal, format!("cannot start `{}`", program.display()), &error))
 }
 
-/// Prints the live topics, which `gleaner-runtime` lists.
+/// Prints the live topics, which `gleaner-ingress` lists.
 pub(crate) fn topics(args: &TopicsArgs) -> Result<Exit, Failure> {
     let mut line: Vec<OsString> = vec!["topics".into()];
     line.extend(args.network.to_args());
     line.extend(args.wait.map(|wait| format!("--wait={wait}").into()));
-    let text = match report(&line)? {
+    let text = match report("gleaner-ingress", &line)? {
         Err(exit) => return Ok(exit),
-        Ok(Report::Topics { topics }) if args.json => render::json_line(&topics),
-        Ok(Report::Topics { topics }) => render::topics(&topics),
+        Ok(IngressReport::Topics { topics }) if args.json => render::json_line(&topics),
+        Ok(IngressReport::Topics { topics }) => render::topics(&topics),
         Ok(_) => {
-            return Err(Failure::new(Exit::Internal, "gleaner-runtime did not report topics"));
+            return Err(Failure::new(Exit::Internal, "gleaner-ingress did not report topics"));
         }
     };
     print(&text)?;
@@ -47,7 +49,7 @@ pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
     line.extend(args.all.then(|| "--all".into()));
     line.push("--".into());
     line.extend(args.drives.iter().map(OsString::from));
-    let drive = match report(&line)? {
+    let drive = match report("gleaner-runtime", &line)? {
         Err(exit) => return Ok(exit),
         Ok(Report::Drive(drive)) => drive,
         Ok(_) => {
@@ -58,27 +60,24 @@ pub(crate) fn inspect(args: &InspectArgs) -> Result<Exit, Failure> {
     Ok(if drive.damaged.is_some() { Exit::DriveDamaged } else { Exit::Ok })
 }
 
-/// Runs `gleaner-runtime` with these arguments; returns its report, or its exit code if it failed.
-fn report(line: &[OsString]) -> Result<Result<Report, Exit>, Failure> {
-    let program = Parts::find()?.program("gleaner-runtime")?;
+/// Runs a program with these arguments; returns its report, or its exit code if it failed.
+fn report<T: DeserializeOwned>(name: &str, line: &[OsString]) -> Result<Result<T, Exit>, Failure> {
+    let program = Parts::find()?.program(name)?;
     let failed =
         |what: &str, error: &dyn std::error::Error| Failure::caused_by(Exit::Internal, what, error);
-    let mut runtime = Command::new(&program);
-    runtime.args(line);
+    let mut command = Command::new(&program);
+    command.args(line);
     // It prints its errors itself.
-    let output = runtime.stderr(std::process::Stdio::inherit()).output();
+    let output = command.stderr(std::process::Stdio::inherit()).output();
     let output =
         output.map_err(|error| failed(&format!("cannot start `{}`", program.display()), &error))?;
     match output.status.code().and_then(Exit::from_code) {
         Some(Exit::Ok) => {}
         Some(exit) => return Ok(Err(exit)),
         None => {
-            return Err(Failure::new(
-                Exit::Internal,
-                format!("gleaner-runtime failed ({})", output.status),
-            ));
+            return Err(Failure::new(Exit::Internal, format!("{name} failed ({})", output.status)));
         }
     }
     let report = serde_json::from_slice(&output.stdout);
-    report.map(Ok).map_err(|error| failed("cannot parse the report of gleaner-runtime", &error))
+    report.map(Ok).map_err(|error| failed(&format!("cannot parse the report of {name}"), &error))
 }

@@ -69,7 +69,7 @@ impl Invoker {
     }
 
     /// Frees the samples of a lambda that keeps so many that it could not be woken. Its next wake
-    /// ends in a fault that says so.
+    /// ends in a fault that names the cause.
     pub fn free_holds(&mut self) {
         self.held_too_many = self.fault_of_holds().or(self.held_too_many.take());
     }

@@ -14,11 +14,7 @@ pub mod isolation;
 pub mod journal;
 pub mod live;
 pub mod memory;
-#[cfg(feature = "dds")]
-mod network;
 pub mod program;
 pub mod replay;
 pub mod schedule;
 pub mod session_setup;
-#[cfg(feature = "dds")]
-mod topics;

@@ -33,8 +33,6 @@ use crate::live;
 use crate::replay::Packed;
 use crate::replay::{self, InspectArgs, ReplayArgs, UnpackedArgs, VerifyArgs};
 use crate::session_setup::{ConfiguredLambda, Load, RunMode};
-#[cfg(feature = "dds")]
-use crate::topics::TopicsArgs;
 
 /// Hosts one lambda. Writes reports, a JSON object a line, to standard output.
 #[derive(Parser)]
@@ -62,9 +60,6 @@ enum RuntimeCommand {
     Inspect(InspectArgs),
     /// Runs a built lambda on live topics, until SIGTERM.
     Run(live::RunArgs),
-    /// Reports the topics of the network.
-    #[cfg(feature = "dds")]
-    Topics(TopicsArgs),
 }
 
 /// A task with a lambda. A process has one, so that its size matters little.
@@ -163,8 +158,8 @@ fn no_worker() -> Failure {
 }
 
 /// Upper bound of the memory in bytes that a process uses before the lambda is loaded: the rings
-/// that it fills itself, decoded images, and an interpreter with numpy and Gleaner's own code, which
-/// take some 100 MB, or more if the user requests many threads of numpy.
+/// that it fills itself, decoded images, and an interpreter with numpy and Gleaner's own code,
+/// which take some 100 MB, or more if the user requests many threads of numpy.
 fn at_start(manifest: &Manifest, is_live: bool) -> u64 {
     const INTERPRETER: u64 = 1 << 30;
     let rings = manifest.inputs.iter().flat_map(|input| {
@@ -198,8 +193,6 @@ impl RuntimeCommand {
             Self::Check(args) => Ok(RuntimeJob::Check(check::CheckJob::new(args)?)),
             Self::Inspect(args) => Err(replay::inspect(&args, &mut reports()?)?),
             Self::Run(args) => Ok(RuntimeJob::Live(live::LiveJob::new(args)?)),
-            #[cfg(feature = "dds")]
-            Self::Topics(args) => Err(crate::topics::run(args, &mut reports()?)?),
         })
     }
 }

@@ -75,7 +75,6 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-base",
             "gleaner-buffers",
             "gleaner-compile",
-            "gleaner-dds",
             "gleaner-drives",
             "gleaner-feed",
             "gleaner-image",
@@ -138,7 +137,6 @@ pub const CRATES: &[(&str, &[&str])] = &[
         "gleaner-recorder",
         &[
             "gleaner-base",
-            "gleaner-dds",
             "gleaner-drives",
             "gleaner-feed",
             "gleaner-image",

@@ -4,8 +4,9 @@ use std::fmt::{self, Write};
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, TriggerKind};
+use gleaner_protocol::ingress::TopicInfo;
 use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
-use gleaner_protocol::{DurationStats, LiveStatus, LiveTopic, Report, TopicInfo};
+use gleaner_protocol::{DurationStats, LiveStatus, LiveTopic, Report};
 use gleaner_report::format::{clip_span, counted, fault_kind, grouped, three_digits};
 use serde_json::Value;
 
@@ -272,10 +273,10 @@ mod tests {
     fn a_report_names_its_lambda_once() {
         let named = named_report("hello", &Report::Ready);
         assert_eq!(named.to_string(), r#"{"lambda":"hello","report":"ready"}"#);
-        let text = r#"{"report":"topics","topics":[],"lambda":"other"}"#;
+        let text = r#"{"report":"isolation","layers":[],"lambda":"other"}"#;
         let report: Report = serde_json::from_str(text).unwrap();
         let named = named_report("hello", &report).to_string();
-        assert_eq!(named, r#"{"lambda":"hello","report":"topics","topics":[]}"#);
+        assert_eq!(named, r#"{"lambda":"hello","layers":[],"report":"isolation"}"#);
         assert_eq!(serde_json::from_str::<Report>(&named).unwrap(), report);
     }
 

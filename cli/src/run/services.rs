@@ -68,6 +68,8 @@ impl IngressProcess {
         match report {
             IngressReport::Ready => self.is_ready = true,
             IngressReport::DriveEnded => self.drive_ended = true,
+            // Only of `gleaner-ingress topics`.
+            IngressReport::Topics { .. } => {}
             IngressReport::Status(status) => {
                 screen.ingress(&status);
                 self.keep_topics(&status);

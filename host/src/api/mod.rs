@@ -121,8 +121,8 @@ impl Session {
         self.lock().backed_off
     }
 
-    /// Returns the error of a lambda that keeps too many samples, if samples could not be read since
-    /// the last call for that reason.
+    /// Returns the error of a lambda that keeps too many samples, if samples could not be read
+    /// since the last call for that reason.
     pub fn take_refused_holds(&self) -> Option<DataError> {
         let state = self.lock();
         state.inputs.iter().filter_map(|topic| topic.take_refused_holds()).last()

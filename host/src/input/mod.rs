@@ -1,8 +1,9 @@
 //! The inputs of a lambda: each is a ring of the newest samples of a topic.
 //!
 //! In a replay this process fills the rings (`filled`): all their memory is mapped and touched
-//! before the first sample, and a delivery copies the sample once and never waits for a lambda. In a
-//! live run the ingress fills them in shared memory (`fed`), and this process reads them in place.
+//! before the first sample, and a delivery copies the sample once and never waits for a lambda. In
+//! a live run the ingress fills them in shared memory (`fed`), and this process reads them in
+//! place.
 
 mod fed;
 mod filled;

@@ -29,5 +29,5 @@ pub use handover::Handover;
 pub use isolation::{Holds, LAYERS_ENV, Layer};
 pub use live_status::{DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus};
 pub use recording::{LossCount, LossOutcome, RecordingCounts};
-pub use report::{ReplaySummary, Report, Round, TopicInfo, TopicReport, Verified};
+pub use report::{ReplaySummary, Report, Round, TopicReport, Verified};
 pub use result_item::{RESULTS_ENV, ResultItem, WokenBy};

@@ -43,11 +43,6 @@ pub enum Report {
     Live(Box<LiveStatus>),
     /// Live: sent once, last.
     Ended(Box<LiveStatus>),
-    /// Sent once, last: the topics of the network.
-    Topics {
-        /// Sorted by name.
-        topics: Vec<TopicInfo>,
-    },
     /// Sent once, last: the result of a check.
     Checked(Box<CheckReport>),
     /// Sent once, last: the content of a recorded drive.
@@ -55,21 +50,6 @@ pub enum Report {
     /// Sent once, last, instead of a summary: a journal was compared, and every decision was the
     /// same.
     Verified(Verified),
-}
-
-/// A topic of the network.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct TopicInfo {
-    /// Absolute name.
-    pub topic: String,
-    /// Message type, for example `sensor_msgs/msg/Imu`.
-    pub type_name: String,
-    /// Number of writers.
-    pub writers: usize,
-    /// Number of readers.
-    pub readers: usize,
-    /// QoS profiles that the writers offer, as text, each once.
-    pub qos: Vec<String>,
 }
 
 /// The result of verifying a journal.

@@ -2,18 +2,22 @@
 
 use std::path::PathBuf;
 
-use clap::Parser;
+use clap::{Parser, Subcommand};
 use gleaner_dds::NetworkArgs;
 use gleaner_jail::Paths;
 use gleaner_jail::ingress::NewSockets;
 use gleaner_transport::Clock;
 
+use super::topics::TopicsArgs;
+
 /// Receives topics for lambdas and the recorder, and shares each sample with them in memory.
 /// Standard input is the socket of a starter; reports, one JSON object per line, go to standard
 /// output.
 #[derive(Parser)]
-#[command(name = "gleaner-ingress", version)]
+#[command(name = "gleaner-ingress", version, args_conflicts_with_subcommands = true)]
 pub(super) struct Args {
+    #[command(subcommand)]
+    pub(super) command: Option<IngressCommand>,
     #[command(flatten)]
     pub(super) network: NetworkArgs,
     /// Name of the node in the ROS 2 graph.
@@ -35,6 +39,12 @@ pub(super) struct Args {
     /// Folder for the content of packed files; default: the system's folder for temporary files.
     #[arg(long, value_name = "FOLDER")]
     pub(super) unpack_in: Option<PathBuf>,
+}
+
+#[derive(Subcommand)]
+pub(super) enum IngressCommand {
+    /// Reports the topics of the network, and ends.
+    Topics(TopicsArgs),
 }
 
 impl Args {

@@ -2,12 +2,16 @@
 //!
 //! - `args`: the command line.
 //! - `source`: the network or a drive.
+//! - `network`: failures of the network, for users.
+//! - `topics`: lists the topics of the network, for `gleaner topics`.
 //! - `report_writer`: reports to the starter, and the thread that writes them, as the starter may
 //!   be slow to read.
 
 mod args;
+mod network;
 mod report_writer;
 mod source;
+mod topics;
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -27,19 +31,32 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use tracing::debug;
 
 use crate::Ingress;
-use args::Args;
+use args::{Args, IngressCommand};
 use report_writer::ReportWriter;
+use topics::TopicsArgs;
 
 /// Runs the program `gleaner-ingress`.
 pub fn main() -> ExitCode {
     gleaner_vitals::log::init();
-    match start(Args::parse()) {
+    let mut args = Args::parse();
+    let ended = match args.command.take() {
+        Some(IngressCommand::Topics(topics)) => list_topics(topics),
+        None => start(args),
+    };
+    match ended {
         Ok(()) => Exit::Ok.into(),
         Err(failure) => {
             eprintln!("{failure}");
             failure.exit.into()
         }
     }
+}
+
+fn list_topics(args: TopicsArgs) -> Result<(), Failure> {
+    let mut reports = reports().map_err(|error| {
+        Failure::caused_by(Exit::Internal, "cannot set up the report stream", &error)
+    })?;
+    topics::run(args, &mut reports)
 }
 
 fn start(args: Args) -> Result<(), Failure> {

@@ -1,11 +1,12 @@
 //! Opens the source of samples: the network or a drive.
 
 use gleaner_base::{Exit, Failure};
-use gleaner_dds::{Dds, DdsError};
+use gleaner_dds::Dds;
 use gleaner_drives::{DriveOptions, DrivePlayer, ReplayError};
 use gleaner_transport::LiveSource;
 
 use super::args::Args;
+use super::network::NetworkError;
 
 pub(super) fn open(args: Args) -> Result<Box<dyn LiveSource>, Failure> {
     let clock = args.clock();
@@ -14,17 +15,13 @@ pub(super) fn open(args: Args) -> Result<Box<dyn LiveSource>, Failure> {
         let drive = DrivePlayer::open(&args.drive, &options, clock, args.rate);
         return Ok(Box::new(drive.map_err(|error| unplayable(&error))?));
     }
-    let usage = |error: DdsError| Failure::caused_by(Exit::Usage, "cannot use the network", &error);
-    let mut network = args.network.options(args.node).map_err(usage)?;
+    let mut network = args.network.options(args.node).map_err(NetworkError::failure)?;
     network.largest = args.largest.unwrap_or(network.largest);
     network.clock = clock;
     // Readers search their own files for definitions.
     network.messages = Vec::new();
     network.prefixes = Vec::new();
-    let dds = Dds::open(network).map_err(|error| {
-        Failure::caused_by(Exit::Unreachable, "cannot join the network", &error)
-    })?;
-    Ok(Box::new(dds))
+    Ok(Box::new(Dds::open(network).map_err(NetworkError::failure)?))
 }
 
 fn unplayable(error: &ReplayError) -> Failure {

@@ -114,6 +114,26 @@ pub enum IngressReport {
     DriveEnded,
     /// It has ended on request. Its last status.
     Ended(Box<IngressStatus>),
+    /// The topics of the network, sorted by name: the only report of `gleaner-ingress topics`.
+    Topics {
+        /// Each topic once.
+        topics: Vec<TopicInfo>,
+    },
+}
+
+/// A topic of the network.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TopicInfo {
+    /// Absolute name.
+    pub topic: String,
+    /// Message type, for example `sensor_msgs/msg/Imu`.
+    pub type_name: String,
+    /// Number of writers.
+    pub writers: usize,
+    /// Number of readers.
+    pub readers: usize,
+    /// QoS profiles that the writers offer, as text, each once.
+    pub qos: Vec<String>,
 }
 
 /// The status of the ingress.
@@ -125,7 +145,8 @@ pub struct IngressStatus {
     pub topics: Vec<IngressTopic>,
     /// Number of connected readers.
     pub readers: usize,
-    /// Resident memory of this process alone, in bytes: samples in shared memory are not part of it.
+    /// Resident memory of this process alone, in bytes: samples in shared memory are not part of
+    /// it.
     pub rss_bytes: u64,
     /// CPU time of this process, in s.
     pub cpu_s: f64,

@@ -21,7 +21,7 @@ pub use grant::{AddReader, AddTopics, HoldGrant, PublishGrant, TopicGrant};
 pub use grant_check::GrantError;
 pub use message::{
     AttachedTopic, IngressReport, IngressStatus, IngressTopic, ReaderMessage, RefusedTopic,
-    RegionLayout, SourceStatus,
+    RegionLayout, SourceStatus, TopicInfo,
 };
 pub use reader::{PUBLISH_MAX, ReaderLink, ReaderRequest};
 pub use source::{Health, Qos, ReceptionStatus};

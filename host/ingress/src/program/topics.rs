@@ -1,4 +1,4 @@
-//! `gleaner-runtime topics`: lists the topics of the network.
+//! `gleaner-ingress topics`: lists the topics of the network.
 
 use std::io::Write;
 use std::time::{Duration, Instant};
@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use gleaner_base::{Exit, Failure};
 use gleaner_dds::{Dds, NetworkArgs};
-use gleaner_protocol::{Report, TopicInfo};
+use gleaner_protocol::ingress::{IngressReport, TopicInfo};
 
-use crate::network::NetworkError;
+use super::network::NetworkError;
 
 /// Default time to listen: participants announce themselves every few seconds, and answer a new
 /// one at once.
@@ -17,7 +17,7 @@ const WAIT_MAX: Duration = Duration::from_secs(3600);
 
 /// Arguments of `topics`.
 #[derive(Args, Clone, Debug)]
-pub struct TopicsArgs {
+pub(super) struct TopicsArgs {
     #[command(flatten)]
     network: NetworkArgs,
     /// Time to listen, in seconds.
@@ -26,7 +26,7 @@ pub struct TopicsArgs {
 }
 
 /// Listens for a while, and reports the topics that were discovered.
-pub(crate) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<Exit, Failure> {
+pub(super) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<(), Failure> {
     let wait = Duration::try_from_secs_f64(args.wait).ok().filter(|wait| *wait <= WAIT_MAX);
     let wait = wait.ok_or_else(|| {
         Failure::new(Exit::Usage, format!("--wait {}: use 0 to 3600 s", args.wait))
@@ -46,9 +46,9 @@ pub(crate) fn run(args: TopicsArgs, reports: &mut impl Write) -> Result<Exit, Fa
         readers: topic.readers,
         qos: topic.qos,
     });
-    let report = Report::Topics { topics: seen.collect() };
+    let report = IngressReport::Topics { topics: seen.collect() };
     // The reader may have ended.
     let _ = serde_json::to_writer(&mut *reports, &report);
     let _ = reports.write_all(b"\n");
-    Ok(Exit::Ok)
+    Ok(())
 }

@@ -6,11 +6,11 @@ use gleaner_dds::DdsError;
 /// A DDS error, for users.
 #[derive(Debug, thiserror::Error)]
 #[error(transparent)]
-pub(crate) struct NetworkError(DdsError);
+pub(super) struct NetworkError(DdsError);
 
 impl NetworkError {
     /// Converts `error`; for `map_err`.
-    pub(crate) fn failure(error: DdsError) -> Failure {
+    pub(super) fn failure(error: DdsError) -> Failure {
         Self(error).into()
     }
 }
