@@ -158,15 +158,3 @@ impl<'de> no_key::Decode<'de, Raw> for CopyOrReport<'_> {
         Ok(self.0.decode_bytes(bytes, encoding).unwrap_or_else(unreadable))
     }
 }
-
-/// Discards a sample.
-#[derive(Copy, Clone)]
-pub(super) struct Discard;
-
-impl<'de> no_key::Decode<'de, Raw> for Discard {
-    type Error = Unreadable;
-
-    fn decode_bytes(self, _: &'de [u8], _: RepresentationIdentifier) -> Result<Raw, Unreadable> {
-        Ok(Raw { at_ns: 0, endian: Endian::Little, copied_to: CopiedTo::SharedMemory })
-    }
-}

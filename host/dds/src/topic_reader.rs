@@ -14,7 +14,7 @@ use tracing::{info, warn};
 use super::before_match::BeforeMatch;
 use super::names::{dds_topic, dds_type, ros_type, visible};
 use super::qos::{Offer, Request, describe};
-use super::raw::{CopiedTo, CopyInto, CopyOrReport, Discard, Raw, RawReader};
+use super::raw::{CopiedTo, CopyInto, CopyOrReport, Raw, RawReader};
 use super::state::{OnceLog, ParticipantState, SubscriptionStatus, UNKNOWN, lock, panic_text};
 use super::type_check::TypeCheck;
 use gleaner_transport::{Clock, Gaps, Guid, Qos, SampleMeta, Sink, TopicSpec};
@@ -50,7 +50,7 @@ pub(super) struct TopicReader {
     /// RustDDS keeps for the topic again.
     read_before: Gaps,
     gaps: Gaps,
-    /// Samples that RustDDS received earlier were for an earlier subscription.
+    /// Samples that RustDDS received earlier were for an earlier subscription, and are skipped.
     not_before: Timestamp,
     /// `None` until the first update.
     before_match: Option<BeforeMatch>,
@@ -391,13 +391,9 @@ impl TopicReader {
             self.read_before = self.gaps.clone();
             self.remove_reader(context.registry, context.state);
         } else if !request.transient_local {
-            // Samples cached for an earlier subscription are skipped: here without a copy, and by
-            // their time those that the new reader gets later, as it has no writer yet.
+            // By their time: taking here all that waits would also take the first samples of a
+            // writer that RustDDS has matched in the meantime.
             self.not_before = before;
-            let mut kept = (0..MOST_KEPT).map(|_| reader.try_take_one_with(Discard));
-            kept.find(|passed| {
-                !matches!(passed, Ok(Some(_)) | Err(ReadError::Deserialization { .. }))
-            });
         }
         info!(topic = %self.spec.topic, qos = %request, kept = kept(&self.spec), "subscribed");
         self.reader = Some(reader);

@@ -5,6 +5,7 @@
 //! reason.
 
 mod discovery;
+mod first_sample;
 mod graph;
 mod hostile;
 mod life;
@@ -46,6 +47,7 @@ fn main() -> ExitCode {
         hostile::TESTS,
         life::TESTS,
         unsubscribe::TESTS,
+        first_sample::TESTS,
     ];
     let trial = |&(name, test): &Test| match &here {
         Ok(()) => Trial::test(name, move || -> Result<(), Failed> {
