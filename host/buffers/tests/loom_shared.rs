@@ -25,7 +25,7 @@ fn warm_topic(
     (windows, singles): (u16, u16),
 ) -> (SharedWriter, SharedReader) {
     let (memory, reading) = in_process(SharedLayout { depth, slots, slot_bytes: 8 }).unwrap();
-    let control = Arc::new(ControlPage::new());
+    let control = ControlPage::on_heap();
     let mut writer = SharedWriter::with_warm_slots(memory, warm);
     let limits = HoldLimits { first_word: 0, windows, window: 2, singles };
     writer.attach(control.clone(), limits).unwrap();
@@ -286,7 +286,7 @@ fn no_ring_is_missed() {
 /// A ring between the reader's look at its topics and its sleep.
 fn rings() {
     loom::model(|| {
-        let control = Arc::new(ControlPage::new());
+        let control = ControlPage::on_heap();
         let state = loom::sync::Mutex::new(Sleep::default());
         let sleeper = Arc::new(Sleeper { state, change: loom::sync::Condvar::new() });
         let published = Arc::new(AtomicU32::new(0));

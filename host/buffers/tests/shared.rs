@@ -11,6 +11,9 @@ use gleaner_buffers::shared::{
     SharedLayout, SharedReader, SharedWriter, WriteError, in_process,
 };
 
+/// Words of a control page that a hostile reader overwrites: more than it is granted.
+const GARBAGE_WORDS: usize = 16;
+
 /// Returns a writer with readers: windows, positions of a window, and single positions of each.
 fn topic<const N: usize>(
     (depth, slots, slot_bytes): (u32, u32, u64),
@@ -19,7 +22,7 @@ fn topic<const N: usize>(
     let (memory, reading) = in_process(SharedLayout { depth, slots, slot_bytes }).unwrap();
     let mut writer = SharedWriter::new(memory);
     let attach = |(windows, window, singles)| {
-        let control = Arc::new(ControlPage::new());
+        let control = ControlPage::on_heap();
         let limits = HoldLimits { first_word: 0, windows, window, singles };
         let id = writer.attach(control.clone(), limits).unwrap();
         // SAFETY: the page is attached with these limits, and the tests store to pages of readers
@@ -102,7 +105,7 @@ fn further_slots_are_used_only_while_samples_are_held() {
     let (memory, reading) =
         in_process(SharedLayout { depth: 2, slots: 32, slot_bytes: 256 }).unwrap();
     let mut writer = SharedWriter::with_warm_slots(memory, 6);
-    let control = Arc::new(ControlPage::new());
+    let control = ControlPage::on_heap();
     let limits = HoldLimits { first_word: 0, windows: 0, window: 0, singles: 9 };
     writer.attach(control.clone(), limits).unwrap();
     // SAFETY: the page is attached with these limits, and nothing else stores to it.
@@ -154,11 +157,11 @@ fn a_reader_that_holds_its_quota_gets_no_more_and_stops_nobody() {
 #[test]
 fn quotas_beyond_the_slots_are_refused() {
     let (mut writer, [(_, _, id)]) = topic((2, 6, 256), [(1, 2, 0)]);
-    let control = Arc::new(ControlPage::new());
+    let control = ControlPage::on_heap();
     let limits = |first_word, singles| HoldLimits { first_word, windows: 0, window: 0, singles };
     let refused = writer.attach(control.clone(), limits(0, 2)).unwrap_err();
     assert_eq!(refused, WriteError::Quota { asked: 2, left: 1 });
-    for limits in [limits(0, 0), limits(HAZARDS as u16, 1), limits(u16::MAX, u16::MAX)] {
+    for limits in [limits(0, 0), limits(HAZARDS as u32, 1), limits(u32::MAX, u16::MAX)] {
         assert_eq!(writer.attach(control.clone(), limits).unwrap_err(), WriteError::Hazards);
     }
     writer.detach(id);
@@ -237,7 +240,7 @@ fn a_sample_larger_than_a_slot_is_refused() {
 
 /// Writes garbage over the hazard words of a control page.
 fn garbage(control: &impl ControlMemory, state: &mut u64) {
-    for word in 0..HAZARDS {
+    for word in 0..GARBAGE_WORDS {
         *state ^= *state << 13;
         *state ^= *state >> 7;
         *state ^= *state << 17;

@@ -2,8 +2,6 @@
 #![allow(unsafe_code)]
 //! A ring over shared memory, through the interface of rings, and the words that its samples take.
 
-use std::sync::Arc;
-
 use gleaner_buffers::shared::{
     ControlPage, HoldLimits, META_WORDS, SharedLayout, SharedReader, SharedWriter, in_process,
 };
@@ -14,7 +12,7 @@ const LIMITS: HoldLimits = HoldLimits { first_word: 0, windows: 2, window: 3, si
 fn topic() -> (SharedWriter, SharedReader) {
     let layout = SharedLayout { depth: 4, slots: 4 + LIMITS.quota() + 1, slot_bytes: 64 };
     let (memory, reading) = in_process(layout).unwrap();
-    let (mut writer, control) = (SharedWriter::new(memory), Arc::new(ControlPage::new()));
+    let (mut writer, control) = (SharedWriter::new(memory), ControlPage::on_heap());
     writer.attach(control.clone(), LIMITS).unwrap();
     // SAFETY: the page is attached with these limits, and nothing else stores to it.
     let reader = unsafe { SharedReader::new(&reading, control, LIMITS) }.unwrap();
@@ -167,4 +165,20 @@ fn without_a_word_for_a_window_its_samples_take_words_for_single_ones() {
     kept.pop();
     ring.last(2, &mut more);
     assert_eq!(values(&more), [104, 105]);
+}
+
+#[test]
+fn a_read_of_more_samples_than_a_word_can_name_takes_several_words() {
+    let (mut writer, reader) = topic();
+    let ring = ring(&reader, 0, 4);
+    publish(&mut writer, 4);
+    let mut all = Vec::new();
+    ring.last(4, &mut all);
+    assert_eq!((values(&all), ring.refused_holds()), (vec![0, 1, 2, 3], 0));
+    let mut newer = Vec::new();
+    publish(&mut writer, 2);
+    ring.last(3, &mut newer);
+    publish(&mut writer, 100);
+    assert_eq!((values(&all), values(&newer)), (vec![0, 1, 2, 3], vec![3, 4, 5]));
+    assert_eq!(ring.refused_holds(), 0, "a window and a single one, and a further window");
 }

@@ -101,7 +101,7 @@ impl OwnPage {
 
     /// Takes words for a topic. Returns `false` if the page lacks some, or another topic has one.
     fn take(&mut self, limits: &HoldLimits) -> bool {
-        let first = usize::from(limits.first_word);
+        let first = limits.first_word as usize;
         let count = usize::from(limits.windows) + usize::from(limits.singles);
         let Some(words) = self.taken.get_mut(first..first + count) else { return false };
         if words.contains(&true) {

@@ -27,7 +27,7 @@ const TIMEOUT: Duration = Duration::from_secs(60);
 const LAYOUT: SharedLayout = SharedLayout { depth: 4, slots: 16, slot_bytes: 64 };
 const HOLDS: HoldGrant = HoldGrant { windows: 1, window: 4, singles: 2 };
 /// Words of `HOLDS`.
-const WORDS: u16 = 3;
+const WORDS: u32 = 3;
 
 struct FakeIngress {
     link: ReaderLink,
@@ -43,7 +43,7 @@ fn connected() -> (FakeIngress, Feed) {
     (FakeIngress { link, control }, Feed::connect(reader_end.into()).unwrap())
 }
 
-fn info(id: u32, first_word: u16) -> AttachedTopic {
+fn info(id: u32, first_word: u32) -> AttachedTopic {
     let SharedLayout { depth, slots, slot_bytes } = LAYOUT;
     AttachedTopic {
         id,
@@ -65,7 +65,7 @@ impl FakeIngress {
     }
 
     /// Attaches a topic.
-    fn attach(&mut self, id: u32, first_word: u16) -> SharedWriter {
+    fn attach(&mut self, id: u32, first_word: u32) -> SharedWriter {
         let (region, file) = region();
         let mut writer = SharedWriter::new(WriterMemory::new(region, LAYOUT).unwrap());
         let HoldGrant { windows, window, singles } = HOLDS;
@@ -279,8 +279,8 @@ fn a_topic_that_does_not_match_its_memory_is_an_error() {
         "topic 2: its first position is impossible"
     );
     assert_eq!(refusal(|info| info.first_word = WORDS - 1, None), words, "one is of topic 1");
-    assert_eq!(refusal(|info| info.first_word = HAZARDS as u16 - 1, None), words);
-    assert_eq!(refusal(|info| info.first_word = u16::MAX, None), words);
+    assert_eq!(refusal(|info| info.first_word = HAZARDS as u32 - 1, None), words);
+    assert_eq!(refusal(|info| info.first_word = u32::MAX, None), words);
     assert_eq!(
         refusal(|info| info.holds = HoldGrant { windows: 0, window: 0, singles: 0 }, None),
         words

@@ -58,7 +58,7 @@ pub(crate) struct ConnectedReader {
     link: ReaderLink,
     pub(crate) control: ControlRegion,
     /// Number of hazard words that are given out.
-    words: u16,
+    words: u32,
     pub(crate) topics: Vec<Attachment>,
     /// Grants that wait for a writer, whose type they take.
     pub(crate) waiting: Vec<TopicGrant>,
@@ -103,8 +103,8 @@ impl ConnectedReader {
     /// Gives out the hazard words of a topic; `None` if the control page lacks so many.
     pub(crate) fn take_words(&mut self, holds: HoldGrant) -> Option<HoldLimits> {
         let HoldGrant { windows, window, singles } = holds;
-        let end = self.words.checked_add(windows)?.checked_add(singles)?;
-        if usize::from(end) > HAZARDS {
+        let end = self.words + u32::from(windows) + u32::from(singles);
+        if end as usize > HAZARDS {
             return None;
         }
         let first_word = std::mem::replace(&mut self.words, end);

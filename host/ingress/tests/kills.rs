@@ -14,7 +14,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use gleaner_buffers::shared::{ControlMemory, HAZARDS};
+use gleaner_buffers::shared::ControlMemory;
 use gleaner_feed::Feed;
 use gleaner_ingress::Ingress;
 use gleaner_messages::Endian;
@@ -33,6 +33,8 @@ const TYPE: &str = "test_msgs/msg/Words";
 const TIMEOUT: Duration = Duration::from_secs(60);
 /// Words of the largest sample.
 const WORDS: usize = 512;
+/// Words of a control page that a hostile reader overwrites: more than it is granted.
+const GARBAGE_WORDS: usize = 16;
 
 fn main() -> ExitCode {
     match env::var(ROLE).as_deref() {
@@ -269,7 +271,7 @@ fn pages() {
     print("ready");
     let mut random = random();
     loop {
-        for word in 0..HAZARDS {
+        for word in 0..GARBAGE_WORDS {
             // SAFETY: this reader holds nothing.
             unsafe { page.overwrite(word, random()) };
         }

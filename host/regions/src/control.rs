@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use gleaner_buffers::shared::{ControlMemory, ControlPage};
 use rustix::fs::{MemfdFlags, SealFlags, fcntl_get_seals, memfd_create};
-use rustix::mm::{MapFlags, ProtFlags};
+use rustix::mm::ProtFlags;
 
 use crate::topic::{FileMapping, seal};
 
@@ -21,7 +21,8 @@ const CONTROL_SEALS: SealFlags = SealFlags::SHRINK.union(SealFlags::GROW).union(
 pub struct ControlRegion(Arc<FileMapping>);
 
 impl ControlRegion {
-    /// Creates a page without hazards, and the file to pass to its reader.
+    /// Creates a page without hazards, and the file to pass to its reader. The kernel adds memory
+    /// for the words that are granted, when the writer and the reader attach them.
     ///
     /// # Errors
     ///
@@ -51,14 +52,14 @@ impl ControlRegion {
     fn map(file: BorrowedFd<'_>) -> io::Result<Self> {
         let access = ProtFlags::READ | ProtFlags::WRITE;
         let len = size_of::<ControlPage>();
-        let mapping = FileMapping::shared(&file, len, access, MapFlags::POPULATE)?;
+        let mapping = FileMapping::shared(&file, len, access)?;
         // A forked process that drops a sample would clear a hazard of this one.
         mapping.keep_from_children()?;
         Ok(Self(Arc::new(mapping)))
     }
 }
 
-// SAFETY: the mapping has the size of a page, is aligned to a page, and lives as long as the value;
+// SAFETY: the mapping has the size of a control page, is aligned to a page of memory, and lives as long as the value;
 // its file cannot shrink. Its fields are atomics.
 unsafe impl ControlMemory for ControlRegion {
     fn page(&self) -> NonNull<ControlPage> {
@@ -68,8 +69,33 @@ unsafe impl ControlMemory for ControlRegion {
 
 #[cfg(test)]
 mod tests {
+    use gleaner_buffers::shared::{
+        HAZARDS, HoldLimits, SharedLayout, SharedReader, SharedWriter, in_process,
+    };
+
     use super::*;
     use crate::TopicRegion;
+
+    #[test]
+    fn a_page_uses_memory_only_for_words_that_are_granted() {
+        let layout = SharedLayout { depth: 1, slots: 4, slot_bytes: 8 };
+        let (page, file) = ControlRegion::create().unwrap();
+        let present = || rustix::fs::fstat(&file).unwrap().st_blocks * 512;
+        assert_eq!(present(), 0);
+        for (topics, first_word) in (1..).zip([0, HAZARDS as u32 - 2]) {
+            let (memory, reading) = in_process(layout).unwrap();
+            let limits = HoldLimits { first_word, windows: 0, window: 0, singles: 2 };
+            let mut writer = SharedWriter::new(memory);
+            writer.attach(page.clone(), limits).unwrap();
+            assert_eq!(present(), topics * 4096);
+            // SAFETY: the page is attached with these limits, and nothing else stores to it.
+            let reader = unsafe { SharedReader::new(&reading, page.clone(), limits) }.unwrap();
+            writer.draft(8).unwrap().fill(7);
+            writer.publish(&Default::default()).unwrap();
+            assert_eq!(*reader.get(0).unwrap().unwrap(), [7; 8]);
+        }
+        assert_eq!(present(), 2 * 4096);
+    }
 
     #[test]
     fn a_file_that_is_not_a_sealed_page_is_refused() {

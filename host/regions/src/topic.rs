@@ -28,15 +28,9 @@ pub(crate) struct FileMapping {
 
 impl FileMapping {
     /// Maps the first `len` bytes of `file`, shared with other processes.
-    pub(crate) fn shared(
-        file: &impl AsFd,
-        len: usize,
-        access: ProtFlags,
-        populate: MapFlags,
-    ) -> io::Result<Self> {
+    pub(crate) fn shared(file: &impl AsFd, len: usize, access: ProtFlags) -> io::Result<Self> {
         // SAFETY: a null hint lets the kernel choose addresses that nothing else uses.
-        let base =
-            unsafe { mmap(ptr::null_mut(), len, access, MapFlags::SHARED | populate, file, 0) }?;
+        let base = unsafe { mmap(ptr::null_mut(), len, access, MapFlags::SHARED, file, 0) }?;
         let base = NonNull::new(base.cast()).ok_or(io::ErrorKind::OutOfMemory)?;
         Ok(Self { base, len })
     }
@@ -118,7 +112,7 @@ impl TopicRegion {
         let file = File::from(memfd_create(name, flags)?);
         file.set_len(len as u64)?;
         let access = ProtFlags::READ | ProtFlags::WRITE;
-        let mapping = FileMapping::shared(&file, len, access, MapFlags::empty())?;
+        let mapping = FileMapping::shared(&file, len, access)?;
         mapping.keep_from_children()?;
         mapping.populate(&file, present.min(len))?;
         seal(&file, TOPIC_SEALS)?;
@@ -174,7 +168,7 @@ impl MappedTopic {
         if !fcntl_get_seals(&file)?.contains(TOPIC_SEALS) {
             return Err(wrong("the memory of the topic is not sealed"));
         }
-        FileMapping::shared(&file, len, ProtFlags::READ, MapFlags::empty()).map(Self)
+        FileMapping::shared(&file, len, ProtFlags::READ).map(Self)
     }
 }
 
@@ -204,8 +198,7 @@ mod tests {
     fn a_sealed_topic_cannot_be_changed_through_its_file() {
         let region = TopicRegion::create("test", LEN, 0).unwrap();
         let file = region.file();
-        let writable =
-            FileMapping::shared(&file, LEN, ProtFlags::READ | ProtFlags::WRITE, MapFlags::empty());
+        let writable = FileMapping::shared(&file, LEN, ProtFlags::READ | ProtFlags::WRITE);
         assert_eq!(writable.err().unwrap().raw_os_error(), Some(Errno::PERM.raw_os_error()));
         assert_eq!(pwrite(file, b"x", 0), Err(Errno::PERM));
         assert_eq!(ftruncate(file, 0), Err(Errno::PERM));

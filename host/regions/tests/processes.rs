@@ -9,7 +9,7 @@ use std::process::{Child, ChildStdout, Command, ExitCode, Stdio};
 use std::time::Duration;
 
 use gleaner_buffers::shared::{
-    Bell, ControlMemory, HAZARDS, HoldLimits, META_WORDS, ReaderId, ReaderMemory, SharedLayout,
+    Bell, ControlMemory, HoldLimits, META_WORDS, ReaderId, ReaderMemory, SharedLayout,
     SharedReader, SharedWriter, WriterMemory,
 };
 use gleaner_regions::{ControlRegion, KernelFutex, MappedTopic, TopicRegion};
@@ -17,6 +17,9 @@ use libtest_mimic::{Arguments, Trial};
 
 const LAYOUT: SharedLayout = SharedLayout { depth: 8, slots: 64, slot_bytes: 4096 };
 const LIMITS: HoldLimits = HoldLimits { first_word: 0, windows: 2, window: 4, singles: 4 };
+
+/// Words of a control page that a hostile reader overwrites: more than it is granted.
+const GARBAGE_WORDS: usize = 16;
 
 /// The variable with the role of a child of this program.
 const ROLE: &str = "GLEANER_TEST_ROLE";
@@ -193,7 +196,7 @@ fn garbage() {
     let (reader, control) = attached();
     let mut state = 0x9e37_79b9_7f4a_7c15_u64.wrapping_mul(u64::from(std::process::id()));
     loop {
-        for word in 0..HAZARDS {
+        for word in 0..GARBAGE_WORDS {
             state ^= state << 13;
             state ^= state >> 7;
             state ^= state << 17;

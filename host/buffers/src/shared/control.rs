@@ -1,18 +1,29 @@
 //! The control page of a reader: its hazards and its bell.
+//!
+//! A "page" has room for more words than most readers are granted. Memory is used only for words
+//! that are granted.
 #![allow(unsafe_code)]
 
 use std::ptr::NonNull;
 
-use crate::sync::{AtomicU32, AtomicU64, Ordering};
+use crate::sync::{Arc, AtomicU32, AtomicU64, Ordering};
 
 #[cfg(not(loom))]
 const _: () = assert!(size_of::<ControlPage>() == CONTROL_BYTES);
 
-/// Bytes of a control page.
-const CONTROL_BYTES: usize = 4096;
+/// Bytes of a control page: enough for the largest manifest, 256 inputs of 1,032 words each.
+///
+/// An odd number of pages of memory: neighbours that are a multiple of 16 apart compete for the
+/// same entries of a TLB, and a look at the hazards of 50 readers took a quarter longer.
+#[cfg(not(loom))]
+const CONTROL_BYTES: usize = 529 << 12;
 
 /// Hazard words of a control page.
+#[cfg(not(loom))]
 pub const HAZARDS: usize = (CONTROL_BYTES - 64) / 8;
+/// A few of them in a model, which creates each of them in every order.
+#[cfg(loom)]
+pub const HAZARDS: usize = 4;
 
 /// The words of a control page.
 ///
@@ -36,7 +47,7 @@ pub struct ControlPage {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HoldLimits {
     /// The first word. Words for windows come first, then words for single positions.
-    pub first_word: u16,
+    pub first_word: u32,
     /// Words that name a window.
     pub windows: u16,
     /// Positions that a window has at most.
@@ -60,28 +71,36 @@ impl HoldLimits {
         if index < usize::from(self.windows) { self.window.into() } else { 1 }
     }
 
+    /// Returns the number of positions that a word may name at most; 1 without words for windows.
+    pub(super) fn largest(&self) -> usize {
+        if self.windows == 0 { 1 } else { self.window.max(1).into() }
+    }
+
     /// Returns the words of the topic; `None` if there are none, or the page lacks some.
     pub(super) fn of_page<'a>(&self, page: &'a ControlPage) -> Option<&'a [AtomicU64]> {
-        let first = usize::from(self.first_word);
-        page.hazards.get(first..first + self.words()).filter(|words| !words.is_empty())
+        let first = self.first_word as usize;
+        let end = first.checked_add(self.words())?;
+        page.hazards.get(first..end).filter(|words| !words.is_empty())
     }
 }
 
 impl ControlPage {
+    /// A page without hazards, on the heap: it is too large for the stack of a thread.
+    #[cfg(not(loom))]
+    pub fn on_heap() -> Arc<Self> {
+        // SAFETY: all fields are atomic numbers, for which zeros are a value.
+        unsafe { Arc::new_zeroed().assume_init() }
+    }
+
     /// A page without hazards.
-    pub fn new() -> Self {
-        Self {
+    #[cfg(loom)]
+    pub fn on_heap() -> Arc<Self> {
+        Arc::new(Self {
             bell: AtomicU32::new(0),
             waiting: AtomicU32::new(0),
             _padding: std::array::from_fn(|_| AtomicU64::new(0)),
             hazards: std::array::from_fn(|_| AtomicU64::new(0)),
-        }
-    }
-}
-
-impl Default for ControlPage {
-    fn default() -> Self {
-        Self::new()
+        })
     }
 }
 
@@ -90,7 +109,7 @@ impl Default for ControlPage {
 /// # Safety
 ///
 /// For as long as the value lives, [`page`](Self::page) returns the same address, which points to
-/// 4,096 mapped bytes, aligned to a cache line, that are valid for atomic reads and writes from any
+/// a mapped page of this type, aligned to a cache line, that are valid for atomic reads and writes from any
 /// thread. Other processes may write them.
 pub unsafe trait ControlMemory: Send + Sync + 'static {
     /// The first byte of the page.
@@ -112,7 +131,7 @@ pub unsafe trait ControlMemory: Send + Sync + 'static {
 }
 
 // SAFETY: a boxed page stays where it is.
-unsafe impl ControlMemory for crate::sync::Arc<ControlPage> {
+unsafe impl ControlMemory for Arc<ControlPage> {
     fn page(&self) -> NonNull<ControlPage> {
         NonNull::from(&**self)
     }

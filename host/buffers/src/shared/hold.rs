@@ -38,7 +38,10 @@ impl HoldTable {
     /// A table without holds; `None` if the words are not on the page.
     pub(super) fn new(control: impl ControlMemory, limits: HoldLimits) -> Option<Self> {
         let page = MappedControl::new(control);
-        let count = limits.of_page(page.control())?.len();
+        let words = limits.of_page(page.control())?;
+        // Also maps their memory now, not at the first hold.
+        words.iter().for_each(clear);
+        let count = words.len();
         let free = WordUse { holds: 0, window: HazardWindow { first: 0, count: 0 } };
         Some(Self { page, limits, words: Mutex::new(vec![free; count].into()) })
     }
@@ -50,7 +53,7 @@ impl HoldTable {
         first: u64,
         count: u32,
         is_shown: impl FnOnce() -> bool,
-    ) -> Result<Option<u16>, ReadError> {
+    ) -> Result<Option<u32>, ReadError> {
         let window = HazardWindow { first, count };
         // Held until the check, so that another thread shares only a word that protects.
         let mut words = self.words();
@@ -61,7 +64,7 @@ impl HoldTable {
                 return Ok(None);
             }
             words[word].holds += 1;
-            return Ok(Some(word as u16));
+            return Ok(Some(word as u32));
         }
         // Words for single positions come last, and are taken first.
         let is_free = |(index, word): &(usize, &WordUse)| {
@@ -77,13 +80,18 @@ impl HoldTable {
             return Ok(None);
         }
         words[word] = WordUse { holds: 1, window };
-        Ok(Some(word as u16))
+        Ok(Some(word as u32))
+    }
+
+    /// Returns the number of positions that one word protects at most.
+    pub(super) fn largest(&self) -> usize {
+        self.limits.largest()
     }
 
     /// Ends a hold; the last one of its word clears the hazard.
-    fn release(&self, word: u16) {
+    fn release(&self, word: u32) {
         let mut words = self.words();
-        let word = usize::from(word);
+        let word = word as usize;
         words[word].holds -= 1;
         if words[word].holds == 0 {
             clear(self.hazard(word));
@@ -102,13 +110,13 @@ impl HoldTable {
 /// A hold on samples at neighbouring positions. Dropping it ends the protection.
 pub(super) struct WindowHold {
     reader: Arc<ReaderState>,
-    word: u16,
+    word: u32,
     samples: Box<[FoundSample]>,
 }
 
 impl WindowHold {
     /// Takes over the hold of `word`, which protects `samples`.
-    pub(super) fn new(reader: Arc<ReaderState>, word: u16, samples: &[FoundSample]) -> Self {
+    pub(super) fn new(reader: Arc<ReaderState>, word: u32, samples: &[FoundSample]) -> Self {
         Self { reader, word, samples: samples.into() }
     }
 }

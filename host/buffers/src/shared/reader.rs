@@ -1,8 +1,6 @@
 //! The reading end of a topic: finds samples, and holds them in place.
 #![allow(unsafe_code)]
 
-use std::slice;
-
 use super::control::{ControlMemory, HoldLimits};
 use super::hold::{HoldTable, WindowHold};
 use super::layout::{COUNTER_WORDS, META_WORDS, ReaderMemory, SharedMemory};
@@ -137,7 +135,7 @@ impl SharedReader {
     pub fn window(&self, first: u64, count: u32) -> Result<Option<HeldWindow>, ReadError> {
         let end = first.saturating_add(count.min(self.depth()).into());
         let found: Vec<_> = (first..end).map_while(|position| self.look(position)).collect();
-        self.hold(found)
+        self.hold(&found)
     }
 
     /// Holds the newest samples below position `end`, `count` of them or fewer, oldest first.
@@ -183,7 +181,7 @@ impl SharedReader {
                 return Ok(None);
             }
             found.reverse();
-            if let Some(window) = self.hold(found)? {
+            if let Some(window) = self.hold(&found)? {
                 return Ok(Some(window));
             }
             // A sample left, so `head` moved: the writer raised it before it took the sample away.
@@ -198,12 +196,14 @@ impl SharedReader {
 
     /// Holds samples at neighbouring positions, oldest first; `None` if there is none, or one has
     /// left.
-    fn hold(&self, found: Vec<FoundSample>) -> Result<Option<HeldWindow>, ReadError> {
-        match self.hold_by_one_word(&found) {
-            // Words for single samples may be left.
+    fn hold(&self, found: &[FoundSample]) -> Result<Option<HeldWindow>, ReadError> {
+        match self.hold_by_one_word(found) {
+            // More than one word can name take several, and words for single samples may be left.
             Err(ReadError::OutOfHolds) if found.len() > 1 => {
-                let alone = |sample| self.hold_by_one_word(slice::from_ref(sample)).transpose();
-                let held: Option<Result<Vec<_>, _>> = found.iter().map(alone).collect();
+                let largest = self.0.holds.largest();
+                let part = if found.len() > largest { largest } else { 1 };
+                let parts = found.chunks(part).map(|part| self.hold(part).transpose());
+                let held: Option<Result<Vec<_>, _>> = parts.collect();
                 Ok(held.transpose()?.map(HeldWindow::concat))
             }
             held => held,
@@ -251,7 +251,7 @@ mod tests {
     fn topic() -> (SharedWriter, SharedReader) {
         let layout = SharedLayout { depth: 4, slots: 16, slot_bytes: 64 };
         let (memory, reading) = in_process(layout).unwrap();
-        let (mut writer, control) = (SharedWriter::new(memory), Arc::new(ControlPage::new()));
+        let (mut writer, control) = (SharedWriter::new(memory), ControlPage::on_heap());
         let limits = HoldLimits { first_word: 0, windows: 2, window: 4, singles: 2 };
         writer.attach(control.clone(), limits).unwrap();
         // SAFETY: the page is attached with these limits, and nothing else stores to it.

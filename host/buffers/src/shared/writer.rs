@@ -113,8 +113,10 @@ impl SharedWriter {
         limits: HoldLimits,
     ) -> Result<ReaderId, WriteError> {
         let page = MappedControl::new(control);
-        if limits.of_page(page.control()).is_none() {
-            return Err(WriteError::Hazards);
+        let words = limits.of_page(page.control()).ok_or(WriteError::Hazards)?;
+        // The kernel adds their memory now, not while a sample is written.
+        for word in words {
+            let _ = word.load(Ordering::Relaxed);
         }
         let layout = self.memory.layout();
         let given: u32 = self.readers.iter().map(|reader| reader.limits.quota()).sum();

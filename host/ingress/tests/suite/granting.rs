@@ -1,7 +1,8 @@
 //! Topics that are granted, refused, or found later.
 
+use gleaner_buffers::shared::HAZARDS;
 use gleaner_feed::{Feed, FeedError, FeedEvent};
-use gleaner_protocol::ingress::{AddReader, AddTopics, RefusedTopic, TopicGrant};
+use gleaner_protocol::ingress::{AddReader, AddTopics, HoldGrant, RefusedTopic, TopicGrant};
 use gleaner_transport::loopback::Loopback;
 
 use crate::support::{Numbers, RunningIngress, TEXT, TIMEOUT, TYPE, grant, meta, wait_for};
@@ -43,17 +44,45 @@ fn refusals_name_the_topic_or_the_type() {
     assert_eq!(status.topics.len(), 1);
 }
 
+/// Returns a grant of a topic with words for `singles` samples.
+fn holding(id: u32, topic: &str, singles: u16) -> TopicGrant {
+    TopicGrant { holds: HoldGrant { windows: 0, window: 0, singles }, ..grant(id, topic) }
+}
+
 #[test]
 fn holds_beyond_the_control_page_are_refused() {
     let mut ingress = RunningIngress::over(Numbers::on("/number").source);
-    let holds = |singles| gleaner_protocol::ingress::HoldGrant { windows: 0, window: 0, singles };
-    let granted = |id, singles| TopicGrant { holds: holds(singles), ..grant(id, "/number") };
-    let topics = vec![granted(0, 300), granted(1, 300), granted(2, 204), granted(3, 1)];
+    let (full, rest) = (HAZARDS / 2048, (HAZARDS % 2048) as u16);
+    let mut topics: Vec<_> = (0..=full as u32).map(|id| holding(id, "/number", 2048)).collect();
+    topics.extend([holding(1000, "/number", rest), holding(1001, "/number", 1)]);
     let mut feed = ingress.reader("one", topics);
-    assert_eq!(feed.topic(0, TIMEOUT).unwrap().info.first_word, 0);
-    assert!(matches!(refusal(&mut feed, 1), RefusedTopic::Other(_)));
-    assert_eq!(feed.topic(2, TIMEOUT).unwrap().info.first_word, 300);
-    assert!(matches!(refusal(&mut feed, 3), RefusedTopic::Other(_)));
+    for id in 0..full as u32 {
+        assert_eq!(feed.topic(id, TIMEOUT).unwrap().info.first_word, id * 2048);
+    }
+    assert!(matches!(refusal(&mut feed, full as u32), RefusedTopic::Other(_)));
+    assert_eq!(feed.topic(1000, TIMEOUT).unwrap().info.first_word as usize, full * 2048);
+    assert!(matches!(refusal(&mut feed, 1001), RefusedTopic::Other(_)));
+}
+
+/// A recorder has one word for each topic, and more topics than any lambda.
+#[test]
+fn a_reader_of_700_topics_holds_samples_of_each() {
+    let source = Loopback::new();
+    let topics: Vec<String> = (0..700).map(|number| format!("/number_{number}")).collect();
+    topics.iter().for_each(|topic| source.add_topic(topic, TYPE, TEXT));
+    let mut ingress = RunningIngress::over(source.clone());
+    let grants = topics.iter().zip(0..).map(|(topic, id)| holding(id, topic, 1)).collect();
+    let mut feed = ingress.reader("recorder", grants);
+    let readers: Vec<_> = (0..700).map(|id| feed.topic(id, TIMEOUT).unwrap().reader).collect();
+    for topic in &topics {
+        source.publish(topic, &meta(1), topic.as_bytes()).unwrap();
+    }
+    let held: Vec<_> = readers.iter().map(|reader| reader.get(0).unwrap().unwrap()).collect();
+    // More than all slots: only those that are held stay.
+    for seq in 2..400 {
+        source.publish(&topics[699], &meta(seq), b"later").unwrap();
+    }
+    assert!(held.iter().zip(&topics).all(|(sample, topic)| **sample == *topic.as_bytes()));
 }
 
 #[test]

@@ -40,7 +40,7 @@ pub struct AttachedTopic {
     /// Sizes of its memory.
     pub layout: RegionLayout,
     /// First of its hazard words on the control page.
-    pub first_word: u16,
+    pub first_word: u32,
     /// Samples that the reader may hold at a time.
     pub holds: HoldGrant,
     /// Position of the first sample that this reader receives.
