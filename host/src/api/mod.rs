@@ -125,7 +125,8 @@ impl Session {
     /// since the last call for that reason.
     pub fn take_refused_holds(&self) -> Option<DataError> {
         let state = self.lock();
-        state.inputs.iter().filter_map(|topic| topic.take_refused_holds()).last()
+        // Each topic is asked, so that none reports the same samples again.
+        state.inputs.iter().fold(None, |found, topic| topic.take_refused_holds().or(found))
     }
 
     /// Due time of the lambda's calls; `None` without inputs, where no call is long.

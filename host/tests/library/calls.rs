@@ -89,7 +89,7 @@ impl HostedData {
             Operation::TopicCounts => answered(topic.counts()),
             Operation::Newest => answered(topic.newest()),
             Operation::Last => topic.last(9).map(drop),
-            Operation::Since => topic.since(0).map(drop).map_err(DataError::from),
+            Operation::Since => topic.since(0).map(drop),
             Operation::Field => topic.field("encoding").map(drop),
             Operation::Column => many.column(x, usize::MAX).map(drop),
             Operation::ColumnSince => many.column_since(x, 0).map(drop),
