@@ -70,6 +70,17 @@ impl Peers {
         self.matched.remove(&own);
     }
 
+    /// Removes matches of the local endpoints `own` with remote ones that are not `present`.
+    ///
+    /// RustDDS reports a loss by another thread than matches: the loss may come first, and the
+    /// match would stay. `present` has to be read after the events of the matches.
+    pub(super) fn keep(&mut self, own: impl Fn(&GUID) -> bool, present: &HashSet<GUID>) {
+        for (own, matched) in self.matched.iter_mut().filter(|(guid, _)| own(guid)) {
+            // Endpoints of our participant are not listed as present.
+            matched.retain(|their| their.prefix == own.prefix || present.contains(their));
+        }
+    }
+
     /// Number of matches of a local endpoint.
     pub(super) fn connected(&self, own: GUID) -> usize {
         self.matched.get(&own).map_or(0, HashSet::len)
@@ -89,5 +100,36 @@ impl Peers {
         let mut prefixes: Vec<Prefix> = self.participants.keys().map(prefix).collect();
         prefixes.sort_unstable();
         prefixes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rustdds::LostReason;
+
+    use super::*;
+
+    fn guid(participant: u8, kind: u8, number: u8) -> GUID {
+        let mut bytes = [participant; 16];
+        bytes[12..].copy_from_slice(&[0, 0, number, kind]);
+        GUID::from_bytes(bytes)
+    }
+
+    #[test]
+    fn a_match_that_is_reported_after_the_loss_of_the_writer_does_not_stay() {
+        let (reader, gone, here, own) =
+            (guid(1, 4, 1), guid(2, 3, 1), guid(2, 3, 2), guid(1, 3, 2));
+        let mut peers = Peers::default();
+        peers.follow(reader);
+        peers.note(&Event::WriterLost { guid: gone, reason: LostReason::Disposed });
+        for remote_writer in [gone, here, own] {
+            peers.note(&Event::RemoteWriterMatched { local_reader: reader, remote_writer });
+        }
+        assert_eq!(peers.connected(reader), 3);
+        let is_reader = |guid: &GUID| guid.entity_id.kind().is_reader();
+        peers.keep(|guid| !is_reader(guid), &HashSet::new());
+        assert_eq!(peers.connected(reader), 3);
+        peers.keep(is_reader, &HashSet::from([here]));
+        assert_eq!(peers.connected(reader), 2, "of this participant, and of the other one");
     }
 }

@@ -12,6 +12,7 @@ use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 
 use mio::{Events, Interest, Poll, Token, Waker};
+use rustdds::discovery::DiscoveredWriterData;
 use rustdds::{
     DomainParticipant, DomainParticipantStatusEvent, DomainParticipantStatusListener, GUID,
     StatusEvented,
@@ -223,6 +224,18 @@ impl Receiver {
         }
     }
 
+    /// Removes matches with endpoints that are gone.
+    fn keep_matches(&self, writers: &[DiscoveredWriterData]) {
+        let present = writers.iter().map(|writer| writer.writer_proxy.remote_writer_guid).collect();
+        self.state.peers().keep(|own| own.entity_id.kind().is_reader(), &present);
+        if !self.writers.is_empty() {
+            let readers = self.participant.discovered_readers();
+            let present =
+                readers.iter().map(|reader| reader.reader_proxy.remote_reader_guid).collect();
+            self.state.peers().keep(|own| self.writers.contains(own), &present);
+        }
+    }
+
     fn take(&mut self) {
         let context = ReceiveContext {
             participant: &self.participant,
@@ -246,7 +259,10 @@ impl Receiver {
                  of best-effort writers and no new participants are received; restart the process"
             ));
         }
+        // Before the writers are read: see `Peers::keep`.
+        self.note_events();
         let writers = self.participant.discovered_writers();
+        self.keep_matches(&writers);
         let offers: Vec<Offer> = writers.iter().map(discovery::offer).collect();
         self.note_events();
         let largest = self.readers.values().map(TopicReader::largest).max().unwrap_or(0);

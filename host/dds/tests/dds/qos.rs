@@ -1,8 +1,6 @@
 //! Tests of offered and requested quality of service.
 
 use std::net::UdpSocket;
-use std::thread;
-use std::time::{Duration, Instant};
 
 use gleaner_transport::{Qos, Transport};
 use rustdds::RTPSEntity;
@@ -98,16 +96,7 @@ fn auto_recovers() {
         drop(strong.take());
         connected(&dds, subscription, 0);
         strong = Some(peer.writer("/driver", true, false));
-        // A writer that is created in the moment in which the reader is replaced is not always
-        // discovered (docs/dds-limits.md): then the next one is.
-        let begun = Instant::now();
-        while dds.status(subscription).writers != Some(1)
-            && begun.elapsed() < Duration::from_secs(3)
-        {
-            thread::sleep(Duration::from_millis(2));
-        }
-        let status = dds.status(subscription);
-        status.writers == Some(1) && status.qos.as_deref() == Some("reliable, volatile")
+        connected(&dds, subscription, 1).qos.as_deref() == Some("reliable, volatile")
     });
     let strong = strong.unwrap();
     sink.mark(&strong, b"received");
