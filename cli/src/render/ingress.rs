@@ -24,10 +24,9 @@ fn write_ingress(text: &mut String, status: &IngressStatus, paint: Paint) -> fmt
     let readers = counted(status.readers as u64, "reader");
     writeln!(text, "{}{domain}: {readers}", paint.bold("ingress"))?;
     if !status.topics.is_empty() {
-        let head = ["topic", "readers", "writers", "received", "lost", "too big", "malformed"]
-            .map(str::to_owned);
+        let head = HEAD.map(str::to_owned);
         let rows = std::iter::once(head).chain(status.topics.iter().map(row)).collect();
-        for line in table(rows, &[1, 2, 3, 4, 5, 6]).lines() {
+        for line in table(rows, &[1, 2, 3, 4, 5, 6, 7]).lines() {
             writeln!(text, "  {line}")?;
         }
     }
@@ -50,7 +49,10 @@ fn write_ingress(text: &mut String, status: &IngressStatus, paint: Paint) -> fmt
     writeln!(text, "  {}", paint.dim(&line))
 }
 
-fn row(topic: &IngressTopic) -> [String; 7] {
+const HEAD: [&str; 8] =
+    ["topic", "readers", "writers", "received", "lost", "before match", "too big", "malformed"];
+
+fn row(topic: &IngressTopic) -> [String; 8] {
     let unknown = || "?".to_owned();
     let reception = &topic.reception;
     [
@@ -59,6 +61,7 @@ fn row(topic: &IngressTopic) -> [String; 7] {
         reception.writers.map_or_else(unknown, |writers| writers.to_string()),
         grouped(topic.received),
         reception.lost.map_or_else(unknown, grouped),
+        reception.before_match.map_or_else(unknown, grouped),
         grouped(topic.too_big),
         grouped(reception.malformed),
     ]
@@ -112,6 +115,7 @@ mod tests {
             reception: ReceptionStatus {
                 writers: Some(1),
                 lost: Some(5),
+                before_match: Some(6),
                 qos_warnings: vec!["a writer is best effort".to_owned()],
                 ..ReceptionStatus::default()
             },
@@ -128,8 +132,8 @@ mod tests {
             ingress(&status, Paint { on: false }).lines().collect::<Vec<_>>(),
             [
                 "ingress, domain 7: 3 readers",
-                "  topic       readers  writers  received  lost  too big  malformed",
-                "  /imu\\u{1b}        2        1     1,000     5        4          0",
+                "  topic       readers  writers  received  lost  before match  too big  malformed",
+                "  /imu\\u{1b}        2        1     1,000     5             6        4          0",
                 "  a writer is best effort",
                 "  lost: 3 datagrams, dropped: socket buffer full",
                 "  lost: 1 datagram, dropped: too large fragments, or fragments of unknown participants",
@@ -146,6 +150,6 @@ mod tests {
         let status = IngressStatus { topics: vec![topic], ..IngressStatus::default() };
         let text = ingress(&status, Paint { on: false });
         assert!(text.starts_with("ingress: 0 readers\n") && !text.contains("socket"), "{text}");
-        assert!(text.contains("/imu         0        ?         0     ?"), "{text}");
+        assert!(text.contains("/imu         0        ?         0     ?             ?"), "{text}");
     }
 }
