@@ -5,8 +5,8 @@ The objects of the host implement the protocols here; plain values are named tup
 constant and needs no call of the host; a method calls the host.
 
 A handle keeps its sample in memory until the handle is dropped: a held sample cannot be
-overwritten. If a lambda holds too many, the ring refuses new samples, and ``Counts.no_slot`` counts
-them.
+overwritten. If a lambda holds too many, a replay refuses new samples, which ``Counts.no_slot``
+counts, and a live wake ends in a fault.
 
 The maximum numbers of bytes (1 MiB) and values (65,536) below are the defaults of ``call_bytes``
 and ``call_items`` in ``[limits]``. The manifest and the vehicle can lower them.

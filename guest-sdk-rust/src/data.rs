@@ -19,8 +19,8 @@ pub struct Topic(wit::Topic);
 /// A compiled path into the messages of one topic.
 pub struct Field(wit::Field);
 
-/// One message. The ring cannot overwrite it until it is dropped. If a lambda holds too many
-/// samples, the ring refuses new ones ([`Counts::no_slot`]).
+/// One message. It cannot be overwritten until it is dropped. If a lambda holds too many samples, a
+/// replay refuses new ones ([`Counts::no_slot`]), and a live wake ends in a fault.
 pub struct Sample(wit::Sample);
 
 /// A sample as an image. Its pixels stay in the host until the lambda reads them.
