@@ -276,7 +276,7 @@ mod tests {
         let text = r#"{"report":"isolation","layers":[],"lambda":"other"}"#;
         let report: Report = serde_json::from_str(text).unwrap();
         let named = named_report("hello", &report).to_string();
-        assert_eq!(named, r#"{"lambda":"hello","layers":[],"report":"isolation"}"#);
+        assert_eq!(named, r#"{"lambda":"hello","report":"isolation","layers":[]}"#);
         assert_eq!(serde_json::from_str::<Report>(&named).unwrap(), report);
     }
 
