@@ -90,9 +90,8 @@ impl FakeIngress {
 /// Returns memory for a topic, and its file.
 fn region() -> (TopicRegion, OwnedFd) {
     let bytes = LAYOUT.bytes_needed().unwrap();
-    let region = TopicRegion::create("test", bytes, bytes).unwrap();
-    let file = region.file().try_clone_to_owned().unwrap();
-    (region, file)
+    let (region, file) = TopicRegion::create("test", bytes, bytes).unwrap();
+    (region, file.into())
 }
 
 fn publish(writer: &mut SharedWriter, value: u8) {

@@ -76,8 +76,7 @@ impl RegionWriter {
     pub(crate) fn create(sizes: RegionSizes) -> std::io::Result<(Self, OwnedFd)> {
         let too_large = || std::io::Error::other("no region can be so large");
         let bytes = sizes.layout.bytes_needed().ok_or_else(too_large)?;
-        let region = TopicRegion::create("gleaner-topic", bytes, sizes.present)?;
-        let file = region.file().try_clone_to_owned()?;
+        let (region, file) = TopicRegion::create("gleaner-topic", bytes, sizes.present)?;
         let memory = WriterMemory::new(region, sizes.layout).ok_or_else(too_large)?;
         let writer = SharedWriter::with_warm_slots(memory, sizes.warm);
         let region = Self {
@@ -89,7 +88,7 @@ impl RegionWriter {
             readers: Vec::new(),
             copied: None,
         };
-        Ok((region, file))
+        Ok((region, file.into()))
     }
 
     fn attach(&mut self, request: &AttachRequest<'_>) -> Result<AttachedReader, WriteError> {

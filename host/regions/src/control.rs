@@ -59,8 +59,8 @@ impl ControlRegion {
     }
 }
 
-// SAFETY: the mapping has the size of a control page, is aligned to a page of memory, and lives as long as the value;
-// its file cannot shrink. Its fields are atomics.
+// SAFETY: the mapping has the size of a control page, is aligned to a page of memory, and lives as
+// long as the value; its file cannot shrink. Its fields are atomics.
 unsafe impl ControlMemory for ControlRegion {
     fn page(&self) -> NonNull<ControlPage> {
         self.0.base().cast()
@@ -103,8 +103,8 @@ mod tests {
         assert!(ControlRegion::open(&page).is_ok());
         let unsealed = File::from(memfd_create("test", MemfdFlags::ALLOW_SEALING).unwrap());
         unsealed.set_len(size_of::<ControlPage>() as u64).unwrap();
-        let larger = TopicRegion::create("test", 2 * size_of::<ControlPage>(), 0).unwrap();
-        for file in [unsealed.as_fd(), larger.file()] {
+        let (_, larger) = TopicRegion::create("test", 2 * size_of::<ControlPage>(), 0).unwrap();
+        for file in [unsealed.as_fd(), larger.as_fd()] {
             let refused = ControlRegion::open(file).err().unwrap();
             assert_eq!(refused.to_string(), "this is not a control page");
         }

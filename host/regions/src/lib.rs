@@ -1,9 +1,9 @@
 //! Memory that one process writes and other processes read in place, and the bells of readers.
 //!
 //! The writer creates a [`TopicRegion`] for each topic, and a [`ControlRegion`] for each reader. It
-//! passes [`TopicRegion::file`] and the file of [`ControlRegion::create`] to the reader, which maps
-//! them with [`MappedTopic::open`] and [`ControlRegion::open`]. `gleaner_buffers::shared` has the
-//! rules of access to that memory; this crate has the mappings.
+//! passes the files of both to the reader, which maps them with [`MappedTopic::open`] and
+//! [`ControlRegion::open`]. `gleaner_buffers::shared` has the rules of access to that memory; this
+//! crate has the mappings.
 //!
 //! # Protection
 //!

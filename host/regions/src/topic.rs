@@ -4,7 +4,7 @@
 use std::ffi::c_void;
 use std::fs::File;
 use std::io;
-use std::os::fd::{AsFd, BorrowedFd};
+use std::os::fd::AsFd;
 use std::ptr::{self, NonNull};
 
 use gleaner_buffers::Region;
@@ -91,15 +91,12 @@ unsafe impl Send for FileMapping {}
 unsafe impl Sync for FileMapping {}
 
 /// The memory of a topic, for its writer.
-pub struct TopicRegion {
-    mapping: FileMapping,
-    file: File,
-}
+pub struct TopicRegion(FileMapping);
 
 impl TopicRegion {
-    /// Creates zeroed memory of `len` bytes, and seals it. The pages of the first `present` bytes
-    /// are present; the kernel adds each of the others when it is first written to. `name` appears
-    /// in `/proc/PID/maps`.
+    /// Creates zeroed memory of `len` bytes, and seals it; also returns the file to pass to
+    /// readers. The pages of the first `present` bytes are present; the kernel adds each of the
+    /// others when it is first written to. `name` appears in `/proc/PID/maps`.
     ///
     /// Children of this process do not inherit the mapping.
     ///
@@ -107,7 +104,7 @@ impl TopicRegion {
     ///
     /// [`io::ErrorKind::Unsupported`] if the kernel cannot seal it; otherwise the kernel's error,
     /// such as out of memory.
-    pub fn create(name: &str, len: usize, present: usize) -> io::Result<Self> {
+    pub fn create(name: &str, len: usize, present: usize) -> io::Result<(Self, File)> {
         let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
         let file = File::from(memfd_create(name, flags)?);
         file.set_len(len as u64)?;
@@ -116,12 +113,7 @@ impl TopicRegion {
         mapping.keep_from_children()?;
         mapping.populate(&file, present.min(len))?;
         seal(&file, TOPIC_SEALS)?;
-        Ok(Self { mapping, file })
-    }
-
-    /// Returns the file to pass to readers.
-    pub fn file(&self) -> BorrowedFd<'_> {
-        self.file.as_fd()
+        Ok((Self(mapping), file))
     }
 }
 
@@ -141,11 +133,11 @@ pub(crate) fn seal(file: &File, seals: SealFlags) -> io::Result<()> {
 // other process can write it, as its file is sealed; readers in other processes only read.
 unsafe impl Region for TopicRegion {
     fn base(&self) -> NonNull<u8> {
-        self.mapping.base()
+        self.0.base()
     }
 
     fn len(&self) -> usize {
-        self.mapping.len()
+        self.0.len()
     }
 }
 
@@ -196,8 +188,8 @@ mod tests {
 
     #[test]
     fn a_sealed_topic_cannot_be_changed_through_its_file() {
-        let region = TopicRegion::create("test", LEN, 0).unwrap();
-        let file = region.file();
+        let (_region, file) = TopicRegion::create("test", LEN, 0).unwrap();
+        let file = &file;
         let writable = FileMapping::shared(&file, LEN, ProtFlags::READ | ProtFlags::WRITE);
         assert_eq!(writable.err().unwrap().raw_os_error(), Some(Errno::PERM.raw_os_error()));
         assert_eq!(pwrite(file, b"x", 0), Err(Errno::PERM));
@@ -210,25 +202,25 @@ mod tests {
     }
 
     /// Bytes of the file that are in memory.
-    fn present(region: &TopicRegion) -> i64 {
-        rustix::fs::fstat(region.file()).unwrap().st_blocks * 512
+    fn present(file: &File) -> i64 {
+        rustix::fs::fstat(file).unwrap().st_blocks * 512
     }
 
     #[test]
     fn only_the_first_pages_are_present_at_the_start() {
-        let region = TopicRegion::create("test", 1 << 30, 10_000).unwrap();
-        assert_eq!(present(&region), 3 * 4096);
+        let (region, file) = TopicRegion::create("test", 1 << 30, 10_000).unwrap();
+        assert_eq!(present(&file), 3 * 4096);
         // SAFETY: the region is that large, and this thread is the only one.
         unsafe { Region::base(&region).add(1 << 20).write(7) };
-        assert_eq!(present(&region), 4 * 4096);
-        let whole = TopicRegion::create("test", LEN, usize::MAX).unwrap();
+        assert_eq!(present(&file), 4 * 4096);
+        let (_, whole) = TopicRegion::create("test", LEN, usize::MAX).unwrap();
         assert_eq!(present(&whole), LEN as i64);
     }
 
     #[test]
     fn a_reader_cannot_make_its_mapping_writable() {
-        let region = TopicRegion::create("test", LEN, 0).unwrap();
-        let mapped = MappedTopic::open(region.file(), LEN).unwrap();
+        let (_, file) = TopicRegion::create("test", LEN, 0).unwrap();
+        let mapped = MappedTopic::open(&file, LEN).unwrap();
         // SAFETY: the bytes are those of the mapping, and the call is refused.
         let refused = unsafe {
             mprotect(mapped.0.address(), LEN, MprotectFlags::READ | MprotectFlags::WRITE)
@@ -238,8 +230,8 @@ mod tests {
 
     #[test]
     fn a_reader_sees_what_the_writer_wrote() {
-        let region = TopicRegion::create("test", LEN, 0).unwrap();
-        let mapped = MappedTopic::open(region.file(), LEN).unwrap();
+        let (region, file) = TopicRegion::create("test", LEN, 0).unwrap();
+        let mapped = MappedTopic::open(&file, LEN).unwrap();
         // SAFETY: both mappings have `LEN` bytes, and this thread is the only one.
         unsafe {
             Region::base(&region).as_ptr().add(5000).write(7);
@@ -249,8 +241,8 @@ mod tests {
 
     #[test]
     fn a_file_of_another_size_or_without_seals_is_refused() {
-        let region = TopicRegion::create("test", LEN, 0).unwrap();
-        let refused = MappedTopic::open(region.file(), LEN + 4096).err().unwrap();
+        let (_, file) = TopicRegion::create("test", LEN, 0).unwrap();
+        let refused = MappedTopic::open(&file, LEN + 4096).err().unwrap();
         assert_eq!(refused.to_string(), "the memory of the topic has another size");
         let file = File::from(memfd_create("test", MemfdFlags::ALLOW_SEALING).unwrap());
         file.set_len(LEN as u64).unwrap();

@@ -75,8 +75,8 @@ impl Drop for ReaderProcess {
 
 impl Topic {
     fn new() -> Self {
-        let region = TopicRegion::create("test", LAYOUT.bytes_needed().unwrap(), 4096).unwrap();
-        let file = region.file().try_clone_to_owned().unwrap().into();
+        let bytes = LAYOUT.bytes_needed().unwrap();
+        let (region, file) = TopicRegion::create("test", bytes, 4096).unwrap();
         let memory = WriterMemory::new(region, LAYOUT).unwrap();
         Self { region: file, writer: SharedWriter::new(memory), bells: Vec::new() }
     }

@@ -3,6 +3,7 @@
 
 mod calls;
 mod faults;
+mod fed_inputs;
 mod greedy;
 mod host_calls;
 mod host_time;

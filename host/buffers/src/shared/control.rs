@@ -109,8 +109,8 @@ impl ControlPage {
 /// # Safety
 ///
 /// For as long as the value lives, [`page`](Self::page) returns the same address, which points to
-/// a mapped page of this type, aligned to a cache line, that are valid for atomic reads and writes from any
-/// thread. Other processes may write them.
+/// a mapped page of this type, aligned to a cache line, that is valid for atomic reads and writes
+/// from any thread. Other processes may write it.
 pub unsafe trait ControlMemory: Send + Sync + 'static {
     /// The first byte of the page.
     fn page(&self) -> NonNull<ControlPage>;
