@@ -26,8 +26,8 @@ use crate::session_setup::{
     ConfiguredLambda, LambdaArgs, Load, RunMode, SessionSetup, not_started,
 };
 
-/// Bytes that the recorder may need beside the preroll: two staging areas, and data on its way to
-/// the disk.
+/// Bytes that the recorder may need beside the preroll: the journals of two open clips, and data on
+/// its way to the disk.
 const RECORDER: u64 = (2 * 256 + 16) << 20;
 
 /// Arguments of `check`.
