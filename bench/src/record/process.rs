@@ -19,7 +19,7 @@ use gleaner_protocol::link::{
     AddLambda, ControlClient, RecorderLink, RecorderMessage, RecorderReport, RecorderStatus,
     recorded_grant,
 };
-use gleaner_recorder::program::{RecorderOptions, run};
+use gleaner_recorder::program::{RecorderConnections, RecorderOptions, run};
 use gleaner_tests::TempFolder;
 use gleaner_transport::Clock;
 use gleaner_transport::loopback::Loopback;
@@ -93,7 +93,8 @@ fn measure(seconds: u64) -> RecorderLatency {
     let reader = AddReader { name: "recorder".to_owned(), topics, publishes: Vec::new() };
     let samples = ingress.add_reader(&reader).expect("the ingress runs");
     let program = thread::spawn(move || {
-        run(options, stdin, samples, File::from(OwnedFd::from(to)), Arc::default())
+        let connections = RecorderConnections { control: stdin, ingress: samples, starter: None };
+        run(options, connections, File::from(OwnedFd::from(to)), Arc::default())
             .expect("nothing fails");
     });
     let reports = thread::spawn(move || last(reports));

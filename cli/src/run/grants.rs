@@ -82,6 +82,18 @@ impl RecordedTopics {
         grants.into_iter().filter(|grant| self.granted.insert(grant.id)).collect()
     }
 
+    /// Returns the grants of a lambda's recorded topics that the recorder has, as far as `again`
+    /// has none of them yet, and adds these to it.
+    pub(super) fn take_again(
+        &self,
+        lambda: &RunLambda,
+        again: &mut HashSet<u32>,
+    ) -> Vec<TopicGrant> {
+        let grants = self.grants_of(lambda).into_iter();
+        let has = |grant: &&TopicGrant| self.granted.contains(&grant.id);
+        grants.filter(has).filter(|grant| again.insert(grant.id)).cloned().collect()
+    }
+
     fn grants_of(&self, lambda: &RunLambda) -> Vec<&TopicGrant> {
         let of_lambda: Vec<String> = recorded(lambda).map(|(topic, _)| topic).collect();
         self.grants.iter().filter(|grant| of_lambda.contains(&grant.topic)).collect()

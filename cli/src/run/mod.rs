@@ -10,7 +10,7 @@
 //! - `failures`: the result of a run in which processes failed.
 //! - `screen`: the terminal.
 //!
-//! A failed process is restarted with a growing delay: that of a lambda alone, the ingress and the
+//! A failed process is restarted with a growing delay: that of a lambda or the ingress alone, the
 //! recorder with all others. A first start that fails ends the run, unless it is that of one lambda
 //! of several.
 
@@ -42,7 +42,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use self::backoff::RestartDelay;
 use self::failures::Failures;
 use self::lambdas::RunLambda;
-use self::process_group::{GroupEnd, ProcessGroup};
+use self::process_group::{GroupEnd, ProcessGroup, RunRecord};
 use self::screen::Screen;
 use self::summary::RunCounts;
 use self::supervised::SupervisedLambda;
@@ -107,10 +107,10 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
         // The runtimes read the same file at each start and report if it cannot be used. That does
         // not end the run.
         limits = allowed().unwrap_or(limits);
-        let mut group =
-            ProcessGroup::start(&context, &mut lambdas, &mut screen, &mut failures, limits)?;
+        let run = RunRecord { failures: &mut failures, counts: &mut counts };
+        let mut group = ProcessGroup::start(&context, &mut lambdas, &mut screen, run, limits)?;
         let ended = group.run(&mut time, &stop);
-        group.add_counts(&mut counts);
+        group.add_counts();
         let reason = match ended? {
             GroupEnd::Complete => break,
             // It has printed the cause. After a successful start it is restarted, since the cause
@@ -129,7 +129,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
         failures.add(reason.clone(), false);
         restarts += 1;
         let delay = delay.after(attempt_started.elapsed());
-        screen.warn(&format!("{reason}; restarting in {} s (restart {restarts})", delay.as_secs()));
+        screen.restarts(&reason, delay, restarts);
         let until = Instant::now() + delay;
         let ends = || stop.load(Ordering::Relaxed) || time.is_over_since_start();
         while Instant::now() < until && !ends() {

@@ -20,10 +20,13 @@ pub(super) const PIPES: u8 = 2;
 /// A process of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum ChildId {
-    Ingress,
+    /// `start` counts the restarts, so that output of an earlier process is not taken for that of
+    /// the current one.
+    Ingress {
+        start: u32,
+    },
     Recorder,
-    /// The lambda at this index; `start` counts its restarts, so that output of an earlier process
-    /// is not taken for that of the current one.
+    /// The lambda at this index; `start` as that of the ingress.
     Lambda {
         index: usize,
         start: u32,
@@ -61,7 +64,7 @@ pub(super) fn forward(child: &mut Child, from: ChildId, sender: &SyncSender<Chil
         let send = send(sender.clone());
         thread::spawn(move || {
             match from {
-                ChildId::Ingress => follow(reports, OutputPiece::Ingress, &send),
+                ChildId::Ingress { .. } => follow(reports, OutputPiece::Ingress, &send),
                 ChildId::Recorder => follow(reports, OutputPiece::Recorder, &send),
                 ChildId::Lambda { .. } => follow(reports, OutputPiece::Runtime, &send),
             }

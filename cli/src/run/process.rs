@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_parts::Parts;
+use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -25,7 +26,7 @@ pub(super) struct ChildProcess {
     name: &'static str,
     child: Child,
     /// Our end of its standard input: open, as its end would mean that this program has ended.
-    _handover: UnixStream,
+    handover: UnixStream,
     /// Time of the request to end.
     requested: Option<Instant>,
 }
@@ -58,7 +59,7 @@ impl ChildProcess {
             .spawn()
             .map_err(|error| failed(&error))?;
         output::forward(&mut child, id, sender);
-        Ok(Self { name, child, _handover: handover, requested: None })
+        Ok(Self { name, child, handover, requested: None })
     }
 
     /// Returns the exit status of the process; `None` while it runs.
@@ -67,6 +68,25 @@ impl ChildProcess {
             Failure::caused_by(Exit::Internal, format!("cannot wait for {}", self.name), &error)
         };
         self.child.try_wait().map_err(failed)
+    }
+
+    /// Passes it a connection to another ingress. If it does not read its messages, it is killed;
+    /// returns the warning to print.
+    pub(super) fn pass_ingress(&self, ingress: OwnedFd) -> Option<String> {
+        let connections = Handover { ingress: Some(ingress), ..Handover::default() };
+        match connections.try_send(&self.handover) {
+            // Its exit status explains why it has ended.
+            Ok(()) | Err(LinkError::Gone { .. }) => None,
+            Err(error) => {
+                self.kill();
+                Some(format!("{}: {error}; killing it", self.name))
+            }
+        }
+    }
+
+    /// Sends SIGKILL.
+    pub(super) fn kill(&self) {
+        self.signal(Signal::KILL);
     }
 
     /// Sends SIGTERM.
@@ -83,7 +103,7 @@ impl ChildProcess {
             return None;
         }
         *requested = Instant::now();
-        self.signal(Signal::KILL);
+        self.kill();
         Some(format!("{} did not end on request; killing it", self.name))
     }
 

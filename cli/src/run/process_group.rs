@@ -1,8 +1,10 @@
 //! Starts and supervises the processes of a run: an ingress, a recorder, and one for each lambda.
 //!
-//! A lambda whose process fails is started again, while the others run on. If the ingress or the
+//! A lambda whose process fails is started again, while the others run on. So is an ingress that
+//! does not play a drive: the processes that run receive a connection to the next one. If the
 //! recorder fails, all end.
 
+use std::collections::HashSet;
 use std::process::ExitStatus;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, SyncSender};
@@ -42,13 +44,22 @@ pub(super) enum GroupEnd {
     Broken(String),
 }
 
+/// What is kept over all process groups of a run.
+pub(super) struct RunRecord<'a> {
+    pub(super) failures: &'a mut Failures,
+    pub(super) counts: &'a mut RunCounts,
+}
+
 /// The processes of a run.
 pub(super) struct ProcessGroup<'a> {
     context: &'a RunContext<'a>,
     pub(super) lambdas: &'a mut [SupervisedLambda],
     pub(super) screen: &'a mut Screen,
     failures: &'a mut Failures,
+    counts: &'a mut RunCounts,
     pub(super) ingress: IngressProcess,
+    /// The largest sample of an input, in bytes.
+    largest: u64,
     recorder: Option<RecorderProcess>,
     sender: SyncSender<ChildOutput>,
     output: Receiver<ChildOutput>,
@@ -61,7 +72,7 @@ impl<'a> ProcessGroup<'a> {
         context: &'a RunContext<'a>,
         lambdas: &'a mut [SupervisedLambda],
         screen: &'a mut Screen,
-        failures: &'a mut Failures,
+        RunRecord { failures, counts }: RunRecord<'a>,
         limits: Limits,
     ) -> Result<Self, Failure> {
         let (sender, output) = mpsc::sync_channel(QUEUE_LENGTH);
@@ -69,7 +80,19 @@ impl<'a> ProcessGroup<'a> {
         let largest = inputs.map(|input| input.max_size.bytes()).max().unwrap_or(0);
         let ingress = IngressProcess::start(context, largest, &sender)?;
         let recorder = None;
-        Ok(Self { context, lambdas, screen, failures, ingress, recorder, sender, output, limits })
+        Ok(Self {
+            context,
+            lambdas,
+            screen,
+            failures,
+            counts,
+            ingress,
+            largest,
+            recorder,
+            sender,
+            output,
+            limits,
+        })
     }
 
     /// Runs the processes until the end of the run, or until the ingress or the recorder fails, and
@@ -103,6 +126,7 @@ impl<'a> ProcessGroup<'a> {
                 return Ok(GroupEnd::Complete);
             }
             if self.ingress.is_ready {
+                self.join_ingress()?;
                 self.start_due()?;
             }
             if self.lambdas.iter().all(SupervisedLambda::is_settled) {
@@ -126,8 +150,8 @@ impl<'a> ProcessGroup<'a> {
     }
 
     /// Adds the counts of ingress and recorder to those of the run.
-    pub(super) fn add_counts(self, counts: &mut RunCounts) {
-        counts.add(self.ingress.status, self.recorder.and_then(|recorder| recorder.status));
+    pub(super) fn add_counts(self) {
+        self.counts.add(self.ingress.status, self.recorder.and_then(|recorder| recorder.status));
     }
 
     /// Starts the recorder, if it is needed and does not run yet, and all lambdas that are due.
@@ -209,30 +233,90 @@ impl<'a> ProcessGroup<'a> {
         Ok(ended)
     }
 
-    /// Returns the end of the group if the ingress or the recorder has ended, or receives nothing
-    /// more.
+    /// Returns the end of the group if the ingress or the recorder has ended, and all others must
+    /// end with it.
     fn ended_service(&mut self) -> Result<Option<GroupEnd>, Failure> {
-        // A damaged drive ends as another one does.
-        if let Some(why) = self.ingress.dead().filter(|_| self.context.args.drive.is_empty()) {
-            return Ok(Some(GroupEnd::Broken(format!("the ingress does not receive: {why}"))));
+        if let Some(end) = self.ended_ingress()? {
+            return Ok(Some(end));
         }
-        let status = match self.ingress.child.status()? {
-            Some(status) => Some(("the ingress", self.ingress.is_ready, status)),
-            None => match &mut self.recorder {
-                Some(recorder) => {
-                    let status = recorder.child.status()?;
-                    status.map(|status| ("the recorder", recorder.is_ready, status))
-                }
-                None => None,
-            },
-        };
-        Ok(status.map(|(name, is_ready, status)| {
-            match status.code().and_then(Exit::from_code) {
-                // It has printed the cause.
-                Some(exit) if !is_ready && exit != Exit::Ok => GroupEnd::NotStarted(exit),
-                _ => GroupEnd::Broken(ended(name, status)),
+        let Some(recorder) = &mut self.recorder else { return Ok(None) };
+        let status = recorder.child.status()?;
+        // Its ingress may have ended before it was ready.
+        let is_first = !recorder.is_ready && self.ingress.start == 0;
+        Ok(status.map(|status| GroupEnd::of("the recorder", status, is_first)))
+    }
+
+    /// Starts the ingress again if it has ended, or receives nothing more; returns the end of the
+    /// group if all others must end with it.
+    fn ended_ingress(&mut self) -> Result<Option<GroupEnd>, Failure> {
+        let Self { ingress, context, .. } = self;
+        if let Some(at) = ingress.again_at {
+            if Instant::now() >= at {
+                let last = ingress.start_again(context, self.largest, &self.sender)?;
+                self.counts.add(last, None);
             }
-        }))
+            return Ok(None);
+        }
+        let plays_drive = !context.args.drive.is_empty();
+        let Some(status) = ingress.child.status()? else {
+            // A damaged drive ends as another one does.
+            if let Some(why) = ingress.dead().filter(|_| !plays_drive) {
+                let why = format!("the ingress does not receive: {why}");
+                if ingress.killed.replace(why).is_none() {
+                    ingress.child.kill();
+                }
+            }
+            return Ok(None);
+        };
+        let end = GroupEnd::of("the ingress", status, !ingress.is_ready);
+        if plays_drive || (ingress.start == 0 && !ingress.is_ready) {
+            return Ok(Some(end));
+        }
+        self.drain(|group| group.ingress.open_pipes > 0);
+        let Self { ingress, screen, .. } = self;
+        let reason = match (ingress.killed.take(), end) {
+            (Some(why), _) => why,
+            (None, GroupEnd::Broken(reason)) => reason,
+            (None, _) => "the ingress could not start".to_owned(),
+        };
+        screen.restarts(&reason, ingress.ended(), ingress.start + 1);
+        self.failures.add(reason, false);
+        self.lambdas.iter_mut().for_each(SupervisedLambda::lost_ingress);
+        Ok(None)
+    }
+
+    /// Connects the processes that ran before the current ingress to it. Does nothing more if it has
+    /// ended, which the caller notices.
+    fn join_ingress(&mut self) -> Result<(), Failure> {
+        let Self { context, lambdas, screen, ingress, recorder, .. } = self;
+        if std::mem::replace(&mut ingress.is_joined, true) {
+            return Ok(());
+        }
+        if let Some(recorder) = recorder {
+            let added = ingress.control.add_reader(&grants::recorder(context.args));
+            let Some(socket) = unless_gone(added)? else { return Ok(()) };
+            let mut again = HashSet::new();
+            for supervised in lambdas.iter() {
+                let topics = recorder.topics.take_again(&supervised.lambda, &mut again);
+                if !topics.is_empty() {
+                    let add = AddTopics { reader: grants::RECORDER.to_owned(), topics };
+                    unless_gone(ingress.control.add_topics(&add))?;
+                }
+            }
+            if let Some(warning) = recorder.child.pass_ingress(socket) {
+                screen.warn(&warning);
+            }
+        }
+        for supervised in lambdas.iter_mut().filter(|supervised| supervised.is_running()) {
+            let lambda = &supervised.lambda;
+            let is_recorded = recorder.is_some() && lambda.manifest.record.is_some();
+            let reader = grants::lambda(lambda, context.args, is_recorded, supervised.restarts);
+            let Some(socket) = unless_gone(ingress.control.add_reader(&reader))? else {
+                return Ok(());
+            };
+            supervised.pass_ingress(socket, screen);
+        }
+        Ok(())
     }
 
     /// Ends all processes: those that read before those that they read from, so that nothing is
@@ -324,7 +408,8 @@ impl<'a> ProcessGroup<'a> {
                 // Processes that an earlier one left running may still write into its pipes.
                 (prefix, Some(supervised).filter(|current| current.restarts == start))
             }
-            ChildId::Ingress | ChildId::Recorder => (String::new(), None),
+            ChildId::Ingress { start } if start != ingress.start => return,
+            ChildId::Ingress { .. } | ChildId::Recorder => (String::new(), None),
         };
         match piece {
             OutputPiece::Stderr { text, begins_line } => {
@@ -346,11 +431,22 @@ impl<'a> ProcessGroup<'a> {
                 }
             }
             OutputPiece::Closed => match (from, current, recorder) {
-                (ChildId::Ingress, ..) => ingress.open_pipes -= 1,
+                (ChildId::Ingress { .. }, ..) => ingress.open_pipes -= 1,
                 (ChildId::Recorder, _, Some(recorder)) => recorder.open_pipes -= 1,
                 (_, Some(current), _) => current.closed(),
                 _ => {}
             },
+        }
+    }
+}
+
+impl GroupEnd {
+    /// The end of a process that all others need. `is_first` is true if it was not ready before.
+    fn of(name: &str, status: ExitStatus, is_first: bool) -> GroupEnd {
+        match status.code().and_then(Exit::from_code) {
+            // It has printed the cause.
+            Some(exit) if is_first && exit != Exit::Ok => GroupEnd::NotStarted(exit),
+            _ => GroupEnd::Broken(ended(name, status)),
         }
     }
 }

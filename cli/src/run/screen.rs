@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Write};
+use std::time::Duration;
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision};
@@ -160,6 +161,12 @@ impl Screen {
     fn clear(&self) {
         self.below.set_message("");
         self.below.tick();
+    }
+
+    /// Warns that something failed for a reason, and is started again after a delay.
+    pub(super) fn restarts(&self, reason: &str, delay: Duration, restarts: u32) {
+        let delay = delay.as_secs_f64();
+        self.warn(&format!("{reason}; restarting in {delay} s (restart {restarts})"));
     }
 
     pub(super) fn warn(&self, text: &str) {

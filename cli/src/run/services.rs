@@ -2,12 +2,14 @@
 
 use std::os::fd::OwnedFd;
 use std::sync::mpsc::SyncSender;
+use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::{IngressControl, IngressReport, IngressStatus, IngressTopic};
 use gleaner_protocol::link::{ControlClient, Loss, RecorderReport, RecorderStatus};
 
+use super::backoff::RestartDelay;
 use super::grants::RecordedTopics;
 use super::lambdas::RunLambda;
 use super::output::{ChildId, ChildOutput, PIPES};
@@ -27,6 +29,18 @@ pub(super) struct IngressProcess {
     pub(super) status: Option<Box<IngressStatus>>,
     /// Last status of each topic that had a reader.
     topics: Vec<IngressTopic>,
+    /// Those of earlier ingresses, summed.
+    earlier_topics: Vec<IngressTopic>,
+    /// Number of earlier ingresses.
+    pub(super) start: u32,
+    started: Instant,
+    delay: RestartDelay,
+    /// Time at which the next ingress is to be started, as this one has ended.
+    pub(super) again_at: Option<Instant>,
+    /// Set when the processes that ran before it were connected to it.
+    pub(super) is_joined: bool,
+    /// The reason why it was killed.
+    pub(super) killed: Option<String>,
 }
 
 impl IngressProcess {
@@ -36,12 +50,36 @@ impl IngressProcess {
         largest: u64,
         sender: &SyncSender<ChildOutput>,
     ) -> Result<Self, Failure> {
+        Self::start_after(None, context, largest, sender)
+    }
+
+    /// Starts another one after this one has ended; also returns the last status of this one.
+    pub(super) fn start_again(
+        &mut self,
+        context: &RunContext<'_>,
+        largest: u64,
+        sender: &SyncSender<ChildOutput>,
+    ) -> Result<Option<Box<IngressStatus>>, Failure> {
+        let next = Self::start_after(Some(self), context, largest, sender)?;
+        Ok(std::mem::replace(self, next).status)
+    }
+
+    fn start_after(
+        before: Option<&mut Self>,
+        context: &RunContext<'_>,
+        largest: u64,
+        sender: &SyncSender<ChildOutput>,
+    ) -> Result<Self, Failure> {
+        let (start, delay, earlier_topics) = match before {
+            None => (0, RestartDelay::of_ingress(), Vec::new()),
+            Some(before) => (before.start + 1, before.delay.clone(), before.topics()),
+        };
         let (control, ingress_end) = IngressControl::pair().map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot connect to the ingress", &error)
         })?;
         let child = ChildProcess::start(
             &context.parts,
-            ("gleaner-ingress", ChildId::Ingress),
+            ("gleaner-ingress", ChildId::Ingress { start }),
             arguments::ingress(context.args, largest, context.offset_ns),
             None,
             Handover { control: Some(ingress_end), ..Handover::default() },
@@ -55,7 +93,22 @@ impl IngressProcess {
             drive_ended: false,
             status: None,
             topics: Vec::new(),
+            earlier_topics,
+            start,
+            started: Instant::now(),
+            delay,
+            again_at: None,
+            is_joined: start == 0,
+            killed: None,
         })
+    }
+
+    /// Notes its end: another one is to be started after the returned delay.
+    pub(super) fn ended(&mut self) -> Duration {
+        let delay = self.delay.after(self.started.elapsed());
+        self.is_ready = false;
+        self.again_at = Some(Instant::now() + delay);
+        delay
     }
 
     /// Returns the reason why it receives no further samples; of a drive, why it ended early.
@@ -78,7 +131,7 @@ impl IngressProcess {
             IngressReport::Ended(mut status) => {
                 self.keep_topics(&status);
                 // Its readers have ended before it, and with them their topics.
-                status.topics = self.topics.clone();
+                status.topics = self.topics();
                 screen.ingress_ended(&status);
                 self.status = Some(status);
             }
@@ -87,15 +140,29 @@ impl IngressProcess {
 
     fn keep_topics(&mut self, status: &IngressStatus) {
         for topic in &status.topics {
-            let is_it = |known: &&mut IngressTopic| {
-                (&known.topic, &known.type_name) == (&topic.topic, &topic.type_name)
-            };
-            match self.topics.iter_mut().find(is_it) {
+            match find(&mut self.topics, topic) {
                 Some(known) => *known = topic.clone(),
                 None => self.topics.push(topic.clone()),
             }
         }
     }
+
+    /// Returns the last status of each topic, with the counts of earlier ingresses.
+    fn topics(&self) -> Vec<IngressTopic> {
+        let mut all = self.earlier_topics.clone();
+        for topic in &self.topics {
+            match find(&mut all, topic) {
+                Some(known) => *known = topic.clone().after(known),
+                None => all.push(topic.clone()),
+            }
+        }
+        all
+    }
+}
+
+fn find<'a>(topics: &'a mut [IngressTopic], topic: &IngressTopic) -> Option<&'a mut IngressTopic> {
+    let names = (&topic.topic, &topic.type_name);
+    topics.iter_mut().find(|known| (&known.topic, &known.type_name) == names)
 }
 
 /// The recorder of a run.

@@ -1,5 +1,6 @@
 //! One lambda of a run: its process, and its counts over all restarts.
 
+use std::os::fd::OwnedFd;
 use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
@@ -55,6 +56,8 @@ struct LambdaProcess {
     has_lost_wake: bool,
     /// Set by the last report of the process.
     has_ended: bool,
+    /// Set when the ingress ended before the process was ready.
+    has_lost_ingress: bool,
     last: Option<Box<LiveStatus>>,
     /// Number of statuses since the end of the drive.
     after_drive: u32,
@@ -113,6 +116,7 @@ impl SupervisedLambda {
             has_faulted: false,
             has_lost_wake: false,
             has_ended: false,
+            has_lost_ingress: false,
             last: None,
             after_drive: 0,
         }));
@@ -143,6 +147,22 @@ impl SupervisedLambda {
     pub(super) fn closed(&mut self) {
         if let Some(process) = self.process() {
             process.open_pipes = process.open_pipes.saturating_sub(1);
+        }
+    }
+
+    /// Notes that the ingress has ended: a process that was not ready ends as well, and is started
+    /// again.
+    pub(super) fn lost_ingress(&mut self) {
+        if let Some(process) = self.process() {
+            process.has_lost_ingress |= !process.is_ready;
+        }
+    }
+
+    /// Passes its process a connection to another ingress.
+    pub(super) fn pass_ingress(&mut self, ingress: OwnedFd, screen: &mut Screen) {
+        let prefix = self.lambda.prefix.clone();
+        if let Some(warning) = self.process().and_then(|it| it.child.pass_ingress(ingress)) {
+            screen.warn(&format!("{prefix}{warning}"));
         }
     }
 
@@ -224,6 +244,10 @@ impl SupervisedLambda {
         screen: &mut Screen,
         failures: &mut Failures,
     ) {
+        let is_lost = |process: &mut LambdaProcess| process.has_lost_ingress && !process.is_ready;
+        if !is_ending && self.process().is_some_and(is_lost) {
+            return self.interrupted(screen, failures);
+        }
         let Some(process) = self.take_process() else { return };
         screen.gone(self.lambda.name());
         let prefix = &self.lambda.prefix;
@@ -255,10 +279,7 @@ impl SupervisedLambda {
             screen.warn(&reason);
         } else {
             let (delay, restarts) = (self.restart_after(ran), self.restarts);
-            screen.warn(&format!(
-                "{reason}; restarting in {} s (restart {restarts})",
-                delay.as_secs()
-            ));
+            screen.restarts(&reason, delay, restarts);
         }
         failures.add(reason, faulted);
     }

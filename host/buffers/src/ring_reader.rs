@@ -35,8 +35,34 @@ impl<M> RingReader<M> {
         depth: usize,
         decode: fn(&[u64; META_WORDS]) -> M,
         too_big: fn(&SharedReader) -> u64,
-    ) -> Self {
+    ) -> Self
+    where
+        M: 'static,
+    {
         Self(RingKind::Shared(Arc::new(SharedRing::new(reader, first, depth, decode, too_big))))
+    }
+
+    /// Continues a ring over shared memory in other memory, whose position `first` follows the
+    /// newest position so far, and whose metadata `decode` converts. Nothing may write to the
+    /// earlier memory any more; its samples stay in the ring until newer ones replace them.
+    ///
+    /// Does nothing for a ring over a pool.
+    pub fn continue_in(
+        &self,
+        reader: SharedReader,
+        first: u64,
+        decode: impl Fn(&[u64; META_WORDS]) -> M + Send + Sync + 'static,
+    ) {
+        if let RingKind::Shared(ring) = &self.0 {
+            ring.continue_in(reader, first, Box::new(decode));
+        }
+    }
+
+    /// Drops earlier memory that has no sample of the ring any more. Held samples stay.
+    pub fn drop_left(&self) {
+        if let RingKind::Shared(ring) = &self.0 {
+            ring.drop_left();
+        }
     }
 
     /// Returns the number of samples published so far: the position of the next one.

@@ -182,3 +182,54 @@ fn a_read_of_more_samples_than_a_word_can_name_takes_several_words() {
     assert_eq!((values(&all), values(&newer)), (vec![0, 1, 2, 3], vec![3, 4, 5]));
     assert_eq!(ring.refused_holds(), 0, "a window and a single one, and a further window");
 }
+
+#[test]
+fn a_ring_continues_in_other_memory_and_keeps_the_earlier_samples_until_newer_ones_replace_them() {
+    let ((mut before, reader), (mut after, other)) = (topic(), topic());
+    let ring = ring(&reader, 0, 3);
+    publish(&mut before, 5);
+    let held = ring.newest().unwrap();
+    drop(before);
+    publish(&mut after, 2);
+    let all = |ring: &RingReader<u64>| {
+        let mut all = Vec::new();
+        ring.last(9, &mut all);
+        all.iter().map(|it| (*it.meta(), it.position().unwrap())).collect::<Vec<_>>()
+    };
+    ring.continue_in(other, 2, |words| words[0] + 1000);
+    assert_eq!((ring.head(), ring.newest_meta()), (5, Some((4, 4))));
+    assert_eq!(all(&ring), [(2, 2), (3, 3), (4, 4)]);
+    publish(&mut after, 1);
+    assert_eq!(all(&ring), [(3, 3), (4, 4), (1002, 5)]);
+    assert_eq!((ring.meta(4), ring.meta(5), ring.meta(2)), (Some(4), Some(1002), None));
+    assert_eq!(ring.get(3).map(|it| *it.meta()), Some(3));
+    assert_eq!(ring.newest_before(5).map(|it| *it.meta()), Some(4));
+    let mut some = Vec::new();
+    ring.newest_while(9, |value| *value > 3, &mut some);
+    assert_eq!(some.iter().map(|it| *it.meta()).collect::<Vec<_>>(), [4, 1002]);
+    ring.newest_while(9, |value| *value > 1002, &mut some);
+    assert!(some.is_empty());
+    publish(&mut after, 2);
+    ring.drop_left();
+    assert_eq!(all(&ring), [(1002, 5), (1003, 6), (1004, 7)]);
+    assert!(ring.get(4).is_none() && ring.meta(4).is_none());
+    assert_eq!((value(&held), held.position()), (4, Some(4)), "what is held stays");
+    assert_eq!(ring.counts(), RingCounts { received: 8, overwritten: 5, no_slot: 0, too_big: 0 });
+}
+
+#[test]
+fn a_ring_that_continues_again_and_again_counts_on_and_keeps_what_it_shows() {
+    let (_, reader) = topic();
+    let ring = ring(&reader, 0, 3);
+    for turn in 0..20_u64 {
+        let (mut writer, reader) = topic();
+        writer.set_counters(&[turn; 8]);
+        ring.continue_in(reader, 0, move |words| words[0] + 10 * turn);
+        publish(&mut writer, turn % 2);
+        writer.set_counters(&[turn + 2; 8]);
+    }
+    assert_eq!((ring.head(), ring.counts().too_big), (10, 40));
+    let mut all = Vec::new();
+    ring.last(9, &mut all);
+    assert_eq!(all.iter().map(|it| *it.meta()).collect::<Vec<_>>(), [150, 170, 190]);
+}

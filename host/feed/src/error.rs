@@ -85,7 +85,8 @@ fn text(reason: &RefusedTopic) -> String {
 }
 
 impl FeedError {
-    pub(crate) fn refused(id: u32, reason: RefusedTopic) -> FeedError {
+    /// Returns the error of a topic that cannot be read.
+    pub fn refused(id: u32, reason: RefusedTopic) -> FeedError {
         let causes = match &reason {
             RefusedTopic::Other(lines) => lines.get(1..).unwrap_or_default(),
             _ => &[],

@@ -1,10 +1,12 @@
 //! The connection of this process to the ingress.
 
 use std::collections::VecDeque;
+use std::ops::ControlFlow;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
 
 use gleaner_base::chain;
+use gleaner_buffers::shared::SharedReader;
 use gleaner_protocol::ingress::{
     IngressLink, IngressRequests, ReaderDelivery, ReaderMessage, RefusedTopic, SourceStatus,
 };
@@ -47,6 +49,19 @@ pub enum FeedEvent {
     },
 }
 
+/// A connection to an ingress that may not have started yet.
+pub(crate) struct JoiningFeed {
+    link: IngressLink,
+    requests: IngressRequests,
+}
+
+/// The samples of an attached topic, from a first position on.
+#[derive(Clone)]
+pub(crate) struct AttachedReader {
+    pub(crate) reader: SharedReader,
+    pub(crate) first: u64,
+}
+
 /// The connection of this process to the ingress.
 ///
 /// It ends when the feed and all its publishers are dropped. Topics and held samples stay valid
@@ -56,10 +71,41 @@ pub struct Feed {
     requests: IngressRequests,
     page: OwnPage,
     status: SourceStatus,
+    /// The topics that are attached, with their ids.
+    attached: Vec<(u32, AttachedReader)>,
     /// Events that no call has returned yet.
     events: VecDeque<FeedEvent>,
     /// The error that ended the connection.
     end: Option<FeedError>,
+}
+
+impl JoiningFeed {
+    pub(crate) fn new(socket: OwnedFd) -> JoiningFeed {
+        let (link, requests) = IngressLink::new(socket);
+        JoiningFeed { link, requests }
+    }
+
+    /// Returns the connection if the ingress has sent its first message. Never waits.
+    pub(crate) fn poll(mut self) -> Result<ControlFlow<Feed, JoiningFeed>, FeedError> {
+        let delivery = match self.link.poll()? {
+            Incoming::Message(delivery) => delivery,
+            Incoming::Ended => return Err(FeedError::Gone),
+            Incoming::Nothing => return Ok(ControlFlow::Continue(self)),
+        };
+        let ReaderDelivery { message: ReaderMessage::Welcome, descriptor: Some(page) } = delivery
+        else {
+            return Err(FeedError::malformed("the first one must open the connection"));
+        };
+        Ok(ControlFlow::Break(Feed {
+            page: OwnPage::open(page)?,
+            link: self.link,
+            requests: self.requests,
+            status: SourceStatus::default(),
+            attached: Vec::new(),
+            events: VecDeque::new(),
+            end: None,
+        }))
+    }
 }
 
 impl Feed {
@@ -74,31 +120,19 @@ impl Feed {
     }
 
     fn connect_within(socket: OwnedFd, timeout: Duration) -> Result<Feed, FeedError> {
-        let (mut link, requests) = IngressLink::new(socket);
+        let mut joining = JoiningFeed::new(socket);
         let until = Instant::now().checked_add(timeout);
-        let delivery = loop {
-            match link.poll()? {
-                Incoming::Message(delivery) => break delivery,
-                Incoming::Ended => return Err(FeedError::Gone),
-                Incoming::Nothing if is_over(until) => {
-                    let (awaited, seconds) = ("a first message".to_owned(), timeout.as_secs());
-                    return Err(FeedError::Silent { awaited, seconds });
-                }
-                Incoming::Nothing => wait(&link, until),
+        loop {
+            joining = match joining.poll()? {
+                ControlFlow::Break(feed) => return Ok(feed),
+                ControlFlow::Continue(joining) => joining,
+            };
+            if is_over(until) {
+                let (awaited, seconds) = ("a first message".to_owned(), timeout.as_secs());
+                return Err(FeedError::Silent { awaited, seconds });
             }
-        };
-        let ReaderDelivery { message: ReaderMessage::Welcome, descriptor: Some(page) } = delivery
-        else {
-            return Err(FeedError::malformed("the first one must open the connection"));
-        };
-        Ok(Feed {
-            link,
-            requests,
-            page: OwnPage::open(page)?,
-            status: SourceStatus::default(),
-            events: VecDeque::new(),
-            end: None,
-        })
+            wait(joining.link.as_fd(), until);
+        }
     }
 
     /// Waits until the topic with this `id` is attached. Events of other topics stay for
@@ -169,6 +203,11 @@ impl Feed {
         &self.status
     }
 
+    /// Returns the topics that are attached, with their ids.
+    pub(crate) fn attached(&self) -> &[(u32, AttachedReader)] {
+        &self.attached
+    }
+
     /// Returns the bell that the ingress rings.
     pub fn bell(&self) -> FeedBell {
         FeedBell::of(&self.page.control)
@@ -200,7 +239,7 @@ impl Feed {
                 let (awaited, seconds) = (name(), timeout.as_secs());
                 return Err(FeedError::Silent { awaited, seconds });
             }
-            wait(&self.link, until);
+            wait(self.as_fd(), until);
         }
     }
 
@@ -234,7 +273,11 @@ impl Feed {
             (ReaderMessage::Attached(info), Some(file)) => {
                 let id = info.id;
                 match self.page.attach(*info, file) {
-                    Ok(topic) => FeedEvent::Attached(topic),
+                    Ok(topic) => {
+                        let (reader, first) = (topic.reader.clone(), topic.info.first);
+                        self.attached.push((id, AttachedReader { reader, first }));
+                        FeedEvent::Attached(topic)
+                    }
                     Err(AttachError::Malformed(error)) => return Err(error),
                     // Other topics may fit.
                     Err(AttachError::Memory(error)) => {
@@ -271,12 +314,12 @@ fn is_over(until: Option<Instant>) -> bool {
 }
 
 /// Waits until a message arrives, until the deadline, or for a short time.
-fn wait(link: &IngressLink, until: Option<Instant>) {
+fn wait(socket: BorrowedFd<'_>, until: Option<Instant>) {
     let left = until.map_or(WAIT_STEP, |until| until.saturating_duration_since(Instant::now()));
     // A step is far below the largest time of the system.
     let timeout = Timespec::try_from(left.min(WAIT_STEP)).ok();
     // Errors end the wait; the next look at the socket reports them.
-    let _ = poll(&mut [PollFd::new(link, PollFlags::IN)], timeout.as_ref());
+    let _ = poll(&mut [PollFd::from_borrowed_fd(socket, PollFlags::IN)], timeout.as_ref());
 }
 
 #[cfg(test)]

@@ -29,6 +29,11 @@
 //! # }
 //! ```
 //!
+//! # Restarts
+//!
+//! An ingress that ends takes nothing with it: topics and held samples stay valid. A [`LastingFeed`]
+//! joins the next one, over the socket of the starter, and counts what was lost meanwhile.
+//!
 //! # Trust
 //!
 //! The ingress parses what strangers send, so a reader checks what it receives: sizes and seals of
@@ -40,16 +45,19 @@
 //!
 //! Nothing here opens a file or a socket. After [`Feed::connect`], a process needs these calls:
 //! `recvmsg`, `send` and `poll` of the open socket, `futex` for the bell, and for each topic that
-//! is attached later `fstat`, `fcntl(F_GET_SEALS)`, `mmap` of the received file, and `close`. It
-//! never calls `sendmsg`.
+//! is attached later, and for the page of a later ingress, `fstat`, `fcntl(F_GET_SEALS)`, `mmap` of
+//! the received file, and `close`. It never calls `sendmsg`.
 
 mod bell;
 mod error;
 mod feed;
+mod lasting;
+mod losses;
 mod publisher;
 mod topic;
 
 pub use bell::FeedBell;
 pub use error::FeedError;
 pub use feed::{Feed, FeedEvent};
+pub use lasting::LastingFeed;
 pub use topic::FedTopic;

@@ -5,6 +5,7 @@
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
+use gleaner_buffers::shared::SharedReader;
 use gleaner_buffers::{Lease, RingCounts, RingReader};
 use gleaner_messages::{CdrError, Definitions, FieldPath, HeaderStamp, header_stamp};
 use gleaner_rules::clamps::{self, WrongField};
@@ -404,9 +405,30 @@ impl Topic {
         self.reader.newest_meta().map(|(_, meta)| meta.sample.at_ns)
     }
 
-    /// Sets the number of samples that were lost before they reached this process.
-    pub(crate) fn set_lost(&self, lost: u64) {
-        self.lost.store(lost, Ordering::Relaxed);
+    /// Sets the number of samples that were lost before they reached this process; `None` if
+    /// unknown.
+    pub(crate) fn set_lost(&self, lost: Option<u64>) {
+        self.lost.store(lost.unwrap_or(UNKNOWN), Ordering::Relaxed);
+    }
+
+    /// Continues the topic in the memory of another ingress, whose samples from position `first` of
+    /// `reader` on follow those so far. `before` are its sums before them.
+    pub(crate) fn continue_in(&self, reader: SharedReader, first: u64, before: SumsBefore) {
+        let so_far = self.sums_so_far();
+        self.reader.continue_in(reader, first, move |words| {
+            let meta = StoredMeta::of_words(words);
+            let digests = meta.digests.wrapping_sub(before.digest).wrapping_add(so_far.digest);
+            let refused = meta.refused.saturating_sub(before.refused) + so_far.refused;
+            StoredMeta { digests, refused, ..meta }
+        });
+    }
+
+    /// Returns the sums over all samples so far, if no further ones arrive.
+    fn sums_so_far(&self) -> SumsBefore {
+        let newest = self.reader.newest_meta();
+        let digest = newest.map_or(self.sums_before.digest, |(_, meta)| meta.digests);
+        let refused = self.sums_before.refused + self.reader.counts().too_big;
+        SumsBefore { digest, refused }
     }
 }
 

@@ -70,6 +70,12 @@ pub fn open_fed_inputs(
     inputs.collect()
 }
 
+/// Continues an input in the memory of an ingress that was started again.
+pub(crate) fn continue_fed_input(topic: &Topic, FedTopic { info, reader }: FedTopic) {
+    let before = SumsBefore { digest: info.digests, refused: info.refused };
+    topic.continue_in(reader, info.first, before);
+}
+
 /// Returns the error of an input whose topic is not attached.
 fn refused(input: &InputSpec, on_network: &str, error: FeedError) -> InputError {
     let (name, topic) = (input.name.to_string(), on_network.to_owned());

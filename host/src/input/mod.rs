@@ -22,6 +22,7 @@ use crate::api::data::{InputRing, PerCall, Topic};
 use crate::api::frame::{Budget, Images};
 use crate::memory::Mapping;
 
+pub(crate) use fed::continue_fed_input;
 pub use fed::open_fed_inputs;
 pub use filled::open_inputs;
 

@@ -4,6 +4,7 @@
 //! with the lambda's name before it: `{"lambda": "hello", "decision": {...}}`.
 
 use gleaner_lambda::Decision;
+use gleaner_transport::Publisher;
 use serde::Serialize;
 
 use super::topic_publisher::TopicPublisher;
@@ -23,6 +24,11 @@ impl Announcer {
     /// Publishes decisions of `lambda` through `publisher`.
     pub(super) fn new(publisher: TopicPublisher, lambda: &str) -> Self {
         Self { publisher, lambda: lambda.to_owned() }
+    }
+
+    /// Publishes through `publisher` from now on.
+    pub(super) fn replace_publisher(&mut self, publisher: Box<dyn Publisher>) {
+        self.publisher.replace(publisher);
     }
 
     /// Number of decisions that were not sent.

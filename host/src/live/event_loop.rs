@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure, nanoseconds};
-use gleaner_feed::{Feed, FeedBell, FeedError};
+use gleaner_feed::{FeedBell, FeedError, FeedEvent, LastingFeed};
 use gleaner_protocol::Report;
 use gleaner_transport::Clock;
 use gleaner_vitals::Pulse;
@@ -18,6 +18,7 @@ use super::round_trip::RoundTrip;
 use super::status::{Around, StatusReporter, Times};
 use crate::api::Session;
 use crate::api::data::{Topic, Wake};
+use crate::input::continue_fed_input;
 use crate::invoker::Invoker;
 use crate::schedule::WakeSchedule;
 
@@ -38,8 +39,11 @@ pub(super) struct LiveEventLoop {
     pub(super) round_trip: Option<RoundTrip>,
     pub(super) announcer: Option<Announcer>,
     pub(super) watch: StatusReporter,
-    pub(super) feed: Feed,
+    pub(super) feed: LastingFeed,
+    /// Bell of the current ingress.
     pub(super) bell: FeedBell,
+    /// Number of ingresses before it.
+    pub(super) connections: u32,
     pub(super) clock: Clock,
     pub(super) pulse: Pulse,
 }
@@ -60,7 +64,10 @@ impl LiveEventLoop {
                 self.pulse.alive(ALIVE);
                 self.results.flush();
                 self.housekeeping(now)?;
+                // There may be another bell.
+                continue;
             }
+            self.feed.look_for_losses();
             if let Some(wake) = self.schedule.next_tick(now).or_else(|| self.schedule.next_event())
             {
                 self.wake(wake)?;
@@ -120,34 +127,29 @@ impl LiveEventLoop {
     pub(super) fn unsent(&self) -> u64 {
         let answers = self.round_trip.as_ref().map_or(0, RoundTrip::unsent);
         let decisions = self.announcer.as_ref().map_or(0, Announcer::unsent);
-        answers.saturating_add(decisions).saturating_add(self.feed.status().unsent)
+        answers.saturating_add(decisions).saturating_add(self.feed.unsent())
     }
 
     fn housekeeping(&mut self, now: i64) -> Result<(), Failure> {
         if let Some(recorder) = &mut self.recorder {
             recorder.poll()?;
         }
-        let ended = self.feed.poll().err();
-        if let Some(why) = &self.feed.status().health.dead {
+        let ended = self.receive().err();
+        if let Some(why) = self.feed.dead() {
             let mut failure = Failure::new(Exit::Unreachable, "the ingress receives no samples");
-            failure.causes = vec![why.clone()];
+            failure.causes = vec![why.to_owned()];
             return Err(
                 failure.with_help("start again; if it happens often, report it with this text")
             );
         }
-        match ended {
-            None => {}
-            Some(FeedError::Gone) => {
-                return Err(Failure::new(Exit::Unreachable, "the ingress has ended")
-                    .with_help("`gleaner run` starts both again"));
-            }
-            Some(error) => return Err(Failure::because("cannot receive samples", &error)),
+        if let Some(failure) = ended {
+            return Err(failure);
         }
         if !self.watch.is_due(now) {
             return Ok(());
         }
         let live = self.watch.report(&Around {
-            source: self.feed.status(),
+            feed: &self.feed,
             inputs: &self.inputs,
             schedule: &self.schedule,
             session: &self.session,
@@ -156,6 +158,45 @@ impl LiveEventLoop {
             recorder_link: self.recorder.as_ref().map(RecorderSender::dropped),
         });
         self.results.report(Report::Live(Box::new(live)));
+        Ok(())
+    }
+
+    /// Handles messages of the ingress. After its restart, inputs continue in its memory.
+    fn receive(&mut self) -> Result<(), Failure> {
+        let events = self.feed.poll().map_err(|error| match error {
+            FeedError::Gone => Failure::new(Exit::Unreachable, "the ingress has ended")
+                .with_help("`gleaner run` starts both again"),
+            error => Failure::because("cannot receive samples", &error),
+        })?;
+        if self.feed.connections() != self.connections {
+            self.connections = self.feed.connections();
+            self.bell = self.feed.bell();
+            // In the order of the grants.
+            let mut index = 0;
+            if let Some(round_trip) = &mut self.round_trip {
+                round_trip.replace_publisher(self.feed.publisher(index));
+                index += 1;
+            }
+            if let Some(announcer) = &mut self.announcer {
+                announcer.replace_publisher(self.feed.publisher(index));
+            }
+        }
+        for event in events {
+            match event {
+                FeedEvent::Attached(fed) => {
+                    let index = usize::try_from(fed.info.id).unwrap_or(usize::MAX);
+                    if let Some(topic) = self.inputs.get(index) {
+                        continue_fed_input(topic, fed);
+                    }
+                }
+                FeedEvent::Refused { id, reason } => {
+                    let refused = FeedError::refused(id, reason);
+                    return Err(Failure::because("cannot receive an input again", &refused));
+                }
+                FeedEvent::Definitions { .. } => {}
+            }
+        }
+        self.inputs.iter().for_each(|topic| topic.reader().drop_left());
         Ok(())
     }
 }

@@ -24,7 +24,7 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_feed::Feed;
+use gleaner_feed::{Feed, LastingFeed};
 use gleaner_journal::TimeRange;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_protocol::{Layer, Report, ResultItem, WokenBy};
@@ -55,6 +55,9 @@ pub struct LiveRun<'a> {
     /// ids, and then the topics of [`Settings::round_trip`] and [`Settings::announce`], as far as
     /// they are set, to publish.
     pub feed: Feed,
+    /// The socket over which the starter passes connections to later ingresses; without one, the
+    /// run ends with the ingress.
+    pub starter: Option<OwnedFd>,
     /// The socket to the recorder, if there is one.
     pub recorder: Option<OwnedFd>,
     /// The pipe for results.
@@ -99,8 +102,8 @@ impl LiveRun<'_> {
         load: Load<'_>,
         reports: impl Write + Send + 'static,
     ) -> Result<Exit, Failure> {
-        let Self { lambda, manifest, settings, mut feed, recorder, results, pulse, close, stop } =
-            self;
+        let Self { lambda, manifest, settings, mut feed, starter, recorder, .. } = self;
+        let Self { results, pulse, close, stop, .. } = self;
         let clock = settings.clock;
         let mode = RunMode::Live(manifest.limits.deadline);
         let SessionSetup { inputs, session, mut guest } =
@@ -157,7 +160,8 @@ impl LiveRun<'_> {
             announcer,
             watch,
             bell: feed.bell(),
-            feed,
+            connections: 0,
+            feed: LastingFeed::new(feed, starter),
             clock,
             pulse,
         };
@@ -169,7 +173,7 @@ impl LiveRun<'_> {
             event_loop;
         let dropped = recorder.map(RecorderSender::leave);
         let last = watch.ended(&Around {
-            source: feed.status(),
+            feed: &feed,
             inputs: &inputs,
             schedule: &schedule,
             session: &session,

@@ -106,7 +106,7 @@ impl LiveJob {
         let stop = stop_flag().map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error)
         })?;
-        // Open until the run is over: the starter sees its end.
+        // Open until the run is over: the starter sees its end, and may pass further connections.
         let starter = take_stdin()?;
         let unconnected = |error| Failure::because("cannot receive the connections", &error);
         let mut connections = Handover::receive(&starter).map_err(unconnected)?;
@@ -119,6 +119,7 @@ impl LiveJob {
             manifest,
             settings,
             feed,
+            starter: Some(starter),
             recorder: connections.recorder.take(),
             results: ResultsPipe::open(pulse.clone())?,
             pulse,

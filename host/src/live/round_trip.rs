@@ -8,7 +8,7 @@
 //! `gleaner play --stamp monotonic`.
 
 use gleaner_lambda::Decision;
-use gleaner_transport::Clock;
+use gleaner_transport::{Clock, Publisher};
 
 use super::topic_publisher::TopicPublisher;
 use crate::api::data::Wake;
@@ -35,6 +35,11 @@ impl RoundTrip {
             }
             Wake::Tick(tick) => clock.monotonic(tick.at_ns),
         }
+    }
+
+    /// Publishes through `publisher` from now on.
+    pub(super) fn replace_publisher(&mut self, publisher: Box<dyn Publisher>) {
+        self.publisher.replace(publisher);
     }
 
     /// Number of answers that were not sent.

@@ -3,10 +3,12 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use gleaner_feed::LastingFeed;
 use gleaner_lambda::Decision;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_protocol::ingress::{ReceptionStatus, SourceStatus};
-use gleaner_protocol::{DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus};
+use gleaner_protocol::{
+    DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus, ReceptionGaps,
+};
 use gleaner_transport::Clock;
 use gleaner_vitals::{IntervalDurations, usage};
 
@@ -32,7 +34,7 @@ pub(super) struct Times {
 
 /// Other sources of a report.
 pub(super) struct Around<'a> {
-    pub(super) source: &'a SourceStatus,
+    pub(super) feed: &'a LastingFeed,
     pub(super) inputs: &'a [Arc<Topic>],
     pub(super) schedule: &'a WakeSchedule,
     pub(super) session: &'a Session,
@@ -91,6 +93,7 @@ impl StatusReporter {
             decision_latency: None,
             topics: Vec::new(),
             network: NetworkStatus::default(),
+            reception_gaps: ReceptionGaps::default(),
             recorder_link: None,
             recording: None,
             rss_bytes: 0,
@@ -153,17 +156,15 @@ impl StatusReporter {
         around: &Around,
         [wake_latency, run, decision_latency]: [Option<DurationStats>; 3],
     ) -> LiveStatus {
-        let Around { source, inputs, schedule, session, unwritten, unsent, recorder_link } =
-            *around;
+        let Around { feed, inputs, schedule, session, unwritten, unsent, recorder_link } = *around;
         let now = self.clock.now();
         let seconds = now.saturating_sub(self.reported) as f64 / 1e9;
         self.reported = now;
         let mut topics = Vec::with_capacity(inputs.len());
-        for (index, topic) in inputs.iter().enumerate() {
-            let status = reception(source, index);
-            if let Some(lost) = status.lost {
-                topic.set_lost(lost);
-            }
+        // An input's topic has the input's index as its id.
+        for ((index, topic), id) in inputs.iter().enumerate().zip(0..) {
+            let status = feed.reception(id).unwrap_or_default();
+            topic.set_lost(status.lost);
             let counts = topic.counts();
             let came = counts
                 .received
@@ -200,16 +201,11 @@ impl StatusReporter {
             run_time: run,
             decision_latency,
             topics,
-            network: source.health.network.clone().unwrap_or_default(),
+            network: feed.status().health.network.clone().unwrap_or_default(),
+            reception_gaps: feed.gaps(),
             rss_bytes: usage::resident(),
             cpu_s: usage::cpu_seconds(),
             ..self.base.clone()
         }
     }
-}
-
-/// Returns the state of the subscription of an input, whose topic has the input's index as its id.
-fn reception(source: &SourceStatus, index: usize) -> ReceptionStatus {
-    let found = source.topics.iter().find(|(id, _)| usize::try_from(*id) == Ok(index));
-    found.map(|(_, status)| status.clone()).unwrap_or_default()
 }

@@ -17,6 +17,11 @@ impl TopicPublisher {
         Self { topic, publisher, unsent: 0, message: CdrWriter::new() }
     }
 
+    /// Publishes through `publisher` from now on.
+    pub(super) fn replace(&mut self, publisher: Box<dyn Publisher>) {
+        self.publisher = publisher;
+    }
+
     /// Number of messages that were not sent.
     pub(super) fn unsent(&self) -> u64 {
         self.unsent

@@ -4,6 +4,7 @@
 use std::fs::File;
 use std::io::{BufRead, BufReader, PipeReader, Read, pipe};
 use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -21,11 +22,16 @@ use gleaner_host::session_setup::ConfiguredLambda;
 use gleaner_ingress::Ingress;
 use gleaner_lambda::manifest::Manifest;
 use gleaner_lambda::{BuildDir, Fault, FaultKind};
-use gleaner_messages::Endian;
-use gleaner_protocol::ingress::{AddReader, IngressControl, PublishGrant, TopicGrant};
-use gleaner_protocol::{Report, ResultItem};
+use gleaner_messages::{Definitions, Endian};
+use gleaner_protocol::ingress::{
+    AddReader, IngressControl, PublishGrant, ReceptionStatus, TopicGrant,
+};
+use gleaner_protocol::{Handover, LiveStatus, Report, ResultItem};
 use gleaner_transport::loopback::Loopback;
-use gleaner_transport::{Clock, Delivery, Guid, Qos, SampleMeta, Sink, TopicSpec, Transport};
+use gleaner_transport::{
+    Clock, Delivery, DiscoveredTopic, Guid, Health, LiveSource, PublishError, Publisher, Qos,
+    SampleMeta, Sink, Subscription, TopicSpec, Transport, TransportError,
+};
 use gleaner_vitals::Pulse;
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -34,6 +40,9 @@ const DECISIONS: &str = "/decisions";
 
 /// Numbers from this on: the lambda keeps the sample.
 const KEEPS: i64 = 1000;
+
+/// The lambda triggers with the number of the first sample that it keeps.
+const RECALLS: i64 = 500;
 
 /// Triggers with the number of each sample; a negative one is a fault.
 struct NumbersGuest {
@@ -49,7 +58,10 @@ impl Guest for NumbersGuest {
     fn wake(&mut self, wake: Wake) -> WakeOutcome {
         let Wake::Event(sample) = wake else { panic!("samples wake this lambda") };
         let value = sample.number(&sample.topic().field("value").unwrap()).unwrap();
-        self.session.event("number", value, Vec::new()).unwrap();
+        let kept = self.kept.first().filter(|_| value == RECALLS as f64);
+        let number = |sample: &Sample| sample.number(&sample.topic().field("value").unwrap());
+        let score = kept.map_or(value, |kept| number(kept).unwrap());
+        self.session.event("number", score, Vec::new()).unwrap();
         if value >= KEEPS as f64 {
             self.kept.push(sample);
         }
@@ -75,9 +87,61 @@ impl Guest for NumbersGuest {
     }
 }
 
+/// A loopback with a writer of each topic, which loses nothing itself.
+struct WrittenLoopback(Loopback);
+
+impl Transport for WrittenLoopback {
+    fn topics(&self) -> Vec<DiscoveredTopic> {
+        self.0.topics()
+    }
+
+    fn subscribe(
+        &mut self,
+        spec: &TopicSpec,
+        sink: Arc<dyn Sink>,
+    ) -> Result<Subscription, TransportError> {
+        self.0.subscribe(spec, sink)
+    }
+
+    fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
+        self.0.definitions(topic)
+    }
+
+    fn status(&self, _: Subscription) -> ReceptionStatus {
+        ReceptionStatus { writers: Some(1), lost: Some(0), ..ReceptionStatus::default() }
+    }
+}
+
+impl LiveSource for WrittenLoopback {
+    fn unsubscribe(&mut self, subscription: Subscription) {
+        self.0.unsubscribe(subscription);
+    }
+
+    fn health(&self) -> Health {
+        self.0.health()
+    }
+
+    fn publisher(
+        &self,
+        topic: &str,
+        type_name: &str,
+        depth: usize,
+    ) -> Result<Box<dyn Publisher>, PublishError> {
+        self.0.publisher(topic, type_name, depth)
+    }
+}
+
+fn add_topics(loopback: &Loopback) {
+    loopback.add_topic(NUMBERS, "test_msgs/msg/Number", "int64 value\n");
+    loopback.add_topic(DECISIONS, "std_msgs/msg/String", "string data\n");
+}
+
 /// A run in a thread of its own.
 struct Running {
     loopback: Loopback,
+    added: AddReader,
+    /// The starter's end of the socket over which it passes connections.
+    handover: UnixStream,
     /// `None` once the ingress has ended.
     ingress: Option<(IngressControl, JoinHandle<()>)>,
     clock: Clock,
@@ -91,17 +155,22 @@ struct Running {
 impl Running {
     /// Starts a run and waits until it is ready.
     fn start(announce: Option<&str>) -> Self {
+        Self::start_of(announce, true)
+    }
+
+    /// As [`start`](Self::start). Without a starter, the run ends with its ingress.
+    fn start_of(announce: Option<&str>, has_starter: bool) -> Self {
         let manifest = "[lambda]\nname = \"numbers\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"numbers.wasm\"\n\
                         [schedule]\nevent = \"numbers\"\n\
                         [[input]]\nname = \"numbers\"\ntopic = \"/numbers\"\ntype = \"test_msgs/msg/Number\"\n";
         let manifest = Manifest::parse(manifest, "lambda.toml").unwrap();
         let (loopback, clock, stop) =
             (Loopback::new(), Clock::from_time_of_day(), Arc::<AtomicBool>::default());
-        loopback.add_topic(NUMBERS, "test_msgs/msg/Number", "int64 value\n");
-        loopback.add_topic(DECISIONS, "std_msgs/msg/String", "string data\n");
+        add_topics(&loopback);
         let (reports, to_reports) = pipe().unwrap();
         let (results, to_results) = pipe().unwrap();
-        let (mut control, ingress) = Ingress::start_in_thread(Box::new(loopback.clone()));
+        let source = Box::new(WrittenLoopback(loopback.clone()));
+        let (mut control, ingress) = Ingress::start_in_thread(source);
         let input = &manifest.inputs[0];
         let added = AddReader {
             name: "numbers".to_owned(),
@@ -109,6 +178,7 @@ impl Running {
             publishes: PublishGrant::of_lambda(None, announce),
         };
         let socket = control.add_reader(&added).unwrap();
+        let (handover, starter) = UnixStream::pair().unwrap();
         let (stopped, announce) = (Arc::clone(&stop), announce.map(str::to_owned));
         let run = thread::spawn(move || {
             let pulse = Pulse::create().unwrap().0;
@@ -131,6 +201,7 @@ impl Running {
                     announce,
                 },
                 feed: Feed::connect(socket).unwrap(),
+                starter: has_starter.then(|| starter.into()),
                 recorder: None,
                 results: ResultsPipe::over(File::from(OwnedFd::from(to_results)), pulse.clone()),
                 pulse,
@@ -143,9 +214,46 @@ impl Running {
             run.run(&mut load, File::from(OwnedFd::from(to_reports)))
         });
         let (ingress, reports) = (Some((control, ingress)), BufReader::new(reports));
-        let mut running = Self { loopback, ingress, clock, stop, reports, results, run, sent: 0 };
+        let sent = 0;
+        let mut running =
+            Self { loopback, added, handover, ingress, clock, stop, reports, results, run, sent };
         running.until(|report| matches!(report, Report::Ready).then_some(()));
         running
+    }
+
+    /// Ends the ingress.
+    fn end_ingress(&mut self) {
+        let (control, ingress) = self.ingress.take().unwrap();
+        drop(control);
+        ingress.join().unwrap();
+        // The next one subscribes them again.
+        add_topics(&self.loopback);
+    }
+
+    /// Waits for the status of a run with so many ends of the ingress.
+    fn interrupted(&mut self, count: u64) -> LiveStatus {
+        self.live(|live| live.reception_gaps.count == count)
+    }
+
+    fn live(&mut self, is_it: impl Fn(&LiveStatus) -> bool) -> LiveStatus {
+        self.until(|report| match report {
+            Report::Live(live) if is_it(&live) => Some(*live),
+            _ => None,
+        })
+    }
+
+    /// Starts an ingress again; returns the run's connection to it.
+    fn start_ingress(&mut self) -> OwnedFd {
+        let source = Box::new(WrittenLoopback(self.loopback.clone()));
+        let (mut control, ingress) = Ingress::start_in_thread(source);
+        let socket = control.add_reader(&self.added).unwrap();
+        self.ingress = Some((control, ingress));
+        socket
+    }
+
+    fn hand_over(&self, socket: OwnedFd) {
+        let ingress = Some(socket);
+        Handover { ingress, ..Handover::default() }.try_send(&self.handover).unwrap();
     }
 
     fn publish(&mut self, value: i64) {
@@ -231,7 +339,7 @@ fn after_a_fault_the_run_goes_on_and_its_exit_code_reports_it() {
 
 #[test]
 fn a_source_that_dies_ends_the_run_with_its_reason_and_the_results_are_complete() {
-    let mut running = Running::start(None);
+    let mut running = Running::start_of(None, false);
     running.publish(4);
     assert_eq!(running.decided(), 4.0);
     running.loopback.fail("the cable is cut");
@@ -246,13 +354,51 @@ fn a_source_that_dies_ends_the_run_with_its_reason_and_the_results_are_complete(
 }
 
 #[test]
-fn a_run_whose_ingress_ends_ends_too_and_says_so() {
+fn a_run_outlives_its_ingress_and_attaches_to_the_next_one() {
+    let mut running = Running::start(Some(DECISIONS));
+    running.publish(KEEPS);
+    assert_eq!(running.decided(), KEEPS as f64);
+    running.live(|live| live.topics[0].lost == Some(0));
+    running.end_ingress();
+    let gone = running.interrupted(1);
+    assert_eq!((gone.topics[0].received, gone.topics[0].lost), (1, None), "unknown is never 0");
+    (0..3).for_each(|value| running.publish(value));
+    // One that ends before it was ready, and another one.
+    let ended = running.start_ingress();
+    running.end_ingress();
+    running.hand_over(ended);
+    let socket = running.start_ingress();
+    running.hand_over(socket);
+    running.live(|live| live.topics[0].writers == Some(1));
+    let decisions = subscribe(&running.loopback, DECISIONS);
+    running.publish(RECALLS);
+    assert_eq!(running.decided(), KEEPS as f64, "the sample in the earlier memory is unchanged");
+    decisions.recv_timeout(PATIENCE).expect("the decision is published through the next ingress");
+    let live = running.live(|live| live.topics[0].lost.is_some());
+    assert_eq!((live.topics[0].received, live.topics[0].lost), (2, Some(3)));
+    assert!(live.reception_gaps.ms > 0, "{live:?}");
+    // Again, without a loss.
+    running.end_ingress();
+    running.interrupted(2);
+    let socket = running.start_ingress();
+    running.hand_over(socket);
+    running.live(|live| live.topics[0].writers == Some(1));
+    running.publish(RECALLS);
+    assert_eq!(running.decided(), KEEPS as f64);
+    running.live(|live| live.topics[0].lost == Some(3));
+    let (ended, pages) = running.stop();
+    assert_eq!(ended.unwrap(), Exit::Ok);
+    let Some(ResultItem::Last(last)) = pages.last() else { panic!("{pages:?}") };
+    assert_eq!((last.wakes, last.unsent, last.reception_gaps.count), (3, 0, 2));
+}
+
+#[test]
+fn a_run_ends_with_its_ingress_if_its_starter_has_ended() {
     let mut running = Running::start(None);
     running.publish(4);
     assert_eq!(running.decided(), 4.0);
-    let (control, ingress) = running.ingress.take().unwrap();
-    drop(control);
-    ingress.join().unwrap();
+    running.handover.shutdown(std::net::Shutdown::Both).unwrap();
+    running.end_ingress();
     running.until(|report| matches!(report, Report::Ended(_)).then_some(()));
     let (ended, pages) = running.stop();
     let failure = ended.unwrap_err();

@@ -4,9 +4,11 @@
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader, PipeReader, pipe};
 use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::sync_channel;
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -23,12 +25,14 @@ use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_lambda::{BuildDir, Clip, Fault, FaultKind};
 use gleaner_messages::Endian;
 use gleaner_messages::Sources;
-use gleaner_protocol::ingress::{AddReader, AddTopics, IngressControl, TopicGrant};
+use gleaner_protocol::ingress::{
+    AddReader, AddTopics, IngressControl, IngressReport, IngressStatus, TopicGrant,
+};
 use gleaner_protocol::link::{
     AddLambda, ControlClient, RecordedTopic, RecorderReport, recorded_grant,
 };
-use gleaner_protocol::{Report, Verified};
-use gleaner_recorder::program::{RecorderOptions, run as record};
+use gleaner_protocol::{Handover, Report, Verified};
+use gleaner_recorder::program::{RecorderConnections, RecorderOptions, run as record};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{Clock, Guid, SampleMeta};
 use gleaner_vitals::Pulse;
@@ -115,6 +119,9 @@ struct RecordedRun {
     run: JoinHandle<Result<Exit, Failure>>,
     recorder: JoinHandle<Result<(), Failure>>,
     ingress: IngressControl,
+    ingress_thread: Option<JoinHandle<()>>,
+    /// To the recorder, and to the lambda.
+    handovers: [UnixStream; 2],
     sent: [u64; 2],
     wakes: Arc<AtomicU64>,
 }
@@ -129,8 +136,7 @@ impl RecordedRun {
         fs::write(lambda.join("build/adder.wasm"), "x").unwrap();
         let (loopback, clock, stop) =
             (Loopback::new(), Clock::from_time_of_day(), Arc::<AtomicBool>::default());
-        loopback.add_topic("/numbers", "test_msgs/msg/Number", "int64 value\n");
-        loopback.add_topic("/others", "test_msgs/msg/Number", "int64 value\n");
+        add_topics(&loopback);
         let (mut control, stdin) = ControlClient::pair().unwrap();
         let (recorder_reports, to_reports) = pipe().unwrap();
         let options = RecorderOptions {
@@ -143,15 +149,21 @@ impl RecordedRun {
             bytes_max: None,
             commands: None,
         };
-        let (mut ingress, _) = Ingress::start_in_thread(Box::new(loopback.clone()));
+        let (mut ingress, ingress_thread) = Ingress::start_in_thread(Box::new(loopback.clone()));
         let reader = AddReader {
             name: "recorder".to_owned(),
             topics: vec![grant(TOPICS[0])],
             publishes: Vec::new(),
         };
         let (socket, stopped) = (ingress.add_reader(&reader).unwrap(), Arc::clone(&stop));
+        let (recorder_handover, handover) = UnixStream::pair().unwrap();
         let recorder = thread::spawn(move || {
-            record(options, stdin, socket, File::from(OwnedFd::from(to_reports)), stopped)
+            let connections = RecorderConnections {
+                control: stdin,
+                ingress: socket,
+                starter: Some(handover.into()),
+            };
+            record(options, connections, File::from(OwnedFd::from(to_reports)), stopped)
         });
         let add = AddLambda {
             lambda: lambda.clone(),
@@ -162,16 +174,8 @@ impl RecordedRun {
         let near = control.add(&add).unwrap();
         let (reports, to_reports) = pipe().unwrap();
         let manifest = Manifest::parse(MANIFEST, "lambda.toml").unwrap();
-        let inputs = manifest.inputs.iter().zip(0..);
-        let reader = AddReader {
-            name: "adder".to_owned(),
-            topics: inputs
-                .map(|(input, id)| {
-                    TopicGrant::for_input(id, input, input.topic.as_str(), id == 0, true)
-                })
-                .collect(),
-            publishes: Vec::new(),
-        };
+        let reader = adder(&manifest);
+        let (handover, starter) = UnixStream::pair().unwrap();
         let (socket, stopped) = (ingress.add_reader(&reader).unwrap(), Arc::clone(&stop));
         let wakes = Arc::<AtomicU64>::default();
         let counted = Arc::clone(&wakes);
@@ -190,6 +194,7 @@ impl RecordedRun {
                     announce: None,
                 },
                 feed: Feed::connect(socket).unwrap(),
+                starter: Some(starter.into()),
                 recorder: Some(near),
                 results: ResultsPipe::over(nowhere, pulse.clone()),
                 pulse,
@@ -211,12 +216,41 @@ impl RecordedRun {
             run,
             recorder,
             ingress,
+            ingress_thread: Some(ingress_thread),
+            handovers: [recorder_handover, handover],
             sent: [0; 2],
             wakes,
         };
         until(&mut running.reports, |report| matches!(report, Report::Ready).then_some(()));
         running.recorder_has("/numbers");
         running
+    }
+
+    /// Ends the ingress, publishes `lost` samples of each topic, and starts the ingress again.
+    fn restart_ingress(&mut self, lost: u64) {
+        let (reports, reported) = sync_channel(64);
+        let (control, ended) = IngressControl::pair().unwrap();
+        drop((std::mem::replace(&mut self.ingress, control), ended));
+        let ended = self.ingress_thread.take().unwrap();
+        ended.join().unwrap();
+        // The next ingress subscribes them again.
+        add_topics(&self.loopback);
+        self.sent.iter_mut().for_each(|sent| *sent += lost);
+        let source = Box::new(self.loopback.clone());
+        let send = move |report| drop(reports.try_send(report));
+        let (control, thread) = Ingress::start_with_reports(source, send).unwrap();
+        (self.ingress, self.ingress_thread) = (control, Some(thread));
+        let manifest = Manifest::parse(MANIFEST, "lambda.toml").unwrap();
+        let (name, publishes) = ("recorder".to_owned(), Vec::new());
+        let recorder = AddReader { name, topics: TOPICS.map(grant).to_vec(), publishes };
+        for (reader, handover) in [recorder, adder(&manifest)].iter().zip(&self.handovers) {
+            let ingress = Some(self.ingress.add_reader(reader).unwrap());
+            Handover { ingress, ..Handover::default() }.try_send(handover).unwrap();
+        }
+        let is_shared = |status: &IngressStatus| {
+            status.topics.len() == 2 && status.topics.iter().all(|topic| topic.readers == 2)
+        };
+        while !matches!(reported.recv().unwrap(), IngressReport::Status(it) if is_shared(&it)) {}
     }
 
     /// Lets the recorder receive the other topic, too.
@@ -275,11 +309,19 @@ impl RecordedRun {
 
     /// Waits for the clip, ends everything, and returns the clip's file.
     fn clip(&mut self) -> PathBuf {
-        let clip: Clip = until(&mut self.recorder_reports, |report| match report {
+        let clip = self.next_clip();
+        self.file_of(&clip)
+    }
+
+    fn next_clip(&mut self) -> Clip {
+        until(&mut self.recorder_reports, |report| match report {
             RecorderReport::Clip(clip) => Some(*clip),
             _ => None,
-        });
-        self.folder.path().join("out").join(clip.file)
+        })
+    }
+
+    fn file_of(&self, clip: &Clip) -> PathBuf {
+        self.folder.path().join("out").join(&clip.file)
     }
 
     fn verify(&self, clip: PathBuf) -> Result<Verified, Failure> {
@@ -299,6 +341,20 @@ impl RecordedRun {
         self.run.join().unwrap().unwrap();
         self.recorder.join().unwrap().unwrap();
     }
+}
+
+fn add_topics(loopback: &Loopback) {
+    for (topic, _) in TOPICS {
+        loopback.add_topic(topic, "test_msgs/msg/Number", "int64 value\n");
+    }
+}
+
+/// The lambda as a reader.
+fn adder(manifest: &Manifest) -> AddReader {
+    let inputs = manifest.inputs.iter().zip(0..);
+    let topics = inputs
+        .map(|(input, id)| TopicGrant::for_input(id, input, input.topic.as_str(), id == 0, true));
+    AddReader { name: "adder".to_owned(), topics: topics.collect(), publishes: Vec::new() }
 }
 
 fn grant((topic, id): (&str, u32)) -> TopicGrant {
@@ -368,6 +424,35 @@ fn samples_that_are_larger_than_the_lambda_accepts_do_not_disturb() {
     let clip = running.clip();
     let verified = running.verify(clip).unwrap();
     assert_eq!((verified.uncovered, verified.triggers), (0, 5), "{verified:?}");
+    running.end();
+}
+
+#[test]
+fn a_clip_over_a_restart_of_the_ingress_is_verified_if_nothing_was_lost() {
+    let mut running = RecordedRun::start();
+    running.record_others();
+    running.burst(5);
+    running.restart_ingress(0);
+    running.burst(3);
+    let clip = running.clip();
+    let verified = running.verify(clip).unwrap();
+    assert_eq!((verified.uncovered, verified.triggers, verified.wakes), (0, 2, 10), "{verified:?}");
+    running.end();
+}
+
+#[test]
+fn a_clip_states_what_a_restart_of_the_ingress_has_lost_and_lambda_and_recorder_agree() {
+    let mut running = RecordedRun::start();
+    running.record_others();
+    running.burst(5);
+    running.restart_ingress(7);
+    running.burst(3);
+    let clip: Clip = running.next_clip();
+    let stated = "the ingress had ended, and was started again ";
+    assert!(clip.incomplete.iter().any(|why| why.starts_with(stated)), "{clip:?}");
+    // Both received the same.
+    let verified = running.verify(running.file_of(&clip)).unwrap();
+    assert_eq!((verified.uncovered, verified.triggers, verified.wakes), (0, 2, 10), "{verified:?}");
     running.end();
 }
 

@@ -6,7 +6,7 @@ use rustix::io::Errno;
 use serde::{Deserialize, Serialize};
 
 use crate::link::frame::{self, tag};
-use crate::link::{FrameReceiver, LinkError, send_frame};
+use crate::link::{FrameReceiver, Incoming, LinkError, ReceivedFrame, send_frame, try_send_frame};
 
 const STARTER: &str = "the starter";
 const PROGRAM: &str = "the started program";
@@ -44,6 +44,22 @@ impl Handover {
     ///
     /// [`LinkError::Gone`] if the program has ended.
     pub fn send(&self, socket: impl AsFd) -> Result<(), LinkError> {
+        let (frame, descriptors) = self.encode()?;
+        send_frame(&socket, &frame, &descriptors, PROGRAM)
+    }
+
+    /// As [`send`](Self::send), but never waits.
+    ///
+    /// # Errors
+    ///
+    /// [`LinkError::Gone`] if the program has ended, [`LinkError::Full`] if it does not read:
+    /// nothing may be sent to it after that.
+    pub fn try_send(&self, socket: impl AsFd) -> Result<(), LinkError> {
+        let (frame, descriptors) = self.encode()?;
+        try_send_frame(&socket, &frame, &descriptors, PROGRAM)
+    }
+
+    fn encode(&self) -> Result<(Vec<u8>, Vec<BorrowedFd<'_>>), LinkError> {
         let all = [
             (ConnectionName::Control, &self.control),
             (ConnectionName::Ingress, &self.ingress),
@@ -53,13 +69,12 @@ impl Handover {
             all.iter().filter_map(|(name, fd)| Some((*name, fd.as_ref()?.as_fd()))).unzip();
         let payload = serde_json::to_vec(&names)
             .map_err(|error| LinkError::Socket { peer: PROGRAM, source: error.into() })?;
-        send_frame(&socket, &frame::encode(tag::HANDOVER, &payload), &descriptors, PROGRAM)
+        Ok((frame::encode(tag::HANDOVER, &payload), descriptors))
     }
 
     /// Waits for the next message of the starter.
     ///
-    /// Exactly one message is read, so that the next call finds the next one. To find out whether
-    /// there is one, poll the socket: a message is sent as a whole.
+    /// Exactly one message is read, so that a [`HandoverReceiver`] finds the next one.
     ///
     /// # Errors
     ///
@@ -77,6 +92,10 @@ impl Handover {
             }
             Err(error) => return Err(error),
         };
+        Handover::of(frame)
+    }
+
+    fn of(frame: ReceivedFrame) -> Result<Handover, LinkError> {
         if frame.tag != tag::HANDOVER {
             return Err(LinkError::Unknown { peer: STARTER, tag: frame.tag });
         }
@@ -117,6 +136,33 @@ impl Handover {
     /// [`LinkError::NoConnection`] if the starter did not pass it.
     pub fn take_ingress(&mut self) -> Result<OwnedFd, LinkError> {
         self.ingress.take().ok_or(LinkError::NoConnection { name: "ingress" })
+    }
+}
+
+/// Receives the messages after the first one, over the same socket. No call waits.
+#[derive(Debug)]
+pub struct HandoverReceiver {
+    socket: OwnedFd,
+    frames: FrameReceiver,
+}
+
+impl HandoverReceiver {
+    /// Receives over the socket from which the first message was received.
+    pub fn new(socket: OwnedFd) -> HandoverReceiver {
+        HandoverReceiver { socket, frames: FrameReceiver::new(STARTER, CONNECTIONS) }
+    }
+
+    /// Returns the next message if it has arrived.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Handover::receive`]; nothing can be read after one.
+    pub fn poll(&mut self) -> Result<Incoming<Handover>, LinkError> {
+        Ok(match self.frames.poll(&self.socket)? {
+            Incoming::Message(frame) => Incoming::Message(Handover::of(frame)?),
+            Incoming::Nothing => Incoming::Nothing,
+            Incoming::Ended => Incoming::Ended,
+        })
     }
 }
 
@@ -168,6 +214,32 @@ mod tests {
         is_connected(later.take_ingress().unwrap(), later_end);
         drop(starter_end);
         assert!(matches!(Handover::receive(&program_end), Err(LinkError::Gone { .. })));
+    }
+
+    #[test]
+    fn later_connections_are_received_without_a_wait_and_sent_without_one() {
+        let (starter_end, program_end) = UnixStream::pair().unwrap();
+        let mut receiver = HandoverReceiver::new(program_end.into());
+        assert!(matches!(receiver.poll(), Ok(Incoming::Nothing)));
+        let (ingress, own_end) = connection();
+        Handover { ingress, ..Handover::default() }.try_send(&starter_end).unwrap();
+        let Ok(Incoming::Message(mut later)) = receiver.poll() else { panic!("no message") };
+        is_connected(later.take_ingress().unwrap(), own_end);
+        // A program that does not read.
+        let (ingress, _own_end) = connection();
+        let handover = Handover { ingress, ..Handover::default() };
+        starter_end.set_nonblocking(true).unwrap();
+        while (&starter_end).write(&[0; 4096]).is_ok() {}
+        let refused = handover.try_send(&starter_end).unwrap_err().to_string();
+        assert_eq!(refused, "the started program does not read its messages");
+        let (starter_end, program_end) = UnixStream::pair().unwrap();
+        let mut receiver = HandoverReceiver::new(program_end.into());
+        handover.try_send(&starter_end).unwrap();
+        drop(starter_end);
+        assert!(matches!(receiver.poll(), Ok(Incoming::Message(_))));
+        assert!(matches!(receiver.poll(), Ok(Incoming::Ended)));
+        let (starter_end, _) = UnixStream::pair().unwrap();
+        assert!(matches!(handover.try_send(&starter_end), Err(LinkError::Gone { .. })));
     }
 
     #[test]

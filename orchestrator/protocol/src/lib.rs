@@ -25,9 +25,11 @@ pub use check_report::{CheckReport, Need, NeedPlace};
 pub use drive_info::{DriveInfo, DriveTopicInfo, PictureInfo};
 pub use drive_time::{DriveTime, DriveTimeError};
 pub use exit_record::{ExitRecord, KillReason, Killed, Phase, SHUTDOWN_TIMEOUT};
-pub use handover::Handover;
+pub use handover::{Handover, HandoverReceiver};
 pub use isolation::{Holds, LAYERS_ENV, Layer};
-pub use live_status::{DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus};
+pub use live_status::{
+    DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus, ReceptionGaps,
+};
 pub use recording::{LossCount, LossOutcome, RecordingCounts};
 pub use report::{ReplaySummary, Report, Round, TopicReport, Verified};
 pub use result_item::{RESULTS_ENV, ResultItem, WokenBy};

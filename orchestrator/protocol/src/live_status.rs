@@ -60,6 +60,9 @@ pub struct LiveStatus {
     pub topics: Vec<LiveTopic>,
     /// Status of the network.
     pub network: NetworkStatus,
+    /// Times without reception, as the ingress had ended.
+    #[serde(default)]
+    pub reception_gaps: ReceptionGaps,
     /// Losses on the link to the recorder; `None` without a recorder.
     pub recorder_link: Option<LinkLosses>,
     /// Counts of the recorders of the run, in `summary.json` only: added by the program that starts
@@ -93,6 +96,8 @@ impl LiveStatus {
             (&mut self.unsent, before.unsent),
             (&mut self.network.socket_drops, before.network.socket_drops),
             (&mut self.network.filtered, before.network.filtered),
+            (&mut self.reception_gaps.count, before.reception_gaps.count),
+            (&mut self.reception_gaps.ms, before.reception_gaps.ms),
         ];
         add(counts);
         for topic in &mut self.topics {
@@ -196,6 +201,18 @@ pub struct NetworkStatus {
     pub unfiltered: Option<String>,
 }
 
+/// Times in which a process received no samples, as the ingress had ended. Samples that were sent
+/// meanwhile are among the lost ones of their topics; where their number is unknown, the number of
+/// lost ones is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ReceptionGaps {
+    /// Number of ingresses that ended while the process ran.
+    pub count: u64,
+    /// Sum of the times until the next one was joined, in ms. Until it has found the writers,
+    /// further samples are lost.
+    pub ms: u64,
+}
+
 /// Losses on the link from a lambda to the recorder.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LinkLosses {
@@ -261,6 +278,7 @@ mod tests {
                 participants: 3,
                 ..NetworkStatus::default()
             },
+            reception_gaps: ReceptionGaps { count, ms: count },
             recorder_link: Some(LinkLosses { wakes_dropped: count, triggers_lost: count }),
             recording: None,
             rss_bytes: count,

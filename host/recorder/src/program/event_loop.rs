@@ -2,7 +2,6 @@
 //! within a fraction of a millisecond.
 
 use std::fs::File;
-use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, channel, sync_channel};
@@ -10,14 +9,13 @@ use std::thread::Builder;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_feed::{Feed, FeedBell};
+use gleaner_feed::{Feed, FeedBell, LastingFeed};
 use gleaner_lambda::manifest::Store;
 use gleaner_protocol::RecordingCounts;
 use gleaner_protocol::link::{COMMANDS_ID, RecorderReport, RecorderStatus};
 use gleaner_transport::Clock;
 use tracing::warn;
 
-use super::RecorderOptions;
 use super::background::{Background, SystemHealth};
 use super::commands::Commands;
 use super::connections::{LoopEvent, starter};
@@ -25,6 +23,7 @@ use super::report_writer::ReportWriter;
 use super::roster::Roster;
 use super::status::Reporter;
 use super::topics::Topics;
+use super::{RecorderConnections, RecorderOptions};
 use crate::recorder::counted;
 use crate::{Recorder, RecorderCounts, RecordingFolder, Settings, Work};
 
@@ -48,21 +47,22 @@ const SLACK: u64 = 64 << 20;
 
 /// Records until the starter sends stop, or ends, or `stop` is set; then open clips are completed.
 ///
-/// `control` is the connection of the starter, and `ingress` the one to the ingress.
+/// While there is no ingress, windows and clips go on without samples; after its restart, the starter
+/// passes a connection to it.
 ///
 /// # Errors
 ///
-/// [`Failure`] if the folder cannot be used, if the preroll fails, or if the ingress or its source
-/// ends: the starter then restarts the process.
+/// [`Failure`] if the folder cannot be used, if the preroll fails, if the source of the ingress ends,
+/// or if the ingress ends and is not restarted: the starter then restarts the process.
 pub fn run(
     options: RecorderOptions,
-    control: OwnedFd,
-    ingress: OwnedFd,
+    connections: RecorderConnections,
     reports: File,
     stop: Arc<AtomicBool>,
 ) -> Result<(), Failure> {
     let internal =
         |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
+    let RecorderConnections { control, ingress, starter: starter_socket } = connections;
     let mut folder = RecordingFolder::open_without_recovery(&options.out)?;
     let mut reports = ReportWriter::start(reports, folder.losses()).map_err(internal)?;
     // Before recovery, which takes disk space.
@@ -83,7 +83,10 @@ pub fn run(
     let feed = Feed::connect(ingress).map_err(|error| {
         Failure::caused_by(Exit::Unreachable, "cannot join the ingress", &error)
     })?;
+    // Of the first ingress, for the whole time: the threads of this process ring it, and a later
+    // ingress has nothing to ring for that could not wait for `IDLE_WAIT`.
     let bell = feed.bell();
+    let feed = LastingFeed::new(feed, starter_socket);
     let (events, inbox) = sync_channel(EVENTS);
     let (searches, requests) = channel();
     let background = Background {
@@ -180,7 +183,7 @@ impl RecorderLoop {
                 }
                 return Err(Failure {
                     causes: vec![why],
-                    ..Failure::new(Exit::Internal, "the network is dead")
+                    ..Failure::new(Exit::Internal, "the recorder receives no samples")
                 });
             }
             if self.is_ending || self.stop.load(Ordering::Relaxed) {
@@ -251,7 +254,9 @@ impl RecorderLoop {
             return;
         }
         self.polled_at = Some(Instant::now());
-        match self.topics.poll(self.clock.now()) {
+        let polled = self.topics.poll(self.clock.now());
+        self.recorder.note_ingress(self.clock.now(), self.topics.has_ingress());
+        match polled {
             Ok(None) => {}
             Ok(Some(fed)) => {
                 if let Some(commands) = &mut self.commands {
@@ -260,8 +265,7 @@ impl RecorderLoop {
             }
             Err(error) => self.dead = Some(gleaner_base::chain(&error)),
         }
-        let health = &self.topics.status().health;
-        self.dead = self.dead.take().or_else(|| health.dead.clone());
+        self.dead = self.dead.take().or_else(|| self.topics.dead().map(str::to_owned));
     }
 
     /// Takes some samples; returns whether there may be more.
@@ -315,9 +319,11 @@ impl RecorderLoop {
             preroll_bound: counts.preroll_bound,
             in_flight: counts.in_flight,
             trigger_to_open: None,
-            commands: commands.map(|commands| commands.status(self.topics.reception(COMMANDS_ID))),
+            commands: commands
+                .map(|commands| commands.status(self.topics.reception(COMMANDS_ID).as_ref())),
             topics: self.topics.statuses(),
             network: self.topics.status().health.network.clone(),
+            reception_gaps: self.topics.gaps(),
             disk_free: self.health.disk_free,
             rss_bytes: self.health.rss_bytes,
             cpu_s: self.health.cpu_s,

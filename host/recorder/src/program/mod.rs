@@ -29,6 +29,7 @@ mod status;
 mod topics;
 
 use std::io;
+use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -69,6 +70,18 @@ pub struct RecorderOptions {
     pub commands: Option<String>,
 }
 
+/// Connections of the process.
+#[derive(Debug)]
+pub struct RecorderConnections {
+    /// Requests of the starter.
+    pub control: OwnedFd,
+    /// The connection to the ingress.
+    pub ingress: OwnedFd,
+    /// The socket over which the starter passes connections to later ingresses; without one, the
+    /// recorder ends with the ingress.
+    pub starter: Option<OwnedFd>,
+}
+
 /// Runs the program `gleaner-recorder`.
 pub fn main() -> ExitCode {
     gleaner_vitals::log::init();
@@ -104,8 +117,12 @@ fn start(args: Args) -> Result<(), Failure> {
             .with_help("start it with `gleaner run LAMBDA`")
     };
     let mut handover = Handover::receive(rustix::stdio::stdin()).map_err(unusable)?;
+    let starter = rustix::io::fcntl_dupfd_cloexec(rustix::stdio::stdin(), 3)
+        .map_err(io::Error::from)
+        .map_err(internal("cannot take the socket of the starter"))?;
     let control = handover.take_control().map_err(unusable)?;
     let ingress = handover.take_ingress().map_err(unusable)?;
     let reports = reports().map_err(internal("cannot set up the report stream"))?;
-    run(args.read(), control, ingress, reports, stop)
+    let connections = RecorderConnections { control, ingress, starter: Some(starter) };
+    run(args.read(), connections, reports, stop)
 }

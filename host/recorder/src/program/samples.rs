@@ -1,14 +1,20 @@
 //! The samples of one topic, in the memory that the ingress shares.
 
+use std::collections::VecDeque;
+
 use gleaner_feed::FedTopic;
 use gleaner_transport::{SampleMeta, StoredMeta, TopicCounters};
 
 /// Attempts to find a sample that stays until it is looked at: the ingress publishes meanwhile.
 const ATTEMPTS: u32 = 8;
 
-/// The samples of one topic, read in order.
+/// The samples of one topic, read in order, over restarts of the ingress.
 pub struct FedSamples {
     fed: FedTopic,
+    /// Later memory of the topic: each begins where nothing is written to the one before it.
+    later: VecDeque<FedTopic>,
+    /// Samples that were too large for earlier memory.
+    too_big_before: u64,
     /// Position of the next sample.
     next: u64,
     /// Stamp of the next sample, once it is known.
@@ -19,7 +25,15 @@ pub struct FedSamples {
 
 impl FedSamples {
     pub fn new(fed: FedTopic) -> FedSamples {
-        FedSamples { next: fed.info.first, fed, ahead: None, received: 0, missed: 0 }
+        let next = fed.info.first;
+        let (later, too_big_before) = (VecDeque::new(), 0);
+        FedSamples { fed, later, too_big_before, next, ahead: None, received: 0, missed: 0 }
+    }
+
+    /// Continues in the memory of an ingress that was started again, after the samples that the
+    /// earlier one has left.
+    pub fn continue_in(&mut self, fed: FedTopic) {
+        self.later.push_back(fed);
     }
 
     pub fn type_name(&self) -> &str {
@@ -47,15 +61,21 @@ impl FedSamples {
 
     /// Number of samples that were too large for the topic.
     pub fn too_big(&self) -> u64 {
-        TopicCounters::of_words(&self.fed.reader.counters()).too_big
+        let now = TopicCounters::of_words(&self.fed.reader.counters()).too_big;
+        self.too_big_before.saturating_add(now)
     }
 
     /// Returns the stamp of the next sample, if there is one.
     pub fn look(&mut self) -> Option<i64> {
         for _ in 0..ATTEMPTS {
-            let head = self.fed.reader.head();
-            if self.ahead.is_some() || head <= self.next {
+            if self.ahead.is_some() {
                 return self.ahead;
+            }
+            if self.fed.reader.head() <= self.next {
+                let Some(later) = self.later.pop_front() else { return None };
+                self.too_big_before = self.too_big();
+                (self.next, self.fed) = (later.info.first, later);
+                continue;
             }
             match self.fed.reader.meta(self.next) {
                 Some(words) => self.ahead = Some(StoredMeta::of_words(&words).sample.at_ns),

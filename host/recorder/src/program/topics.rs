@@ -7,7 +7,8 @@ use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
-use gleaner_feed::{FedTopic, Feed, FeedError, FeedEvent};
+use gleaner_feed::{FedTopic, FeedError, FeedEvent, LastingFeed};
+use gleaner_protocol::ReceptionGaps;
 use gleaner_protocol::ingress::{ReceptionStatus, RefusedTopic, SourceStatus};
 use gleaner_protocol::link::{COMMANDS_ID, RecordedTopic};
 use tracing::{error, warn};
@@ -64,7 +65,7 @@ struct GrantedTopic {
 
 /// The recorded topics.
 pub struct Topics {
-    feed: Feed,
+    feed: LastingFeed,
     /// To the thread that searches definitions.
     searches: Sender<DefinitionsRequest>,
     topics: Vec<GrantedTopic>,
@@ -73,13 +74,28 @@ pub struct Topics {
 }
 
 impl Topics {
-    pub fn new(feed: Feed, searches: Sender<DefinitionsRequest>) -> Topics {
+    pub fn new(feed: LastingFeed, searches: Sender<DefinitionsRequest>) -> Topics {
         Topics { feed, searches, topics: Vec::new(), early: BTreeMap::new() }
     }
 
     /// The newest state of the source.
     pub fn status(&self) -> &SourceStatus {
         self.feed.status()
+    }
+
+    /// The times without an ingress.
+    pub fn gaps(&self) -> ReceptionGaps {
+        self.feed.gaps()
+    }
+
+    /// Returns false while the ingress has ended, and no other one was joined.
+    pub fn has_ingress(&self) -> bool {
+        self.feed.has_ingress()
+    }
+
+    /// As [`LastingFeed::dead`].
+    pub fn dead(&self) -> Option<&str> {
+        self.feed.dead()
     }
 
     /// Adds a topic that an announced lambda records.
@@ -138,6 +154,7 @@ impl Topics {
         most: usize,
         recorder: &mut Recorder,
     ) -> Result<bool, RecordError> {
+        self.feed.look_for_losses();
         let mut stamps: Vec<(i64, usize)> = Vec::new();
         for index in 0..self.topics.len() {
             self.describe(index, recorder);
@@ -176,9 +193,8 @@ impl Topics {
     }
 
     /// Returns the state of a subscription, if the ingress has sent it.
-    pub fn reception(&self, id: u32) -> Option<&ReceptionStatus> {
-        let known = self.feed.status().topics.iter().find(|(known, _)| *known == id);
-        known.map(|(_, status)| status)
+    pub fn reception(&self, id: u32) -> Option<ReceptionStatus> {
+        self.feed.reception(id)
     }
 
     fn attach(&mut self, fed: FedTopic, since_ns: i64) {
@@ -187,6 +203,14 @@ impl Topics {
             self.early.insert(id, Ok(fed));
             return;
         };
+        if let Supply::Fed(earlier) = &mut known.supply {
+            earlier.samples.continue_in(fed);
+            // The answer of an ingress that has ended does not come.
+            if matches!(earlier.description, Description::Asked(_)) {
+                earlier.description = Description::Unknown;
+            }
+            return;
+        }
         let type_name = fed.info.type_name.clone();
         // It ends only with the loop.
         let _ = self.searches.send(DefinitionsRequest { id, type_name });
@@ -279,8 +303,8 @@ impl Topics {
 }
 
 impl GrantedTopic {
-    fn status(&self, reception: Option<&ReceptionStatus>) -> RecordedTopic {
-        let mut status = reception.cloned().unwrap_or_default();
+    fn status(&self, reception: Option<ReceptionStatus>) -> RecordedTopic {
+        let mut status = reception.unwrap_or_default();
         let samples = match &self.supply {
             Supply::Fed(fed) => Some(&fed.samples),
             Supply::Awaited => None,
@@ -317,6 +341,7 @@ fn in_words(reason: &RefusedTopic) -> String {
 mod tests {
     use std::sync::mpsc::channel;
 
+    use gleaner_feed::Feed;
     use gleaner_ingress::Ingress;
     use gleaner_protocol::ingress::{AddReader, IngressControl};
     use gleaner_protocol::link::recorded_grant;
@@ -348,7 +373,7 @@ mod tests {
         let mut recorder = scratch.recorder(|_| {});
         let (source, _control, feed) = fed(&["/a", "/b"], 100);
         let (searches, searched) = channel();
-        let mut topics = Topics::new(feed, searches);
+        let mut topics = Topics::new(LastingFeed::new(feed, None), searches);
         for (name, id) in [("/a", 1), ("/b", 2)] {
             let topic = recorder.add_missing_topic(name).unwrap();
             topics.add(id, name, topic, 0);

@@ -1,5 +1,7 @@
 //! The recent samples and wakes of a recorder, and what of them was lost.
 
+use std::collections::VecDeque;
+
 use gleaner_transport::{Gaps, SampleMeta};
 
 use super::clips::OpenClip;
@@ -7,6 +9,9 @@ use super::sources::RecordedSources;
 use crate::RecordError;
 use crate::preroll::{EntryMeta, Losses, Preroll};
 use crate::window::{Group, Window};
+
+/// Most times without an ingress that are kept, for clips that cover them.
+const OUTAGES: usize = 64;
 
 /// The preroll, with the losses of each source. Time never goes back.
 pub struct History {
@@ -24,6 +29,8 @@ pub struct History {
     evicted_early: u64,
     /// Samples that do not fit.
     too_big: u64,
+    /// Times without an ingress: begin and end, which is unknown while one lasts.
+    outages: VecDeque<(i64, Option<i64>)>,
 }
 
 /// Losses of the samples of a topic.
@@ -32,6 +39,8 @@ struct TopicLosses {
     losses: Losses,
     /// Losses upstream, from gaps in sequence numbers.
     gaps: Gaps,
+    /// Stamp of the last sample.
+    newest: i64,
 }
 
 impl History {
@@ -45,6 +54,7 @@ impl History {
             now: None,
             evicted_early: 0,
             too_big: 0,
+            outages: VecDeque::new(),
         }
     }
 
@@ -119,7 +129,8 @@ impl History {
 
     /// Counts losses before a sample, from its sequence number.
     pub fn note_gap(&mut self, topic: usize, meta: &SampleMeta) {
-        let TopicLosses { losses, gaps } = &mut self.topics[topic];
+        let TopicLosses { losses, gaps, newest } = &mut self.topics[topic];
+        *newest = meta.at_ns.max(*newest);
         let before = gaps.lost();
         let missing = gaps.note(meta.writer, meta.seq);
         if missing > 0 {
@@ -133,6 +144,21 @@ impl History {
     pub fn lost_sample(&mut self, topic: usize, meta: &SampleMeta) {
         self.note_gap(topic, meta);
         self.topics[topic].losses.lost.add(meta.at_ns, 0);
+    }
+
+    /// Notes that the ingress has ended, or that another one was joined.
+    pub fn note_ingress(&mut self, at_ns: i64, is_there: bool) {
+        match self.outages.back_mut() {
+            Some((_, end @ None)) if is_there => *end = Some(at_ns),
+            Some((_, None)) => {}
+            _ if is_there => {}
+            _ => {
+                if self.outages.len() == OUTAGES {
+                    self.outages.pop_front();
+                }
+                self.outages.push_back((at_ns, None));
+            }
+        }
     }
 
     /// Counts wakes that did not arrive.
@@ -192,15 +218,25 @@ impl History {
         sources: &RecordedSources,
         limit: i64,
     ) {
-        let (number, from) = (clip.group(), clip.from(group));
+        let (number, from, to) = (clip.group(), clip.from(group), group.to.min(limit));
+        // What was lost in an outage is known from the next sample.
+        let has_begun = |(begin, _): &&(i64, Option<i64>)| *begin <= to;
+        let last_outage = self.outages.iter().rev().find(has_begun);
+        let last_outage = last_outage.map(|(_, end)| end.unwrap_or(to));
         for topic in sources.topics_of(group) {
-            let lost = &mut self.topics[topic].losses.lost;
+            let TopicLosses { losses, newest, .. } = &mut self.topics[topic];
+            let lost = &mut losses.lost;
             let is_known = !lost.is_unknown(from, number)
-                && sources.found_at(topic).is_none_or(|at| at <= from);
+                && sources.found_at(topic).is_none_or(|at| at <= from)
+                && last_outage.is_none_or(|end| end < from || end < *newest);
             let count = lost.count(number, |at| at <= limit && sources.covers(group, topic, at));
             clip.tally(topic).lost = is_known.then_some(count);
         }
-        let inside = group.begin..=group.to.min(limit);
+        let outages = self.outages.iter().map(|(begin, end)| {
+            end.map_or(to, |end| end.min(to)).saturating_sub((*begin).max(from)).max(0)
+        });
+        clip.lacks_ingress(outages.fold(0, i64::saturating_add));
+        let inside = group.begin..=to;
         for lambda in &group.lambdas {
             let count = self.wakes[*lambda].lost.count(number, |at| inside.contains(&at));
             clip.journals().undelivered(*lambda, count);

@@ -108,6 +108,12 @@ impl Recorder {
         self.material.history.lost_sample(topic.index(), meta);
     }
 
+    /// Notes that the ingress has ended, or that another one was joined. Clips state the time in
+    /// between.
+    pub fn note_ingress(&mut self, at_ns: i64, is_there: bool) {
+        self.material.history.note_ingress(at_ns, is_there);
+    }
+
     /// Executes a command in the name of `lambda`; `source` describes who gave it. It is not a
     /// wake: it is in no journal, and has no effect on the lambda's cooldown. A stop ends only a
     /// recording that a command started with this label.

@@ -9,6 +9,7 @@ mod live;
 mod preroll;
 mod process;
 mod recorder;
+mod restarts;
 #[cfg(feature = "program")]
 mod running;
 mod support;

@@ -15,7 +15,7 @@ use gleaner_lambda::TriggerKind::{Event, Start};
 use gleaner_protocol::link::{
     ControlClient, LinkError, Loss, RecorderLink, RecorderMessage, RecorderReport,
 };
-use gleaner_recorder::program::{RecorderOptions, run};
+use gleaner_recorder::program::{RecorderConnections, RecorderOptions, run};
 use gleaner_transport::Clock;
 
 #[test]
@@ -352,7 +352,9 @@ fn a_preroll_that_cannot_be_allocated_is_an_error_with_help() {
         // The ingress is joined later.
         let (_silent, ingress) = UnixStream::pair().unwrap();
         let reports = File::from(OwnedFd::from(writer));
-        let failure = run(options, stdin, ingress.into(), reports, Arc::default()).unwrap_err();
+        let connections =
+            RecorderConnections { control: stdin, ingress: ingress.into(), starter: None };
+        let failure = run(options, connections, reports, Arc::default()).unwrap_err();
         assert_eq!(failure.exit, Exit::Usage);
         let text = failure.to_string();
         assert!(text.contains("cannot allocate") && text.contains("--preroll-memory"), "{text}");

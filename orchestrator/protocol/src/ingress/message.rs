@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Health, HoldGrant, ReceptionStatus};
+use crate::live_status::add;
 
 /// A message from the ingress to a reader.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -169,4 +170,24 @@ pub struct IngressTopic {
     pub reserved_bytes: u64,
     /// State of its subscription.
     pub reception: ReceptionStatus,
+}
+
+impl IngressTopic {
+    /// Adds the counts that an earlier ingress had for the topic. Samples between the two are not
+    /// counted.
+    #[must_use]
+    pub fn after(mut self, before: &IngressTopic) -> IngressTopic {
+        let sum = |now: Option<u64>, before: Option<u64>| {
+            now.zip(before).map(|(now, before)| now.saturating_add(before))
+        };
+        let (now, earlier) = (&mut self.reception, &before.reception);
+        now.lost = sum(now.lost, earlier.lost);
+        now.before_match = sum(now.before_match, earlier.before_match);
+        add([
+            (&mut self.received, before.received),
+            (&mut self.too_big, before.too_big),
+            (&mut now.malformed, earlier.malformed),
+        ]);
+        self
+    }
 }

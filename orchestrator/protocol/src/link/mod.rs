@@ -33,6 +33,6 @@ pub use frame::FRAME_MAX;
 pub use grants::{COMMANDS_ID, commands_grant, recorded_grant};
 pub use incoming::Incoming;
 pub(crate) use incoming::{FrameReceiver, ReceivedFrame};
-pub(crate) use outgoing::{FrameQueue, send_frame};
+pub(crate) use outgoing::{FrameQueue, send_frame, try_send_frame};
 pub use report::{CommandStatus, Loss, RecordedTopic, RecorderReport, RecorderStatus};
 pub use server::{LambdaLink, LambdaMessage, LambdaReplies};

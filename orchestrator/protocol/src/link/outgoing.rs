@@ -34,6 +34,23 @@ pub(crate) fn send_frame(
     Ok(())
 }
 
+/// Sends a frame and its descriptors as a whole, if the other side has room for it. Never waits.
+pub(crate) fn try_send_frame(
+    socket: &impl AsFd,
+    bytes: &[u8],
+    descriptors: &[BorrowedFd<'_>],
+    peer: &'static str,
+) -> Result<(), LinkError> {
+    loop {
+        match send_some(socket, bytes, descriptors, SendFlags::DONTWAIT) {
+            Ok(sent) if sent == bytes.len() => return Ok(()),
+            Ok(_) | Err(Errno::AGAIN) => return Err(LinkError::Full { peer }),
+            Err(Errno::INTR) => {}
+            Err(error) => return Err(LinkError::of(peer, error)),
+        }
+    }
+}
+
 /// Sends the first of `bytes`. Descriptors go with the first byte, so that they arrive before the
 /// frame is complete.
 fn send_some(

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::live_status::add;
-use crate::{DurationStats, NetworkStatus, RecordingCounts};
+use crate::{DurationStats, NetworkStatus, ReceptionGaps, RecordingCounts};
 use gleaner_lambda::Clip;
 
 /// One line of JSON that `gleaner-recorder` writes on its standard output for the program that
@@ -102,6 +102,9 @@ pub struct RecorderStatus {
     pub topics: Vec<RecordedTopic>,
     /// Status of the network; `None` without one.
     pub network: Option<NetworkStatus>,
+    /// Times without reception, as the ingress had ended.
+    #[serde(default)]
+    pub reception_gaps: ReceptionGaps,
     /// Free bytes on the disk of the clips.
     pub disk_free: Option<u64>,
     /// Resident memory, in bytes.
@@ -117,6 +120,10 @@ impl RecorderStatus {
     pub fn after(mut self, before: &RecorderStatus) -> RecorderStatus {
         self.recording.add(&before.recording);
         self.cpu_s += before.cpu_s;
+        add([
+            (&mut self.reception_gaps.count, before.reception_gaps.count),
+            (&mut self.reception_gaps.ms, before.reception_gaps.ms),
+        ]);
         if let (Some(now), Some(before)) = (&mut self.commands, &before.commands) {
             add([(&mut now.accepted, before.accepted), (&mut now.refused, before.refused)]);
         }
@@ -214,6 +221,7 @@ mod tests {
                 ..CommandStatus::default()
             }),
             topics: topics.iter().map(topic).collect(),
+            reception_gaps: ReceptionGaps { count, ms: count },
             network: Some(NetworkStatus {
                 socket_drops: count,
                 filtered: count,

@@ -68,9 +68,12 @@ impl Commands {
         }
     }
 
-    /// Receives the messages of the topic from now on.
+    /// Receives the messages of the topic from now on, or again from an ingress that was restarted.
     pub fn attach(&mut self, fed: FedTopic) {
-        self.messages = Some(FedSamples::new(fed));
+        match &mut self.messages {
+            Some(messages) => messages.continue_in(fed),
+            None => self.messages = Some(FedSamples::new(fed)),
+        }
     }
 
     /// Adds a lambda that commands may name.

@@ -6,6 +6,7 @@
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader, PipeReader};
 use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -18,12 +19,13 @@ use gleaner_journal::{FileDigest, JournalHeader};
 use gleaner_lambda::Clip;
 use gleaner_lambda::manifest::Limits;
 use gleaner_messages::{Definitions, Sources};
-use gleaner_protocol::ingress::{AddReader, AddTopics, IngressControl};
+use gleaner_protocol::Handover;
+use gleaner_protocol::ingress::{AddReader, AddTopics, IngressControl, ReceptionStatus};
 use gleaner_protocol::link::{
     AddLambda, ControlClient, LinkError, RecorderReport, RecorderStatus, commands_grant,
     recorded_grant,
 };
-use gleaner_recorder::program::{RecorderOptions, run};
+use gleaner_recorder::program::{RecorderConnections, RecorderOptions, run};
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{
     Clock, Delivery, DiscoveredTopic, Health, LiveSource, PublishError, Publisher, Sink,
@@ -97,6 +99,10 @@ impl Transport for FakeNetwork {
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError> {
         self.loopback.definitions(topic)
     }
+
+    fn status(&self, _: Subscription) -> ReceptionStatus {
+        ReceptionStatus { writers: Some(1), lost: Some(0), ..ReceptionStatus::default() }
+    }
 }
 
 impl LiveSource for FakeNetwork {
@@ -123,7 +129,11 @@ const NAME: &str = "recorder";
 pub struct FakeStarter {
     pub control: ControlClient,
     /// `None` once the ingress has ended.
-    pub ingress: Option<IngressControl>,
+    pub ingress: Option<(IngressControl, JoinHandle<()>)>,
+    /// To pass the connection to a later ingress.
+    handover: UnixStream,
+    /// The recorder as a reader, with all topics that were granted so far.
+    reader: AddReader,
     /// Topics that were granted, by their ids from 1 on.
     granted: Vec<String>,
 }
@@ -137,15 +147,41 @@ impl FakeStarter {
         stop: Arc<AtomicBool>,
     ) -> (FakeStarter, JoinHandle<Result<(), Failure>>) {
         let (control, stdin) = ControlClient::pair().unwrap();
-        let (mut ingress, _) = Ingress::start_in_thread(Box::new(network.clone()));
-        let add = AddReader {
+        let (mut ingress, ingress_thread) = Ingress::start_in_thread(Box::new(network.clone()));
+        let reader = AddReader {
             name: NAME.to_owned(),
             topics: options.commands.iter().map(|topic| commands_grant(topic)).collect(),
             publishes: Vec::new(),
         };
-        let socket = ingress.add_reader(&add).unwrap();
-        let thread = thread::spawn(move || run(options, stdin, socket, reports, stop));
-        (FakeStarter { control, ingress: Some(ingress), granted: Vec::new() }, thread)
+        let socket = ingress.add_reader(&reader).unwrap();
+        let (handover, starter) = UnixStream::pair().unwrap();
+        let connections =
+            RecorderConnections { control: stdin, ingress: socket, starter: Some(starter.into()) };
+        let thread = thread::spawn(move || run(options, connections, reports, stop));
+        let ingress = Some((ingress, ingress_thread));
+        (FakeStarter { control, ingress, handover, reader, granted: Vec::new() }, thread)
+    }
+
+    /// Ends the ingress. Topics of the network have no subscription then.
+    pub fn end_ingress(&mut self, network: &FakeNetwork) {
+        // Before its end: nothing writes to the memory of an ingress that has ended.
+        self.granted.iter().for_each(|topic| network.add(topic));
+        let (control, thread) = self.ingress.take().unwrap();
+        drop(control);
+        thread.join().unwrap();
+    }
+
+    /// Ends the connection over which the recorder would receive another one to an ingress.
+    pub fn end_handover(&self) {
+        self.handover.shutdown(std::net::Shutdown::Both).unwrap();
+    }
+
+    /// Starts an ingress again, and passes the recorder its connection.
+    pub fn start_ingress(&mut self, network: &FakeNetwork) {
+        let (mut ingress, thread) = Ingress::start_in_thread(Box::new(network.clone()));
+        let socket = Some(ingress.add_reader(&self.reader).unwrap());
+        Handover { ingress: socket, ..Handover::default() }.try_send(&self.handover).unwrap();
+        self.ingress = Some((ingress, thread));
     }
 
     /// Adds a lambda, and grants the topics of [`lambda`] to the recorder.
@@ -157,7 +193,8 @@ impl FakeStarter {
                 self.granted.push(topic.to_owned());
                 let id = self.granted.len() as u32;
                 let topics = vec![recorded_grant(id, topic, type_name, Some(64 << 10))];
-                let ingress = self.ingress.as_mut().unwrap();
+                self.reader.topics.extend(topics.clone());
+                let (ingress, _) = self.ingress.as_mut().unwrap();
                 ingress.add_topics(&AddTopics { reader: NAME.to_owned(), topics }).unwrap();
                 self.granted.len() - 1
             });

@@ -51,6 +51,8 @@ pub struct OpenClip {
     /// True if it continues a full clip.
     continues: bool,
     begins_late_ns: i64,
+    /// Time without an ingress.
+    outage_ns: i64,
     triggers: u64,
     /// True if it has a topic from which its thumbnail is made.
     has_images: bool,
@@ -85,6 +87,7 @@ impl OpenClip {
             limits,
             continues: false,
             begins_late_ns: 0,
+            outage_ns: 0,
             triggers: 0,
             has_images: false,
             settled: None,
@@ -133,6 +136,11 @@ impl OpenClip {
 
     pub fn journals(&mut self) -> &mut ClipJournals {
         &mut self.journals
+    }
+
+    /// Sets the time without an ingress.
+    pub fn lacks_ingress(&mut self, outage_ns: i64) {
+        self.outage_ns = outage_ns;
     }
 
     /// Notes that nothing was recorded in the first `late_ns` of a window.
@@ -355,6 +363,10 @@ impl OpenClip {
         if self.begins_late_ns > 0 {
             let late = seconds(self.begins_late_ns);
             short.push(format!("the preroll begins {late} late: nothing was recorded before"));
+        }
+        if self.outage_ns > 0 {
+            let outage = seconds(self.outage_ns);
+            short.push(format!("the ingress had ended, and was started again {outage} later"));
         }
         match close {
             CloseReason::Full(_) => {
