@@ -1,12 +1,13 @@
 //! Formats the status of a live lambda and of the recorder, and the list of live topics.
 
 use std::fmt::{self, Write};
+use std::time::Duration;
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, TriggerKind};
 use gleaner_protocol::ingress::TopicInfo;
 use gleaner_protocol::link::{RecordedTopic, RecorderStatus};
-use gleaner_protocol::{DurationStats, LiveStatus, LiveTopic, Report};
+use gleaner_protocol::{DurationStats, LiveStatus, LiveTopic, ReceptionGaps, Report};
 use gleaner_report::format::{clip_span, counted, fault_kind, grouped, three_digits};
 use serde_json::Value;
 
@@ -131,6 +132,7 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
     for line in table(rows, &[2, 3, 4, 5, 6, 7, 8]).lines() {
         writeln!(text, "  {line}")?;
     }
+    write_gaps(text, live.reception_gaps, paint)?;
     let losses = [
         (live.missed_ticks, "tick", "missed"),
         (live.log_dropped, "log line", "over the rate limit"),
@@ -153,6 +155,17 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
         writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
     }
     write_usage(text, live.rss_bytes, live.cpu_s, paint)
+}
+
+/// Writes the times in which a process received nothing, if there were any.
+fn write_gaps(text: &mut String, gaps: ReceptionGaps, paint: Paint) -> fmt::Result {
+    if gaps.count == 0 {
+        return Ok(());
+    }
+    let seconds = Duration::from_millis(gaps.ms).as_secs_f64();
+    let times = counted(gaps.count, "time");
+    let line = format!("no ingress for {seconds:.1} s: it ended {times}, and was started again");
+    writeln!(text, "  {}", paint.yellow(&line))
 }
 
 /// Writes the memory of a process in bytes, and its CPU time in s.
@@ -180,6 +193,7 @@ fn write_recorder(text: &mut String, status: &RecorderStatus, paint: Paint) -> f
     for line in table(rows, &[1, 2, 3]).lines() {
         writeln!(text, "  {line}")?;
     }
+    write_gaps(text, status.reception_gaps, paint)?;
     if let Some(commands) = &status.commands {
         let line = format!(
             "commands on {}: {} accepted, {} refused",

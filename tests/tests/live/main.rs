@@ -42,6 +42,7 @@ const PLAYED: &[LiveCase] = &[
     ("a_recorder_that_is_killed_is_started_again_and_its_clip_recovered", || {
         killed("gleaner-recorder")
     }),
+    ("lambdas_and_recorder_run_on_when_the_ingress_is_killed_and_receive_again", ingress_killed),
 ];
 
 /// Cases with lambdas only.
@@ -401,6 +402,65 @@ fn killed(name: &str) {
     assert_eq!(clips.len(), 1, "{clips:?}");
     assert_eq!(clips[0].recovered.is_some(), name == "gleaner-recorder", "{clips:?}");
     assert!(clips[0].topics.iter().any(|topic| topic.messages > 0), "{clips:?}");
+}
+
+fn ingress_killed() {
+    let lambdas = [("examples/hello/rust", "first"), ("examples/hello/python", "second")]
+        .map(|(of, name)| LambdaCopy::named(of, name));
+    let out = TempFolder::new();
+    let folders = [lambdas[0].path(), lambdas[1].path()];
+    let started = run_all(&folders, out.path(), &["--set", "first.brake_mps2=-1.4"]);
+    let mut ready = 0;
+    started.until_named("both lambdas to be ready", |_, report| {
+        ready += u32::from(matches!(report, Report::Ready));
+        (ready == 2).then_some(())
+    });
+    let drive = sample_drive();
+    let path = drive.to_str().expect("the checkout has a plain path");
+    // The night brake is at 10.8 s.
+    let player = play(&[path, "--wait", "1", "--start", "8"]);
+    started.until("a window", |line| match line {
+        JsonReport::Recorder(RecorderReport::Status(status)) if status.is_recording => Some(()),
+        _ => None,
+    });
+    let readers = || {
+        let names = ["gleaner-runtime", "start.py", "gleaner-recorder"];
+        names.map(|name| descendants(started.pid(), name))
+    };
+    let before = readers();
+    let ingress = descendants(started.pid(), "gleaner-ingress");
+    assert!(before.iter().all(|pids| !pids.is_empty()) && ingress.len() == 1, "{before:?}");
+    signal(ingress[0], "KILL");
+    let mut received = [None; 2];
+    started.until_named("samples from the next ingress", |name, report| {
+        if let Report::Live(live) = report
+            && live.reception_gaps.count == 1
+            && live.topics[0].writers == Some(1)
+        {
+            let first = received[usize::from(name == "second")].get_or_insert(live.wakes);
+            return (live.wakes > *first && !received.contains(&None)).then_some(());
+        }
+        None
+    });
+    assert_eq!(readers(), before, "they run on");
+    drop(player);
+    started.signal("INT");
+    let finished = started.finish();
+    let reason = "the ingress was ended by signal 9; restarting in 0.1 s (restart 1)";
+    assert!(finished.stderr.contains(reason), "{}", finished.stderr);
+    assert_eq!(finished.status.code(), Some(1), "a process has failed: {}", finished.stderr);
+    for name in ["first", "second"] {
+        let ended = finished.ended_of(name).expect("it ended");
+        assert_eq!((ended.restarts, ended.faults, ended.reception_gaps.count), (0, 0, 1));
+        assert!(ended.reception_gaps.ms > 0, "{ended:?}");
+    }
+    let summary = live::summary(&out.path().join("first"));
+    assert_eq!(summary.recording.expect("a recorder").reception_gaps.count, 1);
+    let clips = clips(out.path());
+    assert!(!clips.is_empty());
+    let says =
+        |clip: &Clip| clip.incomplete.iter().any(|why| why.contains("the ingress had ended"));
+    assert!(clips.iter().any(says), "{clips:?}");
 }
 
 fn clips(out: &Path) -> Vec<Clip> {

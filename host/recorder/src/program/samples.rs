@@ -72,7 +72,7 @@ impl FedSamples {
                 return self.ahead;
             }
             if self.fed.reader.head() <= self.next {
-                let Some(later) = self.later.pop_front() else { return None };
+                let later = self.later.pop_front()?;
                 self.too_big_before = self.too_big();
                 (self.next, self.fed) = (later.info.first, later);
                 continue;
