@@ -77,6 +77,12 @@ impl RunTime {
         self.ready.zip(self.limit).is_some_and(|(ready, limit)| ready.elapsed() >= limit)
     }
 
+    /// Returns whether the time is over, counted from the start of the run, and not all lambdas were
+    /// ready yet.
+    fn is_over_before_ready(&self) -> bool {
+        self.ready.is_none() && self.is_over_since_start()
+    }
+
     /// Returns whether the time since the start of the run is over.
     fn is_over_since_start(&self) -> bool {
         self.limit.is_some_and(|limit| self.started.elapsed() >= limit)

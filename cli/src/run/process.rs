@@ -1,6 +1,7 @@
 //! Starts and ends one process of a run.
 
 use std::ffi::OsString;
+use std::io;
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt;
@@ -13,6 +14,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_parts::Parts;
 use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
+use rustix::net::sockopt::set_socket_send_buffer_size;
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::output::{self, ChildId, ChildOutput};
@@ -20,6 +22,10 @@ use super::output::{self, ChildId, ChildOutput};
 /// Time for a process to end, such as to finish a wake or to complete clips. A shim kills its
 /// runtime before.
 const END_TIMEOUT: Duration = SHUTDOWN_TIMEOUT.saturating_add(Duration::from_secs(10));
+
+/// Size of the socket for connections, in bytes. It has room for some messages only: each unread one
+/// keeps the memory of an ingress that has ended.
+const HANDOVER_BYTES: usize = 4096;
 
 /// A Gleaner program that reports as JSON lines.
 pub(super) struct ChildProcess {
@@ -48,6 +54,8 @@ impl ChildProcess {
             Failure::caused_by(Exit::Internal, format!("cannot start `{program}`"), error)
         };
         let (handover, stdin) = UnixStream::pair().map_err(|error| failed(&error))?;
+        set_socket_send_buffer_size(&handover, HANDOVER_BYTES)
+            .map_err(|error| failed(&io::Error::from(error)))?;
         connections.send(&handover).map_err(|error| failed(&error))?;
         let mut child = Command::new(&program)
             .args(line)
@@ -127,7 +135,7 @@ impl Drop for ChildProcess {
 
 /// Returns the text for a process that ended without a request.
 pub(super) fn ended(process: &str, status: ExitStatus) -> String {
-    format!("{process} ended by itself ({status})")
+    format!("{process} ended unexpectedly ({status})")
 }
 
 /// Returns the program to start and its arguments: `name`, or the shim that starts it.

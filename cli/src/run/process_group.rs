@@ -111,7 +111,8 @@ impl<'a> ProcessGroup<'a> {
         let mut drive = DriveProgress::of(self.context.args);
         loop {
             self.poll(POLL_INTERVAL);
-            if stop.load(Ordering::Relaxed) || time.is_over() {
+            let is_late = self.ingress.start > 0 && time.is_over_before_ready();
+            if stop.load(Ordering::Relaxed) || time.is_over() || is_late {
                 return Ok(GroupEnd::Complete);
             }
             let ended = self.ended_lambdas()?;
@@ -126,7 +127,7 @@ impl<'a> ProcessGroup<'a> {
                 return Ok(GroupEnd::Complete);
             }
             if self.ingress.is_ready {
-                self.join_ingress()?;
+                self.join_ingress();
                 self.start_due()?;
             }
             if self.lambdas.iter().all(SupervisedLambda::is_settled) {
@@ -162,11 +163,8 @@ impl<'a> ProcessGroup<'a> {
         };
         if self.recorder.is_none() && self.lambdas.iter().any(|it| is_recorded(&it)) {
             let recorded = self.lambdas.iter().filter(is_recorded).map(|it| &it.lambda);
-            let Some(ingress) =
-                unless_gone(self.ingress.control.add_reader(&grants::recorder(args)))?
-            else {
-                return Ok(());
-            };
+            let added = self.ingress.control.add_reader(&grants::recorder(args));
+            let Some(ingress) = self.ingress.granted(added) else { return Ok(()) };
             let started = RecorderProcess::start(self.context, recorded, ingress, &self.sender)?;
             self.recorder = Some(started);
         }
@@ -192,7 +190,7 @@ impl<'a> ProcessGroup<'a> {
             if !topics.is_empty() {
                 let reader = grants::RECORDER.to_owned();
                 let added = ingress.control.add_topics(&AddTopics { reader, topics });
-                if unless_gone(added)?.is_none() {
+                if ingress.granted(added).is_none() {
                     return Ok(());
                 }
             }
@@ -205,9 +203,8 @@ impl<'a> ProcessGroup<'a> {
             let Some(socket) = unless_gone(recorder.control.add(&add))? else { return Ok(()) };
             connections.recorder = Some(socket);
         }
-        let Some(socket) = unless_gone(ingress.control.add_reader(&reader))? else {
-            return Ok(());
-        };
+        let added = ingress.control.add_reader(&reader);
+        let Some(socket) = ingress.granted(added) else { return Ok(()) };
         connections.ingress = Some(socket);
         let child = ChildProcess::start(
             &context.parts,
@@ -242,43 +239,38 @@ impl<'a> ProcessGroup<'a> {
         let Some(recorder) = &mut self.recorder else { return Ok(None) };
         let status = recorder.child.status()?;
         // Its ingress may have ended before it was ready.
-        let is_first = !recorder.is_ready && self.ingress.start == 0;
+        let is_first =
+            !recorder.is_ready && self.ingress.start == 0 && self.ingress.again_at.is_none();
         Ok(status.map(|status| GroupEnd::of("the recorder", status, is_first)))
     }
 
     /// Starts the ingress again if it has ended, or receives nothing more; returns the end of the
     /// group if all others must end with it.
     fn ended_ingress(&mut self) -> Result<Option<GroupEnd>, Failure> {
-        let Self { ingress, context, .. } = self;
+        let Self { ingress, context, screen, .. } = self;
         if let Some(at) = ingress.again_at {
             if Instant::now() >= at {
-                let last = ingress.start_again(context, self.largest, &self.sender)?;
-                self.counts.add(last, None);
+                match ingress.start_again(context, self.largest, &self.sender) {
+                    Ok(last) => self.counts.add(last, None),
+                    Err(failure) => {
+                        let (reason, starts) = (failure.to_string(), ingress.start + 1);
+                        screen.restarts(&reason, ingress.ended(), starts);
+                    }
+                }
             }
             return Ok(None);
         }
         let plays_drive = !context.args.drive.is_empty();
         let Some(status) = ingress.child.status()? else {
-            // A damaged drive ends as another one does.
-            if let Some(why) = ingress.dead().filter(|_| !plays_drive) {
-                let why = format!("the ingress does not receive: {why}");
-                if ingress.killed.replace(why).is_none() {
-                    ingress.child.kill();
-                }
-            }
+            ingress.kill_if_broken(plays_drive);
             return Ok(None);
         };
-        let end = GroupEnd::of("the ingress", status, !ingress.is_ready);
         if plays_drive || (ingress.start == 0 && !ingress.is_ready) {
-            return Ok(Some(end));
+            return Ok(Some(GroupEnd::of("the ingress", status, !ingress.is_ready)));
         }
         self.drain(|group| group.ingress.open_pipes > 0);
         let Self { ingress, screen, .. } = self;
-        let reason = match (ingress.killed.take(), end) {
-            (Some(why), _) => why,
-            (None, GroupEnd::Broken(reason)) => reason,
-            (None, _) => "the ingress could not start".to_owned(),
-        };
+        let reason = ingress.end_reason(status);
         screen.restarts(&reason, ingress.ended(), ingress.start + 1);
         self.failures.add(reason, false);
         self.lambdas.iter_mut().for_each(SupervisedLambda::lost_ingress);
@@ -287,20 +279,23 @@ impl<'a> ProcessGroup<'a> {
 
     /// Connects the processes that ran before the current ingress to it. Does nothing more if it has
     /// ended, which the caller notices.
-    fn join_ingress(&mut self) -> Result<(), Failure> {
+    fn join_ingress(&mut self) {
         let Self { context, lambdas, screen, ingress, recorder, .. } = self;
         if std::mem::replace(&mut ingress.is_joined, true) {
-            return Ok(());
+            return;
         }
         if let Some(recorder) = recorder {
             let added = ingress.control.add_reader(&grants::recorder(context.args));
-            let Some(socket) = unless_gone(added)? else { return Ok(()) };
+            let Some(socket) = ingress.granted(added) else { return };
             let mut again = HashSet::new();
             for supervised in lambdas.iter() {
                 let topics = recorder.topics.take_again(&supervised.lambda, &mut again);
                 if !topics.is_empty() {
                     let add = AddTopics { reader: grants::RECORDER.to_owned(), topics };
-                    unless_gone(ingress.control.add_topics(&add))?;
+                    let added = ingress.control.add_topics(&add);
+                    if ingress.granted(added).is_none() {
+                        return;
+                    }
                 }
             }
             if let Some(warning) = recorder.child.pass_ingress(socket) {
@@ -311,12 +306,10 @@ impl<'a> ProcessGroup<'a> {
             let lambda = &supervised.lambda;
             let is_recorded = recorder.is_some() && lambda.manifest.record.is_some();
             let reader = grants::lambda(lambda, context.args, is_recorded, supervised.restarts);
-            let Some(socket) = unless_gone(ingress.control.add_reader(&reader))? else {
-                return Ok(());
-            };
+            let added = ingress.control.add_reader(&reader);
+            let Some(socket) = ingress.granted(added) else { return };
             supervised.pass_ingress(socket, screen);
         }
-        Ok(())
     }
 
     /// Ends all processes: those that read before those that they read from, so that nothing is
@@ -451,8 +444,8 @@ impl GroupEnd {
     }
 }
 
-/// Returns the result of a request to the ingress or the recorder; `None` if it has ended, which
-/// its exit status explains.
+/// Returns the result of a request to the recorder; `None` if it has ended, which its exit status
+/// explains.
 fn unless_gone<T>(requested: Result<T, LinkError>) -> Result<Option<T>, Failure> {
     match requested {
         Ok(result) => Ok(Some(result)),

@@ -1,19 +1,20 @@
 //! The processes that all lambdas of a run share: the ingress and the recorder.
 
 use std::os::fd::OwnedFd;
+use std::process::ExitStatus;
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, chain};
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::{IngressControl, IngressReport, IngressStatus, IngressTopic};
-use gleaner_protocol::link::{ControlClient, Loss, RecorderReport, RecorderStatus};
+use gleaner_protocol::link::{ControlClient, LinkError, Loss, RecorderReport, RecorderStatus};
 
 use super::backoff::RestartDelay;
 use super::grants::RecordedTopics;
 use super::lambdas::RunLambda;
 use super::output::{ChildId, ChildOutput, PIPES};
-use super::process::ChildProcess;
+use super::process::{ChildProcess, ended};
 use super::screen::Screen;
 use super::{RunContext, arguments};
 
@@ -40,8 +41,13 @@ pub(super) struct IngressProcess {
     /// Set when the processes that ran before it were connected to it.
     pub(super) is_joined: bool,
     /// The reason why it was killed.
-    pub(super) killed: Option<String>,
+    killed: Option<String>,
+    /// Time of its last report.
+    heard: Instant,
 }
+
+/// Maximum time between two reports of an ingress that is ready; it sends one each second.
+const SILENCE: Duration = Duration::from_secs(15);
 
 impl IngressProcess {
     /// Starts the ingress. `largest` is the largest sample of an input, in bytes.
@@ -100,7 +106,44 @@ impl IngressProcess {
             again_at: None,
             is_joined: start == 0,
             killed: None,
+            heard: Instant::now(),
         })
+    }
+
+    /// Returns the result of a request to it. `None` if it has ended; if the request failed for
+    /// another reason, it is killed.
+    pub(super) fn granted<T>(&mut self, requested: Result<T, LinkError>) -> Option<T> {
+        match requested {
+            Ok(result) => Some(result),
+            Err(LinkError::Gone { .. }) => None,
+            Err(error) => {
+                self.kill(format!("cannot request samples: {}", chain(&error)));
+                None
+            }
+        }
+    }
+
+    /// Kills it, so that another one is started, if it does not receive any more. `plays_drive` is
+    /// true if it plays a drive: a damaged one ends as another one does.
+    pub(super) fn kill_if_broken(&mut self, plays_drive: bool) {
+        if let Some(why) = self.dead().filter(|_| !plays_drive) {
+            self.kill(format!("the ingress does not receive: {why}"));
+        } else if self.is_ready && self.heard.elapsed() > SILENCE {
+            let seconds = SILENCE.as_secs();
+            self.kill(format!("the ingress has not reported for {seconds} s"));
+        }
+    }
+
+    fn kill(&mut self, why: String) {
+        if self.killed.is_none() {
+            self.killed = Some(why);
+            self.child.kill();
+        }
+    }
+
+    /// Returns the reason for its end.
+    pub(super) fn end_reason(&mut self, status: ExitStatus) -> String {
+        self.killed.take().unwrap_or_else(|| ended("the ingress", status))
     }
 
     /// Notes its end: another one is to be started after the returned delay.
@@ -118,6 +161,7 @@ impl IngressProcess {
 
     pub(super) fn show(&mut self, report: IngressReport, screen: &mut Screen) {
         screen.report(&report);
+        self.heard = Instant::now();
         match report {
             IngressReport::Ready => self.is_ready = true,
             IngressReport::DriveEnded => self.drive_ended = true,

@@ -15,6 +15,8 @@ use gleaner_protocol::{LiveStatus, NetworkStatus};
 pub(super) struct RunCounts {
     /// `None` without a network.
     network: Option<NetworkStatus>,
+    /// True if this is the sum of several ingresses.
+    has_several_ingresses: bool,
     /// `None` without a recorder.
     recorder: Option<Box<RecorderStatus>>,
 }
@@ -27,6 +29,7 @@ impl RunCounts {
         recorder: Option<Box<RecorderStatus>>,
     ) {
         let network = ingress.and_then(|ingress| ingress.health.network);
+        self.has_several_ingresses |= network.is_some() && self.network.is_some();
         self.network = match (network, self.network.take()) {
             (Some(last), Some(before)) => Some(NetworkStatus {
                 socket_drops: last.socket_drops.saturating_add(before.socket_drops),
@@ -39,6 +42,11 @@ impl RunCounts {
             (Some(last), Some(before)) => Some(Box::new(last.after(&before))),
             (last, before) => last.or(before),
         };
+    }
+
+    /// Returns whether the summary that a process of a lambda has written lacks some of these counts.
+    fn has_more(&self) -> bool {
+        self.recorder.is_some() || self.has_several_ingresses
     }
 
     /// Returns the counts of the recorder for a summary. The network is counted once, with the
@@ -90,7 +98,7 @@ impl EarlierCounts {
         let sum = match (last, live) {
             (Some(last), Some(before)) => last.after(&before),
             (None, Some(before)) => before,
-            (Some(last), None) if lost_wakes > 0 || recording.is_some() => last,
+            (Some(last), None) if lost_wakes > 0 || counts.has_more() => last,
             _ => return Ok(()),
         };
         let sum = LiveStatus {
@@ -191,6 +199,15 @@ mod tests {
             EarlierCounts::default().complete(Some(live(5, 1)), &counts, out).unwrap();
         });
         assert_eq!(summary, live(5, 3));
+    }
+
+    #[test]
+    fn ingresses_are_summed_up_for_a_process_that_has_seen_them_all() {
+        let summary = completed(&live(5, 0), |out| {
+            let counts = counts([(ingress(4), None), (ingress(30), None)]);
+            EarlierCounts::default().complete(Some(live(5, 0)), &counts, out).unwrap();
+        });
+        assert_eq!((summary.wakes, summary.network.socket_drops), (5, 34));
     }
 
     #[test]

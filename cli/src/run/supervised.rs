@@ -27,6 +27,8 @@ pub(super) struct SupervisedLambda {
     state: LambdaState,
     /// Number of earlier processes.
     pub(super) restarts: u32,
+    /// Set once one of its processes was ready.
+    was_ready: bool,
     delay: RestartDelay,
     earlier: EarlierCounts,
     /// Exit code of the process that ended on request.
@@ -81,6 +83,7 @@ impl SupervisedLambda {
             lambda,
             state: LambdaState::Due(Instant::now()),
             restarts: 0,
+            was_ready: false,
             delay: RestartDelay::new(),
             earlier: EarlierCounts::default(),
             exit: Exit::Ok,
@@ -183,7 +186,9 @@ impl SupervisedLambda {
 
     /// Shows a report of its process. `drive_ended` is true after the end of the drive.
     pub(super) fn show(&mut self, report: Report, drive_ended: bool, screen: &mut Screen) {
-        let Self { lambda, state: LambdaState::Running(process), .. } = self else { return };
+        let Self { lambda, state: LambdaState::Running(process), was_ready, .. } = self else {
+            return;
+        };
         screen.lambda_report(lambda.name(), &report);
         match report {
             Report::Isolation { layers } => {
@@ -191,6 +196,7 @@ impl SupervisedLambda {
             }
             Report::Ready => {
                 process.is_ready = true;
+                *was_ready = true;
                 screen.ready(&lambda.prefix);
             }
             Report::Decision(decision) => {
@@ -259,7 +265,7 @@ impl SupervisedLambda {
             }
             // It has printed the cause. After a successful start it is restarted, since the cause
             // may be temporary.
-            ProcessEnd::NotStarted(exit) if self.restarts == 0 => {
+            ProcessEnd::NotStarted(exit) if !self.was_ready => {
                 failures.add_not_started(exit);
                 self.state = LambdaState::NotStarted;
                 if !prefix.is_empty() {

@@ -27,23 +27,25 @@ impl<M> RingReader<M> {
     ///
     /// Its position 0 is position `first` of `reader`, and it shows the newest `depth` samples, or
     /// as many as the topic shows. `decode` converts the words beside a sample, which another
-    /// process wrote; `too_big` returns the number of samples that were too large, from the
-    /// counters of the topic.
+    /// process wrote. `too_big` returns the number of samples that were too large, from the counters
+    /// of the topic; `too_big_before` of them were before `first`.
     pub fn shared(
         reader: SharedReader,
         first: u64,
         depth: usize,
         decode: fn(&[u64; META_WORDS]) -> M,
         too_big: fn(&SharedReader) -> u64,
+        too_big_before: u64,
     ) -> Self
     where
         M: 'static,
     {
-        Self(RingKind::Shared(Arc::new(SharedRing::new(reader, first, depth, decode, too_big))))
+        let ring = SharedRing::new(reader, first, depth, decode, too_big, too_big_before);
+        Self(RingKind::Shared(Arc::new(ring)))
     }
 
     /// Continues a ring over shared memory in other memory, whose position `first` follows the
-    /// newest position so far, and whose metadata `decode` converts. Nothing may write to the
+    /// newest position so far. The other arguments are those of [`shared`](Self::shared). Nothing may write to the
     /// earlier memory any more; its samples stay in the ring until newer ones replace them.
     ///
     /// Does nothing for a ring over a pool.
@@ -51,10 +53,11 @@ impl<M> RingReader<M> {
         &self,
         reader: SharedReader,
         first: u64,
+        too_big_before: u64,
         decode: impl Fn(&[u64; META_WORDS]) -> M + Send + Sync + 'static,
     ) {
         if let RingKind::Shared(ring) = &self.0 {
-            ring.continue_in(reader, first, Box::new(decode));
+            ring.continue_in(reader, first, too_big_before, Box::new(decode));
         }
     }
 

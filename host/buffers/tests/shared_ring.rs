@@ -21,7 +21,8 @@ fn topic() -> (SharedWriter, SharedReader) {
 
 /// The ring from position `first` on; its metadata is the value of the sample.
 fn ring(reader: &SharedReader, first: u64, depth: usize) -> RingReader<u64> {
-    RingReader::shared(reader.clone(), first, depth, |words| words[0], |it| it.counters()[0])
+    let (too_big_before, words) = (reader.counters()[0], |words: &[u64; META_WORDS]| words[0]);
+    RingReader::shared(reader.clone(), first, depth, words, |it| it.counters()[0], too_big_before)
 }
 
 /// Publishes samples whose bytes and metadata are the next values.
@@ -196,7 +197,7 @@ fn a_ring_continues_in_other_memory_and_keeps_the_earlier_samples_until_newer_on
         ring.last(9, &mut all);
         all.iter().map(|it| (*it.meta(), it.position().unwrap())).collect::<Vec<_>>()
     };
-    ring.continue_in(other, 2, |words| words[0] + 1000);
+    ring.continue_in(other, 2, 0, |words| words[0] + 1000);
     assert_eq!((ring.head(), ring.newest_meta()), (5, Some((4, 4))));
     assert_eq!(all(&ring), [(2, 2), (3, 3), (4, 4)]);
     publish(&mut after, 1);
@@ -224,7 +225,7 @@ fn a_ring_that_continues_again_and_again_counts_on_and_keeps_what_it_shows() {
     for turn in 0..20_u64 {
         let (mut writer, reader) = topic();
         writer.set_counters(&[turn; 8]);
-        ring.continue_in(reader, 0, move |words| words[0] + 10 * turn);
+        ring.continue_in(reader, 0, turn, move |words| words[0] + 10 * turn);
         publish(&mut writer, turn % 2);
         writer.set_counters(&[turn + 2; 8]);
     }

@@ -111,12 +111,6 @@ impl LastingFeed {
         self.gap.is_none()
     }
 
-    /// Returns the reason why no further samples come: the source of the ingress has failed, and no
-    /// starter will end the ingress and start another one.
-    pub fn dead(&self) -> Option<&str> {
-        self.status().health.dead.as_deref().filter(|_| self.starter.is_none())
-    }
-
     /// Returns the newest state of the source. Counts are those of the current ingress.
     pub fn status(&self) -> &SourceStatus {
         self.feed.status()
@@ -132,6 +126,10 @@ impl LastingFeed {
             (None, _) => return None,
         };
         if let Some(topic) = self.topics.get(&id) {
+            if self.gap.is_some() {
+                // Counted with those of earlier ingresses.
+                status.malformed = 0;
+            }
             topic.losses.add_to(&mut status);
         }
         Some(status)

@@ -75,6 +75,8 @@ struct ReceptionGap {
     next: Option<u64>,
     /// True once a sample after it was looked at.
     has_seen: bool,
+    /// Samples after it that had left before they were looked at.
+    missed: u64,
     lost: u64,
 }
 
@@ -92,7 +94,7 @@ impl ReceptionGap {
             }
         }
         let is_known = writers.map_or(!awaited.is_empty(), |writers| writers <= awaited.len());
-        Self { awaited, is_known, next: None, has_seen: false, lost: 0 }
+        Self { awaited, is_known, next: None, has_seen: false, missed: 0, lost: 0 }
     }
 
     /// Looks at further samples; returns the number of lost ones once it is known.
@@ -100,11 +102,11 @@ impl ReceptionGap {
         let mut next = self.next?;
         let head = reader.head();
         let oldest = head.saturating_sub(reader.depth().into());
-        let mut missed = oldest.saturating_sub(next);
+        self.missed = self.missed.saturating_add(oldest.saturating_sub(next));
         next = next.max(oldest);
         while next < head && self.is_known && !self.awaited.is_empty() {
             let Some(words) = reader.meta(next) else {
-                (next, missed) = (next + 1, missed + 1);
+                (next, self.missed) = (next + 1, self.missed + 1);
                 continue;
             };
             let sample = StoredMeta::of_words(&words).sample;
@@ -112,11 +114,11 @@ impl ReceptionGap {
             // Samples that left before the first look were of the only known writer, if it is also
             // that of the next one.
             let is_only = self.awaited.len() == 1 && found.is_some() && !self.has_seen;
-            self.is_known = missed == 0 || is_only;
+            self.is_known = self.missed == 0 || is_only;
             self.has_seen = true;
             if let Some((_, last)) = found.map(|index| self.awaited.swap_remove(index)) {
                 let between = sample.seq.saturating_sub(last).saturating_sub(1);
-                self.lost = self.lost.saturating_add(between.saturating_sub(missed));
+                self.lost = self.lost.saturating_add(between.saturating_sub(self.missed));
             }
             next += 1;
         }

@@ -37,6 +37,8 @@ pub(crate) struct RegionWriter {
     sums: ArrivalSums,
     counters: TopicCounters,
     readers: Vec<RegionReader>,
+    /// First position whose sums have digests, while digests are on.
+    digests_from: u64,
     /// True if the last copy fits; `None` if it was made before this region, or is accepted.
     copied: Option<bool>,
 }
@@ -86,6 +88,7 @@ impl RegionWriter {
             sums: ArrivalSums::default(),
             counters: TopicCounters::default(),
             readers: Vec::new(),
+            digests_from: 0,
             copied: None,
         };
         Ok((region, file.into()))
@@ -93,21 +96,46 @@ impl RegionWriter {
 
     fn attach(&mut self, request: &AttachRequest<'_>) -> Result<AttachedReader, WriteError> {
         let id = self.writer.attach(request.control.clone(), request.limits)?;
-        let head = self.writer.head();
-        let shown = head.min(self.sizes.layout.depth.min(request.depth).into());
         if request.digests {
-            self.sums.enable_digests();
+            self.enable_digests();
         }
+        let first = self.first(request);
+        let (digests, refused) = self.sums_before(first);
         let bell = request.wakes.then(|| Bell::of(request.control.clone()));
         self.readers.push(RegionReader { id, bell, digests: request.digests });
-        Ok(AttachedReader {
-            region: self.id,
-            id,
-            first: if request.is_latched { head - shown } else { head },
-            sizes: self.sizes,
-            digests: self.sums.digests(),
-            refused: self.sums.refused(),
-        })
+        Ok(AttachedReader { region: self.id, id, first, sizes: self.sizes, digests, refused })
+    }
+
+    /// Returns the position of the first sample that a reader receives.
+    fn first(&self, request: &AttachRequest<'_>) -> u64 {
+        let head = self.writer.head();
+        let shown = self.sizes.layout.depth.min(request.depth);
+        if request.is_latched { head.saturating_sub(shown.into()) } else { head }
+    }
+
+    fn enable_digests(&mut self) {
+        if !self.sums.has_digests() {
+            self.sums.enable_digests();
+            self.digests_from = self.writer.head();
+        }
+    }
+
+    /// Returns whether the sums of all samples that a reader receives are as it needs them.
+    fn has_sums_for(&self, request: &AttachRequest<'_>) -> bool {
+        let first = self.first(request);
+        let has_digests = self.sums.has_digests() && self.digests_from <= first;
+        !request.digests || first == self.writer.head() || has_digests
+    }
+
+    /// Returns the sum of the digests, and the number of refused samples, before a position.
+    fn sums_before(&self, position: u64) -> (u32, u64) {
+        match self.writer.shown(position) {
+            Some((cdr, words)) => {
+                let stored = StoredMeta::of_words(&words);
+                (stored.digests_before(cdr), stored.refused)
+            }
+            None => (self.sums.digests(), self.sums.refused()),
+        }
     }
 
     fn detach(&mut self, id: ReaderId) {
@@ -194,7 +222,8 @@ impl TopicSink {
         let mut state = self.lock();
         let mut fitting = state.regions.iter_mut().filter(|region| {
             let layout = region.sizes.layout;
-            layout.slot_bytes == max_bytes && layout.depth >= request.depth
+            let fits = layout.slot_bytes == max_bytes && layout.depth >= request.depth;
+            fits && region.has_sums_for(request)
         });
         fitting.find_map(|region| region.attach(request).ok())
     }
@@ -207,6 +236,9 @@ impl TopicSink {
     ) -> Result<AttachedReader, WriteError> {
         let mut state = self.lock();
         region.id = RegionId(state.next_region);
+        if request.digests {
+            region.enable_digests();
+        }
         if request.is_latched {
             let largest = state.regions.iter().max_by_key(|known| known.sizes.layout.slot_bytes);
             if let Some(known) = largest {
@@ -372,6 +404,37 @@ mod tests {
         let request = AttachRequest { control, limits, depth: 4, wakes, digests, is_latched };
         let (region, _) = RegionWriter::create(RegionSizes::of(max_bytes, true, 4, 1)).unwrap();
         topic.attach_to(region, &request).unwrap();
+    }
+
+    #[test]
+    fn a_reader_that_receives_shown_samples_gets_the_sums_before_them() {
+        let (control, _) = ControlRegion::create().unwrap();
+        let topic = Arc::new(TopicSink::default());
+        let request = |digests, depth, word| AttachRequest {
+            control: &control,
+            limits: HoldLimits { first_word: word, windows: 0, window: 0, singles: 1 },
+            depth,
+            wakes: false,
+            digests,
+            is_latched: true,
+        };
+        let region = || RegionWriter::create(RegionSizes::of(100, true, 4, 3)).unwrap().0;
+        topic.attach_to(region(), &request(false, 4, 0)).unwrap();
+        let sink = SubscriptionSink { topic: Arc::clone(&topic), number: 0 };
+        sink.deliver(&meta(1), &[1; 200]);
+        for seq in 2..=4 {
+            sink.deliver(&meta(seq), &[seq as u8; 50]);
+        }
+        // The samples in the first region have no digests.
+        assert!(topic.attach(100, &request(true, 2, 1)).is_none());
+        let other = topic.attach_to(region(), &request(true, 2, 1)).unwrap();
+        let third = topic.attach(100, &request(true, 3, 2)).unwrap();
+        let sums = |reader: &AttachedReader| (reader.first, reader.digests, reader.refused);
+        let mut expected = ArrivalSums::default();
+        expected.enable_digests();
+        assert_eq!(sums(&third), (0, expected.digests(), 0));
+        expected.add(&meta(2), &[2; 50]);
+        assert_eq!(sums(&other), (1, expected.digests(), 0));
     }
 
     #[test]

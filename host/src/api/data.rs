@@ -415,7 +415,7 @@ impl Topic {
     /// `reader` on follow those so far. `before` are its sums before them.
     pub(crate) fn continue_in(&self, reader: SharedReader, first: u64, before: SumsBefore) {
         let so_far = self.sums_so_far();
-        self.reader.continue_in(reader, first, move |words| {
+        self.reader.continue_in(reader, first, before.refused, move |words| {
             let meta = StoredMeta::of_words(words);
             let digests = meta.digests.wrapping_sub(before.digest).wrapping_add(so_far.digest);
             let refused = meta.refused.saturating_sub(before.refused) + so_far.refused;

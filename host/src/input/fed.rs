@@ -60,6 +60,7 @@ pub fn open_fed_inputs(
                 granted as usize,
                 StoredMeta::of_words,
                 |reader| TopicCounters::of_words(&reader.counters()).too_big,
+                info.refused,
             ),
             depth: input.depth,
             sums_digests: Arc::default(),

@@ -134,17 +134,7 @@ impl LiveEventLoop {
         if let Some(recorder) = &mut self.recorder {
             recorder.poll()?;
         }
-        let ended = self.receive().err();
-        if let Some(why) = self.feed.dead() {
-            let mut failure = Failure::new(Exit::Unreachable, "the ingress receives no samples");
-            failure.causes = vec![why.to_owned()];
-            return Err(
-                failure.with_help("start again; if it happens often, report it with this text")
-            );
-        }
-        if let Some(failure) = ended {
-            return Err(failure);
-        }
+        self.receive()?;
         if !self.watch.is_due(now) {
             return Ok(());
         }

@@ -155,11 +155,6 @@ struct Running {
 impl Running {
     /// Starts a run and waits until it is ready.
     fn start(announce: Option<&str>) -> Self {
-        Self::start_of(announce, true)
-    }
-
-    /// As [`start`](Self::start). Without a starter, the run ends with its ingress.
-    fn start_of(announce: Option<&str>, has_starter: bool) -> Self {
         let manifest = "[lambda]\nname = \"numbers\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"numbers.wasm\"\n\
                         [schedule]\nevent = \"numbers\"\n\
                         [[input]]\nname = \"numbers\"\ntopic = \"/numbers\"\ntype = \"test_msgs/msg/Number\"\n";
@@ -201,7 +196,7 @@ impl Running {
                     announce,
                 },
                 feed: Feed::connect(socket).unwrap(),
-                starter: has_starter.then(|| starter.into()),
+                starter: Some(starter.into()),
                 recorder: None,
                 results: ResultsPipe::over(File::from(OwnedFd::from(to_results)), pulse.clone()),
                 pulse,
@@ -335,22 +330,6 @@ fn after_a_fault_the_run_goes_on_and_its_exit_code_reports_it() {
         .iter()
         .filter(|page| matches!(page, ResultItem::Decision(decision) if decision.fault.is_some()));
     assert_eq!(faults.count(), 1);
-}
-
-#[test]
-fn a_source_that_dies_ends_the_run_with_its_reason_and_the_results_are_complete() {
-    let mut running = Running::start_of(None, false);
-    running.publish(4);
-    assert_eq!(running.decided(), 4.0);
-    running.loopback.fail("the cable is cut");
-    running.until(|report| matches!(report, Report::Ended(_)).then_some(()));
-    let (ended, pages) = running.stop();
-    let failure = ended.unwrap_err();
-    assert_eq!(
-        (failure.exit, failure.causes),
-        (Exit::Unreachable, vec!["the cable is cut".to_owned()])
-    );
-    assert!(matches!(pages.last(), Some(ResultItem::Last(last)) if last.wakes == 1), "{pages:?}");
 }
 
 #[test]

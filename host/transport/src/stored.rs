@@ -62,6 +62,11 @@ impl StoredMeta {
         };
         Self { sample, digests: digests as u32, refused }
     }
+
+    /// Returns the sum of the digests before this sample, of which `cdr` are the bytes.
+    pub fn digests_before(&self, cdr: &[u8]) -> u32 {
+        self.digests.wrapping_sub(sample_digest(&self.sample, cdr))
+    }
 }
 
 /// Sums over the samples of a topic, by the thread that fills its ring.
@@ -80,6 +85,11 @@ impl ArrivalSums {
     /// Adds no further digests. The sum begins at 0 when they are enabled again.
     pub fn disable_digests(&mut self) {
         self.digests = None;
+    }
+
+    /// Returns whether digests are added.
+    pub fn has_digests(&self) -> bool {
+        self.digests.is_some()
     }
 
     /// Returns the sum of the digests so far; 0 while they are off.

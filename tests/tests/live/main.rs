@@ -446,7 +446,8 @@ fn ingress_killed() {
     drop(player);
     started.signal("INT");
     let finished = started.finish();
-    let reason = "the ingress was ended by signal 9; restarting in 0.1 s (restart 1)";
+    let reason =
+        "the ingress ended unexpectedly (signal: 9 (SIGKILL)); restarting in 0.1 s (restart 1)";
     assert!(finished.stderr.contains(reason), "{}", finished.stderr);
     assert_eq!(finished.status.code(), Some(1), "a process has failed: {}", finished.stderr);
     for name in ["first", "second"] {

@@ -61,12 +61,12 @@ impl<M> SharedRing<M> {
         depth: usize,
         decode: fn(&[u64; META_WORDS]) -> M,
         too_big: fn(&SharedReader) -> u64,
+        too_big_before: u64,
     ) -> Self
     where
         M: 'static,
     {
         let depth = (depth as u64).min(reader.depth().into());
-        let too_big_before = too_big(&reader);
         let (base, too_big_earlier) = (0, 0);
         let decode = Box::new(decode);
         let part = RingPart { reader, first, base, decode, too_big_before, too_big_earlier };
@@ -76,10 +76,16 @@ impl<M> SharedRing<M> {
 
     /// Continues the ring from position `first` of `reader` on. Nothing writes to the earlier
     /// memory any more.
-    pub(crate) fn continue_in(&self, reader: SharedReader, first: u64, decode: Decode<M>) {
+    pub(crate) fn continue_in(
+        &self,
+        reader: SharedReader,
+        first: u64,
+        too_big_before: u64,
+        decode: Decode<M>,
+    ) {
         let mut parts = self.parts.write().unwrap_or_else(PoisonError::into_inner);
         let Some(current) = parts.first() else { return };
-        let (base, too_big_before) = (current.end(), (self.too_big)(&reader));
+        let base = current.end();
         let too_big_earlier = self.too_big_of(current);
         let part = RingPart { reader, first, base, decode, too_big_before, too_big_earlier };
         let mut end = base;

@@ -52,8 +52,8 @@ const SLACK: u64 = 64 << 20;
 ///
 /// # Errors
 ///
-/// [`Failure`] if the folder cannot be used, if the preroll fails, if the source of the ingress ends,
-/// or if the ingress ends and is not restarted: the starter then restarts the process.
+/// [`Failure`] if the folder cannot be used, if the preroll fails, or if the ingress ends and is not
+/// restarted: the starter then restarts the process.
 pub fn run(
     options: RecorderOptions,
     connections: RecorderConnections,
@@ -265,7 +265,6 @@ impl RecorderLoop {
             }
             Err(error) => self.dead = Some(gleaner_base::chain(&error)),
         }
-        self.dead = self.dead.take().or_else(|| self.topics.dead().map(str::to_owned));
     }
 
     /// Takes some samples; returns whether there may be more.

@@ -62,7 +62,8 @@ impl FedSamples {
     /// Number of samples that were too large for the topic.
     pub fn too_big(&self) -> u64 {
         let now = TopicCounters::of_words(&self.fed.reader.counters()).too_big;
-        self.too_big_before.saturating_add(now)
+        let here = now.saturating_sub(self.fed.info.refused);
+        self.too_big_before.saturating_add(here)
     }
 
     /// Returns the stamp of the next sample, if there is one.

@@ -11,6 +11,7 @@ use gleaner_feed::{FedTopic, FeedError, FeedEvent, LastingFeed};
 use gleaner_protocol::ReceptionGaps;
 use gleaner_protocol::ingress::{ReceptionStatus, RefusedTopic, SourceStatus};
 use gleaner_protocol::link::{COMMANDS_ID, RecordedTopic};
+use gleaner_transport::same_type;
 use tracing::{error, warn};
 
 use super::background::DefinitionsRequest;
@@ -41,8 +42,6 @@ enum Supply {
     /// Not attached yet.
     Awaited,
     Fed(Box<FedRecording>),
-    /// It cannot be read, for this reason.
-    Refused(String),
 }
 
 /// A topic that is attached.
@@ -61,6 +60,8 @@ struct GrantedTopic {
     name: String,
     topic: TopicId,
     supply: Supply,
+    /// The reason why no further samples can be received, if any.
+    refused: Option<String>,
 }
 
 /// The recorded topics.
@@ -93,18 +94,13 @@ impl Topics {
         self.feed.has_ingress()
     }
 
-    /// As [`LastingFeed::dead`].
-    pub fn dead(&self) -> Option<&str> {
-        self.feed.dead()
-    }
-
     /// Adds a topic that an announced lambda records.
     pub fn add(&mut self, id: u32, name: &str, topic: TopicId, now_ns: i64) {
         if self.topics.iter().any(|known| known.topic == topic) {
             return;
         }
         let name = name.to_owned();
-        self.topics.push(GrantedTopic { id, name, topic, supply: Supply::Awaited });
+        self.topics.push(GrantedTopic { id, name, topic, supply: Supply::Awaited, refused: None });
         match self.early.remove(&id) {
             Some(Ok(fed)) => self.attach(fed, now_ns),
             Some(Err(reason)) => self.refuse(id, reason),
@@ -204,6 +200,10 @@ impl Topics {
             return;
         };
         if let Supply::Fed(earlier) = &mut known.supply {
+            if !same_type(earlier.samples.type_name(), &fed.info.type_name) {
+                return self.refuse(id, RefusedTopic::WrongType { found: fed.info.type_name });
+            }
+            known.refused = None;
             earlier.samples.continue_in(fed);
             // The answer of an ingress that has ended does not come.
             if matches!(earlier.description, Description::Asked(_)) {
@@ -233,25 +233,28 @@ impl Topics {
         };
         let why = in_words(&reason);
         error!(topic = %visible(&known.name), %why, "cannot record a topic");
-        known.supply = Supply::Refused(why);
+        known.refused = Some(why);
     }
 
     fn fed(&mut self, id: u32) -> Option<&mut FedRecording> {
         match &mut self.topics.iter_mut().find(|known| known.id == id)?.supply {
             Supply::Fed(fed) => Some(fed),
-            Supply::Awaited | Supply::Refused(_) => None,
+            Supply::Awaited => None,
         }
     }
 
     /// Passes the description of a topic to the recorder before its first sample.
     fn describe(&mut self, index: usize, recorder: &mut Recorder) {
-        let GrantedTopic { id, name, topic, supply: Supply::Fed(fed) } = &mut self.topics[index]
+        let GrantedTopic { id, name, topic, supply: Supply::Fed(fed), .. } =
+            &mut self.topics[index]
         else {
             return;
         };
         match &fed.description {
             Description::Settled | Description::Searched => return,
             _ if fed.samples.look().is_none() => return,
+            // The next one is asked.
+            Description::Unknown if !self.feed.has_ingress() => return,
             Description::Unknown => {
                 fed.description = match self.feed.request_definitions(*id) {
                     Ok(()) => Description::Asked(Instant::now()),
@@ -308,11 +311,10 @@ impl GrantedTopic {
         let samples = match &self.supply {
             Supply::Fed(fed) => Some(&fed.samples),
             Supply::Awaited => None,
-            Supply::Refused(why) => {
-                status.qos_warnings.push(format!("It cannot be recorded: {why}."));
-                None
-            }
         };
+        if let Some(why) = &self.refused {
+            status.qos_warnings.push(format!("It cannot be recorded: {why}."));
+        }
         RecordedTopic {
             topic: self.name.clone(),
             type_name: samples.map(|samples| samples.type_name().to_owned()),

@@ -232,8 +232,10 @@ impl History {
             let count = lost.count(number, |at| at <= limit && sources.covers(group, topic, at));
             clip.tally(topic).lost = is_known.then_some(count);
         }
+        // A window may be planned to end later than now.
+        let until = self.now.map_or(to, |now| to.min(now));
         let outages = self.outages.iter().map(|(begin, end)| {
-            end.map_or(to, |end| end.min(to)).saturating_sub((*begin).max(from)).max(0)
+            end.map_or(until, |end| end.min(until)).saturating_sub((*begin).max(from)).max(0)
         });
         clip.lacks_ingress(outages.fold(0, i64::saturating_add));
         let inside = group.begin..=to;

@@ -279,28 +279,6 @@ fn a_recorder_is_ready_before_it_recovers_and_reports_what_it_cannot_recover() {
 }
 
 #[test]
-fn a_dead_network_is_a_failure_after_open_clips_are_completed() {
-    let scratch = TestDir::new();
-    let network = FakeNetwork::default();
-    network.add("/a");
-    let mut running = Running::start(&scratch, &network, |_| {});
-    let (folder, header) = lambda(&scratch, "first", (100, 60_000));
-    let mut link = RecorderLink::new(running.add(&add(&folder)).unwrap());
-    link.hello(&header, TIMEOUT).unwrap();
-    let _sensor = Sensor::start(&network, running.clock);
-    received(&mut running, 10);
-    link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
-    running.status(|status| status.is_recording);
-    network.loopback.fail("its thread is gone");
-    running.clip();
-    let failure = running.ended().1.unwrap_err();
-    assert_eq!(
-        (failure.exit, failure.causes),
-        (Exit::Internal, vec!["its thread is gone".to_owned()])
-    );
-}
-
-#[test]
 fn a_topic_is_recorded_with_the_type_of_the_input_whichever_writer_came_first() {
     let scratch = TestDir::new();
     let network = FakeNetwork::default();

@@ -260,23 +260,23 @@ impl ClipVerifyLoop<'_> {
     }
 
     /// Returns how many samples each input receives before this wake. A live clip lacks samples
-    /// that were refused before they reached a reader, so there the newest one decides.
+    /// that were refused before they reached a reader, so there the newest one decides. A sample
+    /// that a writer keeps for later readers comes again after a restart of the ingress.
     fn owed(&mut self, entry: &JournalEntry) -> Result<Vec<u64>, Failure> {
         let until_ns = entry.at_ns.saturating_add(SLACK_NS);
         let mut owed = Vec::new();
         for (input, seen) in entry.seen.iter().enumerate() {
-            let known = self.inputs[input].newest().ok().flatten();
-            let wanted = seen
-                .newest
-                .filter(|newest| !known.is_some_and(|known| is_sample(known.meta(), *newest)));
-            owed.push(match wanted {
+            owed.push(match seen.newest {
                 _ if !self.is_live => seen.new,
-                None => 0,
-                Some(newest) => {
+                Some(newest) if seen.new > 0 => {
                     let found = self.clip.ahead(input, until_ns, |meta| is_sample(meta, newest));
+                    let known = self.inputs[input].newest().ok().flatten();
+                    let is_known = known.is_some_and(|known| is_sample(known.meta(), newest));
                     let is_later = offered(&self.inputs[input]) == 0;
-                    found.map_err(unreadable)?.unwrap_or(if is_later { 0 } else { seen.new })
+                    let missing = if is_later || is_known { 0 } else { seen.new };
+                    found.map_err(unreadable)?.unwrap_or(missing)
                 }
+                _ => 0,
             });
         }
         Ok(owed)

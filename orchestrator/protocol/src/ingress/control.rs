@@ -3,6 +3,7 @@
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::net::UnixStream;
+use std::time::Duration;
 
 use serde::Serialize;
 
@@ -13,7 +14,12 @@ use crate::link::{FRAME_MAX, FrameReceiver, Incoming, LinkError, ReceivedFrame, 
 const STARTER: &str = "the starter";
 const INGRESS: &str = "the ingress";
 
-/// The starter's end of the control connection. Its calls wait while the ingress does not read.
+/// Maximum time that a request waits while the ingress does not read; it reads within seconds even
+/// if it creates memory for many topics.
+const TIMEOUT: Duration = Duration::from_secs(10);
+
+/// The starter's end of the control connection. Its calls wait while the ingress does not read, up
+/// to 10 s: then they fail with [`LinkError::Full`], and nothing may be sent after that.
 #[derive(Debug)]
 pub struct IngressControl {
     socket: UnixStream,
@@ -27,6 +33,7 @@ impl IngressControl {
     /// Errors of the system, such as too many open files.
     pub fn pair() -> io::Result<(IngressControl, OwnedFd)> {
         let (starter_end, ingress_end) = UnixStream::pair()?;
+        starter_end.set_write_timeout(Some(TIMEOUT))?;
         Ok((IngressControl { socket: starter_end }, ingress_end.into()))
     }
 

@@ -46,10 +46,10 @@ pub struct AttachedTopic {
     pub holds: HoldGrant,
     /// Position of the first sample that this reader receives.
     pub first: u64,
-    /// Sum of the digests of all samples before the reader was attached, modulo 2^32.
+    /// Sum of the digests of all samples before the first one, modulo 2^32.
     #[serde(default)]
     pub digests: u32,
-    /// Number of samples refused before the reader was attached.
+    /// Number of samples refused before the first one.
     #[serde(default)]
     pub refused: u64,
     /// ros2msg text of the type and all types it refers to, if the source carries it.

@@ -14,7 +14,7 @@ use super::LinkError;
 const DESCRIPTORS: usize = 4;
 
 /// Sends a frame and its descriptors, and waits until the other side has room for all of it. A peer
-/// that has ended is an error, not a signal.
+/// that has ended is an error, not a signal. If the socket has a timeout, the wait is as long.
 pub(crate) fn send_frame(
     socket: &impl AsFd,
     mut bytes: &[u8],
@@ -28,6 +28,7 @@ pub(crate) fn send_frame(
                 descriptors = &[];
             }
             Err(Errno::INTR) => {}
+            Err(Errno::AGAIN) => return Err(LinkError::Full { peer }),
             Err(error) => return Err(LinkError::of(peer, error)),
         }
     }

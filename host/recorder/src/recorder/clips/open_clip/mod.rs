@@ -366,7 +366,7 @@ impl OpenClip {
         }
         if self.outage_ns > 0 {
             let outage = seconds(self.outage_ns);
-            short.push(format!("the ingress had ended, and was started again {outage} later"));
+            short.push(format!("no samples for {outage}, as the ingress had ended"));
         }
         match close {
             CloseReason::Full(_) => {
