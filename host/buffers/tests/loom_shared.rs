@@ -86,7 +86,7 @@ fn a_held_sample_does_not_change() {
 fn a_sample_in_a_slot_that_was_freed_before_does_not_change() {
     let _alone = alone();
     loom::model(|| {
-        let (mut writer, reader) = warm_topic(1, 4, 4, (0, 1));
+        let (mut writer, reader) = warm_topic(1, 5, 4, (0, 1));
         for value in 0..4 {
             publish(&mut writer, value);
         }

@@ -2,6 +2,7 @@
 #![allow(unsafe_code)]
 //! A topic in shared memory: what readers see, what they may hold, and what hostile ones cannot do.
 
+use std::ptr::NonNull;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
@@ -130,10 +131,48 @@ fn further_slots_are_used_only_while_samples_are_held() {
         publish_some(&mut writer, 1);
     }
     let most = publish_some(&mut writer, 1).0;
-    assert_eq!(most, 8 + 2 + 1, "held, shown and drafted");
+    assert_eq!(most, 8 + 6, "held and warm");
     drop(held);
     for _ in 0..100 {
         assert_eq!(publish_some(&mut writer, 1).0, most, "those are used again");
+    }
+}
+
+/// A page that counts how often it is looked at.
+struct CountedPage(Arc<ControlPage>, Arc<AtomicU64>);
+
+// SAFETY: as for the page in it.
+unsafe impl ControlMemory for CountedPage {
+    fn page(&self) -> NonNull<ControlPage> {
+        self.1.fetch_add(1, Ordering::Relaxed);
+        self.0.page()
+    }
+}
+
+#[test]
+fn a_reader_that_slides_its_windows_does_not_make_each_draft_look_at_them() {
+    let (depth, warm, window) = (8, 16, 32);
+    let (memory, _) =
+        in_process(SharedLayout { depth, slots: warm + 2 * window, slot_bytes: 256 }).unwrap();
+    let mut writer = SharedWriter::with_warm_slots(memory, warm);
+    let (control, looks) = (ControlPage::on_heap(), Arc::new(AtomicU64::new(0)));
+    let limits = HoldLimits { first_word: 0, windows: 2, window: window as u16, singles: 0 };
+    writer.attach(CountedPage(control.clone(), looks.clone()), limits).unwrap();
+    // With so many positions behind the shown ones under hazards, it tries each way to leave one
+    // slot for the next draft.
+    for held in (0..=u64::from(2 * window)).step_by(if cfg!(miri) { 16 } else { 1 }) {
+        looks.store(0, Ordering::Relaxed);
+        for _ in 0..200 {
+            let first = writer.head().saturating_sub(u64::from(depth) + held);
+            for word in 0..2 {
+                let first = first + u64::from(window) * word as u64;
+                // SAFETY: this reader holds nothing.
+                unsafe { control.overwrite(word, first << 16 | u64::from(window)) };
+            }
+            publish(&mut writer);
+        }
+        let looks = looks.load(Ordering::Relaxed);
+        assert!(looks <= 200 / u64::from(warm - depth) + 1, "{looks} looks, {held} held");
     }
 }
 

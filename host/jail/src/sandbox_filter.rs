@@ -124,6 +124,10 @@ const REQUESTS_OF_FILES: [u64; 6] = [8, 10, 15, 1024, 1026, 1031];
 /// Requests of `ioctl`: the same for sockets, and input into another user's terminal.
 const REQUESTS: [u64; 4] = [0x8901, 0x8902, libc::TIOCSTI, 0x541C];
 
+/// Advice by which a process takes pages of shared memory out of use, or moves them.
+const PAGE_ADVICE: [i32; 4] =
+    [libc::MADV_REMOVE, libc::MADV_COLD, libc::MADV_PAGEOUT, libc::MADV_COLLAPSE];
+
 /// Number of descriptors that a process may still open: files of a drive opened again, modules, and
 /// those that the ingress or the starter sends.
 const MORE_FILES: u64 = 512;
@@ -160,7 +164,8 @@ pub fn apply(only_counted_memory: bool) -> Result<Vec<Layer>, JailError> {
 }
 
 fn install_all(only_counted_memory: bool) -> Result<(), JailError> {
-    let mut refused = own_process_only(sockets::none(DeniedCalls::default())).calls(PIDFDS);
+    let denied = no_removed_pages(sockets::none(DeniedCalls::default()));
+    let mut refused = own_process_only(denied).calls(PIDFDS);
     if only_counted_memory {
         // Other processes would wait for a locked file, and a file that is open for reading only
         // can be locked.
@@ -197,7 +202,8 @@ pub(crate) fn own_process_only(refused: DeniedCalls) -> DeniedCalls {
 }
 
 /// Denies what a process does not need any more when it is about to become an interpreter: other
-/// processes and signals to them, sockets, and, with `only_counted_memory`, memory as in [`apply`].
+/// processes and signals to them, sockets, removal of shared pages, and, with
+/// `only_counted_memory`, memory as in [`apply`].
 /// The lambda's code does not run until [`apply`], but the interpreter may be any program that
 /// calls itself Python.
 #[must_use]
@@ -209,7 +215,8 @@ pub fn apply_before_interpreter(only_counted_memory: bool) -> Layer {
 }
 
 fn install_before(only_counted_memory: bool) -> Result<(), JailError> {
-    let mut refused = no_new_processes(no_signals(sockets::none(DeniedCalls::default())));
+    let denied = no_removed_pages(sockets::none(DeniedCalls::default()));
+    let mut refused = no_new_processes(no_signals(denied));
     if only_counted_memory {
         refused = counted_only(refused);
     }
@@ -233,6 +240,15 @@ fn no_new_processes(refused: DeniedCalls) -> DeniedCalls {
 fn no_foreign_queues(refused: DeniedCalls) -> DeniedCalls {
     FUTEX_REQUESTS.iter().fold(refused.calls(&[FUTEX_REQUEUE]), |refused, request| {
         refused.bits(libc::SYS_futex, 1, FUTEX_REQUEST, *request as u64)
+    })
+}
+
+/// Denies calls that take pages of shared memory away: at its next access, another process that
+/// maps the page would wait for their end. Allocators use neither; libraries that reserve space in
+/// a file go on without.
+fn no_removed_pages(refused: DeniedCalls) -> DeniedCalls {
+    PAGE_ADVICE.iter().fold(refused.calls(&[libc::SYS_fallocate]), |refused, advice| {
+        refused.bits(libc::SYS_madvise, 2, ALL, *advice as u64)
     })
 }
 

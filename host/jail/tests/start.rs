@@ -1,8 +1,9 @@
 //! Tests the effects of code that runs before the lambda. Each test sandboxes a process of its own.
+#![allow(unsafe_code)]
 
 use std::fs::{self, File};
 use std::hint::black_box;
-use std::io::{ErrorKind, Write};
+use std::io::{Error, ErrorKind, Write};
 use std::net::{TcpStream, UdpSocket};
 use std::os::unix::net::UnixStream;
 use std::process::Command;
@@ -12,7 +13,7 @@ use std::thread;
 use gleaner_jail::ingress::{self, NewSockets};
 use gleaner_jail::{JailError, Paths, base_filter, memory, recorder, sandbox_filter, sockets};
 use gleaner_protocol::{Holds, Layer};
-use rustix::fs::{MemfdFlags, memfd_create};
+use rustix::fs::{FallocateFlags, MemfdFlags, fallocate, memfd_create};
 use rustix::io::Errno;
 use rustix::process::{Resource, getpid, getppid, getrlimit, test_kill_process};
 
@@ -68,6 +69,52 @@ fn a_starting_interpreter_sends_no_signals_and_has_no_uncounted_memory() {
         assert_eq!(test_kill_process(parent), Err(Errno::PERM));
         test_kill_process(getpid()).unwrap();
         assert_eq!(memfd_create("more", MemfdFlags::CLOEXEC).unwrap_err(), Errno::PERM);
+    });
+}
+
+/// A file that is shared memory, as the control page of a reader.
+fn shared_memory() -> File {
+    let file = File::from(memfd_create("page", MemfdFlags::CLOEXEC).unwrap());
+    file.set_len(4096).unwrap();
+    file
+}
+
+/// Tries calls that take pages of shared memory from other processes.
+fn take_pages(file: &File) -> [Result<(), Errno>; 5] {
+    let hole = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
+    let advise = |advice| {
+        // SAFETY: no bytes are named.
+        match unsafe { libc::madvise(std::ptr::null_mut(), 0, advice) } {
+            0 => Ok(()),
+            _ => Err(Errno::from_io_error(&Error::last_os_error()).unwrap()),
+        }
+    };
+    let [remove, cold, page_out, collapse] =
+        [libc::MADV_REMOVE, libc::MADV_COLD, libc::MADV_PAGEOUT, libc::MADV_COLLAPSE].map(advise);
+    [fallocate(file, hole, 0, 4096), remove, cold, page_out, collapse]
+}
+
+#[test]
+fn a_starting_interpreter_takes_no_pages_from_other_processes() {
+    in_own_process("a_starting_interpreter_takes_no_pages_from_other_processes", || {
+        let file = shared_memory();
+        assert_eq!(take_pages(&file)[..2], [Ok(()); 2]);
+        assert_eq!(sandbox_filter::apply_before_interpreter(true).holds, Holds::Yes);
+        assert_eq!(take_pages(&file), [Err(Errno::PERM); 5]);
+    });
+}
+
+#[test]
+fn a_lambda_takes_no_pages_from_other_processes() {
+    in_own_process("a_lambda_takes_no_pages_from_other_processes", || {
+        let file = shared_memory();
+        sandbox_filter::apply(false).unwrap();
+        assert_eq!(take_pages(&file), [Err(Errno::PERM); 5]);
+        // Allocators give memory back, and ask for large pages.
+        for advice in [libc::MADV_DONTNEED, libc::MADV_FREE, libc::MADV_HUGEPAGE] {
+            // SAFETY: no bytes are named.
+            assert_eq!(unsafe { libc::madvise(std::ptr::null_mut(), 0, advice) }, 0);
+        }
     });
 }
 

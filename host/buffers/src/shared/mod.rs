@@ -19,8 +19,8 @@
 //!    (Release), fences (R), and loads `seq` again. If it changed, the reader clears the hazard and
 //!    gives up. When it is done with the sample, it clears the hazard (Release).
 //! 2. When a position leaves, the writer stores `seq = 0`. The next draft fences (W). If it has no
-//!    free slot, it reads each hazard once (Acquire), and frees all slots that are neither shown
-//!    nor held. It fills one of them, then writes the place, `seq` and `head` (Release).
+//!    free slot, it reads each hazard once (Acquire), and frees slots that are neither shown nor
+//!    held. It fills one of them, then writes the place, `seq` and `head` (Release).
 //! 3. If W precedes R in the order of SeqCst fences, the reader's second load sees the 0 or a later
 //!    value, and the reader gives up. Otherwise the writer's scan sees the hazard, and leaves the
 //!    slot alone, or it sees a later value of that word.
@@ -32,7 +32,8 @@
 //! 7. A slot that was freed stays free until it is filled again: 3 holds for every later hazard
 //!    that names its old position, as that position is not shown any more.
 //! 8. The writer never starves: it reads each word once per W, and counts at most the limit of that
-//!    word. The limits of all words of all readers fit into the region.
+//!    word. The limits of all words of all readers fit into the region. So do the spare slots: each
+//!    look finds as many free ones, so its cost is shared by as many drafts.
 //!
 //! One window is held by one word, as positions leave in order: the check of its oldest position
 //! holds all of it. The places have to be read before the fence, because they are written again

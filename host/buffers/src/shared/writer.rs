@@ -1,7 +1,7 @@
 //! The writing end of a topic: fills slots that no reader holds, and shows the newest samples.
 #![allow(unsafe_code)]
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::ops::{Deref, DerefMut};
 use std::slice;
 
@@ -21,7 +21,7 @@ pub enum WriteError {
         /// Bytes of a slot.
         max: usize,
     },
-    /// The quotas of all readers would exceed the slots of the region.
+    /// The quotas of all readers would exceed the slots that are not warm.
     Quota {
         /// Positions that the reader asks to hold.
         asked: u32,
@@ -40,18 +40,22 @@ pub struct ReaderId(u64);
 pub struct SharedWriter {
     memory: SharedMemory,
     head: u64,
-    /// Position and slot of each sample that is shown or may be held, in order of positions.
+    /// Position and slot of each sample that is shown or left since the last look at the hazards,
+    /// in order of positions.
     filled: VecDeque<(u64, u32)>,
-    /// Slots that had a sample, which is neither shown nor held, and will not be: no position is in
-    /// them.
+    /// Slots by the positions of earlier samples that were held at the last look, or not needed.
+    left: BTreeMap<u64, u32>,
+    /// Slots whose sample, if they had one, is neither shown nor held, and will not be: no position
+    /// is in them.
     free: Vec<u32>,
     /// The first slot that was never used; all after it were not, either.
     untouched: u32,
     /// Number of slots to use before one is used again.
     warm: u32,
     pending: Option<Pending>,
-    /// Set for each slot that a reader holds; computed by each look at the hazards.
-    held: Box<[bool]>,
+    /// Positions that readers hold, from the first to before the second; computed by each look at
+    /// the hazards.
+    held: Vec<(u64, u64)>,
     readers: Vec<AttachedReader>,
     next_reader: u64,
 }
@@ -83,18 +87,19 @@ impl SharedWriter {
     /// A writer of an empty topic that uses `warm` slots, or one more than are shown, before it
     /// uses one again.
     ///
-    /// It uses a further slot only when all of these are shown or held, so that memory beyond them
-    /// is touched only for readers that hold samples. The hazards are read once for all slots that
-    /// are free at that time: with `s` slots more than are shown, about once in `s` drafts.
+    /// Readers that hold `n` samples make it use up to `n` slots more; memory beyond these is not
+    /// touched. With `s` warm slots more than are shown, the hazards are read once in `s` drafts,
+    /// whatever readers write there.
     pub fn with_warm_slots(WriterMemory(memory): WriterMemory, warm: u32) -> Self {
         let slots = memory.layout().slots;
         Self {
             head: 0,
             filled: VecDeque::with_capacity(slots as usize),
+            left: BTreeMap::new(),
             free: Vec::with_capacity(slots as usize),
             untouched: 0,
             warm: warm.max(memory.layout().depth + 1).min(slots),
-            held: vec![false; slots as usize].into(),
+            held: Vec::new(),
             pending: None,
             readers: Vec::new(),
             next_reader: 0,
@@ -118,10 +123,8 @@ impl SharedWriter {
         for word in words {
             let _ = word.load(Ordering::Relaxed);
         }
-        let layout = self.memory.layout();
         let given: u32 = self.readers.iter().map(|reader| reader.limits.quota()).sum();
-        // One slot is drafted while all others are shown or held.
-        let left = (layout.slots - layout.depth - 1).saturating_sub(given);
+        let left = (self.memory.layout().slots - self.warm).saturating_sub(given);
         let asked = limits.quota();
         if asked > left {
             return Err(WriteError::Quota { asked, left });
@@ -165,47 +168,61 @@ impl SharedWriter {
         if self.free.is_empty() && self.untouched >= self.warm {
             self.reclaim();
         }
-        if let Some(slot) = self.free.pop() {
-            return slot;
-        }
-        assert!(self.untouched < self.memory.layout().slots, "more slots than are shown and held");
-        self.untouched += 1;
-        self.untouched - 1
+        self.free.pop().unwrap_or_else(|| self.touch().expect("more slots than are shown and held"))
     }
 
-    /// Frees all slots whose samples are neither shown nor held.
+    /// Takes a slot that was never used; `None` if all were.
+    fn touch(&mut self) -> Option<u32> {
+        let slot = self.untouched;
+        (slot < self.memory.layout().slots).then(|| {
+            self.untouched += 1;
+            slot
+        })
+    }
+
+    /// Frees slots whose samples no hazard names, oldest first, until as many are free as there are
+    /// warm ones beyond the shown ones. Where too many are held, slots that were never used make up
+    /// for them.
     ///
-    /// They stay free until they are used again: a sample that was not shown before the fence of
+    /// Whatever a reader writes, the next drafts need no further look, and the time of a look
+    /// depends on the number of words, but hardly on the number of positions that they name.
+    ///
+    /// Slots stay free until they are used again: a sample that was not shown before the fence of
     /// this draft cannot be held by a later hazard, as its reader checks that after its own fence.
     fn reclaim(&mut self) {
-        self.held[..self.untouched as usize].fill(false);
+        let depth = self.memory.layout().depth;
+        let wanted = (self.warm - depth) as usize;
+        let shown_from = self.head.saturating_sub(depth.into());
+        let leaving = self.filled.partition_point(|(position, _)| *position < shown_from);
+        self.left.extend(self.filled.drain(..leaving));
+        self.held.clear();
         for reader in &self.readers {
             let words = reader.limits.of_page(reader.page.control()).unwrap_or_default();
             for (index, word) in words.iter().enumerate() {
                 // Once: a second load could see another value.
                 let window = HazardWindow::of(word.load(Ordering::Acquire));
                 let count = window.count.min(reader.limits.of_word(index));
-                if count == 0 {
-                    continue;
-                }
-                let from = self.filled.partition_point(|(position, _)| *position < window.first);
-                let end = window.first + u64::from(count);
-                for (position, slot) in self.filled.range(from..) {
-                    if *position >= end {
-                        break;
-                    }
-                    self.held[*slot as usize] = true;
+                if count > 0 && window.first < shown_from {
+                    self.held.push((window.first, window.first + u64::from(count)));
                 }
             }
         }
-        let shown_from = self.head.saturating_sub(u64::from(self.memory.layout().depth));
-        self.filled.retain(|(position, slot)| {
-            let stays = *position >= shown_from || self.held[*slot as usize];
-            if !stays {
-                self.free.push(*slot);
+        self.held.sort_unstable();
+        // Stands for all that is shown.
+        self.held.push((shown_from, u64::MAX));
+        let mut from = 0;
+        for (first, end) in &self.held {
+            if from < *first && self.free.len() < wanted {
+                let gap = self.left.extract_if(from..*first, |_, _| true);
+                self.free.extend(gap.map(|(_, slot)| slot).take(wanted - self.free.len()));
             }
-            stays
-        });
+            from = from.max(*end);
+        }
+        while self.free.len() < wanted
+            && let Some(slot) = self.touch()
+        {
+            self.free.push(slot);
+        }
     }
 
     /// Gives up a draft that was not published.
