@@ -1,9 +1,10 @@
 //! Tracks the writer of each channel, and the last sequence number of each writer.
 
+use std::collections::hash_map::Entry;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 use tracing::warn;
 
@@ -16,14 +17,24 @@ pub(super) struct Writers {
     files: u32,
     /// Sequence numbers, by topic and writer. Two clips of one drive name the same writer, whose
     /// numbers must continue from one to the other.
-    counters: HashMap<(String, Guid), Arc<AtomicU64>>,
+    counters: HashMap<(String, Guid), Arc<Numbers>>,
+}
+
+/// Numbers of a writer. The tracks of a replay share it, which one thread uses at a time: no
+/// ordering is needed.
+#[derive(Default)]
+struct Numbers {
+    last: AtomicU64,
+    /// True if several files have messages of it.
+    is_split: AtomicBool,
 }
 
 /// The writer of one channel.
 pub(super) struct ChannelWriter {
     guid: Guid,
-    /// Shared by the tracks of a replay, which one thread uses at a time: no ordering is needed.
-    last_seq: Arc<AtomicU64>,
+    /// True if the channel's metadata names it.
+    is_claimed: bool,
+    numbers: Arc<Numbers>,
 }
 
 impl ChannelWriter {
@@ -32,14 +43,23 @@ impl ChannelWriter {
     }
 
     pub(super) fn last_seq(&self) -> u64 {
-        self.last_seq.load(Relaxed)
+        self.numbers.last.load(Relaxed)
     }
 
     /// Counts a message with the recorded number `sequence`.
     pub(super) fn count(&self, sequence: u32) {
-        // Recorders that do not count write 0; numbers that fall back after a restart of the writer
-        // would give two samples the same identity.
-        self.last_seq.store(u64::from(sequence).max(self.last_seq() + 1), Relaxed);
+        let last = self.last_seq();
+        // A named writer counts all its life; it has sent a sample twice if its number comes again.
+        // Other recorders may write 0, and numbers that fall back after a restart of the writer or
+        // in another file, which would give two samples the same identity.
+        let seq = match self.is_claimed && last > 0 && !self.numbers.is_split.load(Relaxed) {
+            true => {
+                let step = i64::from(sequence.wrapping_sub(last as u32).cast_signed());
+                last.saturating_add_signed(step)
+            }
+            false => u64::from(sequence).max(last + 1),
+        };
+        self.numbers.last.store(seq, Relaxed);
     }
 }
 
@@ -75,13 +95,20 @@ impl Writers {
         let file = self.files;
         self.files = self.files.saturating_add(1);
         let writers = claims.into_iter().map(|(id, topic, claim)| {
+            let is_claimed = claim.is_some();
             let guid = claim.unwrap_or_else(|| {
                 let mut attempts = (0..=u32::MAX).map(|attempt| made_up(file, id, attempt));
                 let free = attempts.find(|guid| taken.insert((topic, *guid)));
                 free.expect("a file has fewer channels than there are attempts")
             });
-            let last_seq = self.counters.entry((topic.to_owned(), guid)).or_default().clone();
-            (id, ChannelWriter { guid, last_seq })
+            let numbers = match self.counters.entry((topic.to_owned(), guid)) {
+                Entry::Occupied(known) => {
+                    known.get().is_split.store(true, Relaxed);
+                    known.get().clone()
+                }
+                Entry::Vacant(new) => new.insert(Arc::default()).clone(),
+            };
+            (id, ChannelWriter { guid, is_claimed, numbers })
         });
         writers.collect()
     }

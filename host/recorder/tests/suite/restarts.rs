@@ -42,7 +42,7 @@ fn a_clip_goes_on_while_the_ingress_is_started_again_and_states_what_is_missing(
     // It begins before the recorder did.
     assert_eq!(clip.topics[0].lost, None);
     let stated = "as the ingress had ended";
-    assert!(clip.incomplete.iter().any(|why| why.starts_with(stated)), "{:?}", clip.incomplete);
+    assert!(clip.incomplete.iter().any(|why| why.ends_with(stated)), "{:?}", clip.incomplete);
     // Everything but one gap of this size.
     let numbers: Vec<_> = scratch.messages(&clip).into_iter().map(|(_, _, seq, _)| seq).collect();
     let steps: Vec<u32> = numbers.windows(2).map(|pair| pair[1] - pair[0]).collect();
