@@ -266,11 +266,12 @@ impl Transport for Dds {
     }
 
     /// Requests the definitions from a node that writes the topic: one query at a time, and at most
-    /// three for a type.
+    /// three for a type. While it has no writer, there is none.
     fn definitions_may_come(&self, topic: &str) -> bool {
         let type_name = self.type_of(topic);
         type_name.is_ok_and(|type_name| {
-            lock(&self.definitions).may_come(&type_name, &self.receiver, &self.state)
+            let mut definitions = lock(&self.definitions);
+            definitions.may_come(&type_name, &self.participant, &self.receiver, &self.state)
         })
     }
 

@@ -32,7 +32,7 @@ pub const TESTS: &[Test] = &[
     ("an_answer_with_another_hash_than_announced_is_rejected", wrong_hash),
     ("a_type_without_a_hash_is_not_queried", no_hash),
     ("a_node_without_the_service_gets_no_further_query", no_service),
-    ("a_type_without_a_writer_gets_no_further_query", no_writer),
+    ("a_type_without_a_writer_is_queried_once_it_has_one", late_writer),
 ];
 
 /// Computed with Python's `json` and `hashlib`.
@@ -399,7 +399,7 @@ fn no_service() {
     assert!(!wait(&dds, "/wheel"));
 }
 
-fn no_writer() {
+fn late_writer() {
     let domain = domain();
     let mut dds = open(domain);
     let spec = gleaner_transport::TopicSpec {
@@ -407,5 +407,13 @@ fn no_writer() {
         ..super::peer::spec("/wheel", gleaner_transport::Qos::Auto)
     };
     dds.subscribe(&spec, super::peer::KeptSamples::new()).unwrap();
-    assert!(!wait(&dds, "/wheel"));
+    for _ in 0..5 {
+        assert!(!wait(&dds, "/wheel"));
+    }
+    let car = Car::join(domain, Some((ServiceMapping::Enhanced, honest)));
+    car.announce_hashes(&dds, domain);
+    until("the definitions", || {
+        dds.definitions_may_come("/wheel");
+        dds.definitions("/wheel").is_ok()
+    });
 }
