@@ -15,6 +15,7 @@ use super::type_query::{Attempts, QueryOutcome, Retry, TypeQuery};
 use gleaner_base::chain;
 use gleaner_messages::type_description::DescribedDefinitions;
 use gleaner_messages::{Definitions, MessageError, Sources, SourcesError};
+use gleaner_transport::DefinitionsSearch;
 
 /// Most queries for one type that are sent to a node.
 const MOST_QUERIES: usize = 3;
@@ -84,36 +85,38 @@ impl DefinitionsCache {
         Ok(parsed.clone())
     }
 
-    /// Returns whether definitions that are missing now may still come. Starts a query if there was
+    /// Returns whether definitions that are missing now may still come. Starts a query if there is
     /// none, and if the type has a writer.
-    pub(super) fn may_come(
+    pub(super) fn search(
         &mut self,
         type_name: &str,
         participant: &DomainParticipant,
         receiver: &ReceiverHandle,
         state: &ParticipantState,
-    ) -> bool {
+    ) -> DefinitionsSearch {
         self.collect(state);
         let Missing { attempts: before, settled, pause } = match self.entry(type_name) {
-            CachedType::Text(..) => return true,
+            CachedType::Text(..) => return DefinitionsSearch::Waiting,
             CachedType::Missing(missing) => *missing,
         };
         let now = Instant::now();
         if settled || before.times >= MOST_QUERIES || pause.is_some_and(|until| now < until) {
-            return false;
+            return DefinitionsSearch::Ended;
         }
         if !self.is_written(type_name, participant, now) {
             // Not remembered: a writer may start at any time.
-            return now < self.since + DISCOVERY;
+            let is_young = now < self.since + DISCOVERY;
+            return if is_young { DefinitionsSearch::Waiting } else { DefinitionsSearch::Ended };
         }
         // One query at a time.
-        if self.open.is_none() {
-            self.tickets += 1;
-            let query = TypeQuery { ticket: self.tickets, type_name: type_name.to_owned(), before };
-            receiver.send(ReceiverCommand::Query(query.clone()));
-            self.open = Some((query, now));
+        if self.open.is_some() {
+            return DefinitionsSearch::Waiting;
         }
-        true
+        self.tickets += 1;
+        let query = TypeQuery { ticket: self.tickets, type_name: type_name.to_owned(), before };
+        receiver.send(ReceiverCommand::Query(query.clone()));
+        self.open = Some((query, now));
+        DefinitionsSearch::Started
     }
 
     /// Returns whether there is a writer of a type.

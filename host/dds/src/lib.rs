@@ -68,8 +68,8 @@ use gleaner_base::text::nearest;
 use gleaner_messages::{Definitions, Sources};
 use gleaner_protocol::NetworkStatus;
 use gleaner_transport::{
-    DiscoveredTopic, Health, LiveSource, PublishError, Publisher, ReceptionStatus, Sink,
-    Subscription, TopicSpec, Transport, TransportError,
+    DefinitionsSearch, DiscoveredTopic, Health, LiveSource, PublishError, Publisher,
+    ReceptionStatus, Sink, Subscription, TopicSpec, Transport, TransportError,
 };
 use joins::NoJoin;
 use packet_filter::PacketFilter;
@@ -265,14 +265,11 @@ impl Transport for Dds {
         known.ok_or_else(|| TransportError::NoDefinitions { topic: topic.to_owned(), type_name })
     }
 
-    /// Requests the definitions from a node that writes the topic: one query at a time, and at most
+    /// Requests the definitions from a node that writes the type: one query at a time, and at most
     /// three for a type. While it has no writer, there is none.
-    fn definitions_may_come(&self, topic: &str) -> bool {
-        let type_name = self.type_of(topic);
-        type_name.is_ok_and(|type_name| {
-            let mut definitions = lock(&self.definitions);
-            definitions.may_come(&type_name, &self.participant, &self.receiver, &self.state)
-        })
+    fn search_definitions(&self, type_name: &str) -> DefinitionsSearch {
+        let mut definitions = lock(&self.definitions);
+        definitions.search(type_name, &self.participant, &self.receiver, &self.state)
     }
 
     fn status(&self, subscription: Subscription) -> ReceptionStatus {

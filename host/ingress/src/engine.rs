@@ -9,7 +9,7 @@ use gleaner_protocol::ingress::{
     IngressStatus, ReaderMessage, RefusedTopic, RegionLayout, SourceStatus, TopicGrant,
 };
 use gleaner_protocol::link::{Incoming, LinkError};
-use gleaner_transport::{DiscoveredTopic, Health, LiveSource, same_type};
+use gleaner_transport::{DefinitionsSearch, DiscoveredTopic, Health, LiveSource, same_type};
 use gleaner_vitals::usage;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
@@ -38,6 +38,8 @@ pub struct Ingress {
     reports: Reports,
     topics: TopicTable,
     readers: Vec<ConnectedReader>,
+    /// Index of the reader whose definitions are searched first.
+    first: usize,
     health: Health,
     /// True from the start of a drive to its end.
     plays: bool,
@@ -62,6 +64,7 @@ impl Ingress {
             reports,
             topics: TopicTable::default(),
             readers: Vec::new(),
+            first: 0,
             plays: false,
             status_at: now + STATUS_INTERVAL,
             tick_at: now + TICK,
@@ -362,7 +365,13 @@ impl Ingress {
             let topics = self.source.topics();
             for index in 0..self.readers.len() {
                 self.attach_waiting(index, &topics);
-                self.answer_definitions(index, &topics, now);
+            }
+            // There is one query at a time: the reader after the one that it was for is next.
+            let (first, readers) = (self.first, self.readers.len());
+            for index in (0..readers).map(|offset| (first + offset) % readers) {
+                if self.answer_definitions(index, &topics, now) {
+                    self.first = index + 1;
+                }
             }
             self.remove_gone();
         }
@@ -390,7 +399,15 @@ impl Ingress {
         }
     }
 
-    fn answer_definitions(&mut self, index: usize, topics: &[DiscoveredTopic], now: Instant) {
+    /// Answers requests for definitions that have come, or will not. Returns true if a query was
+    /// sent for one of the others.
+    fn answer_definitions(
+        &mut self,
+        index: usize,
+        topics: &[DiscoveredTopic],
+        now: Instant,
+    ) -> bool {
+        let mut has_started = false;
         let reader = &mut self.readers[index];
         for wait in std::mem::take(&mut reader.definitions) {
             let attached = reader.topics.iter().find(|known| known.id == wait.id);
@@ -400,14 +417,21 @@ impl Ingress {
                 let mut same = of_it.filter(|found| same_type(&found.type_name, topic.type_name()));
                 same.find_map(|found| found.definitions_text.clone())
             });
-            let may_come = |topic: &SharedTopic| self.source.definitions_may_come(topic.name());
-            if text.is_none() && now < wait.until && topic.is_some_and(may_come) {
-                reader.definitions.push(wait);
-            } else {
+            let search = match topic {
+                Some(topic) if text.is_none() && now < wait.until => {
+                    self.source.search_definitions(topic.type_name())
+                }
+                _ => DefinitionsSearch::Ended,
+            };
+            has_started |= search == DefinitionsSearch::Started;
+            if search == DefinitionsSearch::Ended {
                 let text = text.map(|text| text.to_string());
                 reader.send(&ReaderMessage::Definitions { id: wait.id, text }, None);
+            } else {
+                reader.definitions.push(wait);
             }
         }
+        has_started
     }
 
     fn update_status(&mut self, now: Instant) {
