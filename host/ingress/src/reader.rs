@@ -12,7 +12,7 @@ use gleaner_protocol::ingress::{
 };
 use gleaner_protocol::link::{Incoming, LinkError};
 use gleaner_regions::ControlRegion;
-use gleaner_transport::{LiveSource, Publisher};
+use gleaner_transport::{LiveSource, PublishError, Publisher};
 use tracing::warn;
 
 use crate::publish_rate::PublishRate;
@@ -52,6 +52,13 @@ pub(crate) struct DefinitionsWait {
     pub(crate) until: Instant,
 }
 
+/// A topic that a reader may publish.
+struct PublishedTopic {
+    /// `None` if the source refused it.
+    publisher: Option<Box<dyn Publisher>>,
+    max_bytes: usize,
+}
+
 /// A reader of granted topics.
 pub(crate) struct ConnectedReader {
     pub(crate) name: String,
@@ -63,7 +70,7 @@ pub(crate) struct ConnectedReader {
     /// Grants that wait for a writer, whose type they take.
     pub(crate) waiting: Vec<TopicGrant>,
     pub(crate) definitions: Vec<DefinitionsWait>,
-    publishers: Vec<Option<Box<dyn Publisher>>>,
+    publishers: Vec<PublishedTopic>,
     rate: PublishRate,
     /// True if requests may have been received that are not handled yet.
     has_more: bool,
@@ -202,25 +209,29 @@ impl ConnectedReader {
     }
 
     fn publish(&mut self, index: u32, cdr: &[u8]) {
-        match self.publishers.get(index as usize) {
+        let Some(topic) = self.publishers.get(index as usize) else {
+            warn!(reader = self.name, index, "a reader publishes a topic that was not granted");
+            self.is_gone = true;
+            return;
+        };
+        let published = match &topic.publisher {
+            // That was logged.
             None => {
-                warn!(reader = self.name, index, "a reader publishes a topic that was not granted");
-                self.is_gone = true;
+                self.unsent += 1;
+                return;
             }
-            Some(None) => self.unsent += 1,
-            Some(Some(publisher)) => {
-                if let Err(error) = publisher.publish(cdr) {
-                    if self.unsent == 0 {
-                        let error = &error as &dyn std::error::Error;
-                        let reader = &self.name;
-                        warn!(
-                            reader,
-                            error, "a message was not published; further ones are counted"
-                        );
-                    }
-                    self.unsent += 1;
-                }
+            Some(_) if cdr.len() > topic.max_bytes => {
+                let (bytes, most) = (cdr.len(), topic.max_bytes);
+                Err(PublishError(format!("it has {bytes} bytes, more than {most}").into()))
             }
+            Some(publisher) => publisher.publish(cdr),
+        };
+        if let Err(error) = published {
+            if self.unsent == 0 {
+                let (reader, error) = (&self.name, &error as &dyn std::error::Error);
+                warn!(reader, error, "a message was not published; further ones are counted");
+            }
+            self.unsent += 1;
         }
     }
 
@@ -238,13 +249,11 @@ impl AsFd for ConnectedReader {
     }
 }
 
-fn open(reader: &str, grant: &PublishGrant, source: &dyn LiveSource) -> Option<Box<dyn Publisher>> {
-    match source.publisher(&grant.topic, &grant.type_name, grant.depth) {
-        Ok(publisher) => Some(publisher),
-        Err(error) => {
-            let (topic, error) = (&grant.topic, &error as &dyn std::error::Error);
-            warn!(reader, topic, error, "a topic cannot be published; its messages are counted");
-            None
-        }
+fn open(reader: &str, grant: &PublishGrant, source: &dyn LiveSource) -> PublishedTopic {
+    let opened = source.publisher(&grant.topic, &grant.type_name, grant.depth);
+    if let Err(error) = &opened {
+        let (topic, error) = (&grant.topic, error as &dyn std::error::Error);
+        warn!(reader, topic, error, "a topic cannot be published; its messages are counted");
     }
+    PublishedTopic { publisher: opened.ok(), max_bytes: grant.max_bytes }
 }

@@ -173,9 +173,8 @@ impl Car {
     /// interface.
     fn announce_hashes(&self, dds: &Dds, domain: u16) {
         wait_for_both(dds);
-        let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
         // Sequence numbers that were used are ignored. The last announcement is processed last.
-        for seq in 1..60 {
+        let announcements = (1..60).map(|seq| {
             let (guid, topic, ty, hash) = match seq {
                 50.. => (GUID::default(), "rt/mark", "car_msgs::msg::dds_::Mark_", WHEEL),
                 _ if seq % 2 == 0 => {
@@ -190,12 +189,9 @@ impl Car {
                 guid.to_bytes().to_vec()
             };
             let guid = GUID::from_bytes(guid.try_into().unwrap());
-            wire.send_to(
-                &announcement(guid, seq, topic, ty, hash),
-                ("127.0.0.1", 7400 + 250 * domain + 10),
-            )
-            .unwrap();
-        }
+            announcement(guid, seq, topic, ty, hash)
+        });
+        announce(domain, announcements);
         until("the hashes", || dds.discovered().iter().any(|topic| topic.topic == "/mark"));
     }
 }
@@ -228,8 +224,16 @@ fn serve(
     }
 }
 
-/// The announcement of a writer: DATA of the built-in publications writer.
-fn announcement(writer: GUID, seq: u32, topic: &str, ty: &str, hash: &str) -> Vec<u8> {
+/// Sends announcements to the first participant of a domain.
+pub fn announce(domain: u16, announcements: impl Iterator<Item = Vec<u8>>) {
+    let wire = UdpSocket::bind("127.0.0.1:0").unwrap();
+    for announcement in announcements {
+        wire.send_to(&announcement, ("127.0.0.1", 7400 + 250 * domain + 10)).unwrap();
+    }
+}
+
+/// The announcement of a writer or a reader: DATA of the built-in writer for these.
+pub fn announcement(endpoint: GUID, seq: u32, topic: &str, ty: &str, hash: &str) -> Vec<u8> {
     let text = |text: &str| {
         let mut value = (text.len() as u32 + 1).to_le_bytes().to_vec();
         value.extend_from_slice(text.as_bytes());
@@ -241,12 +245,13 @@ fn announcement(writer: GUID, seq: u32, topic: &str, ty: &str, hash: &str) -> Ve
     octets.extend_from_slice(user_data.as_bytes());
     octets.resize(octets.len().next_multiple_of(4), 0);
     let reliable = [2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0].to_vec();
-    let mut body = vec![0, 0, 16, 0, 0, 0, 3, 0xc7, 0, 0, 3, 0xc2, 0, 0, 0, 0];
+    let kind = if endpoint.entity_id.kind().is_reader() { 4 } else { 3 };
+    let mut body = vec![0, 0, 16, 0, 0, 0, kind, 0xc7, 0, 0, kind, 0xc2, 0, 0, 0, 0];
     body.extend_from_slice(&seq.to_le_bytes());
     // Encapsulation: a list of parameters, little-endian.
     body.extend_from_slice(&[0, 3, 0, 0]);
     for (id, value) in [
-        (0x5a_u16, writer.to_bytes().to_vec()),
+        (0x5a_u16, endpoint.to_bytes().to_vec()),
         (5, text(topic)),
         (7, text(ty)),
         (0x1a, reliable),
@@ -257,7 +262,7 @@ fn announcement(writer: GUID, seq: u32, topic: &str, ty: &str, hash: &str) -> Ve
         body.extend_from_slice(&value);
     }
     body.extend_from_slice(&[1, 0, 0, 0]);
-    super::hostile::packet(writer, 0x15, &body)
+    super::hostile::packet(endpoint, 0x15, &body)
 }
 
 fn wait_for_both(dds: &Dds) {

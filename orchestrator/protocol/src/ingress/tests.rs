@@ -32,6 +32,7 @@ fn reader(name: &str, topics: u32) -> AddReader {
         topic: "/out".to_owned(),
         type_name: "std_msgs/msg/String".to_owned(),
         depth: 5,
+        max_bytes: 100,
     };
     let topics = (0..topics).map(grant).collect();
     AddReader { name: name.to_owned(), topics, publishes: vec![publish] }
