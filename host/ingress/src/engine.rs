@@ -124,7 +124,7 @@ impl Ingress {
             // While it may make no request, only its end is of interest.
             let reads = if wait.is_zero() { PollFlags::IN } else { PollFlags::empty() };
             let writes = if reader.is_pending() { PollFlags::OUT } else { PollFlags::empty() };
-            if reader.has_more() {
+            if reader.has_more() || !wait.is_zero() {
                 timeout = timeout.min(wait);
             }
             events.push(reads | writes);

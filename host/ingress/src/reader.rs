@@ -188,13 +188,17 @@ impl ConnectedReader {
             if self.is_gone || self.rate.wait(now) > Duration::ZERO {
                 break;
             }
-            match self.link.poll() {
+            let found = self.link.poll();
+            let bytes = self.link.take_received();
+            // A part of a request counts as one: it takes a turn of the loop, too.
+            if bytes > 0 || matches!(found, Ok(Incoming::Message(_))) {
+                self.rate.count(bytes);
+            }
+            match found {
                 Ok(Incoming::Message(ReaderRequest::NeedDefinitions { id })) => {
-                    self.rate.count(0);
                     definitions.push(id);
                 }
                 Ok(Incoming::Message(ReaderRequest::Publish { index, cdr })) => {
-                    self.rate.count(cdr.len());
                     self.publish(index, &cdr);
                 }
                 Ok(Incoming::Nothing) => {

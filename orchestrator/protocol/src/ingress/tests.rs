@@ -344,6 +344,33 @@ fn requests_of_a_reader_arrive_and_never_bring_a_descriptor() {
 }
 
 #[test]
+fn a_reader_that_sends_byte_by_byte_does_not_keep_the_ingress_in_a_call() {
+    let (mut reader_end, ingress_end) = UnixStream::pair().unwrap();
+    let mut link = ReaderLink::new(ingress_end.into());
+    let cdr = vec![5; PUBLISH_MAX];
+    let frame = frame::encode(tag::PUBLISH, &[&[1, 0, 0, 0], &cdr[..]].concat());
+    let len = frame.len();
+    let sender = std::thread::spawn(move || {
+        frame.chunks(1).for_each(|byte| reader_end.write_all(byte).unwrap());
+        reader_end
+    });
+    let (mut received, mut calls) = (0, 0);
+    let request = loop {
+        let found = link.poll().unwrap();
+        let now = link.take_received();
+        received += now;
+        calls += usize::from(now > 0);
+        if let Incoming::Message(request) = found {
+            break request;
+        }
+    };
+    assert_eq!(request, ReaderRequest::Publish { index: 1, cdr });
+    assert_eq!(received, len, "each byte is counted once");
+    assert!(calls > 1, "the ingress has other work between them");
+    drop(sender.join().unwrap());
+}
+
+#[test]
 fn invalid_frames_of_a_reader_are_refused_by_name() {
     let refusal = |bytes: &[u8]| {
         let (mut reader_end, ingress_end) = UnixStream::pair().unwrap();
