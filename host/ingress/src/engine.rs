@@ -184,7 +184,7 @@ impl Ingress {
                 Ok(Incoming::Message(IngressRequest::Stop)) => return Some(LoopEnd::Stopped),
                 Ok(Incoming::Nothing) => return None,
                 Ok(Incoming::Ended) => return Some(LoopEnd::StarterEnded),
-                Err(why @ LinkError::Grant { .. }) => {
+                Err(why @ (LinkError::Grant { .. } | LinkError::NoSocket { .. })) => {
                     let error = &why as &dyn std::error::Error;
                     error!(error, "a request of the starter is refused");
                 }

@@ -4,6 +4,7 @@ use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 
+use gleaner_base::visible;
 use serde::Serialize;
 
 use super::{AddReader, AddTopics};
@@ -121,7 +122,7 @@ impl IngressServer {
     /// # Errors
     ///
     /// [`LinkError`] names the invalid frame; nothing can be read after it, except after
-    /// [`LinkError::Grant`].
+    /// [`LinkError::Grant`] and [`LinkError::NoSocket`].
     pub fn receive(&mut self) -> Result<Option<IngressRequest>, LinkError> {
         self.frames.wait(&self.socket)?.map(request).transpose()
     }
@@ -152,7 +153,11 @@ fn request(mut frame: ReceivedFrame) -> Result<IngressRequest, LinkError> {
         tag::ADD_READER => {
             let add: AddReader = frame.json(STARTER)?;
             add.check().map_err(|source| LinkError::Grant { source })?;
-            Ok(IngressRequest::AddReader(add, frame.descriptor()?))
+            match frame.descriptor() {
+                Ok(socket) => Ok(IngressRequest::AddReader(add, socket)),
+                // The kernel discards it if no further file can be opened.
+                Err(_) => Err(LinkError::NoSocket { reader: visible(&add.name) }),
+            }
         }
         tag::ADD_TOPICS => {
             let add: AddTopics = frame.json(STARTER)?;

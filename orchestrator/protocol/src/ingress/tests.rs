@@ -182,6 +182,14 @@ fn an_invalid_grant_is_not_sent_and_is_refused_if_it_is() {
         matches!(server.receive(), Ok(Some(IngressRequest::Begin))),
         "the connection is usable"
     );
+
+    // As if the ingress had too many open files for the socket.
+    let add = serde_json::to_vec(&reader("x", 1)).unwrap();
+    starter_end.write_all(&frame::encode(tag::ADD_READER, &add)).unwrap();
+    starter_end.write_all(&frame::encode(tag::BEGIN, &[])).unwrap();
+    let refused = server.receive().unwrap_err();
+    assert!(matches!(&refused, LinkError::NoSocket { reader } if reader == "x"), "{refused}");
+    assert!(matches!(server.receive(), Ok(Some(IngressRequest::Begin))));
 }
 
 #[test]
@@ -195,7 +203,7 @@ fn invalid_frames_of_a_starter_are_refused_by_name() {
     let add = serde_json::to_vec(&reader("x", 1)).unwrap();
     assert_eq!(
         refusal(&frame::encode(tag::ADD_READER, &add)),
-        "frame `add reader` came without its descriptor"
+        "cannot serve reader `x`: its socket did not arrive"
     );
     assert!(
         refusal(&frame::encode(tag::ADD_TOPICS, b"[]"))
