@@ -26,6 +26,9 @@ const TICK: Duration = Duration::from_millis(100);
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// Time that a reader waits for definitions at most.
 const DEFINITIONS_TIMEOUT: Duration = Duration::from_secs(6);
+/// Requests of a reader for the definitions of one topic that are answered by a search. A program
+/// keeps what it is sent.
+const SEARCHES: usize = 2;
 /// Most readers at a time. Each has a socket and a control page.
 const READERS: usize = 512;
 
@@ -306,7 +309,7 @@ impl Ingress {
             }
         };
         let before = self.topics.get(topic).map_or_else(Default::default, |it| it.status.clone());
-        reader.topics.push(Attachment { id: grant.id, topic, attached, before });
+        reader.topics.push(Attachment { id: grant.id, topic, attached, before, searches: 0 });
         let SharedLayout { depth, slots, slot_bytes } = attached.sizes.layout;
         let definitions = found.and_then(|found| found.definitions_text.as_deref());
         let message = AttachedTopic {
@@ -341,11 +344,17 @@ impl Ingress {
     /// Answers a reader that has no definitions of a topic, at once or when they come.
     fn need_definitions(&mut self, index: usize, id: u32, now: Instant) {
         let reader = &mut self.readers[index];
-        if !reader.topics.iter().any(|known| known.id == id) {
-            reader.send(&ReaderMessage::Definitions { id, text: None }, None);
-        } else if !reader.definitions.iter().any(|wait| wait.id == id) {
-            reader.definitions.push(DefinitionsWait { id, until: now + DEFINITIONS_TIMEOUT });
-            self.tick_soon();
+        if reader.definitions.iter().any(|wait| wait.id == id) {
+            return;
+        }
+        let topic = reader.topics.iter_mut().find(|known| known.id == id);
+        match topic.filter(|known| known.searches < SEARCHES) {
+            Some(topic) => {
+                topic.searches += 1;
+                reader.definitions.push(DefinitionsWait { id, until: now + DEFINITIONS_TIMEOUT });
+                self.tick_soon();
+            }
+            None => reader.send(&ReaderMessage::Definitions { id, text: None }, None),
         }
     }
 

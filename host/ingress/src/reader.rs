@@ -30,6 +30,8 @@ pub(crate) struct Attachment {
     pub(crate) attached: AttachedReader,
     /// State of the subscription when the reader was attached.
     pub(crate) before: ReceptionStatus,
+    /// Number of requests for its definitions that were or will be answered by a search.
+    pub(crate) searches: usize,
 }
 
 impl Attachment {
