@@ -333,7 +333,8 @@ impl Ingress {
     /// Detaches readers whose connections have ended: what they held is free.
     fn remove_gone(&mut self) {
         while let Some(index) = self.readers.iter().position(|reader| reader.is_gone) {
-            let reader = self.readers.swap_remove(index);
+            // In order: of several readers with a name, the last one is the newest.
+            let reader = self.readers.remove(index);
             for attachment in &reader.topics {
                 self.topics.detach(&mut *self.source, attachment.topic, &attachment.attached);
             }
