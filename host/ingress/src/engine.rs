@@ -363,7 +363,7 @@ impl Ingress {
     fn tick(&mut self, now: Instant) {
         if now >= self.status_at {
             self.update_status(now);
-            self.report_status();
+            self.report_status(now);
         }
         if now < self.tick_at {
             return;
@@ -389,7 +389,7 @@ impl Ingress {
         if self.plays && self.source.has_ended() {
             self.plays = false;
             self.update_status(now);
-            self.report_status();
+            self.report_status(now);
             (self.reports)(IngressReport::DriveEnded);
         }
         let again = some_wait || self.plays || self.topics.has_two_subscriptions();
@@ -451,7 +451,7 @@ impl Ingress {
     }
 
     /// Reports the status to the readers and the starter.
-    fn report_status(&mut self) {
+    fn report_status(&mut self, now: Instant) {
         let mut health = self.health.clone();
         if self.source.knows_all_topics() {
             // A damaged drive ends early. Readers handle what it has delivered.
@@ -467,6 +467,7 @@ impl Ingress {
                 unsent: reader.unsent,
             };
             reader.send(&ReaderMessage::Status(Box::new(status)), None);
+            reader.check_progress(now);
         }
         self.remove_gone();
         let status = self.status();

@@ -21,6 +21,9 @@ use crate::sink::AttachedReader;
 /// Requests of a reader that are handled before others have their turn.
 const TURN: usize = 64;
 
+/// Time after which a reader is disconnected that reads none of the messages that wait for it.
+const STALLED: Duration = Duration::from_secs(30);
+
 /// A topic of a reader.
 pub(crate) struct Attachment {
     /// Id of the grant.
@@ -73,6 +76,8 @@ pub(crate) struct ConnectedReader {
     pub(crate) waiting: Vec<TopicGrant>,
     pub(crate) definitions: Vec<DefinitionsWait>,
     publishers: Vec<PublishedTopic>,
+    /// Number of bytes that were sent when it last read, or when nothing waited, and that time.
+    progress: (u64, Instant),
     rate: PublishRate,
     /// True if requests may have been received that are not handled yet.
     has_more: bool,
@@ -100,6 +105,7 @@ impl ConnectedReader {
             waiting: Vec::new(),
             definitions: Vec::new(),
             publishers: add.publishes.iter().map(|grant| open(&add.name, grant, source)).collect(),
+            progress: (0, now),
             rate: PublishRate::new(now),
             has_more: false,
             unsent: 0,
@@ -125,7 +131,7 @@ impl ConnectedReader {
         self.words = limits.first_word;
     }
 
-    /// Sends a message. A reader that does not read for long is disconnected.
+    /// Sends a message. A reader for which too many messages wait is disconnected.
     pub(crate) fn send(&mut self, message: &ReaderMessage, descriptor: Option<BorrowedFd<'_>>) {
         if self.is_gone {
             return;
@@ -164,6 +170,16 @@ impl ConnectedReader {
     pub(crate) fn flush(&mut self) {
         if let Err(error) = self.link.flush() {
             self.disconnect(&error);
+        }
+    }
+
+    /// Disconnects a reader that has read nothing for long while messages wait for it.
+    pub(crate) fn check_progress(&mut self, now: Instant) {
+        let sent = self.link.sent_bytes();
+        if !self.is_pending() || sent != self.progress.0 {
+            self.progress = (sent, now);
+        } else if now.saturating_duration_since(self.progress.1) >= STALLED {
+            self.disconnect(&LinkError::Full { peer: "the reader" });
         }
     }
 
@@ -262,4 +278,44 @@ fn open(reader: &str, grant: &PublishGrant, source: &dyn LiveSource) -> Publishe
         warn!(reader, topic, error, "a topic cannot be published; its messages are counted");
     }
     PublishedTopic { publisher: opened.ok(), max_bytes: grant.max_bytes }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+    use std::os::unix::net::UnixStream;
+
+    use gleaner_transport::loopback::Loopback;
+
+    use super::*;
+
+    #[test]
+    fn a_reader_that_reads_nothing_is_disconnected_and_a_slow_one_is_not() {
+        let (mut socket, end) = UnixStream::pair().unwrap();
+        let start = Instant::now();
+        let name = "slow".to_owned();
+        let add = AddReader { name, topics: Vec::new(), publishes: Vec::new() };
+        let mut reader =
+            ConnectedReader::welcome(&add, end.into(), &Loopback::new(), start).unwrap();
+        let send_until_pending = |reader: &mut ConnectedReader| {
+            while !reader.is_pending() {
+                let known = vec!["/topic".to_owned(); 10_000];
+                reader.refuse(1, RefusedTopic::NoSuchTopic { known, nearest: None });
+            }
+        };
+        let mut now = start;
+        for _ in 0..5 {
+            send_until_pending(&mut reader);
+            reader.check_progress(now);
+            now += Duration::from_secs(29);
+            reader.check_progress(now);
+            socket.read_exact(&mut vec![0; 200_000]).unwrap();
+            reader.flush();
+        }
+        assert!(!reader.is_gone);
+        send_until_pending(&mut reader);
+        reader.check_progress(now);
+        reader.check_progress(now + Duration::from_secs(30));
+        assert!(reader.is_gone);
+    }
 }

@@ -120,6 +120,11 @@ impl ReaderLink {
         !self.queue.is_empty()
     }
 
+    /// Returns the number of bytes that were sent so far.
+    pub fn sent_bytes(&self) -> u64 {
+        self.queue.total()
+    }
+
     /// Returns the next request if it has arrived completely. A call reads a few times only: while
     /// it returns nothing, the socket may still be readable.
     ///
