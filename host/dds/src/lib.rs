@@ -189,7 +189,10 @@ impl Dds {
 
     /// The ROS 2 topics that other participants write or read, sorted by name; at most 4096.
     pub fn discovered(&self) -> Vec<DomainTopic> {
-        discovery::topics(&self.participant, None).into_iter().map(|(topic, _)| topic).collect()
+        discovery::topics(&self.participant, None, &[])
+            .into_iter()
+            .map(|(topic, _)| topic)
+            .collect()
     }
 
     /// The type of a topic: as it is subscribed, else as others write or read it.
@@ -224,7 +227,11 @@ fn granted(asked: usize, needed: usize) -> usize {
 
 impl Transport for Dds {
     fn topics(&self) -> Vec<DiscoveredTopic> {
-        let topics = discovery::topics(&self.participant, self.state.graph().1);
+        let in_dds = |(spec, _): &(TopicSpec, Arc<SubscriptionStatus>)| {
+            Some((names::dds_topic(&spec.topic)?, names::dds_type(&spec.type_name)?))
+        };
+        let subscribed: Vec<_> = self.subscriptions.values().filter_map(in_dds).collect();
+        let topics = discovery::topics(&self.participant, self.state.graph().1, &subscribed);
         let discovered = |(found, offered_qos): (DomainTopic, Option<String>)| DiscoveredTopic {
             definitions_text: lock(&self.definitions).text(&found.type_name),
             topic: found.topic,
