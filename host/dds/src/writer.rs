@@ -90,7 +90,8 @@ impl TopicWriter {
     /// # Errors
     ///
     /// [`DdsError::Write`] if DDS refuses the message, for example because a reader has not
-    /// acknowledged as many earlier messages as are kept, or 256. The call does not wait for readers.
+    /// acknowledged as many earlier messages as are kept, or 256. The call does not wait for
+    /// readers.
     pub fn write(&self, cdr: &[u8]) -> Result<(), DdsError> {
         let why = |error: WriteError<Bytes>| match error {
             WriteError::WouldBlock { .. } => "readers do not keep up".to_owned(),

@@ -309,7 +309,7 @@ mod tests {
             reader.check_progress(now);
             now += Duration::from_secs(29);
             reader.check_progress(now);
-            socket.read_exact(&mut vec![0; 200_000]).unwrap();
+            assert!(socket.read(&mut vec![0; 1 << 20]).unwrap() > 0);
             reader.flush();
         }
         assert!(!reader.is_gone);
