@@ -57,6 +57,7 @@ pub fn all() -> Vec<Vec<u8>> {
         topic: "/decisions".to_owned(),
         type_name: "std_msgs/msg/String".to_owned(),
         depth: 8,
+        max_bytes: 1024,
     };
     let (name, publishes) = ("brake".to_owned(), vec![publish]);
     let add = AddReader { name: name.clone(), topics: vec![grant(0), grant(1)], publishes };

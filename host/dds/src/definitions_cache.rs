@@ -1,24 +1,32 @@
 //! Caches the definitions of message types: each is searched once, locally and, on demand, at a
 //! node that writes the type.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use rustdds::DomainParticipant;
 use tracing::{info, warn};
 
-use super::names::visible;
+use super::names::{dds_type, visible};
 use super::receive::{ReceiverCommand, ReceiverHandle};
 use super::state::ParticipantState;
-use super::type_query::{Attempts, QueryOutcome, TypeQuery};
+use super::type_query::{Attempts, QueryOutcome, Retry, TypeQuery};
 use gleaner_base::chain;
 use gleaner_messages::type_description::DescribedDefinitions;
 use gleaner_messages::{Definitions, MessageError, Sources, SourcesError};
+use gleaner_transport::DefinitionsSearch;
 
-/// Most queries for one type.
+/// Most queries for one type that are sent to a node.
 const MOST_QUERIES: usize = 3;
 /// Time that the receive thread may take for a query, which has a shorter limit of its own there.
 const TIMEOUT: Duration = Duration::from_secs(10);
+/// Time after the start in which a writer may exist that is not discovered yet.
+const DISCOVERY: Duration = Duration::from_secs(2);
+/// Interval in which the types of writers are listed.
+const WRITTEN: Duration = Duration::from_millis(100);
+/// Time without queries for a type after one that was sent to no node.
+const PAUSE: Duration = Duration::from_secs(10);
 /// Most types that are remembered to have no definitions: more than there are topics.
 const MOST: usize = 8192;
 
@@ -29,26 +37,39 @@ pub(super) struct DefinitionsCache {
     types: HashMap<String, CachedType>,
     open: Option<(TypeQuery, Instant)>,
     tickets: u64,
+    since: Instant,
+    /// The types of all writers, as DDS names them, and the time of this list.
+    written: Option<(HashSet<String>, Instant)>,
 }
 
 #[derive(Debug)]
 enum CachedType {
     /// The text, and its parsed form once a caller needed it.
     Text(Arc<str>, Option<Arc<Definitions>>),
-    /// The queries so far; `settled` if there will be no more.
-    Missing { attempts: Attempts, settled: bool },
+    Missing(Missing),
+}
+
+/// The queries for a type so far.
+#[derive(Copy, Clone, Debug, Default)]
+struct Missing {
+    attempts: Attempts,
+    /// True if there will be no more.
+    settled: bool,
+    /// There will be none until then.
+    pause: Option<Instant>,
 }
 
 impl DefinitionsCache {
     pub(super) fn new(sources: Sources) -> Self {
-        Self { sources, types: HashMap::new(), open: None, tickets: 0 }
+        let since = Instant::now();
+        Self { sources, types: HashMap::new(), open: None, tickets: 0, since, written: None }
     }
 
     /// The text of a type's definitions, if there is one.
     pub(super) fn text(&mut self, type_name: &str) -> Option<Arc<str>> {
         match self.entry(type_name) {
             CachedType::Text(text, _) => Some(text.clone()),
-            CachedType::Missing { .. } => None,
+            CachedType::Missing(_) => None,
         }
     }
 
@@ -64,32 +85,54 @@ impl DefinitionsCache {
         Ok(parsed.clone())
     }
 
-    /// Returns whether definitions that are missing now may still come. Starts a query if there was
-    /// none.
-    pub(super) fn may_come(
+    /// Returns whether definitions that are missing now may still come. Starts a query if there is
+    /// none, and if the type has a writer.
+    pub(super) fn search(
         &mut self,
         type_name: &str,
+        participant: &DomainParticipant,
         receiver: &ReceiverHandle,
         state: &ParticipantState,
-    ) -> bool {
+    ) -> DefinitionsSearch {
         self.collect(state);
-        let before = match self.entry(type_name) {
-            CachedType::Text(..) => return true,
-            CachedType::Missing { attempts, settled }
-                if *settled || attempts.times >= MOST_QUERIES =>
-            {
-                return false;
-            }
-            CachedType::Missing { attempts, .. } => *attempts,
+        let Missing { attempts: before, settled, pause } = match self.entry(type_name) {
+            CachedType::Text(..) => return DefinitionsSearch::Waiting,
+            CachedType::Missing(missing) => *missing,
         };
-        // One query at a time.
-        if self.open.is_none() {
-            self.tickets += 1;
-            let query = TypeQuery { ticket: self.tickets, type_name: type_name.to_owned(), before };
-            receiver.send(ReceiverCommand::Query(query.clone()));
-            self.open = Some((query, Instant::now()));
+        let now = Instant::now();
+        if settled || before.times >= MOST_QUERIES || pause.is_some_and(|until| now < until) {
+            return DefinitionsSearch::Ended;
         }
-        true
+        if !self.is_written(type_name, participant, now) {
+            // Not remembered: a writer may start at any time.
+            let is_young = now < self.since + DISCOVERY;
+            return if is_young { DefinitionsSearch::Waiting } else { DefinitionsSearch::Ended };
+        }
+        // One query at a time.
+        if self.open.is_some() {
+            return DefinitionsSearch::Waiting;
+        }
+        self.tickets += 1;
+        let query = TypeQuery { ticket: self.tickets, type_name: type_name.to_owned(), before };
+        receiver.send(ReceiverCommand::Query(query.clone()));
+        self.open = Some((query, now));
+        DefinitionsSearch::Started
+    }
+
+    /// Returns whether there is a writer of a type.
+    fn is_written(
+        &mut self,
+        type_name: &str,
+        participant: &DomainParticipant,
+        now: Instant,
+    ) -> bool {
+        let Some(name) = dds_type(type_name) else { return false };
+        self.written.take_if(|(_, at)| now >= *at + WRITTEN);
+        let (types, _) = self.written.get_or_insert_with(|| {
+            let writers = participant.discovered_writers().into_iter();
+            (writers.map(|writer| writer.publication_topic_data.type_name).collect(), now)
+        });
+        types.contains(&name)
     }
 
     /// Takes the outcome of the open query, if there is one.
@@ -97,7 +140,7 @@ impl DefinitionsCache {
         let Some((query, since)) = &self.open else { return };
         let late = || {
             let why = "the receive thread does not answer".to_owned();
-            (since.elapsed() >= TIMEOUT).then_some(QueryOutcome::Failed { why, retry: false })
+            (since.elapsed() >= TIMEOUT).then_some(QueryOutcome::Failed { why, retry: Retry::No })
         };
         let Some(outcome) = state.answered(query.ticket).or_else(late) else { return };
         let query = query.clone();
@@ -105,6 +148,11 @@ impl DefinitionsCache {
         let type_name = &query.type_name;
         let mut attempts = Attempts { times: query.before.times + 1, ..query.before };
         let entry = match outcome {
+            QueryOutcome::Failed { why, retry: Retry::Unsent } => {
+                info!(type_name, why, "no node can be asked for the definition of this type yet");
+                let pause = Some(Instant::now() + PAUSE);
+                CachedType::Missing(Missing { attempts: query.before, settled: false, pause })
+            }
             QueryOutcome::Failed { why, retry } => {
                 attempts.unanswered += 1;
                 warn!(
@@ -113,7 +161,7 @@ impl DefinitionsCache {
                     attempts = attempts.times,
                     "no node provides the definition of this type"
                 );
-                CachedType::Missing { attempts, settled: !retry }
+                CachedType::Missing(Missing { attempts, settled: retry == Retry::No, pause: None })
             }
             QueryOutcome::Answer { node, hash, cdr, endian } => {
                 match DescribedDefinitions::read(type_name, &hash, &cdr, endian) {
@@ -135,7 +183,7 @@ impl DefinitionsCache {
                             attempts = attempts.times,
                             "the definition that a node sent for this type is unusable"
                         );
-                        CachedType::Missing { attempts, settled: false }
+                        CachedType::Missing(Missing { attempts, ..Missing::default() })
                     }
                 }
             }
@@ -148,14 +196,14 @@ impl DefinitionsCache {
             // Forgets names from the network. Types with a text are this vehicle's own, or were
             // queried.
             self.types.retain(|_, entry| {
-                !matches!(entry, CachedType::Missing { attempts: Attempts { times: 0, .. }, .. })
+                !matches!(entry, CachedType::Missing(missing) if missing.attempts.times == 0)
             });
         }
         self.types.entry(type_name.to_owned()).or_insert_with(|| {
             match self.sources.find(type_name) {
                 Ok(Some(text)) => CachedType::Text(text, None),
                 Ok(None) | Err(SourcesError::Name { .. }) => {
-                    CachedType::Missing { attempts: Attempts::default(), settled: false }
+                    CachedType::Missing(Missing::default())
                 }
                 Err(error) => {
                     warn!(
@@ -163,7 +211,7 @@ impl DefinitionsCache {
                         error = &error as &dyn std::error::Error,
                         "unusable definition file"
                     );
-                    CachedType::Missing { attempts: Attempts::default(), settled: false }
+                    CachedType::Missing(Missing::default())
                 }
             }
         })

@@ -1,6 +1,6 @@
 //! Lists the topics of a domain, with names made printable.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 
 use rustdds::discovery::{DiscoveredReaderData, DiscoveredWriterData};
 use rustdds::{DomainParticipant, RTPSEntity};
@@ -42,10 +42,12 @@ pub(super) fn offer(writer: &DiscoveredWriterData) -> Offer {
 }
 
 /// The topics of other participants, sorted by name, and under one name by the number of writers,
-/// most first; each with the offers of its writers in the format of rosbag2.
+/// most first; each with the offers of its writers in the format of rosbag2. If there are too many,
+/// those that are `subscribed`, by their names and types in DDS, are among them.
 pub(super) fn topics(
     participant: &DomainParticipant,
     distro: Option<Distro>,
+    subscribed: &[(String, String)],
 ) -> Vec<(DomainTopic, Option<String>)> {
     let own = participant.guid().prefix;
     let writers = participant.discovered_writers();
@@ -56,7 +58,18 @@ pub(super) fn topics(
         .map(offer);
     let readers =
         readers.iter().filter(|reader| reader.reader_proxy.remote_reader_guid.prefix != own);
-    sorted(writers, readers.map(names), distro)
+    sorted(subscribed_first(writers, subscribed), readers.map(names), distro)
+}
+
+fn subscribed_first(
+    writers: impl Iterator<Item = Offer>,
+    subscribed: &[(String, String)],
+) -> impl Iterator<Item = Offer> {
+    let subscribed: HashSet<(&str, &str)> =
+        subscribed.iter().map(|(topic, type_name)| (topic.as_str(), type_name.as_str())).collect();
+    let (first, others): (Vec<_>, Vec<_>) =
+        writers.partition(|offer| subscribed.contains(&(&*offer.topic, &*offer.type_name)));
+    first.into_iter().chain(others)
 }
 
 fn names(reader: &DiscoveredReaderData) -> (&str, &str) {
@@ -150,7 +163,10 @@ mod tests {
     #[test]
     fn the_number_of_topics_is_bounded() {
         let writers = (0..10_000).map(|n| offer(&format!("rt/t{n}"), "x", true));
-        assert_eq!(sorted(writers, std::iter::empty(), None).len(), TOPICS);
+        assert_eq!(sorted(writers.clone(), std::iter::empty(), None).len(), TOPICS);
+        let subscribed = [("rt/t9999".to_owned(), "x".to_owned())];
+        let topics = sorted(subscribed_first(writers, &subscribed), std::iter::empty(), None);
+        assert!(topics.iter().any(|(topic, _)| topic.topic == "/t9999") && topics.len() == TOPICS);
     }
 
     #[test]

@@ -68,8 +68,8 @@ use gleaner_base::text::nearest;
 use gleaner_messages::{Definitions, Sources};
 use gleaner_protocol::NetworkStatus;
 use gleaner_transport::{
-    DiscoveredTopic, Health, LiveSource, PublishError, Publisher, ReceptionStatus, Sink,
-    Subscription, TopicSpec, Transport, TransportError,
+    DefinitionsSearch, DiscoveredTopic, Health, LiveSource, PublishError, Publisher,
+    ReceptionStatus, Sink, Subscription, TopicSpec, Transport, TransportError,
 };
 use joins::NoJoin;
 use packet_filter::PacketFilter;
@@ -189,7 +189,10 @@ impl Dds {
 
     /// The ROS 2 topics that other participants write or read, sorted by name; at most 4096.
     pub fn discovered(&self) -> Vec<DomainTopic> {
-        discovery::topics(&self.participant, None).into_iter().map(|(topic, _)| topic).collect()
+        discovery::topics(&self.participant, None, &[])
+            .into_iter()
+            .map(|(topic, _)| topic)
+            .collect()
     }
 
     /// The type of a topic: as it is subscribed, else as others write or read it.
@@ -224,7 +227,11 @@ fn granted(asked: usize, needed: usize) -> usize {
 
 impl Transport for Dds {
     fn topics(&self) -> Vec<DiscoveredTopic> {
-        let topics = discovery::topics(&self.participant, self.state.graph().1);
+        let in_dds = |(spec, _): &(TopicSpec, Arc<SubscriptionStatus>)| {
+            Some((names::dds_topic(&spec.topic)?, names::dds_type(&spec.type_name)?))
+        };
+        let subscribed: Vec<_> = self.subscriptions.values().filter_map(in_dds).collect();
+        let topics = discovery::topics(&self.participant, self.state.graph().1, &subscribed);
         let discovered = |(found, offered_qos): (DomainTopic, Option<String>)| DiscoveredTopic {
             definitions_text: lock(&self.definitions).text(&found.type_name),
             topic: found.topic,
@@ -265,13 +272,11 @@ impl Transport for Dds {
         known.ok_or_else(|| TransportError::NoDefinitions { topic: topic.to_owned(), type_name })
     }
 
-    /// Requests the definitions from a node that writes the topic: one query at a time, and at most
-    /// three for a type.
-    fn definitions_may_come(&self, topic: &str) -> bool {
-        let type_name = self.type_of(topic);
-        type_name.is_ok_and(|type_name| {
-            lock(&self.definitions).may_come(&type_name, &self.receiver, &self.state)
-        })
+    /// Requests the definitions from a node that writes the type: one query at a time, and at most
+    /// three for a type. While it has no writer, there is none.
+    fn search_definitions(&self, type_name: &str) -> DefinitionsSearch {
+        let mut definitions = lock(&self.definitions);
+        definitions.search(type_name, &self.participant, &self.receiver, &self.state)
     }
 
     fn status(&self, subscription: Subscription) -> ReceptionStatus {

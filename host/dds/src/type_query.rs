@@ -75,11 +75,16 @@ pub(super) enum QueryOutcome {
         endian: Endian,
     },
     /// No node answered.
-    Failed {
-        why: String,
-        /// True if a retry may help.
-        retry: bool,
-    },
+    Failed { why: String, retry: Retry },
+}
+
+/// Whether another query may help after one that failed.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(super) enum Retry {
+    No,
+    Yes,
+    /// Yes, and the failed one does not count: it was sent to no node.
+    Unsent,
 }
 
 /// Runs the open query.
@@ -92,8 +97,8 @@ struct OpenQuery {
     query: TypeQuery,
     begun: Instant,
     call: Option<ServiceCall>,
-    /// The reason if the time limit is reached now, and true if a retry may help.
-    missing: (String, bool),
+    /// The reason if the time limit is reached now.
+    missing: (String, Retry),
 }
 
 /// The client of one node's service.
@@ -114,7 +119,7 @@ struct QueryTarget {
 impl TypeQuerier {
     /// Starts `query`, in place of any other.
     pub(super) fn start(&mut self, query: TypeQuery) {
-        let missing = ("the receive thread was busy".to_owned(), true);
+        let missing = ("the receive thread was busy".to_owned(), Retry::Yes);
         self.open = Some(OpenQuery { query, begun: Instant::now(), call: None, missing });
     }
 
@@ -164,25 +169,28 @@ impl OpenQuery {
             {
                 Ok(call) => self.call = Some(call),
                 // It may not be discovered yet.
-                Err(NoTarget::Yet(why)) => self.missing = (why, false),
+                Err(NoTarget::Yet(why)) => self.missing = (why, Retry::Unsent),
                 Err(NoTarget::Ever(why)) => {
-                    return Some(QueryOutcome::Failed { why, retry: false });
+                    return Some(QueryOutcome::Failed { why, retry: Retry::No });
                 }
             }
         }
         let call = self.call.as_mut()?;
         let node = visible(&call.target.node);
         if call.sent.is_none() {
-            self.missing =
-                (format!("node `{node}` does not offer the service get_type_description"), false);
+            let why = format!("node `{node}` does not offer the service get_type_description");
+            self.missing = (why, Retry::No);
             call.send(context, &self.query)?;
         }
-        self.missing = (format!("node `{node}` did not answer within {} s", LIMIT.as_secs()), true);
+        let why = format!("node `{node}` did not answer within {} s", LIMIT.as_secs());
+        self.missing = (why, Retry::Yes);
         call.take(context).map(|answer| match answer {
             Ok((cdr, endian)) => {
                 QueryOutcome::Answer { node, hash: call.target.hash.clone(), cdr, endian }
             }
-            Err(why) => QueryOutcome::Failed { why: format!("node `{node}`: {why}"), retry: true },
+            Err(why) => {
+                QueryOutcome::Failed { why: format!("node `{node}`: {why}"), retry: Retry::Yes }
+            }
         })
     }
 }

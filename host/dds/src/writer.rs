@@ -16,7 +16,10 @@ use super::state::ParticipantState;
 /// after the write, and one stalled reader must not delay that.
 const MAX_BLOCKING: Duration = Duration::ZERO;
 /// Allowed number of samples that are kept for retransmission.
-const DEPTH: std::ops::RangeInclusive<usize> = 1..=65_536;
+const DEPTH: std::ops::RangeInclusive<i32> = 1..=65_536;
+/// Allowed number of samples that readers have not acknowledged: as many as are kept, but enough
+/// for the time until an acknowledgement, and not more than RustDDS allows for one reader.
+const UNACKNOWLEDGED: std::ops::RangeInclusive<i32> = 256..=8192;
 
 /// A writer of one topic.
 pub struct TopicWriter {
@@ -40,12 +43,24 @@ impl TopicWriter {
             dds_topic(topic).ok_or_else(|| name(topic, "the absolute name of a topic"))?;
         let dds_type = dds_type(type_name)
             .ok_or_else(|| name(type_name, "a message type, such as `std_msgs/msg/Empty`"))?;
-        let depth = i32::try_from(depth.clamp(*DEPTH.start(), *DEPTH.end())).unwrap_or(i32::MAX);
+        let depth = i32::try_from(depth).unwrap_or(i32::MAX);
+        let depth = depth.clamp(*DEPTH.start(), *DEPTH.end());
+        let window = depth.clamp(*UNACKNOWLEDGED.start(), *UNACKNOWLEDGED.end());
         let policies = QosPolicyBuilder::new()
             .reliability(policy::Reliability::Reliable { max_blocking_time: MAX_BLOCKING })
             .durability(policy::Durability::Volatile)
             .history(policy::History::KeepLast { depth })
             .build();
+        // RustDDS keeps all that a reliable reader has not acknowledged, whatever the depth, up to
+        // `max_samples`. Samples that were acknowledged stay for up to 6 s. Not for the topic: its
+        // readers here would get the limit, too.
+        let unacknowledged = policy::ResourceLimits {
+            max_samples: window,
+            max_instances: 1,
+            max_samples_per_instance: window,
+        };
+        let writer_policies = QosPolicyBuilder::new().resource_limits(unacknowledged).build();
+        let writer_policies = policies.modify_by(&writer_policies);
         // Locked until the matches of the writer are counted, so that none is missed.
         let mut peers = state.peers();
         let created = (|| {
@@ -53,7 +68,7 @@ impl TopicWriter {
                 participant.create_topic(dds_topic, dds_type, &policies, TopicKind::NoKey)?;
             participant
                 .create_publisher(&policies)?
-                .create_datawriter_no_key(&topic, Some(policies.clone()))
+                .create_datawriter_no_key(&topic, Some(writer_policies))
         })();
         let writer: RawWriter = created.map_err(|error: CreateError| DdsError::Advertise {
             topic: topic.to_owned(),
@@ -75,7 +90,8 @@ impl TopicWriter {
     /// # Errors
     ///
     /// [`DdsError::Write`] if DDS refuses the message, for example because a reader has not
-    /// acknowledged 8,192 earlier messages. The call does not wait for readers.
+    /// acknowledged as many earlier messages as are kept, or 256. The call does not wait for
+    /// readers.
     pub fn write(&self, cdr: &[u8]) -> Result<(), DdsError> {
         let why = |error: WriteError<Bytes>| match error {
             WriteError::WouldBlock { .. } => "readers do not keep up".to_owned(),

@@ -9,7 +9,7 @@ use gleaner_protocol::ingress::{
     IngressStatus, ReaderMessage, RefusedTopic, RegionLayout, SourceStatus, TopicGrant,
 };
 use gleaner_protocol::link::{Incoming, LinkError};
-use gleaner_transport::{DiscoveredTopic, Health, LiveSource, same_type};
+use gleaner_transport::{DefinitionsSearch, DiscoveredTopic, Health, LiveSource, same_type};
 use gleaner_vitals::usage;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
@@ -26,6 +26,9 @@ const TICK: Duration = Duration::from_millis(100);
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// Time that a reader waits for definitions at most.
 const DEFINITIONS_TIMEOUT: Duration = Duration::from_secs(6);
+/// Requests of a reader for the definitions of one topic that are answered by a search. A program
+/// keeps what it is sent.
+const SEARCHES: usize = 2;
 /// Most readers at a time. Each has a socket and a control page.
 const READERS: usize = 512;
 
@@ -38,6 +41,8 @@ pub struct Ingress {
     reports: Reports,
     topics: TopicTable,
     readers: Vec<ConnectedReader>,
+    /// Index of the reader whose definitions are searched first.
+    first: usize,
     health: Health,
     /// True from the start of a drive to its end.
     plays: bool,
@@ -62,6 +67,7 @@ impl Ingress {
             reports,
             topics: TopicTable::default(),
             readers: Vec::new(),
+            first: 0,
             plays: false,
             status_at: now + STATUS_INTERVAL,
             tick_at: now + TICK,
@@ -121,7 +127,7 @@ impl Ingress {
             // While it may make no request, only its end is of interest.
             let reads = if wait.is_zero() { PollFlags::IN } else { PollFlags::empty() };
             let writes = if reader.is_pending() { PollFlags::OUT } else { PollFlags::empty() };
-            if reader.has_more() {
+            if reader.has_more() || !wait.is_zero() {
                 timeout = timeout.min(wait);
             }
             events.push(reads | writes);
@@ -181,7 +187,7 @@ impl Ingress {
                 Ok(Incoming::Message(IngressRequest::Stop)) => return Some(LoopEnd::Stopped),
                 Ok(Incoming::Nothing) => return None,
                 Ok(Incoming::Ended) => return Some(LoopEnd::StarterEnded),
-                Err(why @ LinkError::Grant { .. }) => {
+                Err(why @ (LinkError::Grant { .. } | LinkError::NoSocket { .. })) => {
                     let error = &why as &dyn std::error::Error;
                     error!(error, "a request of the starter is refused");
                 }
@@ -303,7 +309,7 @@ impl Ingress {
             }
         };
         let before = self.topics.get(topic).map_or_else(Default::default, |it| it.status.clone());
-        reader.topics.push(Attachment { id: grant.id, topic, attached, before });
+        reader.topics.push(Attachment { id: grant.id, topic, attached, before, searches: 0 });
         let SharedLayout { depth, slots, slot_bytes } = attached.sizes.layout;
         let definitions = found.and_then(|found| found.definitions_text.as_deref());
         let message = AttachedTopic {
@@ -327,7 +333,8 @@ impl Ingress {
     /// Detaches readers whose connections have ended: what they held is free.
     fn remove_gone(&mut self) {
         while let Some(index) = self.readers.iter().position(|reader| reader.is_gone) {
-            let reader = self.readers.swap_remove(index);
+            // In order: of several readers with a name, the last one is the newest.
+            let reader = self.readers.remove(index);
             for attachment in &reader.topics {
                 self.topics.detach(&mut *self.source, attachment.topic, &attachment.attached);
             }
@@ -338,11 +345,17 @@ impl Ingress {
     /// Answers a reader that has no definitions of a topic, at once or when they come.
     fn need_definitions(&mut self, index: usize, id: u32, now: Instant) {
         let reader = &mut self.readers[index];
-        if !reader.topics.iter().any(|known| known.id == id) {
-            reader.send(&ReaderMessage::Definitions { id, text: None }, None);
-        } else if !reader.definitions.iter().any(|wait| wait.id == id) {
-            reader.definitions.push(DefinitionsWait { id, until: now + DEFINITIONS_TIMEOUT });
-            self.tick_soon();
+        if reader.definitions.iter().any(|wait| wait.id == id) {
+            return;
+        }
+        let topic = reader.topics.iter_mut().find(|known| known.id == id);
+        match topic.filter(|known| known.searches < SEARCHES) {
+            Some(topic) => {
+                topic.searches += 1;
+                reader.definitions.push(DefinitionsWait { id, until: now + DEFINITIONS_TIMEOUT });
+                self.tick_soon();
+            }
+            None => reader.send(&ReaderMessage::Definitions { id, text: None }, None),
         }
     }
 
@@ -350,7 +363,7 @@ impl Ingress {
     fn tick(&mut self, now: Instant) {
         if now >= self.status_at {
             self.update_status(now);
-            self.report_status();
+            self.report_status(now);
         }
         if now < self.tick_at {
             return;
@@ -362,7 +375,13 @@ impl Ingress {
             let topics = self.source.topics();
             for index in 0..self.readers.len() {
                 self.attach_waiting(index, &topics);
-                self.answer_definitions(index, &topics, now);
+            }
+            // There is one query at a time: the reader after the one that it was for is next.
+            let (first, readers) = (self.first, self.readers.len());
+            for index in (0..readers).map(|offset| (first + offset) % readers) {
+                if self.answer_definitions(index, &topics, now) {
+                    self.first = index + 1;
+                }
             }
             self.remove_gone();
         }
@@ -370,7 +389,7 @@ impl Ingress {
         if self.plays && self.source.has_ended() {
             self.plays = false;
             self.update_status(now);
-            self.report_status();
+            self.report_status(now);
             (self.reports)(IngressReport::DriveEnded);
         }
         let again = some_wait || self.plays || self.topics.has_two_subscriptions();
@@ -390,7 +409,15 @@ impl Ingress {
         }
     }
 
-    fn answer_definitions(&mut self, index: usize, topics: &[DiscoveredTopic], now: Instant) {
+    /// Answers requests for definitions that have come, or will not. Returns true if a query was
+    /// sent for one of the others.
+    fn answer_definitions(
+        &mut self,
+        index: usize,
+        topics: &[DiscoveredTopic],
+        now: Instant,
+    ) -> bool {
+        let mut has_started = false;
         let reader = &mut self.readers[index];
         for wait in std::mem::take(&mut reader.definitions) {
             let attached = reader.topics.iter().find(|known| known.id == wait.id);
@@ -400,14 +427,21 @@ impl Ingress {
                 let mut same = of_it.filter(|found| same_type(&found.type_name, topic.type_name()));
                 same.find_map(|found| found.definitions_text.clone())
             });
-            let may_come = |topic: &SharedTopic| self.source.definitions_may_come(topic.name());
-            if text.is_none() && now < wait.until && topic.is_some_and(may_come) {
-                reader.definitions.push(wait);
-            } else {
+            let search = match topic {
+                Some(topic) if text.is_none() && now < wait.until => {
+                    self.source.search_definitions(topic.type_name())
+                }
+                _ => DefinitionsSearch::Ended,
+            };
+            has_started |= search == DefinitionsSearch::Started;
+            if search == DefinitionsSearch::Ended {
                 let text = text.map(|text| text.to_string());
                 reader.send(&ReaderMessage::Definitions { id: wait.id, text }, None);
+            } else {
+                reader.definitions.push(wait);
             }
         }
+        has_started
     }
 
     fn update_status(&mut self, now: Instant) {
@@ -417,7 +451,7 @@ impl Ingress {
     }
 
     /// Reports the status to the readers and the starter.
-    fn report_status(&mut self) {
+    fn report_status(&mut self, now: Instant) {
         let mut health = self.health.clone();
         if self.source.knows_all_topics() {
             // A damaged drive ends early. Readers handle what it has delivered.
@@ -433,6 +467,7 @@ impl Ingress {
                 unsent: reader.unsent,
             };
             reader.send(&ReaderMessage::Status(Box::new(status)), None);
+            reader.check_progress(now);
         }
         self.remove_gone();
         let status = self.status();

@@ -12,7 +12,7 @@ use gleaner_protocol::ingress::{
 };
 use gleaner_protocol::link::{Incoming, LinkError};
 use gleaner_regions::ControlRegion;
-use gleaner_transport::{LiveSource, Publisher};
+use gleaner_transport::{LiveSource, PublishError, Publisher};
 use tracing::warn;
 
 use crate::publish_rate::PublishRate;
@@ -20,6 +20,9 @@ use crate::sink::AttachedReader;
 
 /// Requests of a reader that are handled before others have their turn.
 const TURN: usize = 64;
+
+/// Time after which a reader is disconnected that reads none of the messages that wait for it.
+const STALLED: Duration = Duration::from_secs(30);
 
 /// A topic of a reader.
 pub(crate) struct Attachment {
@@ -30,6 +33,8 @@ pub(crate) struct Attachment {
     pub(crate) attached: AttachedReader,
     /// State of the subscription when the reader was attached.
     pub(crate) before: ReceptionStatus,
+    /// Number of requests for its definitions that were or will be answered by a search.
+    pub(crate) searches: usize,
 }
 
 impl Attachment {
@@ -52,6 +57,13 @@ pub(crate) struct DefinitionsWait {
     pub(crate) until: Instant,
 }
 
+/// A topic that a reader may publish.
+struct PublishedTopic {
+    /// `None` if the source refused it.
+    publisher: Option<Box<dyn Publisher>>,
+    max_bytes: usize,
+}
+
 /// A reader of granted topics.
 pub(crate) struct ConnectedReader {
     pub(crate) name: String,
@@ -63,7 +75,9 @@ pub(crate) struct ConnectedReader {
     /// Grants that wait for a writer, whose type they take.
     pub(crate) waiting: Vec<TopicGrant>,
     pub(crate) definitions: Vec<DefinitionsWait>,
-    publishers: Vec<Option<Box<dyn Publisher>>>,
+    publishers: Vec<PublishedTopic>,
+    /// Number of bytes that were sent when it last read, or when nothing waited, and that time.
+    progress: (u64, Instant),
     rate: PublishRate,
     /// True if requests may have been received that are not handled yet.
     has_more: bool,
@@ -91,6 +105,7 @@ impl ConnectedReader {
             waiting: Vec::new(),
             definitions: Vec::new(),
             publishers: add.publishes.iter().map(|grant| open(&add.name, grant, source)).collect(),
+            progress: (0, now),
             rate: PublishRate::new(now),
             has_more: false,
             unsent: 0,
@@ -116,7 +131,7 @@ impl ConnectedReader {
         self.words = limits.first_word;
     }
 
-    /// Sends a message. A reader that does not read for long is disconnected.
+    /// Sends a message. A reader for which too many messages wait is disconnected.
     pub(crate) fn send(&mut self, message: &ReaderMessage, descriptor: Option<BorrowedFd<'_>>) {
         if self.is_gone {
             return;
@@ -158,6 +173,16 @@ impl ConnectedReader {
         }
     }
 
+    /// Disconnects a reader that has read nothing for long while messages wait for it.
+    pub(crate) fn check_progress(&mut self, now: Instant) {
+        let sent = self.link.sent_bytes();
+        if !self.is_pending() || sent != self.progress.0 {
+            self.progress = (sent, now);
+        } else if now.saturating_duration_since(self.progress.1) >= STALLED {
+            self.disconnect(&LinkError::Full { peer: "the reader" });
+        }
+    }
+
     pub(crate) fn is_pending(&self) -> bool {
         self.link.is_pending()
     }
@@ -181,13 +206,17 @@ impl ConnectedReader {
             if self.is_gone || self.rate.wait(now) > Duration::ZERO {
                 break;
             }
-            match self.link.poll() {
+            let found = self.link.poll();
+            let bytes = self.link.take_received();
+            // A part of a request counts as one: it takes a turn of the loop, too.
+            if bytes > 0 || matches!(found, Ok(Incoming::Message(_))) {
+                self.rate.count(bytes);
+            }
+            match found {
                 Ok(Incoming::Message(ReaderRequest::NeedDefinitions { id })) => {
-                    self.rate.count(0);
                     definitions.push(id);
                 }
                 Ok(Incoming::Message(ReaderRequest::Publish { index, cdr })) => {
-                    self.rate.count(cdr.len());
                     self.publish(index, &cdr);
                 }
                 Ok(Incoming::Nothing) => {
@@ -202,25 +231,29 @@ impl ConnectedReader {
     }
 
     fn publish(&mut self, index: u32, cdr: &[u8]) {
-        match self.publishers.get(index as usize) {
+        let Some(topic) = self.publishers.get(index as usize) else {
+            warn!(reader = self.name, index, "a reader publishes a topic that was not granted");
+            self.is_gone = true;
+            return;
+        };
+        let published = match &topic.publisher {
+            // That was logged.
             None => {
-                warn!(reader = self.name, index, "a reader publishes a topic that was not granted");
-                self.is_gone = true;
+                self.unsent += 1;
+                return;
             }
-            Some(None) => self.unsent += 1,
-            Some(Some(publisher)) => {
-                if let Err(error) = publisher.publish(cdr) {
-                    if self.unsent == 0 {
-                        let error = &error as &dyn std::error::Error;
-                        let reader = &self.name;
-                        warn!(
-                            reader,
-                            error, "a message was not published; further ones are counted"
-                        );
-                    }
-                    self.unsent += 1;
-                }
+            Some(_) if cdr.len() > topic.max_bytes => {
+                let (bytes, most) = (cdr.len(), topic.max_bytes);
+                Err(PublishError(format!("it has {bytes} bytes, more than {most}").into()))
             }
+            Some(publisher) => publisher.publish(cdr),
+        };
+        if let Err(error) = published {
+            if self.unsent == 0 {
+                let (reader, error) = (&self.name, &error as &dyn std::error::Error);
+                warn!(reader, error, "a message was not published; further ones are counted");
+            }
+            self.unsent += 1;
         }
     }
 
@@ -238,13 +271,53 @@ impl AsFd for ConnectedReader {
     }
 }
 
-fn open(reader: &str, grant: &PublishGrant, source: &dyn LiveSource) -> Option<Box<dyn Publisher>> {
-    match source.publisher(&grant.topic, &grant.type_name, grant.depth) {
-        Ok(publisher) => Some(publisher),
-        Err(error) => {
-            let (topic, error) = (&grant.topic, &error as &dyn std::error::Error);
-            warn!(reader, topic, error, "a topic cannot be published; its messages are counted");
-            None
+fn open(reader: &str, grant: &PublishGrant, source: &dyn LiveSource) -> PublishedTopic {
+    let opened = source.publisher(&grant.topic, &grant.type_name, grant.depth);
+    if let Err(error) = &opened {
+        let (topic, error) = (&grant.topic, error as &dyn std::error::Error);
+        warn!(reader, topic, error, "a topic cannot be published; its messages are counted");
+    }
+    PublishedTopic { publisher: opened.ok(), max_bytes: grant.max_bytes }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+    use std::os::unix::net::UnixStream;
+
+    use gleaner_transport::loopback::Loopback;
+
+    use super::*;
+
+    #[test]
+    fn a_reader_that_reads_nothing_is_disconnected_and_a_slow_one_is_not() {
+        let (mut socket, end) = UnixStream::pair().unwrap();
+        socket.set_nonblocking(true).unwrap();
+        let start = Instant::now();
+        let name = "slow".to_owned();
+        let add = AddReader { name, topics: Vec::new(), publishes: Vec::new() };
+        let mut reader =
+            ConnectedReader::welcome(&add, end.into(), &Loopback::new(), start).unwrap();
+        let send_until_pending = |reader: &mut ConnectedReader| {
+            while !reader.is_pending() {
+                assert!(!reader.is_gone);
+                let known = vec!["/topic".to_owned(); 10_000];
+                reader.refuse(1, RefusedTopic::NoSuchTopic { known, nearest: None });
+            }
+        };
+        let mut now = start;
+        for _ in 0..5 {
+            send_until_pending(&mut reader);
+            reader.check_progress(now);
+            now += Duration::from_secs(29);
+            reader.check_progress(now);
+            while socket.read(&mut [0; 4096]).is_ok_and(|read| read > 0) {}
+            reader.flush();
         }
+        assert!(!reader.is_gone);
+        send_until_pending(&mut reader);
+        reader.check_progress(now);
+        reader.check_progress(now + Duration::from_secs(30));
+        assert!(reader.is_gone);
     }
 }

@@ -91,7 +91,7 @@ fn numbers(topic: &FedTopic) -> Vec<u64> {
 fn takes_over() {
     let (mut control, ingress) = Ingress::start_in_thread(Box::new(open(1, "/ingress")));
     let peer = open(1, "/peer");
-    let writer = peer.writer("/number", TYPE, 100).unwrap();
+    let writer = peer.writer("/number", TYPE, 4096).unwrap();
     let (_small_feed, small) = attach(&mut control, "small", grant(0, "/number", 64));
     until("match", || writer.readers() > 0);
     let stop = AtomicBool::new(false);
@@ -126,7 +126,7 @@ fn publishes() {
     let (mut other_control, _other) = Ingress::start_in_thread(Box::new(open(2, "/other")));
     let (_feed, received) = attach(&mut other_control, "reads", grant(0, "/out", 64));
     let (topic, type_name) = ("/out".to_owned(), TYPE.to_owned());
-    let publishes = vec![PublishGrant { topic, type_name, depth: 10 }];
+    let publishes = vec![PublishGrant { topic, type_name, depth: 10, max_bytes: 64 }];
     let add = AddReader { name: "writes".to_owned(), topics: Vec::new(), publishes };
     let feed = Feed::connect(control.add_reader(&add).unwrap()).unwrap();
     let publisher = feed.publisher(0);
@@ -143,7 +143,7 @@ fn returns() {
     assert!(!source.knows_all_topics());
     let (mut control, _ingress) = Ingress::start_in_thread(Box::new(source));
     let peer = open(3, "/peer");
-    let writer = peer.writer("/number", TYPE, 100).unwrap();
+    let writer = peer.writer("/number", TYPE, 4096).unwrap();
     let mut newest = 0;
     for _ in 0..5 {
         let (feed, topic) = attach(&mut control, "one", grant(0, "/number", 64));

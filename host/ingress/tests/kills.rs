@@ -76,7 +76,7 @@ impl ReaderProcess {
             digests: role == "verify",
         };
         let (topic, type_name) = ("/published".to_owned(), TYPE.to_owned());
-        let publishes = vec![PublishGrant { topic, type_name, depth: 4 }];
+        let publishes = vec![PublishGrant { topic, type_name, depth: 4, max_bytes: 1024 }];
         let add = AddReader { name: role.to_owned(), topics: vec![grant], publishes };
         let socket = control.add_reader(&add).unwrap();
         let mut child = Command::new(env::current_exe().unwrap())

@@ -146,7 +146,12 @@ fn the_program_ends_with_its_starter_and_at_a_signal() {
     let Some(drive) = drive() else { return };
     let drive = drive.to_str().unwrap();
     let mut program = Program::start(&["--drive", drive]);
-    let _reader = program.reader("one", vec![imu(0, 64)]);
+    let mut reader = program.reader("one", vec![imu(0, 64)]);
+    reader.topic(0, TIMEOUT).unwrap();
+    let limits = std::fs::read_to_string(format!("/proc/{}/limits", program.child.id())).unwrap();
+    let open_files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();
+    let words: Vec<_> = open_files.split_whitespace().collect();
+    assert_eq!(words[3], words[4], "the soft limit is raised to the maximum");
     program.control = None;
     assert!(program.ended().0.success(), "the starter has ended");
     let mut program = Program::start(&["--drive", drive]);

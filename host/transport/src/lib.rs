@@ -17,6 +17,6 @@ pub use gleaner_protocol::ingress::{Health, Qos, ReceptionStatus};
 pub use live::{LiveSource, PublishError, Publisher};
 pub use stored::{ArrivalSums, STORED_WORDS, StoredMeta, TopicCounters};
 pub use transport::{
-    Delivery, DiscoveredTopic, Guid, SampleMeta, Sink, Subscription, TopicSpec, Transport,
-    TransportError, same_type,
+    DefinitionsSearch, Delivery, DiscoveredTopic, Guid, SampleMeta, Sink, Subscription, TopicSpec,
+    Transport, TransportError, same_type,
 };

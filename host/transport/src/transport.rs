@@ -157,16 +157,27 @@ pub trait Transport {
     /// [`TransportError`] if there is no such topic, or its definitions are missing or malformed.
     fn definitions(&self, topic: &str) -> Result<Arc<Definitions>, TransportError>;
 
-    /// Returns whether the definitions of a topic that has none may become available soon. A live
-    /// transport then queries the topic's writers, which takes some seconds at most.
-    fn definitions_may_come(&self, _topic: &str) -> bool {
-        false
+    /// Returns whether the definitions of a type that has none may become available soon. A live
+    /// transport then queries the nodes that write the type, which takes some seconds at most.
+    fn search_definitions(&self, _type_name: &str) -> DefinitionsSearch {
+        DefinitionsSearch::Ended
     }
 
     /// Returns the state of a subscription.
     fn status(&self, _subscription: Subscription) -> ReceptionStatus {
         ReceptionStatus::default()
     }
+}
+
+/// State of the search for the definitions of a type.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum DefinitionsSearch {
+    /// This call has sent a query.
+    Started,
+    /// Definitions may come: by a query, this one or another, or as the writer is discovered.
+    Waiting,
+    /// None will come.
+    Ended,
 }
 
 /// Reasons why a topic cannot be read.

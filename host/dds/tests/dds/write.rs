@@ -1,10 +1,14 @@
 //! Tests of writers.
 
+use rustdds::{GUID, RTPSEntity};
+
 use super::Test;
 use super::peer::{Peer, domain, open, policies, take, until};
+use super::type_query::{announce, announcement};
 
 pub const TESTS: &[Test] = &[
     ("written_bytes_arrive_unchanged_and_readers_are_counted", written),
+    ("messages_that_a_reader_does_not_acknowledge_are_limited", unacknowledged),
     ("a_writer_may_outlive_the_participant", outlives),
 ];
 
@@ -31,6 +35,27 @@ fn written() {
     );
     drop(reader);
     until("no reader", || writer.readers() == 0);
+}
+
+/// A reader that exists only in its announcement acknowledges nothing.
+fn unacknowledged() {
+    let domain = domain();
+    let dds = open(domain);
+    let writer = dds.writer("/event", "std_msgs/msg/String", 300).unwrap();
+    let peer = Peer::join(domain);
+    let _ready = peer.writer("/ready", true, false);
+    until("the peer", || dds.discovered().iter().any(|topic| topic.topic == "/ready"));
+    let prefix = peer.0.guid().to_bytes();
+    let guid = [&prefix[..12], &[9, 9, 9, 4]].concat();
+    let guid = GUID::from_bytes(guid.try_into().unwrap());
+    // Sequence numbers that were used are ignored.
+    announce(
+        domain,
+        (1..20).map(|seq| announcement(guid, seq, "rt/event", "std_msgs::msg::dds_::String_", "")),
+    );
+    until("a reader", || writer.readers() == 1);
+    let sent = (0..9000).take_while(|_| writer.write(&[1; 8]).is_ok()).count();
+    assert_eq!(sent, 300);
 }
 
 fn outlives() {

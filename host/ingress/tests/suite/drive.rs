@@ -142,6 +142,7 @@ fn what_a_reader_publishes_reaches_the_other_readers() {
         topic: topic.to_owned(),
         type_name: TYPE.to_owned(),
         depth: 1,
+        max_bytes: 64,
     });
     let publisher = ingress.publisher("publishes", grants.into());
     let mut result = ingress.reading("reads", grant(0, "/result"));

@@ -6,7 +6,7 @@ use gleaner_protocol::ingress::PublishGrant;
 use crate::support::{Numbers, RunningIngress, TYPE, collect, grant, wait_for};
 
 fn publish(topic: &str) -> PublishGrant {
-    PublishGrant { topic: topic.to_owned(), type_name: TYPE.to_owned(), depth: 4 }
+    PublishGrant { topic: topic.to_owned(), type_name: TYPE.to_owned(), depth: 4, max_bytes: 64 }
 }
 
 #[test]
@@ -33,6 +33,22 @@ fn messages_that_cannot_be_published_are_counted() {
         feed.poll().unwrap();
         (feed.status().unsent == 7).then_some(())
     });
+}
+
+#[test]
+fn messages_that_are_too_long_are_counted_and_not_published() {
+    let numbers = Numbers::on("/out");
+    let mut ingress = RunningIngress::over(numbers.source.clone());
+    let mut reading = ingress.reading("other", grant(0, "/out"));
+    let mut feed = ingress.publisher("one", vec![publish("/out")]);
+    for len in [65, 64, 10_000] {
+        feed.publisher(0).publish(&vec![1; len]).unwrap();
+    }
+    wait_for(|| {
+        feed.poll().unwrap();
+        (feed.status().unsent == 2).then_some(())
+    });
+    assert_eq!(reading.new_samples(), [(1, vec![1; 64])]);
 }
 
 #[test]

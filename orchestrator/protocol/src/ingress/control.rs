@@ -5,6 +5,7 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
+use gleaner_base::visible;
 use serde::Serialize;
 
 use super::{AddReader, AddTopics};
@@ -128,7 +129,7 @@ impl IngressServer {
     /// # Errors
     ///
     /// [`LinkError`] names the invalid frame; nothing can be read after it, except after
-    /// [`LinkError::Grant`].
+    /// [`LinkError::Grant`] and [`LinkError::NoSocket`].
     pub fn receive(&mut self) -> Result<Option<IngressRequest>, LinkError> {
         self.frames.wait(&self.socket)?.map(request).transpose()
     }
@@ -159,7 +160,11 @@ fn request(mut frame: ReceivedFrame) -> Result<IngressRequest, LinkError> {
         tag::ADD_READER => {
             let add: AddReader = frame.json(STARTER)?;
             add.check().map_err(|source| LinkError::Grant { source })?;
-            Ok(IngressRequest::AddReader(add, frame.descriptor()?))
+            match frame.descriptor() {
+                Ok(socket) => Ok(IngressRequest::AddReader(add, socket)),
+                // The kernel discards it if no further file can be opened.
+                Err(_) => Err(LinkError::NoSocket { reader: visible(&add.name) }),
+            }
         }
         tag::ADD_TOPICS => {
             let add: AddTopics = frame.json(STARTER)?;

@@ -33,6 +33,8 @@ pub struct PublishGrant {
     pub type_name: String,
     /// Number of newest messages that the network keeps for its slow readers.
     pub depth: usize,
+    /// Size of the largest message, in bytes of CDR; larger ones are counted as unsent.
+    pub max_bytes: usize,
 }
 
 /// A topic that a reader may read.

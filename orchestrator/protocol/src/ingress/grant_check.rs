@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 
 use gleaner_base::{Exit, Explain, visible};
 
-use super::{AddReader, AddTopics, HoldGrant, PublishGrant, Qos, TopicGrant};
+use super::{AddReader, AddTopics, HoldGrant, PUBLISH_MAX, PublishGrant, Qos, TopicGrant};
 
 /// Largest number of topics that a message grants.
 const TOPICS_MAX: usize = 1024;
@@ -14,6 +14,8 @@ const TOPICS_MAX: usize = 1024;
 const NAME_MAX: usize = 1024;
 /// Samples that a subscription or a publisher may queue: the longest history of a manifest.
 const QUEUE: RangeInclusive<u64> = 1..=65_536;
+/// Bytes of all messages that a publisher keeps.
+const PUBLISHED_BYTES: RangeInclusive<u64> = 1..=64 << 20;
 /// Samples that a reader can find: twice the longest history of a manifest.
 const DEPTH: RangeInclusive<u64> = 1..=131_072;
 /// Bytes of the largest sample.
@@ -88,7 +90,10 @@ impl PublishGrant {
         let fields = GrantFields { what: format!("topic `{}`", shown(&self.topic)) };
         fields.name("topic", &self.topic)?;
         fields.name("type_name", &self.type_name)?;
-        fields.number("depth", self.depth as u64, QUEUE)
+        fields.number("depth", self.depth as u64, QUEUE)?;
+        fields.number("max_bytes", self.max_bytes as u64, 1..=PUBLISH_MAX as u64)?;
+        let all = self.depth as u64 * self.max_bytes as u64;
+        fields.number("depth * max_bytes", all, PUBLISHED_BYTES)
     }
 }
 
@@ -215,6 +220,20 @@ mod tests {
         let refused = AddReader { name: long, ..reader(Vec::new()) }.check().unwrap_err();
         assert!(refused.to_string().ends_with("`name` has 2000 bytes, instead of 1 to 1024"));
         assert!(refused.to_string().len() < 250, "a long name is shown in part");
+    }
+
+    #[test]
+    fn the_memory_of_a_publisher_is_limited() {
+        let refused = |depth, max_bytes| {
+            let (topic, type_name) = ("/out".to_owned(), "std_msgs/msg/String".to_owned());
+            let grant = PublishGrant { topic, type_name, depth, max_bytes };
+            grant.check().unwrap_err().to_string()
+        };
+        let topic = |text: &str| format!("the grant of topic `/out` is invalid: {text}");
+        let too_long = "`max_bytes` is 262145, instead of 1 to 262144";
+        assert_eq!(refused(1, PUBLISH_MAX + 1), topic(too_long));
+        let too_much = "`depth * max_bytes` is 67371008, instead of 1 to 67108864";
+        assert_eq!(refused(257, PUBLISH_MAX), topic(too_much));
     }
 
     #[test]

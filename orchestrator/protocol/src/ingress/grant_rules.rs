@@ -20,23 +20,34 @@ const SINGLES: usize = 4;
 
 /// Type of the answers to wakes.
 const ROUND_TRIP_TYPE: &str = "sensor_msgs/msg/TimeReference";
-/// Answers of one second at 1 kHz; older ones are dropped.
-const ROUND_TRIP_DEPTH: usize = 1024;
+/// Answers of four seconds at 1 kHz that a reader has not acknowledged; later ones are dropped.
+const ROUND_TRIP_DEPTH: usize = 4096;
+/// Bytes of an answer, with 16 labels of 128 bytes, and more.
+const ROUND_TRIP_BYTES: usize = 4 << 10;
 /// Type of published decisions.
 const DECISIONS_TYPE: &str = "std_msgs/msg/String";
 /// Decisions that wait for slow readers.
 const DECISIONS_DEPTH: usize = 256;
+/// Bytes of a decision. Most have some hundred; 16 triggers with the longest attributes have more
+/// than a message may have.
+const DECISIONS_BYTES: usize = 64 << 10;
 
 impl PublishGrant {
     /// The grants of a lambda's process: the topic on which it answers each wake, then the topic on
     /// which it publishes decisions, if there are any.
     pub fn of_lambda(round_trip: Option<&str>, decisions: Option<&str>) -> Vec<PublishGrant> {
-        let grant = |topic: &str, type_name: &str, depth| {
-            let (topic, type_name) = (topic.to_owned(), type_name.to_owned());
-            PublishGrant { topic, type_name, depth }
-        };
-        let round_trip = round_trip.map(|topic| grant(topic, ROUND_TRIP_TYPE, ROUND_TRIP_DEPTH));
-        let decisions = decisions.map(|topic| grant(topic, DECISIONS_TYPE, DECISIONS_DEPTH));
+        let round_trip = round_trip.map(|topic| PublishGrant {
+            topic: topic.to_owned(),
+            type_name: ROUND_TRIP_TYPE.to_owned(),
+            depth: ROUND_TRIP_DEPTH,
+            max_bytes: ROUND_TRIP_BYTES,
+        });
+        let decisions = decisions.map(|topic| PublishGrant {
+            topic: topic.to_owned(),
+            type_name: DECISIONS_TYPE.to_owned(),
+            depth: DECISIONS_DEPTH,
+            max_bytes: DECISIONS_BYTES,
+        });
         round_trip.into_iter().chain(decisions).collect()
     }
 }
@@ -148,5 +159,15 @@ mod tests {
         for grant in [small, large, longest] {
             assert_eq!(grant.check(), Ok(()), "every manifest gives a valid grant");
         }
+    }
+
+    #[test]
+    fn the_topics_that_a_lambda_publishes_take_little_memory() {
+        let grants = PublishGrant::of_lambda(Some("/round_trip"), Some("/decisions"));
+        for grant in &grants {
+            assert_eq!(grant.check(), Ok(()));
+            assert!(grant.depth * grant.max_bytes <= 16 << 20, "{grant:?}");
+        }
+        assert_eq!(grants.len(), 2);
     }
 }

@@ -3,6 +3,7 @@
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
+use rustix::buffer::spare_capacity;
 use rustix::io::Errno;
 use rustix::net::{RecvFlags, recv};
 
@@ -22,8 +23,11 @@ pub(super) const REQUEST_MAX: usize = 4 + PUBLISH_MAX;
 /// Number of bytes that may wait for a reader: definitions of a few hundred topics.
 const QUEUE_BYTES: usize = 16 << 20;
 
-/// Number of bytes that are read at a time.
+/// Number of bytes that are read at a time, at least.
 const STEP: usize = 64 << 10;
+
+/// Number of reads in one call of [`ReaderLink::poll`].
+const READS: usize = 4;
 
 /// A request of a reader.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -53,12 +57,15 @@ pub struct ReaderLink {
     received: Vec<u8>,
     /// Number of received bytes that were returned as requests.
     parsed: usize,
+    /// Number of bytes that were received since [`take_received`](Self::take_received).
+    uncounted: usize,
 }
 
 impl ReaderLink {
     /// Creates the link from the socket that the starter sent.
     pub fn new(socket: OwnedFd) -> ReaderLink {
-        ReaderLink { socket, queue: FrameQueue::default(), received: Vec::new(), parsed: 0 }
+        let (queue, received) = (FrameQueue::default(), Vec::new());
+        ReaderLink { socket, queue, received, parsed: 0, uncounted: 0 }
     }
 
     /// Sends a message, with a descriptor if it is [`Welcome`](ReaderMessage::Welcome) or
@@ -113,32 +120,42 @@ impl ReaderLink {
         !self.queue.is_empty()
     }
 
-    /// Returns the next request if it has arrived completely.
+    /// Returns the number of bytes that were sent so far.
+    pub fn sent_bytes(&self) -> u64 {
+        self.queue.total()
+    }
+
+    /// Returns the next request if it has arrived completely. A call reads a few times only: while
+    /// it returns nothing, the socket may still be readable.
     ///
     /// # Errors
     ///
     /// [`LinkError`] names the invalid frame: end the connection.
     pub fn poll(&mut self) -> Result<Incoming<ReaderRequest>, LinkError> {
-        loop {
+        for _ in 0..READS {
             if let Some(request) = self.next_request()? {
                 return Ok(Incoming::Message(request));
             }
             // Requests are removed together, as moving the rest for each would take too long.
             self.received.drain(..std::mem::take(&mut self.parsed));
-            let start = self.received.len();
-            self.received.resize(start + STEP, 0);
+            self.received.reserve(STEP);
             // Not `recvmsg`: the kernel discards descriptors of a reader.
-            let read = recv(&self.socket, &mut self.received[start..], RecvFlags::DONTWAIT);
-            let bytes = read.as_ref().map_or(0, |(_, bytes)| *bytes);
-            self.received.truncate(start + bytes);
-            match read {
+            let room = spare_capacity(&mut self.received);
+            match recv(&self.socket, room, RecvFlags::DONTWAIT) {
                 // The end may also be in the middle of a frame.
                 Ok((_, 0)) | Err(Errno::CONNRESET) => return Ok(Incoming::Ended),
-                Ok(_) | Err(Errno::INTR) => {}
+                Ok((_, bytes)) => self.uncounted += bytes,
+                Err(Errno::INTR) => {}
                 Err(Errno::AGAIN) => return Ok(Incoming::Nothing),
                 Err(error) => return Err(LinkError::of(READER, error)),
             }
         }
+        Ok(self.next_request()?.map_or(Incoming::Nothing, Incoming::Message))
+    }
+
+    /// Returns the number of bytes that were received since the last call, complete or not.
+    pub fn take_received(&mut self) -> usize {
+        std::mem::take(&mut self.uncounted)
     }
 
     /// Returns the next received request.

@@ -32,6 +32,7 @@ fn reader(name: &str, topics: u32) -> AddReader {
         topic: "/out".to_owned(),
         type_name: "std_msgs/msg/String".to_owned(),
         depth: 5,
+        max_bytes: 100,
     };
     let topics = (0..topics).map(grant).collect();
     AddReader { name: name.to_owned(), topics, publishes: vec![publish] }
@@ -181,6 +182,14 @@ fn an_invalid_grant_is_not_sent_and_is_refused_if_it_is() {
         matches!(server.receive(), Ok(Some(IngressRequest::Begin))),
         "the connection is usable"
     );
+
+    // As if the ingress had too many open files for the socket.
+    let add = serde_json::to_vec(&reader("x", 1)).unwrap();
+    starter_end.write_all(&frame::encode(tag::ADD_READER, &add)).unwrap();
+    starter_end.write_all(&frame::encode(tag::BEGIN, &[])).unwrap();
+    let refused = server.receive().unwrap_err();
+    assert!(matches!(&refused, LinkError::NoSocket { reader } if reader == "x"), "{refused}");
+    assert!(matches!(server.receive(), Ok(Some(IngressRequest::Begin))));
 }
 
 #[test]
@@ -194,7 +203,7 @@ fn invalid_frames_of_a_starter_are_refused_by_name() {
     let add = serde_json::to_vec(&reader("x", 1)).unwrap();
     assert_eq!(
         refusal(&frame::encode(tag::ADD_READER, &add)),
-        "frame `add reader` came without its descriptor"
+        "cannot serve reader `x`: its socket did not arrive"
     );
     assert!(
         refusal(&frame::encode(tag::ADD_TOPICS, b"[]"))
@@ -340,6 +349,33 @@ fn requests_of_a_reader_arrive_and_never_bring_a_descriptor() {
     drop(sent);
     assert_eq!(link.poll().unwrap(), Incoming::Message(ReaderRequest::NeedDefinitions { id: 4 }));
     assert!(is_closed(&observer), "the kernel discarded it");
+}
+
+#[test]
+fn a_reader_that_sends_byte_by_byte_does_not_keep_the_ingress_in_a_call() {
+    let (mut reader_end, ingress_end) = UnixStream::pair().unwrap();
+    let mut link = ReaderLink::new(ingress_end.into());
+    let cdr = vec![5; PUBLISH_MAX];
+    let frame = frame::encode(tag::PUBLISH, &[&[1, 0, 0, 0], &cdr[..]].concat());
+    let len = frame.len();
+    let sender = std::thread::spawn(move || {
+        frame.chunks(1).for_each(|byte| reader_end.write_all(byte).unwrap());
+        reader_end
+    });
+    let (mut received, mut calls) = (0, 0);
+    let request = loop {
+        let found = link.poll().unwrap();
+        let now = link.take_received();
+        received += now;
+        calls += usize::from(now > 0);
+        if let Incoming::Message(request) = found {
+            break request;
+        }
+    };
+    assert_eq!(request, ReaderRequest::Publish { index: 1, cdr });
+    assert_eq!(received, len, "each byte is counted once");
+    assert!(calls > 1, "the ingress has other work between them");
+    drop(sender.join().unwrap());
 }
 
 #[test]

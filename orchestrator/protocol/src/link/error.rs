@@ -83,6 +83,12 @@ pub enum LinkError {
         /// Name of the frame.
         frame: &'static str,
     },
+    /// The socket of a reader did not arrive: the ingress has too many open files.
+    #[error("cannot serve reader `{reader}`: its socket did not arrive")]
+    NoSocket {
+        /// Name of the reader.
+        reader: String,
+    },
     /// The starter did not pass a connection that the program needs.
     #[error("the starter passed no connection `{name}`")]
     NoConnection {

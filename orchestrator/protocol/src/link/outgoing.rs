@@ -81,6 +81,8 @@ pub(crate) struct FrameQueue {
     bytes: usize,
     /// Number of bytes of the first frame that are sent.
     sent: usize,
+    /// Number of bytes that were sent so far.
+    total: u64,
 }
 
 #[derive(Debug)]
@@ -108,6 +110,7 @@ impl FrameQueue {
                 Ok(sent) => {
                     first.descriptor = None;
                     self.sent += sent;
+                    self.total += sent as u64;
                 }
                 Err(Errno::INTR) => {}
                 Err(Errno::AGAIN) => return Ok(()),
@@ -124,6 +127,11 @@ impl FrameQueue {
     /// Returns true if all frames are sent.
     pub(crate) fn is_empty(&self) -> bool {
         self.frames.is_empty()
+    }
+
+    /// Returns the number of bytes that were sent so far.
+    pub(crate) fn total(&self) -> u64 {
+        self.total
     }
 
     /// Returns the number of bytes of frames that are not sent completely.
