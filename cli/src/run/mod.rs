@@ -77,8 +77,7 @@ impl RunTime {
         self.ready.zip(self.limit).is_some_and(|(ready, limit)| ready.elapsed() >= limit)
     }
 
-    /// Returns whether the time is over, counted from the start of the run, and not all lambdas were
-    /// ready yet.
+    /// Returns whether the time since the start of the run is over before all lambdas were ready.
     fn is_over_before_ready(&self) -> bool {
         self.ready.is_none() && self.is_over_since_start()
     }

@@ -23,8 +23,8 @@ use super::output::{self, ChildId, ChildOutput};
 /// runtime before.
 const END_TIMEOUT: Duration = SHUTDOWN_TIMEOUT.saturating_add(Duration::from_secs(10));
 
-/// Size of the socket for connections, in bytes. It has room for some messages only: each unread one
-/// keeps the memory of an ingress that has ended.
+/// Size of the socket for connections, in bytes. It has room for some messages only: each unread
+/// one keeps the memory of an ingress that has ended.
 const HANDOVER_BYTES: usize = 4096;
 
 /// A Gleaner program that reports as JSON lines.

@@ -44,7 +44,7 @@ pub(super) enum GroupEnd {
     Broken(String),
 }
 
-/// What is kept over all process groups of a run.
+/// The failures and counts of a run, over all of its process groups.
 pub(super) struct RunRecord<'a> {
     pub(super) failures: &'a mut Failures,
     pub(super) counts: &'a mut RunCounts,
@@ -277,8 +277,8 @@ impl<'a> ProcessGroup<'a> {
         Ok(None)
     }
 
-    /// Connects the processes that ran before the current ingress to it. Does nothing more if it has
-    /// ended, which the caller notices.
+    /// Connects the processes that ran before the current ingress to it. Does nothing more if it
+    /// has ended, which the caller notices.
     fn join_ingress(&mut self) {
         let Self { context, lambdas, screen, ingress, recorder, .. } = self;
         if std::mem::replace(&mut ingress.is_joined, true) {

@@ -44,7 +44,7 @@ impl RunCounts {
         };
     }
 
-    /// Returns whether the summary that a process of a lambda has written lacks some of these counts.
+    /// Returns whether the summary that a process of a lambda has written lacks some of these.
     fn has_more(&self) -> bool {
         self.recorder.is_some() || self.has_several_ingresses
     }

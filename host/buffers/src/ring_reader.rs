@@ -27,8 +27,8 @@ impl<M> RingReader<M> {
     ///
     /// Its position 0 is position `first` of `reader`, and it shows the newest `depth` samples, or
     /// as many as the topic shows. `decode` converts the words beside a sample, which another
-    /// process wrote. `too_big` returns the number of samples that were too large, from the counters
-    /// of the topic; `too_big_before` of them were before `first`.
+    /// process wrote. `too_big` returns the number of samples that were too large, from the
+    /// counters of the topic; `too_big_before` of them were before `first`.
     pub fn shared(
         reader: SharedReader,
         first: u64,
@@ -45,8 +45,9 @@ impl<M> RingReader<M> {
     }
 
     /// Continues a ring over shared memory in other memory, whose position `first` follows the
-    /// newest position so far. The other arguments are those of [`shared`](Self::shared). Nothing may write to the
-    /// earlier memory any more; its samples stay in the ring until newer ones replace them.
+    /// newest position so far. The other arguments are those of [`shared`](Self::shared). Nothing
+    /// may write to the earlier memory any more; its samples stay in the ring until newer ones
+    /// replace them.
     ///
     /// Does nothing for a ring over a pool.
     pub fn continue_in(

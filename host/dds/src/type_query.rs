@@ -78,7 +78,7 @@ pub(super) enum QueryOutcome {
     Failed { why: String, retry: Retry },
 }
 
-/// Whether another query may help after one that failed.
+/// The use of another query after one that failed.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(super) enum Retry {
     No,

@@ -57,7 +57,7 @@ pub(crate) struct JoiningFeed {
 
 /// The samples of an attached topic, from a first position on.
 #[derive(Clone)]
-pub(crate) struct AttachedReader {
+pub(crate) struct TopicMemory {
     pub(crate) reader: SharedReader,
     pub(crate) first: u64,
 }
@@ -72,7 +72,7 @@ pub struct Feed {
     page: OwnPage,
     status: SourceStatus,
     /// The topics that are attached, with their ids.
-    attached: Vec<(u32, AttachedReader)>,
+    attached: Vec<(u32, TopicMemory)>,
     /// Events that no call has returned yet.
     events: VecDeque<FeedEvent>,
     /// The error that ended the connection.
@@ -204,7 +204,7 @@ impl Feed {
     }
 
     /// Returns the topics that are attached, with their ids.
-    pub(crate) fn attached(&self) -> &[(u32, AttachedReader)] {
+    pub(crate) fn attached(&self) -> &[(u32, TopicMemory)] {
         &self.attached
     }
 
@@ -275,7 +275,7 @@ impl Feed {
                 match self.page.attach(*info, file) {
                     Ok(topic) => {
                         let (reader, first) = (topic.reader.clone(), topic.info.first);
-                        self.attached.push((id, AttachedReader { reader, first }));
+                        self.attached.push((id, TopicMemory { reader, first }));
                         FeedEvent::Attached(topic)
                     }
                     Err(AttachError::Malformed(error)) => return Err(error),

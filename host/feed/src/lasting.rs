@@ -11,7 +11,7 @@ use gleaner_protocol::link::Incoming;
 use gleaner_protocol::{HandoverReceiver, ReceptionGaps};
 use gleaner_transport::Publisher;
 
-use crate::feed::{AttachedReader, JoiningFeed};
+use crate::feed::{JoiningFeed, TopicMemory};
 use crate::losses::TopicLosses;
 use crate::{FedTopic, Feed, FeedBell, FeedError, FeedEvent};
 
@@ -37,7 +37,7 @@ pub struct LastingFeed {
 }
 
 struct LastingTopic {
-    attached: AttachedReader,
+    attached: TopicMemory,
     losses: TopicLosses,
 }
 
@@ -170,7 +170,7 @@ impl LastingFeed {
     fn note(&mut self, events: &[FeedEvent]) {
         for event in events {
             let FeedEvent::Attached(FedTopic { info, reader }) = event else { continue };
-            let attached = AttachedReader { reader: reader.clone(), first: info.first };
+            let attached = TopicMemory { reader: reader.clone(), first: info.first };
             match self.topics.get_mut(&info.id) {
                 Some(topic) => {
                     topic.losses.end_gap(&attached);

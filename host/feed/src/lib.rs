@@ -31,8 +31,9 @@
 //!
 //! # Restarts
 //!
-//! An ingress that ends takes nothing with it: topics and held samples stay valid. A [`LastingFeed`]
-//! joins the next one, over the socket of the starter, and counts what was lost meanwhile.
+//! An ingress that ends takes nothing with it: topics and held samples stay valid. A
+//! [`LastingFeed`] joins the next one, over the socket of the starter, and counts what was lost
+//! meanwhile.
 //!
 //! # Trust
 //!

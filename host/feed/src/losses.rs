@@ -8,7 +8,7 @@ use gleaner_buffers::shared::SharedReader;
 use gleaner_protocol::ingress::ReceptionStatus;
 use gleaner_transport::{Guid, StoredMeta};
 
-use crate::feed::AttachedReader;
+use crate::feed::TopicMemory;
 
 /// Counts of a topic over all ingresses so far.
 pub(crate) struct TopicLosses {
@@ -27,7 +27,7 @@ impl Default for TopicLosses {
 impl TopicLosses {
     /// Adds the counts of an ingress that has ended: its last status, and the samples that it has
     /// left. A time without reception begins.
-    pub(crate) fn begin_gap(&mut self, topic: &AttachedReader, last: &ReceptionStatus) {
+    pub(crate) fn begin_gap(&mut self, topic: &TopicMemory, last: &ReceptionStatus) {
         match &self.gap {
             // The ingress after it has ended, too, before it attached the topic.
             Some(gap) if gap.next.is_none() => return,
@@ -41,7 +41,7 @@ impl TopicLosses {
     }
 
     /// Ends the time without reception: the samples are in the memory of another ingress.
-    pub(crate) fn end_gap(&mut self, topic: &AttachedReader) {
+    pub(crate) fn end_gap(&mut self, topic: &TopicMemory) {
         if let Some(gap) = &mut self.gap {
             gap.next = Some(topic.first);
         }
@@ -82,7 +82,7 @@ struct ReceptionGap {
 
 impl ReceptionGap {
     /// Begins a gap after the samples that an ingress has left. It had matched `writers`.
-    fn after(topic: &AttachedReader, writers: Option<usize>) -> Self {
+    fn after(topic: &TopicMemory, writers: Option<usize>) -> Self {
         let head = topic.reader.head();
         let oldest = head.saturating_sub(topic.reader.depth().into()).max(topic.first);
         let mut awaited: Vec<(Guid, u64)> = Vec::new();

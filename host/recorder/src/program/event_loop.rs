@@ -47,13 +47,13 @@ const SLACK: u64 = 64 << 20;
 
 /// Records until the starter sends stop, or ends, or `stop` is set; then open clips are completed.
 ///
-/// While there is no ingress, windows and clips go on without samples; after its restart, the starter
-/// passes a connection to it.
+/// While there is no ingress, windows and clips go on without samples; after its restart, the
+/// starter passes a connection to it.
 ///
 /// # Errors
 ///
-/// [`Failure`] if the folder cannot be used, if the preroll fails, or if the ingress ends and is not
-/// restarted: the starter then restarts the process.
+/// [`Failure`] if the folder cannot be used, if the preroll fails, or if the ingress ends and is
+/// not restarted: the starter then restarts the process.
 pub fn run(
     options: RecorderOptions,
     connections: RecorderConnections,
