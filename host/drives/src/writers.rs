@@ -11,6 +11,9 @@ use tracing::warn;
 use super::file::Channels;
 use gleaner_transport::Guid;
 
+/// The first bytes of the identity of a writer that no file names.
+const MADE_UP: &[u8] = b"mcap";
+
 /// The writers of a drive, over all its files.
 #[derive(Default)]
 pub(super) struct Writers {
@@ -32,8 +35,8 @@ struct Numbers {
 /// The writer of one channel.
 pub(super) struct ChannelWriter {
     guid: Guid,
-    /// True if the channel's metadata names it.
-    is_claimed: bool,
+    /// True if the channel's metadata names it, and it was a real one.
+    is_named: bool,
     numbers: Arc<Numbers>,
 }
 
@@ -52,7 +55,7 @@ impl ChannelWriter {
         // A named writer counts all its life; it has sent a sample twice if its number comes again.
         // Other recorders may write 0, and numbers that fall back after a restart of the writer or
         // in another file, which would give two samples the same identity.
-        let seq = match self.is_claimed && last > 0 && !self.numbers.is_split.load(Relaxed) {
+        let seq = match self.is_named && last > 0 && !self.numbers.is_split.load(Relaxed) {
             true => {
                 let step = i64::from(sequence.wrapping_sub(last as u32).cast_signed());
                 last.saturating_add_signed(step)
@@ -95,7 +98,7 @@ impl Writers {
         let file = self.files;
         self.files = self.files.saturating_add(1);
         let writers = claims.into_iter().map(|(id, topic, claim)| {
-            let is_claimed = claim.is_some();
+            let is_named = claim.is_some_and(|guid| !guid.0.starts_with(MADE_UP));
             let guid = claim.unwrap_or_else(|| {
                 let mut attempts = (0..=u32::MAX).map(|attempt| made_up(file, id, attempt));
                 let free = attempts.find(|guid| taken.insert((topic, *guid)));
@@ -108,7 +111,7 @@ impl Writers {
                 }
                 Entry::Vacant(new) => new.insert(Arc::default()).clone(),
             };
-            (id, ChannelWriter { guid, is_claimed, numbers })
+            (id, ChannelWriter { guid, is_named, numbers })
         });
         writers.collect()
     }
@@ -116,7 +119,7 @@ impl Writers {
 
 fn made_up(file: u32, channel: u16, attempt: u32) -> Guid {
     let mut bytes = [0; 16];
-    bytes[..4].copy_from_slice(b"mcap");
+    bytes[..4].copy_from_slice(MADE_UP);
     bytes[4..8].copy_from_slice(&file.to_be_bytes());
     bytes[8..12].copy_from_slice(&u32::from(channel).to_be_bytes());
     bytes[12..].copy_from_slice(&attempt.to_be_bytes());
