@@ -315,17 +315,24 @@ fn ctrl_c() {
     assert!(out.path().join("summary.json").is_file());
 }
 
-fn shared() {
+/// Runs the lambdas `first` and `second`, and waits until both are ready. Also returns their
+/// folders.
+fn run_two(out: &Path) -> (RunningProgram, [LambdaCopy; 2]) {
     let lambdas = [("examples/hello/rust", "first"), ("examples/hello/python", "second")]
         .map(|(of, name)| LambdaCopy::named(of, name));
-    let out = TempFolder::new();
     let folders = [lambdas[0].path(), lambdas[1].path()];
-    let started = run_all(&folders, out.path(), &["--set", "first.brake_mps2=-1.4"]);
+    let started = run_all(&folders, out, &["--set", "first.brake_mps2=-1.4"]);
     let mut ready = 0;
     started.until_named("both lambdas to be ready", |_, report| {
         ready += u32::from(matches!(report, Report::Ready));
         (ready == 2).then_some(())
     });
+    (started, lambdas)
+}
+
+fn shared() {
+    let out = TempFolder::new();
+    let (started, _lambdas) = run_two(out.path());
     let drive = sample_drive();
     let path = drive.to_str().expect("the checkout has a plain path");
     let played = play(&[path, "--wait", "1", "--start", "8", "--duration", "5"]).finish();
@@ -405,16 +412,8 @@ fn killed(name: &str) {
 }
 
 fn ingress_killed() {
-    let lambdas = [("examples/hello/rust", "first"), ("examples/hello/python", "second")]
-        .map(|(of, name)| LambdaCopy::named(of, name));
     let out = TempFolder::new();
-    let folders = [lambdas[0].path(), lambdas[1].path()];
-    let started = run_all(&folders, out.path(), &["--set", "first.brake_mps2=-1.4"]);
-    let mut ready = 0;
-    started.until_named("both lambdas to be ready", |_, report| {
-        ready += u32::from(matches!(report, Report::Ready));
-        (ready == 2).then_some(())
-    });
+    let (started, _lambdas) = run_two(out.path());
     let drive = sample_drive();
     let path = drive.to_str().expect("the checkout has a plain path");
     // The night brake is at 10.8 s.

@@ -1,7 +1,7 @@
 //! A topic in shared memory as a ring: positions from 0, and metadata of one type.
 //!
-//! When another process takes over the topic, in memory of its own, the ring continues there: the
-//! samples in the earlier memory stay in the ring until newer ones replace them.
+//! The ring continues in other memory when another process takes over the topic: the samples in the
+//! earlier memory stay in the ring until newer ones replace them.
 
 use std::sync::{Arc, PoisonError, RwLock};
 
