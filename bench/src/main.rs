@@ -27,6 +27,9 @@ struct Args {
     /// Live topics instead of drives, in a private network; needs gleaner-player.
     #[arg(long)]
     live: bool,
+    /// Of live topics only the round trips, against a bare reader.
+    #[arg(long, conflicts_with_all = ["live", "kernels", "drives", "isolation"])]
+    rtt: bool,
     /// Arithmetic in lambdas against the same code natively, and calls between lambda and host,
     /// instead of drives.
     #[arg(long, conflicts_with = "live")]
@@ -41,13 +44,14 @@ struct Args {
 }
 
 fn main() -> ExitCode {
-    let Args { quick, live, kernels, drives, isolation } = Args::parse();
-    if live || isolation {
+    let Args { quick, live, rtt, kernels, drives, isolation } = Args::parse();
+    if live || rtt || isolation {
         let figures = match live::in_private_network() {
             Some(Ok(true)) => return ExitCode::SUCCESS,
             Some(Ok(false)) => return ExitCode::FAILURE,
             Some(Err(why)) => Err(why),
             None if isolation => isolation::figures(quick),
+            None if rtt => Ok(live::round_trips(quick)),
             None => Ok(live::figures(quick)),
         };
         return match figures {

@@ -1,5 +1,4 @@
-//! The baseline: a bare RustDDS reader of an IMU that only stamps and answers each sample, in one
-//! thread.
+//! The baseline: a bare RustDDS reader that only stamps and answers each sample, in one thread.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -13,8 +12,11 @@ use gleaner_transport::Clock;
 use mio::{Events, Interest, Poll, Token};
 use rustdds::policy::{Durability, History, Reliability, ResourceLimits};
 use rustdds::{
-    DomainParticipant, QosPolicyBuilder, RepresentationIdentifier, Topic, TopicKind, no_key,
+    DomainParticipantBuilder, QosPolicyBuilder, RepresentationIdentifier, Topic, TopicKind, no_key,
 };
+
+/// Receive buffer of its sockets, as of the ingress.
+const BUFFER_BYTES: usize = 64 << 20;
 
 /// A thread that answers until it is stopped.
 pub(super) struct BareReader {
@@ -23,12 +25,12 @@ pub(super) struct BareReader {
 }
 
 impl BareReader {
-    /// Answers the samples of `input` on `output`.
-    pub(super) fn start(input: &str, output: &str) -> Self {
+    /// Answers the samples of `input`, of a DDS type that begins with a header, on `output`.
+    pub(super) fn start(input: &str, type_name: &str, output: &str) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
-        let (stop_flag, input, output) =
-            (Arc::clone(&stop), format!("rt{input}"), format!("rt{output}"));
-        let thread = thread::spawn(move || answer(&stop_flag, &input, &output));
+        let (stop_flag, input, type_name, output) =
+            (Arc::clone(&stop), format!("rt{input}"), type_name.to_owned(), format!("rt{output}"));
+        let thread = thread::spawn(move || answer(&stop_flag, &input, &type_name, &output));
         Self { stop, thread }
     }
 
@@ -39,8 +41,9 @@ impl BareReader {
     }
 }
 
-fn answer(stop: &AtomicBool, input: &str, output: &str) -> Vec<f64> {
-    let participant = DomainParticipant::new(0).expect("a private network can be joined");
+fn answer(stop: &AtomicBool, input: &str, type_name: &str, output: &str) -> Vec<f64> {
+    let builder = DomainParticipantBuilder::new(0).socket_receive_buffer_size(BUFFER_BYTES);
+    let participant = builder.build().expect("a private network can be joined");
     let limits =
         ResourceLimits { max_samples: 1024, max_instances: 1, max_samples_per_instance: 1024 };
     let reliable = Reliability::Reliable { max_blocking_time: rustdds::Duration::from_millis(100) };
@@ -55,10 +58,8 @@ fn answer(stop: &AtomicBool, input: &str, output: &str) -> Vec<f64> {
             participant.create_topic(name.to_owned(), type_name.to_owned(), &qos, TopicKind::NoKey);
         topic.expect("a topic can be created")
     };
-    let (input, output) = (
-        topic(input, "sensor_msgs::msg::dds_::Imu_"),
-        topic(output, "sensor_msgs::msg::dds_::TimeReference_"),
-    );
+    let (input, output) =
+        (topic(input, type_name), topic(output, "sensor_msgs::msg::dds_::TimeReference_"));
     let subscriber = participant.create_subscriber(&qos).expect("a subscriber can be created");
     let mut reader = subscriber
         .create_simple_datareader_no_key::<i64, StampAdapter>(&input, Some(qos.clone()))

@@ -52,7 +52,7 @@ fn start_in_private_network() -> Result<bool, String> {
 /// All figures.
 pub fn figures(quick: bool) -> Vec<Figure> {
     let seconds = |long: u32| if quick { 2 } else { long };
-    let mut figures = Vec::new();
+    let mut figures = round_trips(quick);
     const FULL_HD: &str = "1920x1080@30";
     for (name, lambdas, players, long) in [
         ("1080p bgr8 at 30 Hz", &["camera"][..], &[&["--synthetic", FULL_HD][..]][..], 60),
@@ -78,9 +78,15 @@ pub fn figures(quick: bool) -> Vec<Figure> {
     ] {
         receive(name, lambdas, players, seconds(long), &mut figures);
     }
-    rounds::figures(seconds(60), &mut figures);
     many(16, seconds(20), &mut figures);
     footprint::figures(seconds(10), &mut figures);
+    figures
+}
+
+/// The times from a sample to its answer.
+pub fn round_trips(quick: bool) -> Vec<Figure> {
+    let mut figures = Vec::new();
+    rounds::figures(if quick { 3 } else { 60 }, &mut figures);
     figures
 }
 

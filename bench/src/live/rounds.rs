@@ -1,48 +1,41 @@
-//! Measures the round trip from a sample to its answer: an empty lambda of each kind and a bare
-//! reader, in one run.
+//! Measures the round trip from a sample to its answer: a bare reader and a lambda of each kind, in
+//! turns.
 
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use gleaner_dds::{Dds, DdsOptions};
+use gleaner_protocol::LiveStatus;
+use gleaner_tests::LambdaCopy;
+use gleaner_tests::live::play;
 
 use super::bare::BareReader;
 use super::{lambda, play_and_stop, start};
 use crate::answers::RttReceiver;
 use crate::measure::{Figure, Twin, quantile};
 
-/// Goal for the round trip of a lambda, relative to the bare reader.
+/// Goals for the round trip of a lambda, relative to the bare reader: median and 99th percentile.
 const RATIO: f64 = 1.5;
+const TAIL_RATIO: f64 = 2.0;
+
+/// Number of turns of each side.
+const ROUNDS: u32 = 3;
+
+/// Topic of the answers.
+const ANSWERS: &str = "/rtt/lambda";
 
 pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
-    let mut dds = Dds::open(DdsOptions::new("/gleaner_bench/answers"))
-        .expect("a private network can be joined");
-    let kinds = [Twin::Rust, Twin::Python]
-        .map(|kind| (kind, RttReceiver::on(&mut dds, &format!("/rtt/{kind}"))));
-    let bare = BareReader::start("/imu/synthetic", "/rtt/bare");
-    let started = kinds.iter().map(|(kind, _)| {
-        start(&lambda("imu", *kind), &["--no-record", "--rtt", &format!("/rtt/{kind}")])
-    });
-    let started = started.collect();
-    let duration = seconds.to_string();
-    let player =
-        vec!["--imu", "100", "--stamp", "monotonic", "--wait", "3", "--duration", &duration];
-    let ended = play_and_stop(started, &[player], &mut Vec::new());
-    // The last answers may still be in transit.
-    std::thread::sleep(Duration::from_millis(200));
-    let base = bare.stop();
-    round_trip("bare reader", &base, figures);
-    let base = quantile(&base, 0.5);
-    for (((kind, answers), live), goals) in
-        kinds.iter().zip(&ended).zip([[20.0, 100.0], [30.0, 150.0]])
-    {
-        let ns = answers.take().iter().map(|answer| answer.ns).collect::<Vec<_>>();
-        round_trip(&format!("empty lambda, {kind}"), &ns, figures);
-        figures.push(Figure::at_most(
-            &format!("IMU round trip at 100 Hz, empty lambda, {kind}, against the bare reader"),
-            "times",
-            RATIO,
-            &[quantile(&ns, 0.5) / base],
-        ));
+    let lambdas = [Twin::Rust, Twin::Python].map(|kind| lambda("imu", kind));
+    let sides = Sides {
+        name: "IMU round trip at 100 Hz, empty lambda".to_owned(),
+        input: "/imu/synthetic",
+        type_name: "sensor_msgs::msg::dds_::Imu_",
+        lambdas: lambdas.each_ref().map(PathBuf::as_path),
+        event: &["--imu", "100"],
+        others: &[],
+    };
+    let ended = sides.compare(seconds, figures);
+    for ((kind, live), goals) in ended.iter().zip([[20.0, 100.0], [30.0, 150.0]]) {
         let spreads =
             [("wake latency", live.wake_latency), ("decision latency", live.decision_latency)];
         for (what, spread) in spreads.iter().filter_map(|(what, spread)| Some((what, (*spread)?))) {
@@ -61,11 +54,93 @@ pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
             ));
         }
     }
+    for (size, name) in [("1280x720@10", "720p"), ("1920x1080@10", "1080p")] {
+        brake_dark(size, name, seconds, figures);
+    }
 }
 
-fn round_trip(name: &str, ns: &[f64], figures: &mut Vec<Figure>) {
-    for (what, share) in [("p50", 0.5), ("p99", 0.99)] {
-        let name = format!("IMU round trip at 100 Hz, {name}: {what}");
-        figures.push(Figure::without_goal(&name, "us", &[quantile(ns, share) / 1e3]));
+/// Measures `examples/brake-dark` on a camera of raw images, where each wake computes the luma.
+fn brake_dark(size: &str, name: &str, seconds: u32, figures: &mut Vec<Figure>) {
+    let lambdas = [Twin::Rust, Twin::Python].map(|kind| {
+        let of_raw_images = |manifest: String| {
+            manifest
+                .replace("/camera/front/compressed", "/camera/synthetic/image_raw")
+                .replace("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+                .replace("/imu/data", "/imu/synthetic")
+                .replace("max_size = \"2 MiB\"", "max_size = \"8 MiB\"")
+                // At rest, too, the image is looked at.
+                .replace("default = -3.0", "default = 100.0")
+        };
+        LambdaCopy::of(&format!("examples/brake-dark/{}", kind.folder()), of_raw_images)
+    });
+    let sides = Sides {
+        name: format!("{name} round trip at 10 Hz, Brake+Dark"),
+        input: "/camera/synthetic/image_raw",
+        type_name: "sensor_msgs::msg::dds_::Image_",
+        lambdas: lambdas.each_ref().map(LambdaCopy::path),
+        event: &["--synthetic", size],
+        others: &["--imu", "100"],
+    };
+    sides.compare(seconds, figures);
+}
+
+/// A bare reader and two lambdas that take turns.
+struct Sides<'a> {
+    name: String,
+    /// The topic whose samples are answered, and its DDS type.
+    input: &'a str,
+    type_name: &'a str,
+    /// The lambda in Rust and in Python.
+    lambdas: [&'a Path; 2],
+    /// Arguments of the player for the topic, and for the other inputs of the lambdas.
+    event: &'a [&'a str],
+    others: &'a [&'a str],
+}
+
+impl Sides<'_> {
+    /// Lets the sides take turns of `seconds` in all; returns the last statuses of the lambdas.
+    fn compare(&self, seconds: u32, figures: &mut Vec<Figure>) -> Vec<(Twin, LiveStatus)> {
+        let mut dds = Dds::open(DdsOptions::new("/gleaner_bench/answers"))
+            .expect("a private network can be joined");
+        let answers = RttReceiver::on(&mut dds, ANSWERS);
+        let duration = seconds.div_ceil(ROUNDS).to_string();
+        let player = ["--stamp", "monotonic", "--wait", "1", "--duration", &duration];
+        let kinds = [Twin::Rust, Twin::Python];
+        let (mut base, mut times) = (Vec::new(), [Vec::new(), Vec::new()]);
+        let mut last = [None, None];
+        for _ in 0..ROUNDS {
+            let bare = BareReader::start(self.input, self.type_name, "/rtt/bare");
+            let played = play(&[self.event, &player].concat()).finish();
+            assert!(played.status.success(), "{}", played.stderr);
+            base.extend(bare.stop());
+            for (index, lambda) in self.lambdas.iter().enumerate() {
+                let started = start(lambda, &["--no-record", "--rtt", ANSWERS]);
+                let played = [self.event, self.others, &player].concat();
+                last[index] = play_and_stop(vec![started], &[played], &mut Vec::new()).pop();
+                // The last answers may still be in transit.
+                std::thread::sleep(Duration::from_millis(200));
+                times[index].extend(answers.take().iter().map(|answer| answer.ns));
+            }
+        }
+        self.round_trip("bare reader", &base, figures);
+        for (kind, ns) in kinds.iter().zip(&times) {
+            self.round_trip(&kind.to_string(), ns, figures);
+            for (what, share, most) in [("p50", 0.5, RATIO), ("p99", 0.99, TAIL_RATIO)] {
+                figures.push(Figure::at_most(
+                    &format!("{}, {kind}, against the bare reader: {what}", self.name),
+                    "times",
+                    most,
+                    &[quantile(ns, share) / quantile(&base, share)],
+                ));
+            }
+        }
+        kinds.into_iter().zip(last).filter_map(|(kind, live)| Some((kind, live?))).collect()
+    }
+
+    fn round_trip(&self, of: &str, ns: &[f64], figures: &mut Vec<Figure>) {
+        for (what, share) in [("p50", 0.5), ("p99", 0.99)] {
+            let name = format!("{}, {of}: {what} of {} answers", self.name, ns.len());
+            figures.push(Figure::without_goal(&name, "us", &[quantile(ns, share) / 1e3]));
+        }
     }
 }

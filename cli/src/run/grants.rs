@@ -45,6 +45,12 @@ pub(super) fn recorder(args: &RunArgs) -> AddReader {
     }
 }
 
+/// Returns the reader as it joins an ingress that was started again.
+pub(super) fn again(reader: AddReader) -> AddReader {
+    let topics = reader.topics.into_iter().map(TopicGrant::again).collect();
+    AddReader { topics, ..reader }
+}
+
 /// The recorded topics of all lambdas of a run, each once.
 pub(super) struct RecordedTopics {
     grants: Vec<TopicGrant>,
@@ -82,8 +88,8 @@ impl RecordedTopics {
         grants.into_iter().filter(|grant| self.granted.insert(grant.id)).collect()
     }
 
-    /// Returns the grants of a lambda's recorded topics that the recorder has, as far as `again`
-    /// has none of them yet, and adds these to it.
+    /// Returns the grants of a lambda's recorded topics that the recorder attaches again after a
+    /// restart of the ingress, as far as `again` has none of them yet, and adds these to it.
     pub(super) fn take_again(
         &self,
         lambda: &RunLambda,
@@ -91,7 +97,8 @@ impl RecordedTopics {
     ) -> Vec<TopicGrant> {
         let grants = self.grants_of(lambda).into_iter();
         let has = |grant: &&TopicGrant| self.granted.contains(&grant.id);
-        grants.filter(has).filter(|grant| again.insert(grant.id)).cloned().collect()
+        let grants = grants.filter(has).filter(|grant| again.insert(grant.id));
+        grants.cloned().map(TopicGrant::again).collect()
     }
 
     fn grants_of(&self, lambda: &RunLambda) -> Vec<&TopicGrant> {

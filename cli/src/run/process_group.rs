@@ -285,7 +285,7 @@ impl<'a> ProcessGroup<'a> {
             return;
         }
         if let Some(recorder) = recorder {
-            let added = ingress.control.add_reader(&grants::recorder(context.args));
+            let added = ingress.control.add_reader(&grants::again(grants::recorder(context.args)));
             let Some(socket) = ingress.granted(added) else { return };
             let mut again = HashSet::new();
             for supervised in lambdas.iter() {
@@ -306,7 +306,7 @@ impl<'a> ProcessGroup<'a> {
             let lambda = &supervised.lambda;
             let is_recorded = recorder.is_some() && lambda.manifest.record.is_some();
             let reader = grants::lambda(lambda, context.args, is_recorded, supervised.restarts);
-            let added = ingress.control.add_reader(&reader);
+            let added = ingress.control.add_reader(&grants::again(reader));
             let Some(socket) = ingress.granted(added) else { return };
             supervised.pass_ingress(socket, screen);
         }

@@ -105,6 +105,7 @@ fn grant(id: u32) -> TopicGrant {
         holds: HoldGrant { windows: 1, window: 20, singles: 3 },
         wakes: true,
         digests: false,
+        shown: false,
     }
 }
 

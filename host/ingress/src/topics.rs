@@ -51,7 +51,7 @@ impl TopicTable {
             depth: grant.depth,
             wakes: grant.wakes,
             digests: grant.digests,
-            is_latched: topic.is_latched(source),
+            is_latched: grant.shown || topic.is_latched(source),
         };
         let attached = match topic.attach(max_bytes, grant.max_bytes.is_some(), &request) {
             Ok(attached) => attached,

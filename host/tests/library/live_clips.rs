@@ -26,7 +26,7 @@ use gleaner_lambda::{BuildDir, Clip, Fault, FaultKind};
 use gleaner_messages::Endian;
 use gleaner_messages::Sources;
 use gleaner_protocol::ingress::{
-    AddReader, AddTopics, IngressControl, IngressReport, IngressStatus, TopicGrant,
+    AddReader, AddTopics, IngressControl, IngressReport, IngressStatus, IngressTopic, TopicGrant,
 };
 use gleaner_protocol::link::{
     AddLambda, ControlClient, RecordedTopic, RecorderReport, recorded_grant,
@@ -227,7 +227,8 @@ impl RecordedRun {
     }
 
     /// Ends the ingress, publishes `lost` samples of each topic, and starts the ingress again.
-    fn restart_ingress(&mut self, lost: u64) {
+    /// Between the recorder and the lambda, `first` other samples are received.
+    fn restart_ingress(&mut self, lost: u64, first: i64) {
         let (reports, reported) = sync_channel(64);
         let (control, ended) = IngressControl::pair().unwrap();
         drop((std::mem::replace(&mut self.ingress, control), ended));
@@ -243,14 +244,20 @@ impl RecordedRun {
         let manifest = Manifest::parse(MANIFEST, "lambda.toml").unwrap();
         let (name, publishes) = ("recorder".to_owned(), Vec::new());
         let recorder = AddReader { name, topics: TOPICS.map(grant).to_vec(), publishes };
-        for (reader, handover) in [recorder, adder(&manifest)].iter().zip(&self.handovers) {
-            let ingress = Some(self.ingress.add_reader(reader).unwrap());
-            Handover { ingress, ..Handover::default() }.try_send(handover).unwrap();
+        for (mut reader, index) in [recorder, adder(&manifest)].into_iter().zip(0..) {
+            reader.topics = reader.topics.into_iter().map(TopicGrant::again).collect();
+            let ingress = Some(self.ingress.add_reader(&reader).unwrap());
+            Handover { ingress, ..Handover::default() }.try_send(&self.handovers[index]).unwrap();
+            let is_shared = |status: &IngressStatus| {
+                let has_both = |topic: &IngressTopic| topic.readers == index + 1;
+                status.topics.len() == 2 && status.topics.iter().all(has_both)
+            };
+            while !matches!(reported.recv().unwrap(), IngressReport::Status(it) if is_shared(&it)) {
+            }
+            if index == 0 {
+                (1..=first).for_each(|value| self.publish("/others", value, 8));
+            }
         }
-        let is_shared = |status: &IngressStatus| {
-            status.topics.len() == 2 && status.topics.iter().all(|topic| topic.readers == 2)
-        };
-        while !matches!(reported.recv().unwrap(), IngressReport::Status(it) if is_shared(&it)) {}
     }
 
     /// Lets the recorder receive the other topic, too.
@@ -432,7 +439,7 @@ fn a_clip_over_a_restart_of_the_ingress_is_verified_if_nothing_was_lost() {
     let mut running = RecordedRun::start();
     running.record_others();
     running.burst(5);
-    running.restart_ingress(0);
+    running.restart_ingress(0, 3);
     running.burst(3);
     let clip = running.clip();
     let verified = running.verify(clip).unwrap();
@@ -445,7 +452,7 @@ fn samples_that_a_restarted_ingress_receives_again_are_repeated_in_the_verificat
     let mut running = RecordedRun::start();
     running.record_others();
     running.burst(5);
-    running.restart_ingress(0);
+    running.restart_ingress(0, 0);
     // A writer with durability `transient_local` sends its last ones again.
     running.sent.iter_mut().for_each(|sent| *sent -= 1);
     running.publish("/others", 5, 8);
@@ -462,7 +469,7 @@ fn a_clip_states_what_a_restart_of_the_ingress_has_lost_and_lambda_and_recorder_
     let mut running = RecordedRun::start();
     running.record_others();
     running.burst(5);
-    running.restart_ingress(7);
+    running.restart_ingress(7, 0);
     running.burst(3);
     let clip: Clip = running.next_clip();
     let stated = "as the ingress had ended";

@@ -61,6 +61,9 @@ pub struct TopicGrant {
     pub wakes: bool,
     /// True if the reader needs the digests of samples, for a journal.
     pub digests: bool,
+    /// True if the reader begins with the oldest sample that the memory of the topic shows, and
+    /// not with the next one.
+    pub shown: bool,
 }
 
 /// Samples of one topic that a reader may hold at a time.

@@ -183,6 +183,7 @@ mod tests {
             holds: HoldGrant { windows: 1, window: 1, singles: 0 },
             wakes: false,
             digests: false,
+            shown: false,
         }
     }
 

@@ -80,7 +80,16 @@ impl TopicGrant {
             holds: HoldGrant { windows, window: bounded(shown), singles: bounded(singles) },
             wakes,
             digests,
+            shown: false,
         }
+    }
+
+    /// Returns the grant with which a reader attaches the topic again after a restart of the
+    /// ingress. All readers begin with the same sample: the first one after the restart, if they
+    /// can still find it. It has a digest, which readers that attach later may need.
+    #[must_use]
+    pub fn again(self) -> TopicGrant {
+        TopicGrant { shown: true, digests: true, ..self }
     }
 }
 

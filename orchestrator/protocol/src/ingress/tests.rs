@@ -24,6 +24,7 @@ fn grant(id: u32) -> TopicGrant {
         holds: HoldGrant { windows: 1, window: 20, singles: 3 },
         wakes: id == 0,
         digests: false,
+        shown: false,
     }
 }
 

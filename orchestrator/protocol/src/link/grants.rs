@@ -42,6 +42,7 @@ pub fn commands_grant(topic: &str) -> TopicGrant {
         holds: HoldGrant { windows: 1, window: SMALL_WINDOW, singles: 0 },
         wakes: true,
         digests: false,
+        shown: false,
     }
 }
 
@@ -71,5 +72,6 @@ pub fn recorded_grant(
         },
         wakes: false,
         digests: false,
+        shown: false,
     }
 }
