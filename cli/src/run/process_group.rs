@@ -401,7 +401,11 @@ impl<'a> ProcessGroup<'a> {
                 // Processes that an earlier one left running may still write into its pipes.
                 (prefix, Some(supervised).filter(|current| current.restarts == start))
             }
-            ChildId::Ingress { start } if start != ingress.start => return,
+            ChildId::Ingress { start }
+                if start != ingress.start && !matches!(piece, OutputPiece::Stderr { .. }) =>
+            {
+                return;
+            }
             ChildId::Ingress { .. } | ChildId::Recorder => (String::new(), None),
         };
         match piece {

@@ -22,8 +22,7 @@ use crate::input::continue_fed_input;
 use crate::invoker::Invoker;
 use crate::schedule::WakeSchedule;
 
-/// Interval at which signals, the recorder and the time of the next report are checked. A wake does
-/// not wait for it.
+/// Interval at which signals, the recorder and the time of the next report are checked.
 const ROUND: Duration = Duration::from_millis(50);
 /// Watchdog interval of the event loop, including stalls.
 const ALIVE: Duration = Duration::from_secs(30);
@@ -56,6 +55,11 @@ impl LiveEventLoop {
             // Before the look at the schedule: a later sample ends the wait.
             let seen = self.bell.value();
             let now = self.clock.now();
+            self.feed.look_for_losses();
+            // A wake does not wait for the round, nor a round for many wakes.
+            let wake = self.schedule.next_tick(now).or_else(|| self.schedule.next_event());
+            let is_woken = wake.is_some();
+            wake.map_or(Ok(()), |wake| self.wake(wake))?;
             if now.saturating_sub(last_round) >= nanoseconds(ROUND) {
                 last_round = now;
                 if stop.load(Ordering::Relaxed) {
@@ -67,10 +71,7 @@ impl LiveEventLoop {
                 // There may be another bell.
                 continue;
             }
-            self.feed.look_for_losses();
-            if let Some(wake) = self.schedule.next_tick(now).or_else(|| self.schedule.next_event())
-            {
-                self.wake(wake)?;
+            if is_woken {
                 continue;
             }
             let due = self
