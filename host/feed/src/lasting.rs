@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use gleaner_buffers::shared::SharedReader;
 use gleaner_protocol::ingress::{ReceptionStatus, SourceStatus};
 use gleaner_protocol::link::Incoming;
-use gleaner_protocol::{HandoverReceiver, ReceptionGaps};
+use gleaner_protocol::{Handover, HandoverReceiver, ReceptionGaps};
 use gleaner_transport::Publisher;
 
 use crate::feed::{JoiningFeed, TopicMemory};
@@ -202,7 +202,8 @@ impl LastingFeed {
         self.gaps.count = self.gaps.count.saturating_add(1);
     }
 
-    /// Joins the next ingress, if the starter has passed a connection to it.
+    /// Joins the next ingress, if the starter has passed a connection to it. If that one has ended
+    /// meanwhile, what it received is read before a further one is joined.
     fn join(&mut self) -> Result<(), FeedError> {
         let Some(OpenGap { until, heads, joining, .. }) = &mut self.gap else { return Ok(()) };
         // An ingress that lives, and has closed this connection, overwrites what this process
@@ -210,28 +211,36 @@ impl LastingFeed {
         if heads.iter().any(|(reader, head)| reader.head() != *head) {
             return Err(FeedError::Gone);
         }
-        let starter = self.starter.as_mut().ok_or(FeedError::Gone)?;
-        loop {
-            match starter.poll()? {
-                Incoming::Message(handover) => {
-                    *joining = handover.ingress.map(JoiningFeed::new).or(joining.take());
-                }
-                Incoming::Nothing => break,
-                Incoming::Ended => return Err(FeedError::Gone),
-            }
-        }
         if Instant::now() >= *until {
             return Err(FeedError::Gone);
         }
-        let Some(connection) = joining.take() else { return Ok(()) };
-        match connection.poll() {
-            Ok(ControlFlow::Continue(connection)) => *joining = Some(connection),
-            Ok(ControlFlow::Break(feed)) => self.joined(feed),
-            // It has ended as well; the starter passes another connection.
-            Err(FeedError::Gone) => {}
-            Err(error) => return Err(error),
+        let starter = self.starter.as_mut().ok_or(FeedError::Gone)?;
+        loop {
+            let connection = match joining.take() {
+                Some(connection) => connection,
+                None => match starter.poll()? {
+                    Incoming::Message(Handover { ingress: Some(socket), .. }) => {
+                        JoiningFeed::new(socket)
+                    }
+                    Incoming::Message(_) => continue,
+                    Incoming::Nothing => return Ok(()),
+                    Incoming::Ended => return Err(FeedError::Gone),
+                },
+            };
+            match connection.poll() {
+                Ok(ControlFlow::Continue(connection)) => {
+                    *joining = Some(connection);
+                    return Ok(());
+                }
+                Ok(ControlFlow::Break(feed)) => {
+                    self.joined(feed);
+                    return Ok(());
+                }
+                // It has ended without a message; the starter passes another connection.
+                Err(FeedError::Gone) => {}
+                Err(error) => return Err(error),
+            }
         }
-        Ok(())
     }
 
     fn joined(&mut self, feed: Feed) {

@@ -60,6 +60,7 @@ fn grant(id: u32, topic: &str, max_bytes: u64) -> TopicGrant {
         holds: HoldGrant { windows: 1, window: 8, singles: 4 },
         wakes: true,
         digests: false,
+        shown: false,
     }
 }
 

@@ -74,6 +74,7 @@ impl ReaderProcess {
             holds: HoldGrant { windows: 2, window: 16, singles: 8 },
             wakes: true,
             digests: role == "verify",
+            shown: false,
         };
         let (topic, type_name) = ("/published".to_owned(), TYPE.to_owned());
         let publishes = vec![PublishGrant { topic, type_name, depth: 4, max_bytes: 1024 }];

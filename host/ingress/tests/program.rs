@@ -107,6 +107,7 @@ fn imu(id: u32, depth: u32) -> TopicGrant {
         holds: HoldGrant { windows: 2, window: 16, singles: 4 },
         wakes: true,
         digests: true,
+        shown: false,
     }
 }
 

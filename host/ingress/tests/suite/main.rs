@@ -5,5 +5,6 @@ mod drive;
 mod granting;
 mod hostile;
 mod publishing;
+mod restarts;
 mod sharing;
 mod support;

@@ -187,6 +187,7 @@ pub fn grant(id: u32, topic: &str) -> TopicGrant {
         holds: HoldGrant { windows: 1, window: 8, singles: 4 },
         wakes: true,
         digests: false,
+        shown: false,
     }
 }
 
