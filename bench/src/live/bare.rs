@@ -18,6 +18,9 @@ use rustdds::{
 /// Receive buffer of its sockets, as of the ingress.
 const BUFFER_BYTES: usize = 64 << 20;
 
+/// Number of samples that it keeps. With more of them, the memory of images would never be reused.
+const DEPTH: i32 = 16;
+
 /// A thread that answers until it is stopped.
 pub(super) struct BareReader {
     stop: Arc<AtomicBool>,
@@ -45,11 +48,11 @@ fn answer(stop: &AtomicBool, input: &str, type_name: &str, output: &str) -> Vec<
     let builder = DomainParticipantBuilder::new(0).socket_receive_buffer_size(BUFFER_BYTES);
     let participant = builder.build().expect("a private network can be joined");
     let limits =
-        ResourceLimits { max_samples: 1024, max_instances: 1, max_samples_per_instance: 1024 };
+        ResourceLimits { max_samples: DEPTH, max_instances: 1, max_samples_per_instance: DEPTH };
     let reliable = Reliability::Reliable { max_blocking_time: rustdds::Duration::from_millis(100) };
     let qos = QosPolicyBuilder::new()
         .reliability(reliable)
-        .history(History::KeepLast { depth: 1024 })
+        .history(History::KeepLast { depth: DEPTH })
         .durability(Durability::Volatile)
         .resource_limits(limits)
         .build();

@@ -28,9 +28,16 @@ impl TopicLosses {
     /// Adds the counts of an ingress that has ended: its last status, and the samples that it has
     /// left. A time without reception begins.
     pub(crate) fn begin_gap(&mut self, topic: &TopicMemory, last: &ReceptionStatus) {
-        match &self.gap {
+        self.look(&topic.reader);
+        match &mut self.gap {
             // The ingress after it has ended, too, before it attached the topic.
             Some(gap) if gap.next.is_none() => return,
+            // Or before it received a sample.
+            Some(gap) if topic.reader.head() == topic.first => {
+                gap.next = None;
+                self.malformed = self.malformed.saturating_add(last.malformed);
+                return;
+            }
             // It is not known any more what was lost in it.
             Some(_) => self.lost = None,
             None => {}
