@@ -62,6 +62,11 @@ impl<M> RingReader<M> {
         }
     }
 
+    /// Returns whether another process fills the ring, over shared memory.
+    pub fn is_shared(&self) -> bool {
+        matches!(self.0, RingKind::Shared(_))
+    }
+
     /// Drops earlier memory that has no sample of the ring any more. Held samples stay.
     pub fn drop_left(&self) {
         if let RingKind::Shared(ring) = &self.0 {

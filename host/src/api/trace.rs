@@ -71,10 +71,13 @@ pub struct Trace {
 }
 
 impl Trace {
-    /// Starts the trace: the samples of `topic` are summed up from now on.
+    /// Starts the trace. Another process sums up all samples of `topic`: then it begins with the
+    /// first one, which the lambda may see in its first wake. Otherwise they are summed up from now
+    /// on.
     pub fn of(topic: &Topic) -> Self {
         topic.sum_digests();
-        let (until, SumsBefore { digest, refused }) = match topic.reader().newest_meta() {
+        let newest = topic.reader().newest_meta().filter(|_| !topic.reader().is_shared());
+        let (until, SumsBefore { digest, refused }) = match newest {
             Some((position, StoredMeta { digests: digest, refused, .. })) => {
                 (position + 1, SumsBefore { digest, refused })
             }

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_feed::Feed;
@@ -267,9 +267,12 @@ impl Running {
 
     /// Reads reports until `looked_for` accepts one.
     fn until<T>(&mut self, mut looked_for: impl FnMut(Report) -> Option<T>) -> T {
+        // There is a report each second.
+        let until = Instant::now() + PATIENCE;
         loop {
             let mut line = String::new();
             assert!(self.reports.read_line(&mut line).unwrap() > 0, "the reports end");
+            assert!(Instant::now() < until, "it is not reported");
             if let Some(found) = looked_for(serde_json::from_str(&line).unwrap()) {
                 return found;
             }

@@ -8,7 +8,7 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::sync_channel;
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -129,6 +129,11 @@ struct RecordedRun {
 impl RecordedRun {
     /// Starts both, and waits until the recorder receives the topic of numbers.
     fn start() -> Self {
+        Self::start_after(0)
+    }
+
+    /// As [`start`](Self::start). `early` numbers are received before the lambda is started.
+    fn start_after(early: i64) -> Self {
         let folder = TempDir::new().unwrap();
         let lambda = folder.path().join("adder");
         fs::create_dir_all(lambda.join("build")).unwrap();
@@ -149,7 +154,10 @@ impl RecordedRun {
             bytes_max: None,
             commands: None,
         };
-        let (mut ingress, ingress_thread) = Ingress::start_in_thread(Box::new(loopback.clone()));
+        let (reports, reported) = sync_channel(64);
+        let send = move |report| drop(reports.try_send(report));
+        let source = Box::new(loopback.clone());
+        let (mut ingress, ingress_thread) = Ingress::start_with_reports(source, send).unwrap();
         let reader = AddReader {
             name: "recorder".to_owned(),
             topics: vec![grant(TOPICS[0])],
@@ -177,6 +185,12 @@ impl RecordedRun {
         let reader = adder(&manifest);
         let (handover, starter) = UnixStream::pair().unwrap();
         let (socket, stopped) = (ingress.add_reader(&reader).unwrap(), Arc::clone(&stop));
+        let mut sent = [0; 2];
+        if early > 0 {
+            wait_for_readers(&reported, 2, &TOPICS[..1]);
+            (1..=early)
+                .for_each(|value| publish(&loopback, clock, &mut sent, "/numbers", value, 8));
+        }
         let wakes = Arc::<AtomicU64>::default();
         let counted = Arc::clone(&wakes);
         let run = thread::spawn(move || {
@@ -218,7 +232,7 @@ impl RecordedRun {
             ingress,
             ingress_thread: Some(ingress_thread),
             handovers: [recorder_handover, handover],
-            sent: [0; 2],
+            sent,
             wakes,
         };
         until(&mut running.reports, |report| matches!(report, Report::Ready).then_some(()));
@@ -248,12 +262,7 @@ impl RecordedRun {
             reader.topics = reader.topics.into_iter().map(TopicGrant::again).collect();
             let ingress = Some(self.ingress.add_reader(&reader).unwrap());
             Handover { ingress, ..Handover::default() }.try_send(&self.handovers[index]).unwrap();
-            let is_shared = |status: &IngressStatus| {
-                let has_both = |topic: &IngressTopic| topic.readers == index + 1;
-                status.topics.len() == 2 && status.topics.iter().all(has_both)
-            };
-            while !matches!(reported.recv().unwrap(), IngressReport::Status(it) if is_shared(&it)) {
-            }
+            wait_for_readers(&reported, index + 1, &TOPICS);
             if index == 0 {
                 (1..=first).for_each(|value| self.publish("/others", value, 8));
             }
@@ -278,20 +287,7 @@ impl RecordedRun {
     }
 
     fn publish(&mut self, topic: &str, value: i64, len: usize) {
-        let sent = &mut self.sent[usize::from(topic == "/others")];
-        *sent += 1;
-        let at_ns = self.clock.now();
-        let meta = SampleMeta {
-            at_ns,
-            publish_ns: at_ns - 5,
-            writer: Guid([7; 16]),
-            seq: *sent,
-            endian: Endian::Little,
-            options: [0; 2],
-        };
-        let mut cdr = value.to_le_bytes().to_vec();
-        cdr.resize(len, 0);
-        self.loopback.publish(topic, &meta, &cdr).unwrap();
+        publish(&self.loopback, self.clock, &mut self.sent, topic, value, len);
     }
 
     /// Publishes a number that wakes the lambda, and waits for the wake.
@@ -350,6 +346,42 @@ impl RecordedRun {
     }
 }
 
+/// Waits until each of `topics` has so many readers.
+fn wait_for_readers(reports: &Receiver<IngressReport>, count: usize, topics: &[(&str, u32)]) {
+    let has_all = |known: &IngressTopic| known.readers == count;
+    let is_it = |status: &IngressStatus| {
+        topics.iter().all(|(topic, _)| {
+            status.topics.iter().any(|known| known.topic == *topic && has_all(known))
+        })
+    };
+    while !matches!(reports.recv().unwrap(), IngressReport::Status(status) if is_it(&status)) {}
+}
+
+/// Publishes a sample of `len` bytes. `sent` has the number of samples of each topic so far.
+fn publish(
+    loopback: &Loopback,
+    clock: Clock,
+    sent: &mut [u64; 2],
+    topic: &str,
+    value: i64,
+    len: usize,
+) {
+    let sent = &mut sent[usize::from(topic == "/others")];
+    *sent += 1;
+    let at_ns = clock.now();
+    let meta = SampleMeta {
+        at_ns,
+        publish_ns: at_ns - 5,
+        writer: Guid([7; 16]),
+        seq: *sent,
+        endian: Endian::Little,
+        options: [0; 2],
+    };
+    let mut cdr = value.to_le_bytes().to_vec();
+    cdr.resize(len, 0);
+    loopback.publish(topic, &meta, &cdr).unwrap();
+}
+
 fn add_topics(loopback: &Loopback) {
     for (topic, _) in TOPICS {
         loopback.add_topic(topic, "test_msgs/msg/Number", "int64 value\n");
@@ -383,9 +415,12 @@ fn until<R: serde::de::DeserializeOwned, T>(
     reports: &mut BufReader<PipeReader>,
     mut looked_for: impl FnMut(R) -> Option<T>,
 ) -> T {
+    // There is a report each second.
+    let until = Instant::now() + Duration::from_secs(60);
     loop {
         let mut line = String::new();
         assert!(reports.read_line(&mut line).unwrap() > 0, "the reports end");
+        assert!(Instant::now() < until, "it is not reported");
         if let Some(found) = looked_for(serde_json::from_str(&line).unwrap()) {
             return found;
         }
@@ -431,6 +466,17 @@ fn samples_that_are_larger_than_the_lambda_accepts_do_not_disturb() {
     let clip = running.clip();
     let verified = running.verify(clip).unwrap();
     assert_eq!((verified.uncovered, verified.triggers), (0, 5), "{verified:?}");
+    running.end();
+}
+
+#[test]
+fn a_lambda_that_is_woken_by_a_sample_from_before_its_start_is_verified() {
+    let mut running = RecordedRun::start_after(3);
+    running.record_others();
+    running.burst(5);
+    let clip = running.clip();
+    let verified = running.verify(clip).unwrap();
+    assert_eq!((verified.uncovered, verified.triggers), (0, 1), "{verified:?}");
     running.end();
 }
 
