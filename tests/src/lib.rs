@@ -8,6 +8,7 @@ pub mod markdown;
 pub mod namespace;
 pub mod parts;
 pub mod peers;
+pub mod random;
 pub mod rooms;
 pub mod transcript;
 pub mod tree;
@@ -245,6 +246,11 @@ impl LambdaCopy {
     /// Copies the lambda in `lambda` as one called `name`, with a deadline that a busy machine
     /// meets.
     pub fn named(lambda: &str, name: &str) -> Self {
+        Self::changed_and_named(lambda, name, |manifest| manifest)
+    }
+
+    /// As [`named`](Self::named), with `change` applied to its manifest.
+    pub fn changed_and_named(lambda: &str, name: &str, change: impl Fn(String) -> String) -> Self {
         Self::of(lambda, |manifest| {
             let mut table = "";
             let mut changed = String::new();
@@ -257,7 +263,7 @@ impl LambdaCopy {
                 };
                 changed.push('\n');
             }
-            changed
+            change(changed)
         })
     }
 

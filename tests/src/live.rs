@@ -253,6 +253,17 @@ pub fn descendants(of: u32, name: &str) -> Vec<u32> {
         .collect()
 }
 
+/// CPU time of a process so far, in ns; 0 if it has ended.
+pub fn cpu_ns(pid: u32) -> u64 {
+    let threads = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
+    // The first word is the time on a core. Threads that have ended are not included.
+    let times = threads.filter_map(|thread| {
+        let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
+        text.split_whitespace().next()?.parse::<u64>().ok()
+    });
+    times.sum()
+}
+
 /// The decisions in a folder of results.
 pub fn decisions(out: &Path) -> Vec<Decision> {
     let text = std::fs::read_to_string(out.join("decisions.jsonl")).unwrap_or_default();

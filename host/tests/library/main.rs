@@ -12,5 +12,6 @@ mod live;
 mod live_clips;
 mod misbehaving;
 mod own_process;
+mod recorded_run;
 mod schedule;
 mod small_limits;

@@ -220,6 +220,11 @@ impl Peer {
         })
     }
 
+    /// Its process id.
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Its exit status as text; `None` while it runs.
     pub fn ended(&mut self) -> Option<String> {
         self.child

@@ -7,12 +7,13 @@ use std::process::Command;
 use gleaner_dds::Dds;
 use gleaner_tests::peers::message::MessageType;
 use gleaner_tests::peers::{PATIENCE, Peer, PeerKind};
+use gleaner_tests::random::XorShift64;
 use gleaner_transport::{LiveSource, Qos, Transport};
 use gleaner_vitals::usage;
 use libtest_mimic::Failed;
 
 use crate::receiver::{TopicReceiver, join};
-use crate::rtps::{ANY, Entity, SPDP_READER, XorShift64, broken, data_frag, packet, valid_packets};
+use crate::rtps::{ANY, Entity, SPDP_READER, broken, data_frag, packet, valid_packets};
 use crate::{DdsCase, Need};
 
 const CYCLONE: Need = Need::Peer(PeerKind::Cyclone);

@@ -1,5 +1,7 @@
 //! Builds RTPS packets, valid and broken. Source: OMG DDSI-RTPS 2.3, sections 8.3.7 and 9.4.5.
 
+use gleaner_tests::random::XorShift64;
+
 /// Id of an endpoint within a participant.
 pub type Entity = [u8; 4];
 
@@ -96,19 +98,6 @@ pub fn valid_packets(prefix: [u8; 12], writer: Entity, cdr: &[u8]) -> Vec<Vec<u8
         one(data(ANY, SEDP_WRITERS, 1, parameters)),
         one(data(ANY, SEDP_READERS, 1, parameters)),
     ]
-}
-
-/// The generator xorshift64: the same numbers in every run.
-pub struct XorShift64(pub u64);
-
-impl XorShift64 {
-    /// A number below `n`, which is not 0.
-    pub fn below(&mut self, n: usize) -> usize {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        (self.0 % n as u64) as usize
-    }
 }
 
 /// Breaks a packet in one of several ways, after the first four bytes: without those it would be

@@ -1,11 +1,16 @@
-//! Several participants of Gleaner read one topic: its writer keeps running, and each of them
-//! receives samples.
+//! Gleaner beside nodes of others: several of its participants read one topic, or its runs start
+//! and stop; writers keep running, and readers receive each sample.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::time::{Duration, Instant};
 
 use gleaner_dds::Dds;
-use gleaner_tests::live::run;
+use gleaner_protocol::Report;
+use gleaner_tests::live::{cpu_ns, run, run_all};
 use gleaner_tests::peers::message::MessageType;
-use gleaner_tests::peers::{Peer, PeerKind};
-use gleaner_tests::{TempFolder, root};
+use gleaner_tests::peers::{Peer, PeerEvent, PeerKind};
+use gleaner_tests::{LambdaCopy, TempFolder, root, times};
 use gleaner_transport::Qos;
 use libtest_mimic::Failed;
 
@@ -23,6 +28,11 @@ pub const CASES: &[DdsCase] = &[
         name: "cyclone_survives_several_readers_of_its_topic",
         needs: &[Need::Peer(PeerKind::Cyclone)],
         run: || survives(PeerKind::Cyclone),
+    },
+    DdsCase {
+        name: "nodes_of_both_kinds_run_on_without_a_loss_while_runs_start_and_stop",
+        needs: &[Need::Peer(PeerKind::Cyclone), Need::Peer(PeerKind::Fast)],
+        run: starts_and_stops,
     },
     DdsCase {
         name: "no_multicast_address_is_announced_for_samples",
@@ -92,6 +102,127 @@ fn receives(writer: &mut Peer, receivers: &[TopicReceiver]) -> Result<(), Failed
             return Err(format!("the writer ended with several readers: {how}").into());
         }
     }
+    Ok(())
+}
+
+/// A reader of another program, and its newest sample.
+struct NodeReader {
+    peer: Peer,
+    newest: Option<u32>,
+    received: u32,
+    lost: u32,
+}
+
+impl NodeReader {
+    /// Waits for `count` further samples.
+    fn receive(&mut self, count: usize) -> Result<(), Failed> {
+        for _ in 0..count {
+            let seq = self.peer.wait("a sample", seq_of)?;
+            self.add(seq);
+        }
+        Ok(())
+    }
+
+    fn add(&mut self, seq: u32) {
+        self.received += 1;
+        self.lost += self.newest.map_or(0, |newest| seq - newest - 1);
+        self.newest = Some(seq);
+    }
+}
+
+fn seq_of(event: PeerEvent) -> Option<u32> {
+    if let PeerEvent::Sample { seq, .. } = event { Some(seq) } else { None }
+}
+
+/// Number of lambdas in each run.
+const LAMBDAS: usize = 10;
+
+/// Writers and readers on Cyclone DDS and Fast DDS, which read each other, while runs of several
+/// lambdas start and stop. Prints the CPU time of these nodes without and beside Gleaner.
+fn starts_and_stops() -> Result<(), Failed> {
+    let topics = [(PeerKind::Cyclone, "/cyclone"), (PeerKind::Fast, "/fast")];
+    let lambdas: Vec<LambdaCopy> = (0..LAMBDAS)
+        .map(|index| {
+            let (_, topic) = topics[index % 2];
+            let lambda = format!("tests/lambdas/ticker/{}", ["rust", "python"][index / 2 % 2]);
+            let on_topic = |manifest: String| manifest.replace("/imu/data", topic);
+            LambdaCopy::changed_and_named(&lambda, &format!("ticker-{index}"), on_topic)
+        })
+        .collect();
+    let folders: Vec<&Path> = lambdas.iter().map(LambdaCopy::path).collect();
+    let start = |(kind, topic): (PeerKind, &str)| {
+        Peer::start(kind.publisher(MessageType::Imu, topic, "--count 0 --rate 100"))
+    };
+    let mut writers = topics.map(start);
+    let mut readers: Vec<NodeReader> = topics
+        .iter()
+        .flat_map(|(_, topic)| topics.map(|(kind, _)| (kind, *topic)))
+        .map(|(kind, topic)| NodeReader {
+            peer: Peer::start(kind.subscriber(MessageType::Imu, topic, "")),
+            newest: None,
+            received: 0,
+            lost: 0,
+        })
+        .collect();
+    for reader in &mut readers {
+        reader.receive(SAMPLES)?;
+    }
+    let cpu = |writers: &[Peer], readers: &[NodeReader]| {
+        let all = writers.iter().chain(readers.iter().map(|reader| &reader.peer));
+        (Instant::now(), all.map(|peer| cpu_ns(peer.pid())).collect::<Vec<u64>>())
+    };
+    let mut looks = vec![cpu(&writers, &readers)];
+    for reader in &mut readers {
+        reader.receive(50 * SAMPLES)?;
+    }
+    looks.push(cpu(&writers, &readers));
+    let starts = times("GLEANER_STARTS", 2);
+    for _ in 0..starts {
+        let out = TempFolder::new();
+        let run = run_all(&folders, out.path(), &["--no-record"]);
+        let mut receiving = BTreeSet::new();
+        run.until_named("samples in all lambdas", |name, report| {
+            if let Report::Live(live) = report
+                && live.topics[0].received > 0
+            {
+                receiving.insert(name);
+            }
+            (receiving.len() == LAMBDAS).then_some(())
+        });
+        run.signal("INT");
+        let finished = run.finish();
+        if !finished.status.success() {
+            return Err(format!("{}: {}", finished.status, finished.stderr).into());
+        }
+    }
+    looks.push(cpu(&writers, &readers));
+    for (writer, (kind, _)) in writers.iter_mut().zip(topics) {
+        if let Some(how) = writer.ended() {
+            return Err(format!("the writer on {kind:?} ended: {how}").into());
+        }
+    }
+    for reader in &mut readers {
+        while let Some(seq) = reader.peer.wait_for(Duration::ZERO, seq_of) {
+            reader.add(seq);
+        }
+        // It still receives.
+        reader.receive(SAMPLES)?;
+        println!("{} samples received by a node, {} lost", reader.received, reader.lost);
+        if reader.lost > 0 {
+            return Err(format!("{} samples are missing in a node", reader.lost).into());
+        }
+    }
+    for (between, what) in looks.windows(2).zip(["without Gleaner", "beside it"]) {
+        let [(began, before), (ended, after)] = between else { continue };
+        let span = ended.duration_since(*began).as_nanos() as f64;
+        let shares = before.iter().zip(after).map(|(before, after)| {
+            let used = after.saturating_sub(*before) as f64;
+            format!("{:.2} %", 100.0 * used / span)
+        });
+        let shares = shares.collect::<Vec<_>>().join(", ");
+        println!("{what}, {:.0} s: writers and readers on a core: {shares}", span / 1e9);
+    }
+    println!("{starts} starts of {LAMBDAS} lambdas");
     Ok(())
 }
 

@@ -1,22 +1,21 @@
 //! Lambdas on live topics: `gleaner run` with the recorder and the player, each case in a private
 //! network.
-//!
-//! `GLEANER_ROUNDS` sets how often a drive is played and compared with its replay; the default is
-//! once.
 
 mod alone;
+mod as_in_replay;
+mod chaos;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use gleaner_lambda::{Clip, Decision, Fault};
+use gleaner_protocol::Report;
 use gleaner_protocol::link::RecorderReport;
-use gleaner_protocol::{LiveStatus, Report};
 use gleaner_tests::live::{
     self, JsonReport, RunningProgram, decisions, descendants, no_player, play, run, run_all, signal,
 };
-use gleaner_tests::{LambdaCopy, TempFolder, namespace, replay_to, root, sample_drive, times};
+use gleaner_tests::{LambdaCopy, TempFolder, namespace, root, sample_drive};
 use libtest_mimic::{Arguments, Trial};
 
 /// Environment variable with the case that this process runs in its private network.
@@ -26,7 +25,7 @@ type LiveCase = (&'static str, fn());
 
 /// Cases with a player.
 const PLAYED: &[LiveCase] = &[
-    ("a_drive_played_live_is_decided_as_in_its_replay", as_in_replay),
+    ("a_drive_played_live_is_decided_as_in_its_replay", as_in_replay::as_in_replay),
     ("a_lambda_slower_than_its_camera_gets_the_newest_frame_and_skips_are_counted", || {
         slow("sleep")
     }),
@@ -43,6 +42,10 @@ const PLAYED: &[LiveCase] = &[
         killed("gleaner-recorder")
     }),
     ("lambdas_and_recorder_run_on_when_the_ingress_is_killed_and_receive_again", ingress_killed),
+    (
+        "whatever_is_killed_each_sample_is_counted_and_listed_clips_are_whole",
+        chaos::killed_at_random,
+    ),
 ];
 
 /// Cases with lambdas only.
@@ -109,118 +112,6 @@ fn trigger_keys(decisions: &[Decision]) -> Vec<TriggerKey> {
             .collect::<Vec<_>>()
     };
     decisions.iter().flat_map(of).collect()
-}
-
-/// Returns whether the labels are the same, for the same camera samples and nearly the same IMU
-/// samples.
-///
-/// Both lambdas use half a second of the IMU by receive stamps. Live, these jitter by a millisecond
-/// and more, so that a sample at the edge is in or out; a threshold may then be crossed some
-/// samples earlier or later. A frame of the camera is 10 of them. Skipped samples add as many.
-fn agrees(live: &[TriggerKey], replay: &[TriggerKey], skipped: u64) -> bool {
-    let is_camera = replay.iter().all(|(label, _)| label == "brake-dark");
-    let slack = skipped + if is_camera { 0 } else { 10 };
-    let same = |((a, n), (b, m)): (&TriggerKey, &TriggerKey)| {
-        a == b && n.zip(*m).is_some_and(|(n, m)| n.abs_diff(m) <= slack)
-    };
-    live.len() == replay.len() && live.iter().zip(replay).all(same)
-}
-
-fn lost(ended: &LiveStatus) -> u64 {
-    ended
-        .topics
-        .iter()
-        .map(|topic| topic.lost.expect("DDS counts losses") + topic.no_slot + topic.malformed)
-        .sum()
-}
-
-/// A busy machine may stall for longer than the jitter of a window. Drives with differences are
-/// played again; differences that repeat are failures.
-fn as_in_replay() {
-    /// Maximum attempts until a lambda decides as in its replay.
-    const TRIES: usize = 6;
-    let set = ["--set", "brake_mps2=-1.4"];
-    let names = ["hello/rust", "hello/python", "brake-dark/rust", "brake-dark/python"];
-    let lambdas = names.map(|name| with_long_deadline(&format!("examples/{name}")));
-    let drive = sample_drive();
-    let replayed = |lambda: &LambdaCopy| {
-        let out = TempFolder::new();
-        let replayed = replay_to(out.path(), lambda.path(), std::slice::from_ref(&drive), &set);
-        let expected = trigger_keys(&replayed.decisions);
-        assert!(!expected.is_empty(), "{}", replayed.stderr);
-        (lambda.path().to_owned(), expected)
-    };
-    let expected: Vec<_> = lambdas.iter().map(replayed).collect();
-    for round in 1..=times("GLEANER_ROUNDS", 1) {
-        let mut failing = names.to_vec();
-        let mut differences = Vec::new();
-        for _ in 0..TRIES {
-            for (name, found) in names.into_iter().zip(played(&drive, &set, &expected)) {
-                match found {
-                    Some(difference) => differences.push(format!("{name}: {difference}")),
-                    None => failing.retain(|other| *other != name),
-                }
-            }
-            if failing.is_empty() {
-                break;
-            }
-        }
-        println!("round {round}: {} differences {differences:#?}", differences.len());
-        assert!(
-            failing.is_empty(),
-            "round {round}: different from the replay in {TRIES} attempts: {differences:#?}"
-        );
-    }
-}
-
-/// Plays the drive to these lambdas together; returns for each how its decisions differ from the
-/// replay.
-fn played(
-    drive: &Path,
-    set: &[&str; 2],
-    lambdas: &[(PathBuf, Vec<TriggerKey>)],
-) -> Vec<Option<String>> {
-    let args = [set[0], set[1], "--no-record"];
-    let outs: Vec<TempFolder> = lambdas.iter().map(|_| TempFolder::new()).collect();
-    let runs: Vec<RunningProgram> = lambdas
-        .iter()
-        .zip(&outs)
-        .map(|((lambda, _), out)| run(lambda, out.path(), &args))
-        .collect();
-    runs.iter().for_each(RunningProgram::until_ready);
-    let path = drive.to_str().expect("the checkout has a plain path");
-    let played =
-        play(&[path, "--wait", "2", "--topics", "/imu/data,/camera/front/compressed"]).finish();
-    assert!(played.status.success(), "{}", played.stderr);
-    // The last sample may be in transit, and windows are open for some seconds after it.
-    for started in &runs {
-        started.until_live("the end of the drive", |live| {
-            let is_over =
-                live.topics.iter().all(|topic| topic.writers == Some(0) && topic.received > 0);
-            // Each sample of the event input was handled: one of the topics causes the wakes.
-            is_over && live.topics.iter().any(|topic| live.wakes + topic.skipped == topic.received)
-        });
-        started.signal("INT");
-    }
-    let compared = |((started, out), (_, expected)): (
-        (RunningProgram, &TempFolder),
-        &(PathBuf, Vec<TriggerKey>),
-    )| {
-        let finished = started.finish();
-        assert!(finished.status.success(), "{}, {}", finished.status, finished.stderr);
-        let ended = finished.ended();
-        assert_eq!(ended.faults, 0, "{}", finished.stderr);
-        let live = trigger_keys(&decisions(out.path()));
-        if lost(&ended) == 0 && agrees(&live, expected, ended.skipped) {
-            return None;
-        }
-        Some(format!(
-            "{} skipped, {} lost: {live:?}, in the replay {expected:?}",
-            ended.skipped,
-            lost(&ended)
-        ))
-    };
-    runs.into_iter().zip(&outs).zip(lambdas).map(compared).collect()
 }
 
 /// Number of frames that the player sends: 6 s.
