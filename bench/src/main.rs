@@ -30,6 +30,9 @@ struct Args {
     /// Of live topics only the round trips, against a bare reader.
     #[arg(long, conflicts_with_all = ["live", "kernels", "drives", "isolation"])]
     rtt: bool,
+    /// Of live topics only what one and several lambdas receive and cost.
+    #[arg(long, conflicts_with_all = ["live", "rtt", "kernels", "drives", "isolation"])]
+    load: bool,
     /// Arithmetic in lambdas against the same code natively, and calls between lambda and host,
     /// instead of drives.
     #[arg(long, conflicts_with = "live")]
@@ -44,14 +47,15 @@ struct Args {
 }
 
 fn main() -> ExitCode {
-    let Args { quick, live, rtt, kernels, drives, isolation } = Args::parse();
-    if live || rtt || isolation {
+    let Args { quick, live, rtt, load, kernels, drives, isolation } = Args::parse();
+    if live || rtt || load || isolation {
         let figures = match live::in_private_network() {
             Some(Ok(true)) => return ExitCode::SUCCESS,
             Some(Ok(false)) => return ExitCode::FAILURE,
             Some(Err(why)) => Err(why),
             None if isolation => isolation::figures(quick),
             None if rtt => Ok(live::round_trips(quick)),
+            None if load => Ok(live::loads(quick)),
             None => Ok(live::figures(quick)),
         };
         return match figures {

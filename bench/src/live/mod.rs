@@ -2,7 +2,7 @@
 //! (Cyclone DDS) as publisher.
 
 mod bare;
-mod footprint;
+mod load;
 mod rounds;
 
 use std::path::{Path, PathBuf};
@@ -12,6 +12,7 @@ use gleaner_tests::live::{RunningProgram, no_player, play, run};
 use gleaner_tests::{TempFolder, namespace, root};
 
 use crate::measure::{Figure, Twin};
+use load::Load;
 
 /// Environment variable of the process in the private network.
 const ALONE: &str = "GLEANER_BENCH_ALONE";
@@ -51,35 +52,62 @@ fn start_in_private_network() -> Result<bool, String> {
 
 /// All figures.
 pub fn figures(quick: bool) -> Vec<Figure> {
-    let seconds = |long: u32| if quick { 2 } else { long };
     let mut figures = round_trips(quick);
+    figures.extend(loads(quick));
+    figures
+}
+
+/// Name, lambdas, players and seconds of a load.
+type LoadArgs<'a> = (&'a str, &'a [(&'a str, usize)], &'a [&'a [&'a str]], u32);
+
+/// Samples that one and several lambdas receive, and their costs.
+pub fn loads(quick: bool) -> Vec<Figure> {
+    let seconds = |long: u32| if quick { 2 } else { long };
+    let mut figures = Vec::new();
     const FULL_HD: &str = "1920x1080@30";
-    for (name, lambdas, players, long) in [
-        ("1080p bgr8 at 30 Hz", &["camera"][..], &[&["--synthetic", FULL_HD][..]][..], 60),
-        ("3848x2168 bgr8 at 10 Hz", &["camera"], &[&["--synthetic", "3848x2168@10"]], 30),
-        ("IMU at 1 kHz", &["imu"], &[&["--imu", "1000"]], 60),
+    let rig: [&[&str]; 2] =
+        [&["--synthetic", FULL_HD, "--imu", "1000"], &["--synthetic", FULL_HD, "--remap", REAR]];
+    let single: [LoadArgs<'_>; 5] = [
+        ("1080p at 30 Hz for a minute", &[("camera", 1)], &[&["--synthetic", FULL_HD]], 60),
+        ("3848x2168 at 10 Hz", &[("camera", 1)], &[&["--synthetic", "3848x2168@10"]], 30),
+        ("IMU at 1 kHz", &[("imu", 1)], &[&["--imu", "1000"]], 60),
         (
             "1080p at 30 Hz and an IMU at 1 kHz",
-            &["camera", "imu"],
+            &[("camera", 1), ("imu", 1)],
             &[&["--synthetic", FULL_HD, "--imu", "1000"]],
             60,
         ),
         // One lambda with three inputs. A player has one camera, so the second one needs another
         // player.
-        (
-            "two cameras of 1080p at 30 Hz and an IMU at 1 kHz at once",
-            &["rig"],
-            &[
-                &["--synthetic", FULL_HD, "--imu", "1000"],
-                &["--synthetic", FULL_HD, "--remap", REAR],
-            ],
-            60,
-        ),
-    ] {
-        receive(name, lambdas, players, seconds(long), &mut figures);
+        ("two cameras of 1080p at 30 Hz and an IMU at 1 kHz at once", &[("rig", 1)], &rig, 60),
+    ];
+    for (name, lambdas, players, long) in single {
+        let seconds = seconds(long);
+        let name = name.to_owned();
+        Load { name, lambdas, kind: Twin::Rust, players, seconds }.measure(&mut figures);
     }
-    many(16, seconds(20), &mut figures);
-    footprint::figures(seconds(10), &mut figures);
+    let counts = if quick { &[1, 4][..] } else { &[1, 4, 8, 16] };
+    for kind in [Twin::Rust, Twin::Python] {
+        for rate in if quick { &[30][..] } else { &[10, 30] } {
+            let camera = format!("1920x1080@{rate}");
+            let mut one = None;
+            for count in counts {
+                let name = format!("1080p at {rate} Hz, {count} in {kind}");
+                let (lambdas, seconds) = (&[("camera", *count)][..], seconds(16));
+                let player = ["--synthetic", &camera];
+                let players = &[&player[..]];
+                let load = Load { name: name.clone(), lambdas, kind, players, seconds };
+                let ingress = load.measure(&mut figures);
+                let ratio = ingress / *one.get_or_insert(ingress);
+                let name = format!("{name}: ingress, against that of one");
+                figures.push(Figure::at_most(&name, "times", 1.1, &[ratio]));
+            }
+        }
+        let (count, seconds) = (if quick { 4 } else { 50 }, seconds(16));
+        let name = format!("IMU at 1 kHz, {count} in {kind}");
+        let (lambdas, players) = (&[("imu", count)][..], &[&["--imu", "1000"][..]][..]);
+        Load { name, lambdas, kind, players, seconds }.measure(&mut figures);
+    }
     figures
 }
 
@@ -101,156 +129,17 @@ fn start(lambda: &Path, args: &[&str]) -> (RunningProgram, TempFolder) {
     (started, out)
 }
 
-/// Plays to the end, with a process for each of `players`, then stops the lambdas and returns their
-/// final statuses. The statuses of the first lambda meanwhile go to `seen`.
-fn play_and_stop(
-    started: Vec<(RunningProgram, TempFolder)>,
-    players: &[Vec<&str>],
-    seen: &mut Vec<LiveStatus>,
-) -> Vec<LiveStatus> {
-    play_all(&started, players, seen);
-    stop(started)
-}
-
-fn stop(started: Vec<(RunningProgram, TempFolder)>) -> Vec<LiveStatus> {
-    started.iter().for_each(|(started, _)| started.signal("INT"));
-    started.into_iter().map(|(started, _out)| started.finish().ended()).collect()
-}
-
-/// Plays to the end; the lambdas keep running.
-fn play_all(
-    started: &[(RunningProgram, TempFolder)],
-    players: &[Vec<&str>],
-    seen: &mut Vec<LiveStatus>,
-) {
-    let playing: Vec<_> = players.iter().map(|player| play(player)).collect();
+/// Plays to the end, then stops the lambda and returns its final status.
+fn play_and_stop((started, _out): (RunningProgram, TempFolder), player: &[&str]) -> LiveStatus {
+    let playing = play(player);
     let mut has_begun = false;
-    let mut is_over = false;
-    while !is_over {
-        let live = started[0].0.until_live("a status", |_| true);
+    started.until_live("the end of the samples", |live| {
         // Begun if something was received, as everything may be lost, or if all writers are there.
         has_begun |= live.topics.iter().all(|topic| topic.writers > Some(0) || topic.received > 0);
-        is_over = has_begun && live.topics.iter().all(|topic| topic.writers == Some(0));
-        seen.push(live);
-    }
-    for played in playing {
-        let played = played.finish();
-        assert!(played.status.success(), "{}", played.stderr);
-    }
-}
-
-/// Measures what the empty `lambdas` receive, each in its own process, and their costs.
-fn receive(
-    name: &str,
-    lambdas: &[&str],
-    players: &[&[&str]],
-    seconds: u32,
-    figures: &mut Vec<Figure>,
-) {
-    let started = lambdas
-        .iter()
-        .map(|lambda| start(&self::lambda(lambda, Twin::Rust), &["--no-record"]))
-        .collect();
-    let duration = seconds.to_string();
-    let players: Vec<_> = players
-        .iter()
-        .map(|player| [player, &["--wait", "1", "--duration", &duration][..]].concat())
-        .collect();
-    let mut seen = Vec::new();
-    let ended = play_and_stop(started, &players, &mut seen);
-    let topics: usize = ended.iter().map(|live| live.topics.len()).sum();
-    for live in &ended {
-        let granted = live.network.buffer_granted >= live.network.buffer_requested;
-        let buffer = live.network.buffer_granted as f64 / f64::from(1 << 20);
-        for topic in &live.topics {
-            let of = if topics > 1 { format!("{name}: {}", topic.name) } else { name.to_owned() };
-            let refused = topic.no_slot + topic.too_big + topic.malformed;
-            figures.push(Figure::without_goal(
-                &format!("{of}: received in {seconds} s"),
-                "samples",
-                &[topic.received as f64],
-            ));
-            let lost = format!(
-                "{of}: lost, with a socket buffer of {buffer:.0} MiB{}",
-                if granted { "" } else { " (not granted)" }
-            );
-            let count = topic.lost.unwrap_or(u64::MAX).saturating_add(refused);
-            figures.push(if granted {
-                Figure::at_most(&lost, "samples", 0.0, &[count as f64])
-            } else {
-                Figure::without_goal(&lost, "samples", &[count as f64])
-            });
-        }
-        // Costs of a process are reported once, for all of its topics.
-        let of = match &live.topics[..] {
-            [topic] if topics > 1 => format!("{name}: {}", topic.name),
-            _ => name.to_owned(),
-        };
-        let cpu = 100.0 * live.cpu_s / live.up_s;
-        figures.push(Figure::without_goal(&format!("{of}: share of a core"), "%", &[cpu]));
-        if let Some(wake_latency) = live.wake_latency {
-            for (what, ns) in [("p50", wake_latency.p50_ns), ("p99", wake_latency.p99_ns)] {
-                figures.push(Figure::without_goal(
-                    &format!("{of}: wake latency, {what}"),
-                    "us",
-                    &[ns as f64 / 1e3],
-                ));
-            }
-        }
-    }
-    // From the first quarter of the time, after warm-up, until the end.
-    let rss = |live: &LiveStatus| live.rss_bytes as f64 / f64::from(1 << 20);
-    if let (Some(warm), Some(last)) = (seen.get(seen.len() / 4), seen.last()) {
-        let growth = 100.0 * (rss(last) / rss(warm) - 1.0);
-        figures.push(Figure::without_goal(
-            &format!("{name}: resident memory"),
-            "MiB",
-            &[rss(last)],
-        ));
-        figures.push(Figure::at_most(
-            &format!("{name}: memory growth after a quarter of the time"),
-            "%",
-            2.0,
-            &[growth],
-        ));
-    }
-}
-
-/// Measures `count` runtimes on one machine: whether all find the publisher, and their costs.
-fn many(count: usize, seconds: u32, figures: &mut Vec<Figure>) {
-    let started: Vec<_> =
-        (0..count).map(|_| start(&lambda("imu", Twin::Rust), &["--no-record"])).collect();
-    let (count, duration) = (count.to_string(), seconds.to_string());
-    let player = vec!["--imu", "100", "--wait", &count, "--duration", &duration];
-    play_all(&started, &[player], &mut Vec::new());
-    let pss: Vec<f64> = started.iter().map(|(started, _)| footprint::megabytes(started)).collect();
-    let ended = stop(started);
-    let connected = ended.iter().filter(|live| live.topics[0].received > 0).count();
-    let lossless = ended.iter().filter(|live| live.topics[0].lost == Some(0)).count();
-    figures.push(Figure::at_least(
-        &format!("{count} runtimes: found the publisher"),
-        "runtimes",
-        ended.len() as f64,
-        &[connected as f64],
-    ));
-    figures.push(Figure::at_least(
-        &format!("{count} runtimes: no losses"),
-        "runtimes",
-        ended.len() as f64,
-        &[lossless as f64],
-    ));
-    let rss: Vec<f64> =
-        ended.iter().map(|live| live.rss_bytes as f64 / f64::from(1 << 20)).collect();
-    figures.push(Figure::without_goal(
-        &format!("{count} runtimes: resident memory of each"),
-        "MiB",
-        &rss,
-    ));
-    figures.push(Figure::without_goal(&format!("{count} runtimes: PSS of each"), "MB", &pss));
-    let cpu: Vec<f64> = ended.iter().map(|live| 100.0 * live.cpu_s / live.up_s).collect();
-    figures.push(Figure::without_goal(
-        &format!("{count} runtimes: share of a core of each"),
-        "%",
-        &cpu,
-    ));
+        has_begun && live.topics.iter().all(|topic| topic.writers == Some(0))
+    });
+    let played = playing.finish();
+    assert!(played.status.success(), "{}", played.stderr);
+    started.signal("INT");
+    started.finish().ended()
 }

@@ -1,7 +1,9 @@
 //! Measures the round trip from a sample to its answer: a bare reader and a lambda of each kind, in
 //! turns.
 
+use std::io;
 use std::path::{Path, PathBuf};
+use std::process::{Child, Command};
 use std::time::Duration;
 
 use gleaner_dds::{Dds, DdsOptions};
@@ -12,14 +14,14 @@ use gleaner_tests::live::play;
 use super::bare::BareReader;
 use super::{lambda, play_and_stop, start};
 use crate::answers::RttReceiver;
-use crate::measure::{Figure, Twin, quantile};
+use crate::measure::{Figure, Twin, cores, quantile};
 
 /// Goals for the round trip of a lambda, relative to the bare reader: median and 99th percentile.
 const RATIO: f64 = 1.5;
 const TAIL_RATIO: f64 = 2.0;
 
-/// Number of turns of each side.
-const ROUNDS: u32 = 3;
+/// Length of a turn, in s.
+const TURN_S: u32 = 20;
 
 /// Topic of the answers.
 const ANSWERS: &str = "/rtt/lambda";
@@ -34,25 +36,15 @@ pub(super) fn figures(seconds: u32, figures: &mut Vec<Figure>) {
         event: &["--imu", "100"],
         others: &[],
     };
-    let ended = sides.compare(seconds, figures);
-    for ((kind, live), goals) in ended.iter().zip([[20.0, 100.0], [30.0, 150.0]]) {
-        let spreads =
-            [("wake latency", live.wake_latency), ("decision latency", live.decision_latency)];
-        for (what, spread) in spreads.iter().filter_map(|(what, spread)| Some((what, (*spread)?))) {
-            let us = |ns: u64| ns as f64 / 1e3;
-            figures.push(Figure::at_most(
-                &format!("{what}, {kind}, p50"),
-                "us",
-                goals[0],
-                &[us(spread.p50_ns)],
-            ));
-            figures.push(Figure::at_most(
-                &format!("{what}, {kind}, p99"),
-                "us",
-                goals[1],
-                &[us(spread.p99_ns)],
-            ));
+    sides.compare(seconds, figures);
+    // A core that sleeps takes some 50 us to run a woken thread. A lambda is one thread further
+    // from the network than a bare reader.
+    match BusyCores::start() {
+        Ok(_busy) => {
+            let name = format!("{}, cores awake", sides.name);
+            Sides { name, ..sides }.compare(seconds, figures);
         }
+        Err(error) => eprintln!("cannot keep the cores awake: {error}"),
     }
     for (size, name) in [("1280x720@10", "720p"), ("1920x1080@10", "1080p")] {
         brake_dark(size, name, seconds, figures);
@@ -98,17 +90,18 @@ struct Sides<'a> {
 }
 
 impl Sides<'_> {
-    /// Lets the sides take turns of `seconds` in all; returns the last statuses of the lambdas.
-    fn compare(&self, seconds: u32, figures: &mut Vec<Figure>) -> Vec<(Twin, LiveStatus)> {
+    /// Lets the sides take turns of `seconds` in all.
+    fn compare(&self, seconds: u32, figures: &mut Vec<Figure>) {
         let mut dds = Dds::open(DdsOptions::new("/gleaner_bench/answers"))
             .expect("a private network can be joined");
         let answers = RttReceiver::on(&mut dds, ANSWERS);
-        let duration = seconds.div_ceil(ROUNDS).to_string();
+        let rounds = seconds.div_ceil(TURN_S);
+        let duration = (seconds / rounds).to_string();
         let player = ["--stamp", "monotonic", "--wait", "1", "--duration", &duration];
         let kinds = [Twin::Rust, Twin::Python];
         let (mut base, mut times) = (Vec::new(), [Vec::new(), Vec::new()]);
         let mut last = [None, None];
-        for _ in 0..ROUNDS {
+        for _ in 0..rounds {
             let bare = BareReader::start(self.input, self.type_name, "/rtt/bare");
             let played = play(&[self.event, &player].concat()).finish();
             assert!(played.status.success(), "{}", played.stderr);
@@ -116,7 +109,7 @@ impl Sides<'_> {
             for (index, lambda) in self.lambdas.iter().enumerate() {
                 let started = start(lambda, &["--no-record", "--rtt", ANSWERS]);
                 let played = [self.event, self.others, &player].concat();
-                last[index] = play_and_stop(vec![started], &[played], &mut Vec::new()).pop();
+                last[index] = Some(play_and_stop(started, &played));
                 // The last answers may still be in transit.
                 std::thread::sleep(Duration::from_millis(200));
                 times[index].extend(answers.take().iter().map(|answer| answer.ns));
@@ -134,13 +127,65 @@ impl Sides<'_> {
                 ));
             }
         }
-        kinds.into_iter().zip(last).filter_map(|(kind, live)| Some((kind, live?))).collect()
+        for (kind, live) in kinds.into_iter().zip(last) {
+            self.stages(kind, &live.expect("it has a last status"), figures);
+        }
+    }
+
+    /// Adds the times of the stages after the reception of a sample.
+    fn stages(&self, kind: Twin, live: &LiveStatus, figures: &mut Vec<Figure>) {
+        let goals = match kind {
+            Twin::Rust => [20.0, 100.0],
+            Twin::Python => [30.0, 150.0],
+        };
+        for (what, stats, has_goal) in [
+            ("wake latency", live.wake_latency, true),
+            ("run time", live.run_time, false),
+            ("decision latency", live.decision_latency, true),
+        ] {
+            let Some(stats) = stats else { continue };
+            for (share, ns, goal) in
+                [("p50", stats.p50_ns, goals[0]), ("p99", stats.p99_ns, goals[1])]
+            {
+                let name = format!("{}, {kind}: {what}, {share}", self.name);
+                let us = [ns as f64 / 1e3];
+                figures.push(if has_goal {
+                    Figure::at_most(&name, "us", goal, &us)
+                } else {
+                    Figure::without_goal(&name, "us", &us)
+                });
+            }
+        }
     }
 
     fn round_trip(&self, of: &str, ns: &[f64], figures: &mut Vec<Figure>) {
         for (what, share) in [("p50", 0.5), ("p99", 0.99)] {
             let name = format!("{}, {of}: {what} of {} answers", self.name, ns.len());
             figures.push(Figure::without_goal(&name, "us", &[quantile(ns, share) / 1e3]));
+        }
+    }
+}
+
+/// Processes of the lowest class, one for each core, which keep the cores from sleeping; ended on
+/// drop.
+struct BusyCores(Vec<Child>);
+
+impl BusyCores {
+    fn start() -> io::Result<Self> {
+        let start = |_| {
+            let mut busy = Command::new("chrt");
+            busy.args(["--idle", "0", "sh", "-c", "while :; do :; done"]).spawn()
+        };
+        cores()?.into_iter().map(start).collect::<io::Result<Vec<Child>>>().map(Self)
+    }
+}
+
+impl Drop for BusyCores {
+    fn drop(&mut self) {
+        for busy in &mut self.0 {
+            // It has not ended, as nothing else ends it.
+            let _ = busy.kill();
+            let _ = busy.wait();
         }
     }
 }

@@ -14,7 +14,7 @@ use gleaner_ingress::Ingress;
 use gleaner_journal::{FileDigest, JournalHeader};
 use gleaner_lambda::manifest::Limits;
 use gleaner_messages::Sources;
-use gleaner_protocol::ingress::AddReader;
+use gleaner_protocol::ingress::{AddReader, Qos};
 use gleaner_protocol::link::{
     AddLambda, ControlClient, RecorderLink, RecorderMessage, RecorderReport, RecorderStatus,
     recorded_grant,
@@ -88,7 +88,9 @@ fn measure(seconds: u64) -> RecorderLatency {
     let grants: Vec<_> = traffic.topics().iter().cloned().zip(1..).collect();
     let topics = grants
         .iter()
-        .map(|(topic, id)| recorded_grant(*id, topic, Some(TYPE.to_owned()), Some(1 << 20)))
+        .map(|(topic, id)| {
+            recorded_grant(*id, topic, Some(TYPE.to_owned()), Some(1 << 20), Qos::Auto)
+        })
         .collect();
     let reader = AddReader { name: "recorder".to_owned(), topics, publishes: Vec::new() };
     let samples = ingress.add_reader(&reader).expect("the ingress runs");

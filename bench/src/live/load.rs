@@ -1,0 +1,220 @@
+//! Lambdas that one `gleaner run` runs over one ingress while players publish: what each process
+//! receives and costs.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::{LiveStatus, Report};
+use gleaner_tests::live::{RunningProgram, cpu_ns, descendants, play, run_all};
+use gleaner_tests::{LambdaCopy, TempFolder};
+
+use crate::measure::{Figure, Twin};
+
+/// Goals for the own memory (USS) of a lambda's process, in MB.
+const OWN_MB: [(Twin, f64); 2] = [(Twin::Rust, 8.0), (Twin::Python, 25.0)];
+
+/// A load: lambdas, players and a duration.
+pub(super) struct Load<'a> {
+    pub name: String,
+    /// Lambdas of `bench/lambdas`, and how many of each.
+    pub lambdas: &'a [(&'a str, usize)],
+    pub kind: Twin,
+    /// Arguments of each player.
+    pub players: &'a [&'a [&'a str]],
+    pub seconds: u32,
+}
+
+/// The processes of a run, with shares of a core in % and own memory in MB.
+struct Costs {
+    ingress: Process,
+    lambdas: Vec<Process>,
+}
+
+#[derive(Clone, Copy)]
+struct Process {
+    pid: u32,
+    cpu_ns: u64,
+    own_mb: f64,
+}
+
+impl Load<'_> {
+    /// Measures the load; returns the share of a core that the ingress took, in %.
+    pub(super) fn measure(&self, figures: &mut Vec<Figure>) -> f64 {
+        let copies = self.lambdas.iter().flat_map(|(lambda, count)| {
+            let folder = format!("bench/lambdas/{lambda}/{}", self.kind.folder());
+            (0..*count).map(move |index| LambdaCopy::named(&folder, &format!("{lambda}-{index}")))
+        });
+        let copies: Vec<LambdaCopy> = copies.collect();
+        let folders: Vec<&Path> = copies.iter().map(LambdaCopy::path).collect();
+        let out = TempFolder::new();
+        let began = Instant::now();
+        let started = run_all(&folders, out.path(), &["--no-record"]);
+        let mut names = Vec::new();
+        if copies.len() == 1 {
+            started.until_ready();
+        } else {
+            started.until_named("all lambdas to be ready", |name, report| {
+                names.extend(matches!(report, Report::Ready).then_some(name));
+                (names.len() == copies.len()).then_some(())
+            });
+        }
+        let ready_ms = began.elapsed().as_secs_f64() * 1e3;
+        let duration = self.seconds.to_string();
+        let players: Vec<_> = self
+            .players
+            .iter()
+            .map(|player| play(&[player, &["--wait", "1", "--duration", &duration][..]].concat()))
+            .collect();
+        // Warm-up, then two looks while the players publish.
+        let part = Duration::from_secs_f64(f64::from(self.seconds) / 4.0);
+        thread::sleep(part);
+        let (first, at) = (Costs::of(&started), Instant::now());
+        thread::sleep(2 * part);
+        let (last, span) = (Costs::of(&started), at.elapsed());
+        let mut sent = BTreeMap::new();
+        for player in players {
+            let played = player.finish();
+            assert!(played.status.success(), "{}", played.stderr);
+            sent.extend(sent_by(&played.lines));
+        }
+        // The last samples may be in transit.
+        thread::sleep(Duration::from_millis(500));
+        started.signal("INT");
+        let finished = started.finish();
+        assert!(finished.status.success(), "{}: {}", finished.status, finished.stderr);
+        let ended: Vec<LiveStatus> = if copies.len() == 1 {
+            vec![finished.ended()]
+        } else {
+            names.iter().map(|name| finished.ended_of(name).expect("it has ended")).collect()
+        };
+        self.receptions(&ended, &sent, figures);
+        self.costs(&first, &last, span, ready_ms, figures);
+        self.latencies(&ended, figures);
+        first.ingress.share(&last.ingress, span)
+    }
+
+    /// Adds what arrived of each topic, and what did not.
+    fn receptions(
+        &self,
+        ended: &[LiveStatus],
+        sent: &BTreeMap<String, u64>,
+        figures: &mut Vec<Figure>,
+    ) {
+        let (mut missing, mut refused) = (Vec::new(), Vec::new());
+        for topic in ended.iter().flat_map(|live| &live.topics) {
+            let counted = topic.no_slot + topic.too_big + topic.malformed;
+            missing.push(sent[&topic.topic] as f64 - topic.received as f64);
+            refused.push(topic.lost.map_or(f64::NAN, |lost| (lost + counted) as f64));
+        }
+        let network = &ended[0].network;
+        let granted = network.buffer_granted >= network.buffer_requested;
+        let buffer = network.buffer_granted as f64 / f64::from(1 << 20);
+        let all: u64 = sent.values().sum();
+        let name = format!(
+            "{}: of {all} sent not received, with a socket buffer of {buffer:.0} MiB{}",
+            self.name,
+            if granted { "" } else { " (not granted)" }
+        );
+        figures.push(if granted {
+            Figure::at_most(&name, "samples", 0.0, &missing)
+        } else {
+            Figure::without_goal(&name, "samples", &missing)
+        });
+        self.add("counted as lost or refused", "samples", &refused, figures);
+    }
+
+    fn costs(
+        &self,
+        first: &Costs,
+        last: &Costs,
+        span: Duration,
+        ready_ms: f64,
+        figures: &mut Vec<Figure>,
+    ) {
+        self.add("from the start of `gleaner run` to ready", "ms", &[ready_ms], figures);
+        let lambdas = first.lambdas.iter().zip(&last.lambdas);
+        let shares: Vec<f64> = lambdas.map(|(first, last)| first.share(last, span)).collect();
+        let ingress = first.ingress.share(&last.ingress, span);
+        self.add("ingress: share of a core", "%", &[ingress], figures);
+        self.add("each lambda: share of a core", "%", &shares, figures);
+        self.add("all: share of a core", "%", &[ingress + shares.iter().sum::<f64>()], figures);
+        self.add("ingress: own memory", "MB", &[last.ingress.own_mb], figures);
+        let own: Vec<f64> = last.lambdas.iter().map(|process| process.own_mb).collect();
+        let goal = OWN_MB.iter().find(|(kind, _)| kind.folder() == self.kind.folder());
+        let name = format!("{}: each lambda: own memory", self.name);
+        figures.push(Figure::at_most(&name, "MB", goal.map_or(f64::NAN, |(_, mb)| *mb), &own));
+        let processes = |costs: &Costs| [&[costs.ingress], &costs.lambdas[..]].concat();
+        let growth = processes(first).into_iter().zip(processes(last));
+        let growth: Vec<f64> =
+            growth.map(|(first, last)| 100.0 * (last.own_mb / first.own_mb - 1.0)).collect();
+        self.add("each process: growth of own memory", "%", &growth, figures);
+    }
+
+    fn latencies(&self, ended: &[LiveStatus], figures: &mut Vec<Figure>) {
+        let stats: Vec<_> = ended.iter().filter_map(|live| live.wake_latency).collect();
+        let us = |ns: fn(&gleaner_protocol::DurationStats) -> u64| {
+            stats.iter().map(|stats| ns(stats) as f64 / 1e3).collect::<Vec<_>>()
+        };
+        self.add("wake latency, p50", "us", &us(|stats| stats.p50_ns), figures);
+        self.add("wake latency, p99", "us", &us(|stats| stats.p99_ns), figures);
+    }
+
+    fn add(&self, what: &str, unit: &'static str, values: &[f64], figures: &mut Vec<Figure>) {
+        figures.push(Figure::without_goal(&format!("{}: {what}", self.name), unit, values));
+    }
+}
+
+impl Costs {
+    /// The costs so far of the processes of a run.
+    fn of(started: &RunningProgram) -> Self {
+        let (mut ingress, mut lambdas) = (None, Vec::new());
+        for pid in descendants(started.pid(), "") {
+            let name = read(pid, "comm");
+            match name.trim() {
+                "gleaner-shim" => {}
+                "gleaner-ingress" => ingress = Some(Process::of(pid)),
+                _ => lambdas.push(Process::of(pid)),
+            }
+        }
+        // In the same order each time.
+        lambdas.sort_by_key(|process| process.pid);
+        Self { ingress: ingress.expect("a run has an ingress"), lambdas }
+    }
+}
+
+impl Process {
+    fn of(pid: u32) -> Self {
+        let rollup = read(pid, "smaps_rollup");
+        let private = rollup.lines().filter_map(|line| {
+            let (name, kib) = line.split_once(':')?;
+            let kib = kib.trim().strip_suffix(" kB")?.trim().parse::<f64>().ok()?;
+            name.starts_with("Private_").then_some(kib)
+        });
+        let own_mb = private.sum::<f64>() * 1024.0 / 1e6;
+        Self { pid, cpu_ns: cpu_ns(pid), own_mb }
+    }
+
+    /// The share of a core that it took until `later`, `span` after this look, in %.
+    fn share(&self, later: &Self, span: Duration) -> f64 {
+        100.0 * later.cpu_ns.saturating_sub(self.cpu_ns) as f64 / span.as_nanos() as f64
+    }
+}
+
+fn read(pid: u32, name: &str) -> String {
+    std::fs::read_to_string(format!("/proc/{pid}/{name}")).unwrap_or_default()
+}
+
+/// The number of samples that a player has sent of each topic, by its summary.
+fn sent_by(lines: &[String]) -> Vec<(String, u64)> {
+    let summary = lines.iter().find_map(|line| {
+        let summary = serde_json::from_str::<serde_json::Value>(line).ok()?;
+        Some(summary.get("topics")?.as_array()?.clone())
+    });
+    let topics = summary.expect("the player prints its summary").into_iter();
+    let count = |topic: serde_json::Value| {
+        Some((topic["topic"].as_str()?.to_owned(), topic["sent"].as_u64()?))
+    };
+    topics.filter_map(count).collect()
+}
