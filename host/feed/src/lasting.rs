@@ -31,6 +31,8 @@ pub struct LastingFeed {
     topics: BTreeMap<u32, LastingTopic>,
     gap: Option<OpenGap>,
     gaps: ReceptionGaps,
+    /// Time at which the ingress was last seen.
+    polled: Instant,
     /// Messages that earlier ingresses did not publish.
     unsent: u64,
     connections: u32,
@@ -64,6 +66,7 @@ impl LastingFeed {
             starter: starter.map(HandoverReceiver::new),
             gap: None,
             gaps: ReceptionGaps::default(),
+            polled: Instant::now(),
             unsent: 0,
             connections: 0,
         }
@@ -82,6 +85,7 @@ impl LastingFeed {
         if self.gap.is_none() {
             match self.feed.poll() {
                 Ok(events) => {
+                    self.polled = Instant::now();
                     self.note(&events);
                     return Ok(events);
                 }
@@ -185,7 +189,6 @@ impl LastingFeed {
     }
 
     fn begin_gap(&mut self) {
-        let since = Instant::now();
         let last = &self.feed.status().topics;
         for (id, topic) in &mut self.topics {
             let last = last.iter().find(|(known, _)| known == id);
@@ -197,8 +200,9 @@ impl LastingFeed {
             let head = reader.head();
             (reader, head)
         });
-        let (until, heads) = (since + TIMEOUT, heads.collect());
-        self.gap = Some(OpenGap { since, until, heads, joining: None });
+        let (until, heads) = (Instant::now() + TIMEOUT, heads.collect());
+        // It may have ended long before this process noticed it, and be joined again at once.
+        self.gap = Some(OpenGap { since: self.polled, until, heads, joining: None });
         self.gaps.count = self.gaps.count.saturating_add(1);
     }
 
@@ -249,6 +253,7 @@ impl LastingFeed {
         self.connections += 1;
         self.gaps = self.gaps();
         self.gap = None;
+        self.polled = Instant::now();
     }
 }
 

@@ -10,6 +10,9 @@ use gleaner_transport::{Guid, StoredMeta};
 
 use crate::feed::TopicMemory;
 
+/// Most writers of a topic whose numbers are followed over a gap.
+const WRITERS: usize = 256;
+
 /// Counts of a topic over all ingresses so far.
 pub(crate) struct TopicLosses {
     /// Sums over earlier ingresses, and over the times between them; `None` if unknown.
@@ -80,10 +83,6 @@ struct ReceptionGap {
     is_known: bool,
     /// Position of the next sample to look at; `None` while the gap lasts.
     next: Option<u64>,
-    /// True once a sample after it was looked at.
-    has_seen: bool,
-    /// Samples after it that had left before they were looked at.
-    missed: u64,
     lost: u64,
 }
 
@@ -93,39 +92,34 @@ impl ReceptionGap {
         let head = topic.reader.head();
         let oldest = head.saturating_sub(topic.reader.depth().into()).max(topic.first);
         let mut awaited: Vec<(Guid, u64)> = Vec::new();
+        let mut is_crowded = false;
         for words in (oldest..head).filter_map(|position| topic.reader.meta(position)) {
             let sample = StoredMeta::of_words(&words).sample;
-            match awaited.iter_mut().find(|(writer, _)| *writer == sample.writer) {
-                Some((_, last)) => *last = (*last).max(sample.seq),
+            match awaited.iter().position(|(writer, _)| *writer == sample.writer) {
+                Some(index) => awaited[index].1 = awaited[index].1.max(sample.seq),
+                None if awaited.len() == WRITERS => is_crowded = true,
                 None => awaited.push((sample.writer, sample.seq)),
             }
         }
         let is_known = writers.map_or(!awaited.is_empty(), |writers| writers <= awaited.len());
-        Self { awaited, is_known, next: None, has_seen: false, missed: 0, lost: 0 }
+        Self { awaited, is_known: is_known && !is_crowded, next: None, lost: 0 }
     }
 
     /// Looks at further samples; returns the number of lost ones once it is known.
     fn look(&mut self, reader: &SharedReader) -> Option<u64> {
         let mut next = self.next?;
         let head = reader.head();
-        let oldest = head.saturating_sub(reader.depth().into());
-        self.missed = self.missed.saturating_add(oldest.saturating_sub(next));
-        next = next.max(oldest);
         while next < head && self.is_known && !self.awaited.is_empty() {
+            // A sample that left before it was looked at may be the first one of any writer.
             let Some(words) = reader.meta(next) else {
-                (next, self.missed) = (next + 1, self.missed + 1);
-                continue;
+                self.is_known = false;
+                break;
             };
             let sample = StoredMeta::of_words(&words).sample;
             let found = self.awaited.iter().position(|(writer, _)| *writer == sample.writer);
-            // Samples that left before the first look were of the only known writer, if it is also
-            // that of the next one.
-            let is_only = self.awaited.len() == 1 && found.is_some() && !self.has_seen;
-            self.is_known = self.missed == 0 || is_only;
-            self.has_seen = true;
             if let Some((_, last)) = found.map(|index| self.awaited.swap_remove(index)) {
                 let between = sample.seq.saturating_sub(last).saturating_sub(1);
-                self.lost = self.lost.saturating_add(between.saturating_sub(self.missed));
+                self.lost = self.lost.saturating_add(between);
             }
             next += 1;
         }

@@ -133,7 +133,8 @@ impl SharedReader {
     ///
     /// [`ReadError::OutOfHolds`].
     pub fn window(&self, first: u64, count: u32) -> Result<Option<HeldWindow>, ReadError> {
-        let end = first.saturating_add(count.min(self.depth()).into());
+        // No reader sees a sample before the others do, so that all have it if the writer dies.
+        let end = first.saturating_add(count.min(self.depth()).into()).min(self.head());
         let found: Vec<_> = (first..end).map_while(|position| self.look(position)).collect();
         self.hold(&found)
     }

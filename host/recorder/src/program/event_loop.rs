@@ -110,6 +110,7 @@ pub fn run(
         inbox,
         topics: Topics::new(feed, searches),
         polled_at: None,
+        looked_at: options.clock.now(),
         commands: options.commands.map(Commands::new),
         roster: Roster::new(options.preroll_bytes),
         health: SystemHealth::default(),
@@ -148,6 +149,8 @@ struct RecorderLoop {
     topics: Topics,
     /// The time of the last look at messages of the ingress.
     polled_at: Option<Instant>,
+    /// The same, as a stamp.
+    looked_at: i64,
     commands: Option<Commands>,
     roster: Roster,
     health: SystemHealth,
@@ -254,8 +257,15 @@ impl RecorderLoop {
             return;
         }
         self.polled_at = Some(Instant::now());
+        let gaps = self.topics.gaps().count;
         let polled = self.topics.poll(self.clock.now());
-        self.recorder.note_ingress(self.clock.now(), self.topics.has_ingress());
+        let now = self.clock.now();
+        let since = std::mem::replace(&mut self.looked_at, now);
+        if self.topics.gaps().count > gaps {
+            // It ended after the last look; the next one may be joined already.
+            self.recorder.note_ingress(since, now, false);
+        }
+        self.recorder.note_ingress(now, now, self.topics.has_ingress());
         match polled {
             Ok(None) => {}
             Ok(Some(fed)) => {

@@ -1,6 +1,7 @@
 //! The samples of one topic, in the memory that the ingress shares.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use gleaner_feed::FedTopic;
 use gleaner_transport::{SampleMeta, StoredMeta, TopicCounters};
@@ -40,9 +41,10 @@ impl FedSamples {
         &self.fed.info.type_name
     }
 
-    /// Definitions that the source carries.
-    pub fn definitions(&self) -> Option<&str> {
-        self.fed.info.definitions.as_deref()
+    /// Returns the definitions to use: those of a recording, `local` ones, or those of nodes.
+    pub fn definitions(&self, local: Option<Arc<str>>) -> Option<Arc<str>> {
+        let carried = || self.fed.info.definitions.as_deref().map(Arc::from);
+        if self.fed.info.is_recorded { carried().or(local) } else { local.or_else(carried) }
     }
 
     pub fn offered_qos(&self) -> Option<&str> {

@@ -70,8 +70,8 @@ pub struct Topics {
     /// To the thread that searches definitions.
     searches: Sender<DefinitionsRequest>,
     topics: Vec<GrantedTopic>,
-    /// Events of topics that no lambda has announced yet.
-    early: BTreeMap<u32, Result<FedTopic, RefusedTopic>>,
+    /// Events of topics that no lambda has announced yet, in their order.
+    early: BTreeMap<u32, Vec<Result<FedTopic, RefusedTopic>>>,
 }
 
 impl Topics {
@@ -101,10 +101,11 @@ impl Topics {
         }
         let name = name.to_owned();
         self.topics.push(GrantedTopic { id, name, topic, supply: Supply::Awaited, refused: None });
-        match self.early.remove(&id) {
-            Some(Ok(fed)) => self.attach(fed, now_ns),
-            Some(Err(reason)) => self.refuse(id, reason),
-            None => {}
+        for event in self.early.remove(&id).unwrap_or_default() {
+            match event {
+                Ok(fed) => self.attach(fed, now_ns),
+                Err(reason) => self.refuse(id, reason),
+            }
         }
     }
 
@@ -131,8 +132,7 @@ impl Topics {
     /// Takes the result of a search on this machine.
     pub fn found_locally(&mut self, id: u32, text: Option<Arc<str>>) {
         if let Some(fed) = self.fed(id) {
-            let carried = || fed.samples.definitions().map(Arc::from);
-            fed.description = match text.or_else(carried) {
+            fed.description = match fed.samples.definitions(text) {
                 Some(text) => Description::Known(Some(text)),
                 None => Description::Unknown,
             };
@@ -196,7 +196,7 @@ impl Topics {
     fn attach(&mut self, fed: FedTopic, since_ns: i64) {
         let id = fed.info.id;
         let Some(known) = self.topics.iter_mut().find(|known| known.id == id) else {
-            self.early.insert(id, Ok(fed));
+            self.early.entry(id).or_default().push(Ok(fed));
             return;
         };
         if let Supply::Fed(earlier) = &mut known.supply {
@@ -227,7 +227,7 @@ impl Topics {
             if id == COMMANDS_ID {
                 error!(why = in_words(&reason), "cannot receive the topic of commands");
             } else {
-                self.early.insert(id, Err(reason));
+                self.early.entry(id).or_default().push(Err(reason));
             }
             return;
         };
@@ -345,7 +345,7 @@ mod tests {
 
     use gleaner_feed::Feed;
     use gleaner_ingress::Ingress;
-    use gleaner_protocol::ingress::{AddReader, IngressControl};
+    use gleaner_protocol::ingress::{AddReader, IngressControl, Qos};
     use gleaner_protocol::link::recorded_grant;
     use gleaner_transport::loopback::Loopback;
 
@@ -361,7 +361,7 @@ mod tests {
         let (mut control, _) = Ingress::start_in_thread(Box::new(source.clone()));
         let topics = names.iter().zip(1..).map(|(name, id)| {
             source.add_topic(name, TYPE, "int64 value\n");
-            recorded_grant(id, name, Some(TYPE.to_owned()), Some(max_bytes))
+            recorded_grant(id, name, Some(TYPE.to_owned()), Some(max_bytes), Qos::Auto)
         });
         let topics = topics.collect();
         let add = AddReader { name: "recorder".to_owned(), topics, publishes: Vec::new() };

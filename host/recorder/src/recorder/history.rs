@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use gleaner_transport::{Gaps, SampleMeta};
+use gleaner_transport::{Gaps, Guid, SampleMeta};
 
 use super::clips::OpenClip;
 use super::sources::RecordedSources;
@@ -12,6 +12,9 @@ use crate::window::{Group, Window};
 
 /// Most times without an ingress that are kept, for clips that cover them.
 const OUTAGES: usize = 64;
+
+/// Most writers of a topic that are followed over a time without an ingress.
+const WRITERS: usize = 256;
 
 /// The preroll, with the losses of each source. Time never goes back.
 pub struct History {
@@ -31,6 +34,9 @@ pub struct History {
     too_big: u64,
     /// Times without an ingress: begin and end, which is unknown while one lasts.
     outages: VecDeque<(i64, Option<i64>)>,
+    /// Time at which the last of them was noticed. Samples of the earlier ingress have earlier
+    /// stamps.
+    noticed_at: i64,
 }
 
 /// Losses of the samples of a topic.
@@ -39,8 +45,9 @@ struct TopicLosses {
     losses: Losses,
     /// Losses upstream, from gaps in sequence numbers.
     gaps: Gaps,
-    /// Stamp of the last sample.
-    newest: i64,
+    /// Each writer, with the stamp of its first sample after the last outage: its loss in the
+    /// outage is known from that one.
+    writers: Vec<(Guid, Option<i64>)>,
 }
 
 impl History {
@@ -55,6 +62,7 @@ impl History {
             evicted_early: 0,
             too_big: 0,
             outages: VecDeque::new(),
+            noticed_at: i64::MIN,
         }
     }
 
@@ -129,8 +137,17 @@ impl History {
 
     /// Counts losses before a sample, from its sequence number.
     pub fn note_gap(&mut self, topic: usize, meta: &SampleMeta) {
-        let TopicLosses { losses, gaps, newest } = &mut self.topics[topic];
-        *newest = meta.at_ns.max(*newest);
+        let TopicLosses { losses, gaps, writers } = &mut self.topics[topic];
+        let first = (meta.at_ns > self.noticed_at).then_some(meta.at_ns);
+        match writers.iter_mut().find(|(writer, _)| *writer == meta.writer) {
+            Some((_, known)) => *known = (*known).or(first),
+            None => {
+                if writers.len() == WRITERS {
+                    writers.remove(0);
+                }
+                writers.push((meta.writer, first));
+            }
+        }
         let before = gaps.lost();
         let missing = gaps.note(meta.writer, meta.seq);
         if missing > 0 {
@@ -140,14 +157,9 @@ impl History {
         }
     }
 
-    /// Counts a sample that arrived without room for it.
-    pub fn lost_sample(&mut self, topic: usize, meta: &SampleMeta) {
-        self.note_gap(topic, meta);
-        self.topics[topic].losses.lost.add(meta.at_ns, 0);
-    }
-
-    /// Notes that the ingress has ended, or that another one was joined.
-    pub fn note_ingress(&mut self, at_ns: i64, is_there: bool) {
+    /// Notes that the ingress has ended at `at_ns` or later, or that another one was joined then.
+    /// `now_ns` is the current time.
+    pub fn note_ingress(&mut self, at_ns: i64, now_ns: i64, is_there: bool) {
         match self.outages.back_mut() {
             Some((_, end @ None)) if is_there => *end = Some(at_ns),
             Some((_, None)) => {}
@@ -157,6 +169,9 @@ impl History {
                     self.outages.pop_front();
                 }
                 self.outages.push_back((at_ns, None));
+                self.noticed_at = now_ns;
+                let writers = self.topics.iter_mut().flat_map(|topic| &mut topic.writers);
+                writers.for_each(|(_, first)| *first = None);
             }
         }
     }
@@ -219,17 +234,21 @@ impl History {
         limit: i64,
     ) {
         let (number, from, to) = (clip.group(), clip.from(group), group.to.min(limit));
-        // What was lost in an outage is known from the next sample.
+        // What was lost in an outage is known from the next sample of each writer. It counts for
+        // the clip that holds this sample; other clips do not know their part.
         let has_begun = |(begin, _): &&(i64, Option<i64>)| *begin <= to;
         let last_outage = self.outages.iter().rev().find(has_begun);
         let last_outage = last_outage.map(|(_, end)| end.unwrap_or(to));
         for topic in sources.topics_of(group) {
-            let TopicLosses { losses, newest, .. } = &mut self.topics[topic];
+            let TopicLosses { losses, writers, .. } = &mut self.topics[topic];
             let lost = &mut losses.lost;
+            let covered = |at: i64| at <= limit && sources.covers(group, topic, at);
+            let is_settled =
+                !writers.is_empty() && writers.iter().all(|(_, first)| first.is_some_and(covered));
             let is_known = !lost.is_unknown(from, number)
                 && sources.found_at(topic).is_none_or(|at| at <= from)
-                && last_outage.is_none_or(|end| end < from || end < *newest);
-            let count = lost.count(number, |at| at <= limit && sources.covers(group, topic, at));
+                && last_outage.is_none_or(|end| end < from || is_settled);
+            let count = lost.count(number, covered);
             clip.tally(topic).lost = is_known.then_some(count);
         }
         // A window may be planned to end later than now.

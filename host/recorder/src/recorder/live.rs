@@ -6,7 +6,6 @@ use gleaner_base::nanoseconds;
 use gleaner_lambda::manifest::Store;
 use gleaner_lambda::{Clip, Moment, Trigger};
 use gleaner_protocol::link::Loss;
-use gleaner_transport::SampleMeta;
 
 use super::clips::Budget;
 use super::writer::ClipDisk;
@@ -103,15 +102,11 @@ impl Recorder {
         self.material.history.lost_wakes(lambda.index(), at_ns, count);
     }
 
-    /// Counts a sample that arrived without room for it.
-    pub fn lost_sample(&mut self, topic: TopicId, meta: &SampleMeta) {
-        self.material.history.lost_sample(topic.index(), meta);
-    }
-
-    /// Notes that the ingress has ended, or that another one was joined. Clips state the time in
-    /// between.
-    pub fn note_ingress(&mut self, at_ns: i64, is_there: bool) {
-        self.material.history.note_ingress(at_ns, is_there);
+    /// Notes that the ingress has ended at `at_ns` or later, or that another one was joined then.
+    /// Clips state the time in between. `now_ns` is the current time: all samples of the earlier
+    /// ingress are stamped before.
+    pub fn note_ingress(&mut self, at_ns: i64, now_ns: i64, is_there: bool) {
+        self.material.history.note_ingress(at_ns, now_ns, is_there);
     }
 
     /// Executes a command in the name of `lambda`; `source` describes who gave it. It is not a

@@ -181,16 +181,15 @@ fn gaps_in_sequence_numbers_are_losses_of_their_clip() {
                 .sum::<u64>();
         recorder.sample(topics[0], &meta(at, seq), b"x").unwrap();
         if ms % 2 == 0 {
-            // One comes late, and is not lost; another had no room here.
+            // One comes late, and is not lost; another does not come.
             let swapped = match ms {
                 540 => 542,
                 542 => 540,
                 ms => ms,
             };
             let meta = SampleMeta { at_ns: at, seq: swapped / 2 + 1, ..other };
-            match ms {
-                520 => recorder.lost_sample(topics[1], &meta),
-                _ => recorder.sample(topics[1], &meta, b"y").unwrap(),
+            if ms != 520 {
+                recorder.sample(topics[1], &meta, b"y").unwrap();
             }
         }
         match ms {
@@ -217,6 +216,52 @@ fn gaps_in_sequence_numbers_are_losses_of_their_clip() {
     ];
     assert_eq!(clip.incomplete, expected);
     assert_eq!(scratch.journal(clip, "hello").0.wakes_before, 3);
+}
+
+/// Records an event at `event_ms`, with windows of 100 ms, while there is no ingress from 550 to
+/// 650 ms; returns the lost samples of two topics. The second has two writers, of which one sends
+/// nothing from 530 to 750 ms, and then its next sample.
+fn lost_in_an_outage(event_ms: i64) -> Vec<Option<u64>> {
+    let scratch = TestDir::new();
+    let mut recorder = live(&scratch, |_| {});
+    let topics = ["/a", "/b"].map(|name| recorder.add_topic(topic(name)).unwrap());
+    let lambda = recorder.add_lambda(member("hello", (100, 100, 0), &topics));
+    for ms in 0..1000_i64 {
+        let at = T0 + ms * MS;
+        match ms {
+            // The end is noticed later than it is.
+            555 => recorder.note_ingress(T0 + 550 * MS, at, false),
+            650 => recorder.note_ingress(at, at, true),
+            _ => {}
+        }
+        if !(551..=650).contains(&ms) {
+            recorder.sample(topics[0], &meta(at, ms as u64), b"x").unwrap();
+            recorder.sample(topics[1], &meta(at, ms as u64), b"y").unwrap();
+        }
+        if !(530..=750).contains(&ms) {
+            let seq = if ms < 530 { ms } else { ms - 221 };
+            let other = SampleMeta { writer: Guid([8; 16]), ..meta(at, seq as u64) };
+            recorder.sample(topics[1], &other, b"z").unwrap();
+        }
+        if ms == event_ms {
+            recorder.wake(lambda, &entry(at, EVENT)).unwrap();
+        }
+        while recorder.work().unwrap() == Work::More {}
+    }
+    recorder.finish(T0 + S).unwrap();
+    let [clip] = recorder.clips() else { panic!() };
+    let is_stated = clip.incomplete.iter().any(|why| why.contains("the ingress had ended"));
+    assert_eq!(is_stated, (450..=750).contains(&event_ms), "{clip:?}");
+    clip.topics.iter().map(|topic| topic.lost).collect()
+}
+
+#[test]
+fn losses_without_an_ingress_are_known_to_the_clip_that_has_the_next_sample_of_each_writer() {
+    assert_eq!(lost_in_an_outage(400), [Some(0), Some(0)], "before it");
+    assert_eq!(lost_in_an_outage(500), [None, None], "it ends meanwhile");
+    assert_eq!(lost_in_an_outage(600), [Some(100), None], "one writer has sent nothing since");
+    assert_eq!(lost_in_an_outage(680), [Some(100), Some(100)], "both have");
+    assert_eq!(lost_in_an_outage(800), [Some(0), Some(0)], "after it");
 }
 
 #[test]

@@ -20,7 +20,7 @@ use gleaner_lambda::Clip;
 use gleaner_lambda::manifest::Limits;
 use gleaner_messages::{Definitions, Sources};
 use gleaner_protocol::Handover;
-use gleaner_protocol::ingress::{AddReader, AddTopics, IngressControl, ReceptionStatus};
+use gleaner_protocol::ingress::{AddReader, AddTopics, IngressControl, Qos, ReceptionStatus};
 use gleaner_protocol::link::{
     AddLambda, ControlClient, LinkError, RecorderReport, RecorderStatus, commands_grant,
     recorded_grant,
@@ -192,7 +192,7 @@ impl FakeStarter {
             let index = known.unwrap_or_else(|| {
                 self.granted.push(topic.to_owned());
                 let id = self.granted.len() as u32;
-                let topics = vec![recorded_grant(id, topic, type_name, Some(64 << 10))];
+                let topics = vec![recorded_grant(id, topic, type_name, Some(64 << 10), Qos::Auto)];
                 self.reader.topics.extend(topics.clone());
                 let (ingress, _) = self.ingress.as_mut().unwrap();
                 ingress.add_topics(&AddTopics { reader: NAME.to_owned(), topics }).unwrap();
