@@ -120,6 +120,7 @@ fn attached() -> AttachedTopic {
         digests: 0,
         refused: 0,
         definitions: None,
+        is_recorded: false,
         offered_qos: None,
     }
 }

@@ -100,7 +100,9 @@ impl RegionWriter {
             self.enable_digests();
         }
         let first = self.first(request);
-        let (digests, refused) = self.sums_before(first);
+        // From position 0 on, it receives all that the region has ever had.
+        let is_all = request.is_latched && first == 0;
+        let (digests, refused) = if is_all { (0, 0) } else { self.sums_before(first) };
         let bell = request.wakes.then(|| Bell::of(request.control.clone()));
         self.readers.push(RegionReader { id, bell, digests: request.digests });
         Ok(AttachedReader { region: self.id, id, first, sizes: self.sizes, digests, refused })
@@ -143,17 +145,6 @@ impl RegionWriter {
         self.readers.retain(|reader| reader.id != id);
         if !self.readers.iter().any(|reader| reader.digests) {
             self.sums.disable_digests();
-        }
-    }
-
-    /// Copies the samples that `other` shows.
-    fn copy_shown(&mut self, other: &RegionWriter) {
-        let head = other.writer.head();
-        for position in head.saturating_sub(other.sizes.layout.depth.into())..head {
-            if let Some((cdr, words)) = other.writer.shown(position) {
-                self.copy(cdr);
-                self.accept(&StoredMeta::of_words(&words).sample);
-            }
         }
     }
 
@@ -234,16 +225,25 @@ impl TopicSink {
         mut region: RegionWriter,
         request: &AttachRequest<'_>,
     ) -> Result<AttachedReader, WriteError> {
-        let mut state = self.lock();
-        region.id = RegionId(state.next_region);
         if request.digests {
             region.enable_digests();
         }
+        let mut next = 0;
         if request.is_latched {
-            let largest = state.regions.iter().max_by_key(|known| known.sizes.layout.slot_bytes);
-            if let Some(known) = largest {
-                region.copy_shown(known);
+            // Large samples take long to copy, so the source may go on after each of them. It may
+            // be faster than this; the last ones are copied under one lock.
+            for _ in 0..region.sizes.layout.depth {
+                let Some(behind) = self.lock().copy_next(&mut region, next) else { break };
+                next = behind;
             }
+        }
+        let mut state = self.lock();
+        region.id = RegionId(state.next_region);
+        if request.is_latched {
+            while let Some(behind) = state.copy_next(&mut region, next) {
+                next = behind;
+            }
+            state.copy_draft(&mut region);
         }
         let attached = region.attach(request)?;
         state.next_region += 1;
@@ -288,6 +288,33 @@ impl TopicSink {
 }
 
 impl SinkState {
+    /// Returns the region that has all samples that any region has.
+    fn largest(&self) -> Option<&RegionWriter> {
+        self.regions.iter().max_by_key(|known| known.sizes.layout.slot_bytes)
+    }
+
+    /// Copies a shown sample to a further region: the first one from position `next` on that the
+    /// region has room for. Returns the position after it; `None` if there is none.
+    fn copy_next(&self, region: &mut RegionWriter, next: u64) -> Option<u64> {
+        let known = self.largest()?;
+        let depth = known.sizes.layout.depth.min(region.sizes.layout.depth);
+        let position = next.max(known.writer.head().saturating_sub(depth.into()));
+        let (cdr, words) = known.writer.shown(position)?;
+        region.copy(cdr);
+        region.accept(&StoredMeta::of_words(&words).sample);
+        Some(position + 1)
+    }
+
+    /// Copies the sample that is copied, and not accepted yet, to a further region.
+    fn copy_draft(&self, region: &mut RegionWriter) {
+        let Some(known) = self.largest().filter(|_| self.copied.is_some()) else { return };
+        match (known.copied, known.writer.drafted()) {
+            (Some(true), Some(cdr)) => drop(region.copy(cdr)),
+            (Some(false), _) => region.copied = Some(false),
+            _ => {}
+        }
+    }
+
     fn copy(&mut self, subscription: u64, cdr: &[u8]) -> Delivery {
         self.copied = Some(subscription);
         let mut delivery = Delivery::Taken;

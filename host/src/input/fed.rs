@@ -21,8 +21,8 @@ const ATTACH_TIMEOUT: Duration = Duration::from_secs(60);
 const QUERY_TIMEOUT: Duration = Duration::from_secs(6);
 
 /// Attaches every input of `manifest`, whose index in the manifest is the id of its topic, and
-/// returns the topics in the manifest's order. Message definitions in `sources` are preferred to
-/// those of the source.
+/// returns the topics in the manifest's order. Message definitions come from the recording of the
+/// samples, from `sources`, or from the nodes that write the topic, in this order.
 ///
 /// # Errors
 ///
@@ -41,7 +41,10 @@ pub fn open_fed_inputs(
         let FedTopic { info, reader } =
             attached.map_err(|error| refused(input, on_network, error))?;
         let received = |source| InputError::Receive { input: input.name.to_string(), source };
-        let text = match local_definitions(sources, input.type_name.as_str()).or(info.definitions) {
+        let local = || local_definitions(sources, input.type_name.as_str());
+        let carried = info.definitions;
+        let known = if info.is_recorded { carried.or_else(local) } else { local().or(carried) };
+        let text = match known {
             Some(text) => Some(text),
             None => {
                 let left = query_until.saturating_duration_since(Instant::now());

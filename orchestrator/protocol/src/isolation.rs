@@ -8,6 +8,9 @@ use serde::{Deserialize, Serialize};
 /// runtime: a JSON list of [`Layer`].
 pub const LAYERS_ENV: &str = "GLEANER_LAYERS";
 
+/// The environment variable in which `gleaner-shim` passes its process id to its runtime.
+pub const SHIM_ENV: &str = "GLEANER_SHIM";
+
 /// A layer of isolation around a lambda's process, as tested on this machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Layer {

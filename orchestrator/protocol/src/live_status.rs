@@ -46,7 +46,7 @@ pub struct LiveStatus {
     /// slow; and of invalid items that native code of the lambda sent in their place.
     pub unwritten: u64,
     /// Number of messages on the topics of `--rtt` and `--decisions` that were dropped, as a reader
-    /// was too slow.
+    /// was too slow, the lambda too fast, or the ingress had ended.
     #[serde(default)]
     pub unsent: u64,
     /// Time from reception of a sample, or from a due tick, until the lambda is entered. `None`
@@ -165,7 +165,7 @@ pub struct LiveTopic {
     pub malformed: u64,
     /// Number of samples that newer ones replaced in the ring.
     pub overwritten: u64,
-    /// Number of samples without a free slot, as the lambda held too many.
+    /// Always 0: a lambda that holds too many samples has a fault.
     pub no_slot: u64,
     /// Number of samples larger than the input's `max_size`.
     pub too_big: u64,
@@ -179,7 +179,7 @@ pub struct LiveTopic {
     pub qos_warnings: Vec<String>,
 }
 
-/// The network status of one process.
+/// The network status of the ingress.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct NetworkStatus {
     /// DDS domain.

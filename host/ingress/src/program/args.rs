@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
 use gleaner_dds::NetworkArgs;
+use gleaner_drives::journals_of;
 use gleaner_jail::Paths;
 use gleaner_jail::ingress::NewSockets;
 use gleaner_transport::Clock;
@@ -58,7 +59,10 @@ impl Args {
             return Paths::default();
         }
         let unpack_in = self.unpack_in.clone().unwrap_or_else(std::env::temp_dir);
-        Paths { read: self.drive.clone(), write: vec![unpack_in] }
+        // Of a database that was not closed, the newest messages are in a file beside it.
+        let beside = self.drive.iter().flat_map(|drive| journals_of(drive));
+        let read = self.drive.iter().cloned().chain(beside.filter(|journal| journal.is_file()));
+        Paths { read: read.collect(), write: vec![unpack_in] }
     }
 
     /// Returns the sockets that the process may create once it has a source.

@@ -22,7 +22,7 @@ fn an_ingress_that_ended_before_it_was_joined_leaves_its_samples_to_the_reader()
         drop(ingress);
         numbers.source.add_topic("/number", TYPE, TEXT);
         ingress = RunningIngress::over(numbers.source.clone());
-        let socket = ingress.socket("reader", vec![grant(0, "/number").again()]);
+        let socket = ingress.socket("reader", vec![grant(0, "/number").again(true)]);
         let passed = Handover { ingress: Some(socket), ..Handover::default() };
         passed.try_send(&starter).unwrap();
         ingress.status(|status| status.topics.iter().any(|topic| topic.readers == 1));

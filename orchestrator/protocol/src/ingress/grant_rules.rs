@@ -86,10 +86,11 @@ impl TopicGrant {
 
     /// Returns the grant with which a reader attaches the topic again after a restart of the
     /// ingress. All readers begin with the same sample: the first one after the restart, if they
-    /// can still find it. It has a digest, which readers that attach later may need.
+    /// can still find it. If the run `is_recorded`, it has a digest, which readers that attach
+    /// later may need.
     #[must_use]
-    pub fn again(self) -> TopicGrant {
-        TopicGrant { shown: true, digests: true, ..self }
+    pub fn again(self, is_recorded: bool) -> TopicGrant {
+        TopicGrant { shown: true, digests: self.digests || is_recorded, ..self }
     }
 }
 

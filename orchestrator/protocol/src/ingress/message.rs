@@ -54,6 +54,9 @@ pub struct AttachedTopic {
     pub refused: u64,
     /// ros2msg text of the type and all types it refers to, if the source carries it.
     pub definitions: Option<String>,
+    /// True if the samples are those of a recording: its definitions are preferred to any other.
+    #[serde(default)]
+    pub is_recorded: bool,
     /// The QoS that the topic's writers offer, as rosbag2 writes it.
     pub offered_qos: Option<String>,
 }
@@ -173,15 +176,15 @@ pub struct IngressTopic {
 }
 
 impl IngressTopic {
-    /// Adds the counts that an earlier ingress had for the topic. Samples between the two are not
-    /// counted.
+    /// Adds the counts that an earlier ingress had for the topic. The number of samples lost
+    /// between the two is known to the readers only.
     #[must_use]
     pub fn after(mut self, before: &IngressTopic) -> IngressTopic {
         let sum = |now: Option<u64>, before: Option<u64>| {
             now.zip(before).map(|(now, before)| now.saturating_add(before))
         };
         let (now, earlier) = (&mut self.reception, &before.reception);
-        now.lost = sum(now.lost, earlier.lost);
+        now.lost = None;
         now.before_match = sum(now.before_match, earlier.before_match);
         add([
             (&mut self.received, before.received),

@@ -47,12 +47,14 @@ pub fn commands_grant(topic: &str) -> TopicGrant {
 }
 
 /// Returns the grant of a recorded topic of samples with `max_bytes` bytes at most; `None` for the
-/// usual size of its type.
+/// usual size of its type. `qos` is that of the input that is recorded: readers of another QoS have
+/// a subscription of their own, which stamps each sample at another time.
 pub fn recorded_grant(
     id: u32,
     topic: &str,
     type_name: Option<String>,
     max_bytes: Option<u64>,
+    qos: Qos,
 ) -> TopicGrant {
     let fits = |bytes: u64| (WAITING_BYTES / bytes.max(1)).clamp(*DEPTH.start(), *DEPTH.end());
     let depth = max_bytes.map_or(USUAL_DEPTH, |bytes| fits(bytes) as u32);
@@ -61,7 +63,7 @@ pub fn recorded_grant(
         id,
         topic: topic.to_owned(),
         type_name,
-        qos: Qos::Auto,
+        qos,
         queue: depth as usize,
         max_bytes,
         depth,

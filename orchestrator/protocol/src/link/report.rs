@@ -183,7 +183,7 @@ pub struct RecordedTopic {
     pub received: u64,
     /// Number of samples lost before they reached it.
     pub lost: Option<u64>,
-    /// Number of samples without a free slot, as the recorder was busy.
+    /// Number of samples that left the shared memory before the recorder took them.
     pub no_slot: u64,
     /// Number of samples that were too large.
     pub too_big: u64,
