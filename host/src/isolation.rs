@@ -11,9 +11,9 @@ use gleaner_base::{Exit, Failure, safe_file};
 use gleaner_jail::{JailError, Paths, cgroup, files, memory, sandbox_filter, self_test};
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_parts::cache_dir;
-use gleaner_protocol::{Holds, LAYERS_ENV, Layer};
+use gleaner_protocol::{Holds, LAYERS_ENV, Layer, SHIM_ENV};
 use gleaner_vitals::{PULSE_ENV, Pulse};
-use rustix::process::{Signal, set_parent_process_death_signal};
+use rustix::process::{Signal, getppid, set_parent_process_death_signal};
 
 /// The sandbox state of this process.
 pub struct Isolation {
@@ -47,7 +47,7 @@ impl Isolation {
     ///
     /// # Errors
     ///
-    /// A failure if the page that the shim reads cannot be used.
+    /// A failure if the page that the shim reads cannot be used, or if the shim has ended already.
     pub fn of_this_process(permissions: SandboxPermissions) -> Result<Self, Failure> {
         let failed = |what: &str, error: &dyn std::error::Error| {
             Failure::caused_by(Exit::Internal, what, error)
@@ -56,6 +56,13 @@ impl Isolation {
             Pulse::inherited().map_err(|error| failed("cannot use the shim's page", &error))?;
         let has_shim = std::env::var_os(PULSE_ENV).is_some();
         die_with_parent(if has_shim { Signal::KILL } else { Signal::TERM })?;
+        // The signal is sent once, so an earlier end of the shim is checked here.
+        let shim = std::env::var(SHIM_ENV).ok().filter(|_| has_shim);
+        let parent = getppid().map(|parent| parent.as_raw_nonzero().to_string());
+        if shim.is_some() && shim != parent {
+            return Err(Failure::new(Exit::Internal, "gleaner-shim has ended")
+                .with_help("start the lambda again"));
+        }
         Ok(Self {
             permissions,
             pulse,

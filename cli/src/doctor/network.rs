@@ -11,7 +11,7 @@ use super::Finding;
 const UP: InterfaceFlags = InterfaceFlags::IFF_UP;
 const MULTICAST: InterfaceFlags = InterfaceFlags::IFF_MULTICAST;
 
-/// Largest socket buffer that a runtime requests.
+/// Largest socket buffer that the ingress requests.
 const BUFFER_BYTES: u64 = 64 << 20;
 /// Memory for the socket filter, with some reserve: see `docs/dds-limits.md`.
 const FILTER_BYTES: u64 = 128 << 10;
@@ -94,7 +94,7 @@ fn discovery(interfaces: &[Interface], routes: &str, localhost_only: bool) -> Fi
          find each other, and none finds other machines"
     );
     let help = format!(
-        "more than {WITHOUT_MULTICAST} lambdas need it: \
+        "more than {WITHOUT_MULTICAST} participants need it: \
          `ip link set lo multicast on; ip route add 224.0.0.0/4 dev lo`"
     );
     Finding::warning(SUBJECT, found, help)
@@ -161,13 +161,13 @@ mod tests {
 
     #[cfg(target_endian = "little")]
     #[test]
-    fn more_than_twelve_runtimes_need_multicast_and_a_route_for_it() {
+    fn more_than_twelve_participants_need_multicast_and_a_route_for_it() {
         let lo = [interface("lo", UP | MULTICAST)];
         let route = format!("{HEAD}lo\t000000E0\t00000000\t0001\t0\t0\t0\t000000F0\t0\t0\t0\n");
         assert_eq!(discovery(&lo, &route, true).state, Severity::Ok);
         assert_eq!(discovery(&lo, HEAD, true).state, Severity::Warning);
         assert_eq!(discovery(&[interface("lo", UP)], &route, true).state, Severity::Warning);
-        assert!(discovery(&lo, HEAD, true).help.unwrap().contains("more than 12 lambdas"));
+        assert!(discovery(&lo, HEAD, true).help.unwrap().contains("more than 12 participants"));
     }
 
     #[cfg(target_endian = "little")]

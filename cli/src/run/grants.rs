@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 
 use gleaner_lambda::Manifest;
-use gleaner_protocol::ingress::{AddReader, PublishGrant, TopicGrant};
+use gleaner_protocol::ingress::{AddReader, PublishGrant, Qos, TopicGrant};
 use gleaner_protocol::link::{COMMANDS_ID, commands_grant, recorded_grant};
 
 use super::lambdas::RunLambda;
@@ -45,14 +45,17 @@ pub(super) fn recorder(args: &RunArgs) -> AddReader {
     }
 }
 
-/// Returns the reader as it joins an ingress that was started again.
-pub(super) fn again(reader: AddReader) -> AddReader {
-    let topics = reader.topics.into_iter().map(TopicGrant::again).collect();
+/// Returns the reader as it joins an ingress that was started again, in a run with a recorder or
+/// without one.
+pub(super) fn again(reader: AddReader, is_recorded: bool) -> AddReader {
+    let topics = reader.topics.into_iter().map(|topic| topic.again(is_recorded)).collect();
     AddReader { topics, ..reader }
 }
 
 /// The recorded topics of all lambdas of a run, each once.
 pub(super) struct RecordedTopics {
+    /// Topics that lambdas request with different QoS.
+    mixed: Vec<String>,
     grants: Vec<TopicGrant>,
     /// Ids of the topics that were granted to the recorder.
     granted: HashSet<u32>,
@@ -69,11 +72,19 @@ impl RecordedTopics {
                 }
             }
         }
+        let mixed = topics.iter().filter(|samples| samples.is_mixed);
+        let mixed = mixed.map(|samples| samples.topic.clone()).collect();
         let grants = topics.into_iter().zip(COMMANDS_ID + 1..).map(|(samples, id)| {
             let max_bytes = samples.max_bytes();
-            recorded_grant(id, &samples.topic, samples.type_name, max_bytes)
+            let qos = samples.qos.unwrap_or(Qos::Auto);
+            recorded_grant(id, &samples.topic, samples.type_name, max_bytes, qos)
         });
-        Self { grants: grants.collect(), granted: HashSet::new() }
+        Self { mixed, grants: grants.collect(), granted: HashSet::new() }
+    }
+
+    /// Returns the topics that lambdas request with different QoS: each QoS has stamps of its own.
+    pub(super) fn mixed(&self) -> impl Iterator<Item = &str> {
+        self.mixed.iter().map(String::as_str)
     }
 
     /// Returns the recorded topics of a lambda, with their ids.
@@ -98,7 +109,7 @@ impl RecordedTopics {
         let grants = self.grants_of(lambda).into_iter();
         let has = |grant: &&TopicGrant| self.granted.contains(&grant.id);
         let grants = grants.filter(has).filter(|grant| again.insert(grant.id));
-        grants.cloned().map(TopicGrant::again).collect()
+        grants.cloned().map(|grant| grant.again(true)).collect()
     }
 
     fn grants_of(&self, lambda: &RunLambda) -> Vec<&TopicGrant> {
@@ -112,6 +123,10 @@ struct RecordedSamples {
     topic: String,
     /// The type that the first manifest states.
     type_name: Option<String>,
+    /// The QoS of the first input.
+    qos: Option<Qos>,
+    /// True if a further input has another QoS.
+    is_mixed: bool,
     /// The largest size that a manifest states, in bytes.
     largest: u64,
     /// True if a manifest states no size.
@@ -121,6 +136,8 @@ struct RecordedSamples {
 impl RecordedSamples {
     fn add(&mut self, other: RecordedSamples) {
         self.type_name = self.type_name.take().or(other.type_name);
+        self.is_mixed |= self.qos.zip(other.qos).is_some_and(|(one, other)| one != other);
+        self.qos = self.qos.or(other.qos);
         self.largest = self.largest.max(other.largest);
         self.is_usual |= other.is_usual;
     }
@@ -140,6 +157,8 @@ fn recorded(lambda: &RunLambda) -> impl Iterator<Item = (String, RecordedSamples
         let samples = RecordedSamples {
             topic: topic.clone(),
             type_name: input.map(|input| input.type_name.to_string()),
+            qos: input.map(|input| TopicGrant::for_input(0, input, &topic, false, false).qos),
+            is_mixed: false,
             largest: input.map_or(0, |input| input.max_size.bytes()),
             is_usual: input.is_none(),
         };

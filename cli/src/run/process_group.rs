@@ -166,6 +166,12 @@ impl<'a> ProcessGroup<'a> {
             let added = self.ingress.control.add_reader(&grants::recorder(args));
             let Some(ingress) = self.ingress.granted(added) else { return Ok(()) };
             let started = RecorderProcess::start(self.context, recorded, ingress, &self.sender)?;
+            started.topics.mixed().for_each(|topic| {
+                self.screen.warn(&format!(
+                    "lambdas request `{topic}` with different `qos`: clips have the samples of the \
+                     first, and are not verified for the others"
+                ));
+            });
             self.recorder = Some(started);
         }
         for index in 0..self.lambdas.len() {
@@ -206,6 +212,8 @@ impl<'a> ProcessGroup<'a> {
         let added = ingress.control.add_reader(&reader);
         let Some(socket) = ingress.granted(added) else { return Ok(()) };
         connections.ingress = Some(socket);
+        // If its shim is killed, it writes none: that of the process before it would be read.
+        let _ = std::fs::remove_file(lambda.exit_record());
         let child = ChildProcess::start(
             &context.parts,
             ("gleaner-runtime", ChildId::Lambda { index, start }),
@@ -271,6 +279,7 @@ impl<'a> ProcessGroup<'a> {
         self.drain(|group| group.ingress.open_pipes > 0);
         let Self { ingress, screen, .. } = self;
         let reason = ingress.end_reason(status);
+        screen.ingress_gone();
         screen.restarts(&reason, ingress.ended(), ingress.start + 1);
         self.failures.add(reason, false);
         self.lambdas.iter_mut().for_each(SupervisedLambda::lost_ingress);
@@ -285,7 +294,8 @@ impl<'a> ProcessGroup<'a> {
             return;
         }
         if let Some(recorder) = recorder {
-            let added = ingress.control.add_reader(&grants::again(grants::recorder(context.args)));
+            let added =
+                ingress.control.add_reader(&grants::again(grants::recorder(context.args), true));
             let Some(socket) = ingress.granted(added) else { return };
             let mut again = HashSet::new();
             for supervised in lambdas.iter() {
@@ -306,7 +316,7 @@ impl<'a> ProcessGroup<'a> {
             let lambda = &supervised.lambda;
             let is_recorded = recorder.is_some() && lambda.manifest.record.is_some();
             let reader = grants::lambda(lambda, context.args, is_recorded, supervised.restarts);
-            let added = ingress.control.add_reader(&grants::again(reader));
+            let added = ingress.control.add_reader(&grants::again(reader, recorder.is_some()));
             let Some(socket) = ingress.granted(added) else { return };
             supervised.pass_ingress(socket, screen);
         }
@@ -333,19 +343,33 @@ impl<'a> ProcessGroup<'a> {
             let _ = recorder.control.stop();
             let status = self.wait(|group| group.recorder.as_mut().map(|it| &mut it.child))?;
             if let Some(status) = status.filter(|status| !status.success()) {
+                let reason = ended("the recorder", status);
                 self.screen.warn(&format!(
-                    "{}: clips may be unfinished, and are recovered by the next run",
-                    ended("the recorder", status)
+                    "{reason}: clips may be unfinished, and are recovered by the next run"
                 ));
+                // Otherwise a failure that counts already has caused the end.
+                if is_requested {
+                    self.failures.add(reason, false);
+                }
             }
         }
         // Fails if it has ended meanwhile.
         let _ = self.ingress.control.stop();
-        self.wait(|group| Some(&mut group.ingress.child))?;
+        let status = self.wait(|group| Some(&mut group.ingress.child))?;
+        // If it is to be started again, its end is reported already.
+        let is_new = self.ingress.again_at.is_none();
+        if let Some(status) = status.filter(|status| is_new && !status.success()) {
+            let reason = self.ingress.end_reason(status);
+            if is_requested {
+                self.screen.warn(&reason);
+                self.failures.add(reason, false);
+            }
+        }
         self.drain(|group| {
             let recorder = group.recorder.as_ref().map_or(0, |recorder| recorder.open_pipes);
             group.ingress.open_pipes > 0 || recorder > 0
         });
+        self.ingress.show_last(self.screen);
         Ok(())
     }
 

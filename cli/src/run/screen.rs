@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Write};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision};
@@ -17,6 +17,10 @@ use crate::render::{self, Paint};
 /// Time without a writer after which a warning about a topic is printed, in s.
 const WAITING_S: f64 = 3.0;
 
+/// Time after which the statistics are shown again while there is no ingress: a bit less than the
+/// second after which a lambda has its next status.
+const STATISTICS_INTERVAL: Duration = Duration::from_millis(900);
+
 /// Standard output, and on a terminal the statistics below it.
 pub(super) struct Screen {
     stats: bool,
@@ -28,6 +32,11 @@ pub(super) struct Screen {
     lambdas: BTreeMap<String, String>,
     /// Last status of the recorder, formatted.
     recorder: String,
+    /// Last status of the ingress, formatted.
+    ingress: String,
+    /// Set while there is no ingress, whose status shows the statistics otherwise.
+    lacks_ingress: bool,
+    shown: Instant,
     /// The statistics; indicatif hides them if standard error is not a terminal.
     below: ProgressBar,
 }
@@ -46,6 +55,9 @@ impl Screen {
             warned: HashSet::new(),
             lambdas: BTreeMap::new(),
             recorder: String::new(),
+            ingress: String::new(),
+            lacks_ingress: false,
+            shown: Instant::now(),
             below: below.with_style(style),
         }
     }
@@ -100,6 +112,10 @@ impl Screen {
     pub(super) fn live(&mut self, lambda: &str, live: &LiveStatus) {
         self.warn_of_missing_writers(live);
         self.lambdas.insert(lambda.to_owned(), render::live(live, self.paint));
+        // Each lambda has one each second.
+        if self.lacks_ingress && self.shown.elapsed() >= STATISTICS_INTERVAL {
+            self.show();
+        }
     }
 
     /// Removes the status of a lambda whose process has ended.
@@ -110,11 +126,27 @@ impl Screen {
     /// Shows the status of the ingress, and below it the last ones of all others. The ingress has
     /// one each second.
     pub(super) fn ingress(&mut self, status: &IngressStatus) {
+        self.lacks_ingress = false;
+        self.ingress = render::ingress(status, self.paint);
+        self.show();
+    }
+
+    /// Shows that there is no ingress, until [`ingress`](Self::ingress) shows the status of the
+    /// next one.
+    pub(super) fn ingress_gone(&mut self) {
+        self.lacks_ingress = true;
+        self.ingress = format!("{}: has ended, and is started again\n", self.paint.bold("ingress"));
+        self.show();
+    }
+
+    /// Shows the statistics.
+    fn show(&mut self) {
         if !self.stats {
             return;
         }
+        self.shown = Instant::now();
         let lambdas: String = self.lambdas.values().map(String::as_str).collect();
-        let text = render::ingress(status, self.paint) + &lambdas + &self.recorder;
+        let text = format!("{}{lambdas}{}", self.ingress, self.recorder);
         if self.below.is_hidden() {
             self.out(&text);
         } else {

@@ -27,6 +27,8 @@ pub(super) struct IngressProcess {
     pub(super) is_ready: bool,
     /// Set at the end of the drive.
     pub(super) drive_ended: bool,
+    /// Set after its final status.
+    has_ended: bool,
     pub(super) status: Option<Box<IngressStatus>>,
     /// Last status of each topic that had a reader.
     topics: Vec<IngressTopic>,
@@ -97,6 +99,7 @@ impl IngressProcess {
             open_pipes: PIPES,
             is_ready: false,
             drive_ended: false,
+            has_ended: false,
             status: None,
             topics: Vec::new(),
             earlier_topics,
@@ -177,8 +180,18 @@ impl IngressProcess {
                 // Its readers have ended before it, and with them their topics.
                 status.topics = self.topics();
                 screen.ingress_ended(&status);
+                self.has_ended = true;
                 self.status = Some(status);
             }
+        }
+    }
+
+    /// Shows the last status of a run that ends without a final one, as the ingress has failed.
+    pub(super) fn show_last(&self, screen: &mut Screen) {
+        let topics = self.topics();
+        if !self.has_ended && !topics.is_empty() {
+            let status = self.status.as_deref().cloned().unwrap_or_default();
+            screen.ingress_ended(&IngressStatus { topics, readers: 0, ..status });
         }
     }
 

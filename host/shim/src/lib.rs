@@ -31,7 +31,7 @@ use clap::Parser;
 use gleaner_base::{Exit, Failure};
 use gleaner_jail::cgroup::{CgroupLimits, Group};
 use gleaner_jail::{Paths, base_filter, cgroup, files, memory, sandbox_filter, self_test, sockets};
-use gleaner_protocol::{ExitRecord, LAYERS_ENV, Layer, RESULTS_ENV};
+use gleaner_protocol::{ExitRecord, LAYERS_ENV, Layer, RESULTS_ENV, SHIM_ENV};
 use gleaner_vitals::{PULSE_ENV, Pulse, make_inheritable};
 
 use self::results::Results;
@@ -130,7 +130,8 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
     orphans::adopt().map_err(|error| cannot("cannot adopt the orphans of a runtime", &error))?;
     let (pulse, page) =
         Pulse::create().map_err(|error| cannot("cannot create the pulse page", &error))?;
-    // The runtime then finds an interpreter, compiles and discovers, before its first sign of life.
+    // The runtime then finds an interpreter, compiles and attaches its topics, before its first
+    // sign of life.
     pulse.alive(START);
     let number =
         make_inheritable(&page).map_err(|error| cannot("cannot pass on the pulse page", &error))?;
@@ -147,6 +148,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
         .envs(environment::for_runtime())
         .env_remove(cgroup::CGROUP_ENV);
     command.env(PULSE_ENV, number).env(LAYERS_ENV, layers).env_remove(RESULTS_ENV);
+    command.env(SHIM_ENV, std::process::id().to_string());
     if let Some(path) = args.exit_record.as_ref().filter(|path| path.as_os_str() != "-") {
         // Otherwise the record of an earlier runtime could be taken for this one's. Mostly there is
         // none.

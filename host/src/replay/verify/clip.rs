@@ -13,7 +13,7 @@ use gleaner_transport::{SampleMeta, Transport};
 
 use super::lockstep::{LockstepDrive, LockstepError};
 use super::reference::{contradiction, unreadable_clip};
-use super::triggers::JournalTriggers;
+use super::triggers::{JournalTriggers, restarts};
 use super::{ReferenceJournal, Rerun, VerifyOutcome, counts_differ, different, seconds};
 use crate::api::data::{Tick, Topic, Wake};
 use crate::api::trace::offered;
@@ -84,7 +84,8 @@ pub(super) fn verify(
                 .with_help(format!("{help}; this clip can be verified against its drive: {DRIVE}")),
         });
     }
-    let notes = note_interrupted(interrupted).into_iter().collect();
+    let later = restarts(&stated, &header.lambda);
+    let notes = note_interrupted(interrupted).into_iter().chain(note_restarts(later)).collect();
     Ok(VerifyOutcome { engine, wakes, triggers, uncovered, uncovered_triggers, notes })
 }
 
@@ -103,6 +104,14 @@ fn note_interrupted(wakes: u64) -> Option<String> {
         "{wakes} that exceeded the deadline on the vehicle: not repeated, the lambda starts again \
          after each"
     ))
+}
+
+/// The note on later processes of the lambda, whose journals are not compared; `None` if there are
+/// none.
+fn note_restarts(times: usize) -> Option<String> {
+    (times > 0).then(|| {
+        format!("the lambda was started again in the clip ({times} times): compared until then")
+    })
 }
 
 /// Refuses a clip that lacks the topic of an input.
@@ -254,7 +263,12 @@ impl ClipVerifyLoop<'_> {
             earlier.push(ahead.saturating_sub(seen.new));
             new.push(ahead.min(seen.new));
         }
-        self.deliver(earlier.into_iter())?;
+        if self.is_live && self.header.wakes_before == 0 {
+            // The lambda was started after them: in its first wake, all that it received is new.
+            self.clip.discard(earlier.into_iter());
+        } else {
+            self.deliver(earlier.into_iter())?;
+        }
         self.rerun.entry_builder.skip();
         self.deliver(new.into_iter())
     }

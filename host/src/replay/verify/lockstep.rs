@@ -127,6 +127,16 @@ impl LockstepDrive {
         Ok(())
     }
 
+    /// Drops the next `unseen` samples of each subscription, as far as they were looked at.
+    pub(super) fn discard(&mut self, unseen: impl Iterator<Item = u64>) {
+        for (sink, n) in self.sinks.iter().zip(unseen) {
+            let mut state = sink.lock();
+            let n = usize::try_from(n).unwrap_or(usize::MAX).min(state.waiting.len());
+            let bytes = state.waiting.drain(..n).map(|(_, held)| held.cost()).sum();
+            sink.waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
+        }
+    }
+
     /// Number of samples of subscription `sink` up to and including the first that `is_wanted`;
     /// `None` if there is none up to `until_ns`.
     pub(super) fn ahead(

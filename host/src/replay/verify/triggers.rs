@@ -20,6 +20,12 @@ pub(super) struct JournalTriggers {
     span: Option<(i64, i64)>,
 }
 
+/// Number of times that a lambda was started again within a clip.
+pub(super) fn restarts(stated: &ClipStatements, lambda: &str) -> usize {
+    let processes = stated.clip().lambdas.iter().filter(|process| process.name == lambda);
+    processes.count().saturating_sub(1)
+}
+
 impl JournalTriggers {
     pub(super) fn of(lambda: &str) -> Self {
         Self { lambda: lambda.to_owned(), count: 0, moments: Vec::new(), span: None }
@@ -43,7 +49,9 @@ impl JournalTriggers {
         // In `incomplete`, a clip notes that its journal lacks wakes, whose triggers cannot be
         // reproduced.
         let lacking = format!("the journal of {} lacks ", self.lambda);
-        let is_short = clip.incomplete.iter().any(|why| why.starts_with(&lacking));
+        // Each process of a lambda has a journal of its own.
+        let is_short = clip.incomplete.iter().any(|why| why.starts_with(&lacking))
+            || restarts(stated, &self.lambda) > 0;
         let is_here = |at_ns: i64| {
             !is_short || self.span.is_some_and(|(first, last)| (first..=last).contains(&at_ns))
         };
