@@ -1,4 +1,4 @@
-//! Reports the state of a process, in the same way for the runtime and the recorder.
+//! Reports the state of a process, in the same way for the runtime, the ingress and the recorder.
 //!
 //! - [`make_inheritable`], [`inherited`], [`close_on_exec`]: open files that the shim passes to its
 //!   runtime.

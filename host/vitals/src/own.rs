@@ -19,8 +19,8 @@ pub fn allocated(bytes: usize) {
     let size = block_bytes(bytes);
     if bytes >= LARGE_BYTES {
         LARGE.fetch_add(size, Relaxed);
-        // A message that the network reassembles may arrive during a wake, and must not count as
-        // the lambda's memory.
+        // Another thread of Gleaner may allocate during a wake, which must not count as the
+        // lambda's memory.
         Pulse::publish_own();
         return;
     }

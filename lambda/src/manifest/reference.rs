@@ -198,8 +198,8 @@ fn input() -> Section {
          Memory is allocated before the first sample, {} at most for all inputs:\n\
          (`depth` + `hold` + 1) × `max_size`, \
          and for compressed images (`hold` + 1) × `decoded_size`.\n\
-         Live, each input takes (`depth` + 1) × `max_size` more; \
-         if `max_size` is above 64 KiB, 3 × `max_size` at most.",
+         Live, all lambdas share the memory for samples: \
+         `gleaner check DIR` shows how much it is.",
         bounds::INPUTS_MEMORY_MAX
     );
     Section { title: "[[input]]", note, keys }
