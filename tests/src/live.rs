@@ -170,7 +170,12 @@ impl RunningProgram {
                 None => thread::sleep(Duration::from_millis(10)),
             }
         };
-        Finished { status, lines, stderr: self.stderr() }
+        // What it wrote last may still be on its way from the pipe.
+        let mut errors = Vec::new();
+        while let Ok(line) = self.errors.recv_timeout(Duration::from_secs(10)) {
+            errors.push(line);
+        }
+        Finished { status, lines, stderr: errors.join("\n") }
     }
 }
 

@@ -181,7 +181,10 @@ fn run_attack(attack: &str, language: &str, outcome: AttackOutcome) {
         Fault(kind) => {
             let fault = decision.and_then(|decision| decision.fault).expect("a fault");
             assert_eq!(fault.kind, kind, "{}", fault.message);
-            assert_eq!(finished.ended().restarts, 0, "the process lives on");
+            // The shim may see the memory of a further attack before that is refused.
+            let by_shim = kind == Memory && finished.stderr.contains("of memory; the limit is");
+            let restarts = finished.ended().restarts;
+            assert!(restarts == 0 || by_shim, "the process lives on: {}", finished.stderr);
         }
         Refused(words) => {
             let decision = decision.expect("an event");
@@ -208,7 +211,7 @@ fn run_attack(attack: &str, language: &str, outcome: AttackOutcome) {
                     .any(|it| it.triggers.iter().any(|trigger| trigger.label == "escaped")),
                 "{written:?}"
             );
-            assert_eq!(finished.ended().restarts, 0, "the process lives on");
+            assert_eq!(finished.ended().restarts, 0, "the process lives on: {}", finished.stderr);
         }
         Killed(words) => {
             let fault = decision.and_then(|decision| decision.fault).expect("a fault");
