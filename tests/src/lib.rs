@@ -181,6 +181,11 @@ pub fn verify(args: &[&OsStr]) -> Verification {
     }
 }
 
+/// Verifies a clip with the lambda in `lambda`.
+pub fn verify_clip(clip: &Path, lambda: &Path) -> Verification {
+    verify(&["verify".as_ref(), clip.as_ref(), "--lambda".as_ref(), lambda.as_ref()])
+}
+
 fn reports(stdout: &[u8]) -> impl Iterator<Item = Report> {
     String::from_utf8_lossy(stdout).lines().map(parsed).collect::<Vec<_>>().into_iter()
 }

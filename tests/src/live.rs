@@ -1,5 +1,6 @@
 //! Starts `gleaner run` and `gleaner play` as processes, reads their reports, and stops them.
 
+use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -131,6 +132,16 @@ impl RunningProgram {
         });
     }
 
+    /// Waits until the `init` of each of `count` lambdas has returned; returns their names.
+    pub fn until_all_ready(&self, count: usize) -> Vec<String> {
+        let mut names = Vec::new();
+        self.until_named("all lambdas to be ready", |name, report| {
+            names.extend(matches!(report, Report::Ready).then_some(name));
+            (names.len() == count).then_some(())
+        });
+        names
+    }
+
     /// Waits for a status of the lambda for which `wanted` holds.
     pub fn until_live(
         &self,
@@ -217,6 +228,22 @@ impl Finished {
         });
         ended
             .unwrap_or_else(|| panic!("no final report; {}, stderr:\n{}", self.status, self.stderr))
+    }
+
+    /// The number of samples that a player has sent of each topic.
+    ///
+    /// # Panics
+    ///
+    /// If it failed, or printed no summary.
+    pub fn sent(&self) -> BTreeMap<String, u64> {
+        assert!(self.status.success(), "{}", self.stderr);
+        let line = self.lines.last().expect("the player prints its summary");
+        let summary: serde_json::Value = serde_json::from_str(line).expect("a summary is JSON");
+        let topics = summary["topics"].as_array().expect("a summary lists topics").iter();
+        let count = |topic: &serde_json::Value| {
+            Some((topic["topic"].as_str()?.to_owned(), topic["sent"].as_u64()?))
+        };
+        topics.map(|topic| count(topic).expect("a topic has a name and a count")).collect()
     }
 
     /// The final status of the lambda `name`, if there is one.

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_protocol::{LiveStatus, Report};
+use gleaner_protocol::LiveStatus;
 use gleaner_tests::live::{RunningProgram, cpu_ns, descendants, play, run_all};
 use gleaner_tests::{LambdaCopy, TempFolder};
 
@@ -51,15 +51,13 @@ impl Load<'_> {
         let out = TempFolder::new();
         let began = Instant::now();
         let started = run_all(&folders, out.path(), &["--no-record"]);
-        let mut names = Vec::new();
-        if copies.len() == 1 {
+        // The only lambda of a run has no name in its reports.
+        let names = if copies.len() == 1 {
             started.until_ready();
+            Vec::new()
         } else {
-            started.until_named("all lambdas to be ready", |name, report| {
-                names.extend(matches!(report, Report::Ready).then_some(name));
-                (names.len() == copies.len()).then_some(())
-            });
-        }
+            started.until_all_ready(copies.len())
+        };
         let ready_ms = began.elapsed().as_secs_f64() * 1e3;
         let duration = self.seconds.to_string();
         let players: Vec<_> = self
@@ -75,9 +73,7 @@ impl Load<'_> {
         let (last, span) = (Costs::of(&started), at.elapsed());
         let mut sent = BTreeMap::new();
         for player in players {
-            let played = player.finish();
-            assert!(played.status.success(), "{}", played.stderr);
-            sent.extend(sent_by(&played.lines));
+            sent.extend(player.finish().sent());
         }
         // The last samples may be in transit.
         thread::sleep(Duration::from_millis(500));
@@ -204,17 +200,4 @@ impl Process {
 
 fn read(pid: u32, name: &str) -> String {
     std::fs::read_to_string(format!("/proc/{pid}/{name}")).unwrap_or_default()
-}
-
-/// The number of samples that a player has sent of each topic, by its summary.
-fn sent_by(lines: &[String]) -> Vec<(String, u64)> {
-    let summary = lines.iter().find_map(|line| {
-        let summary = serde_json::from_str::<serde_json::Value>(line).ok()?;
-        Some(summary.get("topics")?.as_array()?.clone())
-    });
-    let topics = summary.expect("the player prints its summary").into_iter();
-    let count = |topic: serde_json::Value| {
-        Some((topic["topic"].as_str()?.to_owned(), topic["sent"].as_u64()?))
-    };
-    topics.filter_map(count).collect()
 }

@@ -358,12 +358,11 @@ impl<'a> ProcessGroup<'a> {
         let status = self.wait(|group| Some(&mut group.ingress.child))?;
         // If it is to be started again, its end is reported already.
         let is_new = self.ingress.again_at.is_none();
-        if let Some(status) = status.filter(|status| is_new && !status.success()) {
+        let is_failure = |status: &ExitStatus| is_requested && is_new && !status.success();
+        if let Some(status) = status.filter(is_failure) {
             let reason = self.ingress.end_reason(status);
-            if is_requested {
-                self.screen.warn(&reason);
-                self.failures.add(reason, false);
-            }
+            self.screen.warn(&reason);
+            self.failures.add(reason, false);
         }
         self.drain(|group| {
             let recorder = group.recorder.as_ref().map_or(0, |recorder| recorder.open_pipes);

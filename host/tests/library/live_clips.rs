@@ -50,18 +50,18 @@ fn samples_that_are_larger_than_the_lambda_accepts_do_not_disturb() {
 
 #[test]
 fn a_lambda_that_is_woken_by_a_sample_from_before_its_start_is_verified() {
-    let mut running = RecordedRun::start_after(0, 3);
-    running.record_others();
-    running.burst(5);
-    let clip = running.clip();
-    let verified = running.verify(clip).unwrap();
-    assert_eq!((verified.uncovered, verified.triggers), (0, 1), "{verified:?}");
-    running.end();
+    is_verified_after(0, 3);
 }
 
 #[test]
 fn samples_of_a_clip_from_before_the_start_of_the_lambda_are_not_shown_to_it() {
-    let mut running = RecordedRun::start_after(7, 0);
+    is_verified_after(7, 0);
+}
+
+/// Asserts that the clip of a lambda is verified, which is started after these samples; see
+/// [`RecordedRun::start_after`].
+fn is_verified_after(earlier: i64, early: i64) {
+    let mut running = RecordedRun::start_after(earlier, early);
     running.record_others();
     running.burst(5);
     let clip = running.clip();

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use gleaner_protocol::{LiveStatus, LiveTopic, Report};
 use gleaner_tests::live::{decisions, play, run_all};
-use gleaner_tests::{LambdaCopy, TempFolder, replay_to, sample_drive, times, verify};
+use gleaner_tests::{LambdaCopy, TempFolder, replay_to, sample_drive, times, verify_clip};
 
 use super::{TriggerKey, clips, trigger_keys};
 
@@ -97,11 +97,7 @@ fn played(
     let args: Vec<&str> = settings.iter().flat_map(|setting| ["--set", setting]).collect();
     let folders = lambdas.each_ref().map(LambdaCopy::path);
     let started = run_all(&folders, out.path(), &args);
-    let mut ready = 0;
-    started.until_named("all lambdas to be ready", |_, report| {
-        ready += usize::from(matches!(report, Report::Ready));
-        (ready == TWINS.len()).then_some(())
-    });
+    started.until_all_ready(TWINS.len());
     let path = drive.to_str().expect("the checkout has a plain path");
     let played = play(&[path, "--wait", "1"]).finish();
     assert!(played.status.success(), "{}", played.stderr);
@@ -128,8 +124,7 @@ fn played(
         for (_, lambda) in
             of.filter(|((_, name), _)| clip.lambdas.iter().any(|it| it.name == *name))
         {
-            let lambda = lambda.path().as_ref();
-            let again = verify(&["verify".as_ref(), file.as_ref(), "--lambda".as_ref(), lambda]);
+            let again = verify_clip(&file, lambda.path());
             let verified = again.verified.unwrap_or_else(|| panic!("{}: {clip:#?}", again.stderr));
             totals[2] += verified.wakes - verified.uncovered;
         }

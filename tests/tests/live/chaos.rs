@@ -9,11 +9,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::Report;
-use gleaner_tests::live::{
-    Finished, RunningProgram, decisions, descendants, play, run_all, signal, summary,
-};
+use gleaner_tests::live::{RunningProgram, decisions, descendants, play, run_all, signal, summary};
 use gleaner_tests::random::XorShift64;
-use gleaner_tests::{LambdaCopy, TempFolder, times, verify};
+use gleaner_tests::{LambdaCopy, TempFolder, times, verify_clip};
 
 use super::{clips, wait_for};
 
@@ -64,18 +62,14 @@ fn run_once(kills: &Kills, random: &mut XorShift64, totals: &mut ChaosCounts) {
     let args: Vec<&str> = settings.iter().flat_map(|setting| ["--set", setting]).collect();
     let folders: Vec<&Path> = lambdas.iter().map(LambdaCopy::path).collect();
     let started = run_all(&folders, out.path(), &args);
-    let mut ready = 0;
-    started.until_named("all lambdas to be ready", |_, report| {
-        ready += usize::from(matches!(report, Report::Ready));
-        (ready == LAMBDAS.len()).then_some(())
-    });
+    started.until_all_ready(LAMBDAS.len());
     let player = play(&["--imu", "100", "--synthetic", "160x120@10", "--wait", "1"]);
     all_receive(&started, false);
     kill_some(&started, &lambdas, kills, random, totals);
     let spares_recorder = kills.recorder == 0;
     all_receive(&started, spares_recorder);
     player.signal("INT");
-    let sent = sent(&player.finish());
+    let sent = player.finish().sent()["/imu/synthetic"];
     // The last sample is received, too. A lambda that was started again lacks earlier ones.
     started.until_named("the end of the samples", |name, report| match report {
         Report::Live(live) if name == "last" => {
@@ -123,12 +117,7 @@ fn run_once(kills: &Kills, random: &mut XorShift64, totals: &mut ChaosCounts) {
             of.filter(|((_, name), _)| clip.lambdas.iter().any(|it| it.name == *name))
         {
             let file = out.path().join(&clip.file);
-            let found = verify(&[
-                "verify".as_ref(),
-                file.as_ref(),
-                "--lambda".as_ref(),
-                lambda.path().as_ref(),
-            ]);
+            let found = verify_clip(&file, lambda.path());
             // What is missing, or the state of the lambda from before the clip, may leave a wake
             // open; no clip may contradict its lambda.
             match found.exit {
@@ -209,15 +198,6 @@ fn kill_some(
         };
         *totals.kills.entry(kind).or_default() += 1;
     }
-}
-
-fn sent(played: &Finished) -> u64 {
-    assert!(played.status.success(), "{}", played.stderr);
-    let line = played.lines.last().expect("a summary");
-    let summary: serde_json::Value = serde_json::from_str(line).expect("a summary is JSON");
-    let topics = summary["topics"].as_array().expect("topics").iter();
-    let imu = topics.filter(|topic| topic["topic"] == "/imu/synthetic");
-    imu.map(|topic| topic["sent"].as_u64().expect("a number")).sum()
 }
 
 /// Asserts that no wake is listed twice, or before an earlier one.

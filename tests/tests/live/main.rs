@@ -213,11 +213,7 @@ fn run_two(out: &Path) -> (RunningProgram, [LambdaCopy; 2]) {
         .map(|(of, name)| LambdaCopy::named(of, name));
     let folders = [lambdas[0].path(), lambdas[1].path()];
     let started = run_all(&folders, out, &["--set", "first.brake_mps2=-1.4"]);
-    let mut ready = 0;
-    started.until_named("both lambdas to be ready", |_, report| {
-        ready += u32::from(matches!(report, Report::Ready));
-        (ready == 2).then_some(())
-    });
+    started.until_all_ready(2);
     (started, lambdas)
 }
 

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use gleaner_tests::live::{decisions, run_all, summary};
-use gleaner_tests::{LambdaCopy, TempFolder, sample_drive, verify};
+use gleaner_tests::{LambdaCopy, TempFolder, sample_drive, verify_clip};
 
 /// IMU samples of the sample drive.
 const IMU: u64 = 4170;
@@ -53,8 +53,7 @@ fn beside_garbage_on_a_control_page_others_see_each_sample_and_their_clips_prove
         assert_eq!((imu.received, imu.no_slot, live.faults), (IMU, 0, 0), "{live:?}");
         let (mut compared, mut triggers) = (0, 0);
         for clip in clips(out.path()) {
-            let arguments = ["verify".as_ref(), clip.as_ref(), "--lambda".as_ref()];
-            let again = verify(&[&arguments[..], &[lambda.path().as_ref()]].concat());
+            let again = verify_clip(&clip, lambda.path());
             let verified = again.verified.unwrap_or_else(|| panic!("{name}: {}", again.stderr));
             compared += verified.wakes - verified.uncovered;
             triggers += verified.triggers - verified.uncovered_triggers;
