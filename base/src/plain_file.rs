@@ -115,6 +115,11 @@ impl PlainFile {
         Ok(Self { file, found, most, left: most.bytes() })
     }
 
+    /// Returns the open file, to pass it to another program, which checks its length again.
+    pub fn into_file(self) -> File {
+        self.file
+    }
+
     /// Returns the length in bytes at the time of opening.
     pub fn length(&self) -> u64 {
         self.found.len()

@@ -2,6 +2,8 @@
 
 use std::ffi::OsString;
 use std::io::{self, BufRead, BufReader, Read, Write};
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
@@ -11,11 +13,13 @@ use gleaner_base::{Exit, Explain, Failure, each_piece, visible};
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::{LambdaKind, Manifest};
 use gleaner_parts::Parts;
-use gleaner_protocol::{CheckReport, ReplaySummary, Report, Verified};
+use gleaner_protocol::{CheckReport, Handover, ReplaySummary, Report, Verified};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::delegate::starter;
+use crate::inference::{InferenceEvent, InferenceService};
 use crate::pipe_reader::PipeReader;
+use crate::render::{self, Paint};
 
 /// Maximum size of a report, far above that of a trigger with all its attributes or of a clip with
 /// all its lists.
@@ -76,9 +80,16 @@ pub(crate) fn run(
 ) -> Result<(Option<RuntimeResult>, Exit), Failure> {
     let parts = Parts::find()?;
     let runtime = parts.program("gleaner-runtime")?;
-    let shim = if has_worker(lambda) { None } else { Some(parts.program("gleaner-shim")?) };
+    // The runtime reports that it cannot be read.
+    let build = BuildDir::of(lambda);
+    let manifest = Manifest::load(build.path()).ok();
+    let has_worker = manifest.as_ref().is_some_and(|it| it.lambda.kind == LambdaKind::Python);
+    let shim = if has_worker { None } else { Some(parts.program("gleaner-shim")?) };
     let bar = progress_bar();
-    let mut child = start(shim, runtime, arguments)?;
+    let models = manifest.as_ref().filter(|manifest| !manifest.models.is_empty());
+    let models = models.map(|manifest| ModelsOfRun::start(&parts, &build, manifest, &bar));
+    let models = models.transpose()?;
+    let mut child = start(shim, runtime, arguments, models.as_ref())?;
     // Both pipes are read by threads, since a lambda may leave processes running that hold them
     // open forever.
     let explained = Arc::new(AtomicBool::new(false));
@@ -102,8 +113,10 @@ pub(crate) fn run(
     let status = child.wait().map_err(|source| RuntimeError::Read { source })?;
     // The last message of the runtime is the cause of a failure.
     errors.and_then(PipeReader::drain);
+    let has_failed = models.is_some_and(ModelsOfRun::end);
     let result = result?;
     match (result, status.code().and_then(Exit::from_code)) {
+        (Some(result), Some(Exit::Ok)) if has_failed => Ok((Some(result), Exit::Internal)),
         (Some(result), Some(exit)) => Ok((Some(result), exit)),
         (Some(_), None) => Err(RuntimeError::Code { status }.into()),
         // An exit code alone is not trusted: a lambda can end the process with any code.
@@ -114,31 +127,87 @@ pub(crate) fn run(
     }
 }
 
-/// Returns whether the runtime starts a worker for the lambda, below a shim, as it does for Python.
-/// False if the manifest cannot be read, which the runtime reports.
-fn has_worker(lambda: &Path) -> bool {
-    Manifest::load(BuildDir::of(lambda).path())
-        .is_ok_and(|manifest| manifest.lambda.kind == LambdaKind::Python)
+/// The process that runs the models of a replay, and the connection to pass to the runtime.
+struct ModelsOfRun {
+    service: InferenceService,
+    /// Our end of the standard input of the runtime, and its end.
+    handover: UnixStream,
+    stdin: UnixStream,
+    /// Set once the process has ended without a request.
+    has_failed: Arc<AtomicBool>,
+}
+
+impl ModelsOfRun {
+    fn start(
+        parts: &Parts,
+        build: &BuildDir,
+        manifest: &Manifest,
+        bar: &ProgressBar,
+    ) -> Result<Self, Failure> {
+        let (bar, has_failed) = (bar.clone(), Arc::new(AtomicBool::new(false)));
+        let failed = Arc::clone(&has_failed);
+        let service = InferenceService::start(parts, move |event| {
+            let text = match event {
+                InferenceEvent::Report(report) => {
+                    render::inference(&report, Paint::of_stderr()).into_bytes()
+                }
+                InferenceEvent::Stderr(text) => text,
+                InferenceEvent::Ended(reason, delay) => {
+                    failed.store(true, Ordering::Relaxed);
+                    let delay = delay.as_secs_f64();
+                    format!("warning: {}; restarting in {delay} s\n", visible(&reason)).into_bytes()
+                }
+                InferenceEvent::Warning(text) => {
+                    format!("warning: {}\n", visible(&text)).into_bytes()
+                }
+            };
+            bar.suspend(|| drop(io::stderr().write_all(&text)));
+        })?;
+        let inference = service.add(manifest.lambda.name.as_str(), build, manifest)?;
+        let cannot = |error: &dyn std::error::Error| {
+            Failure::caused_by(Exit::Internal, "cannot connect the runtime to its models", error)
+        };
+        let (handover, stdin) = UnixStream::pair().map_err(|error| cannot(&error))?;
+        let connections = Handover { inference: Some(inference), ..Handover::default() };
+        connections.send(&handover).map_err(|error| cannot(&error))?;
+        Ok(Self { service, handover, stdin, has_failed })
+    }
+
+    /// Ends the process; returns whether it had ended before.
+    fn end(self) -> bool {
+        let Self { service, handover, has_failed, .. } = self;
+        service.stop();
+        drop(handover);
+        has_failed.load(Ordering::Relaxed)
+    }
 }
 
 /// Starts the runtime, below `shim` if the lambda runs in the runtime's process.
 fn start(
     shim: Option<PathBuf>,
     runtime: PathBuf,
-    arguments: Vec<OsString>,
+    mut arguments: Vec<OsString>,
+    models: Option<&ModelsOfRun>,
 ) -> Result<Child, RuntimeError> {
     let mut command = Command::new(shim.as_ref().unwrap_or(&runtime));
     if shim.is_some() {
         command.args([starter(), "--".into()]).arg(&runtime);
     }
     let program = shim.unwrap_or(runtime);
+    let failed = |source| RuntimeError::Start { program: program.clone(), source };
+    let mut stdin = Stdio::null();
+    if let Some(models) = models {
+        // After the subcommand.
+        arguments.insert(1, "--starter-passes-inference".into());
+        stdin = OwnedFd::from(models.stdin.try_clone().map_err(failed)?).into();
+    }
     command
         .args(arguments)
-        .stdin(Stdio::null())
+        .stdin(stdin)
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
-        .map_err(|source| RuntimeError::Start { program, source })
+        .map_err(failed)
 }
 
 /// Reads the next report into `line`; returns false at the end. A line beyond [`REPORT_BYTES`],

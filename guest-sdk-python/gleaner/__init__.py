@@ -20,9 +20,10 @@ A lambda is a class, or plain functions, in the file that ``entry`` of its ``lam
 An exception that leaves a handler is a fault of that wake. Before the next wake the host creates a
 fresh instance of the class, or calls ``init`` again; the globals of the module keep their values.
 
-The classes here describe the objects that the host passes to a lambda. Importing them needs no
-host, so a lambda can be type-checked locally, and run locally with `gleaner.testing`. The names are
-those of the WIT package ``gleaner:lambda``, with ``_`` in place of ``-``.
+The classes here describe the objects that the host passes to a lambda; a lambda itself creates a
+``Model`` or ``Tensor``. Importing them needs no host, so a lambda can be type-checked locally, and
+run locally with `gleaner.testing`. The names are those of the WIT package ``gleaner:lambda``, with
+``_`` in place of ``-``.
 """
 
 from .context import Context
@@ -43,7 +44,17 @@ from .data import (
     Value,
 )
 from .error import DeadlineExceeded, Error
-from .inference import Detection, DetectOptions, InferenceError, Model, Preprocess, Tensor
+from .inference import (
+    Detection,
+    DetectOptions,
+    ElementType,
+    InferenceError,
+    Model,
+    Placement,
+    Preprocess,
+    Tensor,
+    TensorInfo,
+)
 from .log import Level
 from .scratch import Entry, Scratch, ScratchError
 from .trigger import AttributeValue, TriggerError
@@ -60,6 +71,7 @@ __all__ = [
     "Detection",
     "Encoding",
     "DeadlineExceeded",
+    "ElementType",
     "Entry",
     "Error",
     "Field",
@@ -70,6 +82,7 @@ __all__ = [
     "InferenceError",
     "Level",
     "Model",
+    "Placement",
     "Preprocess",
     "Roi",
     "Sample",
@@ -77,6 +90,7 @@ __all__ = [
     "ScratchError",
     "Stamps",
     "Tensor",
+    "TensorInfo",
     "Topic",
     "TriggerError",
     "Value",

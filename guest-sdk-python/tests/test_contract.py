@@ -5,6 +5,9 @@ The rules: `-` becomes `_`, types are in CamelCase. The functions of the interfa
 `trigger` and `log` are methods of `Context`, those of `scratch` of `ctx.scratch`. Resources are
 classes, records are named tuples, the case of an error is the `kind` of an exception, an enum is a
 set of strings. A property is constant while a handle exists; a method calls the host.
+
+`gleaner.Tensor` and `gleaner.Model` convert between numpy and the host's objects, so the WIT has
+two descriptions of each: the class of the package, and `HostTensor` and `HostModel`.
 """
 
 from __future__ import annotations
@@ -19,15 +22,23 @@ import wit
 
 import gleaner
 from gleaner import data, inference, log, scratch, trigger
-from gleaner.testing import _context, _data, _frame, _session
+from gleaner.testing import _context, _data, _frame, _inference, _session
+
+
+class Described:
+    """The classes of a host, as the package describes them."""
+
+    Context, Scratch = gleaner.Context, gleaner.Scratch
+    Topic, Field, Sample, Frame = gleaner.Topic, gleaner.Field, gleaner.Sample, gleaner.Frame
+    Tensor, Model = inference.HostTensor, inference.HostModel
 
 
 class Local:
-    """The classes of `gleaner.testing`. A local run has no models."""
+    """The classes of `gleaner.testing`."""
 
     Context, Scratch = _context.Context, _session.Scratch
     Topic, Field, Sample, Frame = _data.Topic, _data.Field, _data.Sample, _frame.Frame
-    Tensor, Model = gleaner.Tensor, gleaner.Model
+    Tensor, Model = _inference.Tensor, _inference.Model
 
 
 INTERFACES = wit.read(home.CHECKOUT / "wit")
@@ -40,7 +51,7 @@ PROPERTIES: Dict[str, Set[str]] = {
     "Field": {"path"},
     "Sample": {"identity", "stamps", "size", "big_endian"},
     "Frame": {"info", "identity", "stamps"},
-    "Tensor": {"shape"},
+    "Tensor": {"element", "shape", "size"},
     "Model": set(),
 }
 
@@ -49,7 +60,15 @@ PROPERTIES: Dict[str, Set[str]] = {
 ONLY_PYTHON: Dict[str, Set[str]] = {
     "Context": {"config", "missed", "scratch"},
     "Frame": {"array", "__array__", "__dlpack__", "__dlpack_device__"},
+    "Tensor": {"array", "from_bytes"},
 }
+ONLY_PACKAGE: Dict[str, Set[str]] = {
+    **ONLY_PYTHON,
+    "Tensor": {"array", "from_values", "__array__"},
+}
+
+# Parameters of the package in place of a record.
+KEYWORDS = {"options": gleaner.DetectOptions._fields}
 
 KINDS: Dict[str, Any] = {
     "data-error": data.DataErrorKind,
@@ -57,7 +76,12 @@ KINDS: Dict[str, Any] = {
     "inference-error": inference.InferenceErrorKind,
     "scratch-error": scratch.ScratchErrorKind,
 }
-ENUMS: Dict[str, Any] = {"encoding": data.Encoding, "level": log.Level}
+ENUMS: Dict[str, Any] = {
+    "encoding": data.Encoding,
+    "level": log.Level,
+    "element-type": inference.ElementType,
+    "placement": inference.Placement,
+}
 
 # The type of a Python value replaces the case of these variants.
 PLAIN_VARIANTS = {"value", "attribute-value", "config-value", "wake"}
@@ -87,10 +111,9 @@ def wanted() -> Dict[str, Dict[str, wit.Function]]:
     }
 
 
-def members(cls: type) -> Set[str]:
-    """Returns the public names of a class, and the special methods listed above."""
-    special = ONLY_PYTHON.get(cls.__name__, set())
-    return {name for name in dir(cls) if not name.startswith("_") or name in special}
+def members(cls: type, only: Set[str]) -> Set[str]:
+    """Returns the public names of a class, and the special methods in `only`."""
+    return {name for name in dir(cls) if not name.startswith("_") or name in only}
 
 
 def parameters(cls: type, name: str) -> List[Tuple[str, Any, bool]]:
@@ -104,29 +127,34 @@ def parameters(cls: type, name: str) -> List[Tuple[str, Any, bool]]:
 
 
 class Surface(unittest.TestCase):
-    def holds(self, module: Any) -> None:
+    def holds(self, module: Any, only: Dict[str, Set[str]] = ONLY_PYTHON) -> None:
         for name, functions in wanted().items():
-            cls = getattr(module, name)
+            cls, more = getattr(module, name), only.get(name, set())
             with self.subTest(cls=name):
-                self.assertEqual(members(cls), set(functions) | ONLY_PYTHON.get(name, set()))
+                self.assertEqual(members(cls, more), set(functions) | more)
                 for function, declared in functions.items():
-                    self.function_holds(cls, function, declared)
+                    with self.subTest(function=function):
+                        self.function_holds(module, name, function, declared)
 
-    def function_holds(self, cls: type, name: str, declared: wit.Function) -> None:
+    def function_holds(self, module: Any, of: str, name: str, declared: wit.Function) -> None:
+        cls = getattr(module, of)
         given = inspect.getattr_static(cls, name)
-        if name in PROPERTIES[cls.__name__]:
-            self.assertTrue(inspect.isdatadescriptor(given), f"{cls.__name__}.{name} is a property")
+        if name in PROPERTIES[of]:
+            self.assertTrue(inspect.isdatadescriptor(given), "it is a property")
             self.assertEqual(declared.parameters, [])
             return
-        self.assertTrue(callable(getattr(cls, name)), f"{cls.__name__}.{name} is a method")
-        self.assertEqual(isinstance(given, staticmethod), declared.static, f"{cls.__name__}.{name}")
-        names = [name for name, _, _ in parameters(cls, name)]
-        self.assertEqual(
-            names, [snake(name) for name in declared.parameters], f"{cls.__name__}.{name}"
-        )
+        self.assertTrue(callable(getattr(cls, name)), "it is a method")
+        self.assertEqual(isinstance(given, staticmethod), declared.static)
+        wanted = [snake(parameter) for parameter in declared.parameters]
+        if module is gleaner:
+            wanted = [one for parameter in wanted for one in KEYWORDS.get(parameter, (parameter,))]
+        self.assertEqual([parameter for parameter, _, _ in parameters(cls, name)], wanted)
 
     def test_the_package_has_the_names_of_the_wit(self) -> None:
-        self.holds(gleaner)
+        self.holds(gleaner, ONLY_PACKAGE)
+
+    def test_the_package_describes_a_host_by_the_names_of_the_wit(self) -> None:
+        self.holds(Described)
 
     def test_the_extension_has_the_names_of_the_wit(self) -> None:
         self.holds(home.extension())
@@ -140,11 +168,22 @@ class Surface(unittest.TestCase):
     def test_a_local_run_takes_the_arguments_of_the_package(self) -> None:
         self.takes_arguments_as_described(Local)
 
+    def test_keyword_arguments_have_the_defaults_of_their_record(self) -> None:
+        defaults = {
+            name: parameter.default
+            for name, parameter in inspect.signature(gleaner.Model.detect).parameters.items()
+            if name in gleaner.DetectOptions._fields
+        }
+        self.assertEqual(defaults, gleaner.DetectOptions()._asdict())
+
     def takes_arguments_as_described(self, module: Any) -> None:
         for cls, functions in wanted().items():
-            for name in set(functions) - PROPERTIES[cls]:
+            callable_names = set(functions) - PROPERTIES[cls]
+            if cls == "Tensor":
+                callable_names |= ONLY_PYTHON[cls]
+            for name in callable_names:
                 with self.subTest(cls=cls, name=name):
-                    given, described = getattr(module, cls), getattr(gleaner, cls)
+                    given, described = getattr(module, cls), getattr(Described, cls)
                     self.assertEqual(parameters(given, name), parameters(described, name))
 
     def test_the_wit_was_parsed(self) -> None:

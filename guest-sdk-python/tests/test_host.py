@@ -141,7 +141,7 @@ class WithoutHost(unittest.TestCase):
             self.addCleanup(sys.modules.__setitem__, "_gleaner", hosted)
         with self.assertRaises(InferenceError) as refused:
             Model.open("detector")
-        self.assertEqual(refused.exception.kind, "no-runtime")
+        self.assertEqual(refused.exception.kind, "unavailable")
 
     def test_a_context_can_be_named_in_a_type_hint(self) -> None:
         def on_tick(ctx: Context) -> None: ...

@@ -259,7 +259,7 @@ class Data(Hosted):
                     ("DataError", "out-of-range"),
                     ("DataError", "out-of-range"),
                     ("TriggerError", "invalid"),
-                    ("InferenceError", "no-runtime"),
+                    ("InferenceError", "no-such-model"),
                 ], found
         """
         self.replay(source, [GREY])

@@ -1,4 +1,4 @@
-"""Runs the suites of `test_hosted` and `test_printed` locally, by inheritance.
+"""Runs the suites of `test_hosted`, `test_printed` and `test_tensors` locally, by inheritance.
 
 Tests that need a process of its own are left out."""
 
@@ -18,6 +18,7 @@ from typing import Dict, List
 import home
 import test_hosted
 import test_printed
+import test_tensors
 from local_run import LocalRun
 from hosted import EACH, GREY, MANIFEST
 
@@ -31,6 +32,10 @@ class Arrays(LocalRun, test_hosted.Arrays):
 class Data(LocalRun, test_hosted.Data):
     # `rosbags` returns log times only.
     PUBLISHED_NS = 1_000_000_000
+
+
+class Tensors(LocalRun, test_tensors.Tensors):
+    pass
 
 
 class Triggers(LocalRun, test_hosted.Triggers):

@@ -10,8 +10,9 @@ pub use crate::bindings::gleaner::lambda::types::{
 use crate::error::into_result;
 use crate::{Error, Result};
 
-/// Bytes that [`Frame::copy_to`] reads at a time: copying reaches memory bandwidth at this size.
-const PIECE: usize = 64 << 10;
+/// Bytes that one call copies where several are needed: copying reaches memory bandwidth at this
+/// size.
+pub(crate) const PIECE: usize = 64 << 10;
 
 /// The ring of one `[[input]]`: its newest samples, at most `depth`.
 pub struct Topic(wit::Topic);

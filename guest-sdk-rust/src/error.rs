@@ -59,10 +59,13 @@ pub(crate) trait HostError {
 /// Converts a result of the bindings. The errors that wit-bindgen generates print as code, so only
 /// their case and message are kept.
 pub(crate) fn into_result<T>(result: std::result::Result<T, impl HostError>) -> Result<T> {
-    result.map_err(|error| {
-        let (kind, message) = error.into_parts();
-        Error { kind: Some(kind), message }
-    })
+    result.map_err(refused)
+}
+
+/// Converts an error of the bindings.
+pub(crate) fn refused(error: impl HostError) -> Error {
+    let (kind, message) = error.into_parts();
+    Error { kind: Some(kind), message }
 }
 
 impl HostError for DataError {
@@ -101,9 +104,10 @@ impl HostError for ScratchError {
 impl HostError for InferenceError {
     fn into_parts(self) -> (&'static str, String) {
         match self {
-            Self::NoRuntime(message) => ("no-runtime", message),
+            Self::Unavailable(message) => ("unavailable", message),
             Self::NoSuchModel(message) => ("no-such-model", message),
             Self::WrongInput(message) => ("wrong-input", message),
+            Self::TooSlow(message) => ("too-slow", message),
             Self::Failed(message) => ("failed", message),
         }
     }

@@ -5,6 +5,7 @@ mod testing {
     pub mod frames;
     pub mod lambda;
     pub mod messages;
+    pub mod models;
     pub mod refusals;
     pub mod rings;
     pub mod runs;

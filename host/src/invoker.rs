@@ -49,6 +49,7 @@ impl Invoker {
         let run = outcome.run_ns.map_or_else(|| started.elapsed(), Duration::from_nanos);
         self.run += run;
         decision.run_ns = run.as_nanos() as u64;
+        decision.model_ns = outcome.model_ns.unwrap_or_else(|| self.session.models().run_ns());
         if let Some(fault) = self.fault_of_holds().or(self.held_too_many.take())
             && outcome.result.is_ok()
         {
@@ -114,6 +115,7 @@ fn cause(wake: &Wake) -> Decision {
         fault: None,
         fuel: None,
         run_ns: 0,
+        model_ns: 0,
     };
     if let Wake::Event(sample) = wake {
         let meta = sample.meta();
@@ -149,7 +151,7 @@ mod tests {
             let fault =
                 Fault { kind: FaultKind::Trap, message: String::new(), used: None, allowed: None };
             let result = if wake.at_ns() < self.until_ns { Err(fault) } else { Ok(()) };
-            WakeOutcome { result, fuel: None, run_ns: None }
+            WakeOutcome { result, fuel: None, run_ns: None, model_ns: None }
         }
 
         fn engine(&self) -> String {

@@ -79,6 +79,16 @@ impl RuntimeJob {
         }
     }
 
+    /// Connects to the process that runs models, if the starter has passed a connection. A live run
+    /// receives it with its others.
+    fn connect_models(&mut self) -> Result<(), Failure> {
+        match self {
+            Self::Replay(job) => job.options.lambda.connect_models(&job.manifest),
+            Self::Check(job) => job.lambda.connect_models(&job.manifest),
+            Self::Live(_) => Ok(()),
+        }
+    }
+
     /// Returns the permissions that a process needs from its start on: the folder of its results,
     /// which is created, and memory for itself and its rings.
     fn start_permissions(&self, is_worker: bool) -> Result<SandboxPermissions, Failure> {
@@ -272,7 +282,8 @@ fn run_with_worker(job: RuntimeJob) -> Result<Exit, Failure> {
     explained.map_or(ended, Ok)
 }
 
-fn run(job: RuntimeJob, load: Load<'_>) -> Result<Exit, Failure> {
+fn run(mut job: RuntimeJob, load: Load<'_>) -> Result<Exit, Failure> {
+    job.connect_models()?;
     let isolation = Arc::new(Isolation::of_this_process(job.permissions(false))?);
     let mut sandboxed = sandboxed(load, &isolation);
     match job {
@@ -283,7 +294,8 @@ fn run(job: RuntimeJob, load: Load<'_>) -> Result<Exit, Failure> {
 
 /// Runs the worker's part of `job`. Once the lambda may have run, errors are no longer printed: the
 /// process that reads the outcomes finds them too, and must not trust this one's output.
-fn work(job: RuntimeJob, load: Load<'_>) -> Result<Exit, Failure> {
+fn work(mut job: RuntimeJob, load: Load<'_>) -> Result<Exit, Failure> {
+    job.connect_models()?;
     let isolation = Arc::new(Isolation::of_this_process(job.permissions(true))?);
     let reports = MessageSender::to(reports()?);
     let mut sandboxed = sandboxed(load, &isolation);
@@ -312,8 +324,10 @@ fn sandboxed<'a>(
         };
         // The memory of a component is counted as it grows.
         let memory = (manifest.lambda.kind == LambdaKind::Python).then_some(limits.memory.bytes());
+        let models = session.models().clone();
         let guest = load(lambda, manifest, session, mode)?;
-        Ok(Box::new(SandboxedGuest::new(guest, Arc::clone(isolation), timeouts, memory)) as _)
+        let isolation = Arc::clone(isolation);
+        Ok(Box::new(SandboxedGuest::new(guest, isolation, timeouts, memory, models)) as _)
     }
 }
 

@@ -31,6 +31,13 @@ pub struct Decision {
     pub fuel: Option<u64>,
     /// Time in the lambda, in ns. It differs from run to run, so twins are not compared by it.
     pub run_ns: u64,
+    /// Run time of models for this wake, in ns. It is a part of `run_ns`.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub model_ns: u64,
+}
+
+fn is_zero(count: &u64) -> bool {
+    *count == 0
 }
 
 /// The cause of a wake.
@@ -190,6 +197,7 @@ mod tests {
             fault: None,
             fuel: Some(1234),
             run_ns: 5600,
+            model_ns: 0,
         }
     }
 

@@ -42,8 +42,10 @@ impl Sources {
     /// lambda's folder.
     pub fn of(lambda_dir: impl AsRef<Path>, manifest: &Manifest) -> Result<Sources, LayoutError> {
         let dir = lambda_dir.as_ref();
-        let models = manifest.models.iter().map(|model| model.file.as_path().to_owned());
-        let mut sources = Sources { copied: models.collect(), compiled: BTreeSet::new() };
+        let models = manifest.models.iter();
+        let named = models.flat_map(|model| std::iter::once(&model.file).chain(&model.labels));
+        let copied = named.map(|file| file.as_path().to_owned()).collect();
+        let mut sources = Sources { copied, compiled: BTreeSet::new() };
         sources.copied.extend(files(dir, "msg", |_| true, |file| has_extension(file, "msg"))?);
         match manifest.lambda.kind {
             LambdaKind::Python => {

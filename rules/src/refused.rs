@@ -11,6 +11,12 @@ pub fn no_such_input<S: AsRef<str>>(name: &str, known: impl IntoIterator<Item = 
     format!("no input `{name}`; the manifest has {}", quoted(known))
 }
 
+/// Returns the text for an unknown model.
+pub fn no_such_model<S: AsRef<str>>(name: &str, known: impl IntoIterator<Item = S>) -> String {
+    let name = name.chars().take(64).collect::<String>();
+    format!("no model `{name}`; the manifest has {}", quoted(known))
+}
+
 /// Returns the text for a message whose bytes do not match its type.
 pub fn malformed(topic: &str, type_name: &str, why: impl Display) -> String {
     format!("a sample of `{topic}` contradicts its type `{type_name}`: {why}")

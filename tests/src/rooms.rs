@@ -92,6 +92,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         ],
     ),
     ("gleaner-image", &["gleaner-rules"]),
+    ("gleaner-inference", &["gleaner-base", "gleaner-jail", "gleaner-protocol", "gleaner-vitals"]),
     (
         "gleaner-ingress",
         &[
@@ -159,6 +160,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"],
     ),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
+    ("gleaner-vision", &["gleaner-rules"]),
     ("gleaner-vitals", &["gleaner-protocol"]),
 ];
 

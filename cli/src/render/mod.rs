@@ -13,6 +13,7 @@ mod check_report;
 mod clips;
 mod diff;
 mod drive;
+mod inference;
 mod ingress;
 mod isolation;
 mod live;
@@ -20,6 +21,7 @@ mod live;
 pub(crate) use check_report::check_report;
 pub(crate) use diff::diff;
 pub(crate) use drive::drive;
+pub(crate) use inference::inference;
 pub(crate) use ingress::ingress;
 pub(crate) use isolation::isolation;
 pub(crate) use live::{clip_line, decision, live, named_report, recorder, topics};
@@ -387,6 +389,11 @@ impl Paint {
     /// Enables colours if standard output is a terminal.
     pub(crate) fn of_stdout() -> Paint {
         Paint::new(io::stdout().is_terminal())
+    }
+
+    /// Enables colours if standard error is a terminal.
+    pub(crate) fn of_stderr() -> Paint {
+        Paint::new(io::stderr().is_terminal())
     }
 
     pub(crate) fn bold(self, text: &str) -> String {

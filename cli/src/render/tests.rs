@@ -72,6 +72,7 @@ fn decision(milliseconds: i64, label: Option<&str>, fault: Option<(FaultKind, &s
         }),
         fuel: None,
         run_ns: 0,
+        model_ns: 0,
     }
 }
 

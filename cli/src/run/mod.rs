@@ -5,7 +5,7 @@
 //! - `grants`, `arguments`: topics and arguments of the processes.
 //! - `process`, `output`: one process, and the threads that read its output.
 //! - `services`: the processes that all lambdas share: ingress and recorder.
-//! - `supervised`: one lambda over all its restarts, with `backoff` and `summary`.
+//! - `supervised`: one lambda over all its restarts, with `summary`.
 //! - `process_group`: all processes, and `drive`: a drive that the ingress plays.
 //! - `failures`: the result of a run in which processes failed.
 //! - `screen`: the terminal.
@@ -15,7 +15,6 @@
 //! of several.
 
 mod arguments;
-mod backoff;
 mod drive;
 mod failures;
 mod grants;
@@ -39,7 +38,6 @@ use gleaner_lambda::manifest::Limits;
 use gleaner_parts::Parts;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-use self::backoff::RestartDelay;
 use self::failures::Failures;
 use self::lambdas::RunLambda;
 use self::process_group::{GroupEnd, ProcessGroup, RunRecord};
@@ -47,6 +45,7 @@ use self::screen::Screen;
 use self::summary::RunCounts;
 use self::supervised::SupervisedLambda;
 use crate::args::RunArgs;
+use crate::restart_delay::RestartDelay;
 
 /// Interval of checks whether to stop.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);

@@ -12,6 +12,7 @@ use gleaner_protocol::ingress::IngressReport;
 use gleaner_protocol::link::RecorderReport;
 use serde::de::DeserializeOwned;
 
+use crate::inference::InferenceEvent;
 use crate::runtime::{next_report, pass_on};
 
 /// Number of pipes of a process.
@@ -26,6 +27,8 @@ pub(super) enum ChildId {
         start: u32,
     },
     Recorder,
+    /// The process that runs models.
+    Inference,
     /// The lambda at this index; `start` as that of the ingress.
     Lambda {
         index: usize,
@@ -46,6 +49,8 @@ pub(super) enum OutputPiece {
     Recorder(RecorderReport),
     /// A report of the ingress.
     Ingress(IngressReport),
+    /// An event of the process that runs models.
+    Inference(InferenceEvent),
     /// The start of a line on standard output that cannot be parsed.
     Unparsable(String),
     /// A piece of standard error.
@@ -67,6 +72,8 @@ pub(super) fn forward(child: &mut Child, from: ChildId, sender: &SyncSender<Chil
                 ChildId::Ingress { .. } => follow(reports, OutputPiece::Ingress, &send),
                 ChildId::Recorder => follow(reports, OutputPiece::Recorder, &send),
                 ChildId::Lambda { .. } => follow(reports, OutputPiece::Runtime, &send),
+                // Its service reads it.
+                ChildId::Inference => {}
             }
             send(OutputPiece::Closed);
         });

@@ -8,9 +8,11 @@ use std::collections::HashSet;
 use std::process::ExitStatus;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, SyncSender};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
+use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::Limits;
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::AddTopics;
@@ -25,6 +27,7 @@ use super::services::{IngressProcess, RecorderProcess};
 use super::summary::RunCounts;
 use super::supervised::SupervisedLambda;
 use super::{POLL_INTERVAL, RunContext, RunTime, arguments, grants};
+use crate::inference::{InferenceEvent, InferenceService};
 
 /// Time to read the pipes of a process after its end: processes that it left running may hold the
 /// pipes open.
@@ -61,6 +64,8 @@ pub(super) struct ProcessGroup<'a> {
     /// The largest sample of an input, in bytes.
     largest: u64,
     recorder: Option<RecorderProcess>,
+    /// The process that runs models, if a lambda has any.
+    inference: Option<InferenceService>,
     sender: SyncSender<ChildOutput>,
     output: Receiver<ChildOutput>,
     limits: Limits,
@@ -79,6 +84,16 @@ impl<'a> ProcessGroup<'a> {
         let inputs = lambdas.iter().flat_map(|supervised| &supervised.lambda.manifest.inputs);
         let largest = inputs.map(|input| input.max_size.bytes()).max().unwrap_or(0);
         let ingress = IngressProcess::start(context, largest, &sender)?;
+        let mut inference = None;
+        if lambdas.iter().any(|supervised| !supervised.lambda.manifest.models.is_empty()) {
+            let sender = sender.clone();
+            let send = move |event| {
+                let piece = OutputPiece::Inference(event);
+                // Fails if the run has ended.
+                let _ = sender.send(ChildOutput { from: ChildId::Inference, piece });
+            };
+            inference = Some(InferenceService::start(&context.parts, send)?);
+        }
         let recorder = None;
         Ok(Self {
             context,
@@ -89,6 +104,7 @@ impl<'a> ProcessGroup<'a> {
             ingress,
             largest,
             recorder,
+            inference,
             sender,
             output,
             limits,
@@ -212,6 +228,12 @@ impl<'a> ProcessGroup<'a> {
         let added = ingress.control.add_reader(&reader);
         let Some(socket) = ingress.granted(added) else { return Ok(()) };
         connections.ingress = Some(socket);
+        if let Some(inference) = &self.inference
+            && !lambda.manifest.models.is_empty()
+        {
+            let build = BuildDir::of(&lambda.folder);
+            connections.inference = Some(inference.add(lambda.name(), &build, &lambda.manifest)?);
+        }
         // If its shim is killed, it writes none: that of the process before it would be read.
         let _ = std::fs::remove_file(lambda.exit_record());
         let child = ChildProcess::start(
@@ -353,6 +375,13 @@ impl<'a> ProcessGroup<'a> {
                 }
             }
         }
+        if let Some(inference) = self.inference.take() {
+            // Its reader threads wait while the queue of outputs is full.
+            let ended = thread::spawn(move || inference.stop());
+            while !ended.is_finished() {
+                self.poll(POLL_INTERVAL);
+            }
+        }
         // Fails if it has ended meanwhile.
         let _ = self.ingress.control.stop();
         let status = self.wait(|group| Some(&mut group.ingress.child))?;
@@ -429,7 +458,9 @@ impl<'a> ProcessGroup<'a> {
             {
                 return;
             }
-            ChildId::Ingress { .. } | ChildId::Recorder => (String::new(), None),
+            ChildId::Ingress { .. } | ChildId::Recorder | ChildId::Inference => {
+                (String::new(), None)
+            }
         };
         match piece {
             OutputPiece::Stderr { text, begins_line } => {
@@ -445,6 +476,12 @@ impl<'a> ProcessGroup<'a> {
                 }
             }
             OutputPiece::Ingress(report) => ingress.show(report, screen),
+            OutputPiece::Inference(event) => {
+                if let InferenceEvent::Ended(reason, _) = &event {
+                    self.failures.add(reason.clone(), false);
+                }
+                screen.inference(event);
+            }
             OutputPiece::Recorder(report) => {
                 if let Some(recorder) = recorder {
                     recorder.show(report, screen);

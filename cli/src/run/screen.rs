@@ -12,6 +12,7 @@ use gleaner_protocol::{LiveStatus, LiveTopic, Report};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
+use crate::inference::InferenceEvent;
 use crate::render::{self, Paint};
 
 /// Time without a writer after which a warning about a topic is printed, in s.
@@ -106,6 +107,22 @@ impl Screen {
     pub(super) fn recorder_ended(&mut self, status: &RecorderStatus) {
         self.recorder.clear();
         self.print(&render::recorder(status, self.paint));
+    }
+
+    /// Shows an event of the process that runs models.
+    pub(super) fn inference(&mut self, event: InferenceEvent) {
+        match event {
+            InferenceEvent::Report(report) => {
+                self.report(&report);
+                self.print(&render::inference(&report, self.paint));
+            }
+            InferenceEvent::Stderr(text) => self.err(&text),
+            InferenceEvent::Ended(reason, delay) => {
+                let delay = delay.as_secs_f64();
+                self.warn(&format!("{reason}; restarting in {delay} s"));
+            }
+            InferenceEvent::Warning(text) => self.warn(&text),
+        }
     }
 
     /// Updates the status of a lambda.

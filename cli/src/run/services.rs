@@ -10,13 +10,13 @@ use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::{IngressControl, IngressReport, IngressStatus, IngressTopic};
 use gleaner_protocol::link::{ControlClient, LinkError, Loss, RecorderReport, RecorderStatus};
 
-use super::backoff::RestartDelay;
 use super::grants::RecordedTopics;
 use super::lambdas::RunLambda;
 use super::output::{ChildId, ChildOutput, PIPES};
 use super::process::{ChildProcess, ended};
 use super::screen::Screen;
 use super::{RunContext, arguments};
+use crate::restart_delay::RestartDelay;
 
 /// The ingress of a run.
 pub(super) struct IngressProcess {
@@ -79,7 +79,7 @@ impl IngressProcess {
         sender: &SyncSender<ChildOutput>,
     ) -> Result<Self, Failure> {
         let (start, delay, earlier_topics) = match before {
-            None => (0, RestartDelay::of_ingress(), Vec::new()),
+            None => (0, RestartDelay::of_service(), Vec::new()),
             Some(before) => (before.start + 1, before.delay.clone(), before.topics()),
         };
         let (control, ingress_end) = IngressControl::pair().map_err(|error| {

@@ -8,7 +8,6 @@ use gleaner_base::{Exit, Failure};
 use gleaner_lambda::FaultKind;
 use gleaner_protocol::{ExitRecord, LiveStatus, Report};
 
-use super::backoff::RestartDelay;
 use super::failures::Failures;
 use super::lambdas::RunLambda;
 use super::output::PIPES;
@@ -16,6 +15,7 @@ use super::process::{ChildProcess, ended};
 use super::screen::Screen;
 use super::summary::{EarlierCounts, RunCounts};
 use crate::render;
+use crate::restart_delay::RestartDelay;
 
 /// Statuses of a lambda after the end of a drive, until one of them counts every sample: the first
 /// may have been on its way already.

@@ -107,6 +107,7 @@ fn extra_arguments(extra: Extra) -> &'static [u8] {
     match extra {
         Extra::Reset | Extra::Wasi => &[],
         Extra::ForgetTopic | Extra::ForgetField | Extra::ForgetSample | Extra::ForgetFrame => &[1],
+        Extra::ForgetTensor => &[0],
         Extra::EventWithTexts => {
             &[1, b'k', 0, 0, 0, 0, 0, 0, 224, 63, 1, b't', 4, b't', b'e', b'x', b't']
         }

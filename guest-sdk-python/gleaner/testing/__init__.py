@@ -12,9 +12,10 @@ notebook.
         assert [round(trigger.at_s, 2) for trigger in run.triggers] == [4.14, 10.81]
 
 Rings with depth and held samples, schedules, fields, limits of triggers, log and scratch, faults
-and back-off follow the rules of a replay by the host. Not included: deadlines; the limit
-``memory``, except of frames that the lambda creates; the sandbox; clips, except their windows;
-models. See ``docs/python.md``. Requires Python 3.10.
+and back-off follow the rules of a replay by the host. A model answers as the test determines: see
+``FakeModel``. Not included: deadlines; the limit ``memory``, except of frames and tensors that the
+lambda creates; the sandbox; clips, except their windows; models, and frames as tensors. See
+``docs/python.md``. Requires Python 3.10.
 """
 
 import sys
@@ -27,6 +28,7 @@ if sys.version_info < (3, 10):
 
 from ._drive import Drive
 from ._error import ReplayError, StartError
+from ._inference import FakeModel
 from ._replay import replay
 from ._run import Decision, Fault, Run
 from ._session import LogLine
@@ -35,6 +37,7 @@ from ._windows import Trigger, Window
 __all__ = [
     "Decision",
     "Drive",
+    "FakeModel",
     "Fault",
     "LogLine",
     "ReplayError",

@@ -42,6 +42,14 @@ class Input:
 
 
 @dataclass(frozen=True)
+class DeclaredModel:
+    """One ``[[model]]``."""
+
+    name: str
+    has_layout: bool
+
+
+@dataclass(frozen=True)
 class Record:
     """The ``[record]`` table; durations in ns."""
 
@@ -62,6 +70,7 @@ class Manifest:
     backlog: str
     period_ns: int
     inputs: List[Input]
+    models: List[DeclaredModel]
     record: Optional[Record]
     limits: Dict[str, int]
     config: Dict[str, ConfigValue]
@@ -114,16 +123,15 @@ def _manifest(file: str, entries: Mapping[str, Any], overrides: Mapping[str, Any
         file, "[lambda]", root.need("lambda", "[lambda] with name, version, kind and entry"), known
     )
     inputs = [_input(file, entry) for entry in root.list("input")]
+    models = [_model(file, entry) for entry in root.list("model")]
     for what, values in {
-        "name": [i.name for i in inputs],
-        "topic": [i.topic for i in inputs],
+        "[[input]] with the name": [i.name for i in inputs],
+        "[[input]] with the topic": [i.topic for i in inputs],
+        "[[model]] with the name": [model.name for model in models],
     }.items():
         twice = [value for value in values if values.count(value) > 1]
         if twice:
-            raise root.refusal(
-                f"has two [[input]] with the {what} `{twice[0]}`",
-                "keep one [[input]] entry per topic",
-            )
+            raise root.refusal(f"has two {what} `{twice[0]}`", "keep one of them")
     event, backlog, period_ns = _schedule(root, inputs)
     return Manifest(
         name=about.form("name", 'name = "brake-dark"', LAMBDA_NAME, 63),
@@ -133,6 +141,7 @@ def _manifest(file: str, entries: Mapping[str, Any], overrides: Mapping[str, Any
         backlog=backlog,
         period_ns=period_ns,
         inputs=inputs,
+        models=models,
         record=_record(root),
         limits=_limits(root),
         config=_config(root, overrides),
@@ -182,6 +191,13 @@ def _input(file: str, entry: Any) -> Input:
         max_size=table.size("max_size", (1, 8 * MIB if large else 4 * KIB, 256 * MIB)),
         decoded_size=table.size("decoded_size", (1, 8 * MIB, 256 * MIB)) if compressed else 0,
     )
+
+
+def _model(file: str, entry: Any) -> DeclaredModel:
+    known = ["name", "file", "sha256", "layout", "labels", "providers", "threads"]
+    table = Table(file, "[[model]]", entry, known)
+    name = table.form("name", 'name = "detector"', ITEM_NAME, 63)
+    return DeclaredModel(name, has_layout="layout" in table)
 
 
 def _record(root: Table) -> Optional[Record]:

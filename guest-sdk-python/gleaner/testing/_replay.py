@@ -15,6 +15,7 @@ from ._drive import Drive, Name
 from ._error import ReplayError, quoted
 from ._frame import Budget, FramePool
 from ._guest import LambdaSource, Guest, Wake, guarded, home, manifest_beside
+from ._inference import FakeModel, ModelTable, available
 from ._manifest import Manifest
 from ._run import Decision, Fault, Run
 from ._schedule import Event, Periodic, Schedule, Tick
@@ -45,6 +46,7 @@ def replay(
     config: Optional[Mapping[str, Any]] = None,
     remap: Optional[Mapping[str, str]] = None,
     types: Optional[Mapping[str, str]] = None,
+    models: Optional[Mapping[str, FakeModel]] = None,
     prints_to_log: bool = True,
 ) -> Run:
     """Runs a lambda over a drive, as ``gleaner replay`` does, and returns its decisions.
@@ -58,9 +60,9 @@ def replay(
 
     ``config`` overrides values of ``[config]``. ``remap`` maps topics of the manifest to topics of
     the drive. ``types`` maps type names to texts of ``.msg`` files, for types that are neither in
-    the drive, nor in the folder ``msg/`` of the lambda, nor in ROS 2. Text that the lambda prints
-    goes to its log; with ``prints_to_log=False``, for example in a debugger, it goes to standard
-    output.
+    the drive, nor in the folder ``msg/`` of the lambda, nor in ROS 2. ``models`` has the answers of
+    each ``[[model]]`` that the lambda opens. Text that the lambda prints goes to its log; with
+    ``prints_to_log=False``, for example in a debugger, it goes to standard output.
 
     Raises ReplayError if an argument cannot be used, and StartError if the lambda's import or
     ``init`` raises. An exception in a wake is a fault in its decision. Ctrl-C ends the replay."""
@@ -73,7 +75,8 @@ def replay(
         )
     beside = home(lambda_) if isinstance(source, Mapping) else Path(source).parent
     more = Definitions(types or {}, None if beside is None else beside / "msg")
-    return _ReplayLoop(lambda_, read, drive, dict(remap or {}), more).run(prints_to_log)
+    table = ModelTable(read.models, models or {}, read.limits)
+    return _ReplayLoop(lambda_, read, drive, dict(remap or {}), more, table).run(prints_to_log)
 
 
 class _ReplayLoop:
@@ -86,7 +89,9 @@ class _ReplayLoop:
         drive: Any,
         remap: Dict[str, str],
         more: Definitions,
+        models: ModelTable,
     ) -> None:
+        self._models = models
         self._given, self._manifest, self._session = given, manifest, Session(manifest.limits)
         _check_remap(remap, manifest)
         names = {one.topic: remap.get(one.topic, one.topic) for one in manifest.inputs}
@@ -120,7 +125,8 @@ class _ReplayLoop:
         ]
 
     def run(self, prints_to_log: bool) -> Run:
-        with guarded(self._session.log if prints_to_log else None, self._given):
+        log = self._session.log if prints_to_log else None
+        with guarded(log, self._given), available(self._models):
             self._guest.init()
             self._run_loop()
         session, drive = self._session, self._drive

@@ -10,8 +10,10 @@ use gleaner_rules::text::quoted;
 use super::data::InputState;
 use super::error::Error;
 use super::frame::FramePool;
+use super::inference::{DeclaredModel, ModelTable};
 use super::manifest::{self, Manifest, ScheduleSpec};
 use super::message::Message;
+use super::model::FakeModel;
 use super::run::Run;
 use super::schedule::{EventInput, Schedule};
 use super::session::{HandleCounter, Session};
@@ -25,13 +27,15 @@ pub struct Host {
     manifest: String,
     set: Vec<(String, ConfigValue)>,
     blanks: Vec<(String, Message)>,
+    models: Vec<(String, FakeModel)>,
 }
 
 impl Host {
     /// Creates a host for the lambda with this `lambda.toml`, usually
     /// `include_str!("../lambda.toml")`. [`load`](Self::load) parses it.
     pub fn from_manifest(text: &str) -> Self {
-        Self { manifest: text.to_owned(), set: Vec::new(), blanks: Vec::new() }
+        let (set, blanks, models) = (Vec::new(), Vec::new(), Vec::new());
+        Self { manifest: text.to_owned(), set, blanks, models }
     }
 
     /// Sets a value of `[config]`, as `gleaner replay --set` does. It must have the type of the
@@ -53,6 +57,13 @@ impl Host {
         self
     }
 
+    /// Sets the answers of the `[[model]]` of this name; without them it cannot be opened. No model
+    /// file is needed.
+    pub fn model(mut self, name: &str, answers: FakeModel) -> Self {
+        self.models.push((name.to_owned(), answers));
+        self
+    }
+
     /// Parses the manifest and runs `init`.
     ///
     /// # Errors
@@ -63,7 +74,8 @@ impl Host {
         let config = Config::from(manifest.config(&self.set)?);
         let handles = HandleCounter::new(&manifest.limits);
         let inputs = self.inputs(&manifest, &handles)?;
-        let session = Session::new(manifest.limits, inputs);
+        let models = ModelTable::new(self.models(&manifest)?, &manifest.limits, handles);
+        let session = Session::new(manifest.limits, inputs, models);
         let schedule = match &manifest.schedule {
             ScheduleSpec::Period(period_ns) => Schedule::periodic(*period_ns),
             ScheduleSpec::Event(name) => {
@@ -109,6 +121,25 @@ impl Host {
             )
         };
         Ok(manifest.inputs.iter().map(source).collect())
+    }
+
+    fn models(&self, manifest: &Manifest) -> Result<Vec<DeclaredModel>, Error> {
+        let names = || manifest.models.iter().map(|model| model.name.as_str());
+        if let Some((asked, _)) =
+            self.models.iter().find(|(asked, _)| names().all(|name| name != asked))
+        {
+            let help = format!("the manifest has {}", quoted(names()));
+            return Err(Error::new(format!("no model `{asked}` for answers"), "", help));
+        }
+        let declared = |model: &manifest::Model| {
+            let answers = self.models.iter().rev().find(|(name, _)| *name == model.name);
+            DeclaredModel {
+                name: model.name.clone(),
+                has_layout: model.has_layout,
+                answers: answers.map(|(_, answers)| answers.clone()),
+            }
+        };
+        Ok(manifest.models.iter().map(declared).collect())
     }
 }
 

@@ -33,10 +33,18 @@ pub(super) struct Input {
     pub(super) decoded_size: u64,
 }
 
+/// One `[[model]]`.
+#[derive(Clone, Debug)]
+pub(super) struct Model {
+    pub(super) name: String,
+    /// True if it has a `layout`, for `detect`.
+    pub(super) has_layout: bool,
+}
+
 /// The values of `[limits]` that apply natively.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Limits {
-    /// Total bytes of the frames that the lambda creates.
+    /// Total bytes of the frames that the lambda creates; tensors may have as many.
     pub(super) memory: usize,
     pub(super) handles: u64,
     pub(super) frames: usize,
@@ -53,6 +61,7 @@ pub(super) struct Manifest {
     pub(super) name: String,
     pub(super) schedule: ScheduleSpec,
     pub(super) inputs: Vec<Input>,
+    pub(super) models: Vec<Model>,
     pub(super) limits: Limits,
     items: Vec<ConfigItem>,
 }
@@ -94,8 +103,10 @@ pub(super) fn read(text: &str) -> Result<Manifest> {
     }
     lambda.text("entry", "entry = \"brake_dark.wasm\"", |_| true)?;
     let inputs = root.list("input")?.iter().map(input).collect::<Result<Vec<_>>>()?;
-    unique("name", inputs.iter().map(|input| &input.name))?;
-    unique("topic", inputs.iter().map(|input| &input.topic))?;
+    let models = root.list("model")?.iter().map(model).collect::<Result<Vec<_>>>()?;
+    unique("[[input]] with the name", inputs.iter().map(|input| &input.name))?;
+    unique("[[input]] with the topic", inputs.iter().map(|input| &input.topic))?;
+    unique("[[model]] with the name", models.iter().map(|model| &model.name))?;
     if let Some(value) = root.get("record") {
         let known =
             ["topics", "preroll", "postroll", "store", "preroll_size", "cooldown", "max_length"];
@@ -105,6 +116,7 @@ pub(super) fn read(text: &str) -> Result<Manifest> {
         name: lambda.text("name", "name = \"brake-dark\"", names::is_lambda)?,
         schedule: schedule(&root, &inputs)?,
         inputs,
+        models,
         limits: limits(&root)?,
         items: items(&root)?,
     })
@@ -114,8 +126,8 @@ fn unique<'a>(what: &str, names: impl Iterator<Item = &'a String>) -> Result<()>
     let mut seen = BTreeSet::new();
     let mut twice = names.filter(|name| !seen.insert(*name));
     twice.next().map_or(Ok(()), |name| {
-        let cause = format!("there are two [[input]] with the {what} `{name}`");
-        Err(Error::new("cannot use the manifest", cause, "keep one [[input]] entry per topic"))
+        let cause = format!("there are two {what} `{name}`");
+        Err(Error::new("cannot use the manifest", cause, "keep one of them"))
     })
 }
 
@@ -172,6 +184,15 @@ fn input(value: &Value) -> Result<Input> {
         max_size: table.size("max_size", (1, size, 256 * MIB))? as usize,
         decoded_size: if is_compressed { decoded_size } else { 0 },
         type_name,
+    })
+}
+
+fn model(value: &Value) -> Result<Model> {
+    let known = ["name", "file", "sha256", "layout", "labels", "providers", "threads"];
+    let table = Table::new("[[model]]", value, &known)?;
+    Ok(Model {
+        name: table.text("name", "name = \"detector\"", names::is_item)?,
+        has_layout: table.get("layout").is_some(),
     })
 }
 

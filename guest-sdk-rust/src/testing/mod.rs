@@ -49,9 +49,12 @@
 //! faults with a fresh instance after each, and back-off. Most of these rules are the host's own
 //! code, in `gleaner-rules`.
 //!
-//! Not included: limits of fuel, time and memory, except of the memory of frames that the lambda
-//! creates; decoders of JPEG and PNG; message definitions, so a message has only the fields that
-//! the test sets; clips; models. See `docs/rust.md` for the consequences.
+//! A model answers as the test determines: see [`FakeModel`].
+//!
+//! Not included: limits of fuel, time and memory, except of the memory of frames and tensors that
+//! the lambda creates; decoders of JPEG and PNG; message definitions, so a message has only the
+//! fields that the test sets; clips; models, and frames as tensors. See `docs/rust.md` for the
+//! consequences.
 //!
 //! The module exists only in native builds, so use it in `#[cfg(test)]`. A function of the SDK that
 //! is called while no lambda runs panics with a message that names the way out.
@@ -68,6 +71,7 @@ mod limits;
 pub(crate) mod log;
 mod manifest;
 mod message;
+mod model;
 mod path;
 mod ring;
 mod run;
@@ -83,4 +87,5 @@ pub use error::Error;
 pub use host::{Host, Setting};
 pub use log::LogLine;
 pub use message::{FieldValue, Message};
+pub use model::{FakeModel, SeenFrame};
 pub use run::Run;

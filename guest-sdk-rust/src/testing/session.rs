@@ -1,5 +1,5 @@
-//! The session of a run: its inputs, triggers, log and scratch memory, and the thread-local through
-//! which the functions of the SDK reach it.
+//! The session of a run: its inputs, models, triggers, log and scratch memory, and the thread-local
+//! through which the functions of the SDK reach it.
 
 use std::any::Any;
 use std::cell::RefCell;
@@ -15,6 +15,7 @@ use gleaner_rules::units::size_in_words;
 
 use super::data::InputState;
 use super::decision::{Fault, FaultKind, Trigger};
+use super::inference::ModelTable;
 use super::log::Log;
 use super::manifest::Limits;
 
@@ -22,6 +23,7 @@ use super::manifest::Limits;
 pub(crate) struct Session {
     limits: Limits,
     pub(super) inputs: Vec<Arc<InputState>>,
+    pub(super) models: ModelTable,
     state: Mutex<SessionState>,
 }
 
@@ -34,11 +36,19 @@ pub(super) struct SessionState {
 }
 
 impl Session {
-    pub(super) fn new(limits: Limits, inputs: Vec<Arc<InputState>>) -> Arc<Self> {
+    pub(super) fn new(
+        limits: Limits,
+        inputs: Vec<Arc<InputState>>,
+        models: ModelTable,
+    ) -> Arc<Self> {
         let (triggers, log) = (Triggers::new(limits.events_per_minute), Log::new(&limits));
         let scratch = Scratch::new(limits.scratch, limits.per_call.bytes);
         let state = Mutex::new(SessionState { now_ns: 0, triggers, log, scratch, backed_off: 0 });
-        Arc::new(Self { limits, inputs, state })
+        Arc::new(Self { limits, inputs, models, state })
+    }
+
+    pub(super) fn limits(&self) -> &Limits {
+        &self.limits
     }
 
     pub(super) fn lock(&self) -> MutexGuard<'_, SessionState> {
@@ -131,7 +141,7 @@ fn panic_text(panic: &(dyn Any + Send)) -> &str {
         .unwrap_or("the panic has no message")
 }
 
-/// Counts the samples, frames, fields and topics that a lambda holds, up to a limit.
+/// Counts the samples, frames, tensors and other objects that a lambda holds, up to a limit.
 pub(crate) struct HandleCounter {
     held: AtomicU64,
     allowed: u64,

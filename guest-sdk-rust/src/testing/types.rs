@@ -128,6 +128,17 @@ pub struct Roi {
     pub height: u32,
 }
 
+/// Place of a frame in the input tensor of a model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Placement {
+    /// The frame is stretched to the whole tensor.
+    Stretch,
+    /// The aspect ratio is kept; the frame is in the middle, with a border around it.
+    Centre,
+    /// The aspect ratio is kept; the frame is in the upper left corner.
+    Corner,
+}
+
 /// Conversion of a frame to the input tensor of a model.
 #[derive(Clone, Copy, Debug)]
 pub struct Preprocess {
@@ -135,16 +146,22 @@ pub struct Preprocess {
     pub width: u32,
     /// Height of the tensor in pixels, 1 to 8,192.
     pub height: u32,
-    /// True to keep the aspect ratio and fill the rest with `fill`; false to stretch.
-    pub letterbox: bool,
-    /// Grey level of the filled border, 0 to 255; 114 is usual.
+    /// Place of the frame in the tensor.
+    pub placement: Placement,
+    /// Grey level of the border, 0 to 255; 114 is usual.
     pub fill: u8,
     /// Channel order of the tensor: true for blue first, false for red first.
     pub bgr: bool,
-    /// Each channel becomes `(value - mean) * scale`, with `value` from 0 to 255.
+    /// True for shape [1, height, width, 3], false for [1, 3, height, width].
+    pub channels_last: bool,
+    /// True for bytes from 0 to 255, without the numbers below; false for 32-bit floats.
+    pub bytes: bool,
+    /// Each channel becomes `(value * scale - mean) / deviation`, with `value` from 0 to 255.
+    pub scale: f32,
+    /// Mean of each channel, in the order of the tensor. See `scale`.
     pub mean: (f32, f32, f32),
-    /// See `mean`.
-    pub scale: (f32, f32, f32),
+    /// Deviation of each channel, in the order of the tensor; not 0. See `scale`.
+    pub deviation: (f32, f32, f32),
 }
 
 /// Reason why data cannot be read. Each message names the object, the cause and the way out.

@@ -9,8 +9,8 @@
 //! 3. [`sandbox_filter`], once files are open: no new processes, no signals to other processes.
 //! 4. [`memory`], with it: a cap on further memory growth.
 //!
-//! A compiler of a lambda whose author is not trusted enters [`compiler`] instead. [`ingress`] and
-//! [`recorder`] are the sandboxes of the two processes that serve all lambdas.
+//! A compiler of a lambda whose author is not trusted enters [`compiler`] instead. [`ingress`],
+//! [`recorder`] and [`inference`] are the sandboxes of the processes that serve all lambdas.
 //!
 //! [`self_test`] then tries what should be denied: a layer counts only if it was seen to deny it.
 //! [`cgroup`] is the supervisor's side, for memory and processes that a lambda starts. A layer that
@@ -24,6 +24,7 @@ mod cgroup_join;
 pub mod compiler;
 pub mod files;
 mod filter;
+pub mod inference;
 pub mod ingress;
 pub mod memory;
 mod own_memory;

@@ -19,6 +19,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyString;
 
 use crate::context::Context;
+use crate::inference;
 
 /// Wakes between two runs of the garbage collector.
 const WAKES_PER_TIDY: u64 = 10;
@@ -95,6 +96,7 @@ impl PythonGuest {
         session: Session,
         allowed: CallLimits,
     ) -> Self {
+        inference::use_session(session.clone());
         Self { host, entry, handler, session, allowed, make: None, instance: None, wakes: 0 }
     }
 
@@ -267,7 +269,7 @@ impl Guest for PythonGuest {
         Python::attach(|py| {
             let result = self.run(py, wake);
             self.tidy(py);
-            WakeOutcome { result, fuel: None, run_ns: None }
+            WakeOutcome { result, fuel: None, run_ns: None, model_ns: None }
         })
     }
 

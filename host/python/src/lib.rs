@@ -6,7 +6,7 @@
 //! `gleaner`; `sdk` looks them up.
 //!
 //! Everything runs in one thread. Threads that receive samples never attach to the interpreter.
-//! `unsafe` code is only in `array`, which lends the pixels of a frame to numpy, and in `memory`,
+//! `unsafe` code is only in `array`, which lends frames and tensors to numpy, and in `memory`,
 //! which counts allocations.
 
 mod array;

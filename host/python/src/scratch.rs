@@ -66,7 +66,7 @@ impl Scratch {
 }
 
 /// The bytes of an object with a buffer: `bytes`, `bytearray`, a numpy array.
-fn to_bytes<'py>(bytes: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyBytes>> {
+pub(crate) fn to_bytes<'py>(bytes: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyBytes>> {
     if let Ok(bytes) = bytes.cast::<PyBytes>() {
         return Ok(bytes.clone());
     }

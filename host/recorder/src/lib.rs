@@ -39,7 +39,7 @@ pub use file::{
 pub use recorder::{
     Commanded, LambdaId, LambdaSpec, Recorder, RecorderCounts, Settings, TOPICS_MAX, TopicId, Work,
 };
-pub use thumbnail::{is_image, thumbnail};
+pub use thumbnail::{ObjectBox, is_image, thumbnail, thumbnail_with_boxes};
 
 /// Most lambdas of one recorder, counted with each start, and of one clip: for each a header is
 /// kept.

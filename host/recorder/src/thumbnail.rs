@@ -12,6 +12,21 @@ const QUALITY: u8 = 80;
 /// Most bytes that a compressed image may have as rgb8; 21 megapixels.
 const DECODED_BYTES: usize = 64 << 20;
 
+/// Colour of boxes, in red, green and blue.
+const BOX: [u8; 3] = [255, 96, 0];
+/// Width of their lines, in pixels.
+const LINE: u32 = 2;
+
+/// A box around an object, in pixels of the image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[allow(missing_docs)]
+pub struct ObjectBox {
+    pub x: f64,
+    pub y: f64,
+    pub width: f64,
+    pub height: f64,
+}
+
 /// Returns whether messages of this type are images, of which there are thumbnails; the name with
 /// or without `msg/`.
 pub fn is_image(type_name: &str) -> bool {
@@ -28,16 +43,28 @@ pub fn is_image(type_name: &str) -> bool {
 /// format, or larger than 64 MiB once decoded. Images without colour, including those of raw
 /// sensors, become grey.
 pub fn thumbnail(type_name: &str, cdr: &[u8], endian: Endian) -> Option<Vec<u8>> {
+    thumbnail_with_boxes(type_name, cdr, endian, &[])
+}
+
+/// As [`thumbnail`], with `boxes` drawn into it.
+pub fn thumbnail_with_boxes(
+    type_name: &str,
+    cdr: &[u8],
+    endian: Endian,
+    boxes: &[ObjectBox],
+) -> Option<Vec<u8>> {
     match type_name {
-        "sensor_msgs/msg/Image" | "sensor_msgs/Image" => raw(&ImageView::read(cdr, endian).ok()?),
+        "sensor_msgs/msg/Image" | "sensor_msgs/Image" => {
+            raw(&ImageView::read(cdr, endian).ok()?, boxes)
+        }
         "sensor_msgs/msg/CompressedImage" | "sensor_msgs/CompressedImage" => {
-            compressed(CompressedView::read(cdr, endian).ok()?.data)
+            compressed(CompressedView::read(cdr, endian).ok()?.data, boxes)
         }
         _ => None,
     }
 }
 
-fn raw(message: &ImageView<'_>) -> Option<Vec<u8>> {
+fn raw(message: &ImageView<'_>, boxes: &[ObjectBox]) -> Option<Vec<u8>> {
     // The colours of a raw sensor lie side by side. Their mean over an area is its grey level, good
     // enough to recognise the scene.
     let encoding = match Encoding::from_ros(message.encoding).ok()? {
@@ -46,28 +73,62 @@ fn raw(message: &ImageView<'_>) -> Option<Vec<u8>> {
         encoding => encoding,
     };
     let (width, height, step) = (message.width, message.height, message.step);
-    small(&View::new(width, height, step, encoding, message.is_bigendian, message.data).ok()?)
+    let view = View::new(width, height, step, encoding, message.is_bigendian, message.data);
+    small(&view.ok()?, boxes)
 }
 
-fn compressed(data: &[u8]) -> Option<Vec<u8>> {
+fn compressed(data: &[u8], boxes: &[ObjectBox]) -> Option<Vec<u8>> {
     let header = image::probe(data).ok()?;
     let len = header.rgb8_len().filter(|len| *len <= DECODED_BYTES)?;
     let mut pixels = vec![0; len];
     image::decode_rgb8(data, &header, DECODED_BYTES, &mut pixels).ok()?;
     let step = header.width.checked_mul(3)?;
-    small(&View::new(header.width, header.height, step, Encoding::Rgb8, false, &pixels).ok()?)
+    let view = View::new(header.width, header.height, step, Encoding::Rgb8, false, &pixels);
+    small(&view.ok()?, boxes)
 }
 
-fn small(view: &View<'_>) -> Option<Vec<u8>> {
+fn small(view: &View<'_>, boxes: &[ObjectBox]) -> Option<Vec<u8>> {
     let (width, height) = fit(view.width(), view.height());
     let (encoding, len) = ops::resized(view, width, height).ok()?;
     let mut pixels = vec![0; len];
     ops::resize(view, width, height, &mut pixels).ok()?;
+    let scale = f64::from(width) / f64::from(view.width());
+    for object in boxes {
+        draw(&mut pixels, (width, height), encoding.is_grey(), object, scale);
+    }
     let color = if encoding.is_grey() { ColorType::Luma } else { ColorType::Rgb };
     let mut jpeg = Vec::new();
     let (width, height) = (u16::try_from(width).ok()?, u16::try_from(height).ok()?);
     Encoder::new(&mut jpeg, QUALITY).encode(&pixels, width, height, color).ok()?;
     Some(jpeg)
+}
+
+/// Draws the outline of `object`, whose pixels are `scale` pixels of the thumbnail.
+fn draw(
+    pixels: &mut [u8],
+    (width, height): (u32, u32),
+    is_grey: bool,
+    object: &ObjectBox,
+    scale: f64,
+) {
+    // A cast clamps, also what is not a number.
+    let at = |position: f64, side: u32| ((position * scale).round() as u32).min(side - 1);
+    let (left, right) = (at(object.x, width), at(object.x + object.width, width));
+    let (top, bottom) = (at(object.y, height), at(object.y + object.height, height));
+    for y in top..=bottom {
+        for x in left..=right {
+            let is_inside =
+                x >= left + LINE && x + LINE <= right && y >= top + LINE && y + LINE <= bottom;
+            if is_inside {
+                continue;
+            }
+            let index = y as usize * width as usize + x as usize;
+            match is_grey {
+                true => pixels[index] = u8::MAX,
+                false => pixels[3 * index..3 * index + 3].copy_from_slice(&BOX),
+            }
+        }
+    }
 }
 
 /// The largest size within a thumbnail's bounds that has the ratio of `width` x `height`, and is

@@ -78,6 +78,12 @@ impl Due {
         self.0.at.store(ns, Ordering::Relaxed);
     }
 
+    /// Returns the due time; `None` without a deadline.
+    pub(super) fn at(&self) -> Option<Instant> {
+        let at = self.0.at.load(Ordering::Relaxed);
+        (at != NEVER).then(|| self.0.base + Duration::from_nanos(at))
+    }
+
     /// Returns an error if the due time has passed.
     pub(super) fn check(&self) -> Result<(), DataError> {
         self.allows(0, 1)

@@ -20,6 +20,7 @@ pub use super::field::Field;
 use super::frame::Images;
 use super::fuel::Fuel;
 pub use super::fuel::OutOfFuel;
+use super::inference::TensorLimits;
 pub use super::sample::Sample;
 use super::trace::{LookBack, SumsBefore};
 pub use super::values::{Column, Counts, Identity, Stamps, Tick};
@@ -106,6 +107,12 @@ impl Topic {
             scratch: Mutex::default(),
             curves: OnceLock::new(),
         })
+    }
+
+    /// Limits of the lambda's tensors, which share the memory of its frames.
+    pub(super) fn tensor_limits(&self) -> TensorLimits {
+        let (per_call, budget) = (self.per_call.clone(), self.images.budget.clone());
+        TensorLimits { per_call, budget }
     }
 
     /// The input's name.

@@ -278,6 +278,12 @@ impl Frame {
         paid.make(Info::tight(self.info.width, self.info.height, Encoding::Mono8), ops::to_gray)
     }
 
+    /// Returns all pixels, for an operation that was charged, and that checks the deadline.
+    pub(super) fn whole(&self) -> Result<View<'_>, DataError> {
+        self.source.topic.per_call.due.check()?;
+        self.view()
+    }
+
     fn view(&self) -> Result<View<'_>, DataError> {
         self.info.view(self.bytes()).map_err(|error| self.source.not_a_frame(error))
     }

@@ -19,6 +19,7 @@ pub mod fuel;
 mod images;
 pub mod inference;
 pub mod log;
+pub mod models;
 pub mod relayed;
 mod sample;
 pub mod scratch;
@@ -33,10 +34,14 @@ use gleaner_journal::LogDigest;
 use gleaner_lambda::Trigger;
 use gleaner_lambda::manifest::{ConfigValue, Limits};
 
+use call::PerCall;
 use data::{DataError, Due, Topic};
 use field::FIELD_BYTES;
 use fuel::{Fuel, OutOfFuel};
+use gleaner_rules::frames::Budget;
+use inference::TensorLimits;
 use log::{Log, LogLine};
+use models::Models;
 use scratch::Scratch;
 use trigger::Triggers;
 
@@ -46,6 +51,8 @@ use trigger::Triggers;
 pub struct Session {
     state: Arc<Mutex<SessionState>>,
     fuel: Fuel,
+    models: Models,
+    tensors: TensorLimits,
 }
 
 struct SessionState {
@@ -69,11 +76,38 @@ impl Session {
         // All inputs of a lambda share them.
         let due = inputs.first().map(|topic| topic.due());
         let fuel = inputs.first().map(|topic| topic.fuel()).unwrap_or_default();
+        let tensors = match inputs.first() {
+            Some(topic) => topic.tensor_limits(),
+            None => TensorLimits {
+                per_call: PerCall::new(limits),
+                budget: Budget::new(
+                    usize::try_from(limits.frames).unwrap_or(usize::MAX),
+                    limits.memory.as_usize(),
+                ),
+            },
+        };
         let (triggers, log) = (Triggers::new(limits.events_per_minute), Log::new(limits));
         let scratch = Scratch::new(limits.scratch.bytes(), limits.call_bytes.as_usize());
         let state =
             SessionState { inputs, config, now_ns: 0, triggers, log, scratch, due, backed_off: 0 };
-        Self { state: Arc::new(Mutex::new(state)), fuel }
+        let state = Arc::new(Mutex::new(state));
+        Self { state, fuel, models: Models::default(), tensors }
+    }
+
+    /// The same session with these models.
+    #[must_use]
+    pub fn with_models(self, models: Models) -> Self {
+        Self { models, ..self }
+    }
+
+    /// The lambda's models.
+    pub fn models(&self) -> &Models {
+        &self.models
+    }
+
+    /// Limits of the lambda's tensors.
+    pub fn tensors(&self) -> &TensorLimits {
+        &self.tensors
     }
 
     /// Begins a wake at `now_ns`, and drops triggers of an earlier one.
@@ -81,6 +115,7 @@ impl Session {
         let mut state = self.lock();
         state.now_ns = now_ns;
         state.triggers.begin();
+        self.models.begin();
     }
 
     /// Ends a wake and returns its triggers, in the order of the calls.

@@ -133,4 +133,6 @@ pub struct WakeOutcome {
     pub fuel: Option<u64>,
     /// Run time of the lambda, if it runs in another process, which measures it.
     pub run_ns: Option<u64>,
+    /// Run time of models, if they were run for another process.
+    pub model_ns: Option<u64>,
 }

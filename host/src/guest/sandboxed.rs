@@ -11,6 +11,7 @@ use gleaner_protocol::{Layer, Phase};
 use super::meter::Meter;
 use super::{Guest, WakeOutcome};
 use crate::api::data::Wake;
+use crate::api::models::Models;
 use crate::isolation::Isolation;
 
 /// Times after which the process of a guest is killed: longer than its deadline, at which the guest
@@ -46,6 +47,8 @@ pub struct SandboxedGuest {
     /// Memory of this process that the lambda may use, in bytes; `None` where its kind counts its
     /// own memory.
     memory: Option<u64>,
+    /// The models that it runs.
+    models: Models,
     meter: Option<Meter>,
     is_prepared: bool,
     /// Set if the next wake begins with an `init`.
@@ -60,12 +63,14 @@ impl SandboxedGuest {
         isolation: Arc<Isolation>,
         timeouts: KillTimeouts,
         memory: Option<u64>,
+        models: Models,
     ) -> Self {
         Self {
             guest,
             isolation,
             timeouts,
             memory,
+            models,
             meter: None,
             is_prepared: false,
             needs_init: false,
@@ -137,7 +142,9 @@ impl Guest for SandboxedGuest {
     }
 
     fn engine(&self) -> String {
-        self.guest.engine()
+        let mut parts = vec![self.guest.engine()];
+        parts.extend(self.models.runtimes());
+        parts.join("; ")
     }
 
     fn layers(&self) -> Result<Vec<Layer>, Failure> {

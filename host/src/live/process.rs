@@ -1,7 +1,6 @@
 //! Sets up the process of a live run: arguments, connections, signals.
 
-use std::io::{self, Write};
-use std::os::fd::OwnedFd;
+use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -16,7 +15,7 @@ use gleaner_vitals::start::stop_flag;
 
 use super::{LiveRun, ResultsPipe, Settings};
 use crate::isolation::{Isolation, definition_dirs};
-use crate::session_setup::{ConfiguredLambda, LambdaArgs, Load};
+use crate::session_setup::{ConfiguredLambda, LambdaArgs, Load, take_stdin};
 
 /// Upper bound of the decisions that wait to be written, in bytes.
 pub(crate) const UNWRITTEN: u64 = 48 << 20;
@@ -102,7 +101,7 @@ impl LiveJob {
         isolation: &Isolation,
         reports: impl Write + Send + 'static,
     ) -> Result<Exit, Failure> {
-        let Self { lambda, manifest, settings } = self;
+        let Self { mut lambda, manifest, settings } = self;
         let stop = stop_flag().map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot listen for SIGTERM", &error)
         })?;
@@ -113,6 +112,7 @@ impl LiveJob {
         let ingress = connections.take_ingress().map_err(unconnected)?;
         let feed = Feed::connect(ingress)
             .map_err(|error| Failure::because("cannot connect to the ingress", &error))?;
+        lambda.use_models(&manifest, connections.inference.take())?;
         let pulse = isolation.pulse().clone();
         let run = LiveRun {
             lambda,
@@ -128,17 +128,4 @@ impl LiveJob {
         };
         run.run(load, reports)
     }
-}
-
-/// Takes the starter's socket from standard input and replaces it by /dev/null: a lambda may read
-/// its standard input.
-fn take_stdin() -> Result<OwnedFd, Failure> {
-    let failed = |error: io::Error| {
-        Failure::caused_by(Exit::Internal, "cannot take the socket of the starter", &error)
-    };
-    let socket =
-        rustix::io::fcntl_dupfd_cloexec(io::stdin(), 3).map_err(io::Error::from).map_err(failed)?;
-    let nothing = std::fs::File::open("/dev/null").map_err(failed)?;
-    rustix::stdio::dup2_stdin(&nothing).map_err(io::Error::from).map_err(failed)?;
-    Ok(socket)
 }

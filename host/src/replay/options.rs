@@ -67,6 +67,9 @@ pub struct VerifyArgs {
     /// The configuration of the vehicle; by default, the limits are those of the journal.
     #[arg(long, value_name = "FILE")]
     pub vehicle: Option<PathBuf>,
+    /// Standard input is a socket of the starter, which passes the connection to gleaner-inference.
+    #[arg(long, hide = true)]
+    pub starter_passes_inference: bool,
 }
 
 /// A lambda and the drives to run it over.
@@ -249,6 +252,7 @@ impl ReplayJob {
             set: Vec::new(),
             remap: Vec::new(),
             vehicle: args.vehicle,
+            starter_passes_inference: args.starter_passes_inference,
         };
         let clip = Drives { named: vec![args.clip.clone()], files: vec![args.clip] };
         let options = reference.options(lambda, build, &mut manifest, clip)?;

@@ -6,9 +6,9 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_base::safe_file;
-use gleaner_lambda::Decision;
 use gleaner_lambda::signals::{Signals, TriggerPicture};
-use gleaner_recorder::{is_image, thumbnail};
+use gleaner_lambda::{Decision, Trigger};
+use gleaner_recorder::{ObjectBox, is_image, thumbnail_with_boxes};
 use gleaner_transport::SampleMeta;
 
 use crate::api::data::Topic;
@@ -62,6 +62,7 @@ struct PendingPicture {
     at_ns: i64,
     topic: String,
     image_ns: i64,
+    has_boxes: bool,
     jpeg: Vec<u8>,
 }
 
@@ -89,34 +90,37 @@ impl TriggerPictures {
             self.pictures.retain(|picture| picture.wake.is_multiple_of(self.every));
         }
         if wake.is_multiple_of(self.every)
-            && let Some(picture) = self.make(wake, decision.at_ns)
+            && let Some(picture) = self.make(wake, decision)
         {
             self.pictures.push(picture);
         }
     }
 
-    fn make(&self, wake: u64, at_ns: i64) -> Option<PendingPicture> {
+    fn make(&self, wake: u64, decision: &Decision) -> Option<PendingPicture> {
+        let boxes: Vec<_> = decision.triggers.iter().filter_map(object_box).collect();
         let picture = |topic: &str, image_ns, jpeg| PendingPicture {
             wake,
-            at_ns,
+            at_ns: decision.at_ns,
             topic: topic.to_owned(),
             image_ns,
+            has_boxes: !boxes.is_empty(),
             jpeg,
+        };
+        let thumbnail = |type_name: &str, cdr: &[u8], meta: SampleMeta| {
+            let as_before = self.as_before(meta.at_ns).filter(|_| boxes.is_empty());
+            as_before.or_else(|| thumbnail_with_boxes(type_name, cdr, meta.endian, &boxes))
         };
         for topic in &self.inputs {
             // Not by the lambda's own calls: the journal notes how far the lambda looked back.
             let Some(lease) = topic.reader().newest() else { continue };
             let meta = lease.meta().sample;
-            let jpeg = self
-                .as_before(meta.at_ns)
-                .or_else(|| thumbnail(topic.type_name(), &lease, meta.endian));
+            let jpeg = thumbnail(topic.type_name(), &lease, meta);
             return jpeg.map(|jpeg| picture(topic.ros_topic(), meta.at_ns, jpeg));
         }
         let camera = self.camera.as_ref()?;
         let newest = camera.newest.lock().unwrap_or_else(PoisonError::into_inner);
         let (meta, cdr) = newest.as_ref()?;
-        let jpeg =
-            self.as_before(meta.at_ns).or_else(|| thumbnail(&camera.type_name, cdr, meta.endian));
+        let jpeg = thumbnail(&camera.type_name, cdr, *meta);
         jpeg.map(|jpeg| picture(&camera.topic, meta.at_ns, jpeg))
     }
 
@@ -124,7 +128,7 @@ impl TriggerPictures {
     fn as_before(&self, image_ns: i64) -> Option<Vec<u8>> {
         self.pictures
             .last()
-            .filter(|picture| picture.image_ns == image_ns)
+            .filter(|picture| picture.image_ns == image_ns && !picture.has_boxes)
             .map(|picture| picture.jpeg.clone())
     }
 
@@ -139,7 +143,7 @@ impl TriggerPictures {
         }
         safe_file::folder(&folder).map_err(|source| OutputError { path: folder, source })?;
         let written = self.pictures.into_iter().map(
-            |PendingPicture { at_ns, topic, image_ns, jpeg, wake }| {
+            |PendingPicture { at_ns, topic, image_ns, jpeg, wake, .. }| {
                 let file = Path::new(FOLDER).join(format!("{PREFIX}{wake:06}.jpg"));
                 let path = out.join(&file);
                 // Always a new file: an existing one may be a link to another place.
@@ -150,6 +154,14 @@ impl TriggerPictures {
         );
         Ok((written.collect::<Result<_, _>>()?, omitted))
     }
+}
+
+/// Returns the box of a trigger with the attributes `x`, `y`, `width` and `height`, in pixels.
+fn object_box(trigger: &Trigger) -> Option<ObjectBox> {
+    let number = |name: &str| trigger.attributes.get(name)?.as_f64();
+    let [x, y] = [number("x")?, number("y")?];
+    let [width, height] = [number("width")?, number("height")?];
+    (width > 0.0 && height > 0.0).then_some(ObjectBox { x, y, width, height })
 }
 
 /// Deletes the pictures of an earlier replay, and no other file in the folder.
@@ -183,7 +195,7 @@ fn remove(folder: &Path) -> Result<(), OutputError> {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_lambda::{Cause, Trigger, TriggerKind};
+    use gleaner_lambda::{Cause, TriggerKind};
     use gleaner_messages::Endian;
     use gleaner_transport::Guid;
 
@@ -229,6 +241,7 @@ mod tests {
             fault: None,
             fuel: None,
             run_ns: 0,
+            model_ns: 0,
         }
     }
 

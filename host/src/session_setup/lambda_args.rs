@@ -1,13 +1,21 @@
 //! Arguments that name the lambda to run and its settings, and their check against the manifest.
 
+use std::io::{self, Read};
+use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use gleaner_base::{Exit, Failure};
-use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, Tightened};
+use gleaner_base::{ByteSize, Exit, Failure, PlainFile};
+use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, ModelSpec, Tightened};
 use gleaner_lambda::{BuildDir, Vehicle};
+use gleaner_protocol::Handover;
+use gleaner_vision::DetectorLayout;
 
+use crate::api::models::{ModelEntry, Models};
 use crate::input::Remap;
+
+/// Longest file of labels; one of a thousand classes has some 10 kB.
+const LABELS_MAX: ByteSize = ByteSize::mib(1);
 
 /// Arguments that name the lambda to run and its settings.
 #[derive(Args, Clone, Debug)]
@@ -23,6 +31,9 @@ pub struct LambdaArgs {
     /// The configuration of the vehicle; its limits lower those of the manifest.
     #[arg(long, value_name = "FILE")]
     pub vehicle: Option<PathBuf>,
+    /// Standard input is a socket of the starter, which passes the connection to gleaner-inference.
+    #[arg(long, hide = true)]
+    pub starter_passes_inference: bool,
 }
 
 /// A lambda with its settings, checked.
@@ -37,6 +48,10 @@ pub struct ConfiguredLambda {
     pub remaps: Vec<Remap>,
     /// The configuration of the vehicle, which an interpreter reads again.
     pub vehicle: Option<PathBuf>,
+    /// Its models, connected to the process that runs them if there is one.
+    pub models: Models,
+    /// Set if the starter passes that connection over standard input.
+    pub passes_inference: bool,
 }
 
 impl ConfiguredLambda {
@@ -51,13 +66,49 @@ impl ConfiguredLambda {
         build: BuildDir,
         manifest: &mut Manifest,
     ) -> Result<Self, Failure> {
-        let LambdaArgs { lambda, set, remap: remaps, vehicle } = args;
+        let LambdaArgs { lambda, set, remap: remaps, vehicle, .. } = args;
+        let passes_inference = args.starter_passes_inference;
         if let Some(vehicle) = &vehicle {
             tighten(manifest, vehicle)?;
         }
         let config = ConfigSet::resolve(manifest, &set)?;
         known_topics(&remaps, manifest)?;
-        Ok(Self { folder: lambda, build, config, remaps, vehicle })
+        let models = Models::default();
+        Ok(Self { folder: lambda, build, config, remaps, vehicle, models, passes_inference })
+    }
+
+    /// Opens its models over the connection that the starter passes on standard input, if it does.
+    ///
+    /// # Errors
+    ///
+    /// A failure if that connection does not arrive, or if labels cannot be read.
+    pub fn connect_models(&mut self, manifest: &Manifest) -> Result<(), Failure> {
+        let mut socket = None;
+        if self.passes_inference {
+            let unconnected = |error| Failure::because("cannot receive the connections", &error);
+            let connections = Handover::receive(take_stdin()?).map_err(unconnected)?;
+            socket = connections.inference;
+        }
+        self.use_models(manifest, socket)
+    }
+
+    /// Opens its models over `socket`, if there is one.
+    ///
+    /// # Errors
+    ///
+    /// A failure if labels cannot be read.
+    pub fn use_models(
+        &mut self,
+        manifest: &Manifest,
+        socket: Option<OwnedFd>,
+    ) -> Result<(), Failure> {
+        if manifest.models.is_empty() {
+            return Ok(());
+        }
+        let entries = manifest.models.iter().map(|model| model_entry(model, &self.build));
+        self.models = Models::new(entries.collect::<Result<_, _>>()?, socket);
+        self.models.open_all(manifest.limits.init_deadline);
+        Ok(())
     }
 }
 
@@ -75,6 +126,42 @@ pub fn tighten(manifest: &mut Manifest, file: &Path) -> Result<(), Failure> {
         tracing::warn!(%lambda, %by, %limits, "limits lowered by the vehicle's configuration");
     }
     Ok(())
+}
+
+/// Reads what the host needs of a model.
+fn model_entry(model: &ModelSpec, build: &BuildDir) -> Result<ModelEntry, Failure> {
+    let layout =
+        model.layout.as_deref().map(DetectorLayout::from_name).transpose().map_err(|error| {
+            Failure::caused_by(Exit::Usage, format!("cannot use model `{}`", model.name), &error)
+        })?;
+    let labels = match &model.labels {
+        None => Vec::new(),
+        Some(file) => {
+            let failed = |error: io::Error| {
+                let message = format!("cannot read `{file}`, the labels of model `{}`", model.name);
+                Failure::caused_by(Exit::Usage, message, &error)
+            };
+            let mut text = String::new();
+            PlainFile::inside(build.path(), file.as_path(), LABELS_MAX)
+                .and_then(|mut file| file.read_to_string(&mut text))
+                .map_err(failed)?;
+            text.lines().map(|line| line.trim().to_owned()).collect()
+        }
+    };
+    Ok(ModelEntry { name: model.name.to_string(), layout, labels })
+}
+
+/// Takes the starter's socket from standard input and replaces it by /dev/null: a lambda may read
+/// its standard input.
+pub(crate) fn take_stdin() -> Result<OwnedFd, Failure> {
+    let failed = |error: io::Error| {
+        Failure::caused_by(Exit::Internal, "cannot take the socket of the starter", &error)
+    };
+    let socket =
+        rustix::io::fcntl_dupfd_cloexec(io::stdin(), 3).map_err(io::Error::from).map_err(failed)?;
+    let nothing = std::fs::File::open("/dev/null").map_err(failed)?;
+    rustix::stdio::dup2_stdin(&nothing).map_err(io::Error::from).map_err(failed)?;
+    Ok(socket)
 }
 
 fn assignment(text: &str) -> Result<(String, String), String> {

@@ -14,6 +14,7 @@ use gleaner_messages::Sources;
 use gleaner_transport::Transport;
 
 pub use gleaner_lambda::{LOCK, Output, OutputError, RESULTS};
+pub(crate) use lambda_args::take_stdin;
 pub use lambda_args::{ConfiguredLambda, LambdaArgs, tighten};
 
 use crate::api::Session;
@@ -94,7 +95,11 @@ impl SessionSetup {
         let inputs = inputs.map_err(|error| {
             Failure::because(format!("cannot start lambda `{}`", manifest.lambda.name), &error)
         })?;
-        let session = Session::new(inputs.clone(), lambda.config.clone(), &manifest.limits);
+        let session = Session::new(inputs.clone(), lambda.config.clone(), &manifest.limits)
+            .with_models(lambda.models.clone());
+        if let RunMode::Live(_) = mode {
+            lambda.models.limit(Some(manifest.limits.model_time));
+        }
         let guest = load(lambda, manifest, session.clone(), mode)?;
         Ok(Self { inputs, session, guest })
     }

@@ -8,13 +8,15 @@ use crate::greedy::publish;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{DataError, Field, Sample, Topic};
 use gleaner_host::api::frame::Frame;
-use gleaner_host::api::inference::{Model, Tensor};
+use gleaner_host::api::inference::{InferenceError, Model};
 use gleaner_host::api::log::Level;
 use gleaner_host::input::open_inputs;
 use gleaner_lambda::manifest::{Limits, Manifest};
 use gleaner_operations::{Deadline, Operation};
+use gleaner_protocol::inference::Element;
 use gleaner_tests::drive::{COMPRESSED, IMAGE, compressed, image};
 use gleaner_transport::loopback::Loopback;
+use gleaner_vision::{Placement, Preprocess};
 
 const WIDTH: u32 = 701;
 const HEIGHT: u32 = 900;
@@ -79,6 +81,8 @@ impl HostedData {
     /// Calls an operation; returns the part of its result that the deadline can change.
     fn call(&self, operation: Operation) -> Result<(), DataError> {
         let Self { session, topic, field, sample, coded, frame, many, x } = self;
+        let tensors = session.tensors();
+        let tensor = || tensors.create(Element::Float32, &[2, 2]).unwrap();
         match operation {
             Operation::Input => session.input("raw").map(drop),
             Operation::Inputs => session.input_names().map(drop).map_err(DataError::from),
@@ -114,11 +118,28 @@ impl HostedData {
             Operation::Start => answered(session.start("s", Vec::new())),
             Operation::Stop => answered(session.stop("s")),
             Operation::Log => answered(session.log(Level::Info, "line")),
-            Operation::FromValues => answered(Tensor::from_values(64, session.fuel())),
-            Operation::FromFrame => answered(Tensor::from_frame(session.fuel())),
-            Operation::Open => answered(Model::open("m", session.fuel())),
-            // No value of their types can be created.
-            Operation::Shape | Operation::TensorRead | Operation::Run | Operation::Detect => Ok(()),
+            Operation::TensorCreate => answered(tensors.create(Element::Int16, &[9])),
+            Operation::FromFrame => {
+                match tensors.of_frame(session.models(), frame, &preprocess()) {
+                    Err(InferenceError::OutOfTime) => Err(DataError::OutOfTime),
+                    other => other.map(drop).map_err(|error| panic!("{error}")),
+                }
+            }
+            Operation::Element | Operation::Shape | Operation::TensorSize => {
+                answered(tensor().content().clone())
+            }
+            Operation::TensorRead => answered(tensor().read(0, 9)),
+            Operation::TensorWrite => answered(tensor().write(0, &[7])),
+            Operation::Open => {
+                answered(Model::open(session.models(), tensors, "no model of the manifest"))
+            }
+            // The tests of gleaner-inference call them.
+            Operation::ModelInputs
+            | Operation::ModelOutputs
+            | Operation::Labels
+            | Operation::Runtime
+            | Operation::Run
+            | Operation::Detect => Ok(()),
             Operation::ScratchPut => answered(session.put("a", b"bytes")),
             Operation::Append => answered(session.append("a", b"bytes")),
             Operation::ScratchGet => answered(session.get("a", 0, 9)),
@@ -126,6 +147,21 @@ impl HostedData {
             Operation::Entries => answered(session.entries()),
             Operation::Free => answered(session.free()),
         }
+    }
+}
+
+fn preprocess() -> Preprocess {
+    Preprocess {
+        width: 640,
+        height: 640,
+        placement: Placement::Centre,
+        fill: 114,
+        bgr: false,
+        channels_last: false,
+        bytes: false,
+        scale: 1.0 / 255.0,
+        mean: [0.0; 3],
+        deviation: [1.0; 3],
     }
 }
 

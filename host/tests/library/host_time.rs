@@ -167,8 +167,8 @@ fn opens_model(bytes: u32) -> TestGuest {
     let imports = r#"
         (import "gleaner:lambda/inference@0.1.0" (instance $inference
             (export "model" (type $model (sub resource)))
-            (type $an-error (variant (case "no-runtime" string) (case "no-such-model" string)
-                (case "wrong-input" string) (case "failed" string)))
+            (type $an-error (variant (case "unavailable" string) (case "no-such-model" string)
+                (case "wrong-input" string) (case "too-slow" string) (case "failed" string)))
             (export "inference-error" (type $error (eq $an-error)))
             (export "[static]model.open" (func (param "name" string) (result (result (own $model) (error $error)))))))
         (alias export $inference "[static]model.open" (func $open))"#;

@@ -83,10 +83,10 @@ impl Guest for AddingGuest {
         if value == SLOW && matches!(self.mode, RunMode::Live(_)) {
             let (kind, message) = (FaultKind::Deadline, "too slow".to_owned());
             let fault = Fault { kind, message, used: None, allowed: None };
-            return WakeOutcome { result: Err(fault), fuel: None, run_ns: None };
+            return WakeOutcome { result: Err(fault), fuel: None, run_ns: None, model_ns: None };
         }
         self.sum = Some(sum);
-        WakeOutcome { result: Ok(()), fuel: Some(7), run_ns: None }
+        WakeOutcome { result: Ok(()), fuel: Some(7), run_ns: None, model_ns: None }
     }
 
     fn discard(&mut self) {

@@ -81,8 +81,14 @@ pub const MAX_LENGTH: Bounds<Duration> = Bounds {
     max: Duration::from_secs(3600),
 };
 
-/// `model.threads`; without it the vehicle chooses.
-pub const THREADS: RangeInclusive<u64> = 1..=64;
+/// `model.threads`. By default, a model leaves the other cores to the lambdas.
+pub const THREADS: Bounds<u64> = Bounds { min: 1, default: 1, max: 64 };
+
+/// Values of `model.layout`.
+pub const LAYOUTS: &[&str] = &["ultralytics", "yolox", "nms-free", "nanodet"];
+
+/// Values in `model.providers`.
+pub const PROVIDERS: &[&str] = &["tensorrt", "cuda", "cpu", "onnxruntime", "rten"];
 
 /// Longest accepted manifest. The longest in use has 3 KiB.
 pub const MANIFEST_MAX: ByteSize = ByteSize::mib(1);

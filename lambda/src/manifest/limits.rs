@@ -112,7 +112,16 @@ limits! {
         max: Duration::from_secs(300)
     }
 
-    /// Memory that the lambda may allocate, and as much again for pixels of frames that it makes.
+    /// Time that the models of a wake may run. Live only.
+    // A model runs in another process, so this bounds what a lambda takes from the others; the
+    // deadline of the wake holds as well.
+    model_time as "model_time_ns": Duration {
+        min: Duration::from_millis(1),
+        default: Duration::from_secs(1),
+        max: Duration::from_secs(60)
+    }
+
+    /// Memory that the lambda may allocate, and as much again for frames and tensors that it makes.
     // The memory of the rings comes on top.
     memory: ByteSize { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(1) }
 

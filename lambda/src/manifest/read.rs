@@ -206,8 +206,8 @@ fn qos(value: &TomlValue) -> Result<Qos> {
 fn models(document: &Document, root: &TomlTable) -> Result<Vec<ModelSpec>> {
     let mut names = Unique::new(document, "model", "give each [[model]] a name of its own");
     let mut models = Vec::new();
-    for table in
-        root.tables("model", &["name", "file", "sha256", "layout", "providers", "threads"])?
+    for table in root
+        .tables("model", &["name", "file", "sha256", "layout", "labels", "providers", "threads"])?
     {
         let name = table.need("name", "name = \"detector\"")?;
         let model = ModelSpec {
@@ -216,12 +216,10 @@ fn models(document: &Document, root: &TomlTable) -> Result<Vec<ModelSpec>> {
             sha256: table
                 .need("sha256", "sha256 = \"<what sha256sum prints for the file>\"")?
                 .parse()?,
-            layout: table.optional_text("layout")?,
+            layout: table.get("layout").map(|value| one_of(&value, bounds::LAYOUTS)).transpose()?,
+            labels: table.get("labels").map(|value| value.parse()).transpose()?,
             providers: table.get("providers").map_or(Ok(Vec::new()), |value| providers(&value))?,
-            threads: table
-                .get("threads")
-                .map(|value| value.integer(&bounds::THREADS).map(count))
-                .transpose()?,
+            threads: count(table.integer("threads", &bounds::THREADS)?),
         };
         names.add(model.name.as_str(), &name)?;
         models.push(model);
@@ -231,7 +229,12 @@ fn models(document: &Document, root: &TomlTable) -> Result<Vec<ModelSpec>> {
 
 fn providers(value: &TomlValue) -> Result<Vec<String>> {
     let items = value.items("an array of texts, for example [\"cuda\", \"cpu\"]")?;
-    items.iter().map(|item| item.text().map(str::to_owned)).collect()
+    items.iter().map(|item| one_of(item, bounds::PROVIDERS)).collect()
+}
+
+fn one_of(value: &TomlValue, known: &[&'static str]) -> Result<String> {
+    let choices: Vec<_> = known.iter().map(|name| (*name, *name)).collect();
+    value.choice(&choices).map(str::to_owned)
 }
 
 fn record(document: &Document, value: &TomlValue) -> Result<RecordSpec> {

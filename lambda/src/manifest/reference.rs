@@ -271,14 +271,12 @@ fn model() -> Section {
         Key::new("file", "ModelSpec", "file", rule::<RelativePath>()).needed(),
         Key::new("sha256", "ModelSpec", "sha256", rule::<Sha256>()).needed(),
         Key::new("layout", "ModelSpec", "layout", "text"),
+        Key::new("labels", "ModelSpec", "labels", rule::<RelativePath>()),
         Key::new("providers", "ModelSpec", "providers", "list of texts").default("empty"),
-        Key::new("threads", "ModelSpec", "threads", "number").within(bounds::THREADS, number),
+        Key::new("threads", "ModelSpec", "threads", "number").bounded(&bounds::THREADS, number),
     ];
-    Section {
-        title: "[[model]]",
-        note: "Checked, but not used yet: models are being built.".to_owned(),
-        keys,
-    }
+    let note = "An ONNX model that the host runs for the lambda; see [models](models.md).";
+    Section { title: "[[model]]", note: note.to_owned(), keys }
 }
 
 /// Returns the rule for a type of name, from the error for an empty one.

@@ -195,12 +195,16 @@ pub struct ModelSpec {
     pub file: RelativePath,
     /// SHA-256 of the file.
     pub sha256: Sha256,
-    /// Layout of the outputs, for example `yolov8`; without it they stay tensors.
+    /// Layout of a detector's input and outputs: `ultralytics`, `yolox`, `nms-free` or `nanodet`.
+    /// Without it, the model has no `detect`.
     pub layout: Option<String>,
-    /// Execution providers in order of preference; if empty, the vehicle chooses.
+    /// Text file with the name of a class in each line, relative to the build folder.
+    pub labels: Option<RelativePath>,
+    /// What runs the model, in order of preference: `tensorrt`, `cuda`, `cpu`, or `onnxruntime` and
+    /// `rten` for one that runs on the CPU. If empty, `cpu`.
     pub providers: Vec<String>,
-    /// Threads that one run may use; without it, the vehicle chooses.
-    pub threads: Option<usize>,
+    /// Threads that one run may use.
+    pub threads: usize,
 }
 
 /// `[record]`: the clip that an event trigger opens.

@@ -23,6 +23,10 @@ pub struct Handover {
     pub ingress: Option<OwnedFd>,
     /// The lambda's end of its connection to the recorder.
     pub recorder: Option<OwnedFd>,
+    /// The lambda's end of its connection to `gleaner-inference`.
+    pub inference: Option<OwnedFd>,
+    /// The file in which `gleaner-inference` notes the models that it loads and runs.
+    pub running: Option<OwnedFd>,
 }
 
 /// Name of a connection.
@@ -32,10 +36,12 @@ enum ConnectionName {
     Control,
     Ingress,
     Recorder,
+    Inference,
+    Running,
 }
 
 /// Largest number of connections in a message.
-const CONNECTIONS: usize = 3;
+const CONNECTIONS: usize = 4;
 
 impl Handover {
     /// Sends the connections. It waits while the other side does not read an earlier message.
@@ -64,6 +70,8 @@ impl Handover {
             (ConnectionName::Control, &self.control),
             (ConnectionName::Ingress, &self.ingress),
             (ConnectionName::Recorder, &self.recorder),
+            (ConnectionName::Inference, &self.inference),
+            (ConnectionName::Running, &self.running),
         ];
         let (names, descriptors): (Vec<ConnectionName>, Vec<BorrowedFd<'_>>) =
             all.iter().filter_map(|(name, fd)| Some((*name, fd.as_ref()?.as_fd()))).unzip();
@@ -112,6 +120,8 @@ impl Handover {
                 ConnectionName::Control => &mut handover.control,
                 ConnectionName::Ingress => &mut handover.ingress,
                 ConnectionName::Recorder => &mut handover.recorder,
+                ConnectionName::Inference => &mut handover.inference,
+                ConnectionName::Running => &mut handover.running,
             };
             if connection.replace(descriptor).is_some() {
                 return Err(malformed(format!("it names {name:?} twice").to_lowercase()));
@@ -198,7 +208,7 @@ mod tests {
     fn each_connection_arrives_under_its_name_and_can_be_replaced_later() {
         let (starter_end, program_end) = UnixStream::pair().unwrap();
         let ((control, control_end), (ingress, ingress_end)) = (connection(), connection());
-        Handover { control, ingress, recorder: None }.send(&starter_end).unwrap();
+        Handover { control, ingress, ..Handover::default() }.send(&starter_end).unwrap();
         let (ingress, later_end) = connection();
         Handover { ingress, ..Handover::default() }.send(&starter_end).unwrap();
 

@@ -44,6 +44,7 @@ impl WokenBy {
             fault: Some(fault),
             fuel,
             run_ns,
+            model_ns: 0,
         }
     }
 }

@@ -1,5 +1,5 @@
 //! Messages between Gleaner programs: reports of a runtime, result items, exit records, frames to
-//! and from the recorder and the ingress.
+//! and from the recorder, the ingress and the process that runs models.
 //!
 //! Nothing here runs a lambda or listens on a socket. Programs share these types; they never link
 //! each other.
@@ -9,6 +9,7 @@ mod drive_info;
 mod drive_time;
 mod exit_record;
 mod handover;
+pub mod inference;
 pub mod ingress;
 mod interrupted_wake;
 mod isolation;

@@ -25,6 +25,8 @@ pub enum Deadline {
     Short,
     /// It checks the deadline before and during its work.
     Checked,
+    /// It waits for the process that runs models, as long as `model_time` in `[limits]` allows.
+    Waiting,
 }
 
 /// A call of an operation, in the language of `driver`, with the host's price.
@@ -42,9 +44,7 @@ pub enum Price {
     /// A unit for each eight bytes that the host touches, plus the base price of a call, for a
     /// cheap and an expensive call. If both are equal, all calls have this price.
     Bytes([PricedCall; 2]),
-    /// As [`Price::Bytes`], plus the price of another call, for creating an object.
-    Create([PricedCall; 2]),
-    /// It cannot be called in this build, because no object has this method.
+    /// The tests cannot call it: it is a method of a model, and `driver` has none.
     Never,
 }
 
@@ -54,20 +54,18 @@ const CALL: u64 = 20;
 impl Price {
     /// The two calls, with their price in units of fuel; `None` if it cannot be called.
     pub fn calls(self) -> Option<[(&'static [u8], u64); 2]> {
-        let (calls, each) = match self {
-            Self::Bytes(calls) => (calls, CALL),
-            Self::Create(calls) => (calls, 2 * CALL),
-            Self::Never => return None,
-        };
-        Some(calls.map(|call| (call.arguments, each + call.bytes / 8)))
+        match self {
+            Self::Bytes(calls) => Some(calls.map(|call| (call.arguments, CALL + call.bytes / 8))),
+            Self::Never => None,
+        }
     }
 }
 
 /// A prelude for programs of `driver`: opens all topics, in the order program, raw camera, coded
 /// camera; of the raw one the fields seconds of the stamp and width; the newest sample of both; the
-/// raw one as a frame; `b` in scratch.
+/// raw one as a frame; `b` in scratch; a tensor of 32 by 32 32-bit floats.
 pub fn setup() -> Vec<u8> {
-    use Operation::{AsFrame, Field, Input, Newest, ScratchPut};
+    use Operation::{AsFrame, Field, Input, Newest, ScratchPut, TensorCreate};
     let steps = [
         (DriverStep::Extra(Extra::Reset), &[][..]),
         (DriverStep::Call(Input), &[0]),
@@ -79,6 +77,7 @@ pub fn setup() -> Vec<u8> {
         (DriverStep::Call(Newest), &[2]),
         (DriverStep::Call(AsFrame), &[0]),
         (DriverStep::Call(ScratchPut), &[1, 0, 16, 0, 0]),
+        (DriverStep::Call(TensorCreate), &[0, 0, 32, 32]),
     ];
     steps.into_iter().flat_map(|(step, arguments)| step.with(arguments)).collect()
 }

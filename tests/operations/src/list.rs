@@ -1,8 +1,8 @@
 //! The list. When a line is added here, the compiler and the tests report what is missing
 //! elsewhere.
 
-use crate::Deadline::{self, Checked, Short};
-use crate::Price::{self, Bytes, Create, Never};
+use crate::Deadline::{self, Checked, Short, Waiting};
+use crate::Price::{self, Bytes, Never};
 use crate::{MESSAGE, PIXELS, PricedCall};
 
 /// Each line: the name in Rust, the name in the WIT, the handling of the deadline, and the price
@@ -92,18 +92,26 @@ operations! {
     Start "trigger.start" Short Bytes([call(&[1, b's'], 74), call(&[255, 0, 16, 0, 0], 4096 + 73)]);
     Stop "trigger.stop" Short Bytes([call(&[1, b's'], 1), call(&[255, 0, 16, 0, 0], 4096)]);
     Log "log.log" Short Bytes([call(&[1, 1, b'l'], 1), call(&[1, 255, 0, 16, 0, 0], 4096)]);
-    FromValues "inference.tensor.from-values" Short
-        Create([
-            call(&[1, 0, 0, 0, 1, 0, 0, 0, 1, 0], 8 + 4),
-            call(&[1, 0, 0, 0, 0, 4, 0, 0, 0, 4], 8 + 4096),
-        ]);
-    FromFrame "inference.tensor.from-frame" Short each(&[0, 8, 0, 0, 0, 8, 0, 0, 0, 100], 0);
-    Open "inference.model.open" Short
-        Create([call(&[1, b'm'], 1), call(&[255, 0, 16, 0, 0], 4096)]);
-    Shape "inference.tensor.shape" Short Never;
-    TensorRead "inference.tensor.read" Short Never;
-    Run "inference.model.run" Short Never;
-    Detect "inference.model.detect" Short Never;
+    // Four bytes for each dimension, and those of the tensor.
+    TensorCreate "inference.tensor.create" Short
+        Bytes([call(&[0, 0, 1, 1], 8 + 4), call(&[0, 0, 32, 32], 8 + 4096)]);
+    FromFrame "inference.tensor.from-frame" Checked
+        Bytes([call(&[0, 0, 8, 8], 12 * 8 * 8), call(&[0, 0, 64, 64], 12 * 64 * 64)]);
+    Element "inference.tensor.element" Short each(&[0], 0);
+    Shape "inference.tensor.shape" Short each(&[0], 0);
+    TensorSize "inference.tensor.size" Short each(&[0], 0);
+    TensorRead "inference.tensor.read" Short
+        Bytes([call(&[0], 0), call(&[0, 0, 0, 0, 0, 0, 0, 0, 0, 160, 15, 0, 0], 4000)]);
+    TensorWrite "inference.tensor.write" Short
+        Bytes([call(&[0], 0), call(&[0, 0, 0, 0, 0, 0, 0, 0, 0, 160, 15, 0, 0], 4000)]);
+    Open "inference.model.open" Waiting
+        Bytes([call(&[1, b'm'], 1), call(&[255, 0, 16, 0, 0], 4096)]);
+    ModelInputs "inference.model.inputs" Short Never;
+    ModelOutputs "inference.model.outputs" Short Never;
+    Labels "inference.model.labels" Short Never;
+    Runtime "inference.model.runtime" Short Never;
+    Run "inference.model.run" Waiting Never;
+    Detect "inference.model.detect" Waiting Never;
     ScratchPut "scratch.put" Short
         Bytes([call(&[0, 0, 0, 0, 0], 1), call(&[0, 0, 16, 0, 0], 1 + 4096)]);
     Append "scratch.append" Short Bytes([call(&[0, 0, 0], 1), call(&[0, 0, 16], 1 + 4096)]);

@@ -21,6 +21,7 @@ pub enum Extra {
     ForgetField,
     ForgetSample,
     ForgetFrame,
+    ForgetTensor,
     EventWithTexts,
     EventWithMany,
     ColumnAtOnce,
@@ -35,12 +36,13 @@ pub enum Extra {
 
 impl Extra {
     /// All of them.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::Reset,
         Self::ForgetTopic,
         Self::ForgetField,
         Self::ForgetSample,
         Self::ForgetFrame,
+        Self::ForgetTensor,
         Self::EventWithTexts,
         Self::EventWithMany,
         Self::ColumnAtOnce,

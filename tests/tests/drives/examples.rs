@@ -125,13 +125,15 @@ fn all_results() -> Result<(), Failed> {
     // The first image was taken by day; and each refusal is the expected one.
     let first = &rust.decisions[0].triggers;
     same(&first[2].score.is_some_and(|luma| (75.0..132.0).contains(&luma)), &true)?;
-    let refusals = first[3].attributes.values().map(|kind| kind.as_str().unwrap_or_default());
+    same(&first[3].attributes["pixels"].as_i64().is_some_and(|hash| hash >= 0), &true)?;
+    let refusals = first[4].attributes.values().map(|kind| kind.as_str().unwrap_or_default());
     same(&refusals.collect::<Vec<_>>(), &REFUSALS.to_vec())
 }
 
 /// Labels that `probe` triggers in each wake, and the refusals that it provokes, in its order.
-const PROBED: [&str; 6] = ["topic", "sample", "frame", "refusals", "recording", "recording"];
-const REFUSALS: [&str; 13] = [
+const PROBED: [&str; 7] =
+    ["topic", "sample", "frame", "tensor", "refusals", "recording", "recording"];
+const REFUSALS: [&str; 14] = [
     "no-such-input",
     "no-such-field",
     "wrong-field",
@@ -142,9 +144,10 @@ const REFUSALS: [&str; 13] = [
     "no-room",
     "invalid",
     "invalid",
-    "no-runtime",
-    "no-runtime",
-    "no-runtime",
+    "no-such-model",
+    "wrong-input",
+    "wrong-input",
+    "wrong-input",
 ];
 
 fn at(drive: &Path, lambda: &str, kind: &str, onsets: &[f64]) -> Result<(), Failed> {

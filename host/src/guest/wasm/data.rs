@@ -271,7 +271,7 @@ impl Hosted {
 
     /// Resolves a handle for a call that only reads a value, and charges the call, which is charged
     /// nowhere else.
-    fn resolve<T: 'static>(&self, handle: &Resource<T>) -> wasmtime::Result<&T> {
+    pub(super) fn resolve<T: 'static>(&self, handle: &Resource<T>) -> wasmtime::Result<&T> {
         self.session.fuel().charge_call()?;
         Ok(self.handles.get(handle)?)
     }

@@ -142,7 +142,9 @@ impl Guest for WasmGuest {
             .map_or_else(|| self.session.clone().during_init(|| self.start()), Ok)
         {
             Ok(live) => live,
-            Err(fault) => return WakeOutcome { result: Err(fault), fuel: None, run_ns: None },
+            Err(fault) => {
+                return WakeOutcome { result: Err(fault), fuel: None, run_ns: None, model_ns: None };
+            }
         };
         let deadline = self.deadline.as_ref().map(|deadline| (deadline, self.limits.deadline));
         let mut call = GuestCall::begin(&mut live.store, self.limits.fuel, deadline);
@@ -156,7 +158,7 @@ impl Guest for WasmGuest {
         // The depth of a full stack depends on the processor for which the code was compiled, and
         // so does the fuel until then.
         let stacked = result.as_ref().is_err_and(|fault| fault.kind == FaultKind::Stack);
-        WakeOutcome { result, fuel: (!stacked).then_some(fuel), run_ns: None }
+        WakeOutcome { result, fuel: (!stacked).then_some(fuel), run_ns: None, model_ns: None }
     }
 
     fn discard(&mut self) {

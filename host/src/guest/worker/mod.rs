@@ -77,6 +77,8 @@ struct CallOutcome {
 struct WakeMessage {
     at_ns: i64,
     run_ns: u64,
+    #[serde(default, skip_serializing_if = "is_zero")]
+    model_ns: u64,
     call: CallOutcome,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     triggers: Vec<Trigger>,

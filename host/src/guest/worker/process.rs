@@ -19,6 +19,9 @@ use super::{MESSAGE_MAX, WorkerMessage};
 /// The argument that makes `gleaner-runtime` a worker; it comes first.
 pub const WORKER: &str = "--worker";
 
+/// The argument of a runtime whose starter passes a connection over standard input.
+const PASSES_INFERENCE: &str = "--starter-passes-inference";
+
 /// Time after SIGTERM until a worker is killed. Its standard error may take as long.
 const UNTIL_KILLED: Duration = Duration::from_secs(2);
 /// Bytes of standard error that are buffered until it is known whether they may come from the
@@ -112,7 +115,13 @@ impl WorkerProcess {
         let mut command = Command::new(&shim);
         command.arg(starter).args(["--exit-record", "-", "--"]);
         command.arg(runtime).arg(WORKER).args(arguments).args(std::env::args_os().skip(1));
-        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        // A starter that passes a connection to models passes it to this worker, over the standard
+        // input that it shares with this process.
+        let passes = std::env::args_os().any(|argument| argument == PASSES_INFERENCE);
+        command
+            .stdin(if passes { Stdio::inherit() } else { Stdio::null() })
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped());
         let mut shim = command
             .spawn()
             .map_err(|error| failed(&format!("cannot start `{}`", shim.display()), &error))?;

@@ -260,20 +260,32 @@ impl Guest for RemoteGuest {
     }
 
     fn wake(&mut self, wake: Wake) -> WakeOutcome {
-        let WakeMessage { run_ns, call, triggers, looked, .. } = match self.woken(&wake) {
+        let WakeMessage { run_ns, model_ns, call, triggers, looked, .. } = match self.woken(&wake) {
             Ok(woken) => woken,
-            Err(fault) => return WakeOutcome { result: Err(fault), fuel: None, run_ns: None },
+            Err(fault) => {
+                return WakeOutcome { result: Err(fault), fuel: None, run_ns: None, model_ns: None };
+            }
         };
         for trigger in triggers {
             if let Err(error) = self.session.relay_trigger(trigger) {
                 let fault = self.killed(Some(&format!("an invalid trigger: {error}")));
-                return WakeOutcome { result: Err(fault), fuel: None, run_ns: None };
+                return WakeOutcome {
+                    result: Err(fault),
+                    fuel: None,
+                    run_ns: None,
+                    model_ns: None,
+                };
             }
         }
         for (topic, back) in self.session.inputs().iter().zip(looked) {
             back.into_iter().for_each(|back| topic.relay_look_back(back));
         }
-        WakeOutcome { result: self.called(call), fuel: None, run_ns: Some(run_ns) }
+        WakeOutcome {
+            result: self.called(call),
+            fuel: None,
+            run_ns: Some(run_ns),
+            model_ns: Some(model_ns),
+        }
     }
 
     fn expects(&mut self, wake: &Wake) -> bool {

@@ -163,6 +163,7 @@ impl Guest for SendingGuest {
         self.messages.send(&WorkerMessage::Woken(WakeMessage {
             at_ns,
             run_ns,
+            model_ns: self.session.models().run_ns(),
             call,
             triggers,
             looked,

@@ -11,6 +11,7 @@ use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, Tightened};
 use gleaner_recorder::{ClipStatements, FalseStatement};
 use serde_json::Value;
 
+use crate::api::models::Models;
 use crate::input::Remap;
 use crate::journal::{CLOCK_OF_DRIVE, LambdaIdentity};
 use crate::replay::journal_file;
@@ -135,7 +136,8 @@ impl ReferenceJournal {
         manifest: &mut Manifest,
         drives: Drives,
     ) -> Result<ReplayOptions, Failure> {
-        let LambdaArgs { lambda: folder, set, remap: remaps, vehicle } = args;
+        let LambdaArgs { lambda: folder, set, remap: remaps, vehicle, .. } = args;
+        let passes_inference = args.starter_passes_inference;
         let header = self.reader.header();
         match &vehicle {
             Some(file) => tighten(manifest, file)?,
@@ -157,7 +159,9 @@ impl ReferenceJournal {
         } else {
             remaps
         };
-        let mut lambda = ConfiguredLambda { folder, build, config: Vec::new(), remaps, vehicle };
+        let (config, models) = (Vec::new(), Models::default());
+        let mut lambda =
+            ConfiguredLambda { folder, build, config, remaps, vehicle, models, passes_inference };
         // The files first: another lambda may not even have the keys of the journal's config.
         let without_config = JournalHeader { config: serde_json::Map::new(), ..header.clone() };
         compare(&without_config, &lambda, manifest)?;

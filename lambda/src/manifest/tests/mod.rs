@@ -205,14 +205,15 @@ fn a_model_is_parsed_with_all_its_keys() {
     let digest = "0123456789abcdef".repeat(4);
     let more = format!(
         "[[model]]\nname = \"detector\"\nfile = \"models/d.onnx\"\nsha256 = \"{digest}\"\n\
-         layout = \"yolov8\"\n\
+         layout = \"yolox\"\nlabels = \"coco.txt\"\n\
          providers = [\"cuda\", \"cpu\"]\nthreads = 2"
     );
     let manifest = Manifest::parse(&format!("{TICKER}{more}"), "lambda.toml").unwrap();
     let model = &manifest.models[0];
     assert_eq!(model.file.as_path(), Path::new("models/d.onnx"));
-    assert_eq!((model.sha256.as_str(), model.threads), (digest.as_str(), Some(2)));
-    assert_eq!((model.layout.as_deref(), model.providers.len()), (Some("yolov8"), 2));
+    assert_eq!((model.sha256.as_str(), model.threads), (digest.as_str(), 2));
+    assert_eq!(model.labels.as_ref().map(|it| it.as_path()), Some(Path::new("coco.txt")));
+    assert_eq!((model.layout.as_deref(), model.providers.len()), (Some("yolox"), 2));
 }
 
 #[test]
@@ -232,7 +233,7 @@ fn as_json_a_manifest_has_the_keys_of_the_file_and_its_defaults() {
             r#""depth":64,"max_size":4096,"decoded_size":null,"hold":8,"qos":"auto"}],"#,
             r#""model":[],"record":null,"#,
             r#""limits":{"fuel":50000000,"init_fuel":1000000000,"deadline_ns":50000000,"#,
-            r#""init_deadline_ns":10000000000,"#,
+            r#""init_deadline_ns":10000000000,"model_time_ns":1000000000,"#,
             r#""memory":67108864,"tables":20000,"stack":524288,"handles":4096,"frames":256,"#,
             r#""call_bytes":1048576,"#,
             r#""call_items":65536,"scratch":0,"log_lines":100,"log_bytes":409600,"#,

@@ -15,7 +15,7 @@ pub(crate) const HEAD: usize = 5;
 pub(crate) mod tag {
     /// Starter to recorder: a lambda, as JSON, with its socket.
     pub(crate) const ADD: u8 = 1;
-    /// Starter to recorder: complete open clips and exit. Starter to ingress: exit.
+    /// Starter to recorder: complete open clips and exit. Starter to others: exit.
     pub(crate) const STOP: u8 = 2;
     /// Starter to ingress: a reader, as JSON, with its socket.
     pub(crate) const ADD_READER: u8 = 3;
@@ -25,6 +25,10 @@ pub(crate) mod tag {
     pub(crate) const BEGIN: u8 = 5;
     /// Starter to a program that it starts: names of connections as JSON, with their sockets.
     pub(crate) const HANDOVER: u8 = 6;
+    /// Starter to gleaner-inference: a model, as JSON, with its file.
+    pub(crate) const MODEL_FILE: u8 = 7;
+    /// Starter to gleaner-inference: a lambda, as JSON, with its socket.
+    pub(crate) const ADD_CLIENT: u8 = 8;
     /// Lambda to recorder: the header of its journal, as JSON. Sent once, first.
     pub(crate) const HELLO: u8 = 16;
     /// Lambda to recorder: `i64` time of the decision, `u32` number of missing wakes before it, and
@@ -61,6 +65,8 @@ pub(crate) fn name(tag: u8) -> &'static str {
         tag::ADD_TOPICS => "add topics",
         tag::BEGIN => "begin",
         tag::HANDOVER => "handover",
+        tag::MODEL_FILE => "model file",
+        tag::ADD_CLIENT => "add client",
         tag::READER => "message",
         tag::DEFINITIONS => "definitions",
         tag::PUBLISH => "publish",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Callable
 
 import numpy as np
-from gleaner import Context, Error, Model, Preprocess, Roi, Sample, Tensor
+from gleaner import Context, Error, InferenceError, Model, Preprocess, Roi, Sample, Tensor
 
 
 class Lambda:
@@ -29,6 +29,7 @@ class Lambda:
         self.topics(ctx)
         self.samples(ctx, sample)
         self.frames(ctx, sample)
+        self.tensors(ctx, sample)
         self.refusals(ctx, sample)
         ctx.log("info", f"{self.forward.path} {ctx.now_ns()}")
         ctx.start("recording", why="probing")
@@ -99,8 +100,31 @@ class Lambda:
             gray=fnv1a(gray.array().tobytes()),
         )
 
+    def tensors(self, ctx: Context, sample: Sample) -> None:
+        tensor = Tensor.create("int16", [2, 3])
+        tensor.write(3, bytes([1, 2, 3, 4, 5]))
+        assert np.array_equal(tensor.array(), np.frombuffer(tensor.read(), "<i2").reshape(2, 3))
+        values = Tensor.from_values(np.array([[0.5], [-1.0], [2.0]], np.float32))
+        how = Preprocess(32, 24, placement="corner", bgr=True, mean=(0.5, 0.25, 0.0))
+        try:
+            pixels = fnv1a(Tensor.from_frame(sample.as_frame(), how).read())
+        except InferenceError:  # A fake host does not convert frames.
+            pixels = -1
+        ctx.event(
+            "tensor",
+            float(values.array().sum()),
+            element=tensor.element,
+            shape=str(tensor.shape),
+            size=tensor.size,
+            read=fnv1a(tensor.read(2, 9)),
+            end=len(tensor.read(11, 9)),
+            values=fnv1a(values.read()),
+            pixels=pixels,
+        )
+
     def refusals(self, ctx: Context, sample: Sample) -> None:
         frame = sample.as_frame()
+        tensor = Tensor.create("uint8", [4])
         ctx.event(
             "refusals",
             0.0,
@@ -115,8 +139,9 @@ class Lambda:
             label=kind(lambda: ctx.event("", 0.0)),
             score=kind(lambda: ctx.event("x", float("inf"))),
             model=kind(lambda: Model.open("nothing")),
-            values=kind(lambda: Tensor.from_values([1], [0.5])),
-            tensor=kind(lambda: Tensor.from_frame(frame, Preprocess(8, 8))),
+            empty=kind(lambda: Tensor.create("boolean", [2, 0])),
+            write=kind(lambda: tensor.write(1, bytes(4))),
+            tensor=kind(lambda: Tensor.from_frame(frame, Preprocess(0, 8))),
         )
 
     def newest(self) -> Sample:

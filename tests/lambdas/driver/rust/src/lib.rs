@@ -8,7 +8,7 @@
 
 use gleaner_operations::{DriverStep, Extra, Operation};
 use gleaner_sdk::data::{Frame, Roi};
-use gleaner_sdk::inference::{DetectOptions, Model, Preprocess, Tensor};
+use gleaner_sdk::inference::{DetectOptions, ElementType, Model, Placement, Preprocess, Tensor};
 use gleaner_sdk::log::{error, trace, warn};
 use gleaner_sdk::{
     Config, Field, Lambda, Result, Sample, Topic, event, input, inputs, now_ns, scratch, start,
@@ -120,10 +120,7 @@ impl HeldObjects {
                 drop(of(&self.frames, bytes).map(|it| it.histogram(bytes.roi())))
             }
             Operation::Resize => self.frames.extend(of(&self.frames, bytes).and_then(|it| {
-                let [width, height] = match bytes.u8() % 2 {
-                    0 => [bytes.u8().into(), bytes.u8().into()],
-                    _ => [bytes.u32(), bytes.u32()],
-                };
+                let [width, height] = bytes.size();
                 it.resize(width, height).ok()
             })),
             Operation::ToGray => {
@@ -136,29 +133,39 @@ impl HeldObjects {
             Operation::Start => drop(start(&bytes.text()).with("k", bytes.u8() > 0).send()),
             Operation::Stop => drop(stop(&bytes.text())),
             Operation::Log => [error, warn, trace][usize::from(bytes.u8() % 3)](&bytes.text()),
-            Operation::FromValues => {
-                let shape = [bytes.u32(), bytes.u32()];
-                self.tensors
-                    .extend(Tensor::from_values(&shape, &vec![0.5; usize::from(bytes.u16())]));
+            Operation::TensorCreate => {
+                self.tensors.extend(Tensor::create(bytes.element(), &bytes.shape()))
             }
             Operation::FromFrame => {
                 let made =
                     of(&self.frames, bytes).map(|it| Tensor::from_frame(it, bytes.preprocess()));
                 self.tensors.extend(made.and_then(Result::ok));
             }
+            Operation::Element => drop(of(&self.tensors, bytes).map(Tensor::element)),
             Operation::Shape => drop(of(&self.tensors, bytes).map(Tensor::shape)),
+            Operation::TensorSize => drop(of(&self.tensors, bytes).map(Tensor::size)),
             Operation::TensorRead => {
                 drop(of(&self.tensors, bytes).map(|it| it.read(bytes.u64(), bytes.u32())))
             }
+            Operation::TensorWrite => drop(
+                of(&self.tensors, bytes)
+                    .map(|it| it.write(bytes.u64(), &vec![1; bytes.u32() as usize % TEXT])),
+            ),
             Operation::Open => self.models.extend(Model::open(&bytes.text())),
+            Operation::ModelInputs => drop(of(&self.models, bytes).map(Model::inputs)),
+            Operation::ModelOutputs => drop(of(&self.models, bytes).map(Model::outputs)),
+            Operation::Labels => drop(of(&self.models, bytes).map(Model::labels)),
+            Operation::Runtime => drop(of(&self.models, bytes).map(Model::runtime)),
             Operation::Run => {
-                let tensors: Vec<_> = of(&self.tensors, bytes).into_iter().collect();
-                drop(of(&self.models, bytes).map(|it| it.run(&tensors)));
+                let name = bytes.text();
+                let inputs: Vec<_> =
+                    of(&self.tensors, bytes).map(|it| (name.as_str(), it)).into_iter().collect();
+                drop(of(&self.models, bytes).map(|it| it.run(&inputs)));
             }
             Operation::Detect => {
-                let frame = of(&self.frames, bytes);
+                let (frame, classes) = (of(&self.frames, bytes), vec![bytes.text()]);
                 let (min_score, max_iou, max_count) = (0.0, f32::NAN, bytes.u32());
-                let options = DetectOptions { classes: Vec::new(), min_score, max_iou, max_count };
+                let options = DetectOptions { classes, min_score, max_iou, max_count };
                 drop(
                     of(&self.models, bytes)
                         .zip(frame)
@@ -185,6 +192,7 @@ impl HeldObjects {
             Extra::ForgetField => forget(&mut self.fields, bytes),
             Extra::ForgetSample => forget(&mut self.samples, bytes),
             Extra::ForgetFrame => forget(&mut self.frames, bytes),
+            Extra::ForgetTensor => forget(&mut self.tensors, bytes),
             Extra::EventWithTexts => {
                 drop(
                     event("e", 0.5)
@@ -316,17 +324,49 @@ impl Bytes<'_> {
         }
     }
 
+    fn size(&mut self) -> [u32; 2] {
+        match self.u8() % 2 {
+            0 => [self.u8().into(), self.u8().into()],
+            _ => [self.u32(), self.u32()],
+        }
+    }
+
+    fn shape(&mut self) -> Vec<u32> {
+        match self.u8() % 3 {
+            0 => vec![self.u8().into(), self.u8().into()],
+            1 => vec![self.u32(), self.u32()],
+            _ => vec![1; usize::from(self.u8())],
+        }
+    }
+
+    fn element(&mut self) -> ElementType {
+        let elements = [
+            ElementType::Float32,
+            ElementType::Float16,
+            ElementType::Float64,
+            ElementType::Int8,
+            ElementType::Int16,
+            ElementType::Int32,
+            ElementType::Int64,
+            ElementType::Uint8,
+            ElementType::Boolean,
+        ];
+        elements[usize::from(self.u8()) % elements.len()]
+    }
+
     fn preprocess(&mut self) -> Preprocess {
-        let (width, height, fill) = (self.u32(), self.u32(), self.u8());
-        let (mean, scale) = ((0.0, 0.0, 0.0), (f32::NAN, 1.0, 1.0));
+        let ([width, height], flags) = (self.size(), self.u8());
+        let placements = [Placement::Stretch, Placement::Centre, Placement::Corner];
         Preprocess {
-            width,
-            height,
-            letterbox: fill > 99,
-            fill,
-            bgr: fill.is_multiple_of(2),
-            mean,
-            scale,
+            placement: placements[usize::from(flags) % placements.len()],
+            fill: flags,
+            bgr: flags & 4 != 0,
+            channels_last: flags & 8 != 0,
+            bytes: flags & 16 != 0,
+            scale: if flags & 32 != 0 { f32::INFINITY } else { 1.0 },
+            mean: (if flags & 64 != 0 { f32::NAN } else { 0.0 }, 1.0, 2.0),
+            deviation: (1.0, 2.0, if flags & 128 != 0 { 0.0 } else { 3.0 }),
+            ..Preprocess::new(width, height)
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Calls every function of the interface and reports the results. Its twin must get the same.
 
 use gleaner_sdk::data::{Roi, Value, encoding_name};
-use gleaner_sdk::inference::{Model, Preprocess, Tensor};
+use gleaner_sdk::inference::{ElementType, Model, Placement, Preprocess, Tensor, element_name};
 use gleaner_sdk::{
     Config, Error, Field, Lambda, Result, Sample, Topic, event, input, inputs, log, now_ns, start,
     stop,
@@ -50,6 +50,7 @@ impl Lambda for Probe {
         self.topics()?;
         self.samples(&sample)?;
         self.frames(&sample)?;
+        self.tensors(&sample)?;
         self.refusals(&sample)?;
         log::info(&format!("{} {}", self.forward.path(), now_ns()));
         start("recording").with("why", "probing").send()?;
@@ -145,18 +146,32 @@ impl Probe {
             .send()
     }
 
+    fn tensors(&self, sample: &Sample) -> Result<()> {
+        let tensor = Tensor::create(ElementType::Int16, &[2, 3])?;
+        tensor.write(3, &[1, 2, 3, 4, 5])?;
+        let values = Tensor::from_values(&[3, 1], &[0.5_f32, -1.0, 2.0])?;
+        let how = Preprocess {
+            placement: Placement::Corner,
+            bgr: true,
+            mean: (0.5, 0.25, 0.0),
+            ..Preprocess::new(32, 24)
+        };
+        // A fake host does not convert frames.
+        let pixels = Tensor::from_frame(&sample.as_frame()?, how);
+        event("tensor", values.values::<f32>()?.iter().copied().map(f64::from).sum())
+            .with("element", element_name(tensor.element()))
+            .with("shape", format!("{:?}", tensor.shape()).as_str())
+            .with("size", tensor.size() as i64)
+            .with("read", fnv1a(&tensor.read(2, 9)))
+            .with("end", tensor.read(11, 9).len() as i64)
+            .with("values", fnv1a(&values.read(0, u32::MAX)))
+            .with("pixels", pixels.map_or(-1, |pixels| fnv1a(&pixels.read(0, u32::MAX))))
+            .send()
+    }
+
     fn refusals(&self, sample: &Sample) -> Result<()> {
         let frame = sample.as_frame()?;
-        let (mean, scale) = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0));
-        let how = Preprocess {
-            width: 8,
-            height: 8,
-            letterbox: false,
-            fill: 114,
-            bgr: false,
-            mean,
-            scale,
-        };
+        let tensor = Tensor::create(ElementType::Uint8, &[4])?;
         event("refusals", 0.0)
             .with("input", kind(input("nothing")))
             .with("field", kind(self.imu.field("nothing")))
@@ -172,8 +187,9 @@ impl Probe {
             .with("label", kind(event("", 0.0).send()))
             .with("score", kind(event("x", f64::INFINITY).send()))
             .with("model", kind(Model::open("nothing")))
-            .with("values", kind(Tensor::from_values(&[1], &[0.5])))
-            .with("tensor", kind(Tensor::from_frame(&frame, how)))
+            .with("empty", kind(Tensor::create(ElementType::Boolean, &[2, 0])))
+            .with("write", kind(tensor.write(1, &[0; 4])))
+            .with("tensor", kind(Tensor::from_frame(&frame, Preprocess::new(0, 8))))
             .send()
     }
 }

@@ -4,8 +4,8 @@ use std::time::Duration;
 
 /// Delay before the first restart; it doubles with each further one.
 const DELAY: Duration = Duration::from_secs(1);
-/// As [`DELAY`], of an ingress: all samples are lost meanwhile.
-const DELAY_INGRESS: Duration = Duration::from_millis(100);
+/// As [`DELAY`], of a process that all lambdas need.
+const DELAY_SERVICE: Duration = Duration::from_millis(100);
 /// Maximum delay, so that a broken deployment does not occupy a core with restarts.
 const DELAY_MAX: Duration = Duration::from_secs(30);
 /// Run time after which the delay is reset.
@@ -13,22 +13,22 @@ const HEALTHY: Duration = Duration::from_secs(60);
 
 /// The delay before the next restart of something.
 #[derive(Clone, Debug)]
-pub(super) struct RestartDelay {
+pub(crate) struct RestartDelay {
     first: Duration,
     next: Duration,
 }
 
 impl RestartDelay {
-    pub(super) fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self { first: DELAY, next: DELAY }
     }
 
-    pub(super) fn of_ingress() -> Self {
-        Self { first: DELAY_INGRESS, next: DELAY_INGRESS }
+    pub(crate) fn of_service() -> Self {
+        Self { first: DELAY_SERVICE, next: DELAY_SERVICE }
     }
 
     /// Returns the delay after a failure, before which it `ran` for this time.
-    pub(super) fn after(&mut self, ran: Duration) -> Duration {
+    pub(crate) fn after(&mut self, ran: Duration) -> Duration {
         let delay = if ran >= HEALTHY { self.first } else { self.next };
         self.next = (delay * 2).min(DELAY_MAX);
         delay
@@ -46,7 +46,7 @@ mod tests {
         assert_eq!(broken, [1, 2, 4, 8, 16, 30, 30]);
         assert_eq!(delay.after(HEALTHY).as_secs(), 1);
         assert_eq!(delay.after(Duration::ZERO).as_secs(), 2);
-        let mut delay = RestartDelay::of_ingress();
+        let mut delay = RestartDelay::of_service();
         assert_eq!(delay.after(Duration::ZERO).as_millis(), 100);
         assert_eq!(delay.after(HEALTHY).as_millis(), 100);
     }

@@ -1,0 +1,249 @@
+//! Chooses backend and provider of a model: tries those of the manifest in order, and keeps the
+//! error of each.
+
+use super::{Backend, BackendError, ExecutionProvider, LoadOptions, LoadedGraph};
+use crate::inspect::ModelSignature;
+
+/// Names in the manifest.
+const KNOWN: &str = "cpu, cuda, tensorrt, rten and onnxruntime";
+
+/// The backends of this process.
+pub struct Backends {
+    rten: Box<dyn Backend>,
+    onnx_runtime: Result<Box<dyn Backend>, String>,
+}
+
+/// A loaded model, with the reason for its backend.
+pub struct ChosenGraph {
+    /// The model.
+    pub graph: Box<dyn LoadedGraph>,
+    /// Backend, version, provider and threads, such as `rten 0.27.0, cpu, 1 thread`.
+    pub runtime: String,
+    /// The reason for this choice, with the errors of those that were tried before.
+    pub reason: String,
+}
+
+/// A library that can be chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Library {
+    Rten,
+    OnnxRuntime,
+}
+
+/// A provider that the manifest names.
+#[derive(Debug, Clone, Copy)]
+struct NamedProvider<'a> {
+    name: &'a str,
+    library: Library,
+    provider: ExecutionProvider,
+}
+
+impl Backends {
+    /// Uses these backends. Without a library of ONNX Runtime, its place has the reason.
+    pub fn new(rten: Box<dyn Backend>, onnx_runtime: Result<Box<dyn Backend>, String>) -> Self {
+        Self { rten, onnx_runtime }
+    }
+
+    /// Loads a model with the first of `providers` that can run it; with any if none is named.
+    ///
+    /// # Errors
+    ///
+    /// An unknown provider, or the error of each provider.
+    pub fn load(
+        &self,
+        model: Vec<u8>,
+        providers: &[String],
+        threads: u32,
+        signature: &ModelSignature,
+    ) -> Result<ChosenGraph, BackendError> {
+        let any = ["cpu".to_owned()];
+        let names = if providers.is_empty() { &any[..] } else { providers };
+        let named: Vec<NamedProvider<'_>> =
+            names.iter().map(|name| self.named(name)).collect::<Result<_, _>>()?;
+        let mut errors = Vec::new();
+        let (mut model, last) = (Some(model), named.len() - 1);
+        for (index, named) in named.iter().enumerate() {
+            // The bytes are needed again only if another one may be tried.
+            let bytes = if index == last { model.take() } else { model.clone() };
+            let options = LoadOptions { provider: named.provider, threads, signature };
+            let loaded = self.backend(named.library).and_then(|backend| {
+                Ok((backend.version(), backend.load(bytes.unwrap_or_default(), &options)?))
+            });
+            match loaded {
+                Ok((version, graph)) => {
+                    let plural = if threads == 1 { "" } else { "s" };
+                    let provider = named.provider.name();
+                    let runtime = format!("{version}, {provider}, {threads} thread{plural}");
+                    let reason = self.reason(providers, named, &errors);
+                    return Ok(ChosenGraph { graph, runtime, reason });
+                }
+                Err(error) => errors.push(format!("`{}` failed: {error}", named.name)),
+            }
+        }
+        Err(BackendError::new(errors.join("; ")))
+    }
+
+    fn named<'a>(&self, name: &'a str) -> Result<NamedProvider<'a>, BackendError> {
+        let (library, provider) = match name {
+            "cpu" if self.onnx_runtime.is_err() => (Library::Rten, ExecutionProvider::Cpu),
+            "cpu" | "onnxruntime" => (Library::OnnxRuntime, ExecutionProvider::Cpu),
+            "rten" => (Library::Rten, ExecutionProvider::Cpu),
+            "cuda" => (Library::OnnxRuntime, ExecutionProvider::Cuda),
+            "tensorrt" => (Library::OnnxRuntime, ExecutionProvider::TensorRt),
+            _ => {
+                return Err(BackendError::new(format_args!(
+                    "provider `{name}` is unknown; known are {KNOWN}"
+                )));
+            }
+        };
+        Ok(NamedProvider { name, library, provider })
+    }
+
+    fn backend(&self, library: Library) -> Result<&dyn Backend, BackendError> {
+        match (library, &self.onnx_runtime) {
+            (Library::Rten, _) => Ok(self.rten.as_ref()),
+            (Library::OnnxRuntime, Ok(backend)) => Ok(backend.as_ref()),
+            (Library::OnnxRuntime, Err(reason)) => {
+                Err(BackendError::new(format_args!("there is no ONNX Runtime: {reason}")))
+            }
+        }
+    }
+
+    fn reason(
+        &self,
+        providers: &[String],
+        chosen: &NamedProvider<'_>,
+        errors: &[String],
+    ) -> String {
+        let mut reason = errors.to_vec();
+        reason.push(match (providers.is_empty(), errors.is_empty()) {
+            (true, _) => "the manifest names no provider".to_owned(),
+            (false, true) => format!("`{}` is the first provider in the manifest", chosen.name),
+            (false, false) => format!("`{}` is the next provider in the manifest", chosen.name),
+        });
+        match &self.onnx_runtime {
+            Err(missing) if chosen.library == Library::Rten && chosen.name == "cpu" => {
+                reason.push(format!("there is no ONNX Runtime: {missing}"));
+            }
+            _ => {}
+        }
+        reason.join("; ")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{StopSignal, TensorValue};
+    use super::*;
+
+    struct FakeBackend {
+        version: &'static str,
+        works: &'static [ExecutionProvider],
+    }
+
+    struct FakeGraph;
+
+    impl Backend for FakeBackend {
+        fn version(&self) -> String {
+            self.version.to_owned()
+        }
+
+        fn load(
+            &self,
+            model: Vec<u8>,
+            options: &LoadOptions<'_>,
+        ) -> Result<Box<dyn LoadedGraph>, BackendError> {
+            assert_eq!(model, b"model");
+            if self.works.contains(&options.provider) {
+                return Ok(Box::new(FakeGraph));
+            }
+            Err(BackendError::new(format_args!("no {}", options.provider.name())))
+        }
+    }
+
+    impl LoadedGraph for FakeGraph {
+        fn run(
+            &mut self,
+            _inputs: &[TensorValue],
+            _stop: &StopSignal,
+        ) -> Result<Vec<TensorValue>, BackendError> {
+            Ok(Vec::new())
+        }
+    }
+
+    const CPU: ExecutionProvider = ExecutionProvider::Cpu;
+
+    /// Returns the runtime and the reason, or the error.
+    fn chosen(
+        library: Option<&'static [ExecutionProvider]>,
+        providers: &[&str],
+        threads: u32,
+    ) -> Result<(String, String), String> {
+        let onnx_runtime =
+            library.map(|works| FakeBackend { version: "onnxruntime 1.23.2", works });
+        let backends = Backends::new(
+            Box::new(FakeBackend { version: "rten 0.27.0", works: &[CPU] }),
+            onnx_runtime.map(|it| Box::new(it) as Box<dyn Backend>).ok_or("no file".to_owned()),
+        );
+        let providers: Vec<String> = providers.iter().map(|name| (*name).to_owned()).collect();
+        let signature = ModelSignature::default();
+        let loaded = backends.load(b"model".to_vec(), &providers, threads, &signature);
+        loaded.map(|it| (it.runtime, it.reason)).map_err(|error| error.to_string())
+    }
+
+    fn pair(runtime: &str, reason: &str) -> Result<(String, String), String> {
+        Ok((runtime.to_owned(), reason.to_owned()))
+    }
+
+    #[test]
+    fn without_a_named_provider_the_library_is_used_if_there_is_one() {
+        assert_eq!(
+            chosen(None, &[], 1),
+            pair(
+                "rten 0.27.0, cpu, 1 thread",
+                "the manifest names no provider; there is no ONNX Runtime: no file"
+            )
+        );
+        assert_eq!(
+            chosen(Some(&[CPU]), &[], 2),
+            pair("onnxruntime 1.23.2, cpu, 2 threads", "the manifest names no provider")
+        );
+    }
+
+    #[test]
+    fn named_providers_are_tried_in_order_and_their_errors_are_kept() {
+        let all = ["tensorrt", "cuda", "cpu"];
+        assert_eq!(
+            chosen(Some(&[ExecutionProvider::Cuda, CPU]), &all, 1),
+            pair(
+                "onnxruntime 1.23.2, cuda, 1 thread",
+                "`tensorrt` failed: no tensorrt; `cuda` is the next provider in the manifest"
+            )
+        );
+        let (runtime, reason) = chosen(None, &all, 1).unwrap();
+        assert_eq!(runtime, "rten 0.27.0, cpu, 1 thread");
+        assert!(reason.starts_with("`tensorrt` failed: there is no ONNX Runtime: no file;"));
+        assert_eq!(
+            chosen(Some(&[CPU]), &["rten"], 1).unwrap(),
+            pair("rten 0.27.0, cpu, 1 thread", "`rten` is the first provider in the manifest")
+                .unwrap()
+        );
+    }
+
+    #[test]
+    fn a_provider_that_fails_is_never_replaced_silently() {
+        assert_eq!(
+            chosen(Some(&[CPU]), &["tensorrt", "cuda"], 1),
+            Err("`tensorrt` failed: no tensorrt; `cuda` failed: no cuda".to_owned())
+        );
+        assert_eq!(
+            chosen(None, &["onnxruntime"], 1),
+            Err("`onnxruntime` failed: there is no ONNX Runtime: no file".to_owned())
+        );
+        assert_eq!(
+            chosen(Some(&[CPU]), &["cpu", "gpu"], 1),
+            Err("provider `gpu` is unknown; known are cpu, cuda, tensorrt, rten and onnxruntime"
+                .to_owned())
+        );
+    }
+}

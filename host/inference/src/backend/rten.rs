@@ -1,0 +1,190 @@
+//! Runs models by rten, a library that is part of this program. It uses the processor only, and a
+//! run cannot be interrupted.
+//!
+//! It computes in `f32`, `i32`, `i8` and `u8`: other types are converted at the edge.
+
+use std::sync::Arc;
+
+use gleaner_protocol::inference::{Element, TensorInfo};
+use rten::{Model, ModelOptions, NodeId, RunOptions, ThreadPool, Value, ValueOrView};
+use rten_gemm::GemmExecutor;
+use rten_tensor::{Layout, Tensor};
+
+use super::elements::{floats, from_floats, from_integers, integers, numbers};
+use super::{Backend, BackendError, LoadOptions, LoadedGraph, StopSignal, TensorValue};
+
+/// The version of rten, as the workspace pins it.
+const VERSION: &str = "rten 0.27.0";
+
+/// Operators that multiply 8-bit integers.
+const INTEGER_PRODUCTS: [&str; 2] = ["ConvInteger", "MatMulInteger"];
+
+/// The backend of rten.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct RtenBackend;
+
+struct RtenGraph {
+    model: Model,
+    pool: Arc<ThreadPool>,
+    inputs: Vec<NodeId>,
+    outputs: Vec<(NodeId, TensorInfo)>,
+}
+
+impl Backend for RtenBackend {
+    fn version(&self) -> String {
+        VERSION.to_owned()
+    }
+
+    fn load(
+        &self,
+        model: Vec<u8>,
+        options: &LoadOptions<'_>,
+    ) -> Result<Box<dyn LoadedGraph>, BackendError> {
+        let signature = options.signature;
+        let outputs = signature.outputs.iter().map(|output| &output.tensor);
+        if let Some(info) =
+            signature.inputs.iter().chain(outputs.clone()).find(|it| it.element == Element::Int16)
+        {
+            let (name, element) = (&info.name, info.element);
+            return Err(BackendError::new(format_args!(
+                "`{name}` has elements of type {element}, which rten does not support"
+            )));
+        }
+        // On x86-64 without VNNI, sums of two products saturate in 16 bits: a usual quantized model
+        // finds nothing, and no error appears.
+        if let Some(operator) =
+            INTEGER_PRODUCTS.iter().find(|it| signature.operators.contains(**it))
+            && products_saturate()
+        {
+            return Err(BackendError::new(format_args!(
+                "it has operator `{operator}`, which rten computes inexactly on this processor, as \
+                 that lacks VNNI; use ONNX Runtime, or a model of floats"
+            )));
+        }
+        let model = ModelOptions::with_all_ops().load(model).map_err(BackendError::new)?;
+        let node = |name: &str| model.node_id(name).map_err(BackendError::new);
+        let inputs =
+            signature.inputs.iter().map(|info| node(&info.name)).collect::<Result<_, _>>()?;
+        let outputs = outputs
+            .map(|info| Ok((node(&info.name)?, info.clone())))
+            .collect::<Result<_, BackendError>>()?;
+        let pool = Arc::new(ThreadPool::with_num_threads(options.threads as usize));
+        Ok(Box::new(RtenGraph { model, pool, inputs, outputs }))
+    }
+}
+
+impl LoadedGraph for RtenGraph {
+    fn run(
+        &mut self,
+        inputs: &[TensorValue],
+        _stop: &StopSignal,
+    ) -> Result<Vec<TensorValue>, BackendError> {
+        let values = self.inputs.iter().zip(inputs).map(|(node, input)| {
+            let value = value_of(input)?;
+            Ok((*node, ValueOrView::Value(value)))
+        });
+        let values = values.collect::<Result<Vec<_>, BackendError>>()?;
+        let nodes: Vec<NodeId> = self.outputs.iter().map(|(node, _)| *node).collect();
+        let options = RunOptions::default().with_thread_pool(Some(Arc::clone(&self.pool)));
+        let results = self.model.run(values, &nodes, Some(options)).map_err(BackendError::new)?;
+        let infos = self.outputs.iter().map(|(_, info)| info);
+        infos.zip(results).map(|(info, value)| output_of(info, value)).collect()
+    }
+}
+
+/// Returns whether products of 8-bit integers are inexact on this processor.
+fn products_saturate() -> bool {
+    GemmExecutor::<u8, i8, i32>::default().may_saturate()
+}
+
+fn value_of(input: &TensorValue) -> Result<Value, BackendError> {
+    let shape: Vec<usize> = input.shape.iter().map(|length| *length as usize).collect();
+    let bytes = &input.bytes;
+    match input.element {
+        element @ (Element::Float32 | Element::Float16 | Element::Float64) => {
+            tensor(&shape, floats(element, bytes)?)
+        }
+        element @ (Element::Int32 | Element::Int64 | Element::Boolean) => {
+            tensor(&shape, integers(element, bytes)?)
+        }
+        Element::Int8 => tensor(&shape, numbers(bytes, i8::from_le_bytes)),
+        Element::Uint8 => tensor(&shape, bytes.clone()),
+        element @ Element::Int16 => {
+            Err(BackendError::new(format_args!("rten does not support {element}")))
+        }
+    }
+}
+
+fn tensor<T>(shape: &[usize], data: Vec<T>) -> Result<Value, BackendError>
+where
+    Value: From<Tensor<T>>,
+{
+    Value::from_shape(shape, data).map_err(BackendError::new)
+}
+
+fn output_of(info: &TensorInfo, value: Value) -> Result<TensorValue, BackendError> {
+    let lengths = value.shape();
+    let lengths = lengths.iter().map(|length| u32::try_from(*length));
+    let shape = lengths.collect::<Result<Vec<_>, _>>().map_err(BackendError::new)?;
+    let element = info.element;
+    let bytes = match (element, value) {
+        (Element::Float32 | Element::Float16 | Element::Float64, Value::FloatTensor(tensor)) => {
+            from_floats(element, &tensor.into_data())
+        }
+        (Element::Int32 | Element::Int64 | Element::Boolean, Value::Int32Tensor(tensor)) => {
+            from_integers(element, &tensor.into_data())
+        }
+        (Element::Int8, Value::Int8Tensor(tensor)) => {
+            tensor.into_data().into_iter().map(i8::cast_unsigned).collect()
+        }
+        (Element::Uint8, Value::UInt8Tensor(tensor)) => tensor.into_data(),
+        (_, other) => {
+            let (name, found) = (&info.name, other.dtype());
+            return Err(BackendError::new(format_args!(
+                "output `{name}` is declared as {element}, and rten returned {found}"
+            )));
+        }
+    };
+    Ok(TensorValue { element, shape, bytes })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::inspect::inspect;
+    use crate::onnx::{INT32, UINT8, graph, model, node, value};
+
+    /// A product of two 8-bit matrices with the largest values.
+    fn product() -> Vec<u8> {
+        model(&graph(
+            &[node("MatMulInteger", &["a", "b"], &["y"], &[])],
+            &[],
+            &[value("a", UINT8, &[8, 64]), value("b", UINT8, &[64, 32])],
+            &[value("y", INT32, &[8, 32])],
+        ))
+    }
+
+    #[test]
+    fn products_of_8_bit_integers_are_exact_or_refused() {
+        let bytes = product();
+        let signature = inspect(&bytes).unwrap();
+        let provider = super::super::ExecutionProvider::Cpu;
+        let options = LoadOptions { provider, threads: 1, signature: &signature };
+        let loaded = RtenBackend.load(bytes, &options);
+        let mut graph = match loaded {
+            Ok(graph) => graph,
+            Err(error) => {
+                assert!(products_saturate(), "{error}");
+                return assert!(error.to_string().contains("`MatMulInteger`"), "{error}");
+            }
+        };
+        let input = |shape: [u32; 2]| TensorValue {
+            element: Element::Uint8,
+            shape: shape.to_vec(),
+            bytes: vec![255; (shape[0] * shape[1]) as usize],
+        };
+        let inputs = [input([8, 64]), input([64, 32])];
+        let outputs = graph.run(&inputs, &StopSignal::default()).unwrap();
+        assert_eq!(outputs[0].bytes, (64 * 255 * 255_i32).to_le_bytes().repeat(8 * 32));
+    }
+}

@@ -1,0 +1,196 @@
+//! A connected lambda: its socket, the models that it may use, its regions, and its call.
+
+use std::collections::{HashMap, HashSet};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::Arc;
+
+use gleaner_protocol::inference::{
+    AddClient, GrantedModel, MAX_TENSOR_BYTES, ModelFault, ModelFaultKind, ModelReply,
+    ModelRequest, ModelResult, ModelSocket,
+};
+use gleaner_protocol::link::{Incoming, LinkError};
+use tracing::warn;
+
+use crate::region::TensorRegion;
+use crate::sessions::{SessionId, SessionKey};
+
+/// Messages of a lambda that are read in one second; a lambda makes a few for each wake.
+const MESSAGES_PER_SECOND: u32 = 2000;
+
+/// Identifies a connected lambda.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub(crate) struct LambdaId(pub(crate) u64);
+
+/// A call that is not answered yet.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct OpenCall {
+    pub(crate) id: u64,
+    /// Time of CLOCK_MONOTONIC, in ns.
+    pub(crate) deadline_ns: Option<u64>,
+    /// Name of the model in the manifest.
+    pub(crate) model: String,
+    pub(crate) session: SessionId,
+    pub(crate) stage: CallStage,
+}
+
+/// The progress of a call.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum CallStage {
+    /// The model is being loaded.
+    Loading,
+    /// The run waits for others.
+    Waiting,
+    /// The run is in progress, with the number of its job.
+    Running(u64),
+}
+
+/// A model that the lambda may use.
+#[derive(Debug)]
+pub(crate) struct GrantedSession {
+    pub(crate) key: SessionKey,
+    /// The reason why it must not be loaded.
+    pub(crate) refused: Option<String>,
+}
+
+/// A connected lambda.
+#[derive(Debug)]
+pub(crate) struct ConnectedLambda {
+    pub(crate) name: String,
+    socket: ModelSocket,
+    models: HashMap<String, GrantedSession>,
+    /// Names of the models that it has opened.
+    pub(crate) opened: HashSet<String>,
+    pub(crate) call: Option<OpenCall>,
+    pub(crate) inputs: Option<Arc<TensorRegion>>,
+    pub(crate) outputs: Option<Arc<TensorRegion>>,
+    last_id: u64,
+    /// Messages that may still be read in this second.
+    messages_left: u32,
+    /// Set once it is not served any more.
+    pub(crate) is_gone: bool,
+}
+
+impl ConnectedLambda {
+    pub(crate) fn new(add: AddClient, socket: OwnedFd) -> Self {
+        let granted = |model: GrantedModel| {
+            let key = SessionKey::of(&model);
+            (model.name, GrantedSession { key, refused: model.refused })
+        };
+        Self {
+            name: add.name,
+            socket: ModelSocket::new(socket),
+            models: add.models.into_iter().map(granted).collect(),
+            opened: HashSet::new(),
+            call: None,
+            inputs: None,
+            outputs: None,
+            last_id: 0,
+            messages_left: MESSAGES_PER_SECOND,
+            is_gone: false,
+        }
+    }
+
+    /// Returns the session of a model; `None` if it was not granted.
+    pub(crate) fn granted(&self, model: &str) -> Option<&GrantedSession> {
+        self.models.get(model)
+    }
+
+    /// Returns whether it may use a session.
+    pub(crate) fn uses(&self, key: &SessionKey) -> bool {
+        self.models.values().any(|granted| granted.key == *key)
+    }
+
+    /// Returns whether it may send a message in this second.
+    pub(crate) fn may_send(&self) -> bool {
+        self.messages_left > 0
+    }
+
+    /// Begins a second.
+    pub(crate) fn reset_messages(&mut self) {
+        self.messages_left = MESSAGES_PER_SECOND;
+    }
+
+    /// Returns its next request. A lambda that sends anything else is gone.
+    pub(crate) fn request(&mut self) -> Option<ModelRequest> {
+        self.messages_left = self.messages_left.saturating_sub(1);
+        match self.socket.poll() {
+            Ok(Incoming::Message(request)) if request.id > self.last_id => {
+                self.last_id = request.id;
+                Some(request)
+            }
+            Ok(Incoming::Message(request)) => {
+                let (id, last) = (request.id, self.last_id);
+                self.drop_for(&format!("its call {id} came after call {last}"));
+                None
+            }
+            Ok(Incoming::Nothing) => None,
+            Ok(Incoming::Ended) => {
+                self.is_gone = true;
+                None
+            }
+            Err(error) => {
+                self.drop_for(&error.to_string());
+                None
+            }
+        }
+    }
+
+    /// Stops serving it, and logs the reason.
+    pub(crate) fn drop_for(&mut self, reason: &str) {
+        if !self.is_gone {
+            warn!(lambda = self.name, reason, "connection to a lambda closed");
+        }
+        self.is_gone = true;
+    }
+
+    /// Sends a reply. A lambda that does not read its replies is gone.
+    pub(crate) fn reply(
+        &mut self,
+        id: u64,
+        result: Result<ModelResult, ModelFault>,
+        region: Option<&TensorRegion>,
+    ) {
+        let region = region.map(AsFd::as_fd);
+        let mut sent = self.socket.reply(&ModelReply { id, result }, region);
+        if let Err(LinkError::TooLong { bytes, max, .. }) = sent {
+            let message = format!("the reply has {bytes} bytes; {max} are allowed");
+            let result = Err(ModelFault::new(ModelFaultKind::Failed, message));
+            sent = self.socket.reply(&ModelReply { id, result }, None);
+        }
+        match sent {
+            Ok(()) => {}
+            Err(LinkError::Gone { .. }) => self.is_gone = true,
+            Err(error) => self.drop_for(&error.to_string()),
+        }
+    }
+
+    /// Creates its region for inputs.
+    pub(crate) fn reserve(&mut self, call: u64, bytes: u64) {
+        if bytes == 0 || bytes > MAX_TENSOR_BYTES {
+            let allowed = format!("1 to {MAX_TENSOR_BYTES} are allowed");
+            let message = format!("a region of {bytes} bytes is requested; {allowed}");
+            return self.fail(call, ModelFaultKind::WrongInput, message);
+        }
+        match TensorRegion::create("gleaner-inputs", bytes) {
+            Ok(region) => {
+                self.reply(call, Ok(ModelResult::Reserved), Some(&region));
+                self.inputs = Some(Arc::new(region));
+            }
+            Err(error) => {
+                let message = format!("the memory for inputs cannot be created: {error}");
+                self.fail(call, ModelFaultKind::Failed, message);
+            }
+        }
+    }
+
+    /// Sends the reply of a call that failed.
+    pub(crate) fn fail(&mut self, id: u64, kind: ModelFaultKind, message: impl Into<String>) {
+        self.reply(id, Err(ModelFault::new(kind, message)), None);
+    }
+}
+
+impl AsFd for ConnectedLambda {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+}

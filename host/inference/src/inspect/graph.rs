@@ -1,0 +1,241 @@
+//! Checks graphs with everything in them: nodes, attributes, subgraphs and constants.
+
+use std::collections::BTreeSet;
+
+use super::InspectError;
+use super::wire::{WireField, WireFields};
+
+/// Depth to which graphs may be nested. Libraries parse them by recursion.
+const MAX_DEPTH: usize = 16;
+
+/// Fields of `GraphProto`.
+mod graph_field {
+    pub(super) const NODE: u64 = 1;
+    pub(super) const INITIALIZER: u64 = 5;
+    pub(super) const INPUT: u64 = 11;
+    pub(super) const OUTPUT: u64 = 12;
+    pub(super) const VALUE_INFO: u64 = 13;
+    pub(super) const SPARSE_INITIALIZER: u64 = 15;
+}
+
+/// Fields of `NodeProto`.
+mod node_field {
+    pub(super) const OPERATOR: u64 = 4;
+    pub(super) const ATTRIBUTE: u64 = 5;
+    pub(super) const DOMAIN: u64 = 7;
+}
+
+/// Fields of `FunctionProto`.
+mod function_field {
+    pub(super) const NODE: u64 = 7;
+    pub(super) const ATTRIBUTE: u64 = 11;
+}
+
+/// Fields of `AttributeProto`.
+mod attribute_field {
+    pub(super) const TENSOR: u64 = 5;
+    pub(super) const GRAPH: u64 = 6;
+    pub(super) const TENSORS: u64 = 10;
+    pub(super) const GRAPHS: u64 = 11;
+    pub(super) const TYPE: u64 = 14;
+    pub(super) const TYPES: u64 = 15;
+    pub(super) const SPARSE_TENSOR: u64 = 22;
+    pub(super) const SPARSE_TENSORS: u64 = 23;
+}
+
+/// Fields of `TensorProto`.
+mod tensor_field {
+    pub(super) const NAME: u64 = 8;
+    pub(super) const EXTERNAL_DATA: u64 = 13;
+    pub(super) const DATA_LOCATION: u64 = 14;
+}
+
+/// Value of `DATA_LOCATION` for data in the model itself.
+const DEFAULT_LOCATION: i64 = 0;
+
+/// Names of the operators in the checked part of a model.
+pub(super) type Operators = BTreeSet<String>;
+
+/// Returns whether a domain is that of the standard operators.
+pub(super) fn is_standard(domain: &str) -> bool {
+    matches!(domain, "" | "ai.onnx")
+}
+
+/// Checks a graph and its subgraphs.
+pub(super) fn check_graph(
+    graph: &[u8],
+    depth: usize,
+    operators: &mut Operators,
+) -> Result<(), InspectError> {
+    if depth > MAX_DEPTH {
+        return Err(InspectError::TooDeep { max: MAX_DEPTH });
+    }
+    for field in WireFields(graph) {
+        let field = field?;
+        match field.number {
+            graph_field::NODE => check_node(field.fields()?, depth, operators)?,
+            graph_field::INITIALIZER => check_tensor(field.fields()?)?,
+            graph_field::SPARSE_INITIALIZER => check_sparse(field)?,
+            graph_field::INPUT | graph_field::OUTPUT | graph_field::VALUE_INFO => {
+                check_value(field)?;
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Checks a function of the model, which is a graph without constants.
+pub(super) fn check_functions(
+    function: &[u8],
+    operators: &mut Operators,
+) -> Result<(), InspectError> {
+    for field in WireFields(function) {
+        let field = field?;
+        match field.number {
+            function_field::NODE => check_node(field.fields()?, 0, operators)?,
+            function_field::ATTRIBUTE => check_attribute(field.fields()?, 0, operators)?,
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+fn check_node(
+    node: WireFields<'_>,
+    depth: usize,
+    operators: &mut Operators,
+) -> Result<(), InspectError> {
+    let (mut domain, mut operator) = ("", "");
+    for field in node {
+        let field = field?;
+        match field.number {
+            node_field::OPERATOR => operator = field.text()?,
+            node_field::DOMAIN => domain = field.text()?,
+            node_field::ATTRIBUTE => check_attribute(field.fields()?, depth, operators)?,
+            _ => {}
+        }
+    }
+    if is_standard(domain) {
+        if !operators.contains(operator) {
+            operators.insert(operator.to_owned());
+        }
+        return Ok(());
+    }
+    Err(InspectError::Domain { domain: domain.to_owned(), operator: operator.to_owned() })
+}
+
+fn check_attribute(
+    attribute: WireFields<'_>,
+    depth: usize,
+    operators: &mut Operators,
+) -> Result<(), InspectError> {
+    for field in attribute {
+        let field = field?;
+        match field.number {
+            attribute_field::GRAPH | attribute_field::GRAPHS => {
+                check_graph(field.bytes()?, depth + 1, operators)?;
+            }
+            attribute_field::TENSOR | attribute_field::TENSORS => check_tensor(field.fields()?)?,
+            attribute_field::SPARSE_TENSOR | attribute_field::SPARSE_TENSORS => {
+                check_sparse(field)?;
+            }
+            attribute_field::TYPE | attribute_field::TYPES => check_type(field, 0)?,
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Checks a tensor with few values other than 0: two tensors, of values and of their places.
+fn check_sparse(sparse: WireField<'_>) -> Result<(), InspectError> {
+    for field in sparse.fields()? {
+        let field = field?;
+        if matches!(field.number, 1 | 2) {
+            check_tensor(field.fields()?)?;
+        }
+    }
+    Ok(())
+}
+
+fn check_tensor(tensor: WireFields<'_>) -> Result<(), InspectError> {
+    let (mut name, mut location, mut is_external) = ("", "", false);
+    for field in tensor {
+        let field = field?;
+        match field.number {
+            tensor_field::NAME => name = field.text()?,
+            tensor_field::DATA_LOCATION => is_external |= field.number()? != DEFAULT_LOCATION,
+            tensor_field::EXTERNAL_DATA => {
+                is_external = true;
+                let (mut key, mut value) = ("", "");
+                for field in field.fields()? {
+                    let field = field?;
+                    match field.number {
+                        1 => key = field.text()?,
+                        2 => value = field.text()?,
+                        _ => {}
+                    }
+                }
+                if key == "location" {
+                    location = value;
+                }
+            }
+            _ => {}
+        }
+    }
+    if !is_external {
+        return Ok(());
+    }
+    Err(InspectError::ExternalData { tensor: name.to_owned(), location: location.to_owned() })
+}
+
+/// Checks the type of a value: types of sequences and options are nested, too.
+fn check_value(value: WireField<'_>) -> Result<(), InspectError> {
+    for field in value.fields()? {
+        let field = field?;
+        if field.number == 2 {
+            check_type(field, 0)?;
+        }
+    }
+    Ok(())
+}
+
+fn check_type(type_field: WireField<'_>, depth: usize) -> Result<(), InspectError> {
+    if depth > MAX_DEPTH {
+        return Err(InspectError::TooDeep { max: MAX_DEPTH });
+    }
+    for field in type_field.fields()? {
+        let field = field?;
+        // Of the types, those of sequences, maps and options contain a further one.
+        let inner = match field.number {
+            1 => {
+                check_tensor_type(field)?;
+                continue;
+            }
+            4 | 9 => 1,
+            5 => 2,
+            _ => continue,
+        };
+        for field in field.fields()? {
+            let field = field?;
+            if field.number == inner {
+                check_type(field, depth + 1)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Checks that the dimensions of the type of a tensor are messages.
+fn check_tensor_type(tensor: WireField<'_>) -> Result<(), InspectError> {
+    for field in tensor.fields()? {
+        let shape = field?;
+        if shape.number != 2 {
+            continue;
+        }
+        for dimension in shape.fields()? {
+            dimension?.fields()?.try_for_each(|field| field.map(drop))?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,135 @@
+//! Checks a model before a library parses it, and reads its inputs and outputs.
+//!
+//! - `wire`: fields of protobuf messages.
+//! - `graph`: graphs, nodes and attributes: operators, data in other files, depth.
+//! - `signature`: inputs and outputs.
+//!
+//! These are own checks: the types of `rten-onnx` copy all weights, take memory for a length before
+//! they compare it with the file, follow subgraphs to any depth, and have no functions and no
+//! sparse tensors.
+
+mod graph;
+mod signature;
+#[cfg(test)]
+mod tests;
+mod wire;
+
+use gleaner_protocol::inference::Element;
+
+use graph::{Operators, check_functions, check_graph};
+use wire::{NoMessage, WireFields};
+
+pub use signature::{ModelSignature, OutputInfo};
+
+/// Oldest version of the standard operators that is accepted.
+const OLDEST_OPSET: i64 = 7;
+/// Newest version of the standard operators of which rten has some.
+const NEWEST_OPSET: i64 = 24;
+
+/// Largest number of inputs and of outputs.
+const MAX_TENSORS: usize = 256;
+
+/// Fields of `ModelProto`.
+mod model_field {
+    pub(super) const IR_VERSION: u64 = 1;
+    pub(super) const GRAPH: u64 = 7;
+    pub(super) const OPSET: u64 = 8;
+    pub(super) const FUNCTIONS: u64 = 25;
+}
+
+/// The reason why a model is refused before it is loaded.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[allow(missing_docs)]
+pub enum InspectError {
+    #[error("it is no ONNX model: it is no protobuf message with a version and a graph")]
+    NoModel,
+    #[error("its graphs are nested more than {max} deep")]
+    TooDeep { max: usize },
+    #[error("it has operator `{operator}` of domain `{domain}`; only standard operators can run")]
+    Domain { domain: String, operator: String },
+    #[error(
+        "it needs version {version} of the standard operators; versions {OLDEST_OPSET} to \
+         {NEWEST_OPSET} can run"
+    )]
+    Opset { version: i64 },
+    #[error("it does not name the version of the standard operators")]
+    NoOpset,
+    #[error(
+        "the data of tensor `{tensor}` is in another file, `{location}`; save the model with its \
+         data in one file"
+    )]
+    ExternalData { tensor: String, location: String },
+    #[error("it has {count} {what}; {MAX_TENSORS} are allowed")]
+    TooMany { what: &'static str, count: usize },
+    #[error("{what} `{name}` is {found}; a lambda can use tensors of numbers and booleans")]
+    NoTensor { what: &'static str, name: String, found: &'static str },
+    #[error("{what} `{name}` has elements of type {found}; supported are {}", elements())]
+    Element { what: &'static str, name: String, found: String },
+    #[error("{what} `{name}` has no declared {lacks}; export the model with it")]
+    Undeclared { what: &'static str, name: String, lacks: &'static str },
+    #[error("{what} `{name}` has a length of {length} in dimension {dimension}")]
+    Length { what: &'static str, name: String, dimension: usize, length: i64 },
+    #[error("{what} `{name}` has {found} dimensions; {max} are allowed")]
+    Dimensions { what: &'static str, name: String, found: usize, max: usize },
+    #[error("two {what}s have the name `{name}`")]
+    Twice { what: &'static str, name: String },
+}
+
+impl From<NoMessage> for InspectError {
+    fn from(_: NoMessage) -> InspectError {
+        InspectError::NoModel
+    }
+}
+
+fn elements() -> String {
+    signature::ELEMENTS.map(|(_, element): (i64, Element)| element.name()).join(", ")
+}
+
+/// Checks the file of a model, and returns its inputs and outputs.
+///
+/// # Errors
+///
+/// [`InspectError`] names the first problem.
+pub fn inspect(model: &[u8]) -> Result<ModelSignature, InspectError> {
+    let (mut graph, mut has_version, mut opset) = (None, false, None);
+    let mut operators = Operators::new();
+    for field in WireFields(model) {
+        let field = field?;
+        match field.number {
+            model_field::IR_VERSION => has_version = field.number().is_ok(),
+            model_field::GRAPH if graph.is_none() => graph = Some(field.bytes()?),
+            // Libraries would disagree on which of two counts.
+            model_field::GRAPH => return Err(InspectError::NoModel),
+            model_field::OPSET => {
+                let (domain, version) = opset_of(field.fields()?)?;
+                if graph::is_standard(domain) {
+                    opset = Some(version);
+                }
+            }
+            model_field::FUNCTIONS => check_functions(field.bytes()?, &mut operators)?,
+            _ => {}
+        }
+    }
+    let graph = graph.filter(|_| has_version).ok_or(InspectError::NoModel)?;
+    check_graph(graph, 0, &mut operators)?;
+    // After the operators: a model of foreign ones only may import no others.
+    match opset {
+        Some(OLDEST_OPSET..=NEWEST_OPSET) => {}
+        Some(version) => return Err(InspectError::Opset { version }),
+        None => return Err(InspectError::NoOpset),
+    }
+    ModelSignature::of(graph, operators)
+}
+
+fn opset_of(fields: WireFields<'_>) -> Result<(&str, i64), NoMessage> {
+    let (mut domain, mut version) = ("", 0);
+    for field in fields {
+        let field = field?;
+        match field.number {
+            1 => domain = field.text()?,
+            2 => version = field.number()?,
+            _ => {}
+        }
+    }
+    Ok((domain, version))
+}

@@ -1,0 +1,226 @@
+//! Reads the inputs and outputs of a model.
+
+use std::collections::{BTreeSet, HashSet};
+
+use gleaner_protocol::inference::{Element, MAX_DIMENSIONS, TensorInfo};
+
+use super::wire::{NoMessage, WireField, WireFields};
+use super::{InspectError, MAX_TENSORS};
+
+/// Types of elements by their number in ONNX.
+pub(super) const ELEMENTS: [(i64, Element); 9] = [
+    (1, Element::Float32),
+    (10, Element::Float16),
+    (11, Element::Float64),
+    (3, Element::Int8),
+    (5, Element::Int16),
+    (6, Element::Int32),
+    (7, Element::Int64),
+    (2, Element::Uint8),
+    (9, Element::Boolean),
+];
+
+/// Names of the other types, for messages.
+const OTHERS: [(i64, &str); 7] = [
+    (4, "uint16"),
+    (8, "string"),
+    (12, "uint32"),
+    (13, "uint64"),
+    (14, "complex64"),
+    (15, "complex128"),
+    (16, "bfloat16"),
+];
+
+/// The inputs and outputs of a model, as its file declares them.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct ModelSignature {
+    /// Its inputs, without those that have a default value.
+    pub inputs: Vec<TensorInfo>,
+    /// Its outputs.
+    pub outputs: Vec<OutputInfo>,
+    /// Names of its operators, in subgraphs and functions, too.
+    pub operators: BTreeSet<String>,
+}
+
+/// An output of a model.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct OutputInfo {
+    /// Name, type and shape; an empty shape if it is not declared.
+    pub tensor: TensorInfo,
+    /// True if the number of dimensions is declared.
+    pub has_shape: bool,
+}
+
+/// A declared value.
+struct DeclaredValue<'a> {
+    name: &'a str,
+    tensor: Option<DeclaredTensor>,
+    /// Name of its type, if it is no tensor.
+    other: Option<&'static str>,
+}
+
+#[derive(Default)]
+struct DeclaredTensor {
+    element: Option<i64>,
+    shape: Option<Vec<i64>>,
+}
+
+impl ModelSignature {
+    /// Reads the inputs and outputs of a graph.
+    pub(super) fn of(
+        graph: &[u8],
+        operators: BTreeSet<String>,
+    ) -> Result<ModelSignature, InspectError> {
+        let (mut inputs, mut outputs, mut constants) = (Vec::new(), Vec::new(), HashSet::new());
+        for field in WireFields(graph) {
+            let field = field?;
+            match field.number {
+                5 => drop(constants.insert(name_of_tensor(field)?)),
+                11 => inputs.push(DeclaredValue::of(field)?),
+                12 => outputs.push(DeclaredValue::of(field)?),
+                _ => {}
+            }
+        }
+        inputs.retain(|input| !constants.contains(input.name));
+        for (what, count) in [("inputs", inputs.len()), ("outputs", outputs.len())] {
+            if count > MAX_TENSORS {
+                return Err(InspectError::TooMany { what, count });
+            }
+        }
+        let inputs = inputs.iter().map(|input| {
+            let found = input.info("input")?;
+            match found.has_shape {
+                true => Ok(found.tensor),
+                false => Err(undeclared("input", input.name, "shape")),
+            }
+        });
+        let inputs: Vec<TensorInfo> = inputs.collect::<Result<_, InspectError>>()?;
+        let outputs: Vec<OutputInfo> =
+            outputs.iter().map(|output| output.info("output")).collect::<Result<_, _>>()?;
+        distinct("input", inputs.iter().map(|info| info.name.as_str()))?;
+        distinct("output", outputs.iter().map(|info| info.tensor.name.as_str()))?;
+        Ok(ModelSignature { inputs, outputs, operators })
+    }
+}
+
+fn distinct<'a>(
+    what: &'static str,
+    names: impl Iterator<Item = &'a str>,
+) -> Result<(), InspectError> {
+    let mut seen = HashSet::new();
+    match names.into_iter().find(|name| !seen.insert(*name)) {
+        Some(name) => Err(InspectError::Twice { what, name: name.to_owned() }),
+        None => Ok(()),
+    }
+}
+
+fn undeclared(what: &'static str, name: &str, lacks: &'static str) -> InspectError {
+    InspectError::Undeclared { what, name: name.to_owned(), lacks }
+}
+
+fn name_of_tensor<'a>(tensor: WireField<'a>) -> Result<&'a str, NoMessage> {
+    let mut name = "";
+    for field in tensor.fields()? {
+        let field = field?;
+        if field.number == 8 {
+            name = field.text()?;
+        }
+    }
+    Ok(name)
+}
+
+impl<'a> DeclaredValue<'a> {
+    fn of(value: WireField<'a>) -> Result<Self, NoMessage> {
+        let mut declared = DeclaredValue { name: "", tensor: None, other: None };
+        for field in value.fields()? {
+            let field = field?;
+            match field.number {
+                1 => declared.name = field.text()?,
+                2 => {
+                    for field in field.fields()? {
+                        let field = field?;
+                        match field.number {
+                            1 => declared.tensor = Some(DeclaredTensor::of(field)?),
+                            4 => declared.other = Some("a sequence"),
+                            5 => declared.other = Some("a map"),
+                            8 => declared.other = Some("a sparse tensor"),
+                            9 => declared.other = Some("optional"),
+                            _ => {}
+                        }
+                    }
+                }
+                _ => {}
+            }
+        }
+        Ok(declared)
+    }
+
+    fn info(&self, what: &'static str) -> Result<OutputInfo, InspectError> {
+        let name = || self.name.to_owned();
+        if let Some(found) = self.other {
+            return Err(InspectError::NoTensor { what, name: name(), found });
+        }
+        let lacks = |lacks| undeclared(what, self.name, lacks);
+        let tensor = self.tensor.as_ref().ok_or_else(|| lacks("type"))?;
+        let number = tensor.element.ok_or_else(|| lacks("type"))?;
+        let Some((_, element)) = ELEMENTS.into_iter().find(|(known, _)| *known == number) else {
+            let found = OTHERS.iter().find(|(known, _)| *known == number);
+            let found = found.map_or_else(|| number.to_string(), |(_, name)| (*name).to_owned());
+            return Err(InspectError::Element { what, name: name(), found });
+        };
+        let lengths = tensor.shape.as_deref().unwrap_or_default();
+        if lengths.len() > MAX_DIMENSIONS {
+            let (found, max) = (lengths.len(), MAX_DIMENSIONS);
+            return Err(InspectError::Dimensions { what, name: name(), found, max });
+        }
+        let shape = lengths.iter().enumerate().map(|(dimension, length)| match *length {
+            ANY => Ok(None),
+            length => match u32::try_from(length) {
+                Ok(known @ 1..) => Ok(Some(known)),
+                _ => Err(InspectError::Length { what, name: name(), dimension, length }),
+            },
+        });
+        let shape = shape.collect::<Result<_, _>>()?;
+        let tensor_info = TensorInfo { name: name(), element, shape };
+        Ok(OutputInfo { tensor: tensor_info, has_shape: tensor.shape.is_some() })
+    }
+}
+
+/// A length that is not declared. Some programs write -1 for it.
+const ANY: i64 = -1;
+
+impl DeclaredTensor {
+    fn of(tensor: WireField<'_>) -> Result<Self, NoMessage> {
+        let mut declared = DeclaredTensor::default();
+        for field in tensor.fields()? {
+            let field = field?;
+            match field.number {
+                1 => declared.element = Some(field.number()?),
+                2 => {
+                    let shape = declared.shape.get_or_insert_default();
+                    for field in field.fields()? {
+                        let field = field?;
+                        if field.number == 1 {
+                            shape.push(length_of(field.fields()?)?);
+                        }
+                    }
+                }
+                _ => {}
+            }
+        }
+        Ok(declared)
+    }
+}
+
+fn length_of(dimension: WireFields<'_>) -> Result<i64, NoMessage> {
+    let mut length = ANY;
+    for field in dimension {
+        let field = field?;
+        match field.number {
+            1 => length = field.number()?,
+            2 => length = ANY,
+            _ => {}
+        }
+    }
+    Ok(length)
+}

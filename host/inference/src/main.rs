@@ -1,0 +1,8 @@
+//! `gleaner-inference`: the process that runs the models of all lambdas on a vehicle. `gleaner`
+//! starts it; see `gleaner-inference --help`.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    gleaner_inference::program::main()
+}

@@ -1,0 +1,139 @@
+//! The program `gleaner-inference`.
+//!
+//! - `args`: the command line.
+//! - `library`: the search for ONNX Runtime.
+//! - `report_writer`: reports to the starter, and the thread that writes them, as the starter may
+//!   be slow to read.
+
+mod args;
+mod library;
+mod report_writer;
+
+use std::fs::File;
+use std::io;
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use clap::Parser;
+use gleaner_base::{Exit, Failure};
+use gleaner_jail::{Paths, inference as sandbox, memory};
+use gleaner_protocol::Handover;
+use gleaner_protocol::inference::InferenceServer;
+use gleaner_vitals::start::reports;
+use rustix::process::{Signal, set_parent_process_death_signal};
+use signal_hook::consts::{SIGINT, SIGTERM};
+use tracing::{debug, warn};
+
+use crate::backend::{Backend, Backends, OnnxRuntime, RtenBackend};
+use crate::engine::{EngineError, InferenceEngine};
+use crate::loader::LoadLimits;
+use crate::region::TensorRegion;
+use crate::threads::ModelThreads;
+use args::Args;
+use report_writer::ReportThread;
+
+/// Runs the program `gleaner-inference`.
+pub fn main() -> ExitCode {
+    gleaner_vitals::log::init();
+    match start(&Args::parse()) {
+        Ok(()) => Exit::Ok.into(),
+        Err(failure) => {
+            eprintln!("{failure}");
+            failure.exit.into()
+        }
+    }
+}
+
+fn start(args: &Args) -> Result<(), Failure> {
+    let internal = |what: &'static str| {
+        move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
+    };
+    let library = library::find(args.ort_lib.as_deref());
+    // First: threads that exist already would keep their privileges.
+    let layers = sandbox::start(&paths(library.as_deref()));
+    // A starter that dies also closes the control connection.
+    set_parent_process_death_signal(Some(Signal::TERM))
+        .map_err(io::Error::from)
+        .map_err(internal("cannot watch for the starter's death"))?;
+    let stop = stop_socket().map_err(internal("cannot handle SIGTERM"))?;
+    let (control, running) = connections()?;
+    let reports = reports().map_err(internal("cannot set up the report stream"))?;
+    // Not without seals: a lambda could take memory away while it is read.
+    TensorRegion::create("gleaner-test", 1).map_err(internal("cannot share tensors"))?;
+    let onnx_runtime = open(library.as_deref());
+    let layers = sandbox::close(layers).map_err(|error| {
+        Failure::caused_by(Exit::Internal, "cannot close the sandbox of the models", &error)
+    })?;
+    for layer in layers.into_iter().chain([memory::limit(args.memory)]) {
+        debug!(?layer, "sandbox");
+    }
+    let backends = Backends::new(Box::new(RtenBackend), onnx_runtime);
+    let Args { model_max, load_max, run_max, .. } = *args;
+    let limits = LoadLimits { model_max, load_max, run_max };
+    let threads = ModelThreads::start(backends, limits, running)
+        .map_err(internal("cannot start the threads for models"))?;
+    let writer = ReportThread::start(reports).map_err(internal("cannot start a thread"))?;
+    let sender = writer.sender();
+    let engine = InferenceEngine::new(threads, Box::new(move |report| sender.send(report)));
+    let ended = engine.run(control, Some(&stop));
+    writer.end();
+    ended.map_err(|error| match error {
+        // Another code than that of an internal error: the model is to blame.
+        EngineError::Overdue(_) => Failure::new(Exit::LambdaFaulted, error.to_string())
+            .with_help("give the model a shorter deadline with ONNX Runtime, or a smaller input"),
+        error => Failure::caused_by(Exit::Internal, "cannot run models", &error),
+    })
+}
+
+/// Opens ONNX Runtime; without it, returns the reason.
+fn open(library: Option<&Path>) -> Result<Box<dyn Backend>, String> {
+    let library = library.ok_or_else(library::searched)?;
+    match OnnxRuntime::open(library) {
+        Ok(backend) => Ok(Box::new(backend)),
+        Err(error) => {
+            let (path, reason) = (library.display(), error.to_string());
+            warn!(library = %path, reason, "ONNX Runtime cannot be used");
+            Err(format!("{path}: {reason}"))
+        }
+    }
+}
+
+/// Returns the files that the process needs: the folder of the library, in which it finds its
+/// providers, and the devices of GPUs.
+fn paths(library: Option<&Path>) -> Paths {
+    let Some(library) = library.and_then(|path| path.canonicalize().ok()) else {
+        return Paths::default();
+    };
+    let devices = std::fs::read_dir("/dev").into_iter().flatten().filter_map(Result::ok);
+    let is_gpu = |path: &Path| {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        ["nvidia", "nvhost", "nvmap", "nvgpu"].iter().any(|prefix| name.starts_with(prefix))
+    };
+    Paths {
+        read: library.parent().map(Path::to_owned).into_iter().collect(),
+        write: devices.map(|entry| entry.path()).filter(|path| is_gpu(path)).collect(),
+    }
+}
+
+/// Returns a socket that becomes readable at SIGTERM.
+fn stop_socket() -> io::Result<OwnedFd> {
+    let (stop, notifier) = UnixStream::pair()?;
+    signal_hook::low_level::pipe::register(SIGTERM, notifier)?;
+    // Ctrl-C in a terminal reaches all processes; the starter decides when this one ends.
+    signal_hook::flag::register(SIGINT, Arc::default())?;
+    Ok(stop.into())
+}
+
+/// Receives the control connection and the file for notes over standard input, the socket of the
+/// starter.
+fn connections() -> Result<(InferenceServer, Option<File>), Failure> {
+    let failed = |error: gleaner_protocol::link::LinkError| {
+        Failure::from(error).with_help("start it with `gleaner run LAMBDA`")
+    };
+    let mut handover = Handover::receive(rustix::stdio::stdin()).map_err(failed)?;
+    let control = handover.take_control().map(InferenceServer::new).map_err(failed)?;
+    Ok((control, handover.running.take().map(File::from)))
+}

@@ -1,0 +1,69 @@
+//! Memory that a lambda shares with this process, for inputs or outputs.
+//!
+//! It is never mapped here: bytes are copied in and out by calls, so that the other process cannot
+//! change them after they were checked.
+
+use std::fs::File;
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::fs::FileExt;
+
+use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
+
+/// A region of fixed size.
+#[derive(Debug)]
+pub(crate) struct TensorRegion {
+    file: File,
+    bytes: u64,
+}
+
+impl TensorRegion {
+    /// Creates a region of zeros, whose size is sealed.
+    pub(crate) fn create(name: &str, bytes: u64) -> io::Result<Self> {
+        let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
+        let file = File::from(memfd_create(name, flags)?);
+        file.set_len(bytes)?;
+        fcntl_add_seals(&file, SealFlags::SHRINK | SealFlags::GROW | SealFlags::SEAL)?;
+        Ok(Self { file, bytes })
+    }
+
+    /// Returns its size.
+    pub(crate) fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// Copies bytes out of the region.
+    pub(crate) fn read(&self, offset: u64, bytes: u64) -> io::Result<Vec<u8>> {
+        let mut copy = vec![0; usize::try_from(bytes).map_err(io::Error::other)?];
+        self.file.read_exact_at(&mut copy, offset)?;
+        Ok(copy)
+    }
+
+    /// Copies bytes into the region.
+    pub(crate) fn write(&self, offset: u64, bytes: &[u8]) -> io::Result<()> {
+        self.file.write_all_at(bytes, offset)
+    }
+}
+
+impl AsFd for TensorRegion {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.file.as_fd()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_are_copied_and_the_size_stays() {
+        let region = TensorRegion::create("test", 100).unwrap();
+        region.write(64, b"abc").unwrap();
+        assert_eq!(region.read(64, 4).unwrap(), b"abc\0");
+        assert_eq!(region.bytes(), 100);
+        assert!(region.read(99, 2).is_err() && region.write(99, b"ab").is_err());
+        for size in [0, 99, 101] {
+            assert!(region.file.set_len(size).is_err(), "{size}");
+        }
+    }
+}

@@ -1,0 +1,306 @@
+//! The thread that runs models, one after another.
+//!
+//! It copies inputs out of shared memory before anything reads them, and keeps inputs and outputs
+//! of the last run of each model: the next request with the same bytes is answered with these.
+
+use std::collections::HashMap;
+use std::io;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::inference::{Element, ModelFault, ModelFaultKind, TensorInfo, TensorPlace};
+
+use crate::backend::{LoadedGraph, StopSignal, TensorValue};
+use crate::loader::caught;
+use crate::places::{PlacedInput, place_outputs};
+use crate::region::TensorRegion;
+use crate::running::{ModelWork, WorkNote};
+use crate::sessions::SessionId;
+
+/// A request to the thread.
+pub(crate) enum WorkerRequest {
+    /// Keep a loaded model.
+    Add(SessionId, WorkerModel),
+    /// Free a model.
+    Remove(SessionId),
+    /// Run a model.
+    Run(RunJob),
+}
+
+/// A loaded model.
+pub(crate) struct WorkerModel {
+    pub(crate) graph: Box<dyn LoadedGraph>,
+    pub(crate) sha256: String,
+    pub(crate) path: String,
+    pub(crate) outputs: Vec<TensorInfo>,
+    pub(crate) last: Option<LastRun>,
+}
+
+/// The last completed run of a model.
+pub(crate) struct LastRun {
+    inputs: Vec<TensorValue>,
+    outputs: Vec<TensorValue>,
+    run_ns: u64,
+}
+
+/// One run.
+pub(crate) struct RunJob {
+    pub(crate) job: u64,
+    pub(crate) session: SessionId,
+    pub(crate) lambda: String,
+    pub(crate) inputs: Vec<PlacedInput>,
+    /// Region of the inputs; `None` if there are none.
+    pub(crate) input_region: Option<Arc<TensorRegion>>,
+    /// Region of the outputs of earlier runs.
+    pub(crate) output_region: Option<Arc<TensorRegion>>,
+    pub(crate) stop: Arc<StopSignal>,
+}
+
+/// The result of a run.
+pub(crate) struct RunDone {
+    pub(crate) job: u64,
+    pub(crate) session: SessionId,
+    pub(crate) result: Result<RunOutputs, ModelFault>,
+    /// Time of the run, in ns, if the model ran.
+    pub(crate) ran_ns: Option<u64>,
+}
+
+/// Outputs in a region.
+pub(crate) struct RunOutputs {
+    pub(crate) places: Vec<TensorPlace>,
+    /// The region, if it is a new one.
+    pub(crate) new_region: Option<Arc<TensorRegion>>,
+    /// Run time of the model in ns; that of the first run if the result is shared.
+    pub(crate) run_ns: u64,
+}
+
+/// The work of the thread.
+pub(crate) struct ModelWorker {
+    models: HashMap<SessionId, WorkerModel>,
+    note: WorkNote,
+    run_max: Duration,
+}
+
+impl ModelWorker {
+    pub(crate) fn new(note: WorkNote, run_max: Duration) -> Self {
+        Self { models: HashMap::new(), note, run_max }
+    }
+
+    /// Handles a request; returns the result of a run.
+    pub(crate) fn handle(&mut self, request: WorkerRequest) -> Option<RunDone> {
+        match request {
+            WorkerRequest::Add(id, model) => {
+                self.models.insert(id, model);
+                None
+            }
+            WorkerRequest::Remove(id) => {
+                self.models.remove(&id);
+                None
+            }
+            WorkerRequest::Run(job) => Some(self.run(job)),
+        }
+    }
+
+    fn run(&mut self, job: RunJob) -> RunDone {
+        let done = |result, ran_ns| RunDone { job: job.job, session: job.session, result, ran_ns };
+        let Some(model) = self.models.get_mut(&job.session) else {
+            return done(Err(failed("the model was removed")), None);
+        };
+        if job.stop.is_stopped() {
+            return done(Err(failed("nothing waits for the result")), None);
+        }
+        self.note.begin(ModelWork {
+            sha256: model.sha256.clone(),
+            path: model.path.clone(),
+            lambdas: vec![job.lambda.clone()],
+            until: Instant::now() + self.run_max,
+            limit: self.run_max,
+            stop: Arc::clone(&job.stop),
+        });
+        let (result, ran_ns) = model.run(&job);
+        self.note.end();
+        done(result, ran_ns)
+    }
+}
+
+impl WorkerModel {
+    fn run(&mut self, job: &RunJob) -> (Result<RunOutputs, ModelFault>, Option<u64>) {
+        let inputs = match read_inputs(job) {
+            Ok(inputs) => inputs,
+            Err(error) => {
+                return (Err(failed(&format!("the inputs cannot be read: {error}"))), None);
+            }
+        };
+        let is_same = self.last.as_ref().is_some_and(|last| last.inputs == inputs);
+        let ran_ns = if is_same {
+            None
+        } else {
+            self.last = None;
+            let start = Instant::now();
+            let ran = caught(|| self.graph.run(&inputs, &job.stop));
+            let run_ns = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
+            let ran = ran.and_then(|ran| ran.map_err(|error| error.to_string()));
+            match ran {
+                Ok(outputs) => self.last = Some(LastRun { inputs, outputs, run_ns }),
+                Err(_) if job.stop.is_stopped() => {
+                    let message = format!("model `{}` was interrupted", self.path);
+                    let fault = ModelFault::new(ModelFaultKind::TooSlow, message);
+                    return (Err(fault), Some(run_ns));
+                }
+                Err(error) => {
+                    let error = format!("model `{}`: its run failed: {error}", self.path);
+                    return (Err(failed(&error)), Some(run_ns));
+                }
+            }
+            Some(run_ns)
+        };
+        let last = self.last.as_ref().expect("it is the same, or has just run");
+        if job.stop.is_stopped() {
+            // The lambda may use the region for its next request.
+            return (Err(failed("nothing waits for the result")), ran_ns);
+        }
+        (last.write(&self.outputs, job), ran_ns)
+    }
+}
+
+impl LastRun {
+    fn write(&self, infos: &[TensorInfo], job: &RunJob) -> Result<RunOutputs, ModelFault> {
+        let tensors = infos.iter().zip(&self.outputs);
+        let named = tensors.map(|(info, it)| (info.name.as_str(), it.element, it.shape.as_slice()));
+        let (places, bytes) = place_outputs(named).map_err(|error| failed(&error.to_string()))?;
+        let no_memory = |error: io::Error| failed(&format!("the outputs cannot be sent: {error}"));
+        let fitting = job.output_region.clone().filter(|region| region.bytes() >= bytes);
+        let new_region = match &fitting {
+            Some(_) => None,
+            None => {
+                let created = TensorRegion::create("gleaner-outputs", bytes.max(1));
+                Some(Arc::new(created.map_err(no_memory)?))
+            }
+        };
+        let region = new_region.clone().or(fitting).expect("an earlier region or a new one");
+        for (place, output) in places.iter().zip(&self.outputs) {
+            region.write(place.offset, &output.bytes).map_err(no_memory)?;
+        }
+        Ok(RunOutputs { places, new_region, run_ns: self.run_ns })
+    }
+}
+
+fn failed(message: &str) -> ModelFault {
+    ModelFault::new(ModelFaultKind::Failed, message)
+}
+
+/// Copies the inputs out of the region.
+fn read_inputs(job: &RunJob) -> io::Result<Vec<TensorValue>> {
+    let inputs = job.inputs.iter().map(|input| {
+        let region = job.input_region.as_ref().ok_or(io::ErrorKind::NotFound)?;
+        let mut bytes = region.read(input.offset, input.bytes)?;
+        if input.element == Element::Boolean {
+            for byte in &mut bytes {
+                *byte = u8::from(*byte != 0);
+            }
+        }
+        Ok(TensorValue { element: input.element, shape: input.shape.clone(), bytes })
+    });
+    inputs.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::backend::BackendError;
+    use crate::running::WorkKind;
+    use crate::sessions::{SessionKey, SessionTable};
+
+    /// Returns its input, and panics for a first byte of 255.
+    struct Echo;
+
+    impl LoadedGraph for Echo {
+        fn run(
+            &mut self,
+            inputs: &[TensorValue],
+            _stop: &StopSignal,
+        ) -> Result<Vec<TensorValue>, BackendError> {
+            assert_ne!(inputs[0].bytes[0], 255, "as requested");
+            Ok(inputs.to_vec())
+        }
+    }
+
+    struct Bench {
+        worker: ModelWorker,
+        session: SessionId,
+        region: Arc<TensorRegion>,
+        outputs: Option<Arc<TensorRegion>>,
+    }
+
+    fn bench(element: Element) -> Bench {
+        let note = WorkNote::new(WorkKind::Run, None);
+        let mut worker = ModelWorker::new(note, Duration::from_secs(60));
+        let key = SessionKey { sha256: "0".repeat(64), providers: Vec::new(), threads: 1 };
+        let session = SessionTable::default().add(key.clone(), String::new());
+        let info = TensorInfo { name: "y".to_owned(), element, shape: vec![None] };
+        let model = WorkerModel {
+            graph: Box::new(Echo),
+            sha256: key.sha256,
+            path: "m.onnx".to_owned(),
+            outputs: vec![info],
+            last: None,
+        };
+        worker.handle(WorkerRequest::Add(session, model));
+        let region = Arc::new(TensorRegion::create("test", 4096).unwrap());
+        Bench { worker, session, region, outputs: None }
+    }
+
+    impl Bench {
+        fn run(&mut self, element: Element, bytes: &[u8]) -> RunDone {
+            self.region.write(0, bytes).unwrap();
+            let shape = vec![bytes.len() as u32];
+            let input = PlacedInput { element, shape, offset: 0, bytes: bytes.len() as u64 };
+            let job = RunJob {
+                job: 1,
+                session: self.session,
+                lambda: "test".to_owned(),
+                inputs: vec![input],
+                input_region: Some(Arc::clone(&self.region)),
+                output_region: self.outputs.clone(),
+                stop: Arc::default(),
+            };
+            self.worker.handle(WorkerRequest::Run(job)).unwrap()
+        }
+    }
+
+    #[test]
+    fn equal_inputs_share_a_run_and_a_region_is_replaced_when_it_is_too_small() {
+        let mut bench = bench(Element::Uint8);
+        let first = bench.run(Element::Uint8, b"abc");
+        let outputs = first.result.unwrap();
+        assert!(first.ran_ns.is_some());
+        bench.outputs = outputs.new_region;
+        let second = bench.run(Element::Uint8, b"abc");
+        assert_eq!(second.ran_ns, None, "it is shared");
+        let shared = second.result.unwrap();
+        assert_eq!(shared.run_ns, outputs.run_ns);
+        assert!(shared.new_region.is_none());
+        let third = bench.run(Element::Uint8, &[7; 200]);
+        let region = third.result.unwrap().new_region.expect("the first one has 3 bytes");
+        assert_eq!(region.read(0, 200).unwrap(), [7; 200]);
+        // The same bytes in another shape are another input.
+        assert!(bench.run(Element::Uint8, &[7; 100]).ran_ns.is_some());
+    }
+
+    #[test]
+    fn bytes_of_booleans_become_0_or_1() {
+        let mut bench = bench(Element::Boolean);
+        let done = bench.run(Element::Boolean, &[0, 1, 7, 255]);
+        let region = done.result.unwrap().new_region.unwrap();
+        assert_eq!(region.read(0, 4).unwrap(), [0, 1, 1, 1]);
+    }
+
+    #[test]
+    fn a_panic_fails_one_run_only() {
+        let mut bench = bench(Element::Uint8);
+        let fault = bench.run(Element::Uint8, &[255]).result.err().unwrap();
+        assert_eq!(fault.kind, ModelFaultKind::Failed);
+        assert!(fault.message.contains("the library panicked"), "{}", fault.message);
+        assert!(bench.run(Element::Uint8, &[1]).result.is_ok());
+    }
+}

@@ -1,0 +1,180 @@
+//! Lambdas that break the protocol lose their connection; others are served.
+
+use std::os::fd::{AsFd, OwnedFd};
+use std::time::{Duration, Instant};
+
+use gleaner_protocol::inference::{
+    MAX_TENSOR_BYTES, MESSAGE_MAX, ModelCall, ModelClient, ModelFaultKind, ModelRequest,
+};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::net::{RecvFlags, SendFlags, recv, send};
+
+use crate::onnx::{ANY, FLOAT32, endless, product, unary};
+use crate::support::{ModelProgram, ModelUser, TestModel, fault, floats, granted};
+
+fn models() -> Vec<TestModel> {
+    vec![granted("product", product()), granted("endless", endless(&[ANY]))]
+}
+
+/// Checks that the program still serves others.
+fn serves(program: &ModelProgram) {
+    let mut lambda = program.lambda("healthy", &models()[..1]);
+    lambda.open("product").unwrap();
+    let outputs = lambda.run("product", &[floats("x", &[1, 3], &[1.0; 3])]).unwrap();
+    assert_eq!(outputs[0].floats(), [9.0, 12.0]);
+}
+
+/// Waits until the program has closed the connection.
+#[track_caller]
+fn is_closed(socket: &OwnedFd) {
+    let until = Instant::now() + Duration::from_secs(60);
+    loop {
+        let second = Timespec { tv_sec: 1, tv_nsec: 0 };
+        let fd = socket.as_fd();
+        let mut polled = [PollFd::new(&fd, PollFlags::IN)];
+        poll(&mut polled, Some(&second)).unwrap();
+        match recv(socket, &mut [0; MESSAGE_MAX][..], RecvFlags::DONTWAIT) {
+            Ok((_, 0)) => return,
+            Ok(_) => {}
+            Err(rustix::io::Errno::AGAIN) => {}
+            Err(_) => return,
+        }
+        assert!(Instant::now() < until, "the connection is still open");
+    }
+}
+
+#[test]
+fn messages_that_are_no_calls_close_the_connection() {
+    let program = ModelProgram::start(&[]);
+    let open = || ModelCall::Open { model: "product".to_owned() };
+    let bytes =
+        |id| serde_json::to_vec(&ModelRequest { id, deadline_ns: None, call: open() }).unwrap();
+    for garbage in [
+        b"{}".to_vec(),
+        b"\xff\xfe\0".to_vec(),
+        vec![b'['; MESSAGE_MAX],
+        vec![b'x'; MESSAGE_MAX + 1],
+        bytes(0),
+        br#"{"id":1,"deadline_ns":null,"call":{"run":{"model":"m","inputs":[{"name":"x"}]}}}"#
+            .to_vec(),
+        br#"{"id":1,"deadline_ns":-1,"call":{"reserve":{"bytes":1e30}}}"#.to_vec(),
+    ] {
+        let (socket, other) = ModelClient::pair().unwrap();
+        program.add("hostile", &models(), &other);
+        drop(other);
+        send(&socket, &garbage, SendFlags::NOSIGNAL).unwrap();
+        is_closed(&socket);
+    }
+    let (socket, other) = ModelClient::pair().unwrap();
+    program.add("repeats", &models(), &other);
+    drop(other);
+    send(&socket, &bytes(2), SendFlags::NOSIGNAL).unwrap();
+    send(&socket, &bytes(2), SendFlags::NOSIGNAL).unwrap();
+    is_closed(&socket);
+    serves(&program);
+}
+
+#[test]
+fn a_second_call_during_a_run_closes_the_connection() {
+    let program = ModelProgram::start(&["--run-max", "60"]);
+    let (socket, other) = ModelClient::pair().unwrap();
+    program.add("impatient", &models(), &other);
+    drop(other);
+    let mut lambda = ModelUser::new(socket.try_clone().unwrap());
+    lambda.open("product").unwrap();
+    let inputs = lambda.place(&[floats("x", &[1, 3], &[0.0; 3])]);
+    let run = || ModelCall::Run { model: "product".to_owned(), inputs: inputs.clone() };
+    // Many at once: a single one could be done before the next is read.
+    for id in 100..400 {
+        let request = ModelRequest { id, deadline_ns: None, call: run() };
+        let bytes = serde_json::to_vec(&request).unwrap();
+        if send(&socket, &bytes, SendFlags::NOSIGNAL | SendFlags::DONTWAIT).is_err() {
+            break;
+        }
+    }
+    is_closed(&socket);
+    serves(&program);
+}
+
+#[test]
+fn a_lambda_that_does_not_read_its_replies_is_disconnected() {
+    let program = ModelProgram::start(&[]);
+    let (socket, other) = ModelClient::pair().unwrap();
+    program.add("deaf", &models(), &other);
+    drop(other);
+    let mut id = 0;
+    while id < 100_000 {
+        id += 1;
+        let call = ModelCall::Reserve { bytes: 64 };
+        let bytes = serde_json::to_vec(&ModelRequest { id, deadline_ns: None, call }).unwrap();
+        match send(&socket, &bytes, SendFlags::NOSIGNAL) {
+            Ok(_) => {}
+            Err(_) => break,
+        }
+    }
+    assert!(id < 100_000, "all calls were read");
+    serves(&program);
+}
+
+#[test]
+fn a_lambda_that_ends_while_it_waits_leaves_nothing_behind() {
+    let program = ModelProgram::start(&[]);
+    for _ in 0..20 {
+        let mut lambda = program.lambda("short", &models());
+        lambda.open("product").unwrap();
+        let inputs = lambda.place(&[floats("x", &[1, 3], &[2.0; 3])]);
+        let call = ModelCall::Run { model: "product".to_owned(), inputs };
+        let _ = lambda.client.call(call, None, Some(Instant::now()));
+    }
+    for _ in 0..20 {
+        let mut lambda = program.lambda("early", &models());
+        let open = ModelCall::Open { model: "product".to_owned() };
+        let _ = lambda.client.call(open, None, Some(Instant::now()));
+    }
+    serves(&program);
+    let status = program.status(|status| status.clients == 0 && status.waiting == 0);
+    assert_eq!(status.models.len(), 1, "it is kept for a while");
+}
+
+#[test]
+fn hostile_offsets_and_lengths_are_refused() {
+    let program = ModelProgram::start(&[]);
+    let mut lambda = program.lambda("hostile", &models());
+    lambda.open("product").unwrap();
+    for bytes in [0, MAX_TENSOR_BYTES + 1, u64::MAX] {
+        fault(ModelFaultKind::WrongInput, lambda.reserve(bytes));
+    }
+    let input = floats("x", &[1, 3], &[1.0; 3]);
+    // Without a region.
+    fault(ModelFaultKind::WrongInput, lambda.run_at("product", vec![input.place(0)], None));
+    lambda.reserve(128).unwrap();
+    for offset in [1, 64 + 63, 128, u64::MAX - 63, u64::MAX] {
+        let ran = lambda.run_at("product", vec![input.place(offset)], None);
+        fault(ModelFaultKind::WrongInput, ran);
+    }
+    for shape in [vec![u32::MAX, 3], vec![0, 3], vec![1 << 30, 3], vec![11, 3], vec![3; 9]] {
+        let place = gleaner_protocol::inference::TensorPlace { shape, ..input.place(0) };
+        let ran = lambda.run_at("product", vec![place], None);
+        fault(ModelFaultKind::WrongInput, ran);
+    }
+    let many: Vec<_> = (0..500).map(|_| input.place(0)).collect();
+    fault(ModelFaultKind::WrongInput, lambda.run_at("product", many, None));
+    let long = "n".repeat(40_000);
+    fault(ModelFaultKind::NoSuchModel, lambda.open(&long));
+    // Escaped, each has 6 bytes. The reply repeats the name, and would exceed a message.
+    let controls = "\u{1}".repeat((MESSAGE_MAX - 70) / 6);
+    fault(ModelFaultKind::Failed, lambda.open(&controls));
+    lambda.reserve(64).unwrap();
+    assert_eq!(lambda.run("product", &[input]).unwrap()[0].floats(), [9.0, 12.0]);
+}
+
+#[test]
+fn a_lambda_cannot_change_the_size_of_its_region() {
+    let program = ModelProgram::start(&[]);
+    let mut lambda = program.lambda("hostile", &[granted("relu", unary("Relu", FLOAT32, &[1]))]);
+    let (_, region) = lambda.call(ModelCall::Reserve { bytes: 4096 }, None);
+    let region = std::fs::File::from(region.unwrap());
+    for size in [0, 64, 8192] {
+        assert!(region.set_len(size).is_err(), "{size}");
+    }
+}

@@ -1,0 +1,133 @@
+//! Lambdas share models, runs and the order of runs.
+
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::Duration;
+
+use gleaner_protocol::inference::{ModelCall, ModelFaultKind, ModelWait};
+
+use crate::onnx::{ANY, FLOAT32, endless, graph, model, node, product, unary, value};
+use crate::support::{ModelProgram, TestModel, fault, floats, granted};
+
+/// A model that takes some ms: products of large matrices.
+fn slow() -> TestModel {
+    let size = 400;
+    let nodes: Vec<_> = (0..8)
+        .map(|index| {
+            let (from, to) = (format!("v{index}"), format!("v{}", index + 1));
+            node("MatMul", &[&from, &from], &[&to], &[])
+        })
+        .collect();
+    granted(
+        "slow",
+        model(&graph(
+            &nodes,
+            &[],
+            &[value("v0", FLOAT32, &[size, size])],
+            &[value("v8", FLOAT32, &[size, size])],
+        )),
+    )
+}
+
+fn slow_input(seed: usize) -> crate::support::TestTensor {
+    let mut values = vec![0.0; 400 * 400];
+    values[seed % 1000] = seed as f32;
+    floats("v0", &[400, 400], &values)
+}
+
+#[test]
+fn two_lambdas_share_a_model_and_the_run_on_the_same_frame() {
+    let program = ModelProgram::start(&[]);
+    let mut lambdas = ["one", "two"].map(|name| program.lambda(name, &[granted(name, product())]));
+    let input = floats("x", &[2, 3], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+    let mut results = Vec::new();
+    for (lambda, name) in lambdas.iter_mut().zip(["one", "two"]) {
+        lambda.open(name).unwrap();
+        results.push((lambda.run(name, std::slice::from_ref(&input)).unwrap(), lambda.run_ns));
+    }
+    assert_eq!(results[0], results[1]);
+    // Another frame, and the first one again.
+    lambdas[0].run("one", &[floats("x", &[2, 3], &[0.0; 6])]).unwrap();
+    assert_eq!(lambdas[1].run("two", &[input]).unwrap(), results[0].0);
+    let last = program.stop();
+    assert_eq!(last.models.len(), 1);
+    let model = &last.models[0];
+    assert_eq!((model.runs, model.shared, model.lambdas.len()), (3, 1, 2));
+}
+
+#[test]
+fn other_options_are_another_session() {
+    let program = ModelProgram::start(&[]);
+    let mut two = granted("two", product());
+    two.grant.threads = Some(2);
+    let mut lambda = program.lambda("options", &[granted("one", product()), two]);
+    assert_eq!(lambda.open("one").unwrap().runtime, "rten 0.27.0, cpu, 1 thread");
+    assert_eq!(lambda.open("two").unwrap().runtime, "rten 0.27.0, cpu, 2 threads");
+    assert_eq!(program.status(|status| status.models.len() == 2).clients, 1);
+}
+
+#[test]
+fn a_lambda_that_always_runs_does_not_starve_another() {
+    let program = ModelProgram::start(&[]);
+    let ends = AtomicBool::new(false);
+    let counts = [(); 2].map(|()| AtomicUsize::new(0));
+    let mut patient = program.lambda("patient", &[slow()]);
+    patient.open("slow").unwrap();
+    std::thread::scope(|scope| {
+        for (index, count) in counts.iter().enumerate() {
+            let (ends, mut flood) = (&ends, program.lambda("flood", &[slow()]));
+            scope.spawn(move || {
+                flood.open("slow").unwrap();
+                let mut seed = index * 100_000;
+                while !ends.load(Ordering::Relaxed) {
+                    seed += 1;
+                    let deadline = Some(Duration::from_secs(30));
+                    flood.run_until("slow", &[slow_input(seed)], deadline).unwrap();
+                    count.fetch_add(1, Ordering::Relaxed);
+                }
+            });
+        }
+        let sum = || counts.iter().map(|count| count.load(Ordering::Relaxed)).sum::<usize>();
+        while sum() < 10 {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        // By their deadlines alone, the others would always come first, and this would never end.
+        for seed in 0..5 {
+            patient.run("slow", &[slow_input(900_000 + seed)]).unwrap();
+        }
+        ends.store(true, Ordering::Relaxed);
+    });
+}
+
+#[test]
+fn a_model_is_loaded_while_another_one_runs() {
+    let program = ModelProgram::start(&[]);
+    let mut stuck = program.lambda("stuck", &[granted("endless", endless(&[ANY]))]);
+    stuck.open("endless").unwrap();
+    let soon = Some(Duration::from_millis(50));
+    let message = fault(
+        ModelFaultKind::TooSlow,
+        stuck.run_until("endless", &[floats("x", &[1], &[1.0])], soon),
+    );
+    assert_eq!(message, "model `endless` is still running at the deadline");
+    let mut other = program.lambda("other", &[granted("relu", unary("Relu", FLOAT32, &[1]))]);
+    other.open("relu").unwrap();
+    let message =
+        fault(ModelFaultKind::TooSlow, other.run_until("relu", &[floats("x", &[1], &[1.0])], soon));
+    assert_eq!(message, "model `relu` has not run yet: others run before it at the deadline");
+}
+
+#[test]
+fn a_request_that_comes_after_its_deadline_is_not_run() {
+    let program = ModelProgram::start(&[]);
+    let mut lambda = program.lambda("late", &[granted("relu", unary("Relu", FLOAT32, &[1]))]);
+    lambda.open("relu").unwrap();
+    let inputs = lambda.place(&[floats("x", &[1], &[1.0])]);
+    let call = ModelCall::Run { model: "relu".to_owned(), inputs };
+    // The first ns of this machine.
+    let Ok(ModelWait::Reply(reply, _)) = lambda.client.call(call, Some(1), None) else {
+        panic!("no reply")
+    };
+    fault(ModelFaultKind::TooSlow, reply.result);
+    let last = program.stop();
+    assert_eq!((last.models[0].runs, last.models[0].failed), (0, 1));
+}

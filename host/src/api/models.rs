@@ -1,0 +1,385 @@
+//! The models of a lambda: its connection to `gleaner-inference`, which runs them, and the time that
+//! they take.
+
+use std::fs::File;
+use std::io;
+use std::os::fd::OwnedFd;
+use std::os::unix::fs::FileExt;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use gleaner_base::chain;
+use gleaner_protocol::inference::{
+    MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelFault, ModelFaultKind, ModelReply, ModelResult,
+    ModelWait, TensorInfo, TensorPlace,
+};
+use gleaner_protocol::link::LinkError;
+use gleaner_vision::{DetectorLayout, Preparer};
+use rustix::time::{ClockId, clock_gettime};
+
+use super::call::Due;
+use super::inference::InferenceError;
+
+/// Alignment of tensors in a region, in bytes.
+const ALIGNMENT: u64 = 64;
+
+/// A `[[model]]` of the manifest.
+pub struct ModelEntry {
+    /// Its name.
+    pub name: String,
+    /// The layout of a detector.
+    pub layout: Option<DetectorLayout>,
+    /// Names of its classes.
+    pub labels: Vec<String>,
+}
+
+/// The models of a lambda. Clones share the connection; one call is made at a time.
+#[derive(Clone, Default)]
+pub struct Models(Arc<Mutex<ModelsState>>);
+
+#[derive(Default)]
+struct ModelsState {
+    entries: Vec<Arc<ModelEntry>>,
+    connection: Option<Connection>,
+    /// Run time of the models in the current wake.
+    used: Duration,
+    /// The limit of `used`, if there is one.
+    allowed: Option<Duration>,
+    preparer: Preparer,
+    /// The prepared frame, whose memory is used again.
+    prepared: Vec<u8>,
+}
+
+/// The connection to `gleaner-inference`.
+struct Connection {
+    client: ModelClient,
+    /// The region for inputs, and its size.
+    inputs: Option<(File, u64)>,
+    /// The region for outputs.
+    outputs: Option<File>,
+    opened: Vec<(String, Arc<OpenedModel>)>,
+    /// The reason why the process has ended, until the next one has started.
+    ended: Option<String>,
+}
+
+/// A model that is loaded.
+#[derive(Debug)]
+pub struct OpenedModel {
+    /// Its inputs.
+    pub inputs: Vec<TensorInfo>,
+    /// Its outputs.
+    pub outputs: Vec<TensorInfo>,
+    /// Backend, version, provider and threads.
+    pub runtime: String,
+}
+
+/// An input or output in the memory of this process.
+pub(super) struct TensorBytes<T> {
+    /// Name, type and shape; the offset is 0.
+    pub(super) place: TensorPlace,
+    /// The elements.
+    pub(super) bytes: T,
+}
+
+impl Models {
+    /// The models `entries`, over `socket` if the starter passed one.
+    pub fn new(entries: Vec<ModelEntry>, socket: Option<OwnedFd>) -> Self {
+        let connection = socket.map(|socket| Connection {
+            client: ModelClient::new(socket),
+            inputs: None,
+            outputs: None,
+            opened: Vec::new(),
+            ended: None,
+        });
+        let entries = entries.into_iter().map(Arc::new).collect();
+        Self(Arc::new(Mutex::new(ModelsState { entries, connection, ..Default::default() })))
+    }
+
+    /// Limits the run time of the models of a wake.
+    pub fn limit(&self, allowed: Option<Duration>) {
+        self.lock().allowed = allowed;
+    }
+
+    /// Begins a wake.
+    pub fn begin(&self) {
+        self.lock().used = Duration::ZERO;
+    }
+
+    /// Run time of the models since [`Models::begin`], in ns.
+    pub fn run_ns(&self) -> u64 {
+        u64::try_from(self.lock().used.as_nanos()).unwrap_or(u64::MAX)
+    }
+
+    /// Opens all models, so that `init` finds them loaded. Errors are kept for the lambda, which
+    /// opens them again. Waits for `timeout` at most.
+    pub fn open_all(&self, timeout: Duration) {
+        let due = Due::default();
+        due.set(Some(Instant::now() + timeout));
+        let mut state = self.lock();
+        for entry in state.entries.clone() {
+            if let Err(error) = state.open(&entry.name, &due) {
+                tracing::warn!(model = entry.name, error = chain(&error), "cannot open the model");
+            }
+        }
+    }
+
+    /// Backend, version, provider and threads of each model, by its name; `none` for one that is
+    /// not loaded.
+    pub fn runtimes(&self) -> Vec<String> {
+        let state = self.lock();
+        let runtime = |entry: &Arc<ModelEntry>| {
+            let opened = state.connection.as_ref().and_then(|it| it.find(&entry.name));
+            let runtime = opened.as_ref().map_or("none", |opened| &opened.runtime);
+            format!("model `{}`: {runtime}", entry.name)
+        };
+        state.entries.iter().map(runtime).collect()
+    }
+
+    /// Returns the model of that name and its entry, loaded.
+    pub(super) fn open(
+        &self,
+        name: &str,
+        due: &Due,
+    ) -> Result<(Arc<ModelEntry>, Arc<OpenedModel>), InferenceError> {
+        let mut state = self.lock();
+        let entry = state.entries.iter().find(|entry| entry.name == name).cloned();
+        let entry = entry.ok_or_else(|| {
+            let known: Vec<_> = state.entries.iter().map(|entry| &*entry.name).collect();
+            InferenceError::no_such_model(name, &known)
+        })?;
+        Ok((entry, state.open(name, due)?))
+    }
+
+    /// Runs a model once.
+    pub(super) fn run(
+        &self,
+        name: &str,
+        inputs: &[TensorBytes<&[u8]>],
+        due: &Due,
+    ) -> Result<Vec<TensorBytes<Vec<u8>>>, InferenceError> {
+        self.lock().run(name, inputs, due)
+    }
+
+    /// Runs a model on one input that `prepare` writes into memory which is used again.
+    pub(super) fn run_prepared<P>(
+        &self,
+        name: &str,
+        place: TensorPlace,
+        due: &Due,
+        prepare: impl FnOnce(&mut Preparer, &mut Vec<u8>) -> Result<P, InferenceError>,
+    ) -> Result<(P, Vec<TensorBytes<Vec<u8>>>), InferenceError> {
+        let mut state = self.lock();
+        let mut bytes = std::mem::take(&mut state.prepared);
+        let result = prepare(&mut state.preparer, &mut bytes).and_then(|placed| {
+            let outputs = state.run(name, &[TensorBytes { place, bytes: &bytes }], due)?;
+            Ok((placed, outputs))
+        });
+        state.prepared = bytes;
+        result
+    }
+
+    /// Prepares a frame as a tensor.
+    pub(super) fn prepare<P>(
+        &self,
+        prepare: impl FnOnce(&mut Preparer) -> Result<P, InferenceError>,
+    ) -> Result<P, InferenceError> {
+        prepare(&mut self.lock().preparer)
+    }
+
+    fn lock(&self) -> MutexGuard<'_, ModelsState> {
+        // After a panic, at worst a region is requested again.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl ModelsState {
+    fn open(&mut self, name: &str, due: &Due) -> Result<Arc<OpenedModel>, InferenceError> {
+        let until = due.at();
+        let connection = self.connection.as_mut().ok_or_else(not_connected)?;
+        connection.check_process(until)?;
+        connection.open(name, until)
+    }
+
+    fn run(
+        &mut self,
+        name: &str,
+        inputs: &[TensorBytes<&[u8]>],
+        due: &Due,
+    ) -> Result<Vec<TensorBytes<Vec<u8>>>, InferenceError> {
+        let started = Instant::now();
+        let left = self.allowed.map(|allowed| allowed.saturating_sub(self.used));
+        let too_slow = || InferenceError::too_slow(name, self.allowed.unwrap_or_default());
+        if left.is_some_and(|left| left.is_zero()) {
+            return Err(too_slow());
+        }
+        let of_models = left.map(|left| started + left);
+        let until = [due.at(), of_models].into_iter().flatten().min();
+        let connection = self.connection.as_mut().ok_or_else(not_connected)?;
+        connection.check_process(until)?;
+        let result = connection
+            .open(name, until)
+            .and_then(|_| connection.run(name, inputs, until))
+            .map_err(|error| match error {
+                // Without a deadline in reach, the time of the models is over.
+                InferenceError::OutOfTime if due.check().is_ok() => too_slow(),
+                error => error,
+            });
+        self.used += match &result {
+            Ok((_, ran)) => *ran,
+            Err(_) => started.elapsed(),
+        };
+        result.map(|(outputs, _)| outputs)
+    }
+}
+
+impl Connection {
+    fn find(&self, name: &str) -> Option<Arc<OpenedModel>> {
+        self.opened.iter().find(|(known, _)| known == name).map(|(_, opened)| Arc::clone(opened))
+    }
+
+    /// Returns an error while the process is not running. Without a deadline, waits for the next.
+    fn check_process(&mut self, until: Option<Instant>) -> Result<(), InferenceError> {
+        while let Some(reply) = self.client.poll().map_err(failed)? {
+            self.note(&reply);
+        }
+        while until.is_none() && self.ended.is_some() {
+            if let Some(reply) = self.client.wait_for_starter(None).map_err(failed)? {
+                self.note(&reply);
+            }
+        }
+        match &self.ended {
+            Some(reason) => {
+                Err(InferenceError::Unavailable(format!("{reason}; it is being started again")))
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// Notes the end or the start of the process.
+    fn note(&mut self, reply: &ModelReply) {
+        self.ended = match &reply.result {
+            Ok(_) => None,
+            Err(fault) => {
+                (self.inputs, self.outputs) = (None, None);
+                self.opened.clear();
+                Some(fault.message.clone())
+            }
+        };
+    }
+
+    fn open(
+        &mut self,
+        name: &str,
+        until: Option<Instant>,
+    ) -> Result<Arc<OpenedModel>, InferenceError> {
+        if let Some(opened) = self.find(name) {
+            return Ok(opened);
+        }
+        let (result, _) = self.call(ModelCall::Open { model: name.to_owned() }, until)?;
+        let ModelResult::Opened { inputs, outputs, runtime } = result else {
+            return Err(unexpected());
+        };
+        let opened = Arc::new(OpenedModel { inputs, outputs, runtime });
+        self.opened.push((name.to_owned(), Arc::clone(&opened)));
+        Ok(opened)
+    }
+
+    fn run(
+        &mut self,
+        name: &str,
+        inputs: &[TensorBytes<&[u8]>],
+        until: Option<Instant>,
+    ) -> Result<(Vec<TensorBytes<Vec<u8>>>, Duration), InferenceError> {
+        let mut places = Vec::new();
+        let mut end = 0_u64;
+        for input in inputs {
+            places.push(TensorPlace { offset: end, ..input.place.clone() });
+            end = end.saturating_add(input.bytes.len() as u64).next_multiple_of(ALIGNMENT);
+        }
+        if end > MAX_TENSOR_BYTES {
+            let inputs = format!("the inputs of model `{name}` have {end} bytes");
+            return Err(InferenceError::WrongInput(format!("{inputs}, above {MAX_TENSOR_BYTES}")));
+        }
+        if self.inputs.as_ref().is_none_or(|(_, bytes)| *bytes < end) {
+            match self.call(ModelCall::Reserve { bytes: end.max(1) }, until)? {
+                (ModelResult::Reserved, Some(region)) => {
+                    self.inputs = Some((File::from(region), end));
+                }
+                _ => return Err(unexpected()),
+            }
+        }
+        let Some((region, _)) = &self.inputs else { return Err(unexpected()) };
+        for (input, place) in inputs.iter().zip(&places) {
+            region.write_all_at(input.bytes, place.offset).map_err(region_failed)?;
+        }
+        let call = ModelCall::Run { model: name.to_owned(), inputs: places };
+        let (result, region) = self.call(call, until)?;
+        let ModelResult::Ran { outputs, run_ns } = result else { return Err(unexpected()) };
+        if let Some(region) = region {
+            self.outputs = Some(File::from(region));
+        }
+        let Some(region) = &self.outputs else { return Err(unexpected()) };
+        let read = |place: TensorPlace| {
+            let len = place.bytes().and_then(|len| usize::try_from(len).ok());
+            let mut bytes = vec![0; len.ok_or_else(unexpected)?];
+            region.read_exact_at(&mut bytes, place.offset).map_err(region_failed)?;
+            Ok(TensorBytes { place, bytes })
+        };
+        let outputs = outputs.into_iter().map(read).collect::<Result<_, InferenceError>>()?;
+        Ok((outputs, Duration::from_nanos(run_ns)))
+    }
+
+    fn call(
+        &mut self,
+        call: ModelCall,
+        until: Option<Instant>,
+    ) -> Result<(ModelResult, Option<OwnedFd>), InferenceError> {
+        let deadline_ns = until.map(|until| {
+            let left = until.saturating_duration_since(Instant::now());
+            monotonic_ns().saturating_add(u64::try_from(left.as_nanos()).unwrap_or(u64::MAX))
+        });
+        let (reply, region) = match self.client.call(call, deadline_ns, until).map_err(failed)? {
+            ModelWait::Reply(reply, region) => (reply, region),
+            ModelWait::TimedOut => return Err(InferenceError::OutOfTime),
+        };
+        if reply.id == 0 {
+            self.note(&reply);
+        }
+        match reply.result {
+            // The process has started again, without this call.
+            Ok(ModelResult::Started) => Err(InferenceError::Unavailable(
+                "gleaner-inference has just been started again".to_owned(),
+            )),
+            Ok(result) => Ok((result, region)),
+            // It noticed first that the time is over.
+            Err(fault) if fault.kind == ModelFaultKind::TooSlow && until.is_some() => {
+                Err(InferenceError::OutOfTime)
+            }
+            Err(ModelFault { kind, message }) => Err(InferenceError::of(kind, message)),
+        }
+    }
+}
+
+fn monotonic_ns() -> u64 {
+    let now = clock_gettime(ClockId::Monotonic);
+    (now.tv_sec as u64).saturating_mul(1_000_000_000).saturating_add(now.tv_nsec as u64)
+}
+
+fn not_connected() -> InferenceError {
+    InferenceError::Unavailable(
+        "no process runs models: start the lambda with `gleaner run` or `gleaner replay`"
+            .to_owned(),
+    )
+}
+
+fn failed(error: LinkError) -> InferenceError {
+    InferenceError::Unavailable(chain(&error))
+}
+
+fn region_failed(error: io::Error) -> InferenceError {
+    InferenceError::Unavailable(format!("cannot use the memory of gleaner-inference: {error}"))
+}
+
+fn unexpected() -> InferenceError {
+    InferenceError::Unavailable("gleaner-inference sent an invalid reply".to_owned())
+}

@@ -1,0 +1,177 @@
+//! Errors of frames, tensors and outputs of models, with their messages for users.
+
+use std::fmt::Write;
+
+use gleaner_rules::pixels::{Encoding, PixelError};
+
+use crate::prepare::MAX_TENSOR_SIDE;
+
+/// Dimensions of a shape that a message lists.
+const LISTED_DIMENSIONS: usize = 8;
+
+/// A frame, a tensor or an output that does not fit.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum VisionError {
+    /// A frame whose pixels have no colour, or more than 8 bits.
+    #[error(
+        "frame of {}: a tensor is made of rgb8, bgr8, rgba8, bgra8, mono8, uyvy or yuyv; {}",
+        encoding.name(),
+        way_out(*encoding)
+    )]
+    Encoding {
+        /// The encoding of the frame.
+        encoding: Encoding,
+    },
+    /// A side of the tensor is 0 or too long.
+    #[error("tensor of {width}x{height} pixels: each side must be 1 to {MAX_TENSOR_SIDE}")]
+    TensorSize {
+        /// Pixels per row.
+        width: u32,
+        /// Rows.
+        height: u32,
+    },
+    /// A number of the normalisation that is not finite, or a deviation of 0.
+    #[error("{name} of the tensor is {value}; it must be finite, and a deviation not 0")]
+    Normalisation {
+        /// `scale`, `mean` or `deviation`.
+        name: &'static str,
+        /// The refused value.
+        value: f32,
+    },
+    /// The length of the caller's slice is not that of the tensor.
+    #[error("tensor needs {needed} bytes; the output has {found}")]
+    TensorLength {
+        /// Bytes of the tensor.
+        needed: usize,
+        /// Bytes of the caller's slice.
+        found: usize,
+    },
+    /// An operation on pixels failed, or was stopped by the caller.
+    #[error(transparent)]
+    Pixels(#[from] PixelError),
+    /// A layout that does not exist.
+    #[error("layout `{name}` is not known; known are {known}")]
+    UnknownLayout {
+        /// The name, cut to 40 characters.
+        name: String,
+        /// The known names.
+        known: String,
+    },
+    /// A model whose input is not a picture of three channels.
+    #[error(
+        "layout `{layout}` needs one input [1, 3, height, width] or [1, height, width, 3]; \
+         the model has {found}"
+    )]
+    InputShape {
+        /// Name of the layout.
+        layout: &'static str,
+        /// Shape of the input.
+        found: String,
+    },
+    /// A model whose input has no fixed size.
+    #[error(
+        "layout `{layout}` needs an input of fixed size; the model has {found}: export it with a \
+         fixed size, such as 640x640"
+    )]
+    DynamicInput {
+        /// Name of the layout.
+        layout: &'static str,
+        /// Shape of the input.
+        found: String,
+    },
+    /// Outputs that another kind of model has.
+    #[error(
+        "layout `{layout}` needs one output {expected} for an input of {width}x{height}; \
+         the model has {found}"
+    )]
+    OutputShape {
+        /// Name of the layout.
+        layout: &'static str,
+        /// The shape that the layout needs.
+        expected: String,
+        /// Width of the input in pixels.
+        width: u32,
+        /// Height of the input in pixels.
+        height: u32,
+        /// Shapes of the outputs.
+        found: String,
+    },
+    /// An output whose number of values contradicts its shape.
+    #[error("output {shape} of the model has {found} values")]
+    OutputLength {
+        /// Shape of the output.
+        shape: String,
+        /// Number of values.
+        found: usize,
+    },
+    /// A class that the model does not have.
+    #[error("class {class} is wanted; the model has classes 0 to {}", classes.saturating_sub(1))]
+    Class {
+        /// The class.
+        class: u32,
+        /// Number of classes of the model.
+        classes: u32,
+    },
+    /// An option of a detection that is not between 0 and 1.
+    #[error("{name} is {value}; it must be 0 to 1")]
+    Fraction {
+        /// Name of the option.
+        name: &'static str,
+        /// The refused value.
+        value: f32,
+    },
+    /// The placement of a frame that no tensor can have.
+    #[error("placement of the frame in the tensor is invalid: take it from the prepared tensor")]
+    Placed,
+}
+
+/// Returns the advice for frames of this encoding.
+fn way_out(encoding: Encoding) -> &'static str {
+    if encoding.is_raw() {
+        "debayer it first, for example by image_proc"
+    } else {
+        "publish it with 8 bits, as mono8"
+    }
+}
+
+/// Cuts `name` for a message.
+pub(crate) fn shortened(name: &str) -> String {
+    const LONGEST: usize = 40;
+    match name.char_indices().nth(LONGEST) {
+        None => name.to_owned(),
+        Some((end, _)) => format!("{}…", &name[..end]),
+    }
+}
+
+/// Formats a shape, such as `[1, 84, ?]`.
+pub(crate) fn shape_text(shape: impl IntoIterator<Item = Option<u32>>) -> String {
+    let mut text = String::from("[");
+    for (index, length) in shape.into_iter().enumerate() {
+        let separator = if index == 0 { "" } else { ", " };
+        if index == LISTED_DIMENSIONS {
+            text.push_str(", …");
+            break;
+        }
+        // Writing to a string does not fail.
+        let _ = match length {
+            Some(length) => write!(text, "{separator}{length}"),
+            None => write!(text, "{separator}?"),
+        };
+    }
+    text.push(']');
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shape_of_many_dimensions_is_cut() {
+        assert_eq!(shape_text([Some(1), None, Some(4)]), "[1, ?, 4]");
+        assert_eq!(shape_text([]), "[]");
+        let text = shape_text(vec![Some(u32::MAX); 1000]);
+        assert!(text.len() < 110 && text.ends_with(", …]"), "{text}");
+    }
+}

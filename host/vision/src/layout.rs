@@ -1,0 +1,349 @@
+//! Families of detectors: the form of their input and of their output.
+
+use crate::error::{VisionError, shape_text, shortened};
+use crate::placement::Placement;
+use crate::prepare::Preprocess;
+
+/// Numbers of a box, in front of the scores.
+pub(crate) const BOX: usize = 4;
+
+/// Sides of a box, each with a distribution of its distance in NanoDet-Plus.
+pub(crate) const SIDES: usize = 4;
+
+/// Distances in such a distribution, 0 to 7: `reg_max` is 7.
+pub(crate) const BINS: usize = 8;
+
+/// Numbers of a row of an NMS-free detector: box, score, class.
+const NMS_FREE_ROW: u32 = 6;
+
+/// Strides of the grids of YOLOX.
+const YOLOX_STRIDES: &[u32] = &[8, 16, 32];
+
+/// Strides of the grids of NanoDet-Plus; older ones lack the last.
+const NANODET_STRIDES: &[u32] = &[8, 16, 32, 64];
+
+/// The family of a detector, which determines its input and the meaning of its output.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum DetectorLayout {
+    /// YOLOv8, YOLO11 and others of Ultralytics: one output [1, 4 + classes, anchors], or the same
+    /// transposed, of boxes by centre and size in pixels of the tensor, and scores of the classes.
+    Ultralytics,
+    /// YOLOX, exported without `--decode_in_inference`: one output [1, cells, 5 + classes] of boxes
+    /// relative to cells of grids with strides 8, 16 and 32, objectness, and scores of the classes.
+    Yolox,
+    /// YOLOv10 and others that need no NMS: one output [1, rows, 6] of corners in
+    /// pixels of the tensor, score and class.
+    NmsFree,
+    /// NanoDet-Plus: one output [1, cells, classes + 32] of scores of the classes and distributions
+    /// of four distances, for grids with strides 8, 16, 32 and 64, or without the last.
+    Nanodet,
+}
+
+/// Form of the output of a detector, after all its lengths have been checked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Form {
+    pub(crate) layout: DetectorLayout,
+    /// Cells, anchors or rows.
+    pub(crate) anchors: usize,
+    /// Numbers of an anchor.
+    pub(crate) numbers: usize,
+    /// Number of classes; none if the model may return any.
+    pub(crate) classes: Option<u32>,
+    /// True if the numbers of an anchor are not next to each other, but the anchors are.
+    pub(crate) by_number: bool,
+    /// Strides of the grids.
+    pub(crate) strides: &'static [u32],
+}
+
+impl DetectorLayout {
+    /// All layouts.
+    pub const ALL: [Self; 4] = [Self::Ultralytics, Self::Yolox, Self::NmsFree, Self::Nanodet];
+
+    /// Returns the name in a manifest.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Ultralytics => "ultralytics",
+            Self::Yolox => "yolox",
+            Self::NmsFree => "nms-free",
+            Self::Nanodet => "nanodet",
+        }
+    }
+
+    /// Returns the layout of this name.
+    ///
+    /// # Errors
+    ///
+    /// [`VisionError::UnknownLayout`] with the list of known names.
+    pub fn from_name(name: &str) -> Result<Self, VisionError> {
+        Self::ALL.into_iter().find(|layout| layout.name() == name).ok_or_else(|| {
+            VisionError::UnknownLayout {
+                name: shortened(name),
+                known: Self::ALL.map(Self::name).join(", "),
+            }
+        })
+    }
+
+    /// Returns the conversion of frames to the input of a model of this family, whose shape is
+    /// `input`: [1, 3, height, width] or [1, height, width, 3].
+    ///
+    /// Sources: `demo/ONNXRuntime` of YOLOX, `ultralytics/data/augment.py`, and the configurations
+    /// `nanodet-plus-m*` of NanoDet, each as its models are trained.
+    ///
+    /// # Errors
+    ///
+    /// [`VisionError::InputShape`] for another shape, [`VisionError::DynamicInput`] for a side that
+    /// is not fixed, and [`VisionError::TensorSize`].
+    pub fn preprocess(self, input: &[Option<u32>]) -> Result<Preprocess, VisionError> {
+        let layout = self.name();
+        let found = || shape_text(input.iter().copied());
+        let (height, width, channels_last) = match *input {
+            [None | Some(1), Some(3), height, width] => (height, width, false),
+            [None | Some(1), height, width, Some(3)] => (height, width, true),
+            _ => return Err(VisionError::InputShape { layout, found: found() }),
+        };
+        let (Some(height), Some(width)) = (height, width) else {
+            return Err(VisionError::DynamicInput { layout, found: found() });
+        };
+        let (placement, bgr, scale) = match self {
+            Self::Ultralytics | Self::NmsFree => (Placement::Centre, false, 1.0 / 255.0),
+            Self::Yolox => (Placement::Corner, true, 1.0),
+            Self::Nanodet => (Placement::Stretch, true, 1.0),
+        };
+        let (mean, deviation) = match self {
+            Self::Nanodet => ([103.53, 116.28, 123.675], [57.375, 57.12, 58.395]),
+            _ => ([0.0; 3], [1.0; 3]),
+        };
+        let how = Preprocess {
+            width,
+            height,
+            placement,
+            fill: 114,
+            bgr,
+            channels_last,
+            bytes: false,
+            scale,
+            mean,
+            deviation,
+        };
+        how.check()?;
+        Ok(how)
+    }
+
+    /// Checks the outputs of a model of this family, whose input has `width` x `height` pixels, and
+    /// returns the number of its classes, if the shape shows it. Lengths that are not fixed pass;
+    /// [`detect`](crate::detect()) checks them for each result.
+    ///
+    /// # Errors
+    ///
+    /// [`VisionError::OutputShape`] with the shapes of both.
+    pub fn check(
+        self,
+        outputs: &[&[Option<u32>]],
+        (width, height): (u32, u32),
+    ) -> Result<Option<u32>, VisionError> {
+        let fixed = |shape: &[Option<u32>]| shape.iter().copied().collect::<Option<Vec<u32>>>();
+        let form = match *outputs {
+            [shape] => match fixed(shape) {
+                Some(shape) => self.form_of(&shape, (width, height)),
+                None if matches!(*shape, [None | Some(1), _, _]) => return Ok(None),
+                None => None,
+            },
+            _ => None,
+        };
+        let texts = outputs.iter().take(8).map(|shape| shape_text(shape.iter().copied()));
+        form.map(|form| form.classes)
+            .ok_or_else(|| self.refusal((width, height), texts.collect::<Vec<_>>().join(", ")))
+    }
+
+    /// Returns the form of an output of `shape`.
+    pub(crate) fn form(self, shape: &[u32], input: (u32, u32)) -> Result<Form, VisionError> {
+        let text = || shape_text(shape.iter().copied().map(Some));
+        self.form_of(shape, input).ok_or_else(|| self.refusal(input, text()))
+    }
+
+    /// Returns the error for outputs with the shapes `found`.
+    pub(crate) fn refusal(self, (width, height): (u32, u32), found: String) -> VisionError {
+        let cells = |strides| cells(strides, (width, height));
+        let expected = match self {
+            Self::Ultralytics => {
+                format!("[1, 4 + classes, {}], or transposed", cells(YOLOX_STRIDES))
+            }
+            Self::Yolox => format!("[1, {}, 5 + classes]", cells(YOLOX_STRIDES)),
+            Self::NmsFree => "[1, rows, 6]".to_owned(),
+            Self::Nanodet => format!(
+                "[1, {}, classes + 32] or [1, {}, classes + 32]",
+                cells(NANODET_STRIDES),
+                cells(&NANODET_STRIDES[..3])
+            ),
+        };
+        let found = if found.is_empty() { "no output".to_owned() } else { found };
+        VisionError::OutputShape { layout: self.name(), expected, width, height, found }
+    }
+
+    fn form_of(self, shape: &[u32], input: (u32, u32)) -> Option<Form> {
+        let [1, rows, columns] = *shape else {
+            return None;
+        };
+        let cells = |strides| cells(strides, input);
+        let by_number = self == Self::Ultralytics && is_by_number(rows, columns, input);
+        let (anchors, numbers) = if by_number { (columns, rows) } else { (rows, columns) };
+        let strides = match self {
+            Self::Ultralytics if anchors > 0 => &[],
+            Self::NmsFree if numbers == NMS_FREE_ROW => &[],
+            Self::Yolox if cells(YOLOX_STRIDES) == u64::from(anchors) => YOLOX_STRIDES,
+            Self::Nanodet => [NANODET_STRIDES, &NANODET_STRIDES[..3]]
+                .into_iter()
+                .find(|strides| cells(strides) == u64::from(anchors))?,
+            _ => return None,
+        };
+        let classes = match self {
+            Self::Ultralytics => Some(numbers.checked_sub(4).filter(|classes| *classes > 0)?),
+            Self::Yolox => Some(numbers.checked_sub(5).filter(|classes| *classes > 0)?),
+            Self::Nanodet => Some(numbers.checked_sub(32).filter(|classes| *classes > 0)?),
+            Self::NmsFree => None,
+        };
+        let (anchors, numbers) = (anchors as usize, numbers as usize);
+        Some(Form { layout: self, anchors, numbers, classes, by_number, strides })
+    }
+}
+
+/// Returns whether an output [1, `rows`, `columns`] of Ultralytics has a row for each number.
+///
+/// The number of anchors is known for the usual strides; otherwise there are more anchors than
+/// numbers.
+fn is_by_number(rows: u32, columns: u32, input: (u32, u32)) -> bool {
+    let anchors = cells(YOLOX_STRIDES, input);
+    if u64::from(columns) == anchors {
+        return true;
+    }
+    u64::from(rows) != anchors && rows <= columns
+}
+
+/// Returns the number of cells of all grids.
+fn cells(strides: &[u32], (width, height): (u32, u32)) -> u64 {
+    let grid =
+        |stride: &u32| u64::from(width.div_ceil(*stride)) * u64::from(height.div_ceil(*stride));
+    strides.iter().map(grid).fold(0, u64::saturating_add)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const INPUT: (u32, u32) = (416, 416);
+
+    fn refusal(layout: DetectorLayout, outputs: &[&[Option<u32>]]) -> String {
+        layout.check(outputs, INPUT).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn layouts_are_found_by_name() {
+        for layout in DetectorLayout::ALL {
+            assert_eq!(DetectorLayout::from_name(layout.name()), Ok(layout));
+        }
+        assert_eq!(
+            DetectorLayout::from_name("yolo").unwrap_err().to_string(),
+            "layout `yolo` is not known; known are ultralytics, yolox, nms-free, nanodet"
+        );
+        let long = DetectorLayout::from_name(&"y".repeat(10_000)).unwrap_err().to_string();
+        assert!(long.len() < 200, "{long}");
+    }
+
+    #[test]
+    fn the_input_determines_size_and_order() {
+        let how =
+            DetectorLayout::Yolox.preprocess(&[Some(1), Some(3), Some(320), Some(416)]).unwrap();
+        assert_eq!((how.width, how.height, how.channels_last, how.bgr), (416, 320, false, true));
+        assert_eq!((how.placement, how.fill, how.scale), (Placement::Corner, 114, 1.0));
+        let how =
+            DetectorLayout::Ultralytics.preprocess(&[None, Some(320), Some(416), Some(3)]).unwrap();
+        assert_eq!((how.width, how.height, how.channels_last, how.bgr), (416, 320, true, false));
+        assert_eq!((how.placement, how.scale), (Placement::Centre, 1.0 / 255.0));
+        let how =
+            DetectorLayout::Nanodet.preprocess(&[Some(1), Some(3), Some(416), Some(416)]).unwrap();
+        assert_eq!(
+            (how.placement, how.mean[0], how.deviation[2]),
+            (Placement::Stretch, 103.53, 58.395)
+        );
+    }
+
+    #[test]
+    fn another_input_is_refused() {
+        let error = |input: &[Option<u32>]| {
+            DetectorLayout::Yolox.preprocess(input).unwrap_err().to_string()
+        };
+        assert_eq!(
+            error(&[Some(1), Some(1), Some(28), Some(28)]),
+            "layout `yolox` needs one input [1, 3, height, width] or [1, height, width, 3]; \
+             the model has [1, 1, 28, 28]"
+        );
+        assert!(error(&[]).ends_with("the model has []"));
+        assert!(error(&[Some(8), Some(3), Some(64), Some(64)]).contains("[8, 3, 64, 64]"));
+        assert_eq!(
+            error(&[None, Some(3), None, None]),
+            "layout `yolox` needs an input of fixed size; the model has [?, 3, ?, ?]: \
+             export it with a fixed size, such as 640x640"
+        );
+        assert_eq!(
+            error(&[Some(1), Some(3), Some(0), Some(9000)]),
+            "tensor of 9000x0 pixels: each side must be 1 to 8192"
+        );
+    }
+
+    #[test]
+    fn the_outputs_show_the_number_of_classes() {
+        let classes = |layout: DetectorLayout, shape: [u32; 3]| {
+            layout.check(&[&shape.map(Some)], INPUT).unwrap()
+        };
+        assert_eq!(classes(DetectorLayout::Yolox, [1, 3549, 85]), Some(80));
+        assert_eq!(classes(DetectorLayout::Ultralytics, [1, 84, 3549]), Some(80));
+        assert_eq!(classes(DetectorLayout::Ultralytics, [1, 3549, 84]), Some(80));
+        // Of a model with a fourth stride.
+        assert_eq!(classes(DetectorLayout::Ultralytics, [1, 5, 3598]), Some(1));
+        assert_eq!(classes(DetectorLayout::NmsFree, [1, 300, 6]), None);
+        assert_eq!(classes(DetectorLayout::NmsFree, [1, 0, 6]), None);
+        assert_eq!(classes(DetectorLayout::Nanodet, [1, 3598, 112]), Some(80));
+        assert_eq!(classes(DetectorLayout::Nanodet, [1, 3549, 33]), Some(1));
+        let dynamic: &[Option<u32>] = &[None, Some(84), None];
+        assert_eq!(DetectorLayout::Ultralytics.check(&[dynamic], INPUT), Ok(None));
+    }
+
+    #[test]
+    fn other_outputs_are_refused_with_both_shapes() {
+        let shape = |lengths: &[u32]| lengths.iter().copied().map(Some).collect::<Vec<_>>();
+        assert_eq!(
+            refusal(DetectorLayout::Yolox, &[&shape(&[1, 2100, 85])]),
+            "layout `yolox` needs one output [1, 3549, 5 + classes] for an input of 416x416; \
+             the model has [1, 2100, 85]"
+        );
+        assert_eq!(
+            refusal(
+                DetectorLayout::Ultralytics,
+                &[&shape(&[1, 116, 3549]), &shape(&[1, 32, 104, 104])]
+            ),
+            "layout `ultralytics` needs one output [1, 4 + classes, 3549], or transposed for an \
+             input of 416x416; the model has [1, 116, 3549], [1, 32, 104, 104]"
+        );
+        assert!(refusal(DetectorLayout::NmsFree, &[]).ends_with("the model has no output"));
+        for layout in DetectorLayout::ALL {
+            for lengths in [
+                &[][..],
+                &[1],
+                &[1, 0, 0],
+                &[0, 3549, 85],
+                &[1, u32::MAX, u32::MAX],
+                &[1, 4, 3549],
+                &[1, 3549, 4],
+                &[2, 3549, 85],
+                &[1, 3549, 85, 1],
+            ] {
+                if layout == DetectorLayout::Ultralytics && lengths == [1, u32::MAX, u32::MAX] {
+                    // A valid shape, but for the number of its values.
+                    continue;
+                }
+                let message = refusal(layout, &[&shape(lengths)]);
+                assert!(message.contains(&format!("{lengths:?}")), "{layout:?} {message}");
+            }
+        }
+    }
+}

@@ -1,0 +1,164 @@
+//! Requests of the starter: the models that exist, and the lambdas that may use them.
+
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::unix::net::UnixStream;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use super::INFERENCE;
+use crate::link::frame::{self, tag};
+use crate::link::{FrameReceiver, Incoming, LinkError, ReceivedFrame, send_frame};
+
+const STARTER: &str = "the starter";
+
+/// Time to wait while the process does not read.
+const TIMEOUT: Duration = Duration::from_secs(10);
+
+/// A model file. It comes as a descriptor; its digest is checked before it is loaded.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ModelFile {
+    /// SHA-256 of the file, 64 hexadecimal digits.
+    pub sha256: String,
+    /// Its path, for messages.
+    pub path: String,
+}
+
+/// A model that a lambda may use.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct GrantedModel {
+    /// Its name in the manifest.
+    pub name: String,
+    /// SHA-256 of its file.
+    pub sha256: String,
+    /// Execution providers in order of preference; empty for any.
+    pub providers: Vec<String>,
+    /// Threads of one run; `None` for 1.
+    pub threads: Option<u32>,
+    /// The reason why it must not be loaded: it has ended the process several times.
+    pub refused: Option<String>,
+}
+
+/// A lambda's process, which comes as the descriptor of its connection.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AddClient {
+    /// Name of the lambda, for messages.
+    pub name: String,
+    /// The models that it may use.
+    pub models: Vec<GrantedModel>,
+}
+
+/// A request of the starter.
+#[derive(Debug)]
+pub enum InferenceRequest {
+    /// A model file, sent before the first lambda that may use it.
+    Model(ModelFile, OwnedFd),
+    /// A lambda.
+    Client(AddClient, OwnedFd),
+    /// Exit.
+    Stop,
+}
+
+/// The starter's end of the control connection. Its calls wait while the process does not read, up
+/// to 10 s.
+#[derive(Debug)]
+pub struct InferenceControl {
+    socket: UnixStream,
+}
+
+impl InferenceControl {
+    /// Creates a connection; also returns the end of the process.
+    ///
+    /// # Errors
+    ///
+    /// Errors of the system, such as too many open files.
+    pub fn pair() -> io::Result<(InferenceControl, OwnedFd)> {
+        let (starter_end, other_end) = UnixStream::pair()?;
+        starter_end.set_write_timeout(Some(TIMEOUT))?;
+        Ok((InferenceControl { socket: starter_end }, other_end.into()))
+    }
+
+    /// Adds a model file.
+    ///
+    /// # Errors
+    ///
+    /// [`LinkError::Gone`] if the process has ended, [`LinkError::Full`] if it does not read.
+    pub fn add_model(&self, model: &ModelFile, file: BorrowedFd<'_>) -> Result<(), LinkError> {
+        self.send(tag::MODEL_FILE, model, file)
+    }
+
+    /// Adds a lambda, whose process has the other end of `socket`.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`add_model`](Self::add_model).
+    pub fn add_client(&self, client: &AddClient, socket: BorrowedFd<'_>) -> Result<(), LinkError> {
+        self.send(tag::ADD_CLIENT, client, socket)
+    }
+
+    /// Requests the process to exit.
+    ///
+    /// # Errors
+    ///
+    /// [`LinkError::Gone`] if it has ended.
+    pub fn stop(&self) -> Result<(), LinkError> {
+        send_frame(&self.socket, &frame::encode(tag::STOP, &[]), &[], INFERENCE)
+    }
+
+    fn send(
+        &self,
+        tag: u8,
+        message: &impl Serialize,
+        descriptor: BorrowedFd<'_>,
+    ) -> Result<(), LinkError> {
+        let failed = |source| LinkError::Socket { peer: INFERENCE, source };
+        let payload = serde_json::to_vec(message).map_err(|error| failed(error.into()))?;
+        send_frame(&self.socket, &frame::encode(tag, &payload), &[descriptor], INFERENCE)
+    }
+}
+
+/// The end of `gleaner-inference` of the control connection.
+///
+/// Its descriptor is readable when [`poll`](Self::poll) has something to read.
+#[derive(Debug)]
+pub struct InferenceServer {
+    socket: OwnedFd,
+    frames: FrameReceiver,
+}
+
+impl InferenceServer {
+    /// Creates the server from its end of the connection.
+    pub fn new(socket: OwnedFd) -> InferenceServer {
+        InferenceServer { socket, frames: FrameReceiver::new(STARTER, 1) }
+    }
+
+    /// Returns the next request if it has arrived completely. Never waits. Call it until it returns
+    /// no message.
+    ///
+    /// # Errors
+    ///
+    /// [`LinkError`] names the invalid frame; nothing can be read after it.
+    pub fn poll(&mut self) -> Result<Incoming<InferenceRequest>, LinkError> {
+        Ok(match self.frames.poll(&self.socket)? {
+            Incoming::Message(frame) => Incoming::Message(request(frame)?),
+            Incoming::Nothing => Incoming::Nothing,
+            Incoming::Ended => Incoming::Ended,
+        })
+    }
+}
+
+impl AsFd for InferenceServer {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+}
+
+fn request(mut frame: ReceivedFrame) -> Result<InferenceRequest, LinkError> {
+    match frame.tag {
+        tag::MODEL_FILE => Ok(InferenceRequest::Model(frame.json(STARTER)?, frame.descriptor()?)),
+        tag::ADD_CLIENT => Ok(InferenceRequest::Client(frame.json(STARTER)?, frame.descriptor()?)),
+        tag::STOP => Ok(InferenceRequest::Stop),
+        tag => Err(LinkError::Unknown { peer: STARTER, tag }),
+    }
+}
