@@ -6,15 +6,17 @@
 
 mod answers;
 mod drives;
+mod inference;
 mod isolation;
 mod kernels;
 mod live;
 mod measure;
 mod record;
 
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::{Parser, Subcommand};
 use gleaner_lambda::manifest::Store;
 use measure::{Figure, ReplayBench, Twin, quantile};
 
@@ -44,10 +46,35 @@ struct Args {
     /// for each lambda, instead of drives; needs gleaner-player.
     #[arg(long, conflicts_with_all = ["live", "kernels"])]
     isolation: bool,
+    /// Detectors: a frame's way through gleaner-inference, by rten and, if ORT_DYLIB_PATH is set,
+    /// by ONNX Runtime, against a plain Python program; several lambdas of one model.
+    #[arg(long, conflicts_with_all = ["live", "rtt", "load", "kernels", "drives", "isolation"])]
+    inference: bool,
+    #[command(subcommand)]
+    command: Option<BenchCommand>,
+}
+
+#[derive(Subcommand)]
+enum BenchCommand {
+    /// Writes a model of the shape of YOLO11, with random weights, and measures nothing.
+    Model {
+        /// Scale of the model.
+        scale: inference::GraphScale,
+        /// The file to write.
+        file: PathBuf,
+    },
 }
 
 fn main() -> ExitCode {
-    let Args { quick, live, rtt, load, kernels, drives, isolation } = Args::parse();
+    let Args { quick, live, rtt, load, kernels, drives, isolation, inference, command } =
+        Args::parse();
+    if let Some(BenchCommand::Model { scale, file }) = command {
+        return write_model(scale, &file);
+    }
+    if inference {
+        inference::measure(quick);
+        return ExitCode::SUCCESS;
+    }
     if live || rtt || load || isolation {
         let figures = match live::in_private_network() {
             Some(Ok(true)) => return ExitCode::SUCCESS,
@@ -212,6 +239,20 @@ fn main() -> ExitCode {
     ));
 
     report(&figures, quick)
+}
+
+fn write_model(scale: inference::GraphScale, file: &Path) -> ExitCode {
+    let (model, parameters) = inference::yolo_shaped(scale);
+    match std::fs::write(file, &model) {
+        Ok(()) => {
+            println!("{}: {parameters} parameters, {} bytes", file.display(), model.len());
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            eprintln!("error: cannot write `{}`\n  cause: {error}", file.display());
+            ExitCode::FAILURE
+        }
+    }
 }
 
 fn report(figures: &[Figure], quick: bool) -> ExitCode {

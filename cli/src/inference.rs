@@ -1,8 +1,8 @@
 //! Supervises `gleaner-inference`, the process that runs the models of all lambdas of a run or of a
 //! replay: starts it, connects lambdas to it, and starts it again after it has ended.
 //!
-//! The socket of a lambda outlives the process: the next one uses the same. A model that was loading
-//! or running at several ends of the process is not loaded again.
+//! The socket of a lambda outlives the process: the next one uses the same. A model that was
+//! loading or running at several ends of the process is not loaded again.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -29,6 +29,7 @@ use gleaner_protocol::inference::{
 };
 use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{MemfdFlags, memfd_create};
 
 use crate::restart_delay::RestartDelay;
@@ -43,6 +44,9 @@ const ENDS_MAX: u32 = 3;
 /// Length of a digest in the file of running models: one of the model that loads, then one of the
 /// model that runs.
 const DIGEST: usize = 64;
+
+/// Time after which a process was healthy: earlier ends do not count any more.
+const HEALTHY: Duration = Duration::from_secs(60);
 
 /// Interval of looks at the process.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
@@ -147,7 +151,10 @@ impl InferenceService {
                 state.models.push((model, file));
             }
         }
-        let client = Client { add: AddClient { name: name.to_owned(), models }, socket };
+        let memory = manifest.limits.memory.bytes();
+        let client = Client { add: AddClient { name: name.to_owned(), memory, models }, socket };
+        // Processes that have ended, such as the one before this, leave their socket here.
+        state.clients.retain(|client| !has_ended(&client.socket));
         state.pass_client(&client);
         state.clients.push(client);
         Ok(lambda_end)
@@ -200,7 +207,7 @@ impl ServiceState {
             let ends = self.ends.get(&model.sha256).copied().unwrap_or(0);
             model.refused = (ends >= ENDS_MAX).then(|| {
                 format!(
-                    "{INFERENCE} has ended {ends} times while model `{}` was loading or running, so \
+                    "{INFERENCE} has ended {ends} times while model `{}` was loading or running: \
                      it is not loaded again in this run",
                     model.name
                 )
@@ -263,10 +270,19 @@ impl Supervisor {
             }
             state.control = None;
             let blamed = self.blame(&mut state);
-            let reason = reason + &blamed;
+            let reason = match &blamed {
+                Some((_, what)) => format!("{reason}, {what}"),
+                None => reason,
+            };
             state.clients.retain(|client| report_state(&client.socket, Some(&reason)).is_ok());
+            if started.elapsed() >= HEALTHY {
+                state.ends.retain(|digest, _| blamed.as_ref().is_some_and(|it| it.0 == *digest));
+            }
+            drop(state);
             let delay = delay.after(started.elapsed());
+            // Not under the lock: the receiver may add a lambda before it reads this.
             (self.events)(InferenceEvent::Ended(reason, delay));
+            let state = self.shared.lock();
             let waited = self.shared.stops.wait_timeout_while(state, delay, |state| !state.stops);
             if waited.unwrap_or_else(PoisonError::into_inner).0.stops {
                 return;
@@ -287,31 +303,33 @@ impl Supervisor {
         let (handover, stdin) = UnixStream::pair()?;
         let running = Some(self.running.try_clone()?.into());
         Handover { control: Some(process_end), running, ..Handover::default() }.send(&handover)?;
-        self.running.set_len(0)?;
-        let mut child = Command::new(&self.program)
+        let child = Command::new(&self.program)
             // Only `gleaner` receives Ctrl-C, and ends its processes in order.
             .process_group(0)
             .stdin(OwnedFd::from(stdin))
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()?;
-        let mut readers = Vec::new();
-        if let Some(reports) = child.stdout.take() {
+        let mut process = Process { child, _handover: handover, readers: Vec::new() };
+        let reader = || thread::Builder::new().name("inference output".to_owned());
+        if let Some(reports) = process.child.stdout.take() {
             let events = Arc::clone(&self.events);
-            readers.push(thread::spawn(move || follow(reports, &events)));
+            process.readers.push(reader().spawn(move || follow(reports, &events))?);
         }
-        if let Some(stderr) = child.stderr.take() {
+        if let Some(stderr) = process.child.stderr.take() {
             let events = Arc::clone(&self.events);
-            readers.push(thread::spawn(move || {
+            let forward = move || {
                 pass_on(stderr, &AtomicBool::new(false), |piece| {
                     events(InferenceEvent::Stderr(piece.to_vec()));
                 });
-            }));
+            };
+            process.readers.push(reader().spawn(forward)?);
         }
         let mut state = self.shared.lock();
         state.control = Some(control);
         state.pass_all();
-        Ok(Process { child, _handover: handover, readers })
+        drop(state);
+        Ok(process)
     }
 
     /// Waits for the end of the process. It is killed if it does not end on request, or does not
@@ -342,20 +360,21 @@ impl Supervisor {
         status
     }
 
-    /// Counts the end against the models that were loading or running; returns their names.
-    fn blame(&self, state: &mut ServiceState) -> String {
+    /// Counts the end against the model that ran, or else the one that was loading; returns its
+    /// digest, and a text about it.
+    fn blame(&self, state: &mut ServiceState) -> Option<(String, String)> {
         let mut digests = [0; 2 * DIGEST];
         let read = self.running.read_at(&mut digests, 0).unwrap_or(0);
-        let mut blamed = String::new();
-        for (what, digest) in ["loaded", "ran"].iter().zip(digests[..read].chunks(DIGEST)) {
-            let Ok(digest) = std::str::from_utf8(digest) else { continue };
-            let found = state.models.iter().find(|(model, _)| model.sha256 == digest);
-            let Some(path) = found.map(|(model, _)| model.path.clone()) else { continue };
-            let ends = state.ends.entry(digest.to_owned()).or_default();
-            *ends += 1;
-            blamed += &format!(", while it {what} `{path}`");
-        }
-        blamed
+        // The note counts once, even if the next process cannot be started.
+        let _ = self.running.set_len(0);
+        let notes = digests[..read].chunks(DIGEST).zip(["loaded", "ran"]);
+        notes.rev().find_map(|(digest, what)| {
+            let digest = std::str::from_utf8(digest).ok()?;
+            let (model, _) = state.models.iter().find(|(model, _)| model.sha256 == digest)?;
+            let text = format!("while it {what} `{}`", model.path);
+            *state.ends.entry(digest.to_owned()).or_default() += 1;
+            Some((digest.to_owned(), text))
+        })
     }
 }
 
@@ -388,6 +407,13 @@ fn follow(reports: impl Read, events: &Events) {
             }
         }
     }
+}
+
+/// Returns whether the lambda's process has closed its end of the connection.
+fn has_ended(socket: &OwnedFd) -> bool {
+    let mut polled = [PollFd::new(socket, PollFlags::empty())];
+    let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+    poll(&mut polled, Some(&now)).is_ok() && polled[0].revents().contains(PollFlags::HUP)
 }
 
 fn model_file(model: &ModelSpec) -> ModelFile {

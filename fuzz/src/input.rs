@@ -11,6 +11,15 @@ impl<'a> FuzzInput<'a> {
         u16::from_le_bytes([self.u8(), self.u8()])
     }
 
+    pub(crate) fn u32(&mut self) -> u32 {
+        u32::from(self.u16()) | u32::from(self.u16()) << 16
+    }
+
+    /// Any float, infinities and NaN included.
+    pub(crate) fn f32(&mut self) -> f32 {
+        f32::from_bits(self.u32())
+    }
+
     /// The next `len` bytes, or as many as there are.
     pub(crate) fn bytes(&mut self, len: usize) -> &'a [u8] {
         let (bytes, rest) = self.0.split_at(len.min(self.0.len()));

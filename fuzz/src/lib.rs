@@ -16,10 +16,20 @@ pub mod drive;
 pub mod image;
 pub mod ingress;
 mod input;
+// The checks of `gleaner-inference` without the libraries that run models, which would take minutes
+// to build once more, instrumented.
+#[path = "../../host/inference/src/inspect/mod.rs"]
+pub mod inspect;
 pub mod journal;
 pub mod link;
 pub mod manifest;
 pub mod message;
+pub mod model;
+// The writer of the tests of `gleaner-inference`, for seeds.
+#[path = "../../host/inference/tests/suite/onnx.rs"]
+mod onnx;
+#[path = "../../host/inference/src/places.rs"]
+pub mod places;
 pub mod seeds;
 
 /// A fuzz target: its name, its check, its seeds and its dictionary.
@@ -38,7 +48,7 @@ pub struct Target {
 }
 
 /// All targets.
-pub const TARGETS: [Target; 9] = [
+pub const TARGETS: [Target; 10] = [
     Target {
         name: "message",
         check: Some(message::check),
@@ -94,6 +104,13 @@ pub const TARGETS: [Target; 9] = [
         longest: 4 << 10,
         seeds: seeds::manifest::all,
         words: seeds::manifest::WORDS,
+    },
+    Target {
+        name: "model",
+        check: Some(model::check),
+        longest: 4 << 10,
+        seeds: seeds::model::all,
+        words: seeds::model::WORDS,
     },
     Target {
         name: "calls",

@@ -19,6 +19,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
 
+use gleaner_lambda::manifest::Manifest;
 use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::{ReplaySummary, Report, Verified};
 use gleaner_report::format::{seconds, trigger_lines};
@@ -134,16 +135,29 @@ pub fn runtime() -> Command {
     runtime
 }
 
-/// Replays the built lambda in `lambda` over `drives`.
+/// `gleaner`, with the same cache.
+pub fn gleaner() -> Command {
+    let mut gleaner = Command::new(program("gleaner"));
+    gleaner.env("XDG_CACHE_HOME", root().join("target/test-cache"));
+    gleaner
+}
+
+/// Replays the built lambda in `lambda` over `drives`; with `gleaner` if it has models, which
+/// starts the process that runs them.
 pub fn replay(lambda: &Path, drives: &[PathBuf], args: &[&str]) -> ReplayRun {
     replay_to(TempFolder::new().path(), lambda, drives, args)
 }
 
 /// As [`replay`], with results in `out`.
 pub fn replay_to(out: &Path, lambda: &Path, drives: &[PathBuf], args: &[&str]) -> ReplayRun {
-    let mut replay = runtime();
+    let manifest = Manifest::load(lambda.join("build"));
+    let has_models = manifest.is_ok_and(|manifest| !manifest.models.is_empty());
+    let mut replay = if has_models { gleaner() } else { runtime() };
     replay.arg("replay").arg(lambda).args(drives).args(args).arg("--out").arg(out);
-    let output = replay.output().expect("gleaner-runtime starts");
+    if has_models {
+        replay.args(["--json", "--no-report"]);
+    }
+    let output = replay.output().expect("the program starts");
     let read = |name: &str| std::fs::read_to_string(out.join(name)).unwrap_or_default();
     ReplayRun {
         exit: output.status.code().unwrap_or(128),
@@ -151,10 +165,14 @@ pub fn replay_to(out: &Path, lambda: &Path, drives: &[PathBuf], args: &[&str]) -
         decisions: read("decisions.jsonl").lines().map(parsed).collect(),
         log: read("log.jsonl").lines().map(parsed).collect(),
         clips: read("clips.jsonl").lines().map(parsed).collect(),
-        summary: reports(&output.stdout).find_map(|report| match report {
-            Report::Summary(summary) => Some(*summary),
-            _ => None,
-        }),
+        summary: if has_models {
+            serde_json::from_slice(&output.stdout).ok()
+        } else {
+            reports(&output.stdout).find_map(|report| match report {
+                Report::Summary(summary) => Some(*summary),
+                _ => None,
+            })
+        },
     }
 }
 
@@ -283,6 +301,21 @@ impl LambdaCopy {
     }
 }
 
+/// Copies all files below `source`, except a manifest, to `name` in `folder`.
+fn copy_files(source: &Path, folder: &TempFolder, name: &str) {
+    let files = std::fs::read_dir(source)
+        .unwrap_or_else(|error| panic!("{}: {error}; run: cargo xtask test", source.display()));
+    for file in files {
+        let file = file.expect("the folder can be read");
+        let to = format!("{name}/{}", file.file_name().to_string_lossy());
+        if file.path().is_dir() {
+            copy_files(&file.path(), folder, &to);
+        } else if file.file_name() != "lambda.toml" {
+            folder.write(&to, std::fs::read(file.path()).expect("a build can be read"));
+        }
+    }
+}
+
 /// Copies the built lambda in `lambda`, a folder of the checkout, to `name` in `folder`, with
 /// `change` applied to its manifest.
 pub fn copy_lambda(
@@ -292,15 +325,7 @@ pub fn copy_lambda(
     change: impl Fn(String) -> String,
 ) {
     let source = root().join(lambda).join("build");
-    let files = std::fs::read_dir(&source)
-        .unwrap_or_else(|error| panic!("{}: {error}; run: cargo xtask test", source.display()));
-    for file in files {
-        let file = file.expect("the folder can be read");
-        if file.file_name() != "lambda.toml" && file.path().is_file() {
-            let to = format!("{name}/build/{}", file.file_name().to_string_lossy());
-            folder.write(&to, std::fs::read(file.path()).expect("a build can be read"));
-        }
-    }
+    copy_files(&source, folder, &format!("{name}/build"));
     let manifest =
         std::fs::read_to_string(source.join("lambda.toml")).expect("a build has a manifest");
     // The build's manifest is written last, because it must not be older than any source.

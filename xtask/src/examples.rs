@@ -24,15 +24,29 @@ const COOKBOOK: &str = "examples/cookbook";
 pub(crate) struct Example {
     pub(crate) name: &'static str,
     pub(crate) set: &'static [&'static str],
+    /// End of the replayed part of the drive in s; `None` for its end.
+    to: Option<&'static str>,
     /// True if its decisions depend only on recent samples, so that a clip alone reproduces them.
     pub(crate) is_stateless: bool,
 }
 
-pub(crate) const EXAMPLES: [Example; 3] = [
-    Example { name: "hello", set: &["brake_mps2=-1.4"], is_stateless: true },
-    Example { name: "brake-dark", set: &["brake_mps2=-1.4", "dark_luma=50"], is_stateless: true },
+pub(crate) const EXAMPLES: [Example; 4] = [
+    Example { name: "hello", set: &["brake_mps2=-1.4"], to: None, is_stateless: true },
+    Example {
+        name: "brake-dark",
+        set: &["brake_mps2=-1.4", "dark_luma=50"],
+        to: None,
+        is_stateless: true,
+    },
     // Its consecutive windows depend on the first sample of the drive.
-    Example { name: "imu-fft", set: &[], is_stateless: false },
+    Example { name: "imu-fft", set: &[], to: None, is_stateless: false },
+    // Some 50 ms for each frame.
+    Example {
+        name: "yolo-detector",
+        set: &["classes=car, truck"],
+        to: Some("3"),
+        is_stateless: true,
+    },
 ];
 
 /// Results of a replay with one twin.
@@ -66,7 +80,8 @@ impl Example {
         let kind = if language == "rust" { "wasm" } else { language };
         let lambda = self.lambda(language);
         let settings = self.set.iter().flat_map(|set| ["--set".to_owned(), (*set).to_owned()]);
-        replay(checkout, &format!("{}-{kind}", self.name), lambda, settings.collect())
+        let to = self.to.iter().flat_map(|to| ["--to".to_owned(), (*to).to_owned()]);
+        replay(checkout, &format!("{}-{kind}", self.name), lambda, settings.chain(to).collect())
     }
 }
 

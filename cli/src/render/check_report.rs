@@ -28,7 +28,12 @@ fn write(text: &mut String, report: &CheckReport, paint: Paint) -> fmt::Result {
         LambdaKind::Wasm => report.engine.split(',').next().unwrap_or_default(),
         LambdaKind::Python => &report.engine,
     };
+    let engine = engine.split("; model `").next().unwrap_or_default();
     writeln!(text, "{} ({}): {init}", paint.bold(&name), visible(engine))?;
+    let models = report.engine.split("; ").filter(|part| part.starts_with("model `"));
+    for model in models {
+        writeln!(text, "{}", visible(model))?;
+    }
     for note in &report.notes {
         writeln!(text, "  {}", paint.yellow(&visible(note)))?;
     }

@@ -22,29 +22,26 @@ pub(crate) fn inference(report: &InferenceReport, paint: Paint) -> String {
 }
 
 fn write_model(text: &mut String, model: &LoadedModel, paint: Paint) -> fmt::Result {
-    let lambdas = visible(&model.lambdas.join(", "));
-    let (reason, load_ms) = (visible(&model.reason), model.load_ns as f64 / 1e6);
+    let (name, reason) = (name(model), visible(&model.reason));
+    let load_ms = model.load_ns as f64 / 1e6;
     match model.state {
         ModelState::Warming => Ok(()),
         ModelState::Ready => {
             let how = format!("{}, loaded in {load_ms:.0} ms", visible(&model.runtime));
-            writeln!(text, "model of {lambdas}: {how} {}", paint.dim(&format!("({reason})")))
+            writeln!(text, "{name}: {how} {}", paint.dim(&format!("({reason})")))
         }
-        ModelState::Failed => {
-            writeln!(text, "{}", paint.red(&format!("model of {lambdas}: {reason}")))
-        }
+        ModelState::Failed => writeln!(text, "{}", paint.red(&format!("{name}: {reason}"))),
     }
 }
 
 fn write_status(text: &mut String, status: &InferenceStatus, paint: Paint) -> fmt::Result {
     for model in status.models.iter().filter(|model| model.runs + model.failed > 0) {
         let mean_ms = model.run_ns as f64 / 1e6 / model.runs.max(1) as f64;
-        let runs = counted(model.runs, "run");
-        let mut line = format!(
-            "model of {}: {runs}, {mean_ms:.1} ms each; {} answered with an equal run's result",
-            visible(&model.lambdas.join(", ")),
-            grouped(model.shared),
-        );
+        let mut line =
+            format!("{}: {}, {mean_ms:.1} ms each", name(model), counted(model.runs, "run"));
+        if model.shared > 0 {
+            line += &format!("; {} answered with an equal run's result", grouped(model.shared));
+        }
         if model.failed > 0 {
             line += &format!("; {} failed", grouped(model.failed));
         }
@@ -52,4 +49,12 @@ fn write_status(text: &mut String, status: &InferenceStatus, paint: Paint) -> fm
     }
     let line = format!("gleaner-inference: {:.1} MiB resident", mib(status.resident_bytes));
     writeln!(text, "{}", paint.dim(&line))
+}
+
+fn name(model: &LoadedModel) -> String {
+    let mut name = format!("model `{}`", visible(&model.path));
+    if !model.lambdas.is_empty() {
+        name += &format!(" of {}", visible(&model.lambdas.join(", ")));
+    }
+    name
 }

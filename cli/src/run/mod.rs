@@ -6,7 +6,8 @@
 //! - `process`, `output`: one process, and the threads that read its output.
 //! - `services`: the processes that all lambdas share: ingress and recorder.
 //! - `supervised`: one lambda over all its restarts, with `summary`.
-//! - `process_group`: all processes, and `drive`: a drive that the ingress plays.
+//! - `process_group`: all processes, `group_end`: their end, and `drive`: a drive that the ingress
+//!   plays.
 //! - `failures`: the result of a run in which processes failed.
 //! - `screen`: the terminal.
 //!
@@ -18,6 +19,7 @@ mod arguments;
 mod drive;
 mod failures;
 mod grants;
+mod group_end;
 mod lambdas;
 mod output;
 mod process;
@@ -39,8 +41,9 @@ use gleaner_parts::Parts;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::failures::Failures;
+use self::group_end::GroupEnd;
 use self::lambdas::RunLambda;
-use self::process_group::{GroupEnd, ProcessGroup, RunRecord};
+use self::process_group::{ProcessGroup, RunRecord};
 use self::screen::Screen;
 use self::summary::RunCounts;
 use self::supervised::SupervisedLambda;

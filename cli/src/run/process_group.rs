@@ -11,7 +11,7 @@ use std::sync::mpsc::{self, Receiver, SyncSender};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::Failure;
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::Limits;
 use gleaner_protocol::Handover;
@@ -20,6 +20,7 @@ use gleaner_protocol::link::{AddLambda, LinkError};
 
 use super::drive::DriveProgress;
 use super::failures::Failures;
+use super::group_end::GroupEnd;
 use super::output::{ChildId, ChildOutput, OutputPiece};
 use super::process::{ChildProcess, ended};
 use super::screen::Screen;
@@ -36,16 +37,6 @@ const DRAIN_TIMEOUT: Duration = Duration::from_millis(300);
 /// Maximum number of queued outputs. Further reports stay in their pipe, and the writer counts
 /// those that do not fit.
 const QUEUE_LENGTH: usize = 16;
-
-/// The end of a process group.
-pub(super) enum GroupEnd {
-    /// It ended on request, its time or its drive was over, or no lambda could start.
-    Complete,
-    /// The ingress or the recorder could not start; it has printed the cause.
-    NotStarted(Exit),
-    /// The ingress or the recorder failed after the start, for this reason.
-    Broken(String),
-}
 
 /// The failures and counts of a run, over all of its process groups.
 pub(super) struct RunRecord<'a> {
@@ -64,11 +55,12 @@ pub(super) struct ProcessGroup<'a> {
     /// The largest sample of an input, in bytes.
     largest: u64,
     recorder: Option<RecorderProcess>,
-    /// The process that runs models, if a lambda has any.
-    inference: Option<InferenceService>,
     sender: SyncSender<ChildOutput>,
     output: Receiver<ChildOutput>,
     limits: Limits,
+    /// The process that runs models, if a lambda has any. Dropped after `output`, as its threads
+    /// may wait for room there.
+    inference: Option<InferenceService>,
 }
 
 impl<'a> ProcessGroup<'a> {
@@ -493,17 +485,6 @@ impl<'a> ProcessGroup<'a> {
                 (_, Some(current), _) => current.closed(),
                 _ => {}
             },
-        }
-    }
-}
-
-impl GroupEnd {
-    /// The end of a process that all others need. `is_first` is true if it was not ready before.
-    fn of(name: &str, status: ExitStatus, is_first: bool) -> GroupEnd {
-        match status.code().and_then(Exit::from_code) {
-            // It has printed the cause.
-            Some(exit) if is_first && exit != Exit::Ok => GroupEnd::NotStarted(exit),
-            _ => GroupEnd::Broken(ended(name, status)),
         }
     }
 }

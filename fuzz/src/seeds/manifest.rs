@@ -27,6 +27,7 @@ pub const WORDS: &[&str] = &[
     "file",
     "sha256",
     "layout",
+    "labels",
     "providers",
     "threads",
     "topics",
@@ -38,6 +39,7 @@ pub const WORDS: &[&str] = &[
     "max_length",
     "fuel",
     "deadline",
+    "model_time",
     "memory",
     "default",
     "min",
@@ -56,6 +58,8 @@ pub const WORDS: &[&str] = &[
     "\"auto\"",
     "\"ram\"",
     "\"disk\"",
+    "\"ultralytics\"",
+    "\"rten\"",
     "sensor_msgs/msg/CompressedImage",
     "\"100ms\"",
     "\"1 MiB\"",
@@ -92,7 +96,8 @@ qos = { reliability = "reliable", durability = "volatile", depth = 10 }
 name = "detector"
 file = "models/detector.onnx"
 sha256 = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
-layout = "yolov8"
+layout = "ultralytics"
+labels = "models/coco.txt"
 providers = ["cuda", "cpu"]
 threads = 2
 [record]
@@ -106,6 +111,7 @@ max_length = "1min"
 [limits]
 fuel = 50_000_000
 deadline = "50ms"
+model_time = "40ms"
 memory = "64 MiB"
 [config]
 on = true

@@ -10,6 +10,7 @@ pub mod journal;
 pub mod link;
 pub mod manifest;
 pub mod message;
+pub mod model;
 
 use std::fs;
 use std::io;

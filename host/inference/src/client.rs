@@ -30,6 +30,8 @@ pub(crate) struct OpenCall {
     /// Name of the model in the manifest.
     pub(crate) model: String,
     pub(crate) session: SessionId,
+    /// Id of the region for outputs that the lambda has.
+    pub(crate) outputs: u64,
     pub(crate) stage: CallStage,
 }
 
@@ -56,6 +58,8 @@ pub(crate) struct GrantedSession {
 #[derive(Debug)]
 pub(crate) struct ConnectedLambda {
     pub(crate) name: String,
+    /// Largest size of its inputs, and of its outputs, in bytes.
+    pub(crate) memory: u64,
     socket: ModelSocket,
     models: HashMap<String, GrantedSession>,
     /// Names of the models that it has opened.
@@ -78,6 +82,7 @@ impl ConnectedLambda {
         };
         Self {
             name: add.name,
+            memory: add.memory.min(MAX_TENSOR_BYTES),
             socket: ModelSocket::new(socket),
             models: add.models.into_iter().map(granted).collect(),
             opened: HashSet::new(),
@@ -143,19 +148,22 @@ impl ConnectedLambda {
         self.is_gone = true;
     }
 
-    /// Sends a reply. A lambda that does not read its replies is gone.
+    /// Sends a reply, with the region `region` if the lambda has another one, whose id is `known`.
+    /// A lambda that does not read its replies is gone.
     pub(crate) fn reply(
         &mut self,
         id: u64,
         result: Result<ModelResult, ModelFault>,
         region: Option<&TensorRegion>,
+        known: u64,
     ) {
-        let region = region.map(AsFd::as_fd);
-        let mut sent = self.socket.reply(&ModelReply { id, result }, region);
+        let region_id = region.map_or(0, |region| region.id);
+        let region = region.filter(|region| region.id != known).map(AsFd::as_fd);
+        let mut sent = self.socket.reply(&ModelReply { id, region: region_id, result }, region);
         if let Err(LinkError::TooLong { bytes, max, .. }) = sent {
             let message = format!("the reply has {bytes} bytes; {max} are allowed");
             let result = Err(ModelFault::new(ModelFaultKind::Failed, message));
-            sent = self.socket.reply(&ModelReply { id, result }, None);
+            sent = self.socket.reply(&ModelReply { id, region: 0, result }, None);
         }
         match sent {
             Ok(()) => {}
@@ -164,17 +172,20 @@ impl ConnectedLambda {
         }
     }
 
-    /// Creates its region for inputs.
+    /// Sends its region for inputs, and creates a larger one if needed.
     pub(crate) fn reserve(&mut self, call: u64, bytes: u64) {
-        if bytes == 0 || bytes > MAX_TENSOR_BYTES {
-            let allowed = format!("1 to {MAX_TENSOR_BYTES} are allowed");
+        if bytes == 0 || bytes > self.memory {
+            let allowed = format!("1 to {}, its `memory`, are allowed", self.memory);
             let message = format!("a region of {bytes} bytes is requested; {allowed}");
             return self.fail(call, ModelFaultKind::WrongInput, message);
         }
-        match TensorRegion::create("gleaner-inputs", bytes) {
+        let known = self.inputs.clone().filter(|region| region.bytes() >= bytes);
+        let region =
+            known.map_or_else(|| TensorRegion::create("gleaner-inputs", bytes).map(Arc::new), Ok);
+        match region {
             Ok(region) => {
-                self.reply(call, Ok(ModelResult::Reserved), Some(&region));
-                self.inputs = Some(Arc::new(region));
+                self.reply(call, Ok(ModelResult::Reserved), Some(&region), 0);
+                self.inputs = Some(region);
             }
             Err(error) => {
                 let message = format!("the memory for inputs cannot be created: {error}");
@@ -185,7 +196,7 @@ impl ConnectedLambda {
 
     /// Sends the reply of a call that failed.
     pub(crate) fn fail(&mut self, id: u64, kind: ModelFaultKind, message: impl Into<String>) {
-        self.reply(id, Err(ModelFault::new(kind, message)), None);
+        self.reply(id, Err(ModelFault::new(kind, message)), None, 0);
     }
 }
 

@@ -1,9 +1,8 @@
 //! The loop: owns the lambdas, the sessions and the order of runs. It never waits for a lambda or a
 //! model.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::fs::File;
-use std::io;
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -19,14 +18,14 @@ use tracing::{error, info};
 
 use crate::backend::StopSignal;
 use crate::client::{CallStage, ConnectedLambda, LambdaId, OpenCall};
+use crate::engine_error::EngineError;
 use crate::lambdas::{LambdaTable, ReadyDescriptors};
 use crate::loader::{LoadDone, LoadJob};
 use crate::places::{PlacedInput, check_inputs};
 use crate::queue::FairQueue;
-use crate::running::ModelWork;
 use crate::sessions::{LoadState, SessionId, SessionKey, SessionTable};
 use crate::threads::{ModelThreads, ThreadResult};
-use crate::worker::{RunDone, RunJob, WorkerModel, WorkerRequest};
+use crate::worker::{RunDone, RunJob, RunOutputs, WorkerModel, WorkerRequest};
 
 /// Interval of the status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
@@ -46,6 +45,9 @@ pub(crate) struct InferenceEngine {
     /// Files by digest.
     files: HashMap<String, (String, Arc<File>)>,
     sessions: SessionTable,
+    /// Models that wait to be loaded.
+    loads: VecDeque<LoadJob>,
+    is_loading: bool,
     queue: FairQueue<LambdaId, Vec<PlacedInput>>,
     run: Option<RunInProgress>,
     last_job: u64,
@@ -58,28 +60,6 @@ struct RunInProgress {
     job: u64,
     lambda: LambdaId,
     stop: Arc<StopSignal>,
-}
-
-/// The reason why the process cannot go on.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum EngineError {
-    /// A model takes too long and cannot be interrupted.
-    #[error(
-        "model `{}` of lambda {} has run for more than {} s", .0.path, names(&.0.lambdas),
-        .0.limit.as_secs_f64()
-    )]
-    Overdue(ModelWork),
-    /// A thread has ended.
-    #[error("a thread of this process has ended")]
-    Thread,
-    /// The system has no memory.
-    #[error("cannot wait for lambdas")]
-    Wait(#[source] io::Error),
-}
-
-fn names(lambdas: &[String]) -> String {
-    let quoted: Vec<String> = lambdas.iter().map(|name| format!("`{name}`")).collect();
-    quoted.join(", ")
 }
 
 /// The reason why the loop ends.
@@ -103,6 +83,8 @@ impl InferenceEngine {
             lambdas: LambdaTable::default(),
             files: HashMap::new(),
             sessions: SessionTable::default(),
+            loads: VecDeque::new(),
+            is_loading: false,
             queue: FairQueue::default(),
             run: None,
             last_job: 0,
@@ -165,6 +147,7 @@ impl InferenceEngine {
             }
             self.remove_gone();
             self.check_deadlines();
+            self.start_load();
             self.start_run();
             self.tick()?;
         }
@@ -213,19 +196,19 @@ impl InferenceEngine {
     fn handle_request(&mut self, id: LambdaId, request: ModelRequest) {
         self.expire(id, now_ns());
         let Some(lambda) = self.lambdas.get_mut(id) else { return };
-        // A lambda that waits for a model may have given that up: it made the call to a process
-        // before this one, which has ended.
-        if lambda.call.take_if(|call| call.stage == CallStage::Loading).is_none()
-            && lambda.call.is_some()
-        {
-            return lambda.drop_for("it made a call before the reply to the one before");
+        // It has given up the call before: its time was over, or it made that call to a process
+        // before this one.
+        let before = lambda.call.take();
+        if let Some(before) = before {
+            self.abandon(id, before.stage);
         }
-        let ModelRequest { id: call, deadline_ns, call: requested } = request;
+        let Some(lambda) = self.lambdas.get_mut(id) else { return };
+        let ModelRequest { id: call, deadline_ns, regions, call: requested } = request;
         match requested {
             ModelCall::Reserve { bytes } => lambda.reserve(call, bytes),
             ModelCall::Open { model } => self.open(id, call, deadline_ns, model),
             ModelCall::Run { model, inputs } => {
-                self.request_run(id, call, deadline_ns, model, &inputs);
+                self.request_run(id, (call, deadline_ns), model, &inputs, regions);
             }
         }
     }
@@ -251,8 +234,8 @@ impl InferenceEngine {
             },
         };
         if let Some(lambda) = self.lambdas.get_mut(id) {
-            let stage = CallStage::Loading;
-            lambda.call = Some(OpenCall { id: call, deadline_ns, model, session, stage });
+            let (outputs, stage) = (0, CallStage::Loading);
+            lambda.call = Some(OpenCall { id: call, deadline_ns, model, session, outputs, stage });
         }
         self.answer_open(id);
     }
@@ -264,8 +247,22 @@ impl InferenceEngine {
         };
         let (path, file, lambdas) = (path.clone(), Arc::clone(file), self.lambdas.users(&key));
         let session = self.sessions.add(key.clone(), path.clone());
-        self.threads.load(LoadJob { session, key, file, path, lambdas });
+        self.loads.push_back(LoadJob { session, key, file, path, lambdas });
         Ok(session)
+    }
+
+    /// Starts the next load, if none is in progress. A model that no lambda waits for any more is
+    /// not loaded.
+    fn start_load(&mut self) {
+        while !self.is_loading {
+            let Some(job) = self.loads.pop_front() else { return };
+            if self.lambdas.with_call_on(job.session).is_empty() {
+                self.sessions.remove(job.session);
+                continue;
+            }
+            self.is_loading = true;
+            self.threads.load(job);
+        }
     }
 
     /// Answers a lambda that opens a model, unless that is still being loaded.
@@ -283,7 +280,7 @@ impl InferenceEngine {
                     runtime: ready.runtime.clone(),
                 };
                 lambda.opened.insert(call.model);
-                lambda.reply(call.id, Ok(opened), None);
+                lambda.reply(call.id, Ok(opened), None, 0);
             }
             Some(LoadState::Failed(reason)) => {
                 lambda.fail(call.id, ModelFaultKind::Failed, reason.clone());
@@ -296,10 +293,10 @@ impl InferenceEngine {
     fn request_run(
         &mut self,
         id: LambdaId,
-        call: u64,
-        deadline_ns: Option<u64>,
+        (call, deadline_ns): (u64, Option<u64>),
         model: String,
         inputs: &[TensorPlace],
+        [input_region, outputs]: [u64; 2],
     ) {
         let Some(lambda) = self.lambdas.get_mut(id) else { return };
         let Some(granted) = lambda.granted(&model) else {
@@ -312,11 +309,14 @@ impl InferenceEngine {
             let message = format!("model `{model}` is not open; open it before its first run");
             return lambda.fail(call, ModelFaultKind::Unavailable, message);
         };
-        let region_bytes = lambda.inputs.as_ref().map_or(0, |region| region.bytes());
+        // Inputs that are in another region would be read from this one.
+        let region = lambda.inputs.as_ref().filter(|region| region.id == input_region);
+        let region_bytes = region.map_or(0, |region| region.bytes());
         match check_inputs(&ready.inputs, inputs, region_bytes) {
             Ok(placed) => {
                 let stage = CallStage::Waiting;
-                lambda.call = Some(OpenCall { id: call, deadline_ns, model, session, stage });
+                lambda.call =
+                    Some(OpenCall { id: call, deadline_ns, model, session, outputs, stage });
                 self.queue.push(id, deadline_ns, placed);
             }
             Err(error) => {
@@ -335,6 +335,7 @@ impl InferenceEngine {
             let Some(call) = &mut lambda.call else { continue };
             self.last_job += 1;
             let (job, stop) = (self.last_job, Arc::new(StopSignal::default()));
+            let left = call.deadline_ns.map(|at| Duration::from_nanos(at.saturating_sub(now_ns())));
             call.stage = CallStage::Running(job);
             self.threads.request(WorkerRequest::Run(RunJob {
                 job,
@@ -343,6 +344,8 @@ impl InferenceEngine {
                 inputs,
                 input_region: lambda.inputs.clone(),
                 output_region: lambda.outputs.clone(),
+                memory: lambda.memory,
+                left,
                 stop: Arc::clone(&stop),
             }));
             self.run = Some(RunInProgress { job, lambda: id, stop });
@@ -351,6 +354,7 @@ impl InferenceEngine {
 
     fn finish_load(&mut self, done: LoadDone) {
         let LoadDone { session: id, loaded } = done;
+        self.is_loading = false;
         let Some(session) = self.sessions.get_mut(id) else { return };
         session.state = match loaded {
             Ok((graph, ready)) => {
@@ -381,7 +385,7 @@ impl InferenceEngine {
         let Some(run) = self.run.take_if(|run| run.job == job) else { return };
         let waits = |call: &mut OpenCall| call.stage == CallStage::Running(job);
         let lambda = self.lambdas.get_mut(run.lambda);
-        let answered = lambda.and_then(|it| Some((it.call.take_if(waits)?.id, it)));
+        let answered = lambda.and_then(|it| Some((it.call.take_if(waits)?, it)));
         if let Some(session) = self.sessions.get_mut(session) {
             let counts = &mut session.counts;
             counts.runs += u64::from(ran_ns.is_some());
@@ -390,14 +394,14 @@ impl InferenceEngine {
             counts.shared += u64::from(ran_ns.is_none() && result.is_ok());
             counts.failed += u64::from(answered.is_some() && result.is_err());
         }
-        let Some((id, lambda)) = answered else { return };
+        let Some((call, lambda)) = answered else { return };
         match result {
-            Ok(outputs) => {
-                let ran = ModelResult::Ran { outputs: outputs.places, run_ns: outputs.run_ns };
-                lambda.reply(id, Ok(ran), outputs.new_region.as_deref());
-                lambda.outputs = outputs.new_region.or(lambda.outputs.take());
+            Ok(RunOutputs { places, region, run_ns }) => {
+                let ran = ModelResult::Ran { outputs: places, run_ns };
+                lambda.reply(call.id, Ok(ran), Some(&region), call.outputs);
+                lambda.outputs = Some(region);
             }
-            Err(fault) => lambda.reply(id, Err(fault), None),
+            Err(fault) => lambda.reply(call.id, Err(fault), None, 0),
         }
     }
 

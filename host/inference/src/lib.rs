@@ -1,6 +1,7 @@
 //! The process that runs the models of all lambdas on this machine.
 //!
-//! - `engine`: the loop: owns the lambdas, the sessions and the order of runs; never waits.
+//! - `engine`, `engine_error`: the loop: owns the lambdas, the sessions and the order of runs;
+//!   never waits.
 //! - `client`, `lambdas`: a connected lambda, and all of them. `sessions`: models with their
 //!   options, shared by lambdas.
 //! - [`queue`]: the order of runs. [`places`]: checks of requests. Both are pure.
@@ -18,6 +19,7 @@
 pub mod backend;
 mod client;
 mod engine;
+mod engine_error;
 pub mod inspect;
 mod lambdas;
 mod loader;

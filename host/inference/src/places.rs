@@ -84,7 +84,8 @@ fn check_input(
     let TensorPlace { element, shape, offset, .. } = place;
     let (name, offset) = (|| info.name.clone(), *offset);
     // First the size: it bounds the number of dimensions, and with it the message below.
-    let bytes = place.bytes().ok_or_else(|| PlaceError::Size { name: name() })?;
+    let bytes = place.bytes().filter(|bytes| *bytes > 0);
+    let bytes = bytes.ok_or_else(|| PlaceError::Size { name: name() })?;
     if !info.accepts(*element, shape) {
         let shape = shape.iter().map(|length| Some(*length)).collect();
         let found = TensorInfo { name: name(), element: *element, shape };
@@ -100,36 +101,26 @@ fn check_input(
     Ok(PlacedInput { element: *element, shape: shape.clone(), offset, bytes })
 }
 
-/// The reason why outputs cannot be sent.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[allow(missing_docs)]
-pub enum UnplacedOutput {
-    #[error("output `{name}` is {found}: a tensor without elements cannot be returned")]
-    Empty { name: String, found: TensorInfo },
-    #[error("the outputs have more than {MAX_TENSOR_BYTES} bytes")]
-    TooLarge,
-}
+/// Outputs that are too large to be sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("the outputs have more than {MAX_TENSOR_BYTES} bytes")]
+pub struct OutputsTooLarge;
 
 /// Places outputs one after another. Returns their places, and the size of the region.
 ///
 /// # Errors
 ///
-/// [`UnplacedOutput`] for tensors without elements, and for too many bytes.
+/// [`OutputsTooLarge`].
 pub fn place_outputs<'a>(
     outputs: impl Iterator<Item = (&'a str, Element, &'a [u32])>,
-) -> Result<(Vec<TensorPlace>, u64), UnplacedOutput> {
+) -> Result<(Vec<TensorPlace>, u64), OutputsTooLarge> {
     let (mut places, mut end) = (Vec::new(), 0_u64);
     for (name, element, shape) in outputs {
-        if shape.contains(&0) {
-            let lengths = shape.iter().map(|length| Some(*length)).collect();
-            let found = TensorInfo { name: name.to_owned(), element, shape: lengths };
-            return Err(UnplacedOutput::Empty { name: name.to_owned(), found });
-        }
-        let bytes = element.bytes_of(shape).ok_or(UnplacedOutput::TooLarge)?;
+        let bytes = element.bytes_of(shape).ok_or(OutputsTooLarge)?;
         let offset = end.next_multiple_of(ALIGNMENT);
         end = offset + bytes;
         if end > MAX_TENSOR_BYTES {
-            return Err(UnplacedOutput::TooLarge);
+            return Err(OutputsTooLarge);
         }
         let (name, shape) = (name.to_owned(), shape.to_vec());
         places.push(TensorPlace { name, element, shape, offset });
@@ -210,12 +201,9 @@ mod tests {
         let (places, bytes) = place_outputs(outputs.into_iter()).unwrap();
         let offsets: Vec<_> = places.iter().map(|place| place.offset).collect();
         assert_eq!((offsets, bytes), (vec![0, 64, 192], 196));
-        let empty = place_outputs([("boxes", F32, &[0_u32, 4][..])].into_iter()).unwrap_err();
-        assert_eq!(
-            empty.to_string(),
-            "output `boxes` is float32 [0, 4]: a tensor without elements cannot be returned"
-        );
+        let empty = place_outputs([("boxes", F32, &[0_u32, 4][..])].into_iter()).unwrap();
+        assert_eq!((empty.0[0].offset, empty.1), (0, 0));
         let huge = [("a", F32, &[1 << 26][..]), ("b", F32, &[1])];
-        assert_eq!(place_outputs(huge.into_iter()), Err(UnplacedOutput::TooLarge));
+        assert_eq!(place_outputs(huge.into_iter()), Err(OutputsTooLarge));
     }
 }

@@ -112,6 +112,11 @@ impl SessionTable {
         id
     }
 
+    /// Removes a session.
+    pub(crate) fn remove(&mut self, id: SessionId) {
+        self.sessions.remove(&id);
+    }
+
     /// Counts a request that failed.
     pub(crate) fn count_failed(&mut self, id: SessionId) {
         if let Some(session) = self.get_mut(id) {
@@ -161,6 +166,7 @@ impl ModelSession {
         };
         LoadedModel {
             sha256: self.key.sha256.clone(),
+            path: self.path.clone(),
             lambdas,
             state,
             runtime: runtime.to_owned(),

@@ -17,6 +17,9 @@ use crate::region::TensorRegion;
 use crate::running::{ModelWork, WorkNote};
 use crate::sessions::SessionId;
 
+/// Time after its deadline for which a run may go on that cannot be interrupted.
+const GRACE: Duration = Duration::from_secs(2);
+
 /// A request to the thread.
 pub(crate) enum WorkerRequest {
     /// Keep a loaded model.
@@ -53,6 +56,10 @@ pub(crate) struct RunJob {
     pub(crate) input_region: Option<Arc<TensorRegion>>,
     /// Region of the outputs of earlier runs.
     pub(crate) output_region: Option<Arc<TensorRegion>>,
+    /// Largest size of the outputs.
+    pub(crate) memory: u64,
+    /// Time until the deadline, if there is one.
+    pub(crate) left: Option<Duration>,
     pub(crate) stop: Arc<StopSignal>,
 }
 
@@ -68,8 +75,7 @@ pub(crate) struct RunDone {
 /// Outputs in a region.
 pub(crate) struct RunOutputs {
     pub(crate) places: Vec<TensorPlace>,
-    /// The region, if it is a new one.
-    pub(crate) new_region: Option<Arc<TensorRegion>>,
+    pub(crate) region: Arc<TensorRegion>,
     /// Run time of the model in ns; that of the first run if the result is shared.
     pub(crate) run_ns: u64,
 }
@@ -109,12 +115,14 @@ impl ModelWorker {
         if job.stop.is_stopped() {
             return done(Err(failed("nothing waits for the result")), None);
         }
+        // After the deadline only other lambdas wait for its end.
+        let limit = job.left.map_or(self.run_max, |left| self.run_max.min(left + GRACE));
         self.note.begin(ModelWork {
             sha256: model.sha256.clone(),
             path: model.path.clone(),
             lambdas: vec![job.lambda.clone()],
-            until: Instant::now() + self.run_max,
-            limit: self.run_max,
+            until: Instant::now() + limit,
+            limit,
             stop: Arc::clone(&job.stop),
         });
         let (result, ran_ns) = model.run(&job);
@@ -169,19 +177,21 @@ impl LastRun {
         let named = tensors.map(|(info, it)| (info.name.as_str(), it.element, it.shape.as_slice()));
         let (places, bytes) = place_outputs(named).map_err(|error| failed(&error.to_string()))?;
         let no_memory = |error: io::Error| failed(&format!("the outputs cannot be sent: {error}"));
+        if bytes > job.memory {
+            let allowed = job.memory;
+            return Err(failed(&format!(
+                "the outputs have {bytes} bytes, above the {allowed} of `memory` in [limits]"
+            )));
+        }
         let fitting = job.output_region.clone().filter(|region| region.bytes() >= bytes);
-        let new_region = match &fitting {
-            Some(_) => None,
-            None => {
-                let created = TensorRegion::create("gleaner-outputs", bytes.max(1));
-                Some(Arc::new(created.map_err(no_memory)?))
-            }
+        let region = match fitting {
+            Some(region) => region,
+            None => Arc::new(TensorRegion::create("gleaner-outputs", bytes).map_err(no_memory)?),
         };
-        let region = new_region.clone().or(fitting).expect("an earlier region or a new one");
         for (place, output) in places.iter().zip(&self.outputs) {
             region.write(place.offset, &output.bytes).map_err(no_memory)?;
         }
-        Ok(RunOutputs { places, new_region, run_ns: self.run_ns })
+        Ok(RunOutputs { places, region, run_ns: self.run_ns })
     }
 }
 
@@ -246,7 +256,7 @@ mod tests {
             last: None,
         };
         worker.handle(WorkerRequest::Add(session, model));
-        let region = Arc::new(TensorRegion::create("test", 4096).unwrap());
+        let region = Arc::new(TensorRegion::create("test", 8192).unwrap());
         Bench { worker, session, region, outputs: None }
     }
 
@@ -262,6 +272,8 @@ mod tests {
                 inputs: vec![input],
                 input_region: Some(Arc::clone(&self.region)),
                 output_region: self.outputs.clone(),
+                memory: 6000,
+                left: None,
                 stop: Arc::default(),
             };
             self.worker.handle(WorkerRequest::Run(job)).unwrap()
@@ -274,15 +286,17 @@ mod tests {
         let first = bench.run(Element::Uint8, b"abc");
         let outputs = first.result.unwrap();
         assert!(first.ran_ns.is_some());
-        bench.outputs = outputs.new_region;
+        bench.outputs = Some(Arc::clone(&outputs.region));
         let second = bench.run(Element::Uint8, b"abc");
         assert_eq!(second.ran_ns, None, "it is shared");
         let shared = second.result.unwrap();
         assert_eq!(shared.run_ns, outputs.run_ns);
-        assert!(shared.new_region.is_none());
-        let third = bench.run(Element::Uint8, &[7; 200]);
-        let region = third.result.unwrap().new_region.expect("the first one has 3 bytes");
-        assert_eq!(region.read(0, 200).unwrap(), [7; 200]);
+        assert_eq!(shared.region.id, outputs.region.id);
+        let third = bench.run(Element::Uint8, &[7; 5000]).result.unwrap();
+        assert_ne!(third.region.id, outputs.region.id, "the first one has 4096 bytes");
+        assert_eq!(third.region.read(0, 5000).unwrap(), [7; 5000]);
+        let fault = bench.run(Element::Uint8, &[7; 6001]).result.err().unwrap();
+        assert!(fault.message.contains("6001 bytes, above the 6000 of `memory`"), "{fault:?}");
         // The same bytes in another shape are another input.
         assert!(bench.run(Element::Uint8, &[7; 100]).ran_ns.is_some());
     }
@@ -291,7 +305,7 @@ mod tests {
     fn bytes_of_booleans_become_0_or_1() {
         let mut bench = bench(Element::Boolean);
         let done = bench.run(Element::Boolean, &[0, 1, 7, 255]);
-        let region = done.result.unwrap().new_region.unwrap();
+        let region = done.result.unwrap().region;
         assert_eq!(region.read(0, 4).unwrap(), [0, 1, 1, 1]);
     }
 

@@ -86,11 +86,11 @@ pub(crate) fn over_tensor<'py>(tensor: &Bound<'py, TensorBytes>) -> PyResult<Bou
         Element::Boolean => "?",
     };
     let descr = PyArrayDescr::new(tensor.py(), code)?;
-    // The product of all lengths fits, as checked above.
     let mut dims: Vec<_> = shape.iter().map(|length| *length as npy_intp).collect();
     let mut strides = vec![element.size() as npy_intp; dims.len()];
     for index in (1..dims.len()).rev() {
-        strides[index - 1] = strides[index] * dims[index];
+        // The product of all lengths fits, as checked above, unless one of them is 0.
+        strides[index - 1] = if bytes.is_empty() { 0 } else { strides[index] * dims[index] };
     }
     // SAFETY: all elements of this shape, in row-major order, lie within `bytes`, as checked above.
     // `tensor` is frozen, and the bytes that it shares are never changed while it lives.
@@ -101,8 +101,8 @@ pub(crate) fn over_tensor<'py>(tensor: &Bound<'py, TensorBytes>) -> PyResult<Bou
 ///
 /// # Safety
 ///
-/// All elements that `descr`, `dims` and `strides` describe lie within `bytes`. These stay in place,
-/// unchanged, while `owner` lives.
+/// All elements that `descr`, `dims` and `strides` describe lie within `bytes`. These stay in
+/// place, unchanged, while `owner` lives.
 unsafe fn lend<'py>(
     owner: &Bound<'py, PyAny>,
     bytes: &[u8],

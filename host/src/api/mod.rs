@@ -24,6 +24,7 @@ pub mod relayed;
 mod sample;
 pub mod scratch;
 mod shared_bytes;
+mod tensor;
 pub mod trace;
 pub mod trigger;
 mod values;

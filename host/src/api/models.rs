@@ -1,17 +1,18 @@
-//! The models of a lambda: its connection to `gleaner-inference`, which runs them, and the time that
-//! they take.
+//! The models of a lambda: its connection to `gleaner-inference`, which runs them, and the time
+//! that they take.
 
 use std::fs::File;
 use std::io;
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::FileExt;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use gleaner_base::chain;
 use gleaner_protocol::inference::{
-    MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelFault, ModelFaultKind, ModelReply, ModelResult,
-    ModelWait, TensorInfo, TensorPlace,
+    MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelFault, ModelReply, ModelResult, ModelWait,
+    TensorInfo, TensorPlace,
 };
 use gleaner_protocol::link::LinkError;
 use gleaner_vision::{DetectorLayout, Preparer};
@@ -19,6 +20,9 @@ use rustix::time::{ClockId, clock_gettime};
 
 use super::call::Due;
 use super::inference::InferenceError;
+
+/// Time after the deadline for which a reply is awaited.
+const REPLY_TIMEOUT: Duration = Duration::from_millis(20);
 
 /// Alignment of tensors in a region, in bytes.
 const ALIGNMENT: u64 = 64;
@@ -35,16 +39,41 @@ pub struct ModelEntry {
 
 /// The models of a lambda. Clones share the connection; one call is made at a time.
 #[derive(Clone, Default)]
-pub struct Models(Arc<Mutex<ModelsState>>);
+pub struct Models {
+    state: Arc<Mutex<ModelsState>>,
+    time: Arc<ModelTime>,
+}
+
+/// Run time of the models in the current wake. No call waits for another one to read it.
+#[derive(Default)]
+struct ModelTime {
+    used_ns: AtomicU64,
+    /// The limit; 0 for none.
+    allowed_ns: AtomicU64,
+}
+
+impl ModelTime {
+    fn add(&self, time: Duration) {
+        let ns = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
+        self.used_ns.fetch_add(ns, Ordering::Relaxed);
+    }
+
+    fn allowed(&self) -> Option<Duration> {
+        let ns = self.allowed_ns.load(Ordering::Relaxed);
+        (ns > 0).then_some(Duration::from_nanos(ns))
+    }
+
+    /// Returns the time that is left; `None` without a limit.
+    fn left(&self) -> Option<Duration> {
+        let used = Duration::from_nanos(self.used_ns.load(Ordering::Relaxed));
+        self.allowed().map(|allowed| allowed.saturating_sub(used))
+    }
+}
 
 #[derive(Default)]
 struct ModelsState {
     entries: Vec<Arc<ModelEntry>>,
     connection: Option<Connection>,
-    /// Run time of the models in the current wake.
-    used: Duration,
-    /// The limit of `used`, if there is one.
-    allowed: Option<Duration>,
     preparer: Preparer,
     /// The prepared frame, whose memory is used again.
     prepared: Vec<u8>,
@@ -53,6 +82,8 @@ struct ModelsState {
 /// The connection to `gleaner-inference`.
 struct Connection {
     client: ModelClient,
+    /// Largest size of inputs, and of outputs.
+    memory: u64,
     /// The region for inputs, and its size.
     inputs: Option<(File, u64)>,
     /// The region for outputs.
@@ -82,32 +113,36 @@ pub(super) struct TensorBytes<T> {
 }
 
 impl Models {
-    /// The models `entries`, over `socket` if the starter passed one.
-    pub fn new(entries: Vec<ModelEntry>, socket: Option<OwnedFd>) -> Self {
+    /// The models `entries`, over `socket` if the starter passed one. `memory` is that of
+    /// `[limits]`.
+    pub fn new(entries: Vec<ModelEntry>, socket: Option<OwnedFd>, memory: u64) -> Self {
         let connection = socket.map(|socket| Connection {
             client: ModelClient::new(socket),
+            memory,
             inputs: None,
             outputs: None,
             opened: Vec::new(),
             ended: None,
         });
         let entries = entries.into_iter().map(Arc::new).collect();
-        Self(Arc::new(Mutex::new(ModelsState { entries, connection, ..Default::default() })))
+        let state = ModelsState { entries, connection, ..Default::default() };
+        Self { state: Arc::new(Mutex::new(state)), time: Arc::default() }
     }
 
     /// Limits the run time of the models of a wake.
     pub fn limit(&self, allowed: Option<Duration>) {
-        self.lock().allowed = allowed;
+        let ns = allowed.map_or(0, |it| u64::try_from(it.as_nanos()).unwrap_or(u64::MAX));
+        self.time.allowed_ns.store(ns, Ordering::Relaxed);
     }
 
     /// Begins a wake.
     pub fn begin(&self) {
-        self.lock().used = Duration::ZERO;
+        self.time.used_ns.store(0, Ordering::Relaxed);
     }
 
     /// Run time of the models since [`Models::begin`], in ns.
     pub fn run_ns(&self) -> u64 {
-        u64::try_from(self.lock().used.as_nanos()).unwrap_or(u64::MAX)
+        self.time.used_ns.load(Ordering::Relaxed)
     }
 
     /// Opens all models, so that `init` finds them loaded. Errors are kept for the lambda, which
@@ -157,7 +192,7 @@ impl Models {
         inputs: &[TensorBytes<&[u8]>],
         due: &Due,
     ) -> Result<Vec<TensorBytes<Vec<u8>>>, InferenceError> {
-        self.lock().run(name, inputs, due)
+        self.lock().run(name, inputs, due, &self.time)
     }
 
     /// Runs a model on one input that `prepare` writes into memory which is used again.
@@ -171,7 +206,8 @@ impl Models {
         let mut state = self.lock();
         let mut bytes = std::mem::take(&mut state.prepared);
         let result = prepare(&mut state.preparer, &mut bytes).and_then(|placed| {
-            let outputs = state.run(name, &[TensorBytes { place, bytes: &bytes }], due)?;
+            let input = TensorBytes { place, bytes: bytes.as_slice() };
+            let outputs = state.run(name, &[input], due, &self.time)?;
             Ok((placed, outputs))
         });
         state.prepared = bytes;
@@ -188,7 +224,7 @@ impl Models {
 
     fn lock(&self) -> MutexGuard<'_, ModelsState> {
         // After a panic, at worst a region is requested again.
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -196,7 +232,6 @@ impl ModelsState {
     fn open(&mut self, name: &str, due: &Due) -> Result<Arc<OpenedModel>, InferenceError> {
         let until = due.at();
         let connection = self.connection.as_mut().ok_or_else(not_connected)?;
-        connection.check_process(until)?;
         connection.open(name, until)
     }
 
@@ -205,10 +240,11 @@ impl ModelsState {
         name: &str,
         inputs: &[TensorBytes<&[u8]>],
         due: &Due,
+        time: &ModelTime,
     ) -> Result<Vec<TensorBytes<Vec<u8>>>, InferenceError> {
         let started = Instant::now();
-        let left = self.allowed.map(|allowed| allowed.saturating_sub(self.used));
-        let too_slow = || InferenceError::too_slow(name, self.allowed.unwrap_or_default());
+        let left = time.left();
+        let too_slow = || InferenceError::too_slow(name, time.allowed().unwrap_or_default());
         if left.is_some_and(|left| left.is_zero()) {
             return Err(too_slow());
         }
@@ -220,14 +256,15 @@ impl ModelsState {
             .open(name, until)
             .and_then(|_| connection.run(name, inputs, until))
             .map_err(|error| match error {
-                // Without a deadline in reach, the time of the models is over.
+                // Before the deadline, the time of the models is over.
                 InferenceError::OutOfTime if due.check().is_ok() => too_slow(),
+                InferenceError::TooSlow(_) if due.check().is_err() => InferenceError::OutOfTime,
                 error => error,
             });
-        self.used += match &result {
+        time.add(match &result {
             Ok((_, ran)) => *ran,
             Err(_) => started.elapsed(),
-        };
+        });
         result.map(|(outputs, _)| outputs)
     }
 }
@@ -242,10 +279,8 @@ impl Connection {
         while let Some(reply) = self.client.poll().map_err(failed)? {
             self.note(&reply);
         }
-        while until.is_none() && self.ended.is_some() {
-            if let Some(reply) = self.client.wait_for_starter(None).map_err(failed)? {
-                self.note(&reply);
-            }
+        if until.is_none() {
+            self.wait_for_process(None)?;
         }
         match &self.ended {
             Some(reason) => {
@@ -253,6 +288,17 @@ impl Connection {
             }
             None => Ok(()),
         }
+    }
+
+    /// Waits until the process runs, or until `until`.
+    fn wait_for_process(&mut self, until: Option<Instant>) -> Result<(), InferenceError> {
+        while self.ended.is_some() {
+            match self.client.wait_for_starter(until).map_err(failed)? {
+                Some(reply) => self.note(&reply),
+                None => return Err(InferenceError::OutOfTime),
+            }
+        }
+        Ok(())
     }
 
     /// Notes the end or the start of the process.
@@ -275,7 +321,15 @@ impl Connection {
         if let Some(opened) = self.find(name) {
             return Ok(opened);
         }
-        let (result, _) = self.call(ModelCall::Open { model: name.to_owned() }, until)?;
+        // Another model may end the process meanwhile, which must not keep this one from loading.
+        let result = loop {
+            self.wait_for_process(until)?;
+            match self.call(ModelCall::Open { model: name.to_owned() }, until) {
+                Err(InferenceError::Unavailable(_)) if self.ended.is_some() => {}
+                Err(InferenceError::Restarted) => {}
+                result => break result?.0,
+            }
+        };
         let ModelResult::Opened { inputs, outputs, runtime } = result else {
             return Err(unexpected());
         };
@@ -315,6 +369,12 @@ impl Connection {
         let call = ModelCall::Run { model: name.to_owned(), inputs: places };
         let (result, region) = self.call(call, until)?;
         let ModelResult::Ran { outputs, run_ns } = result else { return Err(unexpected()) };
+        let all = outputs.iter().map(TensorPlace::bytes).try_fold(0_u64, |all, bytes| {
+            all.checked_add(bytes?).filter(|all| *all <= self.memory)
+        });
+        if all.is_none() {
+            return Err(unexpected());
+        }
         if let Some(region) = region {
             self.outputs = Some(File::from(region));
         }
@@ -338,23 +398,22 @@ impl Connection {
             let left = until.saturating_duration_since(Instant::now());
             monotonic_ns().saturating_add(u64::try_from(left.as_nanos()).unwrap_or(u64::MAX))
         });
-        let (reply, region) = match self.client.call(call, deadline_ns, until).map_err(failed)? {
+        // It replies at the deadline; without a reply, the reason would be unknown.
+        let wait = until.map(|until| until + REPLY_TIMEOUT);
+        let (reply, region) = match self.client.call(call, deadline_ns, wait).map_err(failed)? {
             ModelWait::Reply(reply, region) => (reply, region),
-            ModelWait::TimedOut => return Err(InferenceError::OutOfTime),
+            ModelWait::TimedOut => {
+                (self.inputs, self.outputs) = (None, None);
+                return Err(InferenceError::OutOfTime);
+            }
         };
         if reply.id == 0 {
             self.note(&reply);
         }
         match reply.result {
             // The process has started again, without this call.
-            Ok(ModelResult::Started) => Err(InferenceError::Unavailable(
-                "gleaner-inference has just been started again".to_owned(),
-            )),
+            Ok(ModelResult::Started) => Err(InferenceError::Restarted),
             Ok(result) => Ok((result, region)),
-            // It noticed first that the time is over.
-            Err(fault) if fault.kind == ModelFaultKind::TooSlow && until.is_some() => {
-                Err(InferenceError::OutOfTime)
-            }
             Err(ModelFault { kind, message }) => Err(InferenceError::of(kind, message)),
         }
     }

@@ -106,7 +106,8 @@ impl ConfiguredLambda {
             return Ok(());
         }
         let entries = manifest.models.iter().map(|model| model_entry(model, &self.build));
-        self.models = Models::new(entries.collect::<Result<_, _>>()?, socket);
+        let memory = manifest.limits.memory.bytes();
+        self.models = Models::new(entries.collect::<Result<_, _>>()?, socket, memory);
         self.models.open_all(manifest.limits.init_deadline);
         Ok(())
     }

@@ -200,7 +200,7 @@ pub struct ModelSpec {
     pub layout: Option<String>,
     /// Text file with the name of a class in each line, relative to the build folder.
     pub labels: Option<RelativePath>,
-    /// What runs the model, in order of preference: `tensorrt`, `cuda`, `cpu`, or `onnxruntime` and
+    /// Execution providers, in order of preference: `tensorrt`, `cuda`, `cpu`, or `onnxruntime` and
     /// `rten` for one that runs on the CPU. If empty, `cpu`.
     pub providers: Vec<String>,
     /// Threads that one run may use.

@@ -13,10 +13,11 @@ use libtest_mimic::{Failed, Trial};
 const KINDS: [&str; 2] = ["rust", "python"];
 
 /// The examples, with settings that suit the gentle braking of the sample drive.
-const EXAMPLES: [(&str, &[&str]); 3] = [
+const EXAMPLES: [(&str, &[&str]); 4] = [
     ("hello", &["--set", "brake_mps2=-1.4"]),
     ("brake-dark", &["--set", "brake_mps2=-1.4"]),
     ("imu-fft", &[]),
+    ("yolo-detector", &["--set", "classes=car, truck", "--to", "3"]),
 ];
 
 pub fn trials() -> Vec<Trial> {
@@ -53,6 +54,11 @@ pub fn trials() -> Vec<Trial> {
             move |drive| pixels(&drive, kind),
         ));
     }
+    trials.push(shared(
+        "yolo_detector_finds_people_and_its_twins_agree".to_owned(),
+        "rec_objects_5hz.mcap",
+        |drive| people(&drive),
+    ));
     trials.push(shared(
         "the_twins_of_imu_fft_agree_on_a_walk".to_owned(),
         "rec_sync_gopro_walk.mcap",
@@ -95,6 +101,29 @@ fn expected(example: &str, kind: &str, set: &[&str]) -> Result<(), Failed> {
     let expected =
         std::fs::read_to_string(root().join("examples").join(example).join("expected.txt"))?;
     same(&run.rows(), &expected)
+}
+
+/// People are found in 16 of the 20 frames that show some, and in at most 1 of the 24 others.
+fn people(drive: &Path) -> Result<(), Failed> {
+    let truth = std::fs::read_to_string(drive.with_extension("truth.json"))?;
+    let truth: serde_json::Value = serde_json::from_str(&truth)?;
+    let frames = truth["frames"].as_array().ok_or("no frames")?;
+    let shows = |wanted: bool| {
+        let frames = frames.iter().filter(move |frame| frame["has_person"] == wanted);
+        frames.filter_map(|frame| frame["stamp_ns"].as_i64()).collect::<Vec<_>>()
+    };
+    let found = run("examples/yolo-detector", "rust", drive, &["--all"])?;
+    let has_person = |at_ns: &i64| {
+        let mut decisions = found.decisions.iter().filter(|decision| decision.at_ns == *at_ns);
+        decisions.any(|it| it.triggers.iter().any(|trigger| trigger.label == "person"))
+    };
+    let found = [shows(true), shows(false)]
+        .map(|frames| (frames.iter().filter(|at_ns| has_person(at_ns)).count(), frames.len()));
+    let [(hits, with), (mistakes, without)] = found;
+    if (with, without) != (20, 24) || hits < 16 || mistakes > 1 {
+        return Err(format!("{hits} of {with} people, {mistakes} of {without} others").into());
+    }
+    twins("examples/yolo-detector", drive, &["--all"])
 }
 
 fn twins(lambda: &str, drive: &Path, args: &[&str]) -> Result<(), Failed> {

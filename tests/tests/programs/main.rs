@@ -15,6 +15,7 @@ mod hostile_folders;
 mod journal;
 mod journal_file;
 mod kernels;
+mod models;
 mod native;
 mod new;
 mod python_faults;

@@ -56,6 +56,16 @@ const DEFAULT_LOCATION: i64 = 0;
 /// Names of the operators in the checked part of a model.
 pub(super) type Operators = BTreeSet<String>;
 
+/// Operators whose results differ from run to run, so that no decision could be repeated.
+const RANDOM: [&str; 6] = [
+    "Bernoulli",
+    "Multinomial",
+    "RandomNormal",
+    "RandomNormalLike",
+    "RandomUniform",
+    "RandomUniformLike",
+];
+
 /// Returns whether a domain is that of the standard operators.
 pub(super) fn is_standard(domain: &str) -> bool {
     matches!(domain, "" | "ai.onnx")
@@ -115,6 +125,9 @@ fn check_node(
             node_field::ATTRIBUTE => check_attribute(field.fields()?, depth, operators)?,
             _ => {}
         }
+    }
+    if RANDOM.contains(&operator) {
+        return Err(InspectError::Random { operator: operator.to_owned() });
     }
     if is_standard(domain) {
         if !operators.contains(operator) {

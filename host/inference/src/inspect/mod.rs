@@ -47,6 +47,8 @@ pub enum InspectError {
     TooDeep { max: usize },
     #[error("it has operator `{operator}` of domain `{domain}`; only standard operators can run")]
     Domain { domain: String, operator: String },
+    #[error("it has operator `{operator}`, whose random results no replay could repeat")]
+    Random { operator: String },
     #[error(
         "it needs version {version} of the standard operators; versions {OLDEST_OPSET} to \
          {NEWEST_OPSET} can run"

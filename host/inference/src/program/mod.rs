@@ -28,7 +28,8 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use tracing::{debug, warn};
 
 use crate::backend::{Backend, Backends, OnnxRuntime, RtenBackend};
-use crate::engine::{EngineError, InferenceEngine};
+use crate::engine::InferenceEngine;
+use crate::engine_error::EngineError;
 use crate::loader::LoadLimits;
 use crate::region::TensorRegion;
 use crate::threads::ModelThreads;

@@ -50,7 +50,7 @@ fn a_model_whose_first_run_is_endless_ends_the_process_too() {
     let mut program = ModelProgram::start(&["--run-max", "0.5"]);
     let model = granted("endless", endless(&[1]));
     let mut lambda = program.lambda("stuck", std::slice::from_ref(&model));
-    let slow = lambda.open_until("endless", Some(Duration::from_millis(50)));
+    let slow = lambda.open_until("endless", Some(Duration::from_millis(300)));
     let message = fault(ModelFaultKind::TooSlow, slow);
     assert_eq!(message, "model `endless` is still being loaded at the deadline");
     let (status, errors) = program.end();

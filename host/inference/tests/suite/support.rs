@@ -13,8 +13,8 @@ use std::time::{Duration, Instant};
 use gleaner_protocol::Handover;
 use gleaner_protocol::inference::{
     AddClient, Element, GrantedModel, InferenceControl, InferenceReport, InferenceStatus,
-    LoadedModel, ModelCall, ModelClient, ModelFault, ModelFaultKind, ModelFile, ModelResult,
-    ModelState, ModelWait, TensorInfo, TensorPlace,
+    LoadedModel, MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelFault, ModelFaultKind, ModelFile,
+    ModelResult, ModelState, ModelWait, TensorInfo, TensorPlace,
 };
 use sha2::{Digest, Sha256};
 
@@ -105,7 +105,7 @@ impl ModelProgram {
             control.add_model(&model, file.as_fd()).unwrap();
         }
         let models = models.iter().map(|model| model.grant.clone()).collect();
-        let client = AddClient { name: name.to_owned(), models };
+        let client = AddClient { name: name.to_owned(), memory: MAX_TENSOR_BYTES, models };
         control.add_client(&client, socket.as_fd()).unwrap();
     }
 

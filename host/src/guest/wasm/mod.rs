@@ -143,7 +143,12 @@ impl Guest for WasmGuest {
         {
             Ok(live) => live,
             Err(fault) => {
-                return WakeOutcome { result: Err(fault), fuel: None, run_ns: None, model_ns: None };
+                return WakeOutcome {
+                    result: Err(fault),
+                    fuel: None,
+                    run_ns: None,
+                    model_ns: None,
+                };
             }
         };
         let deadline = self.deadline.as_ref().map(|deadline| (deadline, self.limits.deadline));

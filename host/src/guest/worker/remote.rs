@@ -263,7 +263,12 @@ impl Guest for RemoteGuest {
         let WakeMessage { run_ns, model_ns, call, triggers, looked, .. } = match self.woken(&wake) {
             Ok(woken) => woken,
             Err(fault) => {
-                return WakeOutcome { result: Err(fault), fuel: None, run_ns: None, model_ns: None };
+                return WakeOutcome {
+                    result: Err(fault),
+                    fuel: None,
+                    run_ns: None,
+                    model_ns: None,
+                };
             }
         };
         for trigger in triggers {

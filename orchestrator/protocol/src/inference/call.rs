@@ -11,6 +11,9 @@ pub struct ModelRequest {
     pub id: u64,
     /// Time of CLOCK_MONOTONIC at which the caller stops waiting, in ns.
     pub deadline_ns: Option<u64>,
+    /// Ids of the regions that the caller has, for inputs and for outputs; 0 for none.
+    #[serde(default)]
+    pub regions: [u64; 2],
     /// The call.
     pub call: ModelCall,
 }
@@ -24,7 +27,7 @@ pub enum ModelCall {
         /// Its name in the manifest.
         model: String,
     },
-    /// Create a region for inputs, which replaces an earlier one.
+    /// Provide a region for inputs of at least this size.
     Reserve {
         /// Its size.
         bytes: u64,
@@ -44,6 +47,9 @@ pub struct ModelReply {
     /// Number of the call; 0 for the end of the process, and with it of everything that was opened,
     /// and for the start of the next one. The starter sends these two.
     pub id: u64,
+    /// Id of the region for inputs that was reserved, or that has the outputs of a run; else 0.
+    #[serde(default)]
+    pub region: u64,
     /// The result.
     pub result: Result<ModelResult, ModelFault>,
 }

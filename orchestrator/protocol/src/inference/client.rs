@@ -9,7 +9,7 @@ use rustix::io::Errno;
 use rustix::net::{AddressFamily, SendFlags, SocketFlags, SocketType, send, socketpair};
 
 use super::server::receive;
-use super::{INFERENCE, MESSAGE_MAX, ModelCall, ModelReply, ModelRequest};
+use super::{INFERENCE, MESSAGE_MAX, ModelCall, ModelReply, ModelRequest, ModelResult};
 use crate::link::LinkError;
 
 /// The lambda's end of its connection to `gleaner-inference`: one call at a time.
@@ -17,6 +17,8 @@ use crate::link::LinkError;
 pub struct ModelClient {
     socket: OwnedFd,
     last_id: u64,
+    /// Ids of the regions for inputs and for outputs that the caller has.
+    regions: [u64; 2],
 }
 
 /// The reply to a call, if it came in time.
@@ -24,14 +26,15 @@ pub struct ModelClient {
 pub enum ModelWait {
     /// The reply, with the region that came with it.
     Reply(ModelReply, Option<OwnedFd>),
-    /// There was none by then. A later call ignores it.
+    /// There was none by then. A later call ignores it, so the caller must forget its regions: the
+    /// next replies bring them again.
     TimedOut,
 }
 
 impl ModelClient {
     /// Uses this end of the connection.
     pub fn new(socket: OwnedFd) -> ModelClient {
-        ModelClient { socket, last_id: 0 }
+        ModelClient { socket, last_id: 0, regions: [0; 2] }
     }
 
     /// Creates a connection: the lambda's end and the other one.
@@ -58,8 +61,8 @@ impl ModelClient {
         Ok(None)
     }
 
-    /// Waits for the next message of the starter, until `until` if given; `None` if there is none by
-    /// then.
+    /// Waits for the next message of the starter, until `until` if given; `None` if there is none
+    /// by then.
     ///
     /// # Errors
     ///
@@ -92,7 +95,8 @@ impl ModelClient {
         until: Option<Instant>,
     ) -> Result<ModelWait, LinkError> {
         self.last_id += 1;
-        let request = ModelRequest { id: self.last_id, deadline_ns, call };
+        let regions = std::mem::take(&mut self.regions);
+        let request = ModelRequest { id: self.last_id, deadline_ns, regions, call };
         let failed = |source| LinkError::Socket { peer: INFERENCE, source };
         let bytes = serde_json::to_vec(&request).map_err(|error| failed(error.into()))?;
         if bytes.len() > MESSAGE_MAX {
@@ -118,6 +122,14 @@ impl ModelClient {
             if let Some((reply, region)) = self.receive()?
                 && (reply.id == self.last_id || reply.id == 0)
             {
+                if reply.id != 0 {
+                    self.regions = regions;
+                    match reply.result {
+                        Ok(ModelResult::Reserved) => self.regions[0] = reply.region,
+                        Ok(ModelResult::Ran { .. }) => self.regions[1] = reply.region,
+                        _ => {}
+                    }
+                }
                 return Ok(ModelWait::Reply(reply, region));
             }
         }

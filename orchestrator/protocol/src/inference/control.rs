@@ -45,6 +45,8 @@ pub struct GrantedModel {
 pub struct AddClient {
     /// Name of the lambda, for messages.
     pub name: String,
+    /// Its memory, in bytes: the largest size of its inputs, and of its outputs.
+    pub memory: u64,
     /// The models that it may use.
     pub models: Vec<GrantedModel>,
 }

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// A report.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "report", rename_all = "snake_case")]
+#[serde(tag = "inference", rename_all = "snake_case")]
 pub enum InferenceReport {
     /// It accepts lambdas.
     Ready,
@@ -21,6 +21,8 @@ pub enum InferenceReport {
 pub struct LoadedModel {
     /// SHA-256 of the file.
     pub sha256: String,
+    /// Its path in the build of a lambda.
+    pub path: String,
     /// Names of the lambdas that may use it.
     pub lambdas: Vec<String>,
     /// Its state.

@@ -102,7 +102,7 @@ pub fn report_state(socket: &OwnedFd, reason: Option<&str>) -> Result<(), LinkEr
     let result = reason.map_or(Ok(ModelResult::Started), |reason| {
         Err(ModelFault::new(ModelFaultKind::Unavailable, reason))
     });
-    ModelSocket { socket: copy }.reply(&ModelReply { id: 0, result }, None)
+    ModelSocket { socket: copy }.reply(&ModelReply { id: 0, region: 0, result }, None)
 }
 
 /// A message, and the descriptors that came with it.

@@ -121,8 +121,8 @@ pub struct TensorPlace {
 }
 
 impl TensorPlace {
-    /// Returns the size of the elements in bytes; `None` if the tensor has too many dimensions, a
-    /// length of 0, or more than [`MAX_TENSOR_BYTES`].
+    /// Returns the size of the elements in bytes; `None` if the tensor has too many dimensions, or
+    /// more than [`MAX_TENSOR_BYTES`]. An output may be empty.
     pub fn bytes(&self) -> Option<u64> {
         self.element.bytes_of(&self.shape)
     }
@@ -131,7 +131,7 @@ impl TensorPlace {
 impl Element {
     /// Returns the size of a tensor of `shape` in bytes, as [`TensorPlace::bytes`] does.
     pub fn bytes_of(self, shape: &[u32]) -> Option<u64> {
-        if shape.len() > MAX_DIMENSIONS || shape.contains(&0) {
+        if shape.len() > MAX_DIMENSIONS {
             return None;
         }
         let all = shape

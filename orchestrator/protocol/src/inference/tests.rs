@@ -17,8 +17,8 @@ fn a_call_is_answered_late_replies_are_skipped_and_the_end_of_the_process_arrive
     let open = || ModelCall::Open { model: "m".to_owned() };
     assert!(matches!(client.call(open(), None, soon()), Ok(ModelWait::TimedOut)));
     let Ok(Incoming::Message(request)) = server.poll() else { panic!("no call") };
-    assert_eq!(request, ModelRequest { id: 1, deadline_ns: None, call: open() });
-    let reply = |id| ModelReply { id, result: Ok(ModelResult::Reserved) };
+    assert_eq!(request, ModelRequest { id: 1, deadline_ns: None, regions: [0; 2], call: open() });
+    let reply = |id| ModelReply { id, region: 7, result: Ok(ModelResult::Reserved) };
     server.reply(&reply(1), None).unwrap();
     server.reply(&reply(2), Some(starter.as_fd())).unwrap();
     match client.call(open(), Some(5), None).unwrap() {
@@ -75,7 +75,7 @@ fn models_and_lambdas_arrive_with_their_descriptors() {
         threads: Some(2),
         refused: None,
     };
-    let client = AddClient { name: "yolo".to_owned(), models: vec![model] };
+    let client = AddClient { name: "yolo".to_owned(), memory: 1 << 20, models: vec![model] };
     let (passed, _other) = ModelClient::pair().unwrap();
     control.add_model(&file, passed.as_fd()).unwrap();
     control.add_client(&client, passed.as_fd()).unwrap();
@@ -94,7 +94,8 @@ fn sizes_of_tensors_are_bounded() {
     assert_eq!(bytes(&[1, 3, 416, 416]), Some(2_076_672));
     assert_eq!(bytes(&[]), Some(4));
     assert_eq!(bytes(&[64 << 20]), Some(MAX_TENSOR_BYTES));
-    for refused in [&[(64 << 20) + 1][..], &[0, 1], &[u32::MAX; 8], &[1; 9]] {
+    assert_eq!(bytes(&[0, 6]), Some(0));
+    for refused in [&[(64 << 20) + 1][..], &[u32::MAX; 8], &[1; 9]] {
         assert_eq!(bytes(refused), None, "{refused:?}");
     }
     let shape = vec![Some(1), None, Some(85)];

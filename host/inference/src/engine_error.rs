@@ -1,0 +1,27 @@
+//! Errors after which the process cannot go on.
+
+use std::io;
+
+use crate::running::ModelWork;
+
+/// The reason why the process cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum EngineError {
+    /// A model takes too long and cannot be interrupted.
+    #[error(
+        "model `{}` of lambda {} has run for more than {} s", .0.path, names(&.0.lambdas),
+        .0.limit.as_secs_f64()
+    )]
+    Overdue(ModelWork),
+    /// A thread has ended.
+    #[error("a thread of this process has ended")]
+    Thread,
+    /// The system has no memory.
+    #[error("cannot wait for lambdas")]
+    Wait(#[source] io::Error),
+}
+
+fn names(lambdas: &[String]) -> String {
+    let quoted: Vec<String> = lambdas.iter().map(|name| format!("`{name}`")).collect();
+    quoted.join(", ")
+}

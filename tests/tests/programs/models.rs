@@ -1,0 +1,149 @@
+//! Lambdas with models: what users see of models that cannot be used, of lambdas that share one,
+//! and of the process that runs them if it is killed.
+
+use std::path::Path;
+
+use gleaner_protocol::Report;
+use gleaner_tests::live::{
+    JsonReport, RunningProgram, decisions, descendants, run_all, signal, summary,
+};
+use gleaner_tests::{LambdaCopy, TempFolder, gleaner, replay, root, sample_drive};
+use serde_json::Value;
+
+const DETECTOR: &str = "examples/yolo-detector/rust";
+
+/// Exit code of a lambda that faulted.
+const FAULTED: i32 = 6;
+
+/// SHA-256 of the text `no model`.
+const NO_MODEL: &str = "f62c7d17e241fe5c5c0c64d2e32ab6e3bd10547a9c02977cc126acc0fe6e6554";
+
+fn detector(change: impl Fn(String) -> String) -> LambdaCopy {
+    LambdaCopy::changed_and_named(DETECTOR, "yolo-detector", |manifest| {
+        change(manifest.replace("model_time = \"400ms\"", "model_time = \"5s\""))
+    })
+}
+
+fn replayed(lambda: &LambdaCopy) -> (i32, String) {
+    let run = replay(lambda.path(), &[sample_drive()], &["--to", "0.5", "--no-record"]);
+    (run.exit, run.stderr)
+}
+
+#[test]
+fn a_model_that_cannot_be_used_is_refused_with_its_name_the_cause_and_the_way_out() {
+    let other = "0".repeat(64);
+    let digest = "e8af074932d4ed7e232278e3055cefcdea3edf178874a3694ae292649fb464dd";
+    let cases: [(LambdaCopy, &[&str]); 4] = [
+        (detector(|it| it.replace(digest, &other)), &["models/yolox_nano.onnx", digest, &other]),
+        (
+            detector(|it| it.replace("layout = \"yolox\"", "layout = \"nanodet\"")),
+            &["`detector` is no detector", "classes + 32]", "[1, 3549, 85]"],
+        ),
+        (
+            detector(|it| it.replace("layout =", "providers = [\"cuda\"]\nlayout =")),
+            &["cuda", "onnxruntime"],
+        ),
+        (
+            detector(|it| {
+                it.replace("[[model]]\nname = \"detector\"", "[[model]]\nname = \"other\"")
+            }),
+            &["no model `detector`; the manifest has `other`"],
+        ),
+    ];
+    for (lambda, causes) in cases {
+        let (exit, stderr) = replayed(&lambda);
+        assert_eq!(exit, FAULTED, "{stderr}");
+        for cause in causes {
+            assert!(stderr.to_lowercase().contains(&cause.to_lowercase()), "{cause}: {stderr}");
+        }
+    }
+}
+
+#[test]
+fn files_that_are_no_model_and_wrong_labels_are_refused() {
+    let digest = "e8af074932d4ed7e232278e3055cefcdea3edf178874a3694ae292649fb464dd";
+    let lambda = detector(|it| it.replace(digest, NO_MODEL));
+    lambda.replace("models/yolox_nano.onnx", "no model");
+    let (exit, stderr) = replayed(&lambda);
+    assert_eq!(exit, FAULTED, "{stderr}");
+    assert!(stderr.contains("models/yolox_nano.onnx") && stderr.contains("ONNX"), "{stderr}");
+
+    let lambda = detector(|it| it);
+    lambda.replace("models/coco.txt", "person\nbicycle\n");
+    let (exit, stderr) = replayed(&lambda);
+    assert_eq!(exit, FAULTED, "{stderr}");
+    assert!(stderr.contains("it has 80 classes, and its `labels` have 2 lines"), "{stderr}");
+}
+
+#[test]
+fn a_model_is_checked_before_the_lambda_runs_and_its_runtime_is_shown() {
+    let output = gleaner().arg("check").arg(root().join(DETECTOR)).output().unwrap();
+    let stdout = String::from_utf8_lossy(&output.stdout);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{stderr}");
+    assert!(stdout.contains("model `detector`: "), "{stdout}");
+    assert!(stderr.contains("model `models/yolox_nano.onnx` of yolo-detector: "), "{stderr}");
+}
+
+fn start(lambdas: &[&LambdaCopy], out: &TempFolder, args: &[&str]) -> RunningProgram {
+    let drive = sample_drive();
+    let lambdas: Vec<&Path> = lambdas.iter().map(|lambda| lambda.path()).collect();
+    let drive = ["--drive", drive.to_str().expect("the checkout has a plain path")];
+    run_all(&lambdas, out.path(), &[&drive, args].concat())
+}
+
+#[test]
+fn twins_share_one_model_and_its_results() {
+    let [rust, python] = ["rust", "python"].map(|kind| {
+        LambdaCopy::changed_and_named(&format!("examples/yolo-detector/{kind}"), kind, |manifest| {
+            manifest.replace("model_time = \"400ms\"", "model_time = \"5s\"")
+        })
+    });
+    let out = TempFolder::new();
+    let sets = ["--set", "rust.classes=car, truck", "--set", "python.classes=car, truck"];
+    let args = [&sets[..], &["--no-record", "--for", "6"]].concat();
+    let finished = start(&[&rust, &python], &out, &args).finish();
+    assert!(finished.status.success(), "{}: {}", finished.status, finished.stderr);
+    for name in ["rust", "python"] {
+        let decisions = decisions(&out.path().join(name));
+        assert!(!decisions.is_empty() && summary(&out.path().join(name)).faults == 0, "{name}");
+        assert!(decisions.iter().all(|it| it.model_ns > 0 && it.model_ns <= it.run_ns));
+    }
+    let reports = finished.lines.iter().filter_map(|line| serde_json::from_str(line).ok());
+    let ended = reports.filter(|it: &Value| it["inference"] == "ended").last().expect("its status");
+    let models = ended["models"].as_array().expect("its models");
+    assert_eq!(models.len(), 1, "{ended}");
+    // Both were woken by the same frames, unless a busy machine skipped some.
+    assert!(models[0]["shared"].as_u64() > Some(0), "{ended}");
+}
+
+#[test]
+fn a_killed_process_of_models_is_started_again_and_no_lambda_is_lost() {
+    let lambda = detector(|it| it);
+    let out = TempFolder::new();
+    let args = ["--set", "classes=car, truck", "--no-record", "--all", "--for", "15"];
+    let started = start(&[&lambda], &out, &args);
+    for _ in 0..2 {
+        started.until("a decision with a model", |line| match line {
+            JsonReport::Lambda(Report::Decision(it)) if it.fault.is_none() => {
+                (it.model_ns > 0).then_some(())
+            }
+            _ => None,
+        });
+        let pids = descendants(started.pid(), "gleaner-inference");
+        assert_eq!(pids.len(), 1, "{pids:?}");
+        signal(pids[0], "KILL");
+    }
+    let ended = started.finish();
+    assert_eq!(ended.status.code(), Some(FAULTED), "{}", ended.stderr);
+    let live = summary(out.path());
+    assert_eq!(live.restarts, 0, "{}", ended.stderr);
+    let decisions = decisions(out.path());
+    let faults: Vec<_> = decisions.iter().filter_map(|it| it.fault.as_ref()).collect();
+    assert!(!faults.is_empty());
+    for fault in faults {
+        let message = &fault.message;
+        assert!(message.contains("gleaner-inference"), "{message}");
+    }
+    assert!(decisions.last().is_some_and(|it| it.fault.is_none()), "it detects again");
+}
