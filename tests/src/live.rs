@@ -272,8 +272,11 @@ pub fn signal(pid: u32, name: &str) {
 
 /// The descendants of process `of` whose command line contains `name`.
 pub fn descendants(of: u32, name: &str) -> Vec<u32> {
-    let text =
-        std::fs::read_to_string(format!("/proc/{of}/task/{of}/children")).unwrap_or_default();
+    // Each thread has the children that it started.
+    let threads = std::fs::read_dir(format!("/proc/{of}/task")).into_iter().flatten().flatten();
+    let children = threads
+        .map(|thread| std::fs::read_to_string(thread.path().join("children")).unwrap_or_default());
+    let text = children.collect::<Vec<_>>().join(" ");
     let is_called = |pid: u32| {
         let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
         // Python does not have the program's name in its arguments, but `start.py`.

@@ -81,8 +81,7 @@ impl<'a> ProcessGroup<'a> {
             let sender = sender.clone();
             let send = move |event| {
                 let piece = OutputPiece::Inference(event);
-                // Fails if the run has ended.
-                let _ = sender.send(ChildOutput { from: ChildId::Inference, piece });
+                drop(sender.send(ChildOutput { from: ChildId::Inference, piece }));
             };
             inference = Some(InferenceService::start(&context.parts, send)?);
         }

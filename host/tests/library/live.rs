@@ -16,6 +16,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_feed::Feed;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::{Sample, Wake};
+use gleaner_host::api::models::Models;
 use gleaner_host::guest::{Guest, WakeOutcome};
 use gleaner_host::live::{LiveRun, ResultsPipe, Settings};
 use gleaner_host::session_setup::ConfiguredLambda;
@@ -75,6 +76,7 @@ impl Guest for NumbersGuest {
             result: if value < 0.0 { Err(fault) } else { Ok(()) },
             fuel: None,
             run_ns: None,
+            model_ns: None,
         }
     }
 
@@ -185,6 +187,8 @@ impl Running {
                     config: Vec::new(),
                     remaps: Vec::new(),
                     vehicle: None,
+                    models: Models::default(),
+                    passes_inference: false,
                 },
                 manifest,
                 settings: Settings {

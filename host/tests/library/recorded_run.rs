@@ -15,6 +15,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_feed::Feed;
 use gleaner_host::api::Session;
 use gleaner_host::api::data::Wake;
+use gleaner_host::api::models::Models;
 use gleaner_host::guest::{Guest, WakeOutcome};
 use gleaner_host::live::{LiveRun, ResultsPipe, Settings};
 use gleaner_host::replay::{ReplayJob, VerifyArgs};
@@ -341,7 +342,12 @@ impl RecordedRun {
     pub fn verify(&self, clip: PathBuf) -> Result<Verified, Failure> {
         let lambda = self.folder.path().join("adder");
         let mut reports = Vec::new();
-        let job = ReplayJob::verify(VerifyArgs { clip, lambda, vehicle: None })?;
+        let job = ReplayJob::verify(VerifyArgs {
+            clip,
+            lambda,
+            vehicle: None,
+            starter_passes_inference: false,
+        })?;
         assert_eq!(job.run(&mut load(Arc::default()), &mut reports)?, Exit::Ok);
         match serde_json::from_slice(&reports).unwrap() {
             Report::Verified(verified) => Ok(verified),
@@ -418,6 +424,8 @@ fn configured(lambda: &Path) -> ConfiguredLambda {
         config: Vec::new(),
         remaps: Vec::new(),
         vehicle: None,
+        models: Models::default(),
+        passes_inference: false,
     }
 }
 

@@ -36,8 +36,8 @@ fn a_model_that_cannot_be_used_is_refused_with_its_name_the_cause_and_the_way_ou
     let cases: [(LambdaCopy, &[&str]); 4] = [
         (detector(|it| it.replace(digest, &other)), &["models/yolox_nano.onnx", digest, &other]),
         (
-            detector(|it| it.replace("layout = \"yolox\"", "layout = \"nanodet\"")),
-            &["`detector` is no detector", "classes + 32]", "[1, 3549, 85]"],
+            detector(|it| it.replace("layout = \"yolox\"", "layout = \"nms-free\"")),
+            &["`detector` is no detector", "[1, rows, 6]", "[1, 3549, 85]"],
         ),
         (
             detector(|it| it.replace("layout =", "providers = [\"cuda\"]\nlayout =")),
@@ -133,6 +133,10 @@ fn a_killed_process_of_models_is_started_again_and_no_lambda_is_lost() {
         let pids = descendants(started.pid(), "gleaner-inference");
         assert_eq!(pids.len(), 1, "{pids:?}");
         signal(pids[0], "KILL");
+        started.until("a fault", |line| match line {
+            JsonReport::Lambda(Report::Decision(it)) => it.fault.map(drop),
+            _ => None,
+        });
     }
     let ended = started.finish();
     assert_eq!(ended.status.code(), Some(FAULTED), "{}", ended.stderr);
