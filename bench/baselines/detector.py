@@ -2,9 +2,9 @@
 
 Arguments: model, file of frames (bgr8, one after another), layout (`ultralytics` or `yolox`), width
 and height of a frame, threads, minimum score, maximum overlap, maximum number of boxes. For each
-line of standard input, the number of a frame, it prints one JSON object: milliseconds from the frame
-to its boxes, those of its conversion and of the session in it, and the number of boxes. The first
-line names the versions, or the missing library."""
+line of standard input, the number of a frame, it prints one JSON object: milliseconds from the
+frame to its boxes, those of its conversion and of the session in it, and the number of boxes. The
+first line names the versions, or the missing library."""
 from __future__ import annotations
 
 import json

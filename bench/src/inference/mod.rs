@@ -184,8 +184,8 @@ fn detector(model: &BenchModel, frames: &mut FrameFile) -> Vec<String> {
     notes
 }
 
-/// Describes the largest difference between two outputs for one frame. Relative to a number below 1,
-/// a difference has no meaning: it is taken as it is.
+/// Describes the largest difference between two outputs for one frame. Relative to a number below
+/// 1, a difference has no meaning: it is taken as it is.
 fn difference(a: &[f32], b: &[f32]) -> String {
     let differences = a.iter().zip(b).map(|(a, b)| (a - b).abs() / a.abs().max(b.abs()).max(1.0));
     let largest = differences.fold(0.0, |largest: f32, it| if it > largest { it } else { largest });

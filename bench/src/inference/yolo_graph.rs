@@ -35,8 +35,8 @@ impl GraphScale {
         }
     }
 
-    /// Returns the factor of the last weights of the scores with which few of them are high, as in a
-    /// trained model. Values vary more behind more channels.
+    /// Returns the factor of the last weights of the scores with which few of them are high, as in
+    /// a trained model. Values vary more behind more channels.
     fn gain(self) -> f32 {
         match self {
             Self::N => 0.2,

@@ -112,6 +112,9 @@ pub(super) struct TensorBytes<T> {
     pub(super) bytes: T,
 }
 
+/// Outputs of a run, in the order of the model.
+pub(super) type Outputs = Vec<TensorBytes<Vec<u8>>>;
+
 impl Models {
     /// The models `entries`, over `socket` if the starter passed one. `memory` is that of
     /// `[limits]`.
@@ -191,7 +194,7 @@ impl Models {
         name: &str,
         inputs: &[TensorBytes<&[u8]>],
         due: &Due,
-    ) -> Result<Vec<TensorBytes<Vec<u8>>>, InferenceError> {
+    ) -> Result<Outputs, InferenceError> {
         self.lock().run(name, inputs, due, &self.time)
     }
 
@@ -202,7 +205,7 @@ impl Models {
         place: TensorPlace,
         due: &Due,
         prepare: impl FnOnce(&mut Preparer, &mut Vec<u8>) -> Result<P, InferenceError>,
-    ) -> Result<(P, Vec<TensorBytes<Vec<u8>>>), InferenceError> {
+    ) -> Result<(P, Outputs), InferenceError> {
         let mut state = self.lock();
         let mut bytes = std::mem::take(&mut state.prepared);
         let result = prepare(&mut state.preparer, &mut bytes).and_then(|placed| {
@@ -241,7 +244,7 @@ impl ModelsState {
         inputs: &[TensorBytes<&[u8]>],
         due: &Due,
         time: &ModelTime,
-    ) -> Result<Vec<TensorBytes<Vec<u8>>>, InferenceError> {
+    ) -> Result<Outputs, InferenceError> {
         let started = Instant::now();
         let left = time.left();
         let too_slow = || InferenceError::too_slow(name, time.allowed().unwrap_or_default());
@@ -344,7 +347,7 @@ impl Connection {
         name: &str,
         inputs: &[TensorBytes<&[u8]>],
         until: Option<Instant>,
-    ) -> Result<(Vec<TensorBytes<Vec<u8>>>, Duration), InferenceError> {
+    ) -> Result<(Outputs, Duration), InferenceError> {
         let mut places = Vec::new();
         let mut end = 0_u64;
         for input in inputs {

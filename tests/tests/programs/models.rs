@@ -110,7 +110,8 @@ fn twins_share_one_model_and_its_results() {
         assert!(decisions.iter().all(|it| it.model_ns > 0 && it.model_ns <= it.run_ns));
     }
     let reports = finished.lines.iter().filter_map(|line| serde_json::from_str(line).ok());
-    let ended = reports.filter(|it: &Value| it["inference"] == "ended").last().expect("its status");
+    let mut ended = reports.filter(|it: &Value| it["inference"] == "ended");
+    let ended = ended.next_back().expect("its status");
     let models = ended["models"].as_array().expect("its models");
     assert_eq!(models.len(), 1, "{ended}");
     // Both were woken by the same frames, unless a busy machine skipped some.
