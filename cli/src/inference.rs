@@ -10,7 +10,7 @@ use std::io::{BufReader, Read};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::fs::FileExt;
 use std::os::unix::net::UnixStream;
-use std::os::unix::process::CommandExt;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::AtomicBool;
@@ -31,6 +31,7 @@ use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{MemfdFlags, memfd_create};
+use rustix::process::Signal;
 
 use crate::restart_delay::RestartDelay;
 use crate::runtime::{next_report, pass_on};
@@ -257,9 +258,13 @@ impl Supervisor {
         let mut current = Some(child);
         loop {
             let started = Instant::now();
+            let mut is_killed = false;
             let reason = match current.take() {
                 Some(child) => match self.wait(child) {
-                    Ok(status) => format!("{INFERENCE} ended unexpectedly ({status})"),
+                    Ok(status) => {
+                        is_killed = was_killed(status);
+                        format!("{INFERENCE} ended unexpectedly ({status})")
+                    }
                     Err(reason) => reason,
                 },
                 None => format!("{INFERENCE} could not be started"),
@@ -269,7 +274,7 @@ impl Supervisor {
                 return;
             }
             state.control = None;
-            let blamed = self.blame(&mut state);
+            let blamed = self.blame(&mut state, is_killed);
             let reason = match &blamed {
                 Some((_, what)) => format!("{reason}, {what}"),
                 None => reason,
@@ -360,9 +365,9 @@ impl Supervisor {
         status
     }
 
-    /// Counts the end against the model that ran, or else the one that was loading; returns its
-    /// digest, and a text about it.
-    fn blame(&self, state: &mut ServiceState) -> Option<(String, String)> {
+    /// Counts the end against the model that ran, or else the one that was loading, unless the
+    /// process `is_killed`; returns its digest, and a text about it.
+    fn blame(&self, state: &mut ServiceState, is_killed: bool) -> Option<(String, String)> {
         let mut digests = [0; 2 * DIGEST];
         let read = self.running.read_at(&mut digests, 0).unwrap_or(0);
         // The note counts once, even if the next process cannot be started.
@@ -372,7 +377,7 @@ impl Supervisor {
             let digest = std::str::from_utf8(digest).ok()?;
             let (model, _) = state.models.iter().find(|(model, _)| model.sha256 == digest)?;
             let text = format!("while it {what} `{}`", model.path);
-            *state.ends.entry(digest.to_owned()).or_default() += 1;
+            *state.ends.entry(digest.to_owned()).or_default() += u32::from(!is_killed);
             Some((digest.to_owned(), text))
         })
     }
@@ -407,6 +412,12 @@ fn follow(reports: impl Read, events: &Events) {
             }
         }
     }
+}
+
+/// Returns whether a signal of another process has ended it, which no model can send.
+fn was_killed(status: ExitStatus) -> bool {
+    let signal = status.signal().and_then(Signal::from_named_raw);
+    matches!(signal, Some(Signal::KILL | Signal::TERM | Signal::INT | Signal::HUP))
 }
 
 /// Returns whether the lambda's process has closed its end of the connection.

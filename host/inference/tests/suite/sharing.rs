@@ -103,7 +103,7 @@ fn a_model_is_loaded_while_another_one_runs() {
     let program = ModelProgram::start(&[]);
     let mut stuck = program.lambda("stuck", &[granted("endless", endless(&[ANY]))]);
     stuck.open("endless").unwrap();
-    let soon = Some(Duration::from_millis(50));
+    let soon = Some(Duration::from_millis(500));
     let message = fault(
         ModelFaultKind::TooSlow,
         stuck.run_until("endless", &[floats("x", &[1], &[1.0])], soon),
