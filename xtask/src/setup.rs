@@ -15,10 +15,11 @@ pub(crate) const STEPS: usize = 4;
 pub(crate) const TARGET: &str = "wasm32-wasip2";
 
 /// The packages with installed programs: no benches, no tests, no lambdas.
-const PROGRAMS: [&str; 7] = [
+const PROGRAMS: [&str; 8] = [
     "gleaner-cli",
     "gleaner-compile",
     "gleaner-host",
+    "gleaner-inference",
     "gleaner-ingress",
     "gleaner-python",
     "gleaner-recorder",

@@ -167,7 +167,7 @@ fn hostile_offsets_and_lengths_are_refused() {
     let long = "n".repeat(40_000);
     fault(ModelFaultKind::NoSuchModel, lambda.open(&long));
     // Escaped, each has 6 bytes. The reply repeats the name, and would exceed a message.
-    let controls = "\u{1}".repeat((MESSAGE_MAX - 70) / 6);
+    let controls = "\u{1}".repeat((MESSAGE_MAX - 85) / 6);
     fault(ModelFaultKind::Failed, lambda.open(&controls));
     lambda.reserve(64).unwrap();
     assert_eq!(lambda.run("product", &[input]).unwrap()[0].floats(), [9.0, 12.0]);
