@@ -55,6 +55,8 @@ impl ModelClient {
     pub fn poll(&mut self) -> Result<Option<ModelReply>, LinkError> {
         while let Some((reply, _)) = self.receive()? {
             if reply.id == 0 {
+                // Regions of the next process may have the same ids.
+                self.regions = [0; 2];
                 return Ok(Some(reply));
             }
         }
