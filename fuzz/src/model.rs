@@ -4,7 +4,8 @@
 //! An input is a byte for the mode, and then a file, or the fields of the others.
 
 use gleaner_protocol::inference::{
-    Element, MAX_DIMENSIONS, MAX_TENSOR_BYTES, ModelCall, ModelRequest, TensorInfo, TensorPlace,
+    Element, MAX_DIMENSIONS, MAX_TENSOR_BYTES, ModelCall, ModelRequest, TENSOR_ALIGNMENT,
+    TensorInfo, TensorPlace,
 };
 use gleaner_rules::pixels::{Encoding, View};
 use gleaner_vision::{
@@ -16,7 +17,7 @@ use crate::budget;
 use crate::image::ENCODINGS;
 use crate::input::FuzzInput;
 use crate::inspect::{ModelSignature, inspect};
-use crate::places::{ALIGNMENT, PlacedInput, check_inputs};
+use crate::places::{PlacedInput, check_inputs};
 
 /// Modes of an input.
 pub mod mode {
@@ -136,7 +137,7 @@ fn accepted(info: &TensorInfo, given: &[TensorPlace], placed: &PlacedInput, regi
     let elements = shape.iter().map(|length| u128::from(*length)).product::<u128>();
     assert!(elements > 0 && elements * element.size() as u128 == u128::from(*bytes));
     assert!(u128::from(*offset) + u128::from(*bytes) <= u128::from(region), "{placed:?}");
-    assert!(offset.is_multiple_of(ALIGNMENT), "{placed:?}");
+    assert!(offset.is_multiple_of(TENSOR_ALIGNMENT), "{placed:?}");
 }
 
 /// Decodes outputs of a detector, and checks the boxes.

@@ -12,8 +12,7 @@ use gleaner_protocol::inference::{
     ModelFile, ModelRequest, ModelResult, TensorPlace,
 };
 use gleaner_protocol::link::Incoming;
-use gleaner_vitals::usage;
-use rustix::time::{ClockId, clock_gettime};
+use gleaner_vitals::{monotonic_ns, usage};
 use tracing::{error, info};
 
 use crate::backend::StopSignal;
@@ -67,12 +66,6 @@ struct RunInProgress {
 enum EngineEnd {
     Stopped,
     StarterEnded,
-}
-
-/// Returns the time of CLOCK_MONOTONIC, in ns.
-fn now_ns() -> u64 {
-    let now = clock_gettime(ClockId::Monotonic);
-    (now.tv_sec.cast_unsigned()) * 1_000_000_000 + now.tv_nsec.cast_unsigned()
 }
 
 impl InferenceEngine {
@@ -164,7 +157,7 @@ impl InferenceEngine {
             timeout = timeout.min(WORK_INTERVAL);
         }
         if let Some(deadline) = self.lambdas.next_deadline() {
-            timeout = timeout.min(Duration::from_nanos(deadline.saturating_sub(now_ns())));
+            timeout = timeout.min(Duration::from_nanos(deadline.saturating_sub(monotonic_ns())));
         }
         self.lambdas.wait(control, self.threads.wake(), stop, timeout).map_err(EngineError::Wait)
     }
@@ -194,7 +187,7 @@ impl InferenceEngine {
 
     /// Handles a request of a lambda.
     fn handle_request(&mut self, id: LambdaId, request: ModelRequest) {
-        self.expire(id, now_ns());
+        self.expire(id, monotonic_ns());
         let Some(lambda) = self.lambdas.get_mut(id) else { return };
         // It has given up the call before: its time was over, or it made that call to a process
         // before this one.
@@ -335,7 +328,8 @@ impl InferenceEngine {
             let Some(call) = &mut lambda.call else { continue };
             self.last_job += 1;
             let (job, stop) = (self.last_job, Arc::new(StopSignal::default()));
-            let left = call.deadline_ns.map(|at| Duration::from_nanos(at.saturating_sub(now_ns())));
+            let left =
+                call.deadline_ns.map(|at| Duration::from_nanos(at.saturating_sub(monotonic_ns())));
             call.stage = CallStage::Running(job);
             self.threads.request(WorkerRequest::Run(RunJob {
                 job,
@@ -407,7 +401,7 @@ impl InferenceEngine {
 
     /// Answers all calls whose deadline has passed.
     fn check_deadlines(&mut self) {
-        let now = now_ns();
+        let now = monotonic_ns();
         for id in self.lambdas.late(now) {
             self.expire(id, now);
         }

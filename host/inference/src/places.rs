@@ -1,9 +1,8 @@
 //! Checks the places of tensors in shared memory. Pure functions: they trust no number of a lambda.
 
-use gleaner_protocol::inference::{Element, MAX_TENSOR_BYTES, TensorInfo, TensorPlace};
-
-/// Tensors begin at multiples of this offset.
-pub const ALIGNMENT: u64 = 64;
+use gleaner_protocol::inference::{
+    Element, MAX_TENSOR_BYTES, TENSOR_ALIGNMENT, TensorInfo, TensorPlace,
+};
 
 /// A checked input, to copy out of the region.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -34,7 +33,7 @@ pub enum PlaceError {
     Size { name: String },
     #[error("the inputs have {bytes} bytes; {MAX_TENSOR_BYTES} are allowed")]
     TooLarge { bytes: u64 },
-    #[error("input `{name}` begins at offset {offset}, which is no multiple of {ALIGNMENT}")]
+    #[error("input `{name}` begins at offset {offset}, which is no multiple of {TENSOR_ALIGNMENT}")]
     Unaligned { name: String, offset: u64 },
     #[error(
         "input `{name}` has {bytes} bytes at offset {offset}, beyond the {region} bytes of the \
@@ -92,7 +91,7 @@ fn check_input(
         let (found, needed) = (found.to_string(), info.to_string());
         return Err(PlaceError::Unfit { name: name(), found, needed });
     }
-    if !offset.is_multiple_of(ALIGNMENT) {
+    if !offset.is_multiple_of(TENSOR_ALIGNMENT) {
         return Err(PlaceError::Unaligned { name: name(), offset });
     }
     if offset.checked_add(bytes).is_none_or(|end| end > region_bytes) {
@@ -117,7 +116,7 @@ pub fn place_outputs<'a>(
     let (mut places, mut end) = (Vec::new(), 0_u64);
     for (name, element, shape) in outputs {
         let bytes = element.bytes_of(shape).ok_or(OutputsTooLarge)?;
-        let offset = end.next_multiple_of(ALIGNMENT);
+        let offset = end.next_multiple_of(TENSOR_ALIGNMENT);
         end = offset + bytes;
         if end > MAX_TENSOR_BYTES {
             return Err(OutputsTooLarge);

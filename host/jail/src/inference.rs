@@ -6,7 +6,7 @@
 use gleaner_protocol::Layer;
 
 use crate::filter::{DeniedCalls, install_everywhere};
-use crate::sandbox_filter::{PROCESSES, SHARED_RESOURCES};
+use crate::sandbox_filter::service_layers;
 use crate::{JailError, Paths, base_filter, files, own_memory, sandbox_filter, self_test, sockets};
 
 /// Restricts this process, which has one thread, to `paths` and the system's programs and
@@ -30,20 +30,8 @@ pub fn start(paths: &Paths) -> Vec<Layer> {
 /// [`JailError::ExistingThread`] if a thread of this process cannot have the filter: then the
 /// sandbox does not hold, and no lambda may be served.
 pub fn close(mut layers: Vec<Layer>) -> Result<Vec<Layer>, JailError> {
-    layers.extend(match install() {
-        Ok(()) => [
-            Layer::yes(sockets::NAME, "seccomp: no new sockets, no connections"),
-            Layer::yes(PROCESSES, "seccomp: no new processes, no programs, no signals to others"),
-            Layer::yes(
-                SHARED_RESOURCES,
-                "seccomp: no change of priority, CPU affinity, file owners or dates",
-            ),
-        ],
-        Err(error @ JailError::ExistingThread(_)) => return Err(error),
-        Err(error) => {
-            [sockets::NAME, PROCESSES, SHARED_RESOURCES].map(|name| Layer::no(name, error.chain()))
-        }
-    });
+    let sockets = (sockets::NAME, "seccomp: no new sockets, no connections");
+    layers.extend(service_layers(install(), sockets)?);
     Ok(self_test::verify(layers))
 }
 

@@ -5,7 +5,7 @@
 use gleaner_protocol::Layer;
 
 use crate::filter::{DeniedCalls, install_everywhere};
-use crate::sandbox_filter::{PROCESSES, SHARED_RESOURCES};
+use crate::sandbox_filter::service_layers;
 use crate::{JailError, Paths, base_filter, files, own_memory, sandbox_filter, self_test, sockets};
 
 /// The devices of network interfaces, which `/sys/class/net` links to.
@@ -52,20 +52,7 @@ pub fn close(mut layers: Vec<Layer>, sockets: NewSockets) -> Result<Vec<Layer>, 
         NewSockets::Udp => (sockets::UDP_ONLY, "seccomp: no new sockets but UDP"),
         NewSockets::None => (sockets::NAME, "seccomp: no new sockets, no connections"),
     };
-    layers.extend(match install(denied) {
-        Ok(()) => [
-            Layer::yes(name, note),
-            Layer::yes(PROCESSES, "seccomp: no new processes, no programs, no signals to others"),
-            Layer::yes(
-                SHARED_RESOURCES,
-                "seccomp: no change of priority, CPU affinity, file owners or dates",
-            ),
-        ],
-        Err(error @ JailError::ExistingThread(_)) => return Err(error),
-        Err(error) => {
-            [name, PROCESSES, SHARED_RESOURCES].map(|name| Layer::no(name, error.chain()))
-        }
-    });
+    layers.extend(service_layers(install(denied), (name, note))?);
     Ok(self_test::verify(layers))
 }
 

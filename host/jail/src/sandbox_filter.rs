@@ -16,6 +16,33 @@ pub const SHARED_RESOURCES: &str = "shared resources";
 /// The name of the layer of [`apply_before_interpreter`].
 pub const START: &str = "interpreter start";
 
+/// Returns the layers of a process that serves lambdas, once `installed` has denied it what it does
+/// not need: new sockets, which `sockets` names and describes, processes, and shared resources.
+///
+/// # Errors
+///
+/// [`JailError::ExistingThread`]: then the sandbox does not hold.
+pub(crate) fn service_layers(
+    installed: Result<(), JailError>,
+    sockets: (&'static str, &str),
+) -> Result<[Layer; 3], JailError> {
+    let (name, note) = sockets;
+    match installed {
+        Ok(()) => Ok([
+            Layer::yes(name, note),
+            Layer::yes(PROCESSES, "seccomp: no new processes, no programs, no signals to others"),
+            Layer::yes(
+                SHARED_RESOURCES,
+                "seccomp: no change of priority, CPU affinity, file owners or dates",
+            ),
+        ]),
+        Err(error @ JailError::ExistingThread(_)) => Err(error),
+        Err(error) => {
+            Ok([name, PROCESSES, SHARED_RESOURCES].map(|name| Layer::no(name, error.chain())))
+        }
+    }
+}
+
 const NEW_PROGRAMS: &[i64] = &[libc::SYS_execve, libc::SYS_execveat];
 #[cfg(target_arch = "x86_64")]
 const NEW_PROCESSES: &[i64] = &[libc::SYS_fork, libc::SYS_vfork];

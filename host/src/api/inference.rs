@@ -6,7 +6,7 @@ use std::time::Duration;
 use gleaner_base::visible;
 use gleaner_protocol::inference::{Element, ModelFaultKind, TensorInfo, TensorPlace};
 use gleaner_rules::refused;
-use gleaner_vision::{Detection, OutputView, Preprocess, VisionError, Wanted};
+use gleaner_vision::{Detection, DetectorLayout, OutputView, Preprocess, VisionError, Wanted};
 
 use super::frame::Frame;
 use super::fuel::OutOfFuel;
@@ -118,6 +118,8 @@ pub struct Model {
     limits: TensorLimits,
     entry: Arc<ModelEntry>,
     opened: Arc<OpenedModel>,
+    /// The layout of a detector, and the conversion of frames to its input.
+    detector: Option<(DetectorLayout, Preprocess)>,
 }
 
 impl Model {
@@ -133,40 +135,11 @@ impl Model {
     ) -> Result<Self, InferenceError> {
         limits.per_call.charge(|| name.len())?;
         let (entry, opened) = models.open(name, &limits.per_call.due)?;
-        let model = Self { models: models.clone(), limits: limits.clone(), entry, opened };
-        if model.entry.layout.is_some() {
-            model.check_layout()?;
-        }
-        Ok(model)
-    }
-
-    /// Checks that the model fits its `layout` and `labels`.
-    fn check_layout(&self) -> Result<Preprocess, InferenceError> {
-        let name = &self.entry.name;
-        let wrong = |why: String| {
-            InferenceError::WrongInput(format!("model `{name}` is no detector: {why}"))
+        let detector = match entry.layout {
+            Some(layout) => Some((layout, check_layout(layout, &entry, &opened)?)),
+            None => None,
         };
-        let Some(layout) = self.entry.layout else {
-            return Err(wrong(
-                "it has no `layout` in lambda.toml, which states the meaning of its outputs; add \
-                 it, or call `run`"
-                    .to_owned(),
-            ));
-        };
-        let [input] = &*self.opened.inputs else {
-            return Err(wrong(format!("it has {} inputs", self.opened.inputs.len())));
-        };
-        let how = layout.preprocess(&input.shape).map_err(|error| wrong(error.to_string()))?;
-        let outputs: Vec<_> = self.opened.outputs.iter().map(|it| it.shape.as_slice()).collect();
-        let classes = layout.check(&outputs, (how.width, how.height));
-        let (labels, classes) =
-            (self.entry.labels.len(), classes.map_err(|error| wrong(error.to_string()))?);
-        match classes {
-            Some(classes) if labels > 0 && labels as u64 != u64::from(classes) => Err(wrong(
-                format!("it has {classes} classes, and its `labels` have {labels} lines"),
-            )),
-            _ => Ok(how),
-        }
+        Ok(Self { models: models.clone(), limits: limits.clone(), entry, opened, detector })
     }
 
     /// Its inputs.
@@ -239,7 +212,11 @@ impl Model {
         options: &DetectOptions,
     ) -> Result<Vec<Detection>, InferenceError> {
         let (name, per_call) = (&self.entry.name, &self.limits.per_call);
-        let how = self.check_layout()?;
+        let (layout, how) = self.detector.ok_or_else(|| {
+            let why = "it has no `layout` in lambda.toml, which states the meaning of its outputs; \
+                       add it, or call `run`";
+            no_detector(name, why)
+        })?;
         let bytes_of_classes = || options.classes.iter().map(String::len).sum::<usize>();
         per_call.charge(|| prepare_work(&how).saturating_add(bytes_of_classes()))?;
         let wanted = self.wanted(options)?;
@@ -254,7 +231,6 @@ impl Model {
         let outputs = outputs.iter().map(floats).collect::<Result<Vec<_>, _>>().map_err(wrong)?;
         let views: Vec<_> =
             outputs.iter().map(|(shape, values)| OutputView { shape, values }).collect();
-        let layout = self.entry.layout.ok_or_else(|| wrong("it has no `layout`".to_owned()))?;
         gleaner_vision::detect(layout, &views, &placed, &wanted)
             .map_err(|error| wrong(error.to_string()))
     }
@@ -287,6 +263,33 @@ impl Model {
             max_count: options.max_count,
         })
     }
+}
+
+/// Checks that a model fits its `layout` and `labels`; returns the conversion to its input.
+fn check_layout(
+    layout: DetectorLayout,
+    entry: &ModelEntry,
+    opened: &OpenedModel,
+) -> Result<Preprocess, InferenceError> {
+    let wrong = |why: String| no_detector(&entry.name, &why);
+    let [input] = &*opened.inputs else {
+        return Err(wrong(format!("it has {} inputs", opened.inputs.len())));
+    };
+    let how = layout.preprocess(&input.shape).map_err(|error| wrong(error.to_string()))?;
+    let outputs: Vec<_> = opened.outputs.iter().map(|it| it.shape.as_slice()).collect();
+    let classes = layout.check(&outputs, (how.width, how.height));
+    let (labels, classes) =
+        (entry.labels.len(), classes.map_err(|error| wrong(error.to_string()))?);
+    match classes {
+        Some(classes) if labels > 0 && labels as u64 != u64::from(classes) => {
+            Err(wrong(format!("it has {classes} classes, and its `labels` have {labels} lines")))
+        }
+        _ => Ok(how),
+    }
+}
+
+fn no_detector(name: &str, why: &str) -> InferenceError {
+    InferenceError::WrongInput(format!("model `{name}` is no detector: {why}"))
 }
 
 /// Shape and values of an output.

@@ -12,20 +12,17 @@ use std::time::{Duration, Instant};
 use gleaner_base::chain;
 use gleaner_protocol::inference::{
     MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelFault, ModelReply, ModelResult, ModelWait,
-    TensorInfo, TensorPlace,
+    TENSOR_ALIGNMENT, TensorInfo, TensorPlace,
 };
 use gleaner_protocol::link::LinkError;
 use gleaner_vision::{DetectorLayout, Preparer};
-use rustix::time::{ClockId, clock_gettime};
+use gleaner_vitals::monotonic_ns;
 
 use super::call::Due;
 use super::inference::InferenceError;
 
 /// Time after the deadline for which a reply is awaited.
 const REPLY_TIMEOUT: Duration = Duration::from_millis(20);
-
-/// Alignment of tensors in a region, in bytes.
-const ALIGNMENT: u64 = 64;
 
 /// A `[[model]]` of the manifest.
 pub struct ModelEntry {
@@ -352,7 +349,7 @@ impl Connection {
         let mut end = 0_u64;
         for input in inputs {
             places.push(TensorPlace { offset: end, ..input.place.clone() });
-            end = end.saturating_add(input.bytes.len() as u64).next_multiple_of(ALIGNMENT);
+            end = end.saturating_add(input.bytes.len() as u64).next_multiple_of(TENSOR_ALIGNMENT);
         }
         if end > MAX_TENSOR_BYTES {
             let inputs = format!("the inputs of model `{name}` have {end} bytes");
@@ -421,11 +418,6 @@ impl Connection {
             Err(ModelFault { kind, message }) => Err(InferenceError::of(kind, message)),
         }
     }
-}
-
-fn monotonic_ns() -> u64 {
-    let now = clock_gettime(ClockId::Monotonic);
-    (now.tv_sec as u64).saturating_mul(1_000_000_000).saturating_add(now.tv_nsec as u64)
 }
 
 fn not_connected() -> InferenceError {

@@ -7,6 +7,7 @@
 //! - [`Pulse`]: the current activity and its start, for the shim, which kills a process that does
 //!   not return.
 //! - [`IntervalDurations`], [`Durations`]: statistics of durations, in bounded memory.
+//! - [`ReportWriter`]: reports to a starter that may be slow to read.
 //! - [`start`]: the stream of reports, and the request to stop.
 //! - [`usage`]: memory and CPU time.
 //!
@@ -17,9 +18,11 @@ mod inherited_file;
 pub mod log;
 pub mod own;
 mod pulse;
+mod report_writer;
 pub mod start;
 pub mod usage;
 
 pub use durations::{Durations, IntervalDurations};
 pub use inherited_file::{close_on_exec, inherited, make_inheritable};
-pub use pulse::{Busy, PULSE_ENV, Pulse, Share};
+pub use pulse::{Busy, PULSE_ENV, Pulse, Share, monotonic_ns};
+pub use report_writer::{ReportSender, ReportWriter};

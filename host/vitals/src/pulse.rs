@@ -232,7 +232,7 @@ impl Pulse {
         page.own.store(own::held(), Ordering::Relaxed);
         // A reader must not combine the old allowance with the new start, or the other way round.
         page.allowed_ns.store(0, Ordering::Release);
-        page.since_ns.store(now_ns(), Ordering::Release);
+        page.since_ns.store(monotonic_ns(), Ordering::Release);
         page.phase.store(phase as u32, Ordering::Release);
         page.at_ns.store(at_ns, Ordering::Release);
         page.allowed_ns
@@ -260,7 +260,7 @@ impl Pulse {
         if allowed_ns == 0 || read() != seen {
             return Err(CHECK_INTERVAL);
         }
-        let ran_ns = now_ns().saturating_sub(since_ns);
+        let ran_ns = monotonic_ns().saturating_sub(since_ns);
         if ran_ns >= allowed_ns {
             return Ok(Killed { phase, ran_ns, allowed_ns, at_ns, reason: KillReason::Overdue });
         }
@@ -274,7 +274,7 @@ impl Pulse {
         let since_ns = page.since_ns.load(Ordering::Acquire);
         Killed {
             phase: Phase::from_number(page.phase.load(Ordering::Acquire)),
-            ran_ns: now_ns().saturating_sub(since_ns),
+            ran_ns: monotonic_ns().saturating_sub(since_ns),
             allowed_ns: page.allowed_ns.load(Ordering::Acquire),
             at_ns: page.at_ns.load(Ordering::Acquire),
             reason,
@@ -296,7 +296,8 @@ impl Drop for MappedPage {
     }
 }
 
-fn now_ns() -> u64 {
+/// Returns the time of CLOCK_MONOTONIC, in ns.
+pub fn monotonic_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }

@@ -1,4 +1,5 @@
-//! Writes reports to the starter in a thread of its own: a slow starter does not delay a sample.
+//! Writes reports to the starter in a thread of its own: a slow starter does not delay a process
+//! that serves lambdas.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -7,7 +8,7 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::Builder;
 use std::time::Duration;
 
-use gleaner_protocol::ingress::IngressReport;
+use serde::Serialize;
 use tracing::warn;
 
 /// Maximum number of queued reports. A status more or less does not matter, and there are few
@@ -18,21 +19,26 @@ const WAITING: usize = 256;
 const END_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// The thread that writes reports.
-pub(super) struct ReportWriter {
-    reports: SyncSender<IngressReport>,
+pub struct ReportWriter<T> {
+    reports: SyncSender<T>,
     /// Nothing is sent over it; it closes when the thread has ended.
     ended: Receiver<()>,
 }
 
 /// Queues reports without blocking.
-pub(super) struct ReportSender {
-    reports: SyncSender<IngressReport>,
+pub struct ReportSender<T> {
+    reports: SyncSender<T>,
     /// Set once a report was dropped for lack of room.
     has_dropped: AtomicBool,
 }
 
-impl ReportWriter {
-    pub(super) fn start(to: File) -> io::Result<Self> {
+impl<T: Serialize + Send + 'static> ReportWriter<T> {
+    /// Starts the thread, which writes each report to `to` as a line of JSON.
+    ///
+    /// # Errors
+    ///
+    /// If the system starts no thread.
+    pub fn start(to: File) -> io::Result<Self> {
         let (reports, inbox) = sync_channel(WAITING);
         let (ends, ended) = sync_channel::<()>(0);
         Builder::new().name("reports".to_owned()).spawn(move || {
@@ -42,21 +48,23 @@ impl ReportWriter {
         Ok(Self { reports, ended })
     }
 
-    pub(super) fn sender(&self) -> ReportSender {
+    /// Returns a queue to the thread.
+    pub fn sender(&self) -> ReportSender<T> {
         ReportSender { reports: self.reports.clone(), has_dropped: AtomicBool::new(false) }
     }
 
     /// Waits until all reports are written, once all senders are dropped; not for a starter that
     /// does not read.
-    pub(super) fn end(self) {
+    pub fn end(self) {
         let Self { reports, ended } = self;
         drop(reports);
         let _ = ended.recv_timeout(END_TIMEOUT);
     }
 }
 
-impl ReportSender {
-    pub(super) fn send(&self, report: IngressReport) {
+impl<T> ReportSender<T> {
+    /// Queues a report. One that finds no room is dropped, which is logged once.
+    pub fn send(&self, report: T) {
         match self.reports.try_send(report) {
             Ok(()) | Err(TrySendError::Disconnected(_)) => {}
             Err(TrySendError::Full(_)) => {
@@ -68,7 +76,7 @@ impl ReportSender {
     }
 }
 
-fn write(mut to: File, reports: &Receiver<IngressReport>) {
+fn write<T: Serialize>(mut to: File, reports: &Receiver<T>) {
     for report in reports {
         let mut line = serde_json::to_vec(&report).expect("a report is plain data");
         line.push(b'\n');
@@ -83,6 +91,8 @@ fn write(mut to: File, reports: &Receiver<IngressReport>) {
 mod tests {
     use std::io::{BufRead, BufReader};
     use std::os::fd::OwnedFd;
+
+    use gleaner_protocol::ingress::IngressReport;
 
     use super::*;
 

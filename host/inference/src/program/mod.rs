@@ -2,29 +2,23 @@
 //!
 //! - `args`: the command line.
 //! - `library`: the search for ONNX Runtime.
-//! - `report_writer`: reports to the starter, and the thread that writes them, as the starter may
-//!   be slow to read.
 
 mod args;
 mod library;
-mod report_writer;
 
 use std::fs::File;
 use std::io;
-use std::os::fd::OwnedFd;
-use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::Arc;
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
 use gleaner_jail::{Paths, inference as sandbox, memory};
 use gleaner_protocol::Handover;
 use gleaner_protocol::inference::InferenceServer;
-use gleaner_vitals::start::reports;
+use gleaner_vitals::ReportWriter;
+use gleaner_vitals::start::{reports, stop_socket};
 use rustix::process::{Signal, set_parent_process_death_signal};
-use signal_hook::consts::{SIGINT, SIGTERM};
 use tracing::{debug, warn};
 
 use crate::backend::{Backend, Backends, OnnxRuntime, RtenBackend};
@@ -34,7 +28,6 @@ use crate::loader::LoadLimits;
 use crate::region::TensorRegion;
 use crate::threads::ModelThreads;
 use args::Args;
-use report_writer::ReportThread;
 
 /// Runs the program `gleaner-inference`.
 pub fn main() -> ExitCode {
@@ -76,7 +69,7 @@ fn start(args: &Args) -> Result<(), Failure> {
     let limits = LoadLimits { model_max, load_max, run_max };
     let threads = ModelThreads::start(backends, limits, running)
         .map_err(internal("cannot start the threads for models"))?;
-    let writer = ReportThread::start(reports).map_err(internal("cannot start a thread"))?;
+    let writer = ReportWriter::start(reports).map_err(internal("cannot start a thread"))?;
     let sender = writer.sender();
     let engine = InferenceEngine::new(threads, Box::new(move |report| sender.send(report)));
     let ended = engine.run(control, Some(&stop));
@@ -117,15 +110,6 @@ fn paths(library: Option<&Path>) -> Paths {
         read: library.parent().map(Path::to_owned).into_iter().collect(),
         write: devices.map(|entry| entry.path()).filter(|path| is_gpu(path)).collect(),
     }
-}
-
-/// Returns a socket that becomes readable at SIGTERM.
-fn stop_socket() -> io::Result<OwnedFd> {
-    let (stop, notifier) = UnixStream::pair()?;
-    signal_hook::low_level::pipe::register(SIGTERM, notifier)?;
-    // Ctrl-C in a terminal reaches all processes; the starter decides when this one ends.
-    signal_hook::flag::register(SIGINT, Arc::default())?;
-    Ok(stop.into())
 }
 
 /// Receives the control connection and the file for notes over standard input, the socket of the

@@ -4,20 +4,14 @@
 //! - `source`: the network or a drive.
 //! - `network`: failures of the network, for users.
 //! - `topics`: lists the topics of the network, for `gleaner topics`.
-//! - `report_writer`: reports to the starter, and the thread that writes them, as the starter may
-//!   be slow to read.
 
 mod args;
 mod network;
-mod report_writer;
 mod source;
 mod topics;
 
 use std::io;
-use std::os::fd::OwnedFd;
-use std::os::unix::net::UnixStream;
 use std::process::ExitCode;
-use std::sync::Arc;
 
 use clap::Parser;
 use gleaner_base::{Exit, Failure};
@@ -25,14 +19,13 @@ use gleaner_jail::ingress as sandbox;
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::IngressServer;
 use gleaner_regions::TopicRegion;
-use gleaner_vitals::start::reports;
+use gleaner_vitals::ReportWriter;
+use gleaner_vitals::start::{reports, stop_socket};
 use rustix::process::{Signal, set_parent_process_death_signal};
-use signal_hook::consts::{SIGINT, SIGTERM};
 use tracing::debug;
 
 use crate::Ingress;
 use args::{Args, IngressCommand};
-use report_writer::ReportWriter;
 use topics::TopicsArgs;
 
 /// Runs the program `gleaner-ingress`.
@@ -88,15 +81,6 @@ fn start(args: Args) -> Result<(), Failure> {
     let ended = ingress.run(control, Some(stop));
     writer.end();
     ended.map_err(internal("cannot wait for readers"))
-}
-
-/// Returns a socket that becomes readable at SIGTERM.
-fn stop_socket() -> io::Result<OwnedFd> {
-    let (stop, notifier) = UnixStream::pair()?;
-    signal_hook::low_level::pipe::register(SIGTERM, notifier)?;
-    // Ctrl-C in a terminal reaches all processes; the starter decides when this one ends.
-    signal_hook::flag::register(SIGINT, Arc::default())?;
-    Ok(stop.into())
 }
 
 /// Receives the control connection over standard input, the socket of the starter.

@@ -30,7 +30,9 @@ pub use control::{
 };
 pub use report::{InferenceReport, InferenceStatus, LoadedModel, ModelState};
 pub use server::{ModelSocket, report_state};
-pub use tensor::{Element, MAX_DIMENSIONS, MAX_TENSOR_BYTES, TensorInfo, TensorPlace};
+pub use tensor::{
+    Element, MAX_DIMENSIONS, MAX_TENSOR_BYTES, TENSOR_ALIGNMENT, TensorInfo, TensorPlace,
+};
 
 /// Name of the process in messages.
 const INFERENCE: &str = "gleaner-inference";

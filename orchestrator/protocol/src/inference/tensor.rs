@@ -10,6 +10,9 @@ pub const MAX_DIMENSIONS: usize = 8;
 /// Largest size of the tensors of one call, in bytes.
 pub const MAX_TENSOR_BYTES: u64 = 256 << 20;
 
+/// Tensors in a region begin at multiples of this offset.
+pub const TENSOR_ALIGNMENT: u64 = 64;
+
 /// Type of the elements of a tensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -116,7 +119,7 @@ pub struct TensorPlace {
     pub element: Element,
     /// Length of each dimension.
     pub shape: Vec<u32>,
-    /// Offset of its first byte in the region; a multiple of 64.
+    /// Offset of its first byte in the region; a multiple of [`TENSOR_ALIGNMENT`].
     pub offset: u64,
 }
 
