@@ -69,19 +69,30 @@ impl Neighbours {
 struct BlendedRow {
     /// Number of the row in the frame.
     source: Option<u32>,
-    /// Three levels of each new pixel, in 1/128.
-    levels: Vec<[u16; 3]>,
+    /// Levels of each new pixel, in 1/128.
+    levels: Vec<[u16; 4]>,
+}
+
+/// The left or the right old pixels of all columns.
+#[derive(Debug, Default)]
+struct BlendSide {
+    pixels: Vec<[u8; 4]>,
+    /// The weight of each byte of a pixel.
+    weights: Vec<[u16; 4]>,
 }
 
 /// Buffers of a resize, to be used again.
 #[derive(Debug, Default)]
 pub(crate) struct Bilinear {
-    columns: Vec<Neighbours>,
+    /// The left old pixel of each column.
+    columns: Vec<u32>,
+    /// The left and the right old pixel of each column, and their weights for each byte.
+    sides: [BlendSide; 2],
     rows: [BlendedRow; 2],
     /// A row of the frame, if it has to be changed before it is blended.
     changed: Vec<u8>,
     /// A row of the result.
-    line: Vec<[u8; 3]>,
+    line: Vec<[u8; 4]>,
 }
 
 /// Order of the bytes of pixels that can be resized.
@@ -133,22 +144,49 @@ impl Bilinear {
     ) -> Result<Resize<'a>, VisionError> {
         let order = PixelOrder::of(view.encoding())?;
         self.columns.clear();
+        let [left, right] = &mut self.sides;
+        for side in [&mut *left, &mut *right] {
+            side.weights.clear();
+            side.pixels.resize(width as usize, [0; 4]);
+        }
         let old_width = view.width();
-        let column = |x| Neighbours::of(Blend::of(x, old_width, width), old_width);
-        self.columns.extend((0..width).map(column));
+        for x in 0..width {
+            let Neighbours { first, weights } =
+                Neighbours::of(Blend::of(x, old_width, width), old_width);
+            self.columns.push(first);
+            left.weights.push([weights[0]; 4]);
+            right.weights.push([weights[1]; 4]);
+        }
         for row in &mut self.rows {
             row.source = None;
-            row.levels.resize(width as usize, [0; 3]);
+            row.levels.resize(width as usize, [0; 4]);
         }
-        self.line.resize(width as usize, [0; 3]);
+        self.line.resize(width as usize, [0; 4]);
         Ok(Resize { buffers: self, view, order, bgr, height })
     }
 }
 
 impl Resize<'_> {
-    /// Returns row `y` of the result.
-    pub(crate) fn row(&mut self, y: u32) -> &[[u8; 3]] {
-        let Blend { first, second, weights } = Blend::of(y, self.view.height(), self.height);
+    /// Returns the place of the first, second and third channel of the tensor in a pixel of
+    /// [`row`](Self::row).
+    pub(crate) fn channels(&self) -> [usize; 3] {
+        match (self.order, self.bgr) {
+            (PixelOrder::Grey, _) => [0; 3],
+            (PixelOrder::Bgr | PixelOrder::Bgra, true)
+            | (PixelOrder::Rgb | PixelOrder::Rgba | PixelOrder::Uyvy | PixelOrder::Yuyv, false) => {
+                [0, 1, 2]
+            }
+            _ => [2, 1, 0],
+        }
+    }
+
+    /// Returns row `y` of the result. The bytes of its pixels are in the order of the frame.
+    pub(crate) fn row(&mut self, y: u32) -> &[[u8; 4]] {
+        let Blend { first, mut second, weights } = Blend::of(y, self.view.height(), self.height);
+        if weights[1] == 0 {
+            // It has no part in the result, as in every row of a third of the size.
+            second = first;
+        }
         if self.buffers.rows[0].source != Some(first) {
             self.buffers.rows.swap(0, 1);
         }
@@ -165,7 +203,7 @@ impl Resize<'_> {
 
     /// Puts row `source` of the frame, blended across, into a buffer, unless it is there.
     fn blend_across(&mut self, index: usize, source: u32) {
-        let Bilinear { columns, rows, changed, .. } = &mut *self.buffers;
+        let Bilinear { columns, sides, rows, changed, .. } = &mut *self.buffers;
         let row = &mut rows[index];
         if row.source == Some(source) {
             return;
@@ -185,47 +223,38 @@ impl Resize<'_> {
             _ => pixels,
         };
         let levels = &mut row.levels;
-        match (self.order, self.bgr) {
-            (PixelOrder::Grey, _) => across::<1, 0, 0, 0>(pixels, columns, levels),
-            (PixelOrder::Rgb | PixelOrder::Uyvy | PixelOrder::Yuyv, false)
-            | (PixelOrder::Bgr, true) => {
-                across::<3, 0, 1, 2>(pixels, columns, levels);
-            }
-            (PixelOrder::Rgb | PixelOrder::Uyvy | PixelOrder::Yuyv, true)
-            | (PixelOrder::Bgr, false) => {
-                across::<3, 2, 1, 0>(pixels, columns, levels);
-            }
-            (PixelOrder::Rgba, false) | (PixelOrder::Bgra, true) => {
-                across::<4, 0, 1, 2>(pixels, columns, levels);
-            }
-            (PixelOrder::Rgba, true) | (PixelOrder::Bgra, false) => {
-                across::<4, 2, 1, 0>(pixels, columns, levels);
-            }
+        match self.order {
+            PixelOrder::Grey => take_sides::<1>(pixels, columns, sides),
+            PixelOrder::Rgba | PixelOrder::Bgra => take_sides::<4>(pixels, columns, sides),
+            _ => take_sides::<3>(pixels, columns, sides),
         }
+        blend_sides(sides, levels.as_flattened_mut());
     }
 }
 
-/// Blends pixels of `BYTES` bytes across; a new one has the bytes at the given offsets.
-fn across<const BYTES: usize, const A: usize, const B: usize, const C: usize>(
-    row: &[u8],
-    columns: &[Neighbours],
-    levels: &mut [[u16; 3]],
-) {
-    let (pixels, _) = row.as_chunks::<BYTES>();
-    for (column, levels) in columns.iter().zip(levels) {
-        // Every column has them.
-        let Some([left, right]) =
-            pixels.get(column.first as usize..).and_then(<[_]>::first_chunk::<2>)
-        else {
-            continue;
+/// Copies the two old pixels of each column, of `BYTES` bytes. What follows them does not count.
+fn take_sides<const BYTES: usize>(row: &[u8], columns: &[u32], sides: &mut [BlendSide; 2]) {
+    let [left, right] = sides;
+    let pixels = left.pixels.iter_mut().zip(&mut right.pixels);
+    for (column, (left, right)) in columns.iter().zip(pixels) {
+        let rest = row.get(*column as usize * BYTES..).unwrap_or_default();
+        let word = match rest.first_chunk() {
+            Some(bytes) => u64::from_le_bytes(*bytes),
+            None => rest.iter().rev().fold(0, |word, byte| word << 8 | u64::from(*byte)),
         };
-        let [left_weight, right_weight] = column.weights.map(u32::from);
+        *left = (word as u32).to_le_bytes();
+        *right = ((word >> (8 * BYTES)) as u32).to_le_bytes();
+    }
+}
+
+/// Blends across. No condition is in its loop, so a CPU does several bytes at once.
+fn blend_sides([left, right]: &[BlendSide; 2], levels: &mut [u16]) {
+    let left = left.pixels.as_flattened().iter().zip(left.weights.as_flattened());
+    let right = right.pixels.as_flattened().iter().zip(right.weights.as_flattened());
+    let part = |byte: &u8, weight: &u16| u32::from(*byte) * u32::from(*weight);
+    for (level, (left, right)) in levels.iter_mut().zip(left.zip(right)) {
         // At most 255 * 2048 / 16 = 32,640.
-        let blend = |left: u8, right: u8| {
-            let sum = u32::from(left) * left_weight + u32::from(right) * right_weight;
-            (sum >> DROPPED_BITS) as u16
-        };
-        *levels = [blend(left[A], right[A]), blend(left[B], right[B]), blend(left[C], right[C])];
+        *level = ((part(left.0, left.1) + part(right.0, right.1)) >> DROPPED_BITS) as u16;
     }
 }
 
