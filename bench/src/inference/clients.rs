@@ -81,7 +81,7 @@ fn patient_calls(patient: &mut LambdaPath, calls: u32, name: &str, others: &Atom
         let began = Instant::now();
         patient.mark(number << 1 | u32::from(name != "alone"));
         let started = Instant::now();
-        let (_, session, _) = patient.run(Some(PATIENT));
+        let (_, session) = patient.run(Some(PATIENT));
         if number > 0 {
             times.push(1e3 * started.elapsed().as_secs_f64());
             runs.push(1e3 * session.as_secs_f64());

@@ -14,6 +14,7 @@ use gleaner_vision::{
     Detection, DetectorLayout, OutputView, Placed, Preparer, Preprocess, Wanted, detect,
 };
 use rustix::time::{ClockId, clock_gettime};
+use zerocopy::IntoBytes;
 
 use super::frames::{HEIGHT, WIDTH};
 use super::{MAX_COUNT, MAX_IOU, MIN_SCORE};
@@ -27,12 +28,11 @@ pub(super) struct LambdaPath {
     how: Preprocess,
     preparer: Preparer,
     prepared: Vec<u8>,
+    values: Vec<f32>,
     inputs: File,
     outputs: Option<File>,
     /// Backend, version, provider and threads.
     pub(super) runtime: String,
-    /// Size of the region for outputs.
-    output_bytes: u64,
 }
 
 /// The result of a run.
@@ -44,8 +44,6 @@ pub(super) struct PathResult {
     /// The run of the model in it.
     pub(super) session: Duration,
     pub(super) detections: Vec<Detection>,
-    /// Values of the output.
-    pub(super) values: Vec<f32>,
 }
 
 impl LambdaPath {
@@ -64,7 +62,7 @@ impl LambdaPath {
         let bytes = how.size().map_err(|error| error.to_string())? as u64;
         let (_, region) = call(&mut client, ModelCall::Reserve { bytes }, None)?;
         let inputs = File::from(region.ok_or("no region")?);
-        let (preparer, prepared) = (Preparer::new(), Vec::new());
+        let (preparer, prepared, values) = (Preparer::new(), Vec::new(), Vec::new());
         Ok(Self {
             client,
             model,
@@ -73,10 +71,10 @@ impl LambdaPath {
             how,
             preparer,
             prepared,
+            values,
             inputs,
             outputs: None,
             runtime,
-            output_bytes: 0,
         })
     }
 
@@ -85,12 +83,12 @@ impl LambdaPath {
         let started = Instant::now();
         let placed = self.prepare(frame);
         let prepare = started.elapsed();
-        let (place, session, values) = self.run(None);
-        let view = OutputView { shape: &place.shape, values: &values };
+        let (place, session) = self.run(None);
+        let view = OutputView { shape: &place.shape, values: &self.values };
         let wanted =
             Wanted { classes: None, min_score: MIN_SCORE, max_iou: MAX_IOU, max_count: MAX_COUNT };
         let detections = detect(self.layout, &[view], &placed, &wanted).expect("a detector");
-        PathResult { total: started.elapsed(), prepare, session, detections, values }
+        PathResult { total: started.elapsed(), prepare, session, detections }
     }
 
     /// Prepares a frame as the next input.
@@ -108,9 +106,14 @@ impl LambdaPath {
         }
     }
 
-    /// Runs the model on the prepared input; returns the place of its output, the run time of the
-    /// model and the values.
-    pub(super) fn run(&mut self, deadline: Option<Duration>) -> (TensorPlace, Duration, Vec<f32>) {
+    /// Values of the output of the last run.
+    pub(super) fn values(&self) -> &[f32] {
+        &self.values
+    }
+
+    /// Runs the model on the prepared input; returns the place of its output and the run time of
+    /// the model.
+    pub(super) fn run(&mut self, deadline: Option<Duration>) -> (TensorPlace, Duration) {
         self.inputs.write_all_at(&self.prepared, 0).expect("the region is as large as the input");
         let TensorInfo { name, element, .. } = self.input.clone();
         let place = TensorPlace { name, element, shape: self.how.shape().to_vec(), offset: 0 };
@@ -121,20 +124,20 @@ impl LambdaPath {
             self.outputs = Some(File::from(region));
         }
         let place = outputs.into_iter().next().expect("an output");
-        let mut bytes = vec![0; place.bytes().expect("its size is known") as usize];
+        let bytes = place.bytes().expect("its size is known");
+        self.values.resize(bytes as usize / size_of::<f32>(), 0.0);
         let region = self.outputs.as_ref().expect("a region of outputs");
-        region.read_exact_at(&mut bytes, place.offset).expect("the outputs are there");
-        self.output_bytes = bytes.len() as u64;
-        let values = bytes.as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
-        (place, Duration::from_nanos(run_ns), values)
+        region
+            .read_exact_at(self.values.as_mut_bytes(), place.offset)
+            .expect("the outputs are there");
+        (place, Duration::from_nanos(run_ns))
     }
 
-    /// Memory of the caller in MiB: the frame, the prepared input, the output as bytes and as
-    /// values, and both regions.
+    /// Memory of the caller in MiB: the frame, the prepared input, the output, and both regions.
     pub(super) fn buffers_mib(&self) -> f64 {
         let input = self.prepared.len() as f64;
-        let output = self.output_bytes as f64;
-        (f64::from(3 * WIDTH * HEIGHT) + 2.0 * input + 3.0 * output) / f64::from(1 << 20)
+        let output = size_of_val(self.values()) as f64;
+        (f64::from(3 * WIDTH * HEIGHT) + 2.0 * input + 2.0 * output) / f64::from(1 << 20)
     }
 }
 

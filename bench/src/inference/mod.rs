@@ -159,7 +159,7 @@ fn detector(model: &BenchModel, frames: &mut FrameFile) -> Vec<String> {
                 measured.times.add(times, boxes);
             }
             if number == 0 {
-                measured.first = result.values;
+                measured.first = measured.path.values().to_vec();
             }
         }
         if let Some((python, times)) = &mut python {

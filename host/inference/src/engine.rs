@@ -24,7 +24,7 @@ use crate::places::{PlacedInput, check_inputs};
 use crate::queue::FairQueue;
 use crate::sessions::{LoadState, SessionId, SessionKey, SessionTable};
 use crate::threads::{ModelThreads, ThreadResult};
-use crate::worker::{RunDone, RunJob, RunOutputs, WorkerModel, WorkerRequest};
+use crate::worker::{LastRun, RunDone, RunJob, RunOutputs, WorkerModel, WorkerRequest};
 
 /// Interval of the status.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
@@ -357,7 +357,7 @@ impl InferenceEngine {
                     sha256: session.key.sha256.clone(),
                     path: session.path.clone(),
                     outputs: ready.outputs.clone(),
-                    last: None,
+                    last: LastRun::default(),
                 };
                 self.threads.request(WorkerRequest::Add(id, model));
                 LoadState::Ready(ready)

@@ -45,10 +45,8 @@ impl TensorRegion {
     }
 
     /// Copies bytes out of the region.
-    pub(crate) fn read(&self, offset: u64, bytes: u64) -> io::Result<Vec<u8>> {
-        let mut copy = vec![0; usize::try_from(bytes).map_err(io::Error::other)?];
-        self.file.read_exact_at(&mut copy, offset)?;
-        Ok(copy)
+    pub(crate) fn read(&self, offset: u64, copy: &mut [u8]) -> io::Result<()> {
+        self.file.read_exact_at(copy, offset)
     }
 
     /// Copies bytes into the region.
@@ -71,9 +69,11 @@ mod tests {
     fn bytes_are_copied_and_the_size_stays() {
         let region = TensorRegion::create("test", 5000).unwrap();
         region.write(64, b"abc").unwrap();
-        assert_eq!(region.read(64, 4).unwrap(), b"abc\0");
+        let mut copy = [9; 4];
+        region.read(64, &mut copy).unwrap();
+        assert_eq!(&copy, b"abc\0");
         assert_eq!(region.bytes(), 8192);
-        assert!(region.read(8191, 2).is_err() && region.write(8191, b"ab").is_err());
+        assert!(region.read(8191, &mut [0; 2]).is_err() && region.write(8191, b"ab").is_err());
         for size in [0, 8191, 8193] {
             assert!(region.file.set_len(size).is_err(), "{size}");
         }

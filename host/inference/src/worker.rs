@@ -2,6 +2,7 @@
 //!
 //! It copies inputs out of shared memory before anything reads them, and keeps inputs and outputs
 //! of the last run of each model: the next request with the same bytes is answered with these.
+//! The next inputs take the place of the last: for 5 MB, fresh memory takes longer than the copy.
 
 use std::collections::HashMap;
 use std::io;
@@ -36,12 +37,18 @@ pub(crate) struct WorkerModel {
     pub(crate) sha256: String,
     pub(crate) path: String,
     pub(crate) outputs: Vec<TensorInfo>,
-    pub(crate) last: Option<LastRun>,
+    pub(crate) last: LastRun,
 }
 
-/// The last completed run of a model.
+/// The last run of a model.
+#[derive(Default)]
 pub(crate) struct LastRun {
     inputs: Vec<TensorValue>,
+    /// The result, if it was completed.
+    result: Option<LastResult>,
+}
+
+struct LastResult {
     outputs: Vec<TensorValue>,
     run_ns: u64,
 }
@@ -133,23 +140,21 @@ impl ModelWorker {
 
 impl WorkerModel {
     fn run(&mut self, job: &RunJob) -> (Result<RunOutputs, ModelFault>, Option<u64>) {
-        let inputs = match read_inputs(job) {
-            Ok(inputs) => inputs,
+        let shared = match self.last.read_inputs(job) {
+            Ok(shared) => shared,
             Err(error) => {
                 return (Err(failed(&format!("the inputs cannot be read: {error}"))), None);
             }
         };
-        let is_same = self.last.as_ref().is_some_and(|last| last.inputs == inputs);
-        let ran_ns = if is_same {
+        let ran_ns = if shared {
             None
         } else {
-            self.last = None;
             let start = Instant::now();
-            let ran = caught(|| self.graph.run(&inputs, &job.stop));
+            let ran = caught(|| self.graph.run(&self.last.inputs, &job.stop));
             let run_ns = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
             let ran = ran.and_then(|ran| ran.map_err(|error| error.to_string()));
             match ran {
-                Ok(outputs) => self.last = Some(LastRun { inputs, outputs, run_ns }),
+                Ok(outputs) => self.last.result = Some(LastResult { outputs, run_ns }),
                 Err(_) if job.stop.is_stopped() => {
                     let message = format!("model `{}` was interrupted", self.path);
                     let fault = ModelFault::new(ModelFaultKind::TooSlow, message);
@@ -162,7 +167,7 @@ impl WorkerModel {
             }
             Some(run_ns)
         };
-        let last = self.last.as_ref().expect("it is the same, or has just run");
+        let last = self.last.result.as_ref().expect("it is the same, or has just run");
         if job.stop.is_stopped() {
             // The lambda may use the region for its next request.
             return (Err(failed("nothing waits for the result")), ran_ns);
@@ -171,7 +176,7 @@ impl WorkerModel {
     }
 }
 
-impl LastRun {
+impl LastResult {
     fn write(&self, infos: &[TensorInfo], job: &RunJob) -> Result<RunOutputs, ModelFault> {
         let tensors = infos.iter().zip(&self.outputs);
         let named = tensors.map(|(info, it)| (info.name.as_str(), it.element, it.shape.as_slice()));
@@ -199,19 +204,59 @@ fn failed(message: &str) -> ModelFault {
     ModelFault::new(ModelFaultKind::Failed, message)
 }
 
-/// Copies the inputs out of the region.
-fn read_inputs(job: &RunJob) -> io::Result<Vec<TensorValue>> {
-    let inputs = job.inputs.iter().map(|input| {
-        let region = job.input_region.as_ref().ok_or(io::ErrorKind::NotFound)?;
-        let mut bytes = region.read(input.offset, input.bytes)?;
-        if input.element == Element::Boolean {
-            for byte in &mut bytes {
-                *byte = u8::from(*byte != 0);
+impl LastRun {
+    /// Copies the inputs of `job` out of the region; returns whether there is a result for them.
+    fn read_inputs(&mut self, job: &RunJob) -> io::Result<bool> {
+        let result = self.result.take();
+        let mut is_same = self.inputs.len() == job.inputs.len();
+        self.inputs.truncate(job.inputs.len());
+        for (index, input) in job.inputs.iter().enumerate() {
+            let region = job.input_region.as_ref().ok_or(io::ErrorKind::NotFound)?;
+            let (element, shape) = (input.element, &input.shape);
+            match self.inputs.get_mut(index) {
+                Some(value) if value.element == element && value.shape == *shape => {}
+                Some(value) => {
+                    is_same = false;
+                    (value.element, value.shape) = (element, shape.clone());
+                }
+                None => {
+                    let (shape, bytes) = (shape.clone(), Vec::new());
+                    self.inputs.push(TensorValue { element, shape, bytes });
+                }
             }
+            let bytes = &mut self.inputs[index].bytes;
+            let length = usize::try_from(input.bytes).map_err(io::Error::other)?;
+            if bytes.len() != length {
+                // Not a larger one for a smaller input: it would be kept.
+                (*bytes, is_same) = (vec![0; length], false);
+            }
+            is_same &= read_changes(region, input, bytes)?;
         }
-        Ok(TensorValue { element: input.element, shape: input.shape.clone(), bytes })
-    });
-    inputs.collect()
+        self.result = result.filter(|_| is_same);
+        Ok(self.result.is_some())
+    }
+}
+
+/// Copies an input over `known`; returns whether it has the same bytes. Those of booleans become 0
+/// or 1.
+fn read_changes(region: &TensorRegion, input: &PlacedInput, known: &mut [u8]) -> io::Result<bool> {
+    /// Fits into the first cache of a CPU.
+    const PIECE: usize = 16 << 10;
+    let mut buffer = [0; PIECE];
+    let (mut is_same, mut offset) = (true, input.offset);
+    for known in known.chunks_mut(PIECE) {
+        let piece = &mut buffer[..known.len()];
+        region.read(offset, piece)?;
+        offset += piece.len() as u64;
+        if input.element == Element::Boolean {
+            piece.iter_mut().for_each(|byte| *byte = u8::from(*byte != 0));
+        }
+        if piece != known {
+            known.copy_from_slice(piece);
+            is_same = false;
+        }
+    }
+    Ok(is_same)
 }
 
 #[cfg(test)]
@@ -253,7 +298,7 @@ mod tests {
             sha256: key.sha256,
             path: "m.onnx".to_owned(),
             outputs: vec![info],
-            last: None,
+            last: LastRun::default(),
         };
         worker.handle(WorkerRequest::Add(session, model));
         let region = Arc::new(TensorRegion::create("test", 8192).unwrap());
@@ -294,7 +339,9 @@ mod tests {
         assert_eq!(shared.region.id, outputs.region.id);
         let third = bench.run(Element::Uint8, &[7; 5000]).result.unwrap();
         assert_ne!(third.region.id, outputs.region.id, "the first one has 4096 bytes");
-        assert_eq!(third.region.read(0, 5000).unwrap(), [7; 5000]);
+        let mut found = [0; 5000];
+        third.region.read(0, &mut found).unwrap();
+        assert_eq!(found, [7; 5000]);
         let fault = bench.run(Element::Uint8, &[7; 6001]).result.err().unwrap();
         assert!(fault.message.contains("6001 bytes, above the 6000 of `memory`"), "{fault:?}");
         // The same bytes in another shape are another input.
@@ -306,15 +353,20 @@ mod tests {
         let mut bench = bench(Element::Boolean);
         let done = bench.run(Element::Boolean, &[0, 1, 7, 255]);
         let region = done.result.unwrap().region;
-        assert_eq!(region.read(0, 4).unwrap(), [0, 1, 1, 1]);
+        let mut found = [9; 4];
+        region.read(0, &mut found).unwrap();
+        assert_eq!(found, [0, 1, 1, 1]);
     }
 
     #[test]
     fn a_panic_fails_one_run_only() {
         let mut bench = bench(Element::Uint8);
-        let fault = bench.run(Element::Uint8, &[255]).result.err().unwrap();
-        assert_eq!(fault.kind, ModelFaultKind::Failed);
-        assert!(fault.message.contains("the library panicked"), "{}", fault.message);
+        // The second time, nothing is left of the first to be shared.
+        for _ in 0..2 {
+            let fault = bench.run(Element::Uint8, &[255]).result.err().unwrap();
+            assert_eq!(fault.kind, ModelFaultKind::Failed);
+            assert!(fault.message.contains("the library panicked"), "{}", fault.message);
+        }
         assert!(bench.run(Element::Uint8, &[1]).result.is_ok());
     }
 }

@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_base::visible;
-use gleaner_protocol::inference::{Element, ModelFaultKind, TensorInfo, TensorPlace};
+use gleaner_protocol::inference::{ModelFaultKind, TensorInfo, TensorPlace};
 use gleaner_rules::refused;
-use gleaner_vision::{Detection, DetectorLayout, OutputView, Preprocess, VisionError, Wanted};
+use gleaner_vision::{Detection, DetectorLayout, Preprocess, VisionError, Wanted};
 
 use super::frame::Frame;
 use super::fuel::OutOfFuel;
@@ -223,16 +223,17 @@ impl Model {
         let (element, shape) = prepared_as(&how);
         let input = self.opened.inputs.first().map_or_else(String::new, |it| it.name.clone());
         let place = TensorPlace { name: input, element, shape, offset: 0 };
-        let (placed, outputs) =
-            self.models.run_prepared(name, place, &per_call.due, |preparer, bytes| {
-                self.limits.prepare(preparer, frame, &how, bytes)
-            })?;
-        let wrong = |why: String| InferenceError::WrongInput(format!("model `{name}`: {why}"));
-        let outputs = outputs.iter().map(floats).collect::<Result<Vec<_>, _>>().map_err(wrong)?;
-        let views: Vec<_> =
-            outputs.iter().map(|(shape, values)| OutputView { shape, values }).collect();
-        gleaner_vision::detect(layout, &views, &placed, &wanted)
-            .map_err(|error| wrong(error.to_string()))
+        self.models.run_prepared(
+            name,
+            place,
+            &per_call.due,
+            |preparer, bytes| self.limits.prepare(preparer, frame, &how, bytes),
+            |placed, outputs| {
+                let found = gleaner_vision::detect(layout, outputs, &placed, &wanted);
+                found
+                    .map_err(|error| InferenceError::WrongInput(format!("model `{name}`: {error}")))
+            },
+        )
     }
 
     /// Returns the name of a class.
@@ -290,16 +291,4 @@ fn check_layout(
 
 fn no_detector(name: &str, why: &str) -> InferenceError {
     InferenceError::WrongInput(format!("model `{name}` is no detector: {why}"))
-}
-
-/// Shape and values of an output.
-type Floats = (Vec<u32>, Vec<f32>);
-
-fn floats(output: &TensorBytes<Vec<u8>>) -> Result<Floats, String> {
-    let TensorPlace { name, element, shape, .. } = &output.place;
-    if *element != Element::Float32 {
-        return Err(format!("output `{name}` is {element}, and `detect` needs float32"));
-    }
-    let (values, _) = output.bytes.as_chunks::<4>();
-    Ok((shape.clone(), values.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect()))
 }

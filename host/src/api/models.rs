@@ -11,12 +11,13 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::chain;
 use gleaner_protocol::inference::{
-    MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelFault, ModelReply, ModelResult, ModelWait,
-    TENSOR_ALIGNMENT, TensorInfo, TensorPlace,
+    Element, MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelFault, ModelReply, ModelResult,
+    ModelWait, TENSOR_ALIGNMENT, TensorInfo, TensorPlace,
 };
 use gleaner_protocol::link::LinkError;
-use gleaner_vision::{DetectorLayout, Preparer};
+use gleaner_vision::{DetectorLayout, OutputView, Preparer};
 use gleaner_vitals::monotonic_ns;
+use zerocopy::IntoBytes;
 
 use super::call::Due;
 use super::inference::InferenceError;
@@ -74,6 +75,8 @@ struct ModelsState {
     preparer: Preparer,
     /// The prepared frame, whose memory is used again.
     prepared: Vec<u8>,
+    /// The outputs for it, whose memory is used again.
+    floats: Vec<Vec<f32>>,
 }
 
 /// The connection to `gleaner-inference`.
@@ -192,25 +195,48 @@ impl Models {
         inputs: &[TensorBytes<&[u8]>],
         due: &Due,
     ) -> Result<Outputs, InferenceError> {
-        self.lock().run(name, inputs, due, &self.time)
+        let mut state = self.lock();
+        let places = state.run(name, inputs, due, &self.time)?;
+        let read = |place: TensorPlace| {
+            let mut bytes = vec![0; length(&place)?];
+            state.read(&place, &mut bytes)?;
+            Ok(TensorBytes { place, bytes })
+        };
+        places.into_iter().map(read).collect()
     }
 
-    /// Runs a model on one input that `prepare` writes into memory which is used again.
-    pub(super) fn run_prepared<P>(
+    /// Runs a model on one input that `prepare` writes, and passes its outputs, all of `float32`,
+    /// to `decode`. Memory for both is used again.
+    pub(super) fn run_prepared<P, R>(
         &self,
         name: &str,
         place: TensorPlace,
         due: &Due,
         prepare: impl FnOnce(&mut Preparer, &mut Vec<u8>) -> Result<P, InferenceError>,
-    ) -> Result<(P, Outputs), InferenceError> {
+        decode: impl FnOnce(P, &[OutputView<'_>]) -> Result<R, InferenceError>,
+    ) -> Result<R, InferenceError> {
         let mut state = self.lock();
         let mut bytes = std::mem::take(&mut state.prepared);
+        let mut floats = std::mem::take(&mut state.floats);
         let result = prepare(&mut state.preparer, &mut bytes).and_then(|placed| {
             let input = TensorBytes { place, bytes: bytes.as_slice() };
-            let outputs = state.run(name, &[input], due, &self.time)?;
-            Ok((placed, outputs))
+            let places = state.run(name, &[input], due, &self.time)?;
+            floats.resize_with(places.len(), Vec::new);
+            for (place, values) in places.iter().zip(&mut floats) {
+                let TensorPlace { name: output, element, .. } = place;
+                if *element != Element::Float32 {
+                    return Err(InferenceError::WrongInput(format!(
+                        "model `{name}`: output `{output}` is {element}, and `detect` needs float32"
+                    )));
+                }
+                values.resize(length(place)? / size_of::<f32>(), 0.0);
+                state.read(place, values.as_mut_bytes())?;
+            }
+            let views = places.iter().zip(&floats);
+            let views = views.map(|(place, values)| OutputView { shape: &place.shape, values });
+            decode(placed, &views.collect::<Vec<_>>())
         });
-        state.prepared = bytes;
+        (state.prepared, state.floats) = (bytes, floats);
         result
     }
 
@@ -241,7 +267,7 @@ impl ModelsState {
         inputs: &[TensorBytes<&[u8]>],
         due: &Due,
         time: &ModelTime,
-    ) -> Result<Outputs, InferenceError> {
+    ) -> Result<Vec<TensorPlace>, InferenceError> {
         let started = Instant::now();
         let left = time.left();
         let too_slow = || InferenceError::too_slow(name, time.allowed().unwrap_or_default());
@@ -268,6 +294,19 @@ impl ModelsState {
         });
         result.map(|(outputs, _)| outputs)
     }
+
+    /// Copies an output of the last run.
+    fn read(&self, place: &TensorPlace, bytes: &mut [u8]) -> Result<(), InferenceError> {
+        let connection = self.connection.as_ref().ok_or_else(not_connected)?;
+        let region = connection.outputs.as_ref().ok_or_else(unexpected)?;
+        region.read_exact_at(bytes, place.offset).map_err(region_failed)
+    }
+}
+
+/// Returns the size of an output in bytes.
+fn length(place: &TensorPlace) -> Result<usize, InferenceError> {
+    let length = place.bytes().and_then(|length| usize::try_from(length).ok());
+    length.ok_or_else(unexpected)
 }
 
 impl Connection {
@@ -344,7 +383,7 @@ impl Connection {
         name: &str,
         inputs: &[TensorBytes<&[u8]>],
         until: Option<Instant>,
-    ) -> Result<(Outputs, Duration), InferenceError> {
+    ) -> Result<(Vec<TensorPlace>, Duration), InferenceError> {
         let mut places = Vec::new();
         let mut end = 0_u64;
         for input in inputs {
@@ -379,14 +418,6 @@ impl Connection {
         if let Some(region) = region {
             self.outputs = Some(File::from(region));
         }
-        let Some(region) = &self.outputs else { return Err(unexpected()) };
-        let read = |place: TensorPlace| {
-            let len = place.bytes().and_then(|len| usize::try_from(len).ok());
-            let mut bytes = vec![0; len.ok_or_else(unexpected)?];
-            region.read_exact_at(&mut bytes, place.offset).map_err(region_failed)?;
-            Ok(TensorBytes { place, bytes })
-        };
-        let outputs = outputs.into_iter().map(read).collect::<Result<_, InferenceError>>()?;
         Ok((outputs, Duration::from_nanos(run_ns)))
     }
 

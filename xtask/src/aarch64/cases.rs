@@ -22,6 +22,8 @@ pub(super) struct ReplayCase {
     set: &'static [&'static str],
     /// A limit of the vehicle that is smaller than that of the manifest.
     limit: Option<&'static str>,
+    /// End of the replay, in seconds of the drive.
+    to: Option<&'static str>,
     /// True to set `deterministic` in its manifest.
     deterministic: bool,
     /// Reason why its decisions must differ, which also proves that differences are found.
@@ -29,18 +31,26 @@ pub(super) struct ReplayCase {
 }
 
 const fn case(lambda: &'static str, set: &'static [&'static str]) -> ReplayCase {
-    ReplayCase { lambda, set, limit: None, deterministic: false, known_difference: None }
+    ReplayCase { lambda, set, limit: None, to: None, deterministic: false, known_difference: None }
 }
 
 /// Replays with triggers, all pixels of all pictures, floating point, and every kind of fault that
 /// depends on the processor.
-pub(super) const CASES: [ReplayCase; 13] = [
+pub(super) const CASES: [ReplayCase; 14] = [
     case("examples/hello/rust", &["brake_mps2=-1.4"]),
     case("examples/brake-dark/rust", &["brake_mps2=-1.4", "dark_luma=50"]),
     // Every picture is bright enough, and the car always brakes.
     case("examples/brake-dark/rust", &["brake_mps2=100", "dark_luma=255"]),
     case("tests/lambdas/probe/rust", &["every=1"]),
     case("tests/lambdas/kernels/rust", &[]),
+    // A model; emulated, it takes seconds for each frame.
+    ReplayCase {
+        to: Some("1"),
+        ..case(
+            "examples/yolo-detector/rust",
+            &["classes=person, car, truck, bus", "min_score=0.05"],
+        )
+    },
     case("tests/lambdas/misbehave/rust", &["behaviour=recurse"]),
     case("tests/lambdas/misbehave/rust", &["behaviour=endless"]),
     case("tests/lambdas/misbehave/rust", &["behaviour=panic"]),
@@ -168,6 +178,7 @@ impl ReplayCase {
             .args(["--all", "--json", "--out"])
             .arg(&out);
         replay.args(self.set.iter().flat_map(|set| ["--set", set]));
+        replay.args(self.to.iter().flat_map(|to| ["--to", to]));
         replay.arg("--journal").arg(journal(&out));
         if let Some(limit) = self.limit {
             let vehicle = folder.join("vehicle.toml");

@@ -25,17 +25,18 @@ use cases::{CASES, Machine, ReplayCase};
 use tools::{TARGET, Tools};
 
 /// Packages with the programs of a vehicle.
-const PACKAGES: [&str; 7] = [
+const PACKAGES: [&str; 8] = [
     "gleaner-cli",
     "gleaner-compile",
     "gleaner-host",
+    "gleaner-inference",
     "gleaner-ingress",
     "gleaner-python",
     "gleaner-recorder",
     "gleaner-shim",
 ];
 /// The programs that are run.
-const PROGRAMS: [&str; 3] = ["gleaner", "gleaner-compile", "gleaner-runtime"];
+const PROGRAMS: [&str; 4] = ["gleaner", "gleaner-compile", "gleaner-inference", "gleaner-runtime"];
 const SHIM: &str = "gleaner-shim";
 
 /// Builds, replays here and there, and compares.

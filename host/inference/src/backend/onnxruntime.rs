@@ -3,6 +3,7 @@
 //! Telemetry, memory arenas, memory patterns and spinning threads are off: a vehicle has other work
 //! for its cores, and arenas keep twice the memory.
 
+use std::borrow::Cow;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -12,7 +13,7 @@ use ort::environment::Environment;
 use ort::ep::{self, ExecutionProviderDispatch};
 use ort::logging::LogLevel;
 use ort::session::{RunOptions, Session, SessionInputValue};
-use ort::value::{DynValue, PrimitiveTensorElementType, Tensor};
+use ort::value::{DynValue, PrimitiveTensorElementType, Tensor, TensorRef};
 use tracing::{debug, warn};
 
 use super::elements::{bytes, numbers};
@@ -120,15 +121,13 @@ impl LoadedGraph for OrtGraph {
         let values = self.inputs.iter().zip(inputs).map(|(info, input)| {
             Ok((info.name.as_str(), value_of(input).map_err(BackendError::new)?))
         });
-        let values = values.collect::<Result<Vec<(&str, DynValue)>, BackendError>>()?;
+        let values = values.collect::<Result<Vec<_>, BackendError>>()?;
         let options = Arc::new(RunOptions::new().map_err(BackendError::new)?);
         let terminated = Arc::clone(&options);
         stop.on_stop(move || {
             // Without it the run goes on to its end.
             let _ = terminated.terminate();
         });
-        let values: Vec<(&str, SessionInputValue<'_>)> =
-            values.into_iter().map(|(name, value)| (name, value.into())).collect();
         let results = self.session.run_with_options(values, &options).map_err(BackendError::new)?;
         let found = self.outputs.iter().map(|info| {
             let name = &info.name;
@@ -140,52 +139,55 @@ impl LoadedGraph for OrtGraph {
     }
 }
 
-fn value_of(input: &TensorValue) -> ort::Result<DynValue> {
+fn value_of(input: &TensorValue) -> ort::Result<SessionInputValue<'_>> {
     let shape: Vec<i64> = input.shape.iter().map(|length| i64::from(*length)).collect();
     let data = &input.bytes;
     match input.element {
-        Element::Float32 => owned(shape, numbers(data, f32::from_le_bytes)),
-        Element::Float16 => owned(shape, numbers(data, f16::from_le_bytes)),
-        Element::Float64 => owned(shape, numbers(data, f64::from_le_bytes)),
-        Element::Int8 => owned(shape, numbers(data, i8::from_le_bytes)),
-        Element::Int16 => owned(shape, numbers(data, i16::from_le_bytes)),
-        Element::Int32 => owned(shape, numbers(data, i32::from_le_bytes)),
-        Element::Int64 => owned(shape, numbers(data, i64::from_le_bytes)),
-        Element::Uint8 => owned(shape, data.clone()),
-        Element::Boolean => owned(shape, data.iter().map(|byte| *byte != 0).collect()),
+        Element::Float32 => tensor(shape, numbers::<f32>(data)),
+        Element::Float16 => tensor(shape, numbers::<f16>(data)),
+        Element::Float64 => tensor(shape, numbers::<f64>(data)),
+        Element::Int8 => tensor(shape, numbers::<i8>(data)),
+        Element::Int16 => tensor(shape, numbers::<i16>(data)),
+        Element::Int32 => tensor(shape, numbers::<i32>(data)),
+        Element::Int64 => tensor(shape, numbers::<i64>(data)),
+        Element::Uint8 => tensor(shape, numbers::<u8>(data)),
+        Element::Boolean => tensor(shape, data.iter().map(|byte| *byte != 0).collect()),
     }
 }
 
-fn owned<T>(shape: Vec<i64>, data: Vec<T>) -> ort::Result<DynValue>
+fn tensor<'a, T>(shape: Vec<i64>, data: Cow<'a, [T]>) -> ort::Result<SessionInputValue<'a>>
 where
     T: PrimitiveTensorElementType + std::fmt::Debug + Clone + 'static,
 {
-    Ok(Tensor::from_array((shape, data))?.into_dyn())
+    Ok(match data {
+        Cow::Borrowed(data) => TensorRef::from_array_view((shape, data))?.into(),
+        Cow::Owned(data) => Tensor::from_array((shape, data))?.into(),
+    })
 }
 
 fn output_of(info: &TensorInfo, value: &DynValue) -> ort::Result<TensorValue> {
     let (shape, bytes) = match info.element {
-        Element::Float32 => extracted(value, f32::to_le_bytes)?,
-        Element::Float16 => extracted(value, f16::to_le_bytes)?,
-        Element::Float64 => extracted(value, f64::to_le_bytes)?,
-        Element::Int8 => extracted(value, i8::to_le_bytes)?,
-        Element::Int16 => extracted(value, i16::to_le_bytes)?,
-        Element::Int32 => extracted(value, i32::to_le_bytes)?,
-        Element::Int64 => extracted(value, i64::to_le_bytes)?,
-        Element::Uint8 => extracted(value, u8::to_le_bytes)?,
-        Element::Boolean => extracted(value, |is_true: bool| [u8::from(is_true)])?,
+        Element::Float32 => extracted(value, bytes::<f32>)?,
+        Element::Float16 => extracted(value, bytes::<f16>)?,
+        Element::Float64 => extracted(value, bytes::<f64>)?,
+        Element::Int8 => extracted(value, bytes::<i8>)?,
+        Element::Int16 => extracted(value, bytes::<i16>)?,
+        Element::Int32 => extracted(value, bytes::<i32>)?,
+        Element::Int64 => extracted(value, bytes::<i64>)?,
+        Element::Uint8 => extracted(value, bytes::<u8>)?,
+        Element::Boolean => extracted(value, bytes::<bool>)?,
     };
     Ok(TensorValue { element: info.element, shape, bytes })
 }
 
-fn extracted<const SIZE: usize, T: PrimitiveTensorElementType + Copy>(
+fn extracted<T: PrimitiveTensorElementType>(
     value: &DynValue,
-    write: fn(T) -> [u8; SIZE],
+    bytes_of: fn(&[T]) -> Vec<u8>,
 ) -> ort::Result<(Vec<u32>, Vec<u8>)> {
     let (shape, data) = value.try_extract_tensor::<T>()?;
     // A length that does not fit cannot be of a tensor in memory.
     let shape = shape.iter().map(|length| u32::try_from(*length).unwrap_or(u32::MAX)).collect();
-    Ok((shape, bytes(data, write)))
+    Ok((shape, bytes_of(data)))
 }
 
 fn log(level: LogLevel, message: &str) {

@@ -3,12 +3,13 @@
 //!
 //! It computes in `f32`, `i32`, `i8` and `u8`: other types are converted at the edge.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use gleaner_protocol::inference::{Element, TensorInfo};
-use rten::{Model, ModelOptions, NodeId, RunOptions, ThreadPool, Value, ValueOrView};
+use rten::{Model, ModelOptions, NodeId, RunOptions, ThreadPool, Value, ValueOrView, ValueView};
 use rten_gemm::GemmExecutor;
-use rten_tensor::{Layout, Tensor};
+use rten_tensor::{Layout, Tensor, TensorView};
 
 use super::elements::{floats, from_floats, from_integers, integers, numbers};
 use super::{Backend, BackendError, LoadOptions, LoadedGraph, StopSignal, TensorValue};
@@ -79,10 +80,8 @@ impl LoadedGraph for RtenGraph {
         inputs: &[TensorValue],
         _stop: &StopSignal,
     ) -> Result<Vec<TensorValue>, BackendError> {
-        let values = self.inputs.iter().zip(inputs).map(|(node, input)| {
-            let value = value_of(input)?;
-            Ok((*node, ValueOrView::Value(value)))
-        });
+        let values =
+            self.inputs.iter().zip(inputs).map(|(node, input)| Ok((*node, value_of(input)?)));
         let values = values.collect::<Result<Vec<_>, BackendError>>()?;
         let nodes: Vec<NodeId> = self.outputs.iter().map(|(node, _)| *node).collect();
         let options = RunOptions::default().with_thread_pool(Some(Arc::clone(&self.pool)));
@@ -97,7 +96,7 @@ fn products_saturate() -> bool {
     GemmExecutor::<u8, i8, i32>::default().may_saturate()
 }
 
-fn value_of(input: &TensorValue) -> Result<Value, BackendError> {
+fn value_of(input: &TensorValue) -> Result<ValueOrView<'_>, BackendError> {
     let shape: Vec<usize> = input.shape.iter().map(|length| *length as usize).collect();
     let bytes = &input.bytes;
     match input.element {
@@ -107,19 +106,30 @@ fn value_of(input: &TensorValue) -> Result<Value, BackendError> {
         element @ (Element::Int32 | Element::Int64 | Element::Boolean) => {
             tensor(&shape, integers(element, bytes)?)
         }
-        Element::Int8 => tensor(&shape, numbers(bytes, i8::from_le_bytes)),
-        Element::Uint8 => tensor(&shape, bytes.clone()),
+        Element::Int8 => tensor(&shape, numbers::<i8>(bytes)),
+        Element::Uint8 => tensor(&shape, numbers::<u8>(bytes)),
         element @ Element::Int16 => {
             Err(BackendError::new(format_args!("rten does not support {element}")))
         }
     }
 }
 
-fn tensor<T>(shape: &[usize], data: Vec<T>) -> Result<Value, BackendError>
+fn tensor<'a, T: Clone>(
+    shape: &[usize],
+    data: Cow<'a, [T]>,
+) -> Result<ValueOrView<'a>, BackendError>
 where
+    ValueView<'a>: From<TensorView<'a, T>>,
     Value: From<Tensor<T>>,
 {
-    Value::from_shape(shape, data).map_err(BackendError::new)
+    match data {
+        Cow::Borrowed(data) => {
+            ValueView::from_shape(shape, data).map(ValueOrView::View).map_err(BackendError::new)
+        }
+        Cow::Owned(data) => {
+            Value::from_shape(shape, data).map(ValueOrView::Value).map_err(BackendError::new)
+        }
+    }
 }
 
 fn output_of(info: &TensorInfo, value: Value) -> Result<TensorValue, BackendError> {
