@@ -54,9 +54,9 @@ pub fn check(data: &[u8]) -> bool {
 /// Checks a model's file: what is accepted is within all bounds, and an unknown field changes
 /// nothing.
 fn file(model: &[u8]) -> bool {
-    // A declared input may have two bytes in the file, and has 80 in memory, half as many again
-    // while the list grows.
-    let memory = (64 << 10) + 128 * model.len();
+    // The name of a constant or operator may have five bytes in the file, and has 40 in memory, and
+    // as many again while their set grows.
+    let memory = (64 << 10) + 64 * model.len();
     let signature = match budget::within(memory, || inspect(model)) {
         Ok(signature) => signature,
         Err(error) => {
