@@ -24,6 +24,10 @@ use super::inference::InferenceError;
 /// Time after the deadline for which a reply is awaited.
 const REPLY_TIMEOUT: Duration = Duration::from_millis(20);
 
+/// Most runtimes of all models that are stated, and most characters of one.
+const RUNTIMES: usize = 1024;
+const RUNTIME_MAX: usize = 256;
+
 /// A `[[model]]` of the manifest.
 pub struct ModelEntry {
     /// Its name.
@@ -86,6 +90,8 @@ struct Connection {
     /// The region for outputs.
     outputs: Option<File>,
     opened: Vec<(String, Arc<OpenedModel>)>,
+    /// Name and runtime of all that were opened, each once, also by processes before this one.
+    runtimes: Vec<(String, String)>,
     /// The reason why the process has ended, until the next one has started.
     ended: Option<String>,
 }
@@ -122,6 +128,7 @@ impl Models {
             inputs: None,
             outputs: None,
             opened: Vec::new(),
+            runtimes: Vec::new(),
             ended: None,
         });
         let entries = entries.into_iter().map(Arc::new).collect();
@@ -158,14 +165,16 @@ impl Models {
         }
     }
 
-    /// Backend, version, provider and threads of each model, by its name; `none` for one that is
+    /// Backend, version, provider and threads of each model, by its name; `none` for one that was
     /// not loaded.
     pub fn runtimes(&self) -> Vec<String> {
         let state = self.lock();
         let runtime = |entry: &Arc<ModelEntry>| {
-            let opened = state.connection.as_ref().and_then(|it| it.find(&entry.name));
-            let runtime = opened.as_ref().map_or("none", |opened| &opened.runtime);
-            format!("model `{}`: {runtime}", entry.name)
+            let all = state.connection.iter().flat_map(|connection| &connection.runtimes);
+            let ran = all.filter(|(name, _)| *name == entry.name).map(|(_, runtime)| &**runtime);
+            let ran: Vec<&str> = ran.collect();
+            let ran = if ran.is_empty() { "none".to_owned() } else { ran.join(", then ") };
+            format!("model `{}`: {ran}", entry.name)
         };
         state.entries.iter().map(runtime).collect()
     }
@@ -334,6 +343,10 @@ impl Connection {
         let ModelResult::Opened { inputs, outputs, runtime } = result else {
             return Err(unexpected());
         };
+        let entry = (name.to_owned(), runtime.chars().take(RUNTIME_MAX).collect());
+        if self.runtimes.len() < RUNTIMES && !self.runtimes.contains(&entry) {
+            self.runtimes.push(entry);
+        }
         let opened = Arc::new(OpenedModel { inputs, outputs, runtime });
         self.opened.push((name.to_owned(), Arc::clone(&opened)));
         Ok(opened)
