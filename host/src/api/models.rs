@@ -24,6 +24,9 @@ use super::inference::InferenceError;
 /// Time after the deadline for which a reply is awaited.
 const REPLY_TIMEOUT: Duration = Duration::from_millis(20);
 
+/// Longest wait for the loads of other lambdas. One may take minutes, on a GPU.
+const OTHER_LOADS: Duration = Duration::from_secs(600);
+
 /// Most runtimes of all models that are stated, and most characters of one.
 const RUNTIMES: usize = 1024;
 const RUNTIME_MAX: usize = 256;
@@ -152,14 +155,13 @@ impl Models {
         self.time.used_ns.load(Ordering::Relaxed)
     }
 
-    /// Opens all models, so that `init` finds them loaded. Errors are kept for the lambda, which
-    /// opens them again. Waits for `timeout` at most.
+    /// Opens all models, so that `init` finds them loaded. Errors are logged; the lambda opens them
+    /// again. A load may take `timeout`, which begins when those of other lambdas are over.
     pub fn open_all(&self, timeout: Duration) {
-        let due = Due::default();
-        due.set(Some(Instant::now() + timeout));
+        let latest = Instant::now() + OTHER_LOADS;
         let mut state = self.lock();
         for entry in state.entries.clone() {
-            if let Err(error) = state.open(&entry.name, &due) {
+            if let Err(error) = state.open_in_turn(&entry.name, timeout, latest) {
                 tracing::warn!(model = entry.name, error = chain(&error), "cannot open the model");
             }
         }
@@ -238,6 +240,29 @@ impl Models {
 }
 
 impl ModelsState {
+    /// Opens a model within `timeout`; until `latest`, waits as long again while others are loaded.
+    fn open_in_turn(
+        &mut self,
+        name: &str,
+        timeout: Duration,
+        latest: Instant,
+    ) -> Result<Arc<OpenedModel>, InferenceError> {
+        let due = Due::default();
+        let mut began_late = false;
+        loop {
+            due.set(Some(Instant::now() + timeout));
+            match self.open(name, &due) {
+                Err(InferenceError::Queued(reason)) if Instant::now() < latest => {
+                    tracing::warn!(reason, "a model waits for its load");
+                    began_late = true;
+                }
+                // Its load began within this time, and gets its own.
+                Err(InferenceError::TooSlow(_)) if began_late => began_late = false,
+                result => return result,
+            }
+        }
+    }
+
     fn open(&mut self, name: &str, due: &Due) -> Result<Arc<OpenedModel>, InferenceError> {
         let until = due.at();
         let connection = self.connection.as_mut().ok_or_else(not_connected)?;
@@ -267,7 +292,12 @@ impl ModelsState {
             .map_err(|error| match error {
                 // Before the deadline, the time of the models is over.
                 InferenceError::OutOfTime if due.check().is_ok() => too_slow(),
-                InferenceError::TooSlow(_) if due.check().is_err() => InferenceError::OutOfTime,
+                InferenceError::TooSlow(_) | InferenceError::Queued(_) if due.check().is_err() => {
+                    InferenceError::OutOfTime
+                }
+                InferenceError::TooSlow(state) | InferenceError::Queued(state) => {
+                    InferenceError::TooSlow(format!("{state}: {}", too_slow()))
+                }
                 error => error,
             });
         time.add(match &result {
@@ -284,11 +314,17 @@ impl Connection {
         self.opened.iter().find(|(known, _)| known == name).map(|(_, opened)| Arc::clone(opened))
     }
 
-    /// Returns an error while the process is not running. Without a deadline, waits for the next.
-    fn check_process(&mut self, until: Option<Instant>) -> Result<(), InferenceError> {
+    /// Notes what the starter has sent about the process.
+    fn note_process(&mut self) -> Result<(), InferenceError> {
         while let Some(reply) = self.client.poll().map_err(failed)? {
             self.note(&reply);
         }
+        Ok(())
+    }
+
+    /// Returns an error while the process is not running. Without a deadline, waits for the next.
+    fn check_process(&mut self, until: Option<Instant>) -> Result<(), InferenceError> {
+        self.note_process()?;
         if until.is_none() {
             self.wait_for_process(None)?;
         }
@@ -302,6 +338,7 @@ impl Connection {
 
     /// Waits until the process runs, or until `until`.
     fn wait_for_process(&mut self, until: Option<Instant>) -> Result<(), InferenceError> {
+        self.note_process()?;
         while self.ended.is_some() {
             match self.client.wait_for_starter(until).map_err(failed)? {
                 Some(reply) => self.note(&reply),
@@ -311,16 +348,11 @@ impl Connection {
         Ok(())
     }
 
-    /// Notes the end or the start of the process.
+    /// Notes the end or the start of the process. Its end may not have been sent before its start.
     fn note(&mut self, reply: &ModelReply) {
-        self.ended = match &reply.result {
-            Ok(_) => None,
-            Err(fault) => {
-                (self.inputs, self.outputs) = (None, None);
-                self.opened.clear();
-                Some(fault.message.clone())
-            }
-        };
+        (self.inputs, self.outputs) = (None, None);
+        self.opened.clear();
+        self.ended = reply.result.as_ref().err().map(|fault| fault.message.clone());
     }
 
     fn open(
@@ -451,3 +483,6 @@ fn region_failed(error: io::Error) -> InferenceError {
 fn unexpected() -> InferenceError {
     InferenceError::Unavailable("gleaner-inference sent an invalid reply".to_owned())
 }
+
+#[cfg(test)]
+mod tests;

@@ -205,3 +205,13 @@ fn log_lines_that_are_not_read_delay_nothing_and_are_counted() {
     assert!(status.success(), "{status} {log}");
     assert!(log.contains("standard error was not read dropped="), "{log}");
 }
+
+#[test]
+fn calls_of_a_lambda_beyond_the_maximum_fail_with_the_reason() {
+    let program = ModelProgram::start(&[]);
+    let (_first, socket) = ModelClient::pair().unwrap();
+    (0..512).for_each(|_| program.add("one of many", &[], &socket));
+    let mut last = program.lambda("last", &models()[..1]);
+    let message = fault(ModelFaultKind::Unavailable, last.open("product"));
+    assert!(message.contains("serves 512 lambdas, and this one came later"), "{message}");
+}
