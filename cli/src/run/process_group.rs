@@ -12,8 +12,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_base::Failure;
-use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::Limits;
+use gleaner_lambda::BuildDir;
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::AddTopics;
 use gleaner_protocol::link::{AddLambda, LinkError};
@@ -471,7 +471,7 @@ impl<'a> ProcessGroup<'a> {
                 if let InferenceEvent::Ended(reason, _) = &event {
                     self.failures.add(reason.clone(), false);
                 }
-                screen.inference(event);
+                screen.inference(&event);
             }
             OutputPiece::Recorder(report) => {
                 if let Some(recorder) = recorder {
