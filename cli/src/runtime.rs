@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use gleaner_base::{Exit, Explain, Failure, each_piece, visible};
 use gleaner_lambda::manifest::{LambdaKind, Manifest};
-use gleaner_lambda::BuildDir;
+use gleaner_lambda::{BuildDir, InferenceLimits, Vehicle};
 use gleaner_parts::Parts;
 use gleaner_protocol::{CheckReport, Handover, PASSES_INFERENCE, ReplaySummary, Report, Verified};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -72,10 +72,12 @@ pub(crate) enum RuntimeResult {
     Checked(Box<CheckReport>),
 }
 
-/// Runs the runtime on `lambda` with these arguments. Returns its result and exit code; no result
+/// Runs the runtime on `lambda` with these arguments, and its models within the limits of the
+/// configuration file `vehicle`. Returns its result and exit code; no result
 /// if it has printed an error instead.
 pub(crate) fn run(
     lambda: &Path,
+    vehicle: Option<&Path>,
     arguments: Vec<OsString>,
 ) -> Result<(Option<RuntimeResult>, Exit), Failure> {
     let parts = Parts::find()?;
@@ -87,7 +89,10 @@ pub(crate) fn run(
     let shim = if has_worker { None } else { Some(parts.program("gleaner-shim")?) };
     let bar = progress_bar();
     let models = manifest.as_ref().filter(|manifest| !manifest.models.is_empty());
-    let models = models.map(|manifest| ModelsOfRun::start(&parts, &build, manifest, &bar));
+    // The runtime reports an error in that file.
+    let limits = vehicle.and_then(|file| Vehicle::load(file).ok());
+    let limits = limits.map_or_else(InferenceLimits::default, |vehicle| vehicle.inference);
+    let models = models.map(|manifest| ModelsOfRun::start(&parts, &build, manifest, &limits, &bar));
     let models = models.transpose()?;
     let mut child = start(shim, runtime, arguments, models.as_ref())?;
     // Both pipes are read by threads, since a lambda may leave processes running that hold them
@@ -142,11 +147,12 @@ impl ModelsOfRun {
         parts: &Parts,
         build: &BuildDir,
         manifest: &Manifest,
+        limits: &InferenceLimits,
         bar: &ProgressBar,
     ) -> Result<Self, Failure> {
         let (bar, has_failed) = (bar.clone(), Arc::new(AtomicBool::new(false)));
         let failed = Arc::clone(&has_failed);
-        let service = InferenceService::start(parts, move |event| {
+        let service = InferenceService::start(parts, limits, move |event| {
             if matches!(event, InferenceEvent::Ended(..)) {
                 failed.store(true, Ordering::Relaxed);
             }

@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 use gleaner_base::{Exit, Failure, PlainFile, chain};
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::{Manifest, ModelSpec};
-use gleaner_lambda::BuildDir;
+use gleaner_lambda::{BuildDir, InferenceLimits};
 use gleaner_parts::Parts;
 use gleaner_protocol::inference::{
     AddClient, GrantedModel, InferenceControl, ModelClient, ModelFile,
@@ -84,6 +84,7 @@ impl InferenceService {
     /// A failure if it cannot be started.
     pub(crate) fn start(
         parts: &Parts,
+        limits: &InferenceLimits,
         events: impl Fn(InferenceEvent) + Send + Sync + 'static,
     ) -> Result<InferenceService, Failure> {
         let program = parts.program(INFERENCE)?;
@@ -94,8 +95,14 @@ impl InferenceService {
         let running = File::from(running.map_err(|error| failed(&error))?);
         let shared = Arc::new(Shared::default());
         let (events, totals) = (Arc::new(events), Arc::default());
-        let mut supervisor =
-            Supervisor { program, shared: Arc::clone(&shared), running, events, totals };
+        let mut supervisor = Supervisor {
+            program,
+            limits: *limits,
+            shared: Arc::clone(&shared),
+            running,
+            events,
+            totals,
+        };
         let child = supervisor.start().map_err(|error| failed(&*error))?;
         let supervisor = thread::Builder::new()
             .name("inference".to_owned())
@@ -243,6 +250,7 @@ impl ServiceState {
 /// The thread that starts the process and waits for its end.
 struct Supervisor {
     program: PathBuf,
+    limits: InferenceLimits,
     shared: Arc<Shared>,
     /// The file in which the process notes the digests of models that it loads and runs.
     running: File,
@@ -307,7 +315,11 @@ impl Supervisor {
         let (handover, stdin) = UnixStream::pair()?;
         let running = Some(self.running.try_clone()?.into());
         Handover { control: Some(process_end), running, ..Handover::default() }.send(&handover)?;
+        let InferenceLimits { memory, run_max, load_max } = self.limits;
         let child = Command::new(&self.program)
+            .args(["--memory".to_owned(), memory.bytes().to_string()])
+            .args(["--run-max".to_owned(), run_max.as_secs_f64().to_string()])
+            .args(["--load-max".to_owned(), load_max.as_secs_f64().to_string()])
             // Only `gleaner` receives Ctrl-C, and ends its processes in order.
             .process_group(0)
             .stdin(OwnedFd::from(stdin))
