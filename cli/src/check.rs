@@ -13,5 +13,8 @@ pub(crate) fn run(args: &CheckArgs) -> Result<Exit, Failure> {
     let mut line: Vec<OsString> = vec!["check".into()];
     line.extend(args.target.settings());
     line.extend(["--".into(), args.target.lambda.clone().into()]);
-    print_result(runtime::run(&args.target.lambda, line)?, args.json)
+    print_result(
+        runtime::run(&args.target.lambda, args.target.vehicle.as_deref(), line)?,
+        args.json,
+    )
 }

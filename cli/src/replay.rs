@@ -23,7 +23,8 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<Exit, Failure> {
 /// Replays. Returns the exit code of the runtime, and whether there are new results: a lambda that
 /// cannot start leaves the earlier ones.
 pub(crate) fn results(args: &ReplayArgs) -> Result<(Exit, bool), Failure> {
-    let (mut result, exit) = runtime::run(&args.target.lambda, arguments(args))?;
+    let (mut result, exit) =
+        runtime::run(&args.target.lambda, args.target.vehicle.as_deref(), arguments(args))?;
     let has_results = result.is_some();
     if let Some(RuntimeResult::Summary(summary)) = &mut result {
         // Not the path in the report, which may come from the lambda's process.
@@ -73,7 +74,7 @@ pub(crate) fn verify(args: &VerifyArgs) -> Result<Exit, Failure> {
     let mut line = vec!["verify".into(), "--lambda".into(), args.lambda.clone().into()];
     line.extend(args.vehicle.iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]));
     line.extend(["--".into(), args.clip.clone().into()]);
-    print_result(runtime::run(&args.lambda, line)?, args.json)
+    print_result(runtime::run(&args.lambda, args.vehicle.as_deref(), line)?, args.json)
 }
 
 /// Prints the result of the runtime, and returns its exit code.

@@ -10,16 +10,16 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use gleaner_base::{Exit, Explain, Failure, each_piece, visible};
-use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::{LambdaKind, Manifest};
+use gleaner_lambda::{BuildDir, InferenceLimits, Vehicle};
 use gleaner_parts::Parts;
-use gleaner_protocol::{CheckReport, Handover, ReplaySummary, Report, Verified};
+use gleaner_protocol::{CheckReport, Handover, PASSES_INFERENCE, ReplaySummary, Report, Verified};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::delegate::starter;
 use crate::inference::{InferenceEvent, InferenceService};
 use crate::pipe_reader::PipeReader;
-use crate::render::{self, Paint};
+use crate::render::Paint;
 
 /// Maximum size of a report, far above that of a trigger with all its attributes or of a clip with
 /// all its lists.
@@ -72,10 +72,12 @@ pub(crate) enum RuntimeResult {
     Checked(Box<CheckReport>),
 }
 
-/// Runs the runtime on `lambda` with these arguments. Returns its result and exit code; no result
+/// Runs the runtime on `lambda` with these arguments, and its models within the limits of the
+/// configuration file `vehicle`. Returns its result and exit code; no result
 /// if it has printed an error instead.
 pub(crate) fn run(
     lambda: &Path,
+    vehicle: Option<&Path>,
     arguments: Vec<OsString>,
 ) -> Result<(Option<RuntimeResult>, Exit), Failure> {
     let parts = Parts::find()?;
@@ -87,7 +89,10 @@ pub(crate) fn run(
     let shim = if has_worker { None } else { Some(parts.program("gleaner-shim")?) };
     let bar = progress_bar();
     let models = manifest.as_ref().filter(|manifest| !manifest.models.is_empty());
-    let models = models.map(|manifest| ModelsOfRun::start(&parts, &build, manifest, &bar));
+    // The runtime reports an error in that file.
+    let limits = vehicle.and_then(|file| Vehicle::load(file).ok());
+    let limits = limits.map_or_else(InferenceLimits::default, |vehicle| vehicle.inference);
+    let models = models.map(|manifest| ModelsOfRun::start(&parts, &build, manifest, &limits, &bar));
     let models = models.transpose()?;
     let mut child = start(shim, runtime, arguments, models.as_ref())?;
     // Both pipes are read by threads, since a lambda may leave processes running that hold them
@@ -142,25 +147,16 @@ impl ModelsOfRun {
         parts: &Parts,
         build: &BuildDir,
         manifest: &Manifest,
+        limits: &InferenceLimits,
         bar: &ProgressBar,
     ) -> Result<Self, Failure> {
         let (bar, has_failed) = (bar.clone(), Arc::new(AtomicBool::new(false)));
         let failed = Arc::clone(&has_failed);
-        let service = InferenceService::start(parts, move |event| {
-            let text = match event {
-                InferenceEvent::Report(report) => {
-                    render::inference(&report, Paint::of_stderr()).into_bytes()
-                }
-                InferenceEvent::Stderr(text) => text,
-                InferenceEvent::Ended(reason, delay) => {
-                    failed.store(true, Ordering::Relaxed);
-                    let delay = delay.as_secs_f64();
-                    format!("warning: {}; restarting in {delay} s\n", visible(&reason)).into_bytes()
-                }
-                InferenceEvent::Warning(text) => {
-                    format!("warning: {}\n", visible(&text)).into_bytes()
-                }
-            };
+        let service = InferenceService::start(parts, limits, move |event| {
+            if matches!(event, InferenceEvent::Ended(..)) {
+                failed.store(true, Ordering::Relaxed);
+            }
+            let text = event.text(Paint::of_stderr());
             bar.suspend(|| drop(io::stderr().write_all(&text)));
         })?;
         let inference = service.add(manifest.lambda.name.as_str(), build, manifest)?;
@@ -198,7 +194,7 @@ fn start(
     let mut stdin = Stdio::null();
     if let Some(models) = models {
         // After the subcommand.
-        arguments.insert(1, "--starter-passes-inference".into());
+        arguments.insert(1, format!("--{PASSES_INFERENCE}").into());
         stdin = OwnedFd::from(models.stdin.try_clone().map_err(failed)?).into();
     }
     command

@@ -117,6 +117,9 @@ fn wakes(socket: UnixStream, bytes: usize) -> bool {
                 assert_eq!(entry.seen.len(), inputs);
                 journal::round_trip(inputs, &[*entry]);
             }
+            Ok(Some(LambdaMessage::Engine(_))) => {
+                assert!(inputs.is_some(), "an engine before hello");
+            }
             Ok(Some(LambdaMessage::Bye)) => {}
             Ok(None) | Err(_) => break,
         }

@@ -1,11 +1,11 @@
 //! Fuzzes the way of a frame through a model: the check of the model's file, a lambda's request to
-//! run it, the frame as a tensor, and the boxes in the outputs of a detector.
+//! run it and the reply, the frame as a tensor, and the boxes in the outputs of a detector.
 //!
 //! An input is a byte for the mode, and then a file, or the fields of the others.
 
 use gleaner_protocol::inference::{
-    Element, MAX_DIMENSIONS, MAX_TENSOR_BYTES, ModelCall, ModelRequest, TENSOR_ALIGNMENT,
-    TensorInfo, TensorPlace,
+    Element, MAX_DIMENSIONS, MAX_TENSOR_BYTES, ModelCall, ModelReply, ModelRequest, ModelResult,
+    TENSOR_ALIGNMENT, TensorInfo, TensorPlace,
 };
 use gleaner_rules::pixels::{Encoding, View};
 use gleaner_vision::{
@@ -29,6 +29,8 @@ pub mod mode {
     pub const OUTPUT: u8 = 2;
     /// Encoding and size of a frame and the fields of its conversion follow, then pixels.
     pub const FRAME: u8 = 3;
+    /// A reply as JSON follows.
+    pub const REPLY: u8 = 4;
 }
 
 /// Largest number of inputs, and of outputs, of an accepted model.
@@ -40,13 +42,14 @@ const REGIONS: [u64; 2] = [4096, MAX_TENSOR_BYTES];
 /// Limit on values of an output, and on pixels of a tensor, so that an input takes little time.
 const VALUES_MAX: usize = 16 << 10;
 
-/// Checks a file, a request, outputs or a frame. Returns whether it was accepted.
+/// Checks a file, a request, outputs, a frame or a reply. Returns whether it was accepted.
 pub fn check(data: &[u8]) -> bool {
     let mut input = FuzzInput(data);
     match input.u8() {
         mode::REQUEST => request(&mut input),
         mode::OUTPUT => output(&mut input),
         mode::FRAME => frame(&mut input),
+        mode::REPLY => reply(input.0),
         _ => file(input.0),
     }
 }
@@ -54,9 +57,9 @@ pub fn check(data: &[u8]) -> bool {
 /// Checks a model's file: what is accepted is within all bounds, and an unknown field changes
 /// nothing.
 fn file(model: &[u8]) -> bool {
-    // A declared input may have two bytes in the file, and has 80 in memory, half as many again
-    // while the list grows.
-    let memory = (64 << 10) + 128 * model.len();
+    // The name of a constant or operator may have five bytes in the file, and has 40 in memory, and
+    // as many again while their set grows.
+    let memory = (64 << 10) + 64 * model.len();
     let signature = match budget::within(memory, || inspect(model)) {
         Ok(signature) => signature,
         Err(error) => {
@@ -122,6 +125,27 @@ fn request(input: &mut FuzzInput) -> bool {
             false
         }
     }
+}
+
+/// Checks a reply, as a lambda's process reads it: it can be sent again, and the size of an output
+/// is exact, or refused.
+fn reply(json: &[u8]) -> bool {
+    let memory = (16 << 10) + 64 * json.len();
+    let parsed: Result<ModelReply, _> = budget::within(memory, || serde_json::from_slice(json));
+    let Ok(reply) = parsed else { return false };
+    let again = serde_json::to_vec(&reply).expect("it was parsed");
+    assert_eq!(serde_json::from_slice::<ModelReply>(&again).ok().as_ref(), Some(&reply));
+    let Ok(ModelResult::Ran { outputs, .. }) = &reply.result else { return true };
+    for output in outputs {
+        let lengths = output.shape.iter().map(|length| u128::from(*length));
+        let exact = lengths.fold(output.element.size() as u128, u128::saturating_mul);
+        let fits = output.shape.len() <= MAX_DIMENSIONS && exact <= u128::from(MAX_TENSOR_BYTES);
+        let bytes = output.bytes().map(u128::from);
+        // A length of 0 after others that overflow may be refused.
+        assert!(bytes.is_none_or(|bytes| fits && bytes == exact), "{output:?}: {bytes:?}");
+        assert!(bytes.is_some() || !fits || exact == 0, "{output:?}");
+    }
+    true
 }
 
 /// Checks an accepted input against the one that the model needs, and those that were given.

@@ -92,6 +92,11 @@ impl Invoker {
         self.guest.finish()
     }
 
+    /// The engine of the lambda, with what ran its models so far.
+    pub fn engine(&self) -> String {
+        self.guest.engine()
+    }
+
     /// Peak resident memory of the lambda's process, in bytes.
     pub fn peak_resident_bytes(&self) -> u64 {
         self.guest.peak_resident_bytes()

@@ -1,9 +1,12 @@
-//! `vehicle.toml`: limits for all lambdas on a vehicle. It is parsed as a manifest is, with the
-//! same error messages.
+//! `vehicle.toml`: limits for all lambdas on a vehicle, and of the process that runs their models.
+//! It is parsed as a manifest is, with the same error messages.
 
 use std::path::Path;
+use std::time::Duration;
 
-use crate::manifest::{self, Limits, ManifestError};
+use gleaner_base::ByteSize;
+
+use crate::manifest::{self, Limits, ManifestError, bounds};
 
 /// The validated configuration of a vehicle.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -12,6 +15,36 @@ pub struct Vehicle {
     /// `[limits]`: upper bounds of the limits of each lambda. Limits that the file does not name
     /// are at the maximum of manifests.
     pub limits: Limits,
+    /// `[inference]`.
+    pub inference: InferenceLimits,
+}
+
+/// `[inference]`: limits of the process that runs models.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct InferenceLimits {
+    /// Memory that it may take.
+    pub memory: ByteSize,
+    /// Longest run of a model that cannot be interrupted.
+    pub run_max: Duration,
+    /// Longest time to load a model.
+    pub load_max: Duration,
+}
+
+/// The configuration without a file.
+impl Default for Vehicle {
+    fn default() -> Self {
+        Self { limits: Limits::MAX, inference: InferenceLimits::default() }
+    }
+}
+
+impl Default for InferenceLimits {
+    fn default() -> Self {
+        Self {
+            memory: bounds::INFERENCE_MEMORY.default,
+            run_max: bounds::RUN_MAX.default,
+            load_max: bounds::LOAD_MAX.default,
+        }
+    }
 }
 
 impl Vehicle {
@@ -23,7 +56,7 @@ impl Vehicle {
     /// range of manifests.
     pub fn parse(text: &str, file: impl AsRef<Path>) -> Result<Vehicle, ManifestError> {
         let file = file.as_ref().display().to_string();
-        Ok(Vehicle { limits: manifest::vehicle_limits(text, &file)? })
+        manifest::vehicle(text, &file)
     }
 
     /// Loads the configuration from the file `path`.
@@ -47,12 +80,24 @@ mod tests {
         let vehicle =
             Vehicle::parse("[limits]\nfuel = 10_000_000\nmemory = \"32 MiB\"", "vehicle.toml")
                 .unwrap();
-        assert_eq!(
-            (vehicle.limits.fuel, vehicle.limits.memory),
-            (10_000_000, gleaner_base::ByteSize::mib(32))
-        );
+        assert_eq!((vehicle.limits.fuel, vehicle.limits.memory), (10_000_000, ByteSize::mib(32)));
         assert_eq!(vehicle.limits.deadline, Limits::MAX.deadline);
-        assert_eq!(Vehicle::parse("", "vehicle.toml").unwrap().limits, Limits::MAX);
+        assert_eq!(Vehicle::parse("", "vehicle.toml").unwrap(), Vehicle::default());
+    }
+
+    #[test]
+    fn limits_of_models_have_defaults_of_their_own() {
+        let vehicle = |text: &str| Vehicle::parse(text, "vehicle.toml").unwrap().inference;
+        let defaults = InferenceLimits::default();
+        assert_eq!(vehicle("[limits]"), defaults);
+        assert_eq!(
+            vehicle("[inference]\nmemory = \"4 GiB\"\nload_max = \"10min\""),
+            InferenceLimits {
+                memory: ByteSize::gib(4),
+                load_max: Duration::from_secs(600),
+                ..defaults
+            }
+        );
     }
 
     #[test]
@@ -67,6 +112,16 @@ mod tests {
                 "[limit]",
                 "vehicle.toml, line 1: unknown key `limit` at the top level",
                 "did you mean `limits`?",
+            ),
+            (
+                "[inference]\nrun_max = \"0s\"",
+                "vehicle.toml, line 2: `inference.run_max` is 0s, below the minimum of 1s",
+                "give a value from 1s to 1h",
+            ),
+            (
+                "[inference]\nmodels = 3",
+                "vehicle.toml, line 2: unknown key `models` in [inference]",
+                "the known keys are `memory`, `run_max` and `load_max`",
             ),
             (
                 "[limits]\nframes = 0",

@@ -1,4 +1,5 @@
-//! Limits the number of frames that a lambda holds, and the memory of those that it creates.
+//! Limits the number of frames and tensors that a lambda holds, and the memory of those that it
+//! creates.
 
 use std::fmt;
 use std::sync::Arc;
@@ -43,15 +44,15 @@ impl fmt::Display for NoRoom {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let limit = match self {
             Self::Frames { allowed } => {
-                write!(f, "the lambda holds {allowed} frames; ")?;
+                write!(f, "the lambda holds {allowed} frames and tensors; ")?;
                 "frames"
             }
             Self::Bytes { needed, left } => {
-                write!(f, "a new frame needs {needed} bytes, and {left} are left; ")?;
+                write!(f, "a new frame or tensor needs {needed} bytes, and {left} are left; ")?;
                 "memory"
             }
         };
-        write!(f, "drop frames that are not needed, or raise `{limit}` in [limits]")
+        write!(f, "drop frames and tensors that are not needed, or raise `{limit}` in [limits]")
     }
 }
 

@@ -36,7 +36,6 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::Vehicle;
-use gleaner_lambda::manifest::Limits;
 use gleaner_parts::Parts;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
@@ -96,9 +95,9 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
         RunLambda::load(args)?.into_iter().map(SupervisedLambda::new).collect();
     let allowed = || {
         let vehicle = args.vehicle.as_ref();
-        vehicle.map_or(Ok(Limits::MAX), |file| Vehicle::load(file).map(|vehicle| vehicle.limits))
+        vehicle.map_or(Ok(Vehicle::default()), Vehicle::load)
     };
-    let mut limits = allowed()?;
+    let mut vehicle = allowed()?;
     let stop = stop_flag()?;
     let mut screen = Screen::new(args.stats, args.json);
     let context = RunContext { args, parts: Parts::find()?, offset_ns: clock_offset() };
@@ -113,9 +112,9 @@ pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
         let attempt_started = Instant::now();
         // The runtimes read the same file at each start and report if it cannot be used. That does
         // not end the run.
-        limits = allowed().unwrap_or(limits);
+        vehicle = allowed().unwrap_or(vehicle);
         let run = RunRecord { failures: &mut failures, counts: &mut counts };
-        let mut group = ProcessGroup::start(&context, &mut lambdas, &mut screen, run, limits)?;
+        let mut group = ProcessGroup::start(&context, &mut lambdas, &mut screen, run, &vehicle)?;
         let ended = group.run(&mut time, &stop);
         group.add_counts();
         let reason = match ended? {

@@ -12,8 +12,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_base::Failure;
-use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::Limits;
+use gleaner_lambda::{BuildDir, Vehicle};
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::AddTopics;
 use gleaner_protocol::link::{AddLambda, LinkError};
@@ -70,7 +70,7 @@ impl<'a> ProcessGroup<'a> {
         lambdas: &'a mut [SupervisedLambda],
         screen: &'a mut Screen,
         RunRecord { failures, counts }: RunRecord<'a>,
-        limits: Limits,
+        vehicle: &Vehicle,
     ) -> Result<Self, Failure> {
         let (sender, output) = mpsc::sync_channel(QUEUE_LENGTH);
         let inputs = lambdas.iter().flat_map(|supervised| &supervised.lambda.manifest.inputs);
@@ -83,7 +83,7 @@ impl<'a> ProcessGroup<'a> {
                 let piece = OutputPiece::Inference(event);
                 drop(sender.send(ChildOutput { from: ChildId::Inference, piece }));
             };
-            inference = Some(InferenceService::start(&context.parts, send)?);
+            inference = Some(InferenceService::start(&context.parts, &vehicle.inference, send)?);
         }
         let recorder = None;
         Ok(Self {
@@ -98,7 +98,7 @@ impl<'a> ProcessGroup<'a> {
             inference,
             sender,
             output,
-            limits,
+            limits: vehicle.limits,
         })
     }
 
@@ -471,7 +471,7 @@ impl<'a> ProcessGroup<'a> {
                 if let InferenceEvent::Ended(reason, _) = &event {
                     self.failures.add(reason.clone(), false);
                 }
-                screen.inference(event);
+                screen.inference(&event);
             }
             OutputPiece::Recorder(report) => {
                 if let Some(recorder) = recorder {

@@ -110,19 +110,12 @@ impl Screen {
     }
 
     /// Shows an event of the process that runs models.
-    pub(super) fn inference(&mut self, event: InferenceEvent) {
-        match event {
-            InferenceEvent::Report(report) => {
-                self.report(&report);
-                self.print(&render::inference(&report, self.paint));
-            }
-            InferenceEvent::Stderr(text) => self.err(&text),
-            InferenceEvent::Ended(reason, delay) => {
-                let delay = delay.as_secs_f64();
-                self.warn(&format!("{reason}; restarting in {delay} s"));
-            }
-            InferenceEvent::Warning(text) => self.warn(&text),
-        }
+    pub(super) fn inference(&mut self, event: &InferenceEvent) {
+        let InferenceEvent::Report(report) = &event else {
+            return self.err(&event.text(self.paint));
+        };
+        self.report(report);
+        self.print(&render::inference(report, self.paint));
     }
 
     /// Updates the status of a lambda.

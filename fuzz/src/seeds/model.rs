@@ -1,7 +1,10 @@
-//! Seeds: small ONNX models, requests to run one, outputs of each kind of detector, and frames with
-//! their conversion.
+//! Seeds: small ONNX models, requests to run one and replies, outputs of each kind of detector, and
+//! frames with their conversion.
 
-use gleaner_protocol::inference::{Element, ModelCall, ModelRequest, TensorPlace};
+use gleaner_protocol::inference::{
+    Element, ModelCall, ModelFault, ModelFaultKind, ModelReply, ModelRequest, ModelResult,
+    TensorInfo, TensorPlace,
+};
 
 use crate::image::ENCODINGS;
 use crate::model::mode;
@@ -44,7 +47,38 @@ pub fn all() -> Vec<Vec<u8>> {
     });
     let outputs = outputs().into_iter().map(|output| with_mode(mode::OUTPUT, &output));
     let frames = (0..ENCODINGS.len()).filter_map(frame).map(|it| with_mode(mode::FRAME, &it));
-    files.chain(requests).chain(outputs).chain(frames).collect()
+    let replies = replies().into_iter().map(|reply| {
+        let json = serde_json::to_vec(&reply).expect("a reply is JSON");
+        with_mode(mode::REPLY, &json)
+    });
+    files.chain(requests).chain(outputs).chain(frames).chain(replies).collect()
+}
+
+fn replies() -> Vec<ModelReply> {
+    let place = |shape: &[u32], offset| {
+        let (name, shape) = ("boxes".to_owned(), shape.to_vec());
+        TensorPlace { name, element: Element::Float32, shape, offset }
+    };
+    let outputs = vec![place(&[1, 3549, 85], 0), place(&[0, 6], 1_206_720)];
+    let info = TensorInfo {
+        name: "images".to_owned(),
+        element: Element::Uint8,
+        shape: vec![Some(1), None],
+    };
+    let opened = ModelResult::Opened {
+        inputs: vec![info.clone()],
+        outputs: vec![info],
+        runtime: "rten 0.27.0, cpu, 1 thread".to_owned(),
+    };
+    let fault = ModelFault::new(ModelFaultKind::TooSlow, "model `m` is still running");
+    let results = [
+        Ok(ModelResult::Started),
+        Ok(opened),
+        Ok(ModelResult::Ran { outputs, run_ns: 7 }),
+        Err(fault),
+    ];
+    let reply = |(id, result)| ModelReply { id, region: id, result };
+    (0..).zip(results).map(reply).collect()
 }
 
 fn with_mode(mode: u8, rest: &[u8]) -> Vec<u8> {

@@ -22,8 +22,18 @@ About = Tuple[Identity, Stamps]
 T = TypeVar("T")
 
 
+_WAY_OUT = "drop frames and tensors that are not needed, or raise"
+
+
+def no_memory(size: int, left: int) -> str:
+    """Text for a frame or tensor of ``size`` bytes, while ``left`` are left."""
+    why = f"a new frame or tensor needs {size} bytes, and {left} are left"
+    return f"{why}; {_WAY_OUT} `memory` in [limits]"
+
+
 class Budget:
-    """Limits the number of frames that a lambda holds, and the bytes of those that it created."""
+    """Limits the number of frames and tensors that a lambda holds, and the bytes of those that it
+    created."""
 
     def __init__(self, limits: Mapping[str, int]) -> None:
         self.frames_allowed = self.frames = limits["frames"]
@@ -33,13 +43,10 @@ class Budget:
     def take(self, size: int) -> Reservation:
         """Takes one frame and ``size`` bytes. Raises DataError (``no-room``)."""
         if self.frames == 0:
-            why = "drop frames that are not needed, or raise `frames` in [limits]"
-            raise DataError(f"the lambda holds {self.frames_allowed} frames; {why}", "no-room")
+            why = f"the lambda holds {self.frames_allowed} frames and tensors"
+            raise DataError(f"{why}; {_WAY_OUT} `frames` in [limits]", "no-room")
         if size > self.bytes:
-            why = "drop frames that are not needed, or raise `memory` in [limits]"
-            raise DataError(
-                f"a new frame needs {size} bytes, and {self.bytes} are left; {why}", "no-room"
-            )
+            raise DataError(no_memory(size, self.bytes), "no-room")
         return Reservation(self, size)
 
 

@@ -27,7 +27,7 @@ from .. import inference
 from ..inference import Detection, DetectOptions, ElementType, InferenceError, Preprocess
 from ..inference import TensorInfo
 from ._error import ReplayError, quoted
-from ._frame import Frame
+from ._frame import Frame, no_memory
 from ._manifest import DeclaredModel
 from ._session import piece, u32, u64
 
@@ -121,8 +121,7 @@ class Tensor:
         self._dtype = np.dtype("bool" if element == "boolean" else element).newbyteorder("<")
         size, left = self._dtype.itemsize * math.prod(lengths), self._table.bytes_left
         if size > left:
-            way_out = "drop tensors that are not needed, or raise `memory` in [limits]"
-            raise _wrong(f"a new tensor needs {size} bytes, and {left} are left; {way_out}")
+            raise _wrong(no_memory(size, left))
         self._table.bytes_left -= size
         self._bytes = bytearray(size)
 

@@ -4,7 +4,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_rules::clamps;
-use gleaner_rules::frames::{Budget, FrameLease, NoRoom};
+use gleaner_rules::frames::{Budget, FrameLease};
 use gleaner_rules::refused;
 
 use super::data::Frame;
@@ -151,13 +151,7 @@ impl Tensor {
         let size = lengths.fold(element_size(element), usize::saturating_mul);
         let taken = match session.models.budget.take(size) {
             Ok(taken) => taken,
-            Err(NoRoom::Bytes { needed, left }) => {
-                let way_out = "drop tensors that are not needed, or raise `memory` in [limits]";
-                return wrong(format!(
-                    "a new tensor needs {needed} bytes, and {left} are left; {way_out}"
-                ));
-            }
-            Err(no_room @ NoRoom::Frames { .. }) => return wrong(no_room.to_string()),
+            Err(no_room) => return wrong(no_room.to_string()),
         };
         let (bytes, shape) = (Mutex::new(vec![0; size]), shape.to_vec());
         let handle = session.models.handles.acquire();

@@ -121,10 +121,13 @@ fn frames_and_their_bytes_are_limited_and_released() {
         assert_eq!(large.info().size, 1_000_000);
         let (kind, why) = refused(frame.resize(300, 300)).ok_or(Error::new("there is room"))?;
         assert_eq!(kind, Some("no-room"));
-        assert!(why.contains("a new frame needs 90000 bytes, and 48576 are left"), "{why}");
+        assert!(
+            why.contains("a new frame or tensor needs 90000 bytes, and 48576 are left"),
+            "{why}"
+        );
         let third = frame.to_gray()?;
         let (_, why) = refused(frame.to_gray()).ok_or(Error::new("there are four"))?;
-        assert!(why.contains("the lambda holds 3 frames"), "{why}");
+        assert!(why.contains("the lambda holds 3 frames and tensors"), "{why}");
         drop((large, third));
         frame.resize(300, 300).map(drop)
     });

@@ -1,7 +1,7 @@
 //! The loop: owns the lambdas, the sessions and the order of runs. It never waits for a lambda or a
 //! model.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 use std::fs::File;
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
@@ -18,8 +18,9 @@ use tracing::{error, info};
 use crate::backend::StopSignal;
 use crate::client::{CallStage, ConnectedLambda, LambdaId, OpenCall};
 use crate::engine_error::EngineError;
-use crate::lambdas::{LambdaTable, ReadyDescriptors};
+use crate::lambdas::{LambdaTable, ReadyDescriptors, TOO_MANY};
 use crate::loader::{LoadDone, LoadJob};
+use crate::loads::LoadQueue;
 use crate::places::{PlacedInput, check_inputs};
 use crate::queue::FairQueue;
 use crate::sessions::{LoadState, SessionId, SessionKey, SessionTable};
@@ -44,9 +45,7 @@ pub(crate) struct InferenceEngine {
     /// Files by digest.
     files: HashMap<String, (String, Arc<File>)>,
     sessions: SessionTable,
-    /// Models that wait to be loaded.
-    loads: VecDeque<LoadJob>,
-    is_loading: bool,
+    loads: LoadQueue,
     queue: FairQueue<LambdaId, Vec<PlacedInput>>,
     run: Option<RunInProgress>,
     last_job: u64,
@@ -76,8 +75,7 @@ impl InferenceEngine {
             lambdas: LambdaTable::default(),
             files: HashMap::new(),
             sessions: SessionTable::default(),
-            loads: VecDeque::new(),
-            is_loading: false,
+            loads: LoadQueue::default(),
             queue: FairQueue::default(),
             run: None,
             last_job: 0,
@@ -195,8 +193,12 @@ impl InferenceEngine {
         if let Some(before) = before {
             self.abandon(id, before.stage);
         }
+        let is_beyond = self.lambdas.is_beyond(id);
         let Some(lambda) = self.lambdas.get_mut(id) else { return };
         let ModelRequest { id: call, deadline_ns, regions, call: requested } = request;
+        if is_beyond {
+            return lambda.fail(call, ModelFaultKind::Unavailable, TOO_MANY);
+        }
         match requested {
             ModelCall::Reserve { bytes } => lambda.reserve(call, bytes),
             ModelCall::Open { model } => self.open(id, call, deadline_ns, model),
@@ -240,20 +242,13 @@ impl InferenceEngine {
         };
         let (path, file, lambdas) = (path.clone(), Arc::clone(file), self.lambdas.users(&key));
         let session = self.sessions.add(key.clone(), path.clone());
-        self.loads.push_back(LoadJob { session, key, file, path, lambdas });
+        self.loads.push(LoadJob { session, key, file, path, lambdas });
         Ok(session)
     }
 
-    /// Starts the next load, if none is in progress. A model that no lambda waits for any more is
-    /// not loaded.
+    /// Starts the next load, if none is in progress.
     fn start_load(&mut self) {
-        while !self.is_loading {
-            let Some(job) = self.loads.pop_front() else { return };
-            if self.lambdas.with_call_on(job.session).is_empty() {
-                self.sessions.remove(job.session);
-                continue;
-            }
-            self.is_loading = true;
+        if let Some(job) = self.loads.begin(&self.lambdas, &mut self.sessions) {
             self.threads.load(job);
         }
     }
@@ -348,7 +343,7 @@ impl InferenceEngine {
 
     fn finish_load(&mut self, done: LoadDone) {
         let LoadDone { session: id, loaded } = done;
-        self.is_loading = false;
+        self.loads.end();
         let Some(session) = self.sessions.get_mut(id) else { return };
         session.state = match loaded {
             Ok((graph, ready)) => {
@@ -413,13 +408,18 @@ impl InferenceEngine {
             |call: &mut OpenCall| call.deadline_ns.is_some_and(|deadline| deadline <= now);
         let Some(lambda) = self.lambdas.get_mut(id) else { return };
         let Some(call) = lambda.call.take_if(is_late) else { return };
-        let state = match call.stage {
-            CallStage::Loading => "is still being loaded",
-            CallStage::Waiting => "has not run yet: others run before it",
-            CallStage::Running(_) => "is still running",
+        let (kind, state) = match (call.stage, self.loads.other_than(call.session)) {
+            (CallStage::Loading, Some(other)) => {
+                (ModelFaultKind::Queued, format!("waits for the load of {other}"))
+            }
+            (CallStage::Loading, None) => (ModelFaultKind::TooSlow, "is still being loaded".into()),
+            (CallStage::Waiting, _) => {
+                (ModelFaultKind::TooSlow, "has not run yet: others run before it".into())
+            }
+            (CallStage::Running(_), _) => (ModelFaultKind::TooSlow, "is still running".into()),
         };
         let message = format!("model `{}` {state} at the deadline", call.model);
-        lambda.fail(call.id, ModelFaultKind::TooSlow, message);
+        lambda.fail(call.id, kind, message);
         self.sessions.count_failed(call.session);
         self.abandon(id, call.stage);
     }

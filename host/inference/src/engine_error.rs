@@ -9,7 +9,7 @@ use crate::running::ModelWork;
 pub(crate) enum EngineError {
     /// A model takes too long and cannot be interrupted.
     #[error(
-        "model `{}` of lambda {} has run for more than {} s", .0.path, names(&.0.lambdas),
+        "model `{}` of lambda {} has run for more than {} s", .0.path, quoted(&.0.lambdas),
         .0.limit.as_secs_f64()
     )]
     Overdue(ModelWork),
@@ -21,7 +21,8 @@ pub(crate) enum EngineError {
     Wait(#[source] io::Error),
 }
 
-fn names(lambdas: &[String]) -> String {
+/// Names of lambdas, for messages.
+pub(crate) fn quoted(lambdas: &[String]) -> String {
     let quoted: Vec<String> = lambdas.iter().map(|name| format!("`{name}`")).collect();
     quoted.join(", ")
 }

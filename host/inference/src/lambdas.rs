@@ -13,8 +13,12 @@ use tracing::error;
 use crate::client::{CallStage, ConnectedLambda, LambdaId, OpenCall};
 use crate::sessions::{SessionId, SessionKey};
 
-/// Most lambdas at a time. Each has a socket and two regions.
+/// Most lambdas that are served at a time. Each has a socket and two regions.
 const LAMBDAS: usize = 512;
+
+/// The reason why calls of further lambdas fail.
+pub(crate) const TOO_MANY: &str = "gleaner-inference serves 512 lambdas, and this one came later: stop others, or start it in a \
+     `gleaner run` of its own";
 
 /// All connected lambdas.
 #[derive(Debug, Default)]
@@ -33,14 +37,19 @@ pub(crate) struct ReadyDescriptors {
 }
 
 impl LambdaTable {
-    /// Adds a lambda, unless there are too many.
+    /// Adds a lambda.
     pub(crate) fn add(&mut self, add: AddClient, socket: OwnedFd) {
         if self.lambdas.len() >= LAMBDAS {
             error!(lambda = add.name, "more than {LAMBDAS} lambdas: one is not served");
-            return;
         }
         self.last_id += 1;
         self.lambdas.insert(LambdaId(self.last_id), ConnectedLambda::new(add, socket));
+    }
+
+    /// Returns whether a lambda is not served, as there are too many before it. It is once one of
+    /// them has left.
+    pub(crate) fn is_beyond(&self, id: LambdaId) -> bool {
+        self.lambdas.keys().nth(LAMBDAS).is_some_and(|first| id >= *first)
     }
 
     pub(crate) fn get_mut(&mut self, id: LambdaId) -> Option<&mut ConnectedLambda> {
@@ -77,6 +86,12 @@ impl LambdaTable {
     /// Returns the lambdas whose call is about a session.
     pub(crate) fn with_call_on(&self, session: SessionId) -> Vec<LambdaId> {
         self.with_call(|call| call.session == session)
+    }
+
+    /// Returns the earliest deadline of the calls about a session.
+    pub(crate) fn deadline_of(&self, session: SessionId) -> Option<u64> {
+        let calls = self.calls().filter(|call| call.session == session);
+        calls.filter_map(|call| call.deadline_ns).min()
     }
 
     /// Returns the names of the lambdas that may use a session.
@@ -136,5 +151,27 @@ impl LambdaTable {
         let found =
             self.lambdas.iter().filter(|(_, lambda)| lambda.call.as_ref().is_some_and(&is_it));
         found.map(|(id, _)| *id).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_protocol::inference::ModelClient;
+
+    use super::*;
+
+    #[test]
+    fn a_lambda_beyond_the_maximum_is_served_once_another_one_has_left() {
+        let (_lambda, socket) = ModelClient::pair().unwrap();
+        let mut table = LambdaTable::default();
+        for _ in 0..=LAMBDAS {
+            let add = AddClient { name: "many".to_owned(), memory: 0, models: Vec::new() };
+            table.add(add, socket.try_clone().unwrap());
+        }
+        let (first, last) = (LambdaId(1), LambdaId(LAMBDAS as u64 + 1));
+        assert!(table.is_beyond(last) && !table.is_beyond(LambdaId(LAMBDAS as u64)));
+        table.get_mut(first).unwrap().is_gone = true;
+        table.remove_gone();
+        assert!(!table.is_beyond(last));
     }
 }

@@ -4,7 +4,7 @@
 //!   never waits.
 //! - `client`, `lambdas`: a connected lambda, and all of them. `sessions`: models with their
 //!   options, shared by lambdas.
-//! - [`queue`]: the order of runs. [`places`]: checks of requests. Both are pure.
+//! - [`queue`]: the order of runs. `loads`: that of loads. [`places`]: checks of requests.
 //! - `threads`, `loader`, `worker`: the thread that checks and loads models, and the one that runs
 //!   them. `running`: notes for the starter which model is in use, and the limits of time.
 //! - `region`: memory that is shared with a lambda.
@@ -23,6 +23,7 @@ mod engine_error;
 pub mod inspect;
 mod lambdas;
 mod loader;
+mod loads;
 #[cfg(test)]
 #[path = "../tests/suite/onnx.rs"]
 mod onnx;

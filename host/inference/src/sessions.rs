@@ -167,6 +167,8 @@ impl ModelSession {
         LoadedModel {
             sha256: self.key.sha256.clone(),
             path: self.path.clone(),
+            providers: self.key.providers.clone(),
+            threads: self.key.threads,
             lambdas,
             state,
             runtime: runtime.to_owned(),

@@ -27,6 +27,8 @@ pub enum InferenceError {
     #[error("{0}")]
     TooSlow(String),
     #[error("{0}")]
+    Queued(String),
+    #[error("{0}")]
     Failed(String),
     #[error("gleaner-inference has just been started again")]
     Restarted,
@@ -68,7 +70,9 @@ impl InferenceError {
             Self::NoSuchModel(_) => InferenceErrorKind::NoSuchModel,
             Self::WrongInput(_) => InferenceErrorKind::WrongInput,
             // A guest that can be interrupted is ended instead.
-            Self::TooSlow(_) | Self::OutOfTime | Self::OutOfFuel(_) => InferenceErrorKind::TooSlow,
+            Self::TooSlow(_) | Self::Queued(_) | Self::OutOfTime | Self::OutOfFuel(_) => {
+                InferenceErrorKind::TooSlow
+            }
             Self::Failed(_) => InferenceErrorKind::Failed,
         }
     }
@@ -79,6 +83,7 @@ impl InferenceError {
             ModelFaultKind::NoSuchModel => Self::NoSuchModel(message),
             ModelFaultKind::WrongInput => Self::WrongInput(message),
             ModelFaultKind::TooSlow => Self::TooSlow(message),
+            ModelFaultKind::Queued => Self::Queued(message),
             ModelFaultKind::Failed => Self::Failed(message),
         }
     }

@@ -25,6 +25,13 @@ use super::inference::InferenceError;
 /// Time after the deadline for which a reply is awaited.
 const REPLY_TIMEOUT: Duration = Duration::from_millis(20);
 
+/// Longest wait for the loads of other lambdas. One may take minutes, on a GPU.
+const OTHER_LOADS: Duration = Duration::from_secs(600);
+
+/// Most runtimes of all models that are stated, and most characters of one.
+const RUNTIMES: usize = 1024;
+const RUNTIME_MAX: usize = 256;
+
 /// A `[[model]]` of the manifest.
 pub struct ModelEntry {
     /// Its name.
@@ -89,6 +96,8 @@ struct Connection {
     /// The region for outputs.
     outputs: Option<File>,
     opened: Vec<(String, Arc<OpenedModel>)>,
+    /// Name and runtime of all that were opened, each once, also by processes before this one.
+    runtimes: Vec<(String, String)>,
     /// The reason why the process has ended, until the next one has started.
     ended: Option<String>,
 }
@@ -125,6 +134,7 @@ impl Models {
             inputs: None,
             outputs: None,
             opened: Vec::new(),
+            runtimes: Vec::new(),
             ended: None,
         });
         let entries = entries.into_iter().map(Arc::new).collect();
@@ -148,27 +158,28 @@ impl Models {
         self.time.used_ns.load(Ordering::Relaxed)
     }
 
-    /// Opens all models, so that `init` finds them loaded. Errors are kept for the lambda, which
-    /// opens them again. Waits for `timeout` at most.
+    /// Opens all models, so that `init` finds them loaded. Errors are logged; the lambda opens them
+    /// again. A load may take `timeout`, which begins when those of other lambdas are over.
     pub fn open_all(&self, timeout: Duration) {
-        let due = Due::default();
-        due.set(Some(Instant::now() + timeout));
+        let latest = Instant::now() + OTHER_LOADS;
         let mut state = self.lock();
         for entry in state.entries.clone() {
-            if let Err(error) = state.open(&entry.name, &due) {
+            if let Err(error) = state.open_in_turn(&entry.name, timeout, latest) {
                 tracing::warn!(model = entry.name, error = chain(&error), "cannot open the model");
             }
         }
     }
 
-    /// Backend, version, provider and threads of each model, by its name; `none` for one that is
+    /// Backend, version, provider and threads of each model, by its name; `none` for one that was
     /// not loaded.
     pub fn runtimes(&self) -> Vec<String> {
         let state = self.lock();
         let runtime = |entry: &Arc<ModelEntry>| {
-            let opened = state.connection.as_ref().and_then(|it| it.find(&entry.name));
-            let runtime = opened.as_ref().map_or("none", |opened| &opened.runtime);
-            format!("model `{}`: {runtime}", entry.name)
+            let all = state.connection.iter().flat_map(|connection| &connection.runtimes);
+            let ran = all.filter(|(name, _)| *name == entry.name).map(|(_, runtime)| &**runtime);
+            let ran: Vec<&str> = ran.collect();
+            let ran = if ran.is_empty() { "none".to_owned() } else { ran.join(", then ") };
+            format!("model `{}`: {ran}", entry.name)
         };
         state.entries.iter().map(runtime).collect()
     }
@@ -255,6 +266,29 @@ impl Models {
 }
 
 impl ModelsState {
+    /// Opens a model within `timeout`; until `latest`, waits as long again while others are loaded.
+    fn open_in_turn(
+        &mut self,
+        name: &str,
+        timeout: Duration,
+        latest: Instant,
+    ) -> Result<Arc<OpenedModel>, InferenceError> {
+        let due = Due::default();
+        let mut began_late = false;
+        loop {
+            due.set(Some(Instant::now() + timeout));
+            match self.open(name, &due) {
+                Err(InferenceError::Queued(reason)) if Instant::now() < latest => {
+                    tracing::warn!(reason, "a model waits for its load");
+                    began_late = true;
+                }
+                // Its load began within this time, and gets its own.
+                Err(InferenceError::TooSlow(_)) if began_late => began_late = false,
+                result => return result,
+            }
+        }
+    }
+
     fn open(&mut self, name: &str, due: &Due) -> Result<Arc<OpenedModel>, InferenceError> {
         let until = due.at();
         let connection = self.connection.as_mut().ok_or_else(not_connected)?;
@@ -284,7 +318,12 @@ impl ModelsState {
             .map_err(|error| match error {
                 // Before the deadline, the time of the models is over.
                 InferenceError::OutOfTime if due.check().is_ok() => too_slow(),
-                InferenceError::TooSlow(_) if due.check().is_err() => InferenceError::OutOfTime,
+                InferenceError::TooSlow(_) | InferenceError::Queued(_) if due.check().is_err() => {
+                    InferenceError::OutOfTime
+                }
+                InferenceError::TooSlow(state) | InferenceError::Queued(state) => {
+                    InferenceError::TooSlow(format!("{state}: {}", too_slow()))
+                }
                 error => error,
             });
         time.add(match &result {
@@ -314,11 +353,17 @@ impl Connection {
         self.opened.iter().find(|(known, _)| known == name).map(|(_, opened)| Arc::clone(opened))
     }
 
-    /// Returns an error while the process is not running. Without a deadline, waits for the next.
-    fn check_process(&mut self, until: Option<Instant>) -> Result<(), InferenceError> {
+    /// Notes what the starter has sent about the process.
+    fn note_process(&mut self) -> Result<(), InferenceError> {
         while let Some(reply) = self.client.poll().map_err(failed)? {
             self.note(&reply);
         }
+        Ok(())
+    }
+
+    /// Returns an error while the process is not running. Without a deadline, waits for the next.
+    fn check_process(&mut self, until: Option<Instant>) -> Result<(), InferenceError> {
+        self.note_process()?;
         if until.is_none() {
             self.wait_for_process(None)?;
         }
@@ -332,6 +377,7 @@ impl Connection {
 
     /// Waits until the process runs, or until `until`.
     fn wait_for_process(&mut self, until: Option<Instant>) -> Result<(), InferenceError> {
+        self.note_process()?;
         while self.ended.is_some() {
             match self.client.wait_for_starter(until).map_err(failed)? {
                 Some(reply) => self.note(&reply),
@@ -341,16 +387,11 @@ impl Connection {
         Ok(())
     }
 
-    /// Notes the end or the start of the process.
+    /// Notes the end or the start of the process. Its end may not have been sent before its start.
     fn note(&mut self, reply: &ModelReply) {
-        self.ended = match &reply.result {
-            Ok(_) => None,
-            Err(fault) => {
-                (self.inputs, self.outputs) = (None, None);
-                self.opened.clear();
-                Some(fault.message.clone())
-            }
-        };
+        (self.inputs, self.outputs) = (None, None);
+        self.opened.clear();
+        self.ended = reply.result.as_ref().err().map(|fault| fault.message.clone());
     }
 
     fn open(
@@ -373,6 +414,10 @@ impl Connection {
         let ModelResult::Opened { inputs, outputs, runtime } = result else {
             return Err(unexpected());
         };
+        let entry = (name.to_owned(), runtime.chars().take(RUNTIME_MAX).collect());
+        if self.runtimes.len() < RUNTIMES && !self.runtimes.contains(&entry) {
+            self.runtimes.push(entry);
+        }
         let opened = Arc::new(OpenedModel { inputs, outputs, runtime });
         self.opened.push((name.to_owned(), Arc::clone(&opened)));
         Ok(opened)
@@ -469,3 +514,6 @@ fn region_failed(error: io::Error) -> InferenceError {
 fn unexpected() -> InferenceError {
     InferenceError::Unavailable("gleaner-inference sent an invalid reply".to_owned())
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,7 +1,7 @@
 //! Sandboxes the process before the first call into a guest, and arms the shim's deadline for each
 //! call.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use gleaner_base::Failure;
@@ -49,6 +49,8 @@ pub struct SandboxedGuest {
     memory: Option<u64>,
     /// The models that it runs.
     models: Models,
+    /// The engine without them.
+    engine: OnceLock<String>,
     meter: Option<Meter>,
     is_prepared: bool,
     /// Set if the next wake begins with an `init`.
@@ -74,6 +76,7 @@ impl SandboxedGuest {
             meter: None,
             is_prepared: false,
             needs_init: false,
+            engine: OnceLock::new(),
         }
     }
 }
@@ -142,7 +145,8 @@ impl Guest for SandboxedGuest {
     }
 
     fn engine(&self) -> String {
-        let mut parts = vec![self.guest.engine()];
+        // Once, before the lambda's code can run: that of Python calls into the interpreter.
+        let mut parts = vec![self.engine.get_or_init(|| self.guest.engine()).clone()];
         parts.extend(self.models.runtimes());
         parts.join("; ")
     }

@@ -131,7 +131,15 @@ impl LiveEventLoop {
         answers.saturating_add(decisions).saturating_add(self.feed.unsent())
     }
 
+    /// Passes the engine to the recorder: models may have been opened since.
+    pub(super) fn note_engine(&mut self) {
+        if let Some(recorder) = &mut self.recorder {
+            recorder.engine(self.invoker.engine());
+        }
+    }
+
     fn housekeeping(&mut self, now: i64) -> Result<(), Failure> {
+        self.note_engine();
         if let Some(recorder) = &mut self.recorder {
             recorder.poll()?;
         }

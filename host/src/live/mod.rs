@@ -169,6 +169,7 @@ impl LiveRun<'_> {
         let faults = event_loop.watch.faults();
         event_loop.schedule.finish();
         let unsent = event_loop.unsent();
+        event_loop.note_engine();
         let LiveEventLoop { results, watch, inputs, schedule, session, recorder, feed, .. } =
             event_loop;
         let dropped = recorder.map(RecorderSender::leave);

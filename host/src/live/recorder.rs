@@ -23,6 +23,8 @@ const PATIENCE: Duration = Duration::from_secs(10);
 pub(super) struct RecorderSender {
     link: RecorderLink,
     entry_builder: EntryBuilder,
+    /// The engine that was sent.
+    engine: String,
 }
 
 impl RecorderSender {
@@ -34,7 +36,8 @@ impl RecorderSender {
     ) -> Result<Self, Failure> {
         let mut link = RecorderLink::new(socket);
         link.hello(header, READY).map_err(failed)?;
-        Ok(Self { link, entry_builder: EntryBuilder::new(inputs) })
+        let engine = header.engine.clone();
+        Ok(Self { link, entry_builder: EntryBuilder::new(inputs), engine })
     }
 
     /// Notes the state of the inputs; call it before each wake.
@@ -54,7 +57,15 @@ impl RecorderSender {
         self.link.wake(entry, decided_ns).map_err(failed)
     }
 
-    /// Sends waiting wakes; call it regularly.
+    /// Sends the engine with the next wakes if it has changed.
+    pub(super) fn engine(&mut self, engine: String) {
+        if engine != self.engine {
+            self.link.engine(&engine);
+            self.engine = engine;
+        }
+    }
+
+    /// Sends what waits; call it regularly.
     pub(super) fn poll(&mut self) -> Result<(), Failure> {
         self.link.poll().map(drop).map_err(failed)
     }

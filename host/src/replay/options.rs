@@ -8,7 +8,7 @@ use gleaner_drives::{Unpacked, journals_of};
 use gleaner_jail::Paths;
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_protocol::DriveTime;
+use gleaner_protocol::{DriveTime, PASSES_INFERENCE};
 
 use super::journal_file;
 use super::time_range::RequestedRange;
@@ -68,7 +68,7 @@ pub struct VerifyArgs {
     #[arg(long, value_name = "FILE")]
     pub vehicle: Option<PathBuf>,
     /// Standard input is a socket of the starter, which passes the connection to gleaner-inference.
-    #[arg(long, hide = true)]
+    #[arg(long = PASSES_INFERENCE, hide = true)]
     pub starter_passes_inference: bool,
 }
 

@@ -8,7 +8,7 @@ use clap::Args;
 use gleaner_base::{ByteSize, Exit, Failure, PlainFile};
 use gleaner_lambda::manifest::{ConfigSet, ConfigValue, Manifest, ModelSpec, Tightened};
 use gleaner_lambda::{BuildDir, Vehicle};
-use gleaner_protocol::Handover;
+use gleaner_protocol::{Handover, PASSES_INFERENCE};
 use gleaner_vision::DetectorLayout;
 
 use crate::api::models::{ModelEntry, Models};
@@ -32,7 +32,7 @@ pub struct LambdaArgs {
     #[arg(long, value_name = "FILE")]
     pub vehicle: Option<PathBuf>,
     /// Standard input is a socket of the starter, which passes the connection to gleaner-inference.
-    #[arg(long, hide = true)]
+    #[arg(long = PASSES_INFERENCE, hide = true)]
     pub starter_passes_inference: bool,
 }
 

@@ -155,7 +155,8 @@ fn a_lambda_that_keeps_frames_is_refused_the_next_one() {
             // number.
             let fault = test.fault();
             assert_eq!(fault.kind, FaultKind::Exception);
-            let expected = "the lambda holds 3 frames; drop frames that are not needed, or raise `frames` in [limits]";
+            let expected = "the lambda holds 3 frames and tensors; drop frames and tensors that are \
+                            not needed, or raise `frames` in [limits]";
             assert!(fault.message.contains(expected), "{behaviour}: {}", fault.message);
         }
     }

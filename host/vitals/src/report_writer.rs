@@ -3,7 +3,7 @@
 
 use std::fs::File;
 use std::io::{self, Write};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::Builder;
 use std::time::Duration;
@@ -28,8 +28,8 @@ pub struct ReportWriter<T> {
 /// Queues reports without blocking.
 pub struct ReportSender<T> {
     reports: SyncSender<T>,
-    /// Set once a report was dropped for lack of room.
-    has_dropped: AtomicBool,
+    /// Reports without room since the last one that had some.
+    dropped: AtomicU64,
 }
 
 impl<T: Serialize + Send + 'static> ReportWriter<T> {
@@ -50,7 +50,7 @@ impl<T: Serialize + Send + 'static> ReportWriter<T> {
 
     /// Returns a queue to the thread.
     pub fn sender(&self) -> ReportSender<T> {
-        ReportSender { reports: self.reports.clone(), has_dropped: AtomicBool::new(false) }
+        ReportSender { reports: self.reports.clone(), dropped: AtomicU64::new(0) }
     }
 
     /// Waits until all reports are written, once all senders are dropped; not for a starter that
@@ -63,16 +63,27 @@ impl<T: Serialize + Send + 'static> ReportWriter<T> {
 }
 
 impl<T> ReportSender<T> {
-    /// Queues a report. One that finds no room is dropped, which is logged once.
+    /// Queues a report. One that finds no room is dropped; their number is logged once there is
+    /// room again, and at the end.
     pub fn send(&self, report: T) {
         match self.reports.try_send(report) {
-            Ok(()) | Err(TrySendError::Disconnected(_)) => {}
-            Err(TrySendError::Full(_)) => {
-                if !self.has_dropped.swap(true, Ordering::Relaxed) {
-                    warn!("the starter does not read reports: some are dropped");
-                }
-            }
+            Ok(()) => self.log_dropped(),
+            Err(TrySendError::Disconnected(_)) => {}
+            Err(TrySendError::Full(_)) => drop(self.dropped.fetch_add(1, Ordering::Relaxed)),
         }
+    }
+
+    fn log_dropped(&self) {
+        let dropped = self.dropped.swap(0, Ordering::Relaxed);
+        if dropped > 0 {
+            warn!(dropped, "reports dropped: the starter did not read them");
+        }
+    }
+}
+
+impl<T> Drop for ReportSender<T> {
+    fn drop(&mut self) {
+        self.log_dropped();
     }
 }
 
@@ -102,7 +113,7 @@ mod tests {
         let reports = ReportWriter::start(File::from(OwnedFd::from(writer))).unwrap();
         let sender = reports.sender();
         // The pipe holds 64 KiB; the queue is full some time after it is.
-        while !sender.has_dropped.load(Ordering::Relaxed) {
+        while sender.dropped.load(Ordering::Relaxed) < 3 {
             sender.send(IngressReport::Status(Box::default()));
         }
         drop(sender);

@@ -90,6 +90,20 @@ pub const LAYOUTS: &[&str] = &["ultralytics", "yolox", "nms-free", "nanodet"];
 /// Values in `model.providers`.
 pub const PROVIDERS: &[&str] = &["tensorrt", "cuda", "cpu", "onnxruntime", "rten"];
 
+/// `inference.memory` of a vehicle: the memory of the process that runs the models of all lambdas.
+pub const INFERENCE_MEMORY: Bounds<ByteSize> =
+    Bounds { min: ByteSize::mib(256), default: ByteSize::gib(2), max: ByteSize::gib(1024) };
+
+/// `inference.run_max` of a vehicle: the longest run of a model without a deadline.
+pub const RUN_MAX: Bounds<Duration> = Bounds {
+    min: Duration::from_secs(1),
+    default: Duration::from_secs(30),
+    max: Duration::from_secs(3600),
+};
+
+/// `inference.load_max` of a vehicle. A provider that compiles models may need minutes.
+pub const LOAD_MAX: Bounds<Duration> = Bounds { default: Duration::from_secs(120), ..RUN_MAX };
+
 /// Longest accepted manifest. The longest in use has 3 KiB.
 pub const MANIFEST_MAX: ByteSize = ByteSize::mib(1);
 

@@ -140,7 +140,7 @@ limits! {
     // 13 MB at most.
     handles: u64 { min: 16, default: 4096, max: 65_536 }
 
-    /// Frames of all inputs that the lambda holds at a time.
+    /// Frames of all inputs, and tensors, that the lambda holds at a time.
     // Of any origin. Their pixels are limited by `hold`, `decoded_size` and `memory`.
     frames: u64 { min: 1, default: 256, max: 4096 }
 

@@ -42,6 +42,8 @@ use std::path::Path;
 
 use gleaner_base::{NotPlain, PlainFile};
 
+use crate::Vehicle;
+
 /// Name of the manifest file.
 const FILE: &str = "lambda.toml";
 
@@ -78,8 +80,8 @@ impl Manifest {
     }
 }
 
-/// Parses the limits of a vehicle in `text`; limits that it does not name are at their maximum.
-pub(crate) fn vehicle_limits(text: &str, file: &str) -> Result<Limits, ManifestError> {
+/// Parses the configuration of a vehicle in `text`.
+pub(crate) fn vehicle(text: &str, file: &str) -> Result<Vehicle, ManifestError> {
     read_limits::vehicle(&table::Document { text, file })
 }
 

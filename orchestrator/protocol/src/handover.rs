@@ -40,6 +40,10 @@ enum ConnectionName {
     Running,
 }
 
+/// Option of a runtime whose starter passes the connection to `gleaner-inference` this way, without
+/// its dashes.
+pub const PASSES_INFERENCE: &str = "starter-passes-inference";
+
 /// Largest number of connections in a message.
 const CONNECTIONS: usize = 4;
 

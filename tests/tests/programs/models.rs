@@ -15,6 +15,8 @@ const DETECTOR: &str = "examples/yolo-detector/rust";
 
 /// Exit code of a run in which a process failed.
 const INTERNAL: i32 = 1;
+/// Exit code of a file that cannot be used.
+const USAGE: i32 = 2;
 /// Exit code of a lambda that faulted.
 const FAULTED: i32 = 6;
 
@@ -76,6 +78,15 @@ fn files_that_are_no_model_and_wrong_labels_are_refused() {
     let (exit, stderr) = replayed(&lambda);
     assert_eq!(exit, FAULTED, "{stderr}");
     assert!(stderr.contains("it has 80 classes, and its `labels` have 2 lines"), "{stderr}");
+
+    for (labels, cause) in [(b"caf\xe9\n".to_vec(), "UTF-8"), (vec![b'x'; (1 << 20) + 1], "1 MiB")]
+    {
+        lambda.replace("models/coco.txt", labels);
+        let (exit, stderr) = replayed(&lambda);
+        assert_eq!(exit, USAGE, "{stderr}");
+        let message = "cannot read `models/coco.txt`, the labels of model `detector`";
+        assert!(stderr.contains(message) && stderr.contains(cause), "{stderr}");
+    }
 }
 
 #[test]
@@ -122,10 +133,30 @@ fn twins_share_one_model_and_its_results() {
 }
 
 #[test]
+fn a_run_beyond_model_time_fails_with_the_way_out() {
+    let lambda = LambdaCopy::changed_and_named(DETECTOR, "yolo-detector", |manifest| {
+        manifest.replace("model_time = \"400ms\"", "model_time = \"1ms\"")
+    });
+    let out = TempFolder::new();
+    let finished = start(&[&lambda], &out, &["--no-record", "--for", "4"]).finish();
+    assert_eq!(finished.status.code(), Some(FAULTED), "{}", finished.stderr);
+    let decisions = decisions(out.path());
+    let faults: Vec<_> = decisions.iter().filter_map(|it| it.fault.as_ref()).collect();
+    assert!(!faults.is_empty(), "{}", finished.stderr);
+    for fault in faults {
+        let cause = "took longer than the 1ms of `model_time`: raise it in [limits]";
+        assert!(fault.message.contains(cause), "{}", fault.message);
+    }
+}
+
+#[test]
 fn a_killed_process_of_models_is_started_again_and_no_lambda_is_lost() {
     let lambda = detector(|it| it);
     let out = TempFolder::new();
-    let args = ["--set", "classes=car, truck", "--no-record", "--all"];
+    let config = TempFolder::new();
+    let vehicle = config.write("vehicle.toml", "[inference]\nmemory = \"3 GiB\"");
+    let vehicle = vehicle.to_str().expect("a temporary folder has a plain path");
+    let args = ["--set", "classes=car, truck", "--no-record", "--all", "--vehicle", vehicle];
     let started = start(&[&lambda], &out, &args);
     let detects = |times: u32| {
         let mut seen = 0;
@@ -141,6 +172,9 @@ fn a_killed_process_of_models_is_started_again_and_no_lambda_is_lost() {
     for _ in 0..2 {
         detects(3);
         let [before] = process()[..] else { panic!("{:?}", process()) };
+        let command = std::fs::read(format!("/proc/{before}/cmdline")).expect("it runs");
+        let command = String::from_utf8_lossy(&command);
+        assert!(command.contains("--memory\0") && command.contains("3221225472"), "{command}");
         signal(before, "KILL");
         let deadline = Instant::now() + Duration::from_secs(60);
         while matches!(process()[..], [] | [_]) && process().first().is_none_or(|it| *it == before)

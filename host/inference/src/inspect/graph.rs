@@ -1,25 +1,27 @@
 //! Checks graphs with everything in them: nodes, attributes, subgraphs and constants.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashSet};
 
 use super::InspectError;
-use super::wire::{WireField, WireFields};
+use super::wire::{WireField, WireFields, WireValue};
 
 /// Depth to which graphs may be nested. Libraries parse them by recursion.
 const MAX_DEPTH: usize = 16;
 
 /// Fields of `GraphProto`.
-mod graph_field {
-    pub(super) const NODE: u64 = 1;
-    pub(super) const INITIALIZER: u64 = 5;
-    pub(super) const INPUT: u64 = 11;
-    pub(super) const OUTPUT: u64 = 12;
-    pub(super) const VALUE_INFO: u64 = 13;
-    pub(super) const SPARSE_INITIALIZER: u64 = 15;
+pub(super) mod graph_field {
+    pub(in crate::inspect) const NODE: u64 = 1;
+    pub(in crate::inspect) const INITIALIZER: u64 = 5;
+    pub(in crate::inspect) const INPUT: u64 = 11;
+    pub(in crate::inspect) const OUTPUT: u64 = 12;
+    pub(in crate::inspect) const VALUE_INFO: u64 = 13;
+    pub(in crate::inspect) const SPARSE_INITIALIZER: u64 = 15;
 }
 
 /// Fields of `NodeProto`.
 mod node_field {
+    pub(super) const INPUT: u64 = 1;
+    pub(super) const OUTPUT: u64 = 2;
     pub(super) const OPERATOR: u64 = 4;
     pub(super) const ATTRIBUTE: u64 = 5;
     pub(super) const DOMAIN: u64 = 7;
@@ -45,7 +47,9 @@ mod attribute_field {
 
 /// Fields of `TensorProto`.
 mod tensor_field {
+    pub(super) const INT32_DATA: u64 = 5;
     pub(super) const NAME: u64 = 8;
+    pub(super) const RAW_DATA: u64 = 9;
     pub(super) const EXTERNAL_DATA: u64 = 13;
     pub(super) const DATA_LOCATION: u64 = 14;
 }
@@ -55,6 +59,9 @@ const DEFAULT_LOCATION: i64 = 0;
 
 /// Names of the operators in the checked part of a model.
 pub(super) type Operators = BTreeSet<String>;
+
+/// An operator with random results, unless its third input is absent or false.
+const DROPOUT: &str = "Dropout";
 
 /// Operators whose results differ from run to run, so that no decision could be repeated.
 const RANDOM: [&str; 6] = [
@@ -80,10 +87,11 @@ pub(super) fn check_graph(
     if depth > MAX_DEPTH {
         return Err(InspectError::TooDeep { max: MAX_DEPTH });
     }
+    let mut switches = HashSet::new();
     for field in WireFields(graph) {
         let field = field?;
         match field.number {
-            graph_field::NODE => check_node(field.fields()?, depth, operators)?,
+            graph_field::NODE => switches.extend(check_node(field.fields()?, depth, operators)?),
             graph_field::INITIALIZER => check_tensor(field.fields()?)?,
             graph_field::SPARSE_INITIALIZER => check_sparse(field)?,
             graph_field::INPUT | graph_field::OUTPUT | graph_field::VALUE_INFO => {
@@ -92,7 +100,77 @@ pub(super) fn check_graph(
             _ => {}
         }
     }
-    Ok(())
+    check_switches(graph, switches)
+}
+
+/// Checks that values which make an operator random are constant and false.
+fn check_switches(graph: &[u8], switches: HashSet<&str>) -> Result<(), InspectError> {
+    if switches.is_empty() {
+        return Ok(());
+    }
+    let mut constants = HashSet::new();
+    for field in WireFields(graph) {
+        let field = field?;
+        let (name, is_false) = match field.number {
+            graph_field::NODE => constant_node(field.fields()?)?,
+            graph_field::INITIALIZER => constant(field.fields()?)?,
+            _ => continue,
+        };
+        if switches.contains(name) {
+            if !is_false {
+                return Err(random(DROPOUT));
+            }
+            constants.insert(name);
+        }
+    }
+    if constants.len() == switches.len() { Ok(()) } else { Err(random(DROPOUT)) }
+}
+
+/// Returns the output of a node, and whether the node is a constant that is false.
+fn constant_node(node: WireFields<'_>) -> Result<(&str, bool), InspectError> {
+    let (mut output, mut is_constant, mut is_false) = ("", false, false);
+    for field in node {
+        let field = field?;
+        match field.number {
+            node_field::OUTPUT => output = field.text()?,
+            node_field::OPERATOR => is_constant = field.text()? == "Constant",
+            node_field::ATTRIBUTE => {
+                for field in field.fields()? {
+                    let field = field?;
+                    if field.number == attribute_field::TENSOR {
+                        is_false = constant(field.fields()?)?.1;
+                    }
+                }
+            }
+            _ => {}
+        }
+    }
+    Ok((output, is_constant && is_false))
+}
+
+/// Returns the name of a tensor, and whether it has values and all are false.
+fn constant(tensor: WireFields<'_>) -> Result<(&str, bool), InspectError> {
+    let (mut name, mut has_values, mut is_false) = ("", false, true);
+    for field in tensor {
+        let field = field?;
+        match field.number {
+            tensor_field::NAME => name = field.text()?,
+            tensor_field::RAW_DATA | tensor_field::INT32_DATA => {
+                has_values = true;
+                is_false &= match field.value {
+                    WireValue::Varint(value) => value == 0,
+                    WireValue::Bytes(bytes) => bytes.iter().all(|byte| *byte == 0),
+                    WireValue::Fixed => false,
+                };
+            }
+            _ => {}
+        }
+    }
+    Ok((name, has_values && is_false))
+}
+
+fn random(operator: &str) -> InspectError {
+    InspectError::Random { operator: operator.to_owned() }
 }
 
 /// Checks a function of the model, which is a graph without constants.
@@ -103,7 +181,10 @@ pub(super) fn check_functions(
     for field in WireFields(function) {
         let field = field?;
         match field.number {
-            function_field::NODE => check_node(field.fields()?, 0, operators)?,
+            // The caller of a function gives the value.
+            function_field::NODE if check_node(field.fields()?, 0, operators)?.is_some() => {
+                return Err(random(DROPOUT));
+            }
             function_field::ATTRIBUTE => check_attribute(field.fields()?, 0, operators)?,
             _ => {}
         }
@@ -111,15 +192,22 @@ pub(super) fn check_functions(
     Ok(())
 }
 
-fn check_node(
-    node: WireFields<'_>,
+/// Checks a node; returns the value that makes it random if it is not false.
+fn check_node<'a>(
+    node: WireFields<'a>,
     depth: usize,
     operators: &mut Operators,
-) -> Result<(), InspectError> {
-    let (mut domain, mut operator) = ("", "");
+) -> Result<Option<&'a str>, InspectError> {
+    let (mut domain, mut operator, mut inputs, mut third) = ("", "", 0_usize, "");
     for field in node {
         let field = field?;
         match field.number {
+            node_field::INPUT => {
+                inputs += 1;
+                if inputs == 3 {
+                    third = field.text()?;
+                }
+            }
             node_field::OPERATOR => operator = field.text()?,
             node_field::DOMAIN => domain = field.text()?,
             node_field::ATTRIBUTE => check_attribute(field.fields()?, depth, operators)?,
@@ -127,13 +215,13 @@ fn check_node(
         }
     }
     if RANDOM.contains(&operator) {
-        return Err(InspectError::Random { operator: operator.to_owned() });
+        return Err(random(operator));
     }
     if is_standard(domain) {
         if !operators.contains(operator) {
             operators.insert(operator.to_owned());
         }
-        return Ok(());
+        return Ok(Some(third).filter(|name| operator == DROPOUT && !name.is_empty()));
     }
     Err(InspectError::Domain { domain: domain.to_owned(), operator: operator.to_owned() })
 }

@@ -61,8 +61,8 @@ pub enum InspectError {
          data in one file"
     )]
     ExternalData { tensor: String, location: String },
-    #[error("it has {count} {what}; {MAX_TENSORS} are allowed")]
-    TooMany { what: &'static str, count: usize },
+    #[error("it has more than the {MAX_TENSORS} {what} that are allowed")]
+    TooMany { what: &'static str },
     #[error("{what} `{name}` is {found}; a lambda can use tensors of numbers and booleans")]
     NoTensor { what: &'static str, name: String, found: &'static str },
     #[error("{what} `{name}` has elements of type {found}; supported are {}", elements())]

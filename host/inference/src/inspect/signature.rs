@@ -4,6 +4,7 @@ use std::collections::{BTreeSet, HashSet};
 
 use gleaner_protocol::inference::{Element, MAX_DIMENSIONS, TensorInfo};
 
+use super::graph::graph_field;
 use super::wire::{NoMessage, WireField, WireFields};
 use super::{InspectError, MAX_TENSORS};
 
@@ -62,7 +63,10 @@ struct DeclaredValue<'a> {
 #[derive(Default)]
 struct DeclaredTensor {
     element: Option<i64>,
+    /// The first lengths, as many as a tensor may have.
     shape: Option<Vec<i64>>,
+    /// Number of dimensions.
+    dimensions: usize,
 }
 
 impl ModelSignature {
@@ -71,21 +75,30 @@ impl ModelSignature {
         graph: &[u8],
         operators: BTreeSet<String>,
     ) -> Result<ModelSignature, InspectError> {
-        let (mut inputs, mut outputs, mut constants) = (Vec::new(), Vec::new(), HashSet::new());
+        // Constants first: older models declare each as an input, too.
+        let mut constants = HashSet::new();
         for field in WireFields(graph) {
             let field = field?;
-            match field.number {
-                5 => drop(constants.insert(name_of_tensor(field)?)),
-                11 => inputs.push(DeclaredValue::of(field)?),
-                12 => outputs.push(DeclaredValue::of(field)?),
-                _ => {}
+            if field.number == graph_field::INITIALIZER {
+                constants.insert(name_of_tensor(field)?);
             }
         }
-        inputs.retain(|input| !constants.contains(input.name));
-        for (what, count) in [("inputs", inputs.len()), ("outputs", outputs.len())] {
-            if count > MAX_TENSORS {
-                return Err(InspectError::TooMany { what, count });
+        let (mut inputs, mut outputs) = (Vec::new(), Vec::new());
+        for field in WireFields(graph) {
+            let field = field?;
+            let (what, list) = match field.number {
+                graph_field::INPUT => ("inputs", &mut inputs),
+                graph_field::OUTPUT => ("outputs", &mut outputs),
+                _ => continue,
+            };
+            let declared = DeclaredValue::of(field)?;
+            if what == "inputs" && constants.contains(declared.name) {
+                continue;
             }
+            if list.len() == MAX_TENSORS {
+                return Err(InspectError::TooMany { what });
+            }
+            list.push(declared);
         }
         let inputs = inputs.iter().map(|input| {
             let found = input.info("input")?;
@@ -169,8 +182,8 @@ impl<'a> DeclaredValue<'a> {
             return Err(InspectError::Element { what, name: name(), found });
         };
         let lengths = tensor.shape.as_deref().unwrap_or_default();
-        if lengths.len() > MAX_DIMENSIONS {
-            let (found, max) = (lengths.len(), MAX_DIMENSIONS);
+        if tensor.dimensions > MAX_DIMENSIONS {
+            let (found, max) = (tensor.dimensions, MAX_DIMENSIONS);
             return Err(InspectError::Dimensions { what, name: name(), found, max });
         }
         let shape = lengths.iter().enumerate().map(|(dimension, length)| match *length {
@@ -201,7 +214,11 @@ impl DeclaredTensor {
                     for field in field.fields()? {
                         let field = field?;
                         if field.number == 1 {
-                            shape.push(length_of(field.fields()?)?);
+                            let length = length_of(field.fields()?)?;
+                            declared.dimensions += 1;
+                            if declared.dimensions <= MAX_DIMENSIONS {
+                                shape.push(length);
+                            }
                         }
                     }
                 }

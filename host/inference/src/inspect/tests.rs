@@ -179,7 +179,43 @@ fn inputs_that_a_lambda_cannot_give_are_refused_by_name() {
     }
     assert!(refusal(&with_input(value("x", INT64, &[1; 9]))).contains("9 dimensions"));
     let many: Vec<Proto> = (0..257).map(|index| value(&index.to_string(), FLOAT32, &[1])).collect();
-    assert_eq!(refusal(&model(&graph(&[], &[], &many, &[]))), "it has 257 inputs; 256 are allowed");
+    let too_many = "it has more than the 256 inputs that are allowed";
+    assert_eq!(refusal(&model(&graph(&[], &[], &many, &[]))), too_many);
+    // Constants do not count.
+    let constants = (0..300).map(|index| constant(&index.to_string(), FLOAT32, &[1], &[0; 4]));
+    let constants: Vec<Proto> = constants.collect();
+    assert!(inspect(&model(&graph(&[], &constants, &many, &[]))).is_ok());
     let twice = [value("x", FLOAT32, &[1]), value("x", FLOAT32, &[1])];
     assert_eq!(refusal(&model(&graph(&[], &[], &twice, &[]))), "two inputs have the name `x`");
+}
+
+#[test]
+fn dropout_is_refused_unless_it_is_constantly_out_of_training() {
+    let dropout = |inputs: &[&str]| node("Dropout", inputs, &["y"], &[]);
+    let switch = |value: u8| constant("training", BOOL, &[], &[value]);
+    let of = |nodes: &[Proto], constants: &[Proto]| {
+        let output = value("y", FLOAT32, &[1]);
+        let inputs = [value("x", FLOAT32, &[1]), value("training", BOOL, &[])];
+        inspect(&model(&graph(nodes, constants, &inputs, &[output])))
+    };
+    let inputs = ["x", "", "training"];
+    let as_node = |value: u8| {
+        let attribute = Proto::default().text(1, "value").message(5, &switch(value));
+        node("Constant", &[], &["training"], &[attribute])
+    };
+    let listed = Proto::default().number(2, BOOL).text(8, "training").number(5, 0);
+    assert!(of(&[dropout(&["x"])], &[]).is_ok());
+    assert!(of(&[dropout(&["x", "", ""])], &[]).is_ok());
+    assert!(of(&[dropout(&inputs)], &[switch(0)]).is_ok());
+    assert!(of(&[dropout(&inputs)], &[listed]).is_ok());
+    assert!(of(&[as_node(0), dropout(&inputs)], &[]).is_ok());
+    let random = Err(InspectError::Random { operator: "Dropout".to_owned() });
+    assert_eq!(of(&[dropout(&inputs)], &[switch(1)]), random);
+    assert_eq!(of(&[dropout(&inputs)], &[]), random, "a lambda gives it");
+    assert_eq!(of(&[as_node(1), dropout(&inputs)], &[]), random);
+    let empty = Proto::default().number(2, BOOL).text(8, "training");
+    assert_eq!(of(&[dropout(&inputs)], &[empty]), random);
+    let function = Proto::default().text(1, "f").message(7, &dropout(&inputs));
+    let with_function = Proto(unary("Relu", FLOAT32, &[1])).message(25, &function).0;
+    assert_eq!(inspect(&with_function), random);
 }

@@ -16,8 +16,8 @@ use gleaner_base::{Exit, Failure};
 use gleaner_jail::{Paths, inference as sandbox, memory};
 use gleaner_protocol::Handover;
 use gleaner_protocol::inference::InferenceServer;
-use gleaner_vitals::ReportWriter;
 use gleaner_vitals::start::{reports, stop_socket};
+use gleaner_vitals::{ReportWriter, log};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use tracing::{debug, warn};
 
@@ -31,11 +31,11 @@ use args::Args;
 
 /// Runs the program `gleaner-inference`.
 pub fn main() -> ExitCode {
-    gleaner_vitals::log::init();
+    log::init_service();
     match start(&Args::parse()) {
         Ok(()) => Exit::Ok.into(),
         Err(failure) => {
-            eprintln!("{failure}");
+            log::failure(&failure);
             failure.exit.into()
         }
     }

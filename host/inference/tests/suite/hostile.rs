@@ -183,3 +183,35 @@ fn a_lambda_cannot_change_the_size_of_its_region() {
         assert!(region.set_len(size).is_err(), "{size}");
     }
 }
+
+#[test]
+fn log_lines_that_are_not_read_delay_nothing_and_are_counted() {
+    let mut program = ModelProgram::start(&[]);
+    // Each makes a log line with its name; the pipe of standard error holds 64 KiB.
+    let breaks_the_protocol = |index: usize| {
+        let (lambda, other) = ModelClient::pair().unwrap();
+        program.add(&format!("{index}-{}", "x".repeat(4000)), &[], &other);
+        drop(other);
+        send(&lambda, b"{}", SendFlags::empty()).unwrap();
+        is_closed(&lambda);
+    };
+    (0..40).for_each(breaks_the_protocol);
+    serves(&program);
+    let unread = program.unread_log();
+    assert!(unread.contains("connection to a lambda closed"), "{unread}");
+    breaks_the_protocol(40);
+    drop(program.control.take());
+    let (status, log) = program.end();
+    assert!(status.success(), "{status} {log}");
+    assert!(log.contains("standard error was not read dropped="), "{log}");
+}
+
+#[test]
+fn calls_of_a_lambda_beyond_the_maximum_fail_with_the_reason() {
+    let program = ModelProgram::start(&[]);
+    let (_first, socket) = ModelClient::pair().unwrap();
+    (0..512).for_each(|_| program.add("one of many", &[], &socket));
+    let mut last = program.lambda("last", &models()[..1]);
+    let message = fault(ModelFaultKind::Unavailable, last.open("product"));
+    assert!(message.contains("serves 512 lambdas, and this one came later"), "{message}");
+}

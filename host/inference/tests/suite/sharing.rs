@@ -1,17 +1,25 @@
 //! Lambdas share models, runs and the order of runs.
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use gleaner_protocol::inference::{ModelCall, ModelFaultKind, ModelWait};
 
 use crate::onnx::{ANY, FLOAT32, endless, graph, model, node, product, unary, value};
-use crate::support::{ModelProgram, TestModel, fault, floats, granted};
+use crate::support::{
+    ModelProgram, ModelUser, TestModel, fault, floats, granted, in_future, wait_for,
+};
 
-/// A model that takes some ms: products of large matrices.
+/// A model that takes some ms.
 fn slow() -> TestModel {
+    slow_of(8)
+}
+
+/// A model that takes some ms for 8 products of large matrices.
+fn slow_of(products: usize) -> TestModel {
     let size = 400;
-    let nodes: Vec<_> = (0..8)
+    let last = format!("v{products}");
+    let nodes: Vec<_> = (0..products)
         .map(|index| {
             let (from, to) = (format!("v{index}"), format!("v{}", index + 1));
             node("MatMul", &[&from, &from], &[&to], &[])
@@ -23,7 +31,7 @@ fn slow() -> TestModel {
             &nodes,
             &[],
             &[value("v0", FLOAT32, &[size, size])],
-            &[value("v8", FLOAT32, &[size, size])],
+            &[value(&last, FLOAT32, &[size, size])],
         )),
     )
 }
@@ -130,4 +138,41 @@ fn a_request_that_comes_after_its_deadline_is_not_run() {
     fault(ModelFaultKind::TooSlow, reply.result);
     let last = program.stop();
     assert_eq!((last.models[0].runs, last.models[0].failed), (0, 1));
+}
+
+#[test]
+fn a_model_waits_for_the_load_of_another_one_which_its_error_names() {
+    let program = ModelProgram::start(&[]);
+    let endless = granted("endless", endless(&[1]));
+    let mut stuck = program.lambda("stuck", std::slice::from_ref(&endless));
+    // It is sent, and its reply is not awaited.
+    let call = ModelCall::Open { model: "endless".to_owned() };
+    stuck.client.call(call, None, Some(Instant::now())).unwrap();
+    wait_for(|| program.in_use()[0].clone());
+    let mut other = program.lambda("other", &[granted("relu", unary("Relu", FLOAT32, &[1]))]);
+    let late = other.open_until("relu", Some(Duration::from_millis(200)));
+    assert_eq!(
+        fault(ModelFaultKind::Queued, late),
+        "model `relu` waits for the load of `endless.onnx` of lambda `stuck` at the deadline"
+    );
+}
+
+#[test]
+fn the_model_with_the_earliest_deadline_is_loaded_first() {
+    let program = ModelProgram::start(&[]);
+    // Its load lasts until the other calls have arrived.
+    let mut slow = program.lambda("slow", &[slow_of(200)]);
+    let mut patient = program.lambda("patient", &[granted("abs", unary("Abs", FLOAT32, &[1]))]);
+    let mut urgent = program.lambda("urgent", &[granted("relu", unary("Relu", FLOAT32, &[1]))]);
+    let send = |lambda: &mut ModelUser, model: &str, seconds| {
+        let call = ModelCall::Open { model: model.to_owned() };
+        let deadline = Some(in_future(Duration::from_secs(seconds)));
+        lambda.client.call(call, deadline, Some(Instant::now())).unwrap();
+    };
+    send(&mut slow, "slow", 600);
+    wait_for(|| program.in_use()[0].clone());
+    send(&mut patient, "abs", 500);
+    send(&mut urgent, "relu", 400);
+    let order = [(); 3].map(|()| program.loaded().path);
+    assert_eq!(order, ["slow.onnx", "relu.onnx", "abs.onnx"]);
 }

@@ -147,6 +147,13 @@ impl ModelProgram {
         })
     }
 
+    /// Returns what its pipe of standard error holds.
+    pub fn unread_log(&self) -> String {
+        let mut text = vec![0; 64 << 10];
+        let read = rustix::io::read(self.child.stderr.as_ref().unwrap(), &mut text).unwrap();
+        String::from_utf8_lossy(&text[..read]).into_owned()
+    }
+
     /// Waits for the end; returns the exit status and standard error.
     pub fn end(&mut self) -> (ExitStatus, String) {
         let status = wait_for(|| self.child.try_wait().unwrap());

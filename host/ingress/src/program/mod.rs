@@ -19,8 +19,8 @@ use gleaner_jail::ingress as sandbox;
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::IngressServer;
 use gleaner_regions::TopicRegion;
-use gleaner_vitals::ReportWriter;
 use gleaner_vitals::start::{reports, stop_socket};
+use gleaner_vitals::{ReportWriter, log};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use tracing::debug;
 
@@ -30,7 +30,7 @@ use topics::TopicsArgs;
 
 /// Runs the program `gleaner-ingress`.
 pub fn main() -> ExitCode {
-    gleaner_vitals::log::init();
+    log::init_service();
     let mut args = Args::parse();
     let ended = match args.command.take() {
         Some(IngressCommand::Topics(topics)) => list_topics(topics),
@@ -39,7 +39,7 @@ pub fn main() -> ExitCode {
     match ended {
         Ok(()) => Exit::Ok.into(),
         Err(failure) => {
-            eprintln!("{failure}");
+            log::failure(&failure);
             failure.exit.into()
         }
     }

@@ -58,6 +58,8 @@ pub enum LambdaEvent {
         missing: u32,
         encoded: Vec<u8>,
     },
+    /// The engine, in place of that in the header.
+    Engine(String),
     /// The connection is closed.
     Closed(Option<LinkError>),
 }
@@ -138,6 +140,7 @@ fn read_link(
             Ok(Some(LambdaMessage::Wake { entry, decided_ns, missing, encoded })) => {
                 LambdaEvent::Wake { entry, decided_ns, missing, encoded }
             }
+            Ok(Some(LambdaMessage::Engine(engine))) => LambdaEvent::Engine(engine),
             Ok(Some(LambdaMessage::Bye) | None) => LambdaEvent::Closed(None),
             Err(error) => LambdaEvent::Closed(Some(error)),
         };

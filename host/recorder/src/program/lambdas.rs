@@ -144,6 +144,11 @@ impl ConnectedLambda {
                         self.replies.opened(u64::try_from(wait_ns).unwrap_or(0));
                     }
                 }
+                LambdaEvent::Engine(engine) => {
+                    if let Some(id) = self.id {
+                        recorder.set_engine(id, engine);
+                    }
+                }
                 LambdaEvent::Closed(why) => {
                     if let Some(why) = why {
                         let error = &why as &dyn std::error::Error;

@@ -41,6 +41,7 @@ use gleaner_messages::Sources;
 use gleaner_protocol::Handover;
 use gleaner_protocol::link::LinkError;
 use gleaner_transport::Clock;
+use gleaner_vitals::log;
 use gleaner_vitals::start::{reports, stop_flag};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use tracing::debug;
@@ -84,11 +85,11 @@ pub struct RecorderConnections {
 
 /// Runs the program `gleaner-recorder`.
 pub fn main() -> ExitCode {
-    gleaner_vitals::log::init();
+    log::init_service();
     match start(Args::parse()) {
         Ok(()) => Exit::Ok.into(),
         Err(failure) => {
-            eprintln!("{failure}");
+            log::failure(&failure);
             failure.exit.into()
         }
     }

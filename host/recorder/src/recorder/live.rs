@@ -148,6 +148,11 @@ impl Recorder {
         Ok(commanded)
     }
 
+    /// Replaces the engine of a lambda. Clips that end later state it.
+    pub fn set_engine(&mut self, lambda: LambdaId, engine: String) {
+        self.material.sources.set_engine(lambda.index(), engine);
+    }
+
     /// Ends a lambda, and the recordings that it started and did not stop.
     ///
     /// # Errors

@@ -175,6 +175,11 @@ impl RecordedSources {
         &self.lambdas[lambda].header
     }
 
+    /// Replaces the engine in the header of a lambda.
+    pub fn set_engine(&mut self, lambda: usize, engine: String) {
+        Arc::make_mut(&mut self.lambdas[lambda].header).engine = engine;
+    }
+
     pub fn name(&self, lambda: usize) -> &str {
         &self.lambdas[lambda].header.lambda
     }

@@ -85,6 +85,7 @@ fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
     );
     drive(&mut recorder, &[a], (0, 100, 10), &[]);
     (100..300).for_each(|ms| wake(&mut recorder, lambda, ms));
+    recorder.set_engine(lambda, "Python; model `m`: rten".to_owned());
     recorder.finish(T0 + S).unwrap();
     let clip = &recorder.clips()[0];
     assert_eq!((clip.triggers, clip.moments.len()), (200, Clip::MOMENTS_MAX));
@@ -94,7 +95,7 @@ fn a_clip_lists_as_many_moments_as_it_may_and_counts_all() {
         records.iter().find(|(name, _)| name == "gleaner.lambda").map(|(_, of)| of).unwrap();
     let stated = ["name", "engine", "gleaner", "config", "models", "digest", "windows"]
         .map(|key| lambda[key].as_str());
-    assert_eq!(stated, ["hello", "Python", "0.1.0", "{}", "", "d1e5", "200"]);
+    assert_eq!(stated, ["hello", "Python; model `m`: rten", "0.1.0", "{}", "", "d1e5", "200"]);
     assert_eq!(RecorderLimits::default().moments, 10_000);
 }
 

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure, each_piece};
 use gleaner_parts::Parts;
-use gleaner_protocol::ExitRecord;
+use gleaner_protocol::{ExitRecord, PASSES_INFERENCE};
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::ioctl_fionbio;
 use rustix::process::{Pid, Signal, kill_process};
@@ -18,9 +18,6 @@ use super::{MESSAGE_MAX, WorkerMessage};
 
 /// The argument that makes `gleaner-runtime` a worker; it comes first.
 pub const WORKER: &str = "--worker";
-
-/// The argument of a runtime whose starter passes a connection over standard input.
-const PASSES_INFERENCE: &str = "--starter-passes-inference";
 
 /// Time after SIGTERM until a worker is killed. Its standard error may take as long.
 const UNTIL_KILLED: Duration = Duration::from_secs(2);
@@ -117,7 +114,8 @@ impl WorkerProcess {
         command.arg(runtime).arg(WORKER).args(arguments).args(std::env::args_os().skip(1));
         // A starter that passes a connection to models passes it to this worker, over the standard
         // input that it shares with this process.
-        let passes = std::env::args_os().any(|argument| argument == PASSES_INFERENCE);
+        let passing = format!("--{PASSES_INFERENCE}");
+        let passes = std::env::args_os().any(|argument| argument == *passing);
         command
             .stdin(if passes { Stdio::inherit() } else { Stdio::null() })
             .stdout(Stdio::piped())

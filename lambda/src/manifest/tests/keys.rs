@@ -228,3 +228,23 @@ fn words_outside_of_a_choice_are_refused() {
         "write `auto`",
     );
 }
+
+#[test]
+fn models_have_known_layouts_providers_and_digests() {
+    let model = |more: &str| {
+        let digest = "0".repeat(64);
+        format!("[[model]]\nname = \"m\"\nfile = \"m.onnx\"\nsha256 = \"{digest}\"\n{more}")
+    };
+    refused_below(
+        &model("layout = \"yolov3\""),
+        "lambda.toml, line 12: `model.layout` is `yolov3`, not `ultralytics`, `yolox`, `nms-free` \
+         or `nanodet`",
+        "did you mean `yolox`?",
+    );
+    refused_below(
+        &model("providers = [\"cpu\", \"gpu\"]"),
+        "lambda.toml, line 12: `model.providers` is `gpu`, not `tensorrt`, `cuda`, `cpu`, \
+         `onnxruntime` or `rten`",
+        "did you mean `cpu`?",
+    );
+}

@@ -101,6 +101,8 @@ pub enum ModelFaultKind {
     WrongInput,
     /// The deadline passed before the result.
     TooSlow,
+    /// The deadline passed before the load began, as other models were loaded.
+    Queued,
     /// The model cannot be loaded, or its run failed.
     Failed,
 }

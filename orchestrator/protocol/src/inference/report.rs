@@ -23,6 +23,10 @@ pub struct LoadedModel {
     pub sha256: String,
     /// Its path in the build of a lambda.
     pub path: String,
+    /// Execution providers in order of preference; empty for any.
+    pub providers: Vec<String>,
+    /// Threads of one run.
+    pub threads: u32,
     /// Names of the lambdas that may use it.
     pub lambdas: Vec<String>,
     /// Its state.

@@ -10,6 +10,7 @@ use rustix::net::{RecvFlags, SendFlags, recv, send};
 
 use super::LinkError;
 use super::frame::{self, HEAD, tag};
+use super::outgoing::FrameQueue;
 use super::queue::Queue;
 use crate::LinkLosses;
 use gleaner_journal::{Encoder, JournalEntry, JournalHeader};
@@ -48,6 +49,8 @@ pub struct RecorderLink {
     encoder: OpaqueEncoder,
     frame: Vec<u8>,
     queue: Queue,
+    /// Engines that are not sent yet.
+    engines: FrameQueue,
     /// Frames sent together. They are copied, as sending slices needs `sendmsg`, which can also
     /// send files and is forbidden to a lambda's process.
     batch: Vec<u8>,
@@ -72,6 +75,7 @@ impl RecorderLink {
             encoder: OpaqueEncoder(Encoder::new(0)),
             frame: Vec::new(),
             queue: Queue::new(QUEUE_BYTES),
+            engines: FrameQueue::default(),
             batch: Vec::new(),
             received: Vec::new(),
         }
@@ -157,6 +161,11 @@ impl RecorderLink {
         if is_urgent { self.flush() } else { Ok(()) }
     }
 
+    /// Queues a new engine, in place of that in the header. Wakes may overtake it.
+    pub fn engine(&mut self, engine: &str) {
+        self.engines.push(frame::encode(tag::ENGINE, engine.as_bytes()), None);
+    }
+
     /// Sends queued wakes, and returns received messages.
     ///
     /// # Errors
@@ -183,6 +192,11 @@ impl RecorderLink {
     /// Sends queued wakes and the end of the connection, up to `timeout`. Returns the losses.
     pub fn bye(mut self, timeout: Duration) -> LinkLosses {
         let until = Instant::now() + timeout;
+        let (is_begun, engines) = (self.engines.is_begun(), self.engines.take_rest());
+        if is_begun && self.send_until(&engines, until, timeout).is_err() {
+            self.queue.drop_all();
+            return self.dropped();
+        }
         while let Some(next) = self.queue.next().map(<[u8]>::to_vec) {
             if self.send_until(&next, until, timeout).is_err() {
                 self.queue.drop_all();
@@ -190,11 +204,19 @@ impl RecorderLink {
             }
             self.queue.sent(next.len());
         }
-        let _ = self.send_until(&frame::encode(tag::BYE, &[]), until, timeout);
+        let mut last = if is_begun { Vec::new() } else { engines };
+        last.extend(frame::encode(tag::BYE, &[]));
+        let _ = self.send_until(&last, until, timeout);
         self.dropped()
     }
 
     fn flush(&mut self) -> Result<(), LinkError> {
+        if self.engines.is_begun() {
+            self.engines.flush(&self.socket, RECORDER)?;
+            if self.engines.is_begun() {
+                return Ok(());
+            }
+        }
         while self.queue.bytes() > 0 {
             self.queue.next_batch(&mut self.batch);
             match send(&self.socket, &self.batch, SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
@@ -204,7 +226,7 @@ impl RecorderLink {
                 Err(error) => return Err(LinkError::of(RECORDER, error)),
             }
         }
-        Ok(())
+        self.engines.flush(&self.socket, RECORDER)
     }
 
     fn send_until(

@@ -36,6 +36,8 @@ pub(crate) mod tag {
     pub(crate) const WAKE: u8 = 17;
     /// Lambda to recorder: the end of the connection.
     pub(crate) const BYE: u8 = 18;
+    /// Lambda to recorder: the engine, as text, in place of that in the header.
+    pub(crate) const ENGINE: u8 = 19;
     /// Recorder to lambda: it is accepted.
     pub(crate) const READY: u8 = 32;
     /// Recorder to lambda: it is refused; the reason as text.
@@ -58,6 +60,7 @@ pub(crate) fn name(tag: u8) -> &'static str {
         tag::HELLO => "hello",
         tag::WAKE => "wake",
         tag::BYE => "bye",
+        tag::ENGINE => "engine",
         tag::READY => "ready",
         tag::REFUSED => "refused",
         tag::OPENED => "opened",

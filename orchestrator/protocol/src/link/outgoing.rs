@@ -124,6 +124,21 @@ impl FrameQueue {
         Ok(())
     }
 
+    /// Returns true if a frame is sent in part: nothing else may be sent before its rest.
+    pub(crate) fn is_begun(&self) -> bool {
+        self.sent > 0
+    }
+
+    /// Returns the bytes that are not sent, without descriptors, and drops the frames.
+    pub(crate) fn take_rest(&mut self) -> Vec<u8> {
+        let mut rest = Vec::new();
+        for frame in std::mem::take(&mut self.frames) {
+            rest.extend_from_slice(&frame.bytes[std::mem::take(&mut self.sent)..]);
+        }
+        self.bytes = 0;
+        rest
+    }
+
     /// Returns true if all frames are sent.
     pub(crate) fn is_empty(&self) -> bool {
         self.frames.is_empty()

@@ -30,6 +30,8 @@ pub enum LambdaMessage {
         /// to `entry`, and nothing follows it.
         encoded: Vec<u8>,
     },
+    /// The engine, in place of that in the header.
+    Engine(String),
     /// The end of the connection.
     Bye,
 }
@@ -112,11 +114,15 @@ impl LambdaLink {
                     encoded: encoded.to_vec(),
                 }))
             }
+            (tag::ENGINE, Some(_)) => match std::str::from_utf8(&self.payload) {
+                Ok(engine) => Ok(Some(LambdaMessage::Engine(engine.to_owned()))),
+                Err(error) => Err(malformed("engine", error.to_string())),
+            },
             (tag::BYE, Some(_)) => Ok(Some(LambdaMessage::Bye)),
             (tag::HELLO, Some(_)) => {
                 Err(LinkError::Unexpected { peer: LAMBDA, frame: "hello", expected: "wake" })
             }
-            (tag::WAKE | tag::BYE, None) => Err(LinkError::Unexpected {
+            (tag::WAKE | tag::ENGINE | tag::BYE, None) => Err(LinkError::Unexpected {
                 peer: LAMBDA,
                 frame: frame::name(tag),
                 expected: "hello",

@@ -114,6 +114,38 @@ fn a_recorder_that_has_ended_is_an_error_not_a_signal() {
 }
 
 #[test]
+fn new_engines_arrive_whole_between_wakes() {
+    let (mut lambda, mut link, mut replies) = connected();
+    let recorder = thread::spawn(move || {
+        assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
+        replies.ready();
+        let (mut wakes, mut engines) = (Vec::new(), Vec::new());
+        loop {
+            match link.receive().unwrap() {
+                Some(LambdaMessage::Wake { entry, .. }) => wakes.push(entry.at_ns),
+                Some(LambdaMessage::Engine(engine)) => engines.push(engine),
+                Some(LambdaMessage::Bye) => return (wakes, engines),
+                other => panic!("{other:?}"),
+            }
+        }
+    });
+    lambda.hello(&header("hello"), TIMEOUT).unwrap();
+    lambda.wake(&entry(1, None), 0).unwrap();
+    lambda.engine("rten");
+    lambda.wake(&entry(2, Some("here")), 0).unwrap();
+    // More than the socket takes at once.
+    let long = "x".repeat(1 << 20);
+    lambda.engine(&long);
+    lambda.poll().unwrap();
+    lambda.wake(&entry(3, None), 0).unwrap();
+    lambda.engine("onnxruntime");
+    lambda.bye(TIMEOUT);
+    let (wakes, engines) = recorder.join().unwrap();
+    assert_eq!(wakes, [1, 2, 3]);
+    assert!(engines == ["rten", &long, "onnxruntime"]);
+}
+
+#[test]
 fn wakes_arrive_as_they_were_sent() {
     let (mut lambda, mut link, mut replies) = connected();
     let recorder = thread::spawn(move || {

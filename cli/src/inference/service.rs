@@ -1,5 +1,4 @@
-//! Supervises `gleaner-inference`, the process that runs the models of all lambdas of a run or of a
-//! replay: starts it, connects lambdas to it, and starts it again after it has ended.
+//! Starts the process, connects lambdas to it, and starts it again after it has ended.
 //!
 //! The socket of a lambda outlives the process: the next one uses the same. A model that was
 //! loading or running at several ends of the process is not loaded again.
@@ -19,25 +18,23 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure, PlainFile, chain};
-use gleaner_lambda::BuildDir;
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::{Manifest, ModelSpec};
+use gleaner_lambda::{BuildDir, InferenceLimits};
 use gleaner_parts::Parts;
 use gleaner_protocol::inference::{
-    AddClient, GrantedModel, InferenceControl, InferenceReport, ModelClient, ModelFile,
-    report_state,
+    AddClient, GrantedModel, InferenceControl, ModelClient, ModelFile,
 };
 use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::Signal;
 
+use super::client::{Client, ProcessState};
+use super::totals::ModelTotals;
+use super::{INFERENCE, InferenceEvent};
 use crate::restart_delay::RestartDelay;
 use crate::runtime::{next_report, pass_on};
-
-/// Program and name of the process.
-const INFERENCE: &str = "gleaner-inference";
 
 /// Number of ends of the process that a model may cause before it is refused.
 const ENDS_MAX: u32 = 3;
@@ -51,18 +48,6 @@ const HEALTHY: Duration = Duration::from_secs(60);
 
 /// Interval of looks at the process.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
-
-/// An event of the process, for the user.
-pub(crate) enum InferenceEvent {
-    /// One of its reports.
-    Report(InferenceReport),
-    /// A piece of its standard error.
-    Stderr(Vec<u8>),
-    /// It has ended without a request, for this reason, and is started again after the delay.
-    Ended(String, Duration),
-    /// Something else went wrong.
-    Warning(String),
-}
 
 /// Receives events, in any thread.
 type Events = Arc<dyn Fn(InferenceEvent) + Send + Sync>;
@@ -91,13 +76,6 @@ struct ServiceState {
     stops: bool,
 }
 
-/// A lambda's process.
-struct Client {
-    add: AddClient,
-    /// The end of `gleaner-inference` of its connection.
-    socket: OwnedFd,
-}
-
 impl InferenceService {
     /// Starts the process.
     ///
@@ -106,6 +84,7 @@ impl InferenceService {
     /// A failure if it cannot be started.
     pub(crate) fn start(
         parts: &Parts,
+        limits: &InferenceLimits,
         events: impl Fn(InferenceEvent) + Send + Sync + 'static,
     ) -> Result<InferenceService, Failure> {
         let program = parts.program(INFERENCE)?;
@@ -115,8 +94,15 @@ impl InferenceService {
         let running = memfd_create("gleaner-running", MemfdFlags::CLOEXEC);
         let running = File::from(running.map_err(|error| failed(&error))?);
         let shared = Arc::new(Shared::default());
-        let mut supervisor =
-            Supervisor { program, shared: Arc::clone(&shared), running, events: Arc::new(events) };
+        let (events, totals) = (Arc::new(events), Arc::default());
+        let mut supervisor = Supervisor {
+            program,
+            limits: *limits,
+            shared: Arc::clone(&shared),
+            running,
+            events,
+            totals,
+        };
         let child = supervisor.start().map_err(|error| failed(&*error))?;
         let supervisor = thread::Builder::new()
             .name("inference".to_owned())
@@ -153,9 +139,9 @@ impl InferenceService {
             }
         }
         let memory = manifest.limits.memory.bytes();
-        let client = Client { add: AddClient { name: name.to_owned(), memory, models }, socket };
+        let client = Client::new(AddClient { name: name.to_owned(), memory, models }, socket);
         // Processes that have ended, such as the one before this, leave their socket here.
-        state.clients.retain(|client| !has_ended(&client.socket));
+        state.clients.retain(|client| !client.has_ended());
         state.pass_client(&client);
         state.clients.push(client);
         Ok(lambda_end)
@@ -191,6 +177,21 @@ impl Drop for InferenceService {
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, ServiceState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Waits for `delay`; returns early, and true, if the service is to end.
+    fn stops_within(&self, delay: Duration) -> bool {
+        let until = Instant::now() + delay;
+        let mut state = self.lock();
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            if state.stops || left.is_zero() {
+                return state.stops;
+            }
+            let step = if state.send_states() { POLL_INTERVAL.min(left) } else { left };
+            let waited = self.stops.wait_timeout(state, step);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
     }
 }
 
@@ -231,23 +232,30 @@ impl ServiceState {
             (std::mem::take(&mut self.models), std::mem::take(&mut self.clients));
         models.iter().for_each(|(model, file)| self.pass_model(model, file));
         self.models = models;
-        for client in clients {
-            // It fails if the lambda's process has ended.
-            if report_state(&client.socket, None).is_ok() {
+        for mut client in clients {
+            if client.report(ProcessState::Started) {
                 self.pass_client(&client);
                 self.clients.push(client);
             }
         }
+    }
+
+    /// Sends the states that had no room; returns whether one still has none.
+    fn send_states(&mut self) -> bool {
+        self.clients.retain_mut(Client::send_state);
+        self.clients.iter().any(Client::has_unsent)
     }
 }
 
 /// The thread that starts the process and waits for its end.
 struct Supervisor {
     program: PathBuf,
+    limits: InferenceLimits,
     shared: Arc<Shared>,
     /// The file in which the process notes the digests of models that it loads and runs.
     running: File,
     events: Events,
+    totals: Arc<Mutex<ModelTotals>>,
 }
 
 type StartError = Box<dyn std::error::Error + Send + Sync>;
@@ -279,7 +287,8 @@ impl Supervisor {
                 Some((_, what)) => format!("{reason}, {what}"),
                 None => reason,
             };
-            state.clients.retain(|client| report_state(&client.socket, Some(&reason)).is_ok());
+            let ended = || ProcessState::Ended(reason.clone());
+            state.clients.retain_mut(|client| client.report(ended()));
             if started.elapsed() >= HEALTHY {
                 state.ends.retain(|digest, _| blamed.as_ref().is_some_and(|it| it.0 == *digest));
             }
@@ -287,9 +296,7 @@ impl Supervisor {
             let delay = delay.after(started.elapsed());
             // Not under the lock: the receiver may add a lambda before it reads this.
             (self.events)(InferenceEvent::Ended(reason, delay));
-            let state = self.shared.lock();
-            let waited = self.shared.stops.wait_timeout_while(state, delay, |state| !state.stops);
-            if waited.unwrap_or_else(PoisonError::into_inner).0.stops {
+            if self.shared.stops_within(delay) {
                 return;
             }
             match self.start() {
@@ -308,7 +315,11 @@ impl Supervisor {
         let (handover, stdin) = UnixStream::pair()?;
         let running = Some(self.running.try_clone()?.into());
         Handover { control: Some(process_end), running, ..Handover::default() }.send(&handover)?;
+        let InferenceLimits { memory, run_max, load_max } = self.limits;
         let child = Command::new(&self.program)
+            .args(["--memory".to_owned(), memory.bytes().to_string()])
+            .args(["--run-max".to_owned(), run_max.as_secs_f64().to_string()])
+            .args(["--load-max".to_owned(), load_max.as_secs_f64().to_string()])
             // Only `gleaner` receives Ctrl-C, and ends its processes in order.
             .process_group(0)
             .stdin(OwnedFd::from(stdin))
@@ -318,8 +329,8 @@ impl Supervisor {
         let mut process = Process { child, _handover: handover, readers: Vec::new() };
         let reader = || thread::Builder::new().name("inference output".to_owned());
         if let Some(reports) = process.child.stdout.take() {
-            let events = Arc::clone(&self.events);
-            process.readers.push(reader().spawn(move || follow(reports, &events))?);
+            let (events, totals) = (Arc::clone(&self.events), Arc::clone(&self.totals));
+            process.readers.push(reader().spawn(move || follow(reports, &events, &totals))?);
         }
         if let Some(stderr) = process.child.stderr.take() {
             let events = Arc::clone(&self.events);
@@ -347,7 +358,8 @@ impl Supervisor {
                 Ok(None) => {}
                 Err(error) => break Err(format!("cannot wait for {INFERENCE}: {error}")),
             }
-            let state = self.shared.lock();
+            let mut state = self.shared.lock();
+            state.send_states();
             if state.stops {
                 requested.get_or_insert_with(Instant::now);
             }
@@ -362,6 +374,7 @@ impl Supervisor {
         for reader in std::mem::take(&mut process.readers) {
             let _ = reader.join();
         }
+        self.totals.lock().unwrap_or_else(PoisonError::into_inner).end_process();
         status
     }
 
@@ -400,12 +413,15 @@ impl Drop for Process {
     }
 }
 
-fn follow(reports: impl Read, events: &Events) {
+fn follow(reports: impl Read, events: &Events, totals: &Mutex<ModelTotals>) {
     let mut reports = BufReader::new(reports);
     let mut line = Vec::new();
     while next_report(&mut reports, &mut line).unwrap_or(false) {
         match serde_json::from_slice(&line) {
-            Ok(report) => events(InferenceEvent::Report(report)),
+            Ok(mut report) => {
+                totals.lock().unwrap_or_else(PoisonError::into_inner).add_to(&mut report);
+                events(InferenceEvent::Report(report));
+            }
             Err(error) => {
                 let text = format!("cannot parse a report of {INFERENCE}: {error}");
                 events(InferenceEvent::Warning(text));
@@ -418,13 +434,6 @@ fn follow(reports: impl Read, events: &Events) {
 fn was_killed(status: ExitStatus) -> bool {
     let signal = status.signal().and_then(Signal::from_named_raw);
     matches!(signal, Some(Signal::KILL | Signal::TERM | Signal::INT | Signal::HUP))
-}
-
-/// Returns whether the lambda's process has closed its end of the connection.
-fn has_ended(socket: &OwnedFd) -> bool {
-    let mut polled = [PollFd::new(socket, PollFlags::empty())];
-    let now = Timespec { tv_sec: 0, tv_nsec: 0 };
-    poll(&mut polled, Some(&now)).is_ok() && polled[0].revents().contains(PollFlags::HUP)
 }
 
 fn model_file(model: &ModelSpec) -> ModelFile {
