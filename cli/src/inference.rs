@@ -5,6 +5,7 @@
 //! loading or running at several ends of the process is not loaded again.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::os::fd::{AsFd, OwnedFd};
@@ -24,8 +25,8 @@ use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::{Manifest, ModelSpec};
 use gleaner_parts::Parts;
 use gleaner_protocol::inference::{
-    AddClient, GrantedModel, InferenceControl, InferenceReport, ModelClient, ModelFile,
-    report_state,
+    AddClient, GrantedModel, InferenceControl, InferenceReport, ModelClient, ModelEngine,
+    ModelFile, report_state,
 };
 use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
@@ -33,6 +34,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::Signal;
 
+use crate::engines;
 use crate::restart_delay::RestartDelay;
 use crate::runtime::{next_report, pass_on};
 
@@ -84,11 +86,19 @@ struct Shared {
 struct ServiceState {
     /// The connection to the current process; `None` between two.
     control: Option<InferenceControl>,
-    models: Vec<(ModelFile, File)>,
+    models: Vec<PassedModel>,
     clients: Vec<Client>,
     /// Number of ends of the process at which a model was loading or running, by its digest.
     ends: BTreeMap<String, u32>,
     stops: bool,
+}
+
+/// A model that the process may load.
+struct PassedModel {
+    model: ModelFile,
+    file: File,
+    /// Entry with its engine.
+    engine: Option<File>,
 }
 
 /// A lambda's process.
@@ -99,13 +109,14 @@ struct Client {
 }
 
 impl InferenceService {
-    /// Starts the process.
+    /// Starts the process with these arguments.
     ///
     /// # Errors
     ///
     /// A failure if it cannot be started.
     pub(crate) fn start(
         parts: &Parts,
+        arguments: Vec<OsString>,
         events: impl Fn(InferenceEvent) + Send + Sync + 'static,
     ) -> Result<InferenceService, Failure> {
         let program = parts.program(INFERENCE)?;
@@ -114,9 +125,9 @@ impl InferenceService {
         };
         let running = memfd_create("gleaner-running", MemfdFlags::CLOEXEC);
         let running = File::from(running.map_err(|error| failed(&error))?);
-        let shared = Arc::new(Shared::default());
+        let (shared, events) = (Arc::new(Shared::default()), Arc::new(events));
         let mut supervisor =
-            Supervisor { program, shared: Arc::clone(&shared), running, events: Arc::new(events) };
+            Supervisor { program, arguments, shared: Arc::clone(&shared), running, events };
         let child = supervisor.start().map_err(|error| failed(&*error))?;
         let supervisor = thread::Builder::new()
             .name("inference".to_owned())
@@ -137,23 +148,22 @@ impl InferenceService {
         build: &BuildDir,
         manifest: &Manifest,
     ) -> Result<OwnedFd, Failure> {
-        let mut files = Vec::new();
-        for model in &manifest.models {
-            files.push((model_file(model), open(model, build.path())?));
-        }
+        let models = manifest.models.iter().map(|model| PassedModel::open(model, build.path()));
+        let models: Vec<PassedModel> = models.collect::<Result<_, _>>()?;
         let (lambda_end, socket) = ModelClient::pair().map_err(|error| {
             Failure::caused_by(Exit::Internal, format!("cannot connect to `{INFERENCE}`"), &error)
         })?;
-        let models = manifest.models.iter().map(granted).collect();
+        let granted = manifest.models.iter().map(granted).collect();
         let mut state = self.shared.lock();
-        for (model, file) in files {
-            if !state.models.iter().any(|(known, _)| known.sha256 == model.sha256) {
-                state.pass_model(&model, &file);
-                state.models.push((model, file));
+        for passed in models {
+            if !state.models.iter().any(|known| known.model.sha256 == passed.model.sha256) {
+                state.pass_model(&passed);
+                state.models.push(passed);
             }
         }
         let memory = manifest.limits.memory.bytes();
-        let client = Client { add: AddClient { name: name.to_owned(), memory, models }, socket };
+        let client =
+            Client { add: AddClient { name: name.to_owned(), memory, models: granted }, socket };
         // Processes that have ended, such as the one before this, leave their socket here.
         state.clients.retain(|client| !has_ended(&client.socket));
         state.pass_client(&client);
@@ -198,8 +208,10 @@ impl ServiceState {
     // An error of the connection means that the process has ended, or does not read and is killed:
     // the next one gets everything again.
 
-    fn pass_model(&mut self, model: &ModelFile, file: &File) {
-        self.pass(|control| control.add_model(model, file.as_fd()));
+    fn pass_model(&mut self, passed: &PassedModel) {
+        let PassedModel { model, file, engine } = passed;
+        let engine = engine.as_ref().map(AsFd::as_fd);
+        self.pass(|control| control.add_model(model, file.as_fd(), engine));
     }
 
     fn pass_client(&mut self, client: &Client) {
@@ -229,7 +241,7 @@ impl ServiceState {
     fn pass_all(&mut self) {
         let (models, clients) =
             (std::mem::take(&mut self.models), std::mem::take(&mut self.clients));
-        models.iter().for_each(|(model, file)| self.pass_model(model, file));
+        models.iter().for_each(|passed| self.pass_model(passed));
         self.models = models;
         for client in clients {
             // It fails if the lambda's process has ended.
@@ -244,6 +256,7 @@ impl ServiceState {
 /// The thread that starts the process and waits for its end.
 struct Supervisor {
     program: PathBuf,
+    arguments: Vec<OsString>,
     shared: Arc<Shared>,
     /// The file in which the process notes the digests of models that it loads and runs.
     running: File,
@@ -309,6 +322,7 @@ impl Supervisor {
         let running = Some(self.running.try_clone()?.into());
         Handover { control: Some(process_end), running, ..Handover::default() }.send(&handover)?;
         let child = Command::new(&self.program)
+            .args(&self.arguments)
             // Only `gleaner` receives Ctrl-C, and ends its processes in order.
             .process_group(0)
             .stdin(OwnedFd::from(stdin))
@@ -375,8 +389,8 @@ impl Supervisor {
         let notes = digests[..read].chunks(DIGEST).zip(["loaded", "ran"]);
         notes.rev().find_map(|(digest, what)| {
             let digest = std::str::from_utf8(digest).ok()?;
-            let (model, _) = state.models.iter().find(|(model, _)| model.sha256 == digest)?;
-            let text = format!("while it {what} `{}`", model.path);
+            let known = state.models.iter().find(|known| known.model.sha256 == digest)?;
+            let text = format!("while it {what} `{}`", known.model.path);
             *state.ends.entry(digest.to_owned()).or_default() += u32::from(!is_killed);
             Some((digest.to_owned(), text))
         })
@@ -427,10 +441,6 @@ fn has_ended(socket: &OwnedFd) -> bool {
     poll(&mut polled, Some(&now)).is_ok() && polled[0].revents().contains(PollFlags::HUP)
 }
 
-fn model_file(model: &ModelSpec) -> ModelFile {
-    ModelFile { sha256: model.sha256.to_string(), path: model.file.to_string() }
-}
-
 fn granted(model: &ModelSpec) -> GrantedModel {
     GrantedModel {
         name: model.name.to_string(),
@@ -441,12 +451,22 @@ fn granted(model: &ModelSpec) -> GrantedModel {
     }
 }
 
-/// Opens the file of a model in the build `build`.
-fn open(model: &ModelSpec, build: &Path) -> Result<File, Failure> {
-    let file = PlainFile::inside(build, model.file.as_path(), FILE_MAX).map(PlainFile::into_file);
-    file.map_err(|error| {
-        let message = format!("cannot open `{}`, the file of model `{}`", model.file, model.name);
-        Failure::caused_by(Exit::Usage, message, &error)
-            .with_help("build the lambda again: gleaner build DIR")
-    })
+impl PassedModel {
+    /// Opens the file of a model in the build `build`, and its engine if there is one.
+    fn open(model: &ModelSpec, build: &Path) -> Result<Self, Failure> {
+        let file = PlainFile::inside(build, model.file.as_path(), FILE_MAX);
+        let file = file.map(PlainFile::into_file).map_err(|error| {
+            let message =
+                format!("cannot open `{}`, the file of model `{}`", model.file, model.name);
+            Failure::caused_by(Exit::Usage, message, &error)
+                .with_help("build the lambda again: gleaner build DIR")
+        })?;
+        let (sha256, path) = (model.sha256.to_string(), model.file.to_string());
+        let (engine, entry) = match engines::stored(&sha256) {
+            Ok(Some(entry)) => (ModelEngine::Attached, Some(entry)),
+            Ok(None) => (ModelEngine::None, None),
+            Err(reason) => (ModelEngine::Refused(reason), None),
+        };
+        Ok(Self { model: ModelFile { sha256, path, engine }, file, engine: entry })
+    }
 }

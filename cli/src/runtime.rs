@@ -146,7 +146,7 @@ impl ModelsOfRun {
     ) -> Result<Self, Failure> {
         let (bar, has_failed) = (bar.clone(), Arc::new(AtomicBool::new(false)));
         let failed = Arc::clone(&has_failed);
-        let service = InferenceService::start(parts, move |event| {
+        let service = InferenceService::start(parts, Vec::new(), move |event| {
             let text = match event {
                 InferenceEvent::Report(report) => {
                     render::inference(&report, Paint::of_stderr()).into_bytes()

@@ -50,6 +50,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
     (
         "gleaner-cli",
         &[
+            "gleaner-artifacts",
             "gleaner-base",
             "gleaner-journal",
             "gleaner-lambda",
@@ -95,7 +96,16 @@ pub const CRATES: &[(&str, &[&str])] = &[
         ],
     ),
     ("gleaner-image", &["gleaner-rules"]),
-    ("gleaner-inference", &["gleaner-base", "gleaner-jail", "gleaner-protocol", "gleaner-vitals"]),
+    (
+        "gleaner-inference",
+        &[
+            "gleaner-artifacts",
+            "gleaner-base",
+            "gleaner-jail",
+            "gleaner-protocol",
+            "gleaner-vitals",
+        ],
+    ),
     (
         "gleaner-ingress",
         &[

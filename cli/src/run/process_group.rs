@@ -83,7 +83,7 @@ impl<'a> ProcessGroup<'a> {
                 let piece = OutputPiece::Inference(event);
                 drop(sender.send(ChildOutput { from: ChildId::Inference, piece }));
             };
-            inference = Some(InferenceService::start(&context.parts, send)?);
+            inference = Some(InferenceService::start(&context.parts, Vec::new(), send)?);
         }
         let recorder = None;
         Ok(Self {

@@ -84,16 +84,18 @@ impl DerivedKey {
         file.read_exact(&mut head)?;
         let mut content = Vec::with_capacity(len);
         file.take(max as u64).read_to_end(&mut content)?;
-        if head == self.head(&content) {
+        if head == self.head(&[&content]) {
             Ok(StoreLookup::Content(content))
         } else {
             damaged("its digest does not match its content")
         }
     }
 
-    /// Returns the header before `content` in the file.
-    fn head(&self, content: &[u8]) -> [u8; HEAD_BYTES] {
-        let digest = Sha256::new().chain_update(self.digest).chain_update(content).finalize();
+    /// Returns the header before the content, which has these parts, in the file.
+    fn head(&self, parts: &[&[u8]]) -> [u8; HEAD_BYTES] {
+        let mut digest = Sha256::new().chain_update(self.digest);
+        parts.iter().for_each(|part| digest.update(part));
+        let digest = digest.finalize();
         let mut head = [0; HEAD_BYTES];
         head[..MAGIC.len()].copy_from_slice(&MAGIC);
         head[MAGIC.len()..].copy_from_slice(&digest);
@@ -113,28 +115,24 @@ impl DerivedEntry {
         &self.path
     }
 
-    /// Reads the content and verifies it, see [`DerivedKey::verified`]. Notes the use for pruning.
+    /// Reads the content and verifies it, see [`DerivedKey::verified`].
     ///
     /// # Errors
     ///
     /// Those of [`open`](Self::open).
     pub fn read(&self) -> Result<StoreLookup, StoreError> {
         let Some(file) = self.open()? else { return Ok(StoreLookup::Nothing) };
-        let found = self.key.verified(&file);
-        if matches!(found, StoreLookup::Content(_)) {
-            note_use(&file);
-        }
-        Ok(found)
+        Ok(self.key.verified(&file))
     }
 
-    /// Opens the file, unverified; `None` if there is none.
+    /// Opens the file, unverified; `None` if there is none. Notes the use for pruning.
     ///
     /// # Errors
     ///
     /// [`StoreError::Untrusted`] if another user could have written it: file and folders above it
     /// must belong to this user or to root, and only they may write to them. Also if it is not a
     /// regular file. [`StoreError::Read`] if it cannot be opened.
-    fn open(&self) -> Result<Option<File>, StoreError> {
+    pub fn open(&self) -> Result<Option<File>, StoreError> {
         let kind = self.key.kind;
         let untrusted = |path: &Path, why: String| {
             let path = path.to_owned();
@@ -155,27 +153,44 @@ impl DerivedEntry {
         };
         match foreign(&file.metadata().map_err(cannot)?) {
             Some(why) => Err(untrusted(&self.path, why.to_owned())),
-            None => Ok(Some(file)),
+            None => {
+                note_use(&file);
+                Ok(Some(file))
+            }
         }
     }
 
-    /// Writes the content as a whole; a process that is killed meanwhile leaves the file as it was.
-    /// Then removes the least recently used entries beyond [`STORE_BYTES`], but not this one.
+    /// Writes the content, in parts, as a whole; a process that is killed meanwhile leaves the file
+    /// as it was. Then removes the least recently used entries beyond [`STORE_BYTES`], but not this
+    /// one.
     ///
     /// # Errors
     ///
     /// [`StoreError::Write`]; content above the maximum of its kind is an error, too.
-    pub fn put(&self, content: &[u8]) -> Result<(), StoreError> {
-        let (kind, max) = (self.key.kind, self.key.kind.max_bytes());
-        let failed = |source| StoreError::Write { kind, path: self.path.clone(), source };
-        if content.len() > max {
-            let text = format!("it has {} bytes; the maximum is {max}", content.len());
-            return Err(failed(io::Error::new(io::ErrorKind::FileTooLarge, text)));
+    pub fn put(&self, content: &[&[u8]]) -> Result<(), StoreError> {
+        let (len, max) = (content.iter().map(|part| part.len()).sum::<usize>(), self.max_bytes());
+        if len > max {
+            return Err(self.refused(format!("it has {len} bytes; the maximum is {max}")));
         }
-        write_whole(&self.path, &[&self.key.head(content), content]).map_err(failed)?;
+        let head = self.key.head(content);
+        let parts = [&[&head[..]], content].concat();
+        write_whole(&self.path, &parts).map_err(|error| self.failed(error))?;
         // Entries that cannot be removed now are removed with a later one.
         let _ = prune(self.path.parent().unwrap_or(&self.path), &self.path, STORE_BYTES);
         Ok(())
+    }
+
+    fn max_bytes(&self) -> usize {
+        self.key.kind.max_bytes()
+    }
+
+    /// Returns the error for content that is not put, for this reason.
+    pub(crate) fn refused(&self, reason: String) -> StoreError {
+        self.failed(io::Error::new(io::ErrorKind::InvalidInput, reason))
+    }
+
+    fn failed(&self, source: io::Error) -> StoreError {
+        StoreError::Write { kind: self.key.kind, path: self.path.clone(), source }
     }
 }
 
@@ -209,7 +224,7 @@ mod tests {
             std::env::temp_dir().join(format!("gleaner-entry-{name}-{}", std::process::id()));
         make_store(&store).unwrap();
         let entry = DerivedEntry::of(&store, key("a", b"component"));
-        entry.put(CODE).unwrap();
+        entry.put(&[CODE]).unwrap();
         let bytes = fs::read(&entry.path).unwrap();
         (store, entry, bytes)
     }
@@ -247,7 +262,7 @@ mod tests {
         }
         assert!(damaged(&[&bytes[..], b"x"].concat()) && damaged(CODE) && damaged(b"\x7fELF"));
         let other = key("a", b"another component");
-        assert!(damaged(&[&other.head(CODE), CODE].concat()));
+        assert!(damaged(&[&other.head(&[CODE]), CODE].concat()));
         File::options().write(true).open(&entry.path).unwrap().set_len(1 << 40).unwrap();
         assert_eq!(entry.read().unwrap(), StoreLookup::Damaged("it is too long".to_owned()));
         fs::remove_file(&entry.path).unwrap();
@@ -300,7 +315,7 @@ mod tests {
     #[test]
     fn content_above_the_maximum_is_not_put() {
         let (store, entry, _) = store("large");
-        let error = entry.put(&vec![0; DerivedKind::NativeCode.max_bytes() + 1]).unwrap_err();
+        let error = entry.put(&[&vec![0; entry.max_bytes()], b"x"]).unwrap_err();
         let cause = std::error::Error::source(&error).unwrap().to_string();
         assert_eq!(cause, "it has 268435457 bytes; the maximum is 268435456");
         assert_eq!(entry.read().unwrap(), StoreLookup::Content(CODE.to_vec()));

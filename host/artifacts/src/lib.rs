@@ -1,13 +1,15 @@
-//! The store of what tools make of files, such as the native code of a component. It is a folder of
-//! this user.
+//! The store of what tools make of files: native code of components, and engines of models. It is a
+//! folder of this user.
 //!
 //! - `derived`: an entry, behind a digest that binds it to everything it was made from.
+//! - `engine`: entries with an engine of TensorRT.
 //! - `write`: writes an entry as a whole, or not at all. `prune`: bounds the size of the store.
 //! - `trust`: checks that only this user can write to a file and the folders above it.
 //!
 //! An entry can always be made again: the store may remove any. It never runs a tool.
 
 mod derived;
+mod engine;
 mod prune;
 mod trust;
 mod write;
@@ -21,6 +23,7 @@ use std::path::{Path, PathBuf};
 use gleaner_base::{Exit, Explain};
 
 pub use derived::{DerivedEntry, DerivedKey, StoreLookup};
+pub use engine::BuiltEngine;
 pub use prune::STORE_BYTES;
 
 /// Kind of an entry.
@@ -28,15 +31,19 @@ pub use prune::STORE_BYTES;
 pub enum DerivedKind {
     /// Native code of a component.
     NativeCode,
+    /// Engine of TensorRT, built of a model.
+    Engine,
 }
 
 impl DerivedKind {
-    const ALL: [DerivedKind; 1] = [DerivedKind::NativeCode];
+    const ALL: [DerivedKind; 2] = [DerivedKind::NativeCode, DerivedKind::Engine];
 
     /// Returns the maximum size of an entry, in bytes.
     pub const fn max_bytes(self) -> usize {
         match self {
             DerivedKind::NativeCode => 256 << 20,
+            // An engine is about as large as its model. It is held in memory twice to load it.
+            DerivedKind::Engine => 512 << 20,
         }
     }
 
@@ -44,6 +51,7 @@ impl DerivedKind {
     const fn extension(self) -> &'static str {
         match self {
             DerivedKind::NativeCode => "cwasm",
+            DerivedKind::Engine => "engine",
         }
     }
 }
@@ -52,6 +60,7 @@ impl fmt::Display for DerivedKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             DerivedKind::NativeCode => "native code",
+            DerivedKind::Engine => "an engine of TensorRT",
         })
     }
 }

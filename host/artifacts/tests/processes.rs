@@ -43,7 +43,7 @@ fn child_that_puts() {
     let entry = entry(Path::new(&store));
     let content = vec![byte.parse().unwrap(); CONTENT_BYTES];
     loop {
-        entry.put(&content).unwrap();
+        entry.put(&[&content]).unwrap();
     }
 }
 
@@ -74,7 +74,7 @@ fn an_entry_is_whole_while_processes_replace_it_and_after_each_is_killed() {
             assert!(byte_in(&entry).is_some(), "the entry is gone");
         }
     }
-    entry.put(&[3; CONTENT_BYTES]).unwrap();
+    entry.put(&[&[3; CONTENT_BYTES]]).unwrap();
     assert_eq!(byte_in(&entry), Some(3));
     let left = fs::read_dir(&store).unwrap().count();
     assert_eq!(left, 1, "partial files of killed processes are removed");

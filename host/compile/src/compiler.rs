@@ -31,6 +31,6 @@ pub fn compile(path: &Path, store: &Path, nans: Nans) -> Result<PathBuf, Compile
     if code.len() > CODE_BYTES {
         return Err(CompileError::CodeTooLarge { path: path.to_owned(), bytes: code.len() });
     }
-    entry.put(&code)?;
+    entry.put(&[&code])?;
     Ok(entry.path().to_owned())
 }
