@@ -2,10 +2,10 @@
 //!
 //! `new` creates a lambda's folder, `build` its build folder. `runtime` starts `gleaner-runtime`
 //! for `check`, `replay` and `verify`, `run` supervises it, the ingress and the recorder live,
-//! `inference` supervises the process that runs models, for both, and `delegate` passes commands on
-//! to another program. `render` formats results as text, `report` writes the report page, `diff`
-//! compares two runs, and `dev` repeats all of this whenever a source is saved. `generated` prints
-//! shell completions and man pages.
+//! `inference` supervises the process that runs models, for both, `engines` has it build engines
+//! ahead, and `delegate` passes commands on to another program. `render` formats results as text,
+//! `report` writes the report page, `diff` compares two runs, and `dev` repeats all of this whenever
+//! a source is saved. `generated` prints shell completions and man pages.
 //!
 //! No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts
 //! the other programs and exchanges `gleaner-protocol` messages with them. `gleaner-report` reads
@@ -18,6 +18,7 @@ mod delegate;
 pub mod dev;
 mod diff;
 mod doctor;
+mod engines;
 mod generated;
 mod inference;
 mod new;

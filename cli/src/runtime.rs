@@ -152,7 +152,7 @@ impl ModelsOfRun {
     ) -> Result<Self, Failure> {
         let (bar, has_failed) = (bar.clone(), Arc::new(AtomicBool::new(false)));
         let failed = Arc::clone(&has_failed);
-        let service = InferenceService::start(parts, limits, move |event| {
+        let service = InferenceService::start(parts, limits, None, move |event| {
             if matches!(event, InferenceEvent::Ended(..)) {
                 failed.store(true, Ordering::Relaxed);
             }

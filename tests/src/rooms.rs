@@ -44,11 +44,13 @@ pub const UNSAFE_FILES: &[&str] = &[
 /// The workspace crates that a crate may depend on. A crate that is not listed may depend on
 /// anything: tests, benches and lambdas are outside of the rules.
 pub const CRATES: &[(&str, &[&str])] = &[
+    ("gleaner-artifacts", &["gleaner-base"]),
     ("gleaner-base", &["gleaner-rules"]),
     ("gleaner-buffers", &[]),
     (
         "gleaner-cli",
         &[
+            "gleaner-artifacts",
             "gleaner-base",
             "gleaner-journal",
             "gleaner-lambda",
@@ -57,7 +59,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-report",
         ],
     ),
-    ("gleaner-compile", &["gleaner-base", "gleaner-jail", "gleaner-lambda"]),
+    ("gleaner-compile", &["gleaner-artifacts", "gleaner-base", "gleaner-jail", "gleaner-lambda"]),
     ("gleaner-dds", &["gleaner-base", "gleaner-messages", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-drives", &["gleaner-base", "gleaner-messages", "gleaner-transport"]),
     (
@@ -73,6 +75,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
     (
         "gleaner-host",
         &[
+            "gleaner-artifacts",
             "gleaner-base",
             "gleaner-buffers",
             "gleaner-compile",
@@ -93,7 +96,16 @@ pub const CRATES: &[(&str, &[&str])] = &[
         ],
     ),
     ("gleaner-image", &["gleaner-rules"]),
-    ("gleaner-inference", &["gleaner-base", "gleaner-jail", "gleaner-protocol", "gleaner-vitals"]),
+    (
+        "gleaner-inference",
+        &[
+            "gleaner-artifacts",
+            "gleaner-base",
+            "gleaner-jail",
+            "gleaner-protocol",
+            "gleaner-vitals",
+        ],
+    ),
     (
         "gleaner-ingress",
         &[

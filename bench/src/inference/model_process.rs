@@ -10,7 +10,8 @@ use std::process::{Child, Command, Stdio};
 
 use gleaner_protocol::Handover;
 use gleaner_protocol::inference::{
-    AddClient, GrantedModel, InferenceControl, InferenceReport, ModelClient, ModelFile, ModelState,
+    AddClient, GrantedModel, InferenceControl, InferenceReport, ModelClient, ModelEngine,
+    ModelFile, ModelState,
 };
 use gleaner_tests::program;
 use sha2::{Digest, Sha256};
@@ -64,8 +65,8 @@ impl ModelProcess {
         let process = Self { child, control, _handover: handover };
         let file = File::open(&model.path).expect("the model exists");
         let path = model.path.display().to_string();
-        let sent = ModelFile { sha256: model.sha256.clone(), path };
-        process.control.add_model(&sent, file.as_fd()).expect("gleaner-inference reads");
+        let sent = ModelFile { sha256: model.sha256.clone(), path, engine: ModelEngine::None };
+        process.control.add_model(&sent, file.as_fd(), None).expect("gleaner-inference reads");
         process
     }
 

@@ -286,6 +286,9 @@ pub struct CheckArgs {
     #[command(flatten)]
     #[allow(missing_docs)]
     pub target: LambdaArgs,
+    /// Only build the engines of its models for TensorRT, which takes minutes for each
+    #[arg(long)]
+    pub build_engines: bool,
     /// Print the result as one JSON object
     #[arg(long)]
     pub json: bool,

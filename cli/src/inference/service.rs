@@ -4,6 +4,7 @@
 //! loading or running at several ends of the process is not loaded again.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::os::fd::{AsFd, OwnedFd};
@@ -23,7 +24,7 @@ use gleaner_lambda::manifest::{Manifest, ModelSpec};
 use gleaner_lambda::{BuildDir, InferenceLimits};
 use gleaner_parts::Parts;
 use gleaner_protocol::inference::{
-    AddClient, GrantedModel, InferenceControl, ModelClient, ModelFile,
+    AddClient, GrantedModel, InferenceControl, ModelClient, ModelEngine, ModelFile,
 };
 use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
@@ -33,6 +34,7 @@ use rustix::process::Signal;
 use super::client::{Client, ProcessState};
 use super::totals::ModelTotals;
 use super::{INFERENCE, InferenceEvent};
+use crate::engines;
 use crate::restart_delay::RestartDelay;
 use crate::runtime::{next_report, pass_on};
 
@@ -69,15 +71,24 @@ struct Shared {
 struct ServiceState {
     /// The connection to the current process; `None` between two.
     control: Option<InferenceControl>,
-    models: Vec<(ModelFile, File)>,
+    models: Vec<PassedModel>,
     clients: Vec<Client>,
     /// Number of ends of the process at which a model was loading or running, by its digest.
     ends: BTreeMap<String, u32>,
     stops: bool,
 }
 
+/// A model that the process may load.
+struct PassedModel {
+    model: ModelFile,
+    file: File,
+    /// Entry with its engine.
+    engine: Option<File>,
+}
+
 impl InferenceService {
-    /// Starts the process.
+    /// Starts the process with these limits. If the folder `engines` is given, it builds engines
+    /// into it.
     ///
     /// # Errors
     ///
@@ -85,6 +96,7 @@ impl InferenceService {
     pub(crate) fn start(
         parts: &Parts,
         limits: &InferenceLimits,
+        engines: Option<&Path>,
         events: impl Fn(InferenceEvent) + Send + Sync + 'static,
     ) -> Result<InferenceService, Failure> {
         let program = parts.program(INFERENCE)?;
@@ -98,6 +110,7 @@ impl InferenceService {
         let mut supervisor = Supervisor {
             program,
             limits: *limits,
+            engines: engines.map(Path::to_owned),
             shared: Arc::clone(&shared),
             running,
             events,
@@ -123,23 +136,22 @@ impl InferenceService {
         build: &BuildDir,
         manifest: &Manifest,
     ) -> Result<OwnedFd, Failure> {
-        let mut files = Vec::new();
-        for model in &manifest.models {
-            files.push((model_file(model), open(model, build.path())?));
-        }
+        let models = manifest.models.iter().map(|model| PassedModel::open(model, build.path()));
+        let models: Vec<PassedModel> = models.collect::<Result<_, _>>()?;
         let (lambda_end, socket) = ModelClient::pair().map_err(|error| {
             Failure::caused_by(Exit::Internal, format!("cannot connect to `{INFERENCE}`"), &error)
         })?;
-        let models = manifest.models.iter().map(granted).collect();
+        let granted = manifest.models.iter().map(granted).collect();
         let mut state = self.shared.lock();
-        for (model, file) in files {
-            if !state.models.iter().any(|(known, _)| known.sha256 == model.sha256) {
-                state.pass_model(&model, &file);
-                state.models.push((model, file));
+        for passed in models {
+            if !state.models.iter().any(|known| known.model.sha256 == passed.model.sha256) {
+                state.pass_model(&passed);
+                state.models.push(passed);
             }
         }
         let memory = manifest.limits.memory.bytes();
-        let client = Client::new(AddClient { name: name.to_owned(), memory, models }, socket);
+        let add = AddClient { name: name.to_owned(), memory, models: granted };
+        let client = Client::new(add, socket);
         // Processes that have ended, such as the one before this, leave their socket here.
         state.clients.retain(|client| !client.has_ended());
         state.pass_client(&client);
@@ -199,8 +211,10 @@ impl ServiceState {
     // An error of the connection means that the process has ended, or does not read and is killed:
     // the next one gets everything again.
 
-    fn pass_model(&mut self, model: &ModelFile, file: &File) {
-        self.pass(|control| control.add_model(model, file.as_fd()));
+    fn pass_model(&mut self, passed: &PassedModel) {
+        let PassedModel { model, file, engine } = passed;
+        let engine = engine.as_ref().map(AsFd::as_fd);
+        self.pass(|control| control.add_model(model, file.as_fd(), engine));
     }
 
     fn pass_client(&mut self, client: &Client) {
@@ -230,7 +244,7 @@ impl ServiceState {
     fn pass_all(&mut self) {
         let (models, clients) =
             (std::mem::take(&mut self.models), std::mem::take(&mut self.clients));
-        models.iter().for_each(|(model, file)| self.pass_model(model, file));
+        models.iter().for_each(|passed| self.pass_model(passed));
         self.models = models;
         for mut client in clients {
             if client.report(ProcessState::Started) {
@@ -251,6 +265,8 @@ impl ServiceState {
 struct Supervisor {
     program: PathBuf,
     limits: InferenceLimits,
+    /// Folder in which engines are built instead of running models.
+    engines: Option<PathBuf>,
     shared: Arc<Shared>,
     /// The file in which the process notes the digests of models that it loads and runs.
     running: File,
@@ -320,6 +336,7 @@ impl Supervisor {
             .args(["--memory".to_owned(), memory.bytes().to_string()])
             .args(["--run-max".to_owned(), run_max.as_secs_f64().to_string()])
             .args(["--load-max".to_owned(), load_max.as_secs_f64().to_string()])
+            .args(self.engines.iter().flat_map(|folder| [Path::new("--build-engines"), folder]))
             // Only `gleaner` receives Ctrl-C, and ends its processes in order.
             .process_group(0)
             .stdin(OwnedFd::from(stdin))
@@ -388,8 +405,8 @@ impl Supervisor {
         let notes = digests[..read].chunks(DIGEST).zip(["loaded", "ran"]);
         notes.rev().find_map(|(digest, what)| {
             let digest = std::str::from_utf8(digest).ok()?;
-            let (model, _) = state.models.iter().find(|(model, _)| model.sha256 == digest)?;
-            let text = format!("while it {what} `{}`", model.path);
+            let known = state.models.iter().find(|known| known.model.sha256 == digest)?;
+            let text = format!("while it {what} `{}`", known.model.path);
             *state.ends.entry(digest.to_owned()).or_default() += u32::from(!is_killed);
             Some((digest.to_owned(), text))
         })
@@ -436,8 +453,6 @@ fn was_killed(status: ExitStatus) -> bool {
     matches!(signal, Some(Signal::KILL | Signal::TERM | Signal::INT | Signal::HUP))
 }
 
-fn model_file(model: &ModelSpec) -> ModelFile {
-    ModelFile { sha256: model.sha256.to_string(), path: model.file.to_string() }
 }
 
 fn granted(model: &ModelSpec) -> GrantedModel {
@@ -450,12 +465,22 @@ fn granted(model: &ModelSpec) -> GrantedModel {
     }
 }
 
-/// Opens the file of a model in the build `build`.
-fn open(model: &ModelSpec, build: &Path) -> Result<File, Failure> {
-    let file = PlainFile::inside(build, model.file.as_path(), FILE_MAX).map(PlainFile::into_file);
-    file.map_err(|error| {
-        let message = format!("cannot open `{}`, the file of model `{}`", model.file, model.name);
-        Failure::caused_by(Exit::Usage, message, &error)
-            .with_help("build the lambda again: gleaner build DIR")
-    })
+impl PassedModel {
+    /// Opens the file of a model in the build `build`, and its engine if there is one.
+    fn open(model: &ModelSpec, build: &Path) -> Result<Self, Failure> {
+        let file = PlainFile::inside(build, model.file.as_path(), FILE_MAX);
+        let file = file.map(PlainFile::into_file).map_err(|error| {
+            let message =
+                format!("cannot open `{}`, the file of model `{}`", model.file, model.name);
+            Failure::caused_by(Exit::Usage, message, &error)
+                .with_help("build the lambda again: gleaner build DIR")
+        })?;
+        let (sha256, path) = (model.sha256.to_string(), model.file.to_string());
+        let (engine, entry) = match engines::stored(&sha256) {
+            Ok(Some(entry)) => (ModelEngine::Attached, Some(entry)),
+            Ok(None) => (ModelEngine::None, None),
+            Err(reason) => (ModelEngine::Refused(reason), None),
+        };
+        Ok(Self { model: ModelFile { sha256, path, engine }, file, engine: entry })
+    }
 }

@@ -83,7 +83,8 @@ impl<'a> ProcessGroup<'a> {
                 let piece = OutputPiece::Inference(event);
                 drop(sender.send(ChildOutput { from: ChildId::Inference, piece }));
             };
-            inference = Some(InferenceService::start(&context.parts, &vehicle.inference, send)?);
+            let limits = &vehicle.inference;
+            inference = Some(InferenceService::start(&context.parts, limits, None, send)?);
         }
         let recorder = None;
         Ok(Self {

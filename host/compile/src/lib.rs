@@ -1,20 +1,22 @@
-//! The WebAssembly engine of all lambdas, and the cache of their native code.
+//! The WebAssembly engine of all lambdas, and the native code of their components.
 //!
 //! Compiling takes a second and 40 MB; loading takes 0.3 ms and 11 MB, with a check of 0.2 ms. So a
 //! component is compiled once, in a separate process (`gleaner-compile`), and every runtime loads
-//! the result. Loading native code means trusting it: a cache entry must belong to this user alone,
-//! and has a digest that binds the code to the component, wasmtime's version, the settings below
-//! and the CPU. Components are untrusted, so compiling has a memory and a time limit.
+//! the result from the store of `gleaner-artifacts`. Loading native code means trusting it: the
+//! store checks its owner, and that it was made from this component, by this version of wasmtime,
+//! the settings below and this CPU. Components are untrusted, so compiling has a memory and a time
+//! limit.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
+use gleaner_artifacts::{DerivedEntry, DerivedKey, DerivedKind, StoreError};
 use gleaner_base::{Exit, Explain, NotPlain, PlainFile, chain};
 use gleaner_lambda::layout::COMPONENT_MAX;
 use wasmtime::{Config, Engine};
 
 /// Maximum size of native code, in bytes.
-pub const CODE_BYTES: usize = 256 << 20;
+pub const CODE_BYTES: usize = DerivedKind::NativeCode.max_bytes();
 
 /// Maximum memory for compiling, in bytes. An ordinary lambda takes some 50 MB, but even a small
 /// hostile component can take any amount.
@@ -39,7 +41,7 @@ pub enum Nans {
 
 impl Nans {
     /// Returns wasmtime's version and the settings of [`engine`], as text. A change of either
-    /// invalidates the cache.
+    /// invalidates all native code.
     pub const fn settings(self) -> &'static str {
         match self {
             Self::Native => "wasmtime 48.0.8, fuel, epochs, speed, 1",
@@ -48,7 +50,7 @@ impl Nans {
     }
 }
 
-/// Errors of compiling and of reading the cache.
+/// Errors of compiling.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum CompileError {
@@ -67,12 +69,8 @@ pub enum CompileError {
     CodeTooLarge { path: PathBuf, bytes: usize },
     #[error("cannot set up the engine")]
     Engine { source: Box<dyn std::error::Error + Send + Sync> },
-    #[error("cannot write native code to `{}`", path.display())]
-    Write { path: PathBuf, source: io::Error },
-    #[error("cannot read native code in `{}`", path.display())]
-    ReadCode { path: PathBuf, source: io::Error },
-    #[error("native code in `{}` is not loaded: {why}", path.display())]
-    Untrusted { path: PathBuf, why: String },
+    #[error(transparent)]
+    Store(#[from] StoreError),
 }
 
 /// Content of a file that is not a component, by its first bytes.
@@ -138,12 +136,7 @@ impl Explain for CompileError {
             Self::TooLarge { .. } | Self::CodeTooLarge { .. } => Some(
                 "remove code that the lambda does not need, or move data to model files".to_owned(),
             ),
-            Self::Write { .. } => {
-                Some("make the folder writable, or set XDG_CACHE_HOME to one that is".to_owned())
-            }
-            Self::ReadCode { path, .. } | Self::Untrusted { path, .. } => {
-                Some(format!("delete it, it will be compiled again: rm -r '{}'", path.display()))
-            }
+            Self::Store(error) => error.help(),
             Self::Engine { .. } => None,
         }
     }
@@ -155,8 +148,8 @@ impl Explain for CompileError {
             | Self::CodeTooLarge { .. }
             | Self::NoComponent { .. }
             | Self::Compile { .. } => Exit::Usage,
-            Self::Untrusted { .. } => Exit::Denied,
-            Self::Write { .. } | Self::ReadCode { .. } | Self::Engine { .. } => Exit::Internal,
+            Self::Store(error) => error.exit(),
+            Self::Engine { .. } => Exit::Internal,
         }
     }
 }
@@ -211,15 +204,17 @@ pub fn read_component(path: &Path) -> Result<Vec<u8>, CompileError> {
     })
 }
 
-mod entry;
-pub use entry::{CacheEntry, CacheLookup, make_cache};
+/// Returns the entry of the native code of `component`, compiled with `nans`, in the folder
+/// `store`.
+pub fn code_entry(store: &Path, component: &[u8], nans: Nans) -> DerivedEntry {
+    let key = DerivedKey::of(DerivedKind::NativeCode, nans.settings(), component);
+    DerivedEntry::of(store, key)
+}
+
 #[cfg(feature = "compiler")]
 mod compiler;
 #[cfg(feature = "compiler")]
 pub use compiler::compile;
-#[cfg_attr(not(feature = "compiler"), allow(dead_code, reason = "only the compiler prunes"))]
-mod prune;
-pub use prune::CACHE_BYTES;
 
 #[cfg(test)]
 mod tests {
@@ -234,6 +229,15 @@ mod tests {
             assert!(nans.settings().starts_with("wasmtime 48.0.8,"));
         }
         assert!(workspace.contains("wasmtime = { version = \"=48.0.8\""));
+    }
+
+    #[test]
+    fn another_component_or_other_nans_have_another_entry() {
+        let entry =
+            |component: &[u8], nans| code_entry(Path::new("/s"), component, nans).path().to_owned();
+        assert_eq!(entry(b"a", Nans::Native), entry(b"a", Nans::Native));
+        assert_ne!(entry(b"a", Nans::Native), entry(b"b", Nans::Native));
+        assert_ne!(entry(b"a", Nans::Native), entry(b"a", Nans::Canonical));
     }
 
     #[test]

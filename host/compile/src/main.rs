@@ -55,7 +55,7 @@ fn main() -> ExitCode {
 /// cache, even if a component exploits the compiler. If the kernel does not support that, only the
 /// resource limits apply; the parent process reports it.
 fn sandbox_for(args: &Args) -> Result<(), CompileError> {
-    gleaner_compile::make_cache(&args.cache)?;
+    gleaner_artifacts::make_store(&args.cache)?;
     let paths = Paths { read: vec![args.component.clone()], write: vec![args.cache.clone()] };
     files::confine(&paths);
     let _ = sandbox_filter::apply(false);

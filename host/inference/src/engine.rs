@@ -8,8 +8,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gleaner_protocol::inference::{
-    InferenceReport, InferenceRequest, InferenceServer, InferenceStatus, ModelCall, ModelFaultKind,
-    ModelFile, ModelRequest, ModelResult, TensorPlace,
+    InferenceReport, InferenceRequest, InferenceServer, InferenceStatus, ModelCall, ModelEngine,
+    ModelFaultKind, ModelFile, ModelRequest, ModelResult, TensorPlace,
 };
 use gleaner_protocol::link::Incoming;
 use gleaner_vitals::{monotonic_ns, usage};
@@ -19,7 +19,7 @@ use crate::backend::StopSignal;
 use crate::client::{CallStage, ConnectedLambda, LambdaId, OpenCall};
 use crate::engine_error::EngineError;
 use crate::lambdas::{LambdaTable, ReadyDescriptors, TOO_MANY};
-use crate::loader::{LoadDone, LoadJob};
+use crate::loader::{LoadDone, LoadJob, PassedEngine};
 use crate::loads::LoadQueue;
 use crate::places::{PlacedInput, check_inputs};
 use crate::queue::FairQueue;
@@ -43,7 +43,7 @@ pub(crate) struct InferenceEngine {
     reports: ReportSink,
     lambdas: LambdaTable,
     /// Files by digest.
-    files: HashMap<String, (String, Arc<File>)>,
+    files: HashMap<String, PassedModel>,
     sessions: SessionTable,
     loads: LoadQueue,
     queue: FairQueue<LambdaId, Vec<PlacedInput>>,
@@ -51,6 +51,13 @@ pub(crate) struct InferenceEngine {
     last_job: u64,
     status_at: Instant,
     status: InferenceStatus,
+}
+
+/// A file that the starter has passed.
+struct PassedModel {
+    path: String,
+    file: Arc<File>,
+    engine: PassedEngine,
 }
 
 /// The run in progress.
@@ -164,9 +171,15 @@ impl InferenceEngine {
     fn handle_control(&mut self, control: &mut InferenceServer) -> Option<EngineEnd> {
         loop {
             match control.poll() {
-                Ok(Incoming::Message(InferenceRequest::Model(model, file))) => {
-                    let ModelFile { sha256, path } = model;
-                    self.files.insert(sha256, (path, Arc::new(File::from(file))));
+                Ok(Incoming::Message(InferenceRequest::Model(model, file, entry))) => {
+                    let ModelFile { sha256, path, engine } = model;
+                    let entry = entry.map(|it| Arc::new(File::from(it)));
+                    let engine = match engine {
+                        ModelEngine::Refused(reason) => Err(reason),
+                        ModelEngine::None | ModelEngine::Attached => Ok(entry),
+                    };
+                    let file = Arc::new(File::from(file));
+                    self.files.insert(sha256, PassedModel { path, file, engine });
                 }
                 Ok(Incoming::Message(InferenceRequest::Client(add, socket))) => {
                     self.lambdas.add(add, socket);
@@ -237,12 +250,13 @@ impl InferenceEngine {
 
     /// Begins to load a model.
     fn load(&mut self, key: SessionKey) -> Result<SessionId, String> {
-        let Some((path, file)) = self.files.get(&key.sha256) else {
+        let Some(PassedModel { path, file, engine }) = self.files.get(&key.sha256) else {
             return Err(format!("the starter passed no file with the digest {}", key.sha256));
         };
-        let (path, file, lambdas) = (path.clone(), Arc::clone(file), self.lambdas.users(&key));
+        let (path, file, engine) = (path.clone(), Arc::clone(file), engine.clone());
+        let lambdas = self.lambdas.users(&key);
         let session = self.sessions.add(key.clone(), path.clone());
-        self.loads.push(LoadJob { session, key, file, path, lambdas });
+        self.loads.push(LoadJob { session, key, file, engine, path, lambdas });
         Ok(session)
     }
 

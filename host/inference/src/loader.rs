@@ -4,23 +4,31 @@ use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use gleaner_artifacts::{BuiltEngine, StoreLookup};
 use gleaner_base::chain;
-use gleaner_protocol::inference::{Element, MAX_TENSOR_BYTES, TensorInfo};
+use gleaner_protocol::inference::{Element, MAX_TENSOR_BYTES, TensorInfo, engine_file};
 use sha2::{Digest, Sha256};
 
-use crate::backend::{Backends, ChosenGraph, LoadedGraph, StopSignal, TensorValue};
+use crate::backend::{
+    Backends, ChosenGraph, EngineUse, ExecutionProvider, LoadedGraph, StopSignal, TensorValue,
+};
 use crate::inspect::{InspectError, ModelSignature, inspect};
 use crate::running::{ModelWork, WorkNote};
 use crate::sessions::{ReadyModel, SessionId, SessionKey};
+
+/// The entry with the engine of a model, unverified; or the reason why it must not be used.
+pub(crate) type PassedEngine = Result<Option<Arc<File>>, String>;
 
 /// A model to load.
 pub(crate) struct LoadJob {
     pub(crate) session: SessionId,
     pub(crate) key: SessionKey,
     pub(crate) file: Arc<File>,
+    pub(crate) engine: PassedEngine,
     pub(crate) path: String,
     pub(crate) lambdas: Vec<String>,
 }
@@ -47,6 +55,8 @@ pub(crate) struct LoadLimits {
 pub(crate) struct ModelLoader {
     pub(crate) backends: Backends,
     pub(crate) limits: LoadLimits,
+    /// Folder to write engines to, instead of using those that were built before.
+    pub(crate) engines: Option<PathBuf>,
     pub(crate) note: WorkNote,
 }
 
@@ -96,12 +106,14 @@ impl ModelLoader {
         let model = read(&job.file, &job.key.sha256, self.limits.model_max)?;
         let signature = inspect(&model)?;
         let key = &job.key;
-        let chosen = caught(|| self.backends.load(model, &key.providers, key.threads, &signature));
+        let engine = self.engine(job);
+        let load = || self.backends.load(model, &key.providers, key.threads, &signature, engine);
+        let chosen = caught(load);
         let chosen = match chosen {
             Ok(chosen) => chosen.map_err(|error| ModelError::Backend(error.to_string()))?,
             Err(panic) => return Err(ModelError::Backend(format!("loading it failed: {panic}"))),
         };
-        let ChosenGraph { mut graph, runtime, mut reason } = chosen;
+        let ChosenGraph { mut graph, runtime, mut reason, built_for } = chosen;
         self.note.limit(self.limits.run_max);
         let shapes = match warm(graph.as_mut(), &signature.inputs, stop) {
             Warmed::Ran(outputs) => outputs.into_iter().map(|it| it.shape.len()).collect(),
@@ -123,7 +135,28 @@ impl ModelLoader {
         });
         let outputs = outputs.collect();
         let load_ns = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
-        Ok((graph, ReadyModel { inputs, outputs, runtime, reason, load_ns }))
+        Ok((graph, ReadyModel { inputs, outputs, runtime, reason, built_for, load_ns }))
+    }
+}
+
+impl ModelLoader {
+    /// Returns what to do about an engine, if TensorRT is to load the model.
+    fn engine(&self, job: &LoadJob) -> EngineUse {
+        let sha256 = &job.key.sha256;
+        if !job.key.providers.iter().any(|name| name == ExecutionProvider::TensorRt.name()) {
+            return EngineUse::None;
+        }
+        match (&self.engines, &job.engine) {
+            (Some(folder), _) => EngineUse::Build(folder.join(engine_file(sha256))),
+            (None, Ok(Some(entry))) => match BuiltEngine::key(sha256).verified(entry) {
+                StoreLookup::Content(content) => BuiltEngine::parse(content)
+                    .map_or(EngineUse::Refused("it has no runtime".to_owned()), EngineUse::Built),
+                StoreLookup::Damaged(why) => EngineUse::Refused(format!("it is damaged: {why}")),
+                StoreLookup::Nothing => EngineUse::None,
+            },
+            (None, Ok(None)) => EngineUse::None,
+            (None, Err(reason)) => EngineUse::Refused(reason.clone()),
+        }
     }
 }
 

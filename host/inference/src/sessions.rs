@@ -52,6 +52,8 @@ pub(crate) struct ReadyModel {
     pub(crate) outputs: Vec<TensorInfo>,
     pub(crate) runtime: String,
     pub(crate) reason: String,
+    /// Name of the runtime of the engine that was built.
+    pub(crate) built_for: Option<String>,
     /// Time to load it and to run it once, in ns.
     pub(crate) load_ns: u64,
 }
@@ -157,9 +159,11 @@ impl SessionTable {
 impl ModelSession {
     fn report(&self, lambdas: Vec<String>) -> LoadedModel {
         let counts = self.counts;
+        let mut built_for = None;
         let (state, runtime, reason, load_ns) = match &self.state {
             LoadState::Loading => (ModelState::Warming, "", "", 0),
             LoadState::Ready(ready) => {
+                built_for = ready.built_for.clone();
                 (ModelState::Ready, &*ready.runtime, &*ready.reason, ready.load_ns)
             }
             LoadState::Failed(reason) => (ModelState::Failed, "", &**reason, 0),
@@ -173,6 +177,7 @@ impl ModelSession {
             state,
             runtime: runtime.to_owned(),
             reason: reason.to_owned(),
+            built_for,
             load_ns,
             runs: counts.runs,
             shared: counts.shared,

@@ -3,6 +3,7 @@
 use std::fs::File;
 use std::io;
 use std::os::fd::OwnedFd;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::{Builder, JoinHandle};
@@ -53,10 +54,12 @@ impl ResultSender {
 }
 
 impl ModelThreads {
-    /// Starts the threads. They note their work in `running`.
+    /// Starts the threads. They note their work in `running`, and write engines to the folder
+    /// `engines`, if there is one.
     pub(crate) fn start(
         backends: Backends,
         limits: LoadLimits,
+        engines: Option<PathBuf>,
         running: Option<File>,
     ) -> io::Result<Self> {
         let running = running.map(Arc::new);
@@ -66,7 +69,7 @@ impl ModelThreads {
         let sender = ResultSender { results: results_sender, wake: Arc::clone(&wake) };
         let (loads, load_inbox) = channel::<LoadJob>();
         let (runs, run_inbox) = channel::<WorkerRequest>();
-        let loader = ModelLoader { backends, limits, note: notes[0].clone() };
+        let loader = ModelLoader { backends, limits, engines, note: notes[0].clone() };
         let mut worker = ModelWorker::new(notes[1].clone(), limits.run_max);
         let named = |name: &str| Builder::new().name(name.to_owned()).stack_size(STACK_BYTES);
         let load_sender = sender.clone();

@@ -9,6 +9,7 @@ mod cli;
 mod compile;
 mod cookbook;
 mod dev;
+mod engines;
 mod environment;
 mod forged;
 mod hostile_folders;

@@ -1,6 +1,7 @@
 //! Chooses backend and provider of a model: tries those of the manifest in order, and keeps the
 //! error of each.
 
+use super::tensorrt::{EngineUse, load_tensorrt};
 use super::{Backend, BackendError, ExecutionProvider, LoadOptions, LoadedGraph};
 use crate::inspect::ModelSignature;
 
@@ -21,6 +22,8 @@ pub struct ChosenGraph {
     pub runtime: String,
     /// The reason for this choice, with the errors of those that were tried before.
     pub reason: String,
+    /// Name of the runtime of the engine that was built.
+    pub built_for: Option<String>,
 }
 
 /// A library that can be chosen.
@@ -45,6 +48,7 @@ impl Backends {
     }
 
     /// Loads a model with the first of `providers` that can run it; with any if none is named.
+    /// TensorRT uses or builds an engine, by `engine`.
     ///
     /// # Errors
     ///
@@ -55,29 +59,48 @@ impl Backends {
         providers: &[String],
         threads: u32,
         signature: &ModelSignature,
+        engine: EngineUse,
     ) -> Result<ChosenGraph, BackendError> {
         let any = ["cpu".to_owned()];
         let names = if providers.is_empty() { &any[..] } else { providers };
         let named: Vec<NamedProvider<'_>> =
             names.iter().map(|name| self.named(name)).collect::<Result<_, _>>()?;
         let mut errors = Vec::new();
-        let (mut model, last) = (Some(model), named.len() - 1);
+        let (mut model, mut engine, last) = (Some(model), engine, named.len() - 1);
         for (index, named) in named.iter().enumerate() {
             // The bytes are needed again only if another one may be tried.
             let bytes = if index == last { model.take() } else { model.clone() };
-            let options = LoadOptions { provider: named.provider, threads, signature };
+            let bytes = bytes.unwrap_or_default();
+            let options =
+                LoadOptions { provider: named.provider, threads, signature, engine: None };
+            let mut notes = Vec::new();
             let loaded = self.backend(named.library).and_then(|backend| {
-                Ok((backend.version(), backend.load(bytes.unwrap_or_default(), &options)?))
+                let (graph, built_for) = if named.provider == ExecutionProvider::TensorRt {
+                    load_tensorrt(
+                        backend,
+                        bytes,
+                        &options,
+                        std::mem::take(&mut engine),
+                        &mut notes,
+                    )?
+                } else {
+                    (backend.load(bytes, &options)?, None)
+                };
+                Ok((backend.version(), graph, built_for))
             });
             match loaded {
-                Ok((version, graph)) => {
+                Ok((version, graph, built_for)) => {
                     let plural = if threads == 1 { "" } else { "s" };
                     let provider = named.provider.name();
                     let runtime = format!("{version}, {provider}, {threads} thread{plural}");
-                    let reason = self.reason(providers, named, &errors);
-                    return Ok(ChosenGraph { graph, runtime, reason });
+                    let choice = self.reason(providers, named, &errors);
+                    let reason = [&[choice], &notes[..]].concat().join("; ");
+                    return Ok(ChosenGraph { graph, runtime, reason, built_for });
                 }
-                Err(error) => errors.push(format!("`{}` failed: {error}", named.name)),
+                Err(error) => {
+                    errors.append(&mut notes);
+                    errors.push(format!("`{}` failed: {error}", named.name));
+                }
             }
         }
         Err(BackendError::new(errors.join("; ")))
@@ -187,7 +210,8 @@ mod tests {
         );
         let providers: Vec<String> = providers.iter().map(|name| (*name).to_owned()).collect();
         let signature = ModelSignature::default();
-        let loaded = backends.load(b"model".to_vec(), &providers, threads, &signature);
+        let none = EngineUse::None;
+        let loaded = backends.load(b"model".to_vec(), &providers, threads, &signature, none);
         loaded.map(|it| (it.runtime, it.reason)).map_err(|error| error.to_string())
     }
 

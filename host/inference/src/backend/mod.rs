@@ -2,6 +2,7 @@
 //! [`LoadedGraph`] runs it.
 //!
 //! - `choice`: tries the providers of the manifest in order.
+//! - `tensorrt`: loads a model with an engine that was built before, or builds one.
 //! - `rten`: in this program. `onnxruntime`: a library that is loaded at run time.
 //! - `elements`: conversions between bytes and numbers.
 
@@ -9,8 +10,10 @@ mod choice;
 mod elements;
 mod onnxruntime;
 mod rten;
+mod tensorrt;
 
 use std::fmt;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 
@@ -21,6 +24,7 @@ use crate::inspect::ModelSignature;
 pub use self::rten::RtenBackend;
 pub use choice::{Backends, ChosenGraph};
 pub use onnxruntime::OnnxRuntime;
+pub use tensorrt::EngineUse;
 
 /// A device and the code for it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,6 +57,8 @@ pub struct LoadOptions<'a> {
     pub threads: u32,
     /// Inputs and outputs, from the file.
     pub signature: &'a ModelSignature,
+    /// File to write the engine to, if TensorRT builds one.
+    pub engine: Option<&'a Path>,
 }
 
 /// A library that runs models.
@@ -60,7 +66,12 @@ pub trait Backend: Send + Sync {
     /// Returns its name and version.
     fn version(&self) -> String;
 
-    /// Loads a model whose file was checked.
+    /// Returns one line about everything that an engine of TensorRT depends on.
+    fn engine_runtime(&self) -> String {
+        self.version()
+    }
+
+    /// Loads a model whose file was checked, or an engine that this backend has written.
     ///
     /// # Errors
     ///

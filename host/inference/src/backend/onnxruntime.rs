@@ -26,6 +26,8 @@ use super::{
 pub struct OnnxRuntime {
     environment: Environment,
     version: String,
+    /// A line about the libraries, GPU and driver that an engine depends on.
+    machine: String,
 }
 
 struct OrtGraph {
@@ -35,12 +37,13 @@ struct OrtGraph {
 }
 
 impl OnnxRuntime {
-    /// Opens the library. Call it once, before the sandbox closes.
+    /// Opens the library. Call it once, before the sandbox closes. Engines depend on `machine`, a
+    /// line about libraries, GPU and driver.
     ///
     /// # Errors
     ///
     /// The reason of the loader, or a library that is too old.
-    pub fn open(library: &Path) -> Result<Self, BackendError> {
+    pub fn open(library: &Path, machine: &str) -> Result<Self, BackendError> {
         let builder = ort::init_from(library).map_err(BackendError::new)?;
         let environment = builder
             .with_name("gleaner")
@@ -50,7 +53,7 @@ impl OnnxRuntime {
             .map_err(BackendError::new)?;
         environment.set_log_level(LogLevel::Warning);
         let version = format!("onnxruntime {}", version_of(library, ort::info()));
-        Ok(Self { environment, version })
+        Ok(Self { environment, version, machine: machine.to_owned() })
     }
 
     fn session(&self, model: &[u8], options: &LoadOptions<'_>) -> ort::Result<Session> {
@@ -62,6 +65,17 @@ impl OnnxRuntime {
             .with_inter_op_spinning(false)?
             .with_memory_pattern(false)?
             .with_execution_providers(providers(options.provider))?;
+        if let Some(engine) = options.engine {
+            let path = engine.to_string_lossy();
+            // A model that contains the engine. The keys are those of ONNX Runtime 1.18 and later.
+            for (key, value) in [
+                ("ep.context_enable", "1"),
+                ("ep.context_embed_mode", "1"),
+                ("ep.context_file_path", &path),
+            ] {
+                builder = builder.with_config_entry(key, value)?;
+            }
+        }
         builder.commit_from_memory(model)
     }
 }
@@ -97,6 +111,10 @@ fn version_of(library: &Path, info: &str) -> String {
 impl Backend for OnnxRuntime {
     fn version(&self) -> String {
         self.version.clone()
+    }
+
+    fn engine_runtime(&self) -> String {
+        format!("{}; {}", self.version, self.machine)
     }
 
     fn load(

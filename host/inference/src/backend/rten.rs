@@ -179,7 +179,7 @@ mod tests {
         let bytes = product();
         let signature = inspect(&bytes).unwrap();
         let provider = super::super::ExecutionProvider::Cpu;
-        let options = LoadOptions { provider, threads: 1, signature: &signature };
+        let options = LoadOptions { provider, threads: 1, signature: &signature, engine: None };
         let loaded = RtenBackend.load(bytes, &options);
         let mut graph = match loaded {
             Ok(graph) => graph,

@@ -15,6 +15,10 @@ pub(super) struct Args {
     /// /usr/local/lib; in /usr/lib. Without one, models run by rten.
     #[arg(long, value_name = "FILE")]
     pub(super) ort_lib: Option<PathBuf>,
+    /// Write the engines of models that `tensorrt` loads into this folder; engines that were built
+    /// before are not used.
+    #[arg(long, value_name = "DIR")]
+    pub(super) build_engines: Option<PathBuf>,
     /// Memory that the process may take, in bytes.
     #[arg(long, value_name = "BYTES", default_value_t = 2 << 30)]
     pub(super) memory: u64,

@@ -10,7 +10,7 @@ const NAME: &str = "libonnxruntime.so";
 const VARIABLE: &str = "ORT_DYLIB_PATH";
 
 /// Folders of the system that are searched, in this order.
-const FOLDERS: [&str; 6] = [
+pub(super) const FOLDERS: [&str; 6] = [
     "/usr/local/lib",
     "/usr/local/lib64",
     "/usr/lib",

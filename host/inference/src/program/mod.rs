@@ -1,9 +1,10 @@
 //! The program `gleaner-inference`.
 //!
 //! - `args`: the command line.
-//! - `library`: the search for ONNX Runtime.
+//! - `library`: the search for ONNX Runtime. `gpu`: what its engines depend on.
 
 mod args;
+mod gpu;
 mod library;
 
 use std::fs::File;
@@ -31,8 +32,16 @@ use args::Args;
 
 /// Runs the program `gleaner-inference`.
 pub fn main() -> ExitCode {
+    main_with(open)
+}
+
+/// Runs the program with the backend that `open` returns, or the reason why there is none. It is
+/// called in the sandbox, with the path of ONNX Runtime, and a line about the machine.
+pub fn main_with(
+    open: impl FnOnce(Option<&Path>, String) -> Result<Box<dyn Backend>, String>,
+) -> ExitCode {
     log::init_service();
-    match start(&Args::parse()) {
+    match start(&Args::parse(), open) {
         Ok(()) => Exit::Ok.into(),
         Err(failure) => {
             log::failure(&failure);
@@ -41,13 +50,20 @@ pub fn main() -> ExitCode {
     }
 }
 
-fn start(args: &Args) -> Result<(), Failure> {
+fn start(
+    args: &Args,
+    open: impl FnOnce(Option<&Path>, String) -> Result<Box<dyn Backend>, String>,
+) -> Result<(), Failure> {
     let internal = |what: &'static str| {
         move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
     };
     let library = library::find(args.ort_lib.as_deref());
-    // First: threads that exist already would keep their privileges.
-    let layers = sandbox::start(&paths(library.as_deref()));
+    let variable = std::env::var_os("LD_LIBRARY_PATH");
+    let machine = library.as_deref().map(|it| gpu::describe(Path::new("/"), it, variable));
+    let mut paths = paths(library.as_deref());
+    paths.write.extend(args.build_engines.clone());
+    // Before any thread: one that exists already would keep its privileges.
+    let layers = sandbox::start(&paths);
     // A starter that dies also closes the control connection.
     set_parent_process_death_signal(Some(Signal::TERM))
         .map_err(io::Error::from)
@@ -57,7 +73,7 @@ fn start(args: &Args) -> Result<(), Failure> {
     let reports = reports().map_err(internal("cannot set up the report stream"))?;
     // Not without seals: a lambda could take memory away while it is read.
     TensorRegion::create("gleaner-test", 1).map_err(internal("cannot share tensors"))?;
-    let onnx_runtime = open(library.as_deref());
+    let onnx_runtime = open(library.as_deref(), machine.unwrap_or_default());
     let layers = sandbox::close(layers).map_err(|error| {
         Failure::caused_by(Exit::Internal, "cannot close the sandbox of the models", &error)
     })?;
@@ -67,7 +83,8 @@ fn start(args: &Args) -> Result<(), Failure> {
     let backends = Backends::new(Box::new(RtenBackend), onnx_runtime);
     let Args { model_max, load_max, run_max, .. } = *args;
     let limits = LoadLimits { model_max, load_max, run_max };
-    let threads = ModelThreads::start(backends, limits, running)
+    let engines = args.build_engines.clone();
+    let threads = ModelThreads::start(backends, limits, engines, running)
         .map_err(internal("cannot start the threads for models"))?;
     let writer = ReportWriter::start(reports).map_err(internal("cannot start a thread"))?;
     let sender = writer.sender();
@@ -76,16 +93,18 @@ fn start(args: &Args) -> Result<(), Failure> {
     writer.end();
     ended.map_err(|error| match error {
         // Another code than that of an internal error: the model is to blame.
-        EngineError::Overdue(_) => Failure::new(Exit::LambdaFaulted, error.to_string())
-            .with_help("give the model a shorter deadline with ONNX Runtime, or a smaller input"),
+        EngineError::Overdue(_) => Failure::new(Exit::LambdaFaulted, error.to_string()).with_help(
+            "give the model a shorter deadline with ONNX Runtime, or a smaller input; for \
+                 TensorRT, build its engine ahead: gleaner check DIR --build-engines",
+        ),
         error => Failure::caused_by(Exit::Internal, "cannot run models", &error),
     })
 }
 
 /// Opens ONNX Runtime; without it, returns the reason.
-fn open(library: Option<&Path>) -> Result<Box<dyn Backend>, String> {
+fn open(library: Option<&Path>, machine: String) -> Result<Box<dyn Backend>, String> {
     let library = library.ok_or_else(library::searched)?;
-    match OnnxRuntime::open(library) {
+    match OnnxRuntime::open(library, &machine) {
         Ok(backend) => Ok(Box::new(backend)),
         Err(error) => {
             let (path, reason) = (library.display(), error.to_string());

@@ -13,8 +13,8 @@ use std::time::{Duration, Instant};
 use gleaner_protocol::Handover;
 use gleaner_protocol::inference::{
     AddClient, Element, GrantedModel, InferenceControl, InferenceReport, InferenceStatus,
-    LoadedModel, MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelFault, ModelFaultKind, ModelFile,
-    ModelResult, ModelState, ModelWait, TensorInfo, TensorPlace,
+    LoadedModel, MAX_TENSOR_BYTES, ModelCall, ModelClient, ModelEngine, ModelFault, ModelFaultKind,
+    ModelFile, ModelResult, ModelState, ModelWait, TensorInfo, TensorPlace,
 };
 use sha2::{Digest, Sha256};
 
@@ -101,8 +101,9 @@ impl ModelProgram {
             let mut file = tempfile::tempfile().unwrap();
             file.write_all(bytes).unwrap();
             let path = format!("{}.onnx", grant.name);
-            let model = ModelFile { sha256: grant.sha256.clone(), path };
-            control.add_model(&model, file.as_fd()).unwrap();
+            let engine = ModelEngine::None;
+            let model = ModelFile { sha256: grant.sha256.clone(), path, engine };
+            control.add_model(&model, file.as_fd(), None).unwrap();
         }
         let models = models.iter().map(|model| model.grant.clone()).collect();
         let client = AddClient { name: name.to_owned(), memory: MAX_TENSOR_BYTES, models };

@@ -1,4 +1,4 @@
-//! Loads a component: takes its native code from the cache, or has `gleaner-compile` compile it
+//! Loads a component: takes its native code from the store, or has `gleaner-compile` compile it
 //! there.
 #![allow(unsafe_code)]
 
@@ -6,10 +6,10 @@ use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use gleaner_artifacts::{DerivedEntry, StoreLookup, make_store};
 use gleaner_base::{Exit, Explain, Failure};
 use gleaner_compile::{
-    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CacheEntry, CacheLookup, CompileError, Nans,
-    make_cache, read_component,
+    COMPILE_CPU_SECONDS, COMPILE_MEMORY_BYTES, CompileError, Nans, code_entry, read_component,
 };
 use gleaner_parts::{Parts, PartsError};
 use sha2::{Digest, Sha256};
@@ -114,9 +114,9 @@ impl Loaded {
     ) -> Result<Self, WasmError> {
         let component = read_component(path)?;
         let engine = gleaner_compile::engine(stack_bytes, nans)?;
-        let entry = CacheEntry::of(cache, &component, nans);
+        let entry = code_entry(cache, &component, nans);
         let code = native_code(&entry, path, cache, nans)?;
-        // SAFETY: these bytes are in this process's memory. `CacheEntry::read` found that their
+        // SAFETY: these bytes are in this process's memory. `DerivedEntry::read` found that their
         // digest is the one that `gleaner-compile` wrote for this component, engine and CPU, in a
         // file and below folders to which only this user or root may write.
         let code = unsafe { Component::deserialize(&engine, &code) }.map_err(|source| {
@@ -164,16 +164,16 @@ impl Loaded {
 
 /// Returns the code in `entry`, and compiles it first if it is missing or damaged.
 fn native_code(
-    entry: &CacheEntry,
+    entry: &DerivedEntry,
     path: &Path,
     cache: &Path,
     nans: Nans,
 ) -> Result<Vec<u8>, WasmError> {
-    make_cache(cache)?;
-    match entry.read()? {
-        CacheLookup::Code(code) => return Ok(code),
-        CacheLookup::Nothing => {}
-        CacheLookup::Damaged(why) => {
+    make_store(cache).map_err(CompileError::from)?;
+    match entry.read().map_err(CompileError::from)? {
+        StoreLookup::Content(code) => return Ok(code),
+        StoreLookup::Nothing => {}
+        StoreLookup::Damaged(why) => {
             let file = entry.path().display();
             tracing::warn!(
                 %file,
@@ -183,12 +183,12 @@ fn native_code(
         }
     }
     compile(path, cache, nans)?;
-    let why = match entry.read()? {
-        CacheLookup::Code(code) => return Ok(code),
-        CacheLookup::Nothing => {
+    let why = match entry.read().map_err(CompileError::from)? {
+        StoreLookup::Content(code) => return Ok(code),
+        StoreLookup::Nothing => {
             "the code is missing: the component or the cache was changed meanwhile".to_owned()
         }
-        CacheLookup::Damaged(why) => format!("the code was just written, and {why}"),
+        StoreLookup::Damaged(why) => format!("the code was just written, and {why}"),
     };
     Err(WasmError::Load { path: entry.path().to_owned(), source: why.into() })
 }

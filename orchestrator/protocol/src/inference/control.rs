@@ -23,6 +23,27 @@ pub struct ModelFile {
     pub sha256: String,
     /// Its path, for messages.
     pub path: String,
+    /// Its engine for TensorRT.
+    pub engine: ModelEngine,
+}
+
+/// The engine for TensorRT that was built of a model.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ModelEngine {
+    /// There is none.
+    #[default]
+    None,
+    /// Its entry in the store comes as a second descriptor; it is verified before it is loaded.
+    Attached,
+    /// It must not be used, for this reason.
+    Refused(String),
+}
+
+/// Returns the name of the file with the engine that was built of the model with this SHA-256, in
+/// the folder of `--build-engines`.
+pub fn engine_file(sha256: &str) -> String {
+    format!("{sha256}.onnx")
 }
 
 /// A model that a lambda may use.
@@ -54,8 +75,8 @@ pub struct AddClient {
 /// A request of the starter.
 #[derive(Debug)]
 pub enum InferenceRequest {
-    /// A model file, sent before the first lambda that may use it.
-    Model(ModelFile, OwnedFd),
+    /// A model file and its engine, sent before the first lambda that may use it.
+    Model(ModelFile, OwnedFd, Option<OwnedFd>),
     /// A lambda.
     Client(AddClient, OwnedFd),
     /// Exit.
@@ -81,13 +102,19 @@ impl InferenceControl {
         Ok((InferenceControl { socket: starter_end }, other_end.into()))
     }
 
-    /// Adds a model file.
+    /// Adds a model file, with its engine if that is attached.
     ///
     /// # Errors
     ///
     /// [`LinkError::Gone`] if the process has ended, [`LinkError::Full`] if it does not read.
-    pub fn add_model(&self, model: &ModelFile, file: BorrowedFd<'_>) -> Result<(), LinkError> {
-        self.send(tag::MODEL_FILE, model, file)
+    pub fn add_model(
+        &self,
+        model: &ModelFile,
+        file: BorrowedFd<'_>,
+        engine: Option<BorrowedFd<'_>>,
+    ) -> Result<(), LinkError> {
+        let descriptors: Vec<_> = [file].into_iter().chain(engine).collect();
+        self.send(tag::MODEL_FILE, model, &descriptors)
     }
 
     /// Adds a lambda, whose process has the other end of `socket`.
@@ -96,7 +123,7 @@ impl InferenceControl {
     ///
     /// Those of [`add_model`](Self::add_model).
     pub fn add_client(&self, client: &AddClient, socket: BorrowedFd<'_>) -> Result<(), LinkError> {
-        self.send(tag::ADD_CLIENT, client, socket)
+        self.send(tag::ADD_CLIENT, client, &[socket])
     }
 
     /// Requests the process to exit.
@@ -112,11 +139,11 @@ impl InferenceControl {
         &self,
         tag: u8,
         message: &impl Serialize,
-        descriptor: BorrowedFd<'_>,
+        descriptors: &[BorrowedFd<'_>],
     ) -> Result<(), LinkError> {
         let failed = |source| LinkError::Socket { peer: INFERENCE, source };
         let payload = serde_json::to_vec(message).map_err(|error| failed(error.into()))?;
-        send_frame(&self.socket, &frame::encode(tag, &payload), &[descriptor], INFERENCE)
+        send_frame(&self.socket, &frame::encode(tag, &payload), descriptors, INFERENCE)
     }
 }
 
@@ -132,7 +159,7 @@ pub struct InferenceServer {
 impl InferenceServer {
     /// Creates the server from its end of the connection.
     pub fn new(socket: OwnedFd) -> InferenceServer {
-        InferenceServer { socket, frames: FrameReceiver::new(STARTER, 1) }
+        InferenceServer { socket, frames: FrameReceiver::new(STARTER, 2) }
     }
 
     /// Returns the next request if it has arrived completely. Never waits. Call it until it returns
@@ -158,7 +185,13 @@ impl AsFd for InferenceServer {
 
 fn request(mut frame: ReceivedFrame) -> Result<InferenceRequest, LinkError> {
     match frame.tag {
-        tag::MODEL_FILE => Ok(InferenceRequest::Model(frame.json(STARTER)?, frame.descriptor()?)),
+        tag::MODEL_FILE => {
+            let model: ModelFile = frame.json(STARTER)?;
+            // The last one comes first.
+            let is_attached = model.engine == ModelEngine::Attached;
+            let engine = is_attached.then(|| frame.descriptor()).transpose()?;
+            Ok(InferenceRequest::Model(model, frame.descriptor()?, engine))
+        }
         tag::ADD_CLIENT => Ok(InferenceRequest::Client(frame.json(STARTER)?, frame.descriptor()?)),
         tag::STOP => Ok(InferenceRequest::Stop),
         tag => Err(LinkError::Unknown { peer: STARTER, tag }),

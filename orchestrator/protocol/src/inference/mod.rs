@@ -26,7 +26,8 @@ mod tests;
 pub use call::{ModelCall, ModelFault, ModelFaultKind, ModelReply, ModelRequest, ModelResult};
 pub use client::{ModelClient, ModelWait};
 pub use control::{
-    AddClient, GrantedModel, InferenceControl, InferenceRequest, InferenceServer, ModelFile,
+    AddClient, GrantedModel, InferenceControl, InferenceRequest, InferenceServer, ModelEngine,
+    ModelFile, engine_file,
 };
 pub use report::{InferenceReport, InferenceStatus, LoadedModel, ModelState};
 pub use server::{ModelSocket, report_state};

@@ -35,6 +35,8 @@ pub struct LoadedModel {
     pub runtime: String,
     /// The reason for this backend and provider, with the errors of those that were tried before.
     pub reason: String,
+    /// Name of the runtime for which an engine was built, if the process was started to build some.
+    pub built_for: Option<String>,
     /// Time to load it and to run it once, in ns.
     pub load_ns: u64,
     /// Number of runs.

@@ -67,7 +67,9 @@ fn a_message_that_is_no_call_or_too_long_is_refused() {
 fn models_and_lambdas_arrive_with_their_descriptors() {
     let (control, end) = InferenceControl::pair().unwrap();
     let mut server = InferenceServer::new(end);
-    let file = ModelFile { sha256: "0".repeat(64), path: "m.onnx".to_owned() };
+    let file =
+        ModelFile { sha256: "0".repeat(64), path: "m.onnx".to_owned(), engine: ModelEngine::None };
+    let attached = ModelFile { engine: ModelEngine::Attached, ..file.clone() };
     let model = GrantedModel {
         name: "m".to_owned(),
         sha256: file.sha256.clone(),
@@ -77,15 +79,30 @@ fn models_and_lambdas_arrive_with_their_descriptors() {
     };
     let client = AddClient { name: "yolo".to_owned(), memory: 1 << 20, models: vec![model] };
     let (passed, _other) = ModelClient::pair().unwrap();
-    control.add_model(&file, passed.as_fd()).unwrap();
+    control.add_model(&file, passed.as_fd(), None).unwrap();
+    control.add_model(&attached, passed.as_fd(), Some(passed.as_fd())).unwrap();
     control.add_client(&client, passed.as_fd()).unwrap();
     control.stop().unwrap();
     let mut next = || server.poll().unwrap();
-    assert!(matches!(next(), Incoming::Message(InferenceRequest::Model(it, _)) if it == file));
+    let mut model = |wanted: ModelFile| match next() {
+        Incoming::Message(InferenceRequest::Model(it, _, engine)) if it == wanted => engine,
+        other => panic!("{other:?}"),
+    };
+    assert!(model(file).is_none());
+    assert!(model(attached.clone()).is_some());
     assert!(matches!(next(), Incoming::Message(InferenceRequest::Client(it, _)) if it == client));
     assert!(matches!(next(), Incoming::Message(InferenceRequest::Stop)));
+    // One of the two is missing.
+    control.add_model(&attached, passed.as_fd(), None).unwrap();
+    let error = server.poll().unwrap_err();
+    assert!(matches!(error, LinkError::NoDescriptor { .. }), "{error}");
+}
+
+#[test]
+fn the_end_of_the_starter_arrives() {
+    let (control, end) = InferenceControl::pair().unwrap();
     drop(control);
-    assert!(matches!(next(), Incoming::Ended));
+    assert!(matches!(InferenceServer::new(end).poll(), Ok(Incoming::Ended)));
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Bounds the size of the cache: removes the least recently used entries.
+//! Bounds the size of the store: removes the least recently used entries.
 
 use std::fs::{self, File};
 use std::io;
@@ -7,9 +7,12 @@ use std::time::{Duration, SystemTime};
 
 use gleaner_base::safe_file;
 
-/// Maximum size of the cache, in bytes; an ordinary lambda takes half a megabyte. Code of old
-/// builds, versions and settings is no longer loaded, and so removed first.
-pub const CACHE_BYTES: u64 = 1 << 30;
+use super::DerivedKind;
+
+/// Maximum size of a store, in bytes; native code of an ordinary lambda takes half a megabyte, an
+/// engine as much as its model. Entries of old builds, versions and settings are no longer used, and
+/// so removed first.
+pub const STORE_BYTES: u64 = 2 << 30;
 
 /// Interval in which the use of an entry is noted at most once, so that few starts write to the
 /// disk.
@@ -28,23 +31,23 @@ pub(crate) fn note_use(entry: &File) {
     })();
 }
 
-/// Removes the least recently used entries of `cache`, except `keep`, until at most `max` bytes are
-/// left, and the partial files of killed processes. Processes keep the code that they have loaded.
+/// Removes the least recently used entries of `store`, except `keep`, until at most `max` bytes are
+/// left, and the partial files of killed processes. Processes keep what they have loaded.
 /// Several processes may prune at the same time.
 ///
 /// # Errors
 ///
 /// Errors of reading the folder; files that cannot be removed stay.
-pub(crate) fn prune(cache: &Path, keep: &Path, max: u64) -> io::Result<()> {
+pub(crate) fn prune(store: &Path, keep: &Path, max: u64) -> io::Result<()> {
     let mut bytes = 0_u64;
     let mut entries: Vec<(SystemTime, PathBuf, u64)> = Vec::new();
-    for entry in fs::read_dir(cache)? {
+    for entry in fs::read_dir(store)? {
         let path = entry?.path();
         let Ok(meta) = fs::symlink_metadata(&path) else { continue };
         let Ok(modified) = meta.modified() else { continue };
         match path.extension().and_then(|extension| extension.to_str()) {
             Some("part") => remove_abandoned(&path),
-            Some("cwasm") => {
+            Some(kind) if DerivedKind::ALL.iter().any(|it| it.extension() == kind) => {
                 bytes = bytes.saturating_add(meta.len());
                 entries.extend((path != keep).then_some((modified, path, meta.len())));
             }
@@ -85,21 +88,21 @@ mod tests {
 
     #[test]
     fn the_least_recently_used_entries_are_removed_first() {
-        let cache = std::env::temp_dir().join(format!("gleaner-prune-{}", std::process::id()));
-        fs::create_dir_all(&cache).unwrap();
+        let store = std::env::temp_dir().join(format!("gleaner-prune-{}", std::process::id()));
+        fs::create_dir_all(&store).unwrap();
         for (day, name) in
             ["new.cwasm", "older.cwasm", "oldest.cwasm", "kept.cwasm"].into_iter().enumerate()
         {
-            file(&cache.join(name), 1000, DAY * (day as u32 + 1));
+            file(&store.join(name), 1000, DAY * (day as u32 + 1));
         }
-        file(&cache.join("x.17.part"), 10, DAY * 2);
-        file(&cache.join("y.18.part"), 10, DAY * 2);
-        let writer = safe_file::edit(&cache.join("y.18.part")).unwrap();
+        file(&store.join("x.17.part"), 10, DAY * 2);
+        file(&store.join("y.18.part"), 10, DAY * 2);
+        let writer = safe_file::edit(&store.join("y.18.part")).unwrap();
         writer.lock().unwrap();
-        file(&cache.join("foreign.txt"), 10_000, DAY * 9);
+        file(&store.join("foreign.txt"), 10_000, DAY * 9);
         let left = |max| {
-            prune(&cache, &cache.join("kept.cwasm"), max).unwrap();
-            let mut names: Vec<_> = fs::read_dir(&cache)
+            prune(&store, &store.join("kept.cwasm"), max).unwrap();
+            let mut names: Vec<_> = fs::read_dir(&store)
                 .unwrap()
                 .map(|entry| entry.unwrap().file_name().into_string().unwrap())
                 .collect();
@@ -111,12 +114,12 @@ mod tests {
             "foreign.txt kept.cwasm new.cwasm older.cwasm oldest.cwasm y.18.part"
         );
         assert_eq!(left(3999), "foreign.txt kept.cwasm new.cwasm older.cwasm y.18.part");
-        note_use(&File::open(cache.join("older.cwasm")).unwrap());
+        note_use(&File::open(store.join("older.cwasm")).unwrap());
         assert_eq!(left(2000), "foreign.txt kept.cwasm older.cwasm y.18.part");
         assert_eq!(left(0), "foreign.txt kept.cwasm y.18.part");
         // As if its writer had been killed.
         drop(writer);
         assert_eq!(left(0), "foreign.txt kept.cwasm");
-        fs::remove_dir_all(&cache).unwrap();
+        fs::remove_dir_all(&store).unwrap();
     }
 }
