@@ -1,9 +1,8 @@
 //! The command `gleaner`.
 //!
 //! `new` creates a lambda's folder, `build` its build folder. `runtime` starts `gleaner-runtime`
-//! for `check`, `replay` and `verify`, `run` supervises it, the ingress and the recorder live,
-//! `inference` supervises the process that runs models, for both, and `delegate` passes commands on
-//! to another program. `render` formats results as text, `report` writes the report page, `diff`
+//! for `check`, `replay` and `verify`, `run` runs lambdas live by `gleaner-supervisor`, and `delegate`
+//! passes commands on to another program. `render` formats results as text, `report` writes the report page, `diff`
 //! compares two runs, and `dev` repeats all of this whenever a source is saved. `generated` prints
 //! shell completions and man pages.
 //!
@@ -19,13 +18,11 @@ pub mod dev;
 mod diff;
 mod doctor;
 mod generated;
-mod inference;
 mod new;
 mod pipe_reader;
 mod render;
 mod replay;
 mod report;
-mod restart_delay;
 mod run;
 mod runtime;
 mod stdout;

@@ -33,8 +33,8 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::Signal;
 
+use crate::lines::{next_report, pass_on};
 use crate::restart_delay::RestartDelay;
-use crate::runtime::{next_report, pass_on};
 
 /// Program and name of the process.
 const INFERENCE: &str = "gleaner-inference";
@@ -53,7 +53,7 @@ const HEALTHY: Duration = Duration::from_secs(60);
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// An event of the process, for the user.
-pub(crate) enum InferenceEvent {
+pub enum InferenceEvent {
     /// One of its reports.
     Report(InferenceReport),
     /// A piece of its standard error.
@@ -68,7 +68,7 @@ pub(crate) enum InferenceEvent {
 type Events = Arc<dyn Fn(InferenceEvent) + Send + Sync>;
 
 /// The process, over all its restarts. Dropping it ends the process.
-pub(crate) struct InferenceService {
+pub struct InferenceService {
     shared: Arc<Shared>,
     supervisor: Option<JoinHandle<()>>,
 }
@@ -104,7 +104,7 @@ impl InferenceService {
     /// # Errors
     ///
     /// A failure if it cannot be started.
-    pub(crate) fn start(
+    pub fn start(
         parts: &Parts,
         events: impl Fn(InferenceEvent) + Send + Sync + 'static,
     ) -> Result<InferenceService, Failure> {
@@ -131,7 +131,7 @@ impl InferenceService {
     /// # Errors
     ///
     /// A failure if the file of a model cannot be opened.
-    pub(crate) fn add(
+    pub fn add(
         &self,
         name: &str,
         build: &BuildDir,
@@ -162,7 +162,7 @@ impl InferenceService {
     }
 
     /// Ends the process.
-    pub(crate) fn stop(mut self) {
+    pub fn stop(mut self) {
         self.end();
     }
 
