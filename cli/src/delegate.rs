@@ -14,11 +14,6 @@ use crate::args::{InspectArgs, TopicsArgs};
 use crate::render;
 use crate::stdout::print;
 
-/// Returns the argument that makes `gleaner-shim` end its runtime when this process dies.
-pub(crate) fn starter() -> OsString {
-    format!("--starter={}", std::process::id()).into()
-}
-
 /// Replaces this process by `gleaner-player`.
 pub(crate) fn play(arguments: &[OsString]) -> Result<Exit, Failure> {
     let program = Parts::find()?.program("gleaner-player")?;

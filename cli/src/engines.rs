@@ -3,7 +3,6 @@
 //!
 //! A process of its own builds each: a hostile model can spoil no engine but its own.
 
-use std::fs::File;
 use std::io::{self, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
@@ -11,17 +10,17 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-use gleaner_artifacts::{BuiltEngine, DerivedEntry, DerivedKind, StoreError, make_store};
+use gleaner_artifacts::{BuiltEngine, DerivedKind, make_store};
 use gleaner_base::{ByteSize, Exit, Failure, PlainFile, chain, visible};
-use gleaner_lambda::{BuildDir, InferenceLimits};
 use gleaner_lambda::manifest::{Manifest, ModelSpec};
+use gleaner_lambda::{BuildDir, InferenceLimits};
 use gleaner_parts::{Parts, cache_dir};
 use gleaner_protocol::inference::{
     InferenceReport, ModelCall, ModelClient, ModelState, engine_file,
 };
+use gleaner_supervisor::{InferenceEvent, InferenceService};
 use serde::Serialize;
 
-use crate::inference::{InferenceEvent, InferenceService};
 use crate::render;
 use crate::run::stop_flag;
 use crate::stdout::print;
@@ -55,19 +54,6 @@ struct EngineBuilt {
     runtime: String,
     seconds: f64,
     bytes: u64,
-}
-
-/// Opens the entry with the engine of the model with this SHA-256, if there is one. Otherwise
-/// returns the reason why it must not be used.
-pub(crate) fn stored(sha256: &str) -> Result<Option<File>, String> {
-    let store = cache_dir().map_err(|error| chain(&error))?;
-    match DerivedEntry::of(&store, BuiltEngine::key(sha256)).open() {
-        // There is no store yet.
-        Err(StoreError::Read { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
-            Ok(None)
-        }
-        found => found.map_err(|error| chain(&error)),
-    }
 }
 
 /// Builds the engines of the models of the lambda in the folder `lambda`, and prints the result.

@@ -1,11 +1,11 @@
 //! The command `gleaner`.
 //!
 //! `new` creates a lambda's folder, `build` its build folder. `runtime` starts `gleaner-runtime`
-//! for `check`, `replay` and `verify`, `run` supervises it, the ingress and the recorder live,
-//! `inference` supervises the process that runs models, for both, `engines` has it build engines
-//! ahead, and `delegate` passes commands on to another program. `render` formats results as text,
-//! `report` writes the report page, `diff` compares two runs, and `dev` repeats all of this whenever
-//! a source is saved. `generated` prints shell completions and man pages.
+//! for `check`, `replay` and `verify`, `run` runs lambdas live by `gleaner-supervisor`, `engines`
+//! builds engines of models ahead, and `delegate` passes commands on to another program. `render`
+//! formats results as text, `report` writes the report page, `diff` compares two runs, and `dev`
+//! repeats all of this whenever a source is saved. `generated` prints shell completions and man
+//! pages.
 //!
 //! No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts
 //! the other programs and exchanges `gleaner-protocol` messages with them. `gleaner-report` reads
@@ -20,13 +20,11 @@ mod diff;
 mod doctor;
 mod engines;
 mod generated;
-mod inference;
 mod new;
 mod pipe_reader;
 mod render;
 mod replay;
 mod report;
-mod restart_delay;
 mod run;
 mod runtime;
 mod stdout;

@@ -1,7 +1,7 @@
 //! Runs `gleaner-runtime`: shows its progress and messages, and reads its result.
 
 use std::ffi::OsString;
-use std::io::{self, BufRead, BufReader, Read, Write};
+use std::io::{self, BufReader, Read, Write};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -9,21 +9,17 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use gleaner_base::{Exit, Explain, Failure, each_piece, visible};
+use gleaner_base::{Exit, Explain, Failure, visible};
 use gleaner_lambda::manifest::{LambdaKind, Manifest};
 use gleaner_lambda::{BuildDir, InferenceLimits, Vehicle};
 use gleaner_parts::Parts;
 use gleaner_protocol::{CheckReport, Handover, PASSES_INFERENCE, ReplaySummary, Report, Verified};
+use gleaner_supervisor::lines::{next_report, pass_on};
+use gleaner_supervisor::{InferenceEvent, InferenceService, starter};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::delegate::starter;
-use crate::inference::{InferenceEvent, InferenceService};
 use crate::pipe_reader::PipeReader;
-use crate::render::Paint;
-
-/// Maximum size of a report, far above that of a trigger with all its attributes or of a clip with
-/// all its lists.
-const REPORT_BYTES: u64 = 16 << 20;
+use crate::render::{self, Paint};
 
 /// Failures of the runtime that it cannot report itself.
 #[derive(Debug, thiserror::Error)]
@@ -156,7 +152,7 @@ impl ModelsOfRun {
             if matches!(event, InferenceEvent::Ended(..)) {
                 failed.store(true, Ordering::Relaxed);
             }
-            let text = event.text(Paint::of_stderr());
+            let text = render::inference_event(&event, Paint::of_stderr());
             bar.suspend(|| drop(io::stderr().write_all(&text)));
         })?;
         let inference = service.add(manifest.lambda.name.as_str(), build, manifest)?;
@@ -206,13 +202,6 @@ fn start(
         .map_err(failed)
 }
 
-/// Reads the next report into `line`; returns false at the end. A line beyond [`REPORT_BYTES`],
-/// which a lambda's process could write, comes in pieces that cannot be parsed.
-pub(crate) fn next_report(reports: &mut impl BufRead, line: &mut Vec<u8>) -> io::Result<bool> {
-    line.clear();
-    Ok(reports.take(REPORT_BYTES).read_until(b'\n', line)? > 0)
-}
-
 /// Reads reports up to the result, which is the last; `None` if there is no result.
 fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<RuntimeResult>, RuntimeError> {
     let mut reports = BufReader::new(reports);
@@ -241,23 +230,6 @@ fn follow(reports: impl Read, bar: &ProgressBar) -> Result<Option<RuntimeResult>
     Ok(None)
 }
 
-/// Passes lines to `show`, and sets `explained` if one of them is an error message.
-pub(crate) fn pass_on(stderr: impl Read, explained: &AtomicBool, mut show: impl FnMut(&[u8])) {
-    each_piece(stderr, |piece| {
-        if piece.is_failure() {
-            explained.store(true, Ordering::Relaxed);
-        }
-        show(escaped(piece.bytes).as_bytes());
-    });
-}
-
-/// Escapes control characters, except tabs and the line end.
-fn escaped(piece: &[u8]) -> String {
-    let text = String::from_utf8_lossy(piece);
-    let (words, end) = text.strip_suffix('\n').map_or((&*text, ""), |words| (words, "\n"));
-    words.split('\t').map(visible).collect::<Vec<_>>().join("\t") + end
-}
-
 fn progress_bar() -> ProgressBar {
     // indicatif hides the bar if standard error is not a terminal.
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
@@ -279,18 +251,9 @@ fn signal_of(_: ExitStatus) -> Option<i32> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use gleaner_supervisor::lines::REPORT_BYTES;
 
-    #[test]
-    fn messages_of_the_runtime_are_passed_on_line_by_line_to_the_end() {
-        let long = "x".repeat(10_000);
-        let mut shown = Vec::new();
-        let text = format!("one\n{long}\nno line end");
-        pass_on(text.as_bytes(), &AtomicBool::new(false), |piece| shown.push(piece.to_vec()));
-        assert_eq!(shown[0], b"one\n");
-        assert_eq!(shown.concat(), text.as_bytes());
-        assert!(shown.iter().all(|piece| piece.len() <= 8192));
-    }
+    use super::*;
 
     /// A stream that begins with `text` and never ends; counts the bytes read.
     struct Endless<'a> {
@@ -320,34 +283,5 @@ mod tests {
             assert!(error.to_string().contains("xxxx"), "{error}");
         }
         assert!(follow(&b""[..], &bar).unwrap().is_none());
-    }
-
-    #[test]
-    fn control_characters_of_messages_are_escaped() {
-        for (text, shown) in [
-            ("plain\ttext, ä\n", "plain\ttext, ä\n"),
-            ("\u{1b}]0;owned\u{7}\n", "\\u{1b}]0;owned\\u{7}\n"),
-            ("back\rover", "back\\rover"),
-            ("\u{202e}turned", "\\u{202e}turned"),
-        ] {
-            assert_eq!(escaped(text.as_bytes()), shown);
-        }
-        assert_eq!(escaped(b"\xffbroken\n"), "\u{fffd}broken\n");
-    }
-
-    #[test]
-    fn only_a_line_that_begins_with_error_explains_an_exit_code() {
-        let inside = format!("{}error: x", "y".repeat(8192));
-        for (text, expected) in [
-            ("error: x", true),
-            ("a\nerror: x\n", true),
-            ("an error: x\n", false),
-            (&inside, false),
-            ("", false),
-        ] {
-            let explained = AtomicBool::new(false);
-            pass_on(text.as_bytes(), &explained, |_| {});
-            assert_eq!(explained.into_inner(), expected);
-        }
     }
 }

@@ -57,6 +57,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-parts",
             "gleaner-protocol",
             "gleaner-report",
+            "gleaner-supervisor",
         ],
     ),
     ("gleaner-compile", &["gleaner-artifacts", "gleaner-base", "gleaner-jail", "gleaner-lambda"]),
@@ -174,6 +175,16 @@ pub const CRATES: &[(&str, &[&str])] = &[
         "gleaner-shim",
         &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"],
     ),
+    (
+        "gleaner-supervisor",
+        &[
+            "gleaner-artifacts",
+            "gleaner-base",
+            "gleaner-lambda",
+            "gleaner-parts",
+            "gleaner-protocol",
+        ],
+    ),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
     ("gleaner-vision", &["gleaner-rules"]),
     ("gleaner-vitals", &["gleaner-protocol"]),
@@ -189,6 +200,8 @@ pub const WITHOUT: &[(&str, &[&str])] = &[
     ("gleaner-player", &["pyo3", "rustdds"]),
     // A web page may use it.
     ("gleaner-report", &["clap", "indicatif"]),
+    // A daemon uses it as well as a terminal.
+    ("gleaner-supervisor", &["clap", "indicatif", "wasmtime", "pyo3", "rustdds"]),
 ];
 
 /// For each room of `host/src`, the rooms that it must not use.

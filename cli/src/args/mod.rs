@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::net::IpAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
@@ -98,17 +98,16 @@ pub struct LambdaArgs {
 impl LambdaArgs {
     /// Returns the settings as arguments of the other programs.
     pub(crate) fn settings(&self) -> Vec<OsString> {
-        settings(&self.set, &self.remap, self.vehicle.as_deref())
+        let pairs = |flag: &'static str, values: &[String]| {
+            values.iter().flat_map(|value| [flag.into(), value.into()]).collect::<Vec<OsString>>()
+        };
+        let vehicle = self.vehicle.iter().flat_map(|file| ["--vehicle".into(), file.into()]);
+        pairs("--set", &self.set)
+            .into_iter()
+            .chain(pairs("--remap", &self.remap))
+            .chain(vehicle)
+            .collect()
     }
-}
-
-/// Returns the settings of a lambda as arguments of the other programs.
-pub(crate) fn settings(set: &[String], remap: &[String], vehicle: Option<&Path>) -> Vec<OsString> {
-    let pairs = |flag: &'static str, values: &[String]| {
-        values.iter().flat_map(|value| [flag.into(), value.into()]).collect::<Vec<OsString>>()
-    };
-    let vehicle = vehicle.into_iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]);
-    pairs("--set", set).into_iter().chain(pairs("--remap", remap)).chain(vehicle).collect()
 }
 
 /// The network to join.

@@ -5,8 +5,22 @@ use std::fmt::{self, Write};
 use gleaner_base::visible;
 use gleaner_protocol::inference::{InferenceReport, InferenceStatus, LoadedModel, ModelState};
 use gleaner_report::format::{counted, grouped};
+use gleaner_supervisor::InferenceEvent;
 
 use super::{Paint, mib};
+
+/// Formats an event of the process; empty if it has no text for the user.
+pub(crate) fn inference_event(event: &InferenceEvent, paint: Paint) -> Vec<u8> {
+    let warning = |text: &str| format!("warning: {}\n", visible(text)).into_bytes();
+    match event {
+        InferenceEvent::Report(report) => inference(report, paint).into_bytes(),
+        InferenceEvent::Stderr(text) => text.clone(),
+        InferenceEvent::Ended(reason, delay) => {
+            warning(&format!("{reason}; restarting in {} s", delay.as_secs_f64()))
+        }
+        InferenceEvent::Warning(text) => warning(text),
+    }
+}
 
 /// Formats a report: a model that was loaded or could not be, and the final status; all others are
 /// empty.

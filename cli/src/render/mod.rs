@@ -21,7 +21,7 @@ mod live;
 pub(crate) use check_report::check_report;
 pub(crate) use diff::diff;
 pub(crate) use drive::drive;
-pub(crate) use inference::inference;
+pub(crate) use inference::{inference, inference_event};
 pub(crate) use ingress::ingress;
 pub(crate) use isolation::isolation;
 pub(crate) use live::{clip_line, decision, live, named_report, recorder, topics};

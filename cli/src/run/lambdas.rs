@@ -1,97 +1,55 @@
 //! The lambdas of a run, as the command line gives them: folders, names, result folders, settings.
 
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure, safe_file};
 use gleaner_lambda::{BuildDir, Manifest};
-use gleaner_protocol::ExitRecord;
+use gleaner_supervisor::LambdaSpec;
 
-use crate::args::{self, RunArgs};
+use crate::args::RunArgs;
 
 /// Folder of clips in the result folder of a run of several lambdas.
 const CLIPS: &str = "clips";
 
-/// A lambda of the run.
-pub(super) struct RunLambda {
-    pub(super) folder: PathBuf,
-    pub(super) manifest: Manifest,
-    /// Its result folder.
-    pub(super) out: PathBuf,
-    /// Text before each line about this lambda, if there are several; else empty.
-    pub(super) prefix: String,
-    /// Overrides of its config, as `KEY=VALUE`.
-    set: Vec<String>,
-    /// Renamed topics, as `FROM:=TO`.
-    remap: Vec<String>,
+/// Loads the lambdas, in the order of the command line.
+///
+/// # Errors
+///
+/// A failure if a build cannot be used, if two lambdas have one name, or if a setting is for none
+/// of several lambdas.
+pub(super) fn load(args: &RunArgs) -> Result<Vec<LambdaSpec>, Failure> {
+    let mut lambdas: Vec<LambdaSpec> = Vec::new();
+    let is_single = args.lambdas.len() == 1;
+    for folder in &args.lambdas {
+        let build = BuildDir::check_fresh(folder)?;
+        let manifest = Manifest::load(build.path())?;
+        let name = manifest.lambda.name.as_str();
+        if let Some(other) = lambdas.iter().find(|other| other.name() == name) {
+            return Err(same_name(name, &other.folder, folder));
+        }
+        let out = if is_single { out(args) } else { out(args).join(name) };
+        if !is_single && name == CLIPS {
+            return Err(named_clips(&out));
+        }
+        // Recorder and shim write into the folder before the runtime checks it.
+        safe_file::refuse_linked(&out, folder)?;
+        let prefix = if is_single { String::new() } else { format!("{name}: ") };
+        // The command line has checked the form of renamed topics.
+        let remaps = args.remap.iter().filter_map(|remap| renamed(remap)).collect();
+        let (folder, set) = (folder.clone(), args.set.clone());
+        lambdas.push(LambdaSpec { folder, manifest, out, prefix, set, remaps });
+    }
+    // The runtime checks the settings of a single lambda.
+    if !is_single {
+        share_out(args, &mut lambdas)?;
+    }
+    Ok(lambdas)
 }
 
-impl RunLambda {
-    /// Loads the lambdas, in the order of the command line.
-    ///
-    /// # Errors
-    ///
-    /// A failure if a build cannot be used, if two lambdas have one name, or if a setting is for
-    /// none of several lambdas.
-    pub(super) fn load(args: &RunArgs) -> Result<Vec<RunLambda>, Failure> {
-        let mut lambdas: Vec<RunLambda> = Vec::new();
-        let is_single = args.lambdas.len() == 1;
-        for folder in &args.lambdas {
-            let build = BuildDir::check_fresh(folder)?;
-            let manifest = Manifest::load(build.path())?;
-            let name = manifest.lambda.name.as_str();
-            if let Some(other) = lambdas.iter().find(|other| other.name() == name) {
-                return Err(same_name(name, &other.folder, folder));
-            }
-            let out = if is_single { out(args) } else { out(args).join(name) };
-            if !is_single && name == CLIPS {
-                return Err(named_clips(&out));
-            }
-            // Recorder and shim write into the folder before the runtime checks it.
-            safe_file::refuse_linked(&out, folder)?;
-            let prefix = if is_single { String::new() } else { format!("{name}: ") };
-            let (set, remap) = (args.set.clone(), args.remap.clone());
-            lambdas.push(RunLambda { folder: folder.clone(), manifest, out, prefix, set, remap });
-        }
-        // The runtime checks the settings of a single lambda.
-        if !is_single {
-            share_out(args, &mut lambdas)?;
-        }
-        Ok(lambdas)
-    }
-
-    pub(super) fn name(&self) -> &str {
-        self.manifest.lambda.name.as_str()
-    }
-
-    /// Returns the path of the record of how its process ended.
-    pub(super) fn exit_record(&self) -> PathBuf {
-        self.out.join(ExitRecord::FILE)
-    }
-
-    /// Returns the settings as arguments of the runtime.
-    pub(super) fn settings(&self, vehicle: Option<&Path>) -> Vec<OsString> {
-        args::settings(&self.set, &self.remap, vehicle)
-    }
-
-    /// Returns the renamed topics, from and to. The command line has checked their form.
-    pub(super) fn remaps(&self) -> Vec<(String, String)> {
-        self.remap.iter().filter_map(|remap| renamed(remap)).collect()
-    }
-
-    /// Returns the name of a topic of the manifest on the network.
-    pub(super) fn on_network(&self, topic: &str) -> String {
-        let to = self.remaps().into_iter().find(|(from, _)| from == topic).map(|(_, to)| to);
-        to.unwrap_or_else(|| topic.to_owned())
-    }
-
-    /// Returns the topics of the manifest.
-    fn topics(&self) -> impl Iterator<Item = &str> {
-        let inputs = self.manifest.inputs.iter().map(|input| &input.topic);
-        inputs
-            .chain(self.manifest.record.iter().flat_map(|record| &record.topics))
-            .map(AsRef::as_ref)
-    }
+/// Returns the topics of a manifest.
+fn topics(manifest: &Manifest) -> impl Iterator<Item = &str> {
+    let inputs = manifest.inputs.iter().map(|input| &input.topic);
+    inputs.chain(manifest.record.iter().flat_map(|record| &record.topics)).map(AsRef::as_ref)
 }
 
 /// Returns the result folder of the run; clips are recorded into it.
@@ -104,8 +62,8 @@ pub(super) fn out(args: &RunArgs) -> PathBuf {
 }
 
 /// Gives each of several lambdas its part of the settings.
-fn share_out(args: &RunArgs, lambdas: &mut [RunLambda]) -> Result<(), Failure> {
-    lambdas.iter_mut().for_each(|lambda| (lambda.set, lambda.remap) = Default::default());
+fn share_out(args: &RunArgs, lambdas: &mut [LambdaSpec]) -> Result<(), Failure> {
+    lambdas.iter_mut().for_each(|lambda| (lambda.set, lambda.remaps) = Default::default());
     for setting in &args.set {
         let (key, value) = setting.split_once('=').unwrap_or((setting, ""));
         let named = key.trim().split_once('.');
@@ -116,11 +74,11 @@ fn share_out(args: &RunArgs, lambdas: &mut [RunLambda]) -> Result<(), Failure> {
         lambda.set.push(format!("{key}={value}"));
     }
     for remap in &args.remap {
-        let Some((from, _)) = renamed(remap) else { continue };
+        let Some((from, to)) = renamed(remap) else { continue };
         let mut is_used = false;
         for lambda in &mut *lambdas {
-            if lambda.topics().any(|topic| topic == from) {
-                lambda.remap.push(remap.clone());
+            if topics(&lambda.manifest).any(|topic| topic == from) {
+                lambda.remaps.push((from.clone(), to.clone()));
                 is_used = true;
             }
         }
@@ -150,17 +108,17 @@ fn named_clips(out: &Path) -> Failure {
     failure.with_help(format!("change the name `{CLIPS}` in lambda.toml, or run the lambda alone"))
 }
 
-fn no_lambda_of(setting: &str, lambdas: &[RunLambda]) -> Failure {
+fn no_lambda_of(setting: &str, lambdas: &[LambdaSpec]) -> Failure {
     let message = format!("--set `{setting}` is for none of the lambdas");
-    let names: Vec<_> = lambdas.iter().map(RunLambda::name).collect();
+    let names: Vec<_> = lambdas.iter().map(LambdaSpec::name).collect();
     Failure::new(Exit::Usage, message).with_help(format!(
         "with several lambdas, write NAME.KEY=VALUE; the names are `{}`",
         names.join("`, `")
     ))
 }
 
-fn no_topic(from: &str, lambdas: &[RunLambda]) -> Failure {
-    let mut known: Vec<_> = lambdas.iter().flat_map(RunLambda::topics).collect();
+fn no_topic(from: &str, lambdas: &[LambdaSpec]) -> Failure {
+    let mut known: Vec<_> = lambdas.iter().flat_map(|lambda| topics(&lambda.manifest)).collect();
     known.sort_unstable();
     known.dedup();
     let message = format!("no lambda has the topic `{from}` of --remap");
@@ -169,43 +127,32 @@ fn no_topic(from: &str, lambdas: &[RunLambda]) -> Failure {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+mod tests {
     use super::*;
+    use crate::args;
 
-    /// Returns a lambda with an input, if any: its topic and maximum size. It records `topics`.
-    pub(crate) fn recording(name: &str, input: Option<(&str, &str)>, topics: &[&str]) -> RunLambda {
-        let mut text = format!(
+    /// Returns a lambda that reads and records `topic`.
+    fn lambda(name: &str, topic: &str) -> LambdaSpec {
+        let text = format!(
             "lambda = {{ name = '{name}', version = '0.1.0', kind = 'python', entry = 'x.py' }}\n\
-             schedule.period = '1s'\n"
+             schedule.period = '1s'\nrecord.topics = ['{topic}']\n"
         );
-        if let Some((topic, max_size)) = input {
-            text += &format!(
-                "[[input]]\nname = 'i'\ntopic = '{topic}'\ntype = 'sensor_msgs/msg/Imu'\n\
-                 max_size = '{max_size}'\ndepth = 4\n"
-            );
-        }
-        if !topics.is_empty() {
-            text += &format!("[record]\ntopics = {topics:?}\n");
-        }
-        RunLambda {
+        LambdaSpec {
             folder: PathBuf::from(name),
             manifest: Manifest::parse(&text, "lambda.toml").unwrap(),
-            out: PathBuf::from("live").join(name),
-            prefix: format!("{name}: "),
+            out: PathBuf::new(),
+            prefix: String::new(),
             set: Vec::new(),
-            remap: Vec::new(),
+            remaps: Vec::new(),
         }
     }
 
-    fn shared(arguments: &[&str]) -> Result<Vec<RunLambda>, String> {
+    fn shared(arguments: &[&str]) -> Result<Vec<LambdaSpec>, String> {
         use clap::Parser;
         let line = ["gleaner", "run", "a", "b"].iter().chain(arguments);
         let command = args::Cli::try_parse_from(line).unwrap().command;
         let args::CliCommand::Run(args) = command else { panic!("{command:?}") };
-        let mut lambdas = vec![
-            recording("a", Some(("/imu", "1 KiB")), &[]),
-            recording("b-2", Some(("/camera", "1 KiB")), &["/camera"]),
-        ];
+        let mut lambdas = vec![lambda("a", "/imu"), lambda("b-2", "/camera")];
         share_out(&args, &mut lambdas).map_err(|failure| failure.to_string())?;
         Ok(lambdas)
     }
@@ -221,13 +168,10 @@ pub(super) mod tests {
             "/imu:=/car/imu",
         ])
         .unwrap();
-        assert_eq!(
-            lambdas[0].settings(None),
-            ["--set", "word=x=y", "--remap", "/imu:=/car/imu"].map(OsString::from)
-        );
-        assert_eq!(lambdas[1].settings(None), ["--set", "limit=-1.4"].map(OsString::from));
-        assert_eq!(lambdas[0].on_network("/imu"), "/car/imu");
-        assert_eq!(lambdas[1].on_network("/imu"), "/imu");
+        assert_eq!(lambdas[0].set, ["word=x=y"]);
+        assert_eq!(lambdas[0].remaps, [("/imu".to_owned(), "/car/imu".to_owned())]);
+        assert_eq!(lambdas[1].set, ["limit=-1.4"]);
+        assert!(lambdas[1].remaps.is_empty());
     }
 
     #[test]

@@ -1,156 +1,49 @@
-//! `gleaner run DIR...`: supervises lambdas, an ingress and a recorder until Ctrl-C or the end of a
-//! drive, and prints their reports.
+//! `gleaner run DIR...`: runs lambdas until Ctrl-C or the end of a drive, and prints their reports.
 //!
-//! - `lambdas`: the lambdas of the command line, and their settings.
-//! - `grants`, `arguments`: topics and arguments of the processes.
-//! - `process`, `output`: one process, and the threads that read its output.
-//! - `services`: the processes that all lambdas share: ingress and recorder.
-//! - `supervised`: one lambda over all its restarts, with `summary`.
-//! - `process_group`: all processes, `group_end`: their end, and `drive`: a drive that the ingress
-//!   plays.
-//! - `failures`: the result of a run in which processes failed.
-//! - `screen`: the terminal.
-//!
-//! A failed process is restarted with a growing delay: that of a lambda or the ingress alone, the
-//! recorder with all others. A first start that fails ends the run, unless it is that of one lambda
-//! of several.
+//! `gleaner-supervisor` starts and supervises the processes. `lambdas` loads the lambdas of the
+//! command line with their settings, and `screen` prints to the terminal.
 
-mod arguments;
-mod drive;
-mod failures;
-mod grants;
-mod group_end;
 mod lambdas;
-mod output;
-mod process;
-mod process_group;
 mod screen;
-mod services;
-mod summary;
-mod supervised;
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_lambda::Vehicle;
-use gleaner_parts::Parts;
+use gleaner_supervisor::RunSpec;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-use self::failures::Failures;
-use self::group_end::GroupEnd;
-use self::lambdas::RunLambda;
-use self::process_group::{ProcessGroup, RunRecord};
 use self::screen::Screen;
-use self::summary::RunCounts;
-use self::supervised::SupervisedLambda;
 use crate::args::RunArgs;
-use crate::restart_delay::RestartDelay;
-
-/// Interval of checks whether to stop.
-const POLL_INTERVAL: Duration = Duration::from_millis(100);
-
-/// The unchanging context of a run.
-struct RunContext<'a> {
-    args: &'a RunArgs,
-    parts: Parts,
-    /// Offset of the vehicle's clock to CLOCK_MONOTONIC, in ns.
-    offset_ns: i64,
-}
-
-/// The time of a run, which may be limited.
-struct RunTime {
-    limit: Option<Duration>,
-    started: Instant,
-    /// Set once all lambdas are ready for the first time.
-    ready: Option<Instant>,
-}
-
-impl RunTime {
-    fn begin(&mut self) {
-        self.ready.get_or_insert_with(Instant::now);
-    }
-
-    /// Returns whether the time since the lambdas were ready is over.
-    fn is_over(&self) -> bool {
-        self.ready.zip(self.limit).is_some_and(|(ready, limit)| ready.elapsed() >= limit)
-    }
-
-    /// Returns whether the time since the start of the run is over before all lambdas were ready.
-    fn is_over_before_ready(&self) -> bool {
-        self.ready.is_none() && self.is_over_since_start()
-    }
-
-    /// Returns whether the time since the start of the run is over.
-    fn is_over_since_start(&self) -> bool {
-        self.limit.is_some_and(|limit| self.started.elapsed() >= limit)
-    }
-}
 
 /// Runs until a signal, until the time is over, or until the end of the drive.
 pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
-    let mut lambdas: Vec<_> =
-        RunLambda::load(args)?.into_iter().map(SupervisedLambda::new).collect();
-    let allowed = || {
-        let vehicle = args.vehicle.as_ref();
-        vehicle.map_or(Ok(Vehicle::default()), Vehicle::load)
-    };
-    let mut vehicle = allowed()?;
+    let lambdas = lambdas::load(args)?;
     let stop = stop_flag()?;
     let mut screen = Screen::new(args.stats, args.json);
-    let context = RunContext { args, parts: Parts::find()?, offset_ns: clock_offset() };
-    let limit = args.last.map(|seconds| Duration::from_secs(seconds.into()));
-    let mut time = RunTime { limit, started: Instant::now(), ready: None };
-    let mut delay = RestartDelay::new();
-    let mut restarts = 0;
-    let mut failures = Failures::default();
-    let mut counts = RunCounts::default();
-    let mut cut_short = None;
-    loop {
-        let attempt_started = Instant::now();
-        // The runtimes read the same file at each start and report if it cannot be used. That does
-        // not end the run.
-        vehicle = allowed().unwrap_or(vehicle);
-        let run = RunRecord { failures: &mut failures, counts: &mut counts };
-        let mut group = ProcessGroup::start(&context, &mut lambdas, &mut screen, run, &vehicle)?;
-        let ended = group.run(&mut time, &stop);
-        group.add_counts();
-        let reason = match ended? {
-            GroupEnd::Complete => break,
-            // It has printed the cause. After a successful start it is restarted, since the cause
-            // may be temporary, such as a network that is down.
-            GroupEnd::NotStarted(exit) if restarts == 0 => return Ok(exit),
-            GroupEnd::NotStarted(_) => "it could not start".to_owned(),
-            GroupEnd::Broken(reason) => reason,
-        };
-        // It would be played again from its start, to lambdas that have seen a part of it.
-        if !args.drive.is_empty() {
-            let mut failure = Failure::new(Exit::Internal, "the drive was not played to its end");
-            failure.causes = vec![reason];
-            cut_short = Some(failure);
-            break;
-        }
-        failures.add(reason.clone(), false);
-        restarts += 1;
-        let delay = delay.after(attempt_started.elapsed());
-        screen.restarts(&reason, delay, restarts);
-        let until = Instant::now() + delay;
-        let ends = || stop.load(Ordering::Relaxed) || time.is_over_since_start();
-        while Instant::now() < until && !ends() {
-            thread::sleep(POLL_INTERVAL);
-        }
-        if ends() {
-            break;
-        }
+    gleaner_supervisor::run(lambdas, &spec(args), &mut screen, &stop)
+}
+
+/// Returns what the lambdas share.
+fn spec(args: &RunArgs) -> RunSpec {
+    RunSpec {
+        clips: lambdas::out(args),
+        vehicle: args.vehicle.clone(),
+        drives: args.drive.clone(),
+        rate: args.rate,
+        network: args.network.to_args().collect(),
+        duration: args.last.map(|seconds| Duration::from_secs(seconds.into())),
+        all: args.all,
+        records: !args.no_record,
+        rtt: args.rtt.clone(),
+        decisions: args.decisions.clone(),
+        commands: args.commands.clone(),
+        disk_floor: args.disk_floor,
+        clips_max: args.clips_max,
+        bytes_max: args.bytes_max,
+        cgroup: args.cgroup.clone(),
     }
-    let exits = lambdas.iter().map(|lambda| lambda.exit);
-    let exit = exits.reduce(|first, next| if first == Exit::Ok { next } else { first });
-    for lambda in lambdas {
-        lambda.complete(&counts)?;
-    }
-    cut_short.map_or_else(|| failures.end(exit.unwrap_or(Exit::Ok)), Err)
 }
 
 /// Returns a flag that is set by Ctrl-C, SIGTERM, and the end of the terminal.
@@ -161,15 +54,4 @@ pub(crate) fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
             .map_err(|error| Failure::caused_by(Exit::Internal, "cannot handle signals", &error))?;
     }
     Ok(stop)
-}
-
-/// Returns the offset of the vehicle's clock to CLOCK_MONOTONIC, in ns. The vehicle's clock shows
-/// the current time of day, and never jumps afterwards.
-fn clock_offset() -> i64 {
-    use rustix::time::{ClockId, clock_gettime};
-    let ns = |clock| {
-        let now = clock_gettime(clock);
-        now.tv_sec.saturating_mul(1_000_000_000).saturating_add(now.tv_nsec)
-    };
-    ns(ClockId::Realtime).saturating_sub(ns(ClockId::Monotonic))
 }

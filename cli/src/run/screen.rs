@@ -6,13 +6,13 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
 use gleaner_lambda::{Clip, Decision};
-use gleaner_protocol::ingress::IngressStatus;
-use gleaner_protocol::link::RecorderStatus;
+use gleaner_protocol::ingress::{IngressReport, IngressStatus};
+use gleaner_protocol::link::{Loss, RecorderReport, RecorderStatus};
 use gleaner_protocol::{LiveStatus, LiveTopic, Report};
+use gleaner_supervisor::{InferenceEvent, LambdaSpec, RunObserver};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
-use crate::inference::InferenceEvent;
 use crate::render::{self, Paint};
 
 /// Time without a writer after which a warning about a topic is printed, in s.
@@ -64,62 +64,41 @@ impl Screen {
     }
 
     /// Prints a report with `--json`.
-    pub(super) fn report(&self, report: &impl Serialize) {
+    fn report(&self, report: &impl Serialize) {
         if self.json {
             self.out(&render::json_line(report));
         }
     }
 
-    /// Prints a report of a lambda's process with `--json`.
-    pub(super) fn lambda_report(&self, lambda: &str, report: &Report) {
-        if self.json {
-            self.out(&render::json_line(&render::named_report(lambda, report)));
-        }
-    }
-
     /// Prints permanent text, unless `--json` is set.
-    pub(super) fn print(&self, text: &str) {
+    fn print(&self, text: &str) {
         if !self.json {
             self.out(text);
         }
     }
 
     /// Reports that a lambda is ready. `prefix` is its name before each line, if there are several.
-    pub(super) fn ready(&self, prefix: &str) {
+    fn ready(&self, prefix: &str) {
         let how_to_end = if prefix.is_empty() { "; Ctrl-C ends it" } else { "" };
         self.print(&format!("{prefix}running{how_to_end}\n"));
     }
 
-    pub(super) fn decision(&self, prefix: &str, decision: &Decision) {
+    fn decision(&self, prefix: &str, decision: &Decision) {
         self.print(&render::decision(decision, prefix, self.paint));
     }
 
-    pub(super) fn clip(&self, clip: &Clip) {
+    fn clip(&self, clip: &Clip) {
         self.print(&render::clip_line(clip, self.paint));
     }
 
-    /// Updates the status of the recorder, which is shown below those of the lambdas.
-    pub(super) fn recorder(&mut self, status: &RecorderStatus) {
-        self.recorder = render::recorder(status, self.paint);
-    }
-
     /// Prints the final status of the recorder.
-    pub(super) fn recorder_ended(&mut self, status: &RecorderStatus) {
+    fn recorder_ended(&mut self, status: &RecorderStatus) {
         self.recorder.clear();
         self.print(&render::recorder(status, self.paint));
     }
 
-    /// Shows an event of the process that runs models.
-    pub(super) fn inference(&mut self, event: &InferenceEvent) {
-        let InferenceEvent::Report(report) = &event else {
-            return self.err(&event.text(self.paint));
-        };
-        self.report(report);
-        self.print(&render::inference(report, self.paint));
-    }
-
     /// Updates the status of a lambda.
-    pub(super) fn live(&mut self, lambda: &str, live: &LiveStatus) {
+    fn live(&mut self, lambda: &str, live: &LiveStatus) {
         self.warn_of_missing_writers(live);
         self.lambdas.insert(lambda.to_owned(), render::live(live, self.paint));
         // Each lambda has one each second.
@@ -128,24 +107,11 @@ impl Screen {
         }
     }
 
-    /// Removes the status of a lambda whose process has ended.
-    pub(super) fn gone(&mut self, lambda: &str) {
-        self.lambdas.remove(lambda);
-    }
-
     /// Shows the status of the ingress, and below it the last ones of all others. The ingress has
     /// one each second.
-    pub(super) fn ingress(&mut self, status: &IngressStatus) {
+    fn show_ingress(&mut self, status: &IngressStatus) {
         self.lacks_ingress = false;
         self.ingress = render::ingress(status, self.paint);
-        self.show();
-    }
-
-    /// Shows that there is no ingress, until [`ingress`](Self::ingress) shows the status of the
-    /// next one.
-    pub(super) fn ingress_gone(&mut self) {
-        self.lacks_ingress = true;
-        self.ingress = format!("{}: has ended, and is started again\n", self.paint.bold("ingress"));
         self.show();
     }
 
@@ -163,12 +129,6 @@ impl Screen {
             self.below.set_message(text.trim_end().to_owned());
             self.below.tick();
         }
-    }
-
-    /// Prints the final status of the ingress.
-    pub(super) fn ingress_ended(&mut self, status: &IngressStatus) {
-        self.clear();
-        self.print(&render::ingress(status, self.paint));
     }
 
     /// Warns once about each topic without a writer.
@@ -189,8 +149,8 @@ impl Screen {
     }
 
     /// Prints the final status of a lambda.
-    pub(super) fn ended(&mut self, lambda: &str, live: &LiveStatus) {
-        self.gone(lambda);
+    fn ended(&mut self, lambda: &str, live: &LiveStatus) {
+        self.lambdas.remove(lambda);
         self.clear();
         self.print(&render::live(live, self.paint));
         self.print(&format!(
@@ -205,26 +165,103 @@ impl Screen {
         self.below.tick();
     }
 
-    /// Warns that something failed for a reason, and is started again after a delay.
-    pub(super) fn restarts(&self, reason: &str, delay: Duration, restarts: u32) {
-        let delay = delay.as_secs_f64();
-        self.warn(&format!("{reason}; restarting in {delay} s (restart {restarts})"));
-    }
-
-    pub(super) fn warn(&self, text: &str) {
-        self.err(format!("warning: {}\n", visible(text)).as_bytes());
-    }
-
-    /// Prints a piece of a program's standard error.
-    pub(super) fn err(&self, piece: &[u8]) {
-        // An error of standard error itself cannot be reported.
-        self.below.suspend(|| drop(io::stderr().write_all(piece)));
-    }
-
     fn out(&self, text: &str) {
         // A closed pipe is not an error, since the results are in files.
         self.below.suspend(|| {
             drop(io::stdout().write_all(text.as_bytes()).and_then(|()| io::stdout().flush()))
         });
+    }
+}
+
+impl RunObserver for Screen {
+    fn lambda(&mut self, lambda: &LambdaSpec, report: &Report) {
+        let (name, prefix) = (lambda.name(), &*lambda.prefix);
+        if self.json {
+            self.out(&render::json_line(&render::named_report(name, report)));
+        }
+        match report {
+            Report::Isolation { layers } => {
+                self.print(&format!("{prefix}{}", render::isolation(layers)));
+            }
+            Report::Ready => self.ready(prefix),
+            Report::Decision(decision) => self.decision(prefix, decision),
+            Report::Live(live) => self.live(name, live),
+            Report::Ended(live) => self.ended(name, live),
+            _ => {}
+        }
+    }
+
+    fn lambda_gone(&mut self, lambda: &LambdaSpec) {
+        self.lambdas.remove(lambda.name());
+    }
+
+    fn ingress(&mut self, report: &IngressReport) {
+        self.report(report);
+        if let IngressReport::Status(status) = report {
+            self.show_ingress(status);
+        }
+    }
+
+    fn ingress_gone(&mut self) {
+        self.lacks_ingress = true;
+        self.ingress = format!("{}: has ended, and is started again\n", self.paint.bold("ingress"));
+        self.show();
+    }
+
+    fn ingress_ended(&mut self, status: &IngressStatus) {
+        self.clear();
+        self.print(&render::ingress(status, self.paint));
+    }
+
+    fn recorder(&mut self, report: &RecorderReport) {
+        self.report(report);
+        match report {
+            RecorderReport::Clip(clip) => self.clip(clip),
+            RecorderReport::Recovered(clip) => {
+                self.warn("recovered a clip of an earlier recorder that crashed");
+                self.clip(clip);
+            }
+            RecorderReport::Loss(Loss::Deleted { file, reason, .. }) => {
+                self.warn(&format!("deleted the clip `{}`: {reason}", file.display()));
+            }
+            RecorderReport::Loss(Loss::NotDeleted { file, reason, .. }) => {
+                self.warn(&format!("cannot delete the clip `{}`: {reason}", file.display()));
+            }
+            RecorderReport::Loss(Loss::Failed { reason, .. }) => {
+                self.warn(&format!("cannot write a clip: {reason}"));
+            }
+            RecorderReport::Loss(Loss::DiskSuppressed { triggers, reason, .. }) => {
+                self.warn(&format!("{triggers} triggers without a window: {reason}"));
+            }
+            RecorderReport::Status(status) => self.recorder = render::recorder(status, self.paint),
+            RecorderReport::Ended(status) => self.recorder_ended(status),
+            RecorderReport::Ready => {}
+        }
+    }
+
+    fn inference(&mut self, event: InferenceEvent) {
+        let InferenceEvent::Report(report) = &event else {
+            return self.stderr(&render::inference_event(&event, self.paint));
+        };
+        self.report(report);
+        self.print(&render::inference(report, self.paint));
+    }
+
+    fn playing(&mut self, files: &str) {
+        self.print(&format!("playing {files}\n"));
+    }
+
+    fn restarts(&mut self, reason: &str, delay: Duration, restarts: u32) {
+        let delay = delay.as_secs_f64();
+        self.warn(&format!("{reason}; restarting in {delay} s (restart {restarts})"));
+    }
+
+    fn warn(&mut self, text: &str) {
+        self.stderr(format!("warning: {}\n", visible(text)).as_bytes());
+    }
+
+    fn stderr(&mut self, piece: &[u8]) {
+        // An error of standard error itself cannot be reported.
+        self.below.suspend(|| drop(io::stderr().write_all(piece)));
     }
 }

@@ -4,7 +4,6 @@
 //! loading or running at several ends of the process is not loaded again.
 
 use std::collections::BTreeMap;
-use std::ffi::OsString;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::os::fd::{AsFd, OwnedFd};
@@ -32,11 +31,11 @@ use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::Signal;
 
 use super::client::{Client, ProcessState};
+use super::engine;
 use super::totals::ModelTotals;
 use super::{INFERENCE, InferenceEvent};
-use crate::engines;
+use crate::lines::{next_report, pass_on};
 use crate::restart_delay::RestartDelay;
-use crate::runtime::{next_report, pass_on};
 
 /// Number of ends of the process that a model may cause before it is refused.
 const ENDS_MAX: u32 = 3;
@@ -55,7 +54,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 type Events = Arc<dyn Fn(InferenceEvent) + Send + Sync>;
 
 /// The process, over all its restarts. Dropping it ends the process.
-pub(crate) struct InferenceService {
+pub struct InferenceService {
     shared: Arc<Shared>,
     supervisor: Option<JoinHandle<()>>,
 }
@@ -93,7 +92,7 @@ impl InferenceService {
     /// # Errors
     ///
     /// A failure if it cannot be started.
-    pub(crate) fn start(
+    pub fn start(
         parts: &Parts,
         limits: &InferenceLimits,
         engines: Option<&Path>,
@@ -130,7 +129,7 @@ impl InferenceService {
     /// # Errors
     ///
     /// A failure if the file of a model cannot be opened.
-    pub(crate) fn add(
+    pub fn add(
         &self,
         name: &str,
         build: &BuildDir,
@@ -160,7 +159,7 @@ impl InferenceService {
     }
 
     /// Ends the process.
-    pub(crate) fn stop(mut self) {
+    pub fn stop(mut self) {
         self.end();
     }
 
@@ -453,8 +452,6 @@ fn was_killed(status: ExitStatus) -> bool {
     matches!(signal, Some(Signal::KILL | Signal::TERM | Signal::INT | Signal::HUP))
 }
 
-}
-
 fn granted(model: &ModelSpec) -> GrantedModel {
     GrantedModel {
         name: model.name.to_string(),
@@ -476,7 +473,7 @@ impl PassedModel {
                 .with_help("build the lambda again: gleaner build DIR")
         })?;
         let (sha256, path) = (model.sha256.to_string(), model.file.to_string());
-        let (engine, entry) = match engines::stored(&sha256) {
+        let (engine, entry) = match engine::stored(&sha256) {
             Ok(Some(entry)) => (ModelEngine::Attached, Some(entry)),
             Ok(None) => (ModelEngine::None, None),
             Err(reason) => (ModelEngine::Refused(reason), None),

@@ -6,20 +6,20 @@ use gleaner_lambda::Manifest;
 use gleaner_protocol::ingress::{AddReader, PublishGrant, Qos, TopicGrant};
 use gleaner_protocol::link::{COMMANDS_ID, commands_grant, recorded_grant};
 
-use super::lambdas::RunLambda;
-use crate::args::RunArgs;
+use crate::spec::LambdaSpec;
+use crate::spec::RunSpec;
 
 /// Name of the recorder among the readers of the ingress.
-pub(super) const RECORDER: &str = "recorder";
+pub(crate) const RECORDER: &str = "recorder";
 
 /// Largest of the sizes that the ingress expects of topics for which none is stated.
 const USUAL_BYTES: u64 = 32 << 20;
 
 /// Returns the lambda's process as a reader: it reads its inputs. `start` is the number of its
 /// earlier processes, of which the ingress may still know the last.
-pub(super) fn lambda(
-    lambda: &RunLambda,
-    args: &RunArgs,
+pub(crate) fn lambda(
+    lambda: &LambdaSpec,
+    spec: &RunSpec,
     is_recorded: bool,
     start: u32,
 ) -> AddReader {
@@ -32,28 +32,28 @@ pub(super) fn lambda(
     AddReader {
         name: format!("{} {start}", lambda.name()),
         topics: topics.collect(),
-        publishes: PublishGrant::of_lambda(args.rtt.as_deref(), args.decisions.as_deref()),
+        publishes: PublishGrant::of_lambda(spec.rtt.as_deref(), spec.decisions.as_deref()),
     }
 }
 
 /// Returns the recorder as a reader: it reads commands, and later what lambdas record.
-pub(super) fn recorder(args: &RunArgs) -> AddReader {
+pub(crate) fn recorder(spec: &RunSpec) -> AddReader {
     AddReader {
         name: RECORDER.to_owned(),
-        topics: args.commands.iter().map(|topic| commands_grant(topic)).collect(),
+        topics: spec.commands.iter().map(|topic| commands_grant(topic)).collect(),
         publishes: Vec::new(),
     }
 }
 
 /// Returns the reader as it joins an ingress that was started again, in a run with a recorder or
 /// without one.
-pub(super) fn again(reader: AddReader, is_recorded: bool) -> AddReader {
+pub(crate) fn again(reader: AddReader, is_recorded: bool) -> AddReader {
     let topics = reader.topics.into_iter().map(|topic| topic.again(is_recorded)).collect();
     AddReader { topics, ..reader }
 }
 
 /// The recorded topics of all lambdas of a run, each once.
-pub(super) struct RecordedTopics {
+pub(crate) struct RecordedTopics {
     /// Topics that lambdas request with different QoS.
     mixed: Vec<String>,
     grants: Vec<TopicGrant>,
@@ -62,7 +62,7 @@ pub(super) struct RecordedTopics {
 }
 
 impl RecordedTopics {
-    pub(super) fn of<'a>(lambdas: impl Iterator<Item = &'a RunLambda>) -> Self {
+    pub(crate) fn of<'a>(lambdas: impl Iterator<Item = &'a LambdaSpec>) -> Self {
         let mut topics: Vec<RecordedSamples> = Vec::new();
         for lambda in lambdas {
             for (topic, samples) in recorded(lambda) {
@@ -83,27 +83,27 @@ impl RecordedTopics {
     }
 
     /// Returns the topics that lambdas request with different QoS: each QoS has stamps of its own.
-    pub(super) fn mixed(&self) -> impl Iterator<Item = &str> {
+    pub(crate) fn mixed(&self) -> impl Iterator<Item = &str> {
         self.mixed.iter().map(String::as_str)
     }
 
     /// Returns the recorded topics of a lambda, with their ids.
-    pub(super) fn ids(&self, lambda: &RunLambda) -> Vec<(String, u32)> {
+    pub(crate) fn ids(&self, lambda: &LambdaSpec) -> Vec<(String, u32)> {
         let grants = self.grants_of(lambda);
         grants.into_iter().map(|grant| (grant.topic.clone(), grant.id)).collect()
     }
 
     /// Returns the grants of a lambda's recorded topics that the recorder does not have yet.
-    pub(super) fn take_new(&mut self, lambda: &RunLambda) -> Vec<TopicGrant> {
+    pub(crate) fn take_new(&mut self, lambda: &LambdaSpec) -> Vec<TopicGrant> {
         let grants: Vec<TopicGrant> = self.grants_of(lambda).into_iter().cloned().collect();
         grants.into_iter().filter(|grant| self.granted.insert(grant.id)).collect()
     }
 
     /// Returns the grants of a lambda's recorded topics that the recorder attaches again after a
     /// restart of the ingress, as far as `again` has none of them yet, and adds these to it.
-    pub(super) fn take_again(
+    pub(crate) fn take_again(
         &self,
-        lambda: &RunLambda,
+        lambda: &LambdaSpec,
         again: &mut HashSet<u32>,
     ) -> Vec<TopicGrant> {
         let grants = self.grants_of(lambda).into_iter();
@@ -112,7 +112,7 @@ impl RecordedTopics {
         grants.cloned().map(|grant| grant.again(true)).collect()
     }
 
-    fn grants_of(&self, lambda: &RunLambda) -> Vec<&TopicGrant> {
+    fn grants_of(&self, lambda: &LambdaSpec) -> Vec<&TopicGrant> {
         let of_lambda: Vec<String> = recorded(lambda).map(|(topic, _)| topic).collect();
         self.grants.iter().filter(|grant| of_lambda.contains(&grant.topic)).collect()
     }
@@ -149,7 +149,7 @@ impl RecordedSamples {
 }
 
 /// Returns the recorded topics of a lambda, by their names on the network.
-fn recorded(lambda: &RunLambda) -> impl Iterator<Item = (String, RecordedSamples)> {
+fn recorded(lambda: &LambdaSpec) -> impl Iterator<Item = (String, RecordedSamples)> {
     let Manifest { inputs, record, .. } = &lambda.manifest;
     record.iter().flat_map(|record| &record.topics).map(move |topic| {
         let input = inputs.iter().find(|input| input.topic == *topic);
@@ -168,8 +168,8 @@ fn recorded(lambda: &RunLambda) -> impl Iterator<Item = (String, RecordedSamples
 
 #[cfg(test)]
 mod tests {
-    use super::super::lambdas::tests::recording;
     use super::*;
+    use crate::spec::tests::recording;
 
     #[test]
     fn a_topic_that_two_lambdas_record_is_granted_once_for_the_larger_samples() {

@@ -4,10 +4,10 @@ use std::process::ExitStatus;
 
 use gleaner_base::Exit;
 
-use super::process::ended;
+use crate::process::ended;
 
 /// The end of a process group.
-pub(super) enum GroupEnd {
+pub(crate) enum GroupEnd {
     /// It ended on request, its time or its drive was over, or no lambda could start.
     Complete,
     /// The ingress or the recorder could not start; it has printed the cause.
@@ -18,7 +18,7 @@ pub(super) enum GroupEnd {
 
 impl GroupEnd {
     /// The end of a process that all others need. `is_first` is true if it was not ready before.
-    pub(super) fn of(name: &str, status: ExitStatus, is_first: bool) -> GroupEnd {
+    pub(crate) fn of(name: &str, status: ExitStatus, is_first: bool) -> GroupEnd {
         match status.code().and_then(Exit::from_code) {
             // It has printed the cause.
             Some(exit) if is_first && exit != Exit::Ok => GroupEnd::NotStarted(exit),

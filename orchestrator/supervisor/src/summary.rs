@@ -12,7 +12,7 @@ use gleaner_protocol::{LiveStatus, NetworkStatus};
 
 /// Sums of the counts of all ingresses and all recorders of a run.
 #[derive(Default)]
-pub(super) struct RunCounts {
+pub(crate) struct RunCounts {
     /// `None` without a network.
     network: Option<NetworkStatus>,
     /// True if this is the sum of several ingresses.
@@ -23,7 +23,7 @@ pub(super) struct RunCounts {
 
 impl RunCounts {
     /// Adds the last statuses of an ingress and of a recorder.
-    pub(super) fn add(
+    pub(crate) fn add(
         &mut self,
         ingress: Option<Box<IngressStatus>>,
         recorder: Option<Box<RecorderStatus>>,
@@ -61,7 +61,7 @@ impl RunCounts {
 
 /// Sum of the counts of ended processes of a lambda.
 #[derive(Default)]
-pub(super) struct EarlierCounts {
+pub(crate) struct EarlierCounts {
     live: Option<LiveStatus>,
     /// Wakes during which their process ended, so that it did not count them.
     lost_wakes: u64,
@@ -69,7 +69,7 @@ pub(super) struct EarlierCounts {
 
 impl EarlierCounts {
     /// Adds the last status of an ended process. If it failed, up to a second of counts is missing.
-    pub(super) fn add(&mut self, last: Option<LiveStatus>, has_lost_wake: bool) {
+    pub(crate) fn add(&mut self, last: Option<LiveStatus>, has_lost_wake: bool) {
         self.lost_wakes += u64::from(has_lost_wake);
         self.live = match (last, self.live.take()) {
             (Some(last), Some(before)) => Some(last.after(&before)),
@@ -83,7 +83,7 @@ impl EarlierCounts {
     /// # Errors
     ///
     /// A failure that names the file.
-    pub(super) fn complete(
+    pub(crate) fn complete(
         self,
         last: Option<LiveStatus>,
         counts: &RunCounts,

@@ -17,7 +17,7 @@ use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
 use rustix::net::sockopt::set_socket_send_buffer_size;
 use rustix::process::{Pid, Signal, kill_process};
 
-use super::output::{self, ChildId, ChildOutput};
+use crate::output::{self, ChildId, ChildOutput};
 
 /// Time for a process to end, such as to finish a wake or to complete clips. A shim kills its
 /// runtime before.
@@ -28,7 +28,7 @@ const END_TIMEOUT: Duration = SHUTDOWN_TIMEOUT.saturating_add(Duration::from_sec
 const HANDOVER_BYTES: usize = 4096;
 
 /// A Gleaner program that reports as JSON lines.
-pub(super) struct ChildProcess {
+pub(crate) struct ChildProcess {
     name: &'static str,
     child: Child,
     /// Our end of its standard input: open, as its end would mean that this program has ended.
@@ -40,7 +40,7 @@ pub(super) struct ChildProcess {
 impl ChildProcess {
     /// Starts the program `name` with these connections. `shim` are the arguments of gleaner-shim,
     /// which starts the program if they are given.
-    pub(super) fn start(
+    pub(crate) fn start(
         parts: &Parts,
         (name, id): (&'static str, ChildId),
         line: Vec<OsString>,
@@ -71,7 +71,7 @@ impl ChildProcess {
     }
 
     /// Returns the exit status of the process; `None` while it runs.
-    pub(super) fn status(&mut self) -> Result<Option<ExitStatus>, Failure> {
+    pub(crate) fn status(&mut self) -> Result<Option<ExitStatus>, Failure> {
         let failed = |error| {
             Failure::caused_by(Exit::Internal, format!("cannot wait for {}", self.name), &error)
         };
@@ -80,7 +80,7 @@ impl ChildProcess {
 
     /// Passes it a connection to another ingress. If it does not read its messages, it is killed;
     /// returns the warning to print.
-    pub(super) fn pass_ingress(&self, ingress: OwnedFd) -> Option<String> {
+    pub(crate) fn pass_ingress(&self, ingress: OwnedFd) -> Option<String> {
         let connections = Handover { ingress: Some(ingress), ..Handover::default() };
         match connections.try_send(&self.handover) {
             // Its exit status explains why it has ended.
@@ -93,19 +93,19 @@ impl ChildProcess {
     }
 
     /// Sends SIGKILL.
-    pub(super) fn kill(&self) {
+    pub(crate) fn kill(&self) {
         self.signal(Signal::KILL);
     }
 
     /// Sends SIGTERM.
-    pub(super) fn terminate(&mut self) {
+    pub(crate) fn terminate(&mut self) {
         self.signal(Signal::TERM);
         self.requested = Some(Instant::now());
     }
 
     /// Kills the process if it has not ended within [`END_TIMEOUT`] of the request, or of the first
     /// call. Returns the warning to print, if it does so.
-    pub(super) fn kill_if_late(&mut self) -> Option<String> {
+    pub(crate) fn kill_if_late(&mut self) -> Option<String> {
         let requested = self.requested.get_or_insert_with(Instant::now);
         if requested.elapsed() <= END_TIMEOUT {
             return None;
@@ -134,7 +134,7 @@ impl Drop for ChildProcess {
 }
 
 /// Returns the text for a process that ended without a request.
-pub(super) fn ended(process: &str, status: ExitStatus) -> String {
+pub(crate) fn ended(process: &str, status: ExitStatus) -> String {
     format!("{process} ended unexpectedly ({status})")
 }
 

@@ -4,7 +4,7 @@
 use gleaner_base::{Exit, Failure};
 
 #[derive(Default)]
-pub(super) struct Failures {
+pub(crate) struct Failures {
     /// Reason of the last failure.
     reason: Option<String>,
     times: u32,
@@ -17,29 +17,29 @@ pub(super) struct Failures {
 }
 
 impl Failures {
-    pub(super) fn add(&mut self, reason: String, faulted: bool) {
+    pub(crate) fn add(&mut self, reason: String, faulted: bool) {
         self.reason = Some(reason);
         self.times += 1;
         self.faulted |= faulted;
     }
 
     /// Notes whether a lambda faulted in a process that ended because another one failed.
-    pub(super) fn note(&mut self, faulted: bool) {
+    pub(crate) fn note(&mut self, faulted: bool) {
         self.faulted |= faulted;
     }
 
     /// Adds a lambda that could not start, and is not started again. It has printed the cause.
-    pub(super) fn add_not_started(&mut self, exit: Exit) {
+    pub(crate) fn add_not_started(&mut self, exit: Exit) {
         self.not_started.get_or_insert(exit);
     }
 
     /// Notes that the drive ended early, as it is damaged.
-    pub(super) fn drive_is_damaged(&mut self) {
+    pub(crate) fn drive_is_damaged(&mut self) {
         self.damaged = true;
     }
 
     /// Returns the result of the run if its last processes ended with `exit`.
-    pub(super) fn end(self, exit: Exit) -> Result<Exit, Failure> {
+    pub(crate) fn end(self, exit: Exit) -> Result<Exit, Failure> {
         if let Some(exit) = self.not_started {
             return Ok(exit);
         }

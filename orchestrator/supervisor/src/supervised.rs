@@ -8,31 +8,30 @@ use gleaner_base::{Exit, Failure};
 use gleaner_lambda::FaultKind;
 use gleaner_protocol::{ExitRecord, LiveStatus, Report};
 
-use super::failures::Failures;
-use super::lambdas::RunLambda;
-use super::output::PIPES;
-use super::process::{ChildProcess, ended};
-use super::screen::Screen;
-use super::summary::{EarlierCounts, RunCounts};
-use crate::render;
+use crate::failures::Failures;
+use crate::observer::RunObserver;
+use crate::output::PIPES;
+use crate::process::{ChildProcess, ended};
 use crate::restart_delay::RestartDelay;
+use crate::spec::LambdaSpec;
+use crate::summary::{EarlierCounts, RunCounts};
 
 /// Statuses of a lambda after the end of a drive, until one of them counts every sample: the first
 /// may have been on its way already.
 const STATUSES_AFTER_DRIVE: u32 = 2;
 
 /// A lambda, with its current process.
-pub(super) struct SupervisedLambda {
-    pub(super) lambda: RunLambda,
+pub(crate) struct SupervisedLambda {
+    pub(crate) lambda: LambdaSpec,
     state: LambdaState,
     /// Number of earlier processes.
-    pub(super) restarts: u32,
+    pub(crate) restarts: u32,
     /// Set once one of its processes was ready.
     was_ready: bool,
     delay: RestartDelay,
     earlier: EarlierCounts,
     /// Exit code of the process that ended on request.
-    pub(super) exit: Exit,
+    pub(crate) exit: Exit,
 }
 
 enum LambdaState {
@@ -78,7 +77,7 @@ enum ProcessEnd {
 }
 
 impl SupervisedLambda {
-    pub(super) fn new(lambda: RunLambda) -> Self {
+    pub(crate) fn new(lambda: LambdaSpec) -> Self {
         Self {
             lambda,
             state: LambdaState::Due(Instant::now()),
@@ -91,12 +90,12 @@ impl SupervisedLambda {
     }
 
     /// Returns whether its process is to be started now.
-    pub(super) fn is_due(&self) -> bool {
+    pub(crate) fn is_due(&self) -> bool {
         matches!(&self.state, LambdaState::Due(at) if Instant::now() >= *at)
     }
 
     /// Returns whether it waits for nothing: its process is ready, or it could not start.
-    pub(super) fn is_settled(&self) -> bool {
+    pub(crate) fn is_settled(&self) -> bool {
         match &self.state {
             LambdaState::Running(process) => process.is_ready,
             LambdaState::Due(_) => false,
@@ -105,12 +104,12 @@ impl SupervisedLambda {
     }
 
     /// Returns whether it could not start, and is not started again.
-    pub(super) fn has_not_started(&self) -> bool {
+    pub(crate) fn has_not_started(&self) -> bool {
         matches!(self.state, LambdaState::NotStarted)
     }
 
     /// Sets the process that was started for it.
-    pub(super) fn started(&mut self, child: ChildProcess) {
+    pub(crate) fn started(&mut self, child: ChildProcess) {
         self.state = LambdaState::Running(Box::new(LambdaProcess {
             child,
             started: Instant::now(),
@@ -133,21 +132,21 @@ impl SupervisedLambda {
     }
 
     /// Returns the exit status of its process if that has ended.
-    pub(super) fn status(&mut self) -> Result<Option<ExitStatus>, Failure> {
+    pub(crate) fn status(&mut self) -> Result<Option<ExitStatus>, Failure> {
         self.process().map_or(Ok(None), |process| process.child.status())
     }
 
-    pub(super) fn is_running(&self) -> bool {
+    pub(crate) fn is_running(&self) -> bool {
         matches!(self.state, LambdaState::Running(_))
     }
 
     /// Returns whether a pipe of its process is open.
-    pub(super) fn has_output(&mut self) -> bool {
+    pub(crate) fn has_output(&mut self) -> bool {
         self.process().is_some_and(|process| process.open_pipes > 0)
     }
 
     /// Notes that a pipe of its process is closed.
-    pub(super) fn closed(&mut self) {
+    pub(crate) fn closed(&mut self) {
         if let Some(process) = self.process() {
             process.open_pipes = process.open_pipes.saturating_sub(1);
         }
@@ -155,66 +154,64 @@ impl SupervisedLambda {
 
     /// Notes that the ingress has ended: a process that was not ready ends as well, and is started
     /// again.
-    pub(super) fn lost_ingress(&mut self) {
+    pub(crate) fn lost_ingress(&mut self) {
         if let Some(process) = self.process() {
             process.has_lost_ingress |= !process.is_ready;
         }
     }
 
     /// Passes its process a connection to another ingress.
-    pub(super) fn pass_ingress(&mut self, ingress: OwnedFd, screen: &mut Screen) {
+    pub(crate) fn pass_ingress(&mut self, ingress: OwnedFd, observer: &mut dyn RunObserver) {
         let prefix = self.lambda.prefix.clone();
         if let Some(warning) = self.process().and_then(|it| it.child.pass_ingress(ingress)) {
-            screen.warn(&format!("{prefix}{warning}"));
+            observer.warn(&format!("{prefix}{warning}"));
         }
     }
 
     /// Requests the process to end.
-    pub(super) fn terminate(&mut self) {
+    pub(crate) fn terminate(&mut self) {
         if let Some(process) = self.process() {
             process.child.terminate();
         }
     }
 
     /// Kills the process if it does not end on request.
-    pub(super) fn kill_if_late(&mut self, screen: &mut Screen) {
+    pub(crate) fn kill_if_late(&mut self, observer: &mut dyn RunObserver) {
         let prefix = self.lambda.prefix.clone();
         if let Some(warning) = self.process().and_then(|process| process.child.kill_if_late()) {
-            screen.warn(&format!("{prefix}{warning}"));
+            observer.warn(&format!("{prefix}{warning}"));
         }
     }
 
     /// Shows a report of its process. `drive_ended` is true after the end of the drive.
-    pub(super) fn show(&mut self, report: Report, drive_ended: bool, screen: &mut Screen) {
+    pub(crate) fn show(
+        &mut self,
+        report: Report,
+        drive_ended: bool,
+        observer: &mut dyn RunObserver,
+    ) {
         let Self { lambda, state: LambdaState::Running(process), was_ready, .. } = self else {
             return;
         };
-        screen.lambda_report(lambda.name(), &report);
+        observer.lambda(lambda, &report);
         match report {
-            Report::Isolation { layers } => {
-                screen.print(&format!("{}{}", lambda.prefix, render::isolation(&layers)));
-            }
             Report::Ready => {
                 process.is_ready = true;
                 *was_ready = true;
-                screen.ready(&lambda.prefix);
             }
             Report::Decision(decision) => {
                 let fault = decision.fault.as_ref().map(|fault| fault.kind);
                 process.has_faulted |= fault.is_some();
                 process.has_lost_wake |= fault == Some(FaultKind::Killed);
-                screen.decision(&lambda.prefix, &decision);
             }
             Report::Live(live) => {
                 process.has_faulted |= live.faults > 0;
                 process.after_drive += u32::from(drive_ended);
-                screen.live(lambda.name(), &live);
                 process.last = Some(live);
             }
             Report::Ended(live) => {
                 process.has_ended = true;
                 process.has_faulted |= live.faults > 0;
-                screen.ended(lambda.name(), &live);
                 process.last = Some(live);
             }
             _ => {}
@@ -223,7 +220,7 @@ impl SupervisedLambda {
 
     /// Returns whether its process, if it is ready, has handled all samples of a drive that is
     /// over.
-    pub(super) fn has_handled_drive(&self) -> bool {
+    pub(crate) fn has_handled_drive(&self) -> bool {
         let LambdaState::Running(process) = &self.state else { return true };
         let event = self.lambda.manifest.event_input().map(|input| input.name.as_str());
         let has_handled = |live: &LiveStatus| {
@@ -236,26 +233,26 @@ impl SupervisedLambda {
     }
 
     /// Returns the number of wakes of its process.
-    pub(super) fn wakes(&self) -> u64 {
+    pub(crate) fn wakes(&self) -> u64 {
         let LambdaState::Running(process) = &self.state else { return 0 };
         process.last.as_ref().map_or(0, |live| live.wakes)
     }
 
     /// Handles the end of its process with `status`. It is started again after a delay, unless the
     /// run `is_ending`.
-    pub(super) fn ended(
+    pub(crate) fn ended(
         &mut self,
         status: ExitStatus,
         is_ending: bool,
-        screen: &mut Screen,
+        observer: &mut dyn RunObserver,
         failures: &mut Failures,
     ) {
         let is_lost = |process: &mut LambdaProcess| process.has_lost_ingress && !process.is_ready;
         if !is_ending && self.process().is_some_and(is_lost) {
-            return self.interrupted(screen, failures);
+            return self.interrupted(observer, failures);
         }
         let Some(process) = self.take_process() else { return };
-        screen.gone(self.lambda.name());
+        observer.lambda_gone(&self.lambda);
         let prefix = &self.lambda.prefix;
         let (reason, faulted) = match process.classify(&self.lambda, status, is_ending) {
             ProcessEnd::Complete(exit) => {
@@ -269,7 +266,7 @@ impl SupervisedLambda {
                 failures.add_not_started(exit);
                 self.state = LambdaState::NotStarted;
                 if !prefix.is_empty() {
-                    screen.warn(&format!("{prefix}it could not start; the other lambdas run on"));
+                    observer.warn(&format!("{prefix}it could not start; the other lambdas run on"));
                 }
                 return;
             }
@@ -282,19 +279,19 @@ impl SupervisedLambda {
         let ran = process.started.elapsed();
         self.add_earlier(*process);
         if is_ending {
-            screen.warn(&reason);
+            observer.warn(&reason);
         } else {
             let (delay, restarts) = (self.restart_after(ran), self.restarts);
-            screen.restarts(&reason, delay, restarts);
+            observer.restarts(&reason, delay, restarts);
         }
         failures.add(reason, faulted);
     }
 
     /// Handles the end of its process, which was requested as another process of the run failed.
-    pub(super) fn interrupted(&mut self, screen: &mut Screen, failures: &mut Failures) {
+    pub(crate) fn interrupted(&mut self, observer: &mut dyn RunObserver, failures: &mut Failures) {
         let Some(process) = self.take_process() else { return };
         failures.note(process.has_faulted);
-        screen.gone(self.lambda.name());
+        observer.lambda_gone(&self.lambda);
         self.add_earlier(*process);
         self.restarts += 1;
         self.state = LambdaState::Due(Instant::now());
@@ -323,7 +320,7 @@ impl SupervisedLambda {
     }
 
     /// Completes its `summary.json` after the end of the run, unless it could not start.
-    pub(super) fn complete(self, counts: &RunCounts) -> Result<(), Failure> {
+    pub(crate) fn complete(self, counts: &RunCounts) -> Result<(), Failure> {
         let last = match self.state {
             LambdaState::NotStarted => return Ok(()),
             LambdaState::Ended(last) => last,
@@ -334,7 +331,7 @@ impl SupervisedLambda {
 }
 
 impl LambdaProcess {
-    fn classify(&self, lambda: &RunLambda, status: ExitStatus, requested: bool) -> ProcessEnd {
+    fn classify(&self, lambda: &LambdaSpec, status: ExitStatus, requested: bool) -> ProcessEnd {
         let record = ExitRecord::read(&lambda.exit_record()).ok();
         // A lambda can end its process as if that had been requested. The shim records whether it
         // was requested, and in time.

@@ -4,17 +4,17 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
 
-use super::screen::Screen;
-use super::services::IngressProcess;
-use super::supervised::SupervisedLambda;
-use crate::args::RunArgs;
+use crate::observer::RunObserver;
+use crate::services::IngressProcess;
+use crate::spec::RunSpec;
+use crate::supervised::SupervisedLambda;
 
 /// Time after the end of a drive without a wake, after which the run ends even if a lambda has not
 /// handled all samples: longer than the longest wake.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// The progress of a drive.
-pub(super) struct DriveProgress {
+pub(crate) struct DriveProgress {
     /// The files, as text.
     files: String,
     has_begun: bool,
@@ -24,23 +24,27 @@ pub(super) struct DriveProgress {
 
 impl DriveProgress {
     /// Returns the progress of the drive of a run; `None` without one.
-    pub(super) fn of(args: &RunArgs) -> Option<Self> {
-        let names = args.drive.iter().map(|file| visible(&file.to_string_lossy()));
+    pub(crate) fn of(spec: &RunSpec) -> Option<Self> {
+        let names = spec.drives.iter().map(|file| visible(&file.to_string_lossy()));
         let files = names.collect::<Vec<_>>().join(", ");
         (!files.is_empty()).then_some(Self { files, has_begun: false, last_wake: None })
     }
 
     /// Starts the drive, once: all lambdas must be ready.
-    pub(super) fn begin(&mut self, ingress: &mut IngressProcess, screen: &Screen) {
+    pub(crate) fn begin(&mut self, ingress: &mut IngressProcess, observer: &mut dyn RunObserver) {
         if !self.has_begun {
             // An error means that the ingress has ended, which the caller notices.
             self.has_begun = ingress.control.begin().is_ok();
-            screen.print(&format!("playing {}\n", self.files));
+            observer.playing(&self.files);
         }
     }
 
     /// Returns whether the lambdas have handled all samples of the drive, which has ended.
-    pub(super) fn is_over(&mut self, lambdas: &[SupervisedLambda], screen: &Screen) -> bool {
+    pub(crate) fn is_over(
+        &mut self,
+        lambdas: &[SupervisedLambda],
+        observer: &mut dyn RunObserver,
+    ) -> bool {
         if lambdas.iter().all(SupervisedLambda::has_handled_drive) {
             return true;
         }
@@ -51,7 +55,7 @@ impl DriveProgress {
         }
         let is_late = since.elapsed() >= DRAIN_TIMEOUT;
         if is_late {
-            screen.warn("the drive is over, and a lambda did not handle its last samples");
+            observer.warn("the drive is over, and a lambda did not handle its last samples");
         }
         is_late
     }

@@ -13,14 +13,14 @@ use gleaner_protocol::link::RecorderReport;
 use serde::de::DeserializeOwned;
 
 use crate::inference::InferenceEvent;
-use crate::runtime::{next_report, pass_on};
+use crate::lines::{next_report, pass_on};
 
 /// Number of pipes of a process.
-pub(super) const PIPES: u8 = 2;
+pub(crate) const PIPES: u8 = 2;
 
 /// A process of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum ChildId {
+pub(crate) enum ChildId {
     /// `start` counts the restarts, so that output of an earlier process is not taken for that of
     /// the current one.
     Ingress {
@@ -37,12 +37,12 @@ pub(super) enum ChildId {
 }
 
 /// Output of a process.
-pub(super) struct ChildOutput {
-    pub(super) from: ChildId,
-    pub(super) piece: OutputPiece,
+pub(crate) struct ChildOutput {
+    pub(crate) from: ChildId,
+    pub(crate) piece: OutputPiece,
 }
 
-pub(super) enum OutputPiece {
+pub(crate) enum OutputPiece {
     /// A report of the lambda's process.
     Runtime(Report),
     /// A report of the recorder.
@@ -60,7 +60,7 @@ pub(super) enum OutputPiece {
 }
 
 /// Starts threads that send the output of `child` to `sender`, until its pipes are closed.
-pub(super) fn forward(child: &mut Child, from: ChildId, sender: &SyncSender<ChildOutput>) {
+pub(crate) fn forward(child: &mut Child, from: ChildId, sender: &SyncSender<ChildOutput>) {
     let send = |sender: SyncSender<ChildOutput>| {
         // Sending fails if the run has ended.
         move |piece| sender.send(ChildOutput { from, piece }).is_ok()

@@ -18,17 +18,17 @@ use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::AddTopics;
 use gleaner_protocol::link::{AddLambda, LinkError};
 
-use super::drive::DriveProgress;
-use super::failures::Failures;
-use super::group_end::GroupEnd;
-use super::output::{ChildId, ChildOutput, OutputPiece};
-use super::process::{ChildProcess, ended};
-use super::screen::Screen;
-use super::services::{IngressProcess, RecorderProcess};
-use super::summary::RunCounts;
-use super::supervised::SupervisedLambda;
-use super::{POLL_INTERVAL, RunContext, RunTime, arguments, grants};
+use crate::drive::DriveProgress;
+use crate::failures::Failures;
+use crate::group_end::GroupEnd;
 use crate::inference::{InferenceEvent, InferenceService};
+use crate::observer::RunObserver;
+use crate::output::{ChildId, ChildOutput, OutputPiece};
+use crate::process::{ChildProcess, ended};
+use crate::services::{IngressProcess, RecorderProcess};
+use crate::summary::RunCounts;
+use crate::supervised::SupervisedLambda;
+use crate::{POLL_INTERVAL, RunContext, RunTime, arguments, grants};
 
 /// Time to read the pipes of a process after its end: processes that it left running may hold the
 /// pipes open.
@@ -39,19 +39,19 @@ const DRAIN_TIMEOUT: Duration = Duration::from_millis(300);
 const QUEUE_LENGTH: usize = 16;
 
 /// The failures and counts of a run, over all of its process groups.
-pub(super) struct RunRecord<'a> {
-    pub(super) failures: &'a mut Failures,
-    pub(super) counts: &'a mut RunCounts,
+pub(crate) struct RunRecord<'a> {
+    pub(crate) failures: &'a mut Failures,
+    pub(crate) counts: &'a mut RunCounts,
 }
 
 /// The processes of a run.
-pub(super) struct ProcessGroup<'a> {
+pub(crate) struct ProcessGroup<'a> {
     context: &'a RunContext<'a>,
-    pub(super) lambdas: &'a mut [SupervisedLambda],
-    pub(super) screen: &'a mut Screen,
+    pub(crate) lambdas: &'a mut [SupervisedLambda],
+    pub(crate) observer: &'a mut dyn RunObserver,
     failures: &'a mut Failures,
     counts: &'a mut RunCounts,
-    pub(super) ingress: IngressProcess,
+    pub(crate) ingress: IngressProcess,
     /// The largest sample of an input, in bytes.
     largest: u64,
     recorder: Option<RecorderProcess>,
@@ -65,10 +65,10 @@ pub(super) struct ProcessGroup<'a> {
 
 impl<'a> ProcessGroup<'a> {
     /// Starts the ingress; the others follow when it is ready.
-    pub(super) fn start(
+    pub(crate) fn start(
         context: &'a RunContext<'a>,
         lambdas: &'a mut [SupervisedLambda],
-        screen: &'a mut Screen,
+        observer: &'a mut dyn RunObserver,
         RunRecord { failures, counts }: RunRecord<'a>,
         vehicle: &Vehicle,
     ) -> Result<Self, Failure> {
@@ -90,7 +90,7 @@ impl<'a> ProcessGroup<'a> {
         Ok(Self {
             context,
             lambdas,
-            screen,
+            observer,
             failures,
             counts,
             ingress,
@@ -105,7 +105,7 @@ impl<'a> ProcessGroup<'a> {
 
     /// Runs the processes until the end of the run, or until the ingress or the recorder fails, and
     /// ends them.
-    pub(super) fn run(
+    pub(crate) fn run(
         &mut self,
         time: &mut RunTime,
         stop: &AtomicBool,
@@ -116,7 +116,7 @@ impl<'a> ProcessGroup<'a> {
     }
 
     fn supervise(&mut self, time: &mut RunTime, stop: &AtomicBool) -> Result<GroupEnd, Failure> {
-        let mut drive = DriveProgress::of(self.context.args);
+        let mut drive = DriveProgress::of(self.context.spec);
         loop {
             self.poll(POLL_INTERVAL);
             let is_late = self.ingress.start > 0 && time.is_over_before_ready();
@@ -129,7 +129,7 @@ impl<'a> ProcessGroup<'a> {
                 return Ok(end);
             }
             for (index, status) in ended {
-                self.lambdas[index].ended(status, false, self.screen, self.failures);
+                self.lambdas[index].ended(status, false, self.observer, self.failures);
             }
             if self.lambdas.iter().all(SupervisedLambda::has_not_started) {
                 return Ok(GroupEnd::Complete);
@@ -141,16 +141,16 @@ impl<'a> ProcessGroup<'a> {
             if self.lambdas.iter().all(SupervisedLambda::is_settled) {
                 time.begin();
                 if let Some(drive) = &mut drive {
-                    drive.begin(&mut self.ingress, self.screen);
+                    drive.begin(&mut self.ingress, self.observer);
                 }
             }
             if let Some(drive) = &mut drive
                 && self.ingress.drive_ended
-                && drive.is_over(self.lambdas, self.screen)
+                && drive.is_over(self.lambdas, self.observer)
             {
                 if let Some(why) = self.ingress.dead() {
                     let kept = "the results up to the damage are kept";
-                    self.screen.warn(&format!("the drive is damaged: {why}; {kept}"));
+                    self.observer.warn(&format!("the drive is damaged: {why}; {kept}"));
                     self.failures.drive_is_damaged();
                 }
                 return Ok(GroupEnd::Complete);
@@ -159,23 +159,23 @@ impl<'a> ProcessGroup<'a> {
     }
 
     /// Adds the counts of ingress and recorder to those of the run.
-    pub(super) fn add_counts(self) {
+    pub(crate) fn add_counts(self) {
         self.counts.add(self.ingress.status, self.recorder.and_then(|recorder| recorder.status));
     }
 
     /// Starts the recorder, if it is needed and does not run yet, and all lambdas that are due.
     fn start_due(&mut self) -> Result<(), Failure> {
-        let args = self.context.args;
+        let spec = self.context.spec;
         let is_recorded = |supervised: &&SupervisedLambda| {
-            !args.no_record && supervised.lambda.manifest.record.is_some()
+            spec.records && supervised.lambda.manifest.record.is_some()
         };
         if self.recorder.is_none() && self.lambdas.iter().any(|it| is_recorded(&it)) {
             let recorded = self.lambdas.iter().filter(is_recorded).map(|it| &it.lambda);
-            let added = self.ingress.control.add_reader(&grants::recorder(args));
+            let added = self.ingress.control.add_reader(&grants::recorder(spec));
             let Some(ingress) = self.ingress.granted(added) else { return Ok(()) };
             let started = RecorderProcess::start(self.context, recorded, ingress, &self.sender)?;
             started.topics.mixed().for_each(|topic| {
-                self.screen.warn(&format!(
+                self.observer.warn(&format!(
                     "lambdas request `{topic}` with different `qos`: clips have the samples of the \
                      first, and are not verified for the others"
                 ));
@@ -197,7 +197,7 @@ impl<'a> ProcessGroup<'a> {
         let supervised = &mut self.lambdas[index];
         let (lambda, start) = (&supervised.lambda, supervised.restarts);
         let recorder = recorder.as_mut().filter(|_| lambda.manifest.record.is_some());
-        let reader = grants::lambda(lambda, context.args, recorder.is_some(), start);
+        let reader = grants::lambda(lambda, context.spec, recorder.is_some(), start);
         let mut connections = Handover::default();
         if let Some(recorder) = recorder {
             let topics = recorder.topics.take_new(lambda);
@@ -210,7 +210,7 @@ impl<'a> ProcessGroup<'a> {
             }
             let add = AddLambda {
                 lambda: lambda.folder.clone(),
-                remaps: lambda.remaps(),
+                remaps: lambda.remaps.clone(),
                 most: self.limits,
                 grants: recorder.topics.ids(lambda),
             };
@@ -231,8 +231,8 @@ impl<'a> ProcessGroup<'a> {
         let child = ChildProcess::start(
             &context.parts,
             ("gleaner-runtime", ChildId::Lambda { index, start }),
-            arguments::runtime(context.args, lambda, context.offset_ns, start),
-            Some(arguments::shim(context.args, lambda, start)),
+            arguments::runtime(context.spec, lambda, context.offset_ns, start),
+            Some(arguments::shim(context.spec, lambda, start)),
             connections,
             &self.sender,
         )?;
@@ -269,20 +269,20 @@ impl<'a> ProcessGroup<'a> {
     /// Starts the ingress again if it has ended, or receives nothing more; returns the end of the
     /// group if all others must end with it.
     fn ended_ingress(&mut self) -> Result<Option<GroupEnd>, Failure> {
-        let Self { ingress, context, screen, .. } = self;
+        let Self { ingress, context, observer, .. } = self;
         if let Some(at) = ingress.again_at {
             if Instant::now() >= at {
                 match ingress.start_again(context, self.largest, &self.sender) {
                     Ok(last) => self.counts.add(last, None),
                     Err(failure) => {
                         let (reason, starts) = (failure.to_string(), ingress.start + 1);
-                        screen.restarts(&reason, ingress.ended(), starts);
+                        observer.restarts(&reason, ingress.ended(), starts);
                     }
                 }
             }
             return Ok(None);
         }
-        let plays_drive = !context.args.drive.is_empty();
+        let plays_drive = !context.spec.drives.is_empty();
         let Some(status) = ingress.child.status()? else {
             ingress.kill_if_broken(plays_drive);
             return Ok(None);
@@ -291,10 +291,10 @@ impl<'a> ProcessGroup<'a> {
             return Ok(Some(GroupEnd::of("the ingress", status, !ingress.is_ready)));
         }
         self.drain(|group| group.ingress.open_pipes > 0);
-        let Self { ingress, screen, .. } = self;
+        let Self { ingress, observer, .. } = self;
         let reason = ingress.end_reason(status);
-        screen.ingress_gone();
-        screen.restarts(&reason, ingress.ended(), ingress.start + 1);
+        observer.ingress_gone();
+        observer.restarts(&reason, ingress.ended(), ingress.start + 1);
         self.failures.add(reason, false);
         self.lambdas.iter_mut().for_each(SupervisedLambda::lost_ingress);
         Ok(None)
@@ -303,13 +303,13 @@ impl<'a> ProcessGroup<'a> {
     /// Connects the processes that ran before the current ingress to it. Does nothing more if it
     /// has ended, which the caller notices.
     fn join_ingress(&mut self) {
-        let Self { context, lambdas, screen, ingress, recorder, .. } = self;
+        let Self { context, lambdas, observer, ingress, recorder, .. } = self;
         if std::mem::replace(&mut ingress.is_joined, true) {
             return;
         }
         if let Some(recorder) = recorder {
             let added =
-                ingress.control.add_reader(&grants::again(grants::recorder(context.args), true));
+                ingress.control.add_reader(&grants::again(grants::recorder(context.spec), true));
             let Some(socket) = ingress.granted(added) else { return };
             let mut again = HashSet::new();
             for supervised in lambdas.iter() {
@@ -323,16 +323,16 @@ impl<'a> ProcessGroup<'a> {
                 }
             }
             if let Some(warning) = recorder.child.pass_ingress(socket) {
-                screen.warn(&warning);
+                observer.warn(&warning);
             }
         }
         for supervised in lambdas.iter_mut().filter(|supervised| supervised.is_running()) {
             let lambda = &supervised.lambda;
             let is_recorded = recorder.is_some() && lambda.manifest.record.is_some();
-            let reader = grants::lambda(lambda, context.args, is_recorded, supervised.restarts);
+            let reader = grants::lambda(lambda, context.spec, is_recorded, supervised.restarts);
             let added = ingress.control.add_reader(&grants::again(reader, recorder.is_some()));
             let Some(socket) = ingress.granted(added) else { return };
-            supervised.pass_ingress(socket, screen);
+            supervised.pass_ingress(socket, *observer);
         }
     }
 
@@ -345,12 +345,12 @@ impl<'a> ProcessGroup<'a> {
             for (index, status) in self.ended_lambdas()? {
                 let lambda = &mut self.lambdas[index];
                 if is_requested {
-                    lambda.ended(status, true, self.screen, self.failures);
+                    lambda.ended(status, true, self.observer, self.failures);
                 } else {
-                    lambda.interrupted(self.screen, self.failures);
+                    lambda.interrupted(self.observer, self.failures);
                 }
             }
-            self.lambdas.iter_mut().for_each(|lambda| lambda.kill_if_late(self.screen));
+            self.lambdas.iter_mut().for_each(|lambda| lambda.kill_if_late(self.observer));
         }
         if let Some(recorder) = &mut self.recorder {
             // Fails if it has ended meanwhile, and then has nothing to complete.
@@ -358,7 +358,7 @@ impl<'a> ProcessGroup<'a> {
             let status = self.wait(|group| group.recorder.as_mut().map(|it| &mut it.child))?;
             if let Some(status) = status.filter(|status| !status.success()) {
                 let reason = ended("the recorder", status);
-                self.screen.warn(&format!(
+                self.observer.warn(&format!(
                     "{reason}: clips may be unfinished, and are recovered by the next run"
                 ));
                 // Otherwise a failure that counts already has caused the end.
@@ -382,14 +382,14 @@ impl<'a> ProcessGroup<'a> {
         let is_failure = |status: &ExitStatus| is_requested && is_new && !status.success();
         if let Some(status) = status.filter(is_failure) {
             let reason = self.ingress.end_reason(status);
-            self.screen.warn(&reason);
+            self.observer.warn(&reason);
             self.failures.add(reason, false);
         }
         self.drain(|group| {
             let recorder = group.recorder.as_ref().map_or(0, |recorder| recorder.open_pipes);
             group.ingress.open_pipes > 0 || recorder > 0
         });
-        self.ingress.show_last(self.screen);
+        self.ingress.show_last(self.observer);
         Ok(())
     }
 
@@ -404,7 +404,7 @@ impl<'a> ProcessGroup<'a> {
                 return Ok(Some(status));
             }
             if let Some(warning) = process.kill_if_late() {
-                self.screen.warn(&warning);
+                self.observer.warn(&warning);
             }
             self.poll(POLL_INTERVAL);
         }
@@ -437,7 +437,7 @@ impl<'a> ProcessGroup<'a> {
     }
 
     fn show(&mut self, ChildOutput { from, piece }: ChildOutput) {
-        let Self { lambdas, ingress, recorder, screen, .. } = self;
+        let Self { lambdas, ingress, recorder, observer, .. } = self;
         let (prefix, mut current) = match from {
             ChildId::Lambda { index, start } => {
                 let supervised = &mut lambdas[index];
@@ -457,26 +457,26 @@ impl<'a> ProcessGroup<'a> {
         match piece {
             OutputPiece::Stderr { text, begins_line } => {
                 let prefix = if begins_line { prefix.as_bytes() } else { b"" };
-                screen.err(&[prefix, &text].concat());
+                observer.stderr(&[prefix, &text].concat());
             }
             OutputPiece::Unparsable(line) => {
-                screen.warn(&format!("{prefix}cannot parse a report: {line}"));
+                observer.warn(&format!("{prefix}cannot parse a report: {line}"));
             }
             OutputPiece::Runtime(report) => {
                 if let Some(current) = &mut current {
-                    current.show(report, ingress.drive_ended, screen);
+                    current.show(report, ingress.drive_ended, *observer);
                 }
             }
-            OutputPiece::Ingress(report) => ingress.show(report, screen),
+            OutputPiece::Ingress(report) => ingress.show(report, *observer),
             OutputPiece::Inference(event) => {
                 if let InferenceEvent::Ended(reason, _) = &event {
                     self.failures.add(reason.clone(), false);
                 }
-                screen.inference(&event);
+                observer.inference(event);
             }
             OutputPiece::Recorder(report) => {
                 if let Some(recorder) = recorder {
-                    recorder.show(report, screen);
+                    recorder.show(report, *observer);
                 }
             }
             OutputPiece::Closed => match (from, current, recorder) {

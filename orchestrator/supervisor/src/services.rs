@@ -8,40 +8,40 @@ use std::time::{Duration, Instant};
 use gleaner_base::{Exit, Failure, chain};
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::{IngressControl, IngressReport, IngressStatus, IngressTopic};
-use gleaner_protocol::link::{ControlClient, LinkError, Loss, RecorderReport, RecorderStatus};
+use gleaner_protocol::link::{ControlClient, LinkError, RecorderReport, RecorderStatus};
 
-use super::grants::RecordedTopics;
-use super::lambdas::RunLambda;
-use super::output::{ChildId, ChildOutput, PIPES};
-use super::process::{ChildProcess, ended};
-use super::screen::Screen;
-use super::{RunContext, arguments};
+use crate::grants::RecordedTopics;
+use crate::observer::RunObserver;
+use crate::output::{ChildId, ChildOutput, PIPES};
+use crate::process::{ChildProcess, ended};
 use crate::restart_delay::RestartDelay;
+use crate::spec::LambdaSpec;
+use crate::{RunContext, arguments};
 
 /// The ingress of a run.
-pub(super) struct IngressProcess {
-    pub(super) child: ChildProcess,
-    pub(super) control: IngressControl,
-    pub(super) open_pipes: u8,
+pub(crate) struct IngressProcess {
+    pub(crate) child: ChildProcess,
+    pub(crate) control: IngressControl,
+    pub(crate) open_pipes: u8,
     /// Set when it has joined the network, or opened the drive.
-    pub(super) is_ready: bool,
+    pub(crate) is_ready: bool,
     /// Set at the end of the drive.
-    pub(super) drive_ended: bool,
+    pub(crate) drive_ended: bool,
     /// Set after its final status.
     has_ended: bool,
-    pub(super) status: Option<Box<IngressStatus>>,
+    pub(crate) status: Option<Box<IngressStatus>>,
     /// Last status of each topic that had a reader.
     topics: Vec<IngressTopic>,
     /// Those of earlier ingresses, summed.
     earlier_topics: Vec<IngressTopic>,
     /// Number of earlier ingresses.
-    pub(super) start: u32,
+    pub(crate) start: u32,
     started: Instant,
     delay: RestartDelay,
     /// Time at which the next ingress is to be started, as this one has ended.
-    pub(super) again_at: Option<Instant>,
+    pub(crate) again_at: Option<Instant>,
     /// Set when the processes that ran before it were connected to it.
-    pub(super) is_joined: bool,
+    pub(crate) is_joined: bool,
     /// The reason why it was killed.
     killed: Option<String>,
     /// Time of its last report.
@@ -53,7 +53,7 @@ const SILENCE: Duration = Duration::from_secs(15);
 
 impl IngressProcess {
     /// Starts the ingress. `largest` is the largest sample of an input, in bytes.
-    pub(super) fn start(
+    pub(crate) fn start(
         context: &RunContext<'_>,
         largest: u64,
         sender: &SyncSender<ChildOutput>,
@@ -62,7 +62,7 @@ impl IngressProcess {
     }
 
     /// Starts another one after this one has ended; also returns the last status of this one.
-    pub(super) fn start_again(
+    pub(crate) fn start_again(
         &mut self,
         context: &RunContext<'_>,
         largest: u64,
@@ -88,7 +88,7 @@ impl IngressProcess {
         let child = ChildProcess::start(
             &context.parts,
             ("gleaner-ingress", ChildId::Ingress { start }),
-            arguments::ingress(context.args, largest, context.offset_ns),
+            arguments::ingress(context.spec, largest, context.offset_ns),
             None,
             Handover { control: Some(ingress_end), ..Handover::default() },
             sender,
@@ -115,7 +115,7 @@ impl IngressProcess {
 
     /// Returns the result of a request to it. `None` if it has ended; if the request failed for
     /// another reason, it is killed.
-    pub(super) fn granted<T>(&mut self, requested: Result<T, LinkError>) -> Option<T> {
+    pub(crate) fn granted<T>(&mut self, requested: Result<T, LinkError>) -> Option<T> {
         match requested {
             Ok(result) => Some(result),
             Err(LinkError::Gone { .. }) => None,
@@ -128,7 +128,7 @@ impl IngressProcess {
 
     /// Kills it, so that another one is started, if it does not receive any more. `plays_drive` is
     /// true if it plays a drive: a damaged one ends as another one does.
-    pub(super) fn kill_if_broken(&mut self, plays_drive: bool) {
+    pub(crate) fn kill_if_broken(&mut self, plays_drive: bool) {
         if let Some(why) = self.dead().filter(|_| !plays_drive) {
             self.kill(format!("the ingress does not receive: {why}"));
         } else if self.is_ready && self.heard.elapsed() > SILENCE {
@@ -145,12 +145,12 @@ impl IngressProcess {
     }
 
     /// Returns the reason for its end.
-    pub(super) fn end_reason(&mut self, status: ExitStatus) -> String {
+    pub(crate) fn end_reason(&mut self, status: ExitStatus) -> String {
         self.killed.take().unwrap_or_else(|| ended("the ingress", status))
     }
 
     /// Notes its end: another one is to be started after the returned delay.
-    pub(super) fn ended(&mut self) -> Duration {
+    pub(crate) fn ended(&mut self) -> Duration {
         let delay = self.delay.after(self.started.elapsed());
         self.is_ready = false;
         self.again_at = Some(Instant::now() + delay);
@@ -158,12 +158,12 @@ impl IngressProcess {
     }
 
     /// Returns the reason why it receives no further samples; of a drive, why it ended early.
-    pub(super) fn dead(&self) -> Option<&str> {
+    pub(crate) fn dead(&self) -> Option<&str> {
         self.status.as_ref().and_then(|status| status.health.dead.as_deref())
     }
 
-    pub(super) fn show(&mut self, report: IngressReport, screen: &mut Screen) {
-        screen.report(&report);
+    pub(crate) fn show(&mut self, report: IngressReport, observer: &mut dyn RunObserver) {
+        observer.ingress(&report);
         self.heard = Instant::now();
         match report {
             IngressReport::Ready => self.is_ready = true,
@@ -171,7 +171,6 @@ impl IngressProcess {
             // Only of `gleaner-ingress topics`.
             IngressReport::Topics { .. } => {}
             IngressReport::Status(status) => {
-                screen.ingress(&status);
                 self.keep_topics(&status);
                 self.status = Some(status);
             }
@@ -179,7 +178,7 @@ impl IngressProcess {
                 self.keep_topics(&status);
                 // Its readers have ended before it, and with them their topics.
                 status.topics = self.topics();
-                screen.ingress_ended(&status);
+                observer.ingress_ended(&status);
                 self.has_ended = true;
                 self.status = Some(status);
             }
@@ -187,11 +186,11 @@ impl IngressProcess {
     }
 
     /// Shows the last status of a run that ends without a final one, as the ingress has failed.
-    pub(super) fn show_last(&self, screen: &mut Screen) {
+    pub(crate) fn show_last(&self, observer: &mut dyn RunObserver) {
         let topics = self.topics();
         if !self.has_ended && !topics.is_empty() {
             let status = self.status.as_deref().cloned().unwrap_or_default();
-            screen.ingress_ended(&IngressStatus { topics, readers: 0, ..status });
+            observer.ingress_ended(&IngressStatus { topics, readers: 0, ..status });
         }
     }
 
@@ -223,22 +222,22 @@ fn find<'a>(topics: &'a mut [IngressTopic], topic: &IngressTopic) -> Option<&'a 
 }
 
 /// The recorder of a run.
-pub(super) struct RecorderProcess {
-    pub(super) child: ChildProcess,
-    pub(super) control: ControlClient,
-    pub(super) open_pipes: u8,
+pub(crate) struct RecorderProcess {
+    pub(crate) child: ChildProcess,
+    pub(crate) control: ControlClient,
+    pub(crate) open_pipes: u8,
     /// Set when it accepts lambdas.
-    pub(super) is_ready: bool,
+    pub(crate) is_ready: bool,
     /// Topics that lambdas record.
-    pub(super) topics: RecordedTopics,
-    pub(super) status: Option<Box<RecorderStatus>>,
+    pub(crate) topics: RecordedTopics,
+    pub(crate) status: Option<Box<RecorderStatus>>,
 }
 
 impl RecorderProcess {
     /// Starts the recorder of the lambdas `recorded`. `ingress` is its connection to the ingress.
-    pub(super) fn start<'a>(
+    pub(crate) fn start<'a>(
         context: &RunContext<'_>,
-        recorded: impl Iterator<Item = &'a RunLambda> + Clone,
+        recorded: impl Iterator<Item = &'a LambdaSpec> + Clone,
         ingress: OwnedFd,
         sender: &SyncSender<ChildOutput>,
     ) -> Result<Self, Failure> {
@@ -250,7 +249,7 @@ impl RecorderProcess {
         let child = ChildProcess::start(
             &context.parts,
             ("gleaner-recorder", ChildId::Recorder),
-            arguments::recorder(context.args, recorded.clone(), context.offset_ns),
+            arguments::recorder(context.spec, recorded.clone(), context.offset_ns),
             None,
             connections,
             sender,
@@ -259,35 +258,14 @@ impl RecorderProcess {
         Ok(Self { child, control, open_pipes: PIPES, is_ready: false, topics, status: None })
     }
 
-    pub(super) fn show(&mut self, report: RecorderReport, screen: &mut Screen) {
-        screen.report(&report);
+    pub(crate) fn show(&mut self, report: RecorderReport, observer: &mut dyn RunObserver) {
+        observer.recorder(&report);
         match report {
-            RecorderReport::Clip(clip) => screen.clip(&clip),
-            RecorderReport::Recovered(clip) => {
-                screen.warn("recovered a clip of an earlier recorder that crashed");
-                screen.clip(&clip);
-            }
-            RecorderReport::Loss(Loss::Deleted { file, reason, .. }) => {
-                screen.warn(&format!("deleted the clip `{}`: {reason}", file.display()));
-            }
-            RecorderReport::Loss(Loss::NotDeleted { file, reason, .. }) => {
-                screen.warn(&format!("cannot delete the clip `{}`: {reason}", file.display()));
-            }
-            RecorderReport::Loss(Loss::Failed { reason, .. }) => {
-                screen.warn(&format!("cannot write a clip: {reason}"))
-            }
-            RecorderReport::Loss(Loss::DiskSuppressed { triggers, reason, .. }) => {
-                screen.warn(&format!("{triggers} triggers without a window: {reason}"));
-            }
-            RecorderReport::Status(status) => {
-                screen.recorder(&status);
-                self.status = Some(status);
-            }
-            RecorderReport::Ended(status) => {
-                screen.recorder_ended(&status);
-                self.status = Some(status);
-            }
             RecorderReport::Ready => self.is_ready = true,
+            RecorderReport::Status(status) | RecorderReport::Ended(status) => {
+                self.status = Some(status);
+            }
+            RecorderReport::Clip(_) | RecorderReport::Recovered(_) | RecorderReport::Loss(_) => {}
         }
     }
 }

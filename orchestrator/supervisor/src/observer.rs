@@ -1,0 +1,37 @@
+//! The events of a run, for those who watch it.
+
+use std::time::Duration;
+
+use gleaner_protocol::Report;
+use gleaner_protocol::ingress::{IngressReport, IngressStatus};
+use gleaner_protocol::link::RecorderReport;
+
+use crate::inference::InferenceEvent;
+use crate::spec::LambdaSpec;
+
+/// A receiver of the events of a run, in the thread that supervises it. What takes long there
+/// delays restarts.
+pub trait RunObserver {
+    /// A report of the process of a lambda.
+    fn lambda(&mut self, lambda: &LambdaSpec, report: &Report);
+    /// The process of a lambda has ended.
+    fn lambda_gone(&mut self, lambda: &LambdaSpec);
+    /// A report of the ingress.
+    fn ingress(&mut self, report: &IngressReport);
+    /// The ingress has ended, and is started again.
+    fn ingress_gone(&mut self);
+    /// The final status of the ingress, with the topics of all ingresses of the run.
+    fn ingress_ended(&mut self, status: &IngressStatus);
+    /// A report of the recorder.
+    fn recorder(&mut self, report: &RecorderReport);
+    /// An event of the process that runs models.
+    fn inference(&mut self, event: InferenceEvent);
+    /// A drive begins: its files, as text.
+    fn playing(&mut self, files: &str);
+    /// Something failed for a reason, and is started again after a delay, for the `restarts`th time.
+    fn restarts(&mut self, reason: &str, delay: Duration, restarts: u32);
+    /// Something else went wrong.
+    fn warn(&mut self, text: &str);
+    /// A piece of a process's standard error, without control characters.
+    fn stderr(&mut self, piece: &[u8]);
+}
