@@ -10,8 +10,8 @@ use gleaner_base::safe_file;
 use super::DerivedKind;
 
 /// Maximum size of a store, in bytes; native code of an ordinary lambda takes half a megabyte, an
-/// engine as much as its model. Entries of old builds, versions and settings are no longer used, and
-/// so removed first.
+/// engine as much as its model. Entries of old builds, versions and settings are no longer used,
+/// and so removed first.
 pub const STORE_BYTES: u64 = 2 << 30;
 
 /// Interval in which the use of an entry is noted at most once, so that few starts write to the

@@ -94,6 +94,7 @@ mod tests {
             runs,
             shared: 0,
             failed: 1,
+            built_for: None,
             run_ns: runs * 10,
         }
     }
