@@ -162,6 +162,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         "gleaner-shim",
         &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"],
     ),
+    ("gleaner-spool", &["gleaner-base"]),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
     ("gleaner-vision", &["gleaner-rules"]),
     ("gleaner-vitals", &["gleaner-protocol"]),
