@@ -31,6 +31,7 @@ mod onnx;
 #[path = "../../host/inference/src/places.rs"]
 pub mod places;
 pub mod seeds;
+pub mod spool;
 
 /// A fuzz target: its name, its check, its seeds and its dictionary.
 pub struct Target {
@@ -48,7 +49,7 @@ pub struct Target {
 }
 
 /// All targets.
-pub const TARGETS: [Target; 10] = [
+pub const TARGETS: [Target; 11] = [
     Target {
         name: "message",
         check: Some(message::check),
@@ -111,6 +112,13 @@ pub const TARGETS: [Target; 10] = [
         longest: 4 << 10,
         seeds: seeds::model::all,
         words: seeds::model::WORDS,
+    },
+    Target {
+        name: "spool",
+        check: Some(spool::check),
+        longest: 4 << 10,
+        seeds: seeds::spool::all,
+        words: seeds::spool::WORDS,
     },
     Target {
         name: "calls",

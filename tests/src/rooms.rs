@@ -175,6 +175,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         "gleaner-shim",
         &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"],
     ),
+    ("gleaner-spool", &["gleaner-base"]),
     (
         "gleaner-supervisor",
         &[

@@ -11,6 +11,7 @@ pub mod link;
 pub mod manifest;
 pub mod message;
 pub mod model;
+pub mod spool;
 
 use std::fs;
 use std::io;

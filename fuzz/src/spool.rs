@@ -1,0 +1,178 @@
+//! Fuzzes the segments of a stream.
+//!
+//! An input is a byte for the mode, then data that depends on the mode. Checksums would stop a
+//! fuzzer early, so one mode computes them.
+
+use std::io;
+
+use gleaner_spool::{PAYLOAD_MAX, SegmentFile, SpoolError, SpoolItem, SpoolReader, SpoolStorage};
+
+use crate::budget;
+use crate::input::FuzzInput;
+
+/// Modes of an input.
+pub mod mode {
+    /// A segment follows.
+    pub const FILE: u8 = 0;
+    /// Records follow: kind, numbers skipped before it, length in two bytes, payload. Kind 255
+    /// begins a segment, and has neither length nor payload. The checksums are computed.
+    pub const RECORDS: u8 = 1;
+}
+
+/// Kind of a record that begins a segment instead.
+pub(crate) const NEW_SEGMENT: u8 = 255;
+
+/// Memory of a reader: a window, and a record.
+const MEMORY: usize = 256 << 10;
+
+const STREAM: &str = "s";
+const SALT: [u8; 8] = [0x5a; 8];
+
+/// Reads the input twice. Returns whether it has records and is undamaged.
+pub fn check(data: &[u8]) -> bool {
+    let mut input = FuzzInput(data);
+    let segments = match input.u8() {
+        mode::RECORDS => sealed(input),
+        _ => vec![(0, input.0.to_vec())],
+    };
+    let (valid, records) = read(&segments, None);
+    assert_eq!((valid, records), read(&segments, None), "the same segments, read twice");
+    read(&segments, Some(3));
+    valid && records > 0
+}
+
+/// Segments of the records in `input`, with their first numbers; `docs/spool.md` describes the
+/// format.
+pub(crate) fn sealed(mut input: FuzzInput) -> Vec<(u64, Vec<u8>)> {
+    let mut segments = vec![(0, header(0))];
+    let mut seq = 0_u64;
+    while !input.0.is_empty() {
+        let (kind, skipped) = (input.u8(), input.u8());
+        seq += u64::from(skipped);
+        if kind == NEW_SEGMENT {
+            if segments.last().is_some_and(|(first, _)| *first < seq) {
+                segments.push((seq, header(seq)));
+            }
+            continue;
+        }
+        let len = input.u16();
+        let payload = input.bytes(len.into());
+        let mut head = (payload.len() as u32).to_le_bytes().to_vec();
+        head.extend(crc32fast::hash(payload).to_le_bytes());
+        head.extend(seq.to_le_bytes());
+        head.extend([0; 16]);
+        head.extend([kind, 0, 0, 0]);
+        let crc = crc32fast::hash(&[&SALT[..], &head].concat());
+        let (_, segment) = segments.last_mut().expect("there is a first one");
+        segment.extend(head);
+        segment.extend(crc.to_le_bytes());
+        segment.extend(payload);
+        seq += 1;
+    }
+    segments
+}
+
+fn header(first: u64) -> Vec<u8> {
+    let mut header = b"\x89GLSPL\r\n\x01\x00\x01".to_vec();
+    header.resize(32, 0);
+    header.extend(first.to_le_bytes());
+    header.extend(SALT);
+    header.extend(STREAM.as_bytes());
+    header.resize(124, 0);
+    header.extend(crc32fast::hash(&header).to_le_bytes());
+    header
+}
+
+/// Reads all items, and checks that each number is in exactly one. Returns whether there is no
+/// damage, and the number of records.
+fn read(segments: &[(u64, Vec<u8>)], from: Option<u64>) -> (bool, usize) {
+    let bytes: usize = segments.iter().map(|(_, bytes)| bytes.len()).sum();
+    let mut reader = SpoolReader::with_storage(ReadOnly(segments), STREAM, from);
+    let mut expected = from.or(segments.first().map(|(first, _)| *first)).unwrap_or(0);
+    let (mut valid, mut records, mut items) = (true, 0, 0);
+    while let Some(item) = budget::within(MEMORY, || reader.next()) {
+        items += 1;
+        assert!(items <= bytes, "more items than bytes");
+        match item {
+            Ok(SpoolItem::Record(record)) => {
+                assert_eq!(record.seq, expected);
+                assert!(record.payload.len() <= PAYLOAD_MAX);
+                records += 1;
+                expected += 1;
+            }
+            Ok(SpoolItem::Gap(gap)) => {
+                assert!(gap.from <= gap.to);
+                let explains = gap.record.is_some_and(|record| gap.to + 1 == record);
+                match gap.record {
+                    None => assert_eq!(gap.from, expected),
+                    Some(_) if explains => assert!(gap.from <= expected),
+                    Some(record) => assert_eq!(record, expected),
+                }
+                valid &= gap.record.is_some();
+                expected = gap.record.unwrap_or(gap.to) + 1;
+            }
+            Ok(SpoolItem::Torn(torn)) => {
+                assert_eq!(torn.from, expected);
+                assert!(reader.next().is_none(), "a torn tail is the end");
+                return (false, records);
+            }
+            Err(SpoolError::Version { found, .. }) => {
+                assert_ne!(found, 1);
+                return (false, records);
+            }
+            Err(error) => panic!("{error}"),
+        }
+    }
+    (valid, records)
+}
+
+#[derive(Clone, Copy)]
+struct ReadOnly<'a>(&'a [(u64, Vec<u8>)]);
+
+struct ReadOnlySegment<'a>(&'a [u8]);
+
+impl<'a> SpoolStorage for ReadOnly<'a> {
+    type File = ReadOnlySegment<'a>;
+
+    fn list(&self) -> io::Result<Vec<(u64, u64)>> {
+        Ok(self.0.iter().map(|(first, bytes)| (*first, bytes.len() as u64)).collect())
+    }
+
+    fn open(&self, first: u64) -> io::Result<ReadOnlySegment<'a>> {
+        let found = self.0.iter().find(|segment| segment.0 == first);
+        found.map(|(_, bytes)| ReadOnlySegment(bytes)).ok_or_else(|| io::ErrorKind::NotFound.into())
+    }
+
+    fn create(&self, _: u64) -> io::Result<ReadOnlySegment<'a>> {
+        Err(io::ErrorKind::ReadOnlyFilesystem.into())
+    }
+
+    fn remove(&self, _: u64) -> io::Result<()> {
+        Err(io::ErrorKind::ReadOnlyFilesystem.into())
+    }
+
+    fn sync_names(&self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl SegmentFile for ReadOnlySegment<'_> {
+    fn length(&self) -> io::Result<u64> {
+        Ok(self.0.len() as u64)
+    }
+
+    fn read_at(&self, into: &mut [u8], offset: u64) -> io::Result<usize> {
+        let rest = self.0.get(offset as usize..).unwrap_or_default();
+        let read = rest.len().min(into.len());
+        into[..read].copy_from_slice(&rest[..read]);
+        Ok(read)
+    }
+
+    fn append(&mut self, _: &[u8]) -> io::Result<()> {
+        Err(io::ErrorKind::ReadOnlyFilesystem.into())
+    }
+
+    fn sync(&self) -> io::Result<()> {
+        Ok(())
+    }
+}

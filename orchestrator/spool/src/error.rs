@@ -1,0 +1,147 @@
+//! Errors of a spool.
+
+use std::io;
+use std::path::PathBuf;
+
+use gleaner_base::{ByteSize, Exit, Explain};
+
+use crate::GapReason;
+use crate::format::{NAME_MAX, VERSION};
+use crate::writer::BUDGET_MIN;
+
+/// The reason why a spool refuses a record, or cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum SpoolError {
+    /// The name of the stream is empty or too long.
+    #[error("`{stream}` is not the name of a stream: it has {} bytes", stream.len())]
+    Name {
+        /// The name.
+        stream: String,
+    },
+    /// The budget is too small.
+    #[error("the budget of stream `{stream}` is {budget}, below the minimum of {BUDGET_MIN}")]
+    Budget {
+        /// Name of the stream.
+        stream: String,
+        /// The budget.
+        budget: ByteSize,
+    },
+    /// The folder cannot be used.
+    #[error("cannot use the spool folder `{}`", path.display())]
+    Folder {
+        /// The folder.
+        path: PathBuf,
+        /// The cause.
+        source: io::Error,
+    },
+    /// Another writer has the stream.
+    #[error("another writer uses the spool folder `{}`{}", path.display(), by(*pid))]
+    Busy {
+        /// The folder.
+        path: PathBuf,
+        /// Process id of the writer, if the kernel lists it.
+        pid: Option<u32>,
+    },
+    /// The segments of a stream cannot be read.
+    #[error("cannot read the spool of stream `{stream}`")]
+    Read {
+        /// Name of the stream.
+        stream: String,
+        /// The cause.
+        source: io::Error,
+    },
+    /// A segment has another version of the format.
+    #[error(
+        "segment {first} of stream `{stream}` has version {found}; this gleaner reads {VERSION}"
+    )]
+    Version {
+        /// Name of the stream.
+        stream: String,
+        /// First sequence number of the segment.
+        first: u64,
+        /// Version of the segment.
+        found: u16,
+    },
+    /// A commit failed: its records are not acknowledged. They stay in the queue.
+    #[error("cannot write records {durable} and later of stream `{stream}`")]
+    Write {
+        /// Name of the stream.
+        stream: String,
+        /// First number that is not acknowledged.
+        durable: u64,
+        /// The cause.
+        source: io::Error,
+    },
+    /// The record is longer than a record of this stream may be. It has no number.
+    #[error("a record of stream `{stream}` has {bytes} bytes, above the maximum of {most}")]
+    TooLong {
+        /// Name of the stream.
+        stream: String,
+        /// Length of the payload.
+        bytes: usize,
+        /// Maximum length of the payload.
+        most: usize,
+    },
+    /// The queue is full. The record is lost, and counted; a gap record will have its number.
+    #[error("record {seq} of stream `{stream}` was refused: {}", refusal(*reason))]
+    Refused {
+        /// Name of the stream.
+        stream: String,
+        /// Number of the record.
+        seq: u64,
+        /// The reason.
+        reason: GapReason,
+    },
+}
+
+fn by(pid: Option<u32>) -> String {
+    pid.map(|pid| format!(", process {pid}")).unwrap_or_default()
+}
+
+fn refusal(reason: GapReason) -> &'static str {
+    match reason {
+        GapReason::DiskFull => "the disk is full, and so is the queue",
+        GapReason::WriteFailed => "writing fails, and the queue is full",
+        _ => "the queue is full",
+    }
+}
+
+impl Explain for SpoolError {
+    fn help(&self) -> Option<String> {
+        Some(match self {
+            SpoolError::Name { .. } => format!("choose a name of 1 to {NAME_MAX} bytes"),
+            SpoolError::Budget { .. } => format!("set the budget to {BUDGET_MIN} or more"),
+            SpoolError::Folder { .. } => {
+                "make it a folder of the user that runs the writer, without links".to_owned()
+            }
+            SpoolError::Busy { .. } => "end the other writer first".to_owned(),
+            SpoolError::Read { .. } => {
+                "check the disk; remove files that are not segments from the folder".to_owned()
+            }
+            SpoolError::Version { .. } => "use the gleaner that wrote it".to_owned(),
+            SpoolError::Write { source, .. } if is_full(source) => {
+                "free space on the disk, or lower the budgets".to_owned()
+            }
+            SpoolError::Write { .. } => "check the disk".to_owned(),
+            SpoolError::TooLong { .. } => "split it, or raise the budget".to_owned(),
+            SpoolError::Refused { reason: GapReason::QueueFull, .. } => {
+                "commit more often".to_owned()
+            }
+            SpoolError::Refused { .. } => "free space on the disk, or replace it".to_owned(),
+        })
+    }
+
+    fn exit(&self) -> Exit {
+        match self {
+            SpoolError::Name { .. } | SpoolError::Budget { .. } | SpoolError::Version { .. } => {
+                Exit::Usage
+            }
+            _ => Exit::Internal,
+        }
+    }
+}
+
+/// Returns whether `error` means that the disk, or the user's part of it, is full.
+pub(crate) fn is_full(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
+}

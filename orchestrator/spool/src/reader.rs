@@ -1,0 +1,240 @@
+//! Iterates over the records of a stream, across all segments and all damage.
+
+use std::io;
+use std::num::NonZeroU8;
+use std::path::Path;
+
+use crate::format::{BootId, GAP_KIND, GapReason, RecordHead, SpoolGap, SpoolTime};
+use crate::scan::SegmentScan;
+use crate::writer::TornTail;
+use crate::{SpoolError, SpoolFolder, SpoolStorage};
+
+/// A record of a stream.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SpoolRecord {
+    /// Its number in the stream.
+    pub seq: u64,
+    /// The boot in which it was written.
+    pub boot: BootId,
+    /// Its times.
+    pub time: SpoolTime,
+    /// Its kind, of the caller's choice.
+    pub kind: NonZeroU8,
+    /// Its content, at most [`PAYLOAD_MAX`](crate::PAYLOAD_MAX) bytes.
+    pub payload: Vec<u8>,
+}
+
+/// An item of a stream.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum SpoolItem {
+    /// A record.
+    Record(SpoolRecord),
+    /// Records are missing.
+    Gap(SpoolGap),
+    /// The last segment ends with bytes that are not a record, since a kill or a power cut
+    /// interrupted a commit, or one is in progress. The next writer replaces this by a gap record.
+    Torn(TornTail),
+}
+
+/// Iterates over a stream in the order of its sequence numbers. Each number from the first one on
+/// is in a record, in a gap, or is that of a gap record; damage never ends the iteration.
+///
+/// After `None`, the iterator can be used again: it returns what was written meanwhile. Its memory
+/// is bounded by the longest record.
+#[derive(Debug)]
+pub struct SpoolReader<S: SpoolStorage = SpoolFolder> {
+    storage: S,
+    stream: String,
+    /// The number of the next item; `None` before the first segment was found.
+    expected: Option<u64>,
+    limit: u64,
+    current: Option<OpenSegment<S::File>>,
+    /// Set if the hole before the next record is due to changed bytes, not to a missing segment.
+    damaged: bool,
+    reported: Option<TornTail>,
+}
+
+struct OpenSegment<F> {
+    scan: SegmentScan<F>,
+    first: u64,
+    /// First number of the next segment, if there is one. What this segment has from there on is
+    /// superseded: its commit failed, and the next segment has it again.
+    next_first: Option<u64>,
+}
+
+impl<F> std::fmt::Debug for OpenSegment<F> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "segment {}", self.first)
+    }
+}
+
+impl SpoolReader {
+    /// Opens the stream in the folder `path`, as [`with_storage`](Self::with_storage) does.
+    ///
+    /// # Errors
+    ///
+    /// [`SpoolError::Folder`] if it does not exist or is not a folder.
+    pub fn open(path: &Path, stream: &str, from: Option<u64>) -> Result<SpoolReader, SpoolError> {
+        Ok(SpoolReader::with_storage(SpoolFolder::readable(path)?, stream, from))
+    }
+}
+
+impl<S: SpoolStorage> SpoolReader<S> {
+    /// Reads `stream` from number `from` on, or from the oldest record that is kept.
+    pub fn with_storage(storage: S, stream: &str, from: Option<u64>) -> SpoolReader<S> {
+        SpoolReader {
+            storage,
+            stream: stream.to_owned(),
+            expected: from,
+            limit: u64::MAX,
+            current: None,
+            damaged: false,
+            reported: None,
+        }
+    }
+
+    /// Ends the iteration before number `limit`, until the next call. A reader that follows a
+    /// writer in the same process passes [`SpoolWriter::durable`](crate::SpoolWriter::durable): it
+    /// then returns nothing that a power cut could take back.
+    pub fn set_limit(&mut self, limit: u64) {
+        self.limit = limit;
+    }
+
+    fn advance(&mut self) -> Result<Option<SpoolItem>, SpoolError> {
+        loop {
+            if self.expected.is_some_and(|expected| expected >= self.limit) {
+                return Ok(None);
+            }
+            let (Some(current), Some(expected)) = (&mut self.current, self.expected) else {
+                match self.first_segment()? {
+                    Some(first) => self.enter(first)?,
+                    None => return Ok(None),
+                }
+                continue;
+            };
+            let end = current.next_first.unwrap_or(u64::MAX);
+            let peeked = current.scan.peek().map_err(|source| self.failed(source))?;
+            let item = match peeked.filter(|head| head.seq < end) {
+                Some(head) if head.seq < expected => {
+                    self.consume(&head);
+                    continue;
+                }
+                Some(head) if head.seq >= self.limit => return Ok(None),
+                Some(head) => Some(self.item(&head, expected)?),
+                None => match self.segment_end(expected)? {
+                    SegmentEnd::Continue => continue,
+                    SegmentEnd::Stream(torn) => torn.map(SpoolItem::Torn),
+                },
+            };
+            return Ok(item);
+        }
+    }
+
+    /// Returns the last segment that can have the expected number, or the oldest one.
+    fn first_segment(&self) -> Result<Option<u64>, SpoolError> {
+        let listed = self.list()?;
+        let before = |first: &&u64| self.expected.is_some_and(|expected| **first <= expected);
+        Ok(listed.iter().rfind(before).or(listed.first()).copied())
+    }
+
+    fn list(&self) -> Result<Vec<u64>, SpoolError> {
+        let listed = self.storage.list().map_err(|source| self.failed(source))?;
+        Ok(listed.into_iter().map(|(first, _)| first).collect())
+    }
+
+    fn enter(&mut self, first: u64) -> Result<(), SpoolError> {
+        self.expected.get_or_insert(first);
+        let file = match self.storage.open(first) {
+            // The writer removed it meanwhile: the next segment is the first one then.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                self.current = None;
+                return Ok(());
+            }
+            other => other.map_err(|source| self.failed(source))?,
+        };
+        let scan = SegmentScan::open(file, &self.stream, first)
+            .map_err(|source| self.failed(source))?
+            .map_err(|found| SpoolError::Version { stream: self.stream.clone(), first, found })?;
+        let next_first = self.list()?.into_iter().find(|other| *other > first);
+        self.current = Some(OpenSegment { scan, first, next_first });
+        Ok(())
+    }
+
+    /// Returns the record, or the gap before it.
+    fn item(&mut self, head: &RecordHead, expected: u64) -> Result<SpoolItem, SpoolError> {
+        let current = self.current.as_mut().expect("the caller peeked into it");
+        let damaged = self.damaged || current.scan.damaged;
+        let boot = current.scan.header.as_ref().expect("it has records").boot;
+        let payload = current.scan.payload().map(<[u8]>::to_vec);
+        let payload = payload.map_err(|source| self.failed(source))?;
+        let noted = SpoolGap::parse(&payload, head.seq).filter(|_| head.kind == GAP_KIND);
+        // A gap record that follows its gap explains the hole before it.
+        let hole_end = match &noted {
+            Some(gap) if gap.to + 1 == head.seq => gap.from,
+            _ => head.seq,
+        };
+        if expected < hole_end {
+            let reason = if damaged { GapReason::Damaged } else { GapReason::Missing };
+            self.expected = Some(hole_end);
+            let gap = SpoolGap { from: expected, to: hole_end - 1, reason, record: None };
+            return Ok(SpoolItem::Gap(gap));
+        }
+        self.consume(head);
+        self.expected = Some(head.seq + 1);
+        let Some(kind) = NonZeroU8::new(head.kind) else {
+            let (seq, record) = (head.seq, Some(head.seq));
+            let unknown = SpoolGap { from: seq, to: seq, reason: GapReason::Damaged, record };
+            return Ok(SpoolItem::Gap(noted.unwrap_or(unknown)));
+        };
+        let (seq, time) = (head.seq, head.time);
+        Ok(SpoolItem::Record(SpoolRecord { seq, boot, time, kind, payload }))
+    }
+
+    fn consume(&mut self, head: &RecordHead) {
+        self.damaged = false;
+        if let Some(current) = &mut self.current {
+            current.scan.skip(head);
+        }
+    }
+
+    /// Goes to the next segment if there is one. The current one is searched once more after its
+    /// successor appeared, for what was written in between.
+    fn segment_end(&mut self, expected: u64) -> Result<SegmentEnd, SpoolError> {
+        let listed = self.list()?;
+        let current = self.current.as_mut().expect("the caller peeked into it");
+        let next = listed.into_iter().find(|first| *first > current.first);
+        let known = std::mem::replace(&mut current.next_first, next);
+        match next {
+            Some(next) if known == Some(next) => {
+                self.damaged |= current.scan.torn > 0 || current.scan.damaged;
+                self.enter(next)?;
+                Ok(SegmentEnd::Continue)
+            }
+            None if known.is_none() => {
+                let torn = TornTail { from: expected, bytes: current.scan.torn };
+                let is_new = torn.bytes > 0 && self.reported != Some(torn);
+                Ok(SegmentEnd::Stream(is_new.then(|| *self.reported.insert(torn))))
+            }
+            _ => Ok(SegmentEnd::Continue),
+        }
+    }
+
+    fn failed(&self, source: io::Error) -> SpoolError {
+        SpoolError::Read { stream: self.stream.clone(), source }
+    }
+}
+
+enum SegmentEnd {
+    /// There may be more.
+    Continue,
+    /// The stream ends here, with a torn tail that was not reported yet.
+    Stream(Option<TornTail>),
+}
+
+impl<S: SpoolStorage> Iterator for SpoolReader<S> {
+    type Item = Result<SpoolItem, SpoolError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        self.advance().transpose()
+    }
+}

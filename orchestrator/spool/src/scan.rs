@@ -1,0 +1,130 @@
+//! Finds the valid records of one segment, also behind damage.
+
+use std::io;
+
+use crate::SegmentFile;
+use crate::format::{HEAD_LEN, HEADER_LEN, HeaderFault, RecordHead, SEGMENT_MAX, SegmentHeader};
+
+/// Bytes that are read at once.
+const WINDOW: usize = 16 << 10;
+
+/// A position in a segment.
+pub(crate) struct SegmentScan<F> {
+    file: F,
+    /// `None` if the header is not that of the expected segment: no record can be trusted then.
+    pub(crate) header: Option<SegmentHeader>,
+    /// Offset of the record that [`peek`](Self::peek) found.
+    at: u64,
+    /// Length of that record with its head.
+    len: usize,
+    /// Smallest number that the next record can have.
+    least: u64,
+    /// Set if invalid bytes lie before that record.
+    pub(crate) damaged: bool,
+    /// Number of bytes behind the last valid record, once the end was reached.
+    pub(crate) torn: u64,
+    window: Vec<u8>,
+    window_at: u64,
+}
+
+impl<F: SegmentFile> SegmentScan<F> {
+    /// Opens the segment of `stream` that begins with number `first`. The inner error is the
+    /// version of a segment in another format.
+    pub(crate) fn open(file: F, stream: &str, first: u64) -> io::Result<Result<Self, u16>> {
+        let (at, least) = (HEADER_LEN as u64, first);
+        let mut scan = SegmentScan {
+            file,
+            header: None,
+            at,
+            len: 0,
+            least,
+            damaged: false,
+            torn: 0,
+            window: Vec::new(),
+            window_at: 0,
+        };
+        if scan.file.length()? >= HEADER_LEN as u64 {
+            match SegmentHeader::parse(scan.bytes(0, HEADER_LEN)?) {
+                Ok(header) if header.stream == stream && header.first == first => {
+                    scan.header = Some(header);
+                }
+                Err(HeaderFault::Version(found)) => return Ok(Err(found)),
+                _ => {}
+            }
+        }
+        Ok(Ok(scan))
+    }
+
+    /// Makes the content durable.
+    pub(crate) fn sync(&self) -> io::Result<()> {
+        self.file.sync()
+    }
+
+    /// Finds the next valid record without consuming it; `None` at the end. The segment may grow
+    /// meanwhile.
+    pub(crate) fn peek(&mut self) -> io::Result<Option<RecordHead>> {
+        let length = self.file.length()?;
+        let end = length.min(SEGMENT_MAX);
+        let Some(salt) = self.header.as_ref().map(|header| header.salt) else {
+            self.torn = length;
+            return Ok(None);
+        };
+        let mut at = self.at;
+        while at + HEAD_LEN as u64 <= end {
+            let least = self.least;
+            let head = RecordHead::parse(self.bytes(at, HEAD_LEN)?, salt)
+                .filter(|head| head.seq >= least && at + (HEAD_LEN + head.len) as u64 <= end);
+            let Some(head) = head else {
+                at += 1;
+                continue;
+            };
+            let len = HEAD_LEN + head.len;
+            if crc32fast::hash(&self.bytes(at, len)?[HEAD_LEN..]) == head.payload_crc {
+                self.damaged |= at != self.at;
+                (self.at, self.len) = (at, len);
+                return Ok(Some(head));
+            }
+            at += len as u64;
+        }
+        self.torn = length.saturating_sub(self.at);
+        // What is there now may be a part of what will be there.
+        self.window.clear();
+        Ok(None)
+    }
+
+    /// Payload of the record that [`peek`](Self::peek) found.
+    pub(crate) fn payload(&mut self) -> io::Result<&[u8]> {
+        let (at, len) = (self.at, self.len);
+        Ok(&self.bytes(at, len)?[HEAD_LEN..])
+    }
+
+    /// Consumes the record `head` that [`peek`](Self::peek) found.
+    pub(crate) fn skip(&mut self, head: &RecordHead) {
+        self.at += self.len as u64;
+        self.least = head.seq + 1;
+        self.damaged = false;
+    }
+
+    fn bytes(&mut self, at: u64, len: usize) -> io::Result<&[u8]> {
+        let window_end = self.window_at + self.window.len() as u64;
+        if at < self.window_at || at + len as u64 > window_end {
+            self.window.resize(len.max(WINDOW), 0);
+            self.window_at = at;
+            let mut filled = 0;
+            while filled < len {
+                match self.file.read_at(&mut self.window[filled..], at + filled as u64) {
+                    Ok(0) => break,
+                    Ok(read) => filled += read,
+                    Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                    Err(error) => {
+                        self.window.clear();
+                        return Err(error);
+                    }
+                }
+            }
+            self.window.truncate(filled);
+        }
+        let from = (at - self.window_at) as usize;
+        self.window.get(from..from + len).ok_or_else(|| io::ErrorKind::UnexpectedEof.into())
+    }
+}

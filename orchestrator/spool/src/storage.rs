@@ -1,0 +1,76 @@
+//! The file operations that a spool needs, so that tests can let each of them fail.
+
+use std::io;
+
+/// The folder of one stream. Segments are named by their first sequence number.
+pub trait SpoolStorage {
+    /// An open segment.
+    type File: SegmentFile;
+
+    /// Lists first sequence number and length in bytes of all segments, in ascending order.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system, and anything that is not a plain file under the name of a segment.
+    fn list(&self) -> io::Result<Vec<(u64, u64)>>;
+
+    /// Creates a segment, in place of any of the same name.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn create(&self, first: u64) -> io::Result<Self::File>;
+
+    /// Opens a segment for reading.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system, and a file that is not plain.
+    fn open(&self, first: u64) -> io::Result<Self::File>;
+
+    /// Removes a segment.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn remove(&self, first: u64) -> io::Result<()>;
+
+    /// Makes the names of segments durable.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn sync_names(&self) -> io::Result<()>;
+}
+
+/// An open segment.
+pub trait SegmentFile {
+    /// Returns the length in bytes.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn length(&self) -> io::Result<u64>;
+
+    /// Reads at `offset` as [`std::os::unix::fs::FileExt::read_at`] does; 0 bytes are the end.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn read_at(&self, into: &mut [u8], offset: u64) -> io::Result<usize>;
+
+    /// Writes all `bytes` at the end. After an error, a part of them may be in the file.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn append(&mut self, bytes: &[u8]) -> io::Result<()>;
+
+    /// Makes content and length durable (`fdatasync`).
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system. After one, the content is unknown, and a second call that succeeds
+    /// proves nothing: the kernel may have dropped what it could not write.
+    fn sync(&self) -> io::Result<()>;
+}

@@ -1,0 +1,113 @@
+//! Streams stay within their budget and their queue, and mark what they lose.
+
+use gleaner_base::ByteSize;
+use gleaner_spool::{
+    BUDGET_MIN, GapReason, SpoolError, SpoolGap, SpoolItem, SpoolReader, SpoolWriter,
+};
+
+use crate::model::{KIND, STREAM, TIME, config, items, records};
+use crate::simulated::SimulatedDisk;
+
+fn writer(disk: &SimulatedDisk) -> SpoolWriter<SimulatedDisk> {
+    SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap()
+}
+
+fn gaps(disk: &SimulatedDisk) -> Vec<SpoolGap> {
+    let gap = |item| match item {
+        SpoolItem::Gap(gap) => Some(gap),
+        _ => None,
+    };
+    items(disk.clone()).into_iter().filter_map(gap).collect()
+}
+
+#[test]
+fn the_oldest_segments_are_removed_and_marked() {
+    let disk = SimulatedDisk::new(1);
+    let mut writer = writer(&disk);
+    for _ in 0..1000 {
+        writer.append(KIND, TIME, &[7; 100]).unwrap();
+        writer.commit().unwrap();
+        assert!(writer.status().disk_bytes <= BUDGET_MIN.bytes());
+    }
+    let status = writer.status();
+    assert!(status.disk_bytes > BUDGET_MIN.bytes() / 2);
+    let oldest = disk.firsts()[0];
+    assert_eq!(status.removed, oldest);
+    let newest = gaps(&disk).into_iter().rfind(|gap| gap.reason == GapReason::Budget).unwrap();
+    assert_eq!(newest.to, oldest - 1);
+    let missing = SpoolGap { from: 0, to: oldest - 1, reason: GapReason::Missing, record: None };
+    assert_eq!(gaps(&disk)[0], missing);
+    let first = SpoolReader::with_storage(disk, STREAM, None).next().unwrap().unwrap();
+    assert!(matches!(first, SpoolItem::Record(record) if record.seq == oldest));
+}
+
+#[test]
+fn released_segments_leave_no_gap_record() {
+    let disk = SimulatedDisk::new(1);
+    let mut writer = writer(&disk);
+    for _ in 0..1000 {
+        writer.append(KIND, TIME, &[7; 100]).unwrap();
+        let durable = writer.commit().unwrap();
+        writer.release(durable);
+    }
+    assert_eq!((writer.status().removed, disk.firsts().len()), (0, 1));
+    assert!(gaps(&disk).iter().all(|gap| gap.reason == GapReason::Missing));
+}
+
+#[test]
+fn a_full_queue_refuses_records_and_marks_them() {
+    let disk = SimulatedDisk::new(1);
+    let mut writer = writer(&disk);
+    let refused = (0..100).filter(|_| writer.append(KIND, TIME, &[7; 100]).is_err()).count() as u64;
+    assert!(refused > 0 && writer.queued_bytes() <= 4096);
+    assert!(items(disk.clone()).is_empty());
+    assert_eq!(writer.commit().unwrap(), 101);
+    assert_eq!(writer.append(KIND, TIME, b"").unwrap(), 101);
+    writer.commit().unwrap();
+    let (from, to, record) = (100 - refused, 99, Some(100));
+    assert_eq!(gaps(&disk), [SpoolGap { from, to, reason: GapReason::QueueFull, record }]);
+    assert_eq!(records(&items(disk)).len() as u64, 101 - refused);
+    assert_eq!(writer.status().refused, refused);
+}
+
+#[test]
+fn a_record_that_is_too_long_gets_no_number() {
+    let disk = SimulatedDisk::new(1);
+    let mut writer = writer(&disk);
+    let error = writer.append(KIND, TIME, &[0; 2049]).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "a record of stream `logs` has 2049 bytes, above the maximum of 2048"
+    );
+    assert_eq!(writer.append(KIND, TIME, &[0; 2048]).unwrap(), 0);
+}
+
+#[test]
+fn a_wrong_name_or_budget_is_refused() {
+    let open = |config| SpoolWriter::with_storage(SimulatedDisk::new(1), config).unwrap_err();
+    let mut wrong = config(ByteSize::kib(63));
+    assert!(matches!(open(wrong.clone()), SpoolError::Budget { .. }));
+    wrong.stream = "x".repeat(65);
+    assert!(matches!(open(wrong), SpoolError::Name { .. }));
+}
+
+#[test]
+fn a_reader_follows_a_writer_up_to_the_limit() {
+    let disk = SimulatedDisk::new(1);
+    let mut writer = writer(&disk);
+    let mut reader = SpoolReader::with_storage(disk.clone(), STREAM, None);
+    let mut read = 0;
+    for round in 0..500 {
+        writer.append(KIND, TIME, &[7; 90]).unwrap();
+        reader.set_limit(writer.durable());
+        for item in reader.by_ref() {
+            let SpoolItem::Record(record) = item.unwrap() else { continue };
+            assert!(record.seq < writer.durable());
+            read += 1;
+        }
+        if round % 3 == 2 {
+            writer.commit().unwrap();
+        }
+    }
+    assert!(read >= 498, "{read} records");
+}

@@ -1,0 +1,148 @@
+//! Bytes of the last segment are changed, cut off or added; segments go missing.
+
+use std::collections::BTreeMap;
+
+use gleaner_base::ByteSize;
+use gleaner_spool::{
+    BUDGET_MIN, GapReason, SpoolGap, SpoolItem, SpoolReader, SpoolStorage, SpoolWriter,
+};
+
+use crate::model::{KIND, STREAM, TIME, config, items, records};
+use crate::simulated::SimulatedDisk;
+
+const RECORDS: u64 = 40;
+
+/// A stream of three segments; all is acknowledged.
+fn stream() -> (SimulatedDisk, BTreeMap<u64, Vec<u8>>) {
+    let disk = SimulatedDisk::new(3);
+    for _ in 0..3 {
+        let mut writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
+        for _ in 0..RECORDS {
+            let seq = writer.status().next;
+            writer.append(KIND, TIME, &vec![seq as u8; seq as usize % 23]).unwrap();
+            if seq.is_multiple_of(7) {
+                writer.commit().unwrap();
+            }
+        }
+        assert_eq!(writer.commit().unwrap(), writer.status().next);
+    }
+    let records = records(&items(disk.clone()));
+    assert_eq!((disk.firsts(), records.len()), (vec![0, 40, 80], 120));
+    (disk, records)
+}
+
+/// Reads the stream, continues it with a new writer, and reads it again. Returns the number of
+/// records before that.
+fn read_and_continue(disk: &SimulatedDisk, original: &BTreeMap<u64, Vec<u8>>) -> usize {
+    let kept = records(&items(disk.clone()));
+    assert!(kept.iter().all(|(seq, payload)| original[seq] == *payload));
+    let mut writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
+    let seq = writer.append(KIND, TIME, b"new").unwrap();
+    writer.commit().unwrap();
+    let mut now = records(&items(disk.clone()));
+    assert_eq!(now.remove(&seq).unwrap(), b"new");
+    assert_eq!(now, kept, "a writer changes no record of another one");
+    kept.len()
+}
+
+/// Applies `change` at each offset of the last segment.
+fn with_change(change: impl Fn(&mut Vec<u8>, usize)) {
+    let (disk, original) = stream();
+    let before = disk.with_content(80, |content| content.clone());
+    for at in 0..before.len() {
+        disk.with_content(80, |content| change(content, at));
+        let kept = read_and_continue(&disk, &original);
+        // Without a header, nothing in the segment can be trusted.
+        assert!(if at < 128 { kept == 80 } else { (80..120).contains(&kept) }, "byte {at}: {kept}");
+        for first in disk.firsts().into_iter().filter(|first| *first >= 80) {
+            disk.remove(first).unwrap();
+        }
+        drop(disk.create(80).unwrap());
+        disk.with_content(80, |content| content.clone_from(&before));
+    }
+}
+
+#[test]
+fn a_flipped_bit_at_any_offset_is_detected_and_costs_one_record() {
+    for bit in [0, 7] {
+        let (disk, original) = stream();
+        let before = disk.with_content(80, |content| content.clone());
+        for at in 0..before.len() {
+            disk.with_content(80, |content| content[at] ^= 1 << bit);
+            let found = items(disk.clone());
+            let lost = 120 - records(&found).len();
+            assert_eq!(lost, if at < 128 { 40 } else { 1 }, "byte {at}");
+            let is_torn = matches!(found.last(), Some(SpoolItem::Torn(_)));
+            let is_gap = found.iter().any(
+                |item| matches!(item, SpoolItem::Gap(gap) if gap.reason == GapReason::Damaged),
+            );
+            assert!(is_torn != is_gap, "byte {at}: {found:?}");
+            // No number is used again: the writer cannot know whether the record was acknowledged.
+            let writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
+            assert!(writer.status().next >= 120, "byte {at}");
+            disk.with_content(80, |content| content.clone_from(&before));
+        }
+        read_and_continue(&disk, &original);
+    }
+}
+
+#[test]
+fn a_segment_cut_off_at_any_offset_keeps_what_is_before() {
+    with_change(|content, at| content.truncate(at));
+}
+
+#[test]
+fn zeros_and_remains_of_other_records_are_not_taken_for_records() {
+    with_change(|content, at| content[at..].fill(0));
+    with_change(|content, at| {
+        content.truncate(at);
+        content.extend_from_within(at.min(128)..at.min(300));
+        content.push(1);
+    });
+}
+
+#[test]
+fn a_missing_segment_is_a_gap() {
+    let (disk, _) = stream();
+    disk.remove(40).unwrap();
+    let found = items(disk.clone());
+    let missing = SpoolGap { from: 40, to: 79, reason: GapReason::Missing, record: None };
+    assert!(found.contains(&SpoolItem::Gap(missing)));
+    assert_eq!(records(&found).len(), 80);
+}
+
+#[test]
+fn a_torn_tail_is_reported_once_and_then_marked() {
+    let (disk, _) = stream();
+    disk.with_content(80, |content| content.truncate(content.len() - 1));
+    let mut reader = SpoolReader::with_storage(disk.clone(), STREAM, Some(110));
+    assert_eq!(reader.by_ref().filter(|item| matches!(item, Ok(SpoolItem::Torn(_)))).count(), 1);
+    assert!(reader.next().is_none(), "nothing is new");
+    let mut writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
+    assert_eq!(writer.recovered().unwrap().from, 119);
+    writer.commit().unwrap();
+    let writer = SpoolWriter::with_storage(disk, config(BUDGET_MIN)).unwrap();
+    assert_eq!(writer.recovered(), None);
+    let Some(Ok(SpoolItem::Gap(gap))) = reader.next() else { panic!("no gap") };
+    assert_eq!((gap.from, gap.reason), (119, GapReason::Torn));
+    assert!(reader.next().is_none());
+}
+
+#[test]
+fn a_record_in_the_payload_of_another_is_not_taken_for_one_behind_damage() {
+    let disk = SimulatedDisk::new(3);
+    let large = || config(ByteSize::mib(1));
+    let mut writer = SpoolWriter::with_storage(disk.clone(), large()).unwrap();
+    writer.append(KIND, TIME, b"first").unwrap();
+    writer.commit().unwrap();
+    // The only bytes with the right salt are those of the segment, which a lambda cannot read. A
+    // copy of the first record has an old number.
+    let copy = disk.with_content(0, |content| content[128..].to_vec());
+    for _ in 0..3 {
+        writer.append(KIND, TIME, &copy).unwrap();
+    }
+    writer.commit().unwrap();
+    disk.with_content(0, |content| content[128 + copy.len()] ^= 1);
+    let kept: Vec<u64> = records(&items(disk)).into_keys().collect();
+    assert_eq!(kept, [0, 2, 3]);
+}
