@@ -4,8 +4,8 @@
 //! for `check`, `replay` and `verify`, `run` supervises it, the ingress and the recorder live,
 //! `inference` supervises the process that runs models, for both, and `delegate` passes commands on
 //! to another program. `render` formats results as text, `report` writes the report page, `diff`
-//! compares two runs, and `dev` repeats all of this whenever a source is saved. `generated` prints
-//! shell completions and man pages.
+//! compares two runs, and `dev` repeats all of this whenever a source is saved. `signing` makes
+//! keys and signs builds. `generated` prints shell completions and man pages.
 //!
 //! No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts
 //! the other programs and exchanges `gleaner-protocol` messages with them. `gleaner-report` reads
@@ -28,6 +28,7 @@ mod report;
 mod restart_delay;
 mod run;
 mod runtime;
+mod signing;
 mod stdout;
 
 use gleaner_base::{Exit, Failure};
@@ -53,6 +54,8 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
         CliCommand::Run(args) => run::run(&args),
         CliCommand::Topics(args) => delegate::topics(&args),
         CliCommand::Play { arguments } => delegate::play(&arguments),
+        CliCommand::Keys(command) => signing::keys(&command),
+        CliCommand::Publish(args) => signing::publish(&args),
         CliCommand::Doctor(args) => doctor::run(&args),
         CliCommand::Completions { shell } => generated::completions(shell),
         CliCommand::Man { folder } => generated::man(&folder),

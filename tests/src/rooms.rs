@@ -55,6 +55,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-parts",
             "gleaner-protocol",
             "gleaner-report",
+            "gleaner-trust",
         ],
     ),
     ("gleaner-compile", &["gleaner-base", "gleaner-jail", "gleaner-lambda"]),
@@ -163,6 +164,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"],
     ),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
+    ("gleaner-trust", &["gleaner-base", "gleaner-lambda"]),
     ("gleaner-vision", &["gleaner-rules"]),
     ("gleaner-vitals", &["gleaner-protocol"]),
 ];
