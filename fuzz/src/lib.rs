@@ -31,6 +31,7 @@ mod onnx;
 #[path = "../../host/inference/src/places.rs"]
 pub mod places;
 pub mod seeds;
+pub mod trust;
 
 /// A fuzz target: its name, its check, its seeds and its dictionary.
 pub struct Target {
@@ -48,7 +49,7 @@ pub struct Target {
 }
 
 /// All targets.
-pub const TARGETS: [Target; 10] = [
+pub const TARGETS: [Target; 11] = [
     Target {
         name: "message",
         check: Some(message::check),
@@ -104,6 +105,13 @@ pub const TARGETS: [Target; 10] = [
         longest: 4 << 10,
         seeds: seeds::manifest::all,
         words: seeds::manifest::WORDS,
+    },
+    Target {
+        name: "trust",
+        check: Some(trust::check),
+        longest: 4 << 10,
+        seeds: seeds::trust::all,
+        words: seeds::trust::WORDS,
     },
     Target {
         name: "model",

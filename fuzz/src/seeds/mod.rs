@@ -11,6 +11,7 @@ pub mod link;
 pub mod manifest;
 pub mod message;
 pub mod model;
+pub mod trust;
 
 use std::fs;
 use std::io;
