@@ -2,10 +2,10 @@
 //!
 //! `new` creates a lambda's folder, `build` its build folder. `runtime` starts `gleaner-runtime`
 //! for `check`, `replay` and `verify`, `run` runs lambdas live by `gleaner-supervisor`, `engines`
-//! builds engines of models ahead, and `delegate` passes commands on to another program. `render`
-//! formats results as text, `report` writes the report page, `diff` compares two runs, and `dev`
-//! repeats all of this whenever a source is saved. `generated` prints shell completions and man
-//! pages.
+//! builds engines of models ahead, `signing` makes keys and signs builds, and `delegate` passes
+//! commands on to another program. `render` formats results as text, `report` writes the report
+//! page, `diff` compares two runs, and `dev` repeats all of this whenever a source is saved.
+//! `generated` prints shell completions and man pages.
 //!
 //! No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts
 //! the other programs and exchanges `gleaner-protocol` messages with them. `gleaner-report` reads
@@ -27,6 +27,7 @@ mod replay;
 mod report;
 mod run;
 mod runtime;
+mod signing;
 mod stdout;
 
 use gleaner_base::{Exit, Failure};
@@ -52,6 +53,8 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
         CliCommand::Run(args) => run::run(&args),
         CliCommand::Topics(args) => delegate::topics(&args),
         CliCommand::Play { arguments } => delegate::play(&arguments),
+        CliCommand::Keys(command) => signing::keys(&command),
+        CliCommand::Publish(args) => signing::publish(&args),
         CliCommand::Doctor(args) => doctor::run(&args),
         CliCommand::Completions { shell } => generated::completions(shell),
         CliCommand::Man { folder } => generated::man(&folder),

@@ -32,6 +32,7 @@ mod onnx;
 pub mod places;
 pub mod seeds;
 pub mod spool;
+pub mod trust;
 
 /// A fuzz target: its name, its check, its seeds and its dictionary.
 pub struct Target {
@@ -105,6 +106,13 @@ pub const TARGETS: [Target; 11] = [
         longest: 4 << 10,
         seeds: seeds::manifest::all,
         words: seeds::manifest::WORDS,
+    },
+    Target {
+        name: "trust",
+        check: Some(trust::check),
+        longest: 4 << 10,
+        seeds: seeds::trust::all,
+        words: seeds::trust::WORDS,
     },
     Target {
         name: "model",

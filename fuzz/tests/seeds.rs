@@ -9,7 +9,7 @@ fn inputs(target: &Target) -> u32 {
     match target.name {
         "bag" => 1_000,
         "calls" => 8_000,
-        "drive" => 5_000,
+        "drive" | "trust" => 5_000,
         _ => 20_000,
     }
 }

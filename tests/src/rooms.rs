@@ -58,6 +58,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-protocol",
             "gleaner-report",
             "gleaner-supervisor",
+            "gleaner-trust",
         ],
     ),
     ("gleaner-compile", &["gleaner-artifacts", "gleaner-base", "gleaner-jail", "gleaner-lambda"]),
@@ -187,6 +188,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         ],
     ),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
+    ("gleaner-trust", &["gleaner-base", "gleaner-lambda"]),
     ("gleaner-vision", &["gleaner-rules"]),
     ("gleaner-vitals", &["gleaner-protocol"]),
 ];

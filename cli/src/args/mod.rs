@@ -1,5 +1,7 @@
 //! Defines the command line, and checks arguments as far as possible without opening files.
 
+mod signing;
+
 use std::ffi::OsString;
 use std::net::IpAddr;
 use std::path::PathBuf;
@@ -8,6 +10,8 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_protocol::DriveTime;
+
+pub use signing::{KeysArgs, KeysCommand, PublishArgs};
 
 /// Run small functions (lambdas) next to the sensors of a vehicle, and keep the data worth keeping
 #[derive(Parser, Debug)]
@@ -62,6 +66,11 @@ pub enum CliCommand {
         #[arg(value_name = "ARGUMENTS", trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<OsString>,
     },
+    /// Create or show a key that signs revisions and deployments
+    #[command(subcommand)]
+    Keys(KeysCommand),
+    /// Sign a built lambda: write its revision, by which a vehicle can recognise its files
+    Publish(PublishArgs),
     /// Check whether lambdas can run well on this machine
     Doctor(DoctorArgs),
     /// Print a completion script for a shell

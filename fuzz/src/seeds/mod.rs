@@ -12,6 +12,7 @@ pub mod manifest;
 pub mod message;
 pub mod model;
 pub mod spool;
+pub mod trust;
 
 use std::fs;
 use std::io;

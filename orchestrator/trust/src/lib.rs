@@ -1,0 +1,31 @@
+//! Signed revisions, deployments and trust roots, from the author's key to the checks on a vehicle.
+//!
+//! `keys` has ed25519 keys and their files, `envelope` signs payloads and opens signed ones,
+//! `payload` has their types and bounds, and `files` compares a build folder with its revision.
+//! `verify` decides what a vehicle accepts, by a trust root, a time and the `floors` below which
+//! nothing is accepted again. `publish` signs the build of a lambda.
+//!
+//! Nothing here reads a clock, starts a program or reaches a network. What is verified is a byte
+//! string; only `keys`, `files` and `publish` open files.
+
+mod bounded;
+mod envelope;
+mod files;
+mod floors;
+mod keys;
+mod payload;
+mod publish;
+mod refusal;
+mod verify;
+
+pub use envelope::{Payload, seal};
+pub use files::{FileDigestError, check_files};
+pub use floors::{Accepted, Floors};
+pub use keys::{KeyError, PublicKey, SecretKey};
+pub use payload::{
+    COUNTER_MAX, Deployment, Grants, Labels, LambdaPattern, Revision, RevisionFile, RootKeys,
+    ScopedKey, TrustRoot,
+};
+pub use publish::{Published, Release, ReleaseError, publish};
+pub use refusal::Refusal;
+pub use verify::{Trusted, Verdict, Verifier, first_root, next_root};

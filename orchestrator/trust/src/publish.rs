@@ -1,0 +1,212 @@
+//! Publishing: signs the build of a lambda, and writes the revision beside it.
+
+use std::fs::File;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use gleaner_base::text::shell_word;
+use gleaner_base::{Exit, Explain, NotPlain, PlainFile, write_atomically};
+use gleaner_lambda::manifest::{LambdaName, Sha256};
+use gleaner_lambda::{BuildDir, LayoutError, Manifest, ManifestError};
+
+use crate::envelope::Unverified;
+use crate::files::digests;
+use crate::{COUNTER_MAX, FileDigestError, Payload, Refusal, Revision, SecretKey, seal};
+
+/// A release to publish.
+#[derive(Debug)]
+pub struct Release<'a> {
+    /// The lambda's folder.
+    pub lambda: &'a Path,
+    /// The file to write.
+    pub out: &'a Path,
+    /// Number of the release; without one, the next after that of the revision in `out`.
+    pub release: Option<u64>,
+    /// The time, in seconds since 1970.
+    pub created: u64,
+}
+
+/// A published revision.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Published {
+    /// The revision.
+    pub revision: Revision,
+    /// Its digest, by which deployments name it.
+    pub digest: Sha256,
+    /// True if the file had this build already, signed by this key: it is as it was.
+    pub unchanged: bool,
+}
+
+/// Signs the build of a lambda with `key`. The file is the former one or the new one at any time.
+///
+/// # Errors
+///
+/// [`ReleaseError`].
+pub fn publish(release: &Release<'_>, key: &SecretKey) -> Result<Published, ReleaseError> {
+    let Release { lambda, out, created, .. } = *release;
+    let folder = out.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let folder = folder.unwrap_or(Path::new("."));
+    // First without the lock, which needs the folder, and again below it.
+    BuildDir::check_fresh(lambda)?;
+    let _locks = lock(lambda, folder)?;
+    let build = BuildDir::check_fresh(lambda)?;
+    refuse_inside(out, folder, &build)?;
+    let manifest = Manifest::load(build.path())?.lambda;
+    let mut revision = Revision {
+        name: manifest.name,
+        version: manifest.version,
+        kind: manifest.kind,
+        release: 1,
+        created,
+        files: digests(&build)?,
+    };
+    if let Some((existing, digest, is_ours)) = read_existing(out, key)? {
+        if existing.name != revision.name {
+            let (found, lambda) = (existing.name, revision.name);
+            return Err(ReleaseError::OtherLambda { path: out.to_owned(), found, lambda });
+        }
+        revision.release = existing.release;
+        let is_same = is_ours && revision == Revision { created, ..existing.clone() };
+        let asked = release.release.unwrap_or(existing.release + u64::from(!is_same));
+        if asked == existing.release && is_same {
+            return Ok(Published { revision: existing, digest, unchanged: true });
+        }
+        if asked <= existing.release {
+            let (path, existing) = (out.to_owned(), existing.release);
+            return Err(ReleaseError::Counter { path, asked, existing });
+        }
+        revision.release = asked;
+    } else {
+        revision.release = release.release.unwrap_or(1);
+    }
+    if !(1..=COUNTER_MAX).contains(&revision.release) {
+        return Err(ReleaseError::CounterRange { release: revision.release });
+    }
+    let envelope = seal(&revision, &[key])?;
+    let digest = Unverified::<Revision>::parse(&envelope)?.digest();
+    write_atomically(out, &envelope)
+        .map_err(|source| ReleaseError::Write { path: out.to_owned(), source })?;
+    Ok(Published { revision, digest, unchanged: false })
+}
+
+/// Locks the lambda's folder, as `gleaner build` does, and that of the revision, in one order for
+/// all processes.
+fn lock(lambda: &Path, out: &Path) -> Result<Vec<File>, ReleaseError> {
+    let failed = |path: &Path, source| ReleaseError::Lock { path: path.to_owned(), source };
+    let resolved = |path: &Path| path.canonicalize().map_err(|source| failed(path, source));
+    let mut folders = vec![resolved(lambda)?, resolved(out)?];
+    folders.sort();
+    folders.dedup();
+    let locked = |folder: &PathBuf| {
+        let file = File::open(folder).map_err(|source| failed(folder, source))?;
+        file.lock().map_err(|source| failed(folder, source))?;
+        Ok(file)
+    };
+    folders.iter().map(locked).collect()
+}
+
+/// Refuses a revision within the build: it would be a file that it does not list.
+fn refuse_inside(out: &Path, folder: &Path, build: &BuildDir) -> Result<(), ReleaseError> {
+    let (Ok(folder), Ok(inside)) = (folder.canonicalize(), build.path().canonicalize()) else {
+        return Ok(());
+    };
+    match folder.starts_with(inside) {
+        true => Err(ReleaseError::Inside { path: out.to_owned() }),
+        false => Ok(()),
+    }
+}
+
+/// Returns the revision in `out` with its digest, if there is one, and whether `key` signed it.
+fn read_existing(
+    out: &Path,
+    key: &SecretKey,
+) -> Result<Option<(Revision, Sha256, bool)>, ReleaseError> {
+    let read = PlainFile::result(out, Revision::MAX).and_then(PlainFile::read_whole);
+    let bytes = match read {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        read => read.map_err(|source| ReleaseError::Read { path: out.to_owned(), source })?,
+    };
+    let parse = || {
+        let envelope = Unverified::<Revision>::parse(&bytes)?;
+        let is_ours = envelope.signers([&key.public()]).is_ok();
+        Ok((envelope.payload()?, envelope.digest(), is_ours))
+    };
+    parse().map(Some).map_err(|source| ReleaseError::NoRevision { path: out.to_owned(), source })
+}
+
+/// The reason why a build is not published.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)]
+pub enum ReleaseError {
+    #[error(transparent)]
+    Layout(#[from] LayoutError),
+    #[error(transparent)]
+    Manifest(#[from] ManifestError),
+    #[error(transparent)]
+    Files(#[from] FileDigestError),
+    #[error("cannot sign the revision")]
+    Seal(#[from] Refusal),
+    #[error("cannot lock folder `{}`", path.display())]
+    Lock { path: PathBuf, source: io::Error },
+    #[error("`{}` is in the build folder, whose files the revision lists", path.display())]
+    Inside { path: PathBuf },
+    #[error("cannot read `{}`", path.display())]
+    Read { path: PathBuf, source: io::Error },
+    #[error("`{}` exists and is not a revision", path.display())]
+    NoRevision { path: PathBuf, source: Refusal },
+    #[error("`{}` is a revision of lambda `{found}`, not of `{lambda}`", path.display())]
+    OtherLambda { path: PathBuf, found: LambdaName, lambda: LambdaName },
+    #[error("release {asked} cannot replace release {existing} in `{}`", path.display())]
+    Counter { path: PathBuf, asked: u64, existing: u64 },
+    #[error("release {release} is not from 1 to {COUNTER_MAX}")]
+    CounterRange { release: u64 },
+    #[error("cannot write `{}`", path.display())]
+    Write { path: PathBuf, source: io::Error },
+}
+
+impl Explain for ReleaseError {
+    fn help(&self) -> Option<String> {
+        Some(match self {
+            Self::Layout(error) => return error.help(),
+            Self::Manifest(error) => return error.help(),
+            Self::Files(error) => return error.help(),
+            Self::Seal(_) => return None,
+            Self::Lock { .. } => {
+                "check that the folder exists and lies on a file system with locks".to_owned()
+            }
+            Self::Inside { .. } => "name a file in another folder: --out FILE".to_owned(),
+            Self::Read { source, .. } => match NotPlain::of(source) {
+                Some(reason) => reason.help(),
+                None => "name another file: --out FILE".to_owned(),
+            },
+            Self::NoRevision { path, .. } => {
+                format!("name another file: --out FILE; or run `rm {}`", shell_word(path))
+            }
+            Self::OtherLambda { .. } => {
+                "name another file: --out FILE; each lambda has its own".to_owned()
+            }
+            Self::Counter { existing, .. } => {
+                format!("omit --release for the next one, or give one above {existing}")
+            }
+            Self::CounterRange { .. } => "give a number in this range: --release N".to_owned(),
+            Self::Write { .. } => {
+                "check that the folder is writable, and that its disk has room".to_owned()
+            }
+        })
+    }
+
+    fn exit(&self) -> Exit {
+        match self {
+            Self::Layout(error) => error.exit(),
+            Self::Manifest(error) => error.exit(),
+            Self::Files(error) => error.exit(),
+            Self::Lock { source, .. } | Self::Read { source, .. }
+                if NotPlain::of(source).is_none() && source.kind() != io::ErrorKind::NotFound =>
+            {
+                Exit::Internal
+            }
+            Self::Write { .. } => Exit::Internal,
+            _ => Exit::Usage,
+        }
+    }
+}
