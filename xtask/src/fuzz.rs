@@ -20,7 +20,7 @@ use crate::steps::{self, Steps};
 
 /// The fuzz targets. Their other properties are in `gleaner-fuzz`, which would take too long to
 /// build for this list.
-const TARGETS: [&str; 11] = [
+const TARGETS: [&str; 12] = [
     "message", "drive", "bag", "image", "journal", "link", "ingress", "manifest", "trust", "model",
     "spool", CALLS,
 ];

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io;
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::FileExt;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -21,6 +21,9 @@ use zerocopy::IntoBytes;
 
 use super::call::Due;
 use super::inference::InferenceError;
+use time::ModelTime;
+
+mod time;
 
 /// Time after the deadline for which a reply is awaited.
 const REPLY_TIMEOUT: Duration = Duration::from_millis(20);
@@ -47,32 +50,6 @@ pub struct ModelEntry {
 pub struct Models {
     state: Arc<Mutex<ModelsState>>,
     time: Arc<ModelTime>,
-}
-
-/// Run time of the models in the current wake. No call waits for another one to read it.
-#[derive(Default)]
-struct ModelTime {
-    used_ns: AtomicU64,
-    /// The limit; 0 for none.
-    allowed_ns: AtomicU64,
-}
-
-impl ModelTime {
-    fn add(&self, time: Duration) {
-        let ns = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
-        self.used_ns.fetch_add(ns, Ordering::Relaxed);
-    }
-
-    fn allowed(&self) -> Option<Duration> {
-        let ns = self.allowed_ns.load(Ordering::Relaxed);
-        (ns > 0).then_some(Duration::from_nanos(ns))
-    }
-
-    /// Returns the time that is left; `None` without a limit.
-    fn left(&self) -> Option<Duration> {
-        let used = Duration::from_nanos(self.used_ns.load(Ordering::Relaxed));
-        self.allowed().map(|allowed| allowed.saturating_sub(used))
-    }
 }
 
 #[derive(Default)]

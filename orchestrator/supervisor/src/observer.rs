@@ -28,7 +28,7 @@ pub trait RunObserver {
     fn inference(&mut self, event: InferenceEvent);
     /// A drive begins: its files, as text.
     fn playing(&mut self, files: &str);
-    /// Something failed for a reason, and is started again after a delay, for the `restarts`th time.
+    /// Something failed for a reason, and is started again after a delay; `restarts` counts these.
     fn restarts(&mut self, reason: &str, delay: Duration, restarts: u32);
     /// Something else went wrong.
     fn warn(&mut self, text: &str);

@@ -16,7 +16,7 @@ use gleaner_lambda::manifest::Limits;
 use gleaner_lambda::{BuildDir, Vehicle};
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::AddTopics;
-use gleaner_protocol::link::{AddLambda, LinkError};
+use gleaner_protocol::link::AddLambda;
 
 use crate::drive::DriveProgress;
 use crate::failures::Failures;
@@ -25,7 +25,7 @@ use crate::inference::{InferenceEvent, InferenceService};
 use crate::observer::RunObserver;
 use crate::output::{ChildId, ChildOutput, OutputPiece};
 use crate::process::{ChildProcess, ended};
-use crate::services::{IngressProcess, RecorderProcess};
+use crate::services::{IngressProcess, RecorderProcess, unless_gone};
 use crate::summary::RunCounts;
 use crate::supervised::SupervisedLambda;
 use crate::{POLL_INTERVAL, RunContext, RunTime, arguments, grants};
@@ -486,15 +486,5 @@ impl<'a> ProcessGroup<'a> {
                 _ => {}
             },
         }
-    }
-}
-
-/// Returns the result of a request to the recorder; `None` if it has ended, which its exit status
-/// explains.
-fn unless_gone<T>(requested: Result<T, LinkError>) -> Result<Option<T>, Failure> {
-    match requested {
-        Ok(result) => Ok(Some(result)),
-        Err(LinkError::Gone { .. }) => Ok(None),
-        Err(error) => Err(Failure::because("cannot connect the processes of the run", &error)),
     }
 }

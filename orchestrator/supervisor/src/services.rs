@@ -269,3 +269,13 @@ impl RecorderProcess {
         }
     }
 }
+
+/// Returns the result of a request to the recorder; `None` if it has ended, which its exit status
+/// explains.
+pub(crate) fn unless_gone<T>(requested: Result<T, LinkError>) -> Result<Option<T>, Failure> {
+    match requested {
+        Ok(result) => Ok(Some(result)),
+        Err(LinkError::Gone { .. }) => Ok(None),
+        Err(error) => Err(Failure::because("cannot connect the processes of the run", &error)),
+    }
+}

@@ -1,4 +1,4 @@
-//! What a run consists of, as its starter has decided it.
+//! Description of a run, as its starter has decided it.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
