@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-use gleaner_artifacts::{BuiltEngine, DerivedKind, make_store};
+use gleaner_artifacts::{BuiltEngine, DerivedEntry, DerivedKind, make_store};
 use gleaner_base::{ByteSize, Exit, Failure, PlainFile, chain, visible};
 use gleaner_lambda::manifest::{Manifest, ModelSpec};
 use gleaner_lambda::{BuildDir, InferenceLimits};
@@ -63,6 +63,10 @@ pub(crate) fn build(lambda: &Path, is_json: bool) -> Result<Exit, Failure> {
     let store = cache_dir()?;
     make_store(&store)?;
     let stop = stop_flag()?;
+    // Before minutes of work whose result could not be used.
+    for model in &manifest.models {
+        DerivedEntry::of(&store, BuiltEngine::key(model.sha256.as_str())).open()?;
+    }
     let mut results = Vec::new();
     for model in &manifest.models {
         let is_listed = model.providers.iter().any(|name| name == TENSORRT);
@@ -70,7 +74,15 @@ pub(crate) fn build(lambda: &Path, is_json: bool) -> Result<Exit, Failure> {
             EngineBuild { parts: &parts, build: &build, manifest: &manifest, model, stop: &stop }
                 .run(&store)
         });
-        let engine = engine.transpose()?;
+        let engine = match engine.transpose() {
+            Ok(engine) => engine,
+            Err(failure) => {
+                if is_json {
+                    print(&render::json_line(&results))?;
+                }
+                return Err(failure);
+            }
+        };
         let (model, sha256) = (model.file.to_string(), model.sha256.to_string());
         let result = EngineResult { model, sha256, engine };
         if !is_json {
@@ -164,7 +176,10 @@ impl EngineBuild<'_> {
                 Ok(InferenceEvent::Report(InferenceReport::Model(model))) => {
                     return match (model.state, model.built_for) {
                         (ModelState::Ready, Some(runtime)) => Ok(runtime),
-                        _ => Err(self.failed(visible(&model.reason))),
+                        _ => Err(self.failed(visible(&model.reason)).with_help(
+                            "models run by TensorRT need its libraries, an NVIDIA GPU and fixed \
+                             sizes of tensors; see docs/models.md",
+                        )),
                     };
                 }
                 Ok(InferenceEvent::Ended(reason, _)) => {
@@ -194,9 +209,6 @@ impl EngineBuild<'_> {
 
     fn failed(&self, cause: impl Into<String>) -> Failure {
         let message = format!("cannot build the engine of model `{}`", self.model.name);
-        let help = "models run by TensorRT need its libraries, an NVIDIA GPU and fixed sizes of \
-                    tensors; see docs/models.md";
         Failure { causes: vec![cause.into()], ..Failure::new(Exit::Internal, message) }
-            .with_help(help)
     }
 }

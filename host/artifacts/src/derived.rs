@@ -53,7 +53,12 @@ impl DerivedKey {
     /// its digest. `settings` name the tool and its version.
     pub fn of(kind: DerivedKind, settings: &str, input: &[u8]) -> Self {
         let mut key = Sha256::new();
-        let (arch, cpu) = (std::env::consts::ARCH.as_bytes(), cpu_features());
+        let arch = std::env::consts::ARCH.as_bytes();
+        let cpu = match kind {
+            DerivedKind::NativeCode => cpu_features(),
+            // It runs on the GPU, which its runtime names.
+            DerivedKind::Engine => String::new(),
+        };
         let kind_name = kind.extension().as_bytes();
         for part in [&MAGIC, kind_name, settings.as_bytes(), arch, cpu.as_bytes(), input] {
             key.update((part.len() as u64).to_le_bytes());
@@ -133,16 +138,12 @@ impl DerivedEntry {
     /// must belong to this user or to root, and only they may write to them. Also if it is not a
     /// regular file. [`StoreError::Read`] if it cannot be opened.
     pub fn open(&self) -> Result<Option<File>, StoreError> {
+        self.check_store()?;
         let kind = self.key.kind;
         let untrusted = |path: &Path, why: String| {
             let path = path.to_owned();
             StoreError::Untrusted { kind, path, why }
         };
-        let folder = self.path.parent().unwrap_or(&self.path);
-        let read = |source| StoreError::Read { kind, path: folder.to_owned(), source };
-        if let Err((path, why)) = check_folder(folder).map_err(read)? {
-            return Err(untrusted(&path, why.to_owned()));
-        }
         let cannot = |error: io::Error| match UnsafePath::of(&error) {
             Some(other) => untrusted(&self.path, other.to_string()),
             None => StoreError::Read { kind, path: self.path.clone(), source: error },
@@ -160,6 +161,17 @@ impl DerivedEntry {
         }
     }
 
+    /// Checks that only this user can put entries into the store.
+    fn check_store(&self) -> Result<(), StoreError> {
+        let kind = self.key.kind;
+        let folder = self.path.parent().unwrap_or(&self.path);
+        let read = |source| StoreError::Read { kind, path: folder.to_owned(), source };
+        match check_folder(folder).map_err(read)? {
+            Ok(()) => Ok(()),
+            Err((path, why)) => Err(StoreError::Untrusted { kind, path, why: why.to_owned() }),
+        }
+    }
+
     /// Writes the content, in parts, as a whole; a process that is killed meanwhile leaves the file
     /// as it was. Then removes the least recently used entries beyond [`STORE_BYTES`], but not this
     /// one.
@@ -167,11 +179,13 @@ impl DerivedEntry {
     /// # Errors
     ///
     /// [`StoreError::Write`]; content above the maximum of its kind is an error, too.
+    /// [`StoreError::Untrusted`] for a store from which it would not be read.
     pub fn put(&self, content: &[&[u8]]) -> Result<(), StoreError> {
         let (len, max) = (content.iter().map(|part| part.len()).sum::<usize>(), self.max_bytes());
         if len > max {
             return Err(self.refused(format!("it has {len} bytes; the maximum is {max}")));
         }
+        self.check_store()?;
         let head = self.key.head(content);
         let parts = [&[&head[..]], content].concat();
         write_whole(&self.path, &parts).map_err(|error| self.failed(error))?;

@@ -85,9 +85,16 @@ impl Explain for StoreError {
             Self::Folder { .. } | Self::Write { .. } => {
                 "make the folder writable, or set XDG_CACHE_HOME to one that is".to_owned()
             }
-            Self::Read { path, .. } | Self::Untrusted { path, .. } => {
+            Self::Read { path, .. } | Self::Untrusted { path, .. } if is_entry(path) => {
                 format!("delete it, it will be made again: rm -r '{}'", path.display())
             }
+            // A folder of the user, with more in it than the store.
+            Self::Read { .. } => "set XDG_CACHE_HOME to a folder that can be read".to_owned(),
+            Self::Untrusted { path, .. } => format!(
+                "let only yourself write to it: chmod go-w '{}'; or set XDG_CACHE_HOME to a folder \
+                 of yours",
+                path.display()
+            ),
         })
     }
 
@@ -99,18 +106,19 @@ impl Explain for StoreError {
     }
 }
 
-/// Creates the folder of a store, accessible to this user only.
+/// Returns whether a path is that of an entry.
+fn is_entry(path: &Path) -> bool {
+    let extension = path.extension().and_then(|extension| extension.to_str());
+    DerivedKind::ALL.iter().any(|kind| Some(kind.extension()) == extension)
+}
+
+/// Creates the folder of a store, and those above it that are missing, accessible to this user
+/// only.
 ///
 /// # Errors
 ///
 /// [`StoreError::Folder`].
 pub fn make_store(folder: &Path) -> Result<(), StoreError> {
     let failed = |source| StoreError::Folder { path: folder.to_owned(), source };
-    if let Some(parent) = folder.parent() {
-        fs::create_dir_all(parent).map_err(failed)?;
-    }
-    match fs::DirBuilder::new().mode(0o700).create(folder) {
-        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => Err(failed(error)),
-        _ => Ok(()),
-    }
+    fs::DirBuilder::new().recursive(true).mode(0o700).create(folder).map_err(failed)
 }

@@ -182,6 +182,11 @@ impl Model {
         for (name, tensor) in inputs {
             // A name that the model does not have, of any length, is not sent.
             self.check_name(name)?;
+            if sent.iter().any(|it: &TensorBytes<_>| it.place.name == *name) {
+                let (model, name) = (&self.entry.name, visible(name));
+                let message = format!("input `{name}` of model `{model}` is given twice");
+                return Err(InferenceError::WrongInput(message));
+            }
             sent.push(TensorBytes { place: tensor.place(name), bytes: tensor.bytes.as_slice() });
         }
         let outputs = self.models.run(&self.entry.name, &sent, &self.limits.per_call.due)?;

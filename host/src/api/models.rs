@@ -454,12 +454,12 @@ impl Connection {
         });
         // It replies at the deadline; without a reply, the reason would be unknown.
         let wait = until.map(|until| until + REPLY_TIMEOUT);
-        let (reply, region) = match self.client.call(call, deadline_ns, wait).map_err(failed)? {
-            ModelWait::Reply(reply, region) => (reply, region),
-            ModelWait::TimedOut => {
-                (self.inputs, self.outputs) = (None, None);
-                return Err(InferenceError::OutOfTime);
-            }
+        let called = self.client.call(call, deadline_ns, wait);
+        if !matches!(called, Ok(ModelWait::Reply(..)) | Err(LinkError::TooLong { .. })) {
+            (self.inputs, self.outputs) = (None, None);
+        }
+        let ModelWait::Reply(reply, region) = called.map_err(failed)? else {
+            return Err(InferenceError::OutOfTime);
         };
         if reply.id == 0 {
             self.note(&reply);

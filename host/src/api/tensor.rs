@@ -113,9 +113,7 @@ impl TensorLimits {
         how: &Preprocess,
     ) -> Result<Tensor, InferenceError> {
         self.per_call.charge(|| prepare_work(how))?;
-        how.check().map_err(|error| InferenceError::wrong(&error))?;
         let (element, shape) = prepared_as(how);
-        drop(self.take(self.len(element, &shape)?)?);
         let mut bytes = Vec::new();
         models.prepare(|preparer| self.prepare(preparer, frame, how, &mut bytes))?;
         self.tensor(element, shape, bytes)
@@ -133,6 +131,9 @@ impl TensorLimits {
         let due = &self.per_call.due;
         let in_time = || due.check().is_ok();
         let size = how.size().map_err(|error| InferenceError::wrong(&error))?;
+        let (element, shape) = prepared_as(how);
+        // The budget first: memory is only taken for a tensor that fits.
+        drop(self.take(self.len(element, &shape)?)?);
         out.resize(size, 0);
         let prepared = preparer.prepare_into(&view, how, Some(&StopCheck::new(&in_time)), out);
         prepared.map_err(|error| match due.check() {

@@ -4,6 +4,7 @@ use std::fmt::{self, Display};
 use std::io::{self, Write};
 use std::sync::{Mutex, PoisonError};
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{FileType, Mode, OFlags, fstat, open};
 use rustix::stdio::{dup2_stderr, stderr};
 use tracing::{Event, Level, Subscriber};
@@ -41,8 +42,10 @@ pub fn init_service() {
     }
 }
 
-/// Prints the failure that ends a program.
+/// Prints the failure that ends a program. Waits a moment for room: it is the last line.
 pub fn failure(failure: impl Display) {
+    let wait = Timespec { tv_sec: 2, tv_nsec: 0 };
+    let _ = poll(&mut [PollFd::new(&stderr(), PollFlags::OUT)], Some(&wait));
     let _ = StderrWriter(io::stderr()).write(format!("{failure}\n").as_bytes());
 }
 

@@ -97,7 +97,7 @@ impl ModelClient {
         until: Option<Instant>,
     ) -> Result<ModelWait, LinkError> {
         self.last_id += 1;
-        let regions = std::mem::take(&mut self.regions);
+        let regions = self.regions;
         let request = ModelRequest { id: self.last_id, deadline_ns, regions, call };
         let failed = |source| LinkError::Socket { peer: INFERENCE, source };
         let bytes = serde_json::to_vec(&request).map_err(|error| failed(error.into()))?;
@@ -105,6 +105,8 @@ impl ModelClient {
             let (frame, bytes) = ("call", bytes.len() as u64);
             return Err(LinkError::TooLong { peer: "the lambda", frame, bytes, max: MESSAGE_MAX });
         }
+        // Until a reply confirms them.
+        self.regions = [0; 2];
         loop {
             match send(&self.socket, &bytes, SendFlags::NOSIGNAL | SendFlags::DONTWAIT) {
                 Ok(_) => break,

@@ -27,6 +27,13 @@ fn a_call_is_answered_late_replies_are_skipped_and_the_end_of_the_process_arrive
         }
         ModelWait::TimedOut => panic!("no reply"),
     }
+    assert!(matches!(server.poll(), Ok(Incoming::Message(_))));
+    // A call that is too long is not sent, and the region stays known.
+    let long = ModelCall::Open { model: "m".repeat(MESSAGE_MAX) };
+    assert!(matches!(client.call(long, None, None), Err(LinkError::TooLong { .. })));
+    assert!(matches!(client.call(open(), None, soon()), Ok(ModelWait::TimedOut)));
+    let Ok(Incoming::Message(request)) = server.poll() else { panic!("no call") };
+    assert_eq!(request.regions, [7, 0]);
     // The socket outlives the process: its successor uses the same one.
     drop(server);
     report_state(&starter, Some("it has ended")).unwrap();
