@@ -27,13 +27,6 @@ fn a_call_is_answered_late_replies_are_skipped_and_the_end_of_the_process_arrive
         }
         ModelWait::TimedOut => panic!("no reply"),
     }
-    assert!(matches!(server.poll(), Ok(Incoming::Message(_))));
-    // A call that is too long is not sent, and the region stays known.
-    let long = ModelCall::Open { model: "m".repeat(MESSAGE_MAX) };
-    assert!(matches!(client.call(long, None, None), Err(LinkError::TooLong { .. })));
-    assert!(matches!(client.call(open(), None, soon()), Ok(ModelWait::TimedOut)));
-    let Ok(Incoming::Message(request)) = server.poll() else { panic!("no call") };
-    assert_eq!(request.regions, [7, 0]);
     // The socket outlives the process: its successor uses the same one.
     drop(server);
     report_state(&starter, Some("it has ended")).unwrap();
@@ -65,9 +58,29 @@ fn a_message_that_is_no_call_or_too_long_is_refused() {
         let error = server.poll().unwrap_err().to_string();
         assert!(error.contains(refusal), "{error}");
     }
-    let mut client = ModelClient::new(lambda);
-    let long = ModelCall::Open { model: "m".repeat(MESSAGE_MAX) };
-    assert!(matches!(client.call(long, None, None), Err(LinkError::TooLong { .. })));
+}
+
+#[test]
+fn a_call_that_is_too_long_is_not_sent_and_regions_stay_known() {
+    let (lambda, other) = ModelClient::pair().unwrap();
+    let region = other.try_clone().unwrap();
+    let (mut client, server) = (ModelClient::new(lambda), ModelSocket::new(other));
+    let reply = ModelReply { id: 1, region: 7, result: Ok(ModelResult::Reserved) };
+    server.reply(&reply, Some(region.as_fd())).unwrap();
+    let reserved = client.call(ModelCall::Reserve { bytes: 1 }, None, None);
+    assert!(matches!(reserved, Ok(ModelWait::Reply(..))));
+    let open = |model: String| ModelCall::Open { model };
+    let long = client.call(open("m".repeat(MESSAGE_MAX)), None, None);
+    assert!(matches!(long, Err(LinkError::TooLong { .. })));
+    let late = client.call(open("m".to_owned()), None, Some(Instant::now()));
+    assert!(matches!(late, Ok(ModelWait::TimedOut)));
+    let regions: Vec<_> = (0..2)
+        .map(|_| match server.poll().unwrap() {
+            Incoming::Message(request) => request.regions,
+            _ => panic!("no call"),
+        })
+        .collect();
+    assert_eq!(regions, [[0, 0], [7, 0]]);
 }
 
 #[test]

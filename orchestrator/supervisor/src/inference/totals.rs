@@ -1,4 +1,4 @@
-//! The counts of the models over all processes of a run: those of a process begin at 0.
+//! The counts of the models over all processes of a service: those of a process begin at 0.
 
 use std::collections::BTreeMap;
 
