@@ -172,6 +172,7 @@ impl PythonGuest {
         call: impl PyCallArgs<'py>,
     ) -> Result<Bound<'py, PyAny>, CallFault> {
         let started = Instant::now();
+        self.session.models().end_at((!allowed.is_zero()).then(|| started + allowed));
         let ended = self.host.bind(py).call_method1(intern!(py, "attempt"), call)?;
         let elapsed = started.elapsed();
         match ended

@@ -5,7 +5,6 @@ use std::fs::File;
 use std::io;
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::FileExt;
-use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -119,22 +118,6 @@ impl Models {
         Self { state: Arc::new(Mutex::new(state)), time: Arc::default() }
     }
 
-    /// Limits the run time of the models of a wake.
-    pub fn limit(&self, allowed: Option<Duration>) {
-        let ns = allowed.map_or(0, |it| u64::try_from(it.as_nanos()).unwrap_or(u64::MAX));
-        self.time.allowed_ns.store(ns, Ordering::Relaxed);
-    }
-
-    /// Begins a wake.
-    pub fn begin(&self) {
-        self.time.used_ns.store(0, Ordering::Relaxed);
-    }
-
-    /// Run time of the models since [`Models::begin`], in ns.
-    pub fn run_ns(&self) -> u64 {
-        self.time.used_ns.load(Ordering::Relaxed)
-    }
-
     /// Opens all models, so that `init` finds them loaded. Errors are logged; the lambda opens them
     /// again. A load may take `timeout`, which begins when those of other lambdas are over.
     pub fn open_all(&self, timeout: Duration) {
@@ -173,7 +156,7 @@ impl Models {
             let known: Vec<_> = state.entries.iter().map(|entry| &*entry.name).collect();
             InferenceError::no_such_model(name, &known)
         })?;
-        Ok((entry, state.open(name, due)?))
+        Ok((entry, state.open(name, &self.time.earliest(due))?))
     }
 
     /// Runs a model once.
@@ -184,7 +167,7 @@ impl Models {
         due: &Due,
     ) -> Result<Outputs, InferenceError> {
         let mut state = self.lock();
-        let places = state.run(name, inputs, due, &self.time)?;
+        let places = state.run(name, inputs, &self.time.earliest(due), &self.time)?;
         let read = |place: TensorPlace| {
             let mut bytes = vec![0; length(&place)?];
             state.read(&place, &mut bytes)?;
@@ -208,7 +191,7 @@ impl Models {
         let mut floats = std::mem::take(&mut state.floats);
         let result = prepare(&mut state.preparer, &mut bytes).and_then(|placed| {
             let input = TensorBytes { place, bytes: bytes.as_slice() };
-            let places = state.run(name, &[input], due, &self.time)?;
+            let places = state.run(name, &[input], &self.time.earliest(due), &self.time)?;
             floats.resize_with(places.len(), Vec::new);
             for (place, values) in places.iter().zip(&mut floats) {
                 let TensorPlace { name: output, element, .. } = place;

@@ -238,3 +238,13 @@ fn a_run_that_is_too_slow_names_its_state_and_model_time() {
     drop(models);
     serving.join().unwrap();
 }
+
+#[test]
+fn calls_of_a_guest_without_due_times_end_with_its_call() {
+    let (lambda, _other) = ModelClient::pair().unwrap();
+    let entry = ModelEntry { name: "m".to_owned(), layout: None, labels: Vec::new() };
+    let models = Models::new(vec![entry], Some(lambda), MEMORY);
+    models.end_at(Some(Instant::now()));
+    let opened = models.open("m", &Due::default());
+    assert!(matches!(opened, Err(InferenceError::OutOfTime)), "nothing replies");
+}

@@ -1,17 +1,55 @@
 //! Time that the models of a wake take.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
+
+use super::Models;
+use crate::api::call::Due;
 
 /// Run time of the models in the current wake. No call waits for another one to read it.
 #[derive(Default)]
 pub(super) struct ModelTime {
-    pub(super) used_ns: AtomicU64,
+    used_ns: AtomicU64,
     /// The limit; 0 for none.
-    pub(super) allowed_ns: AtomicU64,
+    allowed_ns: AtomicU64,
+    /// Time at which calls end whose guest gives them no due time.
+    due: Due,
+}
+
+impl Models {
+    /// Limits the run time of the models of a wake.
+    pub fn limit(&self, allowed: Option<Duration>) {
+        let ns = allowed.map_or(0, |it| u64::try_from(it.as_nanos()).unwrap_or(u64::MAX));
+        self.time.allowed_ns.store(ns, Ordering::Relaxed);
+    }
+
+    /// Begins a wake.
+    pub fn begin(&self) {
+        self.time.used_ns.store(0, Ordering::Relaxed);
+    }
+
+    /// Run time of the models since [`Models::begin`], in ns.
+    pub fn run_ns(&self) -> u64 {
+        self.time.used_ns.load(Ordering::Relaxed)
+    }
+
+    /// Ends calls at this time, also for a guest that gives its calls no due time, as Python does: a
+    /// signal interrupts no call into the host. `None` for no deadline.
+    pub fn end_at(&self, at: Option<Instant>) {
+        self.time.due.set(at);
+    }
 }
 
 impl ModelTime {
+    /// Returns the earlier of the due times of a call and of its guest.
+    pub(super) fn earliest(&self, of_call: &Due) -> Due {
+        match (of_call.at(), self.due.at()) {
+            (Some(call), Some(guest)) if guest < call => self.due.clone(),
+            (None, Some(_)) => self.due.clone(),
+            _ => of_call.clone(),
+        }
+    }
+
     pub(super) fn add(&self, time: Duration) {
         let ns = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
         self.used_ns.fetch_add(ns, Ordering::Relaxed);
