@@ -9,7 +9,7 @@
 use std::fs::{self, File, Metadata};
 use std::io::{self, Read};
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
@@ -128,6 +128,11 @@ impl PlainFile {
     /// Returns the permission bits: read, write and execute of user, group and others.
     pub fn mode(&self) -> u32 {
         self.found.permissions().mode() & 0o777
+    }
+
+    /// Returns the id of the user to whom it belongs.
+    pub fn owner(&self) -> u32 {
+        self.found.uid()
     }
 
     /// Reads the whole file.

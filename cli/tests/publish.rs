@@ -104,6 +104,34 @@ fn a_built_lambda_is_signed_with_a_new_key() {
 }
 
 #[test]
+fn a_kill_while_a_key_is_written_leaves_no_file() {
+    let work = Workplace::new();
+    let before = fs::read_dir(work.0.path()).unwrap().count();
+    // The first byte that is written to a file kills the process.
+    let limited =
+        format!("ulimit -f 0; exec '{}' keys new other.pem", env!("CARGO_BIN_EXE_gleaner"));
+    let mut shell = Command::new("sh");
+    let killed = shell.current_dir(work.0.path()).args(["-c", &limited]).output().unwrap();
+    assert!(!killed.status.success());
+    assert_eq!(fs::read_dir(work.0.path()).unwrap().count(), before);
+    work.done(&["keys", "new", "other.pem"]);
+}
+
+#[test]
+fn a_foreign_revision_and_a_key_in_the_build_are_refused() {
+    let work = Workplace::new();
+    work.done(&["keys", "new", "other.pem"]);
+    work.done(&["publish", "brake", "--key", "other.pem", "--release", "41"]);
+    let text = work.fails(2, &PUBLISH);
+    assert!(text.contains("is not signed by this key") && text.contains("give `--release N`"));
+    work.done(&[&PUBLISH[..], &["--release", "42"]].concat());
+    assert_eq!(work.verified().release, 42);
+    fs::copy(work.path("key.pem"), work.path("brake/build/key.pem")).unwrap();
+    let text = work.fails(3, &["publish", "brake", "--key", "brake/build/key.pem"]);
+    assert!(text.contains("brake/build/key.pem` is a secret key"), "{text}");
+}
+
+#[test]
 fn refusals_name_the_cause_and_the_way_out() {
     let work = Workplace::new();
     work.fails(2, &["keys", "new", "key.pem"]);

@@ -37,7 +37,7 @@ pub struct PublishArgs {
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
     /// Number of the release, higher than all before [default: 1, or the next after that in the
-    /// file]
+    /// file, if the key signed it]
     #[arg(long, value_name = "N")]
     pub release: Option<u64>,
     /// Print the result as one JSON object

@@ -60,7 +60,7 @@ pub fn all() -> Vec<Vec<u8>> {
     second.publishers[0].labels.insert("fleet".parse().expect("a name"), "test".to_owned());
     let second = serde_json::to_string(&second).expect("a root is JSON");
     let floors = format!(
-        r#"{{"root":1,"signed_time":2,"time":3,"deployments":{{"front":{{"release":1,"digest":"{digest}"}}}},"lambdas":{{}}}}"#
+        r#"{{"root":1,"root_time":2,"time":3,"deployments":{{"front":{{"release":1,"digest":"{digest}"}}}},"lambdas":{{}}}}"#
     );
     let payloads = [
         (mode::REVISION, Revision::TYPE, revision),

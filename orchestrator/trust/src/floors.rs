@@ -10,7 +10,8 @@ use crate::{Deployment, Refusal, Revision, TrustRoot, Trusted, bounded};
 
 /// Maximum number of deployments, and of lambdas, whose releases are remembered.
 const NAMES_MAX: usize = 4096;
-/// The furthest that one clock or one signed time can move the floor of time, in seconds: a year.
+/// The furthest that a clock or a signed time can raise the trusted time above its anchor, and a
+/// trust root the anchor, in seconds: a year.
 const STEP: u64 = 366 * 86_400;
 /// Longest text of floors.
 const TEXT_MAX: usize = 4 << 20;
@@ -20,8 +21,10 @@ const TEXT_MAX: usize = 4 << 20;
 #[serde(deny_unknown_fields)]
 pub struct Floors {
     root: u64,
-    /// The newest time in accepted deployments and roots.
-    signed_time: u64,
+    /// Anchor of the time: the newest time of signing of an accepted root, each within a year of
+    /// the one before or of the build.
+    root_time: u64,
+    /// The last trusted time.
     time: u64,
     #[serde(deserialize_with = "bounded::map::<_, _, _, NAMES_MAX>")]
     deployments: BTreeMap<ItemName, Accepted>,
@@ -67,48 +70,68 @@ impl Floors {
         clock.max(self.time).max(built)
     }
 
-    /// Raises the last trusted time to `clock`, but at most to a year after the newest signed time.
+    /// Raises the last trusted time to `clock`, but at most to a year after the anchor: the newest
+    /// accepted trust root or `built`, whichever is later.
     ///
     /// So a clock that was far ahead for a while does not expire everything for ever, and a clock
     /// that is set back does not revive what had expired within that year.
     pub fn observe(&mut self, clock: u64, built: u64) {
-        let most = self.signed_time.max(built).saturating_add(STEP);
-        self.time = self.time.max(clock.min(most));
+        self.time = self.time.max(clock.min(self.most(built)));
     }
 
-    /// Remembers an accepted deployment of `revision`. `built` is as in [`now`](Self::now).
+    /// Checks a deployment of `revision` again, and remembers both. `built` is as in
+    /// [`now`](Self::now). The time of signing counts as the clock of [`observe`](Self::observe):
+    /// a deployer can move the trusted time up to the anchor's year, and never the anchor.
+    ///
+    /// # Errors
+    ///
+    /// [`Refusal::OtherRevision`], and those of the releases: [`Refusal::RolledBack`],
+    /// [`Refusal::SameRelease`], [`Refusal::TooManyFloors`]. Nothing is remembered then.
     pub fn accept(
         &mut self,
         deployment: &Trusted<Deployment>,
         revision: &Trusted<Revision>,
         built: u64,
-    ) {
+    ) -> Result<(), Refusal> {
         let (wish, release) = (deployment.payload(), revision.payload());
-        raise(&mut self.deployments, &wish.id, wish.release, deployment.digest());
-        raise(&mut self.lambdas, &release.name, release.release, revision.digest());
-        self.accept_time(wish.created, built);
+        if wish.revision != *revision.digest() {
+            let (wanted, found) = (wish.revision.to_string(), Some(revision.digest().clone()));
+            return Err(Refusal::OtherRevision { role: "revision", wanted, found });
+        }
+        if !self.has_accepted(deployment) {
+            self.check_new(deployment, revision)?;
+            let accepted = |release, digest: &Sha256| Accepted { release, digest: digest.clone() };
+            let deployed = accepted(wish.release, deployment.digest());
+            self.deployments.insert(wish.id.clone(), deployed);
+            let released = accepted(release.release, revision.digest());
+            self.lambdas.insert(release.name.clone(), released);
+        }
+        self.observe(wish.created, built);
+        Ok(())
     }
 
-    /// Remembers an accepted trust root.
+    /// Remembers an accepted trust root. A root that is not newer changes nothing.
+    ///
+    /// The caller persists the file of the root first, and these floors second. After a kill
+    /// between the two, the new root is opened again with the old floors, and this call repeated.
+    /// In the other order, the vehicle would have only a root that its floors refuse.
     pub fn accept_root(&mut self, root: &TrustRoot, built: u64) {
-        self.root = self.root.max(root.version);
-        self.accept_time(root.created, built);
+        if root.version > self.root {
+            self.root = root.version;
+            // A time far ahead, by a wrong clock of the signer, moves the anchor by a year at most.
+            self.root_time = self.root_time.max(root.created.min(self.most(built)));
+            self.time = self.time.max(self.root_time);
+        }
     }
 
-    /// A signed time far ahead, by a wrong clock of the signer, moves the floor by a year at most.
-    fn accept_time(&mut self, created: u64, built: u64) {
-        let most = self.signed_time.max(built).saturating_add(STEP);
-        self.signed_time = self.signed_time.max(created.min(most));
-        self.time = self.time.max(self.signed_time);
+    /// The latest time to which a clock or a signed time can raise the trusted time.
+    fn most(&self, built: u64) -> u64 {
+        self.root_time.max(built).saturating_add(STEP)
     }
 
     pub(crate) fn check_root(&self, version: u64) -> Result<(), Refusal> {
         match version < self.root {
-            true => Err(Refusal::RolledBack {
-                what: "trust root".to_owned(),
-                found: version,
-                floor: self.root,
-            }),
+            true => Err(Refusal::OldRoot { found: version, floor: self.root }),
             false => Ok(()),
         }
     }
@@ -121,15 +144,34 @@ impl Floors {
         })
     }
 
-    pub(crate) fn check_deployment(&self, it: &Trusted<Deployment>) -> Result<(), Refusal> {
-        let (id, release) = (&it.payload().id, it.payload().release);
-        check(&self.deployments, id, || format!("deployment `{id}`"), release, it.digest())
+    /// Checks that a deployment and its revision may be accepted for the first time.
+    pub(crate) fn check_new(
+        &self,
+        deployment: &Trusted<Deployment>,
+        revision: &Trusted<Revision>,
+    ) -> Result<(), Refusal> {
+        let (id, release) = (&deployment.payload().id, deployment.payload().release);
+        let what = || format!("deployment `{id}`");
+        check(&self.deployments, id, what, release, deployment.digest())?;
+        let (name, release) = (&revision.payload().name, revision.payload().release);
+        check(&self.lambdas, name, || lambda(name), release, revision.digest())
     }
 
-    pub(crate) fn check_lambda(&self, it: &Trusted<Revision>) -> Result<(), Refusal> {
-        let (name, release) = (&it.payload().name, it.payload().release);
-        check(&self.lambdas, name, || format!("lambda `{name}`"), release, it.digest())
+    /// Checks a fallback, which may have a lower release than one accepted before.
+    pub(crate) fn check_fallback(&self, fallback: &Trusted<Revision>) -> Result<(), Refusal> {
+        let (name, release) = (&fallback.payload().name, fallback.payload().release);
+        match self.lambdas.get(name) {
+            Some(floor) if release == floor.release && *fallback.digest() != floor.digest => {
+                let (accepted, found) = (floor.digest.clone(), fallback.digest().clone());
+                Err(Refusal::SameRelease { what: lambda(name), accepted, found })
+            }
+            _ => Ok(()),
+        }
     }
+}
+
+fn lambda(name: &LambdaName) -> String {
+    format!("lambda `{name}`")
 }
 
 fn check<K: Ord>(
@@ -149,16 +191,5 @@ fn check<K: Ord>(
         }
         None if floors.len() >= NAMES_MAX => Err(Refusal::TooManyFloors { count: floors.len() }),
         _ => Ok(()),
-    }
-}
-
-fn raise<K: Ord + Clone>(
-    floors: &mut BTreeMap<K, Accepted>,
-    name: &K,
-    release: u64,
-    digest: &Sha256,
-) {
-    if floors.get(name).is_none_or(|floor| floor.release < release) {
-        floors.insert(name.clone(), Accepted { release, digest: digest.clone() });
     }
 }

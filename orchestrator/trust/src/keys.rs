@@ -6,6 +6,7 @@
 use std::fmt;
 use std::fs::{self, File};
 use std::io::{self, Write};
+use std::os::fd::AsRawFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -16,6 +17,9 @@ use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};
 use gleaner_base::text::shell_word;
 use gleaner_base::{ByteSize, Exit, Explain, NotPlain, PlainFile, excerpt};
 use gleaner_lambda::manifest::Sha256;
+use rustix::fs::{AtFlags, CWD, OFlags, linkat};
+use rustix::io::Errno;
+use rustix::process::geteuid;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::bounded;
@@ -51,21 +55,23 @@ impl SecretKey {
         Self(SigningKey::from_bytes(bytes))
     }
 
-    /// Writes the key to the new file `path`, which only its user can read.
+    /// Writes the key to the new file `path`, which only its user can read. After a kill, there is
+    /// the whole file or none, except on a file system without unnamed files, such as NFS.
     ///
     /// # Errors
     ///
     /// [`KeyError::Exists`], [`KeyError::Create`].
     pub fn create_file(&self, path: &Path) -> Result<(), KeyError> {
-        let opened = File::options().write(true).create_new(true).mode(0o600).open(path);
-        let mut file = opened.map_err(|source| match source.kind() {
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        let folder = folder.unwrap_or(Path::new("."));
+        let der = [&PREFIX[..], self.0.as_bytes()].concat();
+        let text = format!("{BEGIN}{}\n{END}", STANDARD.encode(der));
+        write_new(folder, path, text.as_bytes()).map_err(|source| match source.kind() {
             io::ErrorKind::AlreadyExists => KeyError::Exists { path: path.to_owned() },
             _ => KeyError::Create { path: path.to_owned(), source },
         })?;
-        let der = [&PREFIX[..], self.0.as_bytes()].concat();
-        let text = format!("{BEGIN}{}\n{END}", STANDARD.encode(der));
-        file.write_all(text.as_bytes()).and_then(|()| file.sync_all()).map_err(|source| {
-            // It is incomplete; the error matters more than one of removing it.
+        File::open(folder).and_then(|folder| folder.sync_all()).map_err(|source| {
+            // It may be gone after a power cut. This error matters more than one of removing it.
             let _ = fs::remove_file(path);
             KeyError::Create { path: path.to_owned(), source }
         })
@@ -75,18 +81,26 @@ impl SecretKey {
     ///
     /// # Errors
     ///
-    /// [`KeyError::Read`], [`KeyError::Shared`] if other users have access to it,
-    /// [`KeyError::NoKey`].
+    /// [`KeyError::Read`], [`KeyError::NoKey`], [`KeyError::Foreign`] if it belongs to another
+    /// user, [`KeyError::Shared`] if other users have access to it.
     pub fn load(path: &Path) -> Result<Self, KeyError> {
         let failed = |source| KeyError::Read { path: path.to_owned(), source };
         let file = PlainFile::named(path, FILE_MAX).map_err(failed)?;
-        let mode = file.mode();
+        let (mode, owner, user) = (file.mode(), file.owner(), geteuid().as_raw());
         let text = file.read_whole().map_err(failed)?;
         match Self::parse(&text) {
             None => Err(KeyError::NoKey { path: path.to_owned() }),
+            Some(_) if owner != user => {
+                Err(KeyError::Foreign { path: path.to_owned(), owner, user })
+            }
             Some(_) if mode & 0o077 != 0 => Err(KeyError::Shared { path: path.to_owned(), mode }),
             Some(key) => Ok(key),
         }
+    }
+
+    /// Returns whether a file with this content is the file of a secret key.
+    pub(crate) fn is_key(text: &[u8]) -> bool {
+        text.len() as u64 <= FILE_MAX.bytes() && Self::parse(text).is_some()
     }
 
     fn parse(text: &[u8]) -> Option<Self> {
@@ -104,6 +118,28 @@ impl SecretKey {
 
     pub(crate) fn sign(&self, message: &[u8]) -> [u8; 64] {
         self.0.sign(message).to_bytes()
+    }
+}
+
+/// Writes `text` to a file without a name in `folder`, and names it `path` once it is whole.
+fn write_new(folder: &Path, path: &Path, text: &[u8]) -> io::Result<()> {
+    let (mut open, flags) = (File::options(), OFlags::TMPFILE.bits().cast_signed());
+    open.write(true).mode(0o600);
+    let write = |file: &mut File| file.write_all(text).and_then(|()| file.sync_all());
+    match open.clone().custom_flags(flags).open(folder) {
+        Ok(mut file) => {
+            write(&mut file)?;
+            let unnamed = format!("/proc/self/fd/{}", file.as_raw_fd());
+            Ok(linkat(CWD, unnamed, CWD, path, AtFlags::SYMLINK_FOLLOW)?)
+        }
+        // A file system without such files, such as NFS: a kill may leave an incomplete file.
+        Err(error) if Errno::from_io_error(&error) == Some(Errno::OPNOTSUPP) => {
+            let mut file = open.create_new(true).open(path)?;
+            write(&mut file).inspect_err(|_| {
+                let _ = fs::remove_file(path);
+            })
+        }
+        Err(error) => Err(error),
     }
 }
 
@@ -172,6 +208,8 @@ pub enum KeyError {
     Create { path: PathBuf, source: io::Error },
     #[error("cannot read key file `{}`", path.display())]
     Read { path: PathBuf, source: io::Error },
+    #[error("key file `{}` belongs to user {owner}, and this is user {user}", path.display())]
+    Foreign { path: PathBuf, owner: u32, user: u32 },
     #[error("other users have access to key file `{}` (mode {mode:03o})", path.display())]
     Shared { path: PathBuf, mode: u32 },
     #[error("`{}` is not an ed25519 key in PEM", path.display())]
@@ -187,22 +225,34 @@ impl Explain for KeyError {
                 "check that the folder exists and is writable, and that its disk has room"
                     .to_owned()
             }
-            Self::Read { source, .. } => match NotPlain::of(source) {
+            Self::Read { path, source } => match NotPlain::of(source) {
                 Some(reason) => reason.help(),
-                None => "`gleaner keys new FILE` makes a key".to_owned(),
+                None if source.kind() == io::ErrorKind::NotFound => {
+                    format!(
+                        "check its path, or make a key: `gleaner keys new {}`",
+                        shell_word(path)
+                    )
+                }
+                None => "name a file that you can read".to_owned(),
             },
             Self::Shared { path, .. } => format!(
                 "run `chmod 600 {}`; if another user may have read it, make a new key",
                 shell_word(path)
             ),
-            Self::NoKey { .. } => "make one with `gleaner keys new FILE`".to_owned(),
+            Self::Foreign { .. } => {
+                "use a key of your own; that user can read this one, and replace it".to_owned()
+            }
+            Self::NoKey { .. } => {
+                "name the file of a key; `gleaner keys new FILE` makes one under a new name"
+                    .to_owned()
+            }
         })
     }
 
     fn exit(&self) -> Exit {
         match self {
             Self::Random { .. } => Exit::Internal,
-            Self::Shared { .. } => Exit::Denied,
+            Self::Foreign { .. } | Self::Shared { .. } => Exit::Denied,
             _ => Exit::Usage,
         }
     }

@@ -1,17 +1,29 @@
 //! Publishing: signs the build of a lambda, and writes the revision beside it.
 
-use std::fs::File;
+use std::fs::{File, TryLockError};
 use std::io;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::Duration;
 
 use gleaner_base::text::shell_word;
 use gleaner_base::{Exit, Explain, NotPlain, PlainFile, write_atomically};
 use gleaner_lambda::manifest::{LambdaName, Sha256};
 use gleaner_lambda::{BuildDir, LayoutError, Manifest, ManifestError};
+use rustix::fs::OFlags;
 
 use crate::envelope::Unverified;
 use crate::files::digests;
-use crate::{COUNTER_MAX, FileDigestError, Payload, Refusal, Revision, SecretKey, seal};
+use crate::{
+    COUNTER_MAX, FileDigestError, Payload, Refusal, Revision, SecretKey, check_files, seal,
+};
+
+/// Pause between two attempts to lock a folder, and their number: half a minute in all. Another
+/// publish takes less, a build can take more, and any user who can open the folder can hold its
+/// lock for ever.
+const LOCK_PAUSE: Duration = Duration::from_millis(50);
+const LOCK_ATTEMPTS: u32 = 600;
 
 /// A release to publish.
 #[derive(Debug)]
@@ -20,7 +32,8 @@ pub struct Release<'a> {
     pub lambda: &'a Path,
     /// The file to write.
     pub out: &'a Path,
-    /// Number of the release; without one, the next after that of the revision in `out`.
+    /// Number of the release; without one, the next after that of the revision in `out`, which
+    /// must be signed by the same key.
     pub release: Option<u64>,
     /// The time, in seconds since 1970.
     pub created: u64,
@@ -60,28 +73,39 @@ pub fn publish(release: &Release<'_>, key: &SecretKey) -> Result<Published, Rele
         created,
         files: digests(&build)?,
     };
-    if let Some((existing, digest, is_ours)) = read_existing(out, key)? {
-        if existing.name != revision.name {
-            let (found, lambda) = (existing.name, revision.name);
-            return Err(ReleaseError::OtherLambda { path: out.to_owned(), found, lambda });
-        }
-        revision.release = existing.release;
-        let is_same = is_ours && revision == Revision { created, ..existing.clone() };
-        let asked = release.release.unwrap_or(existing.release + u64::from(!is_same));
-        if asked == existing.release && is_same {
-            return Ok(Published { revision: existing, digest, unchanged: true });
-        }
-        if asked <= existing.release {
-            let (path, existing) = (out.to_owned(), existing.release);
-            return Err(ReleaseError::Counter { path, asked, existing });
-        }
-        revision.release = asked;
-    } else {
-        revision.release = release.release.unwrap_or(1);
+    let existing = read_existing(out, key)?;
+    if let Some((other, ..)) = existing.as_ref().filter(|(it, ..)| it.name != revision.name) {
+        let (found, lambda) = (other.name.clone(), revision.name);
+        return Err(ReleaseError::OtherLambda { path: out.to_owned(), found, lambda });
     }
+    revision.release = match (existing, release.release) {
+        (None, asked) => asked.unwrap_or(1),
+        // Any user may have chosen the number in it.
+        (Some((_, _, false)), asked) => {
+            asked.ok_or_else(|| ReleaseError::NotOurs { path: out.to_owned() })?
+        }
+        (Some((existing, digest, true)), asked) => {
+            let former = existing.release;
+            let is_same = existing
+                == Revision { created: existing.created, release: former, ..revision.clone() };
+            let asked = asked.unwrap_or(former + u64::from(!is_same));
+            if is_same && asked == former {
+                return Ok(Published { revision: existing, digest, unchanged: true });
+            }
+            if former == COUNTER_MAX {
+                return Err(ReleaseError::LastRelease { path: out.to_owned() });
+            }
+            if asked <= former {
+                let path = out.to_owned();
+                return Err(ReleaseError::Counter { path, asked, existing: former });
+            }
+            asked
+        }
+    };
     if !(1..=COUNTER_MAX).contains(&revision.release) {
         return Err(ReleaseError::CounterRange { release: revision.release });
     }
+    check_files(&revision, &build)?;
     let envelope = seal(&revision, &[key])?;
     let digest = Unverified::<Revision>::parse(&envelope)?.digest();
     write_atomically(out, &envelope)
@@ -97,12 +121,21 @@ fn lock(lambda: &Path, out: &Path) -> Result<Vec<File>, ReleaseError> {
     let mut folders = vec![resolved(lambda)?, resolved(out)?];
     folders.sort();
     folders.dedup();
-    let locked = |folder: &PathBuf| {
-        let file = File::open(folder).map_err(|source| failed(folder, source))?;
-        file.lock().map_err(|source| failed(folder, source))?;
-        Ok(file)
-    };
-    folders.iter().map(locked).collect()
+    folders.iter().map(|folder| lock_folder(folder, LOCK_ATTEMPTS)).collect()
+}
+
+fn lock_folder(path: &Path, attempts: u32) -> Result<File, ReleaseError> {
+    let failed = |source| ReleaseError::Lock { path: path.to_owned(), source };
+    let flags = OFlags::DIRECTORY.bits().cast_signed();
+    let folder = File::options().read(true).custom_flags(flags).open(path).map_err(failed)?;
+    for _ in 0..attempts {
+        match folder.try_lock() {
+            Ok(()) => return Ok(folder),
+            Err(TryLockError::WouldBlock) => thread::sleep(LOCK_PAUSE),
+            Err(TryLockError::Error(source)) => return Err(failed(source)),
+        }
+    }
+    Err(ReleaseError::Busy { path: path.to_owned() })
 }
 
 /// Refuses a revision within the build: it would be a file that it does not list.
@@ -148,6 +181,8 @@ pub enum ReleaseError {
     Seal(#[from] Refusal),
     #[error("cannot lock folder `{}`", path.display())]
     Lock { path: PathBuf, source: io::Error },
+    #[error("another process has locked folder `{}`", path.display())]
+    Busy { path: PathBuf },
     #[error("`{}` is in the build folder, whose files the revision lists", path.display())]
     Inside { path: PathBuf },
     #[error("cannot read `{}`", path.display())]
@@ -156,6 +191,10 @@ pub enum ReleaseError {
     NoRevision { path: PathBuf, source: Refusal },
     #[error("`{}` is a revision of lambda `{found}`, not of `{lambda}`", path.display())]
     OtherLambda { path: PathBuf, found: LambdaName, lambda: LambdaName },
+    #[error("`{}` is not signed by this key", path.display())]
+    NotOurs { path: PathBuf },
+    #[error("`{}` has release {COUNTER_MAX}, and no number follows it", path.display())]
+    LastRelease { path: PathBuf },
     #[error("release {asked} cannot replace release {existing} in `{}`", path.display())]
     Counter { path: PathBuf, asked: u64, existing: u64 },
     #[error("release {release} is not from 1 to {COUNTER_MAX}")]
@@ -174,6 +213,11 @@ impl Explain for ReleaseError {
             Self::Lock { .. } => {
                 "check that the folder exists and lies on a file system with locks".to_owned()
             }
+            Self::Busy { .. } => {
+                "wait until `gleaner build` or `gleaner publish` ends there; if another user holds \
+                 the lock, publish from and to folders that only you can open"
+                    .to_owned()
+            }
             Self::Inside { .. } => "name a file in another folder: --out FILE".to_owned(),
             Self::Read { source, .. } => match NotPlain::of(source) {
                 Some(reason) => reason.help(),
@@ -185,6 +229,14 @@ impl Explain for ReleaseError {
             Self::OtherLambda { .. } => {
                 "name another file: --out FILE; each lambda has its own".to_owned()
             }
+            Self::NotOurs { .. } => {
+                "give `--release N`, with N above every release of this lambda so far".to_owned()
+            }
+            Self::LastRelease { path } => format!(
+                "if no vehicle has accepted it, run `rm {}` and publish again; otherwise the \
+                 lambda needs a new name",
+                shell_word(path)
+            ),
             Self::Counter { existing, .. } => {
                 format!("omit --release for the next one, or give one above {existing}")
             }
@@ -205,8 +257,24 @@ impl Explain for ReleaseError {
             {
                 Exit::Internal
             }
-            Self::Write { .. } => Exit::Internal,
+            Self::Busy { .. } | Self::Write { .. } => Exit::Internal,
             _ => Exit::Usage,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lock_that_another_process_keeps_is_reported() {
+        let folder = tempfile::tempdir().unwrap();
+        let held = lock_folder(folder.path(), 1).unwrap();
+        let error = lock_folder(folder.path(), 3).unwrap_err();
+        assert!(matches!(error, ReleaseError::Busy { .. }), "{error}");
+        assert!(error.help().is_some_and(|help| help.contains("gleaner build")));
+        drop(held);
+        lock_folder(folder.path(), 1).unwrap();
     }
 }

@@ -3,6 +3,8 @@
 use gleaner_base::{ByteSize, Exit, Explain};
 use gleaner_lambda::manifest::{LambdaName, Sha256};
 
+use crate::{Payload, TrustRoot};
+
 /// The reason why signed data is refused. Times are in seconds since 1970.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[allow(missing_docs)]
@@ -29,6 +31,8 @@ pub enum Refusal {
     Sequence { current: u64, found: u64 },
     #[error("{what} has release {found}; release {floor} was accepted before")]
     RolledBack { what: String, found: u64, floor: u64 },
+    #[error("the trust root has version {found}; version {floor} was accepted before")]
+    OldRoot { found: u64, floor: u64 },
     #[error("{what} was accepted before as {accepted}; with the same release, this is {found}")]
     SameRelease { what: String, accepted: Sha256, found: Sha256 },
     #[error("the {what} expired at {expires}; now it is {now}")]
@@ -37,6 +41,8 @@ pub enum Refusal {
     OtherRevision { role: &'static str, wanted: String, found: Option<Sha256> },
     #[error("the revision is of lambda `{revision}`, and its fallback of `{fallback}`")]
     OtherLambda { revision: LambdaName, fallback: LambdaName },
+    #[error("the fallback has release {fallback}, its revision {revision}; it must be older")]
+    NewerFallback { fallback: u64, revision: u64 },
     #[error("`{path}` of the revision is missing")]
     MissingFile { path: String },
     #[error("`{path}` is not in the revision")]
@@ -45,6 +51,8 @@ pub enum Refusal {
     Length { path: String, signed: u64, found: u64 },
     #[error("`{path}` has the digest {found}; in the revision it has {signed}")]
     Digest { path: String, signed: Sha256, found: Sha256 },
+    #[error("lambda.toml has the {what} `{found}`; the revision has `{signed}`")]
+    OtherManifest { what: &'static str, signed: String, found: String },
     #[error("{count} names have release counters; no more are kept")]
     TooManyFloors { count: usize },
 }
@@ -57,6 +65,10 @@ impl Explain for Refusal {
             }
             Self::WrongType { .. } | Self::OtherRevision { .. } | Self::OtherLambda { .. } => {
                 "name the file that belongs here"
+            }
+            Self::UnknownKey { what: TrustRoot::NAME, .. } => {
+                "a trust root needs signatures by the keys of the current one: add them, or \
+                 install the roots between, in their order"
             }
             Self::UnknownKey { .. } => {
                 "sign it with a key of the trust root, or install the trust root that has the key"
@@ -74,8 +86,17 @@ impl Explain for Refusal {
                 "a trust root needs signatures by the keys of the current one and by its own"
             }
             Self::Sequence { .. } => "install every trust root in its order, none skipped",
+            Self::OldRoot { .. } => {
+                "install the newest trust root; an older one is never accepted again"
+            }
             Self::RolledBack { .. } | Self::SameRelease { .. } => {
                 "sign it again with a higher release"
+            }
+            Self::NewerFallback { .. } => {
+                "sign the deployment again, with an older release as the fallback or without one"
+            }
+            Self::Expired { what: TrustRoot::NAME, .. } => {
+                "install the next trust root; if the time is wrong, set the vehicle's clock"
             }
             Self::Expired { .. } => {
                 "sign it again with a later end; if the time is wrong, set the vehicle's clock"
@@ -84,6 +105,7 @@ impl Explain for Refusal {
             | Self::ExtraFile { .. }
             | Self::Length { .. }
             | Self::Digest { .. } => "restore the published files, or publish the build again",
+            Self::OtherManifest { .. } => "publish the build again",
             Self::TooManyFloors { .. } => "deploy under a name that was used before",
         };
         Some(help.to_owned())

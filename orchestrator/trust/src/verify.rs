@@ -38,8 +38,9 @@ impl<P> Trusted<P> {
 pub enum Verdict {
     /// It may run.
     Current,
-    /// It was accepted before, and may run on, but it or the trust root has expired: its deployer
-    /// should sign it again.
+    /// It was accepted before and may run, but it or the trust root has expired: its deployer
+    /// should sign it again. It may also start again: whether it still ran is not part of the
+    /// floors.
     Stale(Refusal),
 }
 
@@ -84,8 +85,9 @@ impl Verifier<'_> {
 
     /// Decides whether `deployment` may run with `revision` and `fallback`.
     ///
-    /// A deployment that was accepted before stays accepted: expiry and releases of other
-    /// deployments never stop what runs.
+    /// The newest accepted deployment of an id stays accepted: neither expiry nor releases of other
+    /// deployments stop it. The current trust root must still cover it, its revision and its
+    /// fallback with the keys that signed them.
     ///
     /// # Errors
     ///
@@ -113,14 +115,25 @@ impl Verifier<'_> {
             let fallback = other.payload.name.clone();
             return Err(Refusal::OtherLambda { revision: name.clone(), fallback });
         }
+        let release = revision.payload.release;
+        if let Some(other) = fallback.filter(|other| other.digest != revision.digest)
+            && other.payload.release >= release
+        {
+            let fallback = other.payload.release;
+            return Err(Refusal::NewerFallback { fallback, revision: release });
+        }
+        // Again: the root may have changed since the signatures were checked.
+        for revision in [Some(revision), fallback].into_iter().flatten() {
+            self.check_scope(&self.root.publishers, revision, name)?;
+        }
         self.check_scope(&self.root.deployers, deployment, name)?;
         let expired = self.expired(wish.expires, Deployment::NAME);
         let expired = expired.or_else(|| self.expired(self.root.expires, TrustRoot::NAME));
         if self.floors.has_accepted(deployment) {
             return Ok(expired.map_or(Verdict::Current, Verdict::Stale));
         }
-        self.floors.check_deployment(deployment)?;
-        self.floors.check_lambda(revision)?;
+        self.floors.check_new(deployment, revision)?;
+        fallback.map_or(Ok(()), |fallback| self.floors.check_fallback(fallback))?;
         expired.map_or(Ok(Verdict::Current), Err)
     }
 
@@ -138,7 +151,7 @@ impl Verifier<'_> {
     }
 
     /// Checks that one of the signers may sign `lambda` for this vehicle.
-    fn check_scope<P>(
+    fn check_scope<P: Payload>(
         &self,
         keys: &[ScopedKey],
         verified: &Trusted<P>,
@@ -154,7 +167,7 @@ impl Verifier<'_> {
         }
         // Without a signer, the root has changed since the signature was checked.
         Err(refusal.unwrap_or_else(|| Refusal::UnknownKey {
-            what: "payload",
+            what: P::NAME,
             found: verified.signers.iter().map(Sha256::to_string).collect(),
             trusted: keys.len(),
         }))

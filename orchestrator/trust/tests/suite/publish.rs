@@ -1,14 +1,16 @@
 //! Publishing the build of a lambda, and comparing files with a revision.
 
 use std::fs;
-use std::os::unix::fs::{PermissionsExt, symlink};
+use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 
 use gleaner_base::Explain;
-use gleaner_lambda::BuildDir;
+use gleaner_lambda::{BuildDir, LayoutError};
 use gleaner_trust::{
-    FileDigestError, KeyError, Published, Refusal, Release, ReleaseError, check_files, publish,
+    COUNTER_MAX, FileDigestError, KeyError, Published, Refusal, Release, ReleaseError, check_files,
+    publish,
 };
 use tempfile::TempDir;
 
@@ -121,10 +123,7 @@ fn the_release_grows_with_each_change_and_only_then() {
     }
     assert_eq!(lambda.publish(None).unwrap().revision.release, 2);
     assert_eq!(lambda.publish(Some(40)).unwrap().revision.release, 40);
-    // By another key, it is another release.
-    let other = publish_to(lambda.0.path(), &lambda.out(), None, 9).unwrap();
-    assert_eq!(other.revision.release, 41);
-    let most = lambda.publish(Some(gleaner_trust::COUNTER_MAX + 1)).unwrap_err();
+    let most = lambda.publish(Some(COUNTER_MAX + 1)).unwrap_err();
     assert!(matches!(most, ReleaseError::CounterRange { .. }), "{most}");
 }
 
@@ -156,22 +155,183 @@ fn what_cannot_be_published_is_named_and_nothing_is_written() {
 }
 
 #[test]
-fn two_at_once_leave_one_whole_revision() {
+fn several_at_once_leave_the_highest_release_whole() {
     let lambda = BuiltLambda::new();
-    let results = thread::scope(|scope| {
-        let threads: Vec<_> = (0..8)
-            .map(|seed| {
-                let lambda = &lambda;
-                scope.spawn(move || publish_to(lambda.0.path(), &lambda.out(), None, 10 + seed))
-            })
-            .collect();
-        threads.into_iter().map(|it| it.join().unwrap().unwrap()).collect::<Vec<_>>()
+    thread::scope(|scope| {
+        for release in 1..=8 {
+            let lambda = &lambda;
+            scope.spawn(move || match lambda.publish(Some(release)) {
+                Ok(published) => assert_eq!(published.revision.release, release),
+                Err(ReleaseError::Counter { existing, .. }) => assert!(existing > release),
+                Err(error) => panic!("{error}"),
+            });
+        }
     });
-    let mut releases: Vec<_> = results.iter().map(|it| it.revision.release).collect();
-    releases.sort_unstable();
-    assert_eq!(releases, (1..=8).collect::<Vec<_>>(), "each key is a release of its own");
     assert!(!lambda.0.path().join("revision.json.part").exists());
-    assert_eq!(lambda.publish(None).unwrap().revision.release, 9);
+    let last = lambda.publish(None).unwrap();
+    assert_eq!((last.unchanged, last.revision.release), (true, 8));
+}
+
+#[test]
+fn a_counter_by_another_key_is_not_continued() {
+    let lambda = BuiltLambda::new();
+    publish_to(lambda.0.path(), &lambda.out(), Some(COUNTER_MAX), 9).unwrap();
+    let text = fs::read(lambda.out()).unwrap();
+    let error = lambda.publish(None).unwrap_err();
+    assert!(error.to_string().ends_with("revision.json` is not signed by this key"), "{error}");
+    assert!(error.help().is_some_and(|help| help.contains("give `--release N`")));
+    assert_eq!(fs::read(lambda.out()).unwrap(), text);
+    // A signature that names this key and is wrong does not count either.
+    let [own, other] = [PUBLISHER, 9].map(|seed| key(seed).public().id().to_string());
+    lambda.write("revision.json", &String::from_utf8(text).unwrap().replace(&other, &own));
+    assert!(matches!(lambda.publish(None), Err(ReleaseError::NotOurs { .. })));
+    assert_eq!(lambda.publish(Some(7)).unwrap().revision.release, 7);
+    lambda.write("build/main.py", "x = 2\n");
+    assert_eq!(lambda.publish(None).unwrap().revision.release, 8);
+}
+
+#[test]
+fn messages_at_the_last_release_lead_out_of_it() {
+    let lambda = BuiltLambda::new();
+    lambda.publish(Some(COUNTER_MAX)).unwrap();
+    assert!(lambda.publish(None).unwrap().unchanged);
+    lambda.write("build/main.py", "x = 2\n");
+    for asked in [None, Some(1), Some(COUNTER_MAX), Some(COUNTER_MAX + 1)] {
+        let error = lambda.publish(asked).unwrap_err();
+        assert!(matches!(error, ReleaseError::LastRelease { .. }), "{asked:?}: {error}");
+        assert!(error.help().is_some_and(|help| help.contains("new name")));
+    }
+    fs::remove_file(lambda.out()).unwrap();
+    assert_eq!(lambda.publish(None).unwrap().revision.release, 1);
+}
+
+#[test]
+fn a_secret_key_in_the_build_is_refused_by_name() {
+    let lambda = BuiltLambda::new();
+    let path = lambda.0.path().join("build/models/a key");
+    key(PUBLISHER).create_file(&path).unwrap();
+    let refused = || match lambda.publish(None).unwrap_err() {
+        ReleaseError::Files(error @ FileDigestError::SecretKey { .. }) => error,
+        other => panic!("{other}"),
+    };
+    let error = refused();
+    assert!(error.to_string().contains("build/models/a key"), "{error}");
+    assert!(error.help().is_some_and(|help| help.contains("make a new key")));
+    assert!(!lambda.out().exists());
+    // Another key, with the line ends of another system.
+    fs::remove_file(&path).unwrap();
+    key(9).create_file(&path).unwrap();
+    fs::write(&path, fs::read_to_string(&path).unwrap().replace('\n', "\r\n")).unwrap();
+    refused();
+    fs::write(&path, "-----BEGIN PRIVATE KEY-----\nnot one\n").unwrap();
+    lambda.publish(None).unwrap();
+}
+
+#[test]
+fn the_manifest_must_have_the_name_version_and_kind_of_the_revision() {
+    let lambda = BuiltLambda::new();
+    let good = lambda.publish(None).unwrap().revision;
+    let build = BuildDir::of(lambda.0.path());
+    check_files(&good, &build).unwrap();
+    let cases = [
+        ("name", Revision { name: "brake-wet".parse().unwrap(), ..good.clone() }),
+        ("version", Revision { version: "0.2.0".parse().unwrap(), ..good.clone() }),
+        ("kind", Revision { kind: LambdaKind::Wasm, ..good.clone() }),
+    ];
+    for (name, changed) in cases {
+        let refusal = refusal(check_files(&changed, &build));
+        assert!(matches!(refusal, Refusal::OtherManifest { what, .. } if what == name));
+        let (text, value) = (refusal.to_string(), |revision: &Revision| match name {
+            "name" => revision.name.to_string(),
+            "version" => revision.version.to_string(),
+            _ => revision.kind.as_str().to_owned(),
+        });
+        assert!(text.contains(&value(&good)) && text.contains(&value(&changed)), "{text}");
+    }
+    // Without a manifest, and with one that cannot be parsed.
+    let mut without = good.clone();
+    without.files.retain(|file| file.path.as_str() != "lambda.toml");
+    fs::remove_file(build.manifest_path()).unwrap();
+    let missing = Refusal::MissingFile { path: "lambda.toml".to_owned() };
+    assert_eq!(refusal(check_files(&without, &build)), missing);
+    lambda.write("build/lambda.toml", "");
+    let mut empty = good;
+    let file = empty.files.iter_mut().find(|file| file.path.as_str() == "lambda.toml").unwrap();
+    file.bytes = 0;
+    // The SHA-256 of nothing.
+    file.sha256 =
+        "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855".parse().unwrap();
+    let error = check_files(&empty, &build).unwrap_err();
+    assert!(matches!(error, FileDigestError::Layout(LayoutError::Manifest(_))), "{error}");
+}
+
+#[test]
+fn a_manifest_that_changes_during_publishing_is_never_signed_as_another_one() {
+    let lambda = BuiltLambda::new();
+    let versions = ["0.1.0", "0.2.0"];
+    let mut digests = Vec::new();
+    for version in versions {
+        lambda.write("build/lambda.toml", &MANIFEST.replace("0.1.0", version));
+        let revision = lambda.publish(None).unwrap().revision;
+        digests.push(manifest_digest(&revision));
+    }
+    let (is_done, mut count) = (AtomicBool::new(false), 0);
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            for version in versions.iter().cycle() {
+                if is_done.load(Ordering::Relaxed) {
+                    break;
+                }
+                lambda.write("next.toml", &MANIFEST.replace("0.1.0", version));
+                let next = lambda.0.path().join("next.toml");
+                fs::rename(next, lambda.0.path().join("build/lambda.toml")).unwrap();
+            }
+        });
+        for _ in 0..60 {
+            let Ok(Published { revision, .. }) = lambda.publish(None) else { continue };
+            count += 1;
+            let at = versions.iter().position(|it| *it == revision.version.as_str()).unwrap();
+            let is_same = manifest_digest(&revision) == digests[at];
+            is_done.fetch_or(!is_same, Ordering::Relaxed);
+            assert!(is_same, "{revision:?}");
+        }
+        is_done.store(true, Ordering::Relaxed);
+    });
+    assert!(count > 0, "nothing was published");
+}
+
+fn manifest_digest(revision: &Revision) -> String {
+    let file = revision.files.iter().find(|file| file.path.as_str() == "lambda.toml").unwrap();
+    file.sha256.to_string()
+}
+
+#[test]
+fn a_key_of_another_user_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("key.pem");
+    key(7).create_file(&path).unwrap();
+    // Only a privileged user can give a file away.
+    if chown(&path, Some(12_345), None).is_err() {
+        return;
+    }
+    let error = SecretKey::load(&path).unwrap_err();
+    assert!(matches!(error, KeyError::Foreign { owner: 12_345, .. }), "{error}");
+    assert!(error.help().is_some());
+}
+
+#[test]
+fn help_for_keys_is_no_circle() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("key.pem");
+    let error = SecretKey::load(&path).unwrap_err();
+    assert!(error.help().is_some_and(|help| help.contains("keys new") && help.contains("key.pem")));
+    // A file that is there: `gleaner keys new` with its name would be refused.
+    fs::write(&path, "no key").unwrap();
+    let error = SecretKey::load(&path).unwrap_err();
+    assert!(error.help().is_some_and(|help| help.contains("under a new name")), "{error}");
+    let error = key(7).create_file(&folder.path().join("nowhere/key.pem")).unwrap_err();
+    assert!(matches!(error, KeyError::Create { .. }), "{error}");
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
 }
 
 #[test]
