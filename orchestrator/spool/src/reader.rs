@@ -113,8 +113,7 @@ impl<S: SpoolStorage> SpoolReader<S> {
                 continue;
             };
             let end = current.next_first.unwrap_or(u64::MAX);
-            let peeked = current.scan.peek().map_err(|source| self.failed(source))?;
-            let item = match peeked.filter(|head| head.seq < end) {
+            let item = match current.scan.peek()?.filter(|head| head.seq < end) {
                 Some(head) if head.seq < expected => {
                     self.consume(&head);
                     continue;
@@ -152,9 +151,7 @@ impl<S: SpoolStorage> SpoolReader<S> {
             }
             other => other.map_err(|source| self.failed(source))?,
         };
-        let scan = SegmentScan::open(file, &self.stream, first)
-            .map_err(|source| self.failed(source))?
-            .map_err(|found| SpoolError::Version { stream: self.stream.clone(), first, found })?;
+        let scan = SegmentScan::new(file, &self.stream, first);
         let next_first = self.list()?.into_iter().find(|other| *other > first);
         self.current = Some(OpenSegment { scan, first, next_first });
         Ok(())
@@ -165,8 +162,7 @@ impl<S: SpoolStorage> SpoolReader<S> {
         let current = self.current.as_mut().expect("the caller peeked into it");
         let damaged = self.damaged || current.scan.damaged;
         let boot = current.scan.header.as_ref().expect("it has records").boot;
-        let payload = current.scan.payload().map(<[u8]>::to_vec);
-        let payload = payload.map_err(|source| self.failed(source))?;
+        let payload = current.scan.payload()?;
         let noted = SpoolGap::parse(&payload, head.seq).filter(|_| head.kind == GAP_KIND);
         // A gap record that follows its gap explains the hole before it.
         let hole_end = match &noted {

@@ -160,11 +160,9 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         let stream = self.config.stream.clone();
         let failed = |source| SpoolError::Read { stream: stream.clone(), source };
         let file = self.storage.open(first).map_err(failed)?;
-        let mut scan = SegmentScan::open(file, &stream, first)
-            .map_err(failed)?
-            .map_err(|found| SpoolError::Version { stream: stream.clone(), first, found })?;
+        let mut scan = SegmentScan::new(file, &stream, first);
         self.next = first;
-        while let Some(head) = scan.peek().map_err(failed)? {
+        while let Some(head) = scan.peek()? {
             self.next = head.seq + 1;
             scan.skip(&head);
         }
