@@ -194,10 +194,16 @@ impl<S: SpoolStorage> SpoolReader<S> {
     }
 
     /// Goes to the next segment if there is one. The current one is searched once more after its
-    /// successor appeared, for what was written in between.
+    /// successor appeared, for what was written in between. Only the last segment may be replaced
+    /// by another one of its name, so the order is: list, and then look whether it was.
     fn segment_end(&mut self, expected: u64) -> Result<SegmentEnd, SpoolError> {
         let listed = self.list()?;
         let current = self.current.as_mut().expect("the caller peeked into it");
+        if listed.contains(&current.first) && !current.scan.is_linked()? {
+            let first = current.first;
+            self.enter(first)?;
+            return Ok(SegmentEnd::Continue);
+        }
         let next = listed.into_iter().find(|first| *first > current.first);
         let known = std::mem::replace(&mut current.next_first, next);
         match next {

@@ -48,6 +48,11 @@ impl<F: SegmentFile> SegmentScan<F> {
         }
     }
 
+    /// Returns whether the segment still has a name: it was neither removed nor replaced.
+    pub(crate) fn is_linked(&self) -> Result<bool, SpoolError> {
+        self.file.is_linked().map_err(|source| self.failed(source))
+    }
+
     /// Makes the content durable.
     pub(crate) fn sync(&self) -> io::Result<()> {
         self.file.sync()

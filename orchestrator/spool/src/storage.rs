@@ -52,6 +52,13 @@ pub trait SegmentFile {
     /// Those of the file system.
     fn length(&self) -> io::Result<u64>;
 
+    /// Returns whether the file still has a name: it was neither removed nor replaced.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn is_linked(&self) -> io::Result<bool>;
+
     /// Reads at `offset` as [`std::os::unix::fs::FileExt::read_at`] does; 0 bytes are the end.
     ///
     /// # Errors

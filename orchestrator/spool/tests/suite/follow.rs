@@ -49,6 +49,38 @@ fn a_segment_that_was_empty_when_a_reader_entered_it_is_read_once_it_is_filled()
     assert_eq!(numbers(&mut reader), (vec![0, 1, 2], None));
 }
 
+#[test]
+fn a_segment_that_is_replaced_under_its_name_is_opened_again() {
+    let (disk, whole) = (SimulatedDisk::new(1), segment(3));
+    // A commit failed after a part of the header, or of the first record.
+    for part in [0, 50, 128, 150, 169] {
+        drop(disk.create(0).unwrap());
+        disk.with_content(0, |content| content.extend_from_slice(&whole[..part]));
+        let mut reader = SpoolReader::with_storage(disk.clone(), STREAM, None);
+        let before = numbers(&mut reader).0;
+        drop(disk.create(0).unwrap());
+        disk.with_content(0, |content| content.clone_from(&whole));
+        let after = numbers(&mut reader).0;
+        assert_eq!([before, after].concat(), [0, 1, 2], "{part} bytes");
+    }
+}
+
+#[test]
+fn a_segment_replaced_on_the_disk_is_opened_again() {
+    let scratch = tempfile::tempdir().unwrap();
+    let path = scratch.path().join("00000000000000000000.seg");
+    fs::write(&path, b"").unwrap();
+    let mut reader = SpoolReader::open(scratch.path(), STREAM, None).unwrap();
+    assert_eq!(numbers(&mut reader), (vec![], None));
+    let mut writer = SpoolWriter::open(scratch.path(), config(BUDGET_MIN)).unwrap();
+    writer.append(KIND, TIME, b"one").unwrap();
+    writer.commit().unwrap();
+    assert_eq!(numbers(&mut reader), (vec![0], None));
+    // Removed, not replaced: the reader waits for the next segment.
+    fs::remove_file(&path).unwrap();
+    assert_eq!(numbers(&mut reader), (vec![], None));
+}
+
 /// The first number of the oldest segment in `folder`.
 fn oldest(folder: &Path) -> u64 {
     let names = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name());

@@ -189,6 +189,10 @@ impl SegmentFile for SimulatedFile {
         Ok(self.disk.0.borrow().inodes[self.inode].content.len() as u64)
     }
 
+    fn is_linked(&self) -> io::Result<bool> {
+        Ok(self.disk.0.borrow().names.values().any(|inode| *inode == self.inode))
+    }
+
     fn read_at(&self, into: &mut [u8], offset: u64) -> io::Result<usize> {
         self.disk.operation(false)?;
         let disk = self.disk.0.borrow();
