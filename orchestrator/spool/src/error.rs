@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use gleaner_base::{ByteSize, Exit, Explain};
 
 use crate::GapReason;
-use crate::format::{NAME_MAX, VERSION};
+use crate::format::{NAME_MAX, VERSION, segment_name};
 use crate::writer::BUDGET_MIN;
 
 /// The reason why a spool refuses a record, or cannot be used.
@@ -43,10 +43,12 @@ pub enum SpoolError {
         pid: Option<u32>,
     },
     /// The segments of a stream cannot be read.
-    #[error("cannot read the spool of stream `{stream}`")]
+    #[error("cannot read {} of stream `{stream}`", part(*segment))]
     Read {
         /// Name of the stream.
         stream: String,
+        /// First sequence number of the segment; `None` if the folder cannot be read.
+        segment: Option<u64>,
         /// The cause.
         source: io::Error,
     },
@@ -98,6 +100,11 @@ fn by(pid: Option<u32>) -> String {
     pid.map(|pid| format!(", process {pid}")).unwrap_or_default()
 }
 
+fn part(segment: Option<u64>) -> String {
+    let segment = segment.map(|first| format!("segment `{}`", segment_name(first)));
+    segment.unwrap_or_else(|| "the spool".to_owned())
+}
+
 fn refusal(reason: GapReason) -> &'static str {
     match reason {
         GapReason::DiskFull => "the disk is full, and so is the queue",
@@ -115,8 +122,13 @@ impl Explain for SpoolError {
                 "make it a folder of the user that runs the writer, without links".to_owned()
             }
             SpoolError::Busy { .. } => "end the other writer first".to_owned(),
-            SpoolError::Read { .. } => {
-                "check the disk; remove files that are not segments from the folder".to_owned()
+            SpoolError::Read { segment: Some(_), .. } => {
+                "remove it if it is not a segment; otherwise check its owner and the disk"
+                    .to_owned()
+            }
+            SpoolError::Read { segment: None, .. } => {
+                "remove what is not a segment, if the cause names it; otherwise check the disk"
+                    .to_owned()
             }
             SpoolError::Version { .. } => "use the gleaner that wrote it".to_owned(),
             SpoolError::Write { source, .. } if is_full(source) => {

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use gleaner_base::safe_file::{self, UnsafePath};
 use rustix::fs::{FlockOperation, OFlags, flock};
 
+use crate::format::segment_name;
 use crate::{SegmentFile, SpoolError, SpoolStorage};
 
 /// The folder of a stream. Its writer holds a lock on it until it is dropped.
@@ -63,7 +64,7 @@ impl SpoolFolder {
     }
 
     fn segment(&self, first: u64) -> PathBuf {
-        self.path.join(format!("{first:020}.seg"))
+        self.path.join(segment_name(first))
     }
 
     /// Refuses what is not a plain file of the folder's owner with one name.

@@ -137,7 +137,7 @@ impl<S: SpoolStorage> SpoolReader<S> {
     }
 
     fn list(&self) -> Result<Vec<u64>, SpoolError> {
-        let listed = self.storage.list().map_err(|source| self.failed(source))?;
+        let listed = self.storage.list().map_err(|source| self.failed(None, source))?;
         Ok(listed.into_iter().map(|(first, _)| first).collect())
     }
 
@@ -149,7 +149,7 @@ impl<S: SpoolStorage> SpoolReader<S> {
                 self.current = None;
                 return Ok(());
             }
-            other => other.map_err(|source| self.failed(source))?,
+            other => other.map_err(|source| self.failed(Some(first), source))?,
         };
         let scan = SegmentScan::new(file, &self.stream, first);
         let next_first = self.list()?.into_iter().find(|other| *other > first);
@@ -221,8 +221,8 @@ impl<S: SpoolStorage> SpoolReader<S> {
         }
     }
 
-    fn failed(&self, source: io::Error) -> SpoolError {
-        SpoolError::Read { stream: self.stream.clone(), source }
+    fn failed(&self, segment: Option<u64>, source: io::Error) -> SpoolError {
+        SpoolError::Read { stream: self.stream.clone(), segment, source }
     }
 }
 

@@ -8,6 +8,9 @@ use crate::{SegmentFile, SpoolError};
 /// Bytes that are read at once.
 const WINDOW: usize = 16 << 10;
 
+/// Bytes that a disk cannot read if it cannot read one of them: a page of the kernel's cache.
+const BLOCK: u64 = 4096;
+
 /// A position in a segment.
 pub(crate) struct SegmentScan<F> {
     file: F,
@@ -28,6 +31,8 @@ pub(crate) struct SegmentScan<F> {
     pub(crate) torn: u64,
     window: Vec<u8>,
     window_at: u64,
+    /// Length of the file when it was last looked at.
+    length: u64,
 }
 
 impl<F: SegmentFile> SegmentScan<F> {
@@ -45,6 +50,7 @@ impl<F: SegmentFile> SegmentScan<F> {
             torn: 0,
             window: Vec::new(),
             window_at: 0,
+            length: 0,
         }
     }
 
@@ -61,7 +67,8 @@ impl<F: SegmentFile> SegmentScan<F> {
     /// Finds the next valid record without consuming it; `None` at the end. The segment may grow
     /// meanwhile.
     pub(crate) fn peek(&mut self) -> Result<Option<RecordHead>, SpoolError> {
-        let length = self.file.length().map_err(|source| self.failed(source))?;
+        self.length = self.file.length().map_err(|source| self.failed(source))?;
+        let length = self.length;
         if self.header.is_none() {
             self.find_header(length)?;
         }
@@ -131,7 +138,18 @@ impl<F: SegmentFile> SegmentScan<F> {
     }
 
     fn failed(&self, source: io::Error) -> SpoolError {
-        SpoolError::Read { stream: self.stream.clone(), source }
+        SpoolError::Read { stream: self.stream.clone(), segment: Some(self.first), source }
+    }
+
+    /// Fills the rest of a block that cannot be read, from `filled` on in the window, with bytes
+    /// that are no record: an unreadable sector costs its records, and blocks nothing.
+    fn fill_unreadable(&mut self, filled: usize) -> usize {
+        let at = self.window_at + filled as u64;
+        let end = (at + 1).next_multiple_of(BLOCK).min(self.length.max(at + 1));
+        let rest = &mut self.window[filled..];
+        let count = rest.len().min((end - at) as usize);
+        rest[..count].fill(0xff);
+        count
     }
 
     fn bytes(&mut self, at: u64, len: usize) -> io::Result<&[u8]> {
@@ -145,6 +163,9 @@ impl<F: SegmentFile> SegmentScan<F> {
                     Ok(0) => break,
                     Ok(read) => filled += read,
                     Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                    Err(error) if is_unreadable(&error) => {
+                        filled += self.fill_unreadable(filled);
+                    }
                     Err(error) => {
                         self.window.clear();
                         return Err(error);
@@ -156,4 +177,8 @@ impl<F: SegmentFile> SegmentScan<F> {
         let from = (at - self.window_at) as usize;
         self.window.get(from..from + len).ok_or_else(|| io::ErrorKind::UnexpectedEof.into())
     }
+}
+
+fn is_unreadable(error: &io::Error) -> bool {
+    error.raw_os_error() == Some(rustix::io::Errno::IO.raw_os_error())
 }

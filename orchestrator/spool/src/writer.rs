@@ -132,7 +132,8 @@ impl<S: SpoolStorage> SpoolWriter<S> {
     /// for a stream of another version; [`SpoolError::Read`] if it cannot be read or made durable.
     pub fn with_storage(storage: S, config: SpoolConfig) -> Result<SpoolWriter<S>, SpoolError> {
         check(&config)?;
-        let failed = |source| SpoolError::Read { stream: config.stream.clone(), source };
+        let stream = || config.stream.clone();
+        let failed = |source| SpoolError::Read { stream: stream(), segment: None, source };
         let listed = storage.list().map_err(failed)?;
         let last = listed.last().copied();
         let segment = |(first, bytes)| Segment { first, bytes, removed_by: None };
@@ -158,7 +159,8 @@ impl<S: SpoolStorage> SpoolWriter<S> {
     /// Finds the next number in the last segment, and marks its torn tail.
     fn recover(&mut self, first: u64) -> Result<(), SpoolError> {
         let stream = self.config.stream.clone();
-        let failed = |source| SpoolError::Read { stream: stream.clone(), source };
+        let (segment, name) = (Some(first), &stream);
+        let failed = |source| SpoolError::Read { stream: name.clone(), segment, source };
         let file = self.storage.open(first).map_err(failed)?;
         let mut scan = SegmentScan::new(file, &stream, first);
         self.next = first;

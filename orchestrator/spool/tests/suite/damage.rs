@@ -1,14 +1,15 @@
 //! Bytes of the last segment are changed, cut off or added; segments go missing.
 
 use std::collections::BTreeMap;
+use std::io::ErrorKind::Other;
 
-use gleaner_base::ByteSize;
+use gleaner_base::{ByteSize, Explain};
 use gleaner_spool::{
     BUDGET_MIN, GapReason, SpoolGap, SpoolItem, SpoolReader, SpoolStorage, SpoolWriter,
 };
 
 use crate::model::{KIND, STREAM, TIME, config, items, records};
-use crate::simulated::SimulatedDisk;
+use crate::simulated::{DiskFault, SimulatedDisk};
 
 const RECORDS: u64 = 40;
 
@@ -145,4 +146,58 @@ fn a_record_in_the_payload_of_another_is_not_taken_for_one_behind_damage() {
     disk.with_content(0, |content| content[128 + copy.len()] ^= 1);
     let kept: Vec<u64> = records(&items(disk)).into_keys().collect();
     assert_eq!(kept, [0, 2, 3]);
+}
+
+#[test]
+fn an_unreadable_sector_anywhere_costs_its_records_and_blocks_nothing() {
+    const BLOCK: u64 = 4096;
+    let large = || config(ByteSize::mib(1));
+    // Of the last segment, and of one before it.
+    for last in [true, false] {
+        for sector in 0..12 {
+            let disk = SimulatedDisk::new(3);
+            let mut writer = SpoolWriter::with_storage(disk.clone(), large()).unwrap();
+            for seq in 0..60_u64 {
+                writer.append(KIND, TIME, &[seq as u8; 710]).unwrap();
+                writer.commit().unwrap();
+            }
+            if !last {
+                writer = SpoolWriter::with_storage(disk.clone(), large()).unwrap();
+                writer.append(KIND, TIME, b"another segment").unwrap();
+                writer.commit().unwrap();
+            }
+            let next = writer.status().next;
+            disk.set_unreadable(0, sector * BLOCK..(sector + 1) * BLOCK);
+            let found = items(disk.clone());
+            let lost = next as usize - records(&found).len();
+            if sector == 0 {
+                assert_eq!(lost, 60, "without the header, nothing can be trusted");
+            } else {
+                assert!((1..=7).contains(&lost), "sector {sector}: {lost} records lost");
+            }
+            let writer = SpoolWriter::with_storage(disk.clone(), large()).unwrap();
+            assert!(writer.status().next >= next, "sector {sector}");
+        }
+    }
+}
+
+#[test]
+fn a_segment_that_cannot_be_opened_is_named_by_the_error() {
+    let disk = SimulatedDisk::new(3);
+    let mut writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
+    writer.append(KIND, TIME, b"one").unwrap();
+    writer.commit().unwrap();
+    let fault = |after| DiskFault { from: disk.operations() + after, count: 1, kind: Other };
+    let mut reader = SpoolReader::with_storage(disk.clone(), STREAM, None);
+    disk.set_fault(Some(fault(2)));
+    let error = reader.next().unwrap().unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "cannot read segment `00000000000000000000.seg` of stream `logs`"
+    );
+    assert!(error.help().unwrap().contains("remove it if it is not a segment"));
+    disk.set_fault(Some(fault(1)));
+    let error = reader.next().unwrap().unwrap_err();
+    assert_eq!(error.to_string(), "cannot read the spool of stream `logs`");
+    assert!(matches!(reader.next(), Some(Ok(SpoolItem::Record(_)))));
 }

@@ -3,6 +3,7 @@
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::io;
+use std::ops::Range;
 use std::rc::Rc;
 
 use gleaner_spool::{SegmentFile, SpoolStorage};
@@ -49,6 +50,8 @@ struct Disk {
     random: SpoolRandom,
     operations: u64,
     fault: Option<DiskFault>,
+    /// Segment, and range of its bytes, whose reads fail with `EIO`.
+    unreadable: Option<(u64, Range<u64>)>,
 }
 
 #[derive(Clone)]
@@ -75,11 +78,17 @@ impl SimulatedDisk {
             random: SpoolRandom(seed),
             operations: 0,
             fault: None,
+            unreadable: None,
         })))
     }
 
     pub fn set_fault(&self, fault: Option<DiskFault>) {
         self.0.borrow_mut().fault = fault;
+    }
+
+    /// Lets reads fail that begin in `range` of segment `first`. Others end before it.
+    pub fn set_unreadable(&self, first: u64, range: Range<u64>) {
+        self.0.borrow_mut().unreadable = Some((first, range));
     }
 
     pub fn operations(&self) -> u64 {
@@ -197,6 +206,18 @@ impl SegmentFile for SimulatedFile {
         self.disk.operation(false)?;
         let disk = self.disk.0.borrow();
         let content = &disk.inodes[self.inode].content;
+        let mut end = content.len();
+        if let Some((first, range)) = &disk.unreadable
+            && disk.names.get(first) == Some(&self.inode)
+        {
+            if range.contains(&offset) {
+                return Err(io::Error::from_raw_os_error(rustix::io::Errno::IO.raw_os_error()));
+            }
+            if offset < range.start {
+                end = end.min(range.start as usize);
+            }
+        }
+        let content = &content[..end];
         let rest = content.get(offset as usize..).unwrap_or_default();
         let read = rest.len().min(into.len());
         into[..read].copy_from_slice(&rest[..read]);
