@@ -106,6 +106,8 @@ struct ActiveSegment<F> {
     file: F,
     salt: u64,
     bytes: u64,
+    /// Number after its last record.
+    end: u64,
     /// Set once the name of the file is durable.
     named: bool,
 }
@@ -310,7 +312,10 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             let room = |active: &ActiveSegment<_>| {
                 usize::try_from(segment_max.saturating_sub(active.bytes)).unwrap_or(usize::MAX)
             };
-            let Some(active) = self.active.as_mut().filter(|active| len <= room(active)) else {
+            // Refused numbers begin a segment, so that its name has the number after them: a writer
+            // that finds damaged bytes counts a number for each 40 of them, and no more.
+            let fits = |active: &&mut ActiveSegment<_>| len <= room(active) && first == active.end;
+            let Some(active) = self.active.as_mut().filter(fits) else {
                 self.begin_segment(first)?;
                 continue;
             };
@@ -326,7 +331,7 @@ impl<S: SpoolStorage> SpoolWriter<S> {
                 active.named = true;
             }
             let (records, end) = (group.records, group.end);
-            self.durable = end;
+            (active.end, self.durable) = (end, end);
             self.queue.remove(records);
             self.remove_marked();
         }
@@ -342,7 +347,7 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         let bytes = HEADER_LEN as u64;
         self.segments.push_back(Segment { first, bytes, removed_by: None });
         let salt = RandomState::new().build_hasher().finish();
-        let mut active = ActiveSegment { file, salt, bytes, named: false };
+        let mut active = ActiveSegment { file, salt, bytes, end: first, named: false };
         let (stream, boot) = (self.config.stream.clone(), self.config.boot);
         active.file.append(&SegmentHeader { stream, boot, first, salt }.to_bytes())?;
         self.active = Some(active);
@@ -351,9 +356,10 @@ impl<S: SpoolStorage> SpoolWriter<S> {
     }
 
     /// Marks the oldest segments for removal until there is room for two more segments: the active
-    /// one, and the next one, which is written before its own gap record is durable.
+    /// one, and the next one, which is written before its own gap record is durable; and for a
+    /// block with a gap record for refused numbers.
     fn make_room(&mut self) {
-        let room = self.config.budget.bytes().saturating_sub(2 * self.segment_max());
+        let room = self.config.budget.bytes().saturating_sub(2 * self.segment_max() + BLOCK);
         let older = self.segments.len() - 1;
         let kept = |segment: &&Segment| segment.removed_by.is_none();
         let mut bytes: u64 =

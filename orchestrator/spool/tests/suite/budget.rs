@@ -6,7 +6,7 @@ use gleaner_spool::{
 };
 
 use crate::model::{KIND, STREAM, TIME, config, items, records};
-use crate::simulated::SimulatedDisk;
+use crate::simulated::{SimulatedDisk, SpoolRandom};
 
 fn writer(disk: &SimulatedDisk) -> SpoolWriter<SimulatedDisk> {
     SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap()
@@ -68,6 +68,24 @@ fn a_full_queue_refuses_records_and_marks_them() {
     assert_eq!(gaps(&disk), [SpoolGap { from, to, reason: GapReason::QueueFull, record }]);
     assert_eq!(records(&items(disk)).len() as u64, 101 - refused);
     assert_eq!(writer.status().refused, refused);
+}
+
+#[test]
+fn refused_records_keep_the_stream_within_its_budget() {
+    let disk = SimulatedDisk::new(1);
+    let mut writer = writer(&disk);
+    let mut random = SpoolRandom(4);
+    let mut gaps_seen = 0;
+    for _ in 0..600 {
+        for _ in 0..random.below(80) {
+            drop(writer.append(KIND, TIME, &[7; 100]));
+        }
+        writer.commit().unwrap();
+        assert!(writer.status().disk_bytes <= BUDGET_MIN.bytes(), "{:?}", writer.status());
+        gaps_seen += u64::from(writer.status().refused > 0);
+    }
+    assert!(gaps_seen > 500 && writer.status().removed > 0);
+    records(&items(disk));
 }
 
 #[test]

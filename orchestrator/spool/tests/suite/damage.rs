@@ -88,6 +88,32 @@ fn a_flipped_bit_at_any_offset_is_detected_and_costs_one_record() {
 }
 
 #[test]
+fn a_flipped_bit_uses_no_number_twice_after_refused_records() {
+    for bit in [0, 7] {
+        let disk = SimulatedDisk::new(3);
+        let mut writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
+        // Records before the refused ones, and behind them.
+        for count in [3, 1000, 2, 500, 4] {
+            for _ in 0..count {
+                drop(writer.append(KIND, TIME, b"a record of some bytes"));
+            }
+            writer.commit().unwrap();
+        }
+        let (next, refused) = (writer.status().next, writer.status().refused);
+        assert!(refused > 1000, "{refused} refused");
+        let last = *disk.firsts().last().unwrap();
+        let before = disk.with_content(last, |content| content.clone());
+        for at in 0..before.len() {
+            disk.with_content(last, |content| content[at] ^= 1 << bit);
+            records(&items(disk.clone()));
+            let writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
+            assert!(writer.status().next >= next, "byte {at}: {}", writer.status().next);
+            disk.with_content(last, |content| content.clone_from(&before));
+        }
+    }
+}
+
+#[test]
 fn a_segment_cut_off_at_any_offset_keeps_what_is_before() {
     with_change(|content, at| content.truncate(at));
 }
