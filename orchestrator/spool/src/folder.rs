@@ -127,6 +127,15 @@ impl SpoolStorage for SpoolFolder {
         Ok(found)
     }
 
+    fn names(&self) -> io::Result<Vec<u64>> {
+        let mut found = Vec::new();
+        for entry in fs::read_dir(&self.path)? {
+            found.extend(entry?.file_name().to_str().and_then(first_of));
+        }
+        found.sort_unstable();
+        Ok(found)
+    }
+
     fn create(&self, first: u64) -> io::Result<File> {
         safe_file::create(&self.segment(first))
     }

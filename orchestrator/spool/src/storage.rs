@@ -14,6 +14,16 @@ pub trait SpoolStorage {
     /// Those of the file system, and anything that is not a plain file under the name of a segment.
     fn list(&self) -> io::Result<Vec<(u64, u64)>>;
 
+    /// Lists the first sequence numbers of all segments, in ascending order, for readers. Unlike
+    /// [`list`](Self::list), it need not look at each file.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn names(&self) -> io::Result<Vec<u64>> {
+        Ok(self.list()?.into_iter().map(|(first, _)| first).collect())
+    }
+
     /// Creates a segment, in place of any of the same name.
     ///
     /// # Errors

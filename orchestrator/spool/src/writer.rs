@@ -23,6 +23,9 @@ pub const BUDGET_MIN: ByteSize = ByteSize::kib(64);
 /// Space that a file system takes for a file, at least: a segment counts as a multiple of it.
 const BLOCK: u64 = 4096;
 
+/// Maximum number of segments: bounds the time to list a folder of short ones.
+const SEGMENTS_MAX: usize = 4096;
+
 /// The settings of a stream.
 #[derive(Debug, Clone)]
 pub struct SpoolConfig {
@@ -367,7 +370,7 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         let (from, mut to) = (self.segments.iter().position(|segment| kept(&segment)), None);
         let from = from.unwrap_or(older);
         for index in from..older {
-            if bytes <= room {
+            if bytes <= room && older - index < SEGMENTS_MAX {
                 break;
             }
             bytes -= self.segments[index].disk_bytes();

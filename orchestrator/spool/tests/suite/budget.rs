@@ -2,7 +2,7 @@
 
 use gleaner_base::ByteSize;
 use gleaner_spool::{
-    BUDGET_MIN, GapReason, SpoolError, SpoolGap, SpoolItem, SpoolReader, SpoolWriter,
+    BUDGET_MIN, GapReason, SpoolError, SpoolGap, SpoolItem, SpoolReader, SpoolStorage, SpoolWriter,
 };
 
 use crate::model::{KIND, STREAM, TIME, config, items, records};
@@ -86,6 +86,23 @@ fn refused_records_keep_the_stream_within_its_budget() {
     }
     assert!(gaps_seen > 500 && writer.status().removed > 0);
     records(&items(disk));
+}
+
+#[test]
+fn the_number_of_segments_is_bounded() {
+    let disk = SimulatedDisk::new(1);
+    let open = || SpoolWriter::with_storage(disk.clone(), config(ByteSize::gib(1))).unwrap();
+    // Segments of earlier writers, such as those of a program that crashes again and again.
+    for seq in 0..6000 {
+        drop(disk.create(seq).unwrap());
+    }
+    let mut writer = open();
+    for _ in 0..2 {
+        writer.append(KIND, TIME, b"x").unwrap();
+        writer.commit().unwrap();
+    }
+    assert_eq!(disk.firsts().len(), 4096);
+    assert!(gaps(&disk).iter().any(|gap| gap.reason == GapReason::Budget));
 }
 
 #[test]

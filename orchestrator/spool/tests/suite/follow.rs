@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 
+use gleaner_base::ByteSize;
 use gleaner_spool::{
     BUDGET_MIN, GapReason, SpoolItem, SpoolReader, SpoolStorage, SpoolWriter, TornTail,
 };
@@ -79,6 +80,21 @@ fn a_segment_replaced_on_the_disk_is_opened_again() {
     // Removed, not replaced: the reader waits for the next segment.
     fs::remove_file(&path).unwrap();
     assert_eq!(numbers(&mut reader), (vec![], None));
+}
+
+#[test]
+fn reading_lists_the_folder_a_few_times_for_any_number_of_segments() {
+    let disk = SimulatedDisk::new(1);
+    for _ in 0..300 {
+        let config = config(ByteSize::mib(8));
+        let mut writer = SpoolWriter::with_storage(disk.clone(), config).unwrap();
+        writer.append(KIND, TIME, b"one of few").unwrap();
+        writer.commit().unwrap();
+    }
+    let before = disk.lists();
+    let mut reader = SpoolReader::with_storage(disk.clone(), STREAM, None);
+    assert_eq!(numbers(&mut reader).0.len(), 300);
+    assert!(disk.lists() - before <= 3, "{} lists", disk.lists() - before);
 }
 
 /// The first number of the oldest segment in `folder`.

@@ -49,6 +49,7 @@ struct Disk {
     durable_names: BTreeMap<u64, usize>,
     random: SpoolRandom,
     operations: u64,
+    lists: u64,
     fault: Option<DiskFault>,
     /// Segment, and range of its bytes, whose reads fail with `EIO`.
     unreadable: Option<(u64, Range<u64>)>,
@@ -77,6 +78,7 @@ impl SimulatedDisk {
             durable_names: BTreeMap::new(),
             random: SpoolRandom(seed),
             operations: 0,
+            lists: 0,
             fault: None,
             unreadable: None,
         })))
@@ -93,6 +95,11 @@ impl SimulatedDisk {
 
     pub fn operations(&self) -> u64 {
         self.0.borrow().operations
+    }
+
+    /// Number of times that the names were listed.
+    pub fn lists(&self) -> u64 {
+        self.0.borrow().lists
     }
 
     /// Content of the segment `first`, for changes.
@@ -158,6 +165,7 @@ impl SpoolStorage for SimulatedDisk {
 
     fn list(&self) -> io::Result<Vec<(u64, u64)>> {
         self.operation(false)?;
+        self.0.borrow_mut().lists += 1;
         let disk = self.0.borrow();
         let length = |inode: &usize| disk.inodes[*inode].content.len() as u64;
         Ok(disk.names.iter().map(|(first, inode)| (*first, length(inode))).collect())
