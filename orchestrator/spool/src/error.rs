@@ -134,6 +134,9 @@ impl Explain for SpoolError {
             SpoolError::Write { source, .. } if is_full(source) => {
                 "free space on the disk, or lower the budgets".to_owned()
             }
+            SpoolError::Write { source, .. } if source.kind() == io::ErrorKind::NotFound => {
+                "start the writer again: its folder, or files in it, were removed".to_owned()
+            }
             SpoolError::Write { .. } => "check the disk".to_owned(),
             SpoolError::TooLong { .. } => "split it, or raise the budget".to_owned(),
             SpoolError::Refused { reason: GapReason::QueueFull, .. } => {

@@ -333,6 +333,9 @@ impl<S: SpoolStorage> SpoolWriter<S> {
                 self.storage.sync_names()?;
                 active.named = true;
             }
+            if !active.file.is_linked()? {
+                return Err(io::Error::new(io::ErrorKind::NotFound, "the segment was removed"));
+            }
             let (records, end) = (group.records, group.end);
             (active.end, self.durable) = (end, end);
             self.queue.remove(records);
