@@ -64,6 +64,14 @@ pub enum SpoolError {
         /// Version of the segment.
         found: u16,
     },
+    /// The last segment has numbers so high that new records might get none.
+    #[error("{} of stream `{stream}` leaves too few numbers", part(Some(*first)))]
+    Numbers {
+        /// Name of the stream.
+        stream: String,
+        /// First sequence number of the segment.
+        first: u64,
+    },
     /// A commit failed: its records are not acknowledged. They stay in the queue.
     #[error("cannot write records {durable} and later of stream `{stream}`")]
     Write {
@@ -129,6 +137,9 @@ impl Explain for SpoolError {
             SpoolError::Read { segment: None, .. } => {
                 "remove what is not a segment, if the cause names it; otherwise check the disk"
                     .to_owned()
+            }
+            SpoolError::Numbers { .. } => {
+                "remove it if it is not a segment; otherwise use another folder".to_owned()
             }
             SpoolError::Version { .. } => "use the gleaner that wrote it".to_owned(),
             SpoolError::Write { source, .. } if is_full(source) => {

@@ -10,7 +10,7 @@ use gleaner_base::ByteSize;
 
 use crate::error::is_full;
 use crate::format::{
-    BootId, GAP_KIND, GapReason, HEAD_LEN, HEADER_LEN, NAME_MAX, PAYLOAD_MAX, SEGMENT_MAX,
+    BootId, GAP_KIND, GapReason, HEAD_LEN, HEADER_LEN, NAME_MAX, PAYLOAD_MAX, SEGMENT_MAX, SEQ_END,
     SegmentHeader, SpoolGap, SpoolTime,
 };
 use crate::queue::RecordQueue;
@@ -134,7 +134,8 @@ impl<S: SpoolStorage> SpoolWriter<S> {
     /// # Errors
     ///
     /// [`SpoolError::Name`] or [`SpoolError::Budget`] for a wrong setting; [`SpoolError::Version`]
-    /// for a stream of another version; [`SpoolError::Read`] if it cannot be read or made durable.
+    /// for a stream of another version; [`SpoolError::Numbers`] if its numbers come to an end;
+    /// [`SpoolError::Read`] if it cannot be read or made durable.
     pub fn with_storage(storage: S, config: SpoolConfig) -> Result<SpoolWriter<S>, SpoolError> {
         check(&config)?;
         let stream = || config.stream.clone();
@@ -157,6 +158,10 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         };
         if let Some((first, _)) = last {
             writer.recover(first)?;
+            // No writer uses up the other half.
+            if writer.next > SEQ_END / 2 {
+                return Err(SpoolError::Numbers { stream: writer.config.stream, first });
+            }
         }
         Ok(writer)
     }

@@ -227,3 +227,24 @@ fn a_segment_that_cannot_be_opened_is_named_by_the_error() {
     assert_eq!(error.to_string(), "cannot read the spool of stream `logs`");
     assert!(matches!(reader.next(), Some(Ok(SpoolItem::Record(_)))));
 }
+
+#[test]
+fn a_segment_that_leaves_too_few_numbers_is_refused_with_its_name() {
+    let open = |disk: &SimulatedDisk| SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN));
+    for first in [(1 << 62) + 1, (1 << 63) - 1] {
+        let disk = SimulatedDisk::new(3);
+        drop(disk.create(first).unwrap());
+        let error = open(&disk).unwrap_err();
+        let name = format!("segment `{first:020}.seg` of stream `logs` leaves too few numbers");
+        assert_eq!(error.to_string(), name);
+        assert!(error.help().unwrap().contains("remove it if it is not a segment"));
+    }
+    // All that a writer accepts can be read.
+    let disk = SimulatedDisk::new(3);
+    drop(disk.create(1 << 62).unwrap());
+    let mut writer = open(&disk).unwrap();
+    writer.append(KIND, TIME, b"one").unwrap();
+    assert_eq!(writer.commit().unwrap(), (1 << 62) + 1);
+    let read = SpoolReader::with_storage(disk, STREAM, None).next();
+    assert!(matches!(read, Some(Ok(SpoolItem::Record(record))) if record.seq == 1 << 62));
+}
