@@ -161,6 +161,10 @@ impl SegmentFile for ReadOnlySegment<'_> {
         Ok(self.0.len() as u64)
     }
 
+    fn is_linked(&self) -> io::Result<bool> {
+        Ok(true)
+    }
+
     fn read_at(&self, into: &mut [u8], offset: u64) -> io::Result<usize> {
         let rest = self.0.get(offset as usize..).unwrap_or_default();
         let read = rest.len().min(into.len());

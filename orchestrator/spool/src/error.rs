@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use gleaner_base::{ByteSize, Exit, Explain};
 
 use crate::GapReason;
-use crate::format::{NAME_MAX, VERSION};
+use crate::format::{NAME_MAX, VERSION, segment_name};
 use crate::writer::BUDGET_MIN;
 
 /// The reason why a spool refuses a record, or cannot be used.
@@ -43,10 +43,12 @@ pub enum SpoolError {
         pid: Option<u32>,
     },
     /// The segments of a stream cannot be read.
-    #[error("cannot read the spool of stream `{stream}`")]
+    #[error("cannot read {} of stream `{stream}`", part(*segment))]
     Read {
         /// Name of the stream.
         stream: String,
+        /// First sequence number of the segment; `None` if the folder cannot be read.
+        segment: Option<u64>,
         /// The cause.
         source: io::Error,
     },
@@ -61,6 +63,14 @@ pub enum SpoolError {
         first: u64,
         /// Version of the segment.
         found: u16,
+    },
+    /// The last segment has numbers so high that new records might get none.
+    #[error("{} of stream `{stream}` leaves too few numbers", part(Some(*first)))]
+    Numbers {
+        /// Name of the stream.
+        stream: String,
+        /// First sequence number of the segment.
+        first: u64,
     },
     /// A commit failed: its records are not acknowledged. They stay in the queue.
     #[error("cannot write records {durable} and later of stream `{stream}`")]
@@ -98,6 +108,11 @@ fn by(pid: Option<u32>) -> String {
     pid.map(|pid| format!(", process {pid}")).unwrap_or_default()
 }
 
+fn part(segment: Option<u64>) -> String {
+    let segment = segment.map(|first| format!("segment `{}`", segment_name(first)));
+    segment.unwrap_or_else(|| "the spool".to_owned())
+}
+
 fn refusal(reason: GapReason) -> &'static str {
     match reason {
         GapReason::DiskFull => "the disk is full, and so is the queue",
@@ -115,12 +130,23 @@ impl Explain for SpoolError {
                 "make it a folder of the user that runs the writer, without links".to_owned()
             }
             SpoolError::Busy { .. } => "end the other writer first".to_owned(),
-            SpoolError::Read { .. } => {
-                "check the disk; remove files that are not segments from the folder".to_owned()
+            SpoolError::Read { segment: Some(_), .. } => {
+                "remove it if it is not a segment; otherwise check its owner and the disk"
+                    .to_owned()
+            }
+            SpoolError::Read { segment: None, .. } => {
+                "remove what is not a segment, if the cause names it; otherwise check the disk"
+                    .to_owned()
+            }
+            SpoolError::Numbers { .. } => {
+                "remove it if it is not a segment; otherwise use another folder".to_owned()
             }
             SpoolError::Version { .. } => "use the gleaner that wrote it".to_owned(),
             SpoolError::Write { source, .. } if is_full(source) => {
                 "free space on the disk, or lower the budgets".to_owned()
+            }
+            SpoolError::Write { source, .. } if source.kind() == io::ErrorKind::NotFound => {
+                "start the writer again: its folder, or files in it, were removed".to_owned()
             }
             SpoolError::Write { .. } => "check the disk".to_owned(),
             SpoolError::TooLong { .. } => "split it, or raise the budget".to_owned(),

@@ -1,21 +1,39 @@
 //! The folder of a stream on a real disk: locked by its writer, plain files only.
 
-use std::fs::{self, File};
+use std::ffi::CStr;
+use std::fs::{self, DirBuilder, File};
 use std::io::{self, Write};
-use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{DirBuilderExt, FileExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
-use gleaner_base::safe_file::{self, UnsafePath};
-use rustix::fs::{FlockOperation, OFlags, flock};
+use gleaner_base::safe_file::UnsafePath;
+use rustix::fs::{
+    AtFlags, Dir, FileType, FlockOperation, Mode, OFlags, Stat, fchmod, flock, fstat, openat,
+    statat, unlinkat,
+};
+use rustix::io::Errno;
 
+use crate::format::segment_name;
 use crate::{SegmentFile, SpoolError, SpoolStorage};
 
-/// The folder of a stream. Its writer holds a lock on it until it is dropped.
+/// Name of the file that a writer locks.
+const LOCK: &str = "writer.lock";
+
+/// Permissions of the files in the folder.
+const MODE: Mode = Mode::RUSR.union(Mode::WUSR);
+
+/// The folder of a stream. Its writer holds a lock in it until it is dropped.
+///
+/// All files are opened relative to the folder that was opened at first, also if it is renamed or
+/// another folder takes its place.
 #[derive(Debug)]
 pub struct SpoolFolder {
+    /// For messages only.
     path: PathBuf,
     folder: File,
     owner: u32,
+    /// The locked file; `None` for a reader.
+    lock: Option<File>,
 }
 
 impl SpoolFolder {
@@ -25,62 +43,132 @@ impl SpoolFolder {
     ///
     /// [`SpoolError::Folder`] if it does not exist, or is not a folder.
     pub fn readable(path: &Path) -> Result<SpoolFolder, SpoolError> {
+        // A slash at the end would lead through a link.
+        let path = path.components().as_path().to_owned();
         let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::NONBLOCK;
         let mut options = File::options();
         options.read(true).custom_flags(flags.bits().cast_signed());
-        let opened = options.open(path).and_then(|folder| {
-            let owner = folder.metadata()?.uid();
-            Ok(SpoolFolder { path: path.to_owned(), folder, owner })
-        });
-        opened.map_err(|source| SpoolError::Folder { path: path.to_owned(), source })
+        let opened = options.open(&path).and_then(|folder| Ok((folder.metadata()?.uid(), folder)));
+        match opened {
+            Ok((owner, folder)) => Ok(SpoolFolder { path, folder, owner, lock: None }),
+            Err(source) => Err(SpoolError::Folder { path, source }),
+        }
     }
 
-    /// Creates the folder `path` if it does not exist, and locks it for a writer.
+    /// Creates the folder `path` if it does not exist, for its user only, and locks it for a
+    /// writer.
     ///
     /// # Errors
     ///
     /// [`SpoolError::Busy`] if another writer has it; [`SpoolError::Folder`] if it is a link,
     /// belongs to another user, or cannot be made durable.
     pub fn locked(path: &Path) -> Result<SpoolFolder, SpoolError> {
+        let path = path.components().as_path();
         let failed = |source| SpoolError::Folder { path: path.to_owned(), source };
-        safe_file::folder(path).map_err(failed)?;
-        let locked = SpoolFolder::readable(path)?;
-        if locked.owner != rustix::process::geteuid().as_raw() {
-            return Err(failed(foreign(locked.owner)));
+        create_folder(path, &sync_folder).map_err(failed)?;
+        let mut folder = SpoolFolder::readable(path)?;
+        if folder.owner != rustix::process::geteuid().as_raw() {
+            return Err(failed(foreign(folder.owner)));
         }
-        match flock(&locked.folder, FlockOperation::NonBlockingLockExclusive) {
-            Err(rustix::io::Errno::WOULDBLOCK) => {
-                let pid = locked.folder.metadata().ok().and_then(|found| holder(found.ino()));
+        // Any user that may read the folder could lock the folder itself, and keep the writer out.
+        let lock = folder.open_file(LOCK, OFlags::RDWR | OFlags::CREATE).map_err(failed)?;
+        fchmod(&lock, MODE).map_err(|error| failed(error.into()))?;
+        match flock(&lock, FlockOperation::NonBlockingLockExclusive) {
+            Err(Errno::WOULDBLOCK) => {
+                let pid = lock.metadata().ok().and_then(|found| holder(found.ino()));
                 return Err(SpoolError::Busy { path: path.to_owned(), pid });
             }
             other => other.map_err(|error| failed(error.into()))?,
         }
-        // The name of the folder must survive a power cut, too.
-        let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
-        let synced = File::open(parent.unwrap_or(Path::new("."))).and_then(|it| it.sync_all());
-        synced.map_err(failed)?;
-        Ok(locked)
+        folder.lock = Some(lock);
+        Ok(folder)
     }
 
-    fn segment(&self, first: u64) -> PathBuf {
-        self.path.join(format!("{first:020}.seg"))
+    /// Opens the file `name`, which must be plain. Neither a link is followed, nor does a pipe
+    /// block.
+    fn open_file(&self, name: &str, flags: OFlags) -> io::Result<File> {
+        let never = OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
+        let opened =
+            openat(&self.folder, name, flags | never, MODE).map_err(|error| match error {
+                Errno::LOOP => self.refusal(name, &UnsafePath::Link),
+                Errno::NXIO | Errno::ISDIR => self.refusal(name, &UnsafePath::NoFile),
+                other => other.into(),
+            })?;
+        let file = File::from(opened);
+        self.must_be_plain(name, &fstat(&file)?)?;
+        Ok(file)
     }
 
     /// Refuses what is not a plain file of the folder's owner with one name.
-    fn must_be_plain(&self, path: &Path, found: &fs::Metadata) -> io::Result<()> {
-        let unsafe_path = match found.file_type() {
-            kind if kind.is_symlink() => Some(UnsafePath::Link),
-            kind if !kind.is_file() => Some(UnsafePath::NoFile),
-            _ if found.nlink() > 1 => Some(UnsafePath::HardLink),
-            _ => None,
-        };
-        let why = match unsafe_path {
-            Some(why) => io::Error::other(why),
-            None if found.uid() != self.owner => foreign(found.uid()),
-            None => return Ok(()),
-        };
-        Err(io::Error::other(format!("`{}` is not a segment: {why}", path.display())))
+    fn must_be_plain(&self, name: &str, found: &Stat) -> io::Result<()> {
+        match FileType::from_raw_mode(found.st_mode) {
+            FileType::Symlink => Err(self.refusal(name, &UnsafePath::Link)),
+            FileType::RegularFile if found.st_nlink > 1 => {
+                Err(self.refusal(name, &UnsafePath::HardLink))
+            }
+            FileType::RegularFile if found.st_uid != self.owner => {
+                Err(self.refusal(name, &foreign(found.st_uid)))
+            }
+            FileType::RegularFile => Ok(()),
+            _ => Err(self.refusal(name, &UnsafePath::NoFile)),
+        }
     }
+
+    fn refusal(&self, name: &str, why: &dyn std::error::Error) -> io::Error {
+        io::Error::other(format!("`{}` cannot be used: {why}", self.path.join(name).display()))
+    }
+
+    /// Calls `found` with the name of each segment and its first number.
+    fn each_segment(&self, mut found: impl FnMut(&CStr, u64) -> io::Result<()>) -> io::Result<()> {
+        for entry in Dir::read_from(&self.folder)? {
+            let entry = entry?;
+            if let Some(first) = entry.file_name().to_str().ok().and_then(first_of) {
+                found(entry.file_name(), first)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Creates the folder `path` for its user only, and its parents. Parents may be links. The parent
+/// of `path`, and of each folder that is created, is made durable with `sync`: otherwise a power
+/// cut could take the folder with all that is in it.
+fn create_folder(path: &Path, sync: &dyn Fn(&Path) -> io::Result<()>) -> io::Result<()> {
+    let existed = !created(path, 0o700, sync)?;
+    let found = fs::symlink_metadata(path)?.file_type();
+    match (found.is_dir(), found.is_symlink()) {
+        // The process that created it may have ended before it synced the parent.
+        (true, _) if existed => sync(parent_of(path)),
+        (true, _) => Ok(()),
+        (_, true) => Err(io::Error::other(UnsafePath::Link)),
+        _ => Err(io::Error::other(UnsafePath::NoFolder)),
+    }
+}
+
+/// Creates the folder `path` and its parents; returns whether it did not exist.
+fn created(path: &Path, mode: u32, sync: &dyn Fn(&Path) -> io::Result<()>) -> io::Result<bool> {
+    let create = || DirBuilder::new().mode(mode).create(path);
+    let mut result = create();
+    if result.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::NotFound)
+        && path.parent().is_some()
+    {
+        created(parent_of(path), 0o777, sync)?;
+        result = create();
+    }
+    match result {
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => return Ok(false),
+        other => other?,
+    }
+    sync(parent_of(path))?;
+    Ok(true)
+}
+
+fn parent_of(path: &Path) -> &Path {
+    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+fn sync_folder(path: &Path) -> io::Result<()> {
+    File::open(path)?.sync_all()
 }
 
 fn foreign(uid: u32) -> io::Error {
@@ -110,35 +198,56 @@ impl SpoolStorage for SpoolFolder {
     type File = File;
 
     fn list(&self) -> io::Result<Vec<(u64, u64)>> {
-        let mut found = Vec::new();
-        for entry in fs::read_dir(&self.path)? {
-            let entry = entry?;
-            let Some(first) = entry.file_name().to_str().and_then(first_of) else { continue };
-            let metadata = match entry.metadata() {
+        let mut listed = Vec::new();
+        self.each_segment(|name, first| {
+            match statat(&self.folder, name, AtFlags::SYMLINK_NOFOLLOW) {
                 // Removed meanwhile.
-                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
-                other => other?,
-            };
-            self.must_be_plain(&entry.path(), &metadata)?;
-            found.push((first, metadata.len()));
-        }
-        found.sort_unstable();
-        Ok(found)
+                Err(Errno::NOENT) => {}
+                found => {
+                    let found = found?;
+                    self.must_be_plain(&segment_name(first), &found)?;
+                    listed.push((first, u64::try_from(found.st_size).unwrap_or(0)));
+                }
+            }
+            Ok(())
+        })?;
+        listed.sort_unstable();
+        Ok(listed)
+    }
+
+    fn names(&self) -> io::Result<Vec<u64>> {
+        let mut names = Vec::new();
+        self.each_segment(|_, first| {
+            names.push(first);
+            Ok(())
+        })?;
+        names.sort_unstable();
+        Ok(names)
     }
 
     fn create(&self, first: u64) -> io::Result<File> {
-        safe_file::create(&self.segment(first))
+        let Some(lock) = &self.lock else {
+            let why = "the folder was opened for reading";
+            return Err(io::Error::new(io::ErrorKind::PermissionDenied, why));
+        };
+        if !lock.is_linked()? {
+            // Another writer may have the stream.
+            return Err(io::Error::new(io::ErrorKind::NotFound, format!("`{LOCK}` was removed")));
+        }
+        match self.remove(first) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
+        let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL;
+        self.open_file(&segment_name(first), flags)
     }
 
     fn open(&self, first: u64) -> io::Result<File> {
-        let path = self.segment(first);
-        let file = safe_file::read(&path)?;
-        self.must_be_plain(&path, &file.metadata()?)?;
-        Ok(file)
+        self.open_file(&segment_name(first), OFlags::RDONLY)
     }
 
     fn remove(&self, first: u64) -> io::Result<()> {
-        fs::remove_file(self.segment(first))
+        Ok(unlinkat(&self.folder, segment_name(first), AtFlags::empty())?)
     }
 
     fn sync_names(&self) -> io::Result<()> {
@@ -151,6 +260,10 @@ impl SegmentFile for File {
         Ok(self.metadata()?.len())
     }
 
+    fn is_linked(&self) -> io::Result<bool> {
+        Ok(self.metadata()?.nlink() > 0)
+    }
+
     fn read_at(&self, into: &mut [u8], offset: u64) -> io::Result<usize> {
         FileExt::read_at(self, into, offset)
     }
@@ -161,5 +274,27 @@ impl SegmentFile for File {
 
     fn sync(&self) -> io::Result<()> {
         self.sync_data()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::RefCell;
+
+    use super::*;
+
+    #[test]
+    fn the_parent_of_each_created_folder_is_made_durable_behind_its_own() {
+        let scratch = tempfile::tempdir().unwrap();
+        let synced = RefCell::new(Vec::new());
+        let sync = |path: &Path| {
+            synced.borrow_mut().push(path.to_owned());
+            sync_folder(path)
+        };
+        let root = scratch.path();
+        create_folder(&root.join("a/b/c"), &sync).unwrap();
+        assert_eq!(synced.take(), [root.to_owned(), root.join("a"), root.join("a/b")]);
+        create_folder(&root.join("a/b/c"), &sync).unwrap();
+        assert_eq!(synced.take(), [root.join("a/b")]);
     }
 }

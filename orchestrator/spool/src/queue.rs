@@ -39,11 +39,12 @@ impl RecordQueue {
         self.records.front().copied()
     }
 
-    /// Returns the oldest records that fit into `room` bytes, sealed for the segment with `salt`.
+    /// Returns the oldest records that fit into `room` bytes and whose numbers are consecutive,
+    /// sealed for the segment with `salt`.
     pub(crate) fn seal_group(&mut self, room: usize, salt: u64) -> SealedGroup<'_> {
         let (mut taken, mut records, mut end) = (0, 0, 0);
         for (seq, len) in &self.records {
-            if taken + len > room {
+            if taken + len > room || (records > 0 && *seq != end) {
                 break;
             }
             seal(&mut self.bytes[taken..], salt);

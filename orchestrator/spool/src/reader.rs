@@ -48,6 +48,9 @@ pub struct SpoolReader<S: SpoolStorage = SpoolFolder> {
     /// The number of the next item; `None` before the first segment was found.
     expected: Option<u64>,
     limit: u64,
+    /// First numbers of the segments, when they were last listed. Listed again only at the end of
+    /// the last one, or if one is missing: a writer changes nothing but that end.
+    names: Vec<u64>,
     current: Option<OpenSegment<S::File>>,
     /// Set if the hole before the next record is due to changed bytes, not to a missing segment.
     damaged: bool,
@@ -87,6 +90,7 @@ impl<S: SpoolStorage> SpoolReader<S> {
             stream: stream.to_owned(),
             expected: from,
             limit: u64::MAX,
+            names: Vec::new(),
             current: None,
             damaged: false,
             reported: None,
@@ -113,8 +117,7 @@ impl<S: SpoolStorage> SpoolReader<S> {
                 continue;
             };
             let end = current.next_first.unwrap_or(u64::MAX);
-            let peeked = current.scan.peek().map_err(|source| self.failed(source))?;
-            let item = match peeked.filter(|head| head.seq < end) {
+            let item = match current.scan.peek()?.filter(|head| head.seq < end) {
                 Some(head) if head.seq < expected => {
                     self.consume(&head);
                     continue;
@@ -131,15 +134,20 @@ impl<S: SpoolStorage> SpoolReader<S> {
     }
 
     /// Returns the last segment that can have the expected number, or the oldest one.
-    fn first_segment(&self) -> Result<Option<u64>, SpoolError> {
-        let listed = self.list()?;
+    fn first_segment(&mut self) -> Result<Option<u64>, SpoolError> {
+        self.list()?;
         let before = |first: &&u64| self.expected.is_some_and(|expected| **first <= expected);
-        Ok(listed.iter().rfind(before).or(listed.first()).copied())
+        Ok(self.names.iter().rfind(before).or(self.names.first()).copied())
     }
 
-    fn list(&self) -> Result<Vec<u64>, SpoolError> {
-        let listed = self.storage.list().map_err(|source| self.failed(source))?;
-        Ok(listed.into_iter().map(|(first, _)| first).collect())
+    fn list(&mut self) -> Result<(), SpoolError> {
+        self.names = self.storage.names().map_err(|source| self.failed(None, source))?;
+        Ok(())
+    }
+
+    /// Returns the segment after segment `first`, as last listed.
+    fn next_segment(&self, first: u64) -> Option<u64> {
+        self.names.get(self.names.partition_point(|other| *other <= first)).copied()
     }
 
     fn enter(&mut self, first: u64) -> Result<(), SpoolError> {
@@ -150,12 +158,10 @@ impl<S: SpoolStorage> SpoolReader<S> {
                 self.current = None;
                 return Ok(());
             }
-            other => other.map_err(|source| self.failed(source))?,
+            other => other.map_err(|source| self.failed(Some(first), source))?,
         };
-        let scan = SegmentScan::open(file, &self.stream, first)
-            .map_err(|source| self.failed(source))?
-            .map_err(|found| SpoolError::Version { stream: self.stream.clone(), first, found })?;
-        let next_first = self.list()?.into_iter().find(|other| *other > first);
+        let scan = SegmentScan::new(file, &self.stream, first);
+        let next_first = self.next_segment(first);
         self.current = Some(OpenSegment { scan, first, next_first });
         Ok(())
     }
@@ -165,8 +171,7 @@ impl<S: SpoolStorage> SpoolReader<S> {
         let current = self.current.as_mut().expect("the caller peeked into it");
         let damaged = self.damaged || current.scan.damaged;
         let boot = current.scan.header.as_ref().expect("it has records").boot;
-        let payload = current.scan.payload().map(<[u8]>::to_vec);
-        let payload = payload.map_err(|source| self.failed(source))?;
+        let payload = current.scan.payload()?;
         let noted = SpoolGap::parse(&payload, head.seq).filter(|_| head.kind == GAP_KIND);
         // A gap record that follows its gap explains the hole before it.
         let hole_end = match &noted {
@@ -200,27 +205,34 @@ impl<S: SpoolStorage> SpoolReader<S> {
     /// Goes to the next segment if there is one. The current one is searched once more after its
     /// successor appeared, for what was written in between.
     fn segment_end(&mut self, expected: u64) -> Result<SegmentEnd, SpoolError> {
-        let listed = self.list()?;
-        let current = self.current.as_mut().expect("the caller peeked into it");
-        let next = listed.into_iter().find(|first| *first > current.first);
-        let known = std::mem::replace(&mut current.next_first, next);
-        match next {
-            Some(next) if known == Some(next) => {
-                self.damaged |= current.scan.torn > 0 || current.scan.damaged;
-                self.enter(next)?;
-                Ok(SegmentEnd::Continue)
-            }
-            None if known.is_none() => {
-                let torn = TornTail { from: expected, bytes: current.scan.torn };
-                let is_new = torn.bytes > 0 && self.reported != Some(torn);
-                Ok(SegmentEnd::Stream(is_new.then(|| *self.reported.insert(torn))))
-            }
-            _ => Ok(SegmentEnd::Continue),
+        let current = self.current.as_ref().expect("the caller peeked into it");
+        if let Some(next) = current.next_first {
+            self.damaged |= current.scan.torn > 0 || current.scan.damaged;
+            self.enter(next)?;
+            return Ok(SegmentEnd::Continue);
         }
+        // Only the last segment may be replaced by another file of its name, so the order is: list,
+        // and then look whether it was.
+        let first = current.first;
+        self.list()?;
+        let next = self.next_segment(first);
+        let is_listed = self.names.binary_search(&first).is_ok();
+        let current = self.current.as_mut().expect("the caller peeked into it");
+        if is_listed && !current.scan.is_linked()? {
+            self.enter(first)?;
+            return Ok(SegmentEnd::Continue);
+        }
+        current.next_first = next;
+        if next.is_some() {
+            return Ok(SegmentEnd::Continue);
+        }
+        let torn = TornTail { from: expected, bytes: current.scan.torn };
+        let is_new = torn.bytes > 0 && self.reported != Some(torn);
+        Ok(SegmentEnd::Stream(is_new.then(|| *self.reported.insert(torn))))
     }
 
-    fn failed(&self, source: io::Error) -> SpoolError {
-        SpoolError::Read { stream: self.stream.clone(), source }
+    fn failed(&self, segment: Option<u64>, source: io::Error) -> SpoolError {
+        SpoolError::Read { stream: self.stream.clone(), segment, source }
     }
 }
 

@@ -2,16 +2,22 @@
 
 use std::io;
 
-use crate::SegmentFile;
 use crate::format::{HEAD_LEN, HEADER_LEN, HeaderFault, RecordHead, SEGMENT_MAX, SegmentHeader};
+use crate::{SegmentFile, SpoolError};
 
 /// Bytes that are read at once.
 const WINDOW: usize = 16 << 10;
 
+/// Bytes that a disk cannot read if it cannot read one of them: a page of the kernel's cache.
+const BLOCK: u64 = 4096;
+
 /// A position in a segment.
 pub(crate) struct SegmentScan<F> {
     file: F,
-    /// `None` if the header is not that of the expected segment: no record can be trusted then.
+    stream: String,
+    first: u64,
+    /// `None` if the header is not that of the expected segment, or not yet: no record can be
+    /// trusted then.
     pub(crate) header: Option<SegmentHeader>,
     /// Offset of the record that [`peek`](Self::peek) found.
     at: u64,
@@ -25,34 +31,32 @@ pub(crate) struct SegmentScan<F> {
     pub(crate) torn: u64,
     window: Vec<u8>,
     window_at: u64,
+    /// Length of the file when it was last looked at.
+    length: u64,
 }
 
 impl<F: SegmentFile> SegmentScan<F> {
-    /// Opens the segment of `stream` that begins with number `first`. The inner error is the
-    /// version of a segment in another format.
-    pub(crate) fn open(file: F, stream: &str, first: u64) -> io::Result<Result<Self, u16>> {
-        let (at, least) = (HEADER_LEN as u64, first);
-        let mut scan = SegmentScan {
+    /// Reads the segment `file` of `stream` that begins with number `first`.
+    pub(crate) fn new(file: F, stream: &str, first: u64) -> Self {
+        SegmentScan {
             file,
+            stream: stream.to_owned(),
+            first,
             header: None,
-            at,
+            at: HEADER_LEN as u64,
             len: 0,
-            least,
+            least: first,
             damaged: false,
             torn: 0,
             window: Vec::new(),
             window_at: 0,
-        };
-        if scan.file.length()? >= HEADER_LEN as u64 {
-            match SegmentHeader::parse(scan.bytes(0, HEADER_LEN)?) {
-                Ok(header) if header.stream == stream && header.first == first => {
-                    scan.header = Some(header);
-                }
-                Err(HeaderFault::Version(found)) => return Ok(Err(found)),
-                _ => {}
-            }
+            length: 0,
         }
-        Ok(Ok(scan))
+    }
+
+    /// Returns whether the segment still has a name: it was neither removed nor replaced.
+    pub(crate) fn is_linked(&self) -> Result<bool, SpoolError> {
+        self.file.is_linked().map_err(|source| self.failed(source))
     }
 
     /// Makes the content durable.
@@ -62,8 +66,35 @@ impl<F: SegmentFile> SegmentScan<F> {
 
     /// Finds the next valid record without consuming it; `None` at the end. The segment may grow
     /// meanwhile.
-    pub(crate) fn peek(&mut self) -> io::Result<Option<RecordHead>> {
-        let length = self.file.length()?;
+    pub(crate) fn peek(&mut self) -> Result<Option<RecordHead>, SpoolError> {
+        self.length = self.file.length().map_err(|source| self.failed(source))?;
+        let length = self.length;
+        if self.header.is_none() {
+            self.find_header(length)?;
+        }
+        self.find_record(length).map_err(|source| self.failed(source))
+    }
+
+    /// Parses the header, which its writer may not have written yet.
+    fn find_header(&mut self, length: u64) -> Result<(), SpoolError> {
+        if length < HEADER_LEN as u64 {
+            return Ok(());
+        }
+        let header = self.bytes(0, HEADER_LEN).map(SegmentHeader::parse);
+        match header.map_err(|source| self.failed(source))? {
+            Ok(header) if header.stream == self.stream && header.first == self.first => {
+                self.header = Some(header);
+            }
+            Err(HeaderFault::Version(found)) => {
+                let (stream, first) = (self.stream.clone(), self.first);
+                return Err(SpoolError::Version { stream, first, found });
+            }
+            _ => self.window.clear(),
+        }
+        Ok(())
+    }
+
+    fn find_record(&mut self, length: u64) -> io::Result<Option<RecordHead>> {
         let end = length.min(SEGMENT_MAX);
         let Some(salt) = self.header.as_ref().map(|header| header.salt) else {
             self.torn = length;
@@ -93,9 +124,10 @@ impl<F: SegmentFile> SegmentScan<F> {
     }
 
     /// Payload of the record that [`peek`](Self::peek) found.
-    pub(crate) fn payload(&mut self) -> io::Result<&[u8]> {
+    pub(crate) fn payload(&mut self) -> Result<Vec<u8>, SpoolError> {
         let (at, len) = (self.at, self.len);
-        Ok(&self.bytes(at, len)?[HEAD_LEN..])
+        let payload = self.bytes(at, len).map(|bytes| bytes[HEAD_LEN..].to_vec());
+        payload.map_err(|source| self.failed(source))
     }
 
     /// Consumes the record `head` that [`peek`](Self::peek) found.
@@ -103,6 +135,21 @@ impl<F: SegmentFile> SegmentScan<F> {
         self.at += self.len as u64;
         self.least = head.seq + 1;
         self.damaged = false;
+    }
+
+    fn failed(&self, source: io::Error) -> SpoolError {
+        SpoolError::Read { stream: self.stream.clone(), segment: Some(self.first), source }
+    }
+
+    /// Fills the rest of a block that cannot be read, from `filled` on in the window, with bytes
+    /// that are no record: an unreadable sector costs its records, and blocks nothing.
+    fn fill_unreadable(&mut self, filled: usize) -> usize {
+        let at = self.window_at + filled as u64;
+        let end = (at + 1).next_multiple_of(BLOCK).min(self.length.max(at + 1));
+        let rest = &mut self.window[filled..];
+        let count = rest.len().min((end - at) as usize);
+        rest[..count].fill(0xff);
+        count
     }
 
     fn bytes(&mut self, at: u64, len: usize) -> io::Result<&[u8]> {
@@ -116,6 +163,9 @@ impl<F: SegmentFile> SegmentScan<F> {
                     Ok(0) => break,
                     Ok(read) => filled += read,
                     Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                    Err(error) if is_unreadable(&error) => {
+                        filled += self.fill_unreadable(filled);
+                    }
                     Err(error) => {
                         self.window.clear();
                         return Err(error);
@@ -127,4 +177,8 @@ impl<F: SegmentFile> SegmentScan<F> {
         let from = (at - self.window_at) as usize;
         self.window.get(from..from + len).ok_or_else(|| io::ErrorKind::UnexpectedEof.into())
     }
+}
+
+fn is_unreadable(error: &io::Error) -> bool {
+    error.raw_os_error() == Some(rustix::io::Errno::IO.raw_os_error())
 }

@@ -14,6 +14,16 @@ pub trait SpoolStorage {
     /// Those of the file system, and anything that is not a plain file under the name of a segment.
     fn list(&self) -> io::Result<Vec<(u64, u64)>>;
 
+    /// Lists the first sequence numbers of all segments, in ascending order, for readers. Unlike
+    /// [`list`](Self::list), it need not look at each file.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn names(&self) -> io::Result<Vec<u64>> {
+        Ok(self.list()?.into_iter().map(|(first, _)| first).collect())
+    }
+
     /// Creates a segment, in place of any of the same name.
     ///
     /// # Errors
@@ -51,6 +61,13 @@ pub trait SegmentFile {
     ///
     /// Those of the file system.
     fn length(&self) -> io::Result<u64>;
+
+    /// Returns whether the file still has a name: it was neither removed nor replaced.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn is_linked(&self) -> io::Result<bool>;
 
     /// Reads at `offset` as [`std::os::unix::fs::FileExt::read_at`] does; 0 bytes are the end.
     ///

@@ -10,7 +10,7 @@ use gleaner_base::ByteSize;
 
 use crate::error::is_full;
 use crate::format::{
-    BootId, GAP_KIND, GapReason, HEAD_LEN, HEADER_LEN, NAME_MAX, PAYLOAD_MAX, SEGMENT_MAX,
+    BootId, GAP_KIND, GapReason, HEAD_LEN, HEADER_LEN, NAME_MAX, PAYLOAD_MAX, SEGMENT_MAX, SEQ_END,
     SegmentHeader, SpoolGap, SpoolTime,
 };
 use crate::queue::RecordQueue;
@@ -22,6 +22,9 @@ pub const BUDGET_MIN: ByteSize = ByteSize::kib(64);
 
 /// Space that a file system takes for a file, at least: a segment counts as a multiple of it.
 const BLOCK: u64 = 4096;
+
+/// Maximum number of segments: bounds the time to list a folder of short ones.
+const SEGMENTS_MAX: usize = 4096;
 
 /// The settings of a stream.
 #[derive(Debug, Clone)]
@@ -106,6 +109,8 @@ struct ActiveSegment<F> {
     file: F,
     salt: u64,
     bytes: u64,
+    /// Number after its last record.
+    end: u64,
     /// Set once the name of the file is durable.
     named: bool,
 }
@@ -129,10 +134,12 @@ impl<S: SpoolStorage> SpoolWriter<S> {
     /// # Errors
     ///
     /// [`SpoolError::Name`] or [`SpoolError::Budget`] for a wrong setting; [`SpoolError::Version`]
-    /// for a stream of another version; [`SpoolError::Read`] if it cannot be read or made durable.
+    /// for a stream of another version; [`SpoolError::Numbers`] if its numbers come to an end;
+    /// [`SpoolError::Read`] if it cannot be read or made durable.
     pub fn with_storage(storage: S, config: SpoolConfig) -> Result<SpoolWriter<S>, SpoolError> {
         check(&config)?;
-        let failed = |source| SpoolError::Read { stream: config.stream.clone(), source };
+        let stream = || config.stream.clone();
+        let failed = |source| SpoolError::Read { stream: stream(), segment: None, source };
         let listed = storage.list().map_err(failed)?;
         let last = listed.last().copied();
         let segment = |(first, bytes)| Segment { first, bytes, removed_by: None };
@@ -151,6 +158,10 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         };
         if let Some((first, _)) = last {
             writer.recover(first)?;
+            // No writer uses up the other half.
+            if writer.next > SEQ_END / 2 {
+                return Err(SpoolError::Numbers { stream: writer.config.stream, first });
+            }
         }
         Ok(writer)
     }
@@ -158,13 +169,12 @@ impl<S: SpoolStorage> SpoolWriter<S> {
     /// Finds the next number in the last segment, and marks its torn tail.
     fn recover(&mut self, first: u64) -> Result<(), SpoolError> {
         let stream = self.config.stream.clone();
-        let failed = |source| SpoolError::Read { stream: stream.clone(), source };
+        let (segment, name) = (Some(first), &stream);
+        let failed = |source| SpoolError::Read { stream: name.clone(), segment, source };
         let file = self.storage.open(first).map_err(failed)?;
-        let mut scan = SegmentScan::open(file, &stream, first)
-            .map_err(failed)?
-            .map_err(|found| SpoolError::Version { stream: stream.clone(), first, found })?;
+        let mut scan = SegmentScan::new(file, &stream, first);
         self.next = first;
-        while let Some(head) = scan.peek().map_err(failed)? {
+        while let Some(head) = scan.peek()? {
             self.next = head.seq + 1;
             scan.skip(&head);
         }
@@ -310,7 +320,10 @@ impl<S: SpoolStorage> SpoolWriter<S> {
             let room = |active: &ActiveSegment<_>| {
                 usize::try_from(segment_max.saturating_sub(active.bytes)).unwrap_or(usize::MAX)
             };
-            let Some(active) = self.active.as_mut().filter(|active| len <= room(active)) else {
+            // Refused numbers begin a segment, so that its name has the number after them: a writer
+            // that finds damaged bytes counts a number for each 40 of them, and no more.
+            let fits = |active: &&mut ActiveSegment<_>| len <= room(active) && first == active.end;
+            let Some(active) = self.active.as_mut().filter(fits) else {
                 self.begin_segment(first)?;
                 continue;
             };
@@ -325,8 +338,11 @@ impl<S: SpoolStorage> SpoolWriter<S> {
                 self.storage.sync_names()?;
                 active.named = true;
             }
+            if !active.file.is_linked()? {
+                return Err(io::Error::new(io::ErrorKind::NotFound, "the segment was removed"));
+            }
             let (records, end) = (group.records, group.end);
-            self.durable = end;
+            (active.end, self.durable) = (end, end);
             self.queue.remove(records);
             self.remove_marked();
         }
@@ -342,7 +358,7 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         let bytes = HEADER_LEN as u64;
         self.segments.push_back(Segment { first, bytes, removed_by: None });
         let salt = RandomState::new().build_hasher().finish();
-        let mut active = ActiveSegment { file, salt, bytes, named: false };
+        let mut active = ActiveSegment { file, salt, bytes, end: first, named: false };
         let (stream, boot) = (self.config.stream.clone(), self.config.boot);
         active.file.append(&SegmentHeader { stream, boot, first, salt }.to_bytes())?;
         self.active = Some(active);
@@ -351,9 +367,10 @@ impl<S: SpoolStorage> SpoolWriter<S> {
     }
 
     /// Marks the oldest segments for removal until there is room for two more segments: the active
-    /// one, and the next one, which is written before its own gap record is durable.
+    /// one, and the next one, which is written before its own gap record is durable; and for a
+    /// block with a gap record for refused numbers.
     fn make_room(&mut self) {
-        let room = self.config.budget.bytes().saturating_sub(2 * self.segment_max());
+        let room = self.config.budget.bytes().saturating_sub(2 * self.segment_max() + BLOCK);
         let older = self.segments.len() - 1;
         let kept = |segment: &&Segment| segment.removed_by.is_none();
         let mut bytes: u64 =
@@ -361,7 +378,7 @@ impl<S: SpoolStorage> SpoolWriter<S> {
         let (from, mut to) = (self.segments.iter().position(|segment| kept(&segment)), None);
         let from = from.unwrap_or(older);
         for index in from..older {
-            if bytes <= room {
+            if bytes <= room && older - index < SEGMENTS_MAX {
                 break;
             }
             bytes -= self.segments[index].disk_bytes();

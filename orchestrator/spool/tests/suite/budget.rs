@@ -2,11 +2,11 @@
 
 use gleaner_base::ByteSize;
 use gleaner_spool::{
-    BUDGET_MIN, GapReason, SpoolError, SpoolGap, SpoolItem, SpoolReader, SpoolWriter,
+    BUDGET_MIN, GapReason, SpoolError, SpoolGap, SpoolItem, SpoolReader, SpoolStorage, SpoolWriter,
 };
 
 use crate::model::{KIND, STREAM, TIME, config, items, records};
-use crate::simulated::SimulatedDisk;
+use crate::simulated::{SimulatedDisk, SpoolRandom};
 
 fn writer(disk: &SimulatedDisk) -> SpoolWriter<SimulatedDisk> {
     SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap()
@@ -68,6 +68,41 @@ fn a_full_queue_refuses_records_and_marks_them() {
     assert_eq!(gaps(&disk), [SpoolGap { from, to, reason: GapReason::QueueFull, record }]);
     assert_eq!(records(&items(disk)).len() as u64, 101 - refused);
     assert_eq!(writer.status().refused, refused);
+}
+
+#[test]
+fn refused_records_keep_the_stream_within_its_budget() {
+    let disk = SimulatedDisk::new(1);
+    let mut writer = writer(&disk);
+    let mut random = SpoolRandom(4);
+    let mut gaps_seen = 0;
+    for _ in 0..600 {
+        for _ in 0..random.below(80) {
+            drop(writer.append(KIND, TIME, &[7; 100]));
+        }
+        writer.commit().unwrap();
+        assert!(writer.status().disk_bytes <= BUDGET_MIN.bytes(), "{:?}", writer.status());
+        gaps_seen += u64::from(writer.status().refused > 0);
+    }
+    assert!(gaps_seen > 500 && writer.status().removed > 0);
+    records(&items(disk));
+}
+
+#[test]
+fn the_number_of_segments_is_bounded() {
+    let disk = SimulatedDisk::new(1);
+    let open = || SpoolWriter::with_storage(disk.clone(), config(ByteSize::gib(1))).unwrap();
+    // Segments of earlier writers, such as those of a program that crashes again and again.
+    for seq in 0..6000 {
+        drop(disk.create(seq).unwrap());
+    }
+    let mut writer = open();
+    for _ in 0..2 {
+        writer.append(KIND, TIME, b"x").unwrap();
+        writer.commit().unwrap();
+    }
+    assert_eq!(disk.firsts().len(), 4096);
+    assert!(gaps(&disk).iter().any(|gap| gap.reason == GapReason::Budget));
 }
 
 #[test]

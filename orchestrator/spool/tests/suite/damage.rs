@@ -1,14 +1,15 @@
 //! Bytes of the last segment are changed, cut off or added; segments go missing.
 
 use std::collections::BTreeMap;
+use std::io::ErrorKind::Other;
 
-use gleaner_base::ByteSize;
+use gleaner_base::{ByteSize, Explain};
 use gleaner_spool::{
     BUDGET_MIN, GapReason, SpoolGap, SpoolItem, SpoolReader, SpoolStorage, SpoolWriter,
 };
 
 use crate::model::{KIND, STREAM, TIME, config, items, records};
-use crate::simulated::SimulatedDisk;
+use crate::simulated::{DiskFault, SimulatedDisk};
 
 const RECORDS: u64 = 40;
 
@@ -87,6 +88,32 @@ fn a_flipped_bit_at_any_offset_is_detected_and_costs_one_record() {
 }
 
 #[test]
+fn a_flipped_bit_uses_no_number_twice_after_refused_records() {
+    for bit in [0, 7] {
+        let disk = SimulatedDisk::new(3);
+        let mut writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
+        // Records before the refused ones, and behind them.
+        for count in [3, 1000, 2, 500, 4] {
+            for _ in 0..count {
+                drop(writer.append(KIND, TIME, b"a record of some bytes"));
+            }
+            writer.commit().unwrap();
+        }
+        let (next, refused) = (writer.status().next, writer.status().refused);
+        assert!(refused > 1000, "{refused} refused");
+        let last = *disk.firsts().last().unwrap();
+        let before = disk.with_content(last, |content| content.clone());
+        for at in 0..before.len() {
+            disk.with_content(last, |content| content[at] ^= 1 << bit);
+            records(&items(disk.clone()));
+            let writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
+            assert!(writer.status().next >= next, "byte {at}: {}", writer.status().next);
+            disk.with_content(last, |content| content.clone_from(&before));
+        }
+    }
+}
+
+#[test]
 fn a_segment_cut_off_at_any_offset_keeps_what_is_before() {
     with_change(|content, at| content.truncate(at));
 }
@@ -145,4 +172,79 @@ fn a_record_in_the_payload_of_another_is_not_taken_for_one_behind_damage() {
     disk.with_content(0, |content| content[128 + copy.len()] ^= 1);
     let kept: Vec<u64> = records(&items(disk)).into_keys().collect();
     assert_eq!(kept, [0, 2, 3]);
+}
+
+#[test]
+fn an_unreadable_sector_anywhere_costs_its_records_and_blocks_nothing() {
+    const BLOCK: u64 = 4096;
+    let large = || config(ByteSize::mib(1));
+    // Of the last segment, and of one before it.
+    for last in [true, false] {
+        for sector in 0..12 {
+            let disk = SimulatedDisk::new(3);
+            let mut writer = SpoolWriter::with_storage(disk.clone(), large()).unwrap();
+            for seq in 0..60_u64 {
+                writer.append(KIND, TIME, &[seq as u8; 710]).unwrap();
+                writer.commit().unwrap();
+            }
+            if !last {
+                writer = SpoolWriter::with_storage(disk.clone(), large()).unwrap();
+                writer.append(KIND, TIME, b"another segment").unwrap();
+                writer.commit().unwrap();
+            }
+            let next = writer.status().next;
+            disk.set_unreadable(0, sector * BLOCK..(sector + 1) * BLOCK);
+            let found = items(disk.clone());
+            let lost = next as usize - records(&found).len();
+            if sector == 0 {
+                assert_eq!(lost, 60, "without the header, nothing can be trusted");
+            } else {
+                assert!((1..=7).contains(&lost), "sector {sector}: {lost} records lost");
+            }
+            let writer = SpoolWriter::with_storage(disk.clone(), large()).unwrap();
+            assert!(writer.status().next >= next, "sector {sector}");
+        }
+    }
+}
+
+#[test]
+fn a_segment_that_cannot_be_opened_is_named_by_the_error() {
+    let disk = SimulatedDisk::new(3);
+    let mut writer = SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN)).unwrap();
+    writer.append(KIND, TIME, b"one").unwrap();
+    writer.commit().unwrap();
+    let fault = |after| DiskFault { from: disk.operations() + after, count: 1, kind: Other };
+    let mut reader = SpoolReader::with_storage(disk.clone(), STREAM, None);
+    disk.set_fault(Some(fault(2)));
+    let error = reader.next().unwrap().unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "cannot read segment `00000000000000000000.seg` of stream `logs`"
+    );
+    assert!(error.help().unwrap().contains("remove it if it is not a segment"));
+    disk.set_fault(Some(fault(1)));
+    let error = reader.next().unwrap().unwrap_err();
+    assert_eq!(error.to_string(), "cannot read the spool of stream `logs`");
+    assert!(matches!(reader.next(), Some(Ok(SpoolItem::Record(_)))));
+}
+
+#[test]
+fn a_segment_that_leaves_too_few_numbers_is_refused_with_its_name() {
+    let open = |disk: &SimulatedDisk| SpoolWriter::with_storage(disk.clone(), config(BUDGET_MIN));
+    for first in [(1 << 62) + 1, (1 << 63) - 1] {
+        let disk = SimulatedDisk::new(3);
+        drop(disk.create(first).unwrap());
+        let error = open(&disk).unwrap_err();
+        let name = format!("segment `{first:020}.seg` of stream `logs` leaves too few numbers");
+        assert_eq!(error.to_string(), name);
+        assert!(error.help().unwrap().contains("remove it if it is not a segment"));
+    }
+    // All that a writer accepts can be read.
+    let disk = SimulatedDisk::new(3);
+    drop(disk.create(1 << 62).unwrap());
+    let mut writer = open(&disk).unwrap();
+    writer.append(KIND, TIME, b"one").unwrap();
+    assert_eq!(writer.commit().unwrap(), (1 << 62) + 1);
+    let read = SpoolReader::with_storage(disk, STREAM, None).next();
+    assert!(matches!(read, Some(Ok(SpoolItem::Record(record))) if record.seq == 1 << 62));
 }

@@ -1,11 +1,12 @@
 //! Folders on the real disk: one writer, and nothing but plain files of its user.
 
 use std::fs;
-use std::os::unix::fs::{chown, symlink};
+use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::path::Path;
 
+use gleaner_base::Explain;
 use gleaner_spool::{BUDGET_MIN, SpoolError, SpoolItem, SpoolReader, SpoolWriter};
-use rustix::fs::{CWD, FileType, Mode, mknodat};
+use rustix::fs::{CWD, FileType, FlockOperation, Mode, flock, mknodat};
 
 use crate::model::{KIND, STREAM, TIME, config};
 
@@ -77,7 +78,96 @@ fn links_pipes_and_files_of_others_are_refused_without_blocking() {
     }
     assert_eq!(fs::read_to_string(&elsewhere).unwrap(), "precious");
     symlink(scratch.path().join("0"), scratch.path().join("link")).unwrap();
-    let linked = scratch.path().join("link");
-    assert!(matches!(open(&linked), Err(SpoolError::Folder { .. })));
-    assert!(matches!(SpoolReader::open(&linked, STREAM, None), Err(SpoolError::Folder { .. })));
+    for linked in ["link", "link/", "link//", "link/."].map(|name| scratch.path().join(name)) {
+        assert!(matches!(open(&linked), Err(SpoolError::Folder { .. })));
+        let read = SpoolReader::open(&linked, STREAM, None);
+        assert!(matches!(read, Err(SpoolError::Folder { .. })));
+    }
+}
+
+#[test]
+fn a_writer_whose_folder_is_removed_acknowledges_nothing() {
+    let scratch = tempfile::tempdir().unwrap();
+    let path = scratch.path().join("logs");
+    let mut writer = open(&path).unwrap();
+    writer.append(KIND, TIME, b"one").unwrap();
+    writer.commit().unwrap();
+    fs::remove_dir_all(&path).unwrap();
+    // Another writer begins the stream again.
+    let mut other = open(&path).unwrap();
+    other.append(KIND, TIME, b"other").unwrap();
+    other.commit().unwrap();
+    writer.append(KIND, TIME, b"two").unwrap();
+    assert!(matches!(writer.commit(), Err(SpoolError::Write { .. })));
+    assert_eq!(writer.durable(), 1);
+    assert_eq!(payloads(&path), [b"other"]);
+}
+
+#[test]
+fn a_writer_whose_files_are_removed_begins_a_segment_or_reports_the_lost_lock() {
+    let scratch = tempfile::tempdir().unwrap();
+    let mut writer = open(scratch.path()).unwrap();
+    writer.append(KIND, TIME, b"one").unwrap();
+    writer.commit().unwrap();
+    fs::remove_file(scratch.path().join("00000000000000000000.seg")).unwrap();
+    writer.append(KIND, TIME, b"two").unwrap();
+    assert_eq!(writer.commit().unwrap(), 2);
+    assert_eq!(payloads(scratch.path()), [b"two"]);
+    // Without the lock, another writer may have the stream.
+    fs::remove_file(scratch.path().join("writer.lock")).unwrap();
+    fs::remove_file(scratch.path().join("00000000000000000001.seg")).unwrap();
+    writer.append(KIND, TIME, b"three").unwrap();
+    let help = writer.commit().unwrap_err().help().unwrap();
+    assert!(help.starts_with("start the writer again"), "{help}");
+}
+
+#[test]
+fn a_writer_and_a_reader_stay_with_a_folder_that_is_renamed() {
+    let scratch = tempfile::tempdir().unwrap();
+    let (path, renamed) = (scratch.path().join("logs"), scratch.path().join("renamed"));
+    let mut writer = open(&path).unwrap();
+    let mut reader = SpoolReader::open(&path, STREAM, None).unwrap();
+    fs::rename(&path, &renamed).unwrap();
+    drop(open(&path).unwrap());
+    writer.append(KIND, TIME, b"one").unwrap();
+    assert_eq!(writer.commit().unwrap(), 1);
+    assert!(matches!(reader.next(), Some(Ok(SpoolItem::Record(_)))));
+    assert_eq!((payloads(&renamed).len(), payloads(&path).len()), (1, 0));
+    assert!(matches!(open(&renamed), Err(SpoolError::Busy { .. })));
+}
+
+#[test]
+fn other_users_can_neither_read_nor_lock_a_stream() {
+    let scratch = tempfile::tempdir().unwrap();
+    let path = scratch.path().join("streams/logs");
+    let mut writer = open(&path).unwrap();
+    writer.append(KIND, TIME, b"one").unwrap();
+    writer.commit().unwrap();
+    let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+    assert_eq!(mode(&path), 0o700);
+    for entry in fs::read_dir(&path).unwrap() {
+        assert_eq!(mode(&entry.unwrap().path()), 0o600);
+    }
+    drop(writer);
+    // A folder that exists may be readable, so a lock on the folder itself is not the writer's.
+    fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
+    let neighbour = fs::File::open(&path).unwrap();
+    flock(&neighbour, FlockOperation::LockExclusive).unwrap();
+    open(&path).unwrap();
+}
+
+#[test]
+fn a_lock_that_is_a_link_is_refused() {
+    let scratch = tempfile::tempdir().unwrap();
+    symlink(scratch.path().join("elsewhere"), scratch.path().join("writer.lock")).unwrap();
+    assert!(matches!(open(scratch.path()), Err(SpoolError::Folder { .. })));
+    assert!(!scratch.path().join("elsewhere").exists());
+}
+
+fn payloads(path: &Path) -> Vec<Vec<u8>> {
+    let payload = |item| match item {
+        Ok(SpoolItem::Record(record)) => Some(record.payload),
+        _ => None,
+    };
+    SpoolReader::open(path, STREAM, None).unwrap().filter_map(payload).collect()
 }

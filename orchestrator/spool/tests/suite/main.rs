@@ -8,6 +8,7 @@ mod budget;
 mod damage;
 mod faults;
 mod folder;
+mod follow;
 mod kills;
 mod model;
 mod power_cut;

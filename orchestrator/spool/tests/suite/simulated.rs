@@ -3,6 +3,7 @@
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::io;
+use std::ops::Range;
 use std::rc::Rc;
 
 use gleaner_spool::{SegmentFile, SpoolStorage};
@@ -48,7 +49,10 @@ struct Disk {
     durable_names: BTreeMap<u64, usize>,
     random: SpoolRandom,
     operations: u64,
+    lists: u64,
     fault: Option<DiskFault>,
+    /// Segment, and range of its bytes, whose reads fail with `EIO`.
+    unreadable: Option<(u64, Range<u64>)>,
 }
 
 #[derive(Clone)]
@@ -74,7 +78,9 @@ impl SimulatedDisk {
             durable_names: BTreeMap::new(),
             random: SpoolRandom(seed),
             operations: 0,
+            lists: 0,
             fault: None,
+            unreadable: None,
         })))
     }
 
@@ -82,8 +88,18 @@ impl SimulatedDisk {
         self.0.borrow_mut().fault = fault;
     }
 
+    /// Lets reads fail that begin in `range` of segment `first`. Others end before it.
+    pub fn set_unreadable(&self, first: u64, range: Range<u64>) {
+        self.0.borrow_mut().unreadable = Some((first, range));
+    }
+
     pub fn operations(&self) -> u64 {
         self.0.borrow().operations
+    }
+
+    /// Number of times that the names were listed.
+    pub fn lists(&self) -> u64 {
+        self.0.borrow().lists
     }
 
     /// Content of the segment `first`, for changes.
@@ -149,6 +165,7 @@ impl SpoolStorage for SimulatedDisk {
 
     fn list(&self) -> io::Result<Vec<(u64, u64)>> {
         self.operation(false)?;
+        self.0.borrow_mut().lists += 1;
         let disk = self.0.borrow();
         let length = |inode: &usize| disk.inodes[*inode].content.len() as u64;
         Ok(disk.names.iter().map(|(first, inode)| (*first, length(inode))).collect())
@@ -189,10 +206,26 @@ impl SegmentFile for SimulatedFile {
         Ok(self.disk.0.borrow().inodes[self.inode].content.len() as u64)
     }
 
+    fn is_linked(&self) -> io::Result<bool> {
+        Ok(self.disk.0.borrow().names.values().any(|inode| *inode == self.inode))
+    }
+
     fn read_at(&self, into: &mut [u8], offset: u64) -> io::Result<usize> {
         self.disk.operation(false)?;
         let disk = self.disk.0.borrow();
         let content = &disk.inodes[self.inode].content;
+        let mut end = content.len();
+        if let Some((first, range)) = &disk.unreadable
+            && disk.names.get(first) == Some(&self.inode)
+        {
+            if range.contains(&offset) {
+                return Err(io::Error::from_raw_os_error(rustix::io::Errno::IO.raw_os_error()));
+            }
+            if offset < range.start {
+                end = end.min(range.start as usize);
+            }
+        }
+        let content = &content[..end];
         let rest = content.get(offset as usize..).unwrap_or_default();
         let read = rest.len().min(into.len());
         into[..read].copy_from_slice(&rest[..read]);
