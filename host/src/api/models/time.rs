@@ -33,8 +33,8 @@ impl Models {
         self.time.used_ns.load(Ordering::Relaxed)
     }
 
-    /// Ends calls at this time, also for a guest that gives its calls no due time, as Python does: a
-    /// signal interrupts no call into the host. `None` for no deadline.
+    /// Ends calls at this time, also for a guest that gives its calls no due time, as Python does:
+    /// a signal interrupts no call into the host. `None` for no deadline.
     pub fn end_at(&self, at: Option<Instant>) {
         self.time.due.set(at);
     }
