@@ -34,6 +34,9 @@ const BUILD_MAX: Duration = Duration::from_secs(3 * 3600);
 /// Memory that a build may take. TensorRT needs several times that of the model.
 const BUILD_MEMORY: ByteSize = ByteSize::gib(8);
 
+/// The way out for a model whose engine cannot be made or used.
+const SMALLER: &str = "use a smaller model, or leave `tensorrt` out of its `providers`";
+
 /// Interval of lines about a build in progress.
 const PROGRESS_INTERVAL: Duration = Duration::from_secs(5);
 
@@ -136,7 +139,7 @@ impl EngineBuild<'_> {
         let max = ByteSize::new(DerivedKind::Engine.max_bytes() as u64);
         let engine = PlainFile::inside(folder.path(), Path::new(&engine_file(sha256)), max)
             .and_then(PlainFile::read_whole)
-            .map_err(|error| self.failed(chain(&error)))?;
+            .map_err(|error| self.failed(chain(&error)).with_help(SMALLER))?;
         BuiltEngine::put(store, sha256, &runtime, &engine)?;
         let (seconds, bytes) = (begin.elapsed().as_secs_f64(), engine.len() as u64);
         Ok(EngineBuilt { runtime, seconds, bytes })
@@ -183,7 +186,7 @@ impl EngineBuild<'_> {
                     };
                 }
                 Ok(InferenceEvent::Ended(reason, _)) => {
-                    return Err(self.failed(visible(&reason)));
+                    return Err(self.failed(visible(&reason)).with_help(SMALLER));
                 }
                 Ok(InferenceEvent::Stderr(text)) => drop(io::stderr().write_all(&text)),
                 Ok(InferenceEvent::Warning(text)) => self.show(&text),
