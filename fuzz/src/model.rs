@@ -253,8 +253,8 @@ fn frame(input: &mut FuzzInput) -> bool {
     if area > VALUES_MAX {
         return false;
     }
-    // Two rows of 6 bytes for a pixel, one of 3, the columns with 8, and a converted row.
-    let memory = (16 << 10) + 48 * how.width as usize + 8 * view.width() as usize;
+    // Two rows of 8 bytes for a pixel, one of 4, the columns with 28, and a converted row.
+    let memory = (16 << 10) + 64 * how.width as usize + 8 * view.width() as usize;
     let prepare = |preparer: &mut Preparer, before: u8| {
         let mut out = vec![before; size];
         let placed = budget::within(memory, || preparer.prepare_into(&view, &how, None, &mut out));

@@ -144,9 +144,11 @@ impl Bilinear {
     ) -> Result<Resize<'a>, VisionError> {
         let order = PixelOrder::of(view.encoding())?;
         self.columns.clear();
+        self.columns.reserve(width as usize);
         let [left, right] = &mut self.sides;
         for side in [&mut *left, &mut *right] {
             side.weights.clear();
+            side.weights.reserve(width as usize);
             side.pixels.resize(width as usize, [0; 4]);
         }
         let old_width = view.width();
