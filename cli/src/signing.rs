@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_report::format::size;
+use gleaner_report::format::{counted, size};
 use gleaner_trust::{PublicKey, Published, Release, SecretKey};
 use serde_json::json;
 
@@ -52,10 +52,7 @@ fn text_of(
     _: &PublicKey,
     out: &Path,
 ) -> String {
-    let files = match revision.files.len() {
-        1 => "1 file".to_owned(),
-        count => format!("{count} files"),
-    };
+    let files = counted(revision.files.len() as u64, "file");
     format!(
         "{} {} ({} {}, release {}, {files}, {})\n  revision: {digest}\n",
         if *unchanged { "unchanged" } else { "published" },

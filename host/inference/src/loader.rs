@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use gleaner_artifacts::{BuiltEngine, StoreLookup};
-use gleaner_base::chain;
+use gleaner_base::{chain, hex};
 use gleaner_protocol::inference::{Element, MAX_TENSOR_BYTES, TensorInfo, engine_file};
 use sha2::{Digest, Sha256};
 
@@ -137,9 +137,7 @@ impl ModelLoader {
         let load_ns = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
         Ok((graph, ReadyModel { inputs, outputs, runtime, reason, built_for, load_ns }))
     }
-}
 
-impl ModelLoader {
     /// Returns what to do about an engine, if TensorRT is to load the model.
     fn engine(&self, job: &LoadJob) -> EngineUse {
         let sha256 = &job.key.sha256;
@@ -176,7 +174,7 @@ fn read(file: &File, sha256: &str, max: u64) -> Result<Vec<u8>, ModelError> {
     model.try_reserve_exact(length).map_err(|_| no_memory())?;
     model.resize(length, 0);
     file.read_exact_at(&mut model, 0).map_err(ModelError::Read)?;
-    let found: String = Sha256::digest(&model).iter().map(|byte| format!("{byte:02x}")).collect();
+    let found = hex(&Sha256::digest(&model));
     if !found.eq_ignore_ascii_case(sha256) {
         return Err(ModelError::Digest { found, needed: sha256.to_owned() });
     }

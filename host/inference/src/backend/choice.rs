@@ -156,15 +156,13 @@ impl Backends {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{StopSignal, TensorValue};
+    use super::super::tests::FakeGraph;
     use super::*;
 
     struct FakeBackend {
         version: &'static str,
         works: &'static [ExecutionProvider],
     }
-
-    struct FakeGraph;
 
     impl Backend for FakeBackend {
         fn version(&self) -> String {
@@ -181,16 +179,6 @@ mod tests {
                 return Ok(Box::new(FakeGraph));
             }
             Err(BackendError::new(format_args!("no {}", options.provider.name())))
-        }
-    }
-
-    impl LoadedGraph for FakeGraph {
-        fn run(
-            &mut self,
-            _inputs: &[TensorValue],
-            _stop: &StopSignal,
-        ) -> Result<Vec<TensorValue>, BackendError> {
-            Ok(Vec::new())
         }
     }
 

@@ -166,6 +166,19 @@ mod tests {
 
     use super::*;
 
+    /// A model without outputs.
+    pub(super) struct FakeGraph;
+
+    impl LoadedGraph for FakeGraph {
+        fn run(
+            &mut self,
+            _inputs: &[TensorValue],
+            _stop: &StopSignal,
+        ) -> Result<Vec<TensorValue>, BackendError> {
+            Ok(Vec::new())
+        }
+    }
+
     #[test]
     fn a_run_is_stopped_once_whichever_comes_first() {
         for stops_first in [true, false] {

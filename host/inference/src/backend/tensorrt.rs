@@ -82,7 +82,8 @@ mod tests {
     use std::fs;
     use std::path::Path;
 
-    use super::super::{ExecutionProvider, StopSignal, TensorValue};
+    use super::super::ExecutionProvider;
+    use super::super::tests::FakeGraph;
     use super::*;
     use crate::inspect::ModelSignature;
 
@@ -91,8 +92,6 @@ mod tests {
         runtime: &'static str,
         writes: bool,
     }
-
-    struct FakeGraph;
 
     impl Backend for FakeTensorRt {
         fn version(&self) -> String {
@@ -115,16 +114,6 @@ mod tests {
                 b"model" | b"engine of model" => Ok(Box::new(FakeGraph)),
                 _ => Err(BackendError::new("it is no engine of this model")),
             }
-        }
-    }
-
-    impl LoadedGraph for FakeGraph {
-        fn run(
-            &mut self,
-            _inputs: &[TensorValue],
-            _stop: &StopSignal,
-        ) -> Result<Vec<TensorValue>, BackendError> {
-            Ok(Vec::new())
         }
     }
 
