@@ -27,4 +27,7 @@ pub use manifest::{Manifest, ManifestError};
 pub use output::{LOCK, Output, OutputError, RESULTS};
 pub use results::RESULT_ITEM_MAX;
 pub use sources::{SOURCE_MAX, Sources};
-pub use vehicle::{InferenceLimits, Vehicle};
+pub use vehicle::{
+    DeploymentSettings, InferenceLimits, NetworkSettings, RecordingSettings, Vehicle,
+    VehicleIdentity,
+};

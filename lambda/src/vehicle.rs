@@ -1,22 +1,76 @@
-//! `vehicle.toml`: limits for all lambdas on a vehicle, and of the process that runs their models.
-//! It is parsed as a manifest is, with the same error messages.
+//! `vehicle.toml`: identity and network of a vehicle, and limits for all lambdas on it. It is parsed
+//! as a manifest is, with the same error messages.
 
+use std::collections::BTreeMap;
+use std::net::IpAddr;
 use std::path::Path;
 use std::time::Duration;
 
 use gleaner_base::ByteSize;
 
-use crate::manifest::{self, Limits, ManifestError, bounds};
+use crate::manifest::{self, ItemName, Limits, ManifestError, TopicName, bounds};
 
 /// The validated configuration of a vehicle.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Vehicle {
+    /// `[vehicle]`.
+    pub identity: VehicleIdentity,
+    /// `[network]`.
+    pub network: NetworkSettings,
     /// `[limits]`: upper bounds of the limits of each lambda. Limits that the file does not name
     /// are at the maximum of manifests.
     pub limits: Limits,
     /// `[inference]`.
     pub inference: InferenceLimits,
+    /// `[recording]`.
+    pub recording: RecordingSettings,
+    /// `[deployments]`.
+    pub deployments: DeploymentSettings,
+}
+
+/// `[vehicle]`: the vehicle among others.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct VehicleIdentity {
+    /// Its name; without one, that of the machine is used.
+    pub name: Option<ItemName>,
+    /// Names and values by which deployments select vehicles.
+    pub labels: BTreeMap<ItemName, String>,
+}
+
+/// `[network]`: the network of the daemon; `gleaner run` has options instead.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct NetworkSettings {
+    /// DDS domain; without one, `ROS_DOMAIN_ID` counts, else 0.
+    pub domain: Option<u16>,
+    /// Addresses of the network interfaces; without any, all.
+    pub interfaces: Vec<IpAddr>,
+}
+
+/// `[recording]`: settings of the recorder of the daemon.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct RecordingSettings {
+    /// Topic of recording commands.
+    pub commands: Option<TopicName>,
+    /// Free space of the disk below which no clip is started.
+    pub disk_floor: Option<ByteSize>,
+    /// Maximum number of clips to keep.
+    pub clips_max: Option<u64>,
+    /// Maximum total size of clips to keep.
+    pub bytes_max: Option<ByteSize>,
+}
+
+/// `[deployments]`: settings of the daemon.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DeploymentSettings {
+    /// Time that a revision must run without a failure before it is trusted to work.
+    pub probation: Duration,
+    /// Maximum size of the decisions and log lines of one lambda on the disk.
+    pub spool: ByteSize,
+    /// Memory that all lambdas together may ask for; without it, half of the machine's.
+    pub memory: Option<ByteSize>,
+    /// Topic on which decisions are published.
+    pub decisions: Option<TopicName>,
 }
 
 /// `[inference]`: limits of the process that runs models.
@@ -33,7 +87,25 @@ pub struct InferenceLimits {
 /// The configuration without a file.
 impl Default for Vehicle {
     fn default() -> Self {
-        Self { limits: Limits::MAX, inference: InferenceLimits::default() }
+        Self {
+            identity: VehicleIdentity::default(),
+            network: NetworkSettings::default(),
+            limits: Limits::MAX,
+            inference: InferenceLimits::default(),
+            recording: RecordingSettings::default(),
+            deployments: DeploymentSettings::default(),
+        }
+    }
+}
+
+impl Default for DeploymentSettings {
+    fn default() -> Self {
+        Self {
+            probation: bounds::PROBATION.default,
+            spool: bounds::SPOOL.default,
+            memory: None,
+            decisions: None,
+        }
     }
 }
 
@@ -101,8 +173,51 @@ mod tests {
     }
 
     #[test]
+    fn a_vehicle_has_a_name_labels_a_network_and_settings_of_the_daemon() {
+        let text = r#"
+            [vehicle]
+            name = "car-7"
+            labels = { site = "berlin", sensor-set = "b" }
+            [network]
+            domain = 7
+            interfaces = ["10.0.0.5", "::1"]
+            [recording]
+            commands = "/record"
+            clips_max = 100
+            bytes_max = "100 GiB"
+            [deployments]
+            probation = "1min"
+            memory = "2 GiB"
+            "#;
+        let vehicle = Vehicle::parse(text, "vehicle.toml").unwrap();
+        assert_eq!(vehicle.identity.name.unwrap().as_str(), "car-7");
+        let labels: Vec<_> = vehicle.identity.labels.values().collect();
+        assert_eq!(labels, ["b", "berlin"]);
+        assert_eq!(vehicle.network.domain, Some(7));
+        assert_eq!(vehicle.network.interfaces.len(), 2);
+        assert_eq!(vehicle.recording.commands.unwrap().as_str(), "/record");
+        assert_eq!((vehicle.recording.clips_max, vehicle.recording.disk_floor), (Some(100), None));
+        let deployments = DeploymentSettings {
+            probation: Duration::from_secs(60),
+            memory: Some(ByteSize::gib(2)),
+            ..DeploymentSettings::default()
+        };
+        assert_eq!(vehicle.deployments, deployments);
+    }
+
+    #[test]
     fn unknown_keys_and_values_out_of_range_are_refused_with_their_line() {
         for (text, problem, help) in [
+            (
+                "[network]\ninterfaces = [\"eth0\"]",
+                "vehicle.toml, line 2: `network.interfaces` is `eth0`, which is not a network address",
+                "an address of a network interface, such as `192.168.1.5`",
+            ),
+            (
+                "[network]\ndomain = 233",
+                "vehicle.toml, line 2: `network.domain` is 233, above the maximum of 232",
+                "give a value from 0 to 232",
+            ),
             (
                 "\n[limits]\nfule = 1",
                 "vehicle.toml, line 3: unknown key `fule` in [limits]",

@@ -37,7 +37,8 @@ pub(super) fn load(args: &RunArgs) -> Result<Vec<LambdaSpec>, Failure> {
         // The command line has checked the form of renamed topics.
         let remaps = args.remap.iter().filter_map(|remap| renamed(remap)).collect();
         let (folder, set) = (folder.clone(), args.set.clone());
-        lambdas.push(LambdaSpec { folder, manifest, out, prefix, set, remaps });
+        let deployment = None;
+        lambdas.push(LambdaSpec { folder, manifest, out, prefix, set, remaps, deployment });
     }
     // The runtime checks the settings of a single lambda.
     if !is_single {
@@ -144,6 +145,7 @@ mod tests {
             prefix: String::new(),
             set: Vec::new(),
             remaps: Vec::new(),
+            deployment: None,
         }
     }
 

@@ -33,6 +33,7 @@ fn spec(args: &RunArgs) -> RunSpec {
         drives: args.drive.clone(),
         rate: args.rate,
         network: args.network.to_args().collect(),
+        largest: 0,
         duration: args.last.map(|seconds| Duration::from_secs(seconds.into())),
         all: args.all,
         records: !args.no_record,

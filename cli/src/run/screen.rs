@@ -251,7 +251,7 @@ impl RunObserver for Screen {
         self.print(&format!("playing {files}\n"));
     }
 
-    fn restarts(&mut self, reason: &str, delay: Duration, restarts: u32) {
+    fn restarts(&mut self, _: Option<&LambdaSpec>, reason: &str, delay: Duration, restarts: u32) {
         let delay = delay.as_secs_f64();
         self.warn(&format!("{reason}; restarting in {delay} s (restart {restarts})"));
     }

@@ -104,6 +104,18 @@ pub const RUN_MAX: Bounds<Duration> = Bounds {
 /// `inference.load_max` of a vehicle. A provider that compiles models may need minutes.
 pub const LOAD_MAX: Bounds<Duration> = Bounds { default: Duration::from_secs(120), ..RUN_MAX };
 
+/// `deployments.probation` of a vehicle: the time that a revision must run before it is trusted to
+/// work.
+pub const PROBATION: Bounds<Duration> = Bounds {
+    min: Duration::from_secs(1),
+    default: Duration::from_secs(600),
+    max: Duration::from_secs(7 * 86_400),
+};
+
+/// `deployments.spool` of a vehicle: the decisions and log lines of one lambda on the disk.
+pub const SPOOL: Bounds<ByteSize> =
+    Bounds { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(64) };
+
 /// Longest accepted manifest. The longest in use has 3 KiB.
 pub const MANIFEST_MAX: ByteSize = ByteSize::mib(1);
 

@@ -15,6 +15,7 @@ mod names;
 mod read;
 mod read_config;
 mod read_limits;
+mod read_vehicle;
 mod reference;
 mod syntax;
 mod table;
@@ -82,7 +83,7 @@ impl Manifest {
 
 /// Parses the configuration of a vehicle in `text`.
 pub(crate) fn vehicle(text: &str, file: &str) -> Result<Vehicle, ManifestError> {
-    read_limits::vehicle(&table::Document { text, file })
+    read_vehicle::vehicle(&table::Document { text, file })
 }
 
 /// Reads a file in the format of a manifest, which a user has named.

@@ -1,5 +1,5 @@
 //! Messages between Gleaner programs: reports of a runtime, result items, exit records, frames to
-//! and from the recorder, the ingress and the process that runs models.
+//! and from the recorder, the ingress and the process that runs models, and the state of a vehicle.
 //!
 //! Nothing here runs a lambda or listens on a socket. Programs share these types; they never link
 //! each other.
@@ -18,6 +18,7 @@ mod live_status;
 mod recording;
 mod report;
 mod result_item;
+pub mod supervision;
 #[cfg(test)]
 #[path = "../../../base/src/test_folder.rs"]
 mod test_folder;

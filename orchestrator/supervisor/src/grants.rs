@@ -15,13 +15,13 @@ pub(crate) const RECORDER: &str = "recorder";
 /// Largest of the sizes that the ingress expects of topics for which none is stated.
 const USUAL_BYTES: u64 = 32 << 20;
 
-/// Returns the lambda's process as a reader: it reads its inputs. `start` is the number of its
+/// Returns the lambda's process as a reader: it reads its inputs. `number` differs from that of its
 /// earlier processes, of which the ingress may still know the last.
 pub(crate) fn lambda(
     lambda: &LambdaSpec,
     spec: &RunSpec,
     is_recorded: bool,
-    start: u32,
+    number: u32,
 ) -> AddReader {
     let event = lambda.manifest.event_input().map(|input| &input.name);
     let inputs = lambda.manifest.inputs.iter().zip(0..);
@@ -30,7 +30,7 @@ pub(crate) fn lambda(
         TopicGrant::for_input(index, input, &topic, event == Some(&input.name), is_recorded)
     });
     AddReader {
-        name: format!("{} {start}", lambda.name()),
+        name: format!("{} {number}", lambda.name()),
         topics: topics.collect(),
         publishes: PublishGrant::of_lambda(spec.rtt.as_deref(), spec.decisions.as_deref()),
     }
@@ -64,22 +64,38 @@ pub(crate) struct RecordedTopics {
 impl RecordedTopics {
     pub(crate) fn of<'a>(lambdas: impl Iterator<Item = &'a LambdaSpec>) -> Self {
         let mut topics: Vec<RecordedSamples> = Vec::new();
-        for lambda in lambdas {
-            for (topic, samples) in recorded(lambda) {
-                match topics.iter_mut().find(|known| known.topic == topic) {
-                    Some(known) => known.add(samples),
-                    None => topics.push(samples),
-                }
+        for samples in lambdas.flat_map(recorded) {
+            match topics.iter_mut().find(|known| known.topic == samples.topic) {
+                Some(known) => known.add(samples),
+                None => topics.push(samples),
             }
         }
         let mixed = topics.iter().filter(|samples| samples.is_mixed);
         let mixed = mixed.map(|samples| samples.topic.clone()).collect();
-        let grants = topics.into_iter().zip(COMMANDS_ID + 1..).map(|(samples, id)| {
-            let max_bytes = samples.max_bytes();
-            let qos = samples.qos.unwrap_or(Qos::Auto);
-            recorded_grant(id, &samples.topic, samples.type_name, max_bytes, qos)
-        });
+        let grants = topics.into_iter().zip(COMMANDS_ID + 1..);
+        let grants = grants.map(|(samples, id)| samples.grant(id));
         Self { mixed, grants: grants.collect(), granted: HashSet::new() }
+    }
+
+    /// Adds the topics of a lambda that came later.
+    ///
+    /// # Errors
+    ///
+    /// A topic whose samples are larger than granted: the recorder must be started again.
+    pub(crate) fn add(&mut self, lambda: &LambdaSpec) -> Result<(), String> {
+        for samples in recorded(lambda) {
+            let known = self.grants.iter().find(|grant| grant.topic == samples.topic);
+            let Some(known) = known else {
+                let id = COMMANDS_ID + 1 + u32::try_from(self.grants.len()).unwrap_or(u32::MAX);
+                self.grants.push(samples.grant(id));
+                continue;
+            };
+            let granted = known.max_bytes.unwrap_or(USUAL_BYTES);
+            if samples.max_bytes().unwrap_or(USUAL_BYTES) > granted {
+                return Err(samples.topic);
+            }
+        }
+        Ok(())
     }
 
     /// Returns the topics that lambdas request with different QoS: each QoS has stamps of its own.
@@ -113,7 +129,7 @@ impl RecordedTopics {
     }
 
     fn grants_of(&self, lambda: &LambdaSpec) -> Vec<&TopicGrant> {
-        let of_lambda: Vec<String> = recorded(lambda).map(|(topic, _)| topic).collect();
+        let of_lambda: Vec<String> = recorded(lambda).map(|samples| samples.topic).collect();
         self.grants.iter().filter(|grant| of_lambda.contains(&grant.topic)).collect()
     }
 }
@@ -142,6 +158,11 @@ impl RecordedSamples {
         self.is_usual |= other.is_usual;
     }
 
+    fn grant(self, id: u32) -> TopicGrant {
+        let (max_bytes, qos) = (self.max_bytes(), self.qos.unwrap_or(Qos::Auto));
+        recorded_grant(id, &self.topic, self.type_name, max_bytes, qos)
+    }
+
     /// Returns the size to request; `None` for the usual size of the type.
     fn max_bytes(&self) -> Option<u64> {
         (!self.is_usual || self.largest > USUAL_BYTES).then_some(self.largest)
@@ -149,20 +170,19 @@ impl RecordedSamples {
 }
 
 /// Returns the recorded topics of a lambda, by their names on the network.
-fn recorded(lambda: &LambdaSpec) -> impl Iterator<Item = (String, RecordedSamples)> {
+fn recorded(lambda: &LambdaSpec) -> impl Iterator<Item = RecordedSamples> {
     let Manifest { inputs, record, .. } = &lambda.manifest;
     record.iter().flat_map(|record| &record.topics).map(move |topic| {
         let input = inputs.iter().find(|input| input.topic == *topic);
         let topic = lambda.on_network(topic.as_str());
-        let samples = RecordedSamples {
+        RecordedSamples {
             topic: topic.clone(),
             type_name: input.map(|input| input.type_name.to_string()),
             qos: input.map(|input| TopicGrant::for_input(0, input, &topic, false, false).qos),
             is_mixed: false,
             largest: input.map_or(0, |input| input.max_size.bytes()),
             is_usual: input.is_none(),
-        };
-        (topic, samples)
+        }
     })
 }
 

@@ -16,17 +16,24 @@
 //! that of one lambda of several.
 
 mod arguments;
+mod crash_loop;
 mod drive;
+mod event_log;
 mod failures;
 mod grants;
 mod group_end;
+mod group_output;
 mod inference;
+mod lambda_process;
 pub mod lines;
 mod observer;
 mod output;
 mod process;
 mod process_group;
+mod reconcile;
 mod restart_delay;
+mod revision_check;
+pub mod service;
 mod services;
 mod spec;
 mod summary;
@@ -41,11 +48,13 @@ use gleaner_base::{Exit, Failure};
 use gleaner_lambda::Vehicle;
 use gleaner_parts::Parts;
 
+pub use event_log::EventLog;
 use failures::Failures;
 use group_end::GroupEnd;
 pub use inference::{InferenceEvent, InferenceService};
 pub use observer::RunObserver;
 use process_group::{ProcessGroup, RunRecord};
+pub use reconcile::{Action, KnownLambda, reconcile};
 use restart_delay::RestartDelay;
 pub use spec::{LambdaSpec, RunSpec};
 use summary::RunCounts;
@@ -127,7 +136,7 @@ pub fn run(
         vehicle = allowed().unwrap_or(vehicle);
         let run = RunRecord { failures: &mut failures, counts: &mut counts };
         let mut group = ProcessGroup::start(&context, &mut lambdas, observer, run, &vehicle)?;
-        let ended = group.run(&mut time, stop);
+        let ended = group.run(|group| group.supervise(&mut time, stop));
         group.add_counts();
         let reason = match ended? {
             GroupEnd::Complete => break,
@@ -147,7 +156,7 @@ pub fn run(
         failures.add(reason.clone(), false);
         restarts += 1;
         let delay = delay.after(attempt_started.elapsed());
-        observer.restarts(&reason, delay, restarts);
+        observer.restarts(None, &reason, delay, restarts);
         let until = Instant::now() + delay;
         let ends = || stop.load(Ordering::Relaxed) || time.is_over_since_start();
         while Instant::now() < until && !ends() {

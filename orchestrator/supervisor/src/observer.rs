@@ -16,6 +16,8 @@ pub trait RunObserver {
     fn lambda(&mut self, lambda: &LambdaSpec, report: &Report);
     /// The process of a lambda has ended.
     fn lambda_gone(&mut self, lambda: &LambdaSpec);
+    /// A deployed lambda is not started again, for this reason.
+    fn quarantined(&mut self, _lambda: &LambdaSpec, _reason: &str) {}
     /// A report of the ingress.
     fn ingress(&mut self, report: &IngressReport);
     /// The ingress has ended, and is started again.
@@ -28,8 +30,15 @@ pub trait RunObserver {
     fn inference(&mut self, event: InferenceEvent);
     /// A drive begins: its files, as text.
     fn playing(&mut self, files: &str);
-    /// Something failed for a reason, and is started again after a delay; `restarts` counts these.
-    fn restarts(&mut self, reason: &str, delay: Duration, restarts: u32);
+    /// A lambda or something else failed for a reason, and is started again after a delay;
+    /// `restarts` counts these.
+    fn restarts(
+        &mut self,
+        lambda: Option<&LambdaSpec>,
+        reason: &str,
+        delay: Duration,
+        restarts: u32,
+    );
     /// Something else went wrong.
     fn warn(&mut self, text: &str);
     /// A piece of a process's standard error, without control characters.

@@ -29,10 +29,11 @@ pub(crate) enum ChildId {
     Recorder,
     /// The process that runs models.
     Inference,
-    /// The lambda at this index; `start` as that of the ingress.
+    /// This process.
+    Supervisor,
+    /// A process of a lambda, by its number in the group.
     Lambda {
-        index: usize,
-        start: u32,
+        process: u32,
     },
 }
 
@@ -53,14 +54,21 @@ pub(crate) enum OutputPiece {
     Inference(InferenceEvent),
     /// The start of a line on standard output that cannot be parsed.
     Unparsable(String),
-    /// A piece of standard error.
-    Stderr { text: Vec<u8>, begins_line: bool },
+    /// A piece of standard error, with the prefix of its process at the start of a line.
+    Stderr(Vec<u8>),
+    /// Wakes the receiver.
+    Bell,
     /// One of its [`PIPES`] is closed.
     Closed,
 }
 
-/// Starts threads that send the output of `child` to `sender`, until its pipes are closed.
-pub(crate) fn forward(child: &mut Child, from: ChildId, sender: &SyncSender<ChildOutput>) {
+/// Starts threads that send the output of `child` to `sender`, until its pipes are closed. `prefix`
+/// comes before each line of standard error.
+pub(crate) fn forward(
+    child: &mut Child,
+    (from, prefix): (ChildId, &str),
+    sender: &SyncSender<ChildOutput>,
+) {
     let send = |sender: SyncSender<ChildOutput>| {
         // Sending fails if the run has ended.
         move |piece| sender.send(ChildOutput { from, piece }).is_ok()
@@ -72,18 +80,19 @@ pub(crate) fn forward(child: &mut Child, from: ChildId, sender: &SyncSender<Chil
                 ChildId::Ingress { .. } => follow(reports, OutputPiece::Ingress, &send),
                 ChildId::Recorder => follow(reports, OutputPiece::Recorder, &send),
                 ChildId::Lambda { .. } => follow(reports, OutputPiece::Runtime, &send),
-                // Its service reads it.
-                ChildId::Inference => {}
+                // Its service reads it, and the supervisor has no process here.
+                ChildId::Inference | ChildId::Supervisor => {}
             }
             send(OutputPiece::Closed);
         });
     }
     if let Some(stderr) = child.stderr.take() {
-        let send = send(sender.clone());
+        let (send, prefix) = (send(sender.clone()), prefix.to_owned());
         thread::spawn(move || {
             let mut begins_line = true;
             pass_on(stderr, &AtomicBool::new(false), |text| {
-                send(OutputPiece::Stderr { text: text.to_vec(), begins_line });
+                let prefix = if begins_line { prefix.as_bytes() } else { b"" };
+                send(OutputPiece::Stderr([prefix, text].concat()));
                 begins_line = text.ends_with(b"\n");
             });
             send(OutputPiece::Closed);

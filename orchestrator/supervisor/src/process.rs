@@ -38,11 +38,12 @@ pub(crate) struct ChildProcess {
 }
 
 impl ChildProcess {
-    /// Starts the program `name` with these connections. `shim` are the arguments of gleaner-shim,
-    /// which starts the program if they are given.
+    /// Starts the program `name` with these connections. `prefix` is the text before each line of
+    /// its standard error. `shim` are the arguments of gleaner-shim, which starts the program if
+    /// they are given.
     pub(crate) fn start(
         parts: &Parts,
-        (name, id): (&'static str, ChildId),
+        (name, id, prefix): (&'static str, ChildId, &str),
         line: Vec<OsString>,
         shim: Option<Vec<OsString>>,
         connections: Handover,
@@ -66,8 +67,13 @@ impl ChildProcess {
             .stderr(Stdio::piped())
             .spawn()
             .map_err(|error| failed(&error))?;
-        output::forward(&mut child, id, sender);
+        output::forward(&mut child, (id, prefix), sender);
         Ok(Self { name, child, handover, requested: None })
+    }
+
+    /// Returns its number.
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
     }
 
     /// Returns the exit status of the process; `None` while it runs.

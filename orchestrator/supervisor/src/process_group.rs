@@ -9,10 +9,9 @@ use std::process::ExitStatus;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, SyncSender};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use gleaner_base::Failure;
-use gleaner_lambda::manifest::Limits;
 use gleaner_lambda::{BuildDir, Vehicle};
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::AddTopics;
@@ -21,7 +20,7 @@ use gleaner_protocol::link::AddLambda;
 use crate::drive::DriveProgress;
 use crate::failures::Failures;
 use crate::group_end::GroupEnd;
-use crate::inference::{InferenceEvent, InferenceService};
+use crate::inference::InferenceService;
 use crate::observer::RunObserver;
 use crate::output::{ChildId, ChildOutput, OutputPiece};
 use crate::process::{ChildProcess, ended};
@@ -29,10 +28,6 @@ use crate::services::{IngressProcess, RecorderProcess, unless_gone};
 use crate::summary::RunCounts;
 use crate::supervised::SupervisedLambda;
 use crate::{POLL_INTERVAL, RunContext, RunTime, arguments, grants};
-
-/// Time to read the pipes of a process after its end: processes that it left running may hold the
-/// pipes open.
-const DRAIN_TIMEOUT: Duration = Duration::from_millis(300);
 
 /// Maximum number of queued outputs. Further reports stay in their pipe, and the writer counts
 /// those that do not fit.
@@ -47,17 +42,19 @@ pub(crate) struct RunRecord<'a> {
 /// The processes of a run.
 pub(crate) struct ProcessGroup<'a> {
     context: &'a RunContext<'a>,
-    pub(crate) lambdas: &'a mut [SupervisedLambda],
+    pub(crate) lambdas: &'a mut Vec<SupervisedLambda>,
     pub(crate) observer: &'a mut dyn RunObserver,
-    failures: &'a mut Failures,
+    pub(crate) failures: &'a mut Failures,
     counts: &'a mut RunCounts,
     pub(crate) ingress: IngressProcess,
     /// The largest sample of an input, in bytes.
     largest: u64,
-    recorder: Option<RecorderProcess>,
-    sender: SyncSender<ChildOutput>,
-    output: Receiver<ChildOutput>,
-    limits: Limits,
+    pub(crate) recorder: Option<RecorderProcess>,
+    pub(crate) sender: SyncSender<ChildOutput>,
+    pub(crate) output: Receiver<ChildOutput>,
+    vehicle: Vehicle,
+    /// Number of processes of lambdas so far.
+    started: u32,
     /// The process that runs models, if a lambda has any. Dropped after `output`, as its threads
     /// may wait for room there.
     inference: Option<InferenceService>,
@@ -67,27 +64,15 @@ impl<'a> ProcessGroup<'a> {
     /// Starts the ingress; the others follow when it is ready.
     pub(crate) fn start(
         context: &'a RunContext<'a>,
-        lambdas: &'a mut [SupervisedLambda],
+        lambdas: &'a mut Vec<SupervisedLambda>,
         observer: &'a mut dyn RunObserver,
         RunRecord { failures, counts }: RunRecord<'a>,
         vehicle: &Vehicle,
     ) -> Result<Self, Failure> {
         let (sender, output) = mpsc::sync_channel(QUEUE_LENGTH);
-        let inputs = lambdas.iter().flat_map(|supervised| &supervised.lambda.manifest.inputs);
-        let largest = inputs.map(|input| input.max_size.bytes()).max().unwrap_or(0);
+        let largest = largest(lambdas).max(context.spec.largest);
         let ingress = IngressProcess::start(context, largest, &sender)?;
-        let mut inference = None;
-        if lambdas.iter().any(|supervised| !supervised.lambda.manifest.models.is_empty()) {
-            let sender = sender.clone();
-            let send = move |event| {
-                let piece = OutputPiece::Inference(event);
-                drop(sender.send(ChildOutput { from: ChildId::Inference, piece }));
-            };
-            let limits = &vehicle.inference;
-            inference = Some(InferenceService::start(&context.parts, limits, None, send)?);
-        }
-        let recorder = None;
-        Ok(Self {
+        let mut group = Self {
             context,
             lambdas,
             observer,
@@ -95,27 +80,50 @@ impl<'a> ProcessGroup<'a> {
             counts,
             ingress,
             largest,
-            recorder,
-            inference,
+            recorder: None,
+            inference: None,
             sender,
             output,
-            limits: vehicle.limits,
-        })
+            vehicle: vehicle.clone(),
+            started: 0,
+        };
+        if group.lambdas.iter().any(|supervised| !supervised.lambda.manifest.models.is_empty()) {
+            group.start_inference()?;
+        }
+        Ok(group)
     }
 
-    /// Runs the processes until the end of the run, or until the ingress or the recorder fails, and
-    /// ends them.
+    /// Starts the process that runs models, unless it runs.
+    fn start_inference(&mut self) -> Result<(), Failure> {
+        if self.inference.is_none() {
+            let sender = self.sender.clone();
+            let send = move |event| {
+                let piece = OutputPiece::Inference(event);
+                drop(sender.send(ChildOutput { from: ChildId::Inference, piece }));
+            };
+            let (parts, limits) = (&self.context.parts, &self.vehicle.inference);
+            self.inference = Some(InferenceService::start(parts, limits, None, send)?);
+        }
+        Ok(())
+    }
+
+    /// Runs the processes while `supervise` does, which returns at the end of the run or if a
+    /// process failed without which the others cannot go on; then ends them.
     pub(crate) fn run(
         &mut self,
-        time: &mut RunTime,
-        stop: &AtomicBool,
+        supervise: impl FnOnce(&mut Self) -> Result<GroupEnd, Failure>,
     ) -> Result<GroupEnd, Failure> {
-        let ended = self.supervise(time, stop);
+        let ended = supervise(self);
         self.end_all(matches!(ended, Ok(GroupEnd::Complete)))?;
         ended
     }
 
-    fn supervise(&mut self, time: &mut RunTime, stop: &AtomicBool) -> Result<GroupEnd, Failure> {
+    /// Supervises the processes of a run with an end.
+    pub(crate) fn supervise(
+        &mut self,
+        time: &mut RunTime,
+        stop: &AtomicBool,
+    ) -> Result<GroupEnd, Failure> {
         let mut drive = DriveProgress::of(self.context.spec);
         loop {
             self.poll(POLL_INTERVAL);
@@ -123,20 +131,11 @@ impl<'a> ProcessGroup<'a> {
             if stop.load(Ordering::Relaxed) || time.is_over() || is_late {
                 return Ok(GroupEnd::Complete);
             }
-            let ended = self.ended_lambdas()?;
-            // A lambda may end because one of these did.
-            if let Some(end) = self.ended_service()? {
+            if let Some(end) = self.step()? {
                 return Ok(end);
-            }
-            for (index, status) in ended {
-                self.lambdas[index].ended(status, false, self.observer, self.failures);
             }
             if self.lambdas.iter().all(SupervisedLambda::has_not_started) {
                 return Ok(GroupEnd::Complete);
-            }
-            if self.ingress.is_ready {
-                self.join_ingress();
-                self.start_due()?;
             }
             if self.lambdas.iter().all(SupervisedLambda::is_settled) {
                 time.begin();
@@ -158,13 +157,32 @@ impl<'a> ProcessGroup<'a> {
         }
     }
 
+    /// Handles the ends of processes, and starts those that are due. Returns the end of the group if
+    /// a process failed without which the others cannot go on.
+    pub(crate) fn step(&mut self) -> Result<Option<GroupEnd>, Failure> {
+        let ended = self.ended_lambdas()?;
+        // A lambda may end because one of these did.
+        if let Some(end) = self.ended_service()? {
+            return Ok(Some(end));
+        }
+        for (index, status) in ended {
+            self.lambdas[index].ended(status, false, self.observer, self.failures);
+        }
+        if self.ingress.is_ready {
+            self.join_ingress();
+            return self.start_due();
+        }
+        Ok(None)
+    }
+
     /// Adds the counts of ingress and recorder to those of the run.
     pub(crate) fn add_counts(self) {
         self.counts.add(self.ingress.status, self.recorder.and_then(|recorder| recorder.status));
     }
 
     /// Starts the recorder, if it is needed and does not run yet, and all lambdas that are due.
-    fn start_due(&mut self) -> Result<(), Failure> {
+    /// Returns the end of the group if the recorder must be started again for one of them.
+    fn start_due(&mut self) -> Result<Option<GroupEnd>, Failure> {
         let spec = self.context.spec;
         let is_recorded = |supervised: &&SupervisedLambda| {
             spec.records && supervised.lambda.manifest.record.is_some()
@@ -172,7 +190,7 @@ impl<'a> ProcessGroup<'a> {
         if self.recorder.is_none() && self.lambdas.iter().any(|it| is_recorded(&it)) {
             let recorded = self.lambdas.iter().filter(is_recorded).map(|it| &it.lambda);
             let added = self.ingress.control.add_reader(&grants::recorder(spec));
-            let Some(ingress) = self.ingress.granted(added) else { return Ok(()) };
+            let Some(ingress) = self.ingress.granted(added) else { return Ok(None) };
             let started = RecorderProcess::start(self.context, recorded, ingress, &self.sender)?;
             started.topics.mixed().for_each(|topic| {
                 self.observer.warn(&format!(
@@ -183,21 +201,55 @@ impl<'a> ProcessGroup<'a> {
             self.recorder = Some(started);
         }
         for index in 0..self.lambdas.len() {
-            if self.lambdas[index].is_due() {
-                self.start_lambda(index)?;
+            if !self.lambdas[index].is_due() {
+                continue;
+            }
+            let lambda = &self.lambdas[index].lambda;
+            if let Some(recorder) = &mut self.recorder
+                && lambda.manifest.record.is_some()
+                && let Err(topic) = recorder.topics.add(lambda)
+            {
+                let name = lambda.name();
+                let reason =
+                    format!("it is started again, as `{name}` needs larger samples of `{topic}`");
+                return Ok(Some(GroupEnd::Broken(reason)));
+            }
+            self.fit_ingress(index);
+            if let Err(failure) = self.start_lambda(index) {
+                let supervised = &mut self.lambdas[index];
+                if !supervised.is_kept() {
+                    return Err(failure);
+                }
+                supervised.failed_to_start(&failure, self.observer);
             }
         }
-        Ok(())
+        Ok(None)
+    }
+
+    /// Starts another ingress if the lambda has larger samples than this one expects.
+    fn fit_ingress(&mut self, index: usize) {
+        let largest = largest(&self.lambdas[index..=index]);
+        if largest > self.largest {
+            self.largest = largest;
+            let name = self.lambdas[index].lambda.name();
+            self.ingress.kill(format!(
+                "the ingress is started again, as `{name}` reads samples of {largest} bytes"
+            ));
+        }
     }
 
     /// Starts the process of a lambda. Does nothing if the ingress or the recorder has ended, which
     /// the caller notices.
     fn start_lambda(&mut self, index: usize) -> Result<(), Failure> {
+        if !self.lambdas[index].lambda.manifest.models.is_empty() {
+            self.start_inference()?;
+        }
+        let number = self.started;
         let Self { context, ingress, recorder, .. } = self;
         let supervised = &mut self.lambdas[index];
-        let (lambda, start) = (&supervised.lambda, supervised.restarts);
+        let (lambda, restarts) = (&supervised.lambda, supervised.restarts);
         let recorder = recorder.as_mut().filter(|_| lambda.manifest.record.is_some());
-        let reader = grants::lambda(lambda, context.spec, recorder.is_some(), start);
+        let reader = grants::lambda(lambda, context.spec, recorder.is_some(), number);
         let mut connections = Handover::default();
         if let Some(recorder) = recorder {
             let topics = recorder.topics.take_new(lambda);
@@ -211,7 +263,7 @@ impl<'a> ProcessGroup<'a> {
             let add = AddLambda {
                 lambda: lambda.folder.clone(),
                 remaps: lambda.remaps.clone(),
-                most: self.limits,
+                most: self.vehicle.limits,
                 grants: recorder.topics.ids(lambda),
             };
             let Some(socket) = unless_gone(recorder.control.add(&add))? else { return Ok(()) };
@@ -228,15 +280,16 @@ impl<'a> ProcessGroup<'a> {
         }
         // If its shim is killed, it writes none: that of the process before it would be read.
         let _ = std::fs::remove_file(lambda.exit_record());
+        self.started += 1;
         let child = ChildProcess::start(
             &context.parts,
-            ("gleaner-runtime", ChildId::Lambda { index, start }),
-            arguments::runtime(context.spec, lambda, context.offset_ns, start),
-            Some(arguments::shim(context.spec, lambda, start)),
+            ("gleaner-runtime", ChildId::Lambda { process: number }, &lambda.prefix),
+            arguments::runtime(context.spec, lambda, context.offset_ns, restarts),
+            Some(arguments::shim(context.spec, lambda, restarts)),
             connections,
             &self.sender,
         )?;
-        supervised.started(child);
+        supervised.started(child, number);
         Ok(())
     }
 
@@ -276,7 +329,7 @@ impl<'a> ProcessGroup<'a> {
                     Ok(last) => self.counts.add(last, None),
                     Err(failure) => {
                         let (reason, starts) = (failure.to_string(), ingress.start + 1);
-                        observer.restarts(&reason, ingress.ended(), starts);
+                        observer.restarts(None, &reason, ingress.ended(), starts);
                     }
                 }
             }
@@ -294,7 +347,7 @@ impl<'a> ProcessGroup<'a> {
         let Self { ingress, observer, .. } = self;
         let reason = ingress.end_reason(status);
         observer.ingress_gone();
-        observer.restarts(&reason, ingress.ended(), ingress.start + 1);
+        observer.restarts(None, &reason, ingress.ended(), ingress.start + 1);
         self.failures.add(reason, false);
         self.lambdas.iter_mut().for_each(SupervisedLambda::lost_ingress);
         Ok(None)
@@ -329,7 +382,8 @@ impl<'a> ProcessGroup<'a> {
         for supervised in lambdas.iter_mut().filter(|supervised| supervised.is_running()) {
             let lambda = &supervised.lambda;
             let is_recorded = recorder.is_some() && lambda.manifest.record.is_some();
-            let reader = grants::lambda(lambda, context.spec, is_recorded, supervised.restarts);
+            let number = supervised.process_number();
+            let reader = grants::lambda(lambda, context.spec, is_recorded, number);
             let added = ingress.control.add_reader(&grants::again(reader, recorder.is_some()));
             let Some(socket) = ingress.granted(added) else { return };
             supervised.pass_ingress(socket, *observer);
@@ -392,99 +446,10 @@ impl<'a> ProcessGroup<'a> {
         self.ingress.show_last(self.observer);
         Ok(())
     }
+}
 
-    /// Waits for the end of a process, and shows output meanwhile.
-    fn wait(
-        &mut self,
-        child: impl Fn(&mut Self) -> Option<&mut ChildProcess>,
-    ) -> Result<Option<ExitStatus>, Failure> {
-        loop {
-            let Some(process) = child(self) else { return Ok(None) };
-            if let Some(status) = process.status()? {
-                return Ok(Some(status));
-            }
-            if let Some(warning) = process.kill_if_late() {
-                self.observer.warn(&warning);
-            }
-            self.poll(POLL_INTERVAL);
-        }
-    }
-
-    /// Shows output while `is_open`, for [`DRAIN_TIMEOUT`] at most.
-    fn drain(&mut self, is_open: impl Fn(&mut Self) -> bool) {
-        let until = Instant::now() + DRAIN_TIMEOUT;
-        while is_open(self) {
-            let left = until.saturating_duration_since(Instant::now());
-            match self.output.recv_timeout(left) {
-                Ok(output) => self.show(output),
-                Err(_) => return,
-            }
-        }
-    }
-
-    /// Waits for output and shows what is pending. Returns after `timeout` at the latest, so that a
-    /// flood of output does not block the caller.
-    fn poll(&mut self, timeout: Duration) {
-        let until = Instant::now() + timeout;
-        let mut wait = timeout;
-        while let Ok(output) = self.output.recv_timeout(wait) {
-            self.show(output);
-            if Instant::now() >= until {
-                return;
-            }
-            wait = Duration::ZERO;
-        }
-    }
-
-    fn show(&mut self, ChildOutput { from, piece }: ChildOutput) {
-        let Self { lambdas, ingress, recorder, observer, .. } = self;
-        let (prefix, mut current) = match from {
-            ChildId::Lambda { index, start } => {
-                let supervised = &mut lambdas[index];
-                let prefix = supervised.lambda.prefix.clone();
-                // Processes that an earlier one left running may still write into its pipes.
-                (prefix, Some(supervised).filter(|current| current.restarts == start))
-            }
-            ChildId::Ingress { start }
-                if start != ingress.start && !matches!(piece, OutputPiece::Stderr { .. }) =>
-            {
-                return;
-            }
-            ChildId::Ingress { .. } | ChildId::Recorder | ChildId::Inference => {
-                (String::new(), None)
-            }
-        };
-        match piece {
-            OutputPiece::Stderr { text, begins_line } => {
-                let prefix = if begins_line { prefix.as_bytes() } else { b"" };
-                observer.stderr(&[prefix, &text].concat());
-            }
-            OutputPiece::Unparsable(line) => {
-                observer.warn(&format!("{prefix}cannot parse a report: {line}"));
-            }
-            OutputPiece::Runtime(report) => {
-                if let Some(current) = &mut current {
-                    current.show(report, ingress.drive_ended, *observer);
-                }
-            }
-            OutputPiece::Ingress(report) => ingress.show(report, *observer),
-            OutputPiece::Inference(event) => {
-                if let InferenceEvent::Ended(reason, _) = &event {
-                    self.failures.add(reason.clone(), false);
-                }
-                observer.inference(event);
-            }
-            OutputPiece::Recorder(report) => {
-                if let Some(recorder) = recorder {
-                    recorder.show(report, *observer);
-                }
-            }
-            OutputPiece::Closed => match (from, current, recorder) {
-                (ChildId::Ingress { .. }, ..) => ingress.open_pipes -= 1,
-                (ChildId::Recorder, _, Some(recorder)) => recorder.open_pipes -= 1,
-                (_, Some(current), _) => current.closed(),
-                _ => {}
-            },
-        }
-    }
+/// Returns the largest sample of an input, in bytes.
+fn largest(lambdas: &[SupervisedLambda]) -> u64 {
+    let inputs = lambdas.iter().flat_map(|supervised| &supervised.lambda.manifest.inputs);
+    inputs.map(|input| input.max_size.bytes()).max().unwrap_or(0)
 }

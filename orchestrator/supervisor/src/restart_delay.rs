@@ -1,5 +1,6 @@
 //! Delays before restarts.
 
+use std::hash::{BuildHasher, Hasher, RandomState};
 use std::time::Duration;
 
 /// Delay before the first restart; it doubles with each further one.
@@ -8,6 +9,8 @@ const DELAY: Duration = Duration::from_secs(1);
 const DELAY_SERVICE: Duration = Duration::from_millis(100);
 /// Maximum delay, so that a broken deployment does not occupy a core with restarts.
 const DELAY_MAX: Duration = Duration::from_secs(30);
+/// As [`DELAY_MAX`], of a process that other programs kill: its own faults do not count here.
+const DELAY_KILLED_MAX: Duration = Duration::from_secs(1);
 /// Run time after which the delay is reset.
 const HEALTHY: Duration = Duration::from_secs(60);
 
@@ -16,38 +19,66 @@ const HEALTHY: Duration = Duration::from_secs(60);
 pub(crate) struct RestartDelay {
     first: Duration,
     next: Duration,
+    most: Duration,
 }
 
 impl RestartDelay {
     pub(crate) fn new() -> Self {
-        Self { first: DELAY, next: DELAY }
+        Self { first: DELAY, next: DELAY, most: DELAY_MAX }
     }
 
     pub(crate) fn of_service() -> Self {
-        Self { first: DELAY_SERVICE, next: DELAY_SERVICE }
+        Self { first: DELAY_SERVICE, next: DELAY_SERVICE, most: DELAY_MAX }
+    }
+
+    pub(crate) fn of_killed() -> Self {
+        Self { most: DELAY_KILLED_MAX, ..Self::of_service() }
     }
 
     /// Returns the delay after a failure, before which it `ran` for this time.
     pub(crate) fn after(&mut self, ran: Duration) -> Duration {
         let delay = if ran >= HEALTHY { self.first } else { self.next };
-        self.next = (delay * 2).min(DELAY_MAX);
-        delay
+        self.next = (delay * 2).min(self.most);
+        jittered(delay)
     }
+}
+
+/// Returns the delay, up to a fifth shorter: processes that fail together, such as those of several
+/// lambdas without a resource, do not start together again.
+fn jittered(delay: Duration) -> Duration {
+    let random = RandomState::new().build_hasher().finish();
+    delay - delay.mul_f64(0.2 * (random as f64 / u64::MAX as f64))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    /// Returns the delays after failures, each after running for this time.
+    fn delays(mut delay: RestartDelay, ran: &[Duration]) -> Vec<Duration> {
+        ran.iter().map(|ran| delay.after(*ran)).collect()
+    }
+
     #[test]
     fn delays_double_up_to_a_maximum_and_start_again_after_a_healthy_run() {
-        let mut delay = RestartDelay::new();
-        let broken: Vec<_> = (0..7).map(|_| delay.after(Duration::ZERO).as_secs()).collect();
-        assert_eq!(broken, [1, 2, 4, 8, 16, 30, 30]);
-        assert_eq!(delay.after(HEALTHY).as_secs(), 1);
-        assert_eq!(delay.after(Duration::ZERO).as_secs(), 2);
-        let mut delay = RestartDelay::of_service();
-        assert_eq!(delay.after(Duration::ZERO).as_millis(), 100);
-        assert_eq!(delay.after(HEALTHY).as_millis(), 100);
+        let mut ran = [Duration::ZERO; 8];
+        ran[7] = HEALTHY;
+        for (delay, expected) in [
+            (RestartDelay::new(), [1000, 2000, 4000, 8000, 16000, 30000, 30000, 1000]),
+            (RestartDelay::of_service(), [100, 200, 400, 800, 1600, 3200, 6400, 100]),
+            (RestartDelay::of_killed(), [100, 200, 400, 800, 1000, 1000, 1000, 100]),
+        ] {
+            for (delay, expected) in delays(delay, &ran).into_iter().zip(expected) {
+                let (most, delay) = (f64::from(expected), delay.as_secs_f64() * 1000.0);
+                assert!((0.799 * most..=most).contains(&delay), "{delay} of {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn processes_that_fail_together_do_not_start_together() {
+        let all = (0..8).map(|_| RestartDelay::new().after(Duration::ZERO));
+        let different: std::collections::BTreeSet<_> = all.collect();
+        assert!(different.len() > 1);
     }
 }

@@ -87,7 +87,7 @@ impl IngressProcess {
         })?;
         let child = ChildProcess::start(
             &context.parts,
-            ("gleaner-ingress", ChildId::Ingress { start }),
+            ("gleaner-ingress", ChildId::Ingress { start }, ""),
             arguments::ingress(context.spec, largest, context.offset_ns),
             None,
             Handover { control: Some(ingress_end), ..Handover::default() },
@@ -137,7 +137,8 @@ impl IngressProcess {
         }
     }
 
-    fn kill(&mut self, why: String) {
+    /// Kills it for this reason; another one is started.
+    pub(crate) fn kill(&mut self, why: String) {
         if self.killed.is_none() {
             self.killed = Some(why);
             self.child.kill();
@@ -248,7 +249,7 @@ impl RecorderProcess {
             Handover { control: Some(recorder_end), ingress: Some(ingress), ..Handover::default() };
         let child = ChildProcess::start(
             &context.parts,
-            ("gleaner-recorder", ChildId::Recorder),
+            ("gleaner-recorder", ChildId::Recorder, ""),
             arguments::recorder(context.spec, recorded.clone(), context.offset_ns),
             None,
             connections,

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use gleaner_lambda::Manifest;
 use gleaner_protocol::ExitRecord;
+use gleaner_protocol::supervision::DesiredLambda;
 
 /// A run: what all its lambdas share.
 #[derive(Clone, Debug, Default)]
@@ -20,6 +21,8 @@ pub struct RunSpec {
     pub rate: Option<f64>,
     /// Arguments of `gleaner-ingress` that select the network.
     pub network: Vec<OsString>,
+    /// Size of samples that the ingress expects at least, in bytes.
+    pub largest: u64,
     /// Duration of the run, from the time at which all lambdas are ready.
     pub duration: Option<Duration>,
     /// True to write every decision, not only those with a trigger or a fault.
@@ -57,6 +60,9 @@ pub struct LambdaSpec {
     pub set: Vec<String>,
     /// Renamed topics: from and to.
     pub remaps: Vec<(String, String)>,
+    /// Its deployment, on a vehicle: then its files are checked before each start, and it is
+    /// started again after every end, unless it fails too often.
+    pub deployment: Option<Box<DesiredLambda>>,
 }
 
 impl LambdaSpec {
@@ -117,6 +123,7 @@ pub(crate) mod tests {
             prefix: format!("{name}: "),
             set: Vec::new(),
             remaps: Vec::new(),
+            deployment: None,
         }
     }
 

@@ -77,6 +77,14 @@ impl EarlierCounts {
         };
     }
 
+    /// Returns the counts with those of the current process, `last`.
+    pub(crate) fn with(&self, last: Option<&LiveStatus>) -> Option<LiveStatus> {
+        match (last, &self.live) {
+            (Some(last), Some(before)) => Some(last.clone().after(before)),
+            (last, before) => last.or(before.as_ref()).cloned(),
+        }
+    }
+
     /// Adds the last process and writes the sum. Writes nothing if there are only counts of one
     /// successful lambda process, which the shim has written.
     ///

@@ -6,13 +6,16 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::FaultKind;
-use gleaner_protocol::{ExitRecord, LiveStatus, Report};
+use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus};
+use gleaner_protocol::{LiveStatus, Report};
 
+use crate::crash_loop::CrashLoop;
 use crate::failures::Failures;
+use crate::lambda_process::{LambdaProcess, ProcessEnd};
 use crate::observer::RunObserver;
-use crate::output::PIPES;
-use crate::process::{ChildProcess, ended};
+use crate::process::ChildProcess;
 use crate::restart_delay::RestartDelay;
+use crate::revision_check::RevisionCheck;
 use crate::spec::LambdaSpec;
 use crate::summary::{EarlierCounts, RunCounts};
 
@@ -24,11 +27,22 @@ const STATUSES_AFTER_DRIVE: u32 = 2;
 pub(crate) struct SupervisedLambda {
     pub(crate) lambda: LambdaSpec,
     state: LambdaState,
+    /// Time since which it has this state.
+    since: Instant,
     /// Number of earlier processes.
     pub(crate) restarts: u32,
     /// Set once one of its processes was ready.
     was_ready: bool,
+    /// Set when it is to end for good.
+    pub(crate) is_leaving: bool,
+    crashes: CrashLoop,
+    /// Set until its quarantine was reported.
+    has_news: bool,
+    /// The reason of the last end of its process that was not requested.
+    last_end: Option<String>,
     delay: RestartDelay,
+    /// Delay after kills by other programs.
+    kills: RestartDelay,
     earlier: EarlierCounts,
     /// Exit code of the process that ended on request.
     pub(crate) exit: Exit,
@@ -37,43 +51,17 @@ pub(crate) struct SupervisedLambda {
 enum LambdaState {
     /// To be started at this time.
     Due(Instant),
+    /// Its files are being checked before a start.
+    Checking(RevisionCheck),
+    /// Its files are as signed: to be started at once.
+    Checked,
     Running(Box<LambdaProcess>),
     /// It could not start, and is not started again.
     NotStarted,
+    /// It failed too often, and is not started again.
+    Quarantined,
     /// It has ended on request, with this last status.
     Ended(Option<Box<LiveStatus>>),
-}
-
-/// A process of a lambda.
-struct LambdaProcess {
-    child: ChildProcess,
-    started: Instant,
-    open_pipes: u8,
-    /// Set when the lambda has finished its `init`.
-    is_ready: bool,
-    /// Set when the lambda has faulted.
-    has_faulted: bool,
-    /// Set when the process ended during a wake, which it could not count.
-    has_lost_wake: bool,
-    /// Set by the last report of the process.
-    has_ended: bool,
-    /// Set when the ingress ended before the process was ready.
-    has_lost_ingress: bool,
-    last: Option<Box<LiveStatus>>,
-    /// Number of statuses since the end of the drive.
-    after_drive: u32,
-}
-
-/// The end of a process.
-enum ProcessEnd {
-    /// On request.
-    Complete(Exit),
-    /// The lambda could not start; a program has printed the cause.
-    NotStarted(Exit),
-    Broken {
-        reason: String,
-        faulted: bool,
-    },
 }
 
 impl SupervisedLambda {
@@ -81,25 +69,119 @@ impl SupervisedLambda {
         Self {
             lambda,
             state: LambdaState::Due(Instant::now()),
+            since: Instant::now(),
             restarts: 0,
             was_ready: false,
+            is_leaving: false,
+            crashes: CrashLoop::default(),
+            has_news: false,
+            last_end: None,
             delay: RestartDelay::new(),
+            kills: RestartDelay::of_killed(),
             earlier: EarlierCounts::default(),
             exit: Exit::Ok,
         }
     }
 
-    /// Returns whether its process is to be started now.
-    pub(crate) fn is_due(&self) -> bool {
-        matches!(&self.state, LambdaState::Due(at) if Instant::now() >= *at)
+    /// Returns whether its process is to be started now. The files of a deployed lambda are checked
+    /// before, in a thread.
+    pub(crate) fn is_due(&mut self) -> bool {
+        match &mut self.state {
+            _ if self.is_leaving => false,
+            LambdaState::Checked => true,
+            LambdaState::Due(at) if Instant::now() < *at => false,
+            LambdaState::Due(_) => match &self.lambda.deployment {
+                None => true,
+                Some(deployment) => {
+                    let check = RevisionCheck::start(deployment);
+                    self.enter(LambdaState::Checking(check));
+                    false
+                }
+            },
+            LambdaState::Checking(check) => match check.result() {
+                None => false,
+                Some(Ok(())) => {
+                    self.state = LambdaState::Checked;
+                    true
+                }
+                Some(Err(reason)) => {
+                    self.quarantine(reason);
+                    false
+                }
+            },
+            _ => false,
+        }
+    }
+
+    /// Returns whether it is started again after every end, unless it fails too often.
+    pub(crate) fn is_kept(&self) -> bool {
+        self.lambda.deployment.is_some()
+    }
+
+    fn enter(&mut self, state: LambdaState) {
+        (self.state, self.since) = (state, Instant::now());
+    }
+
+    fn quarantine(&mut self, reason: String) {
+        self.has_news = true;
+        self.last_end = Some(reason);
+        self.enter(LambdaState::Quarantined);
+    }
+
+    /// Returns the reason of a quarantine, once.
+    pub(crate) fn take_quarantine(&mut self) -> Option<String> {
+        std::mem::take(&mut self.has_news).then(|| self.last_end.clone().unwrap_or_default())
+    }
+
+    /// Notes that its process could not be created.
+    pub(crate) fn failed_to_start(&mut self, failure: &Failure, observer: &mut dyn RunObserver) {
+        let reason = format!("{}{}", self.lambda.prefix, failure.message);
+        let delay = self.delay.after(Duration::ZERO);
+        self.restart_in(delay);
+        self.last_end = Some(failure.message.clone());
+        observer.restarts(Some(&self.lambda), &reason, delay, self.restarts);
+    }
+
+    /// Ends it for good. It has left when [`has_left`](Self::has_left) returns true.
+    pub(crate) fn leave(&mut self) {
+        if !std::mem::replace(&mut self.is_leaving, true) {
+            self.since = Instant::now();
+            self.terminate();
+        }
+    }
+
+    /// Returns whether it is to end, and has no process any more.
+    pub(crate) fn has_left(&self) -> bool {
+        self.is_leaving && !self.is_running()
+    }
+
+    /// Returns whether this is its current process.
+    pub(crate) fn runs_as(&self, number: u32) -> bool {
+        matches!(&self.state, LambdaState::Running(process) if process.number == number)
+    }
+
+    /// Returns the number of its current process in the group; 0 without one.
+    pub(crate) fn process_number(&self) -> u32 {
+        match &self.state {
+            LambdaState::Running(process) => process.number,
+            _ => 0,
+        }
+    }
+
+    /// Keeps the last error message that its process writes to standard error.
+    pub(crate) fn has_written(&mut self, text: &[u8]) {
+        let prefix = self.lambda.prefix.clone();
+        if let Some(process) = self.process() {
+            process.has_written(text, &prefix);
+        }
     }
 
     /// Returns whether it waits for nothing: its process is ready, or it could not start.
     pub(crate) fn is_settled(&self) -> bool {
         match &self.state {
             LambdaState::Running(process) => process.is_ready,
-            LambdaState::Due(_) => false,
-            LambdaState::NotStarted | LambdaState::Ended(_) => true,
+            LambdaState::Due(_) | LambdaState::Checking(_) | LambdaState::Checked => false,
+            LambdaState::NotStarted | LambdaState::Quarantined | LambdaState::Ended(_) => true,
         }
     }
 
@@ -109,19 +191,8 @@ impl SupervisedLambda {
     }
 
     /// Sets the process that was started for it.
-    pub(crate) fn started(&mut self, child: ChildProcess) {
-        self.state = LambdaState::Running(Box::new(LambdaProcess {
-            child,
-            started: Instant::now(),
-            open_pipes: PIPES,
-            is_ready: false,
-            has_faulted: false,
-            has_lost_wake: false,
-            has_ended: false,
-            has_lost_ingress: false,
-            last: None,
-            after_drive: 0,
-        }));
+    pub(crate) fn started(&mut self, child: ChildProcess, number: u32) {
+        self.enter(LambdaState::Running(Box::new(LambdaProcess::new(child, number))));
     }
 
     fn process(&mut self) -> Option<&mut LambdaProcess> {
@@ -199,6 +270,7 @@ impl SupervisedLambda {
                 process.is_ready = true;
                 *was_ready = true;
             }
+            Report::Isolation { layers } => process.layers = layers,
             Report::Decision(decision) => {
                 let fault = decision.fault.as_ref().map(|fault| fault.kind);
                 process.has_faulted |= fault.is_some();
@@ -232,6 +304,43 @@ impl SupervisedLambda {
                 && process.last.as_deref().is_some_and(has_handled))
     }
 
+    /// Returns what it is doing.
+    pub(crate) fn phase(&self) -> LambdaPhase {
+        match &self.state {
+            _ if self.is_leaving => LambdaPhase::Stopping,
+            LambdaState::Due(_) | LambdaState::Checked => LambdaPhase::Waiting,
+            LambdaState::Checking(_) => LambdaPhase::Checking,
+            LambdaState::Running(process) if !process.is_ready => LambdaPhase::Starting,
+            LambdaState::Running(_) => LambdaPhase::Running,
+            LambdaState::NotStarted | LambdaState::Quarantined | LambdaState::Ended(_) => {
+                LambdaPhase::Quarantined
+            }
+        }
+    }
+
+    /// Returns its status; `None` for one that was not deployed.
+    pub(crate) fn status_report(&self) -> Option<LambdaStatus> {
+        let deployment = self.lambda.deployment.as_ref()?;
+        let process = match &self.state {
+            LambdaState::Running(process) => Some(process),
+            _ => None,
+        };
+        let last = process.and_then(|process| process.last.as_deref());
+        Some(LambdaStatus {
+            id: deployment.id.clone(),
+            name: deployment.name.clone(),
+            revision: deployment.revision.clone(),
+            attempt: deployment.attempt,
+            phase: self.phase(),
+            phase_s: self.since.elapsed().as_secs_f64(),
+            pid: process.map(|process| process.child.pid()),
+            restarts: self.restarts,
+            last_end: self.last_end.clone(),
+            live: self.earlier.with(last).map(Box::new),
+            layers: process.map(|process| process.layers.clone()).unwrap_or_default(),
+        })
+    }
+
     /// Returns the number of wakes of its process.
     pub(crate) fn wakes(&self) -> u64 {
         let LambdaState::Running(process) = &self.state else { return 0 };
@@ -248,21 +357,24 @@ impl SupervisedLambda {
         failures: &mut Failures,
     ) {
         let is_lost = |process: &mut LambdaProcess| process.has_lost_ingress && !process.is_ready;
+        let is_ending = is_ending || self.is_leaving;
         if !is_ending && self.process().is_some_and(is_lost) {
             return self.interrupted(observer, failures);
         }
         let Some(process) = self.take_process() else { return };
         observer.lambda_gone(&self.lambda);
-        let prefix = &self.lambda.prefix;
+        let (prefix, is_kept) = (&self.lambda.prefix, self.is_kept());
+        let mut is_unusable = false;
         let (reason, faulted) = match process.classify(&self.lambda, status, is_ending) {
-            ProcessEnd::Complete(exit) => {
+            ProcessEnd::Complete(exit) if is_ending || !is_kept => {
                 self.exit = exit;
-                self.state = LambdaState::Ended(process.last);
+                self.enter(LambdaState::Ended(process.last));
                 return;
             }
+            ProcessEnd::Complete(_) => ("another program has ended its process".to_owned(), false),
             // It has printed the cause. After a successful start it is restarted, since the cause
             // may be temporary.
-            ProcessEnd::NotStarted(exit) if !self.was_ready => {
+            ProcessEnd::NotStarted(exit) if !self.was_ready && !is_kept => {
                 failures.add_not_started(exit);
                 self.state = LambdaState::NotStarted;
                 if !prefix.is_empty() {
@@ -271,20 +383,38 @@ impl SupervisedLambda {
                 return;
             }
             ProcessEnd::NotStarted(exit) => {
-                ("it could not start".to_owned(), exit == Exit::LambdaFaulted)
+                // A start with the same files and settings fails again.
+                is_unusable = is_kept && matches!(exit, Exit::Usage | Exit::Denied);
+                (process.not_started(is_kept), exit == Exit::LambdaFaulted)
             }
             ProcessEnd::Broken { reason, faulted } => (reason, faulted),
         };
-        let reason = format!("{prefix}{reason}");
-        let ran = process.started.elapsed();
+        let shown = format!("{prefix}{reason}");
+        let (ran, is_ready) = (process.started.elapsed(), process.is_ready);
+        let is_outside = is_kept && process.was_killed_from_outside(&self.lambda, status);
         self.add_earlier(*process);
+        failures.add(shown.clone(), faulted);
         if is_ending {
-            observer.warn(&reason);
-        } else {
-            let (delay, restarts) = (self.restart_after(ran), self.restarts);
-            observer.restarts(&reason, delay, restarts);
+            observer.warn(&shown);
+            return;
         }
-        failures.add(reason, faulted);
+        if is_kept {
+            let quarantine = match is_outside || is_unusable {
+                true => is_unusable.then(|| reason.clone()),
+                false => self
+                    .crashes
+                    .ended(Instant::now(), is_ready)
+                    .map(|why| format!("{why}; the last time, {reason}")),
+            };
+            if let Some(reason) = quarantine {
+                return self.quarantine(reason);
+            }
+            self.last_end = Some(reason);
+        }
+        let delays = if is_outside { &mut self.kills } else { &mut self.delay };
+        let delay = delays.after(ran);
+        self.restart_in(delay);
+        observer.restarts(Some(&self.lambda), &shown, delay, self.restarts);
     }
 
     /// Handles the end of its process, which was requested as another process of the run failed.
@@ -293,8 +423,7 @@ impl SupervisedLambda {
         failures.note(process.has_faulted);
         observer.lambda_gone(&self.lambda);
         self.add_earlier(*process);
-        self.restarts += 1;
-        self.state = LambdaState::Due(Instant::now());
+        self.restart_in(Duration::ZERO);
     }
 
     /// Takes the current process. The caller sets the next state.
@@ -308,11 +437,9 @@ impl SupervisedLambda {
         }
     }
 
-    fn restart_after(&mut self, ran: Duration) -> Duration {
-        let delay = self.delay.after(ran);
+    fn restart_in(&mut self, delay: Duration) {
         self.restarts += 1;
-        self.state = LambdaState::Due(Instant::now() + delay);
-        delay
+        self.enter(LambdaState::Due(Instant::now() + delay));
     }
 
     fn add_earlier(&mut self, process: LambdaProcess) {
@@ -324,35 +451,8 @@ impl SupervisedLambda {
         let last = match self.state {
             LambdaState::NotStarted => return Ok(()),
             LambdaState::Ended(last) => last,
-            LambdaState::Due(_) | LambdaState::Running(_) => None,
+            _ => None,
         };
         self.earlier.complete(last.map(|last| *last), counts, &self.lambda.out)
-    }
-}
-
-impl LambdaProcess {
-    fn classify(&self, lambda: &LambdaSpec, status: ExitStatus, requested: bool) -> ProcessEnd {
-        let record = ExitRecord::read(&lambda.exit_record()).ok();
-        // A lambda can end its process as if that had been requested. The shim records whether it
-        // was requested, and in time.
-        let requested = record.as_ref().map_or(requested, |record| record.end_requested);
-        match status.code().and_then(Exit::from_code) {
-            // Ended before it could handle the signal.
-            None if requested && !self.is_ready => ProcessEnd::Complete(Exit::Ok),
-            Some(exit @ (Exit::Ok | Exit::LambdaFaulted)) if requested && self.has_ended => {
-                ProcessEnd::Complete(exit)
-            }
-            Some(exit) if !self.is_ready && exit != Exit::Ok => ProcessEnd::NotStarted(exit),
-            _ => {
-                let reason = record.as_ref().and_then(ExitRecord::sentence);
-                let faulted =
-                    self.has_faulted || record.is_some_and(|record| record.is_caused_by_lambda());
-                let reason = reason.map_or_else(
-                    || ended("the lambda's process", status),
-                    |reason| format!("the lambda's process {reason}"),
-                );
-                ProcessEnd::Broken { reason, faulted }
-            }
-        }
     }
 }

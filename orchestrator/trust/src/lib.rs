@@ -28,4 +28,4 @@ pub use payload::{
 };
 pub use publish::{Published, Release, ReleaseError, publish};
 pub use refusal::Refusal;
-pub use verify::{Trusted, Verdict, Verifier, first_root, next_root};
+pub use verify::{Trusted, Verdict, Verifier, first_root, next_root, revision_of_digest};

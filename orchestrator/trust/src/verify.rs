@@ -191,6 +191,22 @@ fn verified<P: Payload>(envelope: &[u8], keys: &[ScopedKey]) -> Result<Trusted<P
     Ok(Trusted { payload: envelope.payload()?, digest: envelope.digest(), signers })
 }
 
+/// Opens the revision in `envelope` that a verified deployment names by `digest`: no signature is
+/// checked again, as the digest covers each byte.
+///
+/// # Errors
+///
+/// [`Refusal::OtherRevision`], and those of the format.
+pub fn revision_of_digest(envelope: &[u8], digest: &Sha256) -> Result<Revision, Refusal> {
+    let envelope = Unverified::<Revision>::parse(envelope)?;
+    let found = envelope.digest();
+    if found != *digest {
+        let (wanted, found) = (digest.to_string(), Some(found));
+        return Err(Refusal::OtherRevision { role: "revision", wanted, found });
+    }
+    envelope.payload()
+}
+
 /// Opens the trust root that is installed on a vehicle: its own keys must have signed it, and it
 /// may not be older than one before. The first one is trusted as installed.
 ///

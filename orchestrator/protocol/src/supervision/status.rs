@@ -1,0 +1,142 @@
+//! The status of all processes, which the supervisor sends.
+
+use serde::{Deserialize, Serialize};
+
+use crate::inference::InferenceStatus;
+use crate::ingress::IngressStatus;
+use crate::link::RecorderStatus;
+use crate::{Layer, LiveStatus};
+
+/// A report of the supervisor.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "supervisor", rename_all = "snake_case")]
+pub enum SupervisorReport {
+    /// Sent first on each connection.
+    Welcome(Welcome),
+    /// A request that cannot be met, for this reason. Nothing has changed.
+    Refused {
+        /// The reason.
+        reason: String,
+    },
+    /// Sent once a second, and at once after a change. If the reader is too slow, some are dropped.
+    Status(Box<SupervisorStatus>),
+}
+
+/// The identity of a supervisor.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Welcome {
+    /// [`SUPERVISION_VERSION`](super::SUPERVISION_VERSION).
+    pub version: u32,
+    /// Version of its program.
+    pub program: String,
+    /// Number of its process.
+    pub pid: u32,
+}
+
+/// The status of all processes.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct SupervisorStatus {
+    /// Generation of the newest wanted state that was received.
+    pub generation: u64,
+    /// Time since the start of the supervisor, in s.
+    pub up_s: f64,
+    /// The lambdas, in the order of the wanted state, and those that are ending.
+    pub lambdas: Vec<LambdaStatus>,
+    /// The ingress.
+    pub ingress: ProcessStatus<IngressStatus>,
+    /// The recorder; absent while no lambda records.
+    pub recorder: Option<ProcessStatus<RecorderStatus>>,
+    /// The process that runs models; absent while no lambda has any.
+    pub inference: Option<ProcessStatus<InferenceStatus>>,
+    /// Number of clips since the start of the supervisor.
+    pub clips: u64,
+    /// Number of events that could not be made durable.
+    pub events_lost: u64,
+}
+
+/// The status of a process that all lambdas share.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ProcessStatus<S> {
+    /// True while it runs and is ready.
+    pub is_ready: bool,
+    /// Number of its restarts.
+    pub restarts: u32,
+    /// The reason of its last end.
+    pub last_end: Option<String>,
+    /// Its last status.
+    pub last: Option<Box<S>>,
+}
+
+impl<S> Default for ProcessStatus<S> {
+    fn default() -> Self {
+        Self { is_ready: false, restarts: 0, last_end: None, last: None }
+    }
+}
+
+impl<S> ProcessStatus<S> {
+    /// Counts an end, for this reason.
+    pub fn ended(&mut self, reason: &str) {
+        self.is_ready = false;
+        self.restarts += 1;
+        self.last_end = Some(reason.to_owned());
+    }
+}
+
+/// The status of a lambda.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LambdaStatus {
+    /// Id of its deployment.
+    pub id: String,
+    /// Name of the lambda.
+    pub name: String,
+    /// Digest of its revision.
+    pub revision: String,
+    /// The attempt of the wanted state.
+    pub attempt: u64,
+    /// The phase.
+    pub phase: LambdaPhase,
+    /// Time in this phase, in s.
+    pub phase_s: f64,
+    /// Number of the shim's process, if it runs.
+    pub pid: Option<u32>,
+    /// Number of restarts of this revision.
+    pub restarts: u32,
+    /// The reason of the last end of its process, or of the quarantine.
+    pub last_end: Option<String>,
+    /// Counts of its process, with those of earlier ones.
+    pub live: Option<Box<LiveStatus>>,
+    /// The layers around its process, as tested.
+    pub layers: Vec<Layer>,
+}
+
+/// What a lambda is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LambdaPhase {
+    /// It waits for its start: for the ingress, or after an end.
+    Waiting,
+    /// Its files are being checked.
+    Checking,
+    /// Its process runs, and its `init` is not over.
+    Starting,
+    /// It is ready, or in a wake.
+    Running,
+    /// It was requested to end.
+    Stopping,
+    /// It failed too often, or cannot run, and is not started again.
+    Quarantined,
+}
+
+impl LambdaPhase {
+    /// Returns its name, as in the status.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Waiting => "waiting",
+            Self::Checking => "checking",
+            Self::Starting => "starting",
+            Self::Running => "running",
+            Self::Stopping => "stopping",
+            Self::Quarantined => "quarantined",
+        }
+    }
+}

@@ -1,0 +1,134 @@
+//! One process of a lambda, from its start to its end.
+
+use std::os::unix::process::ExitStatusExt;
+use std::process::ExitStatus;
+use std::time::Instant;
+
+use gleaner_base::Exit;
+use gleaner_protocol::{ExitRecord, Layer, LiveStatus};
+use rustix::process::Signal;
+
+use crate::output::PIPES;
+use crate::process::{ChildProcess, ended};
+use crate::spec::LambdaSpec;
+
+/// Maximum length of an error message that is kept, in bytes.
+const ERROR_MAX: usize = 2048;
+
+const SIGKILL: i32 = Signal::KILL.as_raw();
+const SIGTERM: i32 = Signal::TERM.as_raw();
+
+/// A process of a lambda.
+pub(crate) struct LambdaProcess {
+    pub(crate) child: ChildProcess,
+    /// Its number in the group.
+    pub(crate) number: u32,
+    pub(crate) started: Instant,
+    pub(crate) open_pipes: u8,
+    /// Set when the lambda has finished its `init`.
+    pub(crate) is_ready: bool,
+    /// Set when the lambda has faulted.
+    pub(crate) has_faulted: bool,
+    /// Set when the process ended during a wake, which it could not count.
+    pub(crate) has_lost_wake: bool,
+    /// Set by the last report of the process.
+    pub(crate) has_ended: bool,
+    /// Set when the ingress ended before the process was ready.
+    pub(crate) has_lost_ingress: bool,
+    pub(crate) last: Option<Box<LiveStatus>>,
+    /// The layers around it, as tested.
+    pub(crate) layers: Vec<Layer>,
+    /// Number of statuses since the end of the drive.
+    pub(crate) after_drive: u32,
+    /// The last error message on its standard error.
+    pub(crate) error: String,
+}
+
+/// The end of a process.
+pub(crate) enum ProcessEnd {
+    /// On request.
+    Complete(Exit),
+    /// The lambda could not start; a program has printed the cause.
+    NotStarted(Exit),
+    Broken {
+        reason: String,
+        faulted: bool,
+    },
+}
+
+impl LambdaProcess {
+    pub(crate) fn new(child: ChildProcess, number: u32) -> Self {
+        Self {
+            child,
+            number,
+            started: Instant::now(),
+            open_pipes: PIPES,
+            is_ready: false,
+            has_faulted: false,
+            has_lost_wake: false,
+            has_ended: false,
+            has_lost_ingress: false,
+            last: None,
+            layers: Vec::new(),
+            after_drive: 0,
+            error: String::new(),
+        }
+    }
+
+    /// Keeps the last error message that it writes to standard error, without `prefix`.
+    pub(crate) fn has_written(&mut self, text: &[u8], prefix: &str) {
+        let text = String::from_utf8_lossy(text);
+        let text = text.strip_prefix(prefix).unwrap_or(&text).trim_end();
+        if text.starts_with("error: ") {
+            text.clone_into(&mut self.error);
+        } else if !self.error.is_empty() && self.error.len() < ERROR_MAX {
+            self.error = format!("{}\n{text}", self.error);
+        }
+    }
+
+    /// Returns the reason for a start that failed, with its error message if it is not shown.
+    pub(crate) fn not_started(&self, with_error: bool) -> String {
+        match self.error.strip_prefix("error: ").filter(|_| with_error) {
+            Some(error) => format!("it could not start: {error}"),
+            None => "it could not start".to_owned(),
+        }
+    }
+
+    /// Returns whether another program has killed it: not its shim, nor the kernel for its memory.
+    pub(crate) fn was_killed_from_outside(&self, lambda: &LambdaSpec, status: ExitStatus) -> bool {
+        let killed = matches!(status.signal(), Some(SIGKILL | SIGTERM));
+        let record = ExitRecord::read(&lambda.exit_record()).ok();
+        killed && record.is_none_or(|it| it.killed.is_none() && !it.out_of_memory)
+    }
+
+    /// Returns how it has ended, with `status`. `requested` counts if its shim left no record.
+    pub(crate) fn classify(
+        &self,
+        lambda: &LambdaSpec,
+        status: ExitStatus,
+        requested: bool,
+    ) -> ProcessEnd {
+        let record = ExitRecord::read(&lambda.exit_record()).ok();
+        // A lambda can end its process as if that had been requested. The shim records whether it
+        // was requested, and in time.
+        let requested = record.as_ref().map_or(requested, |record| record.end_requested);
+        match status.code().and_then(Exit::from_code) {
+            // Ended before it could handle the signal.
+            None if requested && !self.is_ready => ProcessEnd::Complete(Exit::Ok),
+            Some(exit @ (Exit::Ok | Exit::LambdaFaulted)) if requested && self.has_ended => {
+                ProcessEnd::Complete(exit)
+            }
+            Some(exit) if !self.is_ready && exit != Exit::Ok => ProcessEnd::NotStarted(exit),
+            _ => {
+                let reason = record.as_ref().and_then(ExitRecord::sentence);
+                let faulted =
+                    self.has_faulted || record.is_some_and(|record| record.is_caused_by_lambda());
+                let reason = reason.map_or_else(
+                    || ended("the lambda's process", status),
+                    |reason| format!("the lambda's process {reason}"),
+                );
+                ProcessEnd::Broken { reason, faulted }
+            }
+        }
+    }
+}

@@ -1,0 +1,47 @@
+//! Compares the files of a deployed lambda with its signed revision before each start.
+
+use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
+use std::thread;
+
+use gleaner_base::{PlainFile, chain};
+use gleaner_lambda::BuildDir;
+use gleaner_protocol::supervision::DesiredLambda;
+use gleaner_trust::{FileDigestError, Payload, Revision, check_files, revision_of_digest};
+
+/// A check in a thread of its own: models of gigabytes take seconds, and other lambdas do not wait.
+pub(crate) struct RevisionCheck {
+    result: Receiver<Result<(), String>>,
+}
+
+impl RevisionCheck {
+    pub(crate) fn start(deployment: &DesiredLambda) -> Self {
+        let (sender, result) = sync_channel(1);
+        let deployment = deployment.clone();
+        let thread = thread::Builder::new().name("revision".to_owned());
+        // Without a thread, the dropped sender is the result.
+        let _ = thread.spawn(move || sender.send(check(&deployment)));
+        Self { result }
+    }
+
+    /// Returns the result, once it is there.
+    pub(crate) fn result(&self) -> Option<Result<(), String>> {
+        match self.result.try_recv() {
+            Ok(result) => Some(result),
+            Err(TryRecvError::Empty) => None,
+            Err(TryRecvError::Disconnected) => {
+                Some(Err("its files could not be checked: no thread".to_owned()))
+            }
+        }
+    }
+}
+
+fn check(deployment: &DesiredLambda) -> Result<(), String> {
+    let DesiredLambda { revision, folder, envelope, .. } = deployment;
+    let digest = revision.parse().map_err(|_| format!("`{revision}` is no digest"))?;
+    let envelope = PlainFile::named(envelope, Revision::MAX).and_then(PlainFile::read_whole);
+    let envelope =
+        envelope.map_err(|error| format!("its revision cannot be read: {}", chain(&error)))?;
+    let refused = |error: FileDigestError| format!("its files are refused: {}", chain(&error));
+    let revision = revision_of_digest(&envelope, &digest).map_err(|it| refused(it.into()))?;
+    check_files(&revision, &BuildDir::of(folder)).map_err(refused)
+}

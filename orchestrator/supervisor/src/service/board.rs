@@ -1,0 +1,190 @@
+//! The events of a run, as the status and as records of the spool `events`.
+
+use std::io::Write;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use gleaner_base::{Failure, format_duration, visible};
+use gleaner_lambda::Clip;
+use gleaner_protocol::Report;
+use gleaner_protocol::inference::InferenceReport;
+use gleaner_protocol::ingress::{IngressReport, IngressStatus};
+use gleaner_protocol::link::{Loss, RecorderReport};
+use gleaner_protocol::supervision::{EventKind, SupervisionSpec, SupervisorStatus, VehicleEvent};
+
+use crate::event_log::EventLog;
+use crate::inference::InferenceEvent;
+use crate::observer::RunObserver;
+use crate::spec::LambdaSpec;
+
+/// The board. A clone shows the same.
+#[derive(Clone)]
+pub(super) struct Board {
+    log: Arc<EventLog>,
+    status: Arc<Mutex<SupervisorStatus>>,
+    started: Instant,
+}
+
+impl Board {
+    /// Opens the log of events.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names its folder.
+    pub(super) fn open(spec: &SupervisionSpec) -> Result<Self, Failure> {
+        let log = Arc::new(EventLog::open(&spec.spool, "events")?);
+        Ok(Self { log, status: Arc::default(), started: Instant::now() })
+    }
+
+    /// Adds an event, about a deployed lambda or not.
+    pub(super) fn event(&self, event: EventKind, lambda: Option<&LambdaSpec>, text: &str) {
+        let deployment = lambda.and_then(|lambda| lambda.deployment.as_ref());
+        self.log.add(&VehicleEvent {
+            event,
+            lambda: deployment.map(|deployment| deployment.id.clone()),
+            revision: deployment.map(|deployment| deployment.revision.clone()),
+            text: visible(text),
+        });
+    }
+
+    /// Returns the status, without generation and lambdas.
+    pub(super) fn status(&self) -> SupervisorStatus {
+        let (up_s, events_lost) = (self.started.elapsed().as_secs_f64(), self.log.lost());
+        SupervisorStatus { up_s, events_lost, ..self.lock().clone() }
+    }
+
+    /// Notes that all shared processes have ended, for this reason.
+    pub(super) fn group_ended(&self, reason: &str) {
+        let mut status = self.lock();
+        status.ingress.ended(reason);
+        if let Some(recorder) = &mut status.recorder {
+            recorder.ended(reason);
+        }
+        if let Some(inference) = &mut status.inference {
+            inference.ended(reason);
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, SupervisorStatus> {
+        self.status.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn clip(&self, clip: &Clip, what: &str) {
+        self.lock().clips += 1;
+        let (file, bytes) = (clip.file.display(), clip.bytes);
+        self.event(EventKind::Clip, None, &format!("{what} clip {file} of {bytes} bytes"));
+    }
+}
+
+impl RunObserver for Board {
+    fn lambda(&mut self, lambda: &LambdaSpec, report: &Report) {
+        if matches!(report, Report::Ready) {
+            self.event(EventKind::Ready, Some(lambda), "ready");
+        }
+    }
+
+    fn lambda_gone(&mut self, _: &LambdaSpec) {}
+
+    fn quarantined(&mut self, lambda: &LambdaSpec, reason: &str) {
+        self.event(EventKind::Quarantined, Some(lambda), reason);
+    }
+
+    fn ingress(&mut self, report: &IngressReport) {
+        let ingress = &mut self.lock().ingress;
+        match report {
+            IngressReport::Ready => ingress.is_ready = true,
+            IngressReport::Status(status) => ingress.last = Some(status.clone()),
+            _ => {}
+        }
+    }
+
+    fn ingress_gone(&mut self) {
+        self.lock().ingress.is_ready = false;
+    }
+
+    fn ingress_ended(&mut self, status: &IngressStatus) {
+        self.lock().ingress.last = Some(Box::new(status.clone()));
+    }
+
+    fn recorder(&mut self, report: &RecorderReport) {
+        match report {
+            RecorderReport::Ready => {
+                self.lock().recorder.get_or_insert_default().is_ready = true;
+            }
+            RecorderReport::Status(status) | RecorderReport::Ended(status) => {
+                self.lock().recorder.get_or_insert_default().last = Some(status.clone());
+            }
+            RecorderReport::Clip(clip) => self.clip(clip, "recorded"),
+            RecorderReport::Recovered(clip) => self.clip(clip, "recovered"),
+            RecorderReport::Loss(loss) => self.event(EventKind::Loss, None, &loss_text(loss)),
+        }
+    }
+
+    fn inference(&mut self, event: InferenceEvent) {
+        match event {
+            InferenceEvent::Report(report) => {
+                let mut status = self.lock();
+                let inference = status.inference.get_or_insert_default();
+                match report {
+                    InferenceReport::Ready => inference.is_ready = true,
+                    InferenceReport::Status(last) | InferenceReport::Ended(last) => {
+                        inference.last = Some(Box::new(last));
+                    }
+                    InferenceReport::Model(_) => {}
+                }
+            }
+            InferenceEvent::Stderr(piece) => self.stderr(&piece),
+            InferenceEvent::Ended(reason, delay) => {
+                self.lock().inference.get_or_insert_default().ended(&reason);
+                self.event(EventKind::Failed, None, &failed(&reason, delay));
+            }
+            InferenceEvent::Warning(text) => self.warn(&text),
+        }
+    }
+
+    fn playing(&mut self, files: &str) {
+        self.event(EventKind::Started, None, &format!("playing {files}"));
+    }
+
+    fn restarts(
+        &mut self,
+        lambda: Option<&LambdaSpec>,
+        reason: &str,
+        delay: Duration,
+        _restarts: u32,
+    ) {
+        if lambda.is_none() {
+            self.lock().ingress.ended(reason);
+        }
+        self.event(EventKind::Failed, lambda, &failed(reason, delay));
+    }
+
+    fn warn(&mut self, text: &str) {
+        self.event(EventKind::Warning, None, text);
+    }
+
+    fn stderr(&mut self, piece: &[u8]) {
+        // Of an orchestrator that has ended, the terminal may be closed.
+        let _ = std::io::stderr().write_all(piece);
+    }
+}
+
+fn failed(reason: &str, delay: Duration) -> String {
+    let delay = Duration::from_millis(u64::try_from(delay.as_millis()).unwrap_or(u64::MAX));
+    format!("{reason}; it starts again in {}", format_duration(delay))
+}
+
+fn loss_text(loss: &Loss) -> String {
+    match loss {
+        Loss::Deleted { file, bytes, reason, .. } => {
+            format!("clip {} of {bytes} bytes was deleted: {reason}", file.display())
+        }
+        Loss::NotDeleted { file, reason, .. } => {
+            format!("clip {} could not be deleted: {reason}", file.display())
+        }
+        Loss::Failed { reason, .. } => format!("a clip could not be written: {reason}"),
+        Loss::DiskSuppressed { triggers, reason, .. } => {
+            format!("{triggers} triggers recorded nothing: {reason}")
+        }
+    }
+}

@@ -1,0 +1,42 @@
+//! The program `gleaner-supervisor`: runs what the orchestrator wants, and goes on without it.
+//!
+//! - `connection`: the orchestrator's requests, and reports to it.
+//! - `board`: the events of a run become the status, and records of the spool `events`.
+//! - `serve`: the loop.
+//!
+//! It has no network and no keys, and runs no code but that of its programs. What it is told comes
+//! over one socket, from a process of the same user.
+
+mod board;
+mod connection;
+mod serve;
+
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixListener;
+use std::process::ExitCode;
+
+use gleaner_base::{Exit, Failure};
+
+/// Runs the program `gleaner-supervisor`. Its standard input is a socket that listens for the
+/// orchestrator.
+pub fn main() -> ExitCode {
+    let ended = listener().and_then(serve::serve);
+    if let Err(failure) = &ended {
+        eprintln!("{failure}");
+    }
+    ended.map_or_else(|failure| failure.exit.code(), |()| Exit::Ok.code()).into()
+}
+
+fn listener() -> Result<UnixListener, Failure> {
+    let unusable = |error: &dyn std::error::Error| {
+        Failure::caused_by(Exit::Usage, "standard input is no socket that listens", error)
+            .with_help("`gleaner-orchestrator` starts this program")
+    };
+    let stdin: OwnedFd = rustix::io::fcntl_dupfd_cloexec(rustix::stdio::stdin(), 3)
+        .map_err(|error| unusable(&std::io::Error::from(error)))?;
+    let listens = rustix::net::sockopt::socket_acceptconn(&stdin);
+    match listens.map_err(|error| unusable(&std::io::Error::from(error)))? {
+        true => Ok(UnixListener::from(stdin)),
+        false => Err(unusable(&std::io::Error::other("it does not listen"))),
+    }
+}

@@ -1,0 +1,309 @@
+//! The loop: keeps running what the orchestrator wants, across failures of processes.
+
+use std::collections::HashSet;
+use std::fs;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use gleaner_base::{Exit, Failure, chain};
+use gleaner_lambda::{BuildDir, Manifest, Vehicle};
+use gleaner_parts::Parts;
+use gleaner_protocol::supervision::{
+    DesiredLambda, DesiredState, EventKind, LAMBDAS_MAX, LambdaPhase, LambdaStatus,
+    SUPERVISION_VERSION, SupervisionSpec, SupervisorReport, SupervisorRequest,
+};
+use signal_hook::consts::{SIGINT, SIGTERM};
+
+use super::board::Board;
+use super::connection::Connection;
+use crate::failures::Failures;
+use crate::group_end::GroupEnd;
+use crate::process_group::{ProcessGroup, RunRecord};
+use crate::reconcile::{Action, KnownLambda, reconcile};
+use crate::restart_delay::RestartDelay;
+use crate::spec::{LambdaSpec, RunSpec};
+use crate::summary::RunCounts;
+use crate::supervised::SupervisedLambda;
+use crate::{POLL_INTERVAL, RunContext, clock_offset};
+
+/// Interval of the status without a change.
+const STATUS_INTERVAL: Duration = Duration::from_secs(1);
+/// Size of samples that the ingress always expects: it is not started again for a lambda with
+/// images of usual cameras.
+const LARGEST: u64 = 8 << 20;
+
+/// Runs what the orchestrator wants until it requests the end, or until SIGTERM.
+pub(super) fn serve(listener: std::os::unix::net::UnixListener) -> Result<(), Failure> {
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [SIGTERM, SIGINT] {
+        signal_hook::flag::register(signal, Arc::clone(&stop))
+            .map_err(|error| Failure::caused_by(Exit::Internal, "cannot handle signals", &error))?;
+    }
+    let connection = Connection::accept(listener)?;
+    let Some(spec) = configured(&connection)? else { return Ok(()) };
+    let board = Board::open(&spec)?;
+    board.event(EventKind::Started, None, "the supervisor has started");
+    let run = run_spec(&spec);
+    let context = RunContext { spec: &run, parts: Parts::find()?, offset_ns: clock_offset() };
+    let mut lambdas = Vec::new();
+    let mut wanted =
+        WantedState { spec: &spec, desired: DesiredState::default(), unusable: Vec::new() };
+    let mut vehicle = Vehicle::default();
+    let (mut failures, mut counts) = (Failures::default(), RunCounts::default());
+    let mut delay = RestartDelay::of_killed();
+    loop {
+        let started = Instant::now();
+        if let Some(file) = &spec.vehicle {
+            match Vehicle::load(file) {
+                Ok(loaded) => vehicle = loaded,
+                Err(error) => board.event(EventKind::Warning, None, &chain(&error)),
+            }
+        }
+        let record = RunRecord { failures: &mut failures, counts: &mut counts };
+        let mut observer = board.clone();
+        let group = ProcessGroup::start(&context, &mut lambdas, &mut observer, record, &vehicle);
+        let ended = group.and_then(|mut group| {
+            connection.rings(group.sender.clone());
+            let ended = group.run(|group| wanted.keep(group, &connection, &board, &stop));
+            group.add_counts();
+            ended
+        });
+        let reason = match ended {
+            Ok(GroupEnd::Complete) => break,
+            Ok(GroupEnd::NotStarted(exit)) => {
+                format!("ingress or recorder could not start (exit code {})", exit.code())
+            }
+            Ok(GroupEnd::Broken(reason)) => reason,
+            Err(failure) => failure.to_string(),
+        };
+        board.group_ended(&reason);
+        let delay = delay.after(started.elapsed());
+        let until = Instant::now() + delay;
+        let text = format!("{reason}; all processes start again in {} ms", delay.as_millis());
+        board.event(EventKind::Failed, None, &text);
+        while Instant::now() < until && !stop.load(Ordering::Relaxed) {
+            thread::sleep(Duration::from_millis(10).min(delay));
+        }
+        if stop.load(Ordering::Relaxed) {
+            break;
+        }
+    }
+    board.event(EventKind::Stopped, None, "the supervisor has stopped");
+    Ok(())
+}
+
+/// Waits for the settings; `None` if it is requested to end.
+fn configured(connection: &Connection) -> Result<Option<SupervisionSpec>, Failure> {
+    loop {
+        match connection.wait() {
+            Some(SupervisorRequest::Configure(spec)) if spec.version == SUPERVISION_VERSION => {
+                return Ok(Some(*spec));
+            }
+            Some(SupervisorRequest::Configure(spec)) => {
+                let reason = format!(
+                    "it has version {SUPERVISION_VERSION}, the orchestrator {}",
+                    spec.version
+                );
+                connection.report(&SupervisorReport::Refused { reason });
+            }
+            Some(SupervisorRequest::Stop) | None => return Ok(None),
+            Some(SupervisorRequest::Apply(_)) => {
+                let reason = "it has no settings yet".to_owned();
+                connection.report(&SupervisorReport::Refused { reason });
+            }
+        }
+    }
+}
+
+fn run_spec(spec: &SupervisionSpec) -> RunSpec {
+    RunSpec {
+        clips: spec.clips.clone(),
+        vehicle: spec.vehicle.clone(),
+        drives: spec.drives.clone(),
+        network: spec.network.iter().map(Into::into).collect(),
+        all: spec.all,
+        records: true,
+        decisions: spec.decisions.clone(),
+        commands: spec.commands.clone(),
+        disk_floor: spec.disk_floor,
+        clips_max: spec.clips_max,
+        bytes_max: spec.bytes_max,
+        cgroup: spec.cgroup.clone(),
+        largest: LARGEST,
+        ..RunSpec::default()
+    }
+}
+
+/// What the orchestrator wants.
+struct WantedState<'a> {
+    spec: &'a SupervisionSpec,
+    desired: DesiredState,
+    /// Lambdas that cannot even be loaded, and the reasons.
+    unusable: Vec<(DesiredLambda, String)>,
+}
+
+impl WantedState<'_> {
+    /// Keeps the group running as wanted, until its end.
+    fn keep(
+        &mut self,
+        group: &mut ProcessGroup<'_>,
+        connection: &Connection,
+        board: &Board,
+        stop: &AtomicBool,
+    ) -> Result<GroupEnd, Failure> {
+        let mut reported: (Option<Instant>, Vec<_>) = (None, Vec::new());
+        loop {
+            group.poll(POLL_INTERVAL);
+            let mut is_new = false;
+            while let Some(request) = connection.next() {
+                is_new = true;
+                match self.handle(request) {
+                    Ok(true) => return Ok(GroupEnd::Complete),
+                    Ok(false) => {}
+                    Err(reason) => connection.report(&SupervisorReport::Refused { reason }),
+                }
+            }
+            if stop.load(Ordering::Relaxed) {
+                return Ok(GroupEnd::Complete);
+            }
+            if let Some(end) = group.step()? {
+                return Ok(end);
+            }
+            for lambda in group.lambdas.iter_mut() {
+                if let Some(reason) = lambda.take_quarantine() {
+                    group.observer.quarantined(&lambda.lambda, &reason);
+                }
+            }
+            self.approach(group.lambdas, board);
+            let phases = group.lambdas.iter().map(SupervisedLambda::phase).collect();
+            let is_due = reported.0.is_none_or(|at| at.elapsed() >= STATUS_INTERVAL);
+            if is_due || is_new || phases != reported.1 {
+                reported = (Some(Instant::now()), phases);
+                connection.report(&self.status(group.lambdas, board));
+            }
+        }
+    }
+
+    /// Handles a request; returns whether it is to end.
+    fn handle(&mut self, request: SupervisorRequest) -> Result<bool, String> {
+        match request {
+            SupervisorRequest::Stop => return Ok(true),
+            SupervisorRequest::Configure(spec) if *spec == *self.spec => {}
+            SupervisorRequest::Configure(_) => {
+                return Err(
+                    "it runs with other settings: they apply once it was stopped".to_owned()
+                );
+            }
+            SupervisorRequest::Apply(state) => {
+                let (newest, found) = (self.desired.generation, state.generation);
+                if found < newest {
+                    return Err(format!("generation {found} is older than {newest}"));
+                }
+                check(&state)?;
+                self.desired = *state;
+            }
+        }
+        Ok(false)
+    }
+
+    /// Starts and stops lambdas as wanted.
+    fn approach(&mut self, lambdas: &mut Vec<SupervisedLambda>, board: &Board) {
+        lambdas.retain(|lambda| {
+            let has_left = lambda.has_left();
+            if has_left {
+                board.event(EventKind::Ended, Some(&lambda.lambda), "ended on request");
+            }
+            !has_left
+        });
+        self.unusable.retain(|(lambda, _)| self.desired.lambdas.contains(lambda));
+        let running = lambdas.iter().filter_map(|it| {
+            let lambda = it.lambda.deployment.as_deref()?;
+            Some(KnownLambda { lambda, is_leaving: it.is_leaving })
+        });
+        let unusable = self.unusable.iter();
+        let unusable = unusable.map(|(lambda, _)| KnownLambda { lambda, is_leaving: false });
+        let known: Vec<_> = running.chain(unusable).collect();
+        for action in reconcile(&self.desired, &known) {
+            match action {
+                Action::Start(lambda) => match self.load(&lambda) {
+                    Ok(spec) => lambdas.push(SupervisedLambda::new(spec)),
+                    Err(reason) => self.unusable.push((lambda, reason)),
+                },
+                Action::Stop(id) => {
+                    let of_id = |it: &&mut SupervisedLambda| {
+                        it.lambda.deployment.as_ref().is_some_and(|deployed| deployed.id == id)
+                    };
+                    lambdas.iter_mut().filter(of_id).for_each(SupervisedLambda::leave);
+                }
+            }
+        }
+    }
+
+    fn load(&self, wanted: &DesiredLambda) -> Result<LambdaSpec, String> {
+        let build = BuildDir::of(&wanted.folder);
+        let manifest = Manifest::load(build.path()).map_err(|error| chain(&error))?;
+        if manifest.lambda.name.as_str() != wanted.name {
+            return Err(format!("its name is `{}`", manifest.lambda.name));
+        }
+        let out = self.spec.records.join(&wanted.id);
+        fs::create_dir_all(&out)
+            .map_err(|error| format!("cannot create `{}`: {error}", out.display()))?;
+        Ok(LambdaSpec {
+            folder: wanted.folder.clone(),
+            manifest,
+            out,
+            prefix: format!("{}: ", wanted.id),
+            set: wanted.set.clone(),
+            remaps: Vec::new(),
+            deployment: Some(Box::new(wanted.clone())),
+        })
+    }
+
+    fn status(&self, lambdas: &[SupervisedLambda], board: &Board) -> SupervisorReport {
+        let mut status = board.status();
+        status.generation = self.desired.generation;
+        status.lambdas = lambdas.iter().filter_map(SupervisedLambda::status_report).collect();
+        status.lambdas.extend(self.unusable.iter().map(|(lambda, reason)| LambdaStatus {
+            id: lambda.id.clone(),
+            name: lambda.name.clone(),
+            revision: lambda.revision.clone(),
+            attempt: lambda.attempt,
+            phase: LambdaPhase::Quarantined,
+            phase_s: 0.0,
+            pid: None,
+            restarts: 0,
+            last_end: Some(format!("it cannot be loaded: {reason}")),
+            live: None,
+            layers: Vec::new(),
+        }));
+        let place = |lambda: &LambdaStatus| {
+            self.desired.lambdas.iter().position(|it| it.id == lambda.id).unwrap_or(usize::MAX)
+        };
+        status.lambdas.sort_by_key(place);
+        SupervisorReport::Status(Box::new(status))
+    }
+}
+
+/// Checks that ids and names are unique, and that an id is the name of a folder.
+fn check(state: &DesiredState) -> Result<(), String> {
+    if state.lambdas.len() > LAMBDAS_MAX {
+        let count = state.lambdas.len();
+        return Err(format!("{count} lambdas are wanted, and {LAMBDAS_MAX} are possible"));
+    }
+    let (mut ids, mut names) = (HashSet::new(), HashSet::new());
+    for lambda in &state.lambdas {
+        let is_name = lambda.id.bytes().all(|it| it.is_ascii_alphanumeric() || b"-_".contains(&it));
+        if lambda.id.is_empty() || !is_name || lambda.id == "events" {
+            return Err(format!(
+                "`{}` is no id of a deployment",
+                gleaner_base::excerpt(&lambda.id)
+            ));
+        }
+        if !ids.insert(&lambda.id) || !names.insert(&lambda.name) {
+            return Err(format!("`{}` or its lambda `{}` is wanted twice", lambda.id, lambda.name));
+        }
+    }
+    Ok(())
+}
