@@ -15,15 +15,17 @@ pub(crate) const STEPS: usize = 4;
 pub(crate) const TARGET: &str = "wasm32-wasip2";
 
 /// The packages with installed programs: no benches, no tests, no lambdas.
-const PROGRAMS: [&str; 8] = [
+const PROGRAMS: [&str; 10] = [
     "gleaner-cli",
     "gleaner-compile",
     "gleaner-host",
     "gleaner-inference",
     "gleaner-ingress",
+    "gleaner-orchestrator",
     "gleaner-python",
     "gleaner-recorder",
     "gleaner-shim",
+    "gleaner-supervisor",
 ];
 
 /// Sets up the wasm target, `.venv`, the programs, and these lambdas.

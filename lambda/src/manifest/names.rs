@@ -1,11 +1,13 @@
 //! Validated names: each type is a text of one form, so that every path, topic or version is valid.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
 use gleaner_rules::names;
-use serde::{Serialize, Serializer};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use gleaner_base::{Exit, Explain};
 
@@ -83,6 +85,14 @@ macro_rules! checked_text {
         impl Serialize for $name {
             fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
                 serializer.serialize_str(&self.0)
+            }
+        }
+
+        impl<'de> Deserialize<'de> for $name {
+            fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+                // Not the error itself, which holds the text, however long it is.
+                let refused = |_| D::Error::custom(concat!("it is no ", $what));
+                Cow::<str>::deserialize(from)?.parse().map_err(refused)
             }
         }
     };

@@ -22,6 +22,7 @@ pub mod supervision;
 #[cfg(test)]
 #[path = "../../../base/src/test_folder.rs"]
 mod test_folder;
+pub mod vehicle_api;
 
 pub use check_report::{CheckReport, Need, NeedPlace};
 pub use drive_info::{DriveInfo, DriveTopicInfo, PictureInfo};

@@ -18,8 +18,10 @@ use std::process::ExitCode;
 use gleaner_base::{Exit, Failure};
 
 /// Runs the program `gleaner-supervisor`. Its standard input is a socket that listens for the
-/// orchestrator.
+/// orchestrator, and its standard output a file whose lock it holds while it runs.
 pub fn main() -> ExitCode {
+    // Fails if it has a session already. A signal to that of its starter does not reach it.
+    let _ = rustix::process::setsid();
     let ended = listener().and_then(serve::serve);
     if let Err(failure) = &ended {
         eprintln!("{failure}");

@@ -1,0 +1,251 @@
+//! The API of the vehicle: HTTP on a socket that only this user and its group can open.
+//!
+//! | request | answer |
+//! |---|---|
+//! | `GET /v1/status` | [`VehicleStatus`] |
+//! | `POST /v1/deployments` | [`DeployReply`], of a [`DeployRequest`] |
+//! | `PUT /v1/objects/SHA256` | nothing, of a file that a deployment needs |
+//! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | [`Changed`] |
+//! | `PUT /v1/trust` | nothing, of a trust root's envelope |
+//! | `GET /v1/events`, `GET /v1/lambdas/ID/records` | a [`StreamLine`] per line, see [`StreamQuery`] |
+//! | `GET /metrics` | counts for Prometheus |
+//!
+//! [`StreamLine`]: gleaner_protocol::vehicle_api::StreamLine
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use axum::Router;
+use axum::body::{Body, Bytes};
+use axum::extract::{DefaultBodyLimit, Path, Query, State};
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post, put};
+use futures_util::StreamExt;
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::manifest::Sha256;
+use gleaner_protocol::vehicle_api::{
+    DeployReply, DeployRequest, Problem, ProgramStatus, VehicleStatus,
+};
+use gleaner_vitals::usage;
+use serde::{Deserialize, Serialize};
+use sha2::Digest;
+use tokio::io::AsyncWriteExt;
+
+use crate::core::Core;
+use crate::layout::Layout;
+use crate::metrics;
+use crate::store::begin_object;
+use crate::streams;
+
+/// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
+/// text in JSON.
+const BODY_MAX: usize = 32 << 20;
+
+/// What the handlers need.
+#[derive(Clone)]
+pub(crate) struct Api {
+    pub(crate) core: Arc<Core>,
+    pub(crate) layout: Layout,
+    pub(crate) name: Arc<str>,
+    pub(crate) started: Instant,
+}
+
+/// The answer to a change of a deployment.
+#[derive(Debug, Serialize, Deserialize)]
+pub(crate) struct Changed {
+    /// Number of the attempt: a status with a lower one is of an earlier one.
+    pub(crate) attempt: u64,
+}
+
+/// Which records of a stream are sent.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct StreamQuery {
+    /// Number of the first record; without one, the oldest that is kept.
+    pub(crate) from: Option<u64>,
+    /// Number of the newest records to send instead.
+    pub(crate) last: Option<usize>,
+    /// True to go on with new records until the client closes the connection.
+    #[serde(default)]
+    pub(crate) follow: bool,
+}
+
+type Reply<T> = Result<T, ApiError>;
+
+impl Api {
+    /// Returns the routes.
+    pub(crate) fn router(self) -> Router {
+        Router::new()
+            .route("/v1/status", get(status))
+            .route("/v1/deployments", post(deploy))
+            .route("/v1/objects/{sha256}", put(object))
+            .route("/v1/deployments/{id}/{change}", post(change))
+            .route("/v1/trust", put(trust))
+            .route("/v1/events", get(events))
+            .route("/v1/lambdas/{id}/records", get(records))
+            .route("/metrics", get(prometheus))
+            .fallback(async || problem("there is nothing under this path"))
+            .layer(DefaultBodyLimit::max(BODY_MAX))
+            .with_state(self)
+    }
+
+    /// Returns the status of the vehicle.
+    pub(crate) fn status(&self) -> VehicleStatus {
+        let (deployments, supervisor, generation) = self.core.status();
+        let labels = self.core.trust(|trust| trust.labels().clone());
+        VehicleStatus {
+            vehicle: self.name.to_string(),
+            labels: labels.into_iter().map(|(name, value)| (name.to_string(), value)).collect(),
+            orchestrator: ProgramStatus {
+                version: env!("CARGO_PKG_VERSION").to_owned(),
+                pid: std::process::id(),
+                up_s: self.started.elapsed().as_secs_f64(),
+                rss_bytes: usage::resident(),
+                cpu_s: usage::cpu_seconds(),
+            },
+            trust: self.core.trust(|trust| trust.status()),
+            generation,
+            deployments,
+            capacity: self.core.capacity(),
+            supervisor,
+        }
+    }
+
+    /// Calls `work`, which waits for the disk, in a thread for that.
+    async fn blocking<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Core) -> Result<T, Failure> + Send + 'static,
+    ) -> Reply<T> {
+        let core = Arc::clone(&self.core);
+        let done = tokio::task::spawn_blocking(move || work(&core)).await;
+        let ended = |_| Failure::new(Exit::Internal, "the request was interrupted");
+        Ok(done.map_err(ended)??)
+    }
+}
+
+async fn status(State(api): State<Api>) -> Response {
+    axum::Json(api.status()).into_response()
+}
+
+async fn prometheus(State(api): State<Api>) -> Response {
+    let text = metrics::text(&api.status());
+    ([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], text).into_response()
+}
+
+async fn deploy(State(api): State<Api>, body: Bytes) -> Reply<axum::Json<DeployReply>> {
+    let request: DeployRequest = serde_json::from_slice(&body)
+        .map_err(|error| Failure::caused_by(Exit::Usage, "the request is no deployment", &error))?;
+    Ok(axum::Json(api.blocking(move |core| core.deploy(&request)).await?))
+}
+
+/// Receives a file. It counts only if its digest is right.
+async fn object(
+    State(api): State<Api>,
+    Path(sha256): Path<String>,
+    body: Body,
+) -> Reply<StatusCode> {
+    let wanted: Sha256 = sha256
+        .parse()
+        .map_err(|_| Failure::new(Exit::Usage, "the path has no SHA-256 of 64 digits"))?;
+    let length = api.core.expected(&wanted)?;
+    let path = api.core.store.object(&wanted);
+    let failed = |error: std::io::Error| {
+        Failure::caused_by(Exit::Internal, format!("cannot receive the file {sha256}"), &error)
+    };
+    let refused = |why: String| {
+        let mut failure = Failure::new(Exit::Denied, format!("the file {sha256} is refused"));
+        failure.causes = vec![why];
+        failure
+    };
+    let (file, part) = begin_object(&path).map_err(failed)?;
+    let mut file = tokio::fs::File::from_std(file);
+    let (mut digest, mut received, mut body) = (sha2::Sha256::new(), 0, body.into_data_stream());
+    while let Some(piece) = body.next().await {
+        let piece = piece.map_err(|error| failed(std::io::Error::other(error)))?;
+        received += piece.len() as u64;
+        if received > length {
+            return Err(refused(format!("it is longer than {length} bytes")).into());
+        }
+        digest.update(&piece);
+        file.write_all(&piece).await.map_err(failed)?;
+    }
+    let found = gleaner_base::hex(&digest.finalize());
+    if received != length || found != wanted.as_str() {
+        let why = format!("it has {received} of {length} bytes, and the SHA-256 {found}");
+        return Err(refused(why).into());
+    }
+    file.sync_all().await.map_err(failed)?;
+    tokio::fs::rename(&part, &path).await.map_err(failed)?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+async fn change(
+    State(api): State<Api>,
+    Path((id, change)): Path<(String, String)>,
+) -> Reply<axum::Json<Changed>> {
+    let changed = api.blocking(move |core| match &*change {
+        "start" => core.set_wanted(&id, true),
+        "stop" => core.set_wanted(&id, false),
+        "rollback" => core.roll_back(&id, "rolled back by a user"),
+        other => {
+            let other = gleaner_base::excerpt(other);
+            Err(Failure::new(Exit::Usage, format!("`{other}` is no change of a deployment"))
+                .with_help("the changes are `start`, `stop` and `rollback`"))
+        }
+    });
+    Ok(axum::Json(Changed { attempt: changed.await? }))
+}
+
+async fn trust(State(api): State<Api>, body: Bytes) -> Reply<StatusCode> {
+    api.blocking(move |core| core.install_root(&body)).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+async fn events(State(api): State<Api>, Query(query): Query<StreamQuery>) -> Reply<Response> {
+    lines(&api, &["events", "orchestrator"], &query)
+}
+
+async fn records(
+    State(api): State<Api>,
+    Path(id): Path<String>,
+    Query(query): Query<StreamQuery>,
+) -> Reply<Response> {
+    let is_known = api.core.status().0.iter().any(|deployment| deployment.id == id);
+    if !is_known {
+        let id = gleaner_base::excerpt(&id);
+        return Err(Failure::new(Exit::Usage, format!("there is no deployment `{id}`")).into());
+    }
+    lines(&api, &[&id], &query)
+}
+
+fn lines(api: &Api, names: &[&str], query: &StreamQuery) -> Reply<Response> {
+    let body = streams::lines(&api.layout.spool(), names, query)?;
+    Ok(([(header::CONTENT_TYPE, "application/x-ndjson")], body).into_response())
+}
+
+fn problem(what: &str) -> Response {
+    ApiError(Failure::new(Exit::Usage, what)).into_response()
+}
+
+/// An error, as the client gets it.
+pub(crate) struct ApiError(Failure);
+
+impl From<Failure> for ApiError {
+    fn from(failure: Failure) -> Self {
+        Self(failure)
+    }
+}
+
+impl IntoResponse for ApiError {
+    fn into_response(self) -> Response {
+        let status = match self.0.exit {
+            Exit::Usage => StatusCode::BAD_REQUEST,
+            Exit::Denied => StatusCode::FORBIDDEN,
+            Exit::Unreachable => StatusCode::SERVICE_UNAVAILABLE,
+            _ => StatusCode::INTERNAL_SERVER_ERROR,
+        };
+        let text = serde_json::to_string(&Problem::from(self.0)).expect("plain data");
+        (status, [(header::CONTENT_TYPE, "application/problem+json")], text).into_response()
+    }
+}

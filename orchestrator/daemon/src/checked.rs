@@ -1,0 +1,156 @@
+//! A deployment whose signatures, files and settings were checked, and what runs by it.
+
+use gleaner_base::text::list;
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::manifest::{ConfigSet, ItemName, Sha256};
+use gleaner_lambda::{BuildDir, Manifest};
+use gleaner_protocol::supervision::DesiredLambda;
+use gleaner_protocol::vehicle_api::{DeploymentStatus, RevisionStatus};
+use gleaner_trust::{Deployment, Revision, Trusted, Verdict, Verifier};
+
+use crate::state::Deployed;
+use crate::store::RevisionStore;
+
+/// A deployment with its revisions, as their keys signed them.
+pub(crate) struct SignedDeployment {
+    pub(crate) deployment: Trusted<Deployment>,
+    pub(crate) revision: Trusted<Revision>,
+    pub(crate) fallback: Option<Trusted<Revision>>,
+    pub(crate) verdict: Verdict,
+}
+
+impl SignedDeployment {
+    /// Verifies the deployment in `envelope`. `find` returns the envelope of a revision.
+    ///
+    /// # Errors
+    ///
+    /// A failure with the first reason that is found.
+    pub(crate) fn verify(
+        verifier: &Verifier<'_>,
+        envelope: &[u8],
+        find: impl Fn(&Sha256) -> Option<Vec<u8>>,
+    ) -> Result<Self, Failure> {
+        let refused = |refusal| Failure::because("the deployment is refused", &refusal);
+        let deployment = verifier.deployment(envelope).map_err(refused)?;
+        let revision = |role: &str, digest: &Sha256| {
+            let envelope = find(digest).ok_or_else(|| {
+                let message = format!("the {role} {digest} of the deployment is unknown here");
+                Failure::new(Exit::Usage, message)
+                    .with_help("send its `revision.json` with the deployment")
+            })?;
+            verifier
+                .revision(&envelope)
+                .map_err(|it| Failure::because(format!("the {role} is refused"), &it))
+        };
+        let wish = deployment.payload();
+        let fallback = wish.fallback.as_ref().map(|it| revision("fallback", it)).transpose()?;
+        let revision = revision("revision", &wish.revision)?;
+        let verdict = verifier.admit(&deployment, &revision, fallback.as_ref()).map_err(refused)?;
+        Ok(Self { deployment, revision, fallback, verdict })
+    }
+
+    pub(crate) fn id(&self) -> &ItemName {
+        &self.deployment.payload().id
+    }
+
+    /// Returns the digests of its revisions.
+    pub(crate) fn digests(&self) -> impl Iterator<Item = &Sha256> {
+        self.revisions().map(Trusted::digest)
+    }
+
+    pub(crate) fn revisions(&self) -> impl Iterator<Item = &Trusted<Revision>> {
+        std::iter::once(&self.revision).chain(&self.fallback)
+    }
+
+    /// Checks that the manifests of its revisions, which are in `store`, fit its grants and its
+    /// config. Returns the manifests.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names what does not fit.
+    pub(crate) fn check_manifests(&self, store: &RevisionStore) -> Result<Vec<Manifest>, Failure> {
+        let wish = self.deployment.payload();
+        self.digests()
+            .map(|digest| {
+                let manifest = Manifest::load(BuildDir::of(store.folder(digest)).path())?;
+                check_grants(wish, &manifest)?;
+                ConfigSet::resolve(&manifest, &overrides(wish)).map_err(|error| {
+                    Failure::because("the config of the deployment does not fit", &error)
+                })?;
+                Ok(manifest)
+            })
+            .collect()
+    }
+
+    /// Returns what runs by it, if `deployed` is its state.
+    pub(crate) fn desired(&self, deployed: &Deployed, store: &RevisionStore) -> DesiredLambda {
+        let wish = self.deployment.payload();
+        let fallback = self.fallback.as_ref().filter(|_| deployed.runs_fallback);
+        let revision = fallback.unwrap_or(&self.revision);
+        let overrides = overrides(wish).into_iter();
+        DesiredLambda {
+            id: wish.id.to_string(),
+            name: revision.payload().name.to_string(),
+            revision: revision.digest().to_string(),
+            folder: store.folder(revision.digest()),
+            envelope: store.envelope_path(revision.digest()),
+            set: overrides.map(|(name, value)| format!("{name}={value}")).collect(),
+            attempt: deployed.attempt,
+        }
+    }
+
+    /// Returns its status, without that of its lambda.
+    pub(crate) fn status(&self, deployed: &Deployed) -> DeploymentStatus {
+        let stale = match &self.verdict {
+            Verdict::Current => None,
+            Verdict::Stale(refusal) => Some(refusal.to_string()),
+        };
+        DeploymentStatus {
+            id: self.id().to_string(),
+            release: self.deployment.payload().release,
+            lambda: self.revision.payload().name.to_string(),
+            revision: revision_status(&self.revision),
+            fallback: self.fallback.as_ref().map(revision_status),
+            is_wanted: deployed.is_wanted,
+            runs_fallback: deployed.runs_fallback,
+            is_proven: deployed.is_proven,
+            failed: deployed.failed.clone(),
+            refused: None,
+            stale,
+            status: None,
+        }
+    }
+}
+
+fn revision_status(revision: &Trusted<Revision>) -> RevisionStatus {
+    let Revision { version, release, .. } = revision.payload();
+    let (digest, version) = (revision.digest().to_string(), version.to_string());
+    RevisionStatus { digest, version, release: *release }
+}
+
+fn overrides(wish: &Deployment) -> Vec<(String, String)> {
+    wish.config.iter().map(|(name, value)| (name.to_string(), value.to_string())).collect()
+}
+
+/// Checks that the deployment grants everything that the manifest asks for.
+fn check_grants(wish: &Deployment, manifest: &Manifest) -> Result<(), Failure> {
+    let inputs = manifest.inputs.iter().map(|input| &input.topic);
+    let topics = inputs.chain(manifest.record.iter().flat_map(|record| &record.topics));
+    let topics = topics.filter(|topic| !wish.grants.topics.contains(topic));
+    let models = manifest.models.iter().map(|model| &model.name);
+    let models = models.filter(|model| !wish.grants.models.contains(model));
+    let recording = manifest.record.iter().filter(|_| !wish.grants.record);
+    let mut lacks: Vec<_> = topics.map(|topic| format!("topic `{topic}`")).collect();
+    lacks.extend(models.map(|model| format!("model `{model}`")));
+    lacks.extend(recording.map(|_| "recording".to_owned()));
+    if lacks.is_empty() {
+        return Ok(());
+    }
+    lacks.dedup();
+    let (name, version) = (&manifest.lambda.name, &manifest.lambda.version);
+    let lacks = list(&lacks, "and");
+    let message = format!("deployment `{}` does not grant {lacks}", wish.id);
+    let mut failure = Failure::new(Exit::Denied, message);
+    failure.causes = vec![format!("`{name}` {version} asks for it in its lambda.toml")];
+    Err(failure.with_help("sign a deployment that grants it, or change the lambda"))
+}

@@ -1,0 +1,134 @@
+//! Files and folders of the orchestrator.
+
+use std::fs::{self, DirBuilder, File, Permissions};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+use gleaner_base::{Exit, Failure};
+use rustix::fs::{FlockOperation, flock};
+
+/// The state folder and the run folder.
+#[derive(Debug, Clone)]
+pub(crate) struct Layout {
+    state: PathBuf,
+    run: PathBuf,
+}
+
+impl Layout {
+    /// Creates the folders, as far as they do not exist, and makes them private.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the folder.
+    pub(crate) fn create(state: &Path, run: &Path) -> Result<Self, Failure> {
+        let layout = Self { state: state.to_owned(), run: run.to_owned() };
+        let folders = [
+            layout.objects(),
+            layout.revisions(),
+            layout.spool(),
+            layout.records(),
+            layout.clips(),
+            layout.cache(),
+        ];
+        private(state)?;
+        folders.iter().try_for_each(|folder| private(folder))?;
+        // The service's group may enter it; its parent belongs to the system.
+        fs::create_dir_all(run).map_err(|error| cannot_create(run, &error))?;
+        Ok(layout)
+    }
+
+    /// Locks the state folder for this process.
+    ///
+    /// # Errors
+    ///
+    /// A failure if another orchestrator has it.
+    pub(crate) fn lock(&self) -> Result<File, Failure> {
+        let path = self.state.join("lock");
+        let file = lock_file(&path)?;
+        match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => Ok(file),
+            Err(_) => {
+                let state = self.state.display();
+                let message = format!("another gleaner-orchestrator runs on `{state}`");
+                let help = "stop that one first: `systemctl stop gleaner`, or SIGTERM";
+                Err(Failure::new(Exit::Usage, message).with_help(help))
+            }
+        }
+    }
+
+    /// Returns the open lock of the supervisor, and whether no supervisor has it.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the file.
+    pub(crate) fn supervisor_lock(&self) -> Result<(File, bool), Failure> {
+        let file = lock_file(&self.state.join("supervisor.lock"))?;
+        let is_free = flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok();
+        Ok((file, is_free))
+    }
+
+    pub(crate) fn trust(&self) -> PathBuf {
+        self.state.join("trust.json")
+    }
+
+    pub(crate) fn floors(&self) -> PathBuf {
+        self.state.join("floors.json")
+    }
+
+    pub(crate) fn state_file(&self) -> PathBuf {
+        self.state.join("state.json")
+    }
+
+    /// Folder of files that were sent, and belong to no revision yet.
+    pub(crate) fn objects(&self) -> PathBuf {
+        self.state.join("objects")
+    }
+
+    pub(crate) fn revisions(&self) -> PathBuf {
+        self.state.join("revisions")
+    }
+
+    pub(crate) fn spool(&self) -> PathBuf {
+        self.state.join("spool")
+    }
+
+    pub(crate) fn records(&self) -> PathBuf {
+        self.state.join("records")
+    }
+
+    pub(crate) fn clips(&self) -> PathBuf {
+        self.state.join("clips")
+    }
+
+    pub(crate) fn cache(&self) -> PathBuf {
+        self.state.join("cache")
+    }
+
+    pub(crate) fn control_socket(&self) -> PathBuf {
+        self.run.join(gleaner_protocol::vehicle_api::API_SOCKET)
+    }
+
+    pub(crate) fn supervisor_socket(&self) -> PathBuf {
+        self.run.join("supervisor.sock")
+    }
+}
+
+fn cannot_create(path: &Path, error: &io::Error) -> Failure {
+    Failure::caused_by(Exit::Usage, format!("cannot use the folder `{}`", path.display()), error)
+        .with_help("choose others with --state and --run, or create it for this user")
+}
+
+/// Creates a folder that only this user can enter.
+fn private(path: &Path) -> Result<(), Failure> {
+    let created = DirBuilder::new().recursive(true).mode(0o700).create(path);
+    created
+        .and_then(|()| fs::set_permissions(path, Permissions::from_mode(0o700)))
+        .map_err(|error| cannot_create(path, &error))
+}
+
+fn lock_file(path: &Path) -> Result<File, Failure> {
+    let mut options = File::options();
+    options.read(true).write(true).create(true).truncate(false);
+    options.open(path).map_err(|error| cannot_create(path, &error))
+}

@@ -1,0 +1,27 @@
+//! The program `gleaner-orchestrator`: the daemon of a vehicle.
+//!
+//! - `layout`, `durable`, `state`, `store`: its files: wanted state, trust, revisions.
+//! - `trust`, `checked`, `admission`: what may run. `compile`: native code before it runs.
+//! - `core`: the state, and the operations that change it.
+//! - `link`: starts `gleaner-supervisor`, which runs all other processes, and tells it what is
+//!   wanted.
+//! - `api`, `streams`, `metrics`: the socket for users and, later, for the cloud.
+//!
+//! Lambdas do not depend on it: it can end and start again while they run.
+
+mod admission;
+mod api;
+mod checked;
+mod compile;
+mod core;
+mod durable;
+mod layout;
+mod link;
+mod metrics;
+mod program;
+mod state;
+mod store;
+mod streams;
+mod trust;
+
+pub use program::main;

@@ -1,0 +1,7 @@
+//! The program `gleaner-orchestrator`.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    gleaner_orchestrator::main()
+}

@@ -1,0 +1,206 @@
+//! The command line, the start and the end of the program.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use clap::Parser;
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::Vehicle;
+use gleaner_protocol::supervision::{EventKind, SUPERVISION_VERSION, SupervisionSpec};
+use gleaner_vitals::log;
+use tokio::net::UnixListener;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::watch;
+
+use crate::api::Api;
+use crate::core::Core;
+use crate::layout::Layout;
+use crate::link::SupervisorLink;
+
+/// Runs what is deployed on this vehicle, until SIGTERM, which ends all lambdas in order. After
+/// SIGHUP it replaces itself by the program that is installed now, and the lambdas run on.
+#[derive(Parser, Debug)]
+#[command(name = "gleaner-orchestrator", version)]
+struct Args {
+    /// Configuration file of the vehicle; see docs/vehicle.md
+    #[arg(long, value_name = "FILE")]
+    vehicle: Option<PathBuf>,
+    /// Folder of everything that survives a restart
+    #[arg(long, value_name = "DIR", default_value = "/var/lib/gleaner")]
+    state: PathBuf,
+    /// Folder of the sockets
+    #[arg(long, value_name = "DIR", default_value = "/run/gleaner")]
+    run: PathBuf,
+    /// Drive to play instead of joining a network, as often as the lambdas start; for tests
+    #[arg(long, value_name = "FILE")]
+    drive: Vec<PathBuf>,
+    /// Keep every decision, not only those with a trigger or a fault
+    #[arg(long)]
+    all: bool,
+    /// Folder of cgroup v2 for the control groups of the lambdas, delegated to this user
+    #[arg(long, value_name = "DIR")]
+    cgroup: Option<PathBuf>,
+}
+
+/// Interval at which the trusted time is moved, and the watchdog is reset.
+const TIME_INTERVAL: Duration = Duration::from_secs(3600);
+const WATCHDOG_INTERVAL: Duration = Duration::from_secs(3);
+
+/// The end of the program.
+enum ProgramEnd {
+    /// By SIGTERM: all lambdas have ended.
+    Stopped,
+    /// By SIGHUP: it is to be started again.
+    Restart,
+}
+
+/// Runs the program.
+pub fn main() -> ExitCode {
+    log::init_service();
+    let args = Args::parse();
+    match run(args) {
+        Ok(ProgramEnd::Stopped) => Exit::Ok.into(),
+        Ok(ProgramEnd::Restart) => {
+            let failure = exec();
+            log::failure(&failure);
+            failure.exit.into()
+        }
+        Err(failure) => {
+            log::failure(&failure);
+            failure.exit.into()
+        }
+    }
+}
+
+/// Becomes the program that is installed now. Returns only on errors.
+fn exec() -> Failure {
+    let program = std::env::args_os().next().unwrap_or_default();
+    let error = std::process::Command::new(program).args(std::env::args_os().skip(1)).exec();
+    Failure::caused_by(Exit::Internal, "cannot start the program again", &error)
+}
+
+fn run(args: Args) -> Result<ProgramEnd, Failure> {
+    let vehicle = args.vehicle.as_ref().map_or_else(|| Ok(Vehicle::default()), Vehicle::load)?;
+    let layout = Layout::create(&args.state, &args.run)?;
+    let _lock = layout.lock()?;
+    let name = match &vehicle.identity.name {
+        Some(name) => name.to_string(),
+        None => rustix::system::uname().nodename().to_string_lossy().into_owned(),
+    };
+    let spec = spec(&args, &layout, &vehicle);
+    let core = Arc::new(Core::open(&layout, vehicle)?);
+    // Two threads: the work that takes long runs in others.
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .thread_name("orchestrator")
+        .enable_all()
+        .build()
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot start threads", &error))?;
+    let ended = runtime.block_on(serve(Arc::clone(&core), layout, spec, name));
+    // A stream that follows never ends by itself.
+    runtime.shutdown_background();
+    if matches!(ended, Ok(ProgramEnd::Stopped)) {
+        core.event(EventKind::Stopped, None, "the orchestrator has stopped");
+    }
+    ended
+}
+
+fn spec(args: &Args, layout: &Layout, vehicle: &Vehicle) -> SupervisionSpec {
+    let domain = vehicle.network.domain.map(|domain| format!("--domain={domain}"));
+    let interfaces = vehicle.network.interfaces.iter().map(|it| format!("--interface={it}"));
+    let recording = &vehicle.recording;
+    SupervisionSpec {
+        version: SUPERVISION_VERSION,
+        spool: layout.spool(),
+        spool_bytes: vehicle.deployments.spool.bytes(),
+        records: layout.records(),
+        clips: layout.clips(),
+        vehicle: args.vehicle.clone(),
+        signer: None,
+        drives: args.drive.clone(),
+        network: domain.into_iter().chain(interfaces).collect(),
+        all: args.all,
+        decisions: vehicle.deployments.decisions.as_ref().map(ToString::to_string),
+        commands: recording.commands.as_ref().map(ToString::to_string),
+        disk_floor: recording.disk_floor.map(|size| size.bytes()),
+        clips_max: recording.clips_max,
+        bytes_max: recording.bytes_max.map(|size| size.bytes()),
+        cgroup: args.cgroup.clone(),
+    }
+}
+
+async fn serve(
+    core: Arc<Core>,
+    layout: Layout,
+    spec: SupervisionSpec,
+    name: String,
+) -> Result<ProgramEnd, Failure> {
+    let failed = |what: &'static str| {
+        move |error: std::io::Error| Failure::caused_by(Exit::Internal, what, &error)
+    };
+    let mut terminate = signal(SignalKind::terminate()).map_err(failed("cannot handle SIGTERM"))?;
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(failed("cannot handle SIGINT"))?;
+    let mut hangup = signal(SignalKind::hangup()).map_err(failed("cannot handle SIGHUP"))?;
+    let listener = listen(&layout)?;
+    let (stop, stopped) = watch::channel(false);
+    let link = SupervisorLink {
+        core: Arc::clone(&core),
+        layout: layout.clone(),
+        spec,
+        desired: core.desired(),
+        stop: stopped,
+    };
+    let mut link = tokio::spawn(link.keep());
+    let api = Api { core: Arc::clone(&core), layout, name: name.into(), started: Instant::now() };
+    tokio::spawn(async move { axum::serve(listener, api.router()).await });
+    let _ = sd_notify::notify(&[sd_notify::NotifyState::Ready]);
+    let mut watchdog = tokio::time::interval(WATCHDOG_INTERVAL);
+    let mut time = tokio::time::interval(TIME_INTERVAL);
+    loop {
+        tokio::select! {
+            _ = terminate.recv() => break,
+            _ = interrupt.recv() => break,
+            _ = hangup.recv() => {
+                let _ = sd_notify::notify(&[sd_notify::NotifyState::Reloading]);
+                return Ok(ProgramEnd::Restart);
+            }
+            _ = watchdog.tick() => {
+                let _ = sd_notify::notify(&[sd_notify::NotifyState::Watchdog]);
+            }
+            _ = time.tick() => core.observe_time(),
+            ended = &mut link => {
+                // It ends only when it is to stop, or with a failure.
+                return ended
+                    .map_err(|_| Failure::new(Exit::Internal, "the link to the supervisor failed"))?
+                    .map(|()| ProgramEnd::Stopped);
+            }
+        }
+    }
+    let _ = sd_notify::notify(&[sd_notify::NotifyState::Stopping]);
+    stop.send_replace(true);
+    let ended = link.await;
+    ended
+        .map_err(|_| Failure::new(Exit::Internal, "the link to the supervisor failed"))?
+        .map(|()| ProgramEnd::Stopped)
+}
+
+/// Listens on the socket of the API. The lock of the state folder ensures that no other orchestrator
+/// uses it.
+fn listen(layout: &Layout) -> Result<UnixListener, Failure> {
+    let path = layout.control_socket();
+    let _ = fs::remove_file(&path);
+    let listener = UnixListener::bind(&path).and_then(|listener| {
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o660))?;
+        Ok(listener)
+    });
+    listener.map_err(|error| {
+        let action = format!("cannot listen on `{}`", path.display());
+        Failure::caused_by(Exit::Usage, action, &error)
+            .with_help("choose another folder with --run")
+    })
+}

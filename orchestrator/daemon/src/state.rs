@@ -1,0 +1,51 @@
+//! The state of a vehicle that survives restarts: its deployments, and what became of them.
+
+use std::collections::BTreeMap;
+
+use gleaner_lambda::manifest::ItemName;
+use gleaner_lambda::manifest::Sha256;
+use serde::{Deserialize, Serialize};
+
+/// Maximum number of revisions of a deployment that are kept, beside those that it names.
+const HISTORY_MAX: usize = 2;
+
+/// All deployments.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct VehicleState {
+    /// Number of the wanted state; it grows with each change.
+    pub(crate) generation: u64,
+    /// The deployments, by id.
+    pub(crate) deployments: BTreeMap<ItemName, Deployed>,
+}
+
+/// An accepted deployment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Deployed {
+    /// Its envelope.
+    pub(crate) envelope: String,
+    /// Number of the attempt to run it: it grows with each deployment, rollback and start.
+    pub(crate) attempt: u64,
+    /// False if a user has stopped it.
+    pub(crate) is_wanted: bool,
+    /// True if its fallback runs.
+    pub(crate) runs_fallback: bool,
+    /// True once its revision ran for the whole probation.
+    pub(crate) is_proven: bool,
+    /// The reason why the fallback runs.
+    pub(crate) failed: Option<String>,
+    /// Revisions that ran before, the newest first.
+    pub(crate) history: Vec<Sha256>,
+}
+
+impl Deployed {
+    /// Returns the history of a deployment that replaces this one, which runs `revision`.
+    pub(crate) fn next_history(&self, revision: &Sha256) -> Vec<Sha256> {
+        let mut history = self.history.clone();
+        history.retain(|before| before != revision);
+        history.insert(0, revision.clone());
+        history.truncate(HISTORY_MAX);
+        history
+    }
+}

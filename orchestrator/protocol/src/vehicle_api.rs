@@ -1,0 +1,197 @@
+//! Messages of the API of `gleaner-orchestrator`: JSON over HTTP, on a socket of the machine.
+
+use std::collections::BTreeMap;
+
+use gleaner_base::{Exit, Failure};
+use serde::{Deserialize, Serialize};
+
+use crate::supervision::{LambdaStatus, SupervisorStatus};
+
+/// Name of the API's socket in the run folder of the orchestrator.
+pub const API_SOCKET: &str = "control.sock";
+
+/// The status of a vehicle: `GET /v1/status`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct VehicleStatus {
+    /// Name of the vehicle.
+    pub vehicle: String,
+    /// Its labels.
+    pub labels: BTreeMap<String, String>,
+    /// The orchestrator itself.
+    pub orchestrator: ProgramStatus,
+    /// The trust root; absent before one is installed.
+    pub trust: Option<TrustStatus>,
+    /// Number of the wanted state.
+    pub generation: u64,
+    /// All deployments, by id.
+    pub deployments: Vec<DeploymentStatus>,
+    /// What all lambdas together may ask for, and do.
+    pub capacity: Vec<Capacity>,
+    /// The processes; absent while the supervisor cannot be reached.
+    pub supervisor: Option<SupervisorStatus>,
+}
+
+/// The status of a program.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ProgramStatus {
+    /// Its version.
+    pub version: String,
+    /// Number of its process.
+    pub pid: u32,
+    /// Time since its start, in s.
+    pub up_s: f64,
+    /// Resident memory, in bytes.
+    pub rss_bytes: u64,
+    /// CPU time, in s.
+    pub cpu_s: f64,
+}
+
+/// The status of the trust root.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TrustStatus {
+    /// Its version.
+    pub version: u64,
+    /// Time from which nothing is accepted for the first time by it, in s since 1970.
+    pub expires: u64,
+    /// True if that time is over.
+    pub is_expired: bool,
+}
+
+/// The status of a deployment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DeploymentStatus {
+    /// Its id.
+    pub id: String,
+    /// Number of its release.
+    pub release: u64,
+    /// Name of the lambda.
+    pub lambda: String,
+    /// The revision.
+    pub revision: RevisionStatus,
+    /// The revision that runs if that fails.
+    pub fallback: Option<RevisionStatus>,
+    /// True unless it was stopped by a user.
+    pub is_wanted: bool,
+    /// True if its fallback runs.
+    pub runs_fallback: bool,
+    /// True once its revision ran for the whole probation.
+    pub is_proven: bool,
+    /// The reason why the fallback runs.
+    pub failed: Option<String>,
+    /// The reason why it does not run although it was accepted.
+    pub refused: Option<String>,
+    /// The reason why its deployer should sign it again.
+    pub stale: Option<String>,
+    /// The status of its lambda, if the supervisor knows it.
+    pub status: Option<LambdaStatus>,
+}
+
+/// A revision of a deployment.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RevisionStatus {
+    /// Digest of the revision.
+    pub digest: String,
+    /// Version in its manifest.
+    pub version: String,
+    /// Number of its release.
+    pub release: u64,
+}
+
+/// A resource that lambdas share.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Capacity {
+    /// Its name: `memory`, `cpu`.
+    pub resource: String,
+    /// Unit of the numbers.
+    pub unit: String,
+    /// What all wanted lambdas ask for.
+    pub asked: f64,
+    /// What they may ask for.
+    pub most: f64,
+    /// The source of `most`.
+    pub source: String,
+}
+
+/// A deployment: `POST /v1/deployments`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DeployRequest {
+    /// The envelope of the deployment.
+    pub deployment: String,
+    /// The envelopes of its revision and its fallback; one that the vehicle has may be left out.
+    pub revisions: Vec<String>,
+}
+
+/// The answer to a deployment.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "result", rename_all = "snake_case")]
+pub enum DeployReply {
+    /// Files are missing: `PUT /v1/objects/SHA256` each, then repeat the request.
+    Missing {
+        /// The missing files.
+        objects: Vec<MissingObject>,
+    },
+    /// It was accepted, and survives a restart of the vehicle.
+    Accepted {
+        /// Id of the deployment.
+        id: String,
+        /// Number of its attempt: a status with a lower one is of an earlier deployment.
+        attempt: u64,
+        /// Number of the wanted state that has it.
+        generation: u64,
+    },
+}
+
+/// A file that a vehicle needs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MissingObject {
+    /// Its digest.
+    pub sha256: String,
+    /// Its length.
+    pub bytes: u64,
+}
+
+/// A line of `GET /v1/events` and `GET /v1/lambdas/ID/records`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StreamLine {
+    /// Name of the stream.
+    pub stream: String,
+    /// Number of the record in the stream; of a gap, its first number.
+    pub seq: u64,
+    /// Time of the record, in ns since 1970, as the clock was set; 0 of a gap without one.
+    pub time_ns: i64,
+    /// Time since the boot, in ns.
+    pub boot_ns: u64,
+    /// The boot, as 32 hexadecimal digits.
+    pub boot: String,
+    /// The record: `{"kind": …}`.
+    pub record: serde_json::Value,
+}
+
+/// An error, as `application/problem+json`: a [`Failure`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Problem {
+    /// The failed action.
+    pub title: String,
+    /// The causes, the nearest first.
+    #[serde(default)]
+    pub causes: Vec<String>,
+    /// What to do.
+    #[serde(default)]
+    pub help: Option<String>,
+    /// Exit code of a command that fails with it.
+    pub exit: u8,
+}
+
+impl From<Failure> for Problem {
+    fn from(Failure { exit, message, causes, help }: Failure) -> Self {
+        Self { title: message, causes, help, exit: exit.code() }
+    }
+}
+
+impl From<Problem> for Failure {
+    fn from(Problem { title, causes, help, exit }: Problem) -> Self {
+        let exit = Exit::from_code(exit.into()).filter(|exit| *exit != Exit::Ok);
+        Failure { exit: exit.unwrap_or(Exit::Internal), message: title, causes, help }
+    }
+}
