@@ -2,8 +2,8 @@
 //!
 //! `new` creates a lambda's folder, `build` its build folder. `runtime` starts `gleaner-runtime`
 //! for `check`, `replay` and `verify`, `run` runs lambdas live by `gleaner-supervisor`, `engines`
-//! builds engines of models ahead, `signing` makes keys and signs builds, and `delegate` passes
-//! commands on to another program. `render` formats results as text, `report` writes the report
+//! builds engines of models ahead, `signing` makes keys and signs builds, `vehicle` deploys builds
+//! and shows what runs, and `delegate` passes commands on to another program. `render` formats results as text, `report` writes the report
 //! page, `diff` compares two runs, and `dev` repeats all of this whenever a source is saved.
 //! `generated` prints shell completions and man pages.
 //!
@@ -29,6 +29,7 @@ mod run;
 mod runtime;
 mod signing;
 mod stdout;
+mod vehicle;
 
 use gleaner_base::{Exit, Failure};
 
@@ -55,6 +56,14 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
         CliCommand::Play { arguments } => delegate::play(&arguments),
         CliCommand::Keys(command) => signing::keys(&command),
         CliCommand::Publish(args) => signing::publish(&args),
+        CliCommand::Trust(command) => vehicle::trust(&command),
+        CliCommand::Deploy(args) => vehicle::deploy(&args),
+        CliCommand::Rollback(args) => vehicle::change(&args, "rollback"),
+        CliCommand::Start(args) => vehicle::change(&args, "start"),
+        CliCommand::Stop(args) => vehicle::change(&args, "stop"),
+        CliCommand::Status(args) => vehicle::status(&args),
+        CliCommand::Logs(args) => vehicle::logs(&args),
+        CliCommand::Events(args) => vehicle::events(&args),
         CliCommand::Doctor(args) => doctor::run(&args),
         CliCommand::Completions { shell } => generated::completions(shell),
         CliCommand::Man { folder } => generated::man(&folder),

@@ -126,6 +126,19 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-journal", &["gleaner-base", "gleaner-lambda"]),
     ("gleaner-lambda", &["gleaner-base", "gleaner-rules"]),
     ("gleaner-messages", &["gleaner-base", "gleaner-rules"]),
+    (
+        "gleaner-orchestrator",
+        &[
+            "gleaner-base",
+            "gleaner-lambda",
+            "gleaner-parts",
+            "gleaner-protocol",
+            "gleaner-spool",
+            "gleaner-supervisor",
+            "gleaner-trust",
+            "gleaner-vitals",
+        ],
+    ),
     ("gleaner-parts", &["gleaner-base"]),
     (
         "gleaner-player",
@@ -185,6 +198,8 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-lambda",
             "gleaner-parts",
             "gleaner-protocol",
+            "gleaner-spool",
+            "gleaner-trust",
         ],
     ),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
@@ -200,6 +215,8 @@ pub const WITHOUT: &[(&str, &[&str])] = &[
     ("gleaner-drives", &["pyo3", "rustdds"]),
     // The runtime loads native code; only `gleaner-compile` generates it.
     ("gleaner-host", &["cranelift-codegen", "pyo3"]),
+    // It reads what strangers send, and runs no code.
+    ("gleaner-orchestrator", &["wasmtime", "pyo3", "rustdds"]),
     ("gleaner-player", &["pyo3", "rustdds"]),
     // A web page may use it.
     ("gleaner-report", &["clap", "indicatif"]),

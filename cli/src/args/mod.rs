@@ -1,6 +1,7 @@
 //! Defines the command line, and checks arguments as far as possible without opening files.
 
 mod signing;
+mod vehicle;
 
 use std::ffi::OsString;
 use std::net::IpAddr;
@@ -12,6 +13,10 @@ use gleaner_lambda::manifest::LambdaKind;
 use gleaner_protocol::DriveTime;
 
 pub use signing::{KeysArgs, KeysCommand, PublishArgs};
+pub use vehicle::{
+    ChangeArgs, DeployArgs, LogsArgs, StatusArgs, StreamArgs, TrustArgs, TrustCommand,
+    TrustInstallArgs, VehicleArgs,
+};
 
 /// Run small functions (lambdas) next to the sensors of a vehicle, and keep the data worth keeping
 #[derive(Parser, Debug)]
@@ -71,6 +76,23 @@ pub enum CliCommand {
     Keys(KeysCommand),
     /// Sign a built lambda: write its revision, by which a vehicle can recognise its files
     Publish(PublishArgs),
+    /// Sign or install a trust root: the keys that a vehicle accepts
+    #[command(subcommand)]
+    Trust(TrustCommand),
+    /// Sign a deployment of a published lambda, send it to a vehicle, and wait until it runs
+    Deploy(DeployArgs),
+    /// Run the fallback of a deployment
+    Rollback(ChangeArgs),
+    /// Start a deployment again that was stopped or failed too often
+    Start(ChangeArgs),
+    /// Stop a deployment, also after a restart of the vehicle
+    Stop(ChangeArgs),
+    /// Show what runs on a vehicle
+    Status(StatusArgs),
+    /// Show decisions and log lines of a deployment
+    Logs(LogsArgs),
+    /// Show what happened on a vehicle
+    Events(StreamArgs),
     /// Check whether lambdas can run well on this machine
     Doctor(DoctorArgs),
     /// Print a completion script for a shell

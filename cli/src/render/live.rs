@@ -233,7 +233,7 @@ fn in_ms(spread: &DurationStats) -> String {
 }
 
 /// Formats a table. Columns are as wide as their widest cell; those in `numbers` are right-aligned.
-pub(super) fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -> String {
+pub(crate) fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -> String {
     let width =
         |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths: Vec<usize> = (0..N).map(width).collect();
@@ -254,7 +254,7 @@ pub(super) fn table<const N: usize>(rows: Vec<[String; N]>, numbers: &[usize]) -
 }
 
 /// Formats the time of day, in UTC.
-fn time_of_day(at_ns: i64) -> String {
+pub(crate) fn time_of_day(at_ns: i64) -> String {
     let ms = at_ns.div_euclid(1_000_000).rem_euclid(86_400_000);
     let (hours, minutes, seconds) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60);
     format!("{hours:02}:{minutes:02}:{seconds:02}.{:03}", ms % 1000)

@@ -24,7 +24,9 @@ pub(crate) use drive::drive;
 pub(crate) use inference::{inference, inference_event};
 pub(crate) use ingress::ingress;
 pub(crate) use isolation::isolation;
-pub(crate) use live::{clip_line, decision, live, named_report, recorder, topics};
+pub(crate) use live::{
+    clip_line, decision, live, named_report, recorder, table, time_of_day, topics,
+};
 
 /// Formats a report as one line of JSON.
 pub(crate) fn json_line<T: serde::Serialize>(result: &T) -> String {

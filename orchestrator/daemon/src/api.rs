@@ -25,10 +25,10 @@ use futures_util::StreamExt;
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::Sha256;
 use gleaner_protocol::vehicle_api::{
-    DeployReply, DeployRequest, Problem, ProgramStatus, VehicleStatus,
+    Changed, DeployReply, DeployRequest, Problem, ProgramStatus, VehicleStatus,
 };
 use gleaner_vitals::usage;
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 use sha2::Digest;
 use tokio::io::AsyncWriteExt;
 
@@ -49,13 +49,6 @@ pub(crate) struct Api {
     pub(crate) layout: Layout,
     pub(crate) name: Arc<str>,
     pub(crate) started: Instant,
-}
-
-/// The answer to a change of a deployment.
-#[derive(Debug, Serialize, Deserialize)]
-pub(crate) struct Changed {
-    /// Number of the attempt: a status with a lower one is of an earlier one.
-    pub(crate) attempt: u64,
 }
 
 /// Which records of a stream are sent.

@@ -5,7 +5,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::{ConfigSet, ItemName, Sha256};
 use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::supervision::DesiredLambda;
-use gleaner_protocol::vehicle_api::{DeploymentStatus, RevisionStatus};
+use gleaner_protocol::vehicle_api::{DeploymentStatus, GrantStatus, RevisionStatus};
 use gleaner_trust::{Deployment, Revision, Trusted, Verdict, Verifier};
 
 use crate::state::Deployed;
@@ -17,6 +17,8 @@ pub(crate) struct SignedDeployment {
     pub(crate) revision: Trusted<Revision>,
     pub(crate) fallback: Option<Trusted<Revision>>,
     pub(crate) verdict: Verdict,
+    /// Overrides of the config that its fallback knows.
+    fallback_set: Vec<(String, String)>,
 }
 
 impl SignedDeployment {
@@ -46,7 +48,7 @@ impl SignedDeployment {
         let fallback = wish.fallback.as_ref().map(|it| revision("fallback", it)).transpose()?;
         let revision = revision("revision", &wish.revision)?;
         let verdict = verifier.admit(&deployment, &revision, fallback.as_ref()).map_err(refused)?;
-        Ok(Self { deployment, revision, fallback, verdict })
+        Ok(Self { deployment, revision, fallback, verdict, fallback_set: Vec::new() })
     }
 
     pub(crate) fn id(&self) -> &ItemName {
@@ -68,18 +70,29 @@ impl SignedDeployment {
     /// # Errors
     ///
     /// A failure that names what does not fit.
-    pub(crate) fn check_manifests(&self, store: &RevisionStore) -> Result<Vec<Manifest>, Failure> {
+    pub(crate) fn check_manifests(
+        &mut self,
+        store: &RevisionStore,
+    ) -> Result<Vec<Manifest>, Failure> {
         let wish = self.deployment.payload();
-        self.digests()
-            .map(|digest| {
-                let manifest = Manifest::load(BuildDir::of(store.folder(digest)).path())?;
-                check_grants(wish, &manifest)?;
-                ConfigSet::resolve(&manifest, &overrides(wish)).map_err(|error| {
-                    Failure::because("the config of the deployment does not fit", &error)
-                })?;
-                Ok(manifest)
-            })
-            .collect()
+        let overrides = overrides(wish);
+        let mut manifests = Vec::new();
+        for digest in self.revisions().map(Trusted::digest) {
+            let manifest = Manifest::load(BuildDir::of(store.folder(digest)).path())?;
+            check_grants(wish, &manifest)?;
+            let set = match manifests.is_empty() {
+                true => overrides.clone(),
+                false => known(&overrides, &manifest),
+            };
+            ConfigSet::resolve(&manifest, &set).map_err(|error| {
+                Failure::because("the config of the deployment does not fit", &error)
+            })?;
+            manifests.push(manifest);
+        }
+        if let Some(manifest) = manifests.get(1) {
+            self.fallback_set = known(&overrides, manifest);
+        }
+        Ok(manifests)
     }
 
     /// Returns what runs by it, if `deployed` is its state.
@@ -87,14 +100,17 @@ impl SignedDeployment {
         let wish = self.deployment.payload();
         let fallback = self.fallback.as_ref().filter(|_| deployed.runs_fallback);
         let revision = fallback.unwrap_or(&self.revision);
-        let overrides = overrides(wish).into_iter();
+        let overrides = match fallback {
+            Some(_) => self.fallback_set.clone(),
+            None => overrides(wish),
+        };
         DesiredLambda {
             id: wish.id.to_string(),
             name: revision.payload().name.to_string(),
             revision: revision.digest().to_string(),
             folder: store.folder(revision.digest()),
             envelope: store.envelope_path(revision.digest()),
-            set: overrides.map(|(name, value)| format!("{name}={value}")).collect(),
+            set: overrides.iter().map(|(name, value)| format!("{name}={value}")).collect(),
             attempt: deployed.attempt,
         }
     }
@@ -105,12 +121,18 @@ impl SignedDeployment {
             Verdict::Current => None,
             Verdict::Stale(refusal) => Some(refusal.to_string()),
         };
+        let grants = &self.deployment.payload().grants;
         DeploymentStatus {
             id: self.id().to_string(),
             release: self.deployment.payload().release,
             lambda: self.revision.payload().name.to_string(),
             revision: revision_status(&self.revision),
             fallback: self.fallback.as_ref().map(revision_status),
+            grants: GrantStatus {
+                topics: grants.topics.iter().map(ToString::to_string).collect(),
+                models: grants.models.iter().map(ToString::to_string).collect(),
+                record: grants.record,
+            },
             is_wanted: deployed.is_wanted,
             runs_fallback: deployed.runs_fallback,
             is_proven: deployed.is_proven,
@@ -130,6 +152,12 @@ fn revision_status(revision: &Trusted<Revision>) -> RevisionStatus {
 
 fn overrides(wish: &Deployment) -> Vec<(String, String)> {
     wish.config.iter().map(|(name, value)| (name.to_string(), value.to_string())).collect()
+}
+
+/// Returns the overrides of items that the manifest has: an older revision may lack some.
+fn known(overrides: &[(String, String)], manifest: &Manifest) -> Vec<(String, String)> {
+    let has = |name: &String| manifest.config.iter().any(|item| item.name == name.as_str());
+    overrides.iter().filter(|(name, _)| has(name)).cloned().collect()
 }
 
 /// Checks that the deployment grants everything that the manifest asks for.

@@ -9,7 +9,9 @@ use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_protocol::supervision::{
     DesiredState, EventKind, LAMBDAS_MAX, LambdaPhase, SupervisorStatus, VehicleEvent,
 };
-use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest, DeploymentStatus};
+use gleaner_protocol::vehicle_api::{
+    DeployReply, DeployRequest, DeploymentStatus, GrantStatus, RevisionStatus,
+};
 use gleaner_supervisor::EventLog;
 use gleaner_trust::{Revision, Trusted};
 use tokio::sync::watch;
@@ -156,7 +158,7 @@ impl Core {
             let sent = sent.get(digest).map(|envelope| envelope.as_bytes().to_vec());
             sent.or_else(|| self.store.envelope(digest).ok())
         };
-        let signed = SignedDeployment::verify(&verifier, request.deployment.as_bytes(), find)?;
+        let mut signed = SignedDeployment::verify(&verifier, request.deployment.as_bytes(), find)?;
         inner.check_name(&signed)?;
         let new: Vec<_> = signed.revisions().filter(|it| !self.store.has(it.digest())).collect();
         let missing = new.iter().flat_map(|revision| self.store.missing(revision.payload()));
@@ -253,10 +255,13 @@ impl Core {
     ///
     /// A failure if there is no such deployment, or the disk is full.
     pub(crate) fn set_wanted(&self, id: &str, is_wanted: bool) -> Result<u64, Failure> {
-        let admitted = self.lock().wanted_memory();
+        let (admitted, memory) = {
+            let inner = self.lock();
+            (inner.wanted_memory(), inner.memory.clone())
+        };
         self.update(id, |deployed, signed| {
             if is_wanted && !deployed.is_wanted {
-                let memory = admission::memory(&signed.check_manifests(&self.store)?);
+                let memory = memory.get(signed.id()).copied().unwrap_or(0);
                 self.memory.admit(signed.id(), memory, &admitted)?;
             }
             deployed.is_wanted = is_wanted;
@@ -408,7 +413,7 @@ impl Core {
             let checked = inner.trust.verifier().and_then(|verifier| {
                 let find = |digest: &Sha256| self.store.envelope(digest).ok();
                 let envelope = deployed.envelope.as_bytes();
-                let signed = SignedDeployment::verify(&verifier, envelope, find)?;
+                let mut signed = SignedDeployment::verify(&verifier, envelope, find)?;
                 let manifests = signed.check_manifests(&self.store)?;
                 memory.insert(id.clone(), admission::memory(&manifests));
                 Ok(signed)
@@ -517,17 +522,14 @@ fn expected(revisions: &[&Trusted<Revision>]) -> BTreeMap<Sha256, u64> {
 
 /// Returns the status of a deployment whose envelope counts no more.
 fn refused(id: &ItemName, deployed: &Deployed, reason: &str) -> DeploymentStatus {
-    let revision = gleaner_protocol::vehicle_api::RevisionStatus {
-        digest: String::new(),
-        version: String::new(),
-        release: 0,
-    };
+    let revision = RevisionStatus { digest: String::new(), version: String::new(), release: 0 };
     DeploymentStatus {
         id: id.to_string(),
         release: 0,
         lambda: String::new(),
         revision,
         fallback: None,
+        grants: GrantStatus::default(),
         is_wanted: deployed.is_wanted,
         runs_fallback: deployed.runs_fallback,
         is_proven: deployed.is_proven,

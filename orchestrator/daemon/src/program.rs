@@ -36,9 +36,6 @@ struct Args {
     /// Folder of the sockets
     #[arg(long, value_name = "DIR", default_value = "/run/gleaner")]
     run: PathBuf,
-    /// Drive to play instead of joining a network, as often as the lambdas start; for tests
-    #[arg(long, value_name = "FILE")]
-    drive: Vec<PathBuf>,
     /// Keep every decision, not only those with a trigger or a fault
     #[arg(long)]
     all: bool,
@@ -122,7 +119,6 @@ fn spec(args: &Args, layout: &Layout, vehicle: &Vehicle) -> SupervisionSpec {
         clips: layout.clips(),
         vehicle: args.vehicle.clone(),
         signer: None,
-        drives: args.drive.clone(),
         network: domain.into_iter().chain(interfaces).collect(),
         all: args.all,
         decisions: vehicle.deployments.decisions.as_ref().map(ToString::to_string),

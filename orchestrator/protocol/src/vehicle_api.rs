@@ -70,6 +70,8 @@ pub struct DeploymentStatus {
     pub revision: RevisionStatus,
     /// The revision that runs if that fails.
     pub fallback: Option<RevisionStatus>,
+    /// Rights of the lambda.
+    pub grants: GrantStatus,
     /// True unless it was stopped by a user.
     pub is_wanted: bool,
     /// True if its fallback runs.
@@ -84,6 +86,24 @@ pub struct DeploymentStatus {
     pub stale: Option<String>,
     /// The status of its lambda, if the supervisor knows it.
     pub status: Option<LambdaStatus>,
+}
+
+/// Rights of a lambda in a deployment.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GrantStatus {
+    /// Topics that it may read.
+    pub topics: Vec<String>,
+    /// Models that it may run.
+    pub models: Vec<String>,
+    /// Permission to record clips.
+    pub record: bool,
+}
+
+/// The answer to a change of a deployment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Changed {
+    /// Number of the attempt: a status with a lower one is of an earlier one.
+    pub attempt: u64,
 }
 
 /// A revision of a deployment.

@@ -14,7 +14,7 @@ use crate::failures::Failures;
 use crate::lambda_process::{LambdaProcess, ProcessEnd};
 use crate::observer::RunObserver;
 use crate::process::ChildProcess;
-use crate::restart_delay::RestartDelay;
+use crate::restart_delay::{RestartDelay, jittered};
 use crate::revision_check::RevisionCheck;
 use crate::spec::LambdaSpec;
 use crate::summary::{EarlierCounts, RunCounts};
@@ -136,7 +136,7 @@ impl SupervisedLambda {
     /// Notes that its process could not be created.
     pub(crate) fn failed_to_start(&mut self, failure: &Failure, observer: &mut dyn RunObserver) {
         let reason = format!("{}{}", self.lambda.prefix, failure.message);
-        let delay = self.delay.after(Duration::ZERO);
+        let delay = jittered(self.delay.after(Duration::ZERO));
         self.restart_in(delay);
         self.last_end = Some(failure.message.clone());
         observer.restarts(Some(&self.lambda), &reason, delay, self.restarts);
@@ -413,6 +413,7 @@ impl SupervisedLambda {
         }
         let delays = if is_outside { &mut self.kills } else { &mut self.delay };
         let delay = delays.after(ran);
+        let delay = if is_kept { jittered(delay) } else { delay };
         self.restart_in(delay);
         observer.restarts(Some(&self.lambda), &shown, delay, self.restarts);
     }

@@ -28,4 +28,6 @@ pub use payload::{
 };
 pub use publish::{Published, Release, ReleaseError, publish};
 pub use refusal::Refusal;
-pub use verify::{Trusted, Verdict, Verifier, first_root, next_root, revision_of_digest};
+pub use verify::{
+    Trusted, Verdict, Verifier, first_root, next_root, revision_of_digest, unverified_revision,
+};

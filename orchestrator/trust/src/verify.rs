@@ -198,13 +198,23 @@ fn verified<P: Payload>(envelope: &[u8], keys: &[ScopedKey]) -> Result<Trusted<P
 ///
 /// [`Refusal::OtherRevision`], and those of the format.
 pub fn revision_of_digest(envelope: &[u8], digest: &Sha256) -> Result<Revision, Refusal> {
-    let envelope = Unverified::<Revision>::parse(envelope)?;
-    let found = envelope.digest();
-    if found != *digest {
-        let (wanted, found) = (digest.to_string(), Some(found));
-        return Err(Refusal::OtherRevision { role: "revision", wanted, found });
+    let (revision, found) = unverified_revision(envelope)?;
+    if found == *digest {
+        return Ok(revision);
     }
-    envelope.payload()
+    let (wanted, found) = (digest.to_string(), Some(found));
+    Err(Refusal::OtherRevision { role: "revision", wanted, found })
+}
+
+/// Reads the revision in `envelope`, and its digest. No signature is checked: this is for those who
+/// send a revision, not for those who run it.
+///
+/// # Errors
+///
+/// Those of the format.
+pub fn unverified_revision(envelope: &[u8]) -> Result<(Revision, Sha256), Refusal> {
+    let envelope = Unverified::<Revision>::parse(envelope)?;
+    Ok((envelope.payload()?, envelope.digest()))
 }
 
 /// Opens the trust root that is installed on a vehicle: its own keys must have signed it, and it

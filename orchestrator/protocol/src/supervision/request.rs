@@ -40,8 +40,6 @@ pub struct SupervisionSpec {
     pub vehicle: Option<PathBuf>,
     /// Key that signs clips, and the name of the vehicle.
     pub signer: Option<(PathBuf, String)>,
-    /// Drives to play instead of joining a network.
-    pub drives: Vec<PathBuf>,
     /// Arguments of `gleaner-ingress` that select the network.
     pub network: Vec<String>,
     /// True to keep every decision, not only those with a trigger or a fault.

@@ -121,7 +121,6 @@ fn run_spec(spec: &SupervisionSpec) -> RunSpec {
     RunSpec {
         clips: spec.clips.clone(),
         vehicle: spec.vehicle.clone(),
-        drives: spec.drives.clone(),
         network: spec.network.iter().map(Into::into).collect(),
         all: spec.all,
         records: true,
@@ -172,6 +171,9 @@ impl WantedState<'_> {
                 return Ok(end);
             }
             for lambda in group.lambdas.iter_mut() {
+                if lambda.is_leaving {
+                    lambda.kill_if_late(group.observer);
+                }
                 if let Some(reason) = lambda.take_quarantine() {
                     group.observer.quarantined(&lambda.lambda, &reason);
                 }

@@ -1,0 +1,305 @@
+//! `gleaner deploy`, `rollback`, `start` and `stop`: change what runs on a vehicle, and wait for it.
+
+use std::collections::BTreeMap;
+use std::str::FromStr;
+use std::thread;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use gleaner_base::{Exit, Failure, PlainFile, format_duration};
+use gleaner_lambda::layout::FILE_MAX;
+use gleaner_lambda::manifest::{ConfigSet, ConfigValue, ItemName, Sha256, TopicName};
+use gleaner_lambda::{BuildDir, Manifest};
+use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus};
+use gleaner_protocol::vehicle_api::{
+    Changed, DeployReply, DeployRequest, DeploymentStatus, MissingObject,
+};
+use gleaner_report::format::counted;
+use gleaner_trust::{
+    Deployment, Grants, Payload, Revision, SecretKey, check_files, seal, unverified_revision,
+};
+use serde_json::json;
+
+use super::client::VehicleClient;
+use crate::args::{ChangeArgs, DeployArgs, VehicleArgs};
+use crate::render::json_line;
+use crate::stdout::print;
+
+/// Interval of looks at the status.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
+
+/// A revision on this machine.
+struct LocalRevision {
+    envelope: String,
+    revision: Revision,
+    digest: Sha256,
+    build: BuildDir,
+    manifest: Manifest,
+}
+
+/// Runs `gleaner deploy`.
+pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
+    let key = SecretKey::load(&args.key)?;
+    let local = LocalRevision::load(args)?;
+    let client = VehicleClient::new(&args.vehicle)?;
+    let status = client.status()?;
+    let id = args.id.clone().unwrap_or_else(|| local.revision.name.to_string());
+    let before = status.deployments.into_iter().find(|deployment| deployment.id == id);
+    let deployment = deployment(args, &local, &id, before.as_ref())?;
+    let release = deployment.release;
+    let sealed = seal(&deployment, &[&key])
+        .map_err(|refusal| Failure::because("cannot sign the deployment", &refusal))?;
+    let request = DeployRequest {
+        deployment: String::from_utf8(sealed).expect("an envelope is JSON"),
+        revisions: vec![local.envelope.clone()],
+    };
+    let mut sent = 0;
+    let attempt = loop {
+        match client.post("/v1/deployments", &request)? {
+            DeployReply::Accepted { attempt, .. } => break attempt,
+            DeployReply::Missing { objects } if sent == 0 => {
+                objects.iter().try_for_each(|object| local.send(&client, object))?;
+                sent = objects.len();
+            }
+            DeployReply::Missing { objects } => {
+                let count = counted(objects.len() as u64, "file");
+                let message = format!("the vehicle lacks {count} although all were sent");
+                return Err(Failure::new(Exit::Internal, message)
+                    .with_help("another deployment may have come between: try again"));
+            }
+        }
+    };
+    if !args.vehicle.json {
+        let Revision { name, version, .. } = &local.revision;
+        let files = counted(sent as u64, "file");
+        print(&format!("deployed {name} {version} as `{id}` (release {release}, {files} sent)\n"))?;
+    }
+    wait(&client, &args.vehicle, &id, attempt, args.timeout)
+}
+
+/// Runs `gleaner rollback`, `gleaner start` and `gleaner stop`.
+pub(crate) fn change(args: &ChangeArgs, change: &str) -> Result<Exit, Failure> {
+    let client = VehicleClient::new(&args.vehicle)?;
+    if args.id.parse::<ItemName>().is_err() {
+        let id = gleaner_base::excerpt(&args.id);
+        return Err(Failure::new(Exit::Usage, format!("`{id}` is no id of a deployment"))
+            .with_help("`gleaner status` lists them"));
+    }
+    let path = format!("/v1/deployments/{}/{change}", args.id);
+    let Changed { attempt } = client.post(&path, &json!({}))?;
+    match change {
+        "stop" => wait_for_end(&client, args),
+        _ => wait(&client, &args.vehicle, &args.id, attempt, args.timeout),
+    }
+}
+
+impl LocalRevision {
+    fn load(args: &DeployArgs) -> Result<Self, Failure> {
+        let path = args.revision.clone().unwrap_or_else(|| args.lambda.join("revision.json"));
+        let read = PlainFile::named(&path, Revision::MAX).and_then(PlainFile::read_whole);
+        let bytes = read.map_err(|error| {
+            Failure::caused_by(Exit::Usage, format!("cannot read `{}`", path.display()), &error)
+                .with_help("sign the build first: `gleaner publish DIR --key publisher.pem`")
+        })?;
+        let (revision, digest) = unverified_revision(&bytes).map_err(|refusal| {
+            Failure::because(format!("cannot use `{}`", path.display()), &refusal)
+        })?;
+        let build = BuildDir::of(&args.lambda);
+        check_files(&revision, &build).map_err(|error| {
+            let name = &revision.name;
+            Failure::because(format!("the build of `{name}` is not the published one"), &error)
+                .with_help("build and publish it again: `gleaner publish DIR --key publisher.pem`")
+        })?;
+        let manifest = Manifest::load(build.path())?;
+        let envelope = String::from_utf8(bytes).expect("an envelope is JSON");
+        Ok(Self { envelope, revision, digest, build, manifest })
+    }
+
+    fn send(&self, client: &VehicleClient, object: &MissingObject) -> Result<(), Failure> {
+        let file = self.revision.files.iter().find(|file| file.sha256 == *object.sha256);
+        let Some(file) = file else {
+            let message = format!("the vehicle lacks the file {} of the fallback", object.sha256);
+            return Err(Failure::new(Exit::Usage, message)
+                .with_help("deploy with `--fallback none`, or deploy the fallback first"));
+        };
+        let path = file.path.as_path();
+        let opened = PlainFile::inside(self.build.path(), path, FILE_MAX).map_err(|error| {
+            Failure::caused_by(Exit::Usage, format!("cannot open `{}`", file.path), &error)
+        })?;
+        client.put_file(&format!("/v1/objects/{}", object.sha256), opened.into_file())
+    }
+}
+
+fn deployment(
+    args: &DeployArgs,
+    local: &LocalRevision,
+    id: &str,
+    before: Option<&DeploymentStatus>,
+) -> Result<Deployment, Failure> {
+    let fallback = match args.fallback.as_deref() {
+        Some("none") => None,
+        Some(digest) => Some(parse::<Sha256>("--fallback", digest)?),
+        None => before.and_then(|before| runs(before)?.parse().ok()),
+    };
+    let created = now();
+    let release = args.release.unwrap_or_else(|| before.map_or(0, |before| before.release) + 1);
+    let label = |text: &String| {
+        let (name, value) = text.split_once('=').unwrap_or((text, ""));
+        Ok((parse("--label", name)?, value.to_owned()))
+    };
+    Ok(Deployment {
+        id: parse("--id", id)?,
+        release,
+        selector: args.label.iter().map(label).collect::<Result<_, Failure>>()?,
+        revision: local.digest.clone(),
+        fallback: fallback.filter(|fallback| *fallback != local.digest),
+        config: config(&local.manifest, &args.set)?,
+        grants: grants(&local.manifest, before),
+        created,
+        expires: created.saturating_add(args.expires.as_secs()),
+    })
+}
+
+/// Returns the digest of the revision that runs.
+fn runs(deployment: &DeploymentStatus) -> Option<&str> {
+    let fallback = deployment.fallback.as_ref().filter(|_| deployment.runs_fallback);
+    let revision = fallback.unwrap_or(&deployment.revision);
+    Some(revision.digest.as_str()).filter(|digest| !digest.is_empty())
+}
+
+/// Returns what the manifest asks for, and what its fallback had.
+fn grants(manifest: &Manifest, before: Option<&DeploymentStatus>) -> Grants {
+    let inputs = manifest.inputs.iter().map(|input| &input.topic);
+    let recorded = manifest.record.iter().flat_map(|record| &record.topics);
+    let granted = before.map(|before| &before.grants);
+    let topics = granted.into_iter().flat_map(|granted| &granted.topics);
+    let topics = topics.filter_map(|topic| topic.parse::<TopicName>().ok());
+    let models = granted.into_iter().flat_map(|granted| &granted.models);
+    let models = models.filter_map(|model| model.parse::<ItemName>().ok());
+    let own = manifest.models.iter().map(|model| model.name.clone());
+    let mut grants = Grants {
+        topics: inputs.chain(recorded).cloned().chain(topics).collect(),
+        models: own.chain(models).collect(),
+        record: manifest.record.is_some() || granted.is_some_and(|granted| granted.record),
+    };
+    grants.topics.sort();
+    grants.topics.dedup();
+    grants.models.sort();
+    grants.models.dedup();
+    grants
+}
+
+fn config(manifest: &Manifest, set: &[String]) -> Result<BTreeMap<ItemName, ConfigValue>, Failure> {
+    let pairs = set.iter().map(|text| {
+        let (name, value) = text.split_once('=').unwrap_or((text, ""));
+        (name.trim().to_owned(), value.to_owned())
+    });
+    let pairs: Vec<_> = pairs.collect();
+    let values = ConfigSet::resolve(manifest, &pairs)?;
+    let is_set = |name: &String| pairs.iter().any(|(key, _)| key == name);
+    let set = values.into_iter().filter(|(name, _)| is_set(name));
+    set.map(|(name, value)| Ok((parse("--set", &name)?, value))).collect()
+}
+
+fn parse<T: FromStr>(option: &str, text: &str) -> Result<T, Failure> {
+    text.parse().map_err(|_| {
+        let text = gleaner_base::excerpt(text);
+        Failure::new(Exit::Usage, format!("`{text}` is not valid for {option}"))
+    })
+}
+
+fn now() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
+}
+
+/// Waits until the lambda runs, for the attempt or a later one.
+fn wait(
+    client: &VehicleClient,
+    args: &VehicleArgs,
+    id: &str,
+    attempt: u64,
+    timeout: Duration,
+) -> Result<Exit, Failure> {
+    let started = Instant::now();
+    loop {
+        let status = client.status()?;
+        let Some(deployment) = status.deployments.iter().find(|it| it.id == *id) else {
+            return Err(Failure::new(Exit::Differs, format!("deployment `{id}` is gone")));
+        };
+        if let Some(refused) = &deployment.refused {
+            let mut failure = Failure::new(Exit::Denied, format!("deployment `{id}` is refused"));
+            failure.causes = vec![refused.clone()];
+            return Err(failure);
+        }
+        let newer = |lambda: &&LambdaStatus| lambda.attempt >= attempt;
+        let lambda = deployment.status.as_ref().filter(newer);
+        match lambda.map(|lambda| lambda.phase) {
+            Some(LambdaPhase::Running) => return running(args, deployment, started.elapsed()),
+            Some(LambdaPhase::Quarantined) => {
+                let mut failure = Failure::new(
+                    Exit::LambdaFaulted,
+                    format!("deployment `{id}` does not run, and is not started again"),
+                );
+                failure.causes = lambda.and_then(|it| it.last_end.clone()).into_iter().collect();
+                return Err(failure.with_help(format!(
+                    "repair the lambda and deploy it again, or `gleaner start {id}`; \
+                     `gleaner logs {id}` shows its log"
+                )));
+            }
+            _ => {}
+        }
+        if started.elapsed() >= timeout {
+            let seconds = format_duration(timeout);
+            let message = format!("deployment `{id}` does not run after {seconds}");
+            let mut failure = Failure::new(Exit::Differs, message);
+            failure.causes =
+                lambda.map(|it| format!("it is {}", it.phase.as_str())).into_iter().collect();
+            return Err(
+                failure.with_help("it goes on: `gleaner status` and `gleaner events` show it")
+            );
+        }
+        thread::sleep(POLL_INTERVAL);
+    }
+}
+
+fn running(
+    args: &VehicleArgs,
+    deployment: &DeploymentStatus,
+    after: Duration,
+) -> Result<Exit, Failure> {
+    let fallback = deployment.fallback.as_ref();
+    // Another attempt than the one that was requested: the fallback came to its place.
+    let failed = deployment.failed.as_deref().filter(|_| deployment.runs_fallback);
+    let version = fallback.filter(|_| deployment.runs_fallback).unwrap_or(&deployment.revision);
+    if args.json {
+        print(&json_line(deployment))?;
+    } else {
+        let (ms, version) = (after.as_millis(), &version.version);
+        print(&match failed {
+            Some(reason) => format!("running its fallback {version}: {reason}\n"),
+            None => format!("running {version} after {ms} ms\n"),
+        })?;
+    }
+    // A rollback that a user asked for is no failure.
+    Ok(Exit::Ok)
+}
+
+fn wait_for_end(client: &VehicleClient, args: &ChangeArgs) -> Result<Exit, Failure> {
+    let started = Instant::now();
+    loop {
+        let status = client.status()?;
+        let deployment = status.deployments.iter().find(|it| it.id == args.id);
+        if deployment.is_none_or(|deployment| deployment.status.is_none()) {
+            let text = match args.vehicle.json {
+                true => json_line(&deployment),
+                false => format!("stopped `{}`\n", args.id),
+            };
+            print(&text)?;
+            return Ok(Exit::Ok);
+        }
+        if started.elapsed() >= args.timeout {
+            let message = format!("`{}` still ends", args.id);
+            return Err(Failure::new(Exit::Differs, message));
+        }
+        thread::sleep(POLL_INTERVAL);
+    }
+}

@@ -1,0 +1,17 @@
+//! The commands for a vehicle: they talk to its `gleaner-orchestrator`.
+//!
+//! - `client`, `file_body`: requests over its socket.
+//! - `deploy`: signs a deployment, sends it and waits; starts, stops and rolls back.
+//! - `trust`: trust roots. `status`, `stream`: what runs, and what happened.
+
+mod client;
+mod deploy;
+mod file_body;
+mod status;
+mod stream;
+mod trust;
+
+pub(crate) use deploy::{change, deploy};
+pub(crate) use status::status;
+pub(crate) use stream::{events, logs};
+pub(crate) use trust::trust;

@@ -1,0 +1,113 @@
+//! `gleaner status`: what runs on a vehicle.
+
+use gleaner_base::{Exit, Failure, format_duration, visible};
+use gleaner_protocol::supervision::{LambdaPhase, ProcessStatus};
+use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
+use gleaner_report::format::{grouped, size};
+
+use super::client::VehicleClient;
+use crate::args::StatusArgs;
+use crate::render::{Paint, json_line, table};
+use crate::stdout::print;
+
+/// Runs `gleaner status`.
+pub(crate) fn status(args: &StatusArgs) -> Result<Exit, Failure> {
+    let status = VehicleClient::new(&args.vehicle)?.status()?;
+    print(&match args.vehicle.json {
+        true => json_line(&status),
+        false => text(&status, Paint::of_stdout()),
+    })?;
+    Ok(Exit::Ok)
+}
+
+/// Formats the status.
+pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
+    let labels = status.labels.iter().map(|(name, value)| format!("{name}={}", visible(value)));
+    let labels = labels.collect::<Vec<_>>().join(" ");
+    let mut text = format!("{} {}\n", paint.bold(&visible(&status.vehicle)), paint.dim(&labels));
+    text += &match &status.trust {
+        None => format!("  {}\n", paint.yellow("no trust root: `gleaner trust install FILE`")),
+        Some(trust) if trust.is_expired => {
+            format!("  {}\n", paint.yellow("the trust root has expired: install the next one"))
+        }
+        Some(trust) => format!("  trust root {}\n", trust.version),
+    };
+    for capacity in &status.capacity {
+        // Of all resources, only memory has a unit of its own.
+        let [asked, most] = [capacity.asked, capacity.most].map(|it| size(it as u64));
+        text += &format!("  {} {asked} of {most} ({})\n", capacity.resource, capacity.source);
+    }
+    match &status.supervisor {
+        None => text += &format!("  {}\n", paint.red("the supervisor does not run")),
+        Some(supervisor) => {
+            text += &service("ingress", Some(&supervisor.ingress), paint);
+            text += &service("recorder", supervisor.recorder.as_ref(), paint);
+            text += &service("inference", supervisor.inference.as_ref(), paint);
+        }
+    }
+    if status.deployments.is_empty() {
+        return text + "\nnothing is deployed: `gleaner deploy --local DIR --key FILE`\n";
+    }
+    let head = [
+        "id", "lambda", "runs", "state", "for", "restarts", "wakes", "triggers", "faults", "p99",
+        "memory",
+    ];
+    let rows = status.deployments.iter().map(row);
+    let rows = std::iter::once(head.map(str::to_owned)).chain(rows);
+    text += "\n";
+    text += &table(rows.collect(), &[5, 6, 7, 8, 9, 10]);
+    for deployment in &status.deployments {
+        for (what, why) in [
+            ("refused", &deployment.refused),
+            ("runs its fallback", &deployment.failed),
+            ("should be signed again", &deployment.stale),
+            ("last end", &deployment.status.as_ref().and_then(|it| it.last_end.clone())),
+        ] {
+            if let Some(why) = why {
+                let line = format!("{}: {what}: {}", deployment.id, visible(why));
+                text += &format!("{}\n", paint.yellow(&line));
+            }
+        }
+    }
+    text
+}
+
+fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> String {
+    let Some(status) = status else { return String::new() };
+    let state = if status.is_ready { paint.green("ready") } else { paint.red("not ready") };
+    let restarts = match &status.last_end {
+        Some(reason) => format!(", restarts {}: {}", status.restarts, visible(reason)),
+        None => String::new(),
+    };
+    format!("  {name} {state}{restarts}\n")
+}
+
+fn row(deployment: &DeploymentStatus) -> [String; 11] {
+    let lambda = deployment.status.as_ref();
+    let fallback = deployment.fallback.as_ref().filter(|_| deployment.runs_fallback);
+    let mark = if fallback.is_some() { " (fallback)" } else { "" };
+    let version = &fallback.unwrap_or(&deployment.revision).version;
+    let state = match lambda.map(|lambda| lambda.phase) {
+        None if !deployment.is_wanted => "stopped",
+        None => "unknown",
+        Some(LambdaPhase::Running) if !deployment.is_proven => "on probation",
+        Some(phase) => phase.as_str(),
+    };
+    let seconds = lambda.map(|lambda| std::time::Duration::from_secs(lambda.phase_s as u64));
+    let live = lambda.and_then(|lambda| lambda.live.as_deref());
+    let count = |count: Option<u64>| count.map_or_else(|| "-".to_owned(), grouped);
+    let latency = live.and_then(|live| live.wake_latency);
+    [
+        deployment.id.clone(),
+        deployment.lambda.clone(),
+        format!("{version}{mark}"),
+        state.to_owned(),
+        seconds.map_or_else(|| "-".to_owned(), format_duration),
+        count(lambda.map(|lambda| lambda.restarts.into())),
+        count(live.map(|live| live.wakes)),
+        count(live.map(|live| live.triggers)),
+        count(live.map(|live| live.faults)),
+        latency.map_or_else(|| "-".to_owned(), |it| format!("{:.2} ms", it.p99_ns as f64 / 1e6)),
+        live.map_or_else(|| "-".to_owned(), |live| size(live.rss_bytes)),
+    ]
+}
