@@ -23,7 +23,7 @@ mod watch;
 
 use std::ffi::OsString;
 use std::io::PipeWriter;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 use std::time::Duration;
 
@@ -212,21 +212,17 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
 
 /// Opens the results, if there are any, and returns the runtime's end of their pipe.
 fn begin_results(args: &Args, pulse: &Pulse) -> Result<Option<(Results, PipeWriter)>, Failure> {
-    if let Some(folder) = args.results.clone() {
+    if let Some(folder) = &args.results {
         let again = args.again;
-        let begun =
-            Results::begin(&folder.clone(), pulse, move || ResultFiles::open(folder, again));
-        return begun.map(Some);
+        let open = move |folder: &Path| ResultFiles::open(folder, again);
+        return Results::begin(folder, pulse, open).map(Some);
     }
-    let Some((folder, origin)) = args.spool.clone().zip(args.origin.clone()) else {
+    let Some((folder, origin)) = args.spool.as_ref().zip(args.origin.clone()) else {
         return Ok(None);
     };
     let budget = args.spool_budget.map_or(BUDGET, ByteSize::new);
-    let open = {
-        let folder = folder.clone();
-        move || ResultSpool::open(&folder, &origin, budget)
-    };
-    Results::begin(&folder, pulse, open).map(Some)
+    let open = move |folder: &Path| ResultSpool::open(folder, &origin, budget);
+    Results::begin(folder, pulse, open).map(Some)
 }
 
 /// Requests SIGTERM for the death of `starter`. The kernel sends it once, so an earlier death is

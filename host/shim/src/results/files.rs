@@ -29,15 +29,16 @@ pub(crate) struct ResultFiles {
 impl ResultFiles {
     /// Creates `folder`. With `again`, lines are appended to the existing files; otherwise these
     /// stay until the runtime is about to enter its lambda.
-    pub(crate) fn open(folder: PathBuf, again: bool) -> Result<Self, Failure> {
+    pub(crate) fn open(folder: &Path, again: bool) -> Result<Self, Failure> {
         let mut output = None;
         if again {
-            output = Some(open_output(&folder, again)?);
+            output = Some(open_output(folder, again)?);
         } else {
             let created =
-                fs::create_dir_all(&folder).and_then(|()| Ok(access(&folder, Access::WRITE_OK)?));
-            created.map_err(|source| OutputError { path: folder.clone(), source })?;
+                fs::create_dir_all(folder).and_then(|()| Ok(access(folder, Access::WRITE_OK)?));
+            created.map_err(|source| OutputError { path: folder.to_owned(), source })?;
         }
+        let folder = folder.to_owned();
         Ok(Self { folder, output, tried: None, without_file: 0, has_pending: false })
     }
 
@@ -97,7 +98,7 @@ impl ResultSink for ResultFiles {
         self.output.as_ref().map_or(0, Output::lost) + self.without_file
     }
 
-    fn finish(self: Box<Self>, end: &ProcessResults<'_>) -> Result<(), Failure> {
+    fn finish(self: Box<Self>, end: ProcessResults<'_>) -> Result<(), Failure> {
         Ok(match (self.output, &end.summary) {
             (Some(output), Some(last)) => output.finish(last),
             (Some(mut output), None) => output.flush(),

@@ -124,7 +124,7 @@ impl ItemWriter {
             last.unwritten = last.unwritten.saturating_add(unwritten);
             last
         });
-        let finished = self.sink.finish(&ProcessResults { summary, record, invalid: self.refused });
+        let finished = self.sink.finish(ProcessResults { summary, record, invalid: self.refused });
         self.first.map_or(finished, Err)
     }
 

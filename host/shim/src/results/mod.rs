@@ -43,7 +43,7 @@ impl Results {
     pub(crate) fn begin<S: ResultSink + 'static>(
         folder: &Path,
         pulse: &Pulse,
-        open: impl FnOnce() -> Result<S, Failure> + Send + 'static,
+        open: impl FnOnce(&Path) -> Result<S, Failure> + Send + 'static,
     ) -> Result<(Self, PipeWriter), Failure> {
         let cannot =
             |error: io::Error| Failure::caused_by(Exit::Internal, "cannot receive results", &error);
@@ -54,9 +54,9 @@ impl Results {
         }
         let (ended, runs) = io::pipe().map_err(cannot)?;
         let (opened, outcome) = mpsc::sync_channel(1);
-        let pulse = pulse.clone();
+        let (pulse, path) = (pulse.clone(), folder.to_owned());
         let write = move || {
-            let (writer, result) = match open() {
+            let (writer, result) = match open(&path) {
                 Ok(sink) => (Some(ItemWriter::new(Box::new(sink), pulse)), Ok(())),
                 Err(failure) => (None, Err(failure)),
             };

@@ -33,7 +33,7 @@ pub(crate) trait ResultSink: Send {
     fn lost(&self) -> u64;
 
     /// Completes the results with the end of the process, and with its summary if it was complete.
-    fn finish(self: Box<Self>, end: &ProcessResults<'_>) -> Result<(), Failure>;
+    fn finish(self: Box<Self>, end: ProcessResults<'_>) -> Result<(), Failure>;
 }
 
 /// The end of a process, for [`ResultSink::finish`].

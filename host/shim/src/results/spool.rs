@@ -144,9 +144,9 @@ impl ResultSink for ResultSpool {
         self.writer.status().refused + self.too_long
     }
 
-    fn finish(mut self: Box<Self>, end: &ProcessResults<'_>) -> Result<(), Failure> {
-        if let Some(summary) = &end.summary {
-            self.append(&SpooledRecord::Summary(summary.clone()))?;
+    fn finish(mut self: Box<Self>, end: ProcessResults<'_>) -> Result<(), Failure> {
+        if let Some(summary) = end.summary {
+            self.append(&SpooledRecord::Summary(summary))?;
         }
         self.append_losses(end.invalid)?;
         self.append(&SpooledRecord::Ended(end.record.clone()))?;
