@@ -7,8 +7,8 @@
 //! the exit record. It exits as the runtime did. The thread that does this allocates next to
 //! nothing, and checks ten times a second.
 //!
-//! With `--results` a second thread writes the result files of the lambda, with `--spool` its spool,
-//! so that the lambda's process cannot write any.
+//! With `--results` a second thread writes the result files of the lambda, with `--spool` its
+//! spool, so that the lambda's process cannot write any.
 //!
 //! It lives as long as its runtime, even if its starter ends; with `--starter` it then asks the
 //! runtime to end.
