@@ -27,7 +27,7 @@ const LABELS_MAX: usize = 64;
 /// Maximum number of config values; a manifest has no more.
 const CONFIG_MAX: usize = gleaner_lambda::manifest::bounds::ITEMS_MAX;
 /// Maximum length of a text in bytes.
-const TEXT_MAX: usize = 4096;
+pub(crate) const TEXT_MAX: usize = 4096;
 
 /// Names and values that describe a vehicle, from its own configuration.
 pub type Labels = BTreeMap<ItemName, String>;
@@ -268,7 +268,7 @@ fn counter(release: u64) -> Result<(), String> {
     }
 }
 
-fn time(seconds: u64) -> Result<(), String> {
+pub(crate) fn time(seconds: u64) -> Result<(), String> {
     match seconds <= TIME_MAX {
         true => Ok(()),
         false => Err(format!("{seconds} s since 1970 is after the year 9999")),
