@@ -47,7 +47,7 @@ pub use inference::{InferenceEvent, InferenceService};
 pub use observer::RunObserver;
 use process_group::{ProcessGroup, RunRecord};
 use restart_delay::RestartDelay;
-pub use spec::{LambdaSpec, RunSpec};
+pub use spec::{ClipSigning, LambdaSpec, RunSpec};
 use summary::RunCounts;
 use supervised::SupervisedLambda;
 

@@ -181,7 +181,8 @@ pub(crate) fn digest_text(digest: &[u8]) -> Sha256 {
     hex(digest).parse().expect("hexadecimal digits of 32 bytes")
 }
 
-pub(crate) fn sha256(bytes: &[u8]) -> Sha256 {
+/// Returns the SHA-256 of `bytes`.
+pub fn sha256(bytes: &[u8]) -> Sha256 {
     digest_text(&sha2::Sha256::digest(bytes))
 }
 

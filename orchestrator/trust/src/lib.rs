@@ -22,10 +22,10 @@ mod refusal;
 mod verify;
 
 pub use clip::{
-    ClipLosses, ClipRefusal, ClipSigner, ClipStatement, ContentDigest, SIGNATURE, SignedClip,
-    SignedFile, SignedLambda, TrustedVehicles, VehicleName, VehiclesError, verify_clip,
+    ClipLosses, ClipRefusal, ClipSigner, ClipStatement, ContentDigest, MEDIA_TYPE, SIGNATURE,
+    SignedClip, SignedFile, SignedLambda, TrustedVehicles, VehicleName, VehiclesError, verify_clip,
 };
-pub use envelope::{Payload, seal};
+pub use envelope::{Payload, seal, sha256};
 pub use files::{FileDigestError, check_files};
 pub use floors::{Accepted, Floors};
 pub use keys::{KeyError, PublicKey, SecretKey};

@@ -26,7 +26,7 @@ mod statement;
 mod vehicles;
 mod verify;
 
-pub use sign::{ClipSigner, ContentDigest, SIGNATURE};
+pub use sign::{ClipSigner, ContentDigest, MEDIA_TYPE, SIGNATURE};
 pub use statement::{ClipLosses, ClipStatement, SignedFile, SignedLambda};
 pub use vehicles::{TrustedVehicles, VehicleName, VehiclesError};
 pub use verify::{ClipRefusal, SignedClip, verify_clip};

@@ -12,8 +12,8 @@ use gleaner_lambda::manifest::Sha256;
 
 /// Name of the attachment with the signature.
 pub const SIGNATURE: &str = "gleaner/signature.json";
-/// Its media type.
-pub(super) const MEDIA_TYPE: &str = "application/json";
+/// Media type of that attachment.
+pub const MEDIA_TYPE: &str = "application/json";
 
 /// Opcodes of MCAP.
 pub(super) const ATTACHMENT: u8 = 0x09;

@@ -127,3 +127,39 @@ impl Explain for VehiclesError {
         Exit::Usage
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::SecretKey;
+
+    #[test]
+    fn a_list_of_vehicles_has_a_name_and_a_key_in_each_line() {
+        let [a, b] = [1, 2].map(|seed| SecretKey::from_bytes(&[seed; 32]).public());
+        let text = format!("# cars\n\ncar-7 {a}\r\n  Car_8.x\t{b}  # new\ncar-7 {b}");
+        let vehicles = TrustedVehicles::parse(text.as_bytes()).unwrap();
+        let named = |key: &PublicKey| {
+            vehicles.named(key.id().as_str()).map(ToString::to_string).collect::<Vec<_>>()
+        };
+        assert_eq!(named(&a), ["car-7"]);
+        assert_eq!(named(&b), ["Car_8.x", "car-7"]);
+        assert_eq!(vehicles.keys().count(), 3);
+    }
+
+    #[test]
+    fn a_wrong_line_of_a_list_of_vehicles_is_named() {
+        let key = SecretKey::from_bytes(&[1; 32]).public();
+        for (line, reason) in [
+            ("car-7".to_owned(), "NAME PUBLICKEY"),
+            (format!("car-7 {key} {key}"), "NAME PUBLICKEY"),
+            (format!("car/7 {key}"), "is not the name of a vehicle"),
+            (format!("{} {key}", "x".repeat(65)), "is not the name of a vehicle"),
+            (format!("car-7 {}", &key.to_string()[1..]), "is not an ed25519 public key"),
+        ] {
+            let (number, found) =
+                TrustedVehicles::parse(format!("#\n{line}\n").as_bytes()).unwrap_err();
+            assert!(number == 2 && found.contains(reason) && found.len() < 300, "{found}");
+        }
+        assert_eq!(TrustedVehicles::parse(b"\xff").unwrap_err().0, 1);
+    }
+}
