@@ -27,7 +27,7 @@ const LABELS_MAX: usize = 64;
 /// Maximum number of config values; a manifest has no more.
 const CONFIG_MAX: usize = gleaner_lambda::manifest::bounds::ITEMS_MAX;
 /// Maximum length of a text in bytes.
-pub(crate) const TEXT_MAX: usize = 4096;
+const TEXT_MAX: usize = 4096;
 
 /// Names and values that describe a vehicle, from its own configuration.
 pub type Labels = BTreeMap<ItemName, String>;

@@ -5,7 +5,7 @@ use gleaner_lambda::manifest::{LambdaKind, LambdaName, Sha256, Version};
 use serde::{Deserialize, Serialize};
 
 use super::VehicleName;
-use crate::payload::{TEXT_MAX, time};
+use crate::payload::time;
 use crate::{Payload, bounded};
 
 /// Maximum number of lambdas of a clip; a recorder has no more.
@@ -108,15 +108,6 @@ impl Payload for ClipStatement {
     const MAX: ByteSize = ByteSize::mib(4);
 
     fn check(&self) -> Result<(), String> {
-        time(self.created)?;
-        let lambdas = self.lambdas.iter();
-        let engines = lambdas.clone().filter_map(|lambda| lambda.engine.as_ref());
-        let files = lambdas.flat_map(|lambda| &lambda.models).chain(&self.journals);
-        let texts = [&self.clip, &self.recorder, &self.clock].into_iter();
-        let mut texts = texts.chain(engines).chain(files.map(|file| &file.name));
-        match texts.find(|text| text.len() > TEXT_MAX || text.contains(char::is_control)) {
-            Some(_) => Err(format!("a text is above {TEXT_MAX} bytes, or has control characters")),
-            None => Ok(()),
-        }
+        time(self.created)
     }
 }
