@@ -120,8 +120,8 @@ impl RecordingFolder {
         Ok(self.retention.insert(retention).make_room(&self.dir))
     }
 
-    /// Signs the clips that are begun or recovered from now on. One that cannot be signed is written
-    /// without a signature.
+    /// Signs the clips that are begun or recovered from now on. One that cannot be signed is
+    /// written without a signature.
     pub fn sign_clips(&self, signer: ClipSigner) {
         self.dir.sign_with(signer);
     }

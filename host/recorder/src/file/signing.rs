@@ -18,7 +18,7 @@ use super::clip_records::{LIBRARY, journal, json};
 /// Name and media type of the attachment with the signature.
 pub(super) const ATTACHMENT: (&str, &str) = (SIGNATURE, MEDIA_TYPE);
 
-/// Returns the statement about a clip, which has the digest of no bytes instead of that of the file.
+/// Returns the statement about a clip, with the digest of no bytes in the place of the file's.
 ///
 /// # Errors
 ///

@@ -13,8 +13,8 @@
 //! summary, footer, magic                          digest
 //! ```
 //!
-//! `digest` means that the SHA-256 covers these bytes. The three others depend on the signature, and
-//! each has exactly one valid value. So no byte of a clip can be changed, added or removed.
+//! `digest` means that the SHA-256 covers these bytes. The three others depend on the signature,
+//! and each has exactly one valid value. So no byte of a clip can be changed, added or removed.
 //!
 //! - `statement`: the signed data.
 //! - `sign`: completes the end of a file, by the vehicle.

@@ -102,7 +102,7 @@ impl ClipSigner {
             what: ClipStatement::NAME,
             reason: "the attachment for it is not the last record of the data".to_owned(),
         };
-        let Some(Places { envelope, crc, end, end_crc }) = Places::of(rest) else {
+        let Some(RestPlaces { envelope, crc, end, end_crc }) = RestPlaces::of(rest) else {
             return Err(malformed());
         };
         let mut content = before.clone();
@@ -124,8 +124,8 @@ impl ClipSigner {
     }
 }
 
-/// Places in a file, from the attachment on.
-struct Places {
+/// RestPlaces in a file, from the attachment on.
+struct RestPlaces {
     envelope: Range<usize>,
     /// Checksum of the attachment.
     crc: Range<usize>,
@@ -135,7 +135,7 @@ struct Places {
     end_crc: Range<usize>,
 }
 
-impl Places {
+impl RestPlaces {
     fn of(rest: &[u8]) -> Option<Self> {
         let length: [u8; 8] = rest.get(BEFORE - 8..BEFORE)?.try_into().ok()?;
         let length = usize::try_from(u64::from_le_bytes(length)).ok()?;
