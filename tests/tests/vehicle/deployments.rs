@@ -37,6 +37,7 @@ pub fn outlive() {
     let orchestrator = vehicle.orchestrator();
     signal(orchestrator, "HUP");
     vehicle.until("the program to start again", |vehicle| {
+        vehicle.try_status()?;
         let started = events(vehicle, EventKind::Started);
         (started.iter().filter(|text| text.contains("orchestrator")).count() == 3).then_some(())
     });
@@ -76,8 +77,7 @@ pub fn stopped() {
 }
 
 /// A lambda whose process ends in its third wake.
-const FAILING: &str = "wakes = 0\n\
-                       def on_tick(self, ctx):\n\
+const FAILING: &str = "def on_tick(self, ctx):\n\
                        \u{20}   self.wakes += 1\n\
                        \u{20}   if self.wakes == 3:\n\
                        \u{20}       import os\n\
