@@ -123,7 +123,7 @@ fn run_spec(spec: &SupervisionSpec) -> Result<RunSpec, Failure> {
             let action = format!("cannot open the key of the vehicle `{}`", path.display());
             Failure::caused_by(Exit::Internal, action, &error)
         })?;
-        Ok(ClipSigning { key: Arc::new(key), vehicle: vehicle.clone() })
+        Ok::<_, Failure>(ClipSigning { key: Arc::new(key), vehicle: vehicle.clone() })
     });
     Ok(RunSpec {
         signing: signing.transpose()?,
