@@ -27,6 +27,9 @@ use crate::stdout::print;
 /// Interval of looks at the status.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
+/// Number of times that files are sent: another deployment may remove some in between.
+const ROUNDS: u32 = 5;
+
 /// A revision on this machine.
 struct LocalRevision {
     envelope: String,
@@ -52,13 +55,13 @@ pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
         deployment: String::from_utf8(sealed).expect("an envelope is JSON"),
         revisions: vec![local.envelope.clone()],
     };
-    let mut sent = 0;
+    let (mut sent, mut rounds) = (0, 0);
     let attempt = loop {
         match client.post("/v1/deployments", &request)? {
             DeployReply::Accepted { attempt, .. } => break attempt,
-            DeployReply::Missing { objects } if sent == 0 => {
+            DeployReply::Missing { objects } if rounds < ROUNDS => {
                 objects.iter().try_for_each(|object| local.send(&client, object))?;
-                sent = objects.len();
+                (sent, rounds) = (sent.max(objects.len()), rounds + 1);
             }
             DeployReply::Missing { objects } => {
                 let count = counted(objects.len() as u64, "file");
@@ -230,6 +233,8 @@ fn wait(
             failure.causes = vec![refused.clone()];
             return Err(failure);
         }
+        // Of a fallback that is about to start, the attempt is a later one.
+        let attempt = attempt.max(deployment.attempt);
         let newer = |lambda: &&LambdaStatus| lambda.attempt >= attempt;
         let lambda = deployment.status.as_ref().filter(newer);
         match lambda.map(|lambda| lambda.phase) {

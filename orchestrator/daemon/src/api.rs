@@ -41,7 +41,7 @@ use crate::streams;
 
 /// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
 /// text in JSON.
-const BODY_MAX: usize = 32 << 20;
+const BODY_MAX: usize = 12 << 20;
 
 /// What the handlers need.
 #[derive(Clone)]
@@ -199,7 +199,7 @@ async fn trust(State(api): State<Api>, body: Bytes) -> Reply<StatusCode> {
 }
 
 async fn events(State(api): State<Api>, Query(query): Query<StreamQuery>) -> Reply<Response> {
-    lines(&api, &streams::STREAMS, &query)
+    lines(&api, "", &streams::STREAMS, &query)
 }
 
 async fn records(
@@ -212,11 +212,11 @@ async fn records(
         let id = gleaner_base::excerpt(&id);
         return Err(Failure::new(Exit::Usage, format!("there is no deployment `{id}`")).into());
     }
-    lines(&api, &[&id], &query)
+    lines(&api, "lambdas", &[&id], &query)
 }
 
-fn lines(api: &Api, names: &[&str], query: &StreamQuery) -> Reply<Response> {
-    let body = streams::lines(&api.layout.spool(), names, query)?;
+fn lines(api: &Api, below: &str, names: &[&str], query: &StreamQuery) -> Reply<Response> {
+    let body = streams::lines(&api.layout.spool().join(below), names, query)?;
     Ok(([(header::CONTENT_TYPE, "application/x-ndjson")], body).into_response())
 }
 

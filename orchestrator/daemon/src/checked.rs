@@ -125,6 +125,7 @@ impl SignedDeployment {
         DeploymentStatus {
             id: self.id().to_string(),
             release: self.deployment.payload().release,
+            attempt: deployed.attempt,
             lambda: self.revision.payload().name.to_string(),
             revision: revision_status(&self.revision),
             fallback: self.fallback.as_ref().map(revision_status),
@@ -168,12 +169,13 @@ fn check_grants(wish: &Deployment, manifest: &Manifest) -> Result<(), Failure> {
     let models = manifest.models.iter().map(|model| &model.name);
     let models = models.filter(|model| !wish.grants.models.contains(model));
     let recording = manifest.record.iter().filter(|_| !wish.grants.record);
-    let mut lacks: Vec<_> = topics.map(|topic| format!("topic `{topic}`")).collect();
-    lacks.extend(models.map(|model| format!("model `{model}`")));
+    let mut lacks: Vec<_> = topics.map(|topic| format!("topic {topic}")).collect();
+    lacks.extend(models.map(|model| format!("model {model}")));
     lacks.extend(recording.map(|_| "recording".to_owned()));
     if lacks.is_empty() {
         return Ok(());
     }
+    lacks.sort();
     lacks.dedup();
     let (name, version) = (&manifest.lambda.name, &manifest.lambda.version);
     let lacks = list(&lacks, "and");

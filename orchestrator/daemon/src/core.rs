@@ -11,7 +11,7 @@ use gleaner_protocol::supervision::{
     DesiredState, EventKind, LAMBDAS_MAX, LambdaPhase, SupervisorStatus, VehicleEvent,
 };
 use gleaner_protocol::vehicle_api::{
-    DeployReply, DeployRequest, DeploymentStatus, GrantStatus, RevisionStatus,
+    DeployReply, DeployRequest, DeploymentStatus, GrantStatus, MissingObject, RevisionStatus,
 };
 use gleaner_supervisor::EventLog;
 use gleaner_trust::{Revision, Trusted};
@@ -25,6 +25,9 @@ use crate::layout::Layout;
 use crate::state::{Deployed, VehicleState};
 use crate::store::RevisionStore;
 use crate::trust::VehicleTrust;
+
+/// Maximum number of deployments that wait for files.
+const OFFERS_MAX: usize = LAMBDAS_MAX;
 
 /// The vehicle.
 pub(crate) struct Core {
@@ -46,8 +49,8 @@ struct Inner {
     state_file: DurableFile,
     /// The deployments of the state that were verified, or the reasons why they do not run.
     signed: BTreeMap<ItemName, Result<SignedDeployment, String>>,
-    /// Files that the deployment needs that was offered last, and their lengths.
-    expected: BTreeMap<Sha256, u64>,
+    /// Files that deployments need that were offered, and their lengths.
+    expected: BTreeMap<ItemName, BTreeMap<Sha256, u64>>,
     /// Memory that each wanted lambda may take.
     memory: BTreeMap<ItemName, u64>,
     status: Option<SupervisorStatus>,
@@ -61,12 +64,14 @@ impl Core {
     /// A failure if state, trust root or floors are damaged.
     pub(crate) fn open(layout: &Layout, vehicle: Vehicle) -> Result<Self, Failure> {
         let events = EventLog::open(&layout.spool(), "orchestrator")?;
-        let (trust, damage) = VehicleTrust::load(layout, vehicle.identity.labels.clone())?;
         let state_file = DurableFile::new(layout.state_file());
         let loaded = state_file.load::<VehicleState>()?;
+        let state = loaded.value.unwrap_or_default();
+        let labels = vehicle.identity.labels.clone();
+        let (trust, damage) = VehicleTrust::load(layout, labels, state.floors.clone());
         let inner = Inner {
             trust,
-            state: loaded.value.unwrap_or_default(),
+            state,
             state_file,
             signed: BTreeMap::new(),
             expected: BTreeMap::new(),
@@ -84,16 +89,19 @@ impl Core {
             vehicle,
         };
         core.event(EventKind::Started, None, "the orchestrator has started");
-        for (file, damage) in [("floors", damage), ("state", loaded.damage)] {
+        for (file, damage) in [("trust root", damage), ("state", loaded.damage)] {
             if let Some(damage) = damage {
-                let text = format!("one of the two copies of the {file} is damaged: {damage}");
+                let text = format!("the file of the {file} is damaged: {damage}");
                 core.event(EventKind::Warning, None, &text);
             }
         }
         let mut inner = core.lock();
-        // What was repaired is written again.
+        inner.trust.observe_time();
         core.verify(&mut inner);
-        core.save(&mut inner)?;
+        // What was repaired is written again. A full disk does not keep anything from running.
+        if let Err(failure) = core.save(&mut inner) {
+            core.event(EventKind::Warning, None, &failure.to_string());
+        }
         core.collect(&inner);
         drop(inner);
         Ok(core)
@@ -121,7 +129,12 @@ impl Core {
 
     /// Moves the trusted time to that of the clock.
     pub(crate) fn observe_time(&self) {
-        if let Err(failure) = self.lock().trust.observe_time() {
+        let mut inner = self.lock();
+        inner.trust.observe_time();
+        let state = inner.state.clone();
+        if *inner.trust.floors() != state.floors
+            && let Err(failure) = self.change(&mut inner, state)
+        {
             self.event(EventKind::Warning, None, &failure.to_string());
         }
     }
@@ -155,21 +168,25 @@ impl Core {
 
     fn try_deploy(&self, request: &DeployRequest) -> Result<DeployReply, Failure> {
         let _deploying = self.deploying.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut inner = self.lock();
+        let inner = self.lock();
         let sent = inner.revisions(request)?;
-        let verifier = inner.trust.verifier()?;
         let find = |digest: &Sha256| {
             let sent = sent.get(digest).map(|envelope| envelope.as_bytes().to_vec());
             sent.or_else(|| self.store.envelope(digest).ok())
         };
-        let mut signed = SignedDeployment::verify(&verifier, request.deployment.as_bytes(), find)?;
+        let verify = |inner: &Inner| {
+            let verifier = inner.trust.verifier()?;
+            SignedDeployment::verify(&verifier, request.deployment.as_bytes(), find)
+        };
+        let mut signed = verify(&inner)?;
         inner.check_name(&signed)?;
-        let new: Vec<_> = signed.revisions().filter(|it| !self.store.has(it.digest())).collect();
+        drop(inner);
+        let damaged = |revision: &&Trusted<Revision>| !self.store.is_intact(revision);
+        let new: Vec<_> = signed.revisions().filter(damaged).collect();
         let missing = new.iter().flat_map(|revision| self.store.missing(revision.payload()));
         let objects: Vec<_> = missing.collect();
-        inner.expected = expected(&new);
-        drop(inner);
         if !objects.is_empty() {
+            self.lock().expect(signed.id(), &objects)?;
             return Ok(DeployReply::Missing { objects });
         }
         for digest in signed.digests() {
@@ -186,7 +203,9 @@ impl Core {
             compile::component(&self.store.folder(digest), &self.cache)?;
         }
         inner = self.lock();
-        inner.trust.accept(&signed.deployment, &signed.revision)?;
+        // Another trust root may have been installed meanwhile.
+        verify(&inner)?;
+        inner.check_name(&signed)?;
         let accepted = self.accept(&mut inner, signed, &request.deployment, memory)?;
         self.collect(&inner);
         Ok(accepted)
@@ -213,6 +232,8 @@ impl Core {
             let kept = before.filter(|before| before.envelope == *envelope);
             let deployed = Deployed {
                 envelope: envelope.to_owned(),
+                lambda: signed.revision.payload().name.clone(),
+                release: signed.deployment.payload().release,
                 attempt: before.map_or(0, |before| before.attempt) + 1,
                 is_wanted: true,
                 runs_fallback: kept.is_some_and(|kept| kept.runs_fallback),
@@ -229,13 +250,14 @@ impl Core {
             );
             let mut state = inner.state.clone();
             state.deployments.insert(id.clone(), deployed);
+            inner.trust.accept(&signed.deployment, &signed.revision)?;
             self.change(inner, state)?;
             inner.signed.insert(id.clone(), Ok(signed));
             inner.memory.insert(id.clone(), memory);
             self.publish(inner);
             self.event(EventKind::Deployed, Some(&id), &text);
         }
-        inner.expected.clear();
+        inner.expected.remove(&id);
         let attempt = inner.state.deployments.get(&id).map_or(0, |deployed| deployed.attempt);
         let generation = inner.state.generation;
         Ok(DeployReply::Accepted { id: id.to_string(), attempt, generation })
@@ -247,7 +269,8 @@ impl Core {
     ///
     /// A failure if no deployment that was offered needs it.
     pub(crate) fn expected(&self, sha256: &Sha256) -> Result<u64, Failure> {
-        self.lock().expected.get(sha256).copied().ok_or_else(|| {
+        let inner = self.lock();
+        inner.expected.values().find_map(|files| files.get(sha256)).copied().ok_or_else(|| {
             Failure::new(Exit::Usage, format!("no deployment needs the file {sha256}"))
                 .with_help("send the deployment first, and then the files that are missing")
         })
@@ -295,9 +318,13 @@ impl Core {
                 let message = format!("deployment `{id}` runs its fallback already");
                 return Err(Failure::new(Exit::Usage, message));
             }
+            if !deployed.is_wanted {
+                let message = format!("deployment `{id}` is stopped");
+                let help = format!("start it first: `gleaner start {id}`");
+                return Err(Failure::new(Exit::Usage, message).with_help(help));
+            }
             deployed.runs_fallback = true;
             deployed.is_proven = true;
-            deployed.is_wanted = true;
             deployed.attempt += 1;
             deployed.failed = Some(reason.to_owned());
             let version = &fallback.payload().version;
@@ -341,7 +368,7 @@ impl Core {
     /// Handles a status of the supervisor: a revision that failed in its probation is replaced by
     /// its fallback.
     pub(crate) fn observe(&self, status: SupervisorStatus) {
-        let mut inner = self.lock();
+        let inner = self.lock();
         let mut proven = BTreeSet::new();
         let mut failed = Vec::new();
         for lambda in &status.lambdas {
@@ -365,21 +392,20 @@ impl Core {
                 _ => {}
             }
         }
-        if !proven.is_empty() {
-            let mut state = inner.state.clone();
-            let all = state.deployments.iter_mut().filter(|(id, _)| proven.contains(*id));
-            all.for_each(|(_, deployed)| deployed.is_proven = true);
-            // On a full disk it is tried again with the next status.
-            if inner.state_file.save(&state).is_ok() {
-                inner.state = state;
-            }
-        }
-        inner.status = Some(status);
         drop(inner);
         for (id, reason) in failed {
             // On a full disk it is tried again with the next status.
             let _ = self.roll_back(id.as_str(), &reason);
         }
+        let mut inner = self.lock();
+        if !proven.is_empty() {
+            let mut state = inner.state.clone();
+            let all = state.deployments.iter_mut().filter(|(id, _)| proven.contains(*id));
+            all.for_each(|(_, deployed)| deployed.is_proven = true);
+            // On a full disk it is tried again with the next status.
+            let _ = self.change(&mut inner, state);
+        }
+        inner.status = Some(status);
     }
 
     /// Notes that the supervisor cannot be reached.
@@ -433,14 +459,20 @@ impl Core {
     /// Writes the state as it is, with the next generation, and publishes what is wanted.
     fn save(&self, inner: &mut Inner) -> Result<(), Failure> {
         let state = inner.state.clone();
-        self.change(inner, state)?;
+        let saved = self.change(inner, state);
         self.publish(inner);
-        Ok(())
+        saved
     }
 
     fn change(&self, inner: &mut Inner, mut state: VehicleState) -> Result<(), Failure> {
         state.generation += 1;
-        inner.state_file.save(&state)?;
+        state.floors = inner.trust.floors().clone();
+        if let Err(failure) = inner.state_file.save(&state) {
+            // What was not written does not count.
+            let floors = inner.state.floors.clone();
+            inner.trust.reset_floors(floors);
+            return Err(failure);
+        }
         inner.state = state;
         Ok(())
     }
@@ -465,7 +497,7 @@ impl Core {
             }
             kept.extend(deployed.history.iter().cloned());
         }
-        let expected = inner.expected.keys().cloned().collect();
+        let expected = inner.expected.values().flat_map(BTreeMap::keys).cloned().collect();
         if let Err(failure) = self.store.collect(&kept, &expected) {
             self.event(EventKind::Warning, None, &failure.to_string());
         }
@@ -477,6 +509,18 @@ impl Core {
 }
 
 impl Inner {
+    /// Notes the files that a deployment needs.
+    fn expect(&mut self, id: &ItemName, objects: &[MissingObject]) -> Result<(), Failure> {
+        if self.expected.len() >= OFFERS_MAX && !self.expected.contains_key(id) {
+            let message = "too many deployments wait for files".to_owned();
+            let help = "send the files of those that were offered, or start the daemon again";
+            return Err(Failure::new(Exit::Unreachable, message).with_help(help));
+        }
+        let files = objects.iter().filter_map(|it| Some((it.sha256.parse().ok()?, it.bytes)));
+        self.expected.insert(id.clone(), files.collect());
+        Ok(())
+    }
+
     /// Returns the memory that each wanted lambda may take.
     fn wanted_memory(&self) -> BTreeMap<ItemName, u64> {
         let is_wanted = |id: &ItemName| {
@@ -502,10 +546,8 @@ impl Inner {
     /// know lambdas by their names.
     fn check_name(&self, signed: &SignedDeployment) -> Result<(), Failure> {
         let (id, name) = (signed.id(), &signed.revision.payload().name);
-        let same_name = |(other, it): &(&ItemName, &Result<SignedDeployment, String>)| {
-            *other != id && it.as_ref().is_ok_and(|it| it.revision.payload().name == *name)
-        };
-        if let Some((other, _)) = self.signed.iter().find(same_name) {
+        let same_name = |(other, it): &(&ItemName, &Deployed)| *other != id && it.lambda == *name;
+        if let Some((other, _)) = self.state.deployments.iter().find(same_name) {
             let message = format!("lambda `{name}` runs already by deployment `{other}`");
             let help = format!("deploy it as `{other}`, or give the lambda another name");
             return Err(Failure::new(Exit::Usage, message).with_help(help));
@@ -519,18 +561,14 @@ impl Inner {
     }
 }
 
-fn expected(revisions: &[&Trusted<Revision>]) -> BTreeMap<Sha256, u64> {
-    let files = revisions.iter().flat_map(|revision| &revision.payload().files);
-    files.map(|file| (file.sha256.clone(), file.bytes)).collect()
-}
-
 /// Returns the status of a deployment whose envelope counts no more.
 fn refused(id: &ItemName, deployed: &Deployed, reason: &str) -> DeploymentStatus {
     let revision = RevisionStatus { digest: String::new(), version: String::new(), release: 0 };
     DeploymentStatus {
         id: id.to_string(),
-        release: 0,
-        lambda: String::new(),
+        release: deployed.release,
+        attempt: deployed.attempt,
+        lambda: deployed.lambda.to_string(),
         revision,
         fallback: None,
         grants: GrantStatus::default(),

@@ -2,11 +2,11 @@
 
 use std::fs::{self, DirBuilder, File, Permissions};
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
-use rustix::fs::{FlockOperation, flock};
+use rustix::fs::{FlockOperation, OFlags, flock};
 
 /// The state folder and the run folder.
 #[derive(Debug, Clone)]
@@ -33,28 +33,36 @@ impl Layout {
         ];
         private(state)?;
         folders.iter().try_for_each(|folder| private(folder))?;
-        // The service's group may enter it; its parent belongs to the system.
-        fs::create_dir_all(run).map_err(|error| cannot_create(run, &error))?;
+        // The folder of a service exists, with its own mode; its group may enter this one, too.
+        let created = fs::create_dir(run);
+        if created.is_ok() {
+            let mode = Permissions::from_mode(0o750);
+            fs::set_permissions(run, mode).map_err(|error| cannot_create(run, &error))?;
+        } else if !run.is_dir() {
+            created.map_err(|error| cannot_create(run, &error))?;
+        }
         Ok(layout)
     }
 
-    /// Locks the state folder for this process.
+    /// Locks both folders for this process.
     ///
     /// # Errors
     ///
     /// A failure if another orchestrator has it.
-    pub(crate) fn lock(&self) -> Result<File, Failure> {
-        let path = self.state.join("lock");
-        let file = lock_file(&path)?;
-        match flock(&file, FlockOperation::NonBlockingLockExclusive) {
-            Ok(()) => Ok(file),
-            Err(_) => {
-                let state = self.state.display();
-                let message = format!("another gleaner-orchestrator runs on `{state}`");
-                let help = "stop that one first: `systemctl stop gleaner`, or SIGTERM";
-                Err(Failure::new(Exit::Usage, message).with_help(help))
+    pub(crate) fn lock(&self) -> Result<[File; 2], Failure> {
+        let lock = |folder: &Path| {
+            let file = lock_file(&folder.join("lock"))?;
+            match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+                Ok(()) => Ok(file),
+                Err(_) => {
+                    let folder = folder.display();
+                    let message = format!("another gleaner-orchestrator uses `{folder}`");
+                    let help = "stop that one first: `systemctl stop gleaner`, or SIGTERM";
+                    Err(Failure::new(Exit::Usage, message).with_help(help))
+                }
             }
-        }
+        };
+        Ok([lock(&self.state)?, lock(&self.run)?])
     }
 
     /// Returns the open lock of the supervisor, and whether no supervisor has it.
@@ -70,10 +78,6 @@ impl Layout {
 
     pub(crate) fn trust(&self) -> PathBuf {
         self.state.join("trust.json")
-    }
-
-    pub(crate) fn floors(&self) -> PathBuf {
-        self.state.join("floors.json")
     }
 
     pub(crate) fn state_file(&self) -> PathBuf {
@@ -135,5 +139,6 @@ fn private(path: &Path) -> Result<(), Failure> {
 fn lock_file(path: &Path) -> Result<File, Failure> {
     let mut options = File::options();
     options.read(true).write(true).create(true).truncate(false);
+    options.custom_flags(OFlags::NOFOLLOW.bits().cast_signed());
     options.open(path).map_err(|error| cannot_create(path, &error))
 }

@@ -132,6 +132,7 @@ impl SupervisorLink {
         let _ = fs::remove_file(&path);
         let listener = UnixListener::bind(&path).map_err(failed)?;
         fs::set_permissions(&path, fs::Permissions::from_mode(0o600)).map_err(failed)?;
+        lock.set_len(0).map_err(failed)?;
         let held = lock.try_clone().map_err(failed)?;
         let mut command = Command::new(&program);
         command
@@ -139,10 +140,7 @@ impl SupervisorLink {
             .stdin(OwnedFd::from(listener))
             .stdout(OwnedFd::from(held));
         let mut child = command.spawn().map_err(failed)?;
-        lock.set_len(0)
-            .and_then(|()| lock.rewind())
-            .and_then(|()| write!(lock, "{}", child.id()))
-            .map_err(failed)?;
+        lock.rewind().and_then(|()| write!(lock, "{}", child.id())).map_err(failed)?;
         // It may outlive this process; while both run, its end is waited for here.
         std::thread::spawn(move || drop(child.wait()));
         Ok(())
@@ -203,7 +201,14 @@ impl SupervisorLink {
                 Some(LinkEnd::Outdated(format!("it has version {found}, this one {wanted}")))
             }
             Ok(SupervisorReport::Welcome(_)) => None,
-            Ok(SupervisorReport::Refused { reason }) => Some(LinkEnd::Outdated(reason)),
+            Ok(SupervisorReport::OtherSettings) => {
+                Some(LinkEnd::Outdated("it runs with other settings".to_owned()))
+            }
+            Ok(SupervisorReport::Refused { reason }) => {
+                let text = format!("the supervisor refuses a request: {reason}");
+                self.core.event(EventKind::Warning, None, &text);
+                None
+            }
             Ok(SupervisorReport::Status(status)) => {
                 self.core.observe(*status);
                 None
@@ -220,12 +225,17 @@ impl SupervisorLink {
         }
         let mut text = String::new();
         let _ = (&mut lock).take(16).read_to_string(&mut text);
-        let pid = text.trim().parse().ok().and_then(Pid::from_raw);
+        let pid =
+            text.trim().parse().ok().and_then(Pid::from_raw).filter(|pid| is_supervisor(*pid));
         if let Some(pid) = pid {
-            // The lock is held: the process with this number is the supervisor, or has just ended.
             let _ = kill_process(pid, Signal::TERM);
         }
-        self.wait_for_end().await
+        let ended = self.wait_for_end().await;
+        if let (Some(pid), true) = (pid.filter(|pid| is_supervisor(*pid)), ended.is_err()) {
+            let _ = kill_process(pid, Signal::KILL);
+            return self.wait_for_end().await;
+        }
+        ended
     }
 
     async fn wait_for_end(&self) -> Result<(), Failure> {
@@ -242,6 +252,14 @@ impl SupervisorLink {
             Err(Failure::new(Exit::Internal, message))
         })
     }
+}
+
+/// Returns whether a process is a supervisor: the number in the file of the lock may be an old one.
+fn is_supervisor(pid: Pid) -> bool {
+    let program = fs::read_link(format!("/proc/{}/exe", pid.as_raw_nonzero()));
+    let name = program.ok().and_then(|it| Some(it.file_name()?.to_str()?.to_owned()));
+    // The kernel marks a program that was replaced on the disk.
+    name.is_some_and(|name| name.trim_end_matches(" (deleted)") == "gleaner-supervisor")
 }
 
 /// Waits until `stop` is set.

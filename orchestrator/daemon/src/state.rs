@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_lambda::manifest::ItemName;
-use gleaner_lambda::manifest::Sha256;
+use gleaner_lambda::manifest::{ItemName, LambdaName, Sha256};
+use gleaner_trust::Floors;
 use serde::{Deserialize, Serialize};
 
 /// Maximum number of revisions of a deployment that are kept, beside those that it names.
@@ -15,6 +15,9 @@ const HISTORY_MAX: usize = 2;
 pub(crate) struct VehicleState {
     /// Number of the wanted state; it grows with each change.
     pub(crate) generation: u64,
+    /// What was accepted: written together with the deployments, so that a kill in between leaves
+    /// neither without the other.
+    pub(crate) floors: Floors,
     /// The deployments, by id.
     pub(crate) deployments: BTreeMap<ItemName, Deployed>,
 }
@@ -25,6 +28,10 @@ pub(crate) struct VehicleState {
 pub(crate) struct Deployed {
     /// Its envelope.
     pub(crate) envelope: String,
+    /// Name of its lambda.
+    pub(crate) lambda: LambdaName,
+    /// Number of its release.
+    pub(crate) release: u64,
     /// Number of the attempt to run it: it grows with each deployment, rollback and start.
     pub(crate) attempt: u64,
     /// False if a user has stopped it.

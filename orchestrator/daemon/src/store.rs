@@ -8,13 +8,15 @@ use std::fs::{self, File, Permissions};
 use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 
-use gleaner_base::{Exit, Failure, PlainFile, safe_file};
+use gleaner_base::{Exit, Failure, PlainFile, hex, safe_file};
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::Sha256;
 use gleaner_protocol::vehicle_api::MissingObject;
-use gleaner_trust::{Payload, Revision, check_files, revision_of_digest};
+use gleaner_trust::{Payload, Revision, Trusted, check_files, revision_of_digest};
+use sha2::Digest;
 
 use crate::durable::sync_folder;
 use crate::layout::Layout;
@@ -62,6 +64,13 @@ impl RevisionStore {
         self.envelope_path(digest).is_file()
     }
 
+    /// Returns whether a revision is stored, and all of its files are as signed.
+    pub(crate) fn is_intact(&self, revision: &Trusted<Revision>) -> bool {
+        let digest = revision.digest();
+        let build = BuildDir::of(self.folder(digest));
+        self.has(digest) && check_files(revision.payload(), &build).is_ok()
+    }
+
     /// Reads the envelope of a revision.
     ///
     /// # Errors
@@ -76,7 +85,8 @@ impl RevisionStore {
         let known = self.known_files();
         let mut missing = BTreeMap::new();
         for file in &revision.files {
-            if !known.contains_key(file.sha256.as_str()) && !self.object(&file.sha256).is_file() {
+            let source = known.get(file.sha256.as_str()).filter(|it| has_digest(it, &file.sha256));
+            if source.is_none() && !has_digest(&self.object(&file.sha256), &file.sha256) {
                 let sha256 = file.sha256.to_string();
                 missing.insert(sha256.clone(), MissingObject { sha256, bytes: file.bytes });
             }
@@ -96,11 +106,15 @@ impl RevisionStore {
     ///
     /// A failure that names the file that is missing, differs, or cannot be written.
     pub(crate) fn add(&self, digest: &Sha256, envelope: &[u8]) -> Result<(), Failure> {
-        if self.has(digest) {
-            return Ok(());
-        }
         let revision = revision_of_digest(envelope, digest)
             .map_err(|refusal| Failure::because("cannot store a revision", &refusal))?;
+        if self.has(digest) {
+            if check_files(&revision, &BuildDir::of(self.folder(digest))).is_ok() {
+                return Ok(());
+            }
+            // The disk has changed it: it is made again.
+            remove(&self.folder(digest));
+        }
         let folder = self.revisions.join(format!("{digest}.tmp"));
         remove(&folder);
         let stored = self.fill(&folder, &revision, envelope, digest);
@@ -140,7 +154,7 @@ impl RevisionStore {
             }
             let object = self.object(&file.sha256);
             let source = match known.get(file.sha256.as_str()) {
-                Some(known) if !object.is_file() => known,
+                Some(known) if !has_digest(&object, &file.sha256) => known,
                 _ => &object,
             };
             copy(source, &path).map_err(failed(&path))?;
@@ -175,7 +189,9 @@ impl RevisionStore {
             name.is_some_and(|name| set.iter().any(|digest| digest.as_str() == name))
         };
         for path in entries(&self.objects)? {
-            if !is_of(expected, &path) {
+            // Parts are being received.
+            let is_part = path.extension().is_some_and(|it| it == "part");
+            if !is_part && !is_of(expected, &path) {
                 remove(&path);
             }
         }
@@ -239,6 +255,15 @@ fn remove(path: &Path) {
 ///
 /// Those of the file system.
 pub(crate) fn begin_object(path: &Path) -> io::Result<(File, PathBuf)> {
-    let part = path.with_extension("part");
+    static NUMBER: AtomicU64 = AtomicU64::new(0);
+    let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+    let part = path.with_extension(format!("{number}.part"));
     Ok((safe_file::create(&part)?, part))
+}
+
+/// Returns whether a file exists and has this digest.
+fn has_digest(path: &Path, sha256: &Sha256) -> bool {
+    let Ok(file) = PlainFile::named(path, FILE_MAX) else { return false };
+    let (mut file, mut digest) = (file.into_file(), sha2::Sha256::new());
+    io::copy(&mut file, &mut digest).is_ok() && hex(&digest.finalize()) == sha256.as_str()
 }

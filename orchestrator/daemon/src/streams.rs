@@ -1,7 +1,8 @@
 //! Records of spools as lines of JSON.
 
 use std::collections::VecDeque;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
@@ -22,6 +23,8 @@ const INTERVAL: Duration = Duration::from_millis(100);
 const QUEUE: usize = 16;
 /// Number of lines in a piece.
 const PIECE: usize = 256;
+/// Maximum number of streams that are read at a time.
+const OPEN_MAX: usize = 32;
 /// Maximum of `last`.
 const LAST_MAX: usize = 10_000;
 
@@ -35,26 +38,75 @@ pub(crate) fn lines(spool: &Path, names: &[&str], query: &StreamQuery) -> Result
         let message = "`from` counts records of one stream, and these are several";
         return Err(Failure::new(Exit::Usage, message).with_help("use `last`"));
     }
-    let mut readers = Vec::new();
-    for name in names {
-        let folder = spool.join(name);
-        // Nothing was written yet.
-        if folder.is_dir() {
-            let reader = SpoolReader::open(&folder, name, query.from);
-            let reader = reader.map_err(|it| Failure::because("cannot read a stream", &it))?;
-            readers.push((reader, (*name).to_owned()));
-        }
-    }
+    let slot = StreamSlot::take()?;
+    let mut readers: Vec<_> = names
+        .iter()
+        .map(|name| StreamReader {
+            folder: spool.join(name),
+            name: (*name).to_owned(),
+            from: query.from,
+            reader: None,
+        })
+        .collect();
+    readers.iter_mut().try_for_each(StreamReader::open)?;
     let (sender, mut pieces) = mpsc::channel::<Bytes>(QUEUE);
-    let (last, follow) = (query.last.map(|last| last.min(LAST_MAX)), query.follow);
-    tokio::task::spawn_blocking(move || send(readers, last, follow, &sender));
+    // Those of several streams are sorted, and thus bounded.
+    let most = (names.len() > 1).then_some(LAST_MAX);
+    let last = query.last.map(|last| last.min(LAST_MAX)).or(most);
+    let follow = query.follow;
+    tokio::task::spawn_blocking(move || {
+        send(readers, last, follow, &sender);
+        drop(slot);
+    });
     let stream = futures_util::stream::poll_fn(move |context| pieces.poll_recv(context));
     Ok(Body::from_stream(futures_util::StreamExt::map(stream, Ok::<_, std::convert::Infallible>)))
 }
 
+/// A stream that is read. It may not exist before its first record.
+struct StreamReader {
+    folder: PathBuf,
+    name: String,
+    from: Option<u64>,
+    reader: Option<SpoolReader>,
+}
+
+impl StreamReader {
+    /// Opens it if it exists, and is not open.
+    fn open(&mut self) -> Result<(), Failure> {
+        if self.reader.is_none() && self.folder.is_dir() {
+            let reader = SpoolReader::open(&self.folder, &self.name, self.from);
+            let reader = reader.map_err(|it| Failure::because("cannot read a stream", &it))?;
+            self.reader = Some(reader);
+        }
+        Ok(())
+    }
+}
+
+/// The right to read a stream; each takes a thread.
+struct StreamSlot;
+
+static STREAMS_OPEN: AtomicUsize = AtomicUsize::new(0);
+
+impl StreamSlot {
+    fn take() -> Result<Self, Failure> {
+        if STREAMS_OPEN.fetch_add(1, Ordering::Relaxed) < OPEN_MAX {
+            return Ok(Self);
+        }
+        drop(Self);
+        let message = format!("{OPEN_MAX} streams are read already");
+        Err(Failure::new(Exit::Unreachable, message).with_help("end another `gleaner logs -f`"))
+    }
+}
+
+impl Drop for StreamSlot {
+    fn drop(&mut self) {
+        STREAMS_OPEN.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
 /// Sends lines until the end, or until the client closes the connection.
 fn send(
-    mut readers: Vec<(SpoolReader, String)>,
+    mut readers: Vec<StreamReader>,
     mut last: Option<usize>,
     follow: bool,
     to: &mpsc::Sender<Bytes>,
@@ -62,7 +114,10 @@ fn send(
     loop {
         let is_first = last.is_some();
         let mut round = VecDeque::new();
-        for (reader, name) in &mut readers {
+        for stream in &mut readers {
+            // A failure is shown by the next request.
+            let _ = stream.open();
+            let StreamReader { name, reader: Some(reader), .. } = stream else { continue };
             let mut kept = VecDeque::new();
             for item in reader.by_ref() {
                 kept.push_back(line(name, item));
@@ -70,11 +125,7 @@ fn send(
                     Some(last) if kept.len() > last => {
                         kept.pop_front();
                     }
-                    None if kept.len() >= PIECE && !follow => {
-                        if !send_piece(&mut kept, to) {
-                            return;
-                        }
-                    }
+                    None if kept.len() >= PIECE && !send_piece(&mut kept, to) => return,
                     _ => {}
                 }
             }

@@ -1,15 +1,12 @@
 //! What the vehicle trusts: its trust root, the floors, the time.
 
 use std::fs;
-use std::io;
-use std::path::PathBuf;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use gleaner_base::{Exit, Failure, PlainFile, write_atomically};
+use gleaner_base::{Exit, Failure};
 use gleaner_protocol::vehicle_api::TrustStatus;
 use gleaner_trust::{
-    Deployment, Floors, Labels, Payload, Revision, TrustRoot, Trusted, Verifier, first_root,
-    next_root,
+    Deployment, Floors, Labels, Revision, TrustRoot, Trusted, Verifier, first_root, next_root,
 };
 
 use crate::durable::DurableFile;
@@ -19,50 +16,40 @@ use crate::layout::Layout;
 #[derive(Debug)]
 pub(crate) struct VehicleTrust {
     root: Option<TrustRoot>,
-    root_file: PathBuf,
+    root_file: DurableFile,
     floors: Floors,
-    floors_file: DurableFile,
     labels: Labels,
     /// Time at which the program was built, in s since 1970.
     built: u64,
 }
 
 impl VehicleTrust {
-    /// Loads trust root and floors. Also returns a warning about a damaged copy.
-    ///
-    /// # Errors
-    ///
-    /// A failure if one of them is damaged.
-    pub(crate) fn load(layout: &Layout, labels: Labels) -> Result<(Self, Option<String>), Failure> {
-        let floors_file = DurableFile::new(layout.floors());
-        let loaded = floors_file.load::<Floors>()?;
-        let mut trust = Self {
-            root: None,
-            root_file: layout.trust(),
-            floors: loaded.value.unwrap_or_default(),
-            floors_file,
-            labels,
-            built: built(),
-        };
-        let read =
-            PlainFile::named(&trust.root_file, TrustRoot::MAX).and_then(PlainFile::read_whole);
-        let failed = |error: &dyn std::error::Error| {
-            let action = format!("cannot use the trust root `{}`", trust.root_file.display());
-            Failure::caused_by(Exit::Denied, action, error)
-                .with_help("install it again: `gleaner trust install FILE`")
-        };
-        match read {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-            Err(error) => return Err(failed(&error)),
-            Ok(envelope) => {
-                let root = first_root(&envelope, &trust.floors).map_err(|it| failed(&it))?;
-                // A kill may have come between the file of the root and the floors.
-                trust.floors.accept_root(&root, trust.built);
-                trust.root = Some(root);
+    /// Loads the trust root. Also returns a warning if it, or one of its copies, is damaged: then
+    /// nothing runs until it is installed again, or the other copy counts.
+    pub(crate) fn load(layout: &Layout, labels: Labels, floors: Floors) -> (Self, Option<String>) {
+        let root_file = DurableFile::new(layout.trust());
+        let mut trust = Self { root: None, root_file, floors, labels, built: built() };
+        let opened = trust.root_file.load::<String>().and_then(|loaded| {
+            let root = loaded.value.map(|envelope| first_root(envelope.as_bytes(), &trust.floors));
+            let root = root.transpose().map_err(|refusal| {
+                Failure::because("the installed trust root is refused", &refusal)
+            })?;
+            Ok((root, loaded.damage))
+        });
+        match opened {
+            Ok((root, damage)) => {
+                if let Some(root) = root {
+                    // A kill may have come between the file of the root and the floors.
+                    trust.floors.accept_root(&root, trust.built);
+                    trust.root = Some(root);
+                }
+                (trust, damage)
+            }
+            Err(failure) => {
+                let failure = failure.with_help("install it again: `gleaner trust install FILE`");
+                (trust, Some(failure.to_string()))
             }
         }
-        trust.observe_time()?;
-        Ok((trust, loaded.damage))
     }
 
     /// Installs a trust root: the first one, or one that the current root's keys have signed.
@@ -77,24 +64,27 @@ impl VehicleTrust {
         };
         let root =
             root.map_err(|refusal| Failure::because("the trust root is refused", &refusal))?;
-        write_atomically(&self.root_file, envelope).map_err(|error| {
-            let action = format!("cannot write `{}`", self.root_file.display());
-            Failure::caused_by(Exit::Internal, action, &error)
-        })?;
+        // Signatures cover text only.
+        let text = String::from_utf8_lossy(envelope);
+        self.root_file.save(&text)?;
         self.floors.accept_root(&root, self.built);
         self.root = Some(root);
-        self.save_floors()
+        Ok(())
     }
 
     /// Moves the trusted time to that of the clock, as far as it counts.
-    ///
-    /// # Errors
-    ///
-    /// A failure that names the file.
-    pub(crate) fn observe_time(&mut self) -> Result<(), Failure> {
-        let before = self.floors.clone();
+    pub(crate) fn observe_time(&mut self) {
         self.floors.observe(clock(), self.built);
-        if self.floors == before { Ok(()) } else { self.save_floors() }
+    }
+
+    /// Returns what was accepted, to persist it.
+    pub(crate) fn floors(&self) -> &Floors {
+        &self.floors
+    }
+
+    /// Sets what was accepted, to that of a state that could not be written.
+    pub(crate) fn reset_floors(&mut self, floors: Floors) {
+        self.floors = floors;
     }
 
     /// Returns the checks of this vehicle, now.
@@ -112,7 +102,7 @@ impl VehicleTrust {
         Ok(Verifier { root, floors: &self.floors, labels: &self.labels, now })
     }
 
-    /// Remembers an accepted deployment, durably.
+    /// Remembers an accepted deployment.
     ///
     /// # Errors
     ///
@@ -122,18 +112,9 @@ impl VehicleTrust {
         deployment: &Trusted<Deployment>,
         revision: &Trusted<Revision>,
     ) -> Result<(), Failure> {
-        let before = self.floors.clone();
         self.floors
             .accept(deployment, revision, self.built)
-            .map_err(|refusal| Failure::because("the deployment is refused", &refusal))?;
-        if self.floors == before {
-            return Ok(());
-        }
-        let saved = self.save_floors();
-        if saved.is_err() {
-            self.floors = before;
-        }
-        saved
+            .map_err(|refusal| Failure::because("the deployment is refused", &refusal))
     }
 
     pub(crate) fn labels(&self) -> &Labels {
@@ -144,10 +125,6 @@ impl VehicleTrust {
         let root = self.root.as_ref()?;
         let is_expired = self.floors.now(clock(), self.built) >= root.expires;
         Some(TrustStatus { version: root.version, expires: root.expires, is_expired })
-    }
-
-    fn save_floors(&self) -> Result<(), Failure> {
-        self.floors_file.save(&self.floors)
     }
 }
 

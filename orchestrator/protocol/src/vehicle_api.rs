@@ -66,6 +66,9 @@ pub struct DeploymentStatus {
     pub id: String,
     /// Number of its release.
     pub release: u64,
+    /// Number of the attempt to run it: the status of its lambda with a lower one is of an earlier
+    /// attempt.
+    pub attempt: u64,
     /// Name of the lambda.
     pub lambda: String,
     /// The revision.

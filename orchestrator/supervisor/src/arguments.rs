@@ -48,7 +48,7 @@ pub(crate) fn shim(spec: &RunSpec, lambda: &LambdaSpec, restarts: u32) -> Vec<Os
                 start: restarts,
             };
             let origin = serde_json::to_string(&origin).expect("an origin is plain data");
-            line.push(option("--spool", folder.join(&deployment.id)));
+            line.push(option("--spool", folder.join("lambdas").join(&deployment.id)));
             line.push(option("--origin", origin));
             line.push(format!("--spool-budget={bytes}").into());
         }

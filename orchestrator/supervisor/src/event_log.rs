@@ -1,6 +1,7 @@
 //! Writes the events of a vehicle to a spool, in a thread: a disk that is slow or full delays
 //! nothing else.
 
+use std::io::Write;
 use std::num::NonZeroU8;
 use std::path::Path;
 use std::sync::Arc;
@@ -98,7 +99,8 @@ fn write(mut writer: SpoolWriter, queue: &Receiver<(SpoolTime, Vec<u8>)>, lost: 
         if let Err(error) = &committed
             && !is_failing
         {
-            eprintln!("events are not durable, and tried again: {}", chain(error));
+            let text = format!("events are not durable, and tried again: {}", chain(error));
+            let _ = writeln!(std::io::stderr(), "{text}");
         }
         is_failing = committed.is_err();
     }

@@ -5,7 +5,7 @@ use std::process::ExitStatus;
 use std::time::Instant;
 
 use gleaner_base::Exit;
-use gleaner_protocol::{ExitRecord, Layer, LiveStatus};
+use gleaner_protocol::{ExitRecord, Layer, LiveStatus, Phase};
 use rustix::process::Signal;
 
 use crate::output::PIPES;
@@ -95,10 +95,15 @@ impl LambdaProcess {
     }
 
     /// Returns whether another program has killed it: not its shim, nor the kernel for its memory.
+    /// In its own code, a lambda may have killed itself.
     pub(crate) fn was_killed_from_outside(&self, lambda: &LambdaSpec, status: ExitStatus) -> bool {
         let killed = matches!(status.signal(), Some(SIGKILL | SIGTERM));
         let record = ExitRecord::read(&lambda.exit_record()).ok();
-        killed && record.is_none_or(|it| it.killed.is_none() && !it.out_of_memory)
+        let is_in_lambda =
+            |record: &ExitRecord| matches!(record.phase, Some(Phase::Init | Phase::Wake));
+        killed
+            && record
+                .is_none_or(|it| it.killed.is_none() && !it.out_of_memory && !is_in_lambda(&it))
     }
 
     /// Returns how it has ended, with `status`. `requested` counts if its shim left no record.

@@ -227,10 +227,10 @@ pub struct LambdaPattern(String);
 
 impl LambdaPattern {
     /// Returns whether it covers `name`.
-    pub fn covers(&self, name: &LambdaName) -> bool {
+    pub fn covers(&self, name: &str) -> bool {
         match self.0.strip_suffix('*') {
-            Some(start) => name.as_str().starts_with(start),
-            None => name == self.0.as_str(),
+            Some(start) => name.starts_with(start),
+            None => name == self.0,
         }
     }
 }

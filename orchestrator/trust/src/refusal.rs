@@ -1,7 +1,7 @@
 //! The reasons why a vehicle does not accept signed data.
 
 use gleaner_base::{ByteSize, Exit, Explain};
-use gleaner_lambda::manifest::{LambdaName, Sha256};
+use gleaner_lambda::manifest::{ItemName, LambdaName, Sha256};
 
 use crate::{Payload, TrustRoot};
 
@@ -21,6 +21,8 @@ pub enum Refusal {
     WrongSignature { what: &'static str, key: Sha256 },
     #[error("key {key} may sign lambdas {allowed}, and this is lambda `{lambda}`")]
     Scope { key: Sha256, allowed: String, lambda: LambdaName },
+    #[error("key {key} may sign lambdas {allowed}, and this is deployment `{id}`")]
+    ScopeId { key: Sha256, allowed: String, id: ItemName },
     #[error("key {key} counts on vehicles with `{label}` = `{wanted}`; here it is {}", or(found))]
     ScopeLabel { key: Sha256, label: String, wanted: String, found: Option<String> },
     #[error("the deployment is for vehicles with `{label}` = `{wanted}`; here it is {}", or(found))]
@@ -75,6 +77,9 @@ impl Explain for Refusal {
             }
             Self::WrongSignature { .. } => {
                 "it was changed after it was signed: transfer it again from a trusted source"
+            }
+            Self::ScopeId { .. } => {
+                "use the name of the lambda as the id, or a key whose scope covers the id"
             }
             Self::Scope { .. } | Self::ScopeLabel { .. } => {
                 "sign it with a key of this scope, or widen the scope in the next trust root"

@@ -127,6 +127,7 @@ impl Verifier<'_> {
             self.check_scope(&self.root.publishers, revision, name)?;
         }
         self.check_scope(&self.root.deployers, deployment, name)?;
+        self.check_id(deployment)?;
         let expired = self.expired(wish.expires, Deployment::NAME);
         let expired = expired.or_else(|| self.expired(self.root.expires, TrustRoot::NAME));
         if self.floors.has_accepted(deployment) {
@@ -173,16 +174,40 @@ impl Verifier<'_> {
         }))
     }
 
+    /// Checks that one of the signers may sign deployments of this id: otherwise the key of one
+    /// lambda could replace the deployment of another, for good.
+    fn check_id(&self, deployment: &Trusted<Deployment>) -> Result<(), Refusal> {
+        let id = &deployment.payload.id;
+        let mut refusal = None;
+        for scoped in &self.root.deployers {
+            let key = scoped.key.id();
+            if !deployment.signers.contains(&key) {
+                continue;
+            }
+            if scoped.lambdas.iter().any(|pattern| pattern.covers(id.as_str())) {
+                return Ok(());
+            }
+            let allowed = allowed(scoped);
+            refusal.get_or_insert(Refusal::ScopeId { key, allowed, id: id.clone() });
+        }
+        // Without a signer, the check of the lambda's name has failed before.
+        refusal.map_or(Ok(()), Err)
+    }
+
     fn scope_refusal(&self, scoped: &ScopedKey, lambda: &LambdaName) -> Option<Refusal> {
         let key = scoped.key.id();
-        if !scoped.lambdas.iter().any(|pattern| pattern.covers(lambda)) {
-            let allowed: Vec<_> = scoped.lambdas.iter().map(|it| format!("`{it}`")).collect();
-            let allowed = format!("[{}]", allowed.join(", "));
+        if !scoped.lambdas.iter().any(|pattern| pattern.covers(lambda.as_str())) {
+            let allowed = allowed(scoped);
             return Some(Refusal::Scope { key, allowed, lambda: lambda.clone() });
         }
         let (label, wanted, found) = self.lacking(&scoped.labels)?;
         Some(Refusal::ScopeLabel { key, label, wanted, found })
     }
+}
+
+fn allowed(scoped: &ScopedKey) -> String {
+    let patterns: Vec<_> = scoped.lambdas.iter().map(|it| format!("`{it}`")).collect();
+    format!("[{}]", patterns.join(", "))
 }
 
 fn verified<P: Payload>(envelope: &[u8], keys: &[ScopedKey]) -> Result<Trusted<P>, Refusal> {

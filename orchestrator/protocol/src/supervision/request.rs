@@ -28,7 +28,7 @@ pub enum SupervisorRequest {
 pub struct SupervisionSpec {
     /// [`SUPERVISION_VERSION`].
     pub version: u32,
-    /// Folder of the spools: one of each lambda, and `events`.
+    /// Folder of the spools: `events`, and in `lambdas` one of each lambda.
     pub spool: PathBuf,
     /// Maximum size of the spool of a lambda, in bytes.
     pub spool_bytes: u64,
@@ -58,7 +58,7 @@ pub struct SupervisionSpec {
     pub cgroup: Option<PathBuf>,
 }
 
-/// The whole wanted state. A newer generation replaces an older one.
+/// The whole wanted state. The newest that is received counts.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DesiredState {

@@ -13,6 +13,8 @@ use crate::{Layer, LiveStatus};
 pub enum SupervisorReport {
     /// Sent first on each connection.
     Welcome(Welcome),
+    /// It runs with other settings, and must be started again to have new ones.
+    OtherSettings,
     /// A request that cannot be met, for this reason. Nothing has changed.
     Refused {
         /// The reason.

@@ -1,10 +1,12 @@
 //! The events of a run, as the status and as records of the spool `events`.
 
 use std::io::Write;
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::Builder;
 use std::time::{Duration, Instant};
 
-use gleaner_base::{Failure, format_duration, visible};
+use gleaner_base::{Exit, Failure, format_duration, visible};
 use gleaner_lambda::Clip;
 use gleaner_protocol::Report;
 use gleaner_protocol::inference::InferenceReport;
@@ -17,12 +19,17 @@ use crate::inference::InferenceEvent;
 use crate::observer::RunObserver;
 use crate::spec::LambdaSpec;
 
+/// Number of pieces of standard error that wait for their reader.
+const STDERR_QUEUE: usize = 256;
+
 /// The board. A clone shows the same.
 #[derive(Clone)]
 pub(super) struct Board {
     log: Arc<EventLog>,
     status: Arc<Mutex<SupervisorStatus>>,
     started: Instant,
+    /// To the thread that writes to standard error, whose reader may be stuck.
+    lines: SyncSender<Vec<u8>>,
 }
 
 impl Board {
@@ -33,7 +40,18 @@ impl Board {
     /// A failure that names its folder.
     pub(super) fn open(spec: &SupervisionSpec) -> Result<Self, Failure> {
         let log = Arc::new(EventLog::open(&spec.spool, "events")?);
-        Ok(Self { log, status: Arc::default(), started: Instant::now() })
+        let (lines, written) = sync_channel::<Vec<u8>>(STDERR_QUEUE);
+        let write = move || {
+            for line in written {
+                // Of an orchestrator that has ended, the terminal may be closed.
+                let _ = std::io::stderr().write_all(&line);
+            }
+        };
+        Builder::new()
+            .name("stderr".to_owned())
+            .spawn(write)
+            .map_err(|it| Failure::caused_by(Exit::Internal, "cannot start a thread", &it))?;
+        Ok(Self { log, status: Arc::default(), started: Instant::now(), lines })
     }
 
     /// Adds an event, about a deployed lambda or not.
@@ -164,8 +182,8 @@ impl RunObserver for Board {
     }
 
     fn stderr(&mut self, piece: &[u8]) {
-        // Of an orchestrator that has ended, the terminal may be closed.
-        let _ = std::io::stderr().write_all(piece);
+        // What does not fit is dropped: the spools have all that counts.
+        let _ = self.lines.try_send(piece.to_vec());
     }
 }
 

@@ -31,13 +31,13 @@ const PAUSE: Duration = Duration::from_secs(1);
 /// The connection to the newest orchestrator.
 pub(super) struct Connection {
     shared: Arc<Shared>,
-    requests: Receiver<SupervisorRequest>,
+    requests: Receiver<(u64, SupervisorRequest)>,
 }
 
 #[derive(Default)]
 struct Shared {
-    /// The newest connection.
-    newest: Mutex<Option<Arc<UnixStream>>>,
+    /// The newest connection, and its number.
+    newest: Mutex<(u64, Option<Arc<UnixStream>>)>,
     /// Wakes the loop.
     bell: Mutex<Option<SyncSender<ChildOutput>>>,
 }
@@ -66,19 +66,20 @@ impl Connection {
         Ok(Self { shared, requests })
     }
 
-    /// Waits for the next request.
-    pub(super) fn wait(&self) -> Option<SupervisorRequest> {
-        self.requests.recv().ok()
-    }
-
-    /// Returns the next request, if there is one.
-    pub(super) fn next(&self) -> Option<SupervisorRequest> {
-        self.requests.try_recv().ok()
+    /// Returns the next request, if it comes within this time. Those of earlier connections are
+    /// skipped: the newest one has sent the whole state again.
+    pub(super) fn next(&self, within: Duration) -> Option<SupervisorRequest> {
+        loop {
+            let (number, request) = self.requests.recv_timeout(within).ok()?;
+            if number == lock(&self.shared.newest).0 {
+                return Some(request);
+            }
+        }
     }
 
     /// Sends a report. One for which there is no room is dropped: a later one replaces it.
     pub(super) fn report(&self, report: &SupervisorReport) {
-        let newest = lock(&self.shared.newest).clone();
+        let newest = lock(&self.shared.newest).1.clone();
         if let Some(stream) = newest {
             send(&stream, report);
         }
@@ -91,7 +92,11 @@ impl Connection {
 }
 
 impl Shared {
-    fn replace(self: &Arc<Self>, stream: UnixStream, requests: &SyncSender<SupervisorRequest>) {
+    fn replace(
+        self: &Arc<Self>,
+        stream: UnixStream,
+        requests: &SyncSender<(u64, SupervisorRequest)>,
+    ) {
         let is_own =
             socket_peercred(&stream).is_ok_and(|peer| peer.uid == rustix::process::getuid());
         if !is_own || prepare(&stream).is_err() {
@@ -99,23 +104,31 @@ impl Shared {
         }
         let stream = Arc::new(stream);
         send(&stream, &welcome());
-        let before = lock(&self.newest).replace(Arc::clone(&stream));
+        let mut newest = lock(&self.newest);
+        let number = newest.0 + 1;
+        let (_, before) = std::mem::replace(&mut *newest, (number, Some(Arc::clone(&stream))));
+        drop(newest);
         if let Some(before) = before {
             let _ = before.shutdown(Shutdown::Both);
         }
         let (shared, requests) = (Arc::clone(self), requests.clone());
         let thread = Builder::new().name("orchestrator".to_owned());
         // Without a thread, the orchestrator gets no answer and connects again.
-        let _ = thread.spawn(move || shared.read(&stream, &requests));
+        let _ = thread.spawn(move || shared.read(number, &stream, &requests));
     }
 
-    fn read(&self, stream: &UnixStream, requests: &SyncSender<SupervisorRequest>) {
+    fn read(
+        &self,
+        number: u64,
+        stream: &UnixStream,
+        requests: &SyncSender<(u64, SupervisorRequest)>,
+    ) {
         let mut reports = BufReader::new(stream);
         let mut line = Vec::new();
         while next_report(&mut reports, &mut line).unwrap_or(false) {
             match serde_json::from_slice(&line) {
                 Ok(request) => {
-                    if requests.send(request).is_err() {
+                    if requests.send((number, request)).is_err() {
                         return;
                     }
                     let from = ChildId::Supervisor;

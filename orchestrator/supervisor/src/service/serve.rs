@@ -42,7 +42,7 @@ pub(super) fn serve(listener: std::os::unix::net::UnixListener) -> Result<(), Fa
             .map_err(|error| Failure::caused_by(Exit::Internal, "cannot handle signals", &error))?;
     }
     let connection = Connection::accept(listener)?;
-    let Some(spec) = configured(&connection)? else { return Ok(()) };
+    let Some(spec) = configured(&connection, &stop) else { return Ok(()) };
     let board = Board::open(&spec)?;
     board.event(EventKind::Started, None, "the supervisor has started");
     let run = run_spec(&spec)?;
@@ -95,11 +95,11 @@ pub(super) fn serve(listener: std::os::unix::net::UnixListener) -> Result<(), Fa
 }
 
 /// Waits for the settings; `None` if it is requested to end.
-fn configured(connection: &Connection) -> Result<Option<SupervisionSpec>, Failure> {
-    loop {
-        match connection.wait() {
+fn configured(connection: &Connection, stop: &AtomicBool) -> Option<SupervisionSpec> {
+    while !stop.load(Ordering::Relaxed) {
+        match connection.next(POLL_INTERVAL) {
             Some(SupervisorRequest::Configure(spec)) if spec.version == SUPERVISION_VERSION => {
-                return Ok(Some(*spec));
+                return Some(*spec);
             }
             Some(SupervisorRequest::Configure(spec)) => {
                 let reason = format!(
@@ -108,13 +108,15 @@ fn configured(connection: &Connection) -> Result<Option<SupervisionSpec>, Failur
                 );
                 connection.report(&SupervisorReport::Refused { reason });
             }
-            Some(SupervisorRequest::Stop) | None => return Ok(None),
+            Some(SupervisorRequest::Stop) => return None,
+            None => {}
             Some(SupervisorRequest::Apply(_)) => {
                 let reason = "it has no settings yet".to_owned();
                 connection.report(&SupervisorReport::Refused { reason });
             }
         }
     }
+    None
 }
 
 fn run_spec(spec: &SupervisionSpec) -> Result<RunSpec, Failure> {
@@ -165,12 +167,12 @@ impl WantedState<'_> {
         loop {
             group.poll(POLL_INTERVAL);
             let mut is_new = false;
-            while let Some(request) = connection.next() {
+            while let Some(request) = connection.next(Duration::ZERO) {
                 is_new = true;
                 match self.handle(request) {
                     Ok(true) => return Ok(GroupEnd::Complete),
                     Ok(false) => {}
-                    Err(reason) => connection.report(&SupervisorReport::Refused { reason }),
+                    Err(refused) => connection.report(&refused),
                 }
             }
             if stop.load(Ordering::Relaxed) {
@@ -198,21 +200,13 @@ impl WantedState<'_> {
     }
 
     /// Handles a request; returns whether it is to end.
-    fn handle(&mut self, request: SupervisorRequest) -> Result<bool, String> {
+    fn handle(&mut self, request: SupervisorRequest) -> Result<bool, SupervisorReport> {
         match request {
             SupervisorRequest::Stop => return Ok(true),
             SupervisorRequest::Configure(spec) if *spec == *self.spec => {}
-            SupervisorRequest::Configure(_) => {
-                return Err(
-                    "it runs with other settings: they apply once it was stopped".to_owned()
-                );
-            }
+            SupervisorRequest::Configure(_) => return Err(SupervisorReport::OtherSettings),
             SupervisorRequest::Apply(state) => {
-                let (newest, found) = (self.desired.generation, state.generation);
-                if found < newest {
-                    return Err(format!("generation {found} is older than {newest}"));
-                }
-                check(&state)?;
+                check(&state).map_err(|reason| SupervisorReport::Refused { reason })?;
                 self.desired = *state;
             }
         }
@@ -306,7 +300,7 @@ fn check(state: &DesiredState) -> Result<(), String> {
     let (mut ids, mut names) = (HashSet::new(), HashSet::new());
     for lambda in &state.lambdas {
         let is_name = lambda.id.bytes().all(|it| it.is_ascii_alphanumeric() || b"-_".contains(&it));
-        if lambda.id.is_empty() || !is_name || lambda.id == "events" {
+        if lambda.id.is_empty() || !is_name {
             return Err(format!(
                 "`{}` is no id of a deployment",
                 gleaner_base::excerpt(&lambda.id)
