@@ -5,7 +5,10 @@
 
 use std::io;
 
-use gleaner_spool::{PAYLOAD_MAX, SegmentFile, SpoolError, SpoolItem, SpoolReader, SpoolStorage};
+use gleaner_protocol::SpooledRecord;
+use gleaner_spool::{
+    PAYLOAD_MAX, SegmentFile, SpoolError, SpoolItem, SpoolReader, SpoolRecord, SpoolStorage,
+};
 
 use crate::budget;
 use crate::input::FuzzInput;
@@ -97,6 +100,7 @@ fn read(segments: &[(u64, Vec<u8>)], from: Option<u64>) -> (bool, usize) {
             Ok(SpoolItem::Record(record)) => {
                 assert_eq!(record.seq, expected);
                 assert!(record.payload.len() <= PAYLOAD_MAX);
+                parse(&record);
                 records += 1;
                 expected += 1;
             }
@@ -124,6 +128,16 @@ fn read(segments: &[(u64, Vec<u8>)], from: Option<u64>) -> (bool, usize) {
         }
     }
     (valid, records)
+}
+
+/// Parses the payload as a record of a lambda: one that is accepted reads back.
+fn parse(record: &SpoolRecord) {
+    // A list of numbers takes 16 times its text, and as much again while it grows.
+    let memory = (64 << 10) + 64 * record.payload.len();
+    let parsed = budget::within(memory, || SpooledRecord::parse(record.kind, &record.payload).ok());
+    let Some(parsed) = parsed else { return };
+    assert_eq!(parsed.kind(), record.kind);
+    assert_eq!(SpooledRecord::parse(record.kind, &parsed.to_payload()).unwrap(), parsed);
 }
 
 #[derive(Clone, Copy)]

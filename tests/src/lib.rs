@@ -12,6 +12,7 @@ pub mod random;
 pub mod rooms;
 pub mod transcript;
 pub mod tree;
+pub mod vehicle;
 pub mod words;
 
 use std::ffi::OsStr;

@@ -187,7 +187,14 @@ pub const CRATES: &[(&str, &[&str])] = &[
     ("gleaner-sdk", &["gleaner-rules"]),
     (
         "gleaner-shim",
-        &["gleaner-base", "gleaner-jail", "gleaner-lambda", "gleaner-protocol", "gleaner-vitals"],
+        &[
+            "gleaner-base",
+            "gleaner-jail",
+            "gleaner-lambda",
+            "gleaner-protocol",
+            "gleaner-spool",
+            "gleaner-vitals",
+        ],
     ),
     ("gleaner-spool", &["gleaner-base"]),
     (

@@ -44,6 +44,7 @@ fn spec(args: &RunArgs) -> RunSpec {
         clips_max: args.clips_max,
         bytes_max: args.bytes_max,
         cgroup: args.cgroup.clone(),
+        spool: None,
     }
 }
 

@@ -47,14 +47,38 @@ fn text(line: &StreamLine, paint: Paint) -> String {
         0 => "--:--:--.---".to_owned(),
         time => time_of_day(time),
     };
-    let kind = field("event").or_else(|| field("kind")).unwrap_or_default();
+    let kind = field("event").unwrap_or_else(|| visible(&line.kind));
     let lambda = field("lambda").map(|it| format!("{it}: ")).unwrap_or_default();
-    let words = field("text").or_else(|| field("message")).unwrap_or_else(|| record.to_string());
-    let words = format!("{lambda}{words}");
+    let words = match &*line.kind {
+        "event" => lambda + &field("text").unwrap_or_default(),
+        "log" => {
+            let level = field("level").unwrap_or_default();
+            format!("{level}: {}", field("message").unwrap_or_default())
+        }
+        "decision" => decision_words(record),
+        "started" => format!("process of revision {}", field("revision").unwrap_or_default()),
+        _ => record.to_string(),
+    };
     let shown = match &*kind {
-        "failed" | "quarantined" | "refused" | "loss" | "gap" | "torn" => paint.red(&words),
-        "warning" | "rolled_back" => paint.yellow(&words),
+        "failed" | "quarantined" | "refused" | "loss" | "lost" | "gap" | "torn" | "damaged" => {
+            paint.red(&words)
+        }
+        "warning" | "rolled_back" | "omitted" => paint.yellow(&words),
+        "decision" => paint.green(&words),
         _ => words,
     };
     format!("{} {kind:<12} {shown}\n", paint.dim(&time))
+}
+
+/// Returns the triggers and the fault of a decision.
+fn decision_words(record: &Value) -> String {
+    let text = |value: &Value, name: &str| {
+        value.get(name).and_then(Value::as_str).map(visible).unwrap_or_default()
+    };
+    let triggers = record.get("triggers").and_then(Value::as_array).into_iter().flatten();
+    let mut words: Vec<_> = triggers.map(|trigger| text(trigger, "label")).collect();
+    if let Some(fault) = record.get("fault").filter(|fault| !fault.is_null()) {
+        words.push(format!("fault {}: {}", text(fault, "kind"), text(fault, "message")));
+    }
+    if words.is_empty() { "nothing".to_owned() } else { words.join(", ") }
 }

@@ -1,4 +1,4 @@
-//! Seeds: a segment, and streams of several segments with gap records.
+//! Seeds: a segment, streams of several segments with gap records, and records of a lambda.
 
 use crate::input::FuzzInput;
 use crate::spool::{NEW_SEGMENT, mode, sealed};
@@ -25,7 +25,24 @@ pub fn all() -> Vec<Vec<u8>> {
         with_mode(mode::FILE, &segment),
         with_mode(mode::RECORDS, &one),
         with_mode(mode::RECORDS, &several.concat()),
+        with_mode(mode::RECORDS, &of_a_lambda()),
     ]
+}
+
+/// Records of each kind that a lambda has, but for the summary.
+fn of_a_lambda() -> Vec<u8> {
+    let start = br#"{"lambda":"l","revision":"0a","generation":1,"start":0,"pid":7,
+        "software":"1"}"#;
+    let decision = br#"{"at_ns":1,"cause":"tick","run_ns":2,"fault":{"kind":"trap","message":"m"},
+        "triggers":[{"kind":"event","label":"a","score":0.5,"attributes":{"b":[1,null]}}]}"#;
+    let log = br#"{"at_ns":-3,"level":"info","message":"m"}"#;
+    let end = br#"{"pid":8,"started_ns":1,"ended_ns":2,"code":0,"signal":null,"killed":null,
+        "out_of_memory":false,"max_rss_bytes":4,"cpu_ns":5,"orphans":0}"#;
+    let lost = br#"{"invalid":1,"refused":2,"too_long":3}"#;
+    let omitted = br#"{"kind":2,"at_ns":1,"triggers":1,"bytes":5000,"allowed":2048}"#;
+    let all: [(u8, u8, &[u8]); 6] =
+        [(1, 0, start), (2, 0, decision), (3, 0, log), (5, 0, end), (6, 0, lost), (7, 0, omitted)];
+    records(&all)
 }
 
 /// Encodes kind, skipped numbers and payload of each record.

@@ -7,8 +7,8 @@
 //! the exit record. It exits as the runtime did. The thread that does this allocates next to
 //! nothing, and checks ten times a second.
 //!
-//! With `--results` a second thread writes the result files of the lambda, so that the lambda's
-//! process cannot write any.
+//! With `--results` a second thread writes the result files of the lambda, with `--spool` its
+//! spool, so that the lambda's process cannot write any.
 //!
 //! It lives as long as its runtime, even if its starter ends; with `--starter` it then asks the
 //! runtime to end.
@@ -16,25 +16,25 @@
 mod compiler;
 mod environment;
 mod health_check;
-mod lines;
 mod orphans;
 mod results;
 mod signals;
 mod watch;
 
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::io::PipeWriter;
+use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 use std::time::Duration;
 
 use clap::Parser;
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{ByteSize, Exit, Failure};
 use gleaner_jail::cgroup::{CgroupLimits, Group};
 use gleaner_jail::{Paths, base_filter, cgroup, files, memory, sandbox_filter, self_test, sockets};
-use gleaner_protocol::{ExitRecord, LAYERS_ENV, Layer, RESULTS_ENV, SHIM_ENV};
+use gleaner_protocol::{ExitRecord, LAYERS_ENV, Layer, ProcessOrigin, RESULTS_ENV, SHIM_ENV};
 use gleaner_vitals::{PULSE_ENV, Pulse, make_inheritable};
 
-use self::results::Results;
+use self::results::{BUDGET, ResultFiles, ResultSpool, Results};
 use self::signals::Signals;
 use self::watch::RunningProcess;
 
@@ -58,6 +58,15 @@ struct Args {
     /// Append the results to those of an earlier process of the same run.
     #[arg(long, requires = "results")]
     again: bool,
+    /// Write the results of a live lambda into the spool in this folder.
+    #[arg(long, value_name = "DIR", requires = "origin", conflicts_with = "results")]
+    spool: Option<PathBuf>,
+    /// Deployment, revision and number of this start, as JSON, for the spool.
+    #[arg(long, value_name = "JSON", requires = "spool")]
+    origin: Option<ProcessOrigin>,
+    /// Maximum size of the spool, in bytes; without it, 64 MiB.
+    #[arg(long, value_name = "BYTES", requires = "spool")]
+    spool_budget: Option<u64>,
     /// Ask the runtime to end when this process dies, which must be the parent of the shim.
     #[arg(long, value_name = "PID")]
     starter: Option<u32>,
@@ -154,12 +163,7 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
         // none.
         let _ = std::fs::remove_file(path);
     }
-    let started = args
-        .results
-        .as_ref()
-        .map(|folder| Results::begin(folder, args.again, &pulse))
-        .transpose()?;
-    let (results, pipe) = started.unzip();
+    let (results, pipe) = begin_results(args, &pulse)?.unzip();
     if let Some(pipe) = &pipe {
         command.env(
             RESULTS_ENV,
@@ -204,6 +208,21 @@ fn run(args: &Args) -> Result<ExitCode, Failure> {
         }
         Ok(()) => Ok(exit_like(&record)),
     }
+}
+
+/// Opens the results, if there are any, and returns the runtime's end of their pipe.
+fn begin_results(args: &Args, pulse: &Pulse) -> Result<Option<(Results, PipeWriter)>, Failure> {
+    if let Some(folder) = &args.results {
+        let again = args.again;
+        let open = move |folder: &Path| ResultFiles::open(folder, again);
+        return Results::begin(folder, pulse, open).map(Some);
+    }
+    let Some((folder, origin)) = args.spool.as_ref().zip(args.origin.clone()) else {
+        return Ok(None);
+    };
+    let budget = args.spool_budget.map_or(BUDGET, ByteSize::new);
+    let open = move |folder: &Path| ResultSpool::open(folder, &origin, budget);
+    Results::begin(folder, pulse, open).map(Some)
 }
 
 /// Requests SIGTERM for the death of `starter`. The kernel sends it once, so an earlier death is

@@ -196,7 +196,7 @@ async fn trust(State(api): State<Api>, body: Bytes) -> Reply<StatusCode> {
 }
 
 async fn events(State(api): State<Api>, Query(query): Query<StreamQuery>) -> Reply<Response> {
-    lines(&api, &["events", "orchestrator"], &query)
+    lines(&api, &streams::STREAMS, &query)
 }
 
 async fn records(

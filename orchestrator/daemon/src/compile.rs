@@ -6,15 +6,15 @@ use std::process::{Command, Stdio};
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{BuildDir, Manifest};
-use gleaner_parts::{Parts, cache_dir};
+use gleaner_parts::Parts;
 
-/// Compiles the component in the folder of a revision, if it has one, in a process of its own. Does
-/// nothing if its native code is in the store of this user already.
+/// Compiles the component in the folder of a revision, if it has one, into the store `cache`, in a
+/// process of its own. Does nothing if its native code is there already.
 ///
 /// # Errors
 ///
 /// The failure of `gleaner-compile`.
-pub(crate) fn component(folder: &Path) -> Result<(), Failure> {
+pub(crate) fn component(folder: &Path, cache: &Path) -> Result<(), Failure> {
     let build = BuildDir::of(folder);
     let manifest = Manifest::load(build.path())?;
     if manifest.lambda.kind != LambdaKind::Wasm {
@@ -28,7 +28,8 @@ pub(crate) fn component(folder: &Path) -> Result<(), Failure> {
     let output = Command::new(&program)
         .arg(build.entry_path(&manifest))
         .arg("--cache")
-        .arg(cache_dir()?)
+        // As the runtime does, for which the supervisor sets `XDG_CACHE_HOME`.
+        .arg(cache.join("gleaner"))
         .args(manifest.lambda.deterministic.then_some("--deterministic"))
         .stdin(Stdio::null())
         .output()

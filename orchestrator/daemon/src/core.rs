@@ -1,6 +1,7 @@
 //! The state of the vehicle, and the operations that change it. Each is durable before it counts.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use gleaner_base::{Exit, Failure};
@@ -29,6 +30,8 @@ use crate::trust::VehicleTrust;
 pub(crate) struct Core {
     pub(crate) vehicle: Vehicle,
     pub(crate) store: RevisionStore,
+    /// Folder of native code.
+    cache: PathBuf,
     memory: MemoryBudget,
     events: EventLog,
     desired: watch::Sender<DesiredState>,
@@ -72,6 +75,7 @@ impl Core {
         };
         let core = Self {
             store: RevisionStore::open(layout)?,
+            cache: layout.cache(),
             memory: MemoryBudget::of(&vehicle),
             events,
             desired: watch::Sender::new(DesiredState::default()),
@@ -179,7 +183,7 @@ impl Core {
         self.memory.admit(signed.id(), memory, &inner.wanted_memory())?;
         drop(inner);
         for digest in signed.digests() {
-            compile::component(&self.store.folder(digest))?;
+            compile::component(&self.store.folder(digest), &self.cache)?;
         }
         inner = self.lock();
         inner.trust.accept(&signed.deployment, &signed.revision)?;

@@ -5,14 +5,17 @@ use std::path::Path;
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
-use gleaner_base::{Exit, Failure, hex};
+use gleaner_base::{Exit, Failure, chain, hex};
+use gleaner_protocol::SpooledRecord;
 use gleaner_protocol::vehicle_api::StreamLine;
-use gleaner_spool::{SpoolItem, SpoolReader};
+use gleaner_spool::{SpoolItem, SpoolReader, SpoolRecord};
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
 use crate::api::StreamQuery;
 
+/// The streams of events.
+pub(crate) const STREAMS: [&str; 2] = ["events", "orchestrator"];
 /// Interval of looks for new records.
 const INTERVAL: Duration = Duration::from_millis(100);
 /// Number of pieces that wait for a slow client; then reading waits.
@@ -106,33 +109,48 @@ fn send_piece(lines: &mut VecDeque<StreamLine>, to: &mpsc::Sender<Bytes>) -> boo
 }
 
 fn line(stream: &str, item: Result<SpoolItem, gleaner_spool::SpoolError>) -> StreamLine {
-    let empty = |seq, record| StreamLine {
+    let line = |seq, kind: &str, record| StreamLine {
         stream: stream.to_owned(),
         seq,
         time_ns: 0,
         boot_ns: 0,
         boot: String::new(),
+        kind: kind.to_owned(),
         record,
     };
     match item {
-        Ok(SpoolItem::Record(record)) => StreamLine {
-            time_ns: record.time.wall_ns,
-            boot_ns: record.time.since_boot_ns,
-            boot: hex(&record.boot.0),
-            ..empty(record.seq, content(&record.payload))
-        },
+        Ok(SpoolItem::Record(record)) => {
+            let (kind, content) = content(stream, &record);
+            StreamLine {
+                time_ns: record.time.wall_ns,
+                boot_ns: record.time.since_boot_ns,
+                boot: hex(&record.boot.0),
+                ..line(record.seq, &kind, content)
+            }
+        }
         Ok(SpoolItem::Gap(gap)) => {
-            let (to, reason) = (gap.to, format!("{:?}", gap.reason));
-            empty(gap.from, json!({ "kind": "gap", "to": to, "reason": reason }))
+            let reason = format!("{:?}", gap.reason);
+            line(gap.from, "gap", json!({ "to": gap.to, "reason": reason }))
         }
-        Ok(SpoolItem::Torn(torn)) => {
-            empty(torn.from, json!({ "kind": "torn", "bytes": torn.bytes }))
-        }
-        Err(error) => empty(0, json!({ "kind": "error", "text": gleaner_base::chain(&error) })),
+        Ok(SpoolItem::Torn(torn)) => line(torn.from, "torn", json!({ "bytes": torn.bytes })),
+        Err(error) => line(0, "damaged", json!({ "text": chain(&error) })),
     }
 }
 
-fn content(payload: &[u8]) -> Value {
-    serde_json::from_slice(payload)
-        .unwrap_or_else(|error| json!({ "kind": "unknown", "text": error.to_string() }))
+/// Returns the kind and the content of a record.
+fn content(stream: &str, record: &SpoolRecord) -> (String, Value) {
+    let damaged = |text: String| ("damaged".to_owned(), json!({ "text": text }));
+    if STREAMS.contains(&stream) {
+        let event = serde_json::from_slice(&record.payload);
+        return event.map_or_else(|it| damaged(it.to_string()), |it| ("event".to_owned(), it));
+    }
+    let parsed = SpooledRecord::parse(record.kind, &record.payload);
+    match parsed.map(|it| serde_json::to_value(it).expect("a record has only text keys")) {
+        Ok(mut value) => {
+            let content = value.get_mut("record").map_or(Value::Null, Value::take);
+            let kind = value.get("kind").and_then(Value::as_str).unwrap_or_default();
+            (kind.to_owned(), content)
+        }
+        Err(error) => damaged(chain(&error)),
+    }
 }

@@ -18,6 +18,7 @@ mod live_status;
 mod recording;
 mod report;
 mod result_item;
+mod spooled;
 pub mod supervision;
 #[cfg(test)]
 #[path = "../../../base/src/test_folder.rs"]
@@ -36,3 +37,7 @@ pub use live_status::{
 pub use recording::{LossCount, LossOutcome, RecordingCounts};
 pub use report::{ReplaySummary, Report, Round, TopicReport, Verified};
 pub use result_item::{RESULTS_ENV, ResultItem, WokenBy};
+pub use spooled::{
+    ItemLosses, OmittedRecord, OriginError, ProcessOrigin, ProcessStart, SpooledRecord,
+    SpooledRecordError,
+};

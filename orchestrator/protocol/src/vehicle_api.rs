@@ -184,7 +184,10 @@ pub struct StreamLine {
     pub boot_ns: u64,
     /// The boot, as 32 hexadecimal digits.
     pub boot: String,
-    /// The record: `{"kind": …}`.
+    /// Its kind: `event`, one of [`SpooledRecord`](crate::SpooledRecord), or `gap`, `torn` or
+    /// `damaged`.
+    pub kind: String,
+    /// Its content.
     pub record: serde_json::Value,
 }
 

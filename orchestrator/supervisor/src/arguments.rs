@@ -2,6 +2,8 @@
 
 use std::ffi::{OsStr, OsString};
 
+use gleaner_protocol::ProcessOrigin;
+
 use crate::spec::{LambdaSpec, RunSpec};
 use crate::starter;
 
@@ -36,12 +38,25 @@ pub(crate) fn runtime(
 
 /// Returns the arguments of the runtime's shim.
 pub(crate) fn shim(spec: &RunSpec, lambda: &LambdaSpec, restarts: u32) -> Vec<OsString> {
-    let mut line = vec![
-        option("--exit-record", lambda.exit_record()),
-        option("--results", &lambda.out),
-        starter(),
-    ];
-    line.extend((restarts > 0).then(|| "--again".into()));
+    let mut line = vec![option("--exit-record", lambda.exit_record()), starter()];
+    match (&lambda.deployment, &spec.spool) {
+        (Some(deployment), Some((folder, bytes))) => {
+            let origin = ProcessOrigin {
+                lambda: deployment.id.clone(),
+                revision: deployment.revision.clone(),
+                generation: deployment.attempt,
+                start: restarts,
+            };
+            let origin = serde_json::to_string(&origin).expect("an origin is plain data");
+            line.push(option("--spool", folder.join(&deployment.id)));
+            line.push(option("--origin", origin));
+            line.push(format!("--spool-budget={bytes}").into());
+        }
+        _ => {
+            line.push(option("--results", &lambda.out));
+            line.extend((restarts > 0).then(|| "--again".into()));
+        }
+    }
     line.extend(spec.cgroup.as_ref().map(|folder| option("--cgroup", folder)));
     line
 }

@@ -41,6 +41,8 @@ pub struct RunSpec {
     pub clips_max: Option<u64>,
     /// Maximum total size of clips to keep, in bytes.
     pub bytes_max: Option<u64>,
+    /// Folder of the spools of deployed lambdas, and the maximum size of each, in bytes.
+    pub spool: Option<(PathBuf, u64)>,
     /// Folder of cgroup v2 for the control groups of the lambdas.
     pub cgroup: Option<PathBuf>,
 }

@@ -130,6 +130,7 @@ fn run_spec(spec: &SupervisionSpec) -> RunSpec {
         clips_max: spec.clips_max,
         bytes_max: spec.bytes_max,
         cgroup: spec.cgroup.clone(),
+        spool: Some((spec.spool.clone(), spec.spool_bytes)),
         largest: LARGEST,
         ..RunSpec::default()
     }

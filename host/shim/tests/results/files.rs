@@ -1,48 +1,17 @@
-//! Tests the results of a live lambda that the shim writes: small programs stand for a runtime, and
-//! write arbitrary bytes into the pipe.
+//! Tests results in files.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 
 use gleaner_lambda::{Decision, FaultKind, LogLine, RESULT_ITEM_MAX};
 use gleaner_protocol::{LiveStatus, Report};
 use rustix::process::{Pid, Signal, kill_process};
 
-const SHIM: &str = env!("CARGO_BIN_EXE_gleaner-shim");
-
-/// Functions for scripts: `item TEXT` writes a item, `woken` the first one, `log N` a line of the
-/// log, `tick N` a decision without a trigger. `asked` makes the shim ask the script to end.
-const ITEMS: &str = r#"
-item() { printf '%s\n' "$1" > "/proc/self/fd/$GLEANER_RESULTS"; }
-log() { item '{"log":{"at_ns":'$1',"level":"info","message":"m"}}'; }
-tick() { item '{"decision":{"at_ns":'$1',"cause":"tick","triggers":[],"run_ns":1}}'; }
-woken() { item '{"woken":{"cause":"event","input":"camera","topic":"/camera"}}'; }
-asked() { local is=; trap 'is=1' TERM; kill -TERM $PPID; until [ "$is" ]; do sleep 0.01; done; }
-last() { item '{"last":{"lambda":"l","version":"1.0.0","kind":"wasm","out":"o","restarts":0,'\
-'"up_s":1.0,"wakes":2,"triggers":0,"faults":0,"skipped":0,"missed_ticks":0,'\
-'"log_lines":0,"log_dropped":0,"triggers_refused":0,"backed_off":0,'\
-'"unwritten":5,"topics":[],"network":{"domain":0,"participants":0,'\
-'"buffer_requested":0,"buffer_granted":0,"socket_drops":0,"filtered":0},'\
-'"rss_bytes":0,"cpu_s":0.0}}'; }
-"#;
-
-/// A folder for one test, removed when dropped.
-struct ResultsFolder(PathBuf);
+use crate::{ITEMS, ResultsFolder, SHIM, stderr};
 
 impl ResultsFolder {
-    fn of(test: &str) -> Self {
-        let path = std::env::temp_dir()
-            .join(format!("gleaner-shim-results-{}-{test}", std::process::id()));
-        fs::create_dir(&path).unwrap();
-        Self(path)
-    }
-
-    fn out(&self) -> PathBuf {
-        self.0.join("out")
-    }
-
     fn decisions(&self) -> Vec<Decision> {
         let text = fs::read_to_string(self.out().join("decisions.jsonl")).unwrap();
         text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
@@ -52,12 +21,6 @@ impl ResultsFolder {
     fn logged(&self) -> Vec<i64> {
         let text = fs::read_to_string(self.out().join("log.jsonl")).unwrap();
         text.lines().map(|line| serde_json::from_str::<LogLine>(line).unwrap().at_ns).collect()
-    }
-}
-
-impl Drop for ResultsFolder {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
     }
 }
 
@@ -80,10 +43,6 @@ fn start(folder: &ResultsFolder, script: &str) -> Child {
     let mut line = String::new();
     BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
     child
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 /// Decisions that the shim reported to its starter.

@@ -1,0 +1,152 @@
+//! Deployments over kills, restarts and failures.
+
+use gleaner_protocol::supervision::{EventKind, LambdaPhase, VehicleEvent};
+use gleaner_tests::live::signal;
+use gleaner_tests::vehicle::{TestVehicle, text};
+
+use super::{PythonLambda, files, ticker};
+
+pub fn outlive() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let lambdas = [ticker("rust", "first"), ticker("python", "second")];
+    for lambda in &lambdas {
+        let deployed = vehicle.deploy(lambda.path(), &[]);
+        assert!(deployed.status.success(), "{}", text(&deployed));
+    }
+    let names = ["gleaner-ingress", "gleaner-shim", "gleaner-runtime", "start.py"];
+    let processes = |vehicle: &TestVehicle| names.map(|name| vehicle.processes(name));
+    let before = processes(&vehicle);
+    assert!(before.iter().all(|pids| !pids.is_empty()), "{before:?}");
+    vehicle.kill_orchestrator();
+    // One that fails meanwhile is started again.
+    let runtime = vehicle.processes("start.py")[0];
+    signal(runtime, "KILL");
+    vehicle.until("the next process", |vehicle| {
+        let next = vehicle.processes("start.py");
+        (!next.is_empty() && next[0] != runtime).then_some(())
+    });
+    vehicle.start();
+    vehicle.until_running(&["first", "second"]);
+    let restarts =
+        ["first", "second"].map(|id| vehicle.deployment(id).status.expect("it runs").restarts);
+    assert_eq!(restarts, [0, 1]);
+    let after = processes(&vehicle);
+    assert_eq!(after[0], before[0], "the ingress runs on");
+    // SIGHUP replaces the program; its number stays.
+    let orchestrator = vehicle.orchestrator();
+    signal(orchestrator, "HUP");
+    vehicle.until("the program to start again", |vehicle| {
+        let started = events(vehicle, EventKind::Started);
+        (started.iter().filter(|text| text.contains("orchestrator")).count() == 3).then_some(())
+    });
+    vehicle.until_running(&["first", "second"]);
+    assert_eq!(processes(&vehicle), after);
+    let decisions = vehicle.records(Some("first"));
+    let seqs: Vec<_> = decisions.iter().map(|line| line.seq).collect();
+    assert!(seqs.is_sorted_by(|a, b| a < b) && seqs.len() > 3, "{seqs:?}");
+    assert!(decisions.iter().any(|line| line.kind == "decision"), "{decisions:?}");
+    // Of deployments without a file to send, too.
+    let again = vehicle.deploy(lambdas[0].path(), &[]);
+    assert!(text(&again).contains("(release 2, 0 files sent)"), "{}", text(&again));
+    let supervisor = vehicle.supervisor();
+    vehicle.stop();
+    let gone = |pid: &u32| !std::path::Path::new(&format!("/proc/{pid}/exe")).exists();
+    assert!(after.iter().flatten().chain([&supervisor]).all(gone), "a process is left");
+}
+
+pub fn stopped() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let lambda = ticker("rust", "ticker");
+    vehicle.deploy(lambda.path(), &[]);
+    vehicle.succeeds(&["stop", "ticker"]);
+    assert_eq!(vehicle.processes("gleaner-shim"), []);
+    vehicle.stop();
+    vehicle.start();
+    // A state that was sent is applied before the next status.
+    vehicle.until("the supervisor", |vehicle| vehicle.status().supervisor);
+    let deployment = vehicle.deployment("ticker");
+    assert!(!deployment.is_wanted && deployment.status.is_none(), "{deployment:?}");
+    let started = vehicle.succeeds(&["start", "ticker"]);
+    assert!(started.contains("running 0.1.0 after"), "{started}");
+    let unknown = text(&vehicle.gleaner(&["stop", "tacker"]));
+    assert!(unknown.contains("there is no deployment `tacker`"), "{unknown}");
+    assert!(unknown.contains("the deployments are `ticker`"), "{unknown}");
+}
+
+/// A lambda whose process ends in its third wake.
+const FAILING: &str = "wakes = 0\n\
+                       def on_tick(self, ctx):\n\
+                       \u{20}   self.wakes += 1\n\
+                       \u{20}   if self.wakes == 3:\n\
+                       \u{20}       import os\n\
+                       \u{20}       os.abort()";
+const HARMLESS: &str = "def on_tick(self, ctx):\n    pass";
+
+pub fn fallback() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let lambda = PythonLambda::new("guard", HARMLESS);
+    let other = ticker("rust", "other");
+    for path in [lambda.path(), other.path()] {
+        let deployed = vehicle.deploy(path, &[]);
+        assert!(deployed.status.success(), "{}", text(&deployed));
+    }
+    lambda.write("guard", "0.2.0", FAILING);
+    vehicle.deploy(lambda.path(), &[]);
+    vehicle
+        .until("the fallback", |vehicle| vehicle.deployment("guard").runs_fallback.then_some(()));
+    vehicle.until_running(&["guard", "other"]);
+    let failed = vehicle.deployment("guard");
+    let reason = failed.failed.as_deref().unwrap_or_default();
+    assert!(reason.contains("it failed 5 times within 10 minutes"), "{failed:?}");
+    let status = failed.status.expect("it runs");
+    assert_eq!(Some(status.revision), failed.fallback.map(|fallback| fallback.digest));
+    assert_eq!(vehicle.deployment("other").status.expect("it runs").restarts, 0);
+    // The failed revision is not tried again.
+    vehicle.stop();
+    vehicle.start();
+    vehicle.until_running(&["guard", "other"]);
+    assert!(vehicle.deployment("guard").runs_fallback);
+    assert_eq!(events(&vehicle, EventKind::RolledBack).len(), 1);
+    // Revisions that neither run nor ran before are removed.
+    for version in ["0.3.0", "0.4.0", "0.5.0", "0.6.0"] {
+        lambda.write("guard", version, HARMLESS);
+        let deployed = vehicle.deploy(lambda.path(), &["--fallback", "none"]);
+        assert!(text(&deployed).contains(&format!("running {version}")), "{}", text(&deployed));
+    }
+    let revisions = files(&vehicle.path("state/revisions"));
+    assert_eq!(revisions.len(), 4, "one of `other`, the newest, and two before: {revisions:?}");
+    assert_eq!(files(&vehicle.path("state/objects")), [] as [&str; 0]);
+}
+
+pub fn quarantined() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let other = ticker("rust", "other");
+    vehicle.deploy(other.path(), &[]);
+    let failing =
+        PythonLambda::new("broken", "def __init__(self, ctx):\n    raise ValueError('no')");
+    let deployed = vehicle.deploy(failing.path(), &[]);
+    let said = text(&deployed);
+    assert_eq!(deployed.status.code(), Some(6), "{said}");
+    assert!(said.contains("deployment `broken` does not run"), "{said}");
+    assert!(said.contains("it failed 3 times in a row before it was ready"), "{said}");
+    let status = vehicle.deployment("broken").status.expect("it is known");
+    assert_eq!((status.phase, status.restarts), (LambdaPhase::Quarantined, 2));
+    // Its log has the cause, also of the first process.
+    let log = vehicle.records(Some("broken"));
+    let starts = log.iter().filter(|line| line.kind == "started").count();
+    assert_eq!(starts, 3, "{log:?}");
+    assert_eq!(vehicle.deployment("other").status.expect("it runs").restarts, 0);
+    assert_eq!(events(&vehicle, EventKind::Quarantined).len(), 1);
+}
+
+/// The texts of the events of a kind.
+fn events(vehicle: &TestVehicle, kind: EventKind) -> Vec<String> {
+    let events = vehicle.records(None).into_iter().filter(|line| line.kind == "event");
+    let events = events
+        .map(|line| serde_json::from_value::<VehicleEvent>(line.record).expect("it is an event"));
+    events.filter(|event| event.event == kind).map(|event| event.text).collect()
+}

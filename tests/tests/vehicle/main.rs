@@ -1,0 +1,89 @@
+//! The daemon of a vehicle, with real lambdas: what is deployed runs, whatever is killed.
+
+mod chaos;
+mod deployments;
+mod refused;
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use gleaner_tests::{LambdaCopy, TempFolder, namespace};
+use libtest_mimic::{Arguments, Trial};
+
+/// A case, and its name.
+type Case = (&'static str, fn());
+
+const CASES: [Case; 8] = [
+    ("lambdas_outlive_the_orchestrator", deployments::outlive),
+    ("a_stopped_deployment_stays_stopped", deployments::stopped),
+    ("a_failed_revision_is_replaced_by_its_fallback_for_good", deployments::fallback),
+    ("a_lambda_without_a_fallback_is_quarantined_alone", deployments::quarantined),
+    ("what_is_not_signed_for_this_vehicle_is_refused", refused::signatures),
+    ("a_file_that_was_changed_later_does_not_start", refused::changed_file),
+    ("what_does_not_fit_is_refused_with_both_numbers", refused::memory),
+    ("processes_are_killed_at_random", chaos::killed_at_random),
+];
+
+/// Selects the case that this process runs, in a network of its own.
+const CASE: &str = "GLEANER_CASE";
+
+fn main() -> ExitCode {
+    if let Ok(case) = std::env::var(CASE) {
+        let case = CASES.iter().find(|(name, _)| *name == case).expect("a case");
+        (case.1)();
+        return ExitCode::SUCCESS;
+    }
+    let mut arguments = Arguments::from_args();
+    // Cases measure the time to recover.
+    arguments.test_threads = Some(1);
+    let missing = namespace::unavailable();
+    let trials = CASES.iter().map(|(name, _)| match missing {
+        Some(why) => Trial::test(format!("{name} [{why}]"), || Ok(())).with_ignored_flag(true),
+        None => Trial::test(*name, || namespace::case(CASE, name)),
+    });
+    libtest_mimic::run(&arguments, trials.collect()).exit_code()
+}
+
+/// A lambda that triggers an event at each tick, ten a second.
+fn ticker(language: &str, name: &str) -> LambdaCopy {
+    LambdaCopy::named(&format!("tests/lambdas/ticker/{language}"), name)
+}
+
+/// A built Python lambda with this code in its class, that wakes ten times a second.
+struct PythonLambda {
+    folder: TempFolder,
+}
+
+impl PythonLambda {
+    fn new(name: &str, code: &str) -> Self {
+        let lambda = Self { folder: TempFolder::new() };
+        lambda.write(name, "0.1.0", code);
+        lambda
+    }
+
+    /// Replaces its code, and builds it.
+    fn write(&self, name: &str, version: &str, code: &str) {
+        let manifest = format!(
+            "[lambda]\nname = \"{name}\"\nversion = \"{version}\"\nkind = \"python\"\n\
+             entry = \"main.py\"\n[schedule]\nperiod = \"100ms\"\n[limits]\ndeadline = \"5s\"\n"
+        );
+        let code: String = code.lines().map(|line| format!("    {line}\n")).collect();
+        // The build last: it must not be older than its sources.
+        for place in ["", "build/"] {
+            self.folder.write(&format!("{place}main.py"), format!("class Lambda:\n{code}"));
+            self.folder.write(&format!("{place}lambda.toml"), &manifest);
+        }
+    }
+
+    fn path(&self) -> &Path {
+        self.folder.path()
+    }
+}
+
+/// The files below `folder`, sorted.
+fn files(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut paths: Vec<_> = entries.map(|entry| entry.path()).collect();
+    paths.sort();
+    paths
+}

@@ -1,0 +1,89 @@
+//! Deployments that a vehicle refuses, and files that were changed after they were accepted.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+
+use gleaner_protocol::supervision::LambdaPhase;
+use gleaner_tests::vehicle::{TestVehicle, text};
+
+use super::{files, ticker};
+
+pub fn signatures() {
+    let mut vehicle = TestVehicle::new();
+    fs::write(vehicle.path("vehicle.toml"), "[vehicle]\nlabels = { site = \"berlin\" }\n")
+        .expect("the folder can be written");
+    vehicle.start();
+    let lambda = ticker("rust", "ticker");
+    let path = lambda.path().to_str().expect("a plain path");
+    let [deployer, stranger] = ["deployer", "stranger"].map(|key| vehicle.key(key));
+    let deploy = |key: &str, args: &[&str]| {
+        text(&vehicle.gleaner(&[&["deploy", "--local", path, "--key", key], args].concat()))
+    };
+    let refused = |said: &str, words: &str| {
+        assert!(said.contains("exit status: 3") && said.contains(words), "{said}");
+    };
+    vehicle.publish(lambda.path(), "stranger");
+    refused(&deploy(&deployer, &[]), "no trusted key signed the revision");
+    fs::remove_file(lambda.path().join("revision.json")).expect("it was written");
+    vehicle.publish(lambda.path(), "publisher");
+    refused(&deploy(&stranger, &[]), "no trusted key signed the deployment");
+    refused(&deploy(&deployer, &["--label", "site=paris"]), "`site=paris`");
+    assert!(vehicle.status().deployments.is_empty());
+    let accepted = deploy(&deployer, &["--label", "site=berlin", "--release", "7"]);
+    assert!(accepted.contains("running"), "{accepted}");
+    refused(&deploy(&deployer, &["--release", "6"]), "7");
+    refused(&deploy(&deployer, &["--release", "7", "--set", "x=1"]), "");
+    // What runs is as before.
+    assert_eq!(vehicle.deployment("ticker").release, 7);
+    assert_eq!(vehicle.deployment("ticker").status.expect("it runs").restarts, 0);
+}
+
+pub fn changed_file() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let lambda = ticker("python", "ticker");
+    vehicle.deploy(lambda.path(), &[]);
+    let revision = files(&vehicle.path("state/revisions")).remove(0);
+    let code = revision.join("build/main.py");
+    let mut changed = fs::read(&code).expect("it is stored");
+    changed.extend(b"# more\n");
+    fs::set_permissions(&code, fs::Permissions::from_mode(0o600)).expect("our file");
+    fs::write(&code, changed).expect("our file");
+    let runtime = vehicle.processes("start.py")[0];
+    gleaner_tests::live::signal(runtime, "KILL");
+    let status = vehicle.until("the refusal", |vehicle| {
+        let status = vehicle.deployment("ticker").status?;
+        (status.phase == LambdaPhase::Quarantined).then_some(status)
+    });
+    let reason = status.last_end.unwrap_or_default();
+    assert!(reason.contains("its files are refused") && reason.contains("main.py"), "{reason}");
+    // The daemon does not start it either.
+    vehicle.stop();
+    vehicle.start();
+    vehicle.until("the refusal", |vehicle| {
+        let status = vehicle.deployment("ticker").status?;
+        (status.phase == LambdaPhase::Quarantined).then_some(())
+    });
+    assert_eq!(vehicle.processes("start.py"), []);
+}
+
+pub fn memory() {
+    let mut vehicle = TestVehicle::new();
+    fs::write(vehicle.path("vehicle.toml"), "[deployments]\nmemory = \"1 GiB\"\n")
+        .expect("the folder can be written");
+    vehicle.start();
+    let [first, second] = ["first", "second"].map(|name| ticker("python", name));
+    let deployed = vehicle.deploy(first.path(), &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    let refused = text(&vehicle.deploy(second.path(), &[]));
+    assert!(refused.contains("there is no memory for deployment `second`"), "{refused}");
+    let numbers =
+        "it asks for 608 MiB, the other deployments for 608 MiB, and all may ask for 1 GiB";
+    assert!(refused.contains(numbers), "{refused}");
+    // One that is stopped takes none.
+    vehicle.succeeds(&["stop", "first"]);
+    let deployed = vehicle.deploy(second.path(), &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    let refused = text(&vehicle.gleaner(&["start", "first"]));
+    assert!(refused.contains("there is no memory for deployment `first`"), "{refused}");
+}
