@@ -4,7 +4,7 @@ use std::path::Path;
 
 use gleaner_base::Failure;
 
-use super::tree::{self, DOC, LIB, Tree};
+use super::tree::{self, DOC, LIB, PackageTree};
 use super::{Architecture, SOURCE, answer};
 use crate::checkout::Checkout;
 use crate::steps;
@@ -15,7 +15,7 @@ const LIBRARIES: &str = "libc6 (>= 2.36), libgcc-s1 (>= 4.2)";
 /// Scripts that dpkg runs.
 const SCRIPTS: [&str; 3] = ["postinst", "prerm", "postrm"];
 
-pub(super) struct Metadata {
+pub(super) struct PackageMetadata {
     version: String,
     architecture: Architecture,
     libraries: String,
@@ -25,11 +25,11 @@ pub(super) struct Metadata {
     date: String,
 }
 
-impl Metadata {
+impl PackageMetadata {
     /// Collects the metadata for the files in `tree`.
     pub(super) fn collect(
         checkout: &Checkout,
-        tree: &Tree,
+        tree: &PackageTree,
         architecture: Architecture,
     ) -> Result<Self, Failure> {
         let git = |arguments: &[&str]| answer(checkout.command("git").args(arguments));
@@ -57,7 +57,11 @@ impl Metadata {
     }
 
     /// Writes Debian's changelog: one entry for this package.
-    pub(super) fn write_changelog(&self, checkout: &Checkout, tree: &Tree) -> Result<(), Failure> {
+    pub(super) fn write_changelog(
+        &self,
+        checkout: &Checkout,
+        tree: &PackageTree,
+    ) -> Result<(), Failure> {
         let control = tree::read(&checkout.path(SOURCE).join("debian/control"))?;
         let maintainer = control.lines().find_map(|line| line.strip_prefix("Maintainer: "));
         let entry = format!(
@@ -71,7 +75,7 @@ impl Metadata {
     }
 
     /// Writes the folder `DEBIAN`.
-    pub(super) fn write(&self, checkout: &Checkout, tree: &Tree) -> Result<(), Failure> {
+    pub(super) fn write(&self, checkout: &Checkout, tree: &PackageTree) -> Result<(), Failure> {
         let files = tree.files()?;
         let kib = |file: &Path| file.metadata().map_or(0, |data| data.len().div_ceil(1024));
         let size: u64 = files.iter().map(|file| kib(file)).sum();
@@ -99,7 +103,7 @@ impl Metadata {
 }
 
 /// Finds the packages with the libraries of all programs; `None` without `dpkg-shlibdeps`.
-fn libraries(checkout: &Checkout, tree: &Tree) -> Result<Option<String>, Failure> {
+fn libraries(checkout: &Checkout, tree: &PackageTree) -> Result<Option<String>, Failure> {
     if !steps::succeeds(checkout.command("dpkg-shlibdeps").arg("--version")) {
         println!("skipped: dpkg-shlibdeps is not installed (dpkg-dev); a fixed list of libraries");
         return Ok(None);

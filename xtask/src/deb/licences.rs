@@ -7,17 +7,17 @@ use std::path::{Path, PathBuf};
 use gleaner_base::{Exit, Failure};
 use serde::Deserialize;
 
-use super::tree::{DOC, Tree};
+use super::tree::{DOC, PackageTree};
 use crate::checkout::Checkout;
 use crate::{setup, steps};
 
 #[derive(Deserialize)]
-struct Workspace {
-    packages: Vec<Package>,
+struct CargoMetadata {
+    packages: Vec<CratePackage>,
 }
 
 #[derive(Deserialize)]
-struct Package {
+struct CratePackage {
     name: String,
     version: String,
     license: Option<String>,
@@ -27,11 +27,11 @@ struct Package {
 }
 
 /// Writes one file with all crates, and the text of each licence once.
-pub(super) fn write(checkout: &Checkout, tree: &Tree) -> Result<(), Failure> {
+pub(super) fn write(checkout: &Checkout, tree: &PackageTree) -> Result<(), Failure> {
     let help = "`cargo fetch` downloads all crates";
     let mut metadata = checkout.cargo();
     metadata.args(["metadata", "--format-version=1", "--locked", "--offline"]);
-    let workspace: Workspace = serde_json::from_str(&steps::output(&mut metadata, help)?)
+    let workspace: CargoMetadata = serde_json::from_str(&steps::output(&mut metadata, help)?)
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot parse the crates", &error))?;
     let mut linked = checkout.cargo();
     linked.args(["tree", "--locked", "--offline", "--edges=normal", "--prefix=none"]);

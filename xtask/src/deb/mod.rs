@@ -20,8 +20,8 @@ use gleaner_base::{Exit, Failure};
 use crate::checkout::Checkout;
 use crate::steps::{self, Steps};
 use crate::{aarch64, setup};
-use control::Metadata;
-use tree::Tree;
+use control::PackageMetadata;
+use tree::PackageTree;
 
 /// Folder of the files of the package that are not built.
 const SOURCE: &str = "orchestrator/package";
@@ -61,13 +61,13 @@ impl Architecture {
 }
 
 #[derive(Debug, PartialEq, Eq)]
-struct Options {
+struct DebOptions {
     architecture: Architecture,
     programs: Option<PathBuf>,
     test: bool,
 }
 
-impl Options {
+impl DebOptions {
     fn parse(arguments: &[OsString]) -> Result<Self, Failure> {
         let mut options =
             Self { architecture: Architecture::of_this_machine(), programs: None, test: false };
@@ -101,7 +101,7 @@ fn usage() -> Failure {
 
 /// Builds the package, and tests it if that is wanted.
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let options = Options::parse(arguments)?;
+    let options = DebOptions::parse(arguments)?;
     let architecture = options.architecture;
     for (tool, package) in
         [("dpkg-deb", "dpkg"), ("gzip", "gzip"), (architecture.strip(), "binutils")]
@@ -117,9 +117,10 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
     println!("{}", programs.display());
     steps.begin("files");
     let work = checkout.target().join("deb");
-    let tree = Tree::create(checkout, &work.join(architecture.name()), &programs, architecture)?;
+    let tree =
+        PackageTree::create(checkout, &work.join(architecture.name()), &programs, architecture)?;
     licences::write(checkout, &tree)?;
-    let metadata = Metadata::collect(checkout, &tree, architecture)?;
+    let metadata = PackageMetadata::collect(checkout, &tree, architecture)?;
     metadata.write_changelog(checkout, &tree)?;
     tree.finish()?;
     steps.begin("service");
@@ -137,7 +138,7 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
     Ok(Exit::Ok)
 }
 
-fn programs(checkout: &Checkout, options: &Options) -> Result<PathBuf, Failure> {
+fn programs(checkout: &Checkout, options: &DebOptions) -> Result<PathBuf, Failure> {
     match &options.programs {
         Some(folder) => Ok(folder.clone()),
         None if options.architecture == Architecture::of_this_machine() => {
@@ -152,9 +153,9 @@ fn programs(checkout: &Checkout, options: &Options) -> Result<PathBuf, Failure> 
 
 fn build(
     checkout: &Checkout,
-    tree: &Tree,
+    tree: &PackageTree,
     package: &Path,
-    metadata: &Metadata,
+    metadata: &PackageMetadata,
 ) -> Result<(), Failure> {
     let mut build = checkout.command("dpkg-deb");
     // No file is newer than the commit: the same files become the same package.
@@ -193,14 +194,14 @@ fn answer(command: &mut Command) -> Option<String> {
 mod tests {
     use super::*;
 
-    fn parse(arguments: &[&str]) -> Option<Options> {
-        Options::parse(&arguments.iter().map(OsString::from).collect::<Vec<_>>()).ok()
+    fn parse(arguments: &[&str]) -> Option<DebOptions> {
+        DebOptions::parse(&arguments.iter().map(OsString::from).collect::<Vec<_>>()).ok()
     }
 
     #[test]
     fn the_package_is_for_this_machine_unless_another_one_is_named() {
         let here = Architecture::of_this_machine();
-        let options = Options { architecture: here, programs: None, test: false };
+        let options = DebOptions { architecture: here, programs: None, test: false };
         assert_eq!(parse(&[]), Some(options));
         let options = parse(&["--arch", "arm64", "--programs", "built"]).unwrap();
         assert_eq!((options.architecture, options.test), (Architecture::Arm64, false));

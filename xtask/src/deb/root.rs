@@ -17,6 +17,8 @@ const PACKAGES: &str = "dbus,init-system-helpers,python3,python3-numpy,python3-v
 const SUITE: &str = "bookworm";
 /// Lambdas of both kinds, with different names, that are deployed there if they are built.
 const LAMBDAS: [&str; 2] = ["examples/hello/rust", "examples/brake-dark/python"];
+/// System calls that a container needs beyond those of systemd-nspawn.
+const CALLS: &str = "landlock_add_rule landlock_create_ruleset landlock_restrict_self pidfd_getfd";
 /// The unit that runs the test in a container, and ends it.
 const TEST_UNIT: &str = "\
 [Unit]
@@ -120,6 +122,7 @@ fn boot(checkout: &Checkout, root: &Path, arguments: &[String]) -> Result<(), Fa
         .map_err(|error| tree::cannot("write", &units, &error))?;
     let mut boot = checkout.command("systemd-nspawn");
     boot.args(["--quiet", "--boot", "--private-network", "--register=no", "--keep-unit"]);
+    boot.arg(format!("--system-call-filter={CALLS}"));
     boot.args(["--console=pipe", "--directory"]).arg(root);
     // Its exit code is that of the container, not that of the test.
     let _ = boot.stdin(std::process::Stdio::null()).output();

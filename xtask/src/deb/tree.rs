@@ -47,11 +47,11 @@ const COMPLETIONS: [(&str, &str); 3] = [
 ];
 
 /// A folder with the files of a package.
-pub(super) struct Tree {
+pub(super) struct PackageTree {
     root: PathBuf,
 }
 
-impl Tree {
+impl PackageTree {
     /// Creates the folder `root` again, with all files but the metadata.
     pub(super) fn create(
         checkout: &Checkout,

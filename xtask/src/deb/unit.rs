@@ -5,7 +5,7 @@ use std::path::Path;
 use gleaner_base::{Exit, Failure};
 
 use super::answer;
-use super::tree::{self, Tree, UNIT};
+use super::tree::{self, PackageTree, UNIT};
 use crate::checkout::Checkout;
 use crate::steps;
 
@@ -16,7 +16,7 @@ const EXPOSURE_MAX: u32 = 20;
 const WITH_SUBGROUPS: u32 = 254;
 
 /// Checks the unit in `tree`. Does nothing but print so if the tool is missing.
-pub(super) fn check(checkout: &Checkout, tree: &Tree, work: &Path) -> Result<(), Failure> {
+pub(super) fn check(checkout: &Checkout, tree: &PackageTree, work: &Path) -> Result<(), Failure> {
     let Some(version) = answer(checkout.command("systemd-analyze").arg("--version")) else {
         println!("skipped: systemd-analyze is not installed (package systemd)");
         return Ok(());
