@@ -212,7 +212,8 @@ fn unreachable(subject: &'static str, failure: Failure) -> Finding {
 fn answer(client: VehicleClient) -> Result<VehicleStatus, Failure> {
     let (sender, receiver) = mpsc::channel();
     let socket = client.socket().display().to_string();
-    thread::spawn(move || sender.send(client.status()));
+    // Its answer is dropped if it comes too late.
+    thread::spawn(move || drop(sender.send(client.status())));
     receiver.recv_timeout(ANSWER).unwrap_or_else(|_| {
         let message = format!("no answer at `{socket}` within {}", format_duration(ANSWER));
         Err(Failure::new(gleaner_base::Exit::Unreachable, message))

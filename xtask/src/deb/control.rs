@@ -9,9 +9,6 @@ use super::{Architecture, SOURCE, answer};
 use crate::checkout::Checkout;
 use crate::steps;
 
-/// Libraries of the programs, if `dpkg-shlibdeps` cannot find them: for another architecture it
-/// needs its packages. The version is that of the C library of Debian 12, which builds them.
-const LIBRARIES: &str = "libc6 (>= 2.36), libgcc-s1 (>= 4.2)";
 /// Scripts that dpkg runs.
 const SCRIPTS: [&str; 3] = ["postinst", "prerm", "postrm"];
 
@@ -48,7 +45,10 @@ impl PackageMetadata {
         } else {
             None
         };
-        let libraries = found.unwrap_or_else(|| LIBRARIES.to_owned());
+        let libraries = match found {
+            Some(found) => found,
+            None => libraries_by_version(tree)?,
+        };
         Ok(Self { version, architecture, libraries, time, date })
     }
 
@@ -105,7 +105,9 @@ impl PackageMetadata {
 /// Finds the packages with the libraries of all programs; `None` without `dpkg-shlibdeps`.
 fn libraries(checkout: &Checkout, tree: &PackageTree) -> Result<Option<String>, Failure> {
     if !steps::succeeds(checkout.command("dpkg-shlibdeps").arg("--version")) {
-        println!("skipped: dpkg-shlibdeps is not installed (dpkg-dev); a fixed list of libraries");
+        println!(
+            "skipped: dpkg-shlibdeps is not installed (dpkg-dev); libraries by their versions"
+        );
         return Ok(None);
     }
     // It reads `debian/control` of a source package.
@@ -130,9 +132,46 @@ fn libraries(checkout: &Checkout, tree: &PackageTree) -> Result<Option<String>, 
     Ok(text.trim().strip_prefix("shlibs:Depends=").map(str::to_owned))
 }
 
+/// Returns the libraries, with the newest version of the C library that a program names. For
+/// another architecture `dpkg-shlibdeps` would need its packages.
+fn libraries_by_version(tree: &PackageTree) -> Result<String, Failure> {
+    let mut newest = 0;
+    for file in tree.files()?.into_iter().filter(|file| is_elf(file)) {
+        let bytes = std::fs::read(&file).map_err(|error| tree::cannot("read", &file, &error))?;
+        newest = newest.max(glibc(&bytes));
+    }
+    Ok(format!("libc6 (>= 2.{newest}), libgcc-s1 (>= 4.2)"))
+}
+
+/// The newest minor version of the C library in the names of versions of a program.
+fn glibc(program: &[u8]) -> u32 {
+    const NAME: &[u8] = b"\0GLIBC_2.";
+    let names = program.windows(NAME.len()).enumerate().filter(|(_, window)| *window == NAME);
+    let minors = names.filter_map(|(at, _)| {
+        let digits: String = program[at + NAME.len()..]
+            .iter()
+            .take_while(|byte| byte.is_ascii_digit())
+            .map(|byte| char::from(*byte))
+            .collect();
+        digits.parse::<u32>().ok()
+    });
+    minors.max().unwrap_or_default()
+}
+
 fn is_elf(file: &Path) -> bool {
     use std::io::Read;
     let mut start = [0; 4];
     let read = std::fs::File::open(file).and_then(|mut file| file.read_exact(&mut start));
     read.is_ok() && start == *b"\x7fELF"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_newest_version_of_the_c_library_counts() {
+        assert_eq!(glibc(b"\x7fELF\0GLIBC_2.34\0GLIBC_2.4\0GLIBC_2.17\0x"), 34);
+        assert_eq!(glibc(b"no names"), 0);
+    }
 }
