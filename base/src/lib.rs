@@ -1,5 +1,5 @@
 //! Basics for every Gleaner program: exit codes, errors for users, safe and atomic file access,
-//! sizes and durations, text of messages.
+//! sizes, durations and dates, text of messages.
 //!
 //! Nothing here depends on what a lambda is.
 
@@ -21,5 +21,5 @@ pub use failure::{Explain, Failure, chain};
 pub use line_pieces::{LinePiece, each_piece};
 pub use plain_file::{NotPlain, PlainFile};
 pub use text::{excerpt, grouped, hex, visible};
-pub use time::nanoseconds;
+pub use time::{UtcTime, nanoseconds};
 pub use units::{ByteSize, UnitError, format_duration, parse_duration};

@@ -8,11 +8,13 @@ use std::path::{Path, PathBuf};
 use gleaner_base::{Exit, Failure};
 use gleaner_protocol::ReplaySummary;
 use gleaner_report::{Decisions, clips};
+use serde_json::Value;
 
 use crate::args::{ReplayArgs, VerifyArgs};
 use crate::render::{self, Digest, Paint};
 use crate::report;
 use crate::runtime::{self, RuntimeResult};
+use crate::signing;
 use crate::stdout::print;
 
 /// Replays; returns the exit code of the runtime.
@@ -69,12 +71,31 @@ fn report_of(out: &Path, no_report: bool) -> Result<Option<PathBuf>, Failure> {
     if no_report { Ok(None) } else { report::write(out).map(Some) }
 }
 
-/// Repeats the decisions of a clip.
+/// Checks the signature of a clip, if vehicles to trust are given, and repeats its decisions.
 pub(crate) fn verify(args: &VerifyArgs) -> Result<Exit, Failure> {
-    let mut line = vec!["verify".into(), "--lambda".into(), args.lambda.clone().into()];
-    line.extend(args.vehicle.iter().flat_map(|file| [OsString::from("--vehicle"), file.into()]));
-    line.extend(["--".into(), args.clip.clone().into()]);
-    print_result(runtime::run(&args.lambda, args.vehicle.as_deref(), line)?, args.json)
+    let check = |trust: &PathBuf| signing::check_clip(&args.clip, trust);
+    let signed = args.trust.as_ref().map(check).transpose()?;
+    if let Some(signed) = signed.as_ref().filter(|_| !args.json) {
+        print(&signing::clip_text(signed, Paint::of_stdout()))?;
+    }
+    let (result, exit) = match &args.lambda {
+        None => (None, Exit::Ok),
+        Some(lambda) => {
+            let mut line = vec!["verify".into(), "--lambda".into(), lambda.into()];
+            let vehicle = args.vehicle.iter();
+            line.extend(vehicle.flat_map(|file| [OsString::from("--vehicle"), file.into()]));
+            line.extend(["--".into(), args.clip.clone().into()]);
+            runtime::run(lambda, args.vehicle.as_deref(), line)?
+        }
+    };
+    match (&signed, &result) {
+        (Some(signed), None) if args.json => print(&signing::clip_json(signed, Value::Null))?,
+        (Some(signed), Some(RuntimeResult::Verified(verified))) if args.json => {
+            print(&signing::clip_json(signed, serde_json::json!(verified)))?;
+        }
+        _ => return print_result((result, exit), args.json),
+    }
+    Ok(exit)
 }
 
 /// Prints the result of the runtime, and returns its exit code.

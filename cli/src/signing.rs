@@ -1,15 +1,22 @@
-//! `gleaner keys` and `gleaner publish`: print the results of `gleaner-trust`.
+//! `gleaner keys`, `gleaner publish` and the signatures of clips: print the results of
+//! `gleaner-trust`.
 
+use std::fs;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Explain, Failure, UtcTime, safe_file, visible};
 use gleaner_report::format::{counted, size};
-use gleaner_trust::{PublicKey, Published, Release, SecretKey};
-use serde_json::json;
+use gleaner_supervisor::ClipSigning;
+use gleaner_trust::{
+    ClipRefusal, PublicKey, Published, Release, SecretKey, SignedClip, SignedLambda,
+    TrustedVehicles, verify_clip,
+};
+use serde_json::{Value, json};
 
-use crate::args::{KeysArgs, KeysCommand, PublishArgs};
-use crate::render::json_line;
+use crate::args::{KeysArgs, KeysCommand, PublishArgs, SignArgs};
+use crate::render::{Paint, json_line};
 use crate::stdout::print;
 
 /// Runs `gleaner keys`.
@@ -45,6 +52,65 @@ pub(crate) fn publish(args: &PublishArgs) -> Result<Exit, Failure> {
     let shown = if args.json { json_of } else { text_of };
     print(&shown(&published, &key.public(), &out))?;
     Ok(Exit::Ok)
+}
+
+/// Returns how the clips of a run are signed. The key is checked before anything is started.
+pub(crate) fn of_clips(args: &SignArgs) -> Result<Option<ClipSigning>, Failure> {
+    let Some(path) = &args.sign else { return Ok(None) };
+    let (_, key) = SecretKey::open(path)?;
+    let vehicle = match &args.vehicle_name {
+        Some(name) => name.to_string(),
+        None => machine()?,
+    };
+    Ok(Some(ClipSigning { key: Arc::new(key), vehicle }))
+}
+
+/// Returns the name of this machine, if a vehicle can have it.
+fn machine() -> Result<String, Failure> {
+    let unnamed = |reason: String| {
+        let mut failure = Failure::new(Exit::Usage, "this machine has no name for signatures");
+        failure.causes = vec![reason];
+        failure.with_help("name the vehicle: --vehicle-name NAME")
+    };
+    let name = fs::read_to_string("/proc/sys/kernel/hostname")
+        .map_err(|error| unnamed(error.to_string()))?;
+    let name = name.trim_end().parse::<gleaner_trust::VehicleName>();
+    name.map(|name| name.to_string()).map_err(unnamed)
+}
+
+/// Checks that one of the vehicles in the file `trust` signed the clip.
+pub(crate) fn check_clip(clip: &Path, trust: &Path) -> Result<SignedClip, Failure> {
+    let vehicles = TrustedVehicles::load(trust)?;
+    let signed = safe_file::read_named(clip)
+        .map_err(|source| ClipRefusal::Read { source })
+        .and_then(|file| verify_clip(file, &vehicles));
+    signed.map_err(|refusal| {
+        let message = format!("clip `{}` is not accepted", clip.display());
+        Failure { exit: refusal.exit(), ..Failure::because(message, &refusal) }
+    })
+}
+
+/// Returns the line about a signed clip.
+pub(crate) fn clip_text(signed: &SignedClip, paint: Paint) -> String {
+    let SignedClip { statement, key } = signed;
+    let lambda = |lambda: &SignedLambda| format!("{} {}", lambda.name, lambda.version);
+    let lambdas = statement.lambdas.iter().map(lambda).collect::<Vec<_>>().join(", ");
+    let time = UtcTime::of(i64::try_from(statement.created).unwrap_or(i64::MAX));
+    let by = format!("signed by {} (key {}) at {time}", statement.vehicle, &key.as_str()[..16]);
+    let messages = counted(statement.messages, "message");
+    let recovered = if statement.recovered { ", recovered after a crash" } else { "" };
+    let name = visible(&statement.clip);
+    format!("{name}: {}: {lambdas}, {messages}{recovered}\n", paint.green(&by))
+}
+
+/// Returns the JSON object about a signed clip, with the members of `more`.
+pub(crate) fn clip_json(signed: &SignedClip, more: Value) -> String {
+    let SignedClip { statement, key } = signed;
+    let mut object = json!({ "signature": { "key": key, "statement": statement } });
+    if let (Value::Object(object), Value::Object(more)) = (&mut object, more) {
+        object.extend(more);
+    }
+    json_line(&object)
 }
 
 fn text_of(

@@ -1,4 +1,4 @@
-//! Fuzzes signed data: envelopes, and the payloads in them.
+//! Fuzzes signed data: envelopes, the payloads in them, and signed clips.
 //!
 //! An input is a byte for the mode, then data that depends on the mode. Signatures would stop a
 //! fuzzer early, so most modes sign the payload.
@@ -8,7 +8,7 @@ use base64::engine::general_purpose::STANDARD;
 use ed25519_dalek::{Signer, SigningKey};
 use gleaner_trust::{
     Deployment, Floors, Labels, Payload, Refusal, Revision, RootKeys, ScopedKey, SecretKey,
-    TrustRoot, Verifier, first_root, next_root, seal,
+    TrustRoot, TrustedVehicles, Verifier, first_root, next_root, seal, verify_clip,
 };
 
 use crate::budget;
@@ -26,11 +26,18 @@ pub mod mode {
     pub const ROOT: u8 = 3;
     /// Floors follow.
     pub const FLOORS: u8 = 4;
+    /// A clip follows.
+    pub const CLIP: u8 = 5;
 }
 
 /// The key that signs everything.
 pub(crate) const KEY: [u8; 32] = [7; 32];
 
+/// The vehicle whose clips are accepted.
+pub(crate) const VEHICLE: &str = "car-7";
+
+/// Memory budget: the largest envelope of a clip, its payload, and what is read at once.
+const CLIP_MEMORY: usize = 32 << 20;
 /// Memory budget: an envelope of 5 KiB, its payload, and what is parsed from it.
 const MEMORY: usize = 4 << 20;
 
@@ -50,6 +57,7 @@ pub fn check(data: &[u8]) -> bool {
             assert_eq!(Floors::parse(&floors.to_json()).as_ref(), Ok(&floors));
             true
         }
+        mode::CLIP => clip(bytes),
         _ => {
             let results = [
                 accepted(|| revision(bytes)).is_ok(),
@@ -60,6 +68,24 @@ pub fn check(data: &[u8]) -> bool {
             results.contains(&true)
         }
     }
+}
+
+/// Verifies a clip. Of one that is accepted, no byte may be changed.
+fn clip(bytes: &[u8]) -> bool {
+    let text = format!("{VEHICLE} {}", SecretKey::from_bytes(&KEY).public());
+    let vehicles = TrustedVehicles::parse(text.as_bytes()).expect("a name and a key");
+    let verified = budget::within(CLIP_MEMORY, || verify_clip(bytes, &vehicles));
+    if let Err(refusal) = verified {
+        let text = refusal.to_string();
+        assert!(text.len() <= MESSAGE_MAX, "a message of {} bytes", text.len());
+        return false;
+    }
+    for at in 0..bytes.len() {
+        let mut changed = bytes.to_vec();
+        changed[at] ^= 1 << (at % 8);
+        assert!(verify_clip(&changed[..], &vehicles).is_err(), "byte {at} was changed");
+    }
+    true
 }
 
 fn again<P>(payload: &[u8], verify: impl Fn(&[u8]) -> Result<P, Refusal>) -> bool

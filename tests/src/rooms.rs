@@ -178,6 +178,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-messages",
             "gleaner-protocol",
             "gleaner-transport",
+            "gleaner-trust",
             "gleaner-vitals",
         ],
     ),

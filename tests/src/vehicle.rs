@@ -159,7 +159,8 @@ impl TestVehicle {
         self.try_status().unwrap_or_else(|| panic!("no status: {}", self.log()))
     }
 
-    fn try_status(&self) -> Option<VehicleStatus> {
+    /// Returns the status of the vehicle, if the orchestrator answers.
+    pub fn try_status(&self) -> Option<VehicleStatus> {
         let output = self.gleaner(&["status", "--json"]);
         serde_json::from_slice(&output.stdout).ok()
     }

@@ -95,7 +95,8 @@ fn measure(seconds: u64) -> RecorderLatency {
     let reader = AddReader { name: "recorder".to_owned(), topics, publishes: Vec::new() };
     let samples = ingress.add_reader(&reader).expect("the ingress runs");
     let program = thread::spawn(move || {
-        let connections = RecorderConnections { control: stdin, ingress: samples, starter: None };
+        let connections =
+            RecorderConnections { control: stdin, ingress: samples, starter: None, signer: None };
         run(options, connections, File::from(OwnedFd::from(to)), Arc::default())
             .expect("nothing fails");
     });

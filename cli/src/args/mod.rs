@@ -2,6 +2,7 @@
 
 mod signing;
 mod vehicle;
+mod verify;
 
 use std::ffi::OsString;
 use std::net::IpAddr;
@@ -12,11 +13,12 @@ use clap_complete::Shell;
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_protocol::DriveTime;
 
-pub use signing::{KeysArgs, KeysCommand, PublishArgs};
+pub use signing::{KeysArgs, KeysCommand, PublishArgs, SignArgs};
 pub use vehicle::{
     ChangeArgs, DeployArgs, LogsArgs, StatusArgs, StreamArgs, TrustArgs, TrustCommand,
     TrustInstallArgs, VehicleArgs,
 };
+pub use verify::VerifyArgs;
 
 /// Run small functions (lambdas) next to the sensors of a vehicle, and keep the data worth keeping
 #[derive(Parser, Debug)]
@@ -55,7 +57,8 @@ pub enum CliCommand {
     Dev(DevArgs),
     /// Repeat the decisions of a clip, and compare them with its journal
     ///
-    /// Exits with 0 if all are identical, and with 4 at the first difference.
+    /// Exits with 0 if all are identical, and with 4 at the first difference; with --trust, with 3
+    /// before that unless one of these vehicles signed exactly this file.
     Verify(VerifyArgs),
     /// Run built lambdas on the live topics of this vehicle, until Ctrl-C
     ///
@@ -71,7 +74,7 @@ pub enum CliCommand {
         #[arg(value_name = "ARGUMENTS", trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<OsString>,
     },
-    /// Create or show a key that signs revisions and deployments
+    /// Create or show a key that signs revisions, deployments and clips
     #[command(subcommand)]
     Keys(KeysCommand),
     /// Sign a built lambda: write its revision, by which a vehicle can recognise its files
@@ -219,6 +222,9 @@ pub struct RunArgs {
     /// Maximum total size of clips to keep; the oldest ones are deleted and counted
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
     pub bytes_max: Option<u64>,
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub sign: SignArgs,
     /// Create a control group for each lambda's process in this cgroup v2 folder, which must be
     /// delegated to this user
     #[arg(long, value_name = "DIR")]
@@ -418,22 +424,6 @@ pub struct DevArgs {
     /// Do not record the clips of the manifest's table `record`, which makes a replay faster
     #[arg(long)]
     pub no_record: bool,
-}
-
-/// Arguments of `gleaner verify`.
-#[derive(Args, Debug)]
-pub struct VerifyArgs {
-    /// A clip that Gleaner recorded
-    pub clip: PathBuf,
-    /// The lambda's folder, built by `gleaner build DIR`
-    #[arg(long, value_name = "DIR")]
-    pub lambda: PathBuf,
-    /// Configuration file of the vehicle [default: the limits in the journal]
-    #[arg(long, value_name = "FILE")]
-    pub vehicle: Option<PathBuf>,
-    /// Print the result as one JSON object
-    #[arg(long)]
-    pub json: bool,
 }
 
 /// Bounds of `--rate`: beyond, a drive of an hour takes longer than a day, or is over at once.

@@ -1,8 +1,9 @@
-//! Arguments of `gleaner keys` and `gleaner publish`.
+//! Arguments of `gleaner keys` and `gleaner publish`, and those of `gleaner run` that sign clips.
 
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
+use gleaner_trust::VehicleName;
 
 /// Commands of `gleaner keys`.
 #[derive(Subcommand, Debug)]
@@ -43,4 +44,15 @@ pub struct PublishArgs {
     /// Print the result as one JSON object
     #[arg(long)]
     pub json: bool,
+}
+
+/// Options of `gleaner run` that sign clips.
+#[derive(Args, Debug)]
+pub struct SignArgs {
+    /// Sign each clip with this key file of the vehicle, made by `gleaner keys new FILE`
+    #[arg(long, value_name = "FILE", conflicts_with = "no_record")]
+    pub sign: Option<PathBuf>,
+    /// Name of the vehicle in the signatures [default: the name of this machine]
+    #[arg(long, value_name = "NAME", requires = "sign")]
+    pub vehicle_name: Option<VehicleName>,
 }

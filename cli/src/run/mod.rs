@@ -11,22 +11,24 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
-use gleaner_supervisor::RunSpec;
+use gleaner_supervisor::{ClipSigning, RunSpec};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::screen::Screen;
 use crate::args::RunArgs;
+use crate::signing;
 
 /// Runs until a signal, until the time is over, or until the end of the drive.
 pub(crate) fn run(args: &RunArgs) -> Result<Exit, Failure> {
     let lambdas = lambdas::load(args)?;
+    let signing = signing::of_clips(&args.sign)?;
     let stop = stop_flag()?;
     let mut screen = Screen::new(args.stats, args.json);
-    gleaner_supervisor::run(lambdas, &spec(args), &mut screen, &stop)
+    gleaner_supervisor::run(lambdas, &spec(args, signing), &mut screen, &stop)
 }
 
 /// Returns what the lambdas share.
-fn spec(args: &RunArgs) -> RunSpec {
+fn spec(args: &RunArgs, signing: Option<ClipSigning>) -> RunSpec {
     RunSpec {
         clips: lambdas::out(args),
         vehicle: args.vehicle.clone(),
@@ -43,6 +45,7 @@ fn spec(args: &RunArgs) -> RunSpec {
         disk_floor: args.disk_floor,
         clips_max: args.clips_max,
         bytes_max: args.bytes_max,
+        signing,
         cgroup: args.cgroup.clone(),
         spool: None,
     }

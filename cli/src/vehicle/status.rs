@@ -25,6 +25,7 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
     let labels = status.labels.iter().map(|(name, value)| format!("{name}={}", visible(value)));
     let labels = labels.collect::<Vec<_>>().join(" ");
     let mut text = format!("{} {}\n", paint.bold(&visible(&status.vehicle)), paint.dim(&labels));
+    text += &format!("  clips are signed by {}\n", visible(&status.key));
     text += &match &status.trust {
         None => format!("  {}\n", paint.yellow("no trust root: `gleaner trust install FILE`")),
         Some(trust) if trust.is_expired => {

@@ -172,6 +172,7 @@ impl RecordedRun {
                 control: stdin,
                 ingress: socket,
                 starter: Some(handover.into()),
+                signer: None,
             };
             record(options, connections, File::from(OwnedFd::from(to_reports)), stopped)
         });

@@ -27,6 +27,7 @@ use gleaner_lambda::manifest::Sha256;
 use gleaner_protocol::vehicle_api::{
     Changed, DeployReply, DeployRequest, Problem, ProgramStatus, VehicleStatus,
 };
+use gleaner_trust::{PublicKey, VehicleName};
 use gleaner_vitals::usage;
 use serde::Deserialize;
 use sha2::Digest;
@@ -47,7 +48,8 @@ const BODY_MAX: usize = 32 << 20;
 pub(crate) struct Api {
     pub(crate) core: Arc<Core>,
     pub(crate) layout: Layout,
-    pub(crate) name: Arc<str>,
+    pub(crate) name: VehicleName,
+    pub(crate) key: PublicKey,
     pub(crate) started: Instant,
 }
 
@@ -89,6 +91,7 @@ impl Api {
         let labels = self.core.trust(|trust| trust.labels().clone());
         VehicleStatus {
             vehicle: self.name.to_string(),
+            key: self.key.to_string(),
             labels: labels.into_iter().map(|(name, value)| (name.to_string(), value)).collect(),
             orchestrator: ProgramStatus {
                 version: env!("CARGO_PKG_VERSION").to_owned(),

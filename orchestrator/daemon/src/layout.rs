@@ -80,6 +80,11 @@ impl Layout {
         self.state.join("state.json")
     }
 
+    /// The key that signs clips.
+    pub(crate) fn key(&self) -> PathBuf {
+        self.state.join("vehicle.pem")
+    }
+
     /// Folder of files that were sent, and belong to no revision yet.
     pub(crate) fn objects(&self) -> PathBuf {
         self.state.join("objects")

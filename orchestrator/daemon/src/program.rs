@@ -12,6 +12,7 @@ use clap::Parser;
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::Vehicle;
 use gleaner_protocol::supervision::{EventKind, SUPERVISION_VERSION, SupervisionSpec};
+use gleaner_trust::{PublicKey, SecretKey, VehicleName};
 use gleaner_vitals::log;
 use tokio::net::UnixListener;
 use tokio::signal::unix::{SignalKind, signal};
@@ -85,11 +86,9 @@ fn run(args: Args) -> Result<ProgramEnd, Failure> {
     let vehicle = args.vehicle.as_ref().map_or_else(|| Ok(Vehicle::default()), Vehicle::load)?;
     let layout = Layout::create(&args.state, &args.run)?;
     let _lock = layout.lock()?;
-    let name = match &vehicle.identity.name {
-        Some(name) => name.to_string(),
-        None => rustix::system::uname().nodename().to_string_lossy().into_owned(),
-    };
-    let spec = spec(&args, &layout, &vehicle);
+    let name = name(&vehicle)?;
+    let key = vehicle_key(&layout)?;
+    let spec = spec(&args, &layout, &vehicle, &name);
     let core = Arc::new(Core::open(&layout, vehicle)?);
     // Two threads: the work that takes long runs in others.
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -98,7 +97,7 @@ fn run(args: Args) -> Result<ProgramEnd, Failure> {
         .enable_all()
         .build()
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot start threads", &error))?;
-    let ended = runtime.block_on(serve(Arc::clone(&core), layout, spec, name));
+    let ended = runtime.block_on(serve(Arc::clone(&core), layout, spec, (name, key)));
     // A stream that follows never ends by itself.
     runtime.shutdown_background();
     if matches!(ended, Ok(ProgramEnd::Stopped)) {
@@ -107,7 +106,29 @@ fn run(args: Args) -> Result<ProgramEnd, Failure> {
     ended
 }
 
-fn spec(args: &Args, layout: &Layout, vehicle: &Vehicle) -> SupervisionSpec {
+/// Returns the name of the vehicle: that of its configuration, or that of the machine.
+fn name(vehicle: &Vehicle) -> Result<VehicleName, Failure> {
+    let name = match &vehicle.identity.name {
+        Some(name) => name.to_string(),
+        None => rustix::system::uname().nodename().to_string_lossy().into_owned(),
+    };
+    name.parse().map_err(|reason| {
+        let mut failure = Failure::new(Exit::Usage, "this vehicle has no name");
+        failure.causes = vec![reason];
+        failure.with_help("name it: `name` in the table [vehicle] of vehicle.toml")
+    })
+}
+
+/// Makes the key of the vehicle if it has none; returns its public part.
+fn vehicle_key(layout: &Layout) -> Result<PublicKey, Failure> {
+    let path = layout.key();
+    if !path.exists() {
+        SecretKey::generate()?.create_file(&path)?;
+    }
+    Ok(SecretKey::load(&path)?.public())
+}
+
+fn spec(args: &Args, layout: &Layout, vehicle: &Vehicle, name: &VehicleName) -> SupervisionSpec {
     let domain = vehicle.network.domain.map(|domain| format!("--domain={domain}"));
     let interfaces = vehicle.network.interfaces.iter().map(|it| format!("--interface={it}"));
     let recording = &vehicle.recording;
@@ -118,7 +139,7 @@ fn spec(args: &Args, layout: &Layout, vehicle: &Vehicle) -> SupervisionSpec {
         records: layout.records(),
         clips: layout.clips(),
         vehicle: args.vehicle.clone(),
-        signer: None,
+        signer: Some((layout.key(), name.to_string())),
         network: domain.into_iter().chain(interfaces).collect(),
         all: args.all,
         decisions: vehicle.deployments.decisions.as_ref().map(ToString::to_string),
@@ -134,7 +155,7 @@ async fn serve(
     core: Arc<Core>,
     layout: Layout,
     spec: SupervisionSpec,
-    name: String,
+    (name, key): (VehicleName, PublicKey),
 ) -> Result<ProgramEnd, Failure> {
     let failed = |what: &'static str| {
         move |error: std::io::Error| Failure::caused_by(Exit::Internal, what, &error)
@@ -152,7 +173,7 @@ async fn serve(
         stop: stopped,
     };
     let mut link = tokio::spawn(link.keep());
-    let api = Api { core: Arc::clone(&core), layout, name: name.into(), started: Instant::now() };
+    let api = Api { core: Arc::clone(&core), layout, name, key, started: Instant::now() };
     tokio::spawn(async move { axum::serve(listener, api.router()).await });
     let _ = sd_notify::notify(&[sd_notify::NotifyState::Ready]);
     let mut watchdog = tokio::time::interval(WATCHDOG_INTERVAL);

@@ -27,6 +27,8 @@ pub struct Handover {
     pub inference: Option<OwnedFd>,
     /// The file in which `gleaner-inference` notes the models that it loads and runs.
     pub running: Option<OwnedFd>,
+    /// The file of the key with which the recorder signs clips.
+    pub key: Option<OwnedFd>,
 }
 
 /// Name of a connection.
@@ -38,6 +40,7 @@ enum ConnectionName {
     Recorder,
     Inference,
     Running,
+    Key,
 }
 
 /// Option of a runtime whose starter passes the connection to `gleaner-inference` this way, without
@@ -76,6 +79,7 @@ impl Handover {
             (ConnectionName::Recorder, &self.recorder),
             (ConnectionName::Inference, &self.inference),
             (ConnectionName::Running, &self.running),
+            (ConnectionName::Key, &self.key),
         ];
         let (names, descriptors): (Vec<ConnectionName>, Vec<BorrowedFd<'_>>) =
             all.iter().filter_map(|(name, fd)| Some((*name, fd.as_ref()?.as_fd()))).unzip();
@@ -126,6 +130,7 @@ impl Handover {
                 ConnectionName::Recorder => &mut handover.recorder,
                 ConnectionName::Inference => &mut handover.inference,
                 ConnectionName::Running => &mut handover.running,
+                ConnectionName::Key => &mut handover.key,
             };
             if connection.replace(descriptor).is_some() {
                 return Err(malformed(format!("it names {name:?} twice").to_lowercase()));

@@ -97,6 +97,9 @@ recording! {
     /// Clips that should have been deleted to make room, and could not be.
     not_deleted => Kept "clip", "clips", "not deleted to make room: see losses.jsonl";
 
+    /// Clips that should have been signed and could not be.
+    unsigned => Kept "clip", "clips", "without a signature: see the recorder's log";
+
     /// Samples that left the full preroll before they were too old for any window.
     evicted_early => Lost "sample", "samples", "evicted from the preroll too early: preroll_size";
 
@@ -121,7 +124,7 @@ pub enum LossOutcome {
     NoWindow,
     /// The data is lost.
     Lost,
-    /// The data was kept, and should not have been.
+    /// The data was kept, and should not have been, or not in this form.
     Kept,
 }
 

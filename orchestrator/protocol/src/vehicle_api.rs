@@ -15,6 +15,8 @@ pub const API_SOCKET: &str = "control.sock";
 pub struct VehicleStatus {
     /// Name of the vehicle.
     pub vehicle: String,
+    /// The public key that verifies its clips.
+    pub key: String,
     /// Its labels.
     pub labels: BTreeMap<String, String>,
     /// The orchestrator itself.

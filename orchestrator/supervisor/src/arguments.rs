@@ -70,6 +70,8 @@ pub(crate) fn recorder<'a>(
     let mut line = vec![option("--out", &spec.clips), format!("--clock-offset={offset_ns}").into()];
     line.extend(recorded.map(|lambda| option("--messages", lambda.folder.join("build/msg"))));
     line.extend(spec.commands.as_ref().map(|topic| option("--commands", topic)));
+    let signing = spec.signing.as_ref();
+    line.extend(signing.map(|signing| option("--vehicle-name", &signing.vehicle)));
     let bounds = [
         ("disk-floor", spec.disk_floor),
         ("clips-max", spec.clips_max),

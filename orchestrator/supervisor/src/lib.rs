@@ -56,7 +56,7 @@ pub use observer::RunObserver;
 use process_group::{ProcessGroup, RunRecord};
 pub use reconcile::{Action, KnownLambda, reconcile};
 use restart_delay::RestartDelay;
-pub use spec::{LambdaSpec, RunSpec};
+pub use spec::{ClipSigning, LambdaSpec, RunSpec};
 use summary::RunCounts;
 use supervised::SupervisedLambda;
 

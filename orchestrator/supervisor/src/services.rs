@@ -245,8 +245,16 @@ impl RecorderProcess {
         let (control, recorder_end) = ControlClient::pair().map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot connect to the recorder", &error)
         })?;
-        let connections =
-            Handover { control: Some(recorder_end), ingress: Some(ingress), ..Handover::default() };
+        let key = context.spec.signing.as_ref().map(|signing| signing.key.try_clone());
+        let key = key.transpose().map_err(|error| {
+            Failure::caused_by(Exit::Internal, "cannot pass the key to the recorder", &error)
+        })?;
+        let connections = Handover {
+            control: Some(recorder_end),
+            ingress: Some(ingress),
+            key: key.map(OwnedFd::from),
+            ..Handover::default()
+        };
         let child = ChildProcess::start(
             &context.parts,
             ("gleaner-recorder", ChildId::Recorder, ""),

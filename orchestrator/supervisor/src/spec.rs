@@ -1,7 +1,9 @@
 //! Description of a run, as its starter has decided it.
 
 use std::ffi::OsString;
+use std::fs::File;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use gleaner_lambda::Manifest;
@@ -43,8 +45,19 @@ pub struct RunSpec {
     pub bytes_max: Option<u64>,
     /// Folder of the spools of deployed lambdas, and the maximum size of each, in bytes.
     pub spool: Option<(PathBuf, u64)>,
+    /// Signature of each clip.
+    pub signing: Option<ClipSigning>,
     /// Folder of cgroup v2 for the control groups of the lambdas.
     pub cgroup: Option<PathBuf>,
+}
+
+/// The signature of the clips of a run.
+#[derive(Clone, Debug)]
+pub struct ClipSigning {
+    /// The open file of the key, which only the recorder reads.
+    pub key: Arc<File>,
+    /// Name of the vehicle.
+    pub vehicle: String,
 }
 
 /// A lambda of a run.

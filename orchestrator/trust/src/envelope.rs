@@ -65,18 +65,24 @@ pub fn seal<P: Payload>(payload: &P, keys: &[&SecretKey]) -> Result<Vec<u8>, Ref
     payload.check().map_err(|reason| Refusal::Malformed { what: P::NAME, reason })?;
     let bytes = serde_json::to_vec(payload).map_err(|error| malformed::<P>(&error))?;
     let message = pae(P::TYPE, &bytes);
-    let signatures: Vec<_> =
-        keys.iter().map(|key| (key.public().id(), STANDARD.encode(key.sign(&message)))).collect();
-    let signatures = signatures.iter().map(|(id, sig)| DsseSignature { keyid: id.as_str(), sig });
-    let envelope = DsseEnvelope {
-        payload_type: P::TYPE,
-        payload: &STANDARD.encode(&bytes),
-        signatures: signatures.collect(),
-    };
-    let envelope = serde_json::to_vec(&envelope).map_err(|error| malformed::<P>(&error))?;
+    let signatures = keys.iter().map(|key| (key.public().id().to_string(), key.sign(&message)));
+    let envelope = encode::<P>(&bytes, &signatures.collect::<Vec<_>>());
     // Everything else that a vehicle bounds, such as the number of items.
     Unverified::<P>::parse(&envelope)?.payload()?;
     Ok(envelope)
+}
+
+/// Returns the envelope of a payload with these signatures, each after the id of its key.
+fn encode<P: Payload>(payload: &[u8], signatures: &[(String, [u8; 64])]) -> Vec<u8> {
+    let encoded = signatures.iter().map(|(keyid, sig)| (keyid, STANDARD.encode(sig)));
+    let encoded = encoded.collect::<Vec<_>>();
+    let signatures = encoded.iter().map(|(keyid, sig)| DsseSignature { keyid, sig });
+    let envelope = DsseEnvelope {
+        payload_type: P::TYPE,
+        payload: &STANDARD.encode(payload),
+        signatures: signatures.collect(),
+    };
+    serde_json::to_vec(&envelope).expect("texts are valid JSON")
 }
 
 /// An envelope whose signatures were not checked.
@@ -146,6 +152,16 @@ impl<P: Payload> Unverified<P> {
         Ok(signers)
     }
 
+    /// Returns whether it has exactly one signature.
+    pub(crate) fn is_single(&self) -> bool {
+        self.signatures.len() == 1
+    }
+
+    /// Returns the envelope as [`seal`] writes it: other bytes can have the same meaning.
+    pub(crate) fn to_bytes(&self) -> Vec<u8> {
+        encode::<P>(&self.payload, &self.signatures)
+    }
+
     pub(crate) fn payload(&self) -> Result<P, Refusal> {
         let payload: P =
             serde_json::from_slice(&self.payload).map_err(|error| malformed::<P>(&error))?;
@@ -165,7 +181,8 @@ pub(crate) fn digest_text(digest: &[u8]) -> Sha256 {
     hex(digest).parse().expect("hexadecimal digits of 32 bytes")
 }
 
-pub(crate) fn sha256(bytes: &[u8]) -> Sha256 {
+/// Returns the SHA-256 of `bytes`.
+pub fn sha256(bytes: &[u8]) -> Sha256 {
     digest_text(&sha2::Sha256::digest(bytes))
 }
 

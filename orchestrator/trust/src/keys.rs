@@ -7,7 +7,7 @@ use std::fmt;
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{FileExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -81,21 +81,44 @@ impl SecretKey {
     ///
     /// # Errors
     ///
+    /// As for [`open`](Self::open).
+    pub fn load(path: &Path) -> Result<Self, KeyError> {
+        Self::open(path).map(|(key, _)| key)
+    }
+
+    /// Loads the key in the file `path`, and returns the open file with it: another program can
+    /// [`read`](Self::read) the key from it, whatever it may open itself.
+    ///
+    /// # Errors
+    ///
     /// [`KeyError::Read`], [`KeyError::NoKey`], [`KeyError::Foreign`] if it belongs to another
     /// user, [`KeyError::Shared`] if other users have access to it.
-    pub fn load(path: &Path) -> Result<Self, KeyError> {
+    pub fn open(path: &Path) -> Result<(Self, File), KeyError> {
         let failed = |source| KeyError::Read { path: path.to_owned(), source };
         let file = PlainFile::named(path, FILE_MAX).map_err(failed)?;
         let (mode, owner, user) = (file.mode(), file.owner(), geteuid().as_raw());
-        let text = file.read_whole().map_err(failed)?;
+        let file = file.into_file();
+        let text = text_of(&file).map_err(failed)?;
         match Self::parse(&text) {
             None => Err(KeyError::NoKey { path: path.to_owned() }),
             Some(_) if owner != user => {
                 Err(KeyError::Foreign { path: path.to_owned(), owner, user })
             }
             Some(_) if mode & 0o077 != 0 => Err(KeyError::Shared { path: path.to_owned(), mode }),
-            Some(key) => Ok(key),
+            Some(key) => Ok((key, file)),
         }
+    }
+
+    /// Reads the key from an open file, whose access rights its opener has checked. The position of
+    /// the file, which several programs may share, stays as it is.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system, and `InvalidData` if the file has no key.
+    pub fn read(file: &File) -> io::Result<Self> {
+        Self::parse(&text_of(file)?).ok_or_else(|| {
+            io::Error::new(io::ErrorKind::InvalidData, "it is not an ed25519 key in PEM")
+        })
     }
 
     /// Returns whether a file with this content is the file of a secret key.
@@ -119,6 +142,24 @@ impl SecretKey {
     pub(crate) fn sign(&self, message: &[u8]) -> [u8; 64] {
         self.0.sign(message).to_bytes()
     }
+}
+
+/// Reads an open key file from its start.
+fn text_of(file: &File) -> io::Result<Vec<u8>> {
+    let mut text = vec![0; FILE_MAX.bytes() as usize + 1];
+    let mut length = 0;
+    while length < text.len() {
+        match file.read_at(&mut text[length..], length as u64)? {
+            0 => break,
+            read => length += read,
+        }
+    }
+    if length == text.len() {
+        let (bytes, most) = (length as u64, FILE_MAX);
+        return Err(io::Error::other(NotPlain::TooLong { bytes, most }));
+    }
+    text.truncate(length);
+    Ok(text)
 }
 
 /// Writes `text` to a file without a name in `folder`, and names it `path` once it is whole.

@@ -3,12 +3,15 @@
 //! `keys` has ed25519 keys and their files, `envelope` signs payloads and opens signed ones,
 //! `payload` has their types and bounds, and `files` compares a build folder with its revision.
 //! `verify` decides what a vehicle accepts, by a trust root, a time and the `floors` below which
-//! nothing is accepted again. `publish` signs the build of a lambda.
+//! nothing is accepted again. `publish` signs the build of a lambda. `clip` signs the clips of a
+//! vehicle, and verifies them.
 //!
 //! Nothing here reads a clock, starts a program or reaches a network. What is verified is a byte
-//! string; only `keys`, `files` and `publish` open files.
+//! string, or read once from its start to its end; only `keys`, `files`, `publish` and the list of
+//! vehicles of `clip` open files.
 
 mod bounded;
+mod clip;
 mod envelope;
 mod files;
 mod floors;
@@ -18,7 +21,11 @@ mod publish;
 mod refusal;
 mod verify;
 
-pub use envelope::{Payload, seal};
+pub use clip::{
+    ClipLosses, ClipRefusal, ClipSigner, ClipStatement, ContentDigest, MEDIA_TYPE, SIGNATURE,
+    SignedClip, SignedFile, SignedLambda, TrustedVehicles, VehicleName, VehiclesError, verify_clip,
+};
+pub use envelope::{Payload, seal, sha256};
 pub use files::{FileDigestError, check_files};
 pub use floors::{Accepted, Floors};
 pub use keys::{KeyError, PublicKey, SecretKey};

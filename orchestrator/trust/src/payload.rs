@@ -268,7 +268,7 @@ fn counter(release: u64) -> Result<(), String> {
     }
 }
 
-fn time(seconds: u64) -> Result<(), String> {
+pub(crate) fn time(seconds: u64) -> Result<(), String> {
     match seconds <= TIME_MAX {
         true => Ok(()),
         false => Err(format!("{seconds} s since 1970 is after the year 9999")),

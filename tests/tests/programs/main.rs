@@ -26,6 +26,7 @@ mod schedule;
 mod scratch;
 mod shared_topics;
 mod signals;
+mod signed_clips;
 mod topics;
 mod transcripts;
 mod vehicle;

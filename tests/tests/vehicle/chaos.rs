@@ -59,7 +59,10 @@ pub fn killed_at_random() {
             }
             "gleaner-supervisor" => signal(vehicle.supervisor(), "KILL"),
             name => {
-                let pids = vehicle.processes(name);
+                // The ingress of a supervisor that was just started may not run yet.
+                let pids = vehicle.until("a victim", |vehicle| {
+                    Some(vehicle.processes(name)).filter(|pids| !pids.is_empty())
+                });
                 signal(pids[random.below(pids.len())], "KILL");
             }
         }

@@ -49,6 +49,9 @@ fn ticker(language: &str, name: &str) -> LambdaCopy {
     LambdaCopy::named(&format!("tests/lambdas/ticker/{language}"), name)
 }
 
+/// The constructor of a lambda that needs nothing.
+const INIT: &str = "def __init__(self, ctx):\n    self.wakes = 0\n";
+
 /// A built Python lambda with this code in its class, that wakes ten times a second.
 struct PythonLambda {
     folder: TempFolder,
@@ -67,6 +70,8 @@ impl PythonLambda {
             "[lambda]\nname = \"{name}\"\nversion = \"{version}\"\nkind = \"python\"\n\
              entry = \"main.py\"\n[schedule]\nperiod = \"100ms\"\n[limits]\ndeadline = \"5s\"\n"
         );
+        let init = if code.contains("__init__") { "" } else { INIT };
+        let code = format!("{init}{code}");
         let code: String = code.lines().map(|line| format!("    {line}\n")).collect();
         // The build last: it must not be older than its sources.
         for place in ["", "build/"] {

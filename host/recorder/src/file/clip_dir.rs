@@ -3,9 +3,11 @@
 use std::collections::HashSet;
 use std::fs::File;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use gleaner_lambda::Clip;
+use gleaner_trust::ClipSigner;
 
 use super::list::ClipList;
 use crate::error::RecordError;
@@ -33,12 +35,40 @@ pub(super) struct ClipDir {
     /// File names that are or were listed, or will be: no name is used twice, even after its clip
     /// was fetched and deleted.
     taken: Mutex<HashSet<String>>,
+    signer: OnceLock<ClipSigner>,
+    /// Number of clips that could not be signed.
+    unsigned: Arc<AtomicU64>,
     _lock: File,
 }
 
 impl ClipDir {
     pub(super) fn new(folder: PathBuf, list: ClipList, taken: HashSet<String>, lock: File) -> Self {
-        Self { folder, list, taken: Mutex::new(taken), _lock: lock }
+        Self {
+            folder,
+            list,
+            taken: Mutex::new(taken),
+            signer: OnceLock::new(),
+            unsigned: Arc::default(),
+            _lock: lock,
+        }
+    }
+
+    /// Signs the clips that are begun from now on. A second call has no effect.
+    pub(super) fn sign_with(&self, signer: ClipSigner) {
+        let _ = self.signer.set(signer);
+    }
+
+    pub(super) fn signer(&self) -> Option<&ClipSigner> {
+        self.signer.get()
+    }
+
+    /// Counts a clip that could not be signed.
+    pub(super) fn count_unsigned(&self) {
+        self.unsigned.fetch_add(1, Ordering::Relaxed);
+    }
+
+    pub(super) fn unsigned(&self) -> Arc<AtomicU64> {
+        Arc::clone(&self.unsigned)
     }
 
     /// Returns the folder, `OUT/clips`.

@@ -97,6 +97,11 @@ fn topics(trailer: &ClipTrailer, written: &Written) -> Vec<ClipTopic> {
     topics
 }
 
+/// Returns the name of the attachment with a journal.
+pub(super) fn journal(name: &str) -> String {
+    format!("journal/{name}.journal")
+}
+
 /// Returns the record before the messages, of a clip that `library` writes.
 pub(super) fn begin(clip_header: &ClipHeader, library: &str) -> MetadataRecord {
     let metadata = pairs([

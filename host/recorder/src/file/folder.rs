@@ -4,10 +4,12 @@ use std::collections::HashSet;
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 
 use gleaner_base::safe_file;
 use gleaner_lambda::Clip;
 use gleaner_protocol::link::Loss;
+use gleaner_trust::ClipSigner;
 use tracing::warn;
 
 use super::clip_dir::{CLIPS, ClipDir, PART};
@@ -116,6 +118,17 @@ impl RecordingFolder {
         let retention =
             Retention::new(&self.dir, self.losses(), self.dir.list().read()?, clips, bytes);
         Ok(self.retention.insert(retention).make_room(&self.dir))
+    }
+
+    /// Signs the clips that are begun or recovered from now on. One that cannot be signed is
+    /// written without a signature.
+    pub fn sign_clips(&self, signer: ClipSigner) {
+        self.dir.sign_with(signer);
+    }
+
+    /// Returns the running number of clips that could not be signed.
+    pub(crate) fn unsigned(&self) -> Arc<AtomicU64> {
+        self.dir.unsigned()
     }
 
     /// Returns the list of losses, `losses.jsonl`.

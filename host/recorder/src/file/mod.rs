@@ -17,6 +17,9 @@
 //! `Recovery` completes an interrupted clip at any stage, and a crash during recovery changes
 //! nothing; a clip that it cannot complete stays for the next start.
 //!
+//! The signature of a clip covers its end too, which follows it in the file. So `sink` holds the
+//! end until `signing` has completed it, and writes it then: the order of writes stays the same.
+//!
 //! Nothing here changes a file that this program did not write. Acknowledged clips are deleted only
 //! by [`EarlierClips::replace`] and, before they are fetched, by
 //! [`RecordingFolder::keep_at_most`].
@@ -32,6 +35,7 @@ mod read;
 mod recover;
 mod replaced;
 mod retention;
+mod signing;
 mod sink;
 mod stated;
 #[cfg(test)]

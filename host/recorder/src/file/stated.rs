@@ -12,6 +12,7 @@ use gleaner_base::{excerpt, visible};
 use gleaner_drives::{Attachment, Extras};
 use gleaner_journal::JournalHeader;
 use gleaner_lambda::{Clip, ClipLambda, ClipTopic, Moment};
+use gleaner_trust::SIGNATURE;
 
 use super::clip_dir::{CLIP, CLIPS, JPG, names};
 use super::clip_records::{
@@ -269,12 +270,13 @@ fn clip(
     Ok(clip)
 }
 
-/// Rejects attachments other than one journal of each lambda, and one thumbnail.
+/// Rejects attachments other than one journal of each lambda, one thumbnail and one signature,
+/// which is checked on request only, by the keys that a user trusts.
 fn attachments(attachments: &[Attachment], clip: &Clip) -> Result<(), FalseStatement> {
-    let mut known = BTreeSet::from([THUMBNAIL.to_owned()]);
+    let mut known = BTreeSet::from([THUMBNAIL, SIGNATURE].map(str::to_owned));
     for lambda in &clip.lambdas {
         // A restarted lambda has another journal.
-        let mut journals = names(&lambda.name).map(|name| format!("journal/{name}.journal"));
+        let mut journals = names(&lambda.name).map(|name| clip_records::journal(&name));
         known.extend(journals.find(|journal| !known.contains(journal)));
     }
     let mut found = BTreeSet::new();

@@ -4,19 +4,19 @@ use std::collections::{BTreeMap, HashMap};
 use std::fs::OpenOptions;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use gleaner_lambda::{Clip, Recovered};
 use gleaner_transport::{Guid, SampleMeta};
+use gleaner_trust::{ClipSigner, ClipStatement};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, McapError, WriteOptions, Writer};
 
 use super::clip_dir::{CLIP, CLIPS, ClipDir, JPG, JPG_PART};
 use super::clip_records::{self, THUMBNAIL};
-use super::durable;
 use super::sink::FileSink;
 use super::written::{Written, encapsulation, stamp};
-use super::{ClipHeader, ClipTrailer, TopicSchema};
+use super::{ClipHeader, ClipTrailer, TopicSchema, durable, signing};
 use crate::error::RecordError;
 
 /// Compression of chunks. On the example drive (JPEG, IMU, speed) zstd at level 1 leaves 0.74 of
@@ -53,6 +53,8 @@ pub(crate) struct UnfinishedClip {
     chunk: Option<Chunk>,
     /// Bytes of the file up to the open chunk.
     closed_bytes: Arc<AtomicU64>,
+    /// Makes the sink hold the end of the file.
+    hold: Arc<AtomicBool>,
     /// Encapsulation and payload of a message.
     frame: Vec<u8>,
     written: Written,
@@ -105,7 +107,8 @@ impl UnfinishedClip {
         let path = dir.path(&name, trailer);
         let file = OpenOptions::new().write(true).create_new(true).open(&path);
         let file = file.map_err(|source| RecordError::Create { path: path.clone(), source })?;
-        Self::begin(dir, name, path, FileSink::new(file), clip_header)
+        let sink = FileSink::new(file, dir.signer().is_some());
+        Self::begin(dir, name, path, sink, clip_header)
     }
 
     pub(super) fn begin(
@@ -115,7 +118,7 @@ impl UnfinishedClip {
         sink: FileSink,
         clip_header: Option<&ClipHeader>,
     ) -> Result<Self, RecordError> {
-        let closed_bytes = sink.position();
+        let (closed_bytes, hold) = (sink.position(), sink.hold());
         let writer = options().create(sink).map_err(|error| cannot_write(&path, error))?;
         let mut clip = Self {
             dir,
@@ -127,6 +130,7 @@ impl UnfinishedClip {
             channels: Channels::default(),
             chunk: None,
             closed_bytes,
+            hold,
             frame: Vec::new(),
             written: Written::default(),
         };
@@ -244,9 +248,10 @@ impl UnfinishedClip {
         {
             self.metadata(name, metadata)?;
         }
+        let signing = dir.signer().and_then(|signer| self.statement(signer, &trailer, &clip));
         for (lambda, journal) in trailer.journals {
             self.attach(
-                format!("journal/{lambda}.journal"),
+                clip_records::journal(&lambda),
                 "application/octet-stream",
                 journal,
                 trailer.to_ns,
@@ -254,6 +259,11 @@ impl UnfinishedClip {
         }
         if let Some(jpeg) = trailer.thumbnail {
             self.attach(THUMBNAIL.to_owned(), "image/jpeg", jpeg, trailer.to_ns)?;
+        }
+        if let Some((_, _, length)) = signing {
+            self.hold.store(true, Ordering::Relaxed);
+            let (name, media_type) = signing::ATTACHMENT;
+            self.attach(name.to_owned(), media_type, vec![b' '; length], trailer.to_ns)?;
         }
         self.with_writer(|writer| writer.finish().map(drop))?;
         let cannot_sync = |source| RecordError::Sync { path: self.path.clone(), source };
@@ -264,12 +274,33 @@ impl UnfinishedClip {
             .into_inner();
         clip.bytes = self.closed_bytes.load(Ordering::Relaxed);
         let file = sink
-            .into_file()
+            .complete(|before, rest| {
+                let Some((signer, statement, _)) = signing else { return };
+                if let Err(error) = signer.complete(before, rest, statement) {
+                    signing::failed(&dir, &clip, &error);
+                }
+            })
             .map_err(|source| RecordError::Write { path: self.path.clone(), source })?;
         file.sync_all().map_err(cannot_sync)?;
         durable::rename(&self.path, &dir.path(name, CLIP), dir.folder())?;
         dir.add(name, &clip)?;
         Ok(clip)
+    }
+
+    /// Returns the statement to sign, and the length of its envelope; `None` if it cannot be
+    /// signed, which is no reason to lose the clip.
+    fn statement<'s>(
+        &self,
+        signer: &'s ClipSigner,
+        trailer: &ClipTrailer,
+        clip: &Clip,
+    ) -> Option<(&'s ClipSigner, ClipStatement, usize)> {
+        let statement = signing::statement(signer, trailer, clip, &self.clock);
+        let ready = statement.and_then(|statement| {
+            let length = signer.length(&statement)?;
+            Ok((signer, statement, length))
+        });
+        ready.inspect_err(|error| signing::failed(&self.dir, clip, error)).ok()
     }
 
     /// Returns the number of messages written.

@@ -6,6 +6,7 @@ use clap::Parser;
 use gleaner_lambda::manifest::TopicName;
 use gleaner_messages::Sources;
 use gleaner_transport::Clock;
+use gleaner_trust::VehicleName;
 
 use super::RecorderOptions;
 
@@ -39,6 +40,10 @@ pub struct Args {
     /// Default: none.
     #[arg(long, value_name = "TOPIC")]
     commands: Option<TopicName>,
+    /// Name of the vehicle in the signatures of clips; the starter passes the key. Default: clips
+    /// are not signed.
+    #[arg(long, value_name = "NAME")]
+    pub(super) vehicle_name: Option<VehicleName>,
 }
 
 impl Args {

@@ -62,8 +62,11 @@ pub fn run(
 ) -> Result<(), Failure> {
     let internal =
         |error: std::io::Error| Failure::caused_by(Exit::Internal, "cannot start a thread", &error);
-    let RecorderConnections { control, ingress, starter: starter_socket } = connections;
+    let RecorderConnections { control, ingress, starter: starter_socket, signer } = connections;
     let mut folder = RecordingFolder::open_without_recovery(&options.out)?;
+    if let Some(signer) = signer {
+        folder.sign_clips(signer);
+    }
     let mut reports = ReportWriter::start(reports, folder.losses()).map_err(internal)?;
     // Before recovery, which takes disk space.
     let mut deleted = Vec::new();

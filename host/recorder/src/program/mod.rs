@@ -28,6 +28,7 @@ mod samples;
 mod status;
 mod topics;
 
+use std::fs::File;
 use std::io;
 use std::os::fd::OwnedFd;
 use std::path::PathBuf;
@@ -41,6 +42,7 @@ use gleaner_messages::Sources;
 use gleaner_protocol::Handover;
 use gleaner_protocol::link::LinkError;
 use gleaner_transport::Clock;
+use gleaner_trust::{ClipSigner, SecretKey, VehicleName};
 use gleaner_vitals::log;
 use gleaner_vitals::start::{reports, stop_flag};
 use rustix::process::{Signal, set_parent_process_death_signal};
@@ -81,6 +83,8 @@ pub struct RecorderConnections {
     /// The socket over which the starter passes connections to later ingresses; without one, the
     /// recorder ends with the ingress.
     pub starter: Option<OwnedFd>,
+    /// The key with which clips are signed, and the name of the vehicle; `None`: they are not.
+    pub signer: Option<ClipSigner>,
 }
 
 /// Runs the program `gleaner-recorder`.
@@ -123,7 +127,29 @@ fn start(args: Args) -> Result<(), Failure> {
         .map_err(internal("cannot take the socket of the starter"))?;
     let control = handover.take_control().map_err(unusable)?;
     let ingress = handover.take_ingress().map_err(unusable)?;
+    let signer = signer(args.vehicle_name.clone(), handover.key.take())?;
     let reports = reports().map_err(internal("cannot set up the report stream"))?;
-    let connections = RecorderConnections { control, ingress, starter: Some(starter) };
+    let connections = RecorderConnections { control, ingress, starter: Some(starter), signer };
     run(args.read(), connections, reports, stop)
+}
+
+/// Returns the signer of clips, with the key in a file that the starter has opened.
+fn signer(
+    vehicle: Option<VehicleName>,
+    key: Option<OwnedFd>,
+) -> Result<Option<ClipSigner>, Failure> {
+    match (vehicle, key) {
+        (None, None) => Ok(None),
+        (Some(vehicle), Some(key)) => {
+            let key = SecretKey::read(&File::from(key)).map_err(|error| {
+                Failure::caused_by(Exit::Usage, "cannot use the key for clips", &error)
+            })?;
+            Ok(Some(ClipSigner::new(key, vehicle)))
+        }
+        _ => {
+            let message = "to sign clips, the recorder needs a key and the name of the vehicle";
+            Err(Failure::new(Exit::Usage, message)
+                .with_help("start it with `gleaner run LAMBDA --sign KEY`"))
+        }
+    }
 }

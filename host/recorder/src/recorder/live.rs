@@ -37,7 +37,9 @@ impl Recorder {
     ///
     /// [`RecordError::Preroll`] as for [`Recorder::new`], and [`RecordError::Thread`].
     pub fn live(folder: RecordingFolder, settings: Settings) -> Result<Recorder, RecordError> {
-        let mut recorder = Recorder::with(ClipDisk::background(folder)?, settings, true)?;
+        let unsigned = folder.unsigned();
+        let disk = ClipDisk::background(folder)?;
+        let mut recorder = Recorder::with(disk, settings, unsigned, true)?;
         recorder.clips.set_grace(nanoseconds(GRACE));
         Ok(recorder)
     }

@@ -16,6 +16,9 @@ mod sources;
 mod tests;
 mod writer;
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use gleaner_base::nanoseconds;
 use gleaner_journal::JournalEntry;
 use gleaner_lambda::{Clip, Moment, TriggerKind};
@@ -58,6 +61,8 @@ pub struct Recorder {
     /// Buffer for an encoded wake.
     encoded: Vec<u8>,
     settings: Settings,
+    /// Number of clips that could not be signed.
+    unsigned: Arc<AtomicU64>,
 }
 
 impl Recorder {
@@ -67,10 +72,16 @@ impl Recorder {
     ///
     /// [`RecordError::Preroll`] if the preroll is on disk and there is no room.
     pub fn new(folder: RecordingFolder, settings: Settings) -> Result<Recorder, RecordError> {
-        Recorder::with(ClipDisk::inline(folder), settings, false)
+        let unsigned = folder.unsigned();
+        Recorder::with(ClipDisk::inline(folder), settings, unsigned, false)
     }
 
-    fn with(disk: ClipDisk, settings: Settings, is_live: bool) -> Result<Recorder, RecordError> {
+    fn with(
+        disk: ClipDisk,
+        settings: Settings,
+        unsigned: Arc<AtomicU64>,
+        is_live: bool,
+    ) -> Result<Recorder, RecordError> {
         let Settings { store, preroll_bytes, prefault, .. } = settings;
         let preroll =
             Preroll::open(store, preroll_bytes, settings.folder.join("preroll"), prefault)?;
@@ -84,6 +95,7 @@ impl Recorder {
             counts: RecorderCounts { preroll_bound: preroll_bytes, ..RecorderCounts::default() },
             encoded: Vec::new(),
             settings,
+            unsigned,
         })
     }
 
@@ -285,8 +297,14 @@ impl Recorder {
         let preroll = self.material.history.preroll();
         let (evicted_early, too_big) = self.material.history.counts();
         let disk_suppressed = self.clips.disk_suppressed();
-        let mut recording =
-            RecordingCounts { evicted_early, too_big, disk_suppressed, ..self.counts.recording };
+        let unsigned = self.unsigned.load(Ordering::Relaxed);
+        let mut recording = RecordingCounts {
+            evicted_early,
+            too_big,
+            disk_suppressed,
+            unsigned,
+            ..self.counts.recording
+        };
         recording.add(self.clips.progress().finished().counts());
         RecorderCounts {
             recording,

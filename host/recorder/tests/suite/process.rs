@@ -330,8 +330,12 @@ fn a_preroll_that_cannot_be_allocated_is_an_error_with_help() {
         // The ingress is joined later.
         let (_silent, ingress) = UnixStream::pair().unwrap();
         let reports = File::from(OwnedFd::from(writer));
-        let connections =
-            RecorderConnections { control: stdin, ingress: ingress.into(), starter: None };
+        let connections = RecorderConnections {
+            control: stdin,
+            ingress: ingress.into(),
+            starter: None,
+            signer: None,
+        };
         let failure = run(options, connections, reports, Arc::default()).unwrap_err();
         assert_eq!(failure.exit, Exit::Usage);
         let text = failure.to_string();

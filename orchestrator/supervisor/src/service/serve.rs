@@ -23,7 +23,7 @@ use crate::group_end::GroupEnd;
 use crate::process_group::{ProcessGroup, RunRecord};
 use crate::reconcile::{Action, KnownLambda, reconcile};
 use crate::restart_delay::RestartDelay;
-use crate::spec::{LambdaSpec, RunSpec};
+use crate::spec::{ClipSigning, LambdaSpec, RunSpec};
 use crate::summary::RunCounts;
 use crate::supervised::SupervisedLambda;
 use crate::{POLL_INTERVAL, RunContext, clock_offset};
@@ -45,7 +45,7 @@ pub(super) fn serve(listener: std::os::unix::net::UnixListener) -> Result<(), Fa
     let Some(spec) = configured(&connection)? else { return Ok(()) };
     let board = Board::open(&spec)?;
     board.event(EventKind::Started, None, "the supervisor has started");
-    let run = run_spec(&spec);
+    let run = run_spec(&spec)?;
     let context = RunContext { spec: &run, parts: Parts::find()?, offset_ns: clock_offset() };
     let mut lambdas = Vec::new();
     let mut wanted =
@@ -117,8 +117,16 @@ fn configured(connection: &Connection) -> Result<Option<SupervisionSpec>, Failur
     }
 }
 
-fn run_spec(spec: &SupervisionSpec) -> RunSpec {
-    RunSpec {
+fn run_spec(spec: &SupervisionSpec) -> Result<RunSpec, Failure> {
+    let signing = spec.signer.as_ref().map(|(path, vehicle)| {
+        let key = fs::File::open(path).map_err(|error| {
+            let action = format!("cannot open the key of the vehicle `{}`", path.display());
+            Failure::caused_by(Exit::Internal, action, &error)
+        })?;
+        Ok::<_, Failure>(ClipSigning { key: Arc::new(key), vehicle: vehicle.clone() })
+    });
+    Ok(RunSpec {
+        signing: signing.transpose()?,
         clips: spec.clips.clone(),
         vehicle: spec.vehicle.clone(),
         network: spec.network.iter().map(Into::into).collect(),
@@ -133,7 +141,7 @@ fn run_spec(spec: &SupervisionSpec) -> RunSpec {
         spool: Some((spec.spool.clone(), spec.spool_bytes)),
         largest: LARGEST,
         ..RunSpec::default()
-    }
+    })
 }
 
 /// What the orchestrator wants.

@@ -2,6 +2,7 @@
 
 mod folder;
 mod recover;
+mod sign;
 mod write;
 
 use std::fs;

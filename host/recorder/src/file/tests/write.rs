@@ -301,7 +301,7 @@ fn a_full_disk_is_reported_and_nothing_is_written_after_it() {
     let scratch = TestDir::new();
     let (folder, _) = scratch.open();
     let path = scratch.path("clips/a.mcap.part");
-    let full = || FileSink::new(OpenOptions::new().write(true).open("/dev/full").unwrap());
+    let full = || FileSink::new(OpenOptions::new().write(true).open("/dev/full").unwrap(), false);
     let dir = std::sync::Arc::clone(&folder.dir);
     let begun =
         UnfinishedClip::begin(dir, "a".to_owned(), path.clone(), full(), Some(&clip_header()));

@@ -155,8 +155,12 @@ impl FakeStarter {
         };
         let socket = ingress.add_reader(&reader).unwrap();
         let (handover, starter) = UnixStream::pair().unwrap();
-        let connections =
-            RecorderConnections { control: stdin, ingress: socket, starter: Some(starter.into()) };
+        let connections = RecorderConnections {
+            control: stdin,
+            ingress: socket,
+            starter: Some(starter.into()),
+            signer: None,
+        };
         let thread = thread::spawn(move || run(options, connections, reports, stop));
         let ingress = Some((ingress, ingress_thread));
         (FakeStarter { control, ingress, handover, reader, granted: Vec::new() }, thread)
