@@ -7,6 +7,7 @@
 mod aarch64;
 mod bless;
 mod checkout;
+mod deb;
 mod demo;
 mod docs;
 mod examples;
@@ -37,7 +38,8 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   player   fetch the tools for gleaner-player, which plays drives with Cyclone DDS, and build it
   fuzz     fuzz parsers of untrusted input; [TARGET...] [--seconds N] [--seed N]
   aarch64  build for ARM vehicles, and compare the decisions of lambdas there, emulated
-  build    only set up: wasm target, Python environment, programs, lambdas";
+  build    only set up: wasm target, Python environment, programs, lambdas
+  deb      build the Debian package; [--arch amd64|arm64] [--programs DIR] [--test]";
 
 fn main() -> ExitCode {
     match run(env::args_os().skip(1).collect()) {
@@ -54,7 +56,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         Some((command, rest)) => (command.to_str().unwrap_or_default(), rest),
         None => ("", &[][..]),
     };
-    if !rest.is_empty() && !["bench", "fuzz", "peers"].contains(&command) {
+    if !rest.is_empty() && !["bench", "deb", "fuzz", "peers"].contains(&command) {
         return Err(Failure::new(
             Exit::Usage,
             format!("`cargo xtask {command}` takes no arguments"),
@@ -71,6 +73,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "fuzz" => fuzz::run(&checkout, rest),
         "peers" => peers::build(&checkout, rest),
         "player" => player::run(&checkout),
+        "deb" => deb::run(&checkout, rest),
         "aarch64" => aarch64::run(&checkout),
         "build" => {
             setup::run(&checkout, &mut Steps::of(setup::STEPS), &checkout.lambdas(&FAMILIES))

@@ -15,7 +15,7 @@ pub(crate) const STEPS: usize = 4;
 pub(crate) const TARGET: &str = "wasm32-wasip2";
 
 /// The packages with installed programs: no benches, no tests, no lambdas.
-const PROGRAMS: [&str; 10] = [
+pub(crate) const PROGRAMS: [&str; 10] = [
     "gleaner-cli",
     "gleaner-compile",
     "gleaner-host",

@@ -1,9 +1,10 @@
 //! `gleaner doctor`: checks whether lambdas can run well on this machine, and suggests fixes.
 //!
-//! It changes, starts and sends nothing.
+//! It changes nothing, and sends no more than a request for the status of the vehicle.
 
 mod isolation;
 mod network;
+mod vehicle;
 
 use gleaner_base::{Exit, Failure};
 use gleaner_parts::Parts;
@@ -57,6 +58,7 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<Exit, Failure> {
     findings.push(python(&parts));
     findings.extend(isolation::findings(&parts));
     findings.extend(network::findings());
+    findings.extend(vehicle::findings());
     let text = findings.iter().map(if args.json { json_line::<Finding> } else { text });
     print(&text.collect::<String>())?;
     let has_error = findings.iter().any(|finding| finding.state == Severity::Error);

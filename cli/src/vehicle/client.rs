@@ -21,14 +21,14 @@ use crate::args::VehicleArgs;
 const RUN_DIR: &str = "/run/gleaner";
 
 /// A client of one orchestrator.
-pub(super) struct VehicleClient {
+pub(crate) struct VehicleClient {
     socket: PathBuf,
     runtime: tokio::runtime::Runtime,
 }
 
 impl VehicleClient {
     /// Creates a client. It connects with each request.
-    pub(super) fn new(args: &VehicleArgs) -> Result<Self, Failure> {
+    pub(crate) fn new(args: &VehicleArgs) -> Result<Self, Failure> {
         let variable = || std::env::var_os("GLEANER_RUN").filter(|it| !it.is_empty());
         let chosen = args.run_dir.clone().or_else(|| variable().map(PathBuf::from));
         let runtime = tokio::runtime::Builder::new_current_thread()
@@ -38,8 +38,13 @@ impl VehicleClient {
         Ok(Self { socket: chosen.unwrap_or_else(|| RUN_DIR.into()).join(API_SOCKET), runtime })
     }
 
+    /// The path of the socket.
+    pub(crate) fn socket(&self) -> &Path {
+        &self.socket
+    }
+
     /// Returns the status of the vehicle.
-    pub(super) fn status(&self) -> Result<VehicleStatus, Failure> {
+    pub(crate) fn status(&self) -> Result<VehicleStatus, Failure> {
         self.json(Method::GET, "/v1/status", Bytes::new())
     }
 

@@ -11,6 +11,7 @@ mod status;
 mod stream;
 mod trust;
 
+pub(crate) use client::VehicleClient;
 pub(crate) use deploy::{change, deploy};
 pub(crate) use status::status;
 pub(crate) use stream::{events, logs};

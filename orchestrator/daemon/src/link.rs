@@ -264,12 +264,34 @@ fn is_supervisor(pid: Pid) -> bool {
 
 /// Waits until `stop` is set.
 async fn is_set(stop: &mut watch::Receiver<bool>) {
-    // An error means that the sender is gone: this program ends.
-    let _ = stop.wait_for(|stop| *stop).await;
+    // An error means that the sender is gone: this program is replaced after SIGHUP, and the
+    // supervisor must go on.
+    if stop.wait_for(|stop| *stop).await.is_err() {
+        std::future::pending::<()>().await;
+    }
 }
 
 async fn send(writer: &mut OwnedWriteHalf, request: &SupervisorRequest) -> std::io::Result<()> {
     let mut text = serde_json::to_vec(request).expect("a request is plain data");
     text.push(b'\n');
     writer.write_all(&text).await
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_program_that_is_replaced_does_not_end_the_supervisor() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
+        runtime.block_on(async {
+            let (sender, mut stop) = watch::channel(false);
+            let short = Duration::from_millis(20);
+            sender.send_replace(true);
+            timeout(short, is_set(&mut stop)).await.expect("it is set");
+            let (sender, mut stop) = watch::channel(false);
+            drop(sender);
+            timeout(short, is_set(&mut stop)).await.expect_err("it was never set");
+        });
+    }
 }

@@ -24,17 +24,6 @@ use crate::steps::{self, Steps};
 use cases::{CASES, Machine, ReplayCase};
 use tools::{TARGET, Tools};
 
-/// Packages with the programs of a vehicle.
-const PACKAGES: [&str; 8] = [
-    "gleaner-cli",
-    "gleaner-compile",
-    "gleaner-host",
-    "gleaner-inference",
-    "gleaner-ingress",
-    "gleaner-python",
-    "gleaner-recorder",
-    "gleaner-shim",
-];
 /// The programs that are run.
 const PROGRAMS: [&str; 4] = ["gleaner", "gleaner-compile", "gleaner-inference", "gleaner-runtime"];
 const SHIM: &str = "gleaner-shim";
@@ -53,7 +42,7 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     setup::programs(checkout)?;
     setup::build_lambdas(checkout, &cases::lambdas())?;
     steps.begin(&format!("programs for {TARGET} (the first time this takes minutes)"));
-    let emulated = build(checkout, &tools)?;
+    let emulated = emulated(checkout, &tools)?;
     println!("built {}", checkout.target().join(TARGET).join("release").display());
     steps.begin("native code of the other processor must be refused");
     let (here, there) = (Machine::here(checkout), Machine::emulated(checkout, emulated));
@@ -66,17 +55,24 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     Ok(if unexpected == 0 { Exit::Ok } else { Exit::Differs })
 }
 
-/// Builds the programs, and writes a script for each one that starts it emulated. Returns the
-/// folder of the scripts.
+/// Builds the programs of a vehicle, and returns their folder.
+pub(crate) fn programs(checkout: &Checkout) -> Result<PathBuf, Failure> {
+    build(checkout, &Tools::find(checkout)?)
+}
+
 fn build(checkout: &Checkout, tools: &Tools) -> Result<PathBuf, Failure> {
     let mut build = tools.cargo(checkout);
     build.args(["build", "--release", "--target", TARGET]);
-    build.args(PACKAGES.iter().flat_map(|package| ["-p", package]));
+    build.args(setup::PROGRAMS.iter().flat_map(|package| ["-p", package]));
     steps::run(&mut build, "see the first error above")?;
-    let (built, scripts) = (
-        checkout.target().join(TARGET).join("release"),
-        checkout.target().join(TARGET).join("emulated"),
-    );
+    Ok(checkout.target().join(TARGET).join("release"))
+}
+
+/// Builds the programs, and writes a script for each one that starts it emulated. Returns the
+/// folder of the scripts.
+fn emulated(checkout: &Checkout, tools: &Tools) -> Result<PathBuf, Failure> {
+    let built = build(checkout, tools)?;
+    let scripts = checkout.target().join(TARGET).join("emulated");
     let here = (SHIM, Tools::native_script(&checkout.program(SHIM)));
     for (name, script) in
         PROGRAMS.map(|name| (name, tools.script(&built.join(name)))).into_iter().chain([here])

@@ -1,0 +1,177 @@
+//! Metadata of the package: version, libraries, sums and scripts.
+
+use std::path::Path;
+
+use gleaner_base::Failure;
+
+use super::tree::{self, DOC, LIB, PackageTree};
+use super::{Architecture, SOURCE, answer};
+use crate::checkout::Checkout;
+use crate::steps;
+
+/// Scripts that dpkg runs.
+const SCRIPTS: [&str; 3] = ["postinst", "prerm", "postrm"];
+
+pub(super) struct PackageMetadata {
+    version: String,
+    architecture: Architecture,
+    libraries: String,
+    /// Time of the commit, in s since 1970.
+    pub(super) time: String,
+    /// The same in the format of mails.
+    date: String,
+}
+
+impl PackageMetadata {
+    /// Collects the metadata for the files in `tree`.
+    pub(super) fn collect(
+        checkout: &Checkout,
+        tree: &PackageTree,
+        architecture: Architecture,
+    ) -> Result<Self, Failure> {
+        let git = |arguments: &[&str]| answer(checkout.command("git").args(arguments));
+        let release = env!("CARGO_PKG_VERSION");
+        // A later commit is a later version, so that `apt` upgrades to it.
+        let format = "--date=format-local:%Y%m%d%H%M%S";
+        let version = match git(&["log", "-1", "--format=%cd.%h", format]) {
+            Some(commit) => format!("{release}+{commit}"),
+            None => release.to_owned(),
+        };
+        let time = git(&["log", "-1", "--format=%ct"]).unwrap_or_else(|| "0".to_owned());
+        let date = git(&["log", "-1", "--format=%cD"])
+            .unwrap_or_else(|| "Thu, 01 Jan 1970 00:00:00 +0000".to_owned());
+        let found = if architecture == Architecture::of_this_machine() {
+            libraries(checkout, tree)?
+        } else {
+            None
+        };
+        let libraries = match found {
+            Some(found) => found,
+            None => libraries_by_version(tree)?,
+        };
+        Ok(Self { version, architecture, libraries, time, date })
+    }
+
+    pub(super) fn file_name(&self) -> String {
+        format!("gleaner_{}_{}.deb", self.version, self.architecture.name())
+    }
+
+    /// Writes Debian's changelog: one entry for this package.
+    pub(super) fn write_changelog(
+        &self,
+        checkout: &Checkout,
+        tree: &PackageTree,
+    ) -> Result<(), Failure> {
+        let control = tree::read(&checkout.path(SOURCE).join("debian/control"))?;
+        let maintainer = control.lines().find_map(|line| line.strip_prefix("Maintainer: "));
+        let entry = format!(
+            "gleaner ({}) unstable; urgency=medium\n\n  * CHANGELOG.md in this folder lists what \
+             changes for users.\n\n -- {}  {}\n",
+            self.version,
+            maintainer.unwrap_or_default(),
+            self.date
+        );
+        tree.write(&format!("{DOC}/changelog"), &entry).map(drop)
+    }
+
+    /// Writes the folder `DEBIAN`.
+    pub(super) fn write(&self, checkout: &Checkout, tree: &PackageTree) -> Result<(), Failure> {
+        let files = tree.files()?;
+        let kib = |file: &Path| file.metadata().map_or(0, |data| data.len().div_ceil(1024));
+        let size: u64 = files.iter().map(|file| kib(file)).sum();
+        let folder = checkout.path(SOURCE).join("debian");
+        let control = tree::read(&folder.join("control"))?
+            .replace("@VERSION@", &self.version)
+            .replace("@ARCHITECTURE@", self.architecture.name())
+            .replace("@LIBRARIES@", &self.libraries)
+            .replace("@INSTALLED_SIZE@", &size.to_string());
+        let relative = |file: &Path| file.strip_prefix(tree.root()).unwrap_or(file).to_owned();
+        let mut sums = checkout.command("md5sum");
+        sums.current_dir(tree.root())
+            .args(files.iter().map(|file| relative(file)).filter(|file| !file.starts_with("etc")));
+        let sums = steps::output(&mut sums, "see the error above")?;
+        tree.write("DEBIAN/control", &control)?;
+        tree.write("DEBIAN/md5sums", &sums)?;
+        tree.write("DEBIAN/conffiles", &tree::read(&folder.join("conffiles"))?)?;
+        for script in SCRIPTS {
+            let text = tree::read(&folder.join(script))?;
+            let file = tree.write(&format!("DEBIAN/{script}"), &text)?;
+            tree::set_mode(&file, 0o755)?;
+        }
+        Ok(())
+    }
+}
+
+/// Finds the packages with the libraries of all programs; `None` without `dpkg-shlibdeps`.
+fn libraries(checkout: &Checkout, tree: &PackageTree) -> Result<Option<String>, Failure> {
+    if !steps::succeeds(checkout.command("dpkg-shlibdeps").arg("--version")) {
+        println!(
+            "skipped: dpkg-shlibdeps is not installed (dpkg-dev); libraries by their versions"
+        );
+        return Ok(None);
+    }
+    // It reads `debian/control` of a source package.
+    let folder = checkout.target().join("deb/shlibdeps");
+    let control = folder.join("debian/control");
+    let failed = |error: std::io::Error| tree::cannot("write", &control, &error);
+    std::fs::create_dir_all(folder.join("debian")).map_err(failed)?;
+    std::fs::write(&control, "Source: gleaner\n\nPackage: gleaner\nArchitecture: any\n")
+        .map_err(failed)?;
+    let mut find = checkout.command("dpkg-shlibdeps");
+    // The extension module's symbols of Python are those of the interpreter that loads it.
+    find.current_dir(&folder).args(["-O", "--warnings=0"]);
+    let folders = ["usr/bin", LIB].map(|folder| tree.root().join(folder));
+    for file in tree.files()? {
+        let is_program = folders.iter().any(|folder| file.parent() == Some(folder));
+        if is_program && is_elf(&file) {
+            find.arg("-e").arg(file);
+        }
+    }
+    // Its remarks are on the place of the programs.
+    let text = answer(&mut find).unwrap_or_default();
+    Ok(text.trim().strip_prefix("shlibs:Depends=").map(str::to_owned))
+}
+
+/// Returns the libraries, with the newest version of the C library that a program names. For
+/// another architecture `dpkg-shlibdeps` would need its packages.
+fn libraries_by_version(tree: &PackageTree) -> Result<String, Failure> {
+    let mut newest = 0;
+    for file in tree.files()?.into_iter().filter(|file| is_elf(file)) {
+        let bytes = std::fs::read(&file).map_err(|error| tree::cannot("read", &file, &error))?;
+        newest = newest.max(glibc(&bytes));
+    }
+    Ok(format!("libc6 (>= 2.{newest}), libgcc-s1 (>= 4.2)"))
+}
+
+/// The newest minor version of the C library in the names of versions of a program.
+fn glibc(program: &[u8]) -> u32 {
+    const NAME: &[u8] = b"\0GLIBC_2.";
+    let names = program.windows(NAME.len()).enumerate().filter(|(_, window)| *window == NAME);
+    let minors = names.filter_map(|(at, _)| {
+        let digits: String = program[at + NAME.len()..]
+            .iter()
+            .take_while(|byte| byte.is_ascii_digit())
+            .map(|byte| char::from(*byte))
+            .collect();
+        digits.parse::<u32>().ok()
+    });
+    minors.max().unwrap_or_default()
+}
+
+fn is_elf(file: &Path) -> bool {
+    use std::io::Read;
+    let mut start = [0; 4];
+    let read = std::fs::File::open(file).and_then(|mut file| file.read_exact(&mut start));
+    read.is_ok() && start == *b"\x7fELF"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_newest_version_of_the_c_library_counts() {
+        assert_eq!(glibc(b"\x7fELF\0GLIBC_2.34\0GLIBC_2.4\0GLIBC_2.17\0x"), 34);
+        assert_eq!(glibc(b"no names"), 0);
+    }
+}

@@ -1,0 +1,213 @@
+//! `cargo xtask deb`: builds the Debian package `gleaner`, with the service of a vehicle.
+//!
+//! `tree` lays out its files, `control` writes its metadata, `licences` collects those of crates,
+//! `unit` checks the service with `systemd-analyze`, and `root` tests the package in a root of its
+//! own. The files that are not built are in `orchestrator/package`.
+
+mod control;
+mod licences;
+mod root;
+mod tree;
+mod unit;
+
+use std::env;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use gleaner_base::{Exit, Failure};
+
+use crate::checkout::Checkout;
+use crate::steps::{self, Steps};
+use crate::{aarch64, setup};
+use control::PackageMetadata;
+use tree::PackageTree;
+
+/// Folder of the files of the package that are not built.
+const SOURCE: &str = "orchestrator/package";
+
+const USAGE: &str = "usage: cargo xtask deb [--arch amd64|arm64] [--programs DIR] [--test]
+  --arch      architecture of the package; default: that of this machine
+  --programs  folder with the built programs; default: build them
+  --test      as root: install, run, upgrade and purge it in a root that debootstrap makes";
+
+/// Architectures of the package, by Debian's names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Architecture {
+    Amd64,
+    Arm64,
+}
+
+impl Architecture {
+    fn of_this_machine() -> Self {
+        if env::consts::ARCH == "aarch64" { Self::Arm64 } else { Self::Amd64 }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Amd64 => "amd64",
+            Self::Arm64 => "arm64",
+        }
+    }
+
+    /// Tool of the package binutils, for programs of this architecture.
+    fn strip(self) -> &'static str {
+        match self {
+            _ if self == Self::of_this_machine() => "strip",
+            Self::Amd64 => "x86_64-linux-gnu-strip",
+            Self::Arm64 => "aarch64-linux-gnu-strip",
+        }
+    }
+}
+
+#[derive(Debug, PartialEq, Eq)]
+struct DebOptions {
+    architecture: Architecture,
+    programs: Option<PathBuf>,
+    test: bool,
+}
+
+impl DebOptions {
+    fn parse(arguments: &[OsString]) -> Result<Self, Failure> {
+        let mut options =
+            Self { architecture: Architecture::of_this_machine(), programs: None, test: false };
+        let mut arguments = arguments.iter();
+        while let Some(argument) = arguments.next() {
+            match (argument.to_str(), argument == "--test") {
+                (_, true) => options.test = true,
+                (Some("--arch"), _) => {
+                    let name = arguments.next();
+                    let known = [Architecture::Amd64, Architecture::Arm64];
+                    let known = known.into_iter().find(|it| name.is_some_and(|is| is == it.name()));
+                    options.architecture = known.ok_or_else(usage)?;
+                }
+                (Some("--programs"), _) => {
+                    options.programs = Some(arguments.next().ok_or_else(usage)?.into());
+                }
+                _ => return Err(usage()),
+            }
+        }
+        if options.test && options.architecture != Architecture::of_this_machine() {
+            let message = "a package of another architecture cannot be tested on this machine";
+            return Err(Failure::new(Exit::Usage, message));
+        }
+        Ok(options)
+    }
+}
+
+fn usage() -> Failure {
+    Failure::new(Exit::Usage, "`cargo xtask deb` does not take these arguments").with_help(USAGE)
+}
+
+/// Builds the package, and tests it if that is wanted.
+pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let options = DebOptions::parse(arguments)?;
+    let architecture = options.architecture;
+    for (tool, package) in
+        [("dpkg-deb", "dpkg"), ("gzip", "gzip"), (architecture.strip(), "binutils")]
+    {
+        if !steps::succeeds(checkout.command(tool).arg("--version")) {
+            return Err(Failure::new(Exit::Unreachable, format!("`{tool}` is missing"))
+                .with_help(format!("on Debian and Ubuntu, as root: apt-get install {package}")));
+        }
+    }
+    let mut steps = Steps::of(if options.test { 5 } else { 4 });
+    steps.begin(&format!("programs for {}", architecture.name()));
+    let programs = programs(checkout, &options)?;
+    println!("{}", programs.display());
+    steps.begin("files");
+    let work = checkout.target().join("deb");
+    let tree =
+        PackageTree::create(checkout, &work.join(architecture.name()), &programs, architecture)?;
+    licences::write(checkout, &tree)?;
+    let metadata = PackageMetadata::collect(checkout, &tree, architecture)?;
+    metadata.write_changelog(checkout, &tree)?;
+    tree.finish()?;
+    steps.begin("service");
+    unit::check(checkout, &tree, &work)?;
+    steps.begin("package");
+    metadata.write(checkout, &tree)?;
+    let package = work.join(metadata.file_name());
+    build(checkout, &tree, &package, &metadata)?;
+    lint(checkout, &package)?;
+    println!("built {} ({} MiB)", package.display(), size_mib(&package));
+    if options.test {
+        steps.begin("installation in a root of its own");
+        root::test(checkout, &package, &work)?;
+    }
+    Ok(Exit::Ok)
+}
+
+fn programs(checkout: &Checkout, options: &DebOptions) -> Result<PathBuf, Failure> {
+    match &options.programs {
+        Some(folder) => Ok(folder.clone()),
+        None if options.architecture == Architecture::of_this_machine() => {
+            setup::programs(checkout)?;
+            Ok(checkout.target().join("release"))
+        }
+        None if options.architecture == Architecture::Arm64 => aarch64::programs(checkout),
+        None => Err(Failure::new(Exit::Usage, "this machine builds no programs for amd64")
+            .with_help("build them elsewhere, and name their folder with --programs DIR")),
+    }
+}
+
+fn build(
+    checkout: &Checkout,
+    tree: &PackageTree,
+    package: &Path,
+    metadata: &PackageMetadata,
+) -> Result<(), Failure> {
+    let mut build = checkout.command("dpkg-deb");
+    // No file is newer than the commit: the same files become the same package.
+    build.env("SOURCE_DATE_EPOCH", &metadata.time);
+    build.args(["--build", "--root-owner-group", "-Zxz"]).arg(tree.root()).arg(package);
+    steps::run(&mut build, "see the error above")
+}
+
+/// Runs lintian, if it is installed. Its remarks are shown; errors fail.
+fn lint(checkout: &Checkout, package: &Path) -> Result<(), Failure> {
+    if !steps::succeeds(checkout.command("lintian").arg("--version")) {
+        println!("skipped: lintian is not installed");
+        return Ok(());
+    }
+    let overrides = checkout.path(SOURCE).join("debian/lintian");
+    let suppressed = tree::read(&overrides)?;
+    let tags: Vec<&str> =
+        suppressed.lines().filter(|line| !line.is_empty() && !line.starts_with('#')).collect();
+    let mut lintian = checkout.command("lintian");
+    lintian.args(["--allow-root", "--fail-on", "error", "--suppress-tags"]);
+    lintian.arg(tags.join(",")).arg(package);
+    steps::run(&mut lintian, "mend the package, or add the tag with its reason to `lintian`")
+}
+
+fn size_mib(file: &Path) -> u64 {
+    file.metadata().map_or(0, |data| data.len().div_ceil(1 << 20))
+}
+
+/// Runs `command`, and returns its output; `None` if it fails or the program is missing.
+fn answer(command: &mut Command) -> Option<String> {
+    let output = command.stderr(std::process::Stdio::null()).output().ok()?;
+    output.status.success().then(|| String::from_utf8_lossy(&output.stdout).trim().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(arguments: &[&str]) -> Option<DebOptions> {
+        DebOptions::parse(&arguments.iter().map(OsString::from).collect::<Vec<_>>()).ok()
+    }
+
+    #[test]
+    fn the_package_is_for_this_machine_unless_another_one_is_named() {
+        let here = Architecture::of_this_machine();
+        let options = DebOptions { architecture: here, programs: None, test: false };
+        assert_eq!(parse(&[]), Some(options));
+        let options = parse(&["--arch", "arm64", "--programs", "built"]).unwrap();
+        assert_eq!((options.architecture, options.test), (Architecture::Arm64, false));
+        assert_eq!(options.programs, Some("built".into()));
+        for wrong in [&["--arch"][..], &["--arch", "mips"], &["--programs"], &["amd64"]] {
+            assert_eq!(parse(wrong), None, "{wrong:?}");
+        }
+    }
+}

@@ -1,0 +1,99 @@
+//! Checks of the service with `systemd-analyze`, which starts nothing.
+
+use std::path::Path;
+
+use gleaner_base::{Exit, Failure};
+
+use super::answer;
+use super::tree::{self, PackageTree, UNIT};
+use crate::checkout::Checkout;
+use crate::steps;
+
+/// The most exposure that `systemd-analyze security` may report, in tenths. It counts what the
+/// service must do: the network, devices, and memory with code.
+const EXPOSURE_MAX: u32 = 20;
+/// The first version that knows the keys of `control-groups.conf`.
+const WITH_SUBGROUPS: u32 = 254;
+
+/// Checks the unit in `tree`. Does nothing but print so if the tool is missing.
+pub(super) fn check(checkout: &Checkout, tree: &PackageTree, work: &Path) -> Result<(), Failure> {
+    let Some(version) = answer(checkout.command("systemd-analyze").arg("--version")) else {
+        println!("skipped: systemd-analyze is not installed (package systemd)");
+        return Ok(());
+    };
+    let version = version.split_whitespace().nth(1).and_then(|word| word.parse::<u32>().ok());
+    // The programs of the unit are in the tree, not in this machine's folders.
+    let root = tree.root().display().to_string();
+    let moved = |text: String| {
+        ["/usr/bin/gleaner", "/usr/lib/gleaner/"]
+            .iter()
+            .fold(text, |text, path| text.replace(&format!("={path}"), &format!("={root}{path}")))
+    };
+    let folder = work.join("unit");
+    let unit = folder.join("gleaner.service");
+    let dropin = folder.join("gleaner.service.d/control-groups.conf");
+    let _ = std::fs::remove_dir_all(&folder);
+    write(&unit, &moved(tree::read(&tree.root().join(UNIT))?))?;
+    let exposure = exposure(checkout, &unit)?;
+    if version.is_some_and(|version| version >= WITH_SUBGROUPS) {
+        let text = tree::read(&tree.root().join("usr/lib/gleaner/control-groups.conf"))?;
+        write(&dropin, &moved(text))?;
+    } else {
+        println!("skipped: control-groups.conf needs systemd {WITH_SUBGROUPS}");
+    }
+    let mut verify = checkout.command("systemd-analyze");
+    verify.args(["verify", "--man=no"]).arg(&unit);
+    let output = verify.output().map_err(|error| tree::cannot("verify", &unit, &error))?;
+    let remarks = String::from_utf8_lossy(&output.stderr);
+    // It succeeds with unknown keys, too. Remarks on other units of this machine do not count.
+    if !output.status.success() || remarks.contains("gleaner") {
+        let mut failure = Failure::new(Exit::Differs, "systemd does not accept the service");
+        failure.causes = remarks.lines().map(str::to_owned).collect();
+        return Err(failure.with_help("mend orchestrator/package/gleaner.service"));
+    }
+    println!("systemd {}: accepted, exposure {exposure}", version.unwrap_or_default());
+    Ok(())
+}
+
+/// Returns the exposure as a text; fails if it is too high.
+fn exposure(checkout: &Checkout, unit: &Path) -> Result<String, Failure> {
+    let mut security = checkout.command("systemd-analyze");
+    security.args(["security", "--offline=yes", "--no-pager"]).arg(unit);
+    let text = steps::output(&mut security, "see the error above")?;
+    let found = parse_exposure(&text).ok_or_else(|| {
+        Failure::new(Exit::Internal, "cannot parse the output of `systemd-analyze security`")
+    })?;
+    let exposure = format!("{}.{}", found / 10, found % 10);
+    if found > EXPOSURE_MAX {
+        let message = format!("the service is exposed too much: {exposure}");
+        return Err(Failure::new(Exit::Differs, message)
+            .with_help("`systemd-analyze security --offline=yes FILE` lists the options"));
+    }
+    Ok(exposure)
+}
+
+/// The overall exposure, in tenths.
+fn parse_exposure(text: &str) -> Option<u32> {
+    let line = text.lines().find(|line| line.contains("Overall exposure level"))?;
+    let (whole, tenth) = line.rsplit_once(": ")?.1.split_whitespace().next()?.split_once('.')?;
+    Some(whole.parse::<u32>().ok()? * 10 + tenth.parse::<u32>().ok()?)
+}
+
+fn write(file: &Path, text: &str) -> Result<(), Failure> {
+    let folder = file.parent().unwrap_or(file);
+    std::fs::create_dir_all(folder)
+        .and_then(|()| std::fs::write(file, text))
+        .map_err(|error| tree::cannot("write", file, &error))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_exposure_is_the_number_of_the_last_line() {
+        let text = "✗ PrivateTmp= 0.2\n\n→ Overall exposure level for gleaner.service: 1.8 OK 🙂\n";
+        assert_eq!(parse_exposure(text), Some(18));
+        assert_eq!(parse_exposure("no line"), None);
+    }
+}
