@@ -15,12 +15,12 @@ use gleaner_tests::vehicle::{TestVehicle, text};
 
 use super::ticker;
 
-/// What is killed, by a part of its command line.
+/// What is killed, by a part of its command line; that of a shim also names its runtime.
 const VICTIMS: [&str; 6] = [
     "gleaner-orchestrator",
     "gleaner-supervisor",
     "gleaner-shim",
-    "gleaner-runtime run",
+    "gleaner-runtime",
     "start.py",
     "gleaner-ingress",
 ];

@@ -27,7 +27,7 @@ pub fn signatures() {
     fs::remove_file(lambda.path().join("revision.json")).expect("it was written");
     vehicle.publish(lambda.path(), "publisher");
     refused(&deploy(&stranger, &[]), "the deployment is signed by");
-    refused(&deploy(&deployer, &["--label", "site=paris"]), "`site=paris`");
+    refused(&deploy(&deployer, &["--label", "site=paris"]), "`site` = `paris`");
     assert!(vehicle.status().deployments.is_empty());
     let accepted = deploy(&deployer, &["--label", "site=berlin", "--release", "7"]);
     assert!(accepted.contains("running"), "{accepted}");
