@@ -3,9 +3,9 @@
 //! `new` creates a lambda's folder, `build` its build folder. `runtime` starts `gleaner-runtime`
 //! for `check`, `replay` and `verify`, `run` runs lambdas live by `gleaner-supervisor`, `engines`
 //! builds engines of models ahead, `signing` makes keys and signs builds, `vehicle` deploys builds
-//! and shows what runs, and `delegate` passes commands on to another program. `render` formats results as text, `report` writes the report
-//! page, `diff` compares two runs, and `dev` repeats all of this whenever a source is saved.
-//! `generated` prints shell completions and man pages.
+//! and shows what runs, and `delegate` passes commands on to another program. `render` formats
+//! results as text, `report` writes the report page, `diff` compares two runs, and `dev` repeats
+//! all of this whenever a source is saved. `generated` prints shell completions and man pages.
 //!
 //! No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts
 //! the other programs and exchanges `gleaner-protocol` messages with them. `gleaner-report` reads

@@ -1,5 +1,5 @@
-//! `vehicle.toml`: identity and network of a vehicle, and limits for all lambdas on it. It is parsed
-//! as a manifest is, with the same error messages.
+//! `vehicle.toml`: identity and network of a vehicle, and limits for all lambdas on it. It is
+//! parsed as a manifest is, with the same error messages.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;

@@ -101,7 +101,7 @@ pub struct LogsArgs {
     /// Id of the deployment
     #[arg(value_name = "ID")]
     pub id: String,
-    /// What to show
+    /// The records to show
     #[command(flatten)]
     pub stream: StreamArgs,
 }

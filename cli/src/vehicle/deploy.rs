@@ -1,4 +1,4 @@
-//! `gleaner deploy`, `rollback`, `start` and `stop`: change what runs on a vehicle, and wait for it.
+//! `gleaner deploy`, `rollback`, `start` and `stop`: change what runs on a vehicle, and wait.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;

@@ -7,7 +7,7 @@
 //! | `PUT /v1/objects/SHA256` | nothing, of a file that a deployment needs |
 //! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | [`Changed`] |
 //! | `PUT /v1/trust` | nothing, of a trust root's envelope |
-//! | `GET /v1/events`, `GET /v1/lambdas/ID/records` | a [`StreamLine`] per line, see [`StreamQuery`] |
+//! | `GET /v1/events`, `GET /v1/lambdas/ID/records` | a [`StreamLine`] per line |
 //! | `GET /metrics` | counts for Prometheus |
 //!
 //! [`StreamLine`]: gleaner_protocol::vehicle_api::StreamLine
@@ -34,7 +34,7 @@ use sha2::Digest;
 use tokio::io::AsyncWriteExt;
 
 use crate::core::Core;
-use crate::layout::Layout;
+use crate::layout::VehicleFolders;
 use crate::metrics;
 use crate::store::begin_object;
 use crate::streams;
@@ -43,17 +43,17 @@ use crate::streams;
 /// text in JSON.
 const BODY_MAX: usize = 12 << 20;
 
-/// What the handlers need.
+/// State of the handlers.
 #[derive(Clone)]
 pub(crate) struct Api {
     pub(crate) core: Arc<Core>,
-    pub(crate) layout: Layout,
+    pub(crate) layout: VehicleFolders,
     pub(crate) name: VehicleName,
     pub(crate) key: PublicKey,
     pub(crate) started: Instant,
 }
 
-/// Which records of a stream are sent.
+/// Choice of the records of a stream.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct StreamQuery {

@@ -8,52 +8,46 @@ use gleaner_base::{Exit, Failure};
 use gleaner_lambda::Vehicle;
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_protocol::supervision::{
-    DesiredState, EventKind, LAMBDAS_MAX, LambdaPhase, SupervisorStatus, VehicleEvent,
+    DesiredState, EventKind, LambdaPhase, SupervisorStatus, VehicleEvent,
 };
-use gleaner_protocol::vehicle_api::{
-    DeployReply, DeployRequest, DeploymentStatus, GrantStatus, MissingObject, RevisionStatus,
-};
+use gleaner_protocol::vehicle_api::{DeploymentStatus, GrantStatus, RevisionStatus};
 use gleaner_supervisor::EventLog;
-use gleaner_trust::{Revision, Trusted};
 use tokio::sync::watch;
 
 use crate::admission::{self, MemoryBudget};
 use crate::checked::SignedDeployment;
-use crate::compile;
 use crate::durable::DurableFile;
-use crate::layout::Layout;
+use crate::layout::VehicleFolders;
 use crate::state::{Deployed, VehicleState};
 use crate::store::RevisionStore;
 use crate::trust::VehicleTrust;
-
-/// Maximum number of deployments that wait for files.
-const OFFERS_MAX: usize = LAMBDAS_MAX;
 
 /// The vehicle.
 pub(crate) struct Core {
     pub(crate) vehicle: Vehicle,
     pub(crate) store: RevisionStore,
     /// Folder of native code.
-    cache: PathBuf,
-    memory: MemoryBudget,
-    events: EventLog,
-    desired: watch::Sender<DesiredState>,
-    inner: Mutex<Inner>,
+    pub(crate) cache: PathBuf,
+    pub(crate) memory: MemoryBudget,
+    pub(crate) events: EventLog,
+    pub(crate) desired: watch::Sender<DesiredState>,
+    pub(crate) inner: Mutex<Inner>,
     /// Held by the operation that changes the store.
-    deploying: Mutex<()>,
+    pub(crate) deploying: Mutex<()>,
 }
 
-struct Inner {
-    trust: VehicleTrust,
-    state: VehicleState,
-    state_file: DurableFile,
+/// State that changes.
+pub(crate) struct Inner {
+    pub(crate) trust: VehicleTrust,
+    pub(crate) state: VehicleState,
+    pub(crate) state_file: DurableFile,
     /// The deployments of the state that were verified, or the reasons why they do not run.
-    signed: BTreeMap<ItemName, Result<SignedDeployment, String>>,
+    pub(crate) signed: BTreeMap<ItemName, Result<SignedDeployment, String>>,
     /// Files that deployments need that were offered, and their lengths.
-    expected: BTreeMap<ItemName, BTreeMap<Sha256, u64>>,
+    pub(crate) expected: BTreeMap<ItemName, BTreeMap<Sha256, u64>>,
     /// Memory that each wanted lambda may take.
-    memory: BTreeMap<ItemName, u64>,
-    status: Option<SupervisorStatus>,
+    pub(crate) memory: BTreeMap<ItemName, u64>,
+    pub(crate) status: Option<SupervisorStatus>,
 }
 
 impl Core {
@@ -62,7 +56,7 @@ impl Core {
     /// # Errors
     ///
     /// A failure if state, trust root or floors are damaged.
-    pub(crate) fn open(layout: &Layout, vehicle: Vehicle) -> Result<Self, Failure> {
+    pub(crate) fn open(layout: &VehicleFolders, vehicle: Vehicle) -> Result<Self, Failure> {
         let events = EventLog::open(&layout.spool(), "orchestrator")?;
         let state_file = DurableFile::new(layout.state_file());
         let loaded = state_file.load::<VehicleState>()?;
@@ -151,129 +145,6 @@ impl Core {
         self.event(EventKind::Deployed, None, &format!("trust root {version} is installed"));
         self.verify(&mut inner);
         self.save(&mut inner)
-    }
-
-    /// Checks a deployment and runs it, or returns the files that are missing for it.
-    ///
-    /// # Errors
-    ///
-    /// A failure with the reason; what ran before goes on.
-    pub(crate) fn deploy(&self, request: &DeployRequest) -> Result<DeployReply, Failure> {
-        let reply = self.try_deploy(request);
-        if let Err(failure) = &reply {
-            self.event(EventKind::Refused, None, &failure.to_string());
-        }
-        reply
-    }
-
-    fn try_deploy(&self, request: &DeployRequest) -> Result<DeployReply, Failure> {
-        let _deploying = self.deploying.lock().unwrap_or_else(PoisonError::into_inner);
-        let inner = self.lock();
-        let sent = inner.revisions(request)?;
-        let find = |digest: &Sha256| {
-            let sent = sent.get(digest).map(|envelope| envelope.as_bytes().to_vec());
-            sent.or_else(|| self.store.envelope(digest).ok())
-        };
-        let verify = |inner: &Inner| {
-            let verifier = inner.trust.verifier()?;
-            SignedDeployment::verify(&verifier, request.deployment.as_bytes(), find)
-        };
-        let mut signed = verify(&inner)?;
-        inner.check_name(&signed)?;
-        drop(inner);
-        let damaged = |revision: &&Trusted<Revision>| !self.store.is_intact(revision);
-        let new: Vec<_> = signed.revisions().filter(damaged).collect();
-        let missing = new.iter().flat_map(|revision| self.store.missing(revision.payload()));
-        let objects: Vec<_> = missing.collect();
-        if !objects.is_empty() {
-            self.lock().expect(signed.id(), &objects)?;
-            return Ok(DeployReply::Missing { objects });
-        }
-        for digest in signed.digests() {
-            if let Some(envelope) = sent.get(digest) {
-                self.store.add(digest, envelope.as_bytes())?;
-            }
-        }
-        let manifests = signed.check_manifests(&self.store)?;
-        let mut inner = self.lock();
-        let memory = admission::memory(&manifests);
-        self.memory.admit(signed.id(), memory, &inner.wanted_memory())?;
-        drop(inner);
-        for digest in signed.digests() {
-            compile::component(&self.store.folder(digest), &self.cache)?;
-        }
-        inner = self.lock();
-        // Another trust root may have been installed meanwhile.
-        verify(&inner)?;
-        inner.check_name(&signed)?;
-        let accepted = self.accept(&mut inner, signed, &request.deployment, memory)?;
-        self.collect(&inner);
-        Ok(accepted)
-    }
-
-    fn accept(
-        &self,
-        inner: &mut Inner,
-        signed: SignedDeployment,
-        envelope: &str,
-        memory: u64,
-    ) -> Result<DeployReply, Failure> {
-        let id = signed.id().clone();
-        let before = inner.state.deployments.get(&id);
-        let is_same = before.is_some_and(|before| before.envelope == *envelope && before.is_wanted);
-        if !is_same {
-            let running = before.map(|_| inner.signed.get(&id)).and_then(|it| it?.as_ref().ok());
-            let history = match (before, running) {
-                (Some(before), Some(running)) => before.next_history(running.revision.digest()),
-                (Some(before), None) => before.history.clone(),
-                (None, _) => Vec::new(),
-            };
-            // The same envelope again is a start after a stop.
-            let kept = before.filter(|before| before.envelope == *envelope);
-            let deployed = Deployed {
-                envelope: envelope.to_owned(),
-                lambda: signed.revision.payload().name.clone(),
-                release: signed.deployment.payload().release,
-                attempt: before.map_or(0, |before| before.attempt) + 1,
-                is_wanted: true,
-                runs_fallback: kept.is_some_and(|kept| kept.runs_fallback),
-                is_proven: kept.is_some_and(|kept| kept.is_proven),
-                failed: kept.and_then(|kept| kept.failed.clone()),
-                history,
-            };
-            let revision = signed.revision.payload();
-            let text = format!(
-                "deployed release {} with {} {}",
-                signed.deployment.payload().release,
-                revision.name,
-                revision.version
-            );
-            let mut state = inner.state.clone();
-            state.deployments.insert(id.clone(), deployed);
-            inner.trust.accept(&signed.deployment, &signed.revision)?;
-            self.change(inner, state)?;
-            inner.signed.insert(id.clone(), Ok(signed));
-            inner.memory.insert(id.clone(), memory);
-            self.publish(inner);
-            self.event(EventKind::Deployed, Some(&id), &text);
-        }
-        inner.expected.remove(&id);
-        let attempt = inner.state.deployments.get(&id).map_or(0, |deployed| deployed.attempt);
-        let generation = inner.state.generation;
-        Ok(DeployReply::Accepted { id: id.to_string(), attempt, generation })
-    }
-
-    /// Returns the length of a file that is expected.
-    ///
-    /// # Errors
-    ///
-    /// A failure if no deployment that was offered needs it.
-    pub(crate) fn expected(&self, sha256: &Sha256) -> Result<u64, Failure> {
-        let inner = self.lock();
-        inner.expected.values().find_map(|files| files.get(sha256)).copied().ok_or_else(|| {
-            Failure::new(Exit::Usage, format!("no deployment needs the file {sha256}"))
-                .with_help("send the deployment first, and then the files that are missing")
-        })
     }
 
     /// Stops a lambda, or starts it, also after a quarantine.
@@ -437,7 +308,7 @@ impl Core {
     }
 
     /// Verifies all deployments of the state again.
-    fn verify(&self, inner: &mut Inner) {
+    pub(crate) fn verify(&self, inner: &mut Inner) {
         let (mut signed, mut memory) = (BTreeMap::new(), BTreeMap::new());
         for (id, deployed) in &inner.state.deployments {
             let checked = inner.trust.verifier().and_then(|verifier| {
@@ -457,14 +328,14 @@ impl Core {
     }
 
     /// Writes the state as it is, with the next generation, and publishes what is wanted.
-    fn save(&self, inner: &mut Inner) -> Result<(), Failure> {
+    pub(crate) fn save(&self, inner: &mut Inner) -> Result<(), Failure> {
         let state = inner.state.clone();
         let saved = self.change(inner, state);
         self.publish(inner);
         saved
     }
 
-    fn change(&self, inner: &mut Inner, mut state: VehicleState) -> Result<(), Failure> {
+    pub(crate) fn change(&self, inner: &mut Inner, mut state: VehicleState) -> Result<(), Failure> {
         state.generation += 1;
         state.floors = inner.trust.floors().clone();
         if let Err(failure) = inner.state_file.save(&state) {
@@ -477,7 +348,7 @@ impl Core {
         Ok(())
     }
 
-    fn publish(&self, inner: &mut Inner) {
+    pub(crate) fn publish(&self, inner: &mut Inner) {
         let wanted = inner.state.deployments.iter().filter(|(_, deployed)| deployed.is_wanted);
         let signed = wanted.filter_map(|(id, deployed)| {
             Some(inner.signed.get(id)?.as_ref().ok()?.desired(deployed, &self.store))
@@ -487,7 +358,7 @@ impl Core {
     }
 
     /// Removes revisions that no deployment names, nor ran before.
-    fn collect(&self, inner: &Inner) {
+    pub(crate) fn collect(&self, inner: &Inner) {
         let mut kept = BTreeSet::new();
         for (id, deployed) in &inner.state.deployments {
             match inner.signed.get(id) {
@@ -503,61 +374,19 @@ impl Core {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, Inner> {
+    pub(crate) fn lock(&self) -> MutexGuard<'_, Inner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Inner {
-    /// Notes the files that a deployment needs.
-    fn expect(&mut self, id: &ItemName, objects: &[MissingObject]) -> Result<(), Failure> {
-        if self.expected.len() >= OFFERS_MAX && !self.expected.contains_key(id) {
-            let message = "too many deployments wait for files".to_owned();
-            let help = "send the files of those that were offered, or start the daemon again";
-            return Err(Failure::new(Exit::Unreachable, message).with_help(help));
-        }
-        let files = objects.iter().filter_map(|it| Some((it.sha256.parse().ok()?, it.bytes)));
-        self.expected.insert(id.clone(), files.collect());
-        Ok(())
-    }
-
     /// Returns the memory that each wanted lambda may take.
-    fn wanted_memory(&self) -> BTreeMap<ItemName, u64> {
+    pub(crate) fn wanted_memory(&self) -> BTreeMap<ItemName, u64> {
         let is_wanted = |id: &ItemName| {
             self.state.deployments.get(id).is_some_and(|deployed| deployed.is_wanted)
         };
         let wanted = self.memory.iter().filter(|(id, _)| is_wanted(id));
         wanted.map(|(id, bytes)| (id.clone(), *bytes)).collect()
-    }
-
-    /// Returns the envelopes of a request, by the digests of their revisions.
-    fn revisions(&self, request: &DeployRequest) -> Result<BTreeMap<Sha256, String>, Failure> {
-        let verifier = self.trust.verifier()?;
-        let digest = |envelope: &String| {
-            let verified = verifier
-                .revision(envelope.as_bytes())
-                .map_err(|it| Failure::because("a revision is refused", &it))?;
-            Ok((verified.digest().clone(), envelope.clone()))
-        };
-        request.revisions.iter().take(2).map(digest).collect()
-    }
-
-    /// Checks that the lambda of the deployment runs by no other deployment: clips and recordings
-    /// know lambdas by their names.
-    fn check_name(&self, signed: &SignedDeployment) -> Result<(), Failure> {
-        let (id, name) = (signed.id(), &signed.revision.payload().name);
-        let same_name = |(other, it): &(&ItemName, &Deployed)| *other != id && it.lambda == *name;
-        if let Some((other, _)) = self.state.deployments.iter().find(same_name) {
-            let message = format!("lambda `{name}` runs already by deployment `{other}`");
-            let help = format!("deploy it as `{other}`, or give the lambda another name");
-            return Err(Failure::new(Exit::Usage, message).with_help(help));
-        }
-        let deployments = &self.state.deployments;
-        if deployments.len() >= LAMBDAS_MAX && !deployments.contains_key(id) {
-            let message = format!("a vehicle has at most {LAMBDAS_MAX} deployments");
-            return Err(Failure::new(Exit::Denied, message));
-        }
-        Ok(())
     }
 }
 

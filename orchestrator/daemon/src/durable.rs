@@ -1,5 +1,5 @@
-//! A small file that survives kills, power cuts and changed bytes: two copies, each with a checksum,
-//! each replaced as a whole.
+//! A small file that survives kills, power cuts and changed bytes: two copies, each with a
+//! checksum, each replaced as a whole.
 
 use std::fs;
 use std::io;

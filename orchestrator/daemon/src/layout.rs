@@ -10,12 +10,12 @@ use rustix::fs::{FlockOperation, OFlags, flock};
 
 /// The state folder and the run folder.
 #[derive(Debug, Clone)]
-pub(crate) struct Layout {
+pub(crate) struct VehicleFolders {
     state: PathBuf,
     run: PathBuf,
 }
 
-impl Layout {
+impl VehicleFolders {
     /// Creates the folders, as far as they do not exist, and makes them private.
     ///
     /// # Errors

@@ -2,9 +2,9 @@
 //!
 //! - `layout`, `durable`, `state`, `store`: its files: wanted state, trust, revisions.
 //! - `trust`, `checked`, `admission`: what may run. `compile`: native code before it runs.
-//! - `core`: the state, and the operations that change it.
-//! - `link`: starts `gleaner-supervisor`, which runs all other processes, and tells it what is
-//!   wanted.
+//! - `core`: the state, and the operations that change it; `deploying`: new deployments.
+//! - `link`: starts `gleaner-supervisor`, which runs all other processes, and sends it the wanted
+//!   state.
 //! - `api`, `streams`, `metrics`: the socket for users and, later, for the cloud.
 //!
 //! Lambdas do not depend on it: it can end and start again while they run.
@@ -14,6 +14,7 @@ mod api;
 mod checked;
 mod compile;
 mod core;
+mod deploying;
 mod durable;
 mod layout;
 mod link;

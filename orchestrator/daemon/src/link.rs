@@ -27,7 +27,7 @@ use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
 use crate::core::Core;
-use crate::layout::Layout;
+use crate::layout::VehicleFolders;
 
 /// Maximum length of a report, in bytes.
 const REPORT_MAX: u64 = 16 << 20;
@@ -43,9 +43,9 @@ const END: Duration = Duration::from_secs(60);
 /// The link.
 pub(crate) struct SupervisorLink {
     pub(crate) core: Arc<Core>,
-    pub(crate) layout: Layout,
+    pub(crate) layout: VehicleFolders,
     pub(crate) spec: SupervisionSpec,
-    /// What is wanted.
+    /// The wanted state.
     pub(crate) desired: watch::Receiver<DesiredState>,
     /// Set to end the supervisor.
     pub(crate) stop: watch::Receiver<bool>,

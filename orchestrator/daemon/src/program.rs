@@ -20,7 +20,7 @@ use tokio::sync::watch;
 
 use crate::api::Api;
 use crate::core::Core;
-use crate::layout::Layout;
+use crate::layout::VehicleFolders;
 use crate::link::SupervisorLink;
 
 /// Runs what is deployed on this vehicle, until SIGTERM, which ends all lambdas in order. After
@@ -84,7 +84,7 @@ fn exec() -> Failure {
 
 fn run(args: Args) -> Result<ProgramEnd, Failure> {
     let vehicle = args.vehicle.as_ref().map_or_else(|| Ok(Vehicle::default()), Vehicle::load)?;
-    let layout = Layout::create(&args.state, &args.run)?;
+    let layout = VehicleFolders::create(&args.state, &args.run)?;
     let _lock = layout.lock()?;
     let name = name(&vehicle)?;
     let key = vehicle_key(&layout)?;
@@ -120,7 +120,7 @@ fn name(vehicle: &Vehicle) -> Result<VehicleName, Failure> {
 }
 
 /// Makes the key of the vehicle if it has none; returns its public part.
-fn vehicle_key(layout: &Layout) -> Result<PublicKey, Failure> {
+fn vehicle_key(layout: &VehicleFolders) -> Result<PublicKey, Failure> {
     let path = layout.key();
     if !path.exists() {
         SecretKey::generate()?.create_file(&path)?;
@@ -128,7 +128,12 @@ fn vehicle_key(layout: &Layout) -> Result<PublicKey, Failure> {
     Ok(SecretKey::load(&path)?.public())
 }
 
-fn spec(args: &Args, layout: &Layout, vehicle: &Vehicle, name: &VehicleName) -> SupervisionSpec {
+fn spec(
+    args: &Args,
+    layout: &VehicleFolders,
+    vehicle: &Vehicle,
+    name: &VehicleName,
+) -> SupervisionSpec {
     let domain = vehicle.network.domain.map(|domain| format!("--domain={domain}"));
     let interfaces = vehicle.network.interfaces.iter().map(|it| format!("--interface={it}"));
     let recording = &vehicle.recording;
@@ -153,7 +158,7 @@ fn spec(args: &Args, layout: &Layout, vehicle: &Vehicle, name: &VehicleName) -> 
 
 async fn serve(
     core: Arc<Core>,
-    layout: Layout,
+    layout: VehicleFolders,
     spec: SupervisionSpec,
     (name, key): (VehicleName, PublicKey),
 ) -> Result<ProgramEnd, Failure> {
@@ -206,9 +211,9 @@ async fn serve(
         .map(|()| ProgramEnd::Stopped)
 }
 
-/// Listens on the socket of the API. The lock of the state folder ensures that no other orchestrator
-/// uses it.
-fn listen(layout: &Layout) -> Result<UnixListener, Failure> {
+/// Listens on the socket of the API. The lock of the run folder ensures that no other
+/// orchestrator uses it.
+fn listen(layout: &VehicleFolders) -> Result<UnixListener, Failure> {
     let path = layout.control_socket();
     let _ = fs::remove_file(&path);
     let listener = UnixListener::bind(&path).and_then(|listener| {

@@ -15,7 +15,7 @@ const HISTORY_MAX: usize = 2;
 pub(crate) struct VehicleState {
     /// Number of the wanted state; it grows with each change.
     pub(crate) generation: u64,
-    /// What was accepted: written together with the deployments, so that a kill in between leaves
+    /// Floors: written together with the deployments, so that a kill in between leaves
     /// neither without the other.
     pub(crate) floors: Floors,
     /// The deployments, by id.

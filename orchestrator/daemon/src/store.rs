@@ -1,7 +1,7 @@
 //! Revisions on the disk, under their digests, and files that were sent and belong to none yet.
 //!
-//! A revision is a folder with `build/` and its envelope, `revision.json`. It appears under its name
-//! only when it is complete, checked and durable, and is never changed afterwards.
+//! A revision is a folder with `build/` and its envelope, `revision.json`. It appears under its
+//! name only when it is complete, checked and durable, and is never changed afterwards.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, Permissions};
@@ -19,7 +19,7 @@ use gleaner_trust::{Payload, Revision, Trusted, check_files, revision_of_digest}
 use sha2::Digest;
 
 use crate::durable::sync_folder;
-use crate::layout::Layout;
+use crate::layout::VehicleFolders;
 
 /// Name of the envelope in the folder of a revision.
 const ENVELOPE: &str = "revision.json";
@@ -37,7 +37,7 @@ impl RevisionStore {
     /// # Errors
     ///
     /// A failure that names the folder.
-    pub(crate) fn open(layout: &Layout) -> Result<Self, Failure> {
+    pub(crate) fn open(layout: &VehicleFolders) -> Result<Self, Failure> {
         let store = Self { objects: layout.objects(), revisions: layout.revisions() };
         let unfinished = [(&store.objects, "part"), (&store.revisions, "tmp")];
         for (folder, extension) in unfinished {
@@ -99,8 +99,8 @@ impl RevisionStore {
         self.objects.join(sha256.as_str())
     }
 
-    /// Makes the revision in `envelope`, which was verified, from the files that were sent and those
-    /// of other revisions.
+    /// Makes the revision in `envelope`, which was verified, from the files that were sent and
+    /// those of other revisions.
     ///
     /// # Errors
     ///

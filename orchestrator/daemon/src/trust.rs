@@ -1,4 +1,4 @@
-//! What the vehicle trusts: its trust root, the floors, the time.
+//! Trust of the vehicle: its trust root, the floors, the time.
 
 use std::fs;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -10,7 +10,7 @@ use gleaner_trust::{
 };
 
 use crate::durable::DurableFile;
-use crate::layout::Layout;
+use crate::layout::VehicleFolders;
 
 /// The trust of a vehicle.
 #[derive(Debug)]
@@ -26,7 +26,11 @@ pub(crate) struct VehicleTrust {
 impl VehicleTrust {
     /// Loads the trust root. Also returns a warning if it, or one of its copies, is damaged: then
     /// nothing runs until it is installed again, or the other copy counts.
-    pub(crate) fn load(layout: &Layout, labels: Labels, floors: Floors) -> (Self, Option<String>) {
+    pub(crate) fn load(
+        layout: &VehicleFolders,
+        labels: Labels,
+        floors: Floors,
+    ) -> (Self, Option<String>) {
         let root_file = DurableFile::new(layout.trust());
         let mut trust = Self { root: None, root_file, floors, labels, built: built() };
         let opened = trust.root_file.load::<String>().and_then(|loaded| {

@@ -27,7 +27,7 @@ pub struct VehicleStatus {
     pub generation: u64,
     /// All deployments, by id.
     pub deployments: Vec<DeploymentStatus>,
-    /// What all lambdas together may ask for, and do.
+    /// Resources that all lambdas share.
     pub capacity: Vec<Capacity>,
     /// The processes; absent while the supervisor cannot be reached.
     pub supervisor: Option<SupervisorStatus>,
@@ -129,9 +129,9 @@ pub struct Capacity {
     pub resource: String,
     /// Unit of the numbers.
     pub unit: String,
-    /// What all wanted lambdas ask for.
+    /// Sum of what all wanted lambdas ask for.
     pub asked: f64,
-    /// What they may ask for.
+    /// Maximum of that sum.
     pub most: f64,
     /// The source of `most`.
     pub source: String,
@@ -204,7 +204,7 @@ pub struct Problem {
     /// The causes, the nearest first.
     #[serde(default)]
     pub causes: Vec<String>,
-    /// What to do.
+    /// Help for the user.
     #[serde(default)]
     pub help: Option<String>,
     /// Exit code of a command that fails with it.

@@ -5,7 +5,7 @@ use gleaner_protocol::supervision::{DesiredLambda, DesiredState};
 /// A lambda that runs, waits, or is ending.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KnownLambda<'a> {
-    /// What it runs as.
+    /// The wanted state by which it runs.
     pub lambda: &'a DesiredLambda,
     /// True if it was requested to end.
     pub is_leaving: bool,
@@ -77,7 +77,7 @@ mod tests {
     #[test]
     fn one_that_is_leaving_is_waited_for_even_if_it_is_wanted_again() {
         let (a, mut other) = (lambda("a", "1"), lambda("x", "1"));
-        assert_eq!(reconcile(&desired(&[a.clone()]), &[known(&a, true)]), []);
+        assert_eq!(reconcile(&desired(std::slice::from_ref(&a)), &[known(&a, true)]), []);
         other.name.clone_from(&a.name);
         assert_eq!(reconcile(&desired(&[other]), &[known(&a, true)]), [], "its name is in use");
     }
@@ -98,8 +98,10 @@ mod tests {
             let mut runs: Vec<(DesiredLambda, bool)> = Vec::new();
             for step in 0..40 {
                 let change = next(&mut seed);
-                if step < 30 && change % 3 == 0 {
-                    let ids = ["a", "b", "c", "d"].into_iter().filter(|_| next(&mut seed) % 2 == 0);
+                if step < 30 && change.is_multiple_of(3) {
+                    let ids = ["a", "b", "c", "d"]
+                        .into_iter()
+                        .filter(|_| next(&mut seed).is_multiple_of(2));
                     let ids: Vec<_> = ids.collect();
                     let of = |id: &&str| {
                         let revision = next(&mut seed) % 3;

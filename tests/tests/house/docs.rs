@@ -214,7 +214,11 @@ fn every_command_on_pages_exists_with_its_flags() {
                     continue;
                 }
                 seen += 1;
-                let name = words.next().unwrap_or_default().to_owned();
+                let mut name = words.next().unwrap_or_default().to_owned();
+                // These have commands of their own.
+                if ["keys", "trust"].contains(&&*name) {
+                    name = format!("{name} {}", words.next().unwrap_or_default());
+                }
                 let help = helps.entry(name.clone()).or_insert_with(|| help(&name));
                 match help {
                     None => {

@@ -15,7 +15,7 @@ use gleaner_tests::vehicle::{TestVehicle, text};
 
 use super::ticker;
 
-/// What is killed, by a part of its command line; that of a shim also names its runtime.
+/// Victims, by a part of their command line; that of a shim also names its runtime.
 const VICTIMS: [&str; 6] = [
     "gleaner-orchestrator",
     "gleaner-supervisor",

@@ -111,7 +111,7 @@ pub struct LambdaStatus {
     pub layers: Vec<Layer>,
 }
 
-/// What a lambda is doing.
+/// Phase of a lambda.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LambdaPhase {

@@ -152,8 +152,7 @@ fn prepare(stream: &UnixStream) -> io::Result<()> {
     stream.set_write_timeout(Some(Duration::from_millis(1)))
 }
 
-/// Sends a report as a whole, or closes the connection: a part of one could not be told from the
-/// next.
+/// Sends a report as a whole, or closes the connection: a part of one would run into the next.
 fn send(mut stream: &UnixStream, report: &SupervisorReport) {
     let mut text = serde_json::to_vec(report).expect("a report is plain data");
     text.push(b'\n');

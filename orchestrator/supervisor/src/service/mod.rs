@@ -4,7 +4,7 @@
 //! - `board`: the events of a run become the status, and records of the spool `events`.
 //! - `serve`: the loop.
 //!
-//! It has no network and no keys, and runs no code but that of its programs. What it is told comes
+//! It has no network and no keys, and runs no code but that of its programs. Its requests come
 //! over one socket, from a process of the same user.
 
 mod board;

@@ -146,7 +146,7 @@ fn run_spec(spec: &SupervisionSpec) -> Result<RunSpec, Failure> {
     })
 }
 
-/// What the orchestrator wants.
+/// The state that the orchestrator wants.
 struct WantedState<'a> {
     spec: &'a SupervisionSpec,
     desired: DesiredState,
