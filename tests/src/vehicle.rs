@@ -50,7 +50,7 @@ impl TestVehicle {
         path.to_str().expect("a plain path").to_owned()
     }
 
-    /// Starts the orchestrator, and waits until it answers. The first time, installs the trust root.
+    /// Starts the orchestrator, and waits until it answers. Installs the trust root if there is none.
     ///
     /// # Panics
     ///

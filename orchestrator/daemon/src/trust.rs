@@ -137,8 +137,8 @@ fn clock() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
 }
 
-/// Returns the time at which this program was built, that of its file: a clock that shows an earlier
-/// time is wrong.
+/// Returns the time at which this program was built, that of its file: a clock that shows an
+/// earlier time is wrong.
 fn built() -> u64 {
     let modified = std::env::current_exe().and_then(fs::metadata).and_then(|it| it.modified());
     modified.ok().and_then(|it| it.duration_since(UNIX_EPOCH).ok()).unwrap_or_default().as_secs()

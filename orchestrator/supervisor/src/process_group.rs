@@ -157,8 +157,8 @@ impl<'a> ProcessGroup<'a> {
         }
     }
 
-    /// Handles the ends of processes, and starts those that are due. Returns the end of the group if
-    /// a process failed without which the others cannot go on.
+    /// Handles the ends of processes, and starts those that are due. Returns the end of the group
+    /// if a process failed without which the others cannot go on.
     pub(crate) fn step(&mut self) -> Result<Option<GroupEnd>, Failure> {
         let ended = self.ended_lambdas()?;
         // A lambda may end because one of these did.

@@ -255,8 +255,8 @@ fn help(name: &str) -> Option<String> {
     if name == "play" {
         return Some(String::new());
     }
-    let output =
-        Command::new(program("gleaner")).args([name, "--help"]).output().expect("gleaner starts");
+    let output = Command::new(program("gleaner")).args(name.split(" ")).arg("--help").output();
+    let output = output.expect("gleaner starts");
     output.status.success().then(|| String::from_utf8_lossy(&output.stdout).into_owned())
 }
 

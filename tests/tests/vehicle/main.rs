@@ -13,11 +13,12 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 8] = [
+const CASES: [Case; 9] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_stopped_deployment_stays_stopped", deployments::stopped),
     ("a_failed_revision_is_replaced_by_its_fallback_for_good", deployments::fallback),
     ("a_lambda_without_a_fallback_is_quarantined_alone", deployments::quarantined),
+    ("deployments_at_once_do_not_disturb_each_other", deployments::at_once),
     ("what_is_not_signed_for_this_vehicle_is_refused", refused::signatures),
     ("a_file_that_was_changed_later_does_not_start", refused::changed_file),
     ("what_does_not_fit_is_refused_with_both_numbers", refused::memory),

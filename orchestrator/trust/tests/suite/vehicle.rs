@@ -114,6 +114,12 @@ fn keys_count_only_for_their_lambdas_and_vehicles() {
     vehicle.root = root();
     vehicle.root.deployers = vec![scoped(DEPLOYER, "lane-*", &[])];
     assert!(matches!(vehicle.accept(&wish, &envelope), Err(Refusal::Scope { .. })));
+    // Nor may a key replace the deployment of another lambda by one of its own.
+    vehicle.root.deployers = vec![scoped(DEPLOYER, "brake-*", &[])];
+    let id = std::mem::replace(&mut wish.id, "lane-keeper".parse().unwrap());
+    let refusal = vehicle.accept(&wish, &envelope).unwrap_err();
+    assert!(matches!(refusal, Refusal::ScopeId { .. }), "{refusal:?}");
+    wish.id = id;
     vehicle.root.deployers = vec![scoped(DEPLOYER, "*", &[("fleet", "test")])];
     let refusal = vehicle.accept(&wish, &envelope).unwrap_err();
     assert!(matches!(&refusal, Refusal::ScopeLabel { found: None, .. }), "{refusal:?}");
