@@ -50,7 +50,8 @@ impl TestVehicle {
         path.to_str().expect("a plain path").to_owned()
     }
 
-    /// Starts the orchestrator, and waits until it answers. Installs the trust root if there is none.
+    /// Starts the orchestrator, and waits until it answers. Installs the trust root if there is
+    /// none.
     ///
     /// # Panics
     ///
