@@ -79,6 +79,8 @@ impl IngressProcess {
         sender: &SyncSender<ChildOutput>,
     ) -> Result<Self, Failure> {
         let (start, delay, earlier_topics) = match before {
+            // On a vehicle, lambdas that start wait for it: never for long.
+            None if context.spec.spool.is_some() => (0, RestartDelay::of_killed(), Vec::new()),
             None => (0, RestartDelay::of_service(), Vec::new()),
             Some(before) => (before.start + 1, before.delay.clone(), before.topics()),
         };
