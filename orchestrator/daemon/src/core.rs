@@ -45,7 +45,7 @@ pub(crate) struct Inner {
     pub(crate) signed: BTreeMap<ItemName, Result<SignedDeployment, String>>,
     /// Files that deployments need that were offered, and their lengths.
     pub(crate) expected: BTreeMap<ItemName, BTreeMap<Sha256, u64>>,
-    /// Memory that each wanted lambda may take.
+    /// Memory that the lambda of each deployment may take.
     pub(crate) memory: BTreeMap<ItemName, u64>,
     pub(crate) status: Option<SupervisorStatus>,
 }
@@ -55,7 +55,7 @@ impl Core {
     ///
     /// # Errors
     ///
-    /// A failure if state, trust root or floors are damaged.
+    /// A failure if both copies of the state are damaged, or a folder cannot be used.
     pub(crate) fn open(layout: &VehicleFolders, vehicle: Vehicle) -> Result<Self, Failure> {
         let events = EventLog::open(&layout.spool(), "orchestrator")?;
         let state_file = DurableFile::new(layout.state_file());

@@ -55,9 +55,9 @@ impl Core {
             self.lock().expect(signed.id(), &objects)?;
             return Ok(DeployReply::Missing { objects });
         }
-        for digest in signed.digests() {
-            if let Some(envelope) = sent.get(digest) {
-                self.store.add(digest, envelope.as_bytes())?;
+        for digest in new.into_iter().map(Trusted::digest) {
+            if let Some(envelope) = find(digest) {
+                self.store.add(digest, &envelope)?;
             }
         }
         let manifests = signed.check_manifests(&self.store)?;

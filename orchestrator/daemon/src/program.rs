@@ -51,9 +51,9 @@ const WATCHDOG_INTERVAL: Duration = Duration::from_secs(3);
 
 /// The end of the program.
 enum ProgramEnd {
-    /// By SIGTERM: all lambdas have ended.
+    /// The end by SIGTERM: all lambdas have ended.
     Stopped,
-    /// By SIGHUP: it is to be started again.
+    /// The end by SIGHUP: it is to be started again.
     Restart,
 }
 
@@ -61,18 +61,13 @@ enum ProgramEnd {
 pub fn main() -> ExitCode {
     log::init_service();
     let args = Args::parse();
-    match run(args) {
-        Ok(ProgramEnd::Stopped) => Exit::Ok.into(),
-        Ok(ProgramEnd::Restart) => {
-            let failure = exec();
-            log::failure(&failure);
-            failure.exit.into()
-        }
-        Err(failure) => {
-            log::failure(&failure);
-            failure.exit.into()
-        }
-    }
+    let failure = match run(args) {
+        Ok(ProgramEnd::Stopped) => return Exit::Ok.into(),
+        Ok(ProgramEnd::Restart) => exec(),
+        Err(failure) => failure,
+    };
+    log::failure(&failure);
+    failure.exit.into()
 }
 
 /// Becomes the program that is installed now. Returns only on errors.

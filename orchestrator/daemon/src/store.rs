@@ -99,8 +99,8 @@ impl RevisionStore {
         self.objects.join(sha256.as_str())
     }
 
-    /// Makes the revision in `envelope`, which was verified, from the files that were sent and
-    /// those of other revisions.
+    /// Makes the revision in `envelope`, which was verified and is not [intact](Self::is_intact),
+    /// from the files that were sent and those of other revisions.
     ///
     /// # Errors
     ///
@@ -108,13 +108,8 @@ impl RevisionStore {
     pub(crate) fn add(&self, digest: &Sha256, envelope: &[u8]) -> Result<(), Failure> {
         let revision = revision_of_digest(envelope, digest)
             .map_err(|refusal| Failure::because("cannot store a revision", &refusal))?;
-        if self.has(digest) {
-            if check_files(&revision, &BuildDir::of(self.folder(digest))).is_ok() {
-                return Ok(());
-            }
-            // The disk has changed it: it is made again.
-            remove(&self.folder(digest));
-        }
+        // Of one that the disk has changed, which is made again.
+        remove(&self.folder(digest));
         let folder = self.revisions.join(format!("{digest}.tmp"));
         remove(&folder);
         let stored = self.fill(&folder, &revision, envelope, digest);
