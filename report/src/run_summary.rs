@@ -259,6 +259,7 @@ impl RunSummary {
                     [
                         ("wakes not sent to the recorder", recorder.wakes_dropped),
                         ("triggers not sent to the recorder", recorder.triggers_lost),
+                        ("ends of the recorder", recorder.recorders_ended),
                     ]
                 }));
                 counts.extend(live.recording.iter().flat_map(|status| recorded(status)));

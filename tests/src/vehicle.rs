@@ -180,15 +180,18 @@ impl TestVehicle {
     pub fn until_running(&self, ids: &[&str]) -> Duration {
         let started = Instant::now();
         self.until(&format!("{ids:?} to run"), |vehicle| {
-            let status = vehicle.try_status()?;
-            let runs = |id: &&str| {
-                let of_id = status.deployments.iter().find(|it| it.id == **id);
-                of_id.and_then(|it| it.status.as_ref()).map(|it| it.phase)
-                    == Some(LambdaPhase::Running)
-            };
-            ids.iter().all(runs).then_some(())
+            Self::all_run(&vehicle.try_status()?, ids).then_some(())
         });
         started.elapsed()
+    }
+
+    /// Returns whether these deployments run.
+    pub fn all_run(status: &VehicleStatus, ids: &[&str]) -> bool {
+        let runs = |id: &&str| {
+            let of_id = status.deployments.iter().find(|it| it.id == **id);
+            of_id.and_then(|it| it.status.as_ref()).map(|it| it.phase) == Some(LambdaPhase::Running)
+        };
+        ids.iter().all(runs)
     }
 
     /// Returns the records of a deployment, or the events without one.

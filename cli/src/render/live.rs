@@ -150,6 +150,11 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
             "trigger",
             "not sent to the recorder",
         ),
+        (
+            live.recorder_link.map_or(0, |recorder| recorder.recorders_ended),
+            "recorder",
+            "ended: clips lack the time until the next one",
+        ),
     ];
     for (count, thing, why) in losses.into_iter().filter(|(count, ..)| *count > 0) {
         writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;

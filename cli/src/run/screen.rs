@@ -9,7 +9,7 @@ use gleaner_lambda::{Clip, Decision};
 use gleaner_protocol::ingress::{IngressReport, IngressStatus};
 use gleaner_protocol::link::{Loss, RecorderReport, RecorderStatus};
 use gleaner_protocol::{LiveStatus, LiveTopic, Report};
-use gleaner_supervisor::{InferenceEvent, LambdaSpec, RunObserver};
+use gleaner_supervisor::{InferenceEvent, LambdaSpec, RestartedPart, RunObserver};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
@@ -251,7 +251,7 @@ impl RunObserver for Screen {
         self.print(&format!("playing {files}\n"));
     }
 
-    fn restarts(&mut self, _: Option<&LambdaSpec>, reason: &str, delay: Duration, restarts: u32) {
+    fn restarts(&mut self, _: RestartedPart<'_>, reason: &str, delay: Duration, restarts: u32) {
         let delay = delay.as_secs_f64();
         self.warn(&format!("{reason}; restarting in {delay} s (restart {restarts})"));
     }

@@ -6,13 +6,13 @@ use std::os::fd::OwnedFd;
 use std::time::{Duration, Instant};
 
 use gleaner_buffers::shared::SharedReader;
+use gleaner_protocol::ReceptionGaps;
 use gleaner_protocol::ingress::{ReceptionStatus, SourceStatus};
-use gleaner_protocol::link::Incoming;
-use gleaner_protocol::{Handover, HandoverReceiver, ReceptionGaps};
 use gleaner_transport::Publisher;
 
 use crate::feed::{JoiningFeed, TopicMemory};
 use crate::losses::TopicLosses;
+use crate::starter::StarterSocket;
 use crate::{FedTopic, Feed, FeedBell, FeedError, FeedEvent};
 
 /// Time without an ingress after which the connection ends: twice the longest delay before a
@@ -27,7 +27,7 @@ const TIMEOUT: Duration = Duration::from_secs(60);
 pub struct LastingFeed {
     feed: Feed,
     /// `None` if the connection ends with the ingress.
-    starter: Option<HandoverReceiver>,
+    starter: Option<StarterSocket>,
     topics: BTreeMap<u32, LastingTopic>,
     gap: Option<OpenGap>,
     gaps: ReceptionGaps,
@@ -63,7 +63,7 @@ impl LastingFeed {
         LastingFeed {
             topics: topics.collect(),
             feed,
-            starter: starter.map(HandoverReceiver::new),
+            starter: starter.map(StarterSocket::new),
             gap: None,
             gaps: ReceptionGaps::default(),
             polled: Instant::now(),
@@ -82,6 +82,9 @@ impl LastingFeed {
     /// Those of [`Feed::poll`]. [`FeedError::Gone`] if there is no starter, if it has ended, if
     /// there was no ingress for 60 s, or if the ingress has only closed this connection.
     pub fn poll(&mut self) -> Result<Vec<FeedEvent>, FeedError> {
+        if let Some(starter) = &mut self.starter {
+            starter.receive()?;
+        }
         if self.gap.is_none() {
             match self.feed.poll() {
                 Ok(events) => {
@@ -113,6 +116,11 @@ impl LastingFeed {
     /// Returns false while the ingress has ended, and no other one was joined.
     pub fn has_ingress(&self) -> bool {
         self.gap.is_none()
+    }
+
+    /// Takes the connection to another recorder, if the starter has passed one.
+    pub fn take_recorder(&mut self) -> Option<OwnedFd> {
+        self.starter.as_mut()?.recorder.take()
     }
 
     /// Returns the newest state of the source. Counts are those of the current ingress.
@@ -222,13 +230,10 @@ impl LastingFeed {
         loop {
             let connection = match joining.take() {
                 Some(connection) => connection,
-                None => match starter.poll()? {
-                    Incoming::Message(Handover { ingress: Some(socket), .. }) => {
-                        JoiningFeed::new(socket)
-                    }
-                    Incoming::Message(_) => continue,
-                    Incoming::Nothing => return Ok(()),
-                    Incoming::Ended => return Err(FeedError::Gone),
+                None => match starter.ingresses.pop_front() {
+                    Some(socket) => JoiningFeed::new(socket),
+                    None if starter.has_ended => return Err(FeedError::Gone),
+                    None => return Ok(()),
                 },
             };
             match connection.poll() {

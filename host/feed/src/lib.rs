@@ -55,6 +55,7 @@ mod feed;
 mod lasting;
 mod losses;
 mod publisher;
+mod starter;
 mod topic;
 
 pub use bell::FeedBell;

@@ -140,10 +140,13 @@ impl LiveEventLoop {
 
     fn housekeeping(&mut self, now: i64) -> Result<(), Failure> {
         self.note_engine();
+        self.receive()?;
         if let Some(recorder) = &mut self.recorder {
+            if let Some(socket) = self.feed.take_recorder() {
+                recorder.rejoin(socket)?;
+            }
             recorder.poll()?;
         }
-        self.receive()?;
         if !self.watch.is_due(now) {
             return Ok(());
         }

@@ -55,8 +55,8 @@ pub struct LiveRun<'a> {
     /// ids, and then the topics of [`Settings::round_trip`] and [`Settings::announce`], as far as
     /// they are set, to publish.
     pub feed: Feed,
-    /// The socket over which the starter passes connections to later ingresses; without one, the
-    /// run ends with the ingress.
+    /// The socket over which the starter passes connections to later ingresses and recorders;
+    /// without one, the run ends with them.
     pub starter: Option<OwnedFd>,
     /// The socket to the recorder, if there is one.
     pub recorder: Option<OwnedFd>,
@@ -121,7 +121,8 @@ impl LiveRun<'_> {
                     clock: &clock.to_string(),
                     part: TimeRange::default(),
                 };
-                Some(RecorderSender::join(socket, &identity.header()?, &inputs)?)
+                let header = identity.header()?;
+                Some(RecorderSender::join(socket, header, &inputs, starter.is_some())?)
             }
             None => None,
         };

@@ -120,6 +120,7 @@ impl LiveStatus {
             add([
                 (&mut now.wakes_dropped, before.wakes_dropped),
                 (&mut now.triggers_lost, before.triggers_lost),
+                (&mut now.recorders_ended, before.recorders_ended),
             ]);
         }
         self
@@ -221,6 +222,10 @@ pub struct LinkLosses {
     pub wakes_dropped: u64,
     /// Number of triggers that could not be sent.
     pub triggers_lost: u64,
+    /// Number of recorders that ended while the process ran. Clips lack the samples until the next
+    /// one had joined, and wakes that were on their way.
+    #[serde(default)]
+    pub recorders_ended: u64,
 }
 
 #[cfg(test)]
@@ -279,7 +284,11 @@ mod tests {
                 ..NetworkStatus::default()
             },
             reception_gaps: ReceptionGaps { count, ms: count },
-            recorder_link: Some(LinkLosses { wakes_dropped: count, triggers_lost: count }),
+            recorder_link: Some(LinkLosses {
+                wakes_dropped: count,
+                triggers_lost: count,
+                recorders_ended: count,
+            }),
             recording: None,
             rss_bytes: count,
             cpu_s: count as f64,

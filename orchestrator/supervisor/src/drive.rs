@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::visible;
 
+use crate::ingress::IngressProcess;
 use crate::observer::RunObserver;
-use crate::services::IngressProcess;
 use crate::spec::RunSpec;
 use crate::supervised::SupervisedLambda;
 

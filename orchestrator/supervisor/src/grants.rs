@@ -9,9 +9,6 @@ use gleaner_protocol::link::{COMMANDS_ID, commands_grant, recorded_grant};
 use crate::spec::LambdaSpec;
 use crate::spec::RunSpec;
 
-/// Name of the recorder among the readers of the ingress.
-pub(crate) const RECORDER: &str = "recorder";
-
 /// Largest of the sizes that the ingress expects of topics for which none is stated.
 const USUAL_BYTES: u64 = 32 << 20;
 
@@ -36,10 +33,16 @@ pub(crate) fn lambda(
     }
 }
 
+/// Returns the name of the recorder among the readers of the ingress, after this number of earlier
+/// recorders: the ingress may still know the last one.
+pub(crate) fn recorder_name(start: u32) -> String {
+    if start == 0 { "recorder".to_owned() } else { format!("recorder {start}") }
+}
+
 /// Returns the recorder as a reader: it reads commands, and later what lambdas record.
-pub(crate) fn recorder(spec: &RunSpec) -> AddReader {
+pub(crate) fn recorder(spec: &RunSpec, start: u32) -> AddReader {
     AddReader {
-        name: RECORDER.to_owned(),
+        name: recorder_name(start),
         topics: spec.commands.iter().map(|topic| commands_grant(topic)).collect(),
         publishes: Vec::new(),
     }
@@ -59,10 +62,14 @@ pub(crate) struct RecordedTopics {
     grants: Vec<TopicGrant>,
     /// Ids of the topics that were granted to the recorder.
     granted: HashSet<u32>,
+    /// True if the recorder reads the samples that the ingress still has, too.
+    is_again: bool,
 }
 
 impl RecordedTopics {
-    pub(crate) fn of<'a>(lambdas: impl Iterator<Item = &'a LambdaSpec>) -> Self {
+    /// Returns the topics of these lambdas. `is_again` is true for a recorder that follows another:
+    /// it also reads the samples that the ingress still has.
+    pub(crate) fn of<'a>(lambdas: impl Iterator<Item = &'a LambdaSpec>, is_again: bool) -> Self {
         let mut topics: Vec<RecordedSamples> = Vec::new();
         for samples in lambdas.flat_map(recorded) {
             match topics.iter_mut().find(|known| known.topic == samples.topic) {
@@ -74,7 +81,7 @@ impl RecordedTopics {
         let mixed = mixed.map(|samples| samples.topic.clone()).collect();
         let grants = topics.into_iter().zip(COMMANDS_ID + 1..);
         let grants = grants.map(|(samples, id)| samples.grant(id));
-        Self { mixed, grants: grants.collect(), granted: HashSet::new() }
+        Self { mixed, grants: grants.collect(), granted: HashSet::new(), is_again }
     }
 
     /// Adds the topics of a lambda that came later.
@@ -112,7 +119,8 @@ impl RecordedTopics {
     /// Returns the grants of a lambda's recorded topics that the recorder does not have yet.
     pub(crate) fn take_new(&mut self, lambda: &LambdaSpec) -> Vec<TopicGrant> {
         let grants: Vec<TopicGrant> = self.grants_of(lambda).into_iter().cloned().collect();
-        grants.into_iter().filter(|grant| self.granted.insert(grant.id)).collect()
+        let grants = grants.into_iter().filter(|grant| self.granted.insert(grant.id));
+        grants.map(|grant| if self.is_again { grant.again(true) } else { grant }).collect()
     }
 
     /// Returns the grants of a lambda's recorded topics that the recorder attaches again after a
@@ -198,7 +206,7 @@ mod tests {
             recording("b", Some(("/imu", "1 MiB")), &["/gps", "/imu"]),
             recording("c", None, &["/odom"]),
         ];
-        let mut topics = RecordedTopics::of(lambdas.iter());
+        let mut topics = RecordedTopics::of(lambdas.iter(), false);
         let ids = [("/imu".to_owned(), 1), ("/gps".to_owned(), 2)];
         assert_eq!(topics.ids(&lambdas[0]), ids);
         assert_eq!(topics.ids(&lambdas[1]), ids);
@@ -221,7 +229,7 @@ mod tests {
             recording("c", Some(("/large", "64 MiB")), &["/large"]),
             recording("d", None, &["/large"]),
         ];
-        let topics = RecordedTopics::of(lambdas.iter());
+        let topics = RecordedTopics::of(lambdas.iter(), false);
         let sizes: Vec<_> = topics.grants.iter().map(|grant| grant.max_bytes).collect();
         assert_eq!(sizes, [None, Some(64 << 20)]);
     }

@@ -61,14 +61,13 @@ impl ProcessGroup<'_> {
 
     fn show(&mut self, ChildOutput { from, piece }: ChildOutput) {
         let Self { lambdas, ingress, recorder, observer, .. } = self;
+        let is_stderr = matches!(piece, OutputPiece::Stderr(_));
+        let recorder_start = recorder.as_ref().map(|recorder| recorder.start);
         // Processes that an earlier one left running may still write into its pipes.
         let mut current = match from {
             ChildId::Lambda { process } => lambdas.iter_mut().find(|it| it.runs_as(process)),
-            ChildId::Ingress { start }
-                if start != ingress.start && !matches!(piece, OutputPiece::Stderr(_)) =>
-            {
-                return;
-            }
+            ChildId::Ingress { start } if start != ingress.start && !is_stderr => return,
+            ChildId::Recorder { start } if recorder_start != Some(start) && !is_stderr => return,
             _ => None,
         };
         match piece {
@@ -102,7 +101,7 @@ impl ProcessGroup<'_> {
             }
             OutputPiece::Closed => match (from, current, recorder) {
                 (ChildId::Ingress { .. }, ..) => ingress.open_pipes -= 1,
-                (ChildId::Recorder, _, Some(recorder)) => recorder.open_pipes -= 1,
+                (ChildId::Recorder { .. }, _, Some(recorder)) => recorder.open_pipes -= 1,
                 (_, Some(current), _) => current.closed(),
                 _ => {}
             },

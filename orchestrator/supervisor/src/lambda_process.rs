@@ -33,8 +33,8 @@ pub(crate) struct LambdaProcess {
     pub(crate) has_lost_wake: bool,
     /// Set by the last report of the process.
     pub(crate) has_ended: bool,
-    /// Set when the ingress ended before the process was ready.
-    pub(crate) has_lost_ingress: bool,
+    /// Set when the ingress or the recorder ended before the process was ready.
+    pub(crate) has_lost_service: bool,
     pub(crate) last: Option<Box<LiveStatus>>,
     /// The layers around it, as tested.
     pub(crate) layers: Vec<Layer>,
@@ -67,7 +67,7 @@ impl LambdaProcess {
             has_faulted: false,
             has_lost_wake: false,
             has_ended: false,
-            has_lost_ingress: false,
+            has_lost_service: false,
             last: None,
             layers: Vec::new(),
             after_drive: 0,

@@ -4,16 +4,16 @@
 //! - `spec`: what a run consists of. `observer`: its events, for those who watch it.
 //! - `grants`, `arguments`: topics and arguments of the processes.
 //! - `process`, `output`, `lines`: one process, and the threads that read its output.
-//! - `services`: the processes that all lambdas share: ingress and recorder. `inference`: the one
-//!   that runs models.
+//! - `ingress`, `recorder`, `inference`: the processes that all lambdas share, each over its
+//!   restarts.
 //! - `supervised`: one lambda over all its restarts, with `summary`.
 //! - `process_group`: all processes, `group_end`: their end, and `drive`: a drive that the ingress
 //!   plays.
 //! - `failures`: the result of a run in which processes failed.
 //!
-//! A failed process is restarted with a growing delay (`restart_delay`): that of a lambda or the
-//! ingress alone, the recorder with all others. A first start that fails ends the run, unless it is
-//! that of one lambda of several.
+//! A failed process is restarted alone, with a growing delay (`restart_delay`); the others receive a
+//! connection to the next one. A first start that fails ends the run, unless it is that of one
+//! lambda of several.
 
 mod arguments;
 mod crash_loop;
@@ -24,6 +24,7 @@ mod grants;
 mod group_end;
 mod group_output;
 mod inference;
+mod ingress;
 mod lambda_process;
 pub mod lines;
 mod observer;
@@ -31,10 +32,10 @@ mod output;
 mod process;
 mod process_group;
 mod reconcile;
+mod recorder;
 mod restart_delay;
 mod revision_check;
 pub mod service;
-mod services;
 mod spec;
 mod summary;
 mod supervised;
@@ -52,7 +53,7 @@ pub use event_log::EventLog;
 use failures::Failures;
 use group_end::GroupEnd;
 pub use inference::{InferenceEvent, InferenceService};
-pub use observer::RunObserver;
+pub use observer::{RestartedPart, RunObserver};
 use process_group::{ProcessGroup, RunRecord};
 pub use reconcile::{Action, KnownLambda, reconcile};
 use restart_delay::RestartDelay;
@@ -156,7 +157,7 @@ pub fn run(
         failures.add(reason.clone(), false);
         restarts += 1;
         let delay = delay.after(attempt_started.elapsed());
-        observer.restarts(None, &reason, delay, restarts);
+        observer.restarts(RestartedPart::All, &reason, delay, restarts);
         let until = Instant::now() + delay;
         let ends = || stop.load(Ordering::Relaxed) || time.is_over_since_start();
         while Instant::now() < until && !ends() {

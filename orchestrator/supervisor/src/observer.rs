@@ -9,6 +9,19 @@ use gleaner_protocol::link::RecorderReport;
 use crate::inference::InferenceEvent;
 use crate::spec::LambdaSpec;
 
+/// A part of a run that is started again.
+#[derive(Clone, Copy, Debug)]
+pub enum RestartedPart<'a> {
+    /// All processes.
+    All,
+    /// The ingress.
+    Ingress,
+    /// The recorder.
+    Recorder,
+    /// The process of a lambda.
+    Lambda(&'a LambdaSpec),
+}
+
 /// A receiver of the events of a run, in the thread that supervises it. What takes long there
 /// delays restarts.
 pub trait RunObserver {
@@ -30,15 +43,9 @@ pub trait RunObserver {
     fn inference(&mut self, event: InferenceEvent);
     /// A drive begins: its files, as text.
     fn playing(&mut self, files: &str);
-    /// A lambda or something else failed for a reason, and is started again after a delay;
-    /// `restarts` counts these.
-    fn restarts(
-        &mut self,
-        lambda: Option<&LambdaSpec>,
-        reason: &str,
-        delay: Duration,
-        restarts: u32,
-    );
+    /// A part of the run failed for a reason, and is started again after a delay; `restarts` counts
+    /// these.
+    fn restarts(&mut self, part: RestartedPart<'_>, reason: &str, delay: Duration, restarts: u32);
     /// Something else went wrong.
     fn warn(&mut self, text: &str);
     /// A piece of a process's standard error, without control characters.

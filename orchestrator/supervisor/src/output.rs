@@ -23,18 +23,15 @@ pub(crate) const PIPES: u8 = 2;
 pub(crate) enum ChildId {
     /// `start` counts the restarts, so that output of an earlier process is not taken for that of
     /// the current one.
-    Ingress {
-        start: u32,
-    },
-    Recorder,
+    Ingress { start: u32 },
+    /// As of the ingress.
+    Recorder { start: u32 },
     /// The process that runs models.
     Inference,
     /// This process.
     Supervisor,
     /// A process of a lambda, by its number in the group.
-    Lambda {
-        process: u32,
-    },
+    Lambda { process: u32 },
 }
 
 /// Output of a process.
@@ -78,7 +75,7 @@ pub(crate) fn forward(
         thread::spawn(move || {
             match from {
                 ChildId::Ingress { .. } => follow(reports, OutputPiece::Ingress, &send),
-                ChildId::Recorder => follow(reports, OutputPiece::Recorder, &send),
+                ChildId::Recorder { .. } => follow(reports, OutputPiece::Recorder, &send),
                 ChildId::Lambda { .. } => follow(reports, OutputPiece::Runtime, &send),
                 // Its service reads it, and the supervisor has no process here.
                 ChildId::Inference | ChildId::Supervisor => {}

@@ -84,10 +84,9 @@ impl ChildProcess {
         self.child.try_wait().map_err(failed)
     }
 
-    /// Passes it a connection to another ingress. If it does not read its messages, it is killed;
-    /// returns the warning to print.
-    pub(crate) fn pass_ingress(&self, ingress: OwnedFd) -> Option<String> {
-        let connections = Handover { ingress: Some(ingress), ..Handover::default() };
+    /// Passes it connections to processes that were started again. If it does not read its messages,
+    /// it is killed; returns the warning to print.
+    pub(crate) fn pass(&self, connections: &Handover) -> Option<String> {
         match connections.try_send(&self.handover) {
             // Its exit status explains why it has ended.
             Ok(()) | Err(LinkError::Gone { .. }) => None,

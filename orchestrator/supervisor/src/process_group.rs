@@ -1,8 +1,8 @@
 //! Starts and supervises the processes of a run: an ingress, a recorder, and one for each lambda.
 //!
-//! A lambda whose process fails is started again, while the others run on. So is an ingress that
-//! does not play a drive: the processes that run receive a connection to the next one. If the
-//! recorder fails, all end.
+//! A process that fails is started again, while the others run on: those that run receive a
+//! connection to the next ingress or recorder. In a run that plays a drive, the end of one of these
+//! two is the end of the run.
 
 use std::collections::HashSet;
 use std::process::ExitStatus;
@@ -15,16 +15,16 @@ use gleaner_base::Failure;
 use gleaner_lambda::{BuildDir, Vehicle};
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::AddTopics;
-use gleaner_protocol::link::AddLambda;
 
 use crate::drive::DriveProgress;
 use crate::failures::Failures;
 use crate::group_end::GroupEnd;
 use crate::inference::InferenceService;
-use crate::observer::RunObserver;
+use crate::ingress::IngressProcess;
+use crate::observer::{RestartedPart, RunObserver};
 use crate::output::{ChildId, ChildOutput, OutputPiece};
 use crate::process::{ChildProcess, ended};
-use crate::services::{IngressProcess, RecorderProcess, unless_gone};
+use crate::recorder::RecorderProcess;
 use crate::summary::RunCounts;
 use crate::supervised::SupervisedLambda;
 use crate::{POLL_INTERVAL, RunContext, RunTime, arguments, grants};
@@ -41,7 +41,7 @@ pub(crate) struct RunRecord<'a> {
 
 /// The processes of a run.
 pub(crate) struct ProcessGroup<'a> {
-    context: &'a RunContext<'a>,
+    pub(crate) context: &'a RunContext<'a>,
     pub(crate) lambdas: &'a mut Vec<SupervisedLambda>,
     pub(crate) observer: &'a mut dyn RunObserver,
     pub(crate) failures: &'a mut Failures,
@@ -52,7 +52,7 @@ pub(crate) struct ProcessGroup<'a> {
     pub(crate) recorder: Option<RecorderProcess>,
     pub(crate) sender: SyncSender<ChildOutput>,
     pub(crate) output: Receiver<ChildOutput>,
-    vehicle: Vehicle,
+    pub(crate) vehicle: Vehicle,
     /// Number of processes of lambdas so far.
     started: u32,
     /// The process that runs models, if a lambda has any. Dropped after `output`, as its threads
@@ -170,7 +170,8 @@ impl<'a> ProcessGroup<'a> {
         }
         if self.ingress.is_ready {
             self.join_ingress();
-            return self.start_due();
+            self.start_recorder()?;
+            self.start_due()?;
         }
         Ok(None)
     }
@@ -180,26 +181,8 @@ impl<'a> ProcessGroup<'a> {
         self.counts.add(self.ingress.status, self.recorder.and_then(|recorder| recorder.status));
     }
 
-    /// Starts the recorder, if it is needed and does not run yet, and all lambdas that are due.
-    /// Returns the end of the group if the recorder must be started again for one of them.
-    fn start_due(&mut self) -> Result<Option<GroupEnd>, Failure> {
-        let spec = self.context.spec;
-        let is_recorded = |supervised: &&SupervisedLambda| {
-            spec.records && supervised.lambda.manifest.record.is_some()
-        };
-        if self.recorder.is_none() && self.lambdas.iter().any(|it| is_recorded(&it)) {
-            let recorded = self.lambdas.iter().filter(is_recorded).map(|it| &it.lambda);
-            let added = self.ingress.control.add_reader(&grants::recorder(spec));
-            let Some(ingress) = self.ingress.granted(added) else { return Ok(None) };
-            let started = RecorderProcess::start(self.context, recorded, ingress, &self.sender)?;
-            started.topics.mixed().for_each(|topic| {
-                self.observer.warn(&format!(
-                    "lambdas request `{topic}` with different `qos`: clips have the samples of the \
-                     first, and are not verified for the others"
-                ));
-            });
-            self.recorder = Some(started);
-        }
+    /// Starts all lambdas that are due.
+    fn start_due(&mut self) -> Result<(), Failure> {
         for index in 0..self.lambdas.len() {
             if !self.lambdas[index].is_due() {
                 continue;
@@ -207,12 +190,19 @@ impl<'a> ProcessGroup<'a> {
             let lambda = &self.lambdas[index].lambda;
             if let Some(recorder) = &mut self.recorder
                 && lambda.manifest.record.is_some()
-                && let Err(topic) = recorder.topics.add(lambda)
             {
-                let name = lambda.name();
-                let reason =
-                    format!("it is started again, as `{name}` needs larger samples of `{topic}`");
-                return Ok(Some(GroupEnd::Broken(reason)));
+                if recorder.is_running()
+                    && let Err(topic) = recorder.topics.add(lambda)
+                {
+                    let name = lambda.name();
+                    recorder.replace(format!(
+                        "the recorder is started again, as `{name}` needs larger samples of \
+                         `{topic}`"
+                    ));
+                }
+                if !recorder.is_running() {
+                    continue;
+                }
             }
             self.fit_ingress(index);
             if let Err(failure) = self.start_lambda(index) {
@@ -223,7 +213,7 @@ impl<'a> ProcessGroup<'a> {
                 supervised.failed_to_start(&failure, self.observer);
             }
         }
-        Ok(None)
+        Ok(())
     }
 
     /// Starts another ingress if the lambda has larger samples than this one expects.
@@ -252,21 +242,8 @@ impl<'a> ProcessGroup<'a> {
         let reader = grants::lambda(lambda, context.spec, recorder.is_some(), number);
         let mut connections = Handover::default();
         if let Some(recorder) = recorder {
-            let topics = recorder.topics.take_new(lambda);
-            if !topics.is_empty() {
-                let reader = grants::RECORDER.to_owned();
-                let added = ingress.control.add_topics(&AddTopics { reader, topics });
-                if ingress.granted(added).is_none() {
-                    return Ok(());
-                }
-            }
-            let add = AddLambda {
-                lambda: lambda.folder.clone(),
-                remaps: lambda.remaps.clone(),
-                most: self.vehicle.limits,
-                grants: recorder.topics.ids(lambda),
-            };
-            let Some(socket) = unless_gone(recorder.control.add(&add))? else { return Ok(()) };
+            let connected = recorder.connect(lambda, self.vehicle.limits, ingress)?;
+            let Some(socket) = connected else { return Ok(()) };
             connections.recorder = Some(socket);
         }
         let added = ingress.control.add_reader(&reader);
@@ -311,12 +288,7 @@ impl<'a> ProcessGroup<'a> {
         if let Some(end) = self.ended_ingress()? {
             return Ok(Some(end));
         }
-        let Some(recorder) = &mut self.recorder else { return Ok(None) };
-        let status = recorder.child.status()?;
-        // Its ingress may have ended before it was ready.
-        let is_first =
-            !recorder.is_ready && self.ingress.start == 0 && self.ingress.again_at.is_none();
-        Ok(status.map(|status| GroupEnd::of("the recorder", status, is_first)))
+        self.ended_recorder()
     }
 
     /// Starts the ingress again if it has ended, or receives nothing more; returns the end of the
@@ -329,7 +301,8 @@ impl<'a> ProcessGroup<'a> {
                     Ok(last) => self.counts.add(last, None),
                     Err(failure) => {
                         let (reason, starts) = (failure.to_string(), ingress.start + 1);
-                        observer.restarts(None, &reason, ingress.ended(), starts);
+                        let delay = ingress.ended();
+                        observer.restarts(RestartedPart::Ingress, &reason, delay, starts);
                     }
                 }
             }
@@ -347,9 +320,10 @@ impl<'a> ProcessGroup<'a> {
         let Self { ingress, observer, .. } = self;
         let reason = ingress.end_reason(status);
         observer.ingress_gone();
-        observer.restarts(None, &reason, ingress.ended(), ingress.start + 1);
+        let (delay, starts) = (ingress.ended(), ingress.start + 1);
+        observer.restarts(RestartedPart::Ingress, &reason, delay, starts);
         self.failures.add(reason, false);
-        self.lambdas.iter_mut().for_each(SupervisedLambda::lost_ingress);
+        self.lambdas.iter_mut().for_each(SupervisedLambda::lost_service);
         Ok(None)
     }
 
@@ -360,22 +334,24 @@ impl<'a> ProcessGroup<'a> {
         if std::mem::replace(&mut ingress.is_joined, true) {
             return;
         }
-        if let Some(recorder) = recorder {
-            let added =
-                ingress.control.add_reader(&grants::again(grants::recorder(context.spec), true));
+        if let Some(recorder) = recorder.as_mut().filter(|recorder| recorder.is_running()) {
+            let reader = grants::recorder(context.spec, recorder.start);
+            let added = ingress.control.add_reader(&grants::again(reader, true));
             let Some(socket) = ingress.granted(added) else { return };
             let mut again = HashSet::new();
             for supervised in lambdas.iter() {
                 let topics = recorder.topics.take_again(&supervised.lambda, &mut again);
                 if !topics.is_empty() {
-                    let add = AddTopics { reader: grants::RECORDER.to_owned(), topics };
+                    let reader = grants::recorder_name(recorder.start);
+                    let add = AddTopics { reader, topics };
                     let added = ingress.control.add_topics(&add);
                     if ingress.granted(added).is_none() {
                         return;
                     }
                 }
             }
-            if let Some(warning) = recorder.child.pass_ingress(socket) {
+            let passed = Handover { ingress: Some(socket), ..Handover::default() };
+            if let Some(warning) = recorder.child.pass(&passed) {
                 observer.warn(&warning);
             }
         }
@@ -386,7 +362,8 @@ impl<'a> ProcessGroup<'a> {
             let reader = grants::lambda(lambda, context.spec, is_recorded, number);
             let added = ingress.control.add_reader(&grants::again(reader, recorder.is_some()));
             let Some(socket) = ingress.granted(added) else { return };
-            supervised.pass_ingress(socket, *observer);
+            let passed = Handover { ingress: Some(socket), ..Handover::default() };
+            supervised.pass(&passed, *observer);
         }
     }
 
@@ -406,7 +383,7 @@ impl<'a> ProcessGroup<'a> {
             }
             self.lambdas.iter_mut().for_each(|lambda| lambda.kill_if_late(self.observer));
         }
-        if let Some(recorder) = &mut self.recorder {
+        if let Some(recorder) = self.recorder.as_mut().filter(|recorder| !recorder.has_ended()) {
             // Fails if it has ended meanwhile, and then has nothing to complete.
             let _ = recorder.control.stop();
             let status = self.wait(|group| group.recorder.as_mut().map(|it| &mut it.child))?;

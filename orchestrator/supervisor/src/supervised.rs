@@ -1,18 +1,17 @@
 //! One lambda of a run: its process, and its counts over all restarts.
 
-use std::os::fd::OwnedFd;
 use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::FaultKind;
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus};
-use gleaner_protocol::{LiveStatus, Report};
+use gleaner_protocol::{Handover, LiveStatus, Report};
 
 use crate::crash_loop::CrashLoop;
 use crate::failures::Failures;
 use crate::lambda_process::{LambdaProcess, ProcessEnd};
-use crate::observer::RunObserver;
+use crate::observer::{RestartedPart, RunObserver};
 use crate::process::ChildProcess;
 use crate::restart_delay::{RestartDelay, jittered};
 use crate::revision_check::RevisionCheck;
@@ -139,7 +138,7 @@ impl SupervisedLambda {
         let delay = jittered(self.delay.after(Duration::ZERO));
         self.restart_in(delay);
         self.last_end = Some(failure.message.clone());
-        observer.restarts(Some(&self.lambda), &reason, delay, self.restarts);
+        observer.restarts(RestartedPart::Lambda(&self.lambda), &reason, delay, self.restarts);
     }
 
     /// Ends it for good. It has left when [`has_left`](Self::has_left) returns true.
@@ -223,18 +222,18 @@ impl SupervisedLambda {
         }
     }
 
-    /// Notes that the ingress has ended: a process that was not ready ends as well, and is started
-    /// again.
-    pub(crate) fn lost_ingress(&mut self) {
+    /// Notes that the ingress or its recorder has ended: a process that was not ready may end as
+    /// well, and is started again.
+    pub(crate) fn lost_service(&mut self) {
         if let Some(process) = self.process() {
-            process.has_lost_ingress |= !process.is_ready;
+            process.has_lost_service |= !process.is_ready;
         }
     }
 
-    /// Passes its process a connection to another ingress.
-    pub(crate) fn pass_ingress(&mut self, ingress: OwnedFd, observer: &mut dyn RunObserver) {
+    /// Passes its process connections to processes that were started again.
+    pub(crate) fn pass(&mut self, connections: &Handover, observer: &mut dyn RunObserver) {
         let prefix = self.lambda.prefix.clone();
-        if let Some(warning) = self.process().and_then(|it| it.child.pass_ingress(ingress)) {
+        if let Some(warning) = self.process().and_then(|it| it.child.pass(connections)) {
             observer.warn(&format!("{prefix}{warning}"));
         }
     }
@@ -356,7 +355,7 @@ impl SupervisedLambda {
         observer: &mut dyn RunObserver,
         failures: &mut Failures,
     ) {
-        let is_lost = |process: &mut LambdaProcess| process.has_lost_ingress && !process.is_ready;
+        let is_lost = |process: &mut LambdaProcess| process.has_lost_service && !process.is_ready;
         let is_ending = is_ending || self.is_leaving;
         if !is_ending && self.process().is_some_and(is_lost) {
             return self.interrupted(observer, failures);
@@ -415,7 +414,7 @@ impl SupervisedLambda {
         let delay = delays.after(ran);
         let delay = if is_kept { jittered(delay) } else { delay };
         self.restart_in(delay);
-        observer.restarts(Some(&self.lambda), &shown, delay, self.restarts);
+        observer.restarts(RestartedPart::Lambda(&self.lambda), &shown, delay, self.restarts);
     }
 
     /// Handles the end of its process, which was requested as another process of the run failed.

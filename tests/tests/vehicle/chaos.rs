@@ -1,30 +1,40 @@
-//! Processes of a vehicle are killed at random while lambdas decide ten times a second: no decision
-//! that was durable is lost or appears twice, every gap is marked, and all runs again soon.
+//! Processes of a vehicle are killed at random while lambdas decide, record and run models: no
+//! decision or clip that was durable is lost or appears twice, every gap is marked, and all runs
+//! again soon.
 //!
 //! `GLEANER_KILLS` sets the number of kills; the first random number is printed.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
-use gleaner_protocol::vehicle_api::StreamLine;
-use gleaner_tests::live::signal;
+use gleaner_lambda::Clip;
+use gleaner_protocol::vehicle_api::{StreamLine, VehicleStatus};
+use gleaner_tests::live::{no_player, play, signal};
 use gleaner_tests::random::XorShift64;
-use gleaner_tests::times;
 use gleaner_tests::vehicle::{TestVehicle, text};
+use gleaner_tests::{LambdaCopy, times};
 
 use super::ticker;
 
 /// Victims, by a part of their command line; that of a shim also names its runtime.
-const VICTIMS: [&str; 6] = [
+const VICTIMS: [&str; 8] = [
     "gleaner-orchestrator",
     "gleaner-supervisor",
     "gleaner-shim",
     "gleaner-runtime",
     "start.py",
     "gleaner-ingress",
+    "gleaner-recorder",
+    "gleaner-inference",
 ];
-const LAMBDAS: [(&str, &str); 3] = [("rust", "first"), ("rust", "second"), ("python", "third")];
+/// Victims whose end ends no lambda.
+const SERVICES: [&str; 4] =
+    ["gleaner-orchestrator", "gleaner-ingress", "gleaner-recorder", "gleaner-inference"];
+/// Lambdas that decide ten times a second. The first and the third record, too.
+const TICKERS: [&str; 3] = ["first", "second", "third"];
+const IDS: [&str; 4] = ["first", "second", "third", "detector"];
 
 pub fn killed_at_random() {
     let since_1970 = SystemTime::UNIX_EPOCH.elapsed().expect("the clock is set");
@@ -32,23 +42,35 @@ pub fn killed_at_random() {
     println!("random numbers from {}", random.0);
     let mut vehicle = TestVehicle::new();
     vehicle.start();
-    let ids = LAMBDAS.map(|(_, name)| name);
-    for (language, name) in LAMBDAS {
-        let deployed = vehicle.deploy(ticker(language, name).path(), &[]);
+    let lambdas = [
+        recording("rust", "first"),
+        ticker("rust", "second"),
+        recording("python", "third"),
+        detector(),
+    ];
+    for lambda in &lambdas {
+        let deployed = vehicle.deploy(lambda.path(), &[]);
         assert!(deployed.status.success(), "{}", text(&deployed));
     }
+    // Without it, clips hold journals only.
+    if let Some(why) = no_player() {
+        println!("no samples: {why}");
+    }
+    let player = no_player()
+        .is_none()
+        .then(|| play(&["--imu", "50", "--synthetic", "160x120@2", "--wait", "1"]));
+    vehicle.until("all processes", |vehicle| runs(vehicle).then_some(()));
     let mut seen: BTreeMap<&str, BTreeMap<u64, StreamLine>> = BTreeMap::new();
+    let mut listed = BTreeSet::new();
     let mut recoveries: BTreeMap<&str, Vec<Duration>> = BTreeMap::new();
     for _ in 0..times("GLEANER_KILLS", 24) {
         thread::sleep(Duration::from_millis(random.below(300) as u64));
         let victim = VICTIMS[random.below(VICTIMS.len())];
-        // The oracle: these records were durable before the kill.
-        for id in ids {
+        // The oracle: these records and clips were durable before the kill.
+        for id in TICKERS {
             keep(seen.entry(id).or_default(), vehicle.records(Some(id)));
         }
-        let restarts = |vehicle: &TestVehicle| {
-            ids.map(|id| vehicle.deployment(id).status.map(|status| status.restarts))
-        };
+        listed.extend(clips(&vehicle).into_iter().map(|clip| clip.file));
         let before = restarts(&vehicle);
         let started = Instant::now();
         match victim {
@@ -59,7 +81,6 @@ pub fn killed_at_random() {
             }
             "gleaner-supervisor" => signal(vehicle.supervisor(), "KILL"),
             name => {
-                // The ingress of a supervisor that was just started may not run yet.
                 let pids = vehicle.until("a victim", |vehicle| {
                     Some(vehicle.processes(name)).filter(|pids| !pids.is_empty())
                 });
@@ -68,14 +89,18 @@ pub fn killed_at_random() {
         }
         // A status from before the kill may still show them all running.
         thread::sleep(Duration::from_millis(50));
-        vehicle.until_running(&ids);
+        vehicle.until("all processes", |vehicle| runs(vehicle).then_some(()));
         recoveries.entry(victim).or_default().push(started.elapsed());
-        if victim == "gleaner-orchestrator" {
-            assert_eq!(restarts(&vehicle), before, "no lambda is started again");
+        if SERVICES.contains(&victim) {
+            assert_eq!(restarts(&vehicle), before, "{victim}: no lambda is started again");
         }
     }
+    if let Some(player) = player {
+        player.signal("INT");
+        player.finish();
+    }
     let mut lost = 0;
-    for id in ids {
+    for id in TICKERS {
         let after = vehicle.records(Some(id));
         let seqs: Vec<_> = after.iter().map(|line| line.seq).collect();
         assert!(seqs.is_sorted_by(|a, b| a < b), "`{id}` has a number twice: {seqs:?}");
@@ -87,12 +112,83 @@ pub fn killed_at_random() {
     }
     for (victim, times) in &mut recoveries {
         times.sort();
-        let (median, most) = (times[times.len() / 2], times[times.len() - 1]);
-        println!("{victim}: {} kills, all run after {median:.2?}, {most:.2?} at most", times.len());
+        let at = |share: f64| times[((times.len() - 1) as f64 * share).round() as usize];
+        let [median, p99, most] = [0.5, 0.99, 1.0].map(at);
+        println!(
+            "{victim}: {} kills, all run after {median:.2?} (p50), {p99:.2?} (p99), {most:.2?} \
+             (max)",
+            times.len()
+        );
     }
     let checked: usize = seen.values().map(BTreeMap::len).sum();
     println!("{checked} durable records are unchanged; gaps have {lost} numbers");
+    let status = vehicle.status();
     vehicle.stop();
+    check_clips(&vehicle, &status, &listed);
+}
+
+/// Returns a ticker that records what the player sends, a second around each tick.
+fn recording(language: &str, name: &str) -> LambdaCopy {
+    LambdaCopy::changed_and_named(&format!("tests/lambdas/ticker/{language}"), name, |manifest| {
+        manifest.replace("/imu/data", "/imu/synthetic")
+            + "[record]\ntopics = [\"/imu/synthetic\", \"/camera/synthetic/image_raw\"]\n\
+               preroll = \"1s\"\npostroll = \"1s\"\nmax_length = \"5s\"\n"
+    })
+}
+
+/// Returns the example with a model, on the images of the player.
+fn detector() -> LambdaCopy {
+    LambdaCopy::changed_and_named("examples/yolo-detector/rust", "detector", |manifest| {
+        let manifest = manifest
+            .replace("/camera/front/compressed", "/camera/synthetic/image_raw")
+            .replace("CompressedImage", "Image");
+        let (before, record) = manifest.split_once("[record]").expect("it records");
+        let (_, after) = record.split_once("[limits]").expect("it has limits");
+        format!("{before}[limits]{after}")
+    })
+}
+
+/// Returns whether all lambdas run, and the processes that they share.
+fn runs(vehicle: &TestVehicle) -> bool {
+    let Some(status) = vehicle.try_status() else { return false };
+    let Some(supervisor) = &status.supervisor else { return false };
+    supervisor.ingress.is_ready
+        && supervisor.recorder.as_ref().is_some_and(|it| it.is_ready)
+        && supervisor.inference.as_ref().is_some_and(|it| it.is_ready)
+        && TestVehicle::all_run(&status, &IDS)
+}
+
+fn restarts(vehicle: &TestVehicle) -> [Option<u32>; 4] {
+    IDS.map(|id| vehicle.deployment(id).status.map(|status| status.restarts))
+}
+
+/// Returns the listed clips.
+fn clips(vehicle: &TestVehicle) -> Vec<Clip> {
+    let text = std::fs::read_to_string(vehicle.path("state/clips/clips.jsonl"));
+    let text = text.unwrap_or_default();
+    // The last line may be in the making.
+    let lines = text.split_inclusive('\n').filter(|line| line.ends_with('\n'));
+    lines.map(|line| serde_json::from_str(line).expect("a line is a clip")).collect()
+}
+
+/// Checks that the clips that were listed before are still there, none is listed twice, and the
+/// signature of the vehicle covers each.
+fn check_clips(vehicle: &TestVehicle, status: &VehicleStatus, before: &BTreeSet<PathBuf>) {
+    let clips = clips(vehicle);
+    let files: BTreeSet<_> = clips.iter().map(|clip| clip.file.clone()).collect();
+    assert_eq!(files.len(), clips.len(), "a clip is listed twice");
+    assert!(before.is_subset(&files), "{before:?} were listed; now {files:?}");
+    let trusted = vehicle.path("vehicles");
+    let line = format!("{} {}\n", status.vehicle, status.key);
+    std::fs::write(&trusted, line).expect("a file is written");
+    let trusted = trusted.to_str().expect("a plain path");
+    for file in &files {
+        let file = vehicle.path("state").join(file);
+        vehicle.succeeds(&["verify", file.to_str().expect("a plain path"), "--trust", trusted]);
+    }
+    let recovered = clips.iter().filter(|clip| clip.recovered.is_some()).count();
+    println!("{} signed clips, of which {recovered} were recovered", clips.len());
+    assert!(!clips.is_empty());
 }
 
 /// Adds records that were read; what was read before must not have changed.

@@ -42,10 +42,14 @@ pub enum RecorderMessage {
     },
 }
 
-/// A lambda's connection to the recorder. Only [`hello`](Self::hello) and [`bye`](Self::bye) block.
+/// A lambda's connection to the recorder, and after a restart of the recorder to the next one. Only
+/// [`hello`](Self::hello) and [`bye`](Self::bye) block.
 #[derive(Debug)]
 pub struct RecorderLink {
     socket: UnixStream,
+    state: LinkState,
+    /// The identity of the lambda, while it is sent again.
+    hello: FrameQueue,
     encoder: OpaqueEncoder,
     frame: Vec<u8>,
     queue: Queue,
@@ -56,6 +60,19 @@ pub struct RecorderLink {
     batch: Vec<u8>,
     /// Received bytes of an incomplete frame.
     received: Vec<u8>,
+    /// Number of recorders that have ended.
+    ends: u64,
+}
+
+/// State of a link.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum LinkState {
+    /// The recorder accepts wakes.
+    Joined,
+    /// It was sent the identity of the lambda, and has not replied.
+    Joining,
+    /// It has ended: wakes are queued for the next one.
+    Gone,
 }
 
 /// Implements `Debug` without the state of the encoder.
@@ -72,12 +89,15 @@ impl RecorderLink {
     pub fn new(socket: OwnedFd) -> RecorderLink {
         RecorderLink {
             socket: socket.into(),
+            state: LinkState::Joined,
+            hello: FrameQueue::default(),
             encoder: OpaqueEncoder(Encoder::new(0)),
             frame: Vec::new(),
             queue: Queue::new(QUEUE_BYTES),
             engines: FrameQueue::default(),
             batch: Vec::new(),
             received: Vec::new(),
+            ends: 0,
         }
     }
 
@@ -90,24 +110,10 @@ impl RecorderLink {
     pub fn hello(&mut self, header: &JournalHeader, timeout: Duration) -> Result<(), LinkError> {
         let until = Instant::now() + timeout;
         let failed = |source: io::Error| LinkError::Socket { peer: RECORDER, source };
-        let payload = serde_json::to_vec(header).map_err(|error| failed(error.into()))?;
-        if payload.len() > super::FRAME_MAX {
-            return Err(LinkError::TooLong {
-                peer: "the lambda",
-                frame: "hello",
-                bytes: payload.len() as u64,
-                max: super::FRAME_MAX,
-            });
-        }
+        let hello = encode_hello(header)?;
         self.encoder = OpaqueEncoder(Encoder::new(header.inputs.len()));
-        let hello = frame::encode(tag::HELLO, &payload);
         if let Err(error) = self.send_until(&hello, until, timeout) {
-            // It may have sent a reason before it closed the connection.
-            let _ = self.read(RecvFlags::DONTWAIT);
-            return match self.next_message() {
-                Ok(Some(RecorderMessage::Refused(reason))) => Err(LinkError::Refused { reason }),
-                _ => Err(error),
-            };
+            return Err(self.refusal().unwrap_or(error));
         }
         loop {
             let remaining = until.saturating_duration_since(Instant::now());
@@ -126,6 +132,41 @@ impl RecorderLink {
         }
     }
 
+    /// Continues with the next recorder, over `socket`: sends the identity of the lambda, and after
+    /// the reply the queued wakes. Never waits: [`poll`](Self::poll) returns the reply.
+    ///
+    /// # Errors
+    ///
+    /// [`LinkError::TooLong`] for a header that is too long.
+    pub fn rejoin(&mut self, socket: OwnedFd, header: &JournalHeader) -> Result<(), LinkError> {
+        let hello = encode_hello(header)?;
+        self.socket = socket.into();
+        self.state = LinkState::Joining;
+        self.hello = FrameQueue::default();
+        self.hello.push(hello, None);
+        // It is in the header.
+        self.engines = FrameQueue::default();
+        self.received.clear();
+        self.queue.send_again();
+        Ok(())
+    }
+
+    /// Returns false while the recorder has ended, and no other one has accepted the lambda.
+    pub fn is_joined(&self) -> bool {
+        self.state == LinkState::Joined
+    }
+
+    /// Returns the refusal that the recorder may have sent before it closed the connection.
+    fn refusal(&mut self) -> Option<LinkError> {
+        let _ = self.read(RecvFlags::DONTWAIT);
+        while let Ok(Some(message)) = self.next_message() {
+            if let RecorderMessage::Refused(reason) = message {
+                return Some(LinkError::Refused { reason });
+            }
+        }
+        None
+    }
+
     /// Queues a wake, which was decided at `decided_monotonic_ns` of `CLOCK_MONOTONIC`.
     ///
     /// A wake with triggers or a fault is sent at once, after those queued before. Other wakes are
@@ -137,7 +178,9 @@ impl RecorderLink {
     ///
     /// # Errors
     ///
-    /// [`LinkError::Gone`] if it had to send, and the recorder has ended.
+    /// [`LinkError::Gone`] if it had to send, and the recorder has ended; [`LinkError::Refused`] if
+    /// it has refused the lambda. The wake stays in the queue, as do further ones, without an
+    /// error, until [`rejoin`](Self::rejoin).
     pub fn wake(
         &mut self,
         entry: &JournalEntry,
@@ -158,7 +201,8 @@ impl RecorderLink {
         }
         self.frame = bytes;
         let is_urgent = triggers > 0 || entry.fault.is_some() || self.queue.bytes() > SEND_BYTES;
-        if is_urgent { self.flush() } else { Ok(()) }
+        let sent = if is_urgent { self.flush() } else { Ok(()) };
+        sent.map_err(|error| self.ended(error))
     }
 
     /// Queues a new engine, in place of that in the header. Wakes may overtake it.
@@ -170,27 +214,46 @@ impl RecorderLink {
     ///
     /// # Errors
     ///
-    /// [`LinkError::Gone`] if the recorder has ended; [`LinkError`] for an invalid message.
+    /// Those of [`wake`](Self::wake); [`LinkError`] for an invalid message.
     pub fn poll(&mut self) -> Result<Vec<RecorderMessage>, LinkError> {
-        self.flush()?;
-        self.read(RecvFlags::DONTWAIT)?;
         let mut all = Vec::new();
+        if self.state == LinkState::Gone {
+            return Ok(all);
+        }
+        let received = self.flush().and_then(|()| self.read(RecvFlags::DONTWAIT));
+        received.map_err(|error| self.ended(error))?;
         while let Some(message) = self.next_message()? {
+            if message == RecorderMessage::Ready {
+                self.state = LinkState::Joined;
+            }
             all.push(message);
         }
         Ok(all)
     }
 
-    /// Returns the number of wakes and triggers that could not be sent.
+    /// Notes that the recorder has ended; returns the error to report.
+    fn ended(&mut self, error: LinkError) -> LinkError {
+        self.state = LinkState::Gone;
+        self.ends += 1;
+        self.refusal().unwrap_or(error)
+    }
+
+    /// Returns the wakes and triggers that could not be sent, and the number of recorders that
+    /// ended.
     pub fn dropped(&self) -> LinkLosses {
         LinkLosses {
             wakes_dropped: self.queue.wakes_dropped,
             triggers_lost: self.queue.triggers_lost,
+            recorders_ended: self.ends,
         }
     }
 
     /// Sends queued wakes and the end of the connection, up to `timeout`. Returns the losses.
     pub fn bye(mut self, timeout: Duration) -> LinkLosses {
+        if self.state != LinkState::Joined {
+            self.queue.drop_all();
+            return self.dropped();
+        }
         let until = Instant::now() + timeout;
         let (is_begun, engines) = (self.engines.is_begun(), self.engines.take_rest());
         if is_begun && self.send_until(&engines, until, timeout).is_err() {
@@ -211,6 +274,11 @@ impl RecorderLink {
     }
 
     fn flush(&mut self) -> Result<(), LinkError> {
+        match self.state {
+            LinkState::Joined => {}
+            LinkState::Joining => return self.hello.flush(&self.socket, RECORDER),
+            LinkState::Gone => return Ok(()),
+        }
         if self.engines.is_begun() {
             self.engines.flush(&self.socket, RECORDER)?;
             if self.engines.is_begun() {
@@ -293,4 +361,19 @@ impl RecorderLink {
         self.received.drain(..HEAD + len);
         Ok(Some(message))
     }
+}
+
+/// Encodes the identity of a lambda.
+fn encode_hello(header: &JournalHeader) -> Result<Vec<u8>, LinkError> {
+    let failed = |source: io::Error| LinkError::Socket { peer: RECORDER, source };
+    let payload = serde_json::to_vec(header).map_err(|error| failed(error.into()))?;
+    if payload.len() > super::FRAME_MAX {
+        return Err(LinkError::TooLong {
+            peer: "the lambda",
+            frame: "hello",
+            bytes: payload.len() as u64,
+            max: super::FRAME_MAX,
+        });
+    }
+    Ok(frame::encode(tag::HELLO, &payload))
 }

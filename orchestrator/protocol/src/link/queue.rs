@@ -121,6 +121,11 @@ impl Queue {
         }
     }
 
+    /// Makes the first frame be sent from its start again, over another connection.
+    pub(super) fn send_again(&mut self) {
+        self.sent = 0;
+    }
+
     /// Returns the number of queued bytes.
     pub(super) fn bytes(&self) -> usize {
         self.bytes
@@ -202,6 +207,10 @@ mod tests {
             assert!(queue.push(&wake(number), triggers));
         }
         assert_eq!(queue.wakes_dropped, 1);
+        // It is sent again from its start.
+        queue.sent(1);
+        queue.send_again();
+        assert_eq!(queue.next().map(<[u8]>::len), Some(wake(0).len()));
         // A partly sent frame cannot be dropped.
         queue.sent(1);
         assert!(queue.push(&wake(4), 1), "2 is dropped");

@@ -269,6 +269,34 @@ fn a_recorder_that_does_not_read_loses_wakes_but_does_not_block_the_lambda() {
 }
 
 #[test]
+fn wakes_wait_for_the_next_recorder() {
+    let (mut lambda, link, mut replies) = connected();
+    replies.ready();
+    lambda.hello(&header("hello"), TIMEOUT).unwrap();
+    drop((link, replies));
+    let ended = lambda.wake(&entry(1, Some("here")), 0).unwrap_err();
+    assert!(matches!(ended, LinkError::Gone { .. }), "{ended}");
+    lambda.wake(&entry(2, Some("here")), 0).unwrap();
+    assert!(lambda.poll().unwrap().is_empty() && !lambda.is_joined());
+    let (lambda_end, recorder_end) = UnixStream::pair().unwrap();
+    let (mut link, mut replies) = LambdaLink::new(recorder_end.into()).unwrap();
+    lambda.rejoin(lambda_end.into(), &header("hello")).unwrap();
+    assert!(lambda.poll().unwrap().is_empty() && !lambda.is_joined());
+    assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
+    replies.ready();
+    while lambda.poll().unwrap().is_empty() {
+        thread::yield_now();
+    }
+    assert!(lambda.is_joined());
+    assert_eq!(lambda.bye(TIMEOUT), crate::LinkLosses { recorders_ended: 1, ..Default::default() });
+    for expected in [1, 2] {
+        let received = link.receive().unwrap();
+        let Some(LambdaMessage::Wake { entry, missing: 0, .. }) = received else { panic!() };
+        assert_eq!(entry.at_ns, expected);
+    }
+}
+
+#[test]
 fn a_refusal_states_its_reason_and_a_silent_recorder_is_a_timeout() {
     let (mut lambda, _link, mut replies) = connected();
     replies.refused("it is another \u{1b}[2J");

@@ -16,7 +16,7 @@ use gleaner_protocol::supervision::{EventKind, SupervisionSpec, SupervisorStatus
 
 use crate::event_log::EventLog;
 use crate::inference::InferenceEvent;
-use crate::observer::RunObserver;
+use crate::observer::{RestartedPart, RunObserver};
 use crate::spec::LambdaSpec;
 
 /// Number of pieces of standard error that wait for their reader.
@@ -164,16 +164,18 @@ impl RunObserver for Board {
         self.event(EventKind::Started, None, &format!("playing {files}"));
     }
 
-    fn restarts(
-        &mut self,
-        lambda: Option<&LambdaSpec>,
-        reason: &str,
-        delay: Duration,
-        _restarts: u32,
-    ) {
-        if lambda.is_none() {
-            self.lock().ingress.ended(reason);
-        }
+    fn restarts(&mut self, part: RestartedPart<'_>, reason: &str, delay: Duration, _restarts: u32) {
+        let lambda = match part {
+            RestartedPart::All | RestartedPart::Ingress => {
+                self.lock().ingress.ended(reason);
+                None
+            }
+            RestartedPart::Recorder => {
+                self.lock().recorder.get_or_insert_default().ended(reason);
+                None
+            }
+            RestartedPart::Lambda(lambda) => Some(lambda),
+        };
         self.event(EventKind::Failed, lambda, &failed(reason, delay));
     }
 

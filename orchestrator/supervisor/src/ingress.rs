@@ -1,6 +1,5 @@
-//! The processes that all lambdas of a run share: the ingress and the recorder.
+//! The ingress of a run, over its restarts.
 
-use std::os::fd::OwnedFd;
 use std::process::ExitStatus;
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
@@ -8,14 +7,12 @@ use std::time::{Duration, Instant};
 use gleaner_base::{Exit, Failure, chain};
 use gleaner_protocol::Handover;
 use gleaner_protocol::ingress::{IngressControl, IngressReport, IngressStatus, IngressTopic};
-use gleaner_protocol::link::{ControlClient, LinkError, RecorderReport, RecorderStatus};
+use gleaner_protocol::link::LinkError;
 
-use crate::grants::RecordedTopics;
 use crate::observer::RunObserver;
 use crate::output::{ChildId, ChildOutput, PIPES};
 use crate::process::{ChildProcess, ended};
 use crate::restart_delay::RestartDelay;
-use crate::spec::LambdaSpec;
 use crate::{RunContext, arguments};
 
 /// The ingress of a run.
@@ -48,8 +45,9 @@ pub(crate) struct IngressProcess {
     heard: Instant,
 }
 
-/// Maximum time between two reports of an ingress that is ready; it sends one each second.
-const SILENCE: Duration = Duration::from_secs(15);
+/// Maximum time between two reports of an ingress or a recorder that is ready: each sends one each
+/// second.
+pub(crate) const SILENCE: Duration = Duration::from_secs(15);
 
 impl IngressProcess {
     /// Starts the ingress. `largest` is the largest sample of an input, in bytes.
@@ -222,71 +220,4 @@ impl IngressProcess {
 fn find<'a>(topics: &'a mut [IngressTopic], topic: &IngressTopic) -> Option<&'a mut IngressTopic> {
     let names = (&topic.topic, &topic.type_name);
     topics.iter_mut().find(|known| (&known.topic, &known.type_name) == names)
-}
-
-/// The recorder of a run.
-pub(crate) struct RecorderProcess {
-    pub(crate) child: ChildProcess,
-    pub(crate) control: ControlClient,
-    pub(crate) open_pipes: u8,
-    /// Set when it accepts lambdas.
-    pub(crate) is_ready: bool,
-    /// Topics that lambdas record.
-    pub(crate) topics: RecordedTopics,
-    pub(crate) status: Option<Box<RecorderStatus>>,
-}
-
-impl RecorderProcess {
-    /// Starts the recorder of the lambdas `recorded`. `ingress` is its connection to the ingress.
-    pub(crate) fn start<'a>(
-        context: &RunContext<'_>,
-        recorded: impl Iterator<Item = &'a LambdaSpec> + Clone,
-        ingress: OwnedFd,
-        sender: &SyncSender<ChildOutput>,
-    ) -> Result<Self, Failure> {
-        let (control, recorder_end) = ControlClient::pair().map_err(|error| {
-            Failure::caused_by(Exit::Internal, "cannot connect to the recorder", &error)
-        })?;
-        let key = context.spec.signing.as_ref().map(|signing| signing.key.try_clone());
-        let key = key.transpose().map_err(|error| {
-            Failure::caused_by(Exit::Internal, "cannot pass the key to the recorder", &error)
-        })?;
-        let connections = Handover {
-            control: Some(recorder_end),
-            ingress: Some(ingress),
-            key: key.map(OwnedFd::from),
-            ..Handover::default()
-        };
-        let child = ChildProcess::start(
-            &context.parts,
-            ("gleaner-recorder", ChildId::Recorder, ""),
-            arguments::recorder(context.spec, recorded.clone(), context.offset_ns),
-            None,
-            connections,
-            sender,
-        )?;
-        let topics = RecordedTopics::of(recorded);
-        Ok(Self { child, control, open_pipes: PIPES, is_ready: false, topics, status: None })
-    }
-
-    pub(crate) fn show(&mut self, report: RecorderReport, observer: &mut dyn RunObserver) {
-        observer.recorder(&report);
-        match report {
-            RecorderReport::Ready => self.is_ready = true,
-            RecorderReport::Status(status) | RecorderReport::Ended(status) => {
-                self.status = Some(status);
-            }
-            RecorderReport::Clip(_) | RecorderReport::Recovered(_) | RecorderReport::Loss(_) => {}
-        }
-    }
-}
-
-/// Returns the result of a request to the recorder; `None` if it has ended, which its exit status
-/// explains.
-pub(crate) fn unless_gone<T>(requested: Result<T, LinkError>) -> Result<Option<T>, Failure> {
-    match requested {
-        Ok(result) => Ok(Some(result)),
-        Err(LinkError::Gone { .. }) => Ok(None),
-        Err(error) => Err(Failure::because("cannot connect the processes of the run", &error)),
-    }
 }
