@@ -1,4 +1,5 @@
-//! `gleaner deploy`, `rollback`, `start`, `stop` and `remove`: change what runs on a vehicle, and wait.
+//! `gleaner deploy`, `rollback`, `start`, `stop` and `remove`: change what runs on a vehicle, and
+//! wait.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;

@@ -70,3 +70,14 @@ fn cpu_time() -> Duration {
     let seconds = u64::try_from(time.tv_sec).unwrap_or(0);
     Duration::new(seconds, u32::try_from(time.tv_nsec).unwrap_or(0))
 }
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn the_speed_of_this_machine_is_measured() {
+        let speed = super::fuel_per_second().unwrap();
+        // No machine that runs this test takes one unit in a microsecond, or a thousand in a
+        // nanosecond.
+        assert!((1e6..1e12).contains(&speed), "{speed}");
+    }
+}

@@ -52,7 +52,7 @@ pub(crate) struct Inner {
     pub(crate) compiling: Vec<Sha256>,
     /// True after a removal, until the files of its revisions are removed.
     pub(crate) has_removed: bool,
-    /// What lambdas used so far.
+    /// Use of resources so far.
     pub(crate) measured: Measurements,
     pub(crate) status: Option<SupervisorStatus>,
 }

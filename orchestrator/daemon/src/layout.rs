@@ -84,7 +84,7 @@ impl VehicleFolders {
         self.state.join("state.json")
     }
 
-    /// What lambdas used, and the speed of the machine.
+    /// File of the measurements.
     pub(crate) fn measured(&self) -> PathBuf {
         self.state.join("measured.json")
     }

@@ -1,4 +1,5 @@
-//! Records of deployments that were removed: they can be read for a while, but do not fill the disk.
+//! Records of deployments that were removed: they can be read for a while, and do not fill the
+//! disk.
 
 use std::collections::BTreeSet;
 use std::fs;

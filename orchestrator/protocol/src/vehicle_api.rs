@@ -93,7 +93,7 @@ pub struct DeploymentStatus {
     pub refused: Option<String>,
     /// The reason why its deployer should sign it again.
     pub stale: Option<String>,
-    /// What it needs of the resources that lambdas share.
+    /// Its demand for each resource that lambdas share.
     #[serde(default)]
     pub demand: Vec<ResourceDemand>,
     /// The status of its lambda, if the supervisor knows it.

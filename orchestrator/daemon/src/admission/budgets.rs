@@ -120,7 +120,7 @@ impl Resource {
 
 /// The most of a resource that may be asked for.
 #[derive(Debug)]
-struct Budget {
+struct ResourceBudget {
     resource: Resource,
     most: f64,
     source: String,
@@ -128,7 +128,7 @@ struct Budget {
 
 /// The budgets of all resources.
 #[derive(Debug)]
-pub(crate) struct Budgets([Budget; 4]);
+pub(crate) struct Budgets([ResourceBudget; 4]);
 
 impl Budgets {
     /// Returns the budgets of the configuration, on this machine.
@@ -139,25 +139,26 @@ impl Budgets {
 
     pub(super) fn on(vehicle: &Vehicle, memory: u64, cores: usize) -> Self {
         let settings = &vehicle.deployments;
-        let size = |resource, chosen: Option<ByteSize>, key: &str, part: u64, text: &str| Budget {
-            resource,
-            most: chosen.map_or(memory / part, ByteSize::bytes) as f64,
-            source: match chosen {
-                Some(_) => format!("`deployments.{key}` in vehicle.toml"),
-                None => format!("{text} of the machine's memory"),
-            },
-        };
+        let size =
+            |resource, chosen: Option<ByteSize>, key: &str, part: u64, text: &str| ResourceBudget {
+                resource,
+                most: chosen.map_or(memory / part, ByteSize::bytes) as f64,
+                source: match chosen {
+                    Some(_) => format!("`deployments.{key}` in vehicle.toml"),
+                    None => format!("{text} of the machine's memory"),
+                },
+            };
         let percent = |share: f64| (share * 100.0).round();
         let of_cores = if cores == 1 { "core".to_owned() } else { format!("{cores} cores") };
         Self([
             size(Resource::Memory, settings.memory, "memory", 2, "half"),
             size(Resource::Topics, settings.topics, "topics", 4, "a quarter"),
-            Budget {
+            ResourceBudget {
                 resource: Resource::Cpu,
                 most: settings.cpu * cores as f64,
                 source: format!("{} % of the machine's {of_cores}", percent(settings.cpu)),
             },
-            Budget {
+            ResourceBudget {
                 resource: Resource::ModelTime,
                 most: settings.model_time,
                 source: format!("{} % of the time", percent(settings.model_time)),
@@ -177,7 +178,7 @@ impl Budgets {
         asked: &LambdaDemand,
         wanted: &BTreeMap<ItemName, LambdaDemand>,
     ) -> Result<(), Failure> {
-        for Budget { resource, most, source } in &self.0 {
+        for ResourceBudget { resource, most, source } in &self.0 {
             let others = || wanted.iter().filter(|(it, _)| *it != id).map(|(_, demand)| demand);
             let sum = resource.sum(others().chain([asked]));
             let before = wanted.get(id).map(|_| resource.sum(wanted.values()));
@@ -207,7 +208,7 @@ impl Budgets {
         wanted: &BTreeMap<ItemName, LambdaDemand>,
         used: &CurrentUse,
     ) -> Vec<Capacity> {
-        let of = |Budget { resource, most, source }: &Budget| Capacity {
+        let of = |ResourceBudget { resource, most, source }: &ResourceBudget| Capacity {
             resource: resource.name().to_owned(),
             unit: resource.unit().to_owned(),
             asked: resource.sum(wanted.values()),

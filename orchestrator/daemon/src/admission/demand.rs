@@ -113,7 +113,7 @@ pub(crate) struct LambdaDemand {
     pub(crate) topics: BTreeMap<TopicName, u64>,
 }
 
-/// What is known of the machine and of its lambdas.
+/// Measurements of the machine and of its lambdas, as a demand depends on them.
 pub(crate) struct DemandModel<'a> {
     /// Fuel units per second.
     pub(crate) fuel_per_s: f64,
@@ -166,7 +166,7 @@ impl DemandModel<'_> {
     }
 
     /// Returns the CPU time of its process.
-    fn cpu(&self, manifest: &Manifest, used: Option<&MeasuredUse>, rate: &Rate) -> Asked {
+    fn cpu(&self, manifest: &Manifest, used: Option<&MeasuredUse>, rate: &WakeRate) -> Asked {
         let per_wake = match (manifest.demand.cpu, manifest.demand.fuel) {
             (Some(cpu), _) => Some((cpu.as_secs_f64(), format_duration(cpu))),
             (None, Some(fuel)) => {
@@ -187,7 +187,12 @@ impl DemandModel<'_> {
         choose(stated, used.map(|used| used.cpu), assumed)
     }
 
-    fn model_time(&self, manifest: &Manifest, used: Option<&MeasuredUse>, rate: &Rate) -> Asked {
+    fn model_time(
+        &self,
+        manifest: &Manifest,
+        used: Option<&MeasuredUse>,
+        rate: &WakeRate,
+    ) -> Asked {
         if manifest.models.is_empty() {
             return Asked::nothing();
         }
@@ -209,12 +214,12 @@ impl DemandModel<'_> {
 }
 
 /// Wakes per second.
-struct Rate {
+struct WakeRate {
     hz: f64,
     source: DemandSource,
 }
 
-impl Rate {
+impl WakeRate {
     fn times(&self, per_wake: f64, text: &str) -> Asked {
         let factors = format!("{} wakes/s of {text}", rounded(self.hz));
         Asked::new(self.hz * per_wake, self.source.max(DemandSource::Stated), factors)
@@ -227,7 +232,7 @@ impl Rate {
     }
 }
 
-fn rate(manifest: &Manifest, used: Option<&MeasuredUse>) -> Rate {
+fn rate(manifest: &Manifest, used: Option<&MeasuredUse>) -> WakeRate {
     let (hz, source) = match (&manifest.schedule, manifest.demand.rate_hz, used) {
         (ScheduleSpec::Periodic { period }, _, _) => {
             (1.0 / period.as_secs_f64(), DemandSource::Stated)
@@ -239,7 +244,7 @@ fn rate(manifest: &Manifest, used: Option<&MeasuredUse>) -> Rate {
             (if is_large { LARGE_RATE } else { SMALL_RATE }, DemandSource::Assumed)
         }
     };
-    Rate { hz, source }
+    WakeRate { hz, source }
 }
 
 /// Chooses the number that counts: the stated one, unless more was measured; else the measured

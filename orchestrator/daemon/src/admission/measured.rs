@@ -1,5 +1,5 @@
-//! What lambdas used on this vehicle, and the speed of the machine, in a file that survives
-//! restarts. Without the file, all is measured again.
+//! Use of resources by the lambdas of this vehicle, and the speed of the machine, in a file that
+//! survives restarts. Without the file, all is measured again.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -38,7 +38,7 @@ pub(crate) struct MeasuredUse {
     pub(crate) is_reported: bool,
 }
 
-/// What all lambdas use now.
+/// Use of resources by all lambdas, now.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct CurrentUse {
     /// Memory, in bytes.
@@ -169,7 +169,8 @@ impl Measurements {
         let sum = |part: fn(&MeasuredUse) -> f64| {
             (!uses.is_empty()).then(|| uses.iter().map(part).sum::<f64>())
         };
-        let live = status.lambdas.iter().filter_map(|lambda| lambda.live.as_deref());
+        let running = status.lambdas.iter().filter(|lambda| lambda.phase == LambdaPhase::Running);
+        let live = running.filter_map(|lambda| lambda.live.as_deref());
         let resident: u64 = live.map(|live| live.rss_bytes).sum();
         CurrentUse {
             memory: (resident > 0).then_some(resident as f64),

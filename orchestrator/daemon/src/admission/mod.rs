@@ -1,6 +1,6 @@
 //! Admission: refuses a deployment that asks for more than the vehicle has.
 //!
-//! - `demand`: what a lambda asks for: as its manifest states, as it was measured, or as is assumed.
+//! - `demand`: what a lambda asks for: as its manifest states, as measured, or as is assumed.
 //! - `budgets`: the most that all lambdas may ask for, and the decision.
 //! - `measured`: what lambdas used on this vehicle, in a file. `board`: the speed of the machine.
 //!
