@@ -352,7 +352,7 @@ impl Core {
                 let find = |digest: &Sha256| self.store.envelope(digest).ok();
                 let envelope = deployed.envelope.as_bytes();
                 let mut signed = SignedDeployment::verify(&verifier, envelope, find)?;
-                manifests.insert(id.clone(), signed.check_manifests(&self.store)?);
+                manifests.insert(id.clone(), self.check_manifests(&mut signed)?);
                 Ok(signed)
             });
             if let Err(failure) = &checked {
@@ -361,6 +361,18 @@ impl Core {
             signed.insert(id.clone(), checked.map_err(|failure| failure.to_string()));
         }
         (inner.signed, inner.manifests) = (signed, manifests);
+    }
+
+    /// Checks the manifests of a deployment, and returns them with the limits that apply here.
+    pub(crate) fn check_manifests(
+        &self,
+        signed: &mut SignedDeployment,
+    ) -> Result<Vec<(Sha256, Manifest)>, Failure> {
+        let mut manifests = signed.check_manifests(&self.store)?;
+        for (_, manifest) in &mut manifests {
+            manifest.limits = manifest.limits.tightened_by(&self.vehicle.limits).0;
+        }
+        Ok(manifests)
     }
 
     /// Writes the state as it is, with the next generation, and publishes what is wanted.

@@ -65,7 +65,7 @@ impl Core {
                 self.store.add(digest, &envelope, &mut known)?;
             }
         }
-        let manifests = signed.check_manifests(&self.store)?;
+        let manifests = self.check_manifests(&mut signed)?;
         let admit = |inner: &Inner| {
             let demand = inner.measured.model().of(&manifests);
             demand.map_or(Ok(()), |it| self.budgets.admit(signed.id(), &it, &inner.wanted_demand()))

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use gleaner_base::{ByteSize, format_duration};
+use gleaner_base::{ByteSize, format_duration, grouped};
 use gleaner_lambda::Manifest;
 use gleaner_lambda::manifest::{LambdaKind, ScheduleSpec, Sha256, Store, TopicName};
 
@@ -171,7 +171,8 @@ impl DemandModel<'_> {
             (Some(cpu), _) => Some((cpu.as_secs_f64(), format_duration(cpu))),
             (None, Some(fuel)) => {
                 let speed = self.fuel_per_s;
-                let text = format!("{fuel} fuel at {:.0} M/s", speed / 1e6);
+                let millions = grouped((speed / 1e6).round());
+                let text = format!("{} fuel units at {millions} M/s", grouped(fuel));
                 Some((HOST_PER_WAKE + fuel as f64 / speed, text))
             }
             (None, None) => None,

@@ -84,7 +84,7 @@ fn what_is_stated_counts_before_what_was_measured_and_that_before_an_assumption(
             stated("rate_hz = 200\nfuel = 1_700_000"),
             None,
             0.4,
-            "stated: 200 wakes/s of 1700000 fuel at 1000 M/s",
+            "stated: 200 wakes/s of 1,700,000 fuel units at 1,000 M/s",
         ),
         // A rate that is not stated makes the product uncertain.
         ("wasm", event, stated("cpu = \"2ms\""), None, 0.2, "assumed: 100 wakes/s of 2ms"),
@@ -103,6 +103,21 @@ fn what_is_stated_counts_before_what_was_measured_and_that_before_an_assumption(
         assert_eq!(cpu.source(), source);
         assert_eq!(cpu.peak, used.map(|used| used.cpu));
     }
+}
+
+#[test]
+fn only_what_exceeds_the_stated_demand_clearly_is_reported() {
+    let of = |more: &str, cores: f64| {
+        let manifest = manifest("wasm", "period = \"10ms\"", more);
+        let cpu = demand(&manifest, used(cores, 100.0, 0.0), None).cpu;
+        (cpu.amount, cpu.exceeds)
+    };
+    let stated = "[demand]\ncpu = \"2ms\"";
+    assert_eq!(of(stated, 0.19), (0.2, false));
+    assert_eq!(of(stated, 0.22), (0.22, false));
+    assert_eq!(of(stated, 0.24), (0.24, true));
+    assert_eq!(of("[demand]\ncpu = \"1us\"", 0.005), (0.005, false), "of the process itself");
+    assert_eq!(of("", 0.9), (0.9, false));
 }
 
 #[test]
