@@ -61,6 +61,7 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
         CliCommand::Rollback(args) => vehicle::change(&args, "rollback"),
         CliCommand::Start(args) => vehicle::change(&args, "start"),
         CliCommand::Stop(args) => vehicle::change(&args, "stop"),
+        CliCommand::Remove(args) => vehicle::remove(&args),
         CliCommand::Status(args) => vehicle::status(&args),
         CliCommand::Logs(args) => vehicle::logs(&args),
         CliCommand::Events(args) => vehicle::events(&args),

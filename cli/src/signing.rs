@@ -1,7 +1,6 @@
 //! `gleaner keys`, `gleaner publish` and the signatures of clips: print the results of
 //! `gleaner-trust`.
 
-use std::fs;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -11,7 +10,7 @@ use gleaner_report::format::{counted, size};
 use gleaner_supervisor::ClipSigning;
 use gleaner_trust::{
     ClipRefusal, PublicKey, Published, Release, SecretKey, SignedClip, SignedLambda,
-    TrustedVehicles, verify_clip,
+    TrustedVehicles, VehicleName, verify_clip,
 };
 use serde_json::{Value, json};
 
@@ -59,23 +58,14 @@ pub(crate) fn of_clips(args: &SignArgs) -> Result<Option<ClipSigning>, Failure> 
     let Some(path) = &args.sign else { return Ok(None) };
     let (_, key) = SecretKey::open(path)?;
     let vehicle = match &args.vehicle_name {
-        Some(name) => name.to_string(),
-        None => machine()?,
+        Some(name) => name.clone(),
+        None => VehicleName::of_machine().map_err(|reason| {
+            let mut failure = Failure::new(Exit::Usage, "this machine has no name for signatures");
+            failure.causes = vec![reason];
+            failure.with_help("name the vehicle: --vehicle-name NAME")
+        })?,
     };
-    Ok(Some(ClipSigning { key: Arc::new(key), vehicle }))
-}
-
-/// Returns the name of this machine, if a vehicle can have it.
-fn machine() -> Result<String, Failure> {
-    let unnamed = |reason: String| {
-        let mut failure = Failure::new(Exit::Usage, "this machine has no name for signatures");
-        failure.causes = vec![reason];
-        failure.with_help("name the vehicle: --vehicle-name NAME")
-    };
-    let name = fs::read_to_string("/proc/sys/kernel/hostname")
-        .map_err(|error| unnamed(error.to_string()))?;
-    let name = name.trim_end().parse::<gleaner_trust::VehicleName>();
-    name.map(|name| name.to_string()).map_err(unnamed)
+    Ok(Some(ClipSigning { key: Arc::new(key), vehicle: vehicle.to_string() }))
 }
 
 /// Checks that one of the vehicles in the file `trust` signed the clip.

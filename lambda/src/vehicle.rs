@@ -11,7 +11,7 @@ use gleaner_base::ByteSize;
 use crate::manifest::{self, ItemName, Limits, ManifestError, TopicName, bounds};
 
 /// The validated configuration of a vehicle.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct Vehicle {
     /// `[vehicle]`.
@@ -61,7 +61,7 @@ pub struct RecordingSettings {
 }
 
 /// `[deployments]`: settings of the daemon.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct DeploymentSettings {
     /// Time that a revision must run without a failure before it is trusted to work.
     pub probation: Duration,
@@ -69,6 +69,13 @@ pub struct DeploymentSettings {
     pub spool: ByteSize,
     /// Memory that all lambdas together may ask for; without it, half of the machine's.
     pub memory: Option<ByteSize>,
+    /// Memory that the topics of all lambdas together may take; without it, a quarter of the
+    /// machine's.
+    pub topics: Option<ByteSize>,
+    /// Share of the machine's cores that all lambdas together may ask for.
+    pub cpu: f64,
+    /// Share of its time in which the process of models may run models.
+    pub model_time: f64,
     /// Topic on which decisions are published.
     pub decisions: Option<TopicName>,
 }
@@ -104,6 +111,9 @@ impl Default for DeploymentSettings {
             probation: bounds::PROBATION.default,
             spool: bounds::SPOOL.default,
             memory: None,
+            topics: None,
+            cpu: bounds::CPU_SHARE.default,
+            model_time: bounds::MODEL_SHARE.default,
             decisions: None,
         }
     }
@@ -188,6 +198,8 @@ mod tests {
             [deployments]
             probation = "1min"
             memory = "2 GiB"
+            cpu = 0.5
+            model_time = 1
             "#;
         let vehicle = Vehicle::parse(text, "vehicle.toml").unwrap();
         assert_eq!(vehicle.identity.name.unwrap().as_str(), "car-7");
@@ -200,6 +212,8 @@ mod tests {
         let deployments = DeploymentSettings {
             probation: Duration::from_secs(60),
             memory: Some(ByteSize::gib(2)),
+            cpu: 0.5,
+            model_time: 1.0,
             ..DeploymentSettings::default()
         };
         assert_eq!(vehicle.deployments, deployments);
@@ -232,6 +246,16 @@ mod tests {
                 "[inference]\nrun_max = \"0s\"",
                 "vehicle.toml, line 2: `inference.run_max` is 0s, below the minimum of 1s",
                 "give a value from 1s to 1h",
+            ),
+            (
+                "[deployments]\ncpu = 1.5",
+                "vehicle.toml, line 2: `deployments.cpu` is 1.5, above the maximum of 1",
+                "give a value from 0.01 to 1",
+            ),
+            (
+                "[deployments]\ncpu = nan",
+                "vehicle.toml, line 2: `deployments.cpu` is `nan`, which is not a finite number",
+                "give a number that is neither infinite nor nan",
             ),
             (
                 "[inference]\nmodels = 3",

@@ -90,6 +90,8 @@ pub enum CliCommand {
     Start(ChangeArgs),
     /// Stop a deployment, also after a restart of the vehicle
     Stop(ChangeArgs),
+    /// Remove a deployment: its lambda ends, and its records stay for a while
+    Remove(ChangeArgs),
     /// Show what runs on a vehicle
     Status(StatusArgs),
     /// Show decisions and log lines of a deployment

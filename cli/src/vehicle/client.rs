@@ -58,6 +58,14 @@ impl VehicleClient {
         self.json(Method::POST, path, body.into())
     }
 
+    /// Sends a request to remove something.
+    pub(super) fn delete(&self, path: &str) -> Result<(), Failure> {
+        self.runtime.block_on(async {
+            let body = Either::Left(Full::default());
+            self.request(Method::DELETE, path, body).await.map(drop)
+        })
+    }
+
     /// Sends bytes.
     pub(super) fn put(&self, path: &str, body: Vec<u8>) -> Result<(), Failure> {
         self.runtime.block_on(async {

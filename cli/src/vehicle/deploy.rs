@@ -1,4 +1,5 @@
-//! `gleaner deploy`, `rollback`, `start` and `stop`: change what runs on a vehicle, and wait.
+//! `gleaner deploy`, `rollback`, `start`, `stop` and `remove`: change what runs on a vehicle, and
+//! wait.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;
@@ -46,8 +47,10 @@ pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
     let client = VehicleClient::new(&args.vehicle)?;
     let status = client.status()?;
     let id = args.id.clone().unwrap_or_else(|| local.revision.name.to_string());
+    let removed = status.removed.get(&id).copied();
     let before = status.deployments.into_iter().find(|deployment| deployment.id == id);
-    let deployment = deployment(args, &local, &id, before.as_ref())?;
+    let newest = before.as_ref().map(|before| before.release).or(removed);
+    let deployment = deployment(args, &local, &id, before.as_ref(), newest.unwrap_or(0))?;
     let release = deployment.release;
     let sealed = seal(&deployment, &[&key])
         .map_err(|refusal| Failure::because("cannot sign the deployment", &refusal))?;
@@ -81,18 +84,29 @@ pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
 
 /// Runs `gleaner rollback`, `gleaner start` and `gleaner stop`.
 pub(crate) fn change(args: &ChangeArgs, change: &str) -> Result<Exit, Failure> {
+    let (client, path) = (VehicleClient::new(&args.vehicle)?, path(&args.id)?);
+    let Changed { attempt } = client.post(&format!("{path}/{change}"), &json!({}))?;
+    match change {
+        "stop" => wait_for_end(&client, args, "stopped"),
+        _ => wait(&client, &args.vehicle, &args.id, attempt, args.timeout),
+    }
+}
+
+/// Runs `gleaner remove`.
+pub(crate) fn remove(args: &ChangeArgs) -> Result<Exit, Failure> {
     let client = VehicleClient::new(&args.vehicle)?;
-    if args.id.parse::<ItemName>().is_err() {
-        let id = gleaner_base::excerpt(&args.id);
+    client.delete(&path(&args.id)?)?;
+    wait_for_end(&client, args, "removed")
+}
+
+/// Returns the path of a deployment in requests.
+fn path(id: &str) -> Result<String, Failure> {
+    if id.parse::<ItemName>().is_err() {
+        let id = gleaner_base::excerpt(id);
         return Err(Failure::new(Exit::Usage, format!("`{id}` is no id of a deployment"))
             .with_help("`gleaner status` lists them"));
     }
-    let path = format!("/v1/deployments/{}/{change}", args.id);
-    let Changed { attempt } = client.post(&path, &json!({}))?;
-    match change {
-        "stop" => wait_for_end(&client, args),
-        _ => wait(&client, &args.vehicle, &args.id, attempt, args.timeout),
-    }
+    Ok(format!("/v1/deployments/{id}"))
 }
 
 impl LocalRevision {
@@ -137,6 +151,7 @@ fn deployment(
     local: &LocalRevision,
     id: &str,
     before: Option<&DeploymentStatus>,
+    newest: u64,
 ) -> Result<Deployment, Failure> {
     let fallback = match args.fallback.as_deref() {
         Some("none") => None,
@@ -144,7 +159,7 @@ fn deployment(
         None => before.and_then(|before| runs(before)?.parse().ok()),
     };
     let created = now();
-    let release = args.release.unwrap_or_else(|| before.map_or(0, |before| before.release) + 1);
+    let release = args.release.unwrap_or(newest + 1);
     let label = |text: &String| {
         let (name, value) = text.split_once('=').unwrap_or((text, ""));
         Ok((parse("--label", name)?, value.to_owned()))
@@ -288,15 +303,19 @@ fn running(
     Ok(Exit::Ok)
 }
 
-fn wait_for_end(client: &VehicleClient, args: &ChangeArgs) -> Result<Exit, Failure> {
+/// Waits until the lambda of a deployment has ended.
+fn wait_for_end(client: &VehicleClient, args: &ChangeArgs, done: &str) -> Result<Exit, Failure> {
     let started = Instant::now();
     loop {
         let status = client.status()?;
         let deployment = status.deployments.iter().find(|it| it.id == args.id);
-        if deployment.is_none_or(|deployment| deployment.status.is_none()) {
-            let text = match args.vehicle.json {
-                true => json_line(&deployment),
-                false => format!("stopped `{}`\n", args.id),
+        // That of a removed deployment is known to the supervisor only.
+        let lambdas = status.supervisor.iter().flat_map(|supervisor| &supervisor.lambdas);
+        if !lambdas.into_iter().any(|lambda| lambda.id == args.id) {
+            let text = match (args.vehicle.json, deployment) {
+                (true, Some(deployment)) => json_line(deployment),
+                (true, None) => json_line(&json!({ "id": args.id, "removed": true })),
+                (false, _) => format!("{done} `{}`\n", args.id),
             };
             print(&text)?;
             return Ok(Exit::Ok);

@@ -1,7 +1,7 @@
 //! The commands for a vehicle: they talk to its `gleaner-orchestrator`.
 //!
 //! - `client`, `file_body`: requests over its socket.
-//! - `deploy`: signs a deployment, sends it and waits; starts, stops and rolls back.
+//! - `deploy`: signs a deployment, sends it and waits; starts, stops, rolls back and removes.
 //! - `trust`: trust roots. `status`, `stream`: what runs, and what happened.
 
 mod client;
@@ -12,7 +12,7 @@ mod stream;
 mod trust;
 
 pub(crate) use client::VehicleClient;
-pub(crate) use deploy::{change, deploy};
+pub(crate) use deploy::{change, deploy, remove};
 pub(crate) use status::status;
 pub(crate) use stream::{events, logs};
 pub(crate) use trust::trust;

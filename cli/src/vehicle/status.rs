@@ -34,9 +34,15 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         Some(trust) => format!("  trust root {}\n", trust.version),
     };
     for capacity in &status.capacity {
-        // Of all resources, only memory has a unit of its own.
-        let [asked, most] = [capacity.asked, capacity.most].map(|it| size(it as u64));
-        text += &format!("  {} {asked} of {most} ({})\n", capacity.resource, capacity.source);
+        let show = |number: f64| amount(number, &capacity.unit);
+        let [asked, most] = [capacity.asked, capacity.most].map(show);
+        let used = capacity.used.map(|used| format!(", {} used", show(used)));
+        text += &format!(
+            "  {} {asked} of {most} asked for{} ({})\n",
+            visible(&capacity.resource),
+            used.unwrap_or_default(),
+            visible(&capacity.source)
+        );
     }
     match &status.supervisor {
         None => text += &format!("  {}\n", paint.red("the supervisor does not run")),
@@ -58,10 +64,15 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
     text += "\n";
     text += &table(rows.collect(), &[5, 6, 7, 8, 9, 10]);
     for deployment in &status.deployments {
+        let exceeds = deployment.demand.iter().find(|demand| demand.exceeds).map(|demand| {
+            let asked = amount(demand.asked, &demand.unit);
+            format!("{} {asked} ({})", demand.resource, demand.source)
+        });
         for (what, why) in [
             ("refused", &deployment.refused),
             ("runs its fallback", &deployment.failed),
             ("should be signed again", &deployment.stale),
+            ("uses more than it states", &exceeds),
             ("last end", &deployment.status.as_ref().and_then(|it| it.last_end.clone())),
         ] {
             if let Some(why) = why {
@@ -71,6 +82,14 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         }
     }
     text
+}
+
+/// Formats an amount of a resource.
+fn amount(number: f64, unit: &str) -> String {
+    match unit {
+        "B" => size(number as u64),
+        _ => format!("{number:.2} {}", visible(unit)),
+    }
 }
 
 fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> String {

@@ -116,7 +116,7 @@ def _manifest(file: str, entries: Mapping[str, Any], overrides: Mapping[str, Any
         file,
         "the file",
         entries,
-        ["lambda", "schedule", "input", "model", "record", "limits", "config"],
+        ["lambda", "schedule", "input", "model", "record", "limits", "demand", "config"],
     )
     known = ["name", "version", "kind", "entry", "description", "deterministic"]
     about = Table(

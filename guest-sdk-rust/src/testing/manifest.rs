@@ -90,7 +90,7 @@ pub(super) fn read(text: &str) -> Result<Manifest> {
     let entries = entries.map_err(|error| {
         Error::new("cannot use the manifest", format!("it is not valid TOML: {error}"), "")
     })?;
-    let known = ["lambda", "schedule", "input", "model", "record", "limits", "config"];
+    let known = ["lambda", "schedule", "input", "model", "record", "limits", "demand", "config"];
     let root = Table::of("the file", &entries, &known)?;
     let known = ["name", "version", "kind", "entry", "description", "deterministic"];
     let lambda = Table::new(

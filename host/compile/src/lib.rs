@@ -215,6 +215,10 @@ pub fn code_entry(store: &Path, component: &[u8], nans: Nans) -> DerivedEntry {
 mod compiler;
 #[cfg(feature = "compiler")]
 pub use compiler::compile;
+#[cfg(feature = "compiler")]
+mod speed;
+#[cfg(feature = "compiler")]
+pub use speed::fuel_per_second;
 
 #[cfg(test)]
 mod tests {

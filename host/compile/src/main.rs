@@ -1,7 +1,7 @@
 //! `gleaner-compile COMPONENT --cache DIR`: compiles a component and prints the path of its native
 //! code.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -14,11 +14,15 @@ use rustix::process::{Resource, Rlimit, setrlimit};
 #[derive(Parser)]
 #[command(version)]
 struct Args {
+    /// Measure the speed of this machine instead, and print fuel units per second
+    #[arg(long, exclusive = true, hide = true)]
+    speed: bool,
     /// The component
-    component: PathBuf,
+    #[arg(required_unless_present = "speed")]
+    component: Option<PathBuf>,
     /// Folder of the compiled code; created if missing
-    #[arg(long, value_name = "DIR")]
-    cache: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "speed")]
+    cache: Option<PathBuf>,
     /// Give NaNs the same bits on every CPU
     #[arg(long)]
     deterministic: bool,
@@ -34,13 +38,15 @@ struct Args {
 
 fn main() -> ExitCode {
     let args = Args::parse();
-    limit_resources(args.cpu_seconds);
-    let nans = if args.deterministic { Nans::Canonical } else { Nans::Native };
-    match sandbox_for(&args)
-        .and_then(|()| gleaner_compile::compile(&args.component, &args.cache, nans))
-    {
-        Ok(entry) => {
-            println!("{}", entry.display());
+    let done = match (&args.component, &args.cache) {
+        (Some(component), Some(cache)) => {
+            compile(component, cache, &args).map(|entry| entry.display().to_string())
+        }
+        _ => gleaner_compile::fuel_per_second().map(|speed| format!("{speed:.0}")),
+    };
+    match done {
+        Ok(line) => {
+            println!("{line}");
             Exit::Ok.into()
         }
         Err(error) => {
@@ -51,12 +57,19 @@ fn main() -> ExitCode {
     }
 }
 
+fn compile(component: &Path, cache: &Path, args: &Args) -> Result<PathBuf, CompileError> {
+    limit_resources(args.cpu_seconds);
+    sandbox_for(component, cache)?;
+    let nans = if args.deterministic { Nans::Canonical } else { Nans::Native };
+    gleaner_compile::compile(component, cache, nans)
+}
+
 /// Sandboxes this process: it can read only the component and system libraries, and write only the
 /// cache, even if a component exploits the compiler. If the kernel does not support that, only the
 /// resource limits apply; the parent process reports it.
-fn sandbox_for(args: &Args) -> Result<(), CompileError> {
-    gleaner_artifacts::make_store(&args.cache)?;
-    let paths = Paths { read: vec![args.component.clone()], write: vec![args.cache.clone()] };
+fn sandbox_for(component: &Path, cache: &Path) -> Result<(), CompileError> {
+    gleaner_artifacts::make_store(cache)?;
+    let paths = Paths { read: vec![component.to_owned()], write: vec![cache.to_owned()] };
     files::confine(&paths);
     let _ = sandbox_filter::apply(false);
     Ok(())

@@ -104,6 +104,7 @@ fn manifest_digest(manifest: &Manifest) -> String {
     if let Some(table) = json.as_object_mut() {
         table.remove("record");
         table.remove("limits");
+        table.remove("demand");
     }
     without_descriptions(&mut json);
     hex(&Sha256::digest(json.to_string()))

@@ -81,6 +81,14 @@ pub const MAX_LENGTH: Bounds<Duration> = Bounds {
     max: Duration::from_secs(3600),
 };
 
+/// `demand.rate_hz`: from one wake in twenty minutes to ten times the shortest period.
+pub const RATE_HZ: RangeInclusive<f64> = 0.001..=10_000.0;
+
+/// `demand.cpu` and `demand.model_time`: from the smallest that is worth a number to the longest
+/// deadline.
+pub const DEMAND_TIME: RangeInclusive<Duration> =
+    Duration::from_micros(1)..=Duration::from_secs(60);
+
 /// `model.threads`. By default, a model leaves the other cores to the lambdas.
 pub const THREADS: Bounds<u64> = Bounds { min: 1, default: 1, max: 64 };
 
@@ -115,6 +123,15 @@ pub const PROBATION: Bounds<Duration> = Bounds {
 /// `deployments.spool` of a vehicle: the decisions and log lines of one lambda on the disk.
 pub const SPOOL: Bounds<ByteSize> =
     Bounds { min: ByteSize::mib(1), default: ByteSize::mib(64), max: ByteSize::gib(64) };
+
+/// `deployments.cpu` of a vehicle: the share of its cores that lambdas may ask for. The rest is for
+/// the ingress, which takes a tenth to a third of a core (`bench/README.md`), the recorder, and
+/// other programs.
+pub const CPU_SHARE: Bounds<f64> = Bounds { min: 0.01, default: 0.8, max: 1.0 };
+
+/// `deployments.model_time` of a vehicle: the share of its time that the process of models may run
+/// models. Models run one at a time, so the nearer it is to 1, the longer they wait for each other.
+pub const MODEL_SHARE: Bounds<f64> = CPU_SHARE;
 
 /// Longest accepted manifest. The longest in use has 3 KiB.
 pub const MANIFEST_MAX: ByteSize = ByteSize::mib(1);

@@ -14,6 +14,7 @@ mod limits;
 mod names;
 mod read;
 mod read_config;
+mod read_demand;
 mod read_limits;
 mod read_vehicle;
 mod reference;
@@ -34,7 +35,7 @@ pub use names::{
 };
 pub use reference::reference;
 pub use types::{
-    Backlog, Durability, InputSpec, LambdaKind, LambdaSection, Manifest, ModelSpec, Qos,
+    Backlog, Demand, Durability, InputSpec, LambdaKind, LambdaSection, Manifest, ModelSpec, Qos,
     RecordSpec, Reliability, ScheduleSpec, Store,
 };
 

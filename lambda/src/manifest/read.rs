@@ -5,6 +5,7 @@ use toml::de::DeTable;
 use super::bounds;
 use super::error::{InputMemory, ManifestError};
 use super::read_config;
+use super::read_demand;
 use super::read_limits;
 use super::syntax;
 use super::table::{Document, TomlTable};
@@ -21,7 +22,7 @@ type Result<T> = std::result::Result<T, ManifestError>;
 pub(super) fn manifest(document: &Document) -> Result<Manifest> {
     let entries =
         DeTable::parse(document.text).map_err(|error| syntax::explain(document, &error))?;
-    let known = &["lambda", "schedule", "input", "model", "record", "limits", "config"];
+    let known = &["lambda", "schedule", "input", "model", "record", "limits", "demand", "config"];
     let root = TomlTable::root(document, entries.get_ref(), known)?;
     let needed = |table: &'static str, example: &'static str| {
         root.get(table).ok_or_else(|| ManifestError::MissingTable {
@@ -37,13 +38,17 @@ pub(super) fn manifest(document: &Document) -> Result<Manifest> {
         &needed("schedule", "[schedule] with event = \"<an input's name>\" or period = \"100ms\"")?,
         &inputs,
     )?;
+    let models = models(document, &root)?;
+    let demand = root.get("demand");
+    let demand = demand.map(|value| read_demand::demand(&value, &lambda, &schedule, &models));
     Ok(Manifest {
         lambda,
         schedule,
         inputs,
-        models: models(document, &root)?,
+        models,
         record: root.get("record").map(|value| record(document, &value)).transpose()?,
         limits: read_limits::limits(root.get("limits").as_ref(), Limits::DEFAULT)?,
+        demand: demand.transpose()?.unwrap_or_default(),
         config: root.get("config").map_or(Ok(Vec::new()), |value| read_config::items(&value))?,
     })
 }

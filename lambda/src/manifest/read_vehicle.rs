@@ -6,12 +6,13 @@ use std::ops::RangeInclusive;
 use gleaner_base::ByteSize;
 use toml::de::DeTable;
 
+use super::bounds::{self, Bounds};
 use super::error::ManifestError;
 use super::read_limits::limits;
 use super::syntax;
 use super::table::{Document, TomlTable};
 use super::value::TomlValue;
-use super::{Limits, TopicName, bounds};
+use super::{Limits, TopicName};
 use crate::vehicle::{
     DeploymentSettings, InferenceLimits, NetworkSettings, RecordingSettings, Vehicle,
     VehicleIdentity,
@@ -44,7 +45,7 @@ pub(super) fn vehicle(document: &Document) -> Result<Vehicle> {
         deployments: part(
             &root,
             "deployments",
-            &["probation", "spool", "memory", "decisions"],
+            &["probation", "spool", "memory", "topics", "cpu", "model_time", "decisions"],
             deployments,
         )?,
     })
@@ -115,12 +116,18 @@ fn recording(table: &TomlTable) -> Result<RecordingSettings> {
 }
 
 fn deployments(table: &TomlTable) -> Result<DeploymentSettings> {
-    let memory =
-        table.get("memory").map(|value| value.size(&(ByteSize::mib(64)..=ByteSize::gib(1024))));
+    let sizes = ByteSize::mib(64)..=ByteSize::gib(1024);
+    let size = |key| table.get(key).map(|value| value.size(&sizes)).transpose();
+    let share = |key, bounds: Bounds<f64>| {
+        table.get(key).map_or(Ok(bounds.default), |value| value.number(&bounds.range()))
+    };
     Ok(DeploymentSettings {
         probation: table.duration("probation", &bounds::PROBATION)?,
         spool: table.size("spool", &bounds::SPOOL)?,
-        memory: memory.transpose()?,
+        memory: size("memory")?,
+        topics: size("topics")?,
+        cpu: share("cpu", bounds::CPU_SHARE)?,
+        model_time: share("model_time", bounds::MODEL_SHARE)?,
         decisions: topic(table, "decisions")?,
     })
 }

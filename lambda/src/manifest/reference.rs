@@ -55,6 +55,10 @@ postroll = "5s"                 # until 5 s after it
 [limits]                        # without this table, the defaults
 memory = "32 MiB"
 
+[demand]                        # without this table, a vehicle assumes and measures
+rate_hz = 30                    # wakes a second
+fuel = 2_000_000                # of a wake; or cpu = "2ms"
+
 [config]                        # settings that the code reads, and `--set` changes
 brake_mps2 = { default = -3.0, unit = "m/s^2", description = "mean forward acceleration below this is braking" }
 dark_luma = { default = 50.0, min = 0, max = 255, description = "mean grey below this is dark" }
@@ -126,7 +130,7 @@ impl Key {
 
 /// Returns all tables, in the order of the page.
 pub(super) fn sections() -> Vec<Section> {
-    vec![lambda(), schedule(), input(), qos(), record(), limits(), config(), model()]
+    vec![lambda(), schedule(), input(), qos(), record(), limits(), demand(), config(), model()]
 }
 
 /// Generates the page `docs/manifest.md`.
@@ -249,6 +253,21 @@ fn limits() -> Section {
         note: "What the lambda may use. A vehicle can lower each limit.".to_owned(),
         keys,
     }
+}
+
+fn demand() -> Section {
+    let key = |name, form: &str| Key::new(name, "Demand", name, form);
+    let keys = vec![
+        key("rate_hz", "number").within(bounds::RATE_HZ, |hz| hz.to_string()),
+        key("cpu", "duration").within(bounds::DEMAND_TIME, duration),
+        key("fuel", "number").within(Limits::MIN.fuel..=Limits::MAX.fuel, number),
+        key("model_time", "duration").within(bounds::DEMAND_TIME, duration),
+    ];
+    let note = "What the lambda needs in its busiest minute, on average over its wakes.\n\
+                A vehicle admits it by these numbers ([a vehicle](vehicle.md#admission)); \
+                they limit nothing.\n\
+                Without one, the vehicle uses what it has measured, and before that an assumption.";
+    Section { title: "[demand]", note: note.to_owned(), keys }
 }
 
 fn config() -> Section {

@@ -29,6 +29,9 @@ pub struct Manifest {
     pub record: Option<RecordSpec>,
     /// `[limits]`: the resources that it may use.
     pub limits: Limits,
+    /// `[demand]`: the resources that it needs, by which a vehicle admits it.
+    #[serde(skip_serializing_if = "Demand::is_empty")]
+    pub demand: Demand,
     /// `[config]`, in the order of the file.
     pub config: Vec<ConfigItem>,
 }
@@ -241,6 +244,29 @@ pub enum Store {
     Disk,
 }
 
+/// `[demand]`: the resources that a lambda needs in its busiest minute, as its author states.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+#[non_exhaustive]
+pub struct Demand {
+    /// Wakes per second; with `event` only, as a period states it.
+    pub rate_hz: Option<f64>,
+    /// CPU time of a wake, on this kind of vehicle.
+    #[serde(rename = "cpu_ns", serialize_with = "optional_nanoseconds")]
+    pub cpu: Option<Duration>,
+    /// Fuel units of a wake, in place of `cpu`: a vehicle converts them by its measured speed.
+    /// Components only.
+    pub fuel: Option<u64>,
+    /// Time that the models of a wake run, on this kind of vehicle.
+    #[serde(rename = "model_time_ns", serialize_with = "optional_nanoseconds")]
+    pub model_time: Option<Duration>,
+}
+
+impl Demand {
+    fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
 impl Manifest {
     /// Returns the input of this name.
     pub fn input(&self, name: &str) -> Option<&InputSpec> {
@@ -264,4 +290,14 @@ impl Manifest {
 /// Serializes a duration as nanoseconds. No duration in a manifest exceeds an hour, so they fit.
 fn nanoseconds<S: Serializer>(duration: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_u64(u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX))
+}
+
+fn optional_nanoseconds<S: Serializer>(
+    duration: &Option<Duration>,
+    serializer: S,
+) -> Result<S::Ok, S::Error> {
+    match duration {
+        Some(duration) => nanoseconds(duration, serializer),
+        None => serializer.serialize_none(),
+    }
 }

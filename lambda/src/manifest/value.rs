@@ -167,6 +167,20 @@ impl<'a> TomlValue<'a> {
         Ok(u64::try_from(number).unwrap_or(*range.end()))
     }
 
+    /// Parses a number with or without a fraction.
+    pub(super) fn number(&self, range: &RangeInclusive<f64>) -> Result<f64> {
+        let text = match self.value {
+            DeValue::Float(float) => float.as_str(),
+            DeValue::Integer(_) => &self.whole_number().unwrap_or(i128::MAX).to_string(),
+            _ => return Err(self.wrong_type("a number")),
+        };
+        let number = text.parse::<f64>().ok().filter(|number| number.is_finite());
+        let rule = "give a number that is neither infinite nor nan";
+        let number = number.ok_or_else(|| self.wrong_form(text, "finite number", rule))?;
+        self.within(&number, Some(range.start()), Some(range.end()), f64::to_string)?;
+        Ok(number)
+    }
+
     pub(super) fn size(&self, range: &RangeInclusive<ByteSize>) -> Result<ByteSize> {
         if let Some(text) = self.value.as_str() {
             let size = text

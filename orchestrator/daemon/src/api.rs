@@ -5,6 +5,7 @@
 //! | `GET /v1/status` | [`VehicleStatus`] |
 //! | `POST /v1/deployments` | [`DeployReply`], of a [`DeployRequest`] |
 //! | `PUT /v1/objects/SHA256` | nothing, of a file that a deployment needs |
+//! | `DELETE /v1/deployments/ID` | nothing, once it is removed |
 //! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | [`Changed`] |
 //! | `PUT /v1/trust` | nothing, of a trust root's envelope |
 //! | `GET /v1/events`, `GET /v1/lambdas/ID/records` | a [`StreamLine`] per line |
@@ -20,10 +21,10 @@ use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Path, Query, State};
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use axum::routing::{get, post, put};
+use axum::routing::{delete, get, post, put};
 use futures_util::StreamExt;
 use gleaner_base::{Exit, Failure};
-use gleaner_lambda::manifest::Sha256;
+use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_protocol::vehicle_api::{
     Changed, DeployReply, DeployRequest, Problem, ProgramStatus, VehicleStatus,
 };
@@ -75,6 +76,7 @@ impl Api {
             .route("/v1/status", get(status))
             .route("/v1/deployments", post(deploy))
             .route("/v1/objects/{sha256}", put(object))
+            .route("/v1/deployments/{id}", delete(remove))
             .route("/v1/deployments/{id}/{change}", post(change))
             .route("/v1/trust", put(trust))
             .route("/v1/events", get(events))
@@ -103,6 +105,7 @@ impl Api {
             trust: self.core.trust(|trust| trust.status()),
             generation,
             deployments,
+            removed: self.core.removed(),
             capacity: self.core.capacity(),
             supervisor,
         }
@@ -193,6 +196,11 @@ async fn change(
     Ok(axum::Json(Changed { attempt: changed.await? }))
 }
 
+async fn remove(State(api): State<Api>, Path(id): Path<String>) -> Reply<StatusCode> {
+    api.blocking(move |core| core.remove(&id)).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
 async fn trust(State(api): State<Api>, body: Bytes) -> Reply<StatusCode> {
     api.blocking(move |core| core.install_root(&body)).await?;
     Ok(StatusCode::NO_CONTENT)
@@ -207,10 +215,10 @@ async fn records(
     Path(id): Path<String>,
     Query(query): Query<StreamQuery>,
 ) -> Reply<Response> {
-    let is_known = api.core.status().0.iter().any(|deployment| deployment.id == id);
-    if !is_known {
-        let id = gleaner_base::excerpt(&id);
-        return Err(Failure::new(Exit::Usage, format!("there is no deployment `{id}`")).into());
+    // Records of a deployment that was removed stay for a while.
+    let name = id.parse::<ItemName>().ok();
+    if !name.is_some_and(|name| api.core.has_records(&name)) {
+        return Err(api.core.lock().unknown(&id).into());
     }
     lines(&api, "lambdas", &[&id], &query)
 }

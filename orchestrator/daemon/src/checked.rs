@@ -65,7 +65,7 @@ impl SignedDeployment {
     }
 
     /// Checks that the manifests of its revisions, which are in `store`, fit its grants and its
-    /// config. Returns the manifests.
+    /// config. Returns the manifests, with the digests of their revisions.
     ///
     /// # Errors
     ///
@@ -73,7 +73,7 @@ impl SignedDeployment {
     pub(crate) fn check_manifests(
         &mut self,
         store: &RevisionStore,
-    ) -> Result<Vec<Manifest>, Failure> {
+    ) -> Result<Vec<(Sha256, Manifest)>, Failure> {
         let wish = self.deployment.payload();
         let overrides = overrides(wish);
         let mut manifests = Vec::new();
@@ -87,9 +87,9 @@ impl SignedDeployment {
             ConfigSet::resolve(&manifest, &set).map_err(|error| {
                 Failure::because("the config of the deployment does not fit", &error)
             })?;
-            manifests.push(manifest);
+            manifests.push((digest.clone(), manifest));
         }
-        if let Some(manifest) = manifests.get(1) {
+        if let Some((_, manifest)) = manifests.get(1) {
             self.fallback_set = known(&overrides, manifest);
         }
         Ok(manifests)
@@ -140,6 +140,7 @@ impl SignedDeployment {
             failed: deployed.failed.clone(),
             refused: None,
             stale,
+            demand: Vec::new(),
             status: None,
         }
     }

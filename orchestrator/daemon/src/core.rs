@@ -5,16 +5,15 @@ use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_lambda::Vehicle;
 use gleaner_lambda::manifest::{ItemName, Sha256};
+use gleaner_lambda::{Manifest, Vehicle};
 use gleaner_protocol::supervision::{
     DesiredState, EventKind, LambdaPhase, SupervisorStatus, VehicleEvent,
 };
-use gleaner_protocol::vehicle_api::{DeploymentStatus, GrantStatus, RevisionStatus};
 use gleaner_supervisor::EventLog;
 use tokio::sync::watch;
 
-use crate::admission::{self, MemoryBudget};
+use crate::admission::{self, Budgets, LambdaDemand, Measurements};
 use crate::checked::SignedDeployment;
 use crate::durable::DurableFile;
 use crate::layout::VehicleFolders;
@@ -26,13 +25,15 @@ use crate::trust::VehicleTrust;
 pub(crate) struct Core {
     pub(crate) vehicle: Vehicle,
     pub(crate) store: RevisionStore,
+    /// Folder of the spools of lambdas.
+    pub(crate) spools: PathBuf,
     /// Folder of native code.
     pub(crate) cache: PathBuf,
-    pub(crate) memory: MemoryBudget,
+    pub(crate) budgets: Budgets,
     pub(crate) events: EventLog,
     pub(crate) desired: watch::Sender<DesiredState>,
     pub(crate) inner: Mutex<Inner>,
-    /// Held by the operation that changes the store.
+    /// Held by the operation that changes the store. Compiling does not change it.
     pub(crate) deploying: Mutex<()>,
 }
 
@@ -45,8 +46,14 @@ pub(crate) struct Inner {
     pub(crate) signed: BTreeMap<ItemName, Result<SignedDeployment, String>>,
     /// Files that deployments need that were offered, and their lengths.
     pub(crate) expected: BTreeMap<ItemName, BTreeMap<Sha256, u64>>,
-    /// Memory that the lambda of each deployment may take.
-    pub(crate) memory: BTreeMap<ItemName, u64>,
+    /// The manifests of the revisions of each deployment, with their digests.
+    pub(crate) manifests: BTreeMap<ItemName, Vec<(Sha256, Manifest)>>,
+    /// Revisions that are compiled for deployments that are not accepted yet.
+    pub(crate) compiling: Vec<Sha256>,
+    /// True after a removal, until the files of its revisions are removed.
+    pub(crate) has_removed: bool,
+    /// Use of resources so far.
+    pub(crate) measured: Measurements,
     pub(crate) status: Option<SupervisorStatus>,
 }
 
@@ -62,6 +69,7 @@ impl Core {
         let loaded = state_file.load::<VehicleState>()?;
         let state = loaded.value.unwrap_or_default();
         let labels = vehicle.identity.labels.clone();
+        let (measured, measured_damage) = Measurements::load(DurableFile::new(layout.measured()));
         let (trust, damage) = VehicleTrust::load(layout, labels, state.floors.clone());
         let inner = Inner {
             trust,
@@ -69,13 +77,17 @@ impl Core {
             state_file,
             signed: BTreeMap::new(),
             expected: BTreeMap::new(),
-            memory: BTreeMap::new(),
+            manifests: BTreeMap::new(),
+            compiling: Vec::new(),
+            has_removed: false,
+            measured,
             status: None,
         };
         let core = Self {
             store: RevisionStore::open(layout)?,
+            spools: layout.spool().join("lambdas"),
             cache: layout.cache(),
-            memory: MemoryBudget::of(&vehicle),
+            budgets: Budgets::of(&vehicle),
             events,
             desired: watch::Sender::new(DesiredState::default()),
             inner: Mutex::new(inner),
@@ -83,7 +95,9 @@ impl Core {
             vehicle,
         };
         core.event(EventKind::Started, None, "the orchestrator has started");
-        for (file, damage) in [("trust root", damage), ("state", loaded.damage)] {
+        let damages =
+            [("trust root", damage), ("state", loaded.damage), ("measurements", measured_damage)];
+        for (file, damage) in damages {
             if let Some(damage) = damage {
                 let text = format!("the file of the {file} is damaged: {damage}");
                 core.event(EventKind::Warning, None, &text);
@@ -96,7 +110,7 @@ impl Core {
         if let Err(failure) = core.save(&mut inner) {
             core.event(EventKind::Warning, None, &failure.to_string());
         }
-        core.collect(&inner);
+        core.collect(&mut inner);
         drop(inner);
         Ok(core)
     }
@@ -153,14 +167,12 @@ impl Core {
     ///
     /// A failure if there is no such deployment, or the disk is full.
     pub(crate) fn set_wanted(&self, id: &str, is_wanted: bool) -> Result<u64, Failure> {
-        let (admitted, memory) = {
-            let inner = self.lock();
-            (inner.wanted_memory(), inner.memory.clone())
-        };
-        self.update(id, |deployed, signed| {
-            if is_wanted && !deployed.is_wanted {
-                let memory = memory.get(signed.id()).copied().unwrap_or(0);
-                self.memory.admit(signed.id(), memory, &admitted)?;
+        self.update(id, |inner, deployed, signed| {
+            if is_wanted
+                && !deployed.is_wanted
+                && let Some(demand) = inner.demand(signed.id())
+            {
+                self.budgets.admit(signed.id(), &demand, &inner.wanted_demand())?;
             }
             deployed.is_wanted = is_wanted;
             deployed.attempt += u64::from(is_wanted);
@@ -178,7 +190,7 @@ impl Core {
     ///
     /// A failure if there is none, or it runs already.
     pub(crate) fn roll_back(&self, id: &str, reason: &str) -> Result<u64, Failure> {
-        self.update(id, |deployed, signed| {
+        self.update(id, |_, deployed, signed| {
             let Some(fallback) = &signed.fallback else {
                 let message = format!("deployment `{id}` has no fallback");
                 return Err(Failure::new(Exit::Usage, message).with_help(
@@ -206,7 +218,11 @@ impl Core {
     fn update(
         &self,
         id: &str,
-        change: impl FnOnce(&mut Deployed, &SignedDeployment) -> Result<(EventKind, String), Failure>,
+        change: impl FnOnce(
+            &Inner,
+            &mut Deployed,
+            &SignedDeployment,
+        ) -> Result<(EventKind, String), Failure>,
     ) -> Result<u64, Failure> {
         let mut inner = self.lock();
         let mut state = inner.state.clone();
@@ -214,21 +230,13 @@ impl Core {
             let deployed = state.deployments.get_mut(&id)?;
             Some((deployed, inner.signed.get(&id)?, id))
         });
-        let Some((deployed, signed, id)) = found else {
-            let known: Vec<_> = inner.state.deployments.keys().map(ItemName::to_string).collect();
-            let message = format!("there is no deployment `{}`", gleaner_base::excerpt(id));
-            let help = match known.is_empty() {
-                true => "`gleaner deploy --local DIR` makes one".to_owned(),
-                false => format!("the deployments are `{}`", known.join("`, `")),
-            };
-            return Err(Failure::new(Exit::Usage, message).with_help(help));
-        };
+        let Some((deployed, signed, id)) = found else { return Err(inner.unknown(id)) };
         let signed = signed.as_ref().map_err(|reason| {
             let mut failure = Failure::new(Exit::Denied, format!("deployment `{id}` is refused"));
             failure.causes = vec![reason.clone()];
             failure
         })?;
-        let (kind, text) = change(deployed, signed)?;
+        let (kind, text) = change(&inner, deployed, signed)?;
         let attempt = deployed.attempt;
         self.change(&mut inner, state)?;
         self.publish(&mut inner);
@@ -276,7 +284,59 @@ impl Core {
             // On a full disk it is tried again with the next status.
             let _ = self.change(&mut inner, state);
         }
+        if inner.measured.observe(&status) {
+            self.report_excess(&mut inner, &status);
+            inner.measured.save_if_changed();
+        }
         inner.status = Some(status);
+        drop(inner);
+        self.collect_removed();
+    }
+
+    /// Removes the revisions of removed deployments, once the supervisor reports that their lambdas
+    /// have ended.
+    fn collect_removed(&self) {
+        let Ok(_changing) = self.deploying.try_lock() else { return };
+        let mut inner = self.lock();
+        let Some(status) = inner.status.as_ref().filter(|_| inner.has_removed) else { return };
+        let is_deployed = |id: &String| {
+            id.parse::<ItemName>().is_ok_and(|id| inner.state.deployments.contains_key(&id))
+        };
+        let have_ended = status.lambdas.iter().all(|lambda| is_deployed(&lambda.id));
+        if have_ended && status.generation >= inner.state.generation {
+            inner.has_removed = false;
+            self.collect(&mut inner);
+        }
+    }
+
+    /// Adds an event for each lambda that uses more than it states, once for each revision.
+    fn report_excess(&self, inner: &mut Inner, status: &SupervisorStatus) {
+        for lambda in &status.lambdas {
+            let Ok(id) = lambda.id.parse::<ItemName>() else { continue };
+            let demand = inner.demand(&id).map(|demand| self.budgets.demand(&demand));
+            for of in demand.into_iter().flatten().filter(|of| of.exceeds) {
+                let digest = lambda.revision.parse::<Sha256>();
+                if digest.is_ok_and(|digest| inner.measured.report(&digest)) {
+                    let text = format!(
+                        "it uses more {} than it states: {:.2} {}, {}",
+                        of.resource, of.asked, of.unit, of.source
+                    );
+                    self.event(EventKind::Warning, Some(&id), &text);
+                }
+            }
+        }
+    }
+
+    /// Measures the speed of this machine, unless that was done before.
+    pub(crate) fn measure_speed(&self) {
+        let machine = admission::machine();
+        if self.lock().measured.has_speed_of(&machine) {
+            return;
+        }
+        match admission::fuel_per_second() {
+            Ok(speed) => self.lock().measured.set_speed(machine, speed),
+            Err(failure) => self.event(EventKind::Warning, None, &failure.to_string()),
+        }
     }
 
     /// Notes that the supervisor cannot be reached.
@@ -284,39 +344,15 @@ impl Core {
         self.lock().status = None;
     }
 
-    /// Returns the status of all deployments, and that of the processes.
-    pub(crate) fn status(&self) -> (Vec<DeploymentStatus>, Option<SupervisorStatus>, u64) {
-        let inner = self.lock();
-        let status = inner.state.deployments.iter().map(|(id, deployed)| {
-            let lambdas = inner.status.iter().flat_map(|status| &status.lambdas);
-            let lambda = lambdas.into_iter().find(|lambda| lambda.id == id.as_str()).cloned();
-            let mut status = match inner.signed.get(id) {
-                Some(Ok(signed)) => signed.status(deployed),
-                Some(Err(reason)) => refused(id, deployed, reason),
-                None => refused(id, deployed, "it was not checked"),
-            };
-            status.status = lambda;
-            status
-        });
-        (status.collect(), inner.status.clone(), inner.state.generation)
-    }
-
-    /// Returns the memory that all wanted lambdas may take, and its limit.
-    pub(crate) fn capacity(&self) -> Vec<gleaner_protocol::vehicle_api::Capacity> {
-        let inner = self.lock();
-        vec![self.memory.capacity(inner.wanted_memory().values().sum())]
-    }
-
     /// Verifies all deployments of the state again.
     pub(crate) fn verify(&self, inner: &mut Inner) {
-        let (mut signed, mut memory) = (BTreeMap::new(), BTreeMap::new());
+        let (mut signed, mut manifests) = (BTreeMap::new(), BTreeMap::new());
         for (id, deployed) in &inner.state.deployments {
             let checked = inner.trust.verifier().and_then(|verifier| {
                 let find = |digest: &Sha256| self.store.envelope(digest).ok();
                 let envelope = deployed.envelope.as_bytes();
                 let mut signed = SignedDeployment::verify(&verifier, envelope, find)?;
-                let manifests = signed.check_manifests(&self.store)?;
-                memory.insert(id.clone(), admission::memory(&manifests));
+                manifests.insert(id.clone(), self.check_manifests(&mut signed)?);
                 Ok(signed)
             });
             if let Err(failure) = &checked {
@@ -324,7 +360,19 @@ impl Core {
             }
             signed.insert(id.clone(), checked.map_err(|failure| failure.to_string()));
         }
-        (inner.signed, inner.memory) = (signed, memory);
+        (inner.signed, inner.manifests) = (signed, manifests);
+    }
+
+    /// Checks the manifests of a deployment, and returns them with the limits that apply here.
+    pub(crate) fn check_manifests(
+        &self,
+        signed: &mut SignedDeployment,
+    ) -> Result<Vec<(Sha256, Manifest)>, Failure> {
+        let mut manifests = signed.check_manifests(&self.store)?;
+        for (_, manifest) in &mut manifests {
+            manifest.limits = manifest.limits.tightened_by(&self.vehicle.limits).0;
+        }
+        Ok(manifests)
     }
 
     /// Writes the state as it is, with the next generation, and publishes what is wanted.
@@ -358,8 +406,8 @@ impl Core {
     }
 
     /// Removes revisions that no deployment names, nor ran before.
-    pub(crate) fn collect(&self, inner: &Inner) {
-        let mut kept = BTreeSet::new();
+    pub(crate) fn collect(&self, inner: &mut Inner) {
+        let mut kept: BTreeSet<_> = inner.compiling.iter().cloned().collect();
         for (id, deployed) in &inner.state.deployments {
             match inner.signed.get(id) {
                 Some(Ok(signed)) => kept.extend(signed.digests().cloned()),
@@ -369,6 +417,10 @@ impl Core {
             kept.extend(deployed.history.iter().cloned());
         }
         let expected = inner.expected.values().flat_map(BTreeMap::keys).cloned().collect();
+        let manifests = inner.manifests.values().flatten();
+        let models = manifests.flat_map(|(_, manifest)| &manifest.models);
+        let models = models.map(|model| model.sha256.clone()).collect();
+        inner.measured.retain(&kept, &models);
         if let Err(failure) = self.store.collect(&kept, &expected) {
             self.event(EventKind::Warning, None, &failure.to_string());
         }
@@ -380,33 +432,25 @@ impl Core {
 }
 
 impl Inner {
-    /// Returns the memory that each wanted lambda may take.
-    pub(crate) fn wanted_memory(&self) -> BTreeMap<ItemName, u64> {
-        let is_wanted = |id: &ItemName| {
-            self.state.deployments.get(id).is_some_and(|deployed| deployed.is_wanted)
+    /// Returns the failure for an id without a deployment.
+    pub(crate) fn unknown(&self, id: &str) -> Failure {
+        let known: Vec<_> = self.state.deployments.keys().map(ItemName::to_string).collect();
+        let message = format!("there is no deployment `{}`", gleaner_base::excerpt(id));
+        let help = match known.is_empty() {
+            true => "`gleaner deploy --local DIR` makes one".to_owned(),
+            false => format!("the deployments are `{}`", known.join("`, `")),
         };
-        let wanted = self.memory.iter().filter(|(id, _)| is_wanted(id));
-        wanted.map(|(id, bytes)| (id.clone(), *bytes)).collect()
+        Failure::new(Exit::Usage, message).with_help(help)
     }
-}
 
-/// Returns the status of a deployment whose envelope counts no more.
-fn refused(id: &ItemName, deployed: &Deployed, reason: &str) -> DeploymentStatus {
-    let revision = RevisionStatus { digest: String::new(), version: String::new(), release: 0 };
-    DeploymentStatus {
-        id: id.to_string(),
-        release: deployed.release,
-        attempt: deployed.attempt,
-        lambda: deployed.lambda.to_string(),
-        revision,
-        fallback: None,
-        grants: GrantStatus::default(),
-        is_wanted: deployed.is_wanted,
-        runs_fallback: deployed.runs_fallback,
-        is_proven: deployed.is_proven,
-        failed: deployed.failed.clone(),
-        refused: Some(reason.to_owned()),
-        stale: None,
-        status: None,
+    /// Returns the demand of a deployment that was verified.
+    pub(crate) fn demand(&self, id: &ItemName) -> Option<LambdaDemand> {
+        self.measured.model().of(self.manifests.get(id)?)
+    }
+
+    /// Returns the demand of each wanted lambda.
+    pub(crate) fn wanted_demand(&self) -> BTreeMap<ItemName, LambdaDemand> {
+        let wanted = self.state.deployments.iter().filter(|(_, deployed)| deployed.is_wanted);
+        wanted.filter_map(|(id, _)| Some((id.clone(), self.demand(id)?))).collect()
     }
 }

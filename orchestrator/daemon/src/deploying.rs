@@ -4,16 +4,18 @@ use std::collections::BTreeMap;
 use std::sync::PoisonError;
 
 use gleaner_base::{Exit, Failure};
+use gleaner_lambda::Manifest;
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_protocol::supervision::{EventKind, LAMBDAS_MAX};
 use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest, MissingObject};
 use gleaner_trust::{Revision, Trusted};
 
-use crate::admission;
 use crate::checked::SignedDeployment;
 use crate::compile;
 use crate::core::{Core, Inner};
+use crate::spools;
 use crate::state::Deployed;
+use crate::store::KnownFiles;
 
 /// Maximum number of deployments that wait for files.
 const OFFERS_MAX: usize = LAMBDAS_MAX;
@@ -33,7 +35,8 @@ impl Core {
     }
 
     fn try_deploy(&self, request: &DeployRequest) -> Result<DeployReply, Failure> {
-        let _deploying = self.deploying.lock().unwrap_or_else(PoisonError::into_inner);
+        let deploying = || self.deploying.lock().unwrap_or_else(PoisonError::into_inner);
+        let changing = deploying();
         let inner = self.lock();
         let sent = inner.revisions(request)?;
         let find = |digest: &Sha256| {
@@ -49,7 +52,9 @@ impl Core {
         drop(inner);
         let damaged = |revision: &&Trusted<Revision>| !self.store.is_intact(revision);
         let new: Vec<_> = signed.revisions().filter(damaged).collect();
-        let missing = new.iter().flat_map(|revision| self.store.missing(revision.payload()));
+        let mut known = if new.is_empty() { KnownFiles::new() } else { self.store.known_files() };
+        let missing = |it: &&Trusted<Revision>| self.store.missing(it.payload(), &known);
+        let missing = new.iter().flat_map(missing);
         let objects: Vec<_> = missing.collect();
         if !objects.is_empty() {
             self.lock().expect(signed.id(), &objects)?;
@@ -57,24 +62,71 @@ impl Core {
         }
         for digest in new.into_iter().map(Trusted::digest) {
             if let Some(envelope) = find(digest) {
-                self.store.add(digest, &envelope)?;
+                self.store.add(digest, &envelope, &mut known)?;
             }
         }
-        let manifests = signed.check_manifests(&self.store)?;
+        let manifests = self.check_manifests(&mut signed)?;
+        let admit = |inner: &Inner| {
+            let demand = inner.measured.model().of(&manifests);
+            demand.map_or(Ok(()), |it| self.budgets.admit(signed.id(), &it, &inner.wanted_demand()))
+        };
         let mut inner = self.lock();
-        let memory = admission::memory(&manifests);
-        self.memory.admit(signed.id(), memory, &inner.wanted_memory())?;
-        drop(inner);
-        for digest in signed.digests() {
-            compile::component(&self.store.folder(digest), &self.cache)?;
-        }
+        admit(&inner)?;
+        let digests: Vec<_> = signed.digests().cloned().collect();
+        inner.compiling.extend(digests.iter().cloned());
+        drop((inner, changing));
+        // Others are deployed meanwhile.
+        let mut digest = digests.iter();
+        let compiled =
+            digest.try_for_each(|it| compile::component(&self.store.folder(it), &self.cache));
+        let _changing = deploying();
         inner = self.lock();
-        // Another trust root may have been installed meanwhile.
+        for digest in &digests {
+            if let Some(index) = inner.compiling.iter().position(|it| it == digest) {
+                inner.compiling.swap_remove(index);
+            }
+        }
+        compiled?;
+        // Another trust root may have been installed, and other deployments accepted.
         verify(&inner)?;
         inner.check_name(&signed)?;
-        let accepted = self.accept(&mut inner, signed, &request.deployment, memory)?;
-        self.collect(&inner);
+        admit(&inner)?;
+        let accepted = self.accept(&mut inner, signed, &request.deployment, manifests)?;
+        self.collect(&mut inner);
         Ok(accepted)
+    }
+
+    /// Removes a deployment, and lets its lambda end. What the vehicle has accepted stays
+    /// remembered: no earlier release of it is accepted afterwards.
+    ///
+    /// # Errors
+    ///
+    /// A failure if there is no such deployment, or the disk is full.
+    pub(crate) fn remove(&self, id: &str) -> Result<(), Failure> {
+        let _changing = self.deploying.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut inner = self.lock();
+        let mut state = inner.state.clone();
+        let name = id.parse::<ItemName>().ok();
+        let Some(name) = name.filter(|name| state.deployments.remove(name).is_some()) else {
+            return Err(inner.unknown(id));
+        };
+        self.change(&mut inner, state)?;
+        inner.signed.remove(&name);
+        inner.manifests.remove(&name);
+        inner.expected.remove(&name);
+        self.publish(&mut inner);
+        inner.has_removed = true;
+        self.event(EventKind::Stopped, Some(&name), "removed by a user");
+        let running = inner.status.iter().flat_map(|status| &status.lambdas);
+        let running = running.map(|lambda| lambda.id.clone());
+        let deployed = inner.state.deployments.keys().map(ItemName::to_string);
+        let kept = running.chain(deployed).chain([name.to_string()]).collect();
+        drop(inner);
+        for id in spools::collect(&self.spools, &kept) {
+            let text = format!("the records of `{id}`, which was removed earlier, are removed");
+            self.event(EventKind::Loss, None, &text);
+        }
+        Ok(())
     }
 
     fn accept(
@@ -82,7 +134,7 @@ impl Core {
         inner: &mut Inner,
         signed: SignedDeployment,
         envelope: &str,
-        memory: u64,
+        manifests: Vec<(Sha256, Manifest)>,
     ) -> Result<DeployReply, Failure> {
         let id = signed.id().clone();
         let before = inner.state.deployments.get(&id);
@@ -100,7 +152,9 @@ impl Core {
                 envelope: envelope.to_owned(),
                 lambda: signed.revision.payload().name.clone(),
                 release: signed.deployment.payload().release,
-                attempt: before.map_or(0, |before| before.attempt) + 1,
+                // Of a removed deployment of this id, an attempt may still end: no later one has
+                // its number, as no attempt is above the generation.
+                attempt: before.map_or(inner.state.generation, |before| before.attempt) + 1,
                 is_wanted: true,
                 runs_fallback: kept.is_some_and(|kept| kept.runs_fallback),
                 is_proven: kept.is_some_and(|kept| kept.is_proven),
@@ -119,7 +173,7 @@ impl Core {
             inner.trust.accept(&signed.deployment, &signed.revision)?;
             self.change(inner, state)?;
             inner.signed.insert(id.clone(), Ok(signed));
-            inner.memory.insert(id.clone(), memory);
+            inner.manifests.insert(id.clone(), manifests);
             self.publish(inner);
             self.event(EventKind::Deployed, Some(&id), &text);
         }

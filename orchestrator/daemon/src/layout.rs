@@ -84,6 +84,11 @@ impl VehicleFolders {
         self.state.join("state.json")
     }
 
+    /// File of the measurements.
+    pub(crate) fn measured(&self) -> PathBuf {
+        self.state.join("measured.json")
+    }
+
     /// The key that signs clips.
     pub(crate) fn key(&self) -> PathBuf {
         self.state.join("vehicle.pem")

@@ -1,8 +1,11 @@
 //! The program `gleaner-orchestrator`: the daemon of a vehicle.
 //!
-//! - `layout`, `durable`, `state`, `store`: its files: wanted state, trust, revisions.
+//! - `layout`, `durable`, `state`, `store`, `spools`: its files: wanted state, trust, revisions,
+//!   records.
 //! - `trust`, `checked`, `admission`: what may run. `compile`: native code before it runs.
-//! - `core`: the state, and the operations that change it; `deploying`: new deployments.
+//! - `core`: the state, and the operations that change it; `deploying`: new deployments, and their
+//!   removal. `report`: the state for users.
+//! - `bounded_process`: programs that must end within a time.
 //! - `link`: starts `gleaner-supervisor`, which runs all other processes, and sends it the wanted
 //!   state.
 //! - `api`, `streams`, `metrics`: the socket for users and, later, for the cloud.
@@ -11,6 +14,7 @@
 
 mod admission;
 mod api;
+mod bounded_process;
 mod checked;
 mod compile;
 mod core;
@@ -20,6 +24,8 @@ mod layout;
 mod link;
 mod metrics;
 mod program;
+mod report;
+mod spools;
 mod state;
 mod store;
 mod streams;

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use gleaner_protocol::vehicle_api::VehicleStatus;
+use gleaner_protocol::vehicle_api::{Capacity, VehicleStatus};
 
 /// Names, types and meanings of the metrics of a lambda.
 const LAMBDA: [(&str, &str, &str); 10] = [
@@ -54,6 +54,24 @@ pub(crate) fn text(status: &VehicleStatus) -> String {
                 // Ids and names have no character that would need an escape.
                 let (id, lambda) = (&deployment.id, &deployment.lambda);
                 let _ = writeln!(text, "{name}{{id=\"{id}\",lambda=\"{lambda}\"}} {value}");
+            }
+        }
+    }
+    for (name, meaning) in [
+        ("asked", "Amount that all wanted lambdas ask for, in the unit of the resource"),
+        ("used", "Amount that they use, where it is measured"),
+        ("most", "Amount that they may ask for"),
+    ] {
+        let name = format!("gleaner_capacity_{name}");
+        let _ = writeln!(text, "# HELP {name} {meaning}\n# TYPE {name} gauge");
+        for Capacity { resource, unit, asked, used, most, .. } in &status.capacity {
+            let value = match name.as_str() {
+                "gleaner_capacity_asked" => Some(asked),
+                "gleaner_capacity_used" => used.as_ref(),
+                _ => Some(most),
+            };
+            if let Some(value) = value {
+                let _ = writeln!(text, "{name}{{resource=\"{resource}\",unit=\"{unit}\"}} {value}");
             }
         }
     }

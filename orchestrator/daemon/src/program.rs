@@ -104,10 +104,10 @@ fn run(args: Args) -> Result<ProgramEnd, Failure> {
 /// Returns the name of the vehicle: that of its configuration, or that of the machine.
 fn name(vehicle: &Vehicle) -> Result<VehicleName, Failure> {
     let name = match &vehicle.identity.name {
-        Some(name) => name.to_string(),
-        None => rustix::system::uname().nodename().to_string_lossy().into_owned(),
+        Some(name) => name.as_str().parse(),
+        None => VehicleName::of_machine(),
     };
-    name.parse().map_err(|reason| {
+    name.map_err(|reason| {
         let mut failure = Failure::new(Exit::Usage, "this vehicle has no name");
         failure.causes = vec![reason];
         failure.with_help("name it: `name` in the table [vehicle] of vehicle.toml")
@@ -173,6 +173,8 @@ async fn serve(
         stop: stopped,
     };
     let mut link = tokio::spawn(link.keep());
+    let measuring = Arc::clone(&core);
+    tokio::task::spawn_blocking(move || measuring.measure_speed());
     let api = Api { core: Arc::clone(&core), layout, name, key, started: Instant::now() };
     tokio::spawn(async move { axum::serve(listener, api.router()).await });
     let _ = sd_notify::notify(&[sd_notify::NotifyState::Ready]);

@@ -24,6 +24,9 @@ use crate::layout::VehicleFolders;
 /// Name of the envelope in the folder of a revision.
 const ENVELOPE: &str = "revision.json";
 
+/// The path of each file of each revision, by its digest.
+pub(crate) type KnownFiles = BTreeMap<String, PathBuf>;
+
 /// The store.
 #[derive(Debug, Clone)]
 pub(crate) struct RevisionStore {
@@ -80,9 +83,9 @@ impl RevisionStore {
         PlainFile::named(&self.envelope_path(digest), Revision::MAX)?.read_whole()
     }
 
-    /// Returns the files of `revision` that neither were sent nor are in a kept revision.
-    pub(crate) fn missing(&self, revision: &Revision) -> Vec<MissingObject> {
-        let known = self.known_files();
+    /// Returns the files of `revision` that neither were sent nor are in a kept revision, which
+    /// `known` lists.
+    pub(crate) fn missing(&self, revision: &Revision, known: &KnownFiles) -> Vec<MissingObject> {
         let mut missing = BTreeMap::new();
         for file in &revision.files {
             let source = known.get(file.sha256.as_str()).filter(|it| has_digest(it, &file.sha256));
@@ -100,24 +103,30 @@ impl RevisionStore {
     }
 
     /// Makes the revision in `envelope`, which was verified and is not [intact](Self::is_intact),
-    /// from the files that were sent and those of other revisions.
+    /// from the files that were sent and those of other revisions, which `known` lists.
+    /// Afterwards it lists its files, too.
     ///
     /// # Errors
     ///
     /// A failure that names the file that is missing, differs, or cannot be written.
-    pub(crate) fn add(&self, digest: &Sha256, envelope: &[u8]) -> Result<(), Failure> {
+    pub(crate) fn add(
+        &self,
+        digest: &Sha256,
+        envelope: &[u8],
+        known: &mut KnownFiles,
+    ) -> Result<(), Failure> {
         let revision = revision_of_digest(envelope, digest)
             .map_err(|refusal| Failure::because("cannot store a revision", &refusal))?;
-        // Of one that the disk has changed, which is made again.
-        remove(&self.folder(digest));
         let folder = self.revisions.join(format!("{digest}.tmp"));
         remove(&folder);
-        let stored = self.fill(&folder, &revision, envelope, digest);
+        let stored = self.fill(&folder, &revision, envelope, (digest, known));
         if stored.is_err() {
             remove(&folder);
         }
         stored?;
         for file in &revision.files {
+            let path = self.folder(digest).join("build").join(file.path.as_path());
+            known.insert(file.sha256.to_string(), path);
             // Of a damaged disk: the object would be sent again, and nothing is lost.
             let _ = fs::remove_file(self.object(&file.sha256));
         }
@@ -129,9 +138,8 @@ impl RevisionStore {
         folder: &Path,
         revision: &Revision,
         envelope: &[u8],
-        digest: &Sha256,
+        (digest, known): (&Sha256, &KnownFiles),
     ) -> Result<(), Failure> {
-        let known = self.known_files();
         let build = folder.join("build");
         let failed = |path: &Path| {
             let action = format!("cannot write `{}`", path.display());
@@ -168,6 +176,8 @@ impl RevisionStore {
             sync_folder(folder).map_err(failed(folder))?;
         }
         let name = self.folder(digest);
+        // Of one that the disk has changed: its other files were copied.
+        remove(&name);
         fs::rename(folder, &name).map_err(failed(&name))?;
         sync_folder(&self.revisions).map_err(failed(&self.revisions))
     }
@@ -196,8 +206,8 @@ impl RevisionStore {
         Ok(unused.len())
     }
 
-    /// Returns the path of each file of each revision, by its digest.
-    fn known_files(&self) -> BTreeMap<String, PathBuf> {
+    /// Lists the files of all revisions.
+    pub(crate) fn known_files(&self) -> KnownFiles {
         let mut known = BTreeMap::new();
         for folder in entries(&self.revisions).unwrap_or_default() {
             let digest =

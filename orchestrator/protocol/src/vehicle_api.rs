@@ -27,6 +27,10 @@ pub struct VehicleStatus {
     pub generation: u64,
     /// All deployments, by id.
     pub deployments: Vec<DeploymentStatus>,
+    /// The newest releases that were accepted of deployments that were removed, by id: only later
+    /// ones are accepted.
+    #[serde(default)]
+    pub removed: BTreeMap<String, u64>,
     /// Resources that all lambdas share.
     pub capacity: Vec<Capacity>,
     /// The processes; absent while the supervisor cannot be reached.
@@ -89,6 +93,9 @@ pub struct DeploymentStatus {
     pub refused: Option<String>,
     /// The reason why its deployer should sign it again.
     pub stale: Option<String>,
+    /// Its demand for each resource that lambdas share.
+    #[serde(default)]
+    pub demand: Vec<ResourceDemand>,
     /// The status of its lambda, if the supervisor knows it.
     pub status: Option<LambdaStatus>,
 }
@@ -125,16 +132,36 @@ pub struct RevisionStatus {
 /// A resource that lambdas share.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Capacity {
-    /// Its name: `memory`, `cpu`.
+    /// Its name: `memory`, `topics`, `cpu`, `model_time`.
     pub resource: String,
-    /// Unit of the numbers.
+    /// Unit of the numbers: `B`, `cores`, or `s/s` for the share of the time.
     pub unit: String,
     /// Sum of what all wanted lambdas ask for.
     pub asked: f64,
+    /// Amount that they use now, where it is measured.
+    #[serde(default)]
+    pub used: Option<f64>,
     /// Maximum of that sum.
     pub most: f64,
     /// The source of `most`.
     pub source: String,
+}
+
+/// The demand of a deployment for a resource.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ResourceDemand {
+    /// Name of the resource, as in [`Capacity`].
+    pub resource: String,
+    /// Unit of the numbers, as there.
+    pub unit: String,
+    /// Amount that counts.
+    pub asked: f64,
+    /// Amount in its busiest minute so far, where it is measured.
+    pub peak: Option<f64>,
+    /// The source of `asked`: stated, measured, assumed, or of the limits; with its factors.
+    pub source: String,
+    /// True if it uses more than its manifest states.
+    pub exceeds: bool,
 }
 
 /// A deployment: `POST /v1/deployments`.

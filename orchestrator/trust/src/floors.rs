@@ -110,6 +110,11 @@ impl Floors {
         Ok(())
     }
 
+    /// Returns the newest accepted release of each deployment, also of removed ones.
+    pub fn releases(&self) -> impl Iterator<Item = (&ItemName, u64)> {
+        self.deployments.iter().map(|(id, accepted)| (id, accepted.release))
+    }
+
     /// Remembers an accepted trust root. A root that is not newer changes nothing.
     ///
     /// The caller persists the file of the root first, and these floors second. After a kill

@@ -76,6 +76,38 @@ pub fn stopped() {
     assert!(unknown.contains("the deployments are `ticker`"), "{unknown}");
 }
 
+pub fn removed() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let [lambda, other] = ["ticker", "other"].map(|name| ticker("rust", name));
+    for (lambda, args) in [(&lambda, &["--release", "7"][..]), (&other, &[])] {
+        let deployed = vehicle.deploy(lambda.path(), args);
+        assert!(deployed.status.success(), "{}", text(&deployed));
+    }
+    let removed = vehicle.succeeds(&["remove", "ticker"]);
+    assert_eq!(removed, "removed `ticker`\n");
+    assert_eq!(vehicle.processes("gleaner-shim").len(), 1);
+    let ids = |vehicle: &TestVehicle| -> Vec<String> {
+        vehicle.status().deployments.into_iter().map(|it| it.id).collect()
+    };
+    assert_eq!(ids(&vehicle), ["other"]);
+    vehicle.until("the end of its files", |vehicle| {
+        (files(&vehicle.path("state/revisions")).len() == 1).then_some(())
+    });
+    assert!(!vehicle.records(Some("ticker")).is_empty(), "its records can be read");
+    let again = text(&vehicle.gleaner(&["remove", "ticker"]));
+    assert!(again.contains("there is no deployment `ticker`"), "{again}");
+    assert!(again.contains("the deployments are `other`"), "{again}");
+    vehicle.stop();
+    vehicle.start();
+    vehicle.until_running(&["other"]);
+    assert_eq!(ids(&vehicle), ["other"]);
+    let old = text(&vehicle.deploy(lambda.path(), &["--release", "6"]));
+    assert!(old.contains("exit status: 3") && old.contains('7'), "{old}");
+    let next = text(&vehicle.deploy(lambda.path(), &[]));
+    assert!(next.contains("(release 8, ") && next.contains("running"), "{next}");
+}
+
 /// A lambda whose process ends in its third wake.
 const FAILING: &str = "def on_tick(self, ctx):\n\
                        \u{20}   self.wakes += 1\n\

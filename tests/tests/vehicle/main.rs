@@ -13,7 +13,7 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 9] = [
+const CASES: [Case; 11] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_stopped_deployment_stays_stopped", deployments::stopped),
     ("a_failed_revision_is_replaced_by_its_fallback_for_good", deployments::fallback),
@@ -21,7 +21,9 @@ const CASES: [Case; 9] = [
     ("deployments_at_once_do_not_disturb_each_other", deployments::at_once),
     ("what_is_not_signed_for_this_vehicle_is_refused", refused::signatures),
     ("a_file_that_was_changed_later_does_not_start", refused::changed_file),
+    ("a_removed_deployment_is_gone_and_its_releases_stay_known", deployments::removed),
     ("what_does_not_fit_is_refused_with_both_numbers", refused::memory),
+    ("a_lambda_that_states_too_much_is_refused_and_others_run_on", refused::cpu),
     ("processes_are_killed_at_random", chaos::killed_at_random),
 ];
 
@@ -78,6 +80,15 @@ impl PythonLambda {
         for place in ["", "build/"] {
             self.folder.write(&format!("{place}main.py"), format!("class Lambda:\n{code}"));
             self.folder.write(&format!("{place}lambda.toml"), &manifest);
+        }
+    }
+
+    /// Adds tables to its manifest.
+    fn add(&self, tables: &str) {
+        for place in ["", "build/"] {
+            let path = self.path().join(format!("{place}lambda.toml"));
+            let manifest = std::fs::read_to_string(&path).expect("it was written");
+            self.folder.write(&format!("{place}lambda.toml"), manifest + tables);
         }
     }
 

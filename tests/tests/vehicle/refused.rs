@@ -6,7 +6,7 @@ use std::os::unix::fs::PermissionsExt;
 use gleaner_protocol::supervision::LambdaPhase;
 use gleaner_tests::vehicle::{TestVehicle, text};
 
-use super::{files, ticker};
+use super::{PythonLambda, files, ticker};
 
 pub fn signatures() {
     let mut vehicle = TestVehicle::new();
@@ -65,6 +65,9 @@ pub fn changed_file() {
         (status.phase == LambdaPhase::Quarantined).then_some(())
     });
     assert!(vehicle.processes("start.py").is_empty());
+    // Its deployment brings the file back; the others are still there.
+    let deployed = text(&vehicle.deploy(lambda.path(), &[]));
+    assert!(deployed.contains("1 file sent") && deployed.contains("running"), "{deployed}");
 }
 
 pub fn memory() {
@@ -86,4 +89,46 @@ pub fn memory() {
     assert!(deployed.status.success(), "{}", text(&deployed));
     let refused = text(&vehicle.gleaner(&["start", "first"]));
     assert!(refused.contains("there is no memory for deployment `first`"), "{refused}");
+    // What was admitted runs, also if the vehicle has less later.
+    vehicle.stop();
+    fs::write(vehicle.path("vehicle.toml"), "[deployments]\nmemory = \"64 MiB\"\n")
+        .expect("the folder can be written");
+    vehicle.start();
+    vehicle.until_running(&["second"]);
+    let shown = vehicle.succeeds(&["status"]);
+    assert!(shown.contains("memory 608 MiB of 64 MiB asked for"), "{shown}");
+}
+
+pub fn cpu() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let other = ticker("rust", "other");
+    let deployed = vehicle.deploy(other.path(), &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    let greedy = PythonLambda::new("greedy", "def on_tick(self, ctx):\n    pass");
+    greedy.add("[demand]\ncpu = \"1min\"\n");
+    let refused = text(&vehicle.deploy(greedy.path(), &[]));
+    for words in [
+        "exit status: 3",
+        "there is no CPU time for deployment `greedy`",
+        "it asks for 600.00 cores, the other deployments for 0.01 cores, and all may ask for ",
+        "its demand is stated: 10 wakes/s of 1min",
+        "raise `deployments.cpu` in vehicle.toml",
+    ] {
+        assert!(refused.contains(words), "{words}: {refused}");
+    }
+    let status = vehicle.status();
+    let ids: Vec<_> = status.deployments.iter().map(|it| it.id.as_str()).collect();
+    assert_eq!(ids, ["other"]);
+    assert_eq!(vehicle.deployment("other").status.expect("it runs").restarts, 0);
+    let demand = &status.deployments[0].demand;
+    let cpu = demand.iter().find(|it| it.resource == "cpu").expect("it is listed");
+    assert_eq!((cpu.asked, &*cpu.source), (0.01, "assumed: 10 wakes/s of 1 ms"));
+    let shown = vehicle.succeeds(&["status"]);
+    assert!(shown.contains("cpu 0.01 cores of "), "{shown}");
+    // The speed of the machine is measured once, in the background.
+    vehicle.until("the speed", |vehicle| {
+        let measured = fs::read_to_string(vehicle.path("state/measured.json")).ok()?;
+        measured.contains("\"machine\":[").then_some(())
+    });
 }

@@ -40,6 +40,31 @@ fn every_limit_has_a_minimum_and_a_maximum() {
 }
 
 #[test]
+fn a_demand_has_bounds_and_needs_none_of_its_keys() {
+    let demand = |text: &str| {
+        let text = format!("{TICKER}[demand]\n{text}");
+        Manifest::parse(&text, "lambda.toml").unwrap().demand
+    };
+    assert_eq!(demand(""), Demand::default());
+    let cpu = Some(Duration::from_micros(1500));
+    assert_eq!(demand("cpu = \"1.5ms\""), Demand { cpu, ..Demand::default() });
+    out_of_bounds(
+        "[demand]\ncpu = \"0s\"",
+        9,
+        "`demand.cpu` is 0s, below the minimum of 1us",
+        "give a value from 1us to 1min",
+    );
+    let event = BRAKE_DARK.replace("[schedule]", "[demand]\nrate_hz = RATE\n[schedule]");
+    let rate = |rate: &str| Manifest::parse(&event.replace("RATE", rate), "lambda.toml");
+    assert_eq!(rate("30").unwrap().demand.rate_hz, Some(30.0));
+    assert_eq!(rate("0.5").unwrap().demand.rate_hz, Some(0.5));
+    for wrong in ["0", "inf", "-1.0", "10_001", "\"30 Hz\""] {
+        let error = rate(wrong).unwrap_err().to_string();
+        assert!(error.contains("`demand.rate_hz` is "), "{wrong}: {error}");
+    }
+}
+
+#[test]
 fn every_limit_is_refused_just_outside_of_its_bounds() {
     for Limit { key, unit, plain: [min, _, max], .. } in Limits::table() {
         let shown = |plain: u64| match unit {

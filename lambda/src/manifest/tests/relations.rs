@@ -91,6 +91,26 @@ fn keys_without_meaning_where_they_stand_are_refused() {
         "lambda.toml, line 9: `record.topics` is empty",
         "list what a clip holds, or remove [record]",
     );
+    for (key, problem, help) in [
+        (
+            "rate_hz = 3",
+            "`demand.rate_hz` has no meaning with `period`",
+            "remove it: the period states the rate",
+        ),
+        (
+            "fuel = 1000",
+            "`demand.fuel` has no meaning with kind = \"python\"",
+            "state `cpu`, the CPU time of a wake: Python has no fuel",
+        ),
+        (
+            "model_time = \"1ms\"",
+            "`demand.model_time` has no meaning without a [[model]]",
+            "remove it, or add the model",
+        ),
+    ] {
+        let problem = format!("lambda.toml, line 9: {problem}");
+        refused_below(&format!("[demand]\n{key}"), &problem, help);
+    }
     refused_below(
         "[config]\non = { default = true, min = 0 }",
         "lambda.toml, line 9: `config.on.min` has no meaning here",

@@ -19,6 +19,17 @@ const NAME_MAX: usize = 64;
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct VehicleName(String);
 
+impl VehicleName {
+    /// Returns the name of this machine.
+    ///
+    /// # Errors
+    ///
+    /// The reason why a vehicle cannot have this name.
+    pub fn of_machine() -> Result<Self, String> {
+        rustix::system::uname().nodename().to_string_lossy().parse()
+    }
+}
+
 impl FromStr for VehicleName {
     type Err = String;
 
