@@ -67,6 +67,8 @@ impl Core {
         drop(inner);
         for digest in signed.digests() {
             compile::component(&self.store.folder(digest), &self.cache)?;
+            // As before each start: what does not fit is refused while the former lambda runs.
+            gleaner_wheels::prepare(&self.store.folder(digest))?;
         }
         inner = self.lock();
         // Another trust root may have been installed meanwhile.

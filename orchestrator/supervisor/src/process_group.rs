@@ -201,7 +201,7 @@ impl<'a> ProcessGroup<'a> {
             self.recorder = Some(started);
         }
         for index in 0..self.lambdas.len() {
-            if !self.lambdas[index].is_due() {
+            if !self.lambdas[index].is_due(self.observer) {
                 continue;
             }
             let lambda = &self.lambdas[index].lambda;
@@ -285,7 +285,7 @@ impl<'a> ProcessGroup<'a> {
             &context.parts,
             ("gleaner-runtime", ChildId::Lambda { process: number }, &lambda.prefix),
             arguments::runtime(context.spec, lambda, context.offset_ns, restarts),
-            Some(arguments::shim(context.spec, lambda, restarts)),
+            Some((arguments::shim(context.spec, lambda, restarts), supervised.python.as_deref())),
             connections,
             &self.sender,
         )?;
