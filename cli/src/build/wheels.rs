@@ -1,13 +1,13 @@
 //! Fetches the wheels that the requirements.txt of a Python lambda locks.
 //!
-//! pip does that, as it resolves platforms, indexes and credentials; it runs no code of a wheel, and
-//! builds nothing. It is not the one of the lambda's own environment, whose code is untrusted. Each
+//! pip does that, as it resolves platforms, indexes and credentials. It runs no code of a wheel and
+//! builds nothing, and is not that of the lambda's own environment, whose code is untrusted. Each
 //! wheel is then checked as a vehicle will check it. Wheels of the former build are used again if
 //! requirements and target are the same.
 
 use std::fs::{self, File};
 use std::io::{self, ErrorKind};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Stdio};
 
 use gleaner_base::text::shell_word;
@@ -44,9 +44,10 @@ pub(super) fn add(args: &BuildArgs, partial: &mut PartialBuild) -> Result<(), Bu
     lock.extend(&text);
 
     let folder = partial.path().join(WHEELS);
-    fs::create_dir(&folder).map_err(failed("create", &folder))?;
     let former = BuildDir::of(&args.lambda);
-    if !reuse(&former, &lock, &folder) {
+    fs::create_dir(&folder).map_err(failed("create", &folder))?;
+    if !reuse(&former, &lock, &folder).is_ok_and(|is_complete| is_complete) {
+        fs::remove_dir_all(&folder).map_err(failed("remove", &folder))?;
         let mut pip = Command::new(&python);
         pip.args(["-I", "-m", "pip", "download", "--quiet", "--no-input"])
             .args(["--disable-pip-version-check", "--require-hashes", "--no-deps"])
@@ -83,17 +84,32 @@ pub(super) fn note(dir: &Path, build: &BuildDir) -> String {
     )
 }
 
-/// Copies the wheels of the `former` build if that was made for the same `lock`.
-fn reuse(former: &BuildDir, lock: &[u8], folder: &Path) -> bool {
+/// Copies the wheels of the `former` build to `folder` if that was made for the same `lock`. Returns
+/// false if it was not, or if one was changed since.
+fn reuse(former: &BuildDir, lock: &[u8], folder: &Path) -> io::Result<bool> {
     let path = Path::new(WHEELS).join(REQUIREMENTS);
-    let read = PlainFile::inside(former.path(), &path, SOURCE_MAX).and_then(PlainFile::read_whole);
-    let copy = |wheel: &PathBuf| {
-        let mut to = File::create(folder.join(wheel.file_name().unwrap_or_default()))?;
-        PlainFile::inside(former.path(), wheel, FILE_MAX)?.copy_to(&mut to)
-    };
-    read.is_ok_and(|former| former == lock)
-        && gleaner_wheels::wheels_of(former)
-            .is_ok_and(|wheels| wheels.iter().try_for_each(copy).is_ok())
+    if PlainFile::inside(former.path(), &path, SOURCE_MAX)?.read_whole()? != lock {
+        return Ok(false);
+    }
+    for wheel in gleaner_wheels::wheels_of(former).map_err(io::Error::other)? {
+        let path = folder.join(wheel.file_name().unwrap_or_default());
+        PlainFile::inside(former.path(), &wheel, FILE_MAX)?.copy_to(&mut File::create(&path)?)?;
+        if !is_locked(lock, &sha256(PlainFile::result(&path, FILE_MAX)?)?) {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+fn sha256(file: PlainFile) -> io::Result<String> {
+    let mut sha256 = Sha256::new();
+    io::copy(&mut file.into_file(), &mut sha256)?;
+    Ok(hex(&sha256.finalize()))
+}
+
+/// Returns whether the requirements in `text` list this digest.
+fn is_locked(text: &[u8], sha256: &str) -> bool {
+    String::from_utf8_lossy(text).contains(&format!("sha256:{sha256}"))
 }
 
 /// Checks the wheels in `folder`: each has a hash of the requirements, and can be unpacked.
@@ -103,16 +119,13 @@ fn check(
     requirements: &Path,
     partial: &mut PartialBuild,
 ) -> Result<(), BuildError> {
-    let text = String::from_utf8_lossy(text);
     let mut has_numpy = false;
     for entry in fs::read_dir(folder).map_err(failed("list", folder))? {
         let path = entry.map_err(failed("list", folder))?.path();
         let file = PlainFile::result(&path, FILE_MAX).map_err(failed("read", &path))?;
         partial.count(file.length())?;
-        let mut sha256 = Sha256::new();
-        io::copy(&mut file.into_file(), &mut sha256).map_err(failed("read", &path))?;
-        let sha256 = hex(&sha256.finalize());
-        if !text.contains(&format!("sha256:{sha256}")) {
+        let sha256 = sha256(file).map_err(failed("read", &path))?;
+        if !is_locked(text, &sha256) {
             let wheel = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             return Err(BuildError::Unlocked { wheel, sha256, path: requirements.to_owned() });
         }

@@ -127,12 +127,14 @@ impl WantedFiles {
 
     /// Returns a difference between the environment in `root` and the wanted one.
     fn difference(&self, root: &Path) -> io::Result<Option<String>> {
-        match root.symlink_metadata() {
+        let found = match root.symlink_metadata() {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
                 return Ok(Some("there was none".to_owned()));
             }
-            Ok(found) if !found.is_dir() => return Ok(Some("it was no folder".to_owned())),
-            found => drop(found?),
+            found => found?,
+        };
+        if !found.is_dir() {
+            return Ok(Some("it was no folder".to_owned()));
         }
         let config =
             FileDigest { bytes: self.config.len() as u64, sha256: digest_of(&self.config) };

@@ -18,12 +18,7 @@ pub enum WheelError {
     #[error("`{name}` is not the name of a wheel")]
     Name { name: String },
     #[error("wheel `{wheel}` does not fit {interpreter}")]
-    Unfit {
-        wheel: String,
-        interpreter: Interpreter,
-        #[source]
-        tags: WheelTags,
-    },
+    Unfit { wheel: String, interpreter: Box<Interpreter>, source: WheelTags },
     #[error("cannot read wheel `{}`", path.display())]
     Read { path: PathBuf, source: io::Error },
     #[error("wheel `{wheel}` is not a zip archive that can be unpacked")]

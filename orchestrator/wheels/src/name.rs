@@ -73,8 +73,8 @@ impl WheelName {
         let (wheel, accepted) = (self.tags.join("-"), interpreter.accepted());
         Err(WheelError::Unfit {
             wheel: self.file.clone(),
-            interpreter: interpreter.clone(),
-            tags: WheelTags { wheel, accepted },
+            interpreter: Box::new(interpreter.clone()),
+            source: WheelTags { wheel, accepted },
         })
     }
 }
