@@ -44,7 +44,7 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
     match cli.command {
         CliCommand::Inspect(args) => delegate::inspect(&args),
         CliCommand::New(args) => new::run(&args),
-        CliCommand::Build(args) => build::run(&args.lambda, args.sandboxed),
+        CliCommand::Build(args) => build::run(&args),
         CliCommand::Check(args) => check::run(&args),
         CliCommand::Replay(args) => replay::run(&args),
         CliCommand::Report(args) => report::run(&args),

@@ -26,7 +26,7 @@ pub use log_line::{LogLevel, LogLine};
 pub use manifest::{Manifest, ManifestError};
 pub use output::{LOCK, Output, OutputError, RESULTS};
 pub use results::RESULT_ITEM_MAX;
-pub use sources::{SOURCE_MAX, Sources};
+pub use sources::{REQUIREMENTS, SOURCE_MAX, Sources};
 pub use vehicle::{
     DeploymentSettings, InferenceLimits, NetworkSettings, RecordingSettings, Vehicle,
     VehicleIdentity,

@@ -16,6 +16,9 @@ const SKIPPED_FOLDERS: [&str; 4] = ["build", "out", "target", "tests"];
 /// 700 KiB.
 pub const SOURCE_MAX: ByteSize = ByteSize::mib(16);
 
+/// The packages of a Python lambda, with a hash of each wheel. The file is optional.
+pub const REQUIREMENTS: &str = "requirements.txt";
+
 /// The sources of a build besides `lambda.toml`: used to build, and to check whether a build is up
 /// to date.
 ///
@@ -29,7 +32,9 @@ pub struct Sources {
     /// (`msg/**/*.msg`), and of a Python lambda its entry and every `.py` file that is not in
     /// `build/`, `out/`, `target/` or `tests/` beside the manifest.
     pub copied: BTreeSet<PathBuf>,
-    /// Files compiled into the entry of a Rust lambda: `Cargo.toml`, `build.rs`, and all in `src/`.
+    /// Files that a build reads but does not copy. Of a Rust lambda, those that are compiled into
+    /// the entry: `Cargo.toml`, `build.rs`, and all in `src/`. Of a Python lambda,
+    /// [`REQUIREMENTS`], which locks its wheels.
     pub compiled: BTreeSet<PathBuf>,
 }
 
@@ -49,6 +54,7 @@ impl Sources {
         sources.copied.extend(files(dir, "msg", |_| true, |file| has_extension(file, "msg"))?);
         match manifest.lambda.kind {
             LambdaKind::Python => {
+                sources.compiled.insert(REQUIREMENTS.into());
                 sources.copied.insert(manifest.lambda.entry.as_path().to_owned());
                 let is_of_the_lambda = |folder: &Path| {
                     !SKIPPED_FOLDERS.iter().any(|skipped| folder == Path::new(skipped))
@@ -177,7 +183,7 @@ mod tests {
             copied,
             ["main.py", "models/m.onnx", "msg/a/msg/B.msg", "other.py", "part/build/deep.py"]
         );
-        assert!(compiled.is_empty());
+        assert_eq!(compiled, ["requirements.txt"]);
     }
 
     #[test]

@@ -59,6 +59,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-report",
             "gleaner-supervisor",
             "gleaner-trust",
+            "gleaner-wheels",
         ],
     ),
     ("gleaner-compile", &["gleaner-artifacts", "gleaner-base", "gleaner-jail", "gleaner-lambda"]),
@@ -137,6 +138,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-supervisor",
             "gleaner-trust",
             "gleaner-vitals",
+            "gleaner-wheels",
         ],
     ),
     ("gleaner-parts", &["gleaner-base"]),
@@ -208,12 +210,14 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-protocol",
             "gleaner-spool",
             "gleaner-trust",
+            "gleaner-wheels",
         ],
     ),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
     ("gleaner-trust", &["gleaner-base", "gleaner-lambda"]),
     ("gleaner-vision", &["gleaner-rules"]),
     ("gleaner-vitals", &["gleaner-protocol"]),
+    ("gleaner-wheels", &["gleaner-base", "gleaner-lambda", "gleaner-parts"]),
 ];
 
 /// Crates that must not be linked into a crate, with any of its features.

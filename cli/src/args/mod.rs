@@ -307,12 +307,19 @@ impl From<Language> for LambdaKind {
 }
 
 /// Arguments of `gleaner build`.
-#[derive(Args, Debug)]
+#[derive(Args, Debug, Default)]
 pub struct BuildArgs {
     /// Compile a Rust lambda in a sandbox: its build scripts and macros reach no network and only
     /// its own files; see docs/security.md
     #[arg(long)]
     pub sandboxed: bool,
+    /// Version of the Python that runs the lambda, such as 3.11, for wheels of its
+    /// requirements.txt; by default that of this machine
+    #[arg(long, value_name = "3.N")]
+    pub python_version: Option<String>,
+    /// Platform of that Python, such as manylinux_2_28_aarch64; by default that of this machine
+    #[arg(long, value_name = "PLATFORM")]
+    pub python_platform: Option<String>,
     /// The lambda's folder, with its lambda.toml
     #[arg(value_name = "DIR")]
     pub lambda: PathBuf,

@@ -9,6 +9,7 @@ use gleaner_lambda::layout::{BUILD_MAX, FILES_MAX};
 use gleaner_lambda::manifest::LambdaKind;
 use gleaner_lambda::{LayoutError, ManifestError};
 use gleaner_parts::PartsError;
+use gleaner_wheels::WheelError;
 
 /// Errors of building a lambda.
 #[derive(Debug, thiserror::Error)]
@@ -48,6 +49,16 @@ pub(super) enum BuildError {
     Toolchain { rustc: PathBuf },
     #[error(transparent)]
     Parts(PartsError),
+    #[error("`{text}` is not the platform of a Python on Linux")]
+    Platform { text: String },
+    #[error("pip did not fetch the wheels of `{}`: it ended with {status}", path.display())]
+    Fetched { path: PathBuf, status: ExitStatus },
+    #[error("wheel `{wheel}` has the SHA-256 {sha256}, which `{}` does not list", path.display())]
+    Unlocked { wheel: String, sha256: String, path: PathBuf },
+    #[error("`{}` locks no numpy, which every Python lambda needs", path.display())]
+    NoNumpy { path: PathBuf },
+    #[error(transparent)]
+    Wheel(WheelError),
     #[error("the package `{}` does not build a component", package.display())]
     NoComponent { package: PathBuf },
     #[error("cannot {action} `{}`", path.display())]
@@ -115,6 +126,24 @@ impl Explain for BuildError {
                 "remove the rust-toolchain.toml that names it, or set RUSTUP_TOOLCHAIN".to_owned()
             }
             BuildError::Parts(error) => return error.help(),
+            BuildError::Wheel(error) => return error.help(),
+            BuildError::Platform { .. } => {
+                "write the version of its glibc and its processor: --python-platform \
+                 manylinux_2_28_aarch64; `ldd --version` on the vehicle shows that of its glibc"
+                    .to_owned()
+            }
+            BuildError::Fetched { .. } => {
+                "its messages are above; lock each package with version and hashes, for example by \
+                 `pip-compile --generate-hashes requirements.in`; only wheels are used. Without \
+                 pip: install python3-pip, or name a Python that has it: GLEANER_PYTHON"
+                    .to_owned()
+            }
+            BuildError::Unlocked { .. } => "lock its hashes again, and build again".to_owned(),
+            BuildError::NoNumpy { .. } => {
+                "add numpy to the requirements, and lock them again; packages of the vehicle are \
+                 not visible to a lambda with wheels"
+                    .to_owned()
+            }
             BuildError::NoSandbox | BuildError::Fetch { .. } => return None,
             BuildError::Manifest(error) => return error.help(),
             BuildError::Sources(error) | BuildError::Layout(error) => return error.help(),
@@ -127,6 +156,7 @@ impl Explain for BuildError {
             BuildError::File { source, .. } if NotPlain::of(source).is_none() => Exit::Internal,
             BuildError::Sources(error) | BuildError::Layout(error) => error.exit(),
             BuildError::Parts(error) => error.exit(),
+            BuildError::Wheel(error) => error.exit(),
             BuildError::NoSandbox => Exit::Denied,
             _ => Exit::Usage,
         }

@@ -56,7 +56,13 @@ impl PartialBuild {
         file.copy_to(&mut copy).map_err(failed("copy", from))
     }
 
-    fn count(&mut self, bytes: u64) -> Result<(), BuildError> {
+    /// Returns its folder. What is written there by others must be [counted](Self::count).
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Counts a file.
+    pub(super) fn count(&mut self, bytes: u64) -> Result<(), BuildError> {
         self.built.files += 1;
         self.built.bytes = self.built.bytes.saturating_add(bytes);
         let is_within =

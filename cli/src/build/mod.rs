@@ -1,6 +1,7 @@
 //! `gleaner build DIR`: builds a lambda's folder `build`, which every other command uses.
 //!
-//! `component` compiles Rust, in a `sandbox` on request. `folder` collects the files beside the old
+//! `component` compiles Rust, in a `sandbox` on request. `wheels` fetches the packages of a Python
+//! lambda that has a requirements.txt. `folder` collects the files beside the old
 //! build and then replaces it, so that a failed build leaves the old one unchanged. The files of a
 //! lambda are listed by `gleaner_lambda::Sources`. Nothing here runs a lambda or parses a
 //! component.
@@ -9,6 +10,7 @@ mod component;
 mod error;
 mod folder;
 mod sandbox;
+mod wheels;
 
 use std::fs::File;
 use std::path::Path;
@@ -23,15 +25,16 @@ use gleaner_report::format::size;
 use error::BuildError;
 use folder::{Built, PartialBuild};
 
+use crate::args::BuildArgs;
 use crate::stdout::print;
 
-/// Builds the lambda in `dir` and prints a summary. If `sandboxed`, build scripts and macros run in
-/// a jail.
-pub(crate) fn run(dir: &Path, sandboxed: bool) -> Result<Exit, Failure> {
+/// Builds a lambda and prints a summary.
+pub(crate) fn run(args: &BuildArgs) -> Result<Exit, Failure> {
+    let dir = &*args.lambda;
     // A source that is changed during the build is then newer than the build.
     let started = SystemTime::now();
     let manifest = Manifest::load(dir)?;
-    let built = build(dir, &manifest, started, sandboxed).map_err(|error| {
+    let built = build(args, &manifest, started).map_err(|error| {
         Failure::because(
             format!("cannot build lambda `{}` in `{}`", manifest.lambda.name, dir.display()),
             &error,
@@ -40,20 +43,17 @@ pub(crate) fn run(dir: &Path, sandboxed: bool) -> Result<Exit, Failure> {
     let (path, files) = (BuildDir::of(dir), built.files);
     let files = if files == 1 { "1 file".to_owned() } else { format!("{files} files") };
     print(&format!(
-        "built {} ({files}, {})\n{}",
+        "built {} ({files}, {})\n{}{}",
         path.path().display(),
         size(built.bytes),
-        note(&manifest)
+        note(&manifest),
+        wheels::note(dir, &path)
     ))?;
     Ok(Exit::Ok)
 }
 
-fn build(
-    dir: &Path,
-    manifest: &Manifest,
-    started: SystemTime,
-    sandboxed: bool,
-) -> Result<Built, BuildError> {
+fn build(args: &BuildArgs, manifest: &Manifest, started: SystemTime) -> Result<Built, BuildError> {
+    let dir = &*args.lambda;
     check_entry(manifest)?;
     // The lock serialises builds of one lambda, where folders can be locked.
     let lock = File::open(dir).and_then(|folder| folder.lock().map(|()| folder));
@@ -62,8 +62,10 @@ fn build(
     let sources = Sources::of(dir, manifest).map_err(BuildError::Sources)?;
     check_named(dir, manifest)?;
     if manifest.lambda.kind == LambdaKind::Wasm {
-        let component = component::compile(dir, sandboxed)?;
+        let component = component::compile(dir, args.sandboxed)?;
         partial.add(&component.path, component.opened, manifest.lambda.entry.as_path())?;
+    } else {
+        wheels::add(args, &mut partial)?;
     }
     for source in &sources.copied {
         let opened = PlainFile::inside(dir, source, max_size(manifest, source));

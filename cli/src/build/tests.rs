@@ -29,7 +29,8 @@ impl LambdaFolder {
 
     fn build(&self) -> Result<Built, BuildError> {
         let started = SystemTime::now();
-        build(&self.0, &Manifest::load(&self.0).unwrap(), started, false)
+        let args = BuildArgs { lambda: self.0.clone(), ..BuildArgs::default() };
+        build(&args, &Manifest::load(&self.0).unwrap(), started)
     }
 
     fn read(&self, relative: &str) -> Option<String> {

@@ -12,7 +12,7 @@ use std::path::Path;
 use gleaner_base::{ByteSize, Exit, Failure, PlainFile, safe_file, visible};
 use gleaner_report::Diff;
 
-use crate::args::{DevArgs, ReplayArgs};
+use crate::args::{BuildArgs, DevArgs, ReplayArgs};
 use crate::render::{self, Paint};
 use crate::stdout::print;
 use crate::{build, replay};
@@ -64,7 +64,7 @@ pub(crate) fn run(args: DevArgs) -> Result<Exit, Failure> {
 /// Builds and replays. Returns whether there are results, which is also the case for a lambda with
 /// faults and for a damaged drive.
 fn once(dir: &Path, args: &ReplayArgs) -> Result<bool, Failure> {
-    build::run(dir, false)?;
+    build::run(&BuildArgs { lambda: dir.to_owned(), ..BuildArgs::default() })?;
     replay::results(args).map(|(_, has_results)| has_results)
 }
 

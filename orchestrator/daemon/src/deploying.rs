@@ -76,9 +76,12 @@ impl Core {
         inner.compiling.extend(digests.iter().cloned());
         drop((inner, changing));
         // Others are deployed meanwhile.
-        let mut digest = digests.iter();
-        let compiled =
-            digest.try_for_each(|it| compile::component(&self.store.folder(it), &self.cache));
+        let compiled = digests.iter().try_for_each(|digest| {
+            let folder = self.store.folder(digest);
+            compile::component(&folder, &self.cache)?;
+            // As before each start: what does not fit is refused while the former lambda runs.
+            gleaner_wheels::prepare(&folder)
+        });
         let _changing = deploying();
         inner = self.lock();
         for digest in &digests {

@@ -1,7 +1,8 @@
 //! Revisions on the disk, under their digests, and files that were sent and belong to none yet.
 //!
 //! A revision is a folder with `build/` and its envelope, `revision.json`. It appears under its
-//! name only when it is complete, checked and durable, and is never changed afterwards.
+//! name only when it is complete, checked and durable, and is never changed afterwards; of one with
+//! wheels, `gleaner-wheels` keeps the environment beside the build.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, Permissions};

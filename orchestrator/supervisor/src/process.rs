@@ -5,7 +5,7 @@ use std::io;
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
@@ -40,15 +40,16 @@ pub(crate) struct ChildProcess {
 impl ChildProcess {
     /// Starts the program `name` with these connections. `prefix` is the text before each line of
     /// its standard error. `shim` are the arguments of gleaner-shim, which starts the program if
-    /// they are given.
+    /// they are given, and the interpreter that the program has to use, if it runs Python.
     pub(crate) fn start(
         parts: &Parts,
         (name, id, prefix): (&'static str, ChildId, &str),
         line: Vec<OsString>,
-        shim: Option<Vec<OsString>>,
+        shim: Option<(Vec<OsString>, Option<&Path>)>,
         connections: Handover,
         sender: &SyncSender<ChildOutput>,
     ) -> Result<Self, Failure> {
+        let (shim, python) = shim.unzip();
         let (program, line) = command_line(parts, name, line, shim)?;
         let failed = |error: &dyn std::error::Error| {
             let program = program.display();
@@ -58,8 +59,11 @@ impl ChildProcess {
         set_socket_send_buffer_size(&handover, HANDOVER_BYTES)
             .map_err(|error| failed(&io::Error::from(error)))?;
         connections.send(&handover).map_err(|error| failed(&error))?;
+        // No other interpreter is tried then.
+        let python = python.flatten().map(|python| ("GLEANER_PYTHON", python));
         let mut child = Command::new(&program)
             .args(line)
+            .envs(python)
             // Only `gleaner` receives Ctrl-C, and ends its processes in order.
             .process_group(0)
             .stdin(OwnedFd::from(stdin))

@@ -184,7 +184,7 @@ impl<'a> ProcessGroup<'a> {
     /// Starts all lambdas that are due.
     fn start_due(&mut self) -> Result<(), Failure> {
         for index in 0..self.lambdas.len() {
-            if !self.lambdas[index].is_due() {
+            if !self.lambdas[index].is_due(self.observer) {
                 continue;
             }
             let lambda = &self.lambdas[index].lambda;
@@ -262,7 +262,7 @@ impl<'a> ProcessGroup<'a> {
             &context.parts,
             ("gleaner-runtime", ChildId::Lambda { process: number }, &lambda.prefix),
             arguments::runtime(context.spec, lambda, context.offset_ns, restarts),
-            Some(arguments::shim(context.spec, lambda, restarts)),
+            Some((arguments::shim(context.spec, lambda, restarts), supervised.python.as_deref())),
             connections,
             &self.sender,
         )?;

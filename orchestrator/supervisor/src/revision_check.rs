@@ -1,4 +1,5 @@
-//! Compares the files of a deployed lambda with its signed revision before each start.
+//! Compares the files of a deployed lambda with its signed revision before each start, and its
+//! Python environment with its wheels.
 
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 use std::thread;
@@ -7,10 +8,14 @@ use gleaner_base::{PlainFile, chain};
 use gleaner_lambda::BuildDir;
 use gleaner_protocol::supervision::DesiredLambda;
 use gleaner_trust::{FileDigestError, Payload, Revision, check_files, revision_of_digest};
+use gleaner_wheels::PreparedPython;
+
+/// The environment of a lambda that has wheels, or the reason why it does not start.
+pub(crate) type CheckResult = Result<Option<PreparedPython>, String>;
 
 /// A check in a thread of its own: models of gigabytes take seconds, and other lambdas do not wait.
 pub(crate) struct RevisionCheck {
-    result: Receiver<Result<(), String>>,
+    result: Receiver<CheckResult>,
 }
 
 impl RevisionCheck {
@@ -24,7 +29,7 @@ impl RevisionCheck {
     }
 
     /// Returns the result, once it is there.
-    pub(crate) fn result(&self) -> Option<Result<(), String>> {
+    pub(crate) fn result(&self) -> Option<CheckResult> {
         match self.result.try_recv() {
             Ok(result) => Some(result),
             Err(TryRecvError::Empty) => None,
@@ -35,7 +40,7 @@ impl RevisionCheck {
     }
 }
 
-fn check(deployment: &DesiredLambda) -> Result<(), String> {
+fn check(deployment: &DesiredLambda) -> CheckResult {
     let DesiredLambda { revision, folder, envelope, .. } = deployment;
     let digest = revision.parse().map_err(|_| format!("`{revision}` is no digest"))?;
     let envelope = PlainFile::named(envelope, Revision::MAX).and_then(PlainFile::read_whole);
@@ -43,5 +48,7 @@ fn check(deployment: &DesiredLambda) -> Result<(), String> {
         envelope.map_err(|error| format!("its revision cannot be read: {}", chain(&error)))?;
     let refused = |error: FileDigestError| format!("its files are refused: {}", chain(&error));
     let revision = revision_of_digest(&envelope, &digest).map_err(|it| refused(it.into()))?;
-    check_files(&revision, &BuildDir::of(folder)).map_err(refused)
+    check_files(&revision, &BuildDir::of(folder)).map_err(refused)?;
+    gleaner_wheels::prepare(folder)
+        .map_err(|error| format!("it has no Python environment: {}", chain(&error)))
 }

@@ -1,5 +1,6 @@
 //! One lambda of a run: its process, and its counts over all restarts.
 
+use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
@@ -25,6 +26,8 @@ const STATUSES_AFTER_DRIVE: u32 = 2;
 /// A lambda, with its current process.
 pub(crate) struct SupervisedLambda {
     pub(crate) lambda: LambdaSpec,
+    /// The interpreter of the environment that was made of its wheels, as checked.
+    pub(crate) python: Option<PathBuf>,
     state: LambdaState,
     /// Time since which it has this state.
     since: Instant,
@@ -67,6 +70,7 @@ impl SupervisedLambda {
     pub(crate) fn new(lambda: LambdaSpec) -> Self {
         Self {
             lambda,
+            python: None,
             state: LambdaState::Due(Instant::now()),
             since: Instant::now(),
             restarts: 0,
@@ -84,7 +88,7 @@ impl SupervisedLambda {
 
     /// Returns whether its process is to be started now. The files of a deployed lambda are checked
     /// before, in a thread.
-    pub(crate) fn is_due(&mut self) -> bool {
+    pub(crate) fn is_due(&mut self, observer: &mut dyn RunObserver) -> bool {
         match &mut self.state {
             _ if self.is_leaving => false,
             LambdaState::Checked => true,
@@ -99,7 +103,12 @@ impl SupervisedLambda {
             },
             LambdaState::Checking(check) => match check.result() {
                 None => false,
-                Some(Ok(())) => {
+                Some(Ok(prepared)) => {
+                    if let Some(made) = prepared.as_ref().and_then(|it| it.made.as_ref()) {
+                        let (prefix, text) = (&self.lambda.prefix, "made its Python environment");
+                        observer.warn(&format!("{prefix}{text}: {made}"));
+                    }
+                    self.python = prepared.map(|it| it.python);
                     self.state = LambdaState::Checked;
                     true
                 }

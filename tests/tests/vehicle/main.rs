@@ -3,6 +3,7 @@
 mod chaos;
 mod deployments;
 mod refused;
+mod wheels;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -24,6 +25,8 @@ const CASES: [Case; 11] = [
     ("a_removed_deployment_is_gone_and_its_releases_stay_known", deployments::removed),
     ("what_does_not_fit_is_refused_with_both_numbers", refused::memory),
     ("a_lambda_that_states_too_much_is_refused_and_others_run_on", refused::cpu),
+    ("a_lambda_runs_with_its_wheels_and_not_with_changed_ones", wheels::runs),
+    ("wheels_that_do_not_fit_are_refused_while_the_former_lambda_runs", wheels::refused),
     ("processes_are_killed_at_random", chaos::killed_at_random),
 ];
 
