@@ -62,6 +62,7 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
         CliCommand::Start(args) => vehicle::change(&args, "start"),
         CliCommand::Stop(args) => vehicle::change(&args, "stop"),
         CliCommand::Status(args) => vehicle::status(&args),
+        CliCommand::Top(args) => vehicle::top(&args),
         CliCommand::Logs(args) => vehicle::logs(&args),
         CliCommand::Events(args) => vehicle::events(&args),
         CliCommand::Doctor(args) => doctor::run(&args),

@@ -208,6 +208,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-protocol",
             "gleaner-spool",
             "gleaner-trust",
+            "gleaner-vitals",
         ],
     ),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),

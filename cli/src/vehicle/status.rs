@@ -2,7 +2,7 @@
 
 use gleaner_base::{Exit, Failure, format_duration, visible};
 use gleaner_protocol::supervision::{LambdaPhase, ProcessStatus};
-use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
+use gleaner_protocol::vehicle_api::{Capacity, DeploymentStatus, VehicleStatus};
 use gleaner_report::format::{grouped, size};
 
 use super::client::VehicleClient;
@@ -34,9 +34,7 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         Some(trust) => format!("  trust root {}\n", trust.version),
     };
     for capacity in &status.capacity {
-        // Of all resources, only memory has a unit of its own.
-        let [asked, most] = [capacity.asked, capacity.most].map(|it| size(it as u64));
-        text += &format!("  {} {asked} of {most} ({})\n", capacity.resource, capacity.source);
+        text += &format!("  {} ({})\n", shared(capacity), visible(&capacity.source));
     }
     match &status.supervisor {
         None => text += &format!("  {}\n", paint.red("the supervisor does not run")),
@@ -58,19 +56,52 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
     text += "\n";
     text += &table(rows.collect(), &[5, 6, 7, 8, 9, 10]);
     for deployment in &status.deployments {
-        for (what, why) in [
-            ("refused", &deployment.refused),
-            ("runs its fallback", &deployment.failed),
-            ("should be signed again", &deployment.stale),
-            ("last end", &deployment.status.as_ref().and_then(|it| it.last_end.clone())),
-        ] {
-            if let Some(why) = why {
-                let line = format!("{}: {what}: {}", deployment.id, visible(why));
-                text += &format!("{}\n", paint.yellow(&line));
-            }
+        for reason in reasons(deployment) {
+            let line = format!("{}: {reason}", deployment.id);
+            text += &format!("{}\n", paint.yellow(&line));
         }
     }
     text
+}
+
+/// Formats a resource that lambdas share: `memory 1.2 MiB of 8.0 MiB`.
+pub(super) fn shared(capacity: &Capacity) -> String {
+    let number = |value: f64| match &*capacity.unit {
+        "B" => size(value as u64),
+        unit => format!("{} {}", (value * 100.0).round() / 100.0, visible(unit)),
+    };
+    let [asked, most] = [capacity.asked, capacity.most].map(number);
+    format!("{} {asked} of {most}", visible(&capacity.resource))
+}
+
+/// Returns the state of a deployment in a word or two.
+pub(super) fn state(deployment: &DeploymentStatus) -> &'static str {
+    match deployment.status.as_ref().map(|lambda| lambda.phase) {
+        None if !deployment.is_wanted => "stopped",
+        None => "unknown",
+        Some(LambdaPhase::Running) if !deployment.is_proven => "on probation",
+        Some(phase) => phase.as_str(),
+    }
+}
+
+/// Returns the version that runs.
+pub(super) fn version(deployment: &DeploymentStatus) -> String {
+    let fallback = deployment.fallback.as_ref().filter(|_| deployment.runs_fallback);
+    let mark = if fallback.is_some() { " (fallback)" } else { "" };
+    format!("{}{mark}", visible(&fallback.unwrap_or(&deployment.revision).version))
+}
+
+/// Returns the reasons why a deployment does not run as wanted, each with its subject.
+pub(super) fn reasons(deployment: &DeploymentStatus) -> Vec<String> {
+    let last_end = deployment.status.as_ref().and_then(|lambda| lambda.last_end.as_ref());
+    let all = [
+        ("refused", deployment.refused.as_ref()),
+        ("runs its fallback", deployment.failed.as_ref()),
+        ("should be signed again", deployment.stale.as_ref()),
+        ("last end", last_end),
+    ];
+    let line = |(what, why): (&str, Option<&String>)| Some(format!("{what}: {}", visible(why?)));
+    all.into_iter().filter_map(line).collect()
 }
 
 fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> String {
@@ -85,15 +116,6 @@ fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> St
 
 fn row(deployment: &DeploymentStatus) -> [String; 11] {
     let lambda = deployment.status.as_ref();
-    let fallback = deployment.fallback.as_ref().filter(|_| deployment.runs_fallback);
-    let mark = if fallback.is_some() { " (fallback)" } else { "" };
-    let version = &fallback.unwrap_or(&deployment.revision).version;
-    let state = match lambda.map(|lambda| lambda.phase) {
-        None if !deployment.is_wanted => "stopped",
-        None => "unknown",
-        Some(LambdaPhase::Running) if !deployment.is_proven => "on probation",
-        Some(phase) => phase.as_str(),
-    };
     let seconds = lambda.map(|lambda| std::time::Duration::from_secs(lambda.phase_s as u64));
     let live = lambda.and_then(|lambda| lambda.live.as_deref());
     let count = |count: Option<u64>| count.map_or_else(|| "-".to_owned(), grouped);
@@ -101,8 +123,8 @@ fn row(deployment: &DeploymentStatus) -> [String; 11] {
     [
         deployment.id.clone(),
         deployment.lambda.clone(),
-        format!("{version}{mark}"),
-        state.to_owned(),
+        version(deployment),
+        state(deployment).to_owned(),
         seconds.map_or_else(|| "-".to_owned(), format_duration),
         count(lambda.map(|lambda| lambda.restarts.into())),
         count(live.map(|live| live.wakes)),
