@@ -10,6 +10,10 @@ use crate::args::StatusArgs;
 use crate::render::{Paint, json_line, table};
 use crate::stdout::print;
 
+/// Shown without deployments.
+pub(super) const NO_DEPLOYMENTS: &str =
+    "nothing is deployed: `gleaner deploy --local DIR --key FILE`";
+
 /// Runs `gleaner status`.
 pub(crate) fn status(args: &StatusArgs) -> Result<Exit, Failure> {
     let status = VehicleClient::new(&args.vehicle)?.status()?;
@@ -45,7 +49,7 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         }
     }
     if status.deployments.is_empty() {
-        return text + "\nnothing is deployed: `gleaner deploy --local DIR --key FILE`\n";
+        return text + &format!("\n{NO_DEPLOYMENTS}\n");
     }
     let head = [
         "id", "lambda", "runs", "state", "for", "restarts", "wakes", "triggers", "faults", "p99",

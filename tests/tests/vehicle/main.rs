@@ -3,6 +3,7 @@
 mod chaos;
 mod deployments;
 mod refused;
+mod top;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -13,7 +14,7 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 9] = [
+const CASES: [Case; 11] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_stopped_deployment_stays_stopped", deployments::stopped),
     ("a_failed_revision_is_replaced_by_its_fallback_for_good", deployments::fallback),
@@ -22,6 +23,8 @@ const CASES: [Case; 9] = [
     ("what_is_not_signed_for_this_vehicle_is_refused", refused::signatures),
     ("a_file_that_was_changed_later_does_not_start", refused::changed_file),
     ("what_does_not_fit_is_refused_with_both_numbers", refused::memory),
+    ("top_shows_figures_and_outlives_the_orchestrator", top::figures),
+    ("top_restores_the_terminal", top::terminal),
     ("processes_are_killed_at_random", chaos::killed_at_random),
 ];
 

@@ -5,7 +5,7 @@ use std::cmp::Ordering;
 use gleaner_base::visible;
 use gleaner_report::format::{grouped, size};
 
-use super::super::status::shared;
+use super::super::status::{NO_DEPLOYMENTS, shared};
 use super::figures::{LambdaFigures, ProgramFigures, VehicleFigures};
 
 /// Spaces between two columns.
@@ -73,6 +73,9 @@ pub(super) fn fitting(
 pub(super) fn text(figures: &VehicleFigures) -> String {
     let mut text: String = head(figures).iter().map(|line| format!("{line}\n")).collect();
     text += "\n";
+    if figures.lambdas.is_empty() {
+        return text + NO_DEPLOYMENTS + "\n";
+    }
     let columns: Vec<_> = fitting(&figures.lambdas, usize::from(u16::MAX)).collect();
     let mut line = |cell: &dyn Fn(&Column) -> String| {
         let cells = columns.iter().map(|(column, width)| match column.is_number() {

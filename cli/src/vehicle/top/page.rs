@@ -12,6 +12,7 @@ use ratatui::style::{Color, Modifier, Style, Stylize};
 use ratatui::text::Line;
 use ratatui::widgets::{Block, Borders, Paragraph, Row, Table, TableState, Wrap};
 
+use super::super::status::NO_DEPLOYMENTS;
 use super::columns::{self, RowOrder};
 use super::figures::{LambdaFigures, losses};
 use super::{POLL_INTERVAL, Polls};
@@ -116,8 +117,7 @@ impl Page {
                 frame.render_widget(lines.block(block), bottom);
             }
             None => {
-                let text = "nothing is deployed: `gleaner deploy --local DIR --key FILE`";
-                frame.render_widget(Paragraph::new(text), bottom);
+                frame.render_widget(Paragraph::new(NO_DEPLOYMENTS), bottom);
             }
         }
         let keys = format!("q quit   up/down select   s sort: {}", self.order.head());
