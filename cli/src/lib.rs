@@ -63,6 +63,7 @@ pub fn run(cli: Cli) -> Result<Exit, Failure> {
         CliCommand::Stop(args) => vehicle::change(&args, "stop"),
         CliCommand::Remove(args) => vehicle::remove(&args),
         CliCommand::Status(args) => vehicle::status(&args),
+        CliCommand::Top(args) => vehicle::top(&args),
         CliCommand::Logs(args) => vehicle::logs(&args),
         CliCommand::Events(args) => vehicle::events(&args),
         CliCommand::Doctor(args) => doctor::run(&args),

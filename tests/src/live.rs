@@ -110,7 +110,8 @@ impl RunningProgram {
         })
     }
 
-    fn until_line<T>(&self, what: &str, mut wanted: impl FnMut(&str) -> Option<T>) -> T {
+    /// As [`until`](Self::until), for lines of any kind.
+    pub fn until_line<T>(&self, what: &str, mut wanted: impl FnMut(&str) -> Option<T>) -> T {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());

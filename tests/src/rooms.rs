@@ -211,6 +211,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-spool",
             "gleaner-trust",
             "gleaner-wheels",
+            "gleaner-vitals",
         ],
     ),
     ("gleaner-transport", &["gleaner-base", "gleaner-messages", "gleaner-protocol"]),
@@ -231,9 +232,9 @@ pub const WITHOUT: &[(&str, &[&str])] = &[
     ("gleaner-orchestrator", &["wasmtime", "pyo3", "rustdds"]),
     ("gleaner-player", &["pyo3", "rustdds"]),
     // A web page may use it.
-    ("gleaner-report", &["clap", "indicatif"]),
+    ("gleaner-report", &["clap", "indicatif", "ratatui"]),
     // A daemon uses it as well as a terminal.
-    ("gleaner-supervisor", &["clap", "indicatif", "wasmtime", "pyo3", "rustdds"]),
+    ("gleaner-supervisor", &["clap", "indicatif", "ratatui", "wasmtime", "pyo3", "rustdds"]),
 ];
 
 /// For each room of `host/src`, the rooms that it must not use.

@@ -29,7 +29,7 @@ use checkout::{Checkout, FAMILIES};
 use steps::Steps;
 
 const USAGE: &str = "usage: cargo xtask COMMAND
-  demo     replay the sample drive with both twins of every example, and show their decisions
+  demo     replay the sample drive with both twins of every example, then run them on a vehicle
   test     run all tests; the last line is `N passed, M failed, K skipped`
   bless    write the examples' decisions to expected.txt, and the generated files
   docs     fetch mdBook and build the pages as a book in target/book
@@ -66,6 +66,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
     let checkout = Checkout::find()?;
     match command {
         "demo" => demo::run(&checkout),
+        demo::VEHICLE_COMMAND => demo::run_vehicle(&checkout),
         "test" => suites::run(&checkout),
         "bless" => bless::run(&checkout),
         "docs" => docs::run(&checkout),

@@ -15,7 +15,7 @@ use gleaner_protocol::DriveTime;
 
 pub use signing::{KeysArgs, KeysCommand, PublishArgs, SignArgs};
 pub use vehicle::{
-    ChangeArgs, DeployArgs, LogsArgs, StatusArgs, StreamArgs, TrustArgs, TrustCommand,
+    ChangeArgs, DeployArgs, LogsArgs, StatusArgs, StreamArgs, TopArgs, TrustArgs, TrustCommand,
     TrustInstallArgs, VehicleArgs,
 };
 pub use verify::VerifyArgs;
@@ -94,6 +94,11 @@ pub enum CliCommand {
     Remove(ChangeArgs),
     /// Show what runs on a vehicle
     Status(StatusArgs),
+    /// Show the cost of each lambda of a vehicle, each second: CPU, memory, latencies, losses
+    ///
+    /// Keys: up and down or j and k select a lambda, s sorts by another column, q ends it.
+    /// With --json, prints one object for each poll; docs/vehicle.md lists its keys.
+    Top(TopArgs),
     /// Show decisions and log lines of a deployment
     Logs(LogsArgs),
     /// Show what happened on a vehicle

@@ -81,6 +81,17 @@ pub struct StatusArgs {
     pub vehicle: VehicleArgs,
 }
 
+/// Arguments of `gleaner top`.
+#[derive(Args, Debug)]
+pub struct TopArgs {
+    /// Print a table after two polls, and end; with --json, one object
+    #[arg(long)]
+    pub once: bool,
+    /// The orchestrator
+    #[command(flatten)]
+    pub vehicle: VehicleArgs,
+}
+
 /// Arguments of `gleaner logs` and `gleaner events`.
 #[derive(Args, Debug)]
 pub struct StreamArgs {

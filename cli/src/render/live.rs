@@ -133,7 +133,16 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
         writeln!(text, "  {line}")?;
     }
     write_gaps(text, live.reception_gaps, paint)?;
-    let losses = [
+    for (count, thing, why) in live_losses(live).into_iter().filter(|(count, ..)| *count > 0) {
+        writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
+    }
+    write_usage(text, live.rss_bytes, live.cpu_s, paint)
+}
+
+/// Returns each count of lost data that is not a sample of a topic, with its thing and its cause;
+/// also those that are 0.
+pub(crate) fn live_losses(live: &LiveStatus) -> [(u64, &'static str, &'static str); 9] {
+    [
         (live.missed_ticks, "tick", "missed"),
         (live.log_dropped, "log line", "over the rate limit"),
         (live.triggers_refused, "trigger", "refused: over `events_per_minute`"),
@@ -155,11 +164,7 @@ fn write_live(text: &mut String, live: &LiveStatus, paint: Paint) -> fmt::Result
             "recorder",
             "ended: clips lack the time until the next one",
         ),
-    ];
-    for (count, thing, why) in losses.into_iter().filter(|(count, ..)| *count > 0) {
-        writeln!(text, "  {}", paint.yellow(&format!("lost: {}, {why}", counted(count, thing))))?;
-    }
-    write_usage(text, live.rss_bytes, live.cpu_s, paint)
+    ]
 }
 
 /// Writes the times in which a process received nothing, if there were any.

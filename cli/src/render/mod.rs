@@ -25,7 +25,7 @@ pub(crate) use inference::{inference, inference_event};
 pub(crate) use ingress::ingress;
 pub(crate) use isolation::isolation;
 pub(crate) use live::{
-    clip_line, decision, live, named_report, recorder, table, time_of_day, topics,
+    clip_line, decision, live, live_losses, named_report, recorder, table, time_of_day, topics,
 };
 
 /// Formats a report as one line of JSON.

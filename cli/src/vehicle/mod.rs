@@ -3,16 +3,19 @@
 //! - `client`, `file_body`: requests over its socket.
 //! - `deploy`: signs a deployment, sends it and waits; starts, stops, rolls back and removes.
 //! - `trust`: trust roots. `status`, `stream`: what runs, and what happened.
+//! - `top`: what each lambda costs, each second.
 
 mod client;
 mod deploy;
 mod file_body;
 mod status;
 mod stream;
+mod top;
 mod trust;
 
 pub(crate) use client::VehicleClient;
 pub(crate) use deploy::{change, deploy, remove};
 pub(crate) use status::status;
 pub(crate) use stream::{events, logs};
+pub(crate) use top::top;
 pub(crate) use trust::trust;

@@ -2,13 +2,17 @@
 
 use gleaner_base::{Exit, Failure, format_duration, visible};
 use gleaner_protocol::supervision::{LambdaPhase, ProcessStatus};
-use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
+use gleaner_protocol::vehicle_api::{Capacity, DeploymentStatus, VehicleStatus};
 use gleaner_report::format::{grouped, size};
 
 use super::client::VehicleClient;
 use crate::args::StatusArgs;
 use crate::render::{Paint, json_line, table};
 use crate::stdout::print;
+
+/// Shown without deployments.
+pub(super) const NO_DEPLOYMENTS: &str =
+    "nothing is deployed: `gleaner deploy --local DIR --key FILE`";
 
 /// Runs `gleaner status`.
 pub(crate) fn status(args: &StatusArgs) -> Result<Exit, Failure> {
@@ -34,15 +38,7 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         Some(trust) => format!("  trust root {}\n", trust.version),
     };
     for capacity in &status.capacity {
-        let show = |number: f64| amount(number, &capacity.unit);
-        let [asked, most] = [capacity.asked, capacity.most].map(show);
-        let used = capacity.used.map(|used| format!(", {} used", show(used)));
-        text += &format!(
-            "  {} {asked} of {most} asked for{} ({})\n",
-            visible(&capacity.resource),
-            used.unwrap_or_default(),
-            visible(&capacity.source)
-        );
+        text += &format!("  {} ({})\n", shared(capacity), visible(&capacity.source));
     }
     match &status.supervisor {
         None => text += &format!("  {}\n", paint.red("the supervisor does not run")),
@@ -53,7 +49,7 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         }
     }
     if status.deployments.is_empty() {
-        return text + "\nnothing is deployed: `gleaner deploy --local DIR --key FILE`\n";
+        return text + &format!("\n{NO_DEPLOYMENTS}\n");
     }
     let head = [
         "id", "lambda", "runs", "state", "for", "restarts", "wakes", "triggers", "faults", "p99",
@@ -64,32 +60,63 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
     text += "\n";
     text += &table(rows.collect(), &[5, 6, 7, 8, 9, 10]);
     for deployment in &status.deployments {
-        let exceeds = deployment.demand.iter().find(|demand| demand.exceeds).map(|demand| {
-            let asked = amount(demand.asked, &demand.unit);
-            format!("{} {asked} ({})", demand.resource, demand.source)
-        });
-        for (what, why) in [
-            ("refused", &deployment.refused),
-            ("runs its fallback", &deployment.failed),
-            ("should be signed again", &deployment.stale),
-            ("uses more than it states", &exceeds),
-            ("last end", &deployment.status.as_ref().and_then(|it| it.last_end.clone())),
-        ] {
-            if let Some(why) = why {
-                let line = format!("{}: {what}: {}", deployment.id, visible(why));
-                text += &format!("{}\n", paint.yellow(&line));
-            }
+        for reason in reasons(deployment) {
+            let line = format!("{}: {reason}", deployment.id);
+            text += &format!("{}\n", paint.yellow(&line));
         }
     }
     text
+}
+
+/// Formats a resource that lambdas share: `memory 1.2 MiB of 8.0 MiB asked for, 0.9 MiB used`.
+pub(super) fn shared(capacity: &Capacity) -> String {
+    let number = |value: f64| amount(value, &capacity.unit);
+    let [asked, most] = [capacity.asked, capacity.most].map(number);
+    let used = capacity.used.map(|used| format!(", {} used", number(used))).unwrap_or_default();
+    format!("{} {asked} of {most} asked for{used}", visible(&capacity.resource))
 }
 
 /// Formats an amount of a resource.
 fn amount(number: f64, unit: &str) -> String {
     match unit {
         "B" => size(number as u64),
-        _ => format!("{number:.2} {}", visible(unit)),
+        unit => format!("{number:.2} {}", visible(unit)),
     }
+}
+
+/// Returns the state of a deployment in a word or two.
+pub(super) fn state(deployment: &DeploymentStatus) -> &'static str {
+    match deployment.status.as_ref().map(|lambda| lambda.phase) {
+        None if !deployment.is_wanted => "stopped",
+        None => "unknown",
+        Some(LambdaPhase::Running) if !deployment.is_proven => "on probation",
+        Some(phase) => phase.as_str(),
+    }
+}
+
+/// Returns the version that runs.
+pub(super) fn version(deployment: &DeploymentStatus) -> String {
+    let fallback = deployment.fallback.as_ref().filter(|_| deployment.runs_fallback);
+    let mark = if fallback.is_some() { " (fallback)" } else { "" };
+    format!("{}{mark}", visible(&fallback.unwrap_or(&deployment.revision).version))
+}
+
+/// Returns the reasons why a deployment does not run as wanted, each with its subject.
+pub(super) fn reasons(deployment: &DeploymentStatus) -> Vec<String> {
+    let last_end = deployment.status.as_ref().and_then(|lambda| lambda.last_end.as_ref());
+    let exceeds = deployment.demand.iter().find(|demand| demand.exceeds).map(|demand| {
+        let asked = amount(demand.asked, &demand.unit);
+        format!("{} {asked} ({})", demand.resource, demand.source)
+    });
+    let all = [
+        ("refused", deployment.refused.as_ref()),
+        ("runs its fallback", deployment.failed.as_ref()),
+        ("should be signed again", deployment.stale.as_ref()),
+        ("uses more than it states", exceeds.as_ref()),
+        ("last end", last_end),
+    ];
+    let line = |(what, why): (&str, Option<&String>)| Some(format!("{what}: {}", visible(why?)));
+    all.into_iter().filter_map(line).collect()
 }
 
 fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> String {
@@ -104,15 +131,6 @@ fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> St
 
 fn row(deployment: &DeploymentStatus) -> [String; 11] {
     let lambda = deployment.status.as_ref();
-    let fallback = deployment.fallback.as_ref().filter(|_| deployment.runs_fallback);
-    let mark = if fallback.is_some() { " (fallback)" } else { "" };
-    let version = &fallback.unwrap_or(&deployment.revision).version;
-    let state = match lambda.map(|lambda| lambda.phase) {
-        None if !deployment.is_wanted => "stopped",
-        None => "unknown",
-        Some(LambdaPhase::Running) if !deployment.is_proven => "on probation",
-        Some(phase) => phase.as_str(),
-    };
     let seconds = lambda.map(|lambda| std::time::Duration::from_secs(lambda.phase_s as u64));
     let live = lambda.and_then(|lambda| lambda.live.as_deref());
     let count = |count: Option<u64>| count.map_or_else(|| "-".to_owned(), grouped);
@@ -120,8 +138,8 @@ fn row(deployment: &DeploymentStatus) -> [String; 11] {
     [
         deployment.id.clone(),
         deployment.lambda.clone(),
-        format!("{version}{mark}"),
-        state.to_owned(),
+        version(deployment),
+        state(deployment).to_owned(),
         seconds.map_or_else(|| "-".to_owned(), format_duration),
         count(lambda.map(|lambda| lambda.restarts.into())),
         count(live.map(|live| live.wakes)),

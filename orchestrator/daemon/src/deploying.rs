@@ -80,7 +80,8 @@ impl Core {
             let folder = self.store.folder(digest);
             compile::component(&folder, &self.cache)?;
             // As before each start: what does not fit is refused while the former lambda runs.
-            gleaner_wheels::prepare(&folder)
+            gleaner_wheels::prepare(&folder)?;
+            Ok::<_, Failure>(())
         });
         let _changing = deploying();
         inner = self.lock();

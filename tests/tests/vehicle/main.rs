@@ -3,6 +3,7 @@
 mod chaos;
 mod deployments;
 mod refused;
+mod top;
 mod wheels;
 
 use std::path::{Path, PathBuf};
@@ -14,7 +15,7 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 11] = [
+const CASES: [Case; 15] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_stopped_deployment_stays_stopped", deployments::stopped),
     ("a_failed_revision_is_replaced_by_its_fallback_for_good", deployments::fallback),
@@ -27,6 +28,8 @@ const CASES: [Case; 11] = [
     ("a_lambda_that_states_too_much_is_refused_and_others_run_on", refused::cpu),
     ("a_lambda_runs_with_its_wheels_and_not_with_changed_ones", wheels::runs),
     ("wheels_that_do_not_fit_are_refused_while_the_former_lambda_runs", wheels::refused),
+    ("top_shows_figures_and_outlives_the_orchestrator", top::figures),
+    ("top_restores_the_terminal", top::terminal),
     ("processes_are_killed_at_random", chaos::killed_at_random),
 ];
 

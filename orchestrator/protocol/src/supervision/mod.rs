@@ -14,5 +14,6 @@ pub use request::{
     SupervisorRequest,
 };
 pub use status::{
-    LambdaPhase, LambdaStatus, ProcessStatus, SupervisorReport, SupervisorStatus, Welcome,
+    ClipCounts, LambdaPhase, LambdaStatus, ProcessStatus, SupervisorReport, SupervisorStatus,
+    Welcome,
 };

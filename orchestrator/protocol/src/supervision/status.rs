@@ -1,5 +1,7 @@
 //! The status of all processes, which the supervisor sends.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
 use crate::inference::InferenceStatus;
@@ -52,8 +54,26 @@ pub struct SupervisorStatus {
     pub inference: Option<ProcessStatus<InferenceStatus>>,
     /// Number of clips since the start of the supervisor.
     pub clips: u64,
+    /// Those with windows of a lambda, by its name. A clip with windows of several counts for each.
+    #[serde(default)]
+    pub clips_by_lambda: BTreeMap<String, ClipCounts>,
     /// Number of events that could not be made durable.
     pub events_lost: u64,
+    /// Resident memory of the supervisor, in bytes.
+    #[serde(default)]
+    pub rss_bytes: u64,
+    /// CPU time of the supervisor, in s.
+    #[serde(default)]
+    pub cpu_s: f64,
+}
+
+/// Number and size of clips.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ClipCounts {
+    /// Their number.
+    pub clips: u64,
+    /// Sum of their sizes, in bytes.
+    pub bytes: u64,
 }
 
 /// The status of a process that all lambdas share.

@@ -13,6 +13,7 @@ use gleaner_protocol::inference::InferenceReport;
 use gleaner_protocol::ingress::{IngressReport, IngressStatus};
 use gleaner_protocol::link::{Loss, RecorderReport};
 use gleaner_protocol::supervision::{EventKind, SupervisionSpec, SupervisorStatus, VehicleEvent};
+use gleaner_vitals::usage;
 
 use crate::event_log::EventLog;
 use crate::inference::InferenceEvent;
@@ -68,7 +69,8 @@ impl Board {
     /// Returns the status, without generation and lambdas.
     pub(super) fn status(&self) -> SupervisorStatus {
         let (up_s, events_lost) = (self.started.elapsed().as_secs_f64(), self.log.lost());
-        SupervisorStatus { up_s, events_lost, ..self.lock().clone() }
+        let (rss_bytes, cpu_s) = (usage::resident(), usage::cpu_seconds());
+        SupervisorStatus { up_s, events_lost, rss_bytes, cpu_s, ..self.lock().clone() }
     }
 
     /// Notes that all shared processes have ended, for this reason.
@@ -88,8 +90,15 @@ impl Board {
     }
 
     fn clip(&self, clip: &Clip, what: &str) {
-        self.lock().clips += 1;
         let (file, bytes) = (clip.file.display(), clip.bytes);
+        let mut status = self.lock();
+        status.clips += 1;
+        for lambda in &clip.lambdas {
+            let counts = status.clips_by_lambda.entry(lambda.name.clone()).or_default();
+            counts.clips += 1;
+            counts.bytes += bytes;
+        }
+        drop(status);
         self.event(EventKind::Clip, None, &format!("{what} clip {file} of {bytes} bytes"));
     }
 }

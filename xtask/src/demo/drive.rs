@@ -1,4 +1,4 @@
-//! `cargo xtask demo`: shows Gleaner's main functions end to end.
+//! The first part of the demo: the sample drive, replayed.
 
 use std::collections::BTreeMap;
 
@@ -8,18 +8,11 @@ use gleaner_report::format::{clip_contents, clip_span, grouped, seconds};
 
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Example, TwinReplay, difference};
-use crate::setup;
 use crate::steps::Steps;
 
 /// Replays the sample drive with both twins of every example, compares them, and repeats every
 /// decision from the journal and from the clips alone.
-pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
-    let mut steps = Steps::of(setup::STEPS + 1);
-    setup::run(
-        checkout,
-        &mut steps,
-        &EXAMPLES.iter().flat_map(Example::lambdas).collect::<Vec<_>>(),
-    )?;
+pub(super) fn run(checkout: &Checkout, steps: &mut Steps) -> Result<Exit, Failure> {
     steps.begin(&format!("replay of {DRIVE}"));
     let mut rows =
         vec![["example", "kind", "wakes", "wakes/s", "peak MiB", "triggers"].map(str::to_owned)];
@@ -148,7 +141,7 @@ fn triggers(decisions: &[Decision], start_ns: i64) -> String {
 
 /// Formats a table with columns as wide as their widest cell: text left-aligned, numbers
 /// right-aligned.
-fn table(rows: &[[String; 6]]) -> String {
+pub(super) fn table(rows: &[[String; 6]]) -> String {
     let width =
         |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let line = |row: &[String; 6]| {

@@ -1,0 +1,201 @@
+//! The table of the lambdas: its columns, as text and for the page.
+
+use std::cmp::Ordering;
+
+use gleaner_base::visible;
+use gleaner_report::format::{grouped, size};
+
+use super::super::status::{NO_DEPLOYMENTS, shared};
+use super::figures::{LambdaFigures, ProgramFigures, VehicleFigures};
+
+/// Spaces between two columns.
+pub(super) const GAP: usize = 2;
+
+/// A column.
+pub(super) struct Column {
+    pub(super) head: &'static str,
+    pub(super) cell: fn(&LambdaFigures) -> String,
+    /// Place in the order in which columns are given room: 0 is the first.
+    rank: u8,
+}
+
+/// All columns, from left to right.
+static COLUMNS: [Column; 15] = [
+    Column { head: "id", rank: 0, cell: |it| visible(&it.id) },
+    Column { head: "state", rank: 1, cell: |it| it.state.to_owned() },
+    Column { head: "wakes/s", rank: 3, cell: |it| decimal(it.wakes_per_s) },
+    Column { head: "p50 ms", rank: 12, cell: |it| ms(it.wake_p50_ns) },
+    Column { head: "p99 ms", rank: 5, cell: |it| ms(it.wake_p99_ns) },
+    Column { head: "run p99", rank: 10, cell: |it| ms(it.run_p99_ns) },
+    Column { head: "CPU %", rank: 2, cell: |it| decimal(it.cpu_percent) },
+    Column { head: "memory", rank: 4, cell: |it| bytes(it.rss_bytes) },
+    Column { head: "lost", rank: 6, cell: |it| count(it.losses) },
+    Column { head: "faults", rank: 7, cell: |it| count(it.faults) },
+    Column { head: "restarts", rank: 8, cell: |it| count(it.restarts.map(u64::from)) },
+    Column { head: "triggers", rank: 9, cell: |it| count(it.triggers) },
+    Column { head: "clips", rank: 11, cell: |it| count(it.clips) },
+    Column { head: "recorded", rank: 13, cell: |it| bytes(it.clip_bytes) },
+    Column { head: "wakes", rank: 14, cell: |it| count(it.wakes) },
+];
+
+impl Column {
+    /// Returns whether its cells are numbers, which are aligned to the right.
+    pub(super) fn is_number(&self) -> bool {
+        self.rank > 1
+    }
+
+    /// Returns the number of characters of its longest cell.
+    pub(super) fn width(&self, lambdas: &[LambdaFigures]) -> usize {
+        let cells = lambdas.iter().map(|it| (self.cell)(it).chars().count());
+        cells.chain([self.head.len()]).max().unwrap_or(0)
+    }
+}
+
+/// Returns the columns that fit into `width` characters, with the width of each.
+pub(super) fn fitting(
+    lambdas: &[LambdaFigures],
+    width: usize,
+) -> impl Iterator<Item = (&'static Column, usize)> {
+    let mut ranked: Vec<_> = COLUMNS.iter().map(|it| (it.rank, it.width(lambdas) + GAP)).collect();
+    ranked.sort();
+    let mut left = width + GAP;
+    let fits = ranked.iter().take_while(|(_, width)| {
+        let fits = *width <= left;
+        left -= if fits { *width } else { 0 };
+        fits
+    });
+    let end = fits.count() as u8;
+    // If there is no room at all, the id is cut.
+    COLUMNS.iter().filter(move |it| it.rank < end.max(1)).map(|it| (it, it.width(lambdas)))
+}
+
+/// Formats all figures as text, with all columns.
+pub(super) fn text(figures: &VehicleFigures) -> String {
+    let mut text: String = head(figures).iter().map(|line| format!("{line}\n")).collect();
+    text += "\n";
+    if figures.lambdas.is_empty() {
+        return text + NO_DEPLOYMENTS + "\n";
+    }
+    let columns: Vec<_> = fitting(&figures.lambdas, usize::from(u16::MAX)).collect();
+    let mut line = |cell: &dyn Fn(&Column) -> String| {
+        let cells = columns.iter().map(|(column, width)| match column.is_number() {
+            true => format!("{:>width$}", cell(column)),
+            false => format!("{:<width$}", cell(column)),
+        });
+        text += cells.collect::<Vec<_>>().join(&" ".repeat(GAP)).trim_end();
+        text.push('\n');
+    };
+    line(&|column| column.head.to_owned());
+    for lambda in &figures.lambdas {
+        line(&|column| (column.cell)(lambda));
+    }
+    for lambda in &figures.lambdas {
+        for reason in &lambda.reasons {
+            text += &format!("{}: {reason}\n", visible(&lambda.id));
+        }
+    }
+    text
+}
+
+/// Returns the lines on the vehicle as a whole.
+pub(super) fn head(figures: &VehicleFigures) -> Vec<String> {
+    let trust = match &figures.trust {
+        None => "no trust root".to_owned(),
+        Some(trust) if trust.is_expired => format!("trust root {} has expired", trust.version),
+        Some(trust) => format!("trust root {}", trust.version),
+    };
+    let supervisor = match &figures.supervisor {
+        None => "the supervisor does not run".to_owned(),
+        Some(supervisor) => format!("supervisor {}", program(supervisor)),
+    };
+    let services = figures.services.iter().map(|service| {
+        let state = if service.is_ready { "" } else { " not ready" };
+        let memory = service.rss_bytes.map(|it| format!(" {}", size(it))).unwrap_or_default();
+        let restarts = match service.restarts {
+            0 => String::new(),
+            count => format!(", restarts {count}"),
+        };
+        format!("{}{state}{memory}{restarts}", service.name)
+    });
+    let capacity = figures.capacity.iter().map(shared);
+    vec![
+        format!("{}   {trust}", visible(&figures.vehicle)),
+        format!("orchestrator {}   {supervisor}", program(&figures.orchestrator)),
+        services.collect::<Vec<_>>().join("   "),
+        capacity.collect::<Vec<_>>().join("   "),
+    ]
+}
+
+fn program(program: &ProgramFigures) -> String {
+    format!("CPU {} %, {}", decimal(program.cpu_percent), size(program.rss_bytes))
+}
+
+fn decimal(value: Option<f64>) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.1}"))
+}
+
+fn ms(ns: Option<u64>) -> String {
+    ns.map_or_else(|| "-".to_owned(), |ns| format!("{:.2}", ns as f64 / 1e6))
+}
+
+fn bytes(bytes: Option<u64>) -> String {
+    bytes.map_or_else(|| "-".to_owned(), size)
+}
+
+fn count(count: Option<u64>) -> String {
+    count.map_or_else(|| "-".to_owned(), grouped)
+}
+
+/// The order of the rows.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) enum RowOrder {
+    #[default]
+    Id,
+    Cpu,
+    Memory,
+    Wakes,
+    Latency,
+    Losses,
+}
+
+impl RowOrder {
+    /// Returns the next one.
+    pub(super) fn next(self) -> Self {
+        match self {
+            Self::Id => Self::Cpu,
+            Self::Cpu => Self::Memory,
+            Self::Memory => Self::Wakes,
+            Self::Wakes => Self::Latency,
+            Self::Latency => Self::Losses,
+            Self::Losses => Self::Id,
+        }
+    }
+
+    /// Returns the head of its column.
+    pub(super) fn head(self) -> &'static str {
+        match self {
+            Self::Id => "id",
+            Self::Cpu => "CPU %",
+            Self::Memory => "memory",
+            Self::Wakes => "wakes/s",
+            Self::Latency => "p99 ms",
+            Self::Losses => "lost",
+        }
+    }
+
+    /// Sorts rows: ids from A to Z, numbers from the highest down, unknown ones last.
+    pub(super) fn sort(self, lambdas: &mut [LambdaFigures]) {
+        let number = |it: &LambdaFigures| match self {
+            Self::Id => None,
+            Self::Cpu => it.cpu_percent,
+            Self::Memory => it.rss_bytes.map(|it| it as f64),
+            Self::Wakes => it.wakes_per_s,
+            Self::Latency => it.wake_p99_ns.map(|it| it as f64),
+            Self::Losses => it.losses.map(|it| it as f64),
+        };
+        lambdas.sort_by(|a, b| {
+            let [one, other] = [a, b].map(|it| number(it).unwrap_or(f64::NEG_INFINITY));
+            other.partial_cmp(&one).unwrap_or(Ordering::Equal).then_with(|| a.id.cmp(&b.id))
+        });
+    }
+}

@@ -1,0 +1,261 @@
+//! A run of the examples on a vehicle: deployed, fed over DDS, one of them killed, and the clips
+//! verified. Each expectation that is not met is an error.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::Path;
+use std::process::{Child, Stdio};
+use std::time::Instant;
+
+use gleaner_base::{Exit, Failure, visible};
+use gleaner_lambda::Clip;
+use gleaner_protocol::Verified;
+use gleaner_protocol::supervision::LambdaPhase;
+use gleaner_protocol::vehicle_api::{DeploymentStatus, StreamLine, VehicleStatus};
+use gleaner_report::clips;
+use gleaner_report::format::{clip_contents, grouped};
+use rustix::process::Signal;
+
+use super::demo_vehicle::{DemoVehicle, OUT, file, signal};
+use super::drive::table;
+use crate::checkout::Checkout;
+use crate::examples::{DRIVE, EXAMPLES, Example};
+
+/// The command of xtask that runs it: for the demo only.
+pub(crate) const COMMAND: &str = "demo-vehicle";
+
+/// The part of the drive that is played, in s: it has a trigger of each example.
+const PLAYED_S: u32 = 20;
+
+/// The topics that the examples read or record.
+const TOPICS: &str = "/camera/front/compressed,/imu/data,/vehicle/speed";
+
+/// Languages of the twins.
+const LANGUAGES: [&str; 2] = ["rust", "python"];
+
+/// The lambda whose process is killed, and the number of its wakes by then: 8 s of the IMU.
+const VICTIM: (&str, u64) = ("hello-python", 800);
+
+/// The lambda whose decisions are repeated from the clips: it keeps no state.
+const REPEATED: &str = "hello-rust";
+
+/// Runs everything, and prints a line for each result.
+pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
+    let vehicle = DemoVehicle::start(checkout)?;
+    println!("keys and a trust root are made, and gleaner-orchestrator runs\n");
+    let lambdas = EXAMPLES.iter().flat_map(|it| LANGUAGES.map(|language| (it, language)));
+    let mut ids = Vec::new();
+    for (example, language) in lambdas {
+        ids.push(deploy(checkout, &vehicle, example, language)?);
+    }
+    let player = play(checkout)?;
+    println!("\nplaying {PLAYED_S} s of {DRIVE} over DDS");
+    kill(&vehicle)?;
+    println!("\n$ gleaner top --once\n{}", vehicle.gleaner(&["top", "--once"])?);
+    finish(player)?;
+    // The window of the last trigger ends some seconds after the drive.
+    let status = vehicle.until("the last clip", |status| {
+        let recorder = status.supervisor.as_ref()?.recorder.as_ref()?.last.as_ref()?;
+        let is_idle = !recorder.is_recording && recorder.in_flight == 0;
+        (is_idle && recorder.recording.clips > 0).then(|| status.clone())
+    })?;
+    println!("\nthe drive has ended:\n{}", counts(&status));
+    if let Some(id) = ids.iter().find(|id| !runs(&status, id)) {
+        return Err(Failure::new(Exit::Differs, format!("`{id}` does not run at the end")));
+    }
+    let vehicles = checkout.path(file("vehicles"));
+    fs::write(&vehicles, format!("{} {}\n", status.vehicle, status.key))
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot write `vehicles`", &error))?;
+    let recorded = clips(&checkout.path(file("state/clips")))?;
+    verify(&vehicle, &recorded)?;
+    report(&vehicle, &recorded)?;
+    vehicle.stop()?;
+    println!("\ngleaner-orchestrator has ended all lambdas; {OUT}/ has keys, state, clips and log");
+    Ok(Exit::Ok)
+}
+
+/// Publishes and deploys a twin under a name of its own, as a vehicle runs each name once.
+fn deploy(
+    checkout: &Checkout,
+    vehicle: &DemoVehicle,
+    example: &Example,
+    language: &str,
+) -> Result<String, Failure> {
+    let name = format!("{}-{language}", example.name);
+    let (from, to) = (Path::new("examples").join(example.name).join(language), folder(&name));
+    let [source, copy] = [from.as_path(), to.as_ref()].map(|path| checkout.path(path));
+    let copied = copy_files(&source.join("build"), &copy.join("build")).and_then(|()| {
+        let manifest = fs::read_to_string(source.join("lambda.toml"))?;
+        let own = format!("name = \"{}\"", example.name);
+        let manifest = manifest.replacen(&own, &format!("name = \"{name}\""), 1);
+        fs::write(copy.join("build/lambda.toml"), &manifest)?;
+        fs::write(copy.join("lambda.toml"), &manifest)
+    });
+    copied.map_err(|error| {
+        Failure::caused_by(Exit::Internal, format!("cannot copy `{}`", from.display()), &error)
+    })?;
+    vehicle.gleaner(&["publish", &to, "--key", &file("publisher.pem")])?;
+    let key = file("deployer.pem");
+    let mut arguments = vec!["deploy", "--local", &to, "--key", &key];
+    arguments.extend(example.set.iter().flat_map(|set| ["--set", *set]));
+    let started = Instant::now();
+    vehicle.gleaner(&arguments)?;
+    println!("  {name:<21} runs after {:.1} s", started.elapsed().as_secs_f64());
+    Ok(name)
+}
+
+/// Starts the player, which waits until the vehicle reads all topics.
+fn play(checkout: &Checkout) -> Result<Child, Failure> {
+    let mut player = checkout.command(checkout.program("gleaner-player"));
+    player.args([DRIVE, "--topics", TOPICS, "--wait", "1", "--json"]);
+    player.args(["--duration", &PLAYED_S.to_string()]);
+    player
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .spawn()
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot start gleaner-player", &error))
+}
+
+fn finish(mut player: Child) -> Result<(), Failure> {
+    match player.wait() {
+        Ok(status) if status.success() => Ok(()),
+        Ok(status) => Err(Failure::new(Exit::Internal, format!("gleaner-player: {status}"))),
+        Err(error) => {
+            Err(Failure::caused_by(Exit::Internal, "cannot wait for gleaner-player", &error))
+        }
+    }
+}
+
+/// Kills the process of a lambda during the drive, and waits until it runs again.
+fn kill(vehicle: &DemoVehicle) -> Result<(), Failure> {
+    let (id, wakes) = VICTIM;
+    let pid = vehicle.until_lambda(id, "to have woken often", |deployment| {
+        let lambda = deployment.status.as_ref()?;
+        lambda.pid.filter(|_| lambda.live.as_ref().is_some_and(|live| live.wakes >= wakes))
+    })?;
+    signal(pid, Signal::KILL)?;
+    let killed = Instant::now();
+    let (next, restarts) = vehicle.until_lambda(id, "to run again", |deployment| {
+        let lambda = deployment.status.as_ref()?;
+        let next = lambda.pid.filter(|next| *next != pid && lambda.phase == LambdaPhase::Running);
+        Some((next?, lambda.restarts)).filter(|(_, restarts)| *restarts > 0)
+    })?;
+    println!(
+        "  kill -9 {pid}: `{id}` runs again as {next} after {:.1} s, restarts {restarts}",
+        killed.elapsed().as_secs_f64()
+    );
+    let events = vehicle.gleaner(&["events", "--json"])?;
+    let mut events =
+        events.lines().filter_map(|line| serde_json::from_str::<StreamLine>(line).ok());
+    let event = events.find(|line| line.record["event"] == "failed" && line.record["lambda"] == id);
+    let event = event.ok_or_else(|| {
+        Failure::new(Exit::Differs, format!("`gleaner events` has no failure of `{id}`"))
+    })?;
+    println!("  gleaner events: {}", visible(event.record["text"].as_str().unwrap_or_default()));
+    Ok(())
+}
+
+/// Formats the counts of each lambda.
+fn counts(status: &VehicleStatus) -> String {
+    let head = ["lambda", "state", "wakes", "faults", "triggers", "restarts"].map(str::to_owned);
+    let row = |deployment: &DeploymentStatus| {
+        let lambda = deployment.status.as_ref();
+        let live = lambda.and_then(|lambda| lambda.live.as_deref());
+        let count = |count: Option<u64>| count.map_or_else(|| "-".to_owned(), grouped);
+        [
+            deployment.id.clone(),
+            lambda.map_or("stopped", |lambda| lambda.phase.as_str()).to_owned(),
+            count(live.map(|live| live.wakes)),
+            count(live.map(|live| live.faults)),
+            count(live.map(|live| live.triggers)),
+            count(lambda.map(|lambda| lambda.restarts.into())),
+        ]
+    };
+    table(&std::iter::once(head).chain(status.deployments.iter().map(row)).collect::<Vec<_>>())
+}
+
+fn runs(status: &VehicleStatus, id: &str) -> bool {
+    let deployment = status.deployments.iter().find(|deployment| deployment.id == id);
+    let lambda = deployment.and_then(|deployment| deployment.status.as_ref());
+    lambda.is_some_and(|lambda| lambda.phase == LambdaPhase::Running)
+}
+
+/// Verifies the signature of each clip, and repeats the decisions of one lambda in it.
+fn verify(vehicle: &DemoVehicle, recorded: &[Clip]) -> Result<(), Failure> {
+    let trust = file("vehicles");
+    println!("clips, verified with `gleaner verify CLIP --trust {trust}`:");
+    let mut all = 0;
+    for clip in recorded {
+        let path = clip_path(clip);
+        vehicle.gleaner(&["verify", &path, "--trust", &trust, "--signature-only"])?;
+        println!("  {path}\n    {}", clip_contents(clip));
+        println!("    signed by the vehicle; {}", labels(clip));
+        if clip.lambdas.iter().any(|lambda| lambda.name == REPEATED) {
+            let lambda = folder(REPEATED);
+            let arguments = ["verify", &path, "--trust", &trust, "--lambda", &lambda, "--json"];
+            let verified: Verified =
+                serde_json::from_str(&vehicle.gleaner(&arguments)?).map_err(|error| {
+                    Failure::caused_by(Exit::Internal, "`gleaner verify` gave no result", &error)
+                })?;
+            let same = verified.wakes.saturating_sub(verified.uncovered);
+            println!("    all {} decisions of `{REPEATED}` repeated, identical", grouped(same));
+            all += same;
+        }
+    }
+    match all {
+        0 => Err(Failure::new(Exit::Differs, format!("no clip has decisions of `{REPEATED}`"))),
+        _ => Ok(()),
+    }
+}
+
+/// Formats the lambdas and labels of a clip: `car 12 (yolo-detector-rust)`.
+fn labels(clip: &Clip) -> String {
+    let mut labels: BTreeMap<(&str, &str), u64> = BTreeMap::new();
+    for moment in &clip.moments {
+        *labels.entry((&moment.lambda, &moment.label)).or_default() += 1;
+    }
+    let words = labels.iter().map(|((lambda, label), count)| {
+        format!("{} {} of {lambda}", visible(label), grouped(*count))
+    });
+    words.collect::<Vec<_>>().join(", ")
+}
+
+/// Replays the first clip of the repeated lambda, which writes the report.
+fn report(vehicle: &DemoVehicle, recorded: &[Clip]) -> Result<(), Failure> {
+    let of_lambda = |clip: &&Clip| clip.lambdas.iter().any(|lambda| lambda.name == REPEATED);
+    let Some(clip) = recorded.iter().find(of_lambda) else { return Ok(()) };
+    let (lambda, out, path) = (folder(REPEATED), file("report"), clip_path(clip));
+    let settings = EXAMPLES.iter().find(|it| REPEATED.starts_with(it.name));
+    let settings = settings.into_iter().flat_map(|it| it.set).flat_map(|set| ["--set", *set]);
+    let mut arguments = vec!["replay", &lambda, &path, "--out", &out];
+    arguments.extend(settings);
+    vehicle.gleaner(&arguments)?;
+    println!("report of `{REPEATED}` on the first clip: {out}/report.html");
+    Ok(())
+}
+
+/// Folder of a lambda, relative to the checkout.
+fn folder(name: &str) -> String {
+    file(&format!("lambdas/{name}"))
+}
+
+/// Path of a clip, relative to the checkout.
+fn clip_path(clip: &Clip) -> String {
+    file(&format!("state/clips/{}", clip.file.display()))
+}
+
+/// Copies all files and folders in `from` to `to`.
+fn copy_files(from: &Path, to: &Path) -> io::Result<()> {
+    fs::create_dir_all(to)?;
+    for entry in fs::read_dir(from)? {
+        let entry = entry?;
+        let target = to.join(entry.file_name());
+        if entry.file_type()?.is_dir() {
+            copy_files(&entry.path(), &target)?;
+        } else {
+            fs::copy(entry.path(), target)?;
+        }
+    }
+    Ok(())
+}
