@@ -28,6 +28,6 @@ pub use output::{LOCK, Output, OutputError, RESULTS};
 pub use results::RESULT_ITEM_MAX;
 pub use sources::{REQUIREMENTS, SOURCE_MAX, Sources};
 pub use vehicle::{
-    DeploymentSettings, InferenceLimits, NetworkSettings, RecordingSettings, Vehicle,
-    VehicleIdentity,
+    DeploymentSettings, InferenceLimits, MetricsSettings, NetworkSettings, RecordingSettings,
+    Vehicle, VehicleIdentity,
 };

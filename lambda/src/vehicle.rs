@@ -2,7 +2,7 @@
 //! parsed as a manifest is, with the same error messages.
 
 use std::collections::BTreeMap;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
 use std::time::Duration;
 
@@ -27,6 +27,8 @@ pub struct Vehicle {
     pub recording: RecordingSettings,
     /// `[deployments]`.
     pub deployments: DeploymentSettings,
+    /// `[metrics]`.
+    pub metrics: MetricsSettings,
 }
 
 /// `[vehicle]`: the vehicle among others.
@@ -80,6 +82,13 @@ pub struct DeploymentSettings {
     pub decisions: Option<TopicName>,
 }
 
+/// `[metrics]`: access to the counts of the daemon without its socket.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct MetricsSettings {
+    /// Address of this machine at which any of its users can read them; default: none.
+    pub listen: Option<SocketAddr>,
+}
+
 /// `[inference]`: limits of the process that runs models.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct InferenceLimits {
@@ -101,6 +110,7 @@ impl Default for Vehicle {
             inference: InferenceLimits::default(),
             recording: RecordingSettings::default(),
             deployments: DeploymentSettings::default(),
+            metrics: MetricsSettings::default(),
         }
     }
 }
@@ -226,6 +236,11 @@ mod tests {
                 "[network]\ninterfaces = [\"eth0\"]",
                 "vehicle.toml, line 2: `network.interfaces` is `eth0`, which is not a network address",
                 "an address of a network interface, such as `192.168.1.5`",
+            ),
+            (
+                "[metrics]\nlisten = \"0.0.0.0:9464\"",
+                "vehicle.toml, line 2: `metrics.listen` is `0.0.0.0:9464`, which is not a metrics address",
+                "an address and a port of this machine, such as `127.0.0.1:9464`",
             ),
             (
                 "[network]\ndomain = 233",

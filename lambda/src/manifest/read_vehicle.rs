@@ -1,6 +1,6 @@
 //! Parses `vehicle.toml`.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeInclusive;
 
 use gleaner_base::ByteSize;
@@ -14,13 +14,14 @@ use super::table::{Document, TomlTable};
 use super::value::TomlValue;
 use super::{Limits, TopicName};
 use crate::vehicle::{
-    DeploymentSettings, InferenceLimits, NetworkSettings, RecordingSettings, Vehicle,
-    VehicleIdentity,
+    DeploymentSettings, InferenceLimits, MetricsSettings, NetworkSettings, RecordingSettings,
+    Vehicle, VehicleIdentity,
 };
 
 type Result<T> = std::result::Result<T, ManifestError>;
 
-const TABLES: &[&str] = &["vehicle", "network", "limits", "inference", "recording", "deployments"];
+const TABLES: &[&str] =
+    &["vehicle", "network", "limits", "inference", "recording", "deployments", "metrics"];
 /// Domains of DDS whose ports exist.
 const DOMAINS: RangeInclusive<u64> = 0..=232;
 /// Length of a label's value in bytes, as in a signed selector.
@@ -48,6 +49,7 @@ pub(super) fn vehicle(document: &Document) -> Result<Vehicle> {
             &["probation", "spool", "memory", "topics", "cpu", "model_time", "decisions"],
             deployments,
         )?,
+        metrics: part(&root, "metrics", &["listen"], metrics)?,
     })
 }
 
@@ -130,6 +132,17 @@ fn deployments(table: &TomlTable) -> Result<DeploymentSettings> {
         model_time: share("model_time", bounds::MODEL_SHARE)?,
         decisions: topic(table, "decisions")?,
     })
+}
+
+fn metrics(table: &TomlTable) -> Result<MetricsSettings> {
+    let listen = table.get("listen").map(|value| {
+        let text = value.text()?;
+        // They are not protected: other machines must not reach them.
+        let rule = "an address and a port of this machine, such as `127.0.0.1:9464`";
+        let address = text.parse().ok().filter(|address: &SocketAddr| address.ip().is_loopback());
+        address.ok_or_else(|| value.wrong_form(text, "metrics address", rule))
+    });
+    Ok(MetricsSettings { listen: listen.transpose()? })
 }
 
 fn topic(table: &TomlTable, key: &str) -> Result<Option<TopicName>> {

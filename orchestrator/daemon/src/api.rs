@@ -87,6 +87,11 @@ impl Api {
             .with_state(self)
     }
 
+    /// Returns the route of the metrics alone.
+    pub(crate) fn metrics_router(self) -> Router {
+        Router::new().route("/metrics", get(prometheus)).with_state(self)
+    }
+
     /// Returns the status of the vehicle.
     pub(crate) fn status(&self) -> VehicleStatus {
         let (deployments, supervisor, generation) = self.core.status();

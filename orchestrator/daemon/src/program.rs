@@ -1,6 +1,7 @@
 //! The command line, the start and the end of the program.
 
 use std::fs;
+use std::net::SocketAddr;
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
@@ -14,7 +15,7 @@ use gleaner_lambda::Vehicle;
 use gleaner_protocol::supervision::{EventKind, SUPERVISION_VERSION, SupervisionSpec};
 use gleaner_trust::{PublicKey, SecretKey, VehicleName};
 use gleaner_vitals::log;
-use tokio::net::UnixListener;
+use tokio::net::{TcpListener, UnixListener};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
 
@@ -84,6 +85,7 @@ fn run(args: Args) -> Result<ProgramEnd, Failure> {
     let name = name(&vehicle)?;
     let key = vehicle_key(&layout)?;
     let spec = spec(&args, &layout, &vehicle, &name);
+    let metrics = vehicle.metrics.listen;
     let core = Arc::new(Core::open(&layout, vehicle)?);
     // Two threads: the work that takes long runs in others.
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -92,7 +94,7 @@ fn run(args: Args) -> Result<ProgramEnd, Failure> {
         .enable_all()
         .build()
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot start threads", &error))?;
-    let ended = runtime.block_on(serve(Arc::clone(&core), layout, spec, (name, key)));
+    let ended = runtime.block_on(serve(Arc::clone(&core), layout, spec, (name, key), metrics));
     // A stream that follows never ends by itself.
     runtime.shutdown_background();
     if matches!(ended, Ok(ProgramEnd::Stopped)) {
@@ -156,6 +158,7 @@ async fn serve(
     layout: VehicleFolders,
     spec: SupervisionSpec,
     (name, key): (VehicleName, PublicKey),
+    metrics: Option<SocketAddr>,
 ) -> Result<ProgramEnd, Failure> {
     let failed = |what: &'static str| {
         move |error: std::io::Error| Failure::caused_by(Exit::Internal, what, &error)
@@ -176,6 +179,9 @@ async fn serve(
     let measuring = Arc::clone(&core);
     tokio::task::spawn_blocking(move || measuring.measure_speed());
     let api = Api { core: Arc::clone(&core), layout, name, key, started: Instant::now() };
+    if let Some(address) = metrics {
+        serve_metrics(address, &api).await;
+    }
     tokio::spawn(async move { axum::serve(listener, api.router()).await });
     let _ = sd_notify::notify(&[sd_notify::NotifyState::Ready]);
     let mut watchdog = tokio::time::interval(WATCHDOG_INTERVAL);
@@ -206,6 +212,21 @@ async fn serve(
     ended
         .map_err(|_| Failure::new(Exit::Internal, "the link to the supervisor failed"))?
         .map(|()| ProgramEnd::Stopped)
+}
+
+/// Serves the metrics at this address. A port that another program uses is an event: it must not
+/// keep lambdas from running.
+async fn serve_metrics(address: SocketAddr, api: &Api) {
+    match TcpListener::bind(address).await {
+        Ok(listener) => {
+            let router = api.clone().metrics_router();
+            tokio::spawn(async move { axum::serve(listener, router).await });
+        }
+        Err(error) => {
+            let text = format!("the metrics are not served at {address}: {error}");
+            api.core.event(EventKind::Warning, None, &text);
+        }
+    }
 }
 
 /// Listens on the socket of the API. The lock of the run folder ensures that no other

@@ -1,6 +1,8 @@
 //! Deployments that a vehicle refuses, and files that were changed after they were accepted.
 
 use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpStream;
 use std::os::unix::fs::PermissionsExt;
 
 use gleaner_protocol::supervision::LambdaPhase;
@@ -91,10 +93,16 @@ pub fn memory() {
     assert!(refused.contains("there is no memory for deployment `first`"), "{refused}");
     // What was admitted runs, also if the vehicle has less later.
     vehicle.stop();
-    fs::write(vehicle.path("vehicle.toml"), "[deployments]\nmemory = \"64 MiB\"\n")
-        .expect("the folder can be written");
+    let settings = "[deployments]\nmemory = \"64 MiB\"\n[metrics]\nlisten = \"127.0.0.1:9464\"\n";
+    fs::write(vehicle.path("vehicle.toml"), settings).expect("the folder can be written");
     vehicle.start();
     vehicle.until_running(&["second"]);
+    let mut metrics = TcpStream::connect("127.0.0.1:9464").expect("it listens");
+    let request = b"GET /metrics HTTP/1.1\r\nhost: here\r\nconnection: close\r\n\r\n";
+    metrics.write_all(request).expect("it reads");
+    let mut answer = String::new();
+    metrics.read_to_string(&mut answer).expect("it answers");
+    assert!(answer.contains("gleaner_lambda_up{id=\"second\",lambda=\"second\"} 1"), "{answer}");
     let shown = vehicle.succeeds(&["status"]);
     assert!(shown.contains("memory 608 MiB of 64 MiB asked for"), "{shown}");
 }
