@@ -58,7 +58,7 @@ pub(super) fn fitting(
 ) -> impl Iterator<Item = (&'static Column, usize)> {
     let mut ranked: Vec<_> = COLUMNS.iter().map(|it| (it.rank, it.width(lambdas) + GAP)).collect();
     ranked.sort();
-    let mut left = width + GAP;
+    let mut left = width.saturating_add(GAP);
     let fits = ranked.iter().take_while(|(_, width)| {
         let fits = *width <= left;
         left -= if fits { *width } else { 0 };
@@ -69,14 +69,14 @@ pub(super) fn fitting(
     COLUMNS.iter().filter(move |it| it.rank < end.max(1)).map(|it| (it, it.width(lambdas)))
 }
 
-/// Formats all figures as text, with all columns.
-pub(super) fn text(figures: &VehicleFigures) -> String {
+/// Formats all figures as text, with the columns that fit into `width` characters.
+pub(super) fn text(figures: &VehicleFigures, width: usize) -> String {
     let mut text: String = head(figures).iter().map(|line| format!("{line}\n")).collect();
     text += "\n";
     if figures.lambdas.is_empty() {
         return text + NO_DEPLOYMENTS + "\n";
     }
-    let columns: Vec<_> = fitting(&figures.lambdas, usize::from(u16::MAX)).collect();
+    let columns: Vec<_> = fitting(&figures.lambdas, width).collect();
     let mut line = |cell: &dyn Fn(&Column) -> String| {
         let cells = columns.iter().map(|(column, width)| match column.is_number() {
             true => format!("{:>width$}", cell(column)),

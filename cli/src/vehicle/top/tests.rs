@@ -292,7 +292,8 @@ fn a_vehicle_without_deployments_shows_that() {
 #[test]
 fn text_has_every_column_and_the_reasons() {
     let lambda = deployment("hello", 2.0, 100, 1.0);
-    let text = columns::text(&figures(vec![changed(lambda, "/refused", json!("unsigned"))]));
+    let text =
+        columns::text(&figures(vec![changed(lambda, "/refused", json!("unsigned"))]), usize::MAX);
     assert!(text.contains("id     state    wakes/s  p50 ms"), "{text}");
     assert!(text.contains("hello  running        -    0.25"), "{text}");
     assert!(text.ends_with("hello: refused: unsigned\n"), "{text}");
