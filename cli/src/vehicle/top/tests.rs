@@ -198,7 +198,7 @@ fn a_wide_page_shows_all_columns() {
             "car-7   trust root 3",
             "orchestrator CPU 10.0 %, 8.6 MiB   supervisor CPU 10.0 %, 3.8 MiB",
             "ingress, restarts 2",
-            "asked: memory 1.0 MiB of 8.0 MiB   cpu 0.5 cores of 2 cores",
+            "asked: memory 1.0 MiB of 8.0 MiB   asked: cpu 0.5 cores of 2 cores",
             "",
             concat!(
                 "id      state    wakes/s  p50 ms  p99 ms  run p99  CPU %    memory  lost  faults",
