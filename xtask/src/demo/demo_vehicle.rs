@@ -80,8 +80,12 @@ impl<'c> DemoVehicle<'c> {
 
     /// Runs `gleaner` with these arguments; returns its standard output.
     pub(super) fn gleaner(&self, arguments: &[&str]) -> Result<String, Failure> {
-        let help = format!("`{OUT}/orchestrator.log` is the log of the orchestrator");
-        steps::output(&mut self.command(arguments), &help)
+        steps::output(&mut self.command(arguments), &see_log())
+    }
+
+    /// Runs `gleaner` with these arguments, with its output shown.
+    pub(super) fn show(&self, arguments: &[&str]) -> Result<(), Failure> {
+        steps::run(&mut self.command(arguments), &see_log())
     }
 
     /// Returns the status, if the orchestrator answers.
@@ -104,8 +108,7 @@ impl<'c> DemoVehicle<'c> {
             thread::sleep(POLL_INTERVAL);
         }
         let message = format!("waited {} s for {what}", PATIENCE.as_secs());
-        Err(Failure::new(Exit::Internal, message)
-            .with_help(format!("`{OUT}/orchestrator.log` is the log of the orchestrator")))
+        Err(Failure::new(Exit::Internal, message).with_help(see_log()))
     }
 
     /// Waits until `wanted` returns a value for the status of a deployment.
@@ -171,7 +174,11 @@ fn terminate(child: &Child) {
 fn not_in_order(why: &str) -> Failure {
     let mut failure = Failure::new(Exit::Internal, "the orchestrator did not end in order");
     failure.causes = vec![why.to_owned()];
-    failure.with_help(format!("`{OUT}/orchestrator.log` is its log"))
+    failure.with_help(see_log())
+}
+
+fn see_log() -> String {
+    format!("`{OUT}/orchestrator.log` is the log of the orchestrator")
 }
 
 fn remove(folder: &Path) -> std::io::Result<()> {

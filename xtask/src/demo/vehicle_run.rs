@@ -1,7 +1,7 @@
 //! A run of the examples on a vehicle: deployed, fed over DDS, one of them killed, and the clips
 //! verified. Each expectation that is not met is an error.
 
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::Path;
@@ -14,7 +14,7 @@ use gleaner_protocol::Verified;
 use gleaner_protocol::supervision::LambdaPhase;
 use gleaner_protocol::vehicle_api::{DeploymentStatus, StreamLine, VehicleStatus};
 use gleaner_report::clips;
-use gleaner_report::format::{clip_contents, grouped};
+use gleaner_report::format::{clip_contents, counted, grouped};
 use rustix::process::Signal;
 
 use super::demo_vehicle::{DemoVehicle, OUT, file, signal};
@@ -44,7 +44,9 @@ const REPEATED: &str = "hello-rust";
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let vehicle = DemoVehicle::start(checkout)?;
     println!("keys and a trust root are made, and gleaner-orchestrator runs\n");
-    let lambdas = EXAMPLES.iter().flat_map(|it| LANGUAGES.map(|language| (it, language)));
+    // The last example records larger samples than the others: deployed later, it would start the
+    // recorder again.
+    let lambdas = EXAMPLES.iter().rev().flat_map(|it| LANGUAGES.map(|language| (it, language)));
     let mut ids = Vec::new();
     for (example, language) in lambdas {
         ids.push(deploy(checkout, &vehicle, example, language)?);
@@ -52,7 +54,8 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let player = play(checkout)?;
     println!("\nplaying {PLAYED_S} s of {DRIVE} over DDS");
     kill(&vehicle)?;
-    println!("\n$ gleaner top --once\n{}", vehicle.gleaner(&["top", "--once"])?);
+    println!("\n$ gleaner top --once");
+    vehicle.show(&["top", "--once"])?;
     finish(player)?;
     // The window of the last trigger ends some seconds after the drive.
     let status = vehicle.until("the last clip", |status| {
@@ -85,12 +88,14 @@ fn deploy(
     let name = format!("{}-{language}", example.name);
     let (from, to) = (Path::new("examples").join(example.name).join(language), folder(&name));
     let [source, copy] = [from.as_path(), to.as_ref()].map(|path| checkout.path(path));
-    let copied = copy_files(&source.join("build"), &copy.join("build")).and_then(|()| {
+    // The build comes after its source, and so is not older.
+    let copied = fs::create_dir_all(&copy).and_then(|()| {
         let manifest = fs::read_to_string(source.join("lambda.toml"))?;
         let own = format!("name = \"{}\"", example.name);
         let manifest = manifest.replacen(&own, &format!("name = \"{name}\""), 1);
-        fs::write(copy.join("build/lambda.toml"), &manifest)?;
-        fs::write(copy.join("lambda.toml"), &manifest)
+        fs::write(copy.join("lambda.toml"), &manifest)?;
+        copy_files(&source.join("build"), &copy.join("build"))?;
+        fs::write(copy.join("build/lambda.toml"), &manifest)
     });
     copied.map_err(|error| {
         Failure::caused_by(Exit::Internal, format!("cannot copy `{}`", from.display()), &error)
@@ -130,19 +135,20 @@ fn finish(mut player: Child) -> Result<(), Failure> {
 /// Kills the process of a lambda during the drive, and waits until it runs again.
 fn kill(vehicle: &DemoVehicle) -> Result<(), Failure> {
     let (id, wakes) = VICTIM;
-    let pid = vehicle.until_lambda(id, "to have woken often", |deployment| {
+    let (pid, before) = vehicle.until_lambda(id, "to have woken often", |deployment| {
         let lambda = deployment.status.as_ref()?;
-        lambda.pid.filter(|_| lambda.live.as_ref().is_some_and(|live| live.wakes >= wakes))
+        let has_woken = lambda.live.as_ref().is_some_and(|live| live.wakes >= wakes);
+        Some((lambda.pid.filter(|_| has_woken)?, lambda.restarts))
     })?;
     signal(pid, Signal::KILL)?;
     let killed = Instant::now();
-    let (next, restarts) = vehicle.until_lambda(id, "to run again", |deployment| {
+    let restarts = vehicle.until_lambda(id, "to run again", |deployment| {
         let lambda = deployment.status.as_ref()?;
-        let next = lambda.pid.filter(|next| *next != pid && lambda.phase == LambdaPhase::Running);
-        Some((next?, lambda.restarts)).filter(|(_, restarts)| *restarts > 0)
+        let runs = lambda.phase == LambdaPhase::Running && lambda.pid != Some(pid);
+        Some(lambda.restarts).filter(|restarts| runs && *restarts > before)
     })?;
     println!(
-        "  kill -9 {pid}: `{id}` runs again as {next} after {:.1} s, restarts {restarts}",
+        "  kill -9 {pid}: `{id}` runs again after {:.1} s, restarts {before} -> {restarts}",
         killed.elapsed().as_secs_f64()
     );
     let events = vehicle.gleaner(&["events", "--json"])?;
@@ -190,7 +196,14 @@ fn verify(vehicle: &DemoVehicle, recorded: &[Clip]) -> Result<(), Failure> {
         let path = clip_path(clip);
         vehicle.gleaner(&["verify", &path, "--trust", &trust, "--signature-only"])?;
         println!("  {path}\n    {}", clip_contents(clip));
-        println!("    signed by the vehicle; {}", labels(clip));
+        // A lambda that was started again in the clip is in it twice.
+        let names: BTreeSet<&str> = clip.lambdas.iter().map(|it| it.name.as_str()).collect();
+        let (triggers, lambdas) =
+            (counted(clip.triggers, "trigger"), counted(names.len() as u64, "lambda"));
+        println!("    signed by the vehicle; {triggers} of {lambdas}");
+        for reason in &clip.incomplete {
+            println!("    incomplete: {}", visible(reason));
+        }
         if clip.lambdas.iter().any(|lambda| lambda.name == REPEATED) {
             let lambda = folder(REPEATED);
             let arguments = ["verify", &path, "--trust", &trust, "--lambda", &lambda, "--json"];
@@ -199,7 +212,7 @@ fn verify(vehicle: &DemoVehicle, recorded: &[Clip]) -> Result<(), Failure> {
                     Failure::caused_by(Exit::Internal, "`gleaner verify` gave no result", &error)
                 })?;
             let same = verified.wakes.saturating_sub(verified.uncovered);
-            println!("    all {} decisions of `{REPEATED}` repeated, identical", grouped(same));
+            println!("    {} decisions of `{REPEATED}` repeated, all identical", grouped(same));
             all += same;
         }
     }
@@ -207,18 +220,6 @@ fn verify(vehicle: &DemoVehicle, recorded: &[Clip]) -> Result<(), Failure> {
         0 => Err(Failure::new(Exit::Differs, format!("no clip has decisions of `{REPEATED}`"))),
         _ => Ok(()),
     }
-}
-
-/// Formats the lambdas and labels of a clip: `car 12 (yolo-detector-rust)`.
-fn labels(clip: &Clip) -> String {
-    let mut labels: BTreeMap<(&str, &str), u64> = BTreeMap::new();
-    for moment in &clip.moments {
-        *labels.entry((&moment.lambda, &moment.label)).or_default() += 1;
-    }
-    let words = labels.iter().map(|((lambda, label), count)| {
-        format!("{} {} of {lambda}", visible(label), grouped(*count))
-    });
-    words.collect::<Vec<_>>().join(", ")
 }
 
 /// Replays the first clip of the repeated lambda, which writes the report.

@@ -58,7 +58,7 @@ pub(super) fn fitting(
 ) -> impl Iterator<Item = (&'static Column, usize)> {
     let mut ranked: Vec<_> = COLUMNS.iter().map(|it| (it.rank, it.width(lambdas) + GAP)).collect();
     ranked.sort();
-    let mut left = width + GAP;
+    let mut left = width.saturating_add(GAP);
     let fits = ranked.iter().take_while(|(_, width)| {
         let fits = *width <= left;
         left -= if fits { *width } else { 0 };
@@ -69,14 +69,14 @@ pub(super) fn fitting(
     COLUMNS.iter().filter(move |it| it.rank < end.max(1)).map(|it| (it, it.width(lambdas)))
 }
 
-/// Formats all figures as text, with all columns.
-pub(super) fn text(figures: &VehicleFigures) -> String {
-    let mut text: String = head(figures).iter().map(|line| format!("{line}\n")).collect();
+/// Formats all figures as text, with the columns that fit into `width` characters.
+pub(super) fn text(figures: &VehicleFigures, width: usize) -> String {
+    let mut text: String = head(figures, width).iter().map(|line| format!("{line}\n")).collect();
     text += "\n";
     if figures.lambdas.is_empty() {
         return text + NO_DEPLOYMENTS + "\n";
     }
-    let columns: Vec<_> = fitting(&figures.lambdas, usize::from(u16::MAX)).collect();
+    let columns: Vec<_> = fitting(&figures.lambdas, width).collect();
     let mut line = |cell: &dyn Fn(&Column) -> String| {
         let cells = columns.iter().map(|(column, width)| match column.is_number() {
             true => format!("{:>width$}", cell(column)),
@@ -97,8 +97,8 @@ pub(super) fn text(figures: &VehicleFigures) -> String {
     text
 }
 
-/// Returns the lines on the vehicle as a whole.
-pub(super) fn head(figures: &VehicleFigures) -> Vec<String> {
+/// Returns the lines on the vehicle as a whole, of at most `width` characters.
+pub(super) fn head(figures: &VehicleFigures, width: usize) -> Vec<String> {
     let trust = match &figures.trust {
         None => "no trust root".to_owned(),
         Some(trust) if trust.is_expired => format!("trust root {} has expired", trust.version),
@@ -118,12 +118,27 @@ pub(super) fn head(figures: &VehicleFigures) -> Vec<String> {
         format!("{}{state}{memory}{restarts}", service.name)
     });
     let capacity = figures.capacity.iter().map(shared);
-    vec![
-        format!("{}   {trust}", visible(&figures.vehicle)),
-        format!("orchestrator {}   {supervisor}", program(&figures.orchestrator)),
-        services.collect::<Vec<_>>().join("   "),
-        capacity.collect::<Vec<_>>().join("   "),
-    ]
+    let vehicle = [visible(&figures.vehicle), trust];
+    let programs = [format!("orchestrator {}", program(&figures.orchestrator)), supervisor];
+    let mut lines = wrapped(vehicle, width);
+    lines.extend(wrapped(programs, width));
+    lines.extend(wrapped(services, width));
+    lines.extend(wrapped(capacity, width));
+    lines
+}
+
+/// Joins parts to lines of at most `width` characters.
+fn wrapped(parts: impl IntoIterator<Item = String>, width: usize) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for part in parts {
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + 3 + part.chars().count() <= width => {
+                *line += &format!("   {part}");
+            }
+            _ => lines.push(part),
+        }
+    }
+    lines
 }
 
 fn program(program: &ProgramFigures) -> String {

@@ -16,6 +16,7 @@ use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_protocol::vehicle_api::VehicleStatus;
+use ratatui::crossterm::terminal;
 use serde_json::json;
 
 use super::client::VehicleClient;
@@ -43,7 +44,7 @@ pub(crate) fn top(args: &TopArgs) -> Result<Exit, Failure> {
     match (args.once, args.vehicle.json) {
         (true, json) => {
             let figures = once(&client, &mut polls)?;
-            print(&if json { json_line(&figures) } else { columns::text(&figures) })?;
+            print(&if json { json_line(&figures) } else { columns::text(&figures, width()) })?;
             Ok(Exit::Ok)
         }
         (false, true) => follow(&client, &mut polls),
@@ -84,6 +85,12 @@ fn once(client: &VehicleClient, polls: &mut Polls) -> Result<VehicleFigures, Fai
             return Ok(figures);
         }
     }
+}
+
+/// Returns the number of characters of a line: all that a terminal has, and any number elsewhere.
+fn width() -> usize {
+    let columns = terminal::size().ok().filter(|_| stdout().is_terminal());
+    columns.map_or(usize::MAX, |(columns, _)| usize::from(columns))
 }
 
 /// Prints an object for each poll, until its reader closes the pipe.

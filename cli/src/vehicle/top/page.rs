@@ -74,7 +74,10 @@ impl Page {
         let mut figures = self.polls.figures();
         self.order.sort(&mut figures.lambdas);
         let lambdas = figures.lambdas.as_slice();
-        let mut head: Vec<Line> = columns::head(&figures).into_iter().map(Line::from).collect();
+        let mut head: Vec<Line> = columns::head(&figures, usize::from(frame.area().width))
+            .into_iter()
+            .map(Line::from)
+            .collect();
         head[0] = head[0].clone().bold();
         if self.failure.is_some() || silent >= SILENCE {
             let since = format_duration(Duration::from_secs(silent.as_secs()));

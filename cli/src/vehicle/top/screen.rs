@@ -1,5 +1,5 @@
-//! The terminal of `gleaner top`: draws the page, and takes keys and signals. Polls have a thread of
-//! their own, as an orchestrator that is stopped does not answer.
+//! The terminal of `gleaner top`: draws the page, and takes keys and signals. Polls have a thread
+//! of their own, as an orchestrator that is stopped does not answer.
 
 use std::io;
 use std::sync::Arc;

@@ -198,7 +198,7 @@ fn a_wide_page_shows_all_columns() {
             "car-7   trust root 3",
             "orchestrator CPU 10.0 %, 8.6 MiB   supervisor CPU 10.0 %, 3.8 MiB",
             "ingress, restarts 2",
-            "asked: memory 1.0 MiB of 8.0 MiB   cpu 0.5 cores of 2 cores",
+            "memory 1.0 MiB of 8.0 MiB asked for   cpu 0.50 cores of 2.00 cores asked for",
             "",
             concat!(
                 "id      state    wakes/s  p50 ms  p99 ms  run p99  CPU %    memory  lost  faults",
@@ -292,7 +292,8 @@ fn a_vehicle_without_deployments_shows_that() {
 #[test]
 fn text_has_every_column_and_the_reasons() {
     let lambda = deployment("hello", 2.0, 100, 1.0);
-    let text = columns::text(&figures(vec![changed(lambda, "/refused", json!("unsigned"))]));
+    let text =
+        columns::text(&figures(vec![changed(lambda, "/refused", json!("unsigned"))]), usize::MAX);
     assert!(text.contains("id     state    wakes/s  p50 ms"), "{text}");
     assert!(text.contains("hello  running        -    0.25"), "{text}");
     assert!(text.ends_with("hello: refused: unsigned\n"), "{text}");

@@ -1,5 +1,6 @@
 //! The events of a run, as the status and as records of the spool `events`.
 
+use std::collections::BTreeSet;
 use std::io::Write;
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -93,8 +94,10 @@ impl Board {
         let (file, bytes) = (clip.file.display(), clip.bytes);
         let mut status = self.lock();
         status.clips += 1;
-        for lambda in &clip.lambdas {
-            let counts = status.clips_by_lambda.entry(lambda.name.clone()).or_default();
+        // A lambda that was started again in the clip is in it twice.
+        let names: BTreeSet<&str> = clip.lambdas.iter().map(|it| it.name.as_str()).collect();
+        for name in names {
+            let counts = status.clips_by_lambda.entry(name.to_owned()).or_default();
             counts.clips += 1;
             counts.bytes += bytes;
         }
