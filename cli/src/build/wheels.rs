@@ -84,8 +84,8 @@ pub(super) fn note(dir: &Path, build: &BuildDir) -> String {
     )
 }
 
-/// Copies the wheels of the `former` build to `folder` if that was made for the same `lock`. Returns
-/// false if it was not, or if one was changed since.
+/// Copies the wheels of the `former` build to `folder` if that was made for the same `lock`.
+/// Returns false if it was not, or if one was changed since.
 fn reuse(former: &BuildDir, lock: &[u8], folder: &Path) -> io::Result<bool> {
     let path = Path::new(WHEELS).join(REQUIREMENTS);
     if PlainFile::inside(former.path(), &path, SOURCE_MAX)?.read_whole()? != lock {

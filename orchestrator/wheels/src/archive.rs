@@ -366,4 +366,33 @@ mod tests {
         let error = WheelArchive::open(&path).unwrap_err();
         assert!(matches!(error, WheelError::TooMuch { .. }), "{error}");
     }
+
+    #[test]
+    fn a_wheel_with_a_changed_or_missing_byte_is_refused_or_has_the_same_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = plain().write(folder.path());
+        let files = |path: &Path| {
+            check(path)?;
+            let files = WheelArchive::open(path)?.files.into_iter();
+            Ok::<_, WheelError>(
+                files.map(|file| (file.path, file.digest.sha256)).collect::<Vec<_>>(),
+            )
+        };
+        let (whole, expected) = (std::fs::read(&path).unwrap(), files(&path).unwrap());
+        let mut refused = 0;
+        for at in 0..whole.len() {
+            for change in [0x01, 0x80, 0xff] {
+                let mut bytes = whole.clone();
+                bytes[at] ^= change;
+                std::fs::write(&path, &bytes).unwrap();
+                match files(&path) {
+                    Ok(found) => assert_eq!(found, expected, "byte {at}"),
+                    Err(_) => refused += 1,
+                }
+            }
+            std::fs::write(&path, &whole[..at]).unwrap();
+            assert!(files(&path).is_err(), "{at} bytes");
+        }
+        assert!(refused > whole.len());
+    }
 }

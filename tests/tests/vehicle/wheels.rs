@@ -157,6 +157,9 @@ pub fn refused() {
     other.lock("answer-2.0-cp39-none-any.whl", "answer.py", "ANSWER = 43.0\n");
     let built = other.build(&["--python-version", "3.9"]);
     assert!(built.contains("exit status: 0"), "{built}");
+    // Its release follows that of the one that runs.
+    let [from, to] = [&lambda, &other].map(|it| it.path().join("revision.json"));
+    fs::copy(from, to).expect("it was published");
     let refused = text(&vehicle.deploy(&other.path(), &[]));
     for part in [
         "wheel `answer-2.0-cp39-none-any.whl` does not fit Python 3.",
