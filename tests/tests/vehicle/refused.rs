@@ -96,7 +96,7 @@ pub fn memory() {
     vehicle.start();
     vehicle.until_running(&["second"]);
     let shown = vehicle.succeeds(&["status"]);
-    assert!(shown.contains("memory 608 MiB of 64 MiB asked for"), "{shown}");
+    assert!(shown.contains("memory 608.0 MiB of 64.0 MiB asked for"), "{shown}");
 }
 
 pub fn cpu() {
