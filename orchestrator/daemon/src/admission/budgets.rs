@@ -84,7 +84,7 @@ impl Resource {
 
     /// Returns what these lambdas ask for together. They share the memory of a topic.
     fn sum<'a>(self, demands: impl Iterator<Item = &'a LambdaDemand>) -> f64 {
-        match self {
+        let sum: f64 = match self {
             Self::Memory => demands.map(|demand| demand.memory.amount).sum(),
             Self::Cpu => demands.map(|demand| demand.cpu.amount).sum(),
             Self::ModelTime => demands.map(|demand| demand.model_time.amount).sum(),
@@ -96,7 +96,9 @@ impl Resource {
                 }
                 topics.into_values().map(|bytes| bytes as f64).sum()
             }
-        }
+        };
+        // A sum of no fractions is -0.
+        sum + 0.0
     }
 
     /// Returns the demand of one lambda, for the status.

@@ -235,7 +235,8 @@ impl Window {
         MeasuredUse {
             cpu: (newest.cpu_s - first.cpu_s).max(0.0) / seconds,
             wakes: wakes / seconds,
-            model_time: models.sum::<f64>() / seconds,
+            // A sum of no fractions is -0.
+            model_time: (models.sum::<f64>() + 0.0) / seconds,
             is_reported: false,
         }
     }
