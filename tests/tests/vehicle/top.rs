@@ -50,8 +50,8 @@ pub fn figures() {
     assert_eq!(refused.status.code(), Some(2));
     assert!(["--once", "--json"].iter().all(|way| text(&refused).contains(way)));
 
-    let mut follow = top(&vehicle, &["--json"]);
-    let follow = RunningProgram::start(follow.stdin(Stdio::null()));
+    let follow = top(&vehicle, &["--json"]);
+    let follow = RunningProgram::start(follow);
     let until = |what: &str, key: &str| {
         follow.until_line(what, |line| {
             let line: Value = serde_json::from_str(line).expect("a line is JSON");
