@@ -83,14 +83,16 @@ impl TestVehicle {
         self.orchestrator.as_ref().expect("it runs").id()
     }
 
-    /// Returns the process id of the supervisor.
+    /// Returns the process id of the supervisor, after waiting for its start.
     ///
     /// # Panics
     ///
     /// If there is none.
     pub fn supervisor(&self) -> u32 {
-        let text = std::fs::read_to_string(self.path("state/supervisor.lock"));
-        text.expect("it was started").trim().parse().expect("a process id")
+        self.until("a supervisor", |vehicle| {
+            let text = std::fs::read_to_string(vehicle.path("state/supervisor.lock"));
+            text.ok()?.trim().parse().ok()
+        })
     }
 
     /// Returns the process ids below the supervisor whose command line contains `name`.

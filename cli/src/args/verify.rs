@@ -9,18 +9,16 @@ use clap::Args;
 pub struct VerifyArgs {
     /// A clip that Gleaner recorded
     pub clip: PathBuf,
-    /// The lambda's folder, built by `gleaner build DIR`
-    #[arg(long, value_name = "DIR", required_unless_present = "signature_only")]
+    /// The lambda's folder, built by `gleaner build DIR`: the decisions in the clip are repeated with
+    /// it
+    #[arg(long, value_name = "DIR", required_unless_present = "trust")]
     pub lambda: Option<PathBuf>,
-    /// Check the signature of the clip first: FILE lists the vehicles to trust, a line `NAME
-    /// PUBLICKEY` each
+    /// Check the signature of the clip, first or alone: FILE lists the vehicles to trust, a line
+    /// `NAME PUBLICKEY` each
     #[arg(long, value_name = "FILE")]
     pub trust: Option<PathBuf>,
-    /// Check only the signature
-    #[arg(long, requires = "trust", conflicts_with_all = ["lambda", "vehicle"])]
-    pub signature_only: bool,
     /// Configuration file of the vehicle [default: the limits in the journal]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", requires = "lambda")]
     pub vehicle: Option<PathBuf>,
     /// Print the result as one JSON object
     #[arg(long)]

@@ -86,7 +86,7 @@ fn a_signed_clip_is_verified_by_its_vehicle_and_refused_once_it_is_changed() {
         (&statement["messages"], statement["recovered"].as_bool()),
         (&messages.into(), Some(false))
     );
-    let only = ["--trust", &trusted, "--signature-only"];
+    let only = ["--trust", &trusted];
     let (code, text, _) = verify(&path, &only);
     assert_eq!((code, text.lines().count()), (0, 1), "{text}");
 
@@ -123,17 +123,15 @@ fn an_unsigned_clip_and_unusable_keys_and_lists_are_refused() {
         .must_exit(0);
     let path = out.path().join(&clips(out.path())[0].file);
     let trusted = scratch.write("trusted", format!("car-7 {public}\n"));
-    let only = ["--trust", trusted.to_str().unwrap(), "--signature-only"];
+    let only = ["--trust", trusted.to_str().unwrap()];
     let (code, _, error) = verify(&path, &only);
     assert!(code == DENIED && error.contains("cause: it is not signed\n"), "{error}");
     assert!(error.contains("help:  record with `gleaner run --sign KEY`"), "{error}");
 
     let wrong = scratch.write("wrong", "car-7\n");
-    let (code, _, error) = verify(&path, &["--trust", wrong.to_str().unwrap(), "--signature-only"]);
+    let (code, _, error) = verify(&path, &["--trust", wrong.to_str().unwrap()]);
     assert!(code == USAGE && error.contains("line 1 of the list of vehicles"), "{error}");
-    let (code, _, error) = verify(&path, &["--signature-only"]);
-    assert!(code == USAGE && error.contains("--trust"), "{error}");
-    let (code, _, error) = verify(&path, &only[..2]);
+    let (code, _, error) = verify(&path, &[]);
     assert!(code == USAGE && error.contains("--lambda"), "{error}");
 
     let drive = sample_drive();

@@ -79,15 +79,22 @@ pub fn killed_at_random() {
                 thread::sleep(Duration::from_millis(random.below(200) as u64));
                 vehicle.start();
             }
-            "gleaner-supervisor" => signal(vehicle.supervisor(), "KILL"),
+            "gleaner-supervisor" => {
+                let pid = vehicle.supervisor();
+                signal(pid, "KILL");
+                vehicle.until("another one", |vehicle| (vehicle.supervisor() != pid).then_some(()));
+            }
             name => {
                 let pids = vehicle.until("a victim", |vehicle| {
                     Some(vehicle.processes(name)).filter(|pids| !pids.is_empty())
                 });
                 signal(pids[random.below(pids.len())], "KILL");
+                vehicle.until("another one", |vehicle| {
+                    vehicle.processes(name).iter().any(|pid| !pids.contains(pid)).then_some(())
+                });
             }
         }
-        // A status from before the kill may still show them all running.
+        // The status may be that of a moment before.
         thread::sleep(Duration::from_millis(50));
         vehicle.until("all processes", |vehicle| runs(vehicle).then_some(()));
         recoveries.entry(victim).or_default().push(started.elapsed());
@@ -183,7 +190,7 @@ fn check_clips(vehicle: &TestVehicle, status: &VehicleStatus, before: &BTreeSet<
     std::fs::write(&trusted, line).expect("a file is written");
     let trusted = trusted.to_str().expect("a plain path");
     for file in &files {
-        let file = vehicle.path("state").join(file);
+        let file = vehicle.path("state/clips").join(file);
         vehicle.succeeds(&["verify", file.to_str().expect("a plain path"), "--trust", trusted]);
     }
     let recovered = clips.iter().filter(|clip| clip.recovered.is_some()).count();

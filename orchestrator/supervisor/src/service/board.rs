@@ -74,6 +74,14 @@ impl Board {
         SupervisorStatus { up_s, events_lost, rss_bytes, cpu_s, ..self.lock().clone() }
     }
 
+    /// Returns which of ingress, recorder and process of models are ready.
+    pub(super) fn ready_services(&self) -> [bool; 3] {
+        let status = self.lock();
+        let recorder = status.recorder.as_ref().is_some_and(|it| it.is_ready);
+        let inference = status.inference.as_ref().is_some_and(|it| it.is_ready);
+        [status.ingress.is_ready, recorder, inference]
+    }
+
     /// Notes that all shared processes have ended, for this reason.
     pub(super) fn group_ended(&self, reason: &str) {
         let mut status = self.lock();

@@ -163,7 +163,7 @@ impl WantedState<'_> {
         board: &Board,
         stop: &AtomicBool,
     ) -> Result<GroupEnd, Failure> {
-        let mut reported: (Option<Instant>, Vec<_>) = (None, Vec::new());
+        let mut reported: (Option<Instant>, (_, Vec<_>)) = (None, ([false; 3], Vec::new()));
         loop {
             group.poll(POLL_INTERVAL);
             let mut is_new = false;
@@ -191,6 +191,7 @@ impl WantedState<'_> {
             }
             self.approach(group.lambdas, board);
             let phases = group.lambdas.iter().map(SupervisedLambda::phase).collect();
+            let phases = (board.ready_services(), phases);
             let is_due = reported.0.is_none_or(|at| at.elapsed() >= STATUS_INTERVAL);
             if is_due || is_new || phases != reported.1 {
                 reported = (Some(Instant::now()), phases);
