@@ -9,8 +9,8 @@ use clap::Args;
 pub struct VerifyArgs {
     /// A clip that Gleaner recorded
     pub clip: PathBuf,
-    /// The lambda's folder, built by `gleaner build DIR`: the decisions in the clip are repeated with
-    /// it
+    /// The lambda's folder, built by `gleaner build DIR`: the decisions in the clip are repeated
+    /// with it
     #[arg(long, value_name = "DIR", required_unless_present = "trust")]
     pub lambda: Option<PathBuf>,
     /// Check the signature of the clip, first or alone: FILE lists the vehicles to trust, a line

@@ -11,8 +11,8 @@
 //!   plays.
 //! - `failures`: the result of a run in which processes failed.
 //!
-//! A failed process is restarted alone, with a growing delay (`restart_delay`); the others receive a
-//! connection to the next one. A first start that fails ends the run, unless it is that of one
+//! A failed process is restarted alone, with a growing delay (`restart_delay`); the others receive
+//! a connection to the next one. A first start that fails ends the run, unless it is that of one
 //! lambda of several.
 
 mod arguments;

@@ -88,8 +88,8 @@ impl ChildProcess {
         self.child.try_wait().map_err(failed)
     }
 
-    /// Passes it connections to processes that were started again. If it does not read its messages,
-    /// it is killed; returns the warning to print.
+    /// Passes it connections to processes that were started again. If it does not read its
+    /// messages, it is killed; returns the warning to print.
     pub(crate) fn pass(&self, connections: &Handover) -> Option<String> {
         match connections.try_send(&self.handover) {
             // Its exit status explains why it has ended.
