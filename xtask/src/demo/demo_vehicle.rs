@@ -17,8 +17,8 @@ use crate::steps;
 /// Folder of everything that the demo leaves, relative to the checkout.
 pub(super) const OUT: &str = "out/demo/vehicle";
 
-/// Name of the vehicle in the signatures of clips.
-const NAME: &str = "demo-car";
+/// The configuration of the vehicle. Two cores are just enough for all examples in both languages.
+const SETTINGS: &str = "[vehicle]\nname = \"demo-car\"\n[deployments]\ncpu = 1\nmodel_time = 1\n";
 
 /// Longest wait for anything: far longer than needed.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -41,9 +41,7 @@ impl<'c> DemoVehicle<'c> {
         let run = std::env::temp_dir().join(format!("gleaner-demo-{}", std::process::id()));
         let prepared = remove(&out)
             .and_then(|()| fs::create_dir_all(&out))
-            .and_then(|()| {
-                fs::write(out.join("vehicle.toml"), format!("[vehicle]\nname = \"{NAME}\"\n"))
-            })
+            .and_then(|()| fs::write(out.join("vehicle.toml"), SETTINGS))
             .and_then(|()| fs::DirBuilder::new().mode(0o700).create(&run))
             .and_then(|()| File::create(out.join("orchestrator.log")));
         let log = prepared.map_err(|error| {
