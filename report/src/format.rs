@@ -28,7 +28,8 @@ pub fn size(bytes: u64) -> String {
     match bytes {
         0..1024 => format!("{bytes} B"),
         1024..1_048_576 => format!("{} KiB", bytes.div_ceil(1024)),
-        _ => format!("{:.1} MiB", bytes as f64 / (1024.0 * 1024.0)),
+        1_048_576..1_073_741_824 => format!("{:.1} MiB", bytes as f64 / 1_048_576.0),
+        _ => format!("{:.1} GiB", bytes as f64 / 1_073_741_824.0),
     }
 }
 
@@ -152,8 +153,9 @@ mod tests {
 
     #[test]
     fn a_size_has_a_suitable_unit() {
-        let sizes = [0, 1023, 1024, 1025, 205_089, 1_048_576, 10_000_000].map(size);
-        assert_eq!(sizes, ["0 B", "1023 B", "1 KiB", "2 KiB", "201 KiB", "1.0 MiB", "9.5 MiB"]);
+        let sizes = [0, 1023, 1024, 1025, 205_089, 1_048_576, 10_000_000, 3 << 30].map(size);
+        let shown = ["0 B", "1023 B", "1 KiB", "2 KiB", "201 KiB", "1.0 MiB", "9.5 MiB", "3.0 GiB"];
+        assert_eq!(sizes, shown);
     }
 
     #[test]

@@ -266,7 +266,9 @@ impl ProcessGroup<'_> {
         let has_started = recorder.is_ready || recorder.start > 0;
         // Its ingress may have ended before it was ready.
         let has_lost_ingress = self.ingress.start > 0 || self.ingress.again_at.is_some();
-        let is_first = !has_started && !has_lost_ingress;
+        // On a vehicle, lambdas that record nothing run on without it.
+        let is_vehicle = self.context.spec.spool.is_some();
+        let is_first = !has_started && !has_lost_ingress && !is_vehicle;
         if is_first || !self.context.spec.drives.is_empty() {
             return Ok(Some(GroupEnd::of("the recorder", status, is_first)));
         }

@@ -278,14 +278,26 @@ fn killed(name: &str) {
     let victims = descendants(started.pid(), name);
     assert_eq!(victims.len(), 1, "{victims:?}");
     signal(victims[0], "KILL");
-    started.until_ready();
-    started.until_live("samples after the restart", |live| {
-        live.restarts == 1 && live.topics[0].received > 0
-    });
+    let restart = if name == "gleaner-recorder" {
+        started.until("the recovered clip", |line| match line {
+            JsonReport::Recorder(RecorderReport::Recovered(_)) => Some(()),
+            _ => None,
+        });
+        started.until_live("the lambda beside the next recorder", |live| {
+            live.restarts == 0 && live.recorder_link.is_some_and(|it| it.recorders_ended == 1)
+        });
+        "restarting in 0.1 s (restart 1)"
+    } else {
+        started.until_ready();
+        started.until_live("samples after the restart", |live| {
+            live.restarts == 1 && live.topics[0].received > 0
+        });
+        "restarting in 1 s (restart 1)"
+    };
     started.signal("INT");
     let finished = started.finish();
     drop(player);
-    assert!(finished.stderr.contains("restarting in 1 s (restart 1)"), "{}", finished.stderr);
+    assert!(finished.stderr.contains(restart), "{}", finished.stderr);
     // Reported decisions are in the file.
     assert!(
         !reported.is_empty() && trigger_keys(&decisions(out.path())).starts_with(&reported),

@@ -398,7 +398,8 @@ fn decisions(moments: &[Moment], clip: &Clip) -> Result<(), FalseStatement> {
     })
 }
 
-/// Compares the record before the messages: later windows may have added lambdas and windows since.
+/// Compares the record before the messages: later windows may have added lambdas and windows since,
+/// and may reach further back.
 fn begin(
     values: &Values,
     clip: &Clip,
@@ -407,7 +408,8 @@ fn begin(
 ) -> Result<(), FalseStatement> {
     let clip_header =
         clip_records::read_begin(values).map_err(|key| malformed(BEGIN, key, values))?;
-    let expected = ClipHeader { clock: header.clock.clone(), from_ns: clip.from_ns, ..clip_header };
+    let from_ns = clip_header.from_ns.min(clip.to_ns).max(clip.from_ns);
+    let expected = ClipHeader { clock: header.clock.clone(), from_ns, ..clip_header };
     same(&format!("record {BEGIN}"), values, &clip_records::begin(&expected, &library(header)).1)?;
     let was_there = |lambda: &ClipLambda| {
         clip.lambdas.iter().any(|now| {
