@@ -1,11 +1,12 @@
 //! The connection to `gleaner-orchestrator`: requests over its socket.
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use bytes::Bytes;
 use gleaner_base::{Exit, Failure};
 use gleaner_protocol::vehicle_api::{API_SOCKET, Problem, VehicleStatus};
-use http_body_util::{BodyExt, Either, Full};
+use http_body_util::{BodyExt, Either, Full, Limited};
 use hyper::body::Incoming;
 use hyper::client::conn::http1;
 use hyper::{Method, Request, Response};
@@ -19,6 +20,12 @@ use crate::args::VehicleArgs;
 
 /// Folder of the socket without another choice.
 const RUN_DIR: &str = "/run/gleaner";
+
+/// Longest wait for a status, which takes some milliseconds.
+const STATUS_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Longest answer, in bytes: that of a thousand lambdas takes some MiB.
+const ANSWER_MAX: usize = 64 << 20;
 
 /// A client of one orchestrator.
 pub(crate) struct VehicleClient {
@@ -45,7 +52,14 @@ impl VehicleClient {
 
     /// Returns the status of the vehicle.
     pub(crate) fn status(&self) -> Result<VehicleStatus, Failure> {
-        self.json(Method::GET, "/v1/status", Bytes::new())
+        self.runtime.block_on(async {
+            let answer = self.json(Method::GET, "/v1/status", Bytes::new());
+            tokio::time::timeout(STATUS_TIMEOUT, answer).await.unwrap_or_else(|_| {
+                let seconds = STATUS_TIMEOUT.as_secs();
+                let message = format!("gleaner-orchestrator has not answered for {seconds} s");
+                Err(Failure::new(Exit::Unreachable, message))
+            })
+        })
     }
 
     /// Sends a request with a body of JSON, and returns the answer.
@@ -55,7 +69,7 @@ impl VehicleClient {
         body: &impl Serialize,
     ) -> Result<T, Failure> {
         let body = serde_json::to_vec(body).expect("a request is plain data");
-        self.json(Method::POST, path, body.into())
+        self.runtime.block_on(self.json(Method::POST, path, body.into()))
     }
 
     /// Sends a request to remove something.
@@ -104,19 +118,18 @@ impl VehicleClient {
         })
     }
 
-    fn json<T: DeserializeOwned>(
+    async fn json<T: DeserializeOwned>(
         &self,
         method: Method,
         path: &str,
         body: Bytes,
     ) -> Result<T, Failure> {
-        self.runtime.block_on(async {
-            let answer = self.request(method, path, Either::Left(Full::new(body))).await?;
-            let bytes = answer.into_body().collect().await.map_err(|error| self.lost(&error))?;
-            serde_json::from_slice(&bytes.to_bytes()).map_err(|error| {
-                Failure::caused_by(Exit::Internal, "cannot parse the answer", &error)
-                    .with_help("use the `gleaner` of the version of gleaner-orchestrator")
-            })
+        let answer = self.request(method, path, Either::Left(Full::new(body))).await?;
+        let body = Limited::new(answer.into_body(), ANSWER_MAX).collect().await;
+        let body = body.map_err(|error| self.lost(&*error))?;
+        serde_json::from_slice(&body.to_bytes()).map_err(|error| {
+            Failure::caused_by(Exit::Internal, "cannot parse the answer", &error)
+                .with_help("use the `gleaner` of the version of gleaner-orchestrator")
         })
     }
 

@@ -152,7 +152,12 @@ impl IngressProcess {
 
     /// Notes its end: another one is to be started after the returned delay.
     pub(crate) fn ended(&mut self) -> Duration {
-        let delay = self.delay.after(self.started.elapsed());
+        self.restart(self.started.elapsed())
+    }
+
+    /// Has another one started, after one that `ran` for this time; returns the delay.
+    pub(crate) fn restart(&mut self, ran: Duration) -> Duration {
+        let delay = self.delay.after(ran);
         self.is_ready = false;
         self.again_at = Some(Instant::now() + delay);
         delay

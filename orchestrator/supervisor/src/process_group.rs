@@ -9,7 +9,7 @@ use std::process::ExitStatus;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, SyncSender};
 use std::thread;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use gleaner_base::Failure;
 use gleaner_lambda::{BuildDir, Vehicle};
@@ -301,7 +301,7 @@ impl<'a> ProcessGroup<'a> {
                     Ok(last) => self.counts.add(last, None),
                     Err(failure) => {
                         let (reason, starts) = (failure.to_string(), ingress.start + 1);
-                        let delay = ingress.ended();
+                        let delay = ingress.restart(Duration::ZERO);
                         observer.restarts(RestartedPart::Ingress, &reason, delay, starts);
                     }
                 }

@@ -167,12 +167,12 @@ impl RecorderProcess {
     /// Handles its end: another one is to be started. Returns the reason, and the delay.
     pub(crate) fn ended(&mut self, status: ExitStatus) -> (String, Duration) {
         let reason = self.requested.take().unwrap_or_else(|| ended("the recorder", status));
-        (reason, self.restart())
+        (reason, self.restart(self.started.elapsed()))
     }
 
-    /// Has another one started; returns the delay.
-    pub(crate) fn restart(&mut self) -> Duration {
-        let delay = self.delay.after(self.started.elapsed());
+    /// Has another one started, after one that `ran` for this time; returns the delay.
+    fn restart(&mut self, ran: Duration) -> Duration {
+        let delay = self.delay.after(ran);
         self.is_ready = false;
         self.again_at = Some(Instant::now() + delay);
         delay
@@ -226,7 +226,7 @@ impl ProcessGroup<'_> {
             (Ok(Some(next)), _) => next,
             (Err(failure), None) => return Err(failure),
             (Err(failure), Some(before)) => {
-                let (reason, delay) = (failure.to_string(), before.restart());
+                let (reason, delay) = (failure.to_string(), before.restart(Duration::ZERO));
                 let starts = before.start + 1;
                 self.observer.restarts(RestartedPart::Recorder, &reason, delay, starts);
                 return Ok(());

@@ -94,10 +94,15 @@ struct Sample {
 impl Measurements {
     /// Loads the file; also returns the reason why it could not be used.
     pub(crate) fn load(file: DurableFile) -> (Self, Option<String>) {
-        let (now, damage) = match file.load::<MeasuredFile>() {
+        let (mut now, damage) = match file.load::<MeasuredFile>() {
             Ok(loaded) => (loaded.value.unwrap_or_default(), loaded.damage),
             Err(failure) => (MeasuredFile::default(), Some(failure.to_string())),
         };
+        // No machine measures others: sums of them would not be numbers.
+        let is_sound = |value: &f64| (0.0..=1e15).contains(value);
+        now.uses.retain(|_, used| [used.cpu, used.wakes, used.model_time].iter().all(is_sound));
+        now.models.retain(|_, time| is_sound(time));
+        now.machine = now.machine.filter(|(_, speed)| *speed >= 1.0 && is_sound(speed));
         (Self { file, saved: now.clone(), now, windows: BTreeMap::new() }, damage)
     }
 
