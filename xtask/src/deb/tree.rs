@@ -245,7 +245,8 @@ mod tests {
     #[test]
     fn the_default_configuration_has_all_keys_of_the_page() {
         let page = include_str!("../../../docs/vehicle.md");
-        let block = page.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
+        let section = page.split("## Configuration\n").nth(1).unwrap();
+        let block = section.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
         let keys = |text: &str| -> Vec<String> {
             let lines = text.lines().map(|line| line.split(['#', '=']).next().unwrap_or_default());
             lines.map(|key| key.trim().to_owned()).filter(|key| !key.is_empty()).collect()
