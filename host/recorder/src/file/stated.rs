@@ -399,7 +399,8 @@ fn decisions(moments: &[Moment], clip: &Clip) -> Result<(), FalseStatement> {
 }
 
 /// Compares the record before the messages: later windows may have added lambdas and windows since.
-/// Triggers of several lambdas may come out of order, so a later window may also reach further back.
+/// Triggers of several lambdas may come out of order, so a later window may also reach further
+/// back.
 fn begin(
     values: &Values,
     clip: &Clip,
