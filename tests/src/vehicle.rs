@@ -15,6 +15,8 @@ use crate::{TempFolder, program};
 pub struct TestVehicle {
     folder: TempFolder,
     orchestrator: Option<Child>,
+    /// Folder of the programs; by default, that of the build.
+    pub home: Option<PathBuf>,
 }
 
 impl Default for TestVehicle {
@@ -26,7 +28,7 @@ impl Default for TestVehicle {
 impl TestVehicle {
     /// Makes keys and a trust root; nothing runs yet.
     pub fn new() -> Self {
-        let vehicle = Self { folder: TempFolder::new(), orchestrator: None };
+        let vehicle = Self { folder: TempFolder::new(), orchestrator: None, home: None };
         for key in ["root", "publisher", "deployer", "stranger"] {
             vehicle.succeeds(&["keys", "new", &vehicle.key(key)]);
         }
@@ -65,6 +67,7 @@ impl TestVehicle {
         if config.is_file() {
             command.arg("--vehicle").arg(config);
         }
+        command.envs(self.home.iter().map(|home| ("GLEANER_HOME", home)));
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log.expect("a log"));
         self.orchestrator = Some(command.spawn().expect("the orchestrator starts"));
         let status = self.until("the orchestrator to answer", |vehicle| vehicle.try_status());

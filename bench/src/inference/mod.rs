@@ -46,7 +46,7 @@ pub fn measure(quick: bool) {
     let mut frames = FrameFile::create(folder.path());
     let models = models(&folder, quick);
     if std::env::var_os(LIBRARY).is_none() {
-        println!("skipped: onnxruntime in gleaner-inference, as {LIBRARY} is not set\n");
+        println!("skipped: onnxruntime and cuda in gleaner-inference, as {LIBRARY} is not set\n");
     }
     println!(
         "| model | program | frames | frame p50, ms | p95, ms | session p50, ms | p95, ms \
@@ -129,8 +129,9 @@ struct MeasuredPath {
 fn detector(model: &BenchModel, frames: &mut FrameFile) -> Vec<String> {
     let mut notes = Vec::new();
     let mut paths = Vec::new();
-    let with_library = std::env::var_os(LIBRARY).map(|_| "onnxruntime");
-    for provider in ["rten"].into_iter().chain(with_library) {
+    let with_library: &[&str] =
+        if std::env::var_os(LIBRARY).is_some() { &["onnxruntime", "cuda"] } else { &[] };
+    for provider in ["rten"].iter().chain(with_library) {
         let process = ModelProcess::start(model);
         let client = process.connect(model, provider);
         match LambdaPath::open(client, model.name, model.layout) {
@@ -178,8 +179,11 @@ fn detector(model: &BenchModel, frames: &mut FrameFile) -> Vec<String> {
         let memory = [peak_mib(python.id()), 0.0, pss_mib(python.id())];
         times.print(model.name, &python.runtime, memory);
     }
-    if let [one, other] = &paths[..] {
-        notes.push(format!("{}: {}", model.name, difference(&one.first, &other.first)));
+    if let [one, others @ ..] = &paths[..] {
+        notes.extend(others.iter().map(|other| {
+            let by = format!("{} and {}", one.path.runtime, other.path.runtime);
+            format!("{} by {by}: {}", model.name, difference(&one.first, &other.first))
+        }));
     }
     notes
 }
@@ -191,5 +195,5 @@ fn difference(a: &[f32], b: &[f32]) -> String {
     let largest = differences.fold(0.0, |largest: f32, it| if it > largest { it } else { largest });
     let finite = a.iter().chain(b).all(|value| value.is_finite());
     let finite = if finite && a.len() == b.len() { "all finite" } else { "not all finite" };
-    format!("outputs of both libraries differ by {largest:.1e} at most, relatively; {finite}")
+    format!("outputs differ by {largest:.1e} at most, relatively; {finite}")
 }

@@ -76,7 +76,12 @@ pub fn all() -> Vec<Vec<u8>> {
         ReaderMessage::Status(Box::default()),
     ];
     let ingress = ingress.iter().map(|message| (48, json(to_vec(message)))).collect();
-    let handover = vec![(6, br#"["ingress"]"#.to_vec()), (6, b"[]".to_vec())];
+    let handover = |connections: &str| {
+        let version = env!("CARGO_PKG_VERSION");
+        let text = format!(r#"{{"version":"{version}","connections":[{connections}]}}"#);
+        (6, text.into_bytes())
+    };
+    let handover = vec![handover(r#""ingress""#), handover("")];
     let all = [
         (mode::READER, reader),
         (mode::STARTER, starter),

@@ -22,21 +22,25 @@ pub fn start(paths: &Paths) -> Vec<Layer> {
 }
 
 /// Denies all threads what the process does not need once its libraries are open: programs,
-/// processes, signals to others, and sockets. New threads are allowed. Returns `layers` and these,
-/// verified.
+/// processes, signals to others, and sockets, but for those that CUDA needs if the process
+/// `has_gpu`. New threads are allowed. Returns `layers` and these, verified.
 ///
 /// # Errors
 ///
 /// [`JailError::ExistingThread`] if a thread of this process cannot have the filter: then the
 /// sandbox does not hold, and no lambda may be served.
-pub fn close(mut layers: Vec<Layer>) -> Result<Vec<Layer>, JailError> {
-    let sockets = (sockets::NAME, "seccomp: no new sockets, no connections");
-    layers.extend(service_layers(install(), sockets)?);
+pub fn close(mut layers: Vec<Layer>, has_gpu: bool) -> Result<Vec<Layer>, JailError> {
+    let note = match has_gpu {
+        true => "seccomp: no new sockets but one that CUDA listens on, no connections",
+        false => "seccomp: no new sockets, no connections",
+    };
+    layers.extend(service_layers(install(has_gpu), (sockets::NAME, note))?);
     Ok(self_test::verify(layers))
 }
 
-fn install() -> Result<(), JailError> {
+fn install(has_gpu: bool) -> Result<(), JailError> {
     // It sends regions to lambdas.
-    let denied = sockets::no_new(DeniedCalls::default());
+    let no_sockets = if has_gpu { sockets::local_listeners_only } else { sockets::no_new };
+    let denied = no_sockets(DeniedCalls::default());
     install_everywhere(&sandbox_filter::own_process_only(denied).filter(libc::EPERM)?)
 }

@@ -49,6 +49,19 @@ pub(crate) fn no_new(refused: DeniedCalls) -> DeniedCalls {
     pairs_only(refused).calls(CREATING).calls(ACCEPTING)
 }
 
+/// Denies new sockets but local ones that only receive, and connections. CUDA does not start unless
+/// it can listen on one, and connects none. Landlock denies those with a path.
+pub(crate) fn local_listeners_only(refused: DeniedCalls) -> DeniedCalls {
+    let refused = pairs_only(refused).calls(&[libc::SYS_connect]).unless(
+        libc::SYS_socket,
+        0,
+        libc::AF_UNIX as u64,
+    );
+    // Datagrams could be sent without a connection.
+    let others = (0..=TYPE).filter(|kind| *kind != libc::SOCK_SEQPACKET as u64);
+    others.fold(refused, |refused, kind| refused.bits(libc::SYS_socket, 1, TYPE, kind))
+}
+
 /// Denies all new sockets but UDP, and those that list the interfaces of the network.
 pub(crate) fn udp_only(refused: DeniedCalls) -> DeniedCalls {
     let mut refused = pairs_only(refused).calls(ACCEPTING);

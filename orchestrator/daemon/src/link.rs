@@ -204,6 +204,9 @@ impl SupervisorLink {
             Ok(SupervisorReport::OtherSettings) => {
                 Some(LinkEnd::Outdated("it runs with other settings".to_owned()))
             }
+            Ok(SupervisorReport::Replaced) => {
+                Some(LinkEnd::Outdated("the programs were replaced".to_owned()))
+            }
             Ok(SupervisorReport::Refused { reason }) => {
                 let text = format!("the supervisor refuses a request: {reason}");
                 self.core.event(EventKind::Warning, None, &text);

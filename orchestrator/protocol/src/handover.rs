@@ -31,6 +31,16 @@ pub struct Handover {
     pub key: Option<OwnedFd>,
 }
 
+/// The text of a message.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct HandoverText {
+    /// Version of the sender.
+    version: String,
+    /// The connections, in the order of the descriptors.
+    connections: Vec<ConnectionName>,
+}
+
 /// Name of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -46,6 +56,9 @@ enum ConnectionName {
 /// Option of a runtime whose starter passes the connection to `gleaner-inference` this way, without
 /// its dashes.
 pub const PASSES_INFERENCE: &str = "starter-passes-inference";
+
+/// Version of the programs of an installation.
+const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// Largest number of connections in a message.
 const CONNECTIONS: usize = 4;
@@ -81,9 +94,10 @@ impl Handover {
             (ConnectionName::Running, &self.running),
             (ConnectionName::Key, &self.key),
         ];
-        let (names, descriptors): (Vec<ConnectionName>, Vec<BorrowedFd<'_>>) =
+        let (connections, descriptors): (Vec<ConnectionName>, Vec<BorrowedFd<'_>>) =
             all.iter().filter_map(|(name, fd)| Some((*name, fd.as_ref()?.as_fd()))).unzip();
-        let payload = serde_json::to_vec(&names)
+        let text = HandoverText { version: VERSION.to_owned(), connections };
+        let payload = serde_json::to_vec(&text)
             .map_err(|error| LinkError::Socket { peer: PROGRAM, source: error.into() })?;
         Ok((frame::encode(tag::HANDOVER, &payload), descriptors))
     }
@@ -95,7 +109,8 @@ impl Handover {
     /// # Errors
     ///
     /// [`LinkError::NoStarter`] if `socket` is no socket, [`LinkError::Gone`] if the starter has
-    /// ended, [`LinkError::Malformed`] for names that do not match the descriptors.
+    /// ended, [`LinkError::OtherVersion`] if it is of another version,
+    /// [`LinkError::Malformed`] for names that do not match the descriptors.
     pub fn receive(socket: impl AsFd) -> Result<Handover, LinkError> {
         let received = FrameReceiver::new(STARTER, CONNECTIONS).wait(socket);
         let frame = match received {
@@ -116,7 +131,10 @@ impl Handover {
             return Err(LinkError::Unknown { peer: STARTER, tag: frame.tag });
         }
         let malformed = |reason| LinkError::Malformed { peer: STARTER, frame: "handover", reason };
-        let names: Vec<ConnectionName> = frame.json(STARTER)?;
+        let HandoverText { version, connections: names } = frame.json(STARTER)?;
+        if version != VERSION {
+            return Err(LinkError::OtherVersion { peer: STARTER, version, own: VERSION });
+        }
         let (named, descriptors) = (names.len(), frame.descriptors.len());
         if named != descriptors {
             let reason = format!("it names {named} connections and has {descriptors} descriptors");
@@ -264,13 +282,21 @@ mod tests {
     #[test]
     fn invalid_messages_and_other_inputs_are_refused() {
         let refusal = |bytes: &[u8]| message(bytes).unwrap_err().to_string();
-        let named = |names: &[u8]| frame::encode(tag::HANDOVER, names);
+        let of = |version: &str, names: &str| {
+            let text = format!(r#"{{"version":"{version}","connections":{names}}}"#);
+            frame::encode(tag::HANDOVER, text.as_bytes())
+        };
+        let named = |names| of(VERSION, names);
         assert_eq!(
-            refusal(&named(br#"["control","ingress"]"#)),
+            refusal(&of("9.0.0", "[]")),
+            format!("the starter is of version `9.0.0` of Gleaner, this program of {VERSION}")
+        );
+        assert_eq!(
+            refusal(&named(r#"["control","ingress"]"#)),
             "frame `handover` from the starter is invalid: \
              it names 2 connections and has 0 descriptors"
         );
-        assert!(refusal(&named(br#"["network"]"#)).contains("unknown variant `network`"));
+        assert!(refusal(&named(r#"["network"]"#)).contains("unknown variant `network`"));
         assert_eq!(refusal(&frame::encode(tag::STOP, &[])), "frame 2 from the starter is unknown");
         assert_eq!(refusal(b"gle"), "the starter has ended, or closed the connection");
         let no_socket = Handover::receive(File::open("/dev/null").unwrap()).unwrap_err();
@@ -279,7 +305,7 @@ mod tests {
         let (starter_end, program_end) = UnixStream::pair().unwrap();
         let (passed, _own) = connection();
         let passed = passed.unwrap();
-        let twice = named(br#"["ingress","ingress"]"#);
+        let twice = named(r#"["ingress","ingress"]"#);
         send_frame(&starter_end, &twice, &[passed.as_fd(), passed.as_fd()], PROGRAM).unwrap();
         let refused = Handover::receive(&program_end).unwrap_err().to_string();
         assert!(refused.ends_with("it names ingress twice"), "{refused}");

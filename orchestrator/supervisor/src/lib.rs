@@ -10,6 +10,7 @@
 //! - `process_group`: all processes, `group_end`: their end, and `drive`: a drive that the ingress
 //!   plays.
 //! - `failures`: the result of a run in which processes failed.
+//! - `installation`: the programs on the disk, which an upgrade replaces.
 //!
 //! A failed process is restarted alone, with a growing delay (`restart_delay`); the others receive
 //! a connection to the next one. A first start that fails ends the run, unless it is that of one
@@ -25,6 +26,7 @@ mod group_end;
 mod group_output;
 mod inference;
 mod ingress;
+mod installation;
 mod lambda_process;
 pub mod lines;
 mod observer;

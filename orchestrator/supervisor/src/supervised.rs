@@ -193,6 +193,15 @@ impl SupervisedLambda {
         }
     }
 
+    /// Returns whether a process is to be started for it, at once or later.
+    pub(crate) fn will_start(&self) -> bool {
+        let is_waiting = matches!(
+            self.state,
+            LambdaState::Due(_) | LambdaState::Checking(_) | LambdaState::Checked
+        );
+        is_waiting && !self.is_leaving
+    }
+
     /// Returns whether it could not start, and is not started again.
     pub(crate) fn has_not_started(&self) -> bool {
         matches!(self.state, LambdaState::NotStarted)

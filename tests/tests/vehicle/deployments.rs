@@ -1,7 +1,10 @@
 //! Deployments over kills, restarts and failures.
 
+use std::os::unix::fs::symlink;
+
 use gleaner_protocol::supervision::{EventKind, LambdaPhase, VehicleEvent};
 use gleaner_tests::live::signal;
+use gleaner_tests::program;
 use gleaner_tests::vehicle::{TestVehicle, text};
 
 use super::{PythonLambda, files, ticker};
@@ -54,6 +57,43 @@ pub fn outlive() {
     vehicle.stop();
     let gone = |pid: &u32| !std::path::Path::new(&format!("/proc/{pid}/exe")).exists();
     assert!(after.iter().flatten().chain([&supervisor]).all(gone), "a process is left");
+}
+
+pub fn upgraded() {
+    let mut vehicle = TestVehicle::new();
+    let home = vehicle.path("home");
+    std::fs::create_dir(&home).expect("a folder");
+    for name in ["compile", "ingress", "runtime", "shim"] {
+        let name = format!("gleaner-{name}");
+        symlink(program(&name), home.join(name)).expect("a link");
+    }
+    let supervisor = home.join("gleaner-supervisor");
+    std::fs::copy(program("gleaner-supervisor"), &supervisor).expect("a copy");
+    vehicle.home = Some(home.clone());
+    vehicle.start();
+    let lambda = ticker("rust", "first");
+    let deployed = vehicle.deploy(lambda.path(), &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    let before = (vehicle.supervisor(), vehicle.processes("gleaner-ingress"));
+    // As a package manager does it.
+    let new = home.join("new");
+    std::fs::copy(&supervisor, &new).and_then(|_| std::fs::rename(&new, &supervisor)).unwrap();
+    signal(vehicle.orchestrator(), "HUP");
+    vehicle.until("the orchestrator to start again", |vehicle| {
+        let started = events(vehicle, EventKind::Started);
+        (started.iter().filter(|text| text.contains("orchestrator")).count() == 2).then_some(())
+    });
+    vehicle.until_running(&["first"]);
+    let after = (vehicle.supervisor(), vehicle.processes("gleaner-ingress"));
+    assert_eq!(after, before, "nothing has to start yet");
+    signal(vehicle.processes("gleaner-runtime")[0], "KILL");
+    vehicle.until("another supervisor", |vehicle| (vehicle.supervisor() != before.0).then_some(()));
+    vehicle.until_running(&["first"]);
+    let ingress = vehicle.processes("gleaner-ingress");
+    assert!(!ingress.is_empty() && ingress != before.1, "{ingress:?}");
+    let warnings = events(&vehicle, EventKind::Warning);
+    assert!(warnings.iter().any(|it| it.contains("replaced by an upgrade")), "{warnings:?}");
+    vehicle.stop();
 }
 
 pub fn stopped() {

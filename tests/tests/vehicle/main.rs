@@ -15,8 +15,9 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 15] = [
+const CASES: [Case; 16] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
+    ("after_an_upgrade_old_and_new_programs_do_not_mix", deployments::upgraded),
     ("a_stopped_deployment_stays_stopped", deployments::stopped),
     ("a_failed_revision_is_replaced_by_its_fallback_for_good", deployments::fallback),
     ("a_lambda_without_a_fallback_is_quarantined_alone", deployments::quarantined),

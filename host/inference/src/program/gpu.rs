@@ -1,7 +1,6 @@
 //! Names what an engine of TensorRT depends on, on this machine: its libraries, the GPU and the
 //! driver.
 
-use std::ffi::OsString;
 use std::fs::{self, File};
 use std::io::Read;
 use std::os::unix::fs::MetadataExt;
@@ -32,17 +31,15 @@ const READ_BYTES: u64 = 400;
 /// Most files of one kind.
 const FILES_MAX: usize = 8;
 
-/// Returns one line about the machine below `root`, with ONNX Runtime in the file `library`. It
-/// changes if a library, the GPU or the driver is replaced. The files of the system can be read
-/// only before the sandbox closes.
-pub(super) fn describe(root: &Path, library: &Path, more: Option<OsString>) -> String {
+/// Returns one line about the machine below `root`, with ONNX Runtime in the file `library` and
+/// further libraries in the folders that are `named`. It changes if a library, the GPU or the
+/// driver is replaced. The files of the system can be read only before the sandbox closes.
+pub(super) fn describe(root: &Path, library: &Path, named: &[PathBuf]) -> String {
     let real = library.canonicalize().ok();
     let beside = real.as_deref().and_then(Path::parent).map(Path::to_owned);
-    let named: Vec<PathBuf> =
-        more.iter().flat_map(std::env::split_paths).filter(|it| it.is_absolute()).collect();
     let system = library::FOLDERS.into_iter().chain([CUDA]);
     let system = system.map(|folder| root.join(folder.trim_start_matches('/')));
-    let folders: Vec<PathBuf> = beside.into_iter().chain(named).chain(system).collect();
+    let folders: Vec<PathBuf> = beside.into_iter().chain(named.to_vec()).chain(system).collect();
     let mut parts = Vec::new();
     for prefix in LIBRARIES {
         let mut found: Vec<String> = folders.iter().flat_map(|it| libraries(it, prefix)).collect();
@@ -105,7 +102,7 @@ mod tests {
     fn another_library_gpu_or_driver_gives_another_line() {
         let folder = tempfile::tempdir().unwrap();
         let (root, library) = (folder.path(), folder.path().join("ort/libonnxruntime.so.1.23.2"));
-        let line = || describe(root, &library, Some(OsString::from("relative")));
+        let line = || describe(root, &library, &[]);
         assert_eq!(
             line(),
             "no libonnxruntime_providers_tensorrt.so; no libnvinfer.so; no NVIDIA driver"

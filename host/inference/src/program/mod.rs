@@ -7,9 +7,10 @@ mod args;
 mod gpu;
 mod library;
 
+use std::ffi::OsString;
 use std::fs::File;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -29,6 +30,9 @@ use crate::loader::LoadLimits;
 use crate::region::TensorRegion;
 use crate::threads::ModelThreads;
 use args::Args;
+
+/// Folder of the threads of this process.
+const OWN_THREADS: &str = "/proc/self/task";
 
 /// Runs the program `gleaner-inference`.
 pub fn main() -> ExitCode {
@@ -58,9 +62,11 @@ fn start(
         move |error: io::Error| Failure::caused_by(Exit::Internal, what, &error)
     };
     let library = library::find(args.ort_lib.as_deref());
-    let variable = std::env::var_os("LD_LIBRARY_PATH");
-    let machine = library.as_deref().map(|it| gpu::describe(Path::new("/"), it, variable));
-    let mut paths = paths(library.as_deref());
+    let named = named_folders(std::env::var_os("LD_LIBRARY_PATH"));
+    let machine = library.as_deref().map(|it| gpu::describe(Path::new("/"), it, &named));
+    let (mut paths, has_gpu) = paths(library.as_deref(), named);
+    // Kept open, as Landlock forgets a folder of /proc that the kernel has forgotten.
+    let _own_threads = File::open(OWN_THREADS);
     paths.write.extend(args.build_engines.clone());
     // Before any thread: one that exists already would keep its privileges.
     let layers = sandbox::start(&paths);
@@ -74,7 +80,7 @@ fn start(
     // Not without seals: a lambda could take memory away while it is read.
     TensorRegion::create("gleaner-test", 1).map_err(internal("cannot share tensors"))?;
     let onnx_runtime = open(library.as_deref(), machine.unwrap_or_default());
-    let layers = sandbox::close(layers).map_err(|error| {
+    let layers = sandbox::close(layers, has_gpu).map_err(|error| {
         Failure::caused_by(Exit::Internal, "cannot close the sandbox of the models", &error)
     })?;
     for layer in layers.into_iter().chain([memory::limit(args.memory)]) {
@@ -114,21 +120,30 @@ fn open(library: Option<&Path>, machine: String) -> Result<Box<dyn Backend>, Str
     }
 }
 
+/// Returns the folders in the value of `LD_LIBRARY_PATH`: images of containers name those of the
+/// driver of NVIDIA there.
+fn named_folders(variable: Option<OsString>) -> Vec<PathBuf> {
+    let folders = variable.iter().flat_map(std::env::split_paths);
+    folders.filter(|folder| folder.is_absolute()).collect()
+}
+
 /// Returns the files that the process needs: the folder of the library, in which it finds its
-/// providers, and the devices of GPUs.
-fn paths(library: Option<&Path>) -> Paths {
+/// providers, the folders that are `named` for others, and the devices of GPUs. Also returns
+/// whether there are any: then CUDA, which does not start otherwise, may also name its threads.
+fn paths(library: Option<&Path>, named: Vec<PathBuf>) -> (Paths, bool) {
     let Some(library) = library.and_then(|path| path.canonicalize().ok()) else {
-        return Paths::default();
+        return (Paths::default(), false);
     };
     let devices = std::fs::read_dir("/dev").into_iter().flatten().filter_map(Result::ok);
     let is_gpu = |path: &Path| {
         let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
         ["nvidia", "nvhost", "nvmap", "nvgpu"].iter().any(|prefix| name.starts_with(prefix))
     };
-    Paths {
-        read: library.parent().map(Path::to_owned).into_iter().collect(),
-        write: devices.map(|entry| entry.path()).filter(|path| is_gpu(path)).collect(),
-    }
+    let read = library.parent().map(Path::to_owned).into_iter().chain(named).collect();
+    let mut write: Vec<_> = devices.map(|entry| entry.path()).filter(|path| is_gpu(path)).collect();
+    let has_gpu = !write.is_empty();
+    write.extend(has_gpu.then(|| OWN_THREADS.into()));
+    (Paths { read, write }, has_gpu)
 }
 
 /// Receives the control connection and the file for notes over standard input, the socket of the

@@ -18,6 +18,11 @@ pub fn library() -> Option<String> {
     library
 }
 
+/// Returns whether this machine has a GPU of NVIDIA.
+fn has_gpu() -> bool {
+    std::path::Path::new("/dev/nvidiactl").exists()
+}
+
 /// Returns a model that runs by any provider.
 pub fn by(name: &str, bytes: Vec<u8>, providers: &[&str]) -> TestModel {
     let mut model = granted(name, bytes);
@@ -26,8 +31,28 @@ pub fn by(name: &str, bytes: Vec<u8>, providers: &[&str]) -> TestModel {
 }
 
 #[test]
+fn a_gpu_runs_models_in_the_sandbox() {
+    let Some(library) = library() else { return };
+    if !has_gpu() {
+        return println!("skipped: this machine has no GPU of NVIDIA");
+    }
+    let program = ModelProgram::start(&["--ort-lib", &library]);
+    let mut lambda = program.lambda("gpu", &[by("m", product(), &["cuda"])]);
+    let opened = lambda.open("m").unwrap();
+    assert!(opened.runtime.ends_with(", cuda, 1 thread"), "{}", opened.runtime);
+    for _ in 0..3 {
+        let outputs = lambda.run("m", &[floats("x", &[2, 3], &[1.0; 6])]).unwrap();
+        assert_eq!(outputs[0].floats(), [9.0, 12.0, 9.0, 12.0]);
+    }
+    println!("{}", opened.runtime);
+}
+
+#[test]
 fn it_is_used_where_it_is_found_and_no_gpu_is_replaced_silently() {
     let Some(library) = library() else { return };
+    if has_gpu() {
+        return println!("skipped: this machine has a GPU of NVIDIA");
+    }
     let program = ModelProgram::start(&["--ort-lib", &library]);
     let models = [
         by("any", product(), &[]),

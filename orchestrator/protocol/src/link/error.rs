@@ -98,6 +98,16 @@ pub enum LinkError {
     /// The standard input of a program is no connection to a starter.
     #[error("the standard input is no socket of a program that starts this one")]
     NoStarter,
+    /// The other side is of another version, and may share memory of another layout.
+    #[error("{peer} is of version `{version}` of Gleaner, this program of {own}")]
+    OtherVersion {
+        /// Its name in messages.
+        peer: &'static str,
+        /// Its version.
+        version: String,
+        /// The version of this program.
+        own: &'static str,
+    },
     /// A grant to a reader is invalid.
     #[error("cannot grant topics to a reader")]
     Grant {
@@ -136,7 +146,7 @@ impl Explain for LinkError {
             LinkError::Refused { .. } => {
                 Some("build the lambda again, and restart recorder and lambda".to_owned())
             }
-            LinkError::Unknown { .. } => {
+            LinkError::Unknown { .. } | LinkError::OtherVersion { .. } => {
                 Some("use programs of the same version of Gleaner".to_owned())
             }
             LinkError::NoStarter => {

@@ -13,7 +13,9 @@ use gleaner_protocol::Report;
 use gleaner_protocol::inference::InferenceReport;
 use gleaner_protocol::ingress::{IngressReport, IngressStatus};
 use gleaner_protocol::link::{Loss, RecorderReport};
-use gleaner_protocol::supervision::{EventKind, SupervisionSpec, SupervisorStatus, VehicleEvent};
+use gleaner_protocol::supervision::{
+    EventKind, ProcessStatus, SupervisionSpec, SupervisorStatus, VehicleEvent,
+};
 use gleaner_vitals::usage;
 
 use crate::event_log::EventLog;
@@ -80,6 +82,17 @@ impl Board {
         let recorder = status.recorder.as_ref().is_some_and(|it| it.is_ready);
         let inference = status.inference.as_ref().is_some_and(|it| it.is_ready);
         [status.ingress.is_ready, recorder, inference]
+    }
+
+    /// Returns whether a process that all lambdas share has ended, and the next one is not ready.
+    pub(super) fn lacks_service(&self) -> bool {
+        fn lacks<S>(service: Option<&ProcessStatus<S>>) -> bool {
+            service.is_some_and(|it| it.restarts > 0 && !it.is_ready)
+        }
+        let status = self.lock();
+        lacks(Some(&status.ingress))
+            || lacks(status.recorder.as_ref())
+            || lacks(status.inference.as_ref())
     }
 
     /// Notes that all shared processes have ended, for this reason.

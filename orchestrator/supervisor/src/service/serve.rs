@@ -20,6 +20,7 @@ use super::board::Board;
 use super::connection::Connection;
 use crate::failures::Failures;
 use crate::group_end::GroupEnd;
+use crate::installation::Installation;
 use crate::process_group::{ProcessGroup, RunRecord};
 use crate::reconcile::{Action, KnownLambda, reconcile};
 use crate::restart_delay::RestartDelay;
@@ -48,8 +49,12 @@ pub(super) fn serve(listener: std::os::unix::net::UnixListener) -> Result<(), Fa
     let run = run_spec(&spec)?;
     let context = RunContext { spec: &run, parts: Parts::find()?, offset_ns: clock_offset() };
     let mut lambdas = Vec::new();
-    let mut wanted =
-        WantedState { spec: &spec, desired: DesiredState::default(), unusable: Vec::new() };
+    let mut wanted = WantedState {
+        spec: &spec,
+        installation: Installation::running(),
+        desired: DesiredState::default(),
+        unusable: Vec::new(),
+    };
     let mut vehicle = Vehicle::default();
     let (mut failures, mut counts) = (Failures::default(), RunCounts::default());
     let mut delay = RestartDelay::of_killed();
@@ -149,6 +154,7 @@ fn run_spec(spec: &SupervisionSpec) -> Result<RunSpec, Failure> {
 /// The state that the orchestrator wants.
 struct WantedState<'a> {
     spec: &'a SupervisionSpec,
+    installation: Installation,
     desired: DesiredState,
     /// Lambdas that cannot even be loaded, and the reasons.
     unusable: Vec<(DesiredLambda, String)>,
@@ -176,6 +182,15 @@ impl WantedState<'_> {
                 }
             }
             if stop.load(Ordering::Relaxed) {
+                return Ok(GroupEnd::Complete);
+            }
+            if (board.lacks_service() || group.lambdas.iter().any(SupervisedLambda::will_start))
+                && self.installation.is_replaced()
+            {
+                let text = "the programs were replaced by an upgrade, and one of them has to \
+                            start: all processes start again with the new ones";
+                board.event(EventKind::Warning, None, text);
+                connection.report(&SupervisorReport::Replaced);
                 return Ok(GroupEnd::Complete);
             }
             if let Some(end) = group.step()? {

@@ -1,0 +1,34 @@
+//! Notices that the programs were replaced while this one runs, as an upgrade does.
+
+use std::fs;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+/// The installation that this program was started from.
+pub(crate) struct Installation {
+    /// Path of this program, and its file; `None` if unknown.
+    program: Option<(PathBuf, FileId)>,
+}
+
+/// Device and number of a file.
+type FileId = (u64, u64);
+
+impl Installation {
+    /// Returns the installation of the running program. Call it once, at the start.
+    pub(crate) fn running() -> Self {
+        let file = id(Path::new("/proc/self/exe"));
+        Self { program: std::env::current_exe().ok().zip(file) }
+    }
+
+    /// Returns whether another file has taken the place of this program. Each upgrade replaces all
+    /// programs; one that is missing is none that could be started instead.
+    pub(crate) fn is_replaced(&self) -> bool {
+        let Some((path, file)) = &self.program else { return false };
+        id(path).is_some_and(|found| found != *file)
+    }
+}
+
+fn id(path: &Path) -> Option<FileId> {
+    let meta = fs::metadata(path).ok()?;
+    Some((meta.dev(), meta.ino()))
+}
