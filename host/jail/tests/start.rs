@@ -11,10 +11,13 @@ use std::sync::mpsc;
 use std::thread;
 
 use gleaner_jail::ingress::{self, NewSockets};
-use gleaner_jail::{JailError, Paths, base_filter, memory, recorder, sandbox_filter, sockets};
+use gleaner_jail::{
+    JailError, Paths, base_filter, inference, memory, recorder, sandbox_filter, sockets,
+};
 use gleaner_protocol::{Holds, Layer};
 use rustix::fs::{FallocateFlags, MemfdFlags, fallocate, memfd_create};
 use rustix::io::Errno;
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketType, bind, connect, listen, socket};
 use rustix::process::{Resource, getpid, getppid, getrlimit, test_kill_process};
 
 /// Set in the process that a test starts.
@@ -205,6 +208,41 @@ fn an_ingress_that_plays_a_drive_has_no_sockets() {
         let layers = ingress::start(&Paths::default());
         hold(&ingress::close(layers, NewSockets::None).unwrap());
         refused(UdpSocket::bind("127.0.0.1:0"));
+    });
+}
+
+#[test]
+fn a_process_with_a_gpu_listens_locally_and_connects_to_nothing() {
+    in_own_process("a_process_with_a_gpu_listens_locally_and_connects_to_nothing", || {
+        let own_threads = "/proc/self/task";
+        let paths = Paths { read: Vec::new(), write: vec![own_threads.into()] };
+        let layers = inference::close(inference::start(&paths), true).unwrap();
+        hold(&layers);
+        thread::Builder::new()
+            .spawn(move || {
+                let id = rustix::thread::gettid().as_raw_nonzero();
+                fs::write(format!("{own_threads}/{id}/comm"), "cuda").unwrap();
+            })
+            .unwrap()
+            .join()
+            .unwrap();
+        let packets = || socket(AddressFamily::UNIX, SocketType::SEQPACKET, None);
+        let listener = packets().unwrap();
+        let name = format!("gleaner-jail-{}", std::process::id());
+        let name = SocketAddrUnix::new_abstract_name(name.as_bytes()).unwrap();
+        bind(&listener, &name).unwrap();
+        listen(&listener, 1).unwrap();
+        assert_eq!(connect(packets().unwrap(), &name), Err(Errno::PERM));
+        for kind in [SocketType::STREAM, SocketType::DGRAM] {
+            assert_eq!(socket(AddressFamily::UNIX, kind, None).err(), Some(Errno::PERM));
+        }
+        refused(UdpSocket::bind("127.0.0.1:0"));
+        refused(TcpStream::connect("127.0.0.1:9"));
+        if files_hold(&layers) {
+            let path = std::env::temp_dir().join("gleaner-inference-escaped");
+            let path = SocketAddrUnix::new(&path).unwrap();
+            assert_eq!(bind(packets().unwrap(), &path), Err(Errno::ACCESS));
+        }
     });
 }
 
