@@ -21,6 +21,9 @@ use crate::steps::{Steps, succeeds};
 use crate::venv;
 use counts::{OutputFormat, TestCounts};
 
+/// Features with which `.ci/run` checks the workspace.
+const LINTED: &str = "gleaner-fuzz/calls,gleaner-fuzz/programs";
+
 struct Suite {
     name: String,
     action: SuiteAction,
@@ -145,27 +148,13 @@ fn player_suites(checkout: &Checkout) -> Result<Vec<Suite>, Failure> {
             SuiteAction::Skip("no gleaner-player; run: cargo xtask player"),
         )]);
     }
+    // With the features of the whole workspace, and in lints with those of `.ci/run`, so that
+    // nothing is built twice.
+    let only = ["--release", "--workspace", "--bin", "gleaner-player", "--test", "player"];
     let mut lints = player::cargo(checkout)?;
-    lints.args([
-        "clippy",
-        "--release",
-        "-p",
-        "gleaner-player",
-        "--all-targets",
-        "--",
-        "-D",
-        "warnings",
-    ]);
+    lints.arg("clippy").args(only).args(["--features", LINTED, "--", "-D", "warnings"]);
     let mut tests = player::cargo(checkout)?;
-    tests.args([
-        "test",
-        "--release",
-        "--workspace",
-        "--bin",
-        "gleaner-player",
-        "--test",
-        "program",
-    ]);
+    tests.arg("test").args(only);
     Ok(vec![
         suite("lints: player", SuiteAction::Run(lints, OutputFormat::None)),
         suite("cargo test: player", SuiteAction::Run(tests, OutputFormat::Libtest)),
