@@ -4,6 +4,86 @@ use std::path::Path;
 
 use crate::safe_file;
 
+/// The file operations of an atomic write, so that tests can let each of them fail.
+pub trait WriteSteps {
+    /// An open file.
+    type File;
+
+    /// Creates a file in place of any of this name.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system, as for all steps.
+    fn create(&self, path: &Path) -> io::Result<Self::File>;
+
+    /// Writes all `bytes`. After an error, a part of them may be in the file.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn write(&self, file: &mut Self::File, bytes: &[u8]) -> io::Result<()>;
+
+    /// Makes the content durable.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system. The content is unknown then.
+    fn sync(&self, file: &Self::File) -> io::Result<()>;
+
+    /// Renames a file, in place of any at `to`.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
+
+    /// Removes a file.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn remove(&self, path: &Path) -> io::Result<()>;
+
+    /// Makes the names in a folder durable.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system.
+    fn sync_folder(&self, folder: &Path) -> io::Result<()>;
+}
+
+/// The steps on the file system.
+#[derive(Clone, Copy, Debug)]
+pub struct DiskSteps;
+
+impl WriteSteps for DiskSteps {
+    type File = File;
+
+    fn create(&self, path: &Path) -> io::Result<File> {
+        safe_file::create(path)
+    }
+
+    fn write(&self, file: &mut File, bytes: &[u8]) -> io::Result<()> {
+        file.write_all(bytes)
+    }
+
+    fn sync(&self, file: &File) -> io::Result<()> {
+        file.sync_all()
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        fs::rename(from, to)
+    }
+
+    fn remove(&self, path: &Path) -> io::Result<()> {
+        fs::remove_file(path)
+    }
+
+    fn sync_folder(&self, folder: &Path) -> io::Result<()> {
+        File::open(folder)?.sync_all()
+    }
+}
+
 /// Writes `content` to the file `path` atomically, by way of a temporary file `PATH.part`: after a
 /// crash, `path` is the former file or the new one, never a part of it. After an error the
 /// temporary file is removed: on a full disk, its room is needed.
@@ -12,20 +92,33 @@ use crate::safe_file;
 ///
 /// Those of the file system.
 pub fn write_atomically(path: &Path, content: &[u8]) -> io::Result<()> {
+    write_atomically_by(&DiskSteps, path, content)
+}
+
+/// As [`write_atomically`], by these steps.
+///
+/// # Errors
+///
+/// Those of the steps.
+pub fn write_atomically_by<S: WriteSteps>(
+    steps: &S,
+    path: &Path,
+    content: &[u8],
+) -> io::Result<()> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
     let part = Path::new(&part);
-    let mut file = safe_file::create(part)?;
-    let written = file
-        .write_all(content)
-        .and_then(|()| file.sync_all())
-        .and_then(|()| fs::rename(part, path));
+    let mut file = steps.create(part)?;
+    let written = steps
+        .write(&mut file, content)
+        .and_then(|()| steps.sync(&file))
+        .and_then(|()| steps.rename(part, path));
     if let Err(error) = written {
-        let _ = fs::remove_file(part);
+        let _ = steps.remove(part);
         return Err(error);
     }
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
-    File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
+    steps.sync_folder(folder.unwrap_or(Path::new(".")))
 }
 
 #[cfg(test)]

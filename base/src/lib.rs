@@ -7,19 +7,23 @@ mod atomic_write;
 mod exit;
 mod failure;
 mod line_pieces;
+mod open_files;
 mod plain_file;
 pub mod safe_file;
+mod shortage;
 #[cfg(test)]
 mod test_folder;
 pub mod text;
 mod time;
 pub mod units;
 
-pub use atomic_write::write_atomically;
+pub use atomic_write::{DiskSteps, WriteSteps, write_atomically, write_atomically_by};
 pub use exit::Exit;
 pub use failure::{Explain, Failure, chain};
 pub use line_pieces::{LinePiece, each_piece};
+pub use open_files::{raise_open_files, restore_open_files};
 pub use plain_file::{NotPlain, PlainFile};
+pub use shortage::is_shortage;
 pub use text::{excerpt, grouped, hex, visible};
 pub use time::{UtcTime, nanoseconds};
 pub use units::{ByteSize, UnitError, format_duration, parse_duration};

@@ -123,7 +123,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-vitals",
         ],
     ),
-    ("gleaner-jail", &["gleaner-protocol"]),
+    ("gleaner-jail", &["gleaner-base", "gleaner-protocol"]),
     ("gleaner-journal", &["gleaner-base", "gleaner-lambda"]),
     ("gleaner-lambda", &["gleaner-base", "gleaner-rules"]),
     ("gleaner-messages", &["gleaner-base", "gleaner-rules"]),

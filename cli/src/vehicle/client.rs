@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bytes::Bytes;
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{ByteSize, Exit, Failure};
 use gleaner_protocol::vehicle_api::{API_SOCKET, Problem, VehicleStatus};
-use http_body_util::{BodyExt, Either, Full, Limited};
+use http_body_util::{BodyExt, Either, Full, LengthLimitError, Limited};
 use hyper::body::Incoming;
 use hyper::client::conn::http1;
 use hyper::{Method, Request, Response};
@@ -24,8 +24,8 @@ const RUN_DIR: &str = "/run/gleaner";
 /// Longest wait for a status, which takes some milliseconds.
 const STATUS_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Longest answer, in bytes: that of a thousand lambdas takes some MiB.
-const ANSWER_MAX: usize = 64 << 20;
+/// Longest answer, and longest line of one: that of a thousand lambdas takes some MiB.
+const ANSWER_MAX: ByteSize = ByteSize::mib(64);
 
 /// A client of one orchestrator.
 pub(crate) struct VehicleClient {
@@ -108,10 +108,15 @@ impl VehicleClient {
             let mut text: Vec<u8> = Vec::new();
             while let Some(frame) = body.frame().await {
                 let frame = frame.map_err(|error| self.lost(&error))?;
-                text.extend_from_slice(frame.data_ref().map_or(&[], |data| data));
-                while let Some(end) = text.iter().position(|byte| *byte == b'\n') {
-                    let line: Vec<u8> = text.drain(..=end).collect();
-                    take(String::from_utf8_lossy(&line).trim_end())?;
+                let data = frame.data_ref().map_or(&[][..], |data| data);
+                for piece in data.split_inclusive(|byte| *byte == b'\n') {
+                    text.extend_from_slice(piece);
+                    if text.ends_with(b"\n") {
+                        take(String::from_utf8_lossy(&text).trim_end())?;
+                        text.clear();
+                    } else if text.len() as u64 > ANSWER_MAX.bytes() {
+                        return Err(self.too_long());
+                    }
                 }
             }
             Ok(())
@@ -125,9 +130,8 @@ impl VehicleClient {
         body: Bytes,
     ) -> Result<T, Failure> {
         let answer = self.request(method, path, Either::Left(Full::new(body))).await?;
-        let body = Limited::new(answer.into_body(), ANSWER_MAX).collect().await;
-        let body = body.map_err(|error| self.lost(&*error))?;
-        serde_json::from_slice(&body.to_bytes()).map_err(|error| {
+        let body = self.whole(answer.into_body()).await?;
+        serde_json::from_slice(&body).map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot parse the answer", &error)
                 .with_help("use the `gleaner` of the version of gleaner-orchestrator")
         })
@@ -155,12 +159,30 @@ impl VehicleClient {
             return Ok(answer);
         }
         let status = answer.status();
-        let bytes = answer.into_body().collect().await.map_err(|error| self.lost(&error))?;
-        let problem = serde_json::from_slice::<Problem>(&bytes.to_bytes());
+        let problem = serde_json::from_slice::<Problem>(&self.whole(answer.into_body()).await?);
         Err(problem.map_or_else(
             |_| Failure::new(Exit::Internal, format!("gleaner-orchestrator answers {status}")),
             Failure::from,
         ))
+    }
+
+    /// Reads an answer up to its maximum length.
+    async fn whole(&self, body: Incoming) -> Result<Bytes, Failure> {
+        let most = ANSWER_MAX.bytes().try_into().unwrap_or(usize::MAX);
+        let read = Limited::new(body, most).collect().await;
+        let read = read.map_err(|error| match error.is::<LengthLimitError>() {
+            true => self.too_long(),
+            false => self.lost(&*error),
+        });
+        Ok(read?.to_bytes())
+    }
+
+    fn too_long(&self) -> Failure {
+        let socket = self.socket.display();
+        let message = format!("an answer at `{socket}` has more than {ANSWER_MAX}");
+        Failure::new(Exit::Internal, message).with_help(
+            "check that gleaner-orchestrator serves this socket, in the version of `gleaner`",
+        )
     }
 
     fn lost(&self, error: &dyn std::error::Error) -> Failure {
@@ -181,4 +203,54 @@ fn unreachable(socket: &Path, error: &std::io::Error) -> Failure {
         }
     };
     Failure::caused_by(Exit::Unreachable, action, error).with_help(help)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{Read, Write};
+    use std::os::unix::net::UnixListener;
+    use std::thread;
+
+    use super::*;
+
+    /// Serves an answer that never ends, to one request.
+    fn serve_without_end(listener: &UnixListener, status: &str) {
+        let (mut stream, _) = listener.accept().unwrap();
+        let (mut request, mut byte) = (Vec::new(), [0]);
+        while !request.ends_with(b"\r\n\r\n") {
+            stream.read_exact(&mut byte).unwrap();
+            request.push(byte[0]);
+        }
+        let head = format!("HTTP/1.1 {status}\r\ncontent-type: application/json\r\n\r\n");
+        stream.write_all(head.as_bytes()).unwrap();
+        let piece = vec![b' '; 1 << 20];
+        while stream.write_all(&piece).is_ok() {}
+    }
+
+    #[test]
+    fn an_answer_without_end_is_refused_with_its_socket_and_the_maximum() {
+        let folder = tempfile::tempdir().unwrap();
+        let listener = UnixListener::bind(folder.path().join(API_SOCKET)).unwrap();
+        let args = VehicleArgs { run_dir: Some(folder.path().to_owned()), json: true };
+        type Request = fn(&VehicleClient) -> Result<(), Failure>;
+        let requests: [(&str, Request); 3] = [
+            ("200 OK", |client| client.status().map(drop)),
+            ("500 Internal Server Error", |client| client.delete("/v1/deployments/id")),
+            ("200 OK", |client| client.lines("/v1/events", |_| Ok(()))),
+        ];
+        for (status, request) in requests {
+            let failure = thread::scope(|scope| {
+                let served = scope.spawn(|| serve_without_end(&listener, status));
+                let client = VehicleClient::new(&args).unwrap();
+                let failure = request(&client).unwrap_err().to_string();
+                // It closes the connection.
+                drop(client);
+                served.join().unwrap();
+                failure
+            });
+            for part in ["control.sock` has more than 64 MiB", "help:"] {
+                assert!(failure.contains(part), "{failure}");
+            }
+        }
+    }
 }

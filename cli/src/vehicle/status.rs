@@ -48,6 +48,14 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
             text += &service("inference", supervisor.inference.as_ref(), paint);
         }
     }
+    let supervisor = status.supervisor.as_ref().map_or(0, |supervisor| supervisor.events_lost);
+    for (program, lost) in [("orchestrator", status.events_lost), ("supervisor", supervisor)] {
+        if lost > 0 {
+            let lost = grouped(lost);
+            let line = format!("events of the {program} lost: {lost}; check the disk and its room");
+            text += &format!("  {}\n", paint.red(&line));
+        }
+    }
     if status.deployments.is_empty() {
         return text + &format!("\n{NO_DEPLOYMENTS}\n");
     }

@@ -7,7 +7,7 @@ use serde_json::Value;
 use super::client::VehicleClient;
 use crate::args::{LogsArgs, StreamArgs};
 use crate::render::{Paint, time_of_day};
-use crate::stdout::print;
+use crate::stdout::{end_with_reader, print};
 
 /// Runs `gleaner logs`.
 pub(crate) fn logs(args: &LogsArgs) -> Result<Exit, Failure> {
@@ -28,6 +28,9 @@ fn show(path: &str, args: &StreamArgs) -> Result<Exit, Failure> {
     let client = VehicleClient::new(&args.vehicle)?;
     let path = format!("{path}?last={}&follow={}", args.last, args.follow);
     let paint = Paint::of_stdout();
+    if args.follow {
+        end_with_reader();
+    }
     client.lines(&path, |line| {
         if args.vehicle.json {
             return print(&format!("{line}\n"));

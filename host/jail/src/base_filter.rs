@@ -178,13 +178,6 @@ fn limit_open_files() -> Layer {
     }
 }
 
-/// Allows this process as many open files as its maximum. Otherwise the usual limit of 1,024 stays.
-pub(crate) fn raise_open_files() {
-    let maximum = getrlimit(Resource::Nofile).maximum;
-    // Raising it to the maximum is never refused.
-    let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });
-}
-
 /// Limits this process to `more` open files beyond those that it has. Where these cannot be
 /// counted, the limit stays.
 pub(crate) fn limit_open_files_beyond(more: u64) {

@@ -15,7 +15,7 @@ use crate::{JailError, Paths, base_filter, files, own_memory, sandbox_filter, se
 pub fn start(paths: &Paths) -> Vec<Layer> {
     let mut layers = base_filter::apply();
     // Each lambda has a socket and two regions.
-    base_filter::raise_open_files();
+    gleaner_base::raise_open_files();
     layers.push(own_memory::hide());
     layers.push(files::confine_program(paths));
     layers

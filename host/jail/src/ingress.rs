@@ -26,7 +26,7 @@ pub enum NewSockets {
 pub fn start(paths: &Paths) -> Vec<Layer> {
     let mut layers = base_filter::apply();
     // Each reader and each region has one.
-    base_filter::raise_open_files();
+    gleaner_base::raise_open_files();
     layers.push(own_memory::hide());
     let mut paths = paths.clone();
     paths.read.push(NETWORK_DEVICES.into());

@@ -112,6 +112,7 @@ impl Api {
             deployments,
             removed: self.core.removed(),
             capacity: self.core.capacity(),
+            events_lost: self.core.events.lost(),
             supervisor,
         }
     }
@@ -258,3 +259,6 @@ impl IntoResponse for ApiError {
         (status, [(header::CONTENT_TYPE, "application/problem+json")], text).into_response()
     }
 }
+
+#[cfg(test)]
+mod tests;

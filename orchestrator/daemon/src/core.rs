@@ -18,7 +18,7 @@ use crate::checked::SignedDeployment;
 use crate::durable::DurableFile;
 use crate::layout::VehicleFolders;
 use crate::state::{Deployed, VehicleState};
-use crate::store::RevisionStore;
+use crate::store::{self, RevisionStore};
 use crate::trust::VehicleTrust;
 
 /// The vehicle.
@@ -27,6 +27,8 @@ pub(crate) struct Core {
     pub(crate) store: RevisionStore,
     /// Folder of the spools of lambdas.
     pub(crate) spools: PathBuf,
+    /// Folder of the records of ends, by deployment.
+    records: PathBuf,
     /// Folder of native code.
     pub(crate) cache: PathBuf,
     pub(crate) budgets: Budgets,
@@ -50,7 +52,8 @@ pub(crate) struct Inner {
     pub(crate) manifests: BTreeMap<ItemName, Vec<(Sha256, Manifest)>>,
     /// Revisions that are compiled for deployments that are not accepted yet.
     pub(crate) compiling: Vec<Sha256>,
-    /// True after a removal, until the files of its revisions are removed.
+    /// True after a removal, until its files are removed; and at the start, as an earlier process
+    /// may not have come to that.
     pub(crate) has_removed: bool,
     /// Use of resources so far.
     pub(crate) measured: Measurements,
@@ -79,13 +82,14 @@ impl Core {
             expected: BTreeMap::new(),
             manifests: BTreeMap::new(),
             compiling: Vec::new(),
-            has_removed: false,
+            has_removed: true,
             measured,
             status: None,
         };
         let core = Self {
             store: RevisionStore::open(layout)?,
             spools: layout.spool().join("lambdas"),
+            records: layout.records(),
             cache: layout.cache(),
             budgets: Budgets::of(&vehicle),
             events,
@@ -293,19 +297,25 @@ impl Core {
         self.collect_removed();
     }
 
-    /// Removes the revisions of removed deployments, once the supervisor reports that their lambdas
-    /// have ended.
+    /// Removes the revisions and the records of ends of removed deployments, once the supervisor
+    /// reports that their lambdas have ended.
     fn collect_removed(&self) {
         let Ok(_changing) = self.deploying.try_lock() else { return };
         let mut inner = self.lock();
         let Some(status) = inner.status.as_ref().filter(|_| inner.has_removed) else { return };
-        let is_deployed = |id: &String| {
+        let is_deployed = |inner: &Inner, id: &str| {
             id.parse::<ItemName>().is_ok_and(|id| inner.state.deployments.contains_key(&id))
         };
-        let have_ended = status.lambdas.iter().all(|lambda| is_deployed(&lambda.id));
+        let have_ended = status.lambdas.iter().all(|lambda| is_deployed(&inner, &lambda.id));
         if have_ended && status.generation >= inner.state.generation {
             inner.has_removed = false;
             self.collect(&mut inner);
+            for path in store::entries(&self.records).unwrap_or_default() {
+                let id = path.file_name().map(|name| name.to_string_lossy().into_owned());
+                if !id.is_some_and(|id| is_deployed(&inner, &id)) {
+                    store::remove(&path);
+                }
+            }
         }
     }
 

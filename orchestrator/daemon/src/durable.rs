@@ -5,7 +5,9 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gleaner_base::{ByteSize, Exit, Failure, PlainFile, hex, write_atomically};
+use gleaner_base::{
+    ByteSize, DiskSteps, Exit, Failure, PlainFile, WriteSteps, hex, write_atomically_by,
+};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
@@ -24,7 +26,7 @@ pub(crate) struct DurableFile {
 pub(crate) struct Loaded<T> {
     /// The value; `None` if neither copy exists.
     pub(crate) value: Option<T>,
-    /// The reason why the first copy was not used, if it exists.
+    /// The reasons why copies that exist were not used.
     pub(crate) damage: Option<String>,
 }
 
@@ -36,28 +38,39 @@ impl DurableFile {
         Self { paths: [path, copy.into()] }
     }
 
-    /// Reads the first copy, or the second one if that is damaged.
+    /// Reads the first copy, or the second one if that is lost or damaged. Such a copy is written
+    /// again, if the disk has room.
     ///
     /// # Errors
     ///
-    /// A failure if all existing copies are damaged.
-    pub(crate) fn load<T: DeserializeOwned>(&self) -> Result<Loaded<T>, Failure> {
-        let [first, second] = self.paths.each_ref().map(|path| read(path));
-        match (first, second) {
-            (Ok(None), Ok(value)) => Ok(Loaded { value, damage: None }),
-            (Ok(value), _) => Ok(Loaded { value, damage: None }),
-            (Err(damage), Ok(Some(value))) => {
-                Ok(Loaded { value: Some(value), damage: Some(damage) })
-            }
-            (Err(damage), _) => {
+    /// A failure if no copy can be used, and not both are absent.
+    pub(crate) fn load<T: Serialize + DeserializeOwned>(&self) -> Result<Loaded<T>, Failure> {
+        let copies = self.paths.each_ref().map(|path| read::<T>(path));
+        let is_whole = copies.iter().all(|copy| matches!(copy, Ok(Some(_))));
+        let errors = copies.iter().zip(&self.paths).filter_map(|(copy, path)| {
+            Some(format!("`{}`: {}", path.display(), copy.as_ref().err()?))
+        });
+        let errors: Vec<_> = errors.collect();
+        match copies.into_iter().find_map(|copy| copy.ok().flatten()) {
+            None if errors.is_empty() => Ok(Loaded { value: None, damage: None }),
+            None => {
                 let path = self.paths[0].display();
                 let mut failure = Failure::new(Exit::Internal, format!("`{path}` is damaged"));
-                failure.causes = vec![damage];
+                failure.causes = errors;
                 let help = format!(
-                    "restore `{path}` and `{path}.copy` from a backup; without one, remove both and \
-                     deploy again: the vehicle then accepts releases that it had replaced"
+                    "check the disk, and restore `{path}` and `{path}.copy` from a backup; without \
+                     one, remove both and deploy again: the vehicle then accepts releases that it \
+                     had replaced"
                 );
                 Err(failure.with_help(help))
+            }
+            Some(value) => {
+                if !is_whole {
+                    // A full disk does not keep anything from running: the other copy is there.
+                    let _ = self.save(&value);
+                }
+                let damage = (!errors.is_empty()).then(|| errors.join("; "));
+                Ok(Loaded { value: Some(value), damage })
             }
         }
     }
@@ -68,10 +81,20 @@ impl DurableFile {
     ///
     /// A failure that names the file. Either the former value or the new one is read afterwards.
     pub(crate) fn save(&self, value: &impl Serialize) -> Result<(), Failure> {
+        self.save_by(&DiskSteps, value)
+    }
+
+    fn save_by(&self, steps: &impl WriteSteps, value: &impl Serialize) -> Result<(), Failure> {
         let json = serde_json::to_string(value).expect("plain data");
         let text = format!("{}\n{json}\n", hex(&Sha256::digest(&json)));
+        if text.len() as u64 > MAX.bytes() {
+            let path = self.paths[0].display();
+            let message = format!("`{path}` would have {} bytes, and may have {MAX}", text.len());
+            return Err(Failure::new(Exit::Denied, message)
+                .with_help("remove deployments first, or sign smaller ones"));
+        }
         for path in &self.paths {
-            write_atomically(path, text.as_bytes()).map_err(|error| {
+            write_atomically_by(steps, path, text.as_bytes()).map_err(|error| {
                 let action = format!("cannot write `{}`", path.display());
                 Failure::caused_by(Exit::Internal, action, &error)
                     .with_help("make room on the disk; what ran before goes on")
@@ -101,45 +124,6 @@ pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn file(folder: &tempfile::TempDir) -> DurableFile {
-        DurableFile::new(folder.path().join("state.json"))
-    }
-
-    #[test]
-    fn any_changed_byte_and_any_cut_of_one_copy_is_found_and_the_other_is_read() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = file(&folder);
-        assert_eq!(file.load::<Vec<u32>>().unwrap(), Loaded { value: None, damage: None });
-        file.save(&vec![1, 22, 333]).unwrap();
-        let whole = fs::read(&file.paths[0]).unwrap();
-        let load = || file.load::<Vec<u32>>();
-        for at in 0..whole.len() {
-            let mut changed = whole.clone();
-            changed[at] ^= 1;
-            for damaged in [&changed, &whole[..at]] {
-                fs::write(&file.paths[0], damaged).unwrap();
-                let loaded = load().unwrap();
-                assert_eq!(loaded.value, Some(vec![1, 22, 333]), "{at}");
-                assert!(loaded.damage.is_some(), "{at}");
-                fs::write(&file.paths[1], damaged).unwrap();
-                assert!(load().unwrap_err().to_string().contains("is damaged"), "{at}");
-                fs::write(&file.paths[1], &whole).unwrap();
-            }
-        }
-        fs::remove_file(&file.paths[0]).unwrap();
-        assert_eq!(load().unwrap().value, Some(vec![1, 22, 333]), "the first copy was lost");
-    }
-
-    #[test]
-    fn a_value_that_cannot_be_written_leaves_the_former_one() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = file(&folder);
-        file.save(&1).unwrap();
-        fs::create_dir(folder.path().join("state.json.part")).unwrap();
-        file.save(&2).unwrap_err();
-        assert_eq!(file.load::<u32>().unwrap().value, Some(1));
-    }
-}
+mod lossy_disk;
+#[cfg(test)]
+mod tests;

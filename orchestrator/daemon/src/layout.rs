@@ -5,6 +5,7 @@ use std::io;
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+use gleaner_base::text::list;
 use gleaner_base::{Exit, Failure};
 use rustix::fs::{FlockOperation, OFlags, flock};
 
@@ -31,7 +32,15 @@ impl VehicleFolders {
             layout.clips(),
             layout.cache(),
         ];
-        private(state)?;
+        // Its own path may lead through links of the administrator. Once it is private, no other
+        // user can put one into it.
+        DirBuilder::new()
+            .recursive(true)
+            .mode(0o700)
+            .create(state)
+            .and_then(|()| File::open(state)?.set_permissions(Permissions::from_mode(0o700)))
+            .map_err(|error| cannot_create(state, &error))?;
+        layout.refuse_links()?;
         folders.iter().try_for_each(|folder| private(folder))?;
         // The folder of a service exists, with its own mode; its group may enter this one, too.
         let created = fs::create_dir(run);
@@ -42,6 +51,26 @@ impl VehicleFolders {
             created.map_err(|error| cannot_create(run, &error))?;
         }
         Ok(layout)
+    }
+
+    /// Refuses links in the place of files and folders: another user may have put them there before
+    /// the folder was private.
+    fn refuse_links(&self) -> Result<(), Failure> {
+        let entries = fs::read_dir(&self.state)
+            .and_then(Iterator::collect::<io::Result<Vec<_>>>)
+            .map_err(|error| cannot_create(&self.state, &error))?;
+        let links = entries.iter().filter(|it| it.file_type().is_ok_and(|kind| kind.is_symlink()));
+        let links: Vec<_> = links.map(|it| format!("`{}`", it.path().display())).collect();
+        if links.is_empty() {
+            return Ok(());
+        }
+        let message = format!("the state folder `{}` has links in it", self.state.display());
+        let mut failure = Failure::new(Exit::Denied, message);
+        failure.causes = vec![format!("{} may lead to files of others", list(&links, "and"))];
+        Err(failure.with_help(
+            "remove them, or put the files themselves there; for another disk, mount it there, or \
+             choose its folder with --state",
+        ))
     }
 
     /// Locks both folders for this process.
@@ -133,11 +162,16 @@ fn cannot_create(path: &Path, error: &io::Error) -> Failure {
         .with_help("choose others with --state and --run, or create it for this user")
 }
 
-/// Creates a folder that only this user can enter.
+/// Creates a folder that only this user can enter, unless a link is in its place.
 fn private(path: &Path) -> Result<(), Failure> {
-    let created = DirBuilder::new().recursive(true).mode(0o700).create(path);
+    let created = match DirBuilder::new().mode(0o700).create(path) {
+        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => Err(error),
+        _ => Ok(()),
+    };
+    let flags = (OFlags::NOFOLLOW | OFlags::DIRECTORY).bits().cast_signed();
     created
-        .and_then(|()| fs::set_permissions(path, Permissions::from_mode(0o700)))
+        .and_then(|()| File::options().read(true).custom_flags(flags).open(path))
+        .and_then(|folder| folder.set_permissions(Permissions::from_mode(0o700)))
         .map_err(|error| cannot_create(path, &error))
 }
 
@@ -146,4 +180,41 @@ fn lock_file(path: &Path) -> Result<File, Failure> {
     options.read(true).write(true).create(true).truncate(false);
     options.custom_flags(OFlags::NOFOLLOW.bits().cast_signed());
     options.open(path).map_err(|error| cannot_create(path, &error))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+
+    fn mode(path: &Path) -> u32 {
+        path.metadata().unwrap().permissions().mode() & 0o777
+    }
+
+    #[test]
+    fn links_in_the_state_folder_are_named_and_their_targets_stay_as_they_are() {
+        let scratch = tempfile::tempdir().unwrap();
+        let [state, run, precious] = ["state", "run", "precious"].map(|it| scratch.path().join(it));
+        for path in [&state, &precious] {
+            fs::create_dir(path).unwrap();
+            fs::set_permissions(path, Permissions::from_mode(0o755)).unwrap();
+        }
+        for name in ["clips", "vehicle.pem"] {
+            symlink(&precious, state.join(name)).unwrap();
+            let failure = VehicleFolders::create(&state, &run).unwrap_err().to_string();
+            for part in [name, "has links in it", "help:", "--state"] {
+                assert!(failure.contains(part), "{failure}");
+            }
+            // As if it had been put there in between.
+            private(&state.join(name)).unwrap_err();
+            fs::remove_file(state.join(name)).unwrap();
+        }
+        assert_eq!((mode(&precious), fs::read_dir(&precious).unwrap().count()), (0o755, 0));
+        // The folder itself may be a link.
+        let link = scratch.path().join("link");
+        symlink(&state, &link).unwrap();
+        VehicleFolders::create(&link, &run).unwrap();
+        assert_eq!([mode(&state), mode(&state.join("clips")), mode(&run)], [0o700, 0o700, 0o750]);
+    }
 }

@@ -19,7 +19,7 @@ use gleaner_protocol::supervision::{
     DesiredState, EventKind, SUPERVISION_VERSION, SupervisionSpec, SupervisorReport,
     SupervisorRequest,
 };
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::{Pid, Signal, WaitOptions, kill_process, waitpid};
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
 use tokio::net::unix::OwnedWriteHalf;
@@ -68,6 +68,7 @@ impl SupervisorLink {
     ///
     /// A failure if it does not end in time.
     pub(crate) async fn keep(self) -> Result<(), Failure> {
+        self.adopt();
         let mut is_failing = false;
         loop {
             let end = match self.connect().await {
@@ -96,6 +97,17 @@ impl SupervisorLink {
                     sleep(PAUSE).await;
                 }
             }
+        }
+    }
+
+    /// Waits, in a thread, for the end of a supervisor that this process started before SIGHUP, as
+    /// another program: it stays its child.
+    fn adopt(&self) {
+        if let Ok((mut lock, false)) = self.layout.supervisor_lock()
+            && let Some(pid) = supervisor(&mut lock)
+        {
+            // An error means that another process has started it, which then waits for it.
+            std::thread::spawn(move || waitpid(Some(pid), WaitOptions::empty()));
         }
     }
 
@@ -226,10 +238,7 @@ impl SupervisorLink {
         if is_free {
             return Ok(());
         }
-        let mut text = String::new();
-        let _ = (&mut lock).take(16).read_to_string(&mut text);
-        let pid =
-            text.trim().parse().ok().and_then(Pid::from_raw).filter(|pid| is_supervisor(*pid));
+        let pid = supervisor(&mut lock);
         if let Some(pid) = pid {
             let _ = kill_process(pid, Signal::TERM);
         }
@@ -255,6 +264,13 @@ impl SupervisorLink {
             Err(Failure::new(Exit::Internal, message))
         })
     }
+}
+
+/// Returns the process that has this lock.
+fn supervisor(lock: &mut File) -> Option<Pid> {
+    let mut text = String::new();
+    lock.take(16).read_to_string(&mut text).ok()?;
+    text.trim().parse().ok().and_then(Pid::from_raw).filter(|pid| is_supervisor(*pid))
 }
 
 /// Returns whether a process is a supervisor: the number in the file of the lock may be an old one.

@@ -26,6 +26,7 @@ pub(crate) fn text(status: &VehicleStatus) -> String {
         ("generation", "gauge", "Number of the wanted state", status.generation as f64),
         ("resident_bytes", "gauge", "Resident memory", program.rss_bytes as f64),
         ("cpu_seconds_total", "counter", "CPU time", program.cpu_s),
+        ("events_lost_total", "counter", "Events that are not durable", status.events_lost as f64),
     ] {
         let name = format!("gleaner_orchestrator_{name}");
         let _ = writeln!(text, "# HELP {name} {meaning}\n# TYPE {name} {kind}\n{name} {value}");

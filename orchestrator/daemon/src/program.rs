@@ -61,6 +61,8 @@ enum ProgramEnd {
 /// Runs the program.
 pub fn main() -> ExitCode {
     log::init_service();
+    // Each connection takes one; the usual limit is low.
+    gleaner_base::raise_open_files();
     let args = Args::parse();
     let failure = match run(args) {
         Ok(ProgramEnd::Stopped) => return Exit::Ok.into(),

@@ -234,7 +234,8 @@ fn copy(from: &Path, to: &Path) -> io::Result<()> {
     target.sync_all()
 }
 
-fn entries(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
+/// Lists the paths in a folder.
+pub(crate) fn entries(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     let listed = fs::read_dir(folder)
         .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect::<io::Result<_>>());
     listed.map_err(|error| {
@@ -244,7 +245,7 @@ fn entries(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
 }
 
 /// Removes a file or a folder, as far as that is possible: it is tried again at the next start.
-fn remove(path: &Path) {
+pub(crate) fn remove(path: &Path) {
     let removed = match path.symlink_metadata() {
         Ok(found) if found.is_dir() => fs::remove_dir_all(path),
         Ok(_) => fs::remove_file(path),

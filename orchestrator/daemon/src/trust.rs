@@ -86,9 +86,13 @@ impl VehicleTrust {
         &self.floors
     }
 
-    /// Sets what was accepted, to that of a state that could not be written.
+    /// Sets what was accepted, to that of a state that could not be written. The file of the root
+    /// is durable, so the root stays accepted.
     pub(crate) fn reset_floors(&mut self, floors: Floors) {
         self.floors = floors;
+        if let Some(root) = &self.root {
+            self.floors.accept_root(root, self.built);
+        }
     }
 
     /// Returns the checks of this vehicle, now.

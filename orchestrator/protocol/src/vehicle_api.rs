@@ -33,6 +33,9 @@ pub struct VehicleStatus {
     pub removed: BTreeMap<String, u64>,
     /// Resources that all lambdas share.
     pub capacity: Vec<Capacity>,
+    /// Number of events of the orchestrator that could not be made durable.
+    #[serde(default)]
+    pub events_lost: u64,
     /// The processes; absent while the supervisor cannot be reached.
     pub supervisor: Option<SupervisorStatus>,
 }

@@ -1,17 +1,32 @@
 //! Compares the files of a deployed lambda with its signed revision before each start, and its
 //! Python environment with its wheels.
 
+use std::error::Error;
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 use std::thread;
 
-use gleaner_base::{PlainFile, chain};
+use gleaner_base::{PlainFile, chain, is_shortage};
 use gleaner_lambda::BuildDir;
 use gleaner_protocol::supervision::DesiredLambda;
 use gleaner_trust::{FileDigestError, Payload, Revision, check_files, revision_of_digest};
 use gleaner_wheels::PreparedPython;
 
 /// The environment of a lambda that has wheels, or the reason why it does not start.
-pub(crate) type CheckResult = Result<Option<PreparedPython>, String>;
+pub(crate) type CheckResult = Result<Option<PreparedPython>, CheckFailure>;
+
+/// The reason why a lambda does not start.
+pub(crate) struct CheckFailure {
+    pub(crate) reason: String,
+    /// True if this machine lacks something: then the revision may be as it should be.
+    pub(crate) is_shortage: bool,
+}
+
+impl CheckFailure {
+    /// Creates the failure `what`, caused by `error`.
+    pub(crate) fn of(what: &str, error: &(dyn Error + 'static)) -> Self {
+        Self { reason: format!("{what}: {}", chain(error)), is_shortage: is_shortage(error) }
+    }
+}
 
 /// A check in a thread of its own: models of gigabytes take seconds, and other lambdas do not wait.
 pub(crate) struct RevisionCheck {
@@ -28,13 +43,22 @@ impl RevisionCheck {
         Self { result }
     }
 
+    /// Returns a check that has ended with this result.
+    #[cfg(test)]
+    pub(crate) fn ended(result: CheckResult) -> Self {
+        let (sender, received) = sync_channel(1);
+        let _ = sender.send(result);
+        Self { result: received }
+    }
+
     /// Returns the result, once it is there.
     pub(crate) fn result(&self) -> Option<CheckResult> {
         match self.result.try_recv() {
             Ok(result) => Some(result),
             Err(TryRecvError::Empty) => None,
             Err(TryRecvError::Disconnected) => {
-                Some(Err("its files could not be checked: no thread".to_owned()))
+                let reason = "its files could not be checked: no thread".to_owned();
+                Some(Err(CheckFailure { reason, is_shortage: true }))
             }
         }
     }
@@ -42,13 +66,12 @@ impl RevisionCheck {
 
 fn check(deployment: &DesiredLambda) -> CheckResult {
     let DesiredLambda { revision, folder, envelope, .. } = deployment;
-    let digest = revision.parse().map_err(|_| format!("`{revision}` is no digest"))?;
+    let failed = CheckFailure::of;
+    let digest = revision.parse().map_err(|error| failed("its revision has no digest", &error))?;
     let envelope = PlainFile::named(envelope, Revision::MAX).and_then(PlainFile::read_whole);
-    let envelope =
-        envelope.map_err(|error| format!("its revision cannot be read: {}", chain(&error)))?;
-    let refused = |error: FileDigestError| format!("its files are refused: {}", chain(&error));
+    let envelope = envelope.map_err(|error| failed("its revision cannot be read", &error))?;
+    let refused = |error: FileDigestError| failed("its files are refused", &error);
     let revision = revision_of_digest(&envelope, &digest).map_err(|it| refused(it.into()))?;
     check_files(&revision, &BuildDir::of(folder)).map_err(refused)?;
-    gleaner_wheels::prepare(folder)
-        .map_err(|error| format!("it has no Python environment: {}", chain(&error)))
+    gleaner_wheels::prepare(folder).map_err(|error| failed("it has no Python environment", &error))
 }

@@ -15,7 +15,7 @@ use crate::lambda_process::{LambdaProcess, ProcessEnd};
 use crate::observer::{RestartedPart, RunObserver};
 use crate::process::ChildProcess;
 use crate::restart_delay::{RestartDelay, jittered};
-use crate::revision_check::RevisionCheck;
+use crate::revision_check::{CheckFailure, RevisionCheck};
 use crate::spec::LambdaSpec;
 use crate::summary::{EarlierCounts, RunCounts};
 
@@ -112,7 +112,11 @@ impl SupervisedLambda {
                     self.state = LambdaState::Checked;
                     true
                 }
-                Some(Err(reason)) => {
+                Some(Err(CheckFailure { reason, is_shortage: true })) => {
+                    self.failed_to_start(&Failure::new(Exit::Internal, reason), observer);
+                    false
+                }
+                Some(Err(CheckFailure { reason, .. })) => {
                     self.quarantine(reason);
                     false
                 }
@@ -141,7 +145,7 @@ impl SupervisedLambda {
         std::mem::take(&mut self.has_news).then(|| self.last_end.clone().unwrap_or_default())
     }
 
-    /// Notes that its process could not be created.
+    /// Notes that its process could not be created, by no fault of its own.
     pub(crate) fn failed_to_start(&mut self, failure: &Failure, observer: &mut dyn RunObserver) {
         let reason = format!("{}{}", self.lambda.prefix, failure.message);
         let delay = jittered(self.delay.after(Duration::ZERO));
@@ -474,3 +478,6 @@ impl SupervisedLambda {
         self.earlier.complete(last.map(|last| *last), counts, &self.lambda.out)
     }
 }
+
+#[cfg(test)]
+mod tests;

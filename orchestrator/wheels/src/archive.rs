@@ -39,7 +39,7 @@ pub(crate) struct FileDigest {
 }
 
 /// A file of a wheel that an environment gets.
-#[derive(Debug)]
+#[derive(Debug, PartialEq)]
 pub(crate) struct WheelFile {
     /// Its number in the archive.
     index: usize,
@@ -132,10 +132,14 @@ impl WheelArchive {
         let mut files = Vec::new();
         for (&index, (entry, bytes)) in entries {
             let data = entry.split_once('/').filter(|(top, _)| top.ends_with(".data"));
-            let path = match data.map(|(_, rest)| rest.split_once('/').unwrap_or((rest, ""))) {
+            let path = match data.map(|(_, rest)| rest.split_once('/')) {
                 None => entry,
-                Some(("purelib" | "platlib", path)) if !path.is_empty() => path,
-                Some(_) => continue,
+                Some(Some(("purelib" | "platlib", path))) => path,
+                Some(Some(("scripts" | "headers" | "data", _))) => continue,
+                Some(_) => {
+                    let reason = "a folder .data has only purelib, platlib, scripts, headers, data";
+                    return Err(self.name.refused(entry, reason));
+                }
             };
             let digest = match listed.get(entry) {
                 Some(digest) if digest.bytes == *bytes => *digest,
@@ -310,6 +314,8 @@ mod tests {
                 plain().unlisted("plain/x.py", "").listed("plain/x.py,md5=abc,0\n"),
                 "the line of `plain/x.py` has no SHA-256",
             ),
+            (plain().file("plain-1.0.data/lib/x.py", ""), "the entry `plain-1.0.data/lib/x.py`"),
+            (plain().file("plain-1.0.data/purelib", ""), "a folder .data has only"),
             (plain().without_record(), "there is none"),
             (plain().file("other-2.dist-info/METADATA", ""), "not exactly one folder .dist-info"),
         ] {

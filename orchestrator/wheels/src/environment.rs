@@ -6,17 +6,17 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
-use std::io::{self, Read};
+use std::io;
 use std::os::unix::fs::{OpenOptionsExt, symlink};
 use std::path::{Path, PathBuf};
 
-use gleaner_base::PlainFile;
+use gleaner_base::{PlainFile, is_shortage};
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_parts::Parts;
 use sha2::{Digest, Sha256};
 
-use crate::archive::{FILES_MAX, FileDigest, UNPACKED_MAX, WheelArchive};
+use crate::archive::{FILES_MAX, FileDigest, UNPACKED_MAX, WheelArchive, WheelFile};
 use crate::{Interpreter, WheelError, wheels_of};
 
 /// Name of the environment in the folder of a revision.
@@ -60,7 +60,7 @@ pub(crate) fn prepare_for(
     wheels: &[PathBuf],
     folder: &Path,
 ) -> Result<PreparedPython, WheelError> {
-    let mut wanted = WantedFiles::of(interpreter, wheels)?;
+    let wanted = WantedFiles::of(interpreter, wheels)?;
     let path = folder.join(ENVIRONMENT);
     // Another process may prepare it, too: the orchestrator for a deployment, or the supervisor.
     let _lock = File::open(folder)
@@ -75,9 +75,13 @@ pub(crate) fn prepare_for(
 
 /// The content of an environment.
 struct WantedFiles {
-    wheels: Vec<WheelArchive>,
-    /// Paths in the environment, with the number of the wheel and that of the file in it.
-    files: BTreeMap<PathBuf, (FileDigest, usize, usize)>,
+    /// The paths of the wheels, with the files that they have. One is open at a time: a lambda may
+    /// have more wheels than a process may have open files.
+    wheels: Vec<(PathBuf, Vec<WheelFile>)>,
+    /// Folder of packages in the environment.
+    packages: PathBuf,
+    /// Paths in the environment, with the number of the wheel.
+    files: BTreeMap<PathBuf, (FileDigest, usize)>,
     folders: BTreeSet<PathBuf>,
     /// The text of `pyvenv.cfg`.
     config: String,
@@ -86,31 +90,40 @@ struct WantedFiles {
 }
 
 impl WantedFiles {
-    fn of(interpreter: &Interpreter, wheels: &[PathBuf]) -> Result<Self, WheelError> {
-        let mut opened = Vec::new();
-        for path in wheels {
-            let wheel = WheelArchive::open(path)?;
-            wheel.name.check_fits(interpreter)?;
-            opened.push(wheel);
-        }
+    fn of(interpreter: &Interpreter, paths: &[PathBuf]) -> Result<Self, WheelError> {
         let packages = interpreter.packages();
+        let (mut wheels, mut names) = (Vec::new(), Vec::new());
         let mut files = BTreeMap::new();
         let mut bytes = 0;
-        for (number, wheel) in opened.iter().enumerate() {
-            for (index, file) in wheel.files.iter().enumerate() {
+        for (number, path) in paths.iter().enumerate() {
+            let wheel = WheelArchive::open(path)?;
+            wheel.name.check_fits(interpreter)?;
+            names.push(wheel.name.as_str().to_owned());
+            for file in &wheel.files {
                 let (path, digest) = (packages.join(&file.path), file.digest);
                 bytes += digest.bytes;
-                let before = files.insert(path, (digest, number, index));
+                let before = files.insert(path, (digest, number));
                 // Packages of one namespace may have the same `__init__.py`.
-                if let Some((_, first, _)) = before.filter(|(other, ..)| *other != digest) {
-                    let name = |number: usize| opened[number].name.as_str().to_owned();
-                    let (first, second) = (name(first), name(number));
+                if let Some((_, first)) = before.filter(|(other, _)| *other != digest) {
+                    let (first, second) = (names[first].clone(), names[number].clone());
                     let entry = file.path.to_string_lossy().into_owned();
                     return Err(WheelError::Conflict { first, second, entry });
                 }
             }
             if files.len() > FILES_MAX || bytes > UNPACKED_MAX.bytes() {
                 return Err(wheel.too_much());
+            }
+            wheels.push((path.clone(), wheel.files));
+        }
+        for (path, (_, second)) in &files {
+            let above = path.ancestors().skip(1);
+            if let Some((folder, (_, first))) =
+                above.filter_map(|folder| files.get_key_value(folder)).next()
+            {
+                let (first, second) = (names[*first].clone(), names[*second].clone());
+                let entry = folder.strip_prefix(&packages).unwrap_or(folder);
+                let entry = entry.to_string_lossy().into_owned();
+                return Err(WheelError::FileAndFolder { first, second, entry });
             }
         }
         let (major, minor) = interpreter.version;
@@ -121,8 +134,9 @@ impl WantedFiles {
         let paths = files.keys().map(PathBuf::as_path).chain([Path::new(PYTHON), &packages]);
         let folders = paths.flat_map(|path| path.ancestors().skip(1)).map(Path::to_owned);
         let mut folders: BTreeSet<_> = folders.collect();
-        folders.insert(packages);
-        Ok(Self { wheels: opened, files, folders, config, program: interpreter.program.clone() })
+        folders.insert(packages.clone());
+        let program = interpreter.program.clone();
+        Ok(Self { wheels, packages, files, folders, config, program })
     }
 
     /// Returns a difference between the environment in `root` and the wanted one.
@@ -155,7 +169,10 @@ impl WantedFiles {
                     path == Path::new(PYTHON) && fs::read_link(entry.path())? == self.program
                 } else {
                     found += 1;
-                    wanted.is_some_and(|wanted| is_file(&entry.path(), wanted))
+                    match wanted {
+                        Some(wanted) => is_file(&entry.path(), wanted)?,
+                        None => false,
+                    }
                 };
                 if !is_wanted {
                     return Ok(Some(format!("`{}` was changed", path.display())));
@@ -169,7 +186,7 @@ impl WantedFiles {
 
     /// Makes the environment `path`, in place of what is there. A process that still runs with that
     /// keeps its open files.
-    fn make(&mut self, path: &Path) -> Result<(), WheelError> {
+    fn make(&self, path: &Path) -> Result<(), WheelError> {
         let [unfinished, old] = ["tmp", "old"].map(|it| path.with_extension(it));
         let remake = || {
             remove(&unfinished).map_err(failed("remove", &unfinished))?;
@@ -192,14 +209,25 @@ impl WantedFiles {
         remake()
     }
 
-    fn fill(&mut self, root: &Path) -> Result<(), WheelError> {
+    fn fill(&self, root: &Path) -> Result<(), WheelError> {
         let folder = |path: &Path| fs::create_dir_all(path).map_err(failed("create", path));
         folder(root)?;
         self.folders.iter().try_for_each(|path| folder(&root.join(path)))?;
-        for (path, (_, wheel, number)) in &self.files {
-            let path = root.join(path);
-            let mut file = create(&path).map_err(failed("create", &path))?;
-            self.wheels[*wheel].copy(*number, &mut file)?;
+        for (wheel, (path, files)) in self.wheels.iter().enumerate() {
+            let mut archive = WheelArchive::open(path)?;
+            if archive.files != *files {
+                let source = io::Error::other("it was changed while it was unpacked");
+                return Err(WheelError::Read { path: path.clone(), source });
+            }
+            for (number, file) in files.iter().enumerate() {
+                let path = self.packages.join(&file.path);
+                // Of a file in several wheels, the last one counts.
+                if self.files.get(&path).is_some_and(|(_, last)| *last == wheel) {
+                    let path = root.join(path);
+                    let mut file = create(&path).map_err(failed("create", &path))?;
+                    archive.copy(number, &mut file)?;
+                }
+            }
         }
         let config = root.join(CONFIG);
         let write = |mut file: File| io::Write::write_all(&mut file, self.config.as_bytes());
@@ -214,20 +242,18 @@ fn create(path: &Path) -> io::Result<File> {
     File::options().write(true).create_new(true).mode(0o400).open(path)
 }
 
-/// Returns whether the file `path`, not through a link, has this length and digest.
-fn is_file(path: &Path, wanted: FileDigest) -> bool {
-    let Ok(mut file) = PlainFile::result(path, FILE_MAX) else { return false };
-    if file.length() != wanted.bytes {
-        return false;
-    }
-    let (mut sha256, mut piece) = (Sha256::new(), vec![0; 64 << 10]);
-    loop {
-        match file.read(&mut piece) {
-            Ok(0) => return <[u8; 32]>::from(sha256.finalize()) == wanted.sha256,
-            Ok(read) => sha256.update(&piece[..read]),
-            Err(_) => return false,
+/// Returns whether the file `path`, not through a link, has this length and digest. One that cannot
+/// be read has not, unless that is a shortage of this machine.
+fn is_file(path: &Path, wanted: FileDigest) -> io::Result<bool> {
+    let found = PlainFile::result(path, FILE_MAX).and_then(|mut file| {
+        if file.length() != wanted.bytes {
+            return Ok(false);
         }
-    }
+        let mut sha256 = Sha256::new();
+        io::copy(&mut file, &mut sha256)?;
+        Ok(<[u8; 32]>::from(sha256.finalize()) == wanted.sha256)
+    });
+    found.or_else(|error| if is_shortage(&error) { Err(error) } else { Ok(false) })
 }
 
 fn digest_of(text: &str) -> [u8; 32] {
@@ -375,6 +401,68 @@ mod tests {
         });
         assert_eq!(all.iter().filter(|it| it.made.is_some()).count(), 1, "{all:?}");
         assert!(!made.folder.path().join("environment.tmp").exists());
+    }
+
+    /// Set for a process of its own, which may have few open files.
+    const FEW_FILES: &str = "GLEANER_FEW_FILES";
+
+    #[test]
+    fn many_wheels_need_few_open_files_and_a_shortage_of_them_is_reported_as_one() {
+        let mut made = Made::new();
+        for number in 0..60 {
+            let wheel = MadeWheel::new(&format!("more{number}")).file(&format!("m{number}.py"), "");
+            made.wheels.push(wheel.write(made.folder.path()));
+        }
+        if std::env::var_os(FEW_FILES).is_some() {
+            assert_eq!(made.prepare().made.as_deref(), Some("there was none"));
+            let taken: Vec<_> = std::iter::from_fn(|| File::open("/dev/null").ok()).collect();
+            let prepared = prepare_for(&made.interpreter, &made.wheels, made.folder.path());
+            let python = Interpreter::probe(&made.interpreter.program);
+            drop(taken);
+            for error in [prepared.unwrap_err(), python.unwrap_err()] {
+                assert!(is_shortage(&error), "{error:?}");
+            }
+            return assert_eq!(made.prepare().made, None);
+        }
+        let test = "environment::tests::many_wheels_need_few_open_files_and_a_shortage_of_them_is_reported_as_one";
+        let mut limited = Command::new("sh");
+        limited.args(["-c", "ulimit -n 32; exec \"$@\"", "sh"]).env(FEW_FILES, "1");
+        limited.arg(std::env::current_exe().unwrap()).args(["--exact", test]);
+        let output = limited.output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stdout));
+    }
+
+    #[test]
+    fn a_file_and_a_folder_of_one_name_are_refused_by_name() {
+        let made = Made::new();
+        let refused = |wheel: MadeWheel| {
+            let all = [&made.wheels[..], &[wheel.write(made.folder.path())]].concat();
+            let error = prepare_for(&made.interpreter, &all, made.folder.path()).unwrap_err();
+            gleaner_base::Failure::from(error).to_string()
+        };
+        let twice =
+            MadeWheel::new("odd").file("odd.py", "1").file("odd-1.0.data/purelib/odd.py", "2");
+        for (wheel, parts) in [
+            (
+                MadeWheel::new("third").file("second.py/x.py", ""),
+                ["`second-1.0-py3-none-any.whl`", "`third-1.0-py3-none-any.whl`", "`second.py`"],
+            ),
+            (
+                MadeWheel::new("third").file("first", ""),
+                ["`third-1.0-py3-none-any.whl`", "`first-1.0-py3-none-any.whl`", "`first`"],
+            ),
+            (
+                MadeWheel::new("odd").file("odd", "").file("odd/x.py", ""),
+                ["wheel `odd-1.0-py3-none-any.whl` has", "a file and a folder", "`odd`"],
+            ),
+            (twice, ["wheel `odd-1.0-py3-none-any.whl` has", "two different files", "`odd.py`"]),
+        ] {
+            let text = refused(wheel);
+            for part in parts.iter().chain(&["help:"]) {
+                assert!(text.contains(part), "{part}: {text}");
+            }
+        }
+        assert!(!made.path("").exists(), "nothing is unpacked");
     }
 
     #[test]

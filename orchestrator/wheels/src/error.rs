@@ -17,6 +17,8 @@ use crate::archive::{FILES_MAX, UNPACKED_MAX};
 pub enum WheelError {
     #[error("`{name}` is not the name of a wheel")]
     Name { name: String },
+    #[error("cannot start the interpreter `{}`", python.display())]
+    Start { python: PathBuf, source: io::Error },
     #[error("wheel `{wheel}` does not fit {interpreter}")]
     Unfit { wheel: String, interpreter: Box<Interpreter>, source: WheelTags },
     #[error("cannot read wheel `{}`", path.display())]
@@ -35,8 +37,10 @@ pub enum WheelError {
         "the wheels up to `{wheel}` have more than {FILES_MAX} files, or more than {UNPACKED_MAX}"
     )]
     TooMuch { wheel: String },
-    #[error("wheels `{first}` and `{second}` have different files `{entry}`")]
+    #[error("{} different files `{entry}`", both(first, second, "two"))]
     Conflict { first: String, second: String, entry: String },
+    #[error("{} a file and a folder `{entry}`", both(first, second, ""))]
+    FileAndFolder { first: String, second: String, entry: String },
     #[error("cannot use the interpreter `{}`: {reason}", python.display())]
     Interpreter { python: PathBuf, reason: String },
     #[error("cannot {action} `{}`", path.display())]
@@ -45,6 +49,14 @@ pub enum WheelError {
     Layout(#[from] LayoutError),
     #[error(transparent)]
     Parts(#[from] PartsError),
+}
+
+/// Names the wheels of a conflict, which may be one.
+fn both(first: &str, second: &str, count: &str) -> String {
+    match first == second {
+        true => format!("wheel `{first}` has {count}").trim_end().to_owned(),
+        false => format!("wheels `{first}` and `{second}` have"),
+    }
 }
 
 /// The tags of a wheel, as the cause of a refusal.
@@ -72,16 +84,23 @@ impl Explain for WheelError {
                     .to_owned(),
             },
             Self::TooMuch { .. } => "lock fewer packages in requirements.txt".to_owned(),
-            Self::Conflict { .. } => {
+            Self::Conflict { first, second, .. } | Self::FileAndFolder { first, second, .. }
+                if first != second =>
+            {
                 "lock only one of the two packages in requirements.txt".to_owned()
             }
-            Self::Interpreter { .. } => {
+            Self::Interpreter { .. } | Self::Start { .. } => {
                 "install CPython 3.9 or newer, or name one: GLEANER_PYTHON=/path/to/python3"
                     .to_owned()
             }
             Self::Layout(error) => return error.help(),
             Self::Parts(error) => return error.help(),
+            Self::Name { name } if name.to_ascii_lowercase().ends_with(".whl") => {
+                "name it as its author did: `PACKAGE-VERSION-PYTHON-ABI-PLATFORM.whl`".to_owned()
+            }
             Self::Name { .. }
+            | Self::Conflict { .. }
+            | Self::FileAndFolder { .. }
             | Self::Archive { .. }
             | Self::Entry { .. }
             | Self::Record { .. }
@@ -97,7 +116,7 @@ impl Explain for WheelError {
         match self {
             Self::Layout(error) => error.exit(),
             Self::Parts(error) => error.exit(),
-            Self::Unpack { .. } | Self::Environment { .. } => Exit::Internal,
+            Self::Unpack { .. } | Self::Environment { .. } | Self::Start { .. } => Exit::Internal,
             Self::Read { source, .. } if NotPlain::of(source).is_none() => Exit::Internal,
             Self::Entry { .. } | Self::Differs { .. } => Exit::Denied,
             _ => Exit::Usage,

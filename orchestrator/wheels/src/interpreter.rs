@@ -36,13 +36,14 @@ impl Interpreter {
     ///
     /// # Errors
     ///
-    /// [`WheelError::Interpreter`] if it is not CPython, or does not start.
+    /// [`WheelError::Interpreter`] if it is not CPython; [`WheelError::Start`].
     pub fn probe(python: &Path) -> Result<Self, WheelError> {
         let refused =
             |reason: String| WheelError::Interpreter { python: python.to_owned(), reason };
         let probe =
             Command::new(python).args(["-I", "-S", "-c", PROBE]).stdin(Stdio::null()).output();
-        let output = probe.map_err(|error| refused(error.to_string()))?;
+        let output =
+            probe.map_err(|source| WheelError::Start { python: python.to_owned(), source })?;
         let text = String::from_utf8_lossy(&output.stdout);
         let lines: Vec<_> = text.lines().collect();
         let [implementation, major, minor, flags, machine, libc, program] = lines[..] else {

@@ -31,8 +31,10 @@ pub const WHEELS: &str = "wheels";
 ///
 /// Those of [`BuildDir::files`].
 pub fn wheels_of(build: &BuildDir) -> Result<Vec<PathBuf>, LayoutError> {
+    // One with an ending in capitals is refused by its name: it must not be missing silently.
     let is_wheel = |path: &PathBuf| {
-        path.parent() == Some(Path::new(WHEELS)) && path.extension().is_some_and(|it| it == "whl")
+        path.parent() == Some(Path::new(WHEELS))
+            && path.extension().is_some_and(|it| it.eq_ignore_ascii_case("whl"))
     };
     Ok(build.files()?.into_iter().filter(is_wheel).collect())
 }

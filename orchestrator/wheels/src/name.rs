@@ -164,6 +164,13 @@ mod tests {
             ("cp312-abi3-manylinux2014_x86_64", false),
             ("py3-none-manylinux2014_x86_64", true),
             ("pp310-pypy310_pp73-manylinux2014_x86_64", false),
+            ("cp-none-any", false),
+            ("py-none-any", false),
+            ("cp399999999999-none-any", false),
+            ("py3.-none-any", true),
+            ("cp311-cp311-manylinux_2_x86_64", false),
+            ("cp311-cp311-manylinux_99999999999_0_x86_64", false),
+            ("cp311-cp311-_x86_64", false),
         ] {
             let name: WheelName = format!("Some.thing_x-1.0+local-{tags}.whl").parse().unwrap();
             assert_eq!(name.distribution(), "some-thing-x");
@@ -210,6 +217,11 @@ mod tests {
             ["", "x.whl", "x-1-py3-none.whl", "x-1-py3-none-any.zip", "../x-1-py3-none-any.whl"]
         {
             assert!(name.parse::<WheelName>().is_err(), "{name}");
+        }
+        let capitals = "x-1-py3-none-any.WHL".parse::<WheelName>().unwrap_err();
+        let text = gleaner_base::Failure::from(capitals).to_string();
+        for part in ["`x-1-py3-none-any.WHL` is not the name", "-PLATFORM.whl`"] {
+            assert!(text.contains(part), "{text}");
         }
     }
 }

@@ -1,6 +1,10 @@
 //! Deployments over kills, restarts and failures.
 
+<<<<<<< HEAD
 use std::os::unix::fs::symlink;
+=======
+use std::process::Command;
+>>>>>>> hA3
 
 use gleaner_protocol::supervision::{EventKind, LambdaPhase, VehicleEvent};
 use gleaner_tests::live::signal;
@@ -9,7 +13,18 @@ use gleaner_tests::vehicle::{TestVehicle, text};
 
 use super::{PythonLambda, files, ticker};
 
+/// Returns the limits of open files of a process: the soft and the hard one.
+fn open_files(pid: u32) -> [u64; 2] {
+    let limits = std::fs::read_to_string(format!("/proc/{pid}/limits")).expect("it runs");
+    let line = limits.lines().find_map(|line| line.strip_prefix("Max open files"));
+    let mut numbers = line.expect("a line").split_whitespace();
+    [(); 2].map(|()| numbers.next().and_then(|it| it.parse().ok()).expect("a number"))
+}
+
 pub fn outlive() {
+    let own = std::process::id().to_string();
+    let limited = Command::new("prlimit").args(["--pid", &own, "--nofile=256:"]).status();
+    assert!(limited.expect("util-linux has `prlimit`").success());
     let mut vehicle = TestVehicle::new();
     vehicle.start();
     let lambdas = [ticker("rust", "first"), ticker("python", "second")];
@@ -21,6 +36,12 @@ pub fn outlive() {
     let processes = |vehicle: &TestVehicle| names.map(|name| vehicle.processes(name));
     let before = processes(&vehicle);
     assert!(before.iter().all(|pids| !pids.is_empty()), "{before:?}");
+    for pid in [vehicle.orchestrator(), vehicle.supervisor()] {
+        let [soft, hard] = open_files(pid);
+        assert!(soft == hard && soft > 256, "{soft} of {hard}");
+    }
+    let shims = vehicle.processes("gleaner-shim");
+    assert!(shims.iter().all(|pid| open_files(*pid)[0] == 256), "as before");
     vehicle.kill_orchestrator();
     // One that fails meanwhile is started again.
     let runtime = vehicle.processes("start.py")[0];
@@ -59,6 +80,7 @@ pub fn outlive() {
     assert!(after.iter().flatten().chain([&supervisor]).all(gone), "a process is left");
 }
 
+<<<<<<< HEAD
 pub fn upgraded() {
     let mut vehicle = TestVehicle::new();
     let home = vehicle.path("home");
@@ -94,6 +116,27 @@ pub fn upgraded() {
     let warnings = events(&vehicle, EventKind::Warning);
     assert!(warnings.iter().any(|it| it.contains("replaced by an upgrade")), "{warnings:?}");
     vehicle.stop();
+=======
+pub fn reaped() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let supervisor = vehicle.supervisor();
+    signal(vehicle.orchestrator(), "HUP");
+    vehicle.until("the program to start again", |vehicle| {
+        vehicle.try_status()?.supervisor?;
+        let started = events(vehicle, EventKind::Started);
+        (started.iter().filter(|text| text.contains("orchestrator")).count() == 2).then_some(())
+    });
+    assert_eq!(vehicle.supervisor(), supervisor, "it runs on");
+    signal(supervisor, "KILL");
+    // Of a zombie, the folder stays.
+    let folder = std::path::Path::new("/proc").join(supervisor.to_string());
+    vehicle.until("its end", |_| (!folder.exists()).then_some(()));
+    vehicle.until("another one", |vehicle| {
+        let other = vehicle.supervisor();
+        (other != supervisor && vehicle.try_status()?.supervisor.is_some()).then_some(())
+    });
+>>>>>>> hA3
 }
 
 pub fn stopped() {
@@ -132,7 +175,9 @@ pub fn removed() {
     };
     assert_eq!(ids(&vehicle), ["other"]);
     vehicle.until("the end of its files", |vehicle| {
-        (files(&vehicle.path("state/revisions")).len() == 1).then_some(())
+        let of_other = [vehicle.path("state/records/other")];
+        let is_gone = files(&vehicle.path("state/records")) == of_other;
+        (is_gone && files(&vehicle.path("state/revisions")).len() == 1).then_some(())
     });
     assert!(!vehicle.records(Some("ticker")).is_empty(), "its records can be read");
     let again = text(&vehicle.gleaner(&["remove", "ticker"]));

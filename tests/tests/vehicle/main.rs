@@ -15,8 +15,9 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 16] = [
+const CASES: [Case; 19] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
+    ("a_supervisor_that_ends_after_sighup_is_no_zombie", deployments::reaped),
     ("after_an_upgrade_old_and_new_programs_do_not_mix", deployments::upgraded),
     ("a_stopped_deployment_stays_stopped", deployments::stopped),
     ("a_failed_revision_is_replaced_by_its_fallback_for_good", deployments::fallback),
@@ -31,6 +32,8 @@ const CASES: [Case; 16] = [
     ("wheels_that_do_not_fit_are_refused_while_the_former_lambda_runs", wheels::refused),
     ("top_shows_figures_and_outlives_the_orchestrator", top::figures),
     ("top_restores_the_terminal", top::terminal),
+    ("top_ends_with_a_terminal_that_sends_no_signal", top::lost_terminal),
+    ("what_follows_ends_with_its_reader_although_nothing_happens", top::readers),
     ("processes_are_killed_at_random", chaos::killed_at_random),
 ];
 

@@ -4,8 +4,10 @@ use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
 
-use gleaner_tests::live::{RunningProgram, descendants, signal};
+use gleaner_tests::live::{PATIENCE, RunningProgram, descendants, signal};
 use gleaner_tests::program;
 use gleaner_tests::vehicle::{TestVehicle, text};
 use serde_json::Value;
@@ -90,24 +92,70 @@ pub fn terminal() {
         shown(vehicle, "\u{1b}[?1049l");
         shown(vehicle, "\u{1b}[?25h");
     };
-    let mut script = start(&vehicle, &page);
+    let mut script = start(&vehicle, &page, "");
     shown(&vehicle, "on probation");
     let mut keys = script.stdin.take().expect("a pipe");
     keys.write_all(b"sjq").expect("it reads keys");
     ended(&vehicle, script);
 
-    let script = start(&vehicle, &page);
+    let script = start(&vehicle, &page, "");
     shown(&vehicle, "on probation");
     signal(*descendants(script.id(), "--run-dir").last().expect("it runs"), "TERM");
     ended(&vehicle, script);
 }
 
-/// Starts `gleaner top` on a terminal of 80 columns, whose output goes to `page`.
-fn start(vehicle: &TestVehicle, page: &Path) -> Child {
+pub fn lost_terminal() {
+    let vehicle = vehicle();
+    let page = vehicle.path("page");
+    // In a session of its own, it gets no SIGHUP.
+    let mut script = start(&vehicle, &page, "setsid --wait ");
+    vehicle.until("the page", |_| {
+        String::from_utf8_lossy(&fs::read(&page).ok()?).contains("on probation").then_some(())
+    });
+    let top = *descendants(script.id(), "--run-dir").last().expect("it runs");
+    script.kill().expect("it runs");
+    script.wait().expect("it was killed");
+    let program = Path::new("/proc").join(format!("{top}/exe"));
+    vehicle.until("the end of `gleaner top`", |_| fs::read_link(&program).is_err().then_some(()));
+}
+
+pub fn readers() {
+    let vehicle = vehicle();
+    for args in [&["events", "--follow"][..], &["logs", "first", "--follow"], &["top", "--json"]] {
+        let mut follow = Command::new(program("gleaner"));
+        follow.env("GLEANER_RUN", vehicle.path("run")).args(args).stdout(Stdio::piped());
+        let mut follow = follow.spawn().expect("it starts");
+        let mut reader = BufReader::new(follow.stdout.take().expect("a pipe"));
+        reader.read_line(&mut String::new()).expect("a line");
+        // Nothing comes any more.
+        signal(vehicle.orchestrator(), "STOP");
+        drop(reader);
+        let deadline = Instant::now() + PATIENCE;
+        let ended = loop {
+            if let Some(ended) = follow.try_wait().expect("our child") {
+                break Some(ended);
+            }
+            if Instant::now() > deadline {
+                break None;
+            }
+            thread::sleep(Duration::from_millis(10));
+        };
+        signal(vehicle.orchestrator(), "CONT");
+        let _ = follow.kill();
+        assert!(ended.is_some_and(|ended| ended.success()), "{args:?}: {ended:?}");
+    }
+}
+
+/// Starts `gleaner top` on a terminal of 80 columns, whose output goes to `page`, by the program
+/// `by`.
+fn start(vehicle: &TestVehicle, page: &Path, by: &str) -> Child {
     File::create(page).expect("the folder is writable");
     let (gleaner, run) = (program("gleaner"), vehicle.path("run"));
-    let top =
-        format!("stty rows 24 cols 80; exec {} top --run-dir {}", gleaner.display(), run.display());
+    let top = format!(
+        "stty rows 24 cols 80; exec {by}{} top --run-dir {}",
+        gleaner.display(),
+        run.display()
+    );
     let mut script = Command::new("script");
     script.args(["--quiet", "--flush", "--return", "--command", &top]).arg(page);
     script.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().expect("util-linux has `script`")

@@ -22,7 +22,7 @@ use serde_json::json;
 use super::client::VehicleClient;
 use crate::args::TopArgs;
 use crate::render::json_line;
-use crate::stdout::{print, print_to_reader};
+use crate::stdout::{end_with_reader, print, print_to_reader};
 use figures::VehicleFigures;
 
 /// Time from a poll to the next. The processes report their counts as often.
@@ -38,6 +38,9 @@ pub(crate) fn top(args: &TopArgs) -> Result<Exit, Failure> {
     if !args.once && !args.vehicle.json && !stdout().is_terminal() {
         return Err(Failure::new(Exit::Usage, "`gleaner top` needs a terminal")
             .with_help("`--once` prints a table, and `--json` an object for each poll"));
+    }
+    if !args.once {
+        end_with_reader();
     }
     let mut polls = Polls::default();
     polls.add(client.status()?);

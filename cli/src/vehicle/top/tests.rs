@@ -305,3 +305,18 @@ fn old_statuses_are_dropped() {
     (0..9).for_each(|up_s| polls.add(status(vehicle(up_s.into(), Vec::new()))));
     assert_eq!(polls.0.len(), POLLS_KEPT);
 }
+
+#[test]
+fn the_status_shows_events_that_were_lost() {
+    let mut vehicle = vehicle(1.0, Vec::new());
+    let text = |vehicle: &Value| {
+        crate::vehicle::status::text(&status(vehicle.clone()), crate::render::Paint::new(false))
+    };
+    assert!(!text(&vehicle).contains("lost"), "also of an orchestrator that does not count them");
+    vehicle["events_lost"] = 1234.into();
+    vehicle["supervisor"]["events_lost"] = 5.into();
+    let text = text(&vehicle);
+    for line in ["events of the orchestrator lost: 1,234", "events of the supervisor lost: 5"] {
+        assert!(text.contains(line), "{text}");
+    }
+}

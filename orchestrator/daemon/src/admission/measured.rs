@@ -96,7 +96,10 @@ impl Measurements {
     pub(crate) fn load(file: DurableFile) -> (Self, Option<String>) {
         let (mut now, damage) = match file.load::<MeasuredFile>() {
             Ok(loaded) => (loaded.value.unwrap_or_default(), loaded.damage),
-            Err(failure) => (MeasuredFile::default(), Some(failure.to_string())),
+            Err(failure) => {
+                let failure = failure.with_help("nothing is to be done: all is measured again");
+                (MeasuredFile::default(), Some(failure.to_string()))
+            }
         };
         // No machine measures others: sums of them would not be numbers.
         let is_sound = |value: &f64| (0.0..=1e15).contains(value);

@@ -319,3 +319,33 @@ fn the_busiest_minute_counts_and_survives_a_restart_of_the_program() {
     assert!(measured.has_speed_of("board") && !measured.has_speed_of("other"));
     assert_eq!(measured.model().fuel_per_s, 3e9);
 }
+
+#[test]
+fn absurd_measurements_in_the_file_do_not_count() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("measured.json");
+    let of = |uses: serde_json::Value, models: serde_json::Value, machine: serde_json::Value| {
+        let content = serde_json::json!({ "machine": machine, "uses": uses, "models": models });
+        DurableFile::new(path.clone()).save(&content).unwrap();
+        Measurements::load(DurableFile::new(path.clone()))
+    };
+    let used = |cpu: f64, wakes: f64, model_time: f64| serde_json::json!({ "cpu": cpu, "wakes": wakes, "model_time": model_time });
+    let manifest = manifest("python", "period = \"10ms\"", "");
+    for (cpu, wakes, time) in [(1e308, 1.0, 0.0), (0.1, -1.0, 0.0), (0.1, 1.0, f64::MAX)] {
+        let uses = serde_json::json!({ digest('a').as_str(): used(cpu, wakes, time) });
+        let models = serde_json::json!({ digest('c').as_str(): -1e308 });
+        let (measured, damage) = of(uses, models, serde_json::json!(["machine", 1e308]));
+        assert_eq!(damage, None);
+        assert!(!measured.has_speed_of("machine"));
+        let demand = measured.model().of(&[(digest('a'), manifest.clone())]).unwrap();
+        assert!(demand.cpu.source().starts_with("assumed: "), "{demand:?}");
+        assert!(demand.cpu.amount.is_finite() && demand.cpu.peak.is_none(), "{demand:?}");
+    }
+    // What is no table of measurements at all is damage, and all is measured again.
+    for uses in [serde_json::json!(vec![0; 1_000_000]), serde_json::json!({ "x": {} })] {
+        let (measured, damage) = of(uses, serde_json::json!({}), serde_json::Value::Null);
+        let damage = damage.unwrap();
+        assert!(damage.contains("measured.json") && damage.contains("measured again"), "{damage}");
+        assert!(measured.model().uses.is_empty());
+    }
+}

@@ -22,6 +22,8 @@ use gleaner_base::{Exit, Failure};
 pub fn main() -> ExitCode {
     // Fails if it has a session already. A signal to that of its starter does not reach it.
     let _ = rustix::process::setsid();
+    // Each lambda takes several.
+    gleaner_base::raise_open_files();
     let ended = listener().and_then(serve::serve);
     if let Err(failure) = &ended {
         eprintln!("{failure}");

@@ -24,6 +24,7 @@ use crate::installation::Installation;
 use crate::process_group::{ProcessGroup, RunRecord};
 use crate::reconcile::{Action, KnownLambda, reconcile};
 use crate::restart_delay::RestartDelay;
+use crate::revision_check::CheckFailure;
 use crate::spec::{ClipSigning, LambdaSpec, RunSpec};
 use crate::summary::RunCounts;
 use crate::supervised::SupervisedLambda;
@@ -31,6 +32,8 @@ use crate::{POLL_INTERVAL, RunContext, clock_offset};
 
 /// Interval of the status without a change.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
+/// Pause before a lambda that this machine lacked something to load is loaded again.
+const SHORTAGE_PAUSE: Duration = Duration::from_secs(5);
 /// Size of samples that the ingress always expects: it is not started again for a lambda with
 /// images of usual cameras.
 const LARGEST: u64 = 8 << 20;
@@ -156,8 +159,14 @@ struct WantedState<'a> {
     spec: &'a SupervisionSpec,
     installation: Installation,
     desired: DesiredState,
-    /// Lambdas that cannot even be loaded, and the reasons.
-    unusable: Vec<(DesiredLambda, String)>,
+    unusable: Vec<UnusableLambda>,
+}
+
+/// A lambda that cannot even be loaded.
+struct UnusableLambda {
+    lambda: DesiredLambda,
+    failure: CheckFailure,
+    since: Instant,
 }
 
 impl WantedState<'_> {
@@ -238,19 +247,25 @@ impl WantedState<'_> {
             }
             !has_left
         });
-        self.unusable.retain(|(lambda, _)| self.desired.lambdas.contains(lambda));
+        self.unusable.retain(|UnusableLambda { lambda, failure, since }| {
+            let is_over = failure.is_shortage && since.elapsed() >= SHORTAGE_PAUSE;
+            !is_over && self.desired.lambdas.contains(lambda)
+        });
         let running = lambdas.iter().filter_map(|it| {
             let lambda = it.lambda.deployment.as_deref()?;
             Some(KnownLambda { lambda, is_leaving: it.is_leaving })
         });
         let unusable = self.unusable.iter();
-        let unusable = unusable.map(|(lambda, _)| KnownLambda { lambda, is_leaving: false });
+        let unusable = unusable.map(|it| KnownLambda { lambda: &it.lambda, is_leaving: false });
         let known: Vec<_> = running.chain(unusable).collect();
         for action in reconcile(&self.desired, &known) {
             match action {
                 Action::Start(lambda) => match self.load(&lambda) {
                     Ok(spec) => lambdas.push(SupervisedLambda::new(spec)),
-                    Err(reason) => self.unusable.push((lambda, reason)),
+                    Err(failure) => {
+                        let since = Instant::now();
+                        self.unusable.push(UnusableLambda { lambda, failure, since });
+                    }
                 },
                 Action::Stop(id) => {
                     let of_id = |it: &&mut SupervisedLambda| {
@@ -262,15 +277,20 @@ impl WantedState<'_> {
         }
     }
 
-    fn load(&self, wanted: &DesiredLambda) -> Result<LambdaSpec, String> {
+    fn load(&self, wanted: &DesiredLambda) -> Result<LambdaSpec, CheckFailure> {
+        let cannot = |error: &(dyn std::error::Error + 'static)| {
+            CheckFailure::of("it cannot be loaded", error)
+        };
         let build = BuildDir::of(&wanted.folder);
-        let manifest = Manifest::load(build.path()).map_err(|error| chain(&error))?;
+        let manifest = Manifest::load(build.path()).map_err(|error| cannot(&error))?;
         if manifest.lambda.name.as_str() != wanted.name {
-            return Err(format!("its name is `{}`", manifest.lambda.name));
+            let reason = format!("it cannot be loaded: its name is `{}`", manifest.lambda.name);
+            return Err(CheckFailure { reason, is_shortage: false });
         }
         let out = self.spec.records.join(&wanted.id);
-        fs::create_dir_all(&out)
-            .map_err(|error| format!("cannot create `{}`: {error}", out.display()))?;
+        fs::create_dir_all(&out).map_err(|error| {
+            CheckFailure::of(&format!("cannot create `{}`", out.display()), &error)
+        })?;
         Ok(LambdaSpec {
             folder: wanted.folder.clone(),
             manifest,
@@ -286,19 +306,24 @@ impl WantedState<'_> {
         let mut status = board.status();
         status.generation = self.desired.generation;
         status.lambdas = lambdas.iter().filter_map(SupervisedLambda::status_report).collect();
-        status.lambdas.extend(self.unusable.iter().map(|(lambda, reason)| LambdaStatus {
-            id: lambda.id.clone(),
-            name: lambda.name.clone(),
-            revision: lambda.revision.clone(),
-            attempt: lambda.attempt,
-            phase: LambdaPhase::Quarantined,
-            phase_s: 0.0,
-            pid: None,
-            restarts: 0,
-            last_end: Some(format!("it cannot be loaded: {reason}")),
-            live: None,
-            layers: Vec::new(),
-        }));
+        status.lambdas.extend(self.unusable.iter().map(
+            |UnusableLambda { lambda, failure, .. }| LambdaStatus {
+                id: lambda.id.clone(),
+                name: lambda.name.clone(),
+                revision: lambda.revision.clone(),
+                attempt: lambda.attempt,
+                phase: match failure.is_shortage {
+                    true => LambdaPhase::Waiting,
+                    false => LambdaPhase::Quarantined,
+                },
+                phase_s: 0.0,
+                pid: None,
+                restarts: 0,
+                last_end: Some(failure.reason.clone()),
+                live: None,
+                layers: Vec::new(),
+            },
+        ));
         let place = |lambda: &LambdaStatus| {
             self.desired.lambdas.iter().position(|it| it.id == lambda.id).unwrap_or(usize::MAX)
         };

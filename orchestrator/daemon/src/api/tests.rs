@@ -1,0 +1,53 @@
+//! Requests with odd paths, over a socket.
+
+use std::io::{Read, Write};
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+
+use gleaner_trust::SecretKey;
+
+use super::*;
+
+/// Sends a request; returns the whole answer.
+fn answer(socket: &Path, method: &str, path: &str) -> String {
+    let mut stream = UnixStream::connect(socket).unwrap();
+    let request = format!("{method} {path} HTTP/1.1\r\nhost: v\r\nconnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    answer
+}
+
+#[test]
+fn odd_ids_are_refused_and_leave_all_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let [state, run] = ["state", "run"].map(|name| folder.path().join(name));
+    let layout = VehicleFolders::create(&state, &run).unwrap();
+    let core = Arc::new(Core::open(&layout, gleaner_lambda::Vehicle::default()).unwrap());
+    let key = SecretKey::generate().unwrap().public();
+    let socket = layout.control_socket();
+    let name = "car".parse().unwrap();
+    let api = Api { core, layout, name, key, started: Instant::now() };
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
+    let _entered = runtime.enter();
+    let listener = tokio::net::UnixListener::bind(&socket).unwrap();
+    runtime.spawn(async move { axum::serve(listener, api.router()).await });
+    let before = std::fs::read(state.join("state.json")).unwrap();
+    let long = "a".repeat(300);
+    for id in ["", ".", "..", "%2e%2e", "%2e%2e%2fstate", "a%2fb", "%00", "%0a%1b[31m", &long] {
+        for (method, end) in [("DELETE", ""), ("POST", "/stop"), ("POST", "/rollback")] {
+            let answer = answer(&socket, method, &format!("/v1/deployments/{id}{end}"));
+            assert!(answer.starts_with("HTTP/1.1 400 "), "{id}: {answer}");
+            let (_, body) = answer.split_once("\r\n\r\n").unwrap();
+            let problem: Problem = serde_json::from_str(body).unwrap();
+            let is_named = problem.title.starts_with("there is no deployment `")
+                || problem.title == "there is nothing under this path";
+            assert!(is_named && problem.title.len() < 200, "{id}: {problem:?}");
+            assert!(!problem.title.contains(char::is_control), "{id}: {problem:?}");
+        }
+    }
+    // Bytes that are no text.
+    assert!(answer(&socket, "DELETE", "/v1/deployments/%ff").starts_with("HTTP/1.1 400 "));
+    assert_eq!(std::fs::read(state.join("state.json")).unwrap(), before);
+    assert!(["records", "clips", "spool"].iter().all(|name| state.join(name).is_dir()));
+}
