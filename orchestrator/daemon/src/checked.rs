@@ -6,7 +6,7 @@ use gleaner_lambda::manifest::{ConfigSet, ItemName, Sha256};
 use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::supervision::DesiredLambda;
 use gleaner_protocol::vehicle_api::{DeploymentStatus, GrantStatus, RevisionStatus};
-use gleaner_trust::{Deployment, Revision, Trusted, Verdict, Verifier};
+use gleaner_trust::{Deployment, Refusal, Revision, Trusted, Verifier};
 
 use crate::state::Deployed;
 use crate::store::RevisionStore;
@@ -16,7 +16,6 @@ pub(crate) struct SignedDeployment {
     pub(crate) deployment: Trusted<Deployment>,
     pub(crate) revision: Trusted<Revision>,
     pub(crate) fallback: Option<Trusted<Revision>>,
-    pub(crate) verdict: Verdict,
     /// Overrides of the config that its fallback knows.
     fallback_set: Vec<(String, String)>,
 }
@@ -47,8 +46,8 @@ impl SignedDeployment {
         let wish = deployment.payload();
         let fallback = wish.fallback.as_ref().map(|it| revision("fallback", it)).transpose()?;
         let revision = revision("revision", &wish.revision)?;
-        let verdict = verifier.admit(&deployment, &revision, fallback.as_ref()).map_err(refused)?;
-        Ok(Self { deployment, revision, fallback, verdict, fallback_set: Vec::new() })
+        verifier.admit(&deployment, &revision, fallback.as_ref()).map_err(refused)?;
+        Ok(Self { deployment, revision, fallback, fallback_set: Vec::new() })
     }
 
     pub(crate) fn id(&self) -> &ItemName {
@@ -116,11 +115,8 @@ impl SignedDeployment {
     }
 
     /// Returns its status, without that of its lambda.
-    pub(crate) fn status(&self, deployed: &Deployed) -> DeploymentStatus {
-        let stale = match &self.verdict {
-            Verdict::Current => None,
-            Verdict::Stale(refusal) => Some(refusal.to_string()),
-        };
+    /// `stale` is the reason if its end is over.
+    pub(crate) fn status(&self, deployed: &Deployed, stale: Option<Refusal>) -> DeploymentStatus {
         let grants = &self.deployment.payload().grants;
         DeploymentStatus {
             id: self.id().to_string(),
@@ -139,7 +135,7 @@ impl SignedDeployment {
             is_proven: deployed.is_proven,
             failed: deployed.failed.clone(),
             refused: None,
-            stale,
+            stale: stale.map(|refusal| refusal.to_string()),
             demand: Vec::new(),
             status: None,
         }

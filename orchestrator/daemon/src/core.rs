@@ -139,15 +139,18 @@ impl Core {
         read(&self.lock().trust)
     }
 
-    /// Moves the trusted time to that of the clock.
+    /// Moves the trusted time to that of the clock, and makes that durable if it is a minute or
+    /// more.
     pub(crate) fn observe_time(&self) {
         let mut inner = self.lock();
         inner.trust.observe_time();
         let state = inner.state.clone();
-        if *inner.trust.floors() != state.floors
-            && let Err(failure) = self.change(&mut inner, state)
-        {
-            self.event(EventKind::Warning, None, &failure.to_string());
+        if !inner.trust.floors().is_later(&state.floors, 60) {
+            return;
+        }
+        match self.change(&mut inner, state) {
+            Ok(()) => self.publish(&mut inner),
+            Err(failure) => self.event(EventKind::Warning, None, &failure.to_string()),
         }
     }
 

@@ -14,7 +14,7 @@ use crate::checked::SignedDeployment;
 use crate::compile;
 use crate::core::{Core, Inner};
 use crate::spools;
-use crate::state::Deployed;
+use crate::state::{Deployed, VehicleState};
 use crate::store::KnownFiles;
 
 /// Maximum number of deployments that wait for files.
@@ -30,6 +30,8 @@ impl Core {
         let reply = self.try_deploy(request);
         if let Err(failure) = &reply {
             self.event(EventKind::Refused, None, &failure.to_string());
+            // What has expired once stays expired, also if the clock is reset soon.
+            self.observe_time();
         }
         reply
     }
@@ -111,7 +113,7 @@ impl Core {
         let mut inner = self.lock();
         let mut state = inner.state.clone();
         let name = id.parse::<ItemName>().ok();
-        let Some(name) = name.filter(|name| state.deployments.remove(name).is_some()) else {
+        let Some(name) = name.filter(|name| state.remove(name, spools::KEPT)) else {
             return Err(inner.unknown(id));
         };
         self.change(&mut inner, state)?;
@@ -123,8 +125,9 @@ impl Core {
         self.event(EventKind::Stopped, Some(&name), "removed by a user");
         let running = inner.status.iter().flat_map(|status| &status.lambdas);
         let running = running.map(|lambda| lambda.id.clone());
-        let deployed = inner.state.deployments.keys().map(ItemName::to_string);
-        let kept = running.chain(deployed).chain([name.to_string()]).collect();
+        let VehicleState { deployments, removed, .. } = &inner.state;
+        let kept = deployments.keys().chain(removed).map(ItemName::to_string);
+        let kept = running.chain(kept).collect();
         drop(inner);
         for id in spools::collect(&self.spools, &kept) {
             let text = format!("the records of `{id}`, which was removed earlier, are removed");

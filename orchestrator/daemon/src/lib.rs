@@ -16,6 +16,7 @@ mod admission;
 mod api;
 mod bounded_process;
 mod checked;
+mod clock_jumps;
 mod compile;
 mod core;
 mod deploying;

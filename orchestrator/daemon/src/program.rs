@@ -20,6 +20,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
 
 use crate::api::Api;
+use crate::clock_jumps::ClockJumps;
 use crate::core::Core;
 use crate::layout::VehicleFolders;
 use crate::link::SupervisorLink;
@@ -46,8 +47,10 @@ struct Args {
     cgroup: Option<PathBuf>,
 }
 
-/// Interval at which the trusted time is moved, and the watchdog is reset.
-const TIME_INTERVAL: Duration = Duration::from_secs(3600);
+/// Interval at which the trusted time is moved; also at the end, after a jump of the clock and with
+/// a refusal. Each time is a write of the state.
+const TIME_INTERVAL: Duration = Duration::from_secs(600);
+/// Interval at which the watchdog is reset, and the clock is looked at.
 const WATCHDOG_INTERVAL: Duration = Duration::from_secs(3);
 
 /// The end of the program.
@@ -99,6 +102,7 @@ fn run(args: Args) -> Result<ProgramEnd, Failure> {
     let ended = runtime.block_on(serve(Arc::clone(&core), layout, spec, (name, key), metrics));
     // A stream that follows never ends by itself.
     runtime.shutdown_background();
+    core.observe_time();
     if matches!(ended, Ok(ProgramEnd::Stopped)) {
         core.event(EventKind::Stopped, None, "the orchestrator has stopped");
     }
@@ -188,6 +192,7 @@ async fn serve(
     let _ = sd_notify::notify(&[sd_notify::NotifyState::Ready]);
     let mut watchdog = tokio::time::interval(WATCHDOG_INTERVAL);
     let mut time = tokio::time::interval(TIME_INTERVAL);
+    let mut jumps = ClockJumps::new();
     loop {
         tokio::select! {
             _ = terminate.recv() => break,
@@ -198,6 +203,10 @@ async fn serve(
             }
             _ = watchdog.tick() => {
                 let _ = sd_notify::notify(&[sd_notify::NotifyState::Watchdog]);
+                if let Some(text) = jumps.look() {
+                    core.event(EventKind::Warning, None, &text);
+                    core.observe_time();
+                }
             }
             _ = time.tick() => core.observe_time(),
             ended = &mut link => {

@@ -17,7 +17,11 @@ impl Core {
             let lambdas = inner.status.iter().flat_map(|status| &status.lambdas);
             let lambda = lambdas.into_iter().find(|lambda| lambda.id == id.as_str()).cloned();
             let mut status = match inner.signed.get(id) {
-                Some(Ok(signed)) => signed.status(deployed),
+                Some(Ok(signed)) => {
+                    let verifier = inner.trust.verifier().ok();
+                    let stale = verifier.and_then(|it| it.expiry(signed.deployment.payload()));
+                    signed.status(deployed, stale)
+                }
                 Some(Err(reason)) => refused(id, deployed, reason),
                 None => refused(id, deployed, "it was not checked"),
             };

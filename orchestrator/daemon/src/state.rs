@@ -20,6 +20,24 @@ pub(crate) struct VehicleState {
     pub(crate) floors: Floors,
     /// The deployments, by id.
     pub(crate) deployments: BTreeMap<ItemName, Deployed>,
+    /// Deployments that were removed and whose records are kept, the newest last.
+    #[serde(default)]
+    pub(crate) removed: Vec<ItemName>,
+}
+
+impl VehicleState {
+    /// Removes a deployment; returns whether there was one. Records of earlier ones than the newest
+    /// `kept` that were removed are not kept any more.
+    pub(crate) fn remove(&mut self, id: &ItemName, kept: usize) -> bool {
+        let was_deployed = self.deployments.remove(id).is_some();
+        if was_deployed {
+            let deployments = &self.deployments;
+            self.removed.retain(|it| it != id && !deployments.contains_key(it));
+            self.removed.push(id.clone());
+            self.removed.drain(..self.removed.len().saturating_sub(kept));
+        }
+        was_deployed
+    }
 }
 
 /// An accepted deployment.

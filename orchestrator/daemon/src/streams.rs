@@ -28,7 +28,8 @@ const OPEN_MAX: usize = 32;
 /// Maximum of `last`.
 const LAST_MAX: usize = 10_000;
 
-/// Returns the lines of the streams `names` in the folder `spool`, those of several by time.
+/// Returns the lines of the streams `names` in the folder `spool`, those of several by boot and by
+/// the time since it.
 ///
 /// # Errors
 ///
@@ -46,6 +47,7 @@ pub(crate) fn lines(spool: &Path, names: &[&str], query: &StreamQuery) -> Result
             name: (*name).to_owned(),
             from: query.from,
             reader: None,
+            last: Default::default(),
         })
         .collect();
     readers.iter_mut().try_for_each(StreamReader::open)?;
@@ -68,6 +70,8 @@ struct StreamReader {
     name: String,
     from: Option<u64>,
     reader: Option<SpoolReader>,
+    /// Boot and time of its last record that has them.
+    last: (String, u64),
 }
 
 impl StreamReader {
@@ -113,11 +117,13 @@ fn send(
 ) {
     loop {
         let is_first = last.is_some();
-        let mut round = VecDeque::new();
+        let mut round = Vec::new();
         for stream in &mut readers {
             // A failure is shown by the next request.
             let _ = stream.open();
-            let StreamReader { name, reader: Some(reader), .. } = stream else { continue };
+            let StreamReader { name, reader: Some(reader), last: before, .. } = stream else {
+                continue;
+            };
             let mut kept = VecDeque::new();
             for item in reader.by_ref() {
                 kept.push_back(line(name, item));
@@ -129,9 +135,9 @@ fn send(
                     _ => {}
                 }
             }
-            round.extend(kept);
+            round.push(placed(kept, before));
         }
-        round.make_contiguous().sort_by_key(|line| line.time_ns);
+        let mut round = merged(round);
         if let Some(last) = last.take() {
             round.drain(..round.len().saturating_sub(last));
         }
@@ -148,6 +154,60 @@ fn send(
             std::thread::sleep(INTERVAL);
         }
     }
+}
+
+/// A line, with the boot and the time since it by which it is ordered.
+type PlacedLine = (StreamLine, (String, u64));
+
+/// Gives each line of a stream its place: its own boot and time or, for gaps and damage, those of
+/// the record before it. `last` is the place of the last record so far.
+fn placed(lines: VecDeque<StreamLine>, last: &mut (String, u64)) -> Vec<PlacedLine> {
+    // At the begin of a stream, a gap has the place of the record after it.
+    if last.0.is_empty()
+        && let Some(first) = lines.iter().find(|line| !line.boot.is_empty())
+    {
+        *last = (first.boot.clone(), first.boot_ns);
+    }
+    let place = |line: StreamLine| {
+        if !line.boot.is_empty() {
+            *last = (line.boot.clone(), line.boot_ns);
+        }
+        (line, last.clone())
+    };
+    lines.into_iter().map(place).collect()
+}
+
+/// Merges the lines of streams, each of which keeps its order: the time of day may have been set.
+fn merged(streams: Vec<Vec<PlacedLine>>) -> VecDeque<StreamLine> {
+    let boots = boots(&streams);
+    let mut streams: Vec<_> = streams.into_iter().map(|it| it.into_iter().peekable()).collect();
+    let mut lines = VecDeque::new();
+    loop {
+        let first = streams.iter_mut().enumerate().filter_map(|(index, stream)| {
+            let (_, (boot, since)) = stream.peek()?;
+            Some((boots.iter().position(|it| it == boot), *since, index))
+        });
+        let Some((.., index)) = first.min() else { return lines };
+        lines.extend(streams[index].next().map(|(line, _)| line));
+    }
+}
+
+/// Returns the boots of all streams in their order, as far as a stream has two of them.
+fn boots(streams: &[Vec<PlacedLine>]) -> Vec<String> {
+    let mut boots: Vec<String> = Vec::new();
+    for stream in streams {
+        let mut next = 0;
+        for (_, (boot, _)) in stream {
+            match boots.iter().position(|it| it == boot) {
+                Some(at) => next = at + 1,
+                None => {
+                    boots.insert(next, boot.clone());
+                    next += 1;
+                }
+            }
+        }
+    }
+    boots
 }
 
 fn send_piece(lines: &mut VecDeque<StreamLine>, to: &mpsc::Sender<Bytes>) -> bool {
@@ -203,5 +263,36 @@ fn content(stream: &str, record: &SpoolRecord) -> (String, Value) {
             (kind.to_owned(), content)
         }
         Err(error) => damaged(chain(&error)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stream(name: &str, lines: &[(&str, u64)]) -> VecDeque<StreamLine> {
+        let lines = lines.iter().enumerate().map(|(seq, (boot, boot_ns))| StreamLine {
+            stream: name.to_owned(),
+            seq: seq as u64,
+            time_ns: 0,
+            boot_ns: *boot_ns,
+            boot: (*boot).to_owned(),
+            kind: String::new(),
+            record: Value::Null,
+        });
+        lines.collect()
+    }
+
+    #[test]
+    fn streams_are_merged_by_boot_and_time_and_gaps_stay_in_their_place() {
+        let gap = ("", 0);
+        let events = [gap, ("a", 10), ("a", 30), gap, ("b", 5), ("c", 7)];
+        let orchestrator = [("a", 20), ("b", 1), ("b", 6), gap];
+        let lasts = &mut [Default::default(), Default::default()];
+        let streams = [stream("e", &events), stream("o", &orchestrator)];
+        let placed = streams.into_iter().zip(lasts).map(|(lines, last)| placed(lines, last));
+        let merged = merged(placed.collect());
+        let order: Vec<_> = merged.iter().map(|it| format!("{}{}", it.stream, it.seq)).collect();
+        assert_eq!(order, ["e0", "e1", "o0", "e2", "e3", "o1", "e4", "o2", "o3", "e5"]);
     }
 }

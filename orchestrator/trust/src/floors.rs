@@ -79,6 +79,11 @@ impl Floors {
         self.time = self.time.max(clock.min(self.most(built)));
     }
 
+    /// Returns whether the last trusted time is later than that of `other` by `seconds` at least.
+    pub fn is_later(&self, other: &Floors, seconds: u64) -> bool {
+        self.time >= other.time.saturating_add(seconds)
+    }
+
     /// Checks a deployment of `revision` again, and remembers both. `built` is as in
     /// [`now`](Self::now). The time of signing counts as the clock of [`observe`](Self::observe):
     /// a deployer can move the trusted time up to the anchor's year, and never the anchor.

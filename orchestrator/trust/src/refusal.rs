@@ -1,6 +1,6 @@
 //! The reasons why a vehicle does not accept signed data.
 
-use gleaner_base::{ByteSize, Exit, Explain};
+use gleaner_base::{ByteSize, Exit, Explain, UtcTime};
 use gleaner_lambda::manifest::{ItemName, LambdaName, Sha256};
 
 use crate::{Payload, TrustRoot};
@@ -37,7 +37,7 @@ pub enum Refusal {
     OldRoot { found: u64, floor: u64 },
     #[error("{what} was accepted before as {accepted}; with the same release, this is {found}")]
     SameRelease { what: String, accepted: Sha256, found: Sha256 },
-    #[error("the {what} expired at {expires}; now it is {now}")]
+    #[error("the {what} expired at {}; the trusted time is {}", date(*expires), date(*now))]
     Expired { what: &'static str, expires: u64, now: u64 },
     #[error("the deployment names {role} {wanted}; this is {}", or(found))]
     OtherRevision { role: &'static str, wanted: String, found: Option<Sha256> },
@@ -101,10 +101,11 @@ impl Explain for Refusal {
                 "sign the deployment again, with an older release as the fallback or without one"
             }
             Self::Expired { what: TrustRoot::NAME, .. } => {
-                "install the next trust root; if the time is wrong, set the vehicle's clock"
+                "install the next trust root; if the vehicle's clock is ahead, set it"
             }
             Self::Expired { .. } => {
-                "sign it again with a later end; if the time is wrong, set the vehicle's clock"
+                "sign it again with a later end; if the vehicle's clock is ahead, set it. The trusted \
+                 time stays at the latest that the clock has shown, within a year"
             }
             Self::MissingFile { .. }
             | Self::ExtraFile { .. }
@@ -119,6 +120,10 @@ impl Explain for Refusal {
     fn exit(&self) -> Exit {
         Exit::Denied
     }
+}
+
+fn date(seconds: u64) -> UtcTime {
+    UtcTime::of(i64::try_from(seconds).unwrap_or(i64::MAX))
 }
 
 fn keys(found: &[String]) -> String {

@@ -128,14 +128,20 @@ impl Verifier<'_> {
         }
         self.check_scope(&self.root.deployers, deployment, name)?;
         self.check_id(deployment)?;
-        let expired = self.expired(wish.expires, Deployment::NAME);
-        let expired = expired.or_else(|| self.expired(self.root.expires, TrustRoot::NAME));
+        let expired = self.expiry(wish);
         if self.floors.has_accepted(deployment) {
             return Ok(expired.map_or(Verdict::Current, Verdict::Stale));
         }
         self.floors.check_new(deployment, revision)?;
         fallback.map_or(Ok(()), |fallback| self.floors.check_fallback(fallback))?;
         expired.map_or(Ok(Verdict::Current), Err)
+    }
+
+    /// Returns the reason why the deployment would not be accepted as a new one now: it or the trust
+    /// root has expired.
+    pub fn expiry(&self, deployment: &Deployment) -> Option<Refusal> {
+        self.expired(deployment.expires, Deployment::NAME)
+            .or_else(|| self.expired(self.root.expires, TrustRoot::NAME))
     }
 
     fn expired(&self, expires: u64, what: &'static str) -> Option<Refusal> {

@@ -1,10 +1,7 @@
 //! Deployments over kills, restarts and failures.
 
-<<<<<<< HEAD
 use std::os::unix::fs::symlink;
-=======
 use std::process::Command;
->>>>>>> hA3
 
 use gleaner_protocol::supervision::{EventKind, LambdaPhase, VehicleEvent};
 use gleaner_tests::live::signal;
@@ -80,7 +77,6 @@ pub fn outlive() {
     assert!(after.iter().flatten().chain([&supervisor]).all(gone), "a process is left");
 }
 
-<<<<<<< HEAD
 pub fn upgraded() {
     let mut vehicle = TestVehicle::new();
     let home = vehicle.path("home");
@@ -116,7 +112,8 @@ pub fn upgraded() {
     let warnings = events(&vehicle, EventKind::Warning);
     assert!(warnings.iter().any(|it| it.contains("replaced by an upgrade")), "{warnings:?}");
     vehicle.stop();
-=======
+}
+
 pub fn reaped() {
     let mut vehicle = TestVehicle::new();
     vehicle.start();
@@ -136,7 +133,6 @@ pub fn reaped() {
         let other = vehicle.supervisor();
         (other != supervisor && vehicle.try_status()?.supervisor.is_some()).then_some(())
     });
->>>>>>> hA3
 }
 
 pub fn stopped() {
