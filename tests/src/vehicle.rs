@@ -65,6 +65,11 @@ impl TestVehicle {
         if config.is_file() {
             command.arg("--vehicle").arg(config);
         }
+        // Programs in it are used instead of those that were built.
+        let home = self.path("home");
+        if home.is_dir() {
+            command.env("GLEANER_HOME", home);
+        }
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log.expect("a log"));
         self.orchestrator = Some(command.spawn().expect("the orchestrator starts"));
         let status = self.until("the orchestrator to answer", |vehicle| vehicle.try_status());
