@@ -1,10 +1,10 @@
 //! Deployments over kills, restarts and failures.
 
-use gleaner_protocol::supervision::{EventKind, LambdaPhase, VehicleEvent};
+use gleaner_protocol::supervision::{EventKind, LambdaPhase};
 use gleaner_tests::live::signal;
 use gleaner_tests::vehicle::{TestVehicle, text};
 
-use super::{PythonLambda, files, ticker};
+use super::{PythonLambda, events, files, ticker};
 
 pub fn outlive() {
     let mut vehicle = TestVehicle::new();
@@ -199,12 +199,4 @@ pub fn at_once() {
     });
     vehicle.until_running(&names);
     assert!(events(vehicle, EventKind::Warning).is_empty(), "{}", vehicle.log());
-}
-
-/// The texts of the events of a kind.
-fn events(vehicle: &TestVehicle, kind: EventKind) -> Vec<String> {
-    let events = vehicle.records(None).into_iter().filter(|line| line.kind == "event");
-    let events = events
-        .map(|line| serde_json::from_value::<VehicleEvent>(line.record).expect("it is an event"));
-    events.filter(|event| event.event == kind).map(|event| event.text).collect()
 }
