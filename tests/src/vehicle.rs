@@ -15,8 +15,6 @@ use crate::{TempFolder, program};
 pub struct TestVehicle {
     folder: TempFolder,
     orchestrator: Option<Child>,
-    /// Folder of the programs; by default, that of the build.
-    pub home: Option<PathBuf>,
 }
 
 impl Default for TestVehicle {
@@ -28,7 +26,7 @@ impl Default for TestVehicle {
 impl TestVehicle {
     /// Makes keys and a trust root; nothing runs yet.
     pub fn new() -> Self {
-        let vehicle = Self { folder: TempFolder::new(), orchestrator: None, home: None };
+        let vehicle = Self { folder: TempFolder::new(), orchestrator: None };
         for key in ["root", "publisher", "deployer", "stranger"] {
             vehicle.succeeds(&["keys", "new", &vehicle.key(key)]);
         }
@@ -67,7 +65,11 @@ impl TestVehicle {
         if config.is_file() {
             command.arg("--vehicle").arg(config);
         }
-        command.envs(self.home.iter().map(|home| ("GLEANER_HOME", home)));
+        // Programs in it are used instead of those that were built.
+        let home = self.path("home");
+        if home.is_dir() {
+            command.env("GLEANER_HOME", home);
+        }
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log.expect("a log"));
         self.orchestrator = Some(command.spawn().expect("the orchestrator starts"));
         let status = self.until("the orchestrator to answer", |vehicle| vehicle.try_status());

@@ -1,7 +1,7 @@
 //! `gleaner status`: what runs on a vehicle.
 
 use gleaner_base::{Exit, Failure, format_duration, visible};
-use gleaner_protocol::supervision::{LambdaPhase, ProcessStatus};
+use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus};
 use gleaner_protocol::vehicle_api::{Capacity, DeploymentStatus, VehicleStatus};
 use gleaner_report::format::{grouped, size};
 
@@ -124,7 +124,8 @@ pub(super) fn reasons(deployment: &DeploymentStatus) -> Vec<String> {
         ("last end", last_end),
     ];
     let line = |(what, why): (&str, Option<&String>)| Some(format!("{what}: {}", visible(why?)));
-    all.into_iter().filter_map(line).collect()
+    let warnings = deployment.status.iter().flat_map(LambdaStatus::warnings).flatten();
+    all.into_iter().filter_map(line).chain(warnings).collect()
 }
 
 fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> String {

@@ -6,9 +6,7 @@ use std::sync::Arc;
 use gleaner_feed::LastingFeed;
 use gleaner_lambda::Decision;
 use gleaner_lambda::manifest::Manifest;
-use gleaner_protocol::{
-    DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus, ReceptionGaps,
-};
+use gleaner_protocol::{DurationStats, LinkLosses, LiveStatus, LiveTopic};
 use gleaner_transport::Clock;
 use gleaner_vitals::{IntervalDurations, usage};
 
@@ -70,35 +68,9 @@ impl StatusReporter {
         clock: Clock,
     ) -> Self {
         let now = clock.now();
-        let base = LiveStatus {
-            lambda: manifest.lambda.name.to_string(),
-            version: manifest.lambda.version.to_string(),
-            kind: manifest.lambda.kind,
-            out: out.to_string_lossy().into_owned().into(),
-            restarts,
-            up_s: 0.0,
-            wakes: 0,
-            triggers: 0,
-            faults: 0,
-            skipped: 0,
-            missed_ticks: 0,
-            log_lines: 0,
-            log_dropped: 0,
-            triggers_refused: 0,
-            backed_off: 0,
-            unwritten: 0,
-            unsent: 0,
-            wake_latency: None,
-            run_time: None,
-            decision_latency: None,
-            topics: Vec::new(),
-            network: NetworkStatus::default(),
-            reception_gaps: ReceptionGaps::default(),
-            recorder_link: None,
-            recording: None,
-            rss_bytes: 0,
-            cpu_s: 0.0,
-        };
+        let lambda = &manifest.lambda;
+        let (name, version) = (lambda.name.as_str(), lambda.version.to_string());
+        let base = LiveStatus { restarts, ..LiveStatus::new(name, &version, lambda.kind, out) };
         let wire = manifest
             .inputs
             .iter()

@@ -5,7 +5,6 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, PipeReader, Read, pipe};
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
@@ -28,6 +27,7 @@ use gleaner_protocol::ingress::{
     AddReader, IngressControl, PublishGrant, ReceptionStatus, TopicGrant,
 };
 use gleaner_protocol::{Handover, LiveStatus, Report, ResultItem};
+use gleaner_tests::TempFolder;
 use gleaner_transport::loopback::Loopback;
 use gleaner_transport::{
     Clock, Delivery, DiscoveredTopic, Guid, Health, LiveSource, PublishError, Publisher, Qos,
@@ -35,7 +35,7 @@ use gleaner_transport::{
 };
 use gleaner_vitals::Pulse;
 
-const PATIENCE: Duration = Duration::from_secs(60);
+pub const PATIENCE: Duration = Duration::from_secs(60);
 const NUMBERS: &str = "/numbers";
 const DECISIONS: &str = "/decisions";
 
@@ -139,7 +139,9 @@ fn add_topics(loopback: &Loopback) {
 }
 
 /// A run in a thread of its own.
-struct Running {
+pub struct Running {
+    /// Folder of the lambda.
+    _folder: TempFolder,
     loopback: Loopback,
     added: AddReader,
     /// The starter's end of the socket over which it passes connections.
@@ -157,9 +159,18 @@ struct Running {
 impl Running {
     /// Starts a run and waits until it is ready.
     fn start(announce: Option<&str>) -> Self {
+        let mut running = Self::begin(announce, None);
+        running.until(|report| matches!(report, Report::Ready).then_some(()));
+        running
+    }
+
+    /// Starts a run with this connection to a recorder, if any.
+    pub fn begin(announce: Option<&str>, recorder: Option<OwnedFd>) -> Self {
         let manifest = "[lambda]\nname = \"numbers\"\nversion = \"0.1.0\"\nkind = \"wasm\"\nentry = \"numbers.wasm\"\n\
                         [schedule]\nevent = \"numbers\"\n\
                         [[input]]\nname = \"numbers\"\ntopic = \"/numbers\"\ntype = \"test_msgs/msg/Number\"\n";
+        let lambda = TempFolder::new();
+        lambda.write("build/lambda.toml", manifest);
         let manifest = Manifest::parse(manifest, "lambda.toml").unwrap();
         let (loopback, clock, stop) =
             (Loopback::new(), Clock::from_time_of_day(), Arc::<AtomicBool>::default());
@@ -177,9 +188,9 @@ impl Running {
         let socket = control.add_reader(&added).unwrap();
         let (handover, starter) = UnixStream::pair().unwrap();
         let (stopped, announce) = (Arc::clone(&stop), announce.map(str::to_owned));
+        let folder = lambda.path().to_owned();
         let run = thread::spawn(move || {
             let pulse = Pulse::create().unwrap().0;
-            let folder = PathBuf::from("numbers");
             let run = LiveRun {
                 lambda: ConfiguredLambda {
                     build: BuildDir::of(&folder),
@@ -201,7 +212,7 @@ impl Running {
                 },
                 feed: Feed::connect(socket).unwrap(),
                 starter: Some(starter.into()),
-                recorder: None,
+                recorder,
                 results: ResultsPipe::over(File::from(OwnedFd::from(to_results)), pulse.clone()),
                 pulse,
                 close: &mut || Ok(Vec::new()),
@@ -213,11 +224,30 @@ impl Running {
             run.run(&mut load, File::from(OwnedFd::from(to_reports)))
         });
         let (ingress, reports) = (Some((control, ingress)), BufReader::new(reports));
-        let sent = 0;
-        let mut running =
-            Self { loopback, added, handover, ingress, clock, stop, reports, results, run, sent };
-        running.until(|report| matches!(report, Report::Ready).then_some(()));
-        running
+        Self {
+            _folder: lambda,
+            loopback,
+            added,
+            handover,
+            ingress,
+            clock,
+            stop,
+            reports,
+            results,
+            run,
+            sent: 0,
+        }
+    }
+
+    /// Waits for the end of the run, which ends by itself.
+    pub fn ended(self) -> Result<Exit, Failure> {
+        self.run.join().unwrap()
+    }
+
+    /// Passes a connection to another recorder.
+    pub fn pass_recorder(&self, socket: OwnedFd) {
+        let recorder = Some(socket);
+        Handover { recorder, ..Handover::default() }.try_send(&self.handover).unwrap();
     }
 
     /// Ends the ingress.
@@ -234,7 +264,7 @@ impl Running {
         self.live(|live| live.reception_gaps.count == count)
     }
 
-    fn live(&mut self, is_it: impl Fn(&LiveStatus) -> bool) -> LiveStatus {
+    pub fn live(&mut self, is_it: impl Fn(&LiveStatus) -> bool) -> LiveStatus {
         self.until(|report| match report {
             Report::Live(live) if is_it(&live) => Some(*live),
             _ => None,
@@ -255,7 +285,7 @@ impl Running {
         Handover { ingress, ..Handover::default() }.try_send(&self.handover).unwrap();
     }
 
-    fn publish(&mut self, value: i64) {
+    pub fn publish(&mut self, value: i64) {
         self.sent += 1;
         let (at_ns, seq) = (self.clock.now(), self.sent);
         let meta = SampleMeta {
@@ -284,14 +314,14 @@ impl Running {
     }
 
     /// Waits for the decision of the next wake with a trigger, and returns its score.
-    fn decided(&mut self) -> f64 {
+    pub fn decided(&mut self) -> f64 {
         self.until(|report| {
             if let Report::Decision(decision) = report { decision.triggers[0].score } else { None }
         })
     }
 
     /// Stops the run; returns its end, and its results.
-    fn stop(mut self) -> (Result<Exit, Failure>, Vec<ResultItem>) {
+    pub fn stop(mut self) -> (Result<Exit, Failure>, Vec<ResultItem>) {
         self.stop.store(true, Ordering::Relaxed);
         let ended = self.run.join().unwrap();
         let mut text = String::new();

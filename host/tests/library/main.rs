@@ -15,3 +15,4 @@ mod own_process;
 mod recorded_run;
 mod schedule;
 mod small_limits;
+mod unrecorded;

@@ -7,6 +7,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_lambda::{Manifest, Vehicle};
+use gleaner_protocol::LiveStatus;
 use gleaner_protocol::supervision::{
     DesiredState, EventKind, LambdaPhase, SupervisorStatus, VehicleEvent,
 };
@@ -264,18 +265,21 @@ impl Core {
                 continue;
             }
             let has_run = lambda.phase_s >= self.vehicle.deployments.probation.as_secs_f64();
-            match lambda.phase {
-                LambdaPhase::Running if has_run => {
-                    proven.insert(id);
-                }
-                LambdaPhase::Quarantined => {
+            let failure = match lambda.phase {
+                LambdaPhase::Quarantined => Some(lambda.last_end.clone().unwrap_or_default()),
+                _ => lambda.live.as_deref().and_then(LiveStatus::faulty),
+            };
+            match failure {
+                Some(reason) => {
                     let signed = inner.signed.get(&id).and_then(|signed| signed.as_ref().ok());
                     if !deployed.runs_fallback && signed.is_some_and(|it| it.fallback.is_some()) {
-                        let reason = lambda.last_end.clone().unwrap_or_default();
                         failed.push((id, reason));
                     }
                 }
-                _ => {}
+                None if lambda.phase == LambdaPhase::Running && has_run => {
+                    proven.insert(id);
+                }
+                None => {}
             }
         }
         drop(inner);

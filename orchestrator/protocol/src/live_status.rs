@@ -75,7 +75,55 @@ pub struct LiveStatus {
     pub cpu_s: f64,
 }
 
+/// Number of wakes from which on a lambda can be [faulty](LiveStatus::faulty): fewer are too few to
+/// judge it by.
+const FAULTY_WAKES_MIN: u64 = 20;
+/// Number of its wakes, of which one ended with a fault, in a lambda that is faulty: at least half.
+const FAULTY_ONE_OF: u64 = 2;
+
 impl LiveStatus {
+    /// Returns the status of a lambda before its first wake: all counts are 0.
+    pub fn new(lambda: &str, version: &str, kind: LambdaKind, out: PathBuf) -> LiveStatus {
+        LiveStatus {
+            lambda: lambda.to_owned(),
+            version: version.to_owned(),
+            kind,
+            out,
+            restarts: 0,
+            up_s: 0.0,
+            wakes: 0,
+            triggers: 0,
+            faults: 0,
+            skipped: 0,
+            missed_ticks: 0,
+            log_lines: 0,
+            log_dropped: 0,
+            triggers_refused: 0,
+            backed_off: 0,
+            unwritten: 0,
+            unsent: 0,
+            wake_latency: None,
+            run_time: None,
+            decision_latency: None,
+            topics: Vec::new(),
+            network: NetworkStatus::default(),
+            reception_gaps: ReceptionGaps::default(),
+            recorder_link: None,
+            recording: None,
+            rss_bytes: 0,
+            cpu_s: 0.0,
+        }
+    }
+
+    /// Returns a sentence with the numbers if the lambda is faulty: at least 20 of its wakes ended,
+    /// and at least half of them with a fault. Its probation has failed then.
+    pub fn faulty(&self) -> Option<String> {
+        let Self { wakes, faults, .. } = self;
+        let is_faulty =
+            *wakes >= FAULTY_WAKES_MIN && faults.saturating_mul(FAULTY_ONE_OF) >= *wakes;
+        is_faulty.then(|| format!("{faults} of its {wakes} wakes ended with a fault"))
+    }
+
     /// Adds the counts of `before`, an earlier process of the same lambda. Durations, rates and
     /// instantaneous values stay those of this process.
     #[must_use]
@@ -217,8 +265,8 @@ pub struct ReceptionGaps {
 /// Losses on the link from a lambda to the recorder.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LinkLosses {
-    /// Number of wakes without a trigger that were dropped because the recorder was too slow: clips
-    /// state how many they lack.
+    /// Number of wakes without a trigger that were dropped because the recorder was too slow, or
+    /// there was none for a minute: clips state how many they lack.
     pub wakes_dropped: u64,
     /// Number of triggers that could not be sent.
     pub triggers_lost: u64,
@@ -226,6 +274,9 @@ pub struct LinkLosses {
     /// one had joined, and wakes that were on their way.
     #[serde(default)]
     pub recorders_ended: u64,
+    /// Time since which there is no recorder, in s; 0 with one.
+    #[serde(default)]
+    pub absent_s: u64,
 }
 
 #[cfg(test)]
@@ -251,10 +302,6 @@ mod tests {
             qos_warnings: Vec::new(),
         };
         LiveStatus {
-            lambda: "hello".to_owned(),
-            version: "0.1.0".to_owned(),
-            kind: LambdaKind::Wasm,
-            out: PathBuf::from("out"),
             restarts: count as u32,
             up_s: count as f64,
             wakes: count,
@@ -274,8 +321,6 @@ mod tests {
                 p99_ns: count,
                 max_ns: count,
             }),
-            run_time: None,
-            decision_latency: None,
             topics: vec![topic],
             network: NetworkStatus {
                 socket_drops: count,
@@ -288,10 +333,11 @@ mod tests {
                 wakes_dropped: count,
                 triggers_lost: count,
                 recorders_ended: count,
+                absent_s: 0,
             }),
-            recording: None,
             rss_bytes: count,
             cpu_s: count as f64,
+            ..LiveStatus::new("hello", "0.1.0", LambdaKind::Wasm, PathBuf::from("out"))
         }
     }
 
@@ -309,5 +355,14 @@ mod tests {
         );
         let long = live(u64::MAX, None).after(&live(1, None));
         assert_eq!(long.wakes, u64::MAX);
+    }
+
+    #[test]
+    fn half_of_twenty_wakes_with_a_fault_make_a_lambda_faulty() {
+        let faulty = |wakes, faults| LiveStatus { wakes, faults, ..live(0, None) }.faulty();
+        assert_eq!([faulty(19, 19), faulty(20, 9), faulty(1000, 499)], [None, None, None]);
+        let text = faulty(20, 10).unwrap();
+        assert_eq!(text, "10 of its 20 wakes ended with a fault");
+        assert!(faulty(u64::MAX, u64::MAX).is_some());
     }
 }

@@ -62,19 +62,30 @@ impl ProcessGroup<'_> {
     fn show(&mut self, ChildOutput { from, piece }: ChildOutput) {
         let Self { lambdas, ingress, recorder, observer, .. } = self;
         let is_stderr = matches!(piece, OutputPiece::Stderr(_));
-        let recorder_start = recorder.as_ref().map(|recorder| recorder.start);
+        let recorder_start = recorder.as_ref().map(|recorder| recorder.restarts.start);
         // Processes that an earlier one left running may still write into its pipes.
         let mut current = match from {
             ChildId::Lambda { process } => lambdas.iter_mut().find(|it| it.runs_as(process)),
-            ChildId::Ingress { start } if start != ingress.start && !is_stderr => return,
+            ChildId::Ingress { start } if start != ingress.restarts.start && !is_stderr => return,
             ChildId::Recorder { start } if recorder_start != Some(start) && !is_stderr => return,
             _ => None,
         };
         match piece {
             OutputPiece::Bell => {}
             OutputPiece::Stderr(text) => {
-                if let Some(current) = &mut current {
-                    current.has_written(&text);
+                match (from, recorder) {
+                    (ChildId::Lambda { .. }, _) => {
+                        current.iter_mut().for_each(|current| current.has_written(&text));
+                    }
+                    (ChildId::Ingress { start }, _) if start == ingress.restarts.start => {
+                        ingress.restarts.has_written(&text);
+                    }
+                    (ChildId::Recorder { start }, Some(recorder))
+                        if start == recorder.restarts.start =>
+                    {
+                        recorder.restarts.has_written(&text);
+                    }
+                    _ => {}
                 }
                 observer.stderr(&text);
             }

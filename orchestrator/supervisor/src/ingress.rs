@@ -2,7 +2,6 @@
 
 use std::process::ExitStatus;
 use std::sync::mpsc::SyncSender;
-use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure, chain};
 use gleaner_protocol::Handover;
@@ -11,8 +10,8 @@ use gleaner_protocol::link::LinkError;
 
 use crate::observer::RunObserver;
 use crate::output::{ChildId, ChildOutput, PIPES};
-use crate::process::{ChildProcess, ended};
-use crate::restart_delay::RestartDelay;
+use crate::process::ChildProcess;
+use crate::service_restarts::{SILENCE, ServiceRestarts};
 use crate::{RunContext, arguments};
 
 /// The ingress of a run.
@@ -20,8 +19,8 @@ pub(crate) struct IngressProcess {
     pub(crate) child: ChildProcess,
     pub(crate) control: IngressControl,
     pub(crate) open_pipes: u8,
-    /// Set when it has joined the network, or opened the drive.
-    pub(crate) is_ready: bool,
+    /// It is ready when it has joined the network, or opened the drive.
+    pub(crate) restarts: ServiceRestarts,
     /// Set at the end of the drive.
     pub(crate) drive_ended: bool,
     /// Set after its final status.
@@ -31,23 +30,9 @@ pub(crate) struct IngressProcess {
     topics: Vec<IngressTopic>,
     /// Those of earlier ingresses, summed.
     earlier_topics: Vec<IngressTopic>,
-    /// Number of earlier ingresses.
-    pub(crate) start: u32,
-    started: Instant,
-    delay: RestartDelay,
-    /// Time at which the next ingress is to be started, as this one has ended.
-    pub(crate) again_at: Option<Instant>,
     /// Set when the processes that ran before it were connected to it.
     pub(crate) is_joined: bool,
-    /// The reason why it was killed.
-    killed: Option<String>,
-    /// Time of its last report.
-    heard: Instant,
 }
-
-/// Maximum time between two reports of an ingress or a recorder that is ready: each sends one each
-/// second.
-pub(crate) const SILENCE: Duration = Duration::from_secs(15);
 
 impl IngressProcess {
     /// Starts the ingress. `largest` is the largest sample of an input, in bytes.
@@ -76,12 +61,11 @@ impl IngressProcess {
         largest: u64,
         sender: &SyncSender<ChildOutput>,
     ) -> Result<Self, Failure> {
-        let (start, delay, earlier_topics) = match before {
-            // On a vehicle, lambdas that start wait for it: never for long.
-            None if context.spec.spool.is_some() => (0, RestartDelay::of_killed(), Vec::new()),
-            None => (0, RestartDelay::of_service(), Vec::new()),
-            Some(before) => (before.start + 1, before.delay.clone(), before.topics()),
+        let (restarts, earlier_topics) = match before {
+            None => (ServiceRestarts::first(), Vec::new()),
+            Some(before) => (before.restarts.next(), before.topics()),
         };
+        let start = restarts.start;
         let (control, ingress_end) = IngressControl::pair().map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot connect to the ingress", &error)
         })?;
@@ -97,19 +81,13 @@ impl IngressProcess {
             child,
             control,
             open_pipes: PIPES,
-            is_ready: false,
+            is_joined: start == 0,
+            restarts,
             drive_ended: false,
             has_ended: false,
             status: None,
             topics: Vec::new(),
             earlier_topics,
-            start,
-            started: Instant::now(),
-            delay,
-            again_at: None,
-            is_joined: start == 0,
-            killed: None,
-            heard: Instant::now(),
         })
     }
 
@@ -131,36 +109,27 @@ impl IngressProcess {
     pub(crate) fn kill_if_broken(&mut self, plays_drive: bool) {
         if let Some(why) = self.dead().filter(|_| !plays_drive) {
             self.kill(format!("the ingress does not receive: {why}"));
-        } else if self.is_ready && self.heard.elapsed() > SILENCE {
+        } else if self.restarts.is_ready && self.restarts.is_silent(SILENCE) {
             let seconds = SILENCE.as_secs();
             self.kill(format!("the ingress has not reported for {seconds} s"));
         }
     }
 
-    /// Kills it for this reason; another one is started.
+    /// Kills it for this reason, as it has failed; another one is started.
     pub(crate) fn kill(&mut self, why: String) {
-        if self.killed.is_none() {
-            self.killed = Some(why);
-            self.child.kill();
-        }
+        self.restarts.fails(why);
+        self.child.kill();
+    }
+
+    /// Kills it for this reason; one with other settings is started.
+    pub(crate) fn replace(&mut self, why: String) {
+        self.restarts.is_replaced(why);
+        self.child.kill();
     }
 
     /// Returns the reason for its end.
-    pub(crate) fn end_reason(&mut self, status: ExitStatus) -> String {
-        self.killed.take().unwrap_or_else(|| ended("the ingress", status))
-    }
-
-    /// Notes its end: another one is to be started after the returned delay.
-    pub(crate) fn ended(&mut self) -> Duration {
-        self.restart(self.started.elapsed())
-    }
-
-    /// Has another one started, after one that `ran` for this time; returns the delay.
-    pub(crate) fn restart(&mut self, ran: Duration) -> Duration {
-        let delay = self.delay.after(ran);
-        self.is_ready = false;
-        self.again_at = Some(Instant::now() + delay);
-        delay
+    pub(crate) fn end_reason(&self, status: ExitStatus) -> String {
+        self.restarts.reason("the ingress", status)
     }
 
     /// Returns the reason why it receives no further samples; of a drive, why it ended early.
@@ -170,9 +139,9 @@ impl IngressProcess {
 
     pub(crate) fn show(&mut self, report: IngressReport, observer: &mut dyn RunObserver) {
         observer.ingress(&report);
-        self.heard = Instant::now();
+        self.restarts.reports();
         match report {
-            IngressReport::Ready => self.is_ready = true,
+            IngressReport::Ready => self.restarts.is_ready = true,
             IngressReport::DriveEnded => self.drive_ended = true,
             // Only of `gleaner-ingress topics`.
             IngressReport::Topics { .. } => {}

@@ -8,12 +8,10 @@ use gleaner_base::Exit;
 use gleaner_protocol::{ExitRecord, Layer, LiveStatus, Phase};
 use rustix::process::Signal;
 
+use crate::last_error::LastError;
 use crate::output::PIPES;
 use crate::process::{ChildProcess, ended};
 use crate::spec::LambdaSpec;
-
-/// Maximum length of an error message that is kept, in bytes.
-const ERROR_MAX: usize = 2048;
 
 const SIGKILL: i32 = Signal::KILL.as_raw();
 const SIGTERM: i32 = Signal::TERM.as_raw();
@@ -33,7 +31,7 @@ pub(crate) struct LambdaProcess {
     pub(crate) has_lost_wake: bool,
     /// Set by the last report of the process.
     pub(crate) has_ended: bool,
-    /// Set when the ingress or the recorder ended before the process was ready.
+    /// Set when the ingress ended before the process was ready.
     pub(crate) has_lost_service: bool,
     pub(crate) last: Option<Box<LiveStatus>>,
     /// The layers around it, as tested.
@@ -41,7 +39,7 @@ pub(crate) struct LambdaProcess {
     /// Number of statuses since the end of the drive.
     pub(crate) after_drive: u32,
     /// The last error message on its standard error.
-    pub(crate) error: String,
+    pub(crate) error: LastError,
 }
 
 /// The end of a process.
@@ -71,24 +69,13 @@ impl LambdaProcess {
             last: None,
             layers: Vec::new(),
             after_drive: 0,
-            error: String::new(),
-        }
-    }
-
-    /// Keeps the last error message that it writes to standard error, without `prefix`.
-    pub(crate) fn has_written(&mut self, text: &[u8], prefix: &str) {
-        let text = String::from_utf8_lossy(text);
-        let text = text.strip_prefix(prefix).unwrap_or(&text).trim_end();
-        if text.starts_with("error: ") {
-            text.clone_into(&mut self.error);
-        } else if !self.error.is_empty() && self.error.len() < ERROR_MAX {
-            self.error = format!("{}\n{text}", self.error);
+            error: LastError::default(),
         }
     }
 
     /// Returns the reason for a start that failed, with its error message if it is not shown.
     pub(crate) fn not_started(&self, with_error: bool) -> String {
-        match self.error.strip_prefix("error: ").filter(|_| with_error) {
+        match self.error.message().filter(|_| with_error) {
             Some(error) => format!("it could not start: {error}"),
             None => "it could not start".to_owned(),
         }

@@ -5,7 +5,7 @@
 //! - `grants`, `arguments`: topics and arguments of the processes.
 //! - `process`, `output`, `lines`: one process, and the threads that read its output.
 //! - `ingress`, `recorder`, `inference`: the processes that all lambdas share, each over its
-//!   restarts.
+//!   restarts (`service_restarts`). `last_error`: the message that explains an end.
 //! - `supervised`: one lambda over all its restarts, with `summary`.
 //! - `process_group`: all processes, `group_end`: their end, and `drive`: a drive that the ingress
 //!   plays.
@@ -13,8 +13,8 @@
 //! - `installation`: the programs on the disk, which an upgrade replaces.
 //!
 //! A failed process is restarted alone, with a growing delay (`restart_delay`); the others receive
-//! a connection to the next one. A first start that fails ends the run, unless it is that of one
-//! lambda of several.
+//! a connection to the next one, and lambdas decide without a recorder meanwhile. A first start
+//! that fails ends the run, unless it is that of one lambda of several, or the run is a vehicle's.
 
 mod arguments;
 mod crash_loop;
@@ -28,16 +28,21 @@ mod inference;
 mod ingress;
 mod installation;
 mod lambda_process;
+mod last_error;
 pub mod lines;
 mod observer;
 mod output;
 mod process;
 mod process_group;
+#[cfg(test)]
+#[path = "../../../tests/src/random.rs"]
+mod random;
 mod reconcile;
 mod recorder;
 mod restart_delay;
 mod revision_check;
 pub mod service;
+mod service_restarts;
 mod spec;
 mod summary;
 mod supervised;

@@ -9,7 +9,6 @@ use std::process::ExitStatus;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, SyncSender};
 use std::thread;
-use std::time::{Duration, Instant};
 
 use gleaner_base::Failure;
 use gleaner_lambda::{BuildDir, Vehicle};
@@ -87,7 +86,10 @@ impl<'a> ProcessGroup<'a> {
             vehicle: vehicle.clone(),
             started: 0,
         };
-        if group.lambdas.iter().any(|supervised| !supervised.lambda.manifest.models.is_empty()) {
+        // On a vehicle, it is started with the first lambda that has any: that one waits if it fails.
+        let has_models =
+            |supervised: &SupervisedLambda| !supervised.lambda.manifest.models.is_empty();
+        if !context.spec.is_vehicle() && group.lambdas.iter().any(has_models) {
             group.start_inference()?;
         }
         Ok(group)
@@ -127,7 +129,7 @@ impl<'a> ProcessGroup<'a> {
         let mut drive = DriveProgress::of(self.context.spec);
         loop {
             self.poll(POLL_INTERVAL);
-            let is_late = self.ingress.start > 0 && time.is_over_before_ready();
+            let is_late = self.ingress.restarts.start > 0 && time.is_over_before_ready();
             if stop.load(Ordering::Relaxed) || time.is_over() || is_late {
                 return Ok(GroupEnd::Complete);
             }
@@ -168,7 +170,7 @@ impl<'a> ProcessGroup<'a> {
         for (index, status) in ended {
             self.lambdas[index].ended(status, false, self.observer, self.failures);
         }
-        if self.ingress.is_ready {
+        if self.ingress.restarts.is_ready {
             self.join_ingress();
             self.start_recorder()?;
             self.start_due()?;
@@ -178,7 +180,8 @@ impl<'a> ProcessGroup<'a> {
 
     /// Adds the counts of ingress and recorder to those of the run.
     pub(crate) fn add_counts(self) {
-        self.counts.add(self.ingress.status, self.recorder.and_then(|recorder| recorder.status));
+        let recorder = self.recorder.and_then(|recorder| recorder.last_status());
+        self.counts.add(self.ingress.status, recorder);
     }
 
     /// Starts all lambdas that are due.
@@ -190,19 +193,13 @@ impl<'a> ProcessGroup<'a> {
             let lambda = &self.lambdas[index].lambda;
             if let Some(recorder) = &mut self.recorder
                 && lambda.manifest.record.is_some()
+                && recorder.restarts.is_running()
+                && let Err(topic) = recorder.topics.add(lambda)
             {
-                if recorder.is_running()
-                    && let Err(topic) = recorder.topics.add(lambda)
-                {
-                    let name = lambda.name();
-                    recorder.replace(format!(
-                        "the recorder is started again, as `{name}` needs larger samples of \
-                         `{topic}`"
-                    ));
-                }
-                if !recorder.is_running() {
-                    continue;
-                }
+                let name = lambda.name();
+                recorder.replace(format!(
+                    "the recorder is started again, as `{name}` needs larger samples of `{topic}`"
+                ));
             }
             self.fit_ingress(index);
             if let Err(failure) = self.start_lambda(index) {
@@ -222,14 +219,14 @@ impl<'a> ProcessGroup<'a> {
         if largest > self.largest {
             self.largest = largest;
             let name = self.lambdas[index].lambda.name();
-            self.ingress.kill(format!(
+            self.ingress.replace(format!(
                 "the ingress is started again, as `{name}` reads samples of {largest} bytes"
             ));
         }
     }
 
-    /// Starts the process of a lambda. Does nothing if the ingress or the recorder has ended, which
-    /// the caller notices.
+    /// Starts the process of a lambda. Does nothing if the ingress has ended, which the caller
+    /// notices.
     fn start_lambda(&mut self, index: usize) -> Result<(), Failure> {
         if !self.lambdas[index].lambda.manifest.models.is_empty() {
             self.start_inference()?;
@@ -295,13 +292,13 @@ impl<'a> ProcessGroup<'a> {
     /// group if all others must end with it.
     fn ended_ingress(&mut self) -> Result<Option<GroupEnd>, Failure> {
         let Self { ingress, context, observer, .. } = self;
-        if let Some(at) = ingress.again_at {
-            if Instant::now() >= at {
+        if ingress.restarts.has_ended() {
+            if ingress.restarts.is_due() {
                 match ingress.start_again(context, self.largest, &self.sender) {
                     Ok(last) => self.counts.add(last, None),
                     Err(failure) => {
-                        let (reason, starts) = (failure.to_string(), ingress.start + 1);
-                        let delay = ingress.restart(Duration::ZERO);
+                        let (reason, delay) = ingress.restarts.not_started(&failure);
+                        let starts = ingress.restarts.start + 1;
                         observer.restarts(RestartedPart::Ingress, &reason, delay, starts);
                     }
                 }
@@ -313,14 +310,16 @@ impl<'a> ProcessGroup<'a> {
             ingress.kill_if_broken(plays_drive);
             return Ok(None);
         };
-        if plays_drive || (ingress.start == 0 && !ingress.is_ready) {
-            return Ok(Some(GroupEnd::of("the ingress", status, !ingress.is_ready)));
+        let is_ready = ingress.restarts.is_ready;
+        let is_first = ingress.restarts.start == 0 && !is_ready && !context.spec.is_vehicle();
+        if plays_drive || is_first {
+            return Ok(Some(GroupEnd::of("the ingress", status, !is_ready)));
         }
         self.drain(|group| group.ingress.open_pipes > 0);
         let Self { ingress, observer, .. } = self;
         let reason = ingress.end_reason(status);
         observer.ingress_gone();
-        let (delay, starts) = (ingress.ended(), ingress.start + 1);
+        let (delay, starts) = (ingress.restarts.ended(status), ingress.restarts.start + 1);
         observer.restarts(RestartedPart::Ingress, &reason, delay, starts);
         self.failures.add(reason, false);
         self.lambdas.iter_mut().for_each(SupervisedLambda::lost_service);
@@ -334,15 +333,16 @@ impl<'a> ProcessGroup<'a> {
         if std::mem::replace(&mut ingress.is_joined, true) {
             return;
         }
-        if let Some(recorder) = recorder.as_mut().filter(|recorder| recorder.is_running()) {
-            let reader = grants::recorder(context.spec, recorder.start);
+        if let Some(recorder) = recorder.as_mut().filter(|it| it.restarts.is_running()) {
+            let start = recorder.restarts.start;
+            let reader = grants::recorder(context.spec, start);
             let added = ingress.control.add_reader(&grants::again(reader, true));
             let Some(socket) = ingress.granted(added) else { return };
             let mut again = HashSet::new();
             for supervised in lambdas.iter() {
                 let topics = recorder.topics.take_again(&supervised.lambda, &mut again);
                 if !topics.is_empty() {
-                    let reader = grants::recorder_name(recorder.start);
+                    let reader = grants::recorder_name(start);
                     let add = AddTopics { reader, topics };
                     let added = ingress.control.add_topics(&add);
                     if ingress.granted(added).is_none() {
@@ -351,7 +351,7 @@ impl<'a> ProcessGroup<'a> {
                 }
             }
             let passed = Handover { ingress: Some(socket), ..Handover::default() };
-            if let Some(warning) = recorder.child.pass(&passed) {
+            if let Some(warning) = recorder.child().and_then(|child| child.pass(&passed)) {
                 observer.warn(&warning);
             }
         }
@@ -383,10 +383,10 @@ impl<'a> ProcessGroup<'a> {
             }
             self.lambdas.iter_mut().for_each(|lambda| lambda.kill_if_late(self.observer));
         }
-        if let Some(recorder) = self.recorder.as_mut().filter(|recorder| !recorder.has_ended()) {
-            // Fails if it has ended meanwhile, and then has nothing to complete.
-            let _ = recorder.control.stop();
-            let status = self.wait(|group| group.recorder.as_mut().map(|it| &mut it.child))?;
+        let recorder = self.recorder.as_mut();
+        if let Some(recorder) = recorder.filter(|recorder| !recorder.restarts.has_ended()) {
+            recorder.stop();
+            let status = self.wait(|group| group.recorder.as_mut()?.child())?;
             if let Some(status) = status.filter(|status| !status.success()) {
                 let reason = ended("the recorder", status);
                 self.observer.warn(&format!(
@@ -409,7 +409,7 @@ impl<'a> ProcessGroup<'a> {
         let _ = self.ingress.control.stop();
         let status = self.wait(|group| Some(&mut group.ingress.child))?;
         // If it is to be started again, its end is reported already.
-        let is_new = self.ingress.again_at.is_none();
+        let is_new = !self.ingress.restarts.has_ended();
         let is_failure = |status: &ExitStatus| is_requested && is_new && !status.success();
         if let Some(status) = status.filter(is_failure) {
             let reason = self.ingress.end_reason(status);

@@ -1,9 +1,10 @@
 //! The recorder of a run, over its restarts.
 
+use std::ffi::OsString;
 use std::os::fd::OwnedFd;
-use std::process::ExitStatus;
+use std::os::unix::net::UnixStream;
 use std::sync::mpsc::SyncSender;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::Limits;
@@ -13,108 +14,84 @@ use gleaner_protocol::link::{AddLambda, ControlClient, LinkError, RecorderReport
 
 use crate::grants::{self, RecordedTopics};
 use crate::group_end::GroupEnd;
-use crate::ingress::{IngressProcess, SILENCE};
+use crate::ingress::IngressProcess;
 use crate::observer::{RestartedPart, RunObserver};
 use crate::output::{ChildId, ChildOutput, PIPES};
-use crate::process::{ChildProcess, ended};
+use crate::process::ChildProcess;
 use crate::process_group::ProcessGroup;
-use crate::restart_delay::RestartDelay;
+use crate::service_restarts::{SILENCE, ServiceRestarts};
 use crate::spec::LambdaSpec;
 use crate::supervised::SupervisedLambda;
 use crate::{RunContext, arguments};
 
+/// Time for the recorder to become ready: on a busy machine, with a large preroll to allocate. The
+/// lambdas wait as long for it at their start.
+const READY: Duration = Duration::from_secs(120);
+
 /// The recorder of a run.
 pub(crate) struct RecorderProcess {
-    pub(crate) child: ChildProcess,
-    pub(crate) control: ControlClient,
+    /// `None` if it could not be started.
+    process: Option<(ChildProcess, ControlClient)>,
     pub(crate) open_pipes: u8,
-    /// Set when it accepts lambdas.
-    pub(crate) is_ready: bool,
+    /// It is ready when it accepts lambdas.
+    pub(crate) restarts: ServiceRestarts,
     /// Topics that lambdas record.
     pub(crate) topics: RecordedTopics,
     /// Its last status, with the counts of earlier recorders.
     pub(crate) status: Option<Box<RecorderStatus>>,
     /// The last status of the recorder before it.
     earlier: Option<Box<RecorderStatus>>,
-    /// Number of earlier recorders.
-    pub(crate) start: u32,
-    started: Instant,
-    delay: RestartDelay,
-    /// Time at which the next recorder is to be started, as this one has ended.
-    again_at: Option<Instant>,
-    /// The reason why it was requested to end, or killed.
-    requested: Option<String>,
-    /// Time of its last report.
-    heard: Instant,
 }
 
 impl RecorderProcess {
-    /// Starts the recorder of the lambdas `recorded`, after `before` has ended; returns `None` if
-    /// the ingress has ended, which the caller notices.
+    /// Starts the recorder of the lambdas `recorded`, after `before` has ended; also returns the
+    /// failure if it could not be started. `None` if the ingress has ended, which the caller
+    /// notices.
     pub(crate) fn start<'a>(
         before: Option<&Self>,
         context: &RunContext<'_>,
         recorded: impl Iterator<Item = &'a LambdaSpec> + Clone,
         ingress: &mut IngressProcess,
         sender: &SyncSender<ChildOutput>,
-    ) -> Result<Option<Self>, Failure> {
-        let start = before.map_or(0, |before| before.start + 1);
+    ) -> Option<(Self, Option<Failure>)> {
+        let restarts = before.map_or_else(ServiceRestarts::first, |it| it.restarts.next());
+        let start = restarts.start;
         let added = ingress.control.add_reader(&grants::recorder(context.spec, start));
-        let Some(ingress) = ingress.granted(added) else { return Ok(None) };
-        let (control, recorder_end) = ControlClient::pair().map_err(|error| {
-            Failure::caused_by(Exit::Internal, "cannot connect to the recorder", &error)
-        })?;
-        let key = context.spec.signing.as_ref().map(|signing| signing.key.try_clone());
-        let key = key.transpose().map_err(|error| {
-            Failure::caused_by(Exit::Internal, "cannot pass the key to the recorder", &error)
-        })?;
-        let connections = Handover {
-            control: Some(recorder_end),
-            ingress: Some(ingress),
-            key: key.map(OwnedFd::from),
-            ..Handover::default()
+        let ingress = ingress.granted(added)?;
+        let line = arguments::recorder(context.spec, recorded.clone(), context.offset_ns);
+        let started = start_process(context, start, line, ingress, sender);
+        let (process, failure) = match started {
+            Ok(process) => (Some(process), None),
+            Err(failure) => (None, Some(failure)),
         };
-        let child = ChildProcess::start(
-            &context.parts,
-            ("gleaner-recorder", ChildId::Recorder { start }, ""),
-            arguments::recorder(context.spec, recorded.clone(), context.offset_ns),
-            None,
-            connections,
-            sender,
-        )?;
-        Ok(Some(Self {
-            child,
-            control,
-            open_pipes: PIPES,
-            is_ready: false,
+        let recorder = Self {
+            open_pipes: if process.is_some() { PIPES } else { 0 },
+            process,
+            restarts,
             // The samples of the time without a recorder are in the memory of the ingress.
             topics: RecordedTopics::of(recorded, start > 0),
             status: None,
-            earlier: before.and_then(|before| before.status.clone()),
-            start,
-            started: Instant::now(),
-            delay: match before {
-                Some(before) => before.delay.clone(),
-                None if context.spec.spool.is_some() => RestartDelay::of_killed(),
-                None => RestartDelay::of_service(),
-            },
-            again_at: None,
-            requested: None,
-            heard: Instant::now(),
-        }))
+            earlier: before.and_then(Self::last_status),
+        };
+        Some((recorder, failure))
     }
 
-    /// Connects the process of a lambda to it; returns the lambda's end. `None` if the recorder or
-    /// the ingress has ended, which the caller notices.
+    /// Connects the process of a lambda to it; returns the lambda's end. If it does not run, that
+    /// is a closed connection: the lambda decides without a recorder until it is connected to the
+    /// next one. `None` if the ingress has ended, which the caller notices.
     pub(crate) fn connect(
         &mut self,
         lambda: &LambdaSpec,
         most: Limits,
         ingress: &mut IngressProcess,
     ) -> Result<Option<OwnedFd>, Failure> {
+        let Some((_, control)) = self.process.as_mut().filter(|_| self.restarts.is_running())
+        else {
+            return closed_connection().map(Some);
+        };
         let topics = self.topics.take_new(lambda);
         if !topics.is_empty() {
-            let reader = grants::recorder_name(self.start);
+            let reader = grants::recorder_name(self.restarts.start);
             let added = ingress.control.add_topics(&AddTopics { reader, topics });
             if ingress.granted(added).is_none() {
                 return Ok(None);
@@ -126,56 +103,50 @@ impl RecorderProcess {
             most,
             grants: self.topics.ids(lambda),
         };
-        match self.control.add(&add) {
+        match control.add(&add) {
             Ok(socket) => Ok(Some(socket)),
-            Err(LinkError::Gone { .. }) => Ok(None),
+            Err(LinkError::Gone { .. }) => closed_connection().map(Some),
             Err(error) => Err(Failure::because("cannot connect the processes of the run", &error)),
         }
     }
 
-    /// Returns whether it runs, and was not requested to end.
-    pub(crate) fn is_running(&self) -> bool {
-        self.again_at.is_none() && self.requested.is_none()
+    /// Returns its process; `None` if it could not be started.
+    pub(crate) fn child(&mut self) -> Option<&mut ChildProcess> {
+        self.process.as_mut().map(|(child, _)| child)
     }
 
-    /// Returns whether it has ended, and the end was handled.
-    pub(crate) fn has_ended(&self) -> bool {
-        self.again_at.is_some()
+    /// Returns its last status, or that of a recorder before it.
+    pub(crate) fn last_status(&self) -> Option<Box<RecorderStatus>> {
+        self.status.clone().or_else(|| self.earlier.clone())
     }
 
-    /// Returns whether the next one is to be started now.
-    pub(crate) fn is_due(&self) -> bool {
-        self.again_at.is_some_and(|at| Instant::now() >= at)
-    }
-
-    /// Requests it to complete its clips and to end, for this reason; another one is started.
-    pub(crate) fn replace(&mut self, why: String) {
-        // Fails if it has ended.
-        let _ = self.control.stop();
-        self.requested.get_or_insert(why);
-    }
-
-    /// Kills it, so that another one is started, if it does not report any more.
-    fn kill_if_silent(&mut self) {
-        if self.is_ready && self.heard.elapsed() > SILENCE {
-            let seconds = SILENCE.as_secs();
-            self.requested = Some(format!("the recorder has not reported for {seconds} s"));
-            self.child.kill();
+    /// Requests it to complete its clips and to end.
+    pub(crate) fn stop(&mut self) {
+        if let Some((_, control)) = &mut self.process {
+            // Fails if it has ended.
+            let _ = control.stop();
         }
     }
 
-    /// Handles its end: another one is to be started. Returns the reason, and the delay.
-    pub(crate) fn ended(&mut self, status: ExitStatus) -> (String, Duration) {
-        let reason = self.requested.take().unwrap_or_else(|| ended("the recorder", status));
-        (reason, self.restart(self.started.elapsed()))
+    /// As [`stop`](Self::stop), for this reason; another one is started.
+    pub(crate) fn replace(&mut self, why: String) {
+        self.stop();
+        self.restarts.is_replaced(why);
     }
 
-    /// Has another one started, after one that `ran` for this time; returns the delay.
-    fn restart(&mut self, ran: Duration) -> Duration {
-        let delay = self.delay.after(ran);
-        self.is_ready = false;
-        self.again_at = Some(Instant::now() + delay);
-        delay
+    /// Kills it, so that another one is started, if it does not become ready, or does not report
+    /// any more.
+    fn kill_if_silent(&mut self) {
+        let (most, what) = match self.restarts.is_ready {
+            true => (SILENCE, "has not reported for"),
+            false => (READY, "was not ready after"),
+        };
+        if self.restarts.is_silent(most) {
+            self.restarts.fails(format!("the recorder {what} {} s", most.as_secs()));
+            if let Some(child) = self.child() {
+                child.kill();
+            }
+        }
     }
 
     pub(crate) fn show(&mut self, report: RecorderReport, observer: &mut dyn RunObserver) {
@@ -185,9 +156,9 @@ impl RecorderProcess {
             report => report,
         };
         observer.recorder(&report);
-        self.heard = Instant::now();
+        self.restarts.reports();
         match report {
-            RecorderReport::Ready => self.is_ready = true,
+            RecorderReport::Ready => self.restarts.is_ready = true,
             RecorderReport::Status(status) | RecorderReport::Ended(status) => {
                 self.status = Some(status);
             }
@@ -203,6 +174,39 @@ impl RecorderProcess {
     }
 }
 
+/// Starts the program, with its connection to the ingress.
+fn start_process(
+    context: &RunContext<'_>,
+    start: u32,
+    line: Vec<OsString>,
+    ingress: OwnedFd,
+    sender: &SyncSender<ChildOutput>,
+) -> Result<(ChildProcess, ControlClient), Failure> {
+    let (control, recorder_end) = ControlClient::pair().map_err(|error| {
+        Failure::caused_by(Exit::Internal, "cannot connect to the recorder", &error)
+    })?;
+    let key = context.spec.signing.as_ref().map(|signing| signing.key.try_clone());
+    let key = key.transpose().map_err(|error| {
+        Failure::caused_by(Exit::Internal, "cannot pass the key to the recorder", &error)
+    })?;
+    let connections = Handover {
+        control: Some(recorder_end),
+        ingress: Some(ingress),
+        key: key.map(OwnedFd::from),
+        ..Handover::default()
+    };
+    let name = ("gleaner-recorder", ChildId::Recorder { start }, "");
+    let child = ChildProcess::start(&context.parts, name, line, None, connections, sender)?;
+    Ok((child, control))
+}
+
+/// Returns a lambda's end of a connection to a recorder that has ended.
+fn closed_connection() -> Result<OwnedFd, Failure> {
+    let pair = UnixStream::pair();
+    pair.map(|(lambda_end, _)| lambda_end.into())
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot create a socket", &error))
+}
+
 impl ProcessGroup<'_> {
     /// Starts the recorder if it is needed and does not run, and connects the processes that run.
     pub(crate) fn start_recorder(&mut self) -> Result<(), Failure> {
@@ -212,7 +216,7 @@ impl ProcessGroup<'_> {
         };
         let is_due = match &self.recorder {
             None => self.lambdas.iter().any(|it| is_recorded(&it)),
-            Some(recorder) => recorder.is_due(),
+            Some(recorder) => recorder.restarts.is_due(),
         };
         if !is_due {
             return Ok(());
@@ -221,18 +225,21 @@ impl ProcessGroup<'_> {
         let Self { context, ingress, sender, .. } = self;
         let before = self.recorder.as_ref();
         let started = RecorderProcess::start(before, context, recorded, ingress, sender);
-        let next = match (started, &mut self.recorder) {
-            (Ok(None), _) => return Ok(()),
-            (Ok(Some(next)), _) => next,
-            (Err(failure), None) => return Err(failure),
-            (Err(failure), Some(before)) => {
-                let (reason, delay) = (failure.to_string(), before.restart(Duration::ZERO));
-                let starts = before.start + 1;
+        let Some((mut next, failure)) = started else { return Ok(()) };
+        let is_first = next.restarts.start == 0;
+        match failure {
+            // On a vehicle, lambdas run on without it.
+            Some(failure) if is_first && !spec.is_vehicle() => return Err(failure),
+            Some(failure) => {
+                let (reason, delay) = next.restarts.not_started(&failure);
+                let starts = next.restarts.start + 1;
                 self.observer.restarts(RestartedPart::Recorder, &reason, delay, starts);
+                self.recorder = Some(next);
                 return Ok(());
             }
-        };
-        if next.start == 0 {
+            None => {}
+        }
+        if is_first {
             next.topics.mixed().for_each(|topic| {
                 self.observer.warn(&format!(
                     "lambdas request `{topic}` with different `qos`: clips have the samples of the \
@@ -256,30 +263,27 @@ impl ProcessGroup<'_> {
     /// all others must end with it.
     pub(crate) fn ended_recorder(&mut self) -> Result<Option<GroupEnd>, Failure> {
         let Some(recorder) = &mut self.recorder else { return Ok(None) };
-        if recorder.has_ended() {
+        if recorder.restarts.has_ended() {
             return Ok(None);
         }
-        let Some(status) = recorder.child.status()? else {
+        let Some(child) = recorder.child() else { return Ok(None) };
+        let Some(status) = child.status()? else {
             recorder.kill_if_silent();
             return Ok(None);
         };
-        let has_started = recorder.is_ready || recorder.start > 0;
+        let has_started = recorder.restarts.is_ready || recorder.restarts.start > 0;
         // Its ingress may have ended before it was ready.
-        let has_lost_ingress = self.ingress.start > 0 || self.ingress.again_at.is_some();
-        // On a vehicle, lambdas that record nothing run on without it.
-        let is_vehicle = self.context.spec.spool.is_some();
-        let is_first = !has_started && !has_lost_ingress && !is_vehicle;
+        let has_lost_ingress = self.ingress.restarts.start > 0 || self.ingress.restarts.has_ended();
+        let is_first = !has_started && !has_lost_ingress && !self.context.spec.is_vehicle();
         if is_first || !self.context.spec.drives.is_empty() {
             return Ok(Some(GroupEnd::of("the recorder", status, is_first)));
         }
         self.drain(|group| group.recorder.as_ref().is_some_and(|it| it.open_pipes > 0));
         let Some(recorder) = &mut self.recorder else { return Ok(None) };
-        let (reason, delay) = recorder.ended(status);
-        let starts = recorder.start + 1;
+        let reason = recorder.restarts.reason("the recorder", status);
+        let (delay, starts) = (recorder.restarts.ended(status), recorder.restarts.start + 1);
         self.observer.restarts(RestartedPart::Recorder, &reason, delay, starts);
         self.failures.add(reason, false);
-        let recorded = self.lambdas.iter_mut().filter(|it| it.lambda.manifest.record.is_some());
-        recorded.for_each(SupervisedLambda::lost_service);
         Ok(None)
     }
 }

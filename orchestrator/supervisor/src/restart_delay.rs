@@ -1,7 +1,11 @@
 //! Delays before restarts.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
+use std::os::unix::process::ExitStatusExt;
+use std::process::ExitStatus;
 use std::time::Duration;
+
+use rustix::process::Signal;
 
 /// Delay before the first restart; it doubles with each further one.
 const DELAY: Duration = Duration::from_secs(1);
@@ -43,11 +47,37 @@ impl RestartDelay {
     }
 }
 
+/// The delays of a process that all lambdas share: after its own faults, and after kills by other
+/// programs.
+#[derive(Clone, Debug)]
+pub(crate) struct ServiceDelays {
+    faults: RestartDelay,
+    kills: RestartDelay,
+}
+
+impl ServiceDelays {
+    pub(crate) fn new() -> Self {
+        Self { faults: RestartDelay::of_service(), kills: RestartDelay::of_killed() }
+    }
+
+    /// Returns the delay after an end, before which it `ran` for this time.
+    pub(crate) fn after(&mut self, ran: Duration, is_killed: bool) -> Duration {
+        if is_killed { self.kills.after(ran) } else { jittered(self.faults.after(ran)) }
+    }
+}
+
+/// Returns whether another program has ended a process: by a signal that no fault of its own sends.
+pub(crate) fn was_killed(status: ExitStatus) -> bool {
+    let signal = status.signal().and_then(Signal::from_named_raw);
+    matches!(signal, Some(Signal::KILL | Signal::TERM | Signal::INT | Signal::HUP))
+}
+
 /// Returns the delay, up to a fifth shorter: processes that fail together, such as those of several
 /// lambdas without a resource, do not start together again.
 pub(crate) fn jittered(delay: Duration) -> Duration {
     let random = RandomState::new().build_hasher().finish();
-    delay - delay.mul_f64(0.2 * (random as f64 / u64::MAX as f64))
+    let shorter = delay.mul_f64(0.2 * (random as f64 / u64::MAX as f64)).as_millis();
+    delay - Duration::from_millis(u64::try_from(shorter).unwrap_or(0))
 }
 
 #[cfg(test)]

@@ -51,6 +51,13 @@ pub struct RunSpec {
     pub cgroup: Option<PathBuf>,
 }
 
+impl RunSpec {
+    /// Returns whether it is the endless run of a vehicle.
+    pub(crate) fn is_vehicle(&self) -> bool {
+        self.spool.is_some()
+    }
+}
+
 /// The signature of the clips of a run.
 #[derive(Clone, Debug)]
 pub struct ClipSigning {

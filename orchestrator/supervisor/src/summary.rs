@@ -145,19 +145,15 @@ fn unwritten(summary: &Path) -> u64 {
 mod tests {
     use std::fs;
 
+    use gleaner_lambda::manifest::LambdaKind;
     use gleaner_protocol::RecordingCounts;
     use gleaner_protocol::ingress::Health;
 
     use super::*;
 
     fn live(wakes: u64, unwritten: u64) -> LiveStatus {
-        let text = format!(
-            r#"{{"lambda":"l","version":"1.0.0","kind":"wasm","out":"o","restarts":0,"up_s":1.0,"wakes":{wakes},"triggers":0,
-            "faults":0,"skipped":0,"missed_ticks":0,"log_lines":0,"log_dropped":0,"triggers_refused":0,"backed_off":0,
-            "unwritten":{unwritten},"topics":[],"network":{{"domain":0,"participants":0,"buffer_requested":0,"buffer_granted":0,
-            "socket_drops":0}},"rss_bytes":0,"cpu_s":0.0}}"#
-        );
-        serde_json::from_str(&text).unwrap()
+        let status = LiveStatus::new("l", "1.0.0", LambdaKind::Wasm, "o".into());
+        LiveStatus { wakes, unwritten, ..status }
     }
 
     fn recorder(disk_suppressed: u64) -> Option<Box<RecorderStatus>> {

@@ -42,6 +42,10 @@ pub(crate) struct SupervisedLambda {
     has_news: bool,
     /// The reason of the last end of its process that was not requested.
     last_end: Option<String>,
+    /// Set once the observer was warned of its faults.
+    has_warned_of_faults: bool,
+    /// Set while it is known to have no recorder.
+    is_unrecorded: bool,
     delay: RestartDelay,
     /// Delay after kills by other programs.
     kills: RestartDelay,
@@ -79,6 +83,8 @@ impl SupervisedLambda {
             crashes: CrashLoop::default(),
             has_news: false,
             last_end: None,
+            has_warned_of_faults: false,
+            is_unrecorded: false,
             delay: RestartDelay::new(),
             kills: RestartDelay::of_killed(),
             earlier: EarlierCounts::default(),
@@ -184,7 +190,7 @@ impl SupervisedLambda {
     pub(crate) fn has_written(&mut self, text: &[u8]) {
         let prefix = self.lambda.prefix.clone();
         if let Some(process) = self.process() {
-            process.has_written(text, &prefix);
+            process.error.add(text, &prefix);
         }
     }
 
@@ -244,8 +250,8 @@ impl SupervisedLambda {
         }
     }
 
-    /// Notes that the ingress or its recorder has ended: a process that was not ready may end as
-    /// well, and is started again.
+    /// Notes that the ingress has ended: a process that was not ready may end as well, and is
+    /// started again.
     pub(crate) fn lost_service(&mut self) {
         if let Some(process) = self.process() {
             process.has_lost_service |= !process.is_ready;
@@ -301,6 +307,7 @@ impl SupervisedLambda {
                 process.has_faulted |= live.faults > 0;
                 process.after_drive += u32::from(drive_ended);
                 process.last = Some(live);
+                self.warn(observer);
             }
             Report::Ended(live) => {
                 process.has_ended = true;
@@ -308,6 +315,20 @@ impl SupervisedLambda {
                 process.last = Some(live);
             }
             _ => {}
+        }
+    }
+
+    /// Warns once that a deployed lambda is faulty, and once for each time without a recorder.
+    fn warn(&mut self, observer: &mut dyn RunObserver) {
+        let Some(status) = self.status_report() else { return };
+        let [faults, unrecorded] = status.warnings();
+        let is_new = [!self.has_warned_of_faults, !self.is_unrecorded];
+        self.has_warned_of_faults |= faults.is_some();
+        self.is_unrecorded = unrecorded.is_some();
+        for (text, is_new) in [faults, unrecorded].into_iter().zip(is_new) {
+            if let Some(text) = text.filter(|_| is_new) {
+                observer.warn(&format!("{}{text}", self.lambda.prefix));
+            }
         }
     }
 

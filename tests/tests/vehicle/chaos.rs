@@ -9,14 +9,13 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
-use gleaner_lambda::Clip;
 use gleaner_protocol::vehicle_api::{StreamLine, VehicleStatus};
 use gleaner_tests::live::{no_player, play, signal};
 use gleaner_tests::random::XorShift64;
 use gleaner_tests::vehicle::{TestVehicle, text};
 use gleaner_tests::{LambdaCopy, times};
 
-use super::ticker;
+use super::{clips, recording, ticker};
 
 /// Victims, by a part of their command line; that of a shim also names its runtime.
 const VICTIMS: [&str; 8] = [
@@ -134,15 +133,6 @@ pub fn killed_at_random() {
     check_clips(&vehicle, &status, &listed);
 }
 
-/// Returns a ticker that records what the player sends, a second around each tick.
-fn recording(language: &str, name: &str) -> LambdaCopy {
-    LambdaCopy::changed_and_named(&format!("tests/lambdas/ticker/{language}"), name, |manifest| {
-        manifest.replace("/imu/data", "/imu/synthetic")
-            + "[record]\ntopics = [\"/imu/synthetic\", \"/camera/synthetic/image_raw\"]\n\
-               preroll = \"1s\"\npostroll = \"1s\"\nmax_length = \"5s\"\n"
-    })
-}
-
 /// Returns the example with a model, on the images of the player.
 fn detector() -> LambdaCopy {
     LambdaCopy::changed_and_named("examples/yolo-detector/rust", "detector", |manifest| {
@@ -167,15 +157,6 @@ fn runs(vehicle: &TestVehicle) -> bool {
 
 fn restarts(vehicle: &TestVehicle) -> [Option<u32>; 4] {
     IDS.map(|id| vehicle.deployment(id).status.map(|status| status.restarts))
-}
-
-/// Returns the listed clips.
-fn clips(vehicle: &TestVehicle) -> Vec<Clip> {
-    let text = std::fs::read_to_string(vehicle.path("state/clips/clips.jsonl"));
-    let text = text.unwrap_or_default();
-    // The last line may be in the making.
-    let lines = text.split_inclusive('\n').filter(|line| line.ends_with('\n'));
-    lines.map(|line| serde_json::from_str(line).expect("a line is a clip")).collect()
 }
 
 /// Checks that the clips that were listed before are still there, none is listed twice, and the

@@ -3,12 +3,12 @@
 use std::os::unix::fs::symlink;
 use std::process::Command;
 
-use gleaner_protocol::supervision::{EventKind, LambdaPhase, VehicleEvent};
+use gleaner_protocol::supervision::{EventKind, LambdaPhase};
 use gleaner_tests::live::signal;
 use gleaner_tests::program;
 use gleaner_tests::vehicle::{TestVehicle, text};
 
-use super::{PythonLambda, files, ticker};
+use super::{PythonLambda, events, files, ticker};
 
 /// Returns the limits of open files of a process: the soft and the hard one.
 fn open_files(pid: u32) -> [u64; 2] {
@@ -87,7 +87,6 @@ pub fn upgraded() {
     }
     let supervisor = home.join("gleaner-supervisor");
     std::fs::copy(program("gleaner-supervisor"), &supervisor).expect("a copy");
-    vehicle.home = Some(home.clone());
     vehicle.start();
     let lambda = ticker("rust", "first");
     let deployed = vehicle.deploy(lambda.path(), &[]);
@@ -280,12 +279,4 @@ pub fn at_once() {
     });
     vehicle.until_running(&names);
     assert!(events(vehicle, EventKind::Warning).is_empty(), "{}", vehicle.log());
-}
-
-/// The texts of the events of a kind.
-fn events(vehicle: &TestVehicle, kind: EventKind) -> Vec<String> {
-    let events = vehicle.records(None).into_iter().filter(|line| line.kind == "event");
-    let events = events
-        .map(|line| serde_json::from_value::<VehicleEvent>(line.record).expect("it is an event"));
-    events.filter(|event| event.event == kind).map(|event| event.text).collect()
 }

@@ -2,6 +2,8 @@
 
 mod chaos;
 mod deployments;
+mod faults;
+mod recorder;
 mod refused;
 mod top;
 mod wheels;
@@ -9,19 +11,25 @@ mod wheels;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use gleaner_lambda::Clip;
+use gleaner_protocol::supervision::{EventKind, VehicleEvent};
+use gleaner_tests::vehicle::TestVehicle;
 use gleaner_tests::{LambdaCopy, TempFolder, namespace};
 use libtest_mimic::{Arguments, Trial};
 
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 19] = [
+const CASES: [Case; 22] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_supervisor_that_ends_after_sighup_is_no_zombie", deployments::reaped),
     ("after_an_upgrade_old_and_new_programs_do_not_mix", deployments::upgraded),
     ("a_stopped_deployment_stays_stopped", deployments::stopped),
     ("a_failed_revision_is_replaced_by_its_fallback_for_good", deployments::fallback),
     ("a_lambda_without_a_fallback_is_quarantined_alone", deployments::quarantined),
+    ("a_revision_whose_wakes_fault_fails_its_probation", faults::probation),
+    ("a_proven_lambda_whose_wakes_fault_runs_on_with_a_warning", faults::proven),
+    ("a_lambda_decides_without_a_recorder_and_joins_the_next_one", recorder::missing),
     ("deployments_at_once_do_not_disturb_each_other", deployments::at_once),
     ("what_is_not_signed_for_this_vehicle_is_refused", refused::signatures),
     ("a_file_that_was_changed_later_does_not_start", refused::changed_file),
@@ -60,6 +68,24 @@ fn main() -> ExitCode {
 /// A lambda that triggers an event at each tick, ten a second.
 fn ticker(language: &str, name: &str) -> LambdaCopy {
     LambdaCopy::named(&format!("tests/lambdas/ticker/{language}"), name)
+}
+
+/// Returns a ticker that records what the player sends, a second around each tick.
+fn recording(language: &str, name: &str) -> LambdaCopy {
+    LambdaCopy::changed_and_named(&format!("tests/lambdas/ticker/{language}"), name, |manifest| {
+        manifest.replace("/imu/data", "/imu/synthetic")
+            + "[record]\ntopics = [\"/imu/synthetic\", \"/camera/synthetic/image_raw\"]\n\
+               preroll = \"1s\"\npostroll = \"1s\"\nmax_length = \"5s\"\n"
+    })
+}
+
+/// Returns the listed clips.
+fn clips(vehicle: &TestVehicle) -> Vec<Clip> {
+    let text = std::fs::read_to_string(vehicle.path("state/clips/clips.jsonl"));
+    let text = text.unwrap_or_default();
+    // The last line may be in the making.
+    let lines = text.split_inclusive('\n').filter(|line| line.ends_with('\n'));
+    lines.map(|line| serde_json::from_str(line).expect("a line is a clip")).collect()
 }
 
 /// The constructor of a lambda that needs nothing.
@@ -105,6 +131,14 @@ impl PythonLambda {
     fn path(&self) -> &Path {
         self.folder.path()
     }
+}
+
+/// The texts of the events of a kind.
+fn events(vehicle: &TestVehicle, kind: EventKind) -> Vec<String> {
+    let events = vehicle.records(None).into_iter().filter(|line| line.kind == "event");
+    let events = events
+        .map(|line| serde_json::from_value::<VehicleEvent>(line.record).expect("it is an event"));
+    events.filter(|event| event.event == kind).map(|event| event.text).collect()
 }
 
 /// The files below `folder`, sorted.

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use gleaner_base::{ByteSize, Failure};
 use gleaner_lambda::manifest::{ItemName, LambdaKind, Sha256};
 use gleaner_lambda::{Manifest, Vehicle};
+use gleaner_protocol::LiveStatus;
 use gleaner_protocol::inference::{InferenceStatus, LoadedModel, ModelState};
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus, SupervisorStatus};
-use gleaner_protocol::{LiveStatus, NetworkStatus, ReceptionGaps};
 
 use super::demand::DemandModel;
 use super::measured::MeasuredUse;
@@ -223,35 +223,8 @@ fn a_deployment_asks_for_the_larger_of_its_revision_and_its_fallback() {
 
 /// A status with one lambda, which has run for `up_s`.
 fn status(up_s: f64, cpu_s: f64, wakes: u64, restarts: u32, runs: u64) -> SupervisorStatus {
-    let live = LiveStatus {
-        lambda: "test".to_owned(),
-        version: "0.1.0".to_owned(),
-        kind: LambdaKind::Wasm,
-        out: "out".into(),
-        restarts,
-        up_s,
-        wakes,
-        triggers: 0,
-        faults: 0,
-        skipped: 0,
-        missed_ticks: 0,
-        log_lines: 0,
-        log_dropped: 0,
-        triggers_refused: 0,
-        backed_off: 0,
-        unwritten: 0,
-        unsent: 0,
-        wake_latency: None,
-        run_time: None,
-        decision_latency: None,
-        topics: Vec::new(),
-        network: NetworkStatus::default(),
-        reception_gaps: ReceptionGaps::default(),
-        recorder_link: None,
-        recording: None,
-        rss_bytes: 1000,
-        cpu_s,
-    };
+    let status = LiveStatus::new("test", "0.1.0", LambdaKind::Wasm, "out".into());
+    let live = LiveStatus { restarts, up_s, wakes, rss_bytes: 1000, cpu_s, ..status };
     let lambda = LambdaStatus {
         id: "test".to_owned(),
         name: "test".to_owned(),

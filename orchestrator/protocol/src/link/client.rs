@@ -6,7 +6,8 @@ use std::os::unix::net::UnixStream;
 use std::time::{Duration, Instant};
 
 use rustix::io::Errno;
-use rustix::net::{RecvFlags, SendFlags, recv, send};
+use rustix::net::sockopt::socket_domain;
+use rustix::net::{AddressFamily, RecvFlags, SendFlags, recv, send};
 
 use super::LinkError;
 use super::frame::{self, HEAD, tag};
@@ -106,10 +107,23 @@ impl RecorderLink {
     /// # Errors
     ///
     /// [`LinkError::Refused`] if the recorder expects another lambda, [`LinkError::Silent`] if it
-    /// does not respond, and [`LinkError::Gone`] if it has ended.
+    /// does not respond, and [`LinkError::Gone`] if it has ended. After an error, wakes are queued
+    /// until [`rejoin`](Self::rejoin).
     pub fn hello(&mut self, header: &JournalHeader, timeout: Duration) -> Result<(), LinkError> {
+        let joined = self.join(header, timeout);
+        if joined.is_err() {
+            self.state = LinkState::Gone;
+        }
+        joined
+    }
+
+    fn join(&mut self, header: &JournalHeader, timeout: Duration) -> Result<(), LinkError> {
         let until = Instant::now() + timeout;
         let failed = |source: io::Error| LinkError::Socket { peer: RECORDER, source };
+        let family = socket_domain(&self.socket).map_err(|error| failed(error.into()))?;
+        if family != AddressFamily::UNIX {
+            return Err(failed(io::Error::other("it is no Unix socket")));
+        }
         let hello = encode_hello(header)?;
         self.encoder = OpaqueEncoder(Encoder::new(header.inputs.len()));
         if let Err(error) = self.send_until(&hello, until, timeout) {
@@ -238,6 +252,11 @@ impl RecorderLink {
         self.refusal().unwrap_or(error)
     }
 
+    /// Drops the queued wakes, and counts them as lost: there is no recorder for them.
+    pub fn drop_queued(&mut self) {
+        self.queue.drop_all();
+    }
+
     /// Returns the wakes and triggers that could not be sent, and the number of recorders that
     /// ended.
     pub fn dropped(&self) -> LinkLosses {
@@ -245,6 +264,7 @@ impl RecorderLink {
             wakes_dropped: self.queue.wakes_dropped,
             triggers_lost: self.queue.triggers_lost,
             recorders_ended: self.ends,
+            absent_s: 0,
         }
     }
 

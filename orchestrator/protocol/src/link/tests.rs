@@ -297,6 +297,29 @@ fn wakes_wait_for_the_next_recorder() {
 }
 
 #[test]
+fn what_is_dropped_without_a_recorder_is_counted_and_missing_for_the_next_one() {
+    let (closed, _) = UnixStream::pair().unwrap();
+    let mut lambda = RecorderLink::new(closed.into());
+    assert!(matches!(lambda.hello(&header("hello"), TIMEOUT), Err(LinkError::Gone { .. })));
+    lambda.wake(&entry(1, Some("here")), 0).unwrap();
+    lambda.wake(&entry(2, None), 0).unwrap();
+    lambda.drop_queued();
+    let dropped = lambda.dropped();
+    assert_eq!((dropped.triggers_lost, dropped.wakes_dropped, dropped.recorders_ended), (1, 1, 0));
+    let (lambda_end, recorder_end) = UnixStream::pair().unwrap();
+    let (mut link, mut replies) = LambdaLink::new(recorder_end.into()).unwrap();
+    lambda.rejoin(lambda_end.into(), &header("hello")).unwrap();
+    replies.ready();
+    while !lambda.is_joined() {
+        lambda.poll().unwrap();
+    }
+    lambda.wake(&entry(3, Some("here")), 0).unwrap();
+    assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
+    let received = link.receive();
+    assert!(matches!(received, Ok(Some(LambdaMessage::Wake { missing: 2, .. }))), "{received:?}");
+}
+
+#[test]
 fn a_refusal_states_its_reason_and_a_silent_recorder_is_a_timeout() {
     let (mut lambda, _link, mut replies) = connected();
     replies.refused("it is another \u{1b}[2J");

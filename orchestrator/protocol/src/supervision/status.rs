@@ -134,6 +134,22 @@ pub struct LambdaStatus {
     pub layers: Vec<Layer>,
 }
 
+impl LambdaStatus {
+    /// Returns what is wrong while it runs, as sentences: its faults, and a recorder that is
+    /// missing.
+    pub fn warnings(&self) -> [Option<String>; 2] {
+        let Some(live) = self.live.as_deref() else { return [None, None] };
+        let link = live.recorder_link.filter(|link| link.absent_s > 0);
+        let unrecorded = link.map(|link| {
+            format!(
+                "no recorder for {} s: it records nothing, {} triggers and {} other wakes are lost",
+                link.absent_s, link.triggers_lost, link.wakes_dropped
+            )
+        });
+        [live.faulty(), unrecorded]
+    }
+}
+
 /// Phase of a lambda.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

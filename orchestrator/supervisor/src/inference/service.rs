@@ -9,7 +9,7 @@ use std::io::{BufReader, Read};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::fs::FileExt;
 use std::os::unix::net::UnixStream;
-use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::AtomicBool;
@@ -28,14 +28,14 @@ use gleaner_protocol::inference::{
 use gleaner_protocol::link::LinkError;
 use gleaner_protocol::{Handover, SHUTDOWN_TIMEOUT};
 use rustix::fs::{MemfdFlags, memfd_create};
-use rustix::process::Signal;
 
 use super::client::{Client, ProcessState};
 use super::engine;
 use super::totals::ModelTotals;
 use super::{INFERENCE, InferenceEvent};
 use crate::lines::{next_report, pass_on};
-use crate::restart_delay::RestartDelay;
+use crate::process::ended;
+use crate::restart_delay::{ServiceDelays, was_killed};
 
 /// Number of ends of the process that a model may cause before it is refused.
 const ENDS_MAX: u32 = 3;
@@ -277,20 +277,17 @@ type StartError = Box<dyn std::error::Error + Send + Sync>;
 
 impl Supervisor {
     fn supervise(mut self, child: Process) {
-        let mut delay = RestartDelay::of_service();
-        let mut current = Some(child);
+        let mut delays = ServiceDelays::new();
+        let mut current = Ok(child);
         loop {
             let started = Instant::now();
             let mut is_killed = false;
-            let reason = match current.take() {
-                Some(child) => match self.wait(child) {
-                    Ok(status) => {
-                        is_killed = was_killed(status);
-                        format!("{INFERENCE} ended unexpectedly ({status})")
-                    }
-                    Err(reason) => reason,
-                },
-                None => format!("{INFERENCE} could not be started"),
+            let reason = match current.and_then(|child| self.wait(child)) {
+                Ok(status) => {
+                    is_killed = was_killed(status);
+                    ended(INFERENCE, status)
+                }
+                Err(reason) => reason,
             };
             let mut state = self.shared.lock();
             if state.stops {
@@ -302,25 +299,21 @@ impl Supervisor {
                 Some((_, what)) => format!("{reason}, {what}"),
                 None => reason,
             };
-            let ended = || ProcessState::Ended(reason.clone());
-            state.clients.retain_mut(|client| client.report(ended()));
+            let state_of_client = || ProcessState::Ended(reason.clone());
+            state.clients.retain_mut(|client| client.report(state_of_client()));
             if started.elapsed() >= HEALTHY {
                 state.ends.retain(|digest, _| blamed.as_ref().is_some_and(|it| it.0 == *digest));
             }
             drop(state);
-            let delay = delay.after(started.elapsed());
+            let delay = delays.after(started.elapsed(), is_killed);
             // Not under the lock: the receiver may add a lambda before it reads this.
             (self.events)(InferenceEvent::Ended(reason, delay));
             if self.shared.stops_within(delay) {
                 return;
             }
-            match self.start() {
-                Ok(child) => current = Some(child),
-                Err(error) => {
-                    let text = format!("cannot start {INFERENCE}: {}", chain(&*error));
-                    (self.events)(InferenceEvent::Warning(text));
-                }
-            }
+            current = self
+                .start()
+                .map_err(|error| format!("{INFERENCE} could not be started: {}", chain(&*error)));
         }
     }
 
@@ -444,12 +437,6 @@ fn follow(reports: impl Read, events: &Events, totals: &Mutex<ModelTotals>) {
             }
         }
     }
-}
-
-/// Returns whether a signal of another process has ended it, which no model can send.
-fn was_killed(status: ExitStatus) -> bool {
-    let signal = status.signal().and_then(Signal::from_named_raw);
-    matches!(signal, Some(Signal::KILL | Signal::TERM | Signal::INT | Signal::HUP))
 }
 
 fn granted(model: &ModelSpec) -> GrantedModel {

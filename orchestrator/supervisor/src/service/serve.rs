@@ -23,7 +23,7 @@ use crate::group_end::GroupEnd;
 use crate::installation::Installation;
 use crate::process_group::{ProcessGroup, RunRecord};
 use crate::reconcile::{Action, KnownLambda, reconcile};
-use crate::restart_delay::RestartDelay;
+use crate::restart_delay::{RestartDelay, jittered};
 use crate::revision_check::CheckFailure;
 use crate::spec::{ClipSigning, LambdaSpec, RunSpec};
 use crate::summary::RunCounts;
@@ -34,6 +34,8 @@ use crate::{POLL_INTERVAL, RunContext, clock_offset};
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// Pause before a lambda that this machine lacked something to load is loaded again.
 const SHORTAGE_PAUSE: Duration = Duration::from_secs(5);
+/// Interval of looks for requests between two groups.
+const PAUSE: Duration = Duration::from_millis(10);
 /// Size of samples that the ingress always expects: it is not started again for a lambda with
 /// images of usual cameras.
 const LARGEST: u64 = 8 << 20;
@@ -60,7 +62,7 @@ pub(super) fn serve(listener: std::os::unix::net::UnixListener) -> Result<(), Fa
     };
     let mut vehicle = Vehicle::default();
     let (mut failures, mut counts) = (Failures::default(), RunCounts::default());
-    let mut delay = RestartDelay::of_killed();
+    let mut delay = RestartDelay::of_service();
     loop {
         let started = Instant::now();
         if let Some(file) = &spec.vehicle {
@@ -87,14 +89,11 @@ pub(super) fn serve(listener: std::os::unix::net::UnixListener) -> Result<(), Fa
             Err(failure) => failure.to_string(),
         };
         board.group_ended(&reason);
-        let delay = delay.after(started.elapsed());
+        let delay = jittered(delay.after(started.elapsed()));
         let until = Instant::now() + delay;
         let text = format!("{reason}; all processes start again in {} ms", delay.as_millis());
         board.event(EventKind::Failed, None, &text);
-        while Instant::now() < until && !stop.load(Ordering::Relaxed) {
-            thread::sleep(Duration::from_millis(10).min(delay));
-        }
-        if stop.load(Ordering::Relaxed) {
+        if wanted.pause(until, &lambdas, &connection, &board, &stop) {
             break;
         }
     }
@@ -181,16 +180,8 @@ impl WantedState<'_> {
         let mut reported: (Option<Instant>, (_, Vec<_>)) = (None, ([false; 3], Vec::new()));
         loop {
             group.poll(POLL_INTERVAL);
-            let mut is_new = false;
-            while let Some(request) = connection.next(Duration::ZERO) {
-                is_new = true;
-                match self.handle(request) {
-                    Ok(true) => return Ok(GroupEnd::Complete),
-                    Ok(false) => {}
-                    Err(refused) => connection.report(&refused),
-                }
-            }
-            if stop.load(Ordering::Relaxed) {
+            let (is_new, ends) = self.receive(connection);
+            if ends || stop.load(Ordering::Relaxed) {
                 return Ok(GroupEnd::Complete);
             }
             if (board.lacks_service() || group.lambdas.iter().any(SupervisedLambda::will_start))
@@ -222,6 +213,45 @@ impl WantedState<'_> {
                 connection.report(&self.status(group.lambdas, board));
             }
         }
+    }
+
+    /// Waits between two groups, and goes on reporting; returns whether it is to end.
+    fn pause(
+        &mut self,
+        until: Instant,
+        lambdas: &[SupervisedLambda],
+        connection: &Connection,
+        board: &Board,
+        stop: &AtomicBool,
+    ) -> bool {
+        let mut reported: Option<Instant> = None;
+        while Instant::now() < until {
+            let (is_new, ends) = self.receive(connection);
+            if ends || stop.load(Ordering::Relaxed) {
+                return true;
+            }
+            if is_new || reported.is_none_or(|at| at.elapsed() >= STATUS_INTERVAL) {
+                reported = Some(Instant::now());
+                connection.report(&self.status(lambdas, board));
+            }
+            thread::sleep(PAUSE);
+        }
+        false
+    }
+
+    /// Handles the requests that have arrived; returns whether there were any, and whether it is
+    /// to end.
+    fn receive(&mut self, connection: &Connection) -> (bool, bool) {
+        let mut is_new = false;
+        while let Some(request) = connection.next(Duration::ZERO) {
+            is_new = true;
+            match self.handle(request) {
+                Ok(true) => return (is_new, true),
+                Ok(false) => {}
+                Err(refused) => connection.report(&refused),
+            }
+        }
+        (is_new, false)
     }
 
     /// Handles a request; returns whether it is to end.

@@ -1,0 +1,192 @@
+//! The restarts of a process that all lambdas share: when, and why.
+
+use std::process::ExitStatus;
+use std::time::{Duration, Instant};
+
+use gleaner_base::Failure;
+
+use crate::last_error::LastError;
+use crate::process::ended;
+use crate::restart_delay::{ServiceDelays, was_killed};
+
+/// Maximum time between two reports of a process that is ready: it sends one each second.
+pub(crate) const SILENCE: Duration = Duration::from_secs(15);
+
+/// One process, and the number of those before it.
+#[derive(Debug)]
+pub(crate) struct ServiceRestarts {
+    /// Number of earlier processes.
+    pub(crate) start: u32,
+    /// Set when it has reported that it is ready, until its end.
+    pub(crate) is_ready: bool,
+    started: Instant,
+    delays: ServiceDelays,
+    /// Time at which the next one is to be started, as this one has ended.
+    again_at: Option<Instant>,
+    requested: Option<RequestedEnd>,
+    /// Time of its last report.
+    reported: Instant,
+    error: LastError,
+}
+
+/// An end that this program has requested.
+#[derive(Debug)]
+struct RequestedEnd {
+    reason: String,
+    /// True if the process has failed, false if another one is to have other settings.
+    has_failed: bool,
+}
+
+impl ServiceRestarts {
+    /// Begins with the first process.
+    pub(crate) fn first() -> Self {
+        Self::with(0, ServiceDelays::new())
+    }
+
+    /// Continues with the next process.
+    pub(crate) fn next(&self) -> Self {
+        Self::with(self.start + 1, self.delays.clone())
+    }
+
+    fn with(start: u32, delays: ServiceDelays) -> Self {
+        let now = Instant::now();
+        Self {
+            start,
+            is_ready: false,
+            started: now,
+            delays,
+            again_at: None,
+            requested: None,
+            reported: now,
+            error: LastError::default(),
+        }
+    }
+
+    /// Returns whether it runs, and was not requested to end.
+    pub(crate) fn is_running(&self) -> bool {
+        self.again_at.is_none() && self.requested.is_none()
+    }
+
+    /// Returns whether it has ended, and the end was handled.
+    pub(crate) fn has_ended(&self) -> bool {
+        self.again_at.is_some()
+    }
+
+    /// Returns whether the next one is to be started now.
+    pub(crate) fn is_due(&self) -> bool {
+        self.again_at.is_some_and(|at| Instant::now() >= at)
+    }
+
+    /// Notes a report.
+    pub(crate) fn reports(&mut self) {
+        self.reported = Instant::now();
+    }
+
+    /// Keeps what it writes to standard error.
+    pub(crate) fn has_written(&mut self, text: &[u8]) {
+        self.error.add(text, "");
+    }
+
+    /// Returns whether it has not reported for this time.
+    pub(crate) fn is_silent(&self, most: Duration) -> bool {
+        self.reported.elapsed() > most
+    }
+
+    /// Notes that it is requested to end, or killed, as it has failed. The first reason counts.
+    pub(crate) fn fails(&mut self, reason: String) {
+        self.requested.get_or_insert(RequestedEnd { reason, has_failed: true });
+    }
+
+    /// Notes that it is requested to end, as another one is to have other settings. The first
+    /// reason counts.
+    pub(crate) fn is_replaced(&mut self, reason: String) {
+        self.requested.get_or_insert(RequestedEnd { reason, has_failed: false });
+    }
+
+    /// Returns the reason of its end.
+    pub(crate) fn reason(&self, name: &str, status: ExitStatus) -> String {
+        match (&self.requested, self.error.in_one_line()) {
+            (Some(requested), _) => requested.reason.clone(),
+            (None, Some(cause)) if !was_killed(status) => {
+                format!("{}: {cause}", ended(name, status))
+            }
+            (None, _) => ended(name, status),
+        }
+    }
+
+    /// Notes its end: another one is to be started after the returned delay.
+    pub(crate) fn ended(&mut self, status: ExitStatus) -> Duration {
+        let has_failed = match &self.requested {
+            Some(requested) => requested.has_failed,
+            None => !was_killed(status),
+        };
+        self.restart_after(self.started.elapsed(), has_failed)
+    }
+
+    /// Notes that it could not be started; returns the reason, and the delay before another
+    /// attempt.
+    pub(crate) fn not_started(&mut self, failure: &Failure) -> (String, Duration) {
+        let texts = std::iter::once(&failure.message).chain(&failure.causes);
+        let texts: Vec<_> = texts.map(|text| text.lines().collect::<Vec<_>>().join(" ")).collect();
+        (texts.join(": "), self.restart_after(Duration::ZERO, true))
+    }
+
+    fn restart_after(&mut self, ran: Duration, has_failed: bool) -> Duration {
+        let delay = self.delays.after(ran, !has_failed);
+        self.is_ready = false;
+        self.again_at = Some(Instant::now() + delay);
+        delay
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::process::ExitStatusExt;
+
+    use gleaner_base::Exit;
+
+    use super::*;
+
+    #[test]
+    fn an_end_is_explained_by_the_request_or_by_the_last_message() {
+        let (failed, killed) = (ExitStatus::from_raw(1 << 8), ExitStatus::from_raw(9));
+        let mut restarts = ServiceRestarts::first();
+        restarts.has_written(b"error: cannot lock the folder\n");
+        restarts.has_written(b"  cause: the disk is full\n");
+        let reason = restarts.reason("the recorder", failed);
+        let expected = "the recorder ended unexpectedly (exit status: 1): cannot lock the folder; \
+                        cause: the disk is full";
+        assert_eq!(reason, expected);
+        let reason = restarts.reason("the recorder", killed);
+        assert_eq!(reason, "the recorder ended unexpectedly (signal: 9 (SIGKILL))");
+        restarts.is_replaced("it needs more".to_owned());
+        restarts.fails("it is silent".to_owned());
+        assert_eq!(restarts.reason("the recorder", failed), "it needs more");
+    }
+
+    #[test]
+    fn faults_of_its_own_are_retried_more_and_more_rarely_and_kills_soon() {
+        let [failed, killed] = [1 << 8, 9].map(ExitStatus::from_raw);
+        let mut restarts = ServiceRestarts::first();
+        let mut last = |status| {
+            let mut delay = Duration::ZERO;
+            for _ in 0..10 {
+                restarts = restarts.next();
+                delay = restarts.ended(status);
+            }
+            assert!(restarts.has_ended() && !restarts.is_running());
+            delay.as_secs()
+        };
+        assert!((24..=30).contains(&last(failed)));
+        assert_eq!(last(killed), 1);
+        assert_eq!(restarts.start, 20);
+    }
+
+    #[test]
+    fn a_start_that_failed_is_explained_in_one_line() {
+        let mut failure = Failure::new(Exit::Internal, "cannot find x; searched in\n/a\n/b");
+        failure.causes = vec!["it is gone".to_owned()];
+        let (reason, _) = ServiceRestarts::first().not_started(&failure);
+        assert_eq!(reason, "cannot find x; searched in /a /b: it is gone");
+    }
+}
