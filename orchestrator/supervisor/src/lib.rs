@@ -6,7 +6,7 @@
 //! - `process`, `output`, `lines`: one process, and the threads that read its output.
 //! - `ingress`, `recorder`, `inference`: the processes that all lambdas share, each over its
 //!   restarts (`service_restarts`). `last_error`: the message that explains an end.
-//! - `supervised`: one lambda over all its restarts, with `summary`.
+//! - `supervised`, `lambda_state`: one lambda over all its restarts, with `summary`.
 //! - `process_group`: all processes, `group_end`: their end, and `drive`: a drive that the ingress
 //!   plays.
 //! - `failures`: the result of a run in which processes failed.
@@ -28,6 +28,7 @@ mod inference;
 mod ingress;
 mod installation;
 mod lambda_process;
+mod lambda_state;
 mod last_error;
 pub mod lines;
 mod observer;

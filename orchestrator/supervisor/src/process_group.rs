@@ -9,6 +9,7 @@ use std::process::ExitStatus;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, SyncSender};
 use std::thread;
+use std::time::{Duration, Instant};
 
 use gleaner_base::Failure;
 use gleaner_lambda::{BuildDir, Vehicle};
@@ -54,6 +55,8 @@ pub(crate) struct ProcessGroup<'a> {
     pub(crate) vehicle: Vehicle,
     /// Number of processes of lambdas so far.
     started: u32,
+    /// Time of the last look at the processes of all lambdas.
+    looked: Instant,
     /// The process that runs models, if a lambda has any. Dropped after `output`, as its threads
     /// may wait for room there.
     inference: Option<InferenceService>,
@@ -85,6 +88,7 @@ impl<'a> ProcessGroup<'a> {
             output,
             vehicle: vehicle.clone(),
             started: 0,
+            looked: Instant::now(),
         };
         // On a vehicle, it is started with the first lambda that has any: that one waits if it fails.
         let has_models =
@@ -187,7 +191,7 @@ impl<'a> ProcessGroup<'a> {
     /// Starts all lambdas that are due.
     fn start_due(&mut self) -> Result<(), Failure> {
         for index in 0..self.lambdas.len() {
-            if !self.lambdas[index].is_due(self.observer) {
+            if !self.lambdas[index].is_due(&self.sender, self.observer) {
                 continue;
             }
             let lambda = &self.lambdas[index].lambda;
@@ -267,10 +271,25 @@ impl<'a> ProcessGroup<'a> {
         Ok(())
     }
 
-    /// Returns the lambdas whose processes have ended, after showing the rest of their output.
+    /// Returns the time until a lambda can be started, at most [`POLL_INTERVAL`].
+    pub(crate) fn due_in(&self) -> Duration {
+        let lambdas = self.lambdas.iter().filter(|_| self.ingress.restarts.is_ready);
+        lambdas.filter_map(SupervisedLambda::due_in).fold(POLL_INTERVAL, Duration::min)
+    }
+
+    /// Returns the lambdas whose processes have ended, after showing the rest of their output. One
+    /// that has ended has closed its pipes; all are looked at from time to time only, as others may
+    /// have them open.
     fn ended_lambdas(&mut self) -> Result<Vec<(usize, ExitStatus)>, Failure> {
+        let looks_at_all = self.looked.elapsed() >= POLL_INTERVAL;
+        if looks_at_all {
+            self.looked = Instant::now();
+        }
         let mut ended = Vec::new();
         for index in 0..self.lambdas.len() {
+            if !looks_at_all && !self.lambdas[index].has_closed_a_pipe() {
+                continue;
+            }
             if let Some(status) = self.lambdas[index].status()? {
                 self.drain(|group| group.lambdas[index].has_output());
                 ended.push((index, status));

@@ -2,7 +2,7 @@
 //! Python environment with its wheels.
 
 use std::error::Error;
-use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::thread;
 
 use gleaner_base::{PlainFile, chain, is_shortage};
@@ -10,6 +10,8 @@ use gleaner_lambda::BuildDir;
 use gleaner_protocol::supervision::DesiredLambda;
 use gleaner_trust::{FileDigestError, Payload, Revision, check_files, revision_of_digest};
 use gleaner_wheels::PreparedPython;
+
+use crate::output::{ChildId, ChildOutput, OutputPiece};
 
 /// The environment of a lambda that has wheels, or the reason why it does not start.
 pub(crate) type CheckResult = Result<Option<PreparedPython>, CheckFailure>;
@@ -34,12 +36,18 @@ pub(crate) struct RevisionCheck {
 }
 
 impl RevisionCheck {
-    pub(crate) fn start(deployment: &DesiredLambda) -> Self {
+    /// Starts the check, which rings `bell` at its end.
+    pub(crate) fn start(deployment: &DesiredLambda, bell: SyncSender<ChildOutput>) -> Self {
         let (sender, result) = sync_channel(1);
         let deployment = deployment.clone();
         let thread = thread::Builder::new().name("revision".to_owned());
         // Without a thread, the dropped sender is the result.
-        let _ = thread.spawn(move || sender.send(check(&deployment)));
+        let _ = thread.spawn(move || {
+            let _ = sender.send(check(&deployment));
+            // If it is full, the loop is awake.
+            let _ =
+                bell.try_send(ChildOutput { from: ChildId::Supervisor, piece: OutputPiece::Bell });
+        });
         Self { result }
     }
 

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 use std::process::ExitStatus;
+use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
@@ -12,7 +13,9 @@ use gleaner_protocol::{Handover, LiveStatus, Report};
 use crate::crash_loop::CrashLoop;
 use crate::failures::Failures;
 use crate::lambda_process::{LambdaProcess, ProcessEnd};
+use crate::lambda_state::LambdaState;
 use crate::observer::{RestartedPart, RunObserver};
+use crate::output::{ChildOutput, PIPES};
 use crate::process::ChildProcess;
 use crate::restart_delay::{RestartDelay, jittered};
 use crate::revision_check::{CheckFailure, RevisionCheck};
@@ -54,22 +57,6 @@ pub(crate) struct SupervisedLambda {
     pub(crate) exit: Exit,
 }
 
-enum LambdaState {
-    /// To be started at this time.
-    Due(Instant),
-    /// Its files are being checked before a start.
-    Checking(RevisionCheck),
-    /// Its files are as signed: to be started at once.
-    Checked,
-    Running(Box<LambdaProcess>),
-    /// It could not start, and is not started again.
-    NotStarted,
-    /// It failed too often, and is not started again.
-    Quarantined,
-    /// It has ended on request, with this last status.
-    Ended(Option<Box<LiveStatus>>),
-}
-
 impl SupervisedLambda {
     pub(crate) fn new(lambda: LambdaSpec) -> Self {
         Self {
@@ -94,7 +81,11 @@ impl SupervisedLambda {
 
     /// Returns whether its process is to be started now. The files of a deployed lambda are checked
     /// before, in a thread.
-    pub(crate) fn is_due(&mut self, observer: &mut dyn RunObserver) -> bool {
+    pub(crate) fn is_due(
+        &mut self,
+        bell: &SyncSender<ChildOutput>,
+        observer: &mut dyn RunObserver,
+    ) -> bool {
         match &mut self.state {
             _ if self.is_leaving => false,
             LambdaState::Checked => true,
@@ -102,7 +93,7 @@ impl SupervisedLambda {
             LambdaState::Due(_) => match &self.lambda.deployment {
                 None => true,
                 Some(deployment) => {
-                    let check = RevisionCheck::start(deployment);
+                    let check = RevisionCheck::start(deployment, bell.clone());
                     self.enter(LambdaState::Checking(check));
                     false
                 }
@@ -205,11 +196,12 @@ impl SupervisedLambda {
 
     /// Returns whether a process is to be started for it, at once or later.
     pub(crate) fn will_start(&self) -> bool {
-        let is_waiting = matches!(
-            self.state,
-            LambdaState::Due(_) | LambdaState::Checking(_) | LambdaState::Checked
-        );
-        is_waiting && !self.is_leaving
+        !self.is_leaving && self.state.will_start()
+    }
+
+    /// Returns the time until it is to be started; `None` if it is not, or waits for its check.
+    pub(crate) fn due_in(&self) -> Option<Duration> {
+        self.state.due_in().filter(|_| !self.is_leaving)
     }
 
     /// Returns whether it could not start, and is not started again.
@@ -236,6 +228,11 @@ impl SupervisedLambda {
 
     pub(crate) fn is_running(&self) -> bool {
         matches!(self.state, LambdaState::Running(_))
+    }
+
+    /// Returns whether its process has closed a pipe.
+    pub(crate) fn has_closed_a_pipe(&mut self) -> bool {
+        self.process().is_some_and(|process| process.open_pipes < PIPES)
     }
 
     /// Returns whether a pipe of its process is open.
@@ -348,16 +345,7 @@ impl SupervisedLambda {
 
     /// Returns what it is doing.
     pub(crate) fn phase(&self) -> LambdaPhase {
-        match &self.state {
-            _ if self.is_leaving => LambdaPhase::Stopping,
-            LambdaState::Due(_) | LambdaState::Checked => LambdaPhase::Waiting,
-            LambdaState::Checking(_) => LambdaPhase::Checking,
-            LambdaState::Running(process) if !process.is_ready => LambdaPhase::Starting,
-            LambdaState::Running(_) => LambdaPhase::Running,
-            LambdaState::NotStarted | LambdaState::Quarantined | LambdaState::Ended(_) => {
-                LambdaPhase::Quarantined
-            }
-        }
+        if self.is_leaving { LambdaPhase::Stopping } else { self.state.phase() }
     }
 
     /// Returns its status; `None` for one that was not deployed.

@@ -58,6 +58,7 @@ pub(super) fn serve(listener: std::os::unix::net::UnixListener) -> Result<(), Fa
         spec: &spec,
         installation: Installation::running(),
         desired: DesiredState::default(),
+        is_new: true,
         unusable: Vec::new(),
     };
     let mut vehicle = Vehicle::default();
@@ -158,6 +159,8 @@ struct WantedState<'a> {
     spec: &'a SupervisionSpec,
     installation: Installation,
     desired: DesiredState,
+    /// Set while the wanted state was not compared with what runs.
+    is_new: bool,
     unusable: Vec<UnusableLambda>,
 }
 
@@ -178,8 +181,9 @@ impl WantedState<'_> {
         stop: &AtomicBool,
     ) -> Result<GroupEnd, Failure> {
         let mut reported: (Option<Instant>, (_, Vec<_>)) = (None, ([false; 3], Vec::new()));
+        let mut has_changed = false;
         loop {
-            group.poll(POLL_INTERVAL);
+            group.poll(if has_changed { Duration::ZERO } else { group.due_in() });
             let (is_new, ends) = self.receive(connection);
             if ends || stop.load(Ordering::Relaxed) {
                 return Ok(GroupEnd::Complete);
@@ -204,7 +208,7 @@ impl WantedState<'_> {
                     group.observer.quarantined(&lambda.lambda, &reason);
                 }
             }
-            self.approach(group.lambdas, board);
+            has_changed = self.approach(group.lambdas, board);
             let phases = group.lambdas.iter().map(SupervisedLambda::phase).collect();
             let phases = (board.ready_services(), phases);
             let is_due = reported.0.is_none_or(|at| at.elapsed() >= STATUS_INTERVAL);
@@ -262,14 +266,19 @@ impl WantedState<'_> {
             SupervisorRequest::Configure(_) => return Err(SupervisorReport::OtherSettings),
             SupervisorRequest::Apply(state) => {
                 check(&state).map_err(|reason| SupervisorReport::Refused { reason })?;
-                self.desired = *state;
+                (self.desired, self.is_new) = (*state, true);
             }
         }
         Ok(false)
     }
 
-    /// Starts and stops lambdas as wanted.
-    fn approach(&mut self, lambdas: &mut Vec<SupervisedLambda>, board: &Board) {
+    /// Starts and stops lambdas as wanted; returns whether it did any of that.
+    fn approach(&mut self, lambdas: &mut Vec<SupervisedLambda>, board: &Board) -> bool {
+        // With many lambdas the comparison costs more than all else in this loop.
+        let has_left = lambdas.iter().any(SupervisedLambda::has_left);
+        if !std::mem::take(&mut self.is_new) && !has_left && self.unusable.is_empty() {
+            return false;
+        }
         lambdas.retain(|lambda| {
             let has_left = lambda.has_left();
             if has_left {
@@ -288,7 +297,9 @@ impl WantedState<'_> {
         let unusable = self.unusable.iter();
         let unusable = unusable.map(|it| KnownLambda { lambda: &it.lambda, is_leaving: false });
         let known: Vec<_> = running.chain(unusable).collect();
-        for action in reconcile(&self.desired, &known) {
+        let actions = reconcile(&self.desired, &known);
+        let has_changed = !actions.is_empty();
+        for action in actions {
             match action {
                 Action::Start(lambda) => match self.load(&lambda) {
                     Ok(spec) => lambdas.push(SupervisedLambda::new(spec)),
@@ -305,6 +316,7 @@ impl WantedState<'_> {
                 }
             }
         }
+        has_changed
     }
 
     fn load(&self, wanted: &DesiredLambda) -> Result<LambdaSpec, CheckFailure> {

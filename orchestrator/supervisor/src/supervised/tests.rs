@@ -46,7 +46,8 @@ fn checked(is_shortage: bool) -> (SupervisedLambda, Vec<String>) {
     let failure = CheckFailure { reason: "no open files are left".to_owned(), is_shortage };
     lambda.enter(LambdaState::Checking(RevisionCheck::ended(Err(failure))));
     let mut observer = RestartReasons::default();
-    assert!(!lambda.is_due(&mut observer));
+    let (bell, _rings) = std::sync::mpsc::sync_channel(1);
+    assert!(!lambda.is_due(&bell, &mut observer));
     (lambda, observer.0)
 }
 
