@@ -60,7 +60,7 @@ impl VehicleFolders {
             .and_then(Iterator::collect::<io::Result<Vec<_>>>)
             .map_err(|error| cannot_create(&self.state, &error))?;
         let links = entries.iter().filter(|it| it.file_type().is_ok_and(|kind| kind.is_symlink()));
-        let links: Vec<_> = links.map(|it| format!("`{}`", it.path().display())).collect();
+        let links: Vec<_> = links.map(|it| it.path().display().to_string()).collect();
         if links.is_empty() {
             return Ok(());
         }

@@ -38,7 +38,7 @@ pub fn outlive() {
         assert!(soft == hard && soft > 256, "{soft} of {hard}");
     }
     let shims = vehicle.processes("gleaner-shim");
-    assert!(shims.iter().all(|pid| open_files(*pid)[0] == 256), "as before");
+    assert!(shims.iter().all(|pid| open_files(*pid)[0] == 1024), "the usual limit");
     vehicle.kill_orchestrator();
     // One that fails meanwhile is started again.
     let runtime = vehicle.processes("start.py")[0];
