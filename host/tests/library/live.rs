@@ -160,8 +160,13 @@ impl Running {
     /// Starts a run and waits until it is ready.
     fn start(announce: Option<&str>) -> Self {
         let mut running = Self::begin(announce, None);
-        running.until(|report| matches!(report, Report::Ready).then_some(()));
+        running.until_ready();
         running
+    }
+
+    /// Waits until samples wake the lambda.
+    pub fn until_ready(&mut self) {
+        self.until(|report| matches!(report, Report::Ready).then_some(()));
     }
 
     /// Starts a run with this connection to a recorder, if any.

@@ -19,6 +19,7 @@ fn closed() -> OwnedFd {
 #[test]
 fn a_run_decides_without_a_recorder_and_its_wakes_wait_for_one() {
     let mut running = Running::begin(None, Some(closed()));
+    running.until_ready();
     running.publish(3);
     assert_eq!(running.decided(), 3.0);
     // Another one that has ended before it was joined.
@@ -64,6 +65,7 @@ fn a_connection_that_is_none_ends_the_run_with_an_error_that_names_it() {
     }
     // Later, too.
     let mut running = Running::begin(None, Some(closed()));
+    running.until_ready();
     running.publish(3);
     assert_eq!(running.decided(), 3.0);
     running.pass_recorder(null());

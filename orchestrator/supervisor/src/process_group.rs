@@ -90,7 +90,7 @@ impl<'a> ProcessGroup<'a> {
             started: 0,
             looked: Instant::now(),
         };
-        // On a vehicle, it is started with the first lambda that has any: that one waits if it fails.
+        // On a vehicle, it is started with the first lambda that has any: only that one may wait.
         let has_models =
             |supervised: &SupervisedLambda| !supervised.lambda.manifest.models.is_empty();
         if !context.spec.is_vehicle() && group.lambdas.iter().any(has_models) {
