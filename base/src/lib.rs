@@ -21,7 +21,7 @@ pub use atomic_write::{DiskSteps, WriteSteps, write_atomically, write_atomically
 pub use exit::Exit;
 pub use failure::{Explain, Failure, chain};
 pub use line_pieces::{LinePiece, each_piece};
-pub use open_files::{raise_open_files, restore_open_files};
+pub use open_files::raise_open_files;
 pub use plain_file::{NotPlain, PlainFile};
 pub use shortage::is_shortage;
 pub use text::{excerpt, grouped, hex, visible};

@@ -113,6 +113,16 @@ impl TestVehicle {
         }
     }
 
+    /// Replaces the program of the orchestrator by SIGHUP, and waits until the next one answers.
+    pub fn reload(&self) {
+        let requested = Instant::now();
+        signal(self.orchestrator(), "HUP");
+        self.until("the next program", |vehicle| {
+            let up = Duration::from_secs_f64(vehicle.try_status()?.orchestrator.up_s);
+            (up < requested.elapsed()).then_some(())
+        });
+    }
+
     /// Ends the orchestrator by SIGTERM, and with it all processes.
     ///
     /// # Panics

@@ -168,11 +168,19 @@ fn no_core_files() -> Layer {
     }
 }
 
-/// Limits open files: each descriptor takes kernel memory, which no other limit counts.
+/// Limits open files: each descriptor takes kernel memory, which no other limit counts. The soft
+/// limit is the usual one at most, whatever the starter has.
 fn limit_open_files() -> Layer {
     const NAME: &str = "open files";
     const MOST: u64 = 4096;
-    match limit_files(MOST) {
+    const USUAL: u64 = 1024;
+    let limited = limit_files(MOST).and_then(|most| {
+        let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+        let current = current.map(|current| current.min(USUAL));
+        setrlimit(Resource::Nofile, Rlimit { current, maximum })?;
+        Ok(most)
+    });
+    match limited {
         Ok(most) => Layer::yes(NAME, format!("at most {most}; fewer while a lambda runs")),
         Err(error) => Layer::no(NAME, std::io::Error::from(error).to_string()),
     }

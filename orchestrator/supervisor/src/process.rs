@@ -50,7 +50,6 @@ impl ChildProcess {
         sender: &SyncSender<ChildOutput>,
     ) -> Result<Self, Failure> {
         let (shim, python) = shim.unzip();
-        let has_shim = shim.is_some();
         let (program, line) = command_line(parts, name, line, shim)?;
         let failed = |error: &dyn std::error::Error| {
             let program = program.display();
@@ -72,9 +71,6 @@ impl ChildProcess {
             .stderr(Stdio::piped())
             .spawn()
             .map_err(|error| failed(&error))?;
-        if has_shim {
-            gleaner_base::restore_open_files(child.id());
-        }
         output::forward(&mut child, (id, prefix), sender);
         Ok(Self { name, child, handover, requested: None })
     }

@@ -137,8 +137,8 @@ impl Verifier<'_> {
         expired.map_or(Ok(Verdict::Current), Err)
     }
 
-    /// Returns the reason why the deployment would not be accepted as a new one now: it or the trust
-    /// root has expired.
+    /// Returns the reason why the deployment would not be accepted as a new one now: it or the
+    /// trust root has expired.
     pub fn expiry(&self, deployment: &Deployment) -> Option<Refusal> {
         self.expired(deployment.expires, Deployment::NAME)
             .or_else(|| self.expired(self.root.expires, TrustRoot::NAME))

@@ -55,13 +55,9 @@ pub fn outlive() {
     let after = processes(&vehicle);
     assert_eq!(after[0], before[0], "the ingress runs on");
     // SIGHUP replaces the program; its number stays.
-    let orchestrator = vehicle.orchestrator();
-    signal(orchestrator, "HUP");
-    vehicle.until("the program to start again", |vehicle| {
-        vehicle.try_status()?;
-        let started = events(vehicle, EventKind::Started);
-        (started.iter().filter(|text| text.contains("orchestrator")).count() == 3).then_some(())
-    });
+    vehicle.reload();
+    let started = events(&vehicle, EventKind::Started);
+    assert_eq!(started.iter().filter(|text| text.contains("orchestrator")).count(), 3);
     vehicle.until_running(&["first", "second"]);
     assert_eq!(processes(&vehicle), after);
     let decisions = vehicle.records(Some("first"));
@@ -95,11 +91,7 @@ pub fn upgraded() {
     // As a package manager does it.
     let new = home.join("new");
     std::fs::copy(&supervisor, &new).and_then(|_| std::fs::rename(&new, &supervisor)).unwrap();
-    signal(vehicle.orchestrator(), "HUP");
-    vehicle.until("the orchestrator to start again", |vehicle| {
-        let started = events(vehicle, EventKind::Started);
-        (started.iter().filter(|text| text.contains("orchestrator")).count() == 2).then_some(())
-    });
+    vehicle.reload();
     vehicle.until_running(&["first"]);
     let after = (vehicle.supervisor(), vehicle.processes("gleaner-ingress"));
     assert_eq!(after, before, "nothing has to start yet");
@@ -117,12 +109,8 @@ pub fn reaped() {
     let mut vehicle = TestVehicle::new();
     vehicle.start();
     let supervisor = vehicle.supervisor();
-    signal(vehicle.orchestrator(), "HUP");
-    vehicle.until("the program to start again", |vehicle| {
-        vehicle.try_status()?.supervisor?;
-        let started = events(vehicle, EventKind::Started);
-        (started.iter().filter(|text| text.contains("orchestrator")).count() == 2).then_some(())
-    });
+    vehicle.reload();
+    vehicle.until("its connection", |vehicle| vehicle.try_status()?.supervisor.map(|_| ()));
     assert_eq!(vehicle.supervisor(), supervisor, "it runs on");
     signal(supervisor, "KILL");
     // Of a zombie, the folder stays.

@@ -17,8 +17,8 @@ pub enum SupervisorReport {
     Welcome(Welcome),
     /// It runs with other settings, and must be started again to have new ones.
     OtherSettings,
-    /// An upgrade has replaced the programs, and one of them has to start. It ends all processes and
-    /// itself, so that programs of two versions never run together.
+    /// An upgrade has replaced the programs, and one of them has to start. It ends all processes,
+    /// and itself, so that programs of two versions never run together.
     Replaced,
     /// A request that cannot be met, for this reason. Nothing has changed.
     Refused {
