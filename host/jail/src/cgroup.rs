@@ -2,7 +2,7 @@
 //! (`Delegate=yes` of systemd).
 //!
 //! It bounds what no limit of a single process can: memory and number of all processes of a lambda
-//! together, including the kernel's memory for them. Version 2 only. The kernel allows processes in
+//! together, including the kernel's memory for them, and their CPU time. Version 2 only. The kernel allows processes in
 //! leaves only: the supervisor itself must not live in the delegated folder.
 
 use std::fs::{self, OpenOptions};
@@ -22,6 +22,11 @@ pub const CGROUP_ENV: &str = "GLEANER_CGROUP";
 
 const MEMORY_MAX: &str = "memory.max";
 const TASKS_MAX: &str = "pids.max";
+const CPU_MAX: &str = "cpu.max";
+
+/// CPU time of a group in each interval, both in us: one core. A lambda has one thread, and more of
+/// them would take the time of other lambdas.
+const ONE_CORE: &str = "100000 100000";
 
 /// Limits of a group.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -53,18 +58,19 @@ impl Group {
         };
         let controllers = fs::read_to_string(tree.join("cgroup.controllers"));
         let controllers = controllers.map_err(|error| cannot("read cgroup.controllers", error))?;
-        let missing: Vec<_> = ["memory", "pids"]
-            .into_iter()
-            .filter(|wanted| !controllers.split_whitespace().any(|it| it == *wanted))
-            .collect();
+        let has = |wanted: &str| controllers.split_whitespace().any(|it| it == wanted);
+        let missing: Vec<_> = ["memory", "pids"].into_iter().filter(|it| !has(it)).collect();
         if !missing.is_empty() {
             return Err(format!(
-                "`{}` has no controller for {}; delegate it: Delegate=memory pids",
+                "`{}` has no controller for {}; delegate it: Delegate=cpu memory pids",
                 tree.display(),
                 missing.join(" and ")
             ));
         }
-        fs::write(tree.join("cgroup.subtree_control"), "+memory +pids")
+        // Older units delegate none for CPU time.
+        let has_cpu = has("cpu");
+        let enabled = if has_cpu { "+cpu +memory +pids" } else { "+memory +pids" };
+        fs::write(tree.join("cgroup.subtree_control"), enabled)
             .map_err(|error| cannot("enable the controllers", error))?;
         let folder = tree.join(name);
         match fs::create_dir(&folder) {
@@ -85,7 +91,8 @@ impl Group {
             ("memory.oom.group", "1".to_owned()),
             (TASKS_MAX, bounds.tasks.to_string()),
         ];
-        for (file, value) in bounds {
+        let cpu = has_cpu.then(|| (CPU_MAX, ONE_CORE.to_owned()));
+        for (file, value) in bounds.into_iter().chain(cpu) {
             match fs::write(group.folder.join(file), value) {
                 // A kernel without swap does not have this file.
                 Err(error)
@@ -151,7 +158,8 @@ fn layer(folder: &Path) -> Layer {
         Ok(bytes) => format!("{} MiB", bytes >> 20),
         Err(_) => "as much memory as the lambda needs".to_owned(),
     };
-    Layer::yes(NAME, format!("`{}`: {memory}, {} tasks", folder.display(), tasks.trim()))
+    let cpu = if bound(CPU_MAX).trim() == ONE_CORE { "one core" } else { "all cores" };
+    Layer::yes(NAME, format!("`{}`: {memory}, {} tasks, {cpu}", folder.display(), tasks.trim()))
 }
 
 fn killed_for_memory(folder: &Path) -> u64 {
@@ -201,7 +209,9 @@ mod tests {
     fn a_group_is_bounded_before_a_process_joins_it() {
         let tree = Tree::with("cpu memory pids\n", "bounded");
         let group = Group::create(&tree.0, "brake-dark", BOUNDS).unwrap();
-        assert_eq!(tree.text("cgroup.subtree_control"), "+memory +pids");
+        assert_eq!(tree.text("cgroup.subtree_control"), "+cpu +memory +pids");
+        assert_eq!(tree.text("brake-dark/cpu.max"), "100000 100000");
+        assert!(group.layer().note.ends_with("64 MiB, 32 tasks, one core"), "{:?}", group.layer());
         assert_eq!(tree.text("brake-dark/memory.max"), "67108864");
         assert_eq!(tree.text("brake-dark/memory.oom.group"), "1");
         assert_eq!(tree.text("brake-dark/pids.max"), "32");
@@ -236,9 +246,9 @@ mod tests {
         let group = Group::create(&tree.0, "x", CgroupLimits { memory: None, tasks: 9 }).unwrap();
         assert_eq!(tree.text("x/memory.max"), "max");
         let note = |bytes| limit_memory_in(&group.folder, bytes).unwrap().note;
-        assert!(note(96 << 20).ends_with("x`: 96 MiB, 9 tasks"), "{}", note(96 << 20));
+        assert!(note(96 << 20).ends_with("x`: 96 MiB, 9 tasks, all cores"), "{}", note(96 << 20));
         assert_eq!(tree.text("x/memory.max"), (96 << 20).to_string());
-        assert!(note(97 << 20).ends_with("x`: 96 MiB, 9 tasks"), "{}", note(97 << 20));
+        assert!(note(97 << 20).ends_with("x`: 96 MiB, 9 tasks, all cores"), "{}", note(97 << 20));
         assert!(limit_memory_in(&tree.0.join("gone"), 1).is_err());
     }
 
@@ -247,7 +257,7 @@ mod tests {
         let tree = Tree::with("cpu pids\n", "missing");
         let why = Group::create(&tree.0, "x", BOUNDS).unwrap_err();
         assert!(
-            why.contains("has no controller for memory; delegate it: Delegate=memory pids"),
+            why.contains("has no controller for memory; delegate it: Delegate=cpu memory pids"),
             "{why}"
         );
         let why = Group::create(&tree.0.join("nowhere"), "x", BOUNDS).unwrap_err();
