@@ -310,8 +310,11 @@ fn wait_for_end(client: &VehicleClient, args: &ChangeArgs, done: &str) -> Result
         let status = client.status()?;
         let deployment = status.deployments.iter().find(|it| it.id == args.id);
         // That of a removed deployment is known to the supervisor only.
-        let lambdas = status.supervisor.iter().flat_map(|supervisor| &supervisor.lambdas);
-        if !lambdas.into_iter().any(|lambda| lambda.id == args.id) {
+        let has_ended = status
+            .supervisor
+            .as_ref()
+            .map(|supervisor| supervisor.lambdas.iter().all(|lambda| lambda.id != args.id));
+        if has_ended == Some(true) {
             let text = match (args.vehicle.json, deployment) {
                 (true, Some(deployment)) => json_line(deployment),
                 (true, None) => json_line(&json!({ "id": args.id, "removed": true })),
@@ -321,8 +324,16 @@ fn wait_for_end(client: &VehicleClient, args: &ChangeArgs, done: &str) -> Result
             return Ok(Exit::Ok);
         }
         if started.elapsed() >= args.timeout {
-            let message = format!("`{}` still ends", args.id);
-            return Err(Failure::new(Exit::Differs, message));
+            let id = &args.id;
+            return Err(match has_ended {
+                Some(_) => Failure::new(Exit::Differs, format!("`{id}` still ends")),
+                None => {
+                    let message = format!("{done} `{id}`, but whether it has ended is unknown");
+                    let mut failure = Failure::new(Exit::Unreachable, message);
+                    failure.causes = vec!["the supervisor does not report".to_owned()];
+                    failure.with_help("see `gleaner events`")
+                }
+            });
         }
         thread::sleep(POLL_INTERVAL);
     }

@@ -1,6 +1,8 @@
 //! `gleaner status`: what runs on a vehicle.
 
 use gleaner_base::{Exit, Failure, format_duration, visible};
+use gleaner_protocol::LossOutcome;
+use gleaner_protocol::link::RecorderStatus;
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus};
 use gleaner_protocol::vehicle_api::{Capacity, DeploymentStatus, VehicleStatus};
 use gleaner_report::format::{grouped, size};
@@ -45,6 +47,7 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         Some(supervisor) => {
             text += &service("ingress", Some(&supervisor.ingress), paint);
             text += &service("recorder", supervisor.recorder.as_ref(), paint);
+            text += &losses(supervisor.recorder.as_ref(), paint);
             text += &service("inference", supervisor.inference.as_ref(), paint);
         }
     }
@@ -126,6 +129,14 @@ pub(super) fn reasons(deployment: &DeploymentStatus) -> Vec<String> {
     let line = |(what, why): (&str, Option<&String>)| Some(format!("{what}: {}", visible(why?)));
     let warnings = deployment.status.iter().flat_map(LambdaStatus::warnings).flatten();
     all.into_iter().filter_map(line).chain(warnings).collect()
+}
+
+/// Returns a line for each cause of data that the recorder lost.
+fn losses(recorder: Option<&ProcessStatus<RecorderStatus>>, paint: Paint) -> String {
+    let last = recorder.and_then(|recorder| recorder.last.as_deref());
+    let counts = last.map(|last| last.recording.by_cause()).unwrap_or_default();
+    let lost = counts.iter().filter(|it| it.count > 0 && it.outcome != LossOutcome::NoWindow);
+    lost.map(|it| format!("    {}\n", paint.yellow(&it.in_words()))).collect()
 }
 
 fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> String {

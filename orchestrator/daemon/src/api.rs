@@ -180,6 +180,8 @@ async fn object(
         let why = format!("it has {received} of {length} bytes, and the SHA-256 {found}");
         return Err(refused(why).into());
     }
+    // The last write goes on in the background, and only this returns its error.
+    file.flush().await.map_err(failed)?;
     file.sync_all().await.map_err(failed)?;
     tokio::fs::rename(&part, &path).await.map_err(failed)?;
     Ok(StatusCode::NO_CONTENT)

@@ -29,7 +29,6 @@ impl VehicleFolders {
             layout.revisions(),
             layout.spool(),
             layout.records(),
-            layout.clips(),
             layout.cache(),
         ];
         // Its own path may lead through links of the administrator. Once it is private, no other
@@ -42,6 +41,10 @@ impl VehicleFolders {
             .map_err(|error| cannot_create(state, &error))?;
         layout.refuse_links()?;
         folders.iter().try_for_each(|folder| private(folder))?;
+        // Lambdas run without a recorder, whose status then has the reason.
+        if let Err(failure) = private(&layout.clips()) {
+            tracing::warn!("clips cannot be recorded: {failure}");
+        }
         // The folder of a service exists, with its own mode; its group may enter this one, too.
         let created = fs::create_dir(run);
         if created.is_ok() {

@@ -35,8 +35,14 @@ const REPORT_MAX: u64 = 16 << 20;
 const SILENCE: Duration = Duration::from_secs(10);
 /// Time to connect to a supervisor that runs; afterwards its socket is lost, and it is ended.
 const CONNECT: Duration = Duration::from_secs(5);
-/// Pause between two attempts.
+/// Pause between two attempts; it doubles up to the longest while a supervisor does not stay.
 const PAUSE: Duration = Duration::from_millis(100);
+const PAUSE_MAX: Duration = Duration::from_secs(10);
+/// Time after which a connection was one to a supervisor that stays.
+const STAYS: Duration = Duration::from_secs(1);
+/// Number of connections in a row without any report after which the supervisor hangs, and is
+/// ended.
+const SILENT_MAX: u32 = 3;
 /// Time for the supervisor to end all processes.
 const END: Duration = Duration::from_secs(60);
 
@@ -59,6 +65,8 @@ enum LinkEnd {
     Outdated(String),
     /// The connection is lost, for this reason.
     Lost(String),
+    /// It has not reported for [`SILENCE`].
+    Silent,
 }
 
 impl SupervisorLink {
@@ -69,22 +77,35 @@ impl SupervisorLink {
     /// A failure if it does not end in time.
     pub(crate) async fn keep(self) -> Result<(), Failure> {
         self.adopt();
-        let mut is_failing = false;
+        let (mut is_failing, mut pause, mut silent) = (false, PAUSE, 0);
         loop {
+            let connected = tokio::time::Instant::now();
             let end = match self.connect().await {
-                Ok(stream) => {
-                    is_failing = false;
-                    self.serve(stream).await
-                }
+                Ok(stream) => self.serve(stream).await,
                 Err(failure) => LinkEnd::Lost(failure.to_string()),
             };
             self.core.lost_supervisor();
+            silent = if matches!(end, LinkEnd::Silent) { silent + 1 } else { 0 };
+            if silent == 0 && connected.elapsed() >= STAYS {
+                (is_failing, pause) = (false, PAUSE);
+            }
             match end {
                 LinkEnd::Stopped => return self.wait_for_end().await,
                 LinkEnd::Outdated(reason) => {
                     let text = format!("the supervisor is started again: {reason}");
                     self.core.event(EventKind::Warning, None, &text);
                     self.end_by_signal().await?;
+                }
+                LinkEnd::Silent if silent >= SILENT_MAX => {
+                    silent = 0;
+                    let text = "the supervisor hangs, and is ended";
+                    self.core.event(EventKind::Failed, None, text);
+                    self.end_by_signal().await?;
+                }
+                LinkEnd::Silent => {
+                    if *self.stop.borrow() {
+                        return self.end_by_signal().await;
+                    }
                 }
                 LinkEnd::Lost(reason) => {
                     if !std::mem::replace(&mut is_failing, true) {
@@ -94,7 +115,8 @@ impl SupervisorLink {
                     if *self.stop.borrow() {
                         return self.end_by_signal().await;
                     }
-                    sleep(PAUSE).await;
+                    sleep(pause).await;
+                    pause = PAUSE_MAX.min(2 * pause);
                 }
             }
         }
@@ -174,7 +196,7 @@ impl SupervisorLink {
                 // A read that is cancelled keeps what it has read in `line`.
                 read = timeout(SILENCE, limited.read_until(b'\n', &mut line)) => {
                     match read {
-                        Err(_) => return LinkEnd::Lost("it has not reported for 10 s".to_owned()),
+                        Err(_) => return LinkEnd::Silent,
                         Ok(Err(error)) => return LinkEnd::Lost(error.to_string()),
                         Ok(Ok(_)) if !line.ends_with(b"\n") => {
                             return LinkEnd::Lost("it closed the connection".to_owned());

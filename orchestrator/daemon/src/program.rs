@@ -67,13 +67,17 @@ pub fn main() -> ExitCode {
     // Each connection takes one; the usual limit is low.
     gleaner_base::raise_open_files();
     let args = Args::parse();
-    let failure = match run(args) {
-        Ok(ProgramEnd::Stopped) => return Exit::Ok.into(),
-        Ok(ProgramEnd::Restart) => exec(),
-        Err(failure) => failure,
-    };
-    log::failure(&failure);
-    failure.exit.into()
+    loop {
+        match run(&args) {
+            Ok(ProgramEnd::Stopped) => return Exit::Ok.into(),
+            // Without the new program, this one goes on.
+            Ok(ProgramEnd::Restart) => log::failure(exec()),
+            Err(failure) => {
+                log::failure(&failure);
+                return failure.exit.into();
+            }
+        }
+    }
 }
 
 /// Becomes the program that is installed now. Returns only on errors.
@@ -83,13 +87,13 @@ fn exec() -> Failure {
     Failure::caused_by(Exit::Internal, "cannot start the program again", &error)
 }
 
-fn run(args: Args) -> Result<ProgramEnd, Failure> {
+fn run(args: &Args) -> Result<ProgramEnd, Failure> {
     let vehicle = args.vehicle.as_ref().map_or_else(|| Ok(Vehicle::default()), Vehicle::load)?;
     let layout = VehicleFolders::create(&args.state, &args.run)?;
     let _lock = layout.lock()?;
     let name = name(&vehicle)?;
     let key = vehicle_key(&layout)?;
-    let spec = spec(&args, &layout, &vehicle, &name);
+    let spec = spec(args, &layout, &vehicle, &name);
     let metrics = vehicle.metrics.listen;
     let core = Arc::new(Core::open(&layout, vehicle)?);
     // Two threads: the work that takes long runs in others.

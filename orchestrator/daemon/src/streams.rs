@@ -192,22 +192,26 @@ fn merged(streams: Vec<Vec<PlacedLine>>) -> VecDeque<StreamLine> {
     }
 }
 
-/// Returns the boots of all streams in their order, as far as a stream has two of them.
+/// Returns the boots of all streams in their order. Those of which no stream has two are ordered by
+/// the time of day.
 fn boots(streams: &[Vec<PlacedLine>]) -> Vec<String> {
-    let mut boots: Vec<String> = Vec::new();
+    let mut boots: Vec<(String, i64)> = Vec::new();
     for stream in streams {
+        let own: Vec<&String> = stream.iter().map(|(_, (boot, _))| boot).collect();
         let mut next = 0;
-        for (_, (boot, _)) in stream {
-            match boots.iter().position(|it| it == boot) {
-                Some(at) => next = at + 1,
-                None => {
-                    boots.insert(next, boot.clone());
-                    next += 1;
-                }
+        for (line, (boot, _)) in stream {
+            if let Some(at) = boots.iter().position(|(it, _)| it == boot) {
+                next = at + 1;
+                continue;
             }
+            let is_before =
+                |(other, at): &&(String, i64)| !own.contains(&other) && *at <= line.time_ns;
+            next += boots[next..].iter().take_while(is_before).count();
+            boots.insert(next, (boot.clone(), line.time_ns));
+            next += 1;
         }
     }
-    boots
+    boots.into_iter().map(|(boot, _)| boot).collect()
 }
 
 fn send_piece(lines: &mut VecDeque<StreamLine>, to: &mpsc::Sender<Bytes>) -> bool {
@@ -294,5 +298,17 @@ mod tests {
         let merged = merged(placed.collect());
         let order: Vec<_> = merged.iter().map(|it| format!("{}{}", it.stream, it.seq)).collect();
         assert_eq!(order, ["e0", "e1", "o0", "e2", "e3", "o1", "e4", "o2", "o3", "e5"]);
+    }
+
+    #[test]
+    fn boots_of_different_streams_are_ordered_by_the_time_of_day() {
+        let at = |boot: &str, time_ns| {
+            let mut lines = stream("e", &[(boot, 5)]);
+            lines[0].time_ns = time_ns;
+            placed(lines, &mut Default::default())
+        };
+        let of = |streams: [Vec<PlacedLine>; 2]| boots(&streams);
+        assert_eq!(of([at("b", 10), at("c", 20)]), ["b", "c"]);
+        assert_eq!(of([at("c", 20), at("b", 10)]), ["b", "c"]);
     }
 }

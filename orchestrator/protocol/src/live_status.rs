@@ -75,9 +75,9 @@ pub struct LiveStatus {
     pub cpu_s: f64,
 }
 
-/// Number of wakes from which on a lambda can be [faulty](LiveStatus::faulty): fewer are too few to
+/// Number of faults from which on a lambda can be [faulty](LiveStatus::faulty): fewer are too few to
 /// judge it by.
-const FAULTY_WAKES_MIN: u64 = 20;
+const FAULTS_MIN: u64 = 10;
 /// Number of its wakes, of which one ended with a fault, in a lambda that is faulty: at least half.
 const FAULTY_ONE_OF: u64 = 2;
 
@@ -115,13 +115,19 @@ impl LiveStatus {
         }
     }
 
-    /// Returns a sentence with the numbers if the lambda is faulty: at least 20 of its wakes ended,
-    /// and at least half of them with a fault. Its probation has failed then.
+    /// Returns a sentence with the numbers if the lambda is faulty: at least 10 of its wakes ended
+    /// with a fault, and these are at least half of all. Those that were skipped after faults count
+    /// as such. Its probation has failed then.
     pub fn faulty(&self) -> Option<String> {
-        let Self { wakes, faults, .. } = self;
-        let is_faulty =
-            *wakes >= FAULTY_WAKES_MIN && faults.saturating_mul(FAULTY_ONE_OF) >= *wakes;
-        is_faulty.then(|| format!("{faults} of its {wakes} wakes ended with a fault"))
+        let Self { wakes, faults, backed_off, .. } = self;
+        let failed = faults.saturating_add(*backed_off);
+        let all = wakes.saturating_add(*backed_off);
+        let is_faulty = *faults >= FAULTS_MIN && failed.saturating_mul(FAULTY_ONE_OF) >= all;
+        let skipped = match backed_off {
+            0 => String::new(),
+            _ => format!(", and {backed_off} were skipped after them"),
+        };
+        is_faulty.then(|| format!("{faults} of its {wakes} wakes ended with a fault{skipped}"))
     }
 
     /// Adds the counts of `before`, an earlier process of the same lambda. Durations, rates and
@@ -358,11 +364,14 @@ mod tests {
     }
 
     #[test]
-    fn half_of_twenty_wakes_with_a_fault_make_a_lambda_faulty() {
-        let faulty = |wakes, faults| LiveStatus { wakes, faults, ..live(0, None) }.faulty();
-        assert_eq!([faulty(19, 19), faulty(20, 9), faulty(1000, 499)], [None, None, None]);
-        let text = faulty(20, 10).unwrap();
-        assert_eq!(text, "10 of its 20 wakes ended with a fault");
-        assert!(faulty(u64::MAX, u64::MAX).is_some());
+    fn ten_faults_that_are_half_of_all_wakes_make_a_lambda_faulty() {
+        let faulty = |wakes, faults, backed_off| {
+            LiveStatus { wakes, faults, backed_off, ..live(0, None) }.faulty()
+        };
+        assert_eq!([faulty(9, 9, 0), faulty(21, 10, 0), faulty(1000, 499, 1)], [const { None }; 3]);
+        assert_eq!(faulty(20, 10, 0).unwrap(), "10 of its 20 wakes ended with a fault");
+        let text = faulty(176, 76, 6218).unwrap();
+        assert!(text.ends_with("a fault, and 6218 were skipped after them"), "{text}");
+        assert!(faulty(u64::MAX, u64::MAX, u64::MAX).is_some());
     }
 }

@@ -4,6 +4,8 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use gleaner_parts::Parts;
+
 /// The installation that this program was started from.
 pub(crate) struct Installation {
     /// Path of this program, and its file; `None` if unknown.
@@ -14,10 +16,11 @@ pub(crate) struct Installation {
 type FileId = (u64, u64);
 
 impl Installation {
-    /// Returns the installation of the running program. Call it once, at the start.
-    pub(crate) fn running() -> Self {
-        let file = id(Path::new("/proc/self/exe"));
-        Self { program: std::env::current_exe().ok().zip(file) }
+    /// Returns the installation `parts`, to which the running program belongs.
+    pub(crate) fn of(parts: &Parts) -> Self {
+        // Not the path that the kernel gives: the installation may be behind a link, which moves.
+        let path = parts.program("gleaner-supervisor").ok();
+        Self { program: path.zip(id(Path::new("/proc/self/exe"))) }
     }
 
     /// Returns whether another file has taken the place of this program. Each upgrade replaces all

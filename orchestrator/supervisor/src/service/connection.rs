@@ -85,6 +85,11 @@ impl Connection {
         }
     }
 
+    /// Returns whether an orchestrator is connected.
+    pub(super) fn is_open(&self) -> bool {
+        lock(&self.shared.newest).1.is_some()
+    }
+
     /// Sets what each further request wakes.
     pub(super) fn rings(&self, bell: SyncSender<ChildOutput>) {
         *lock(&self.shared.bell) = Some(bell);
@@ -114,7 +119,13 @@ impl Shared {
         let (shared, requests) = (Arc::clone(self), requests.clone());
         let thread = Builder::new().name("orchestrator".to_owned());
         // Without a thread, the orchestrator gets no answer and connects again.
-        let _ = thread.spawn(move || shared.read(number, &stream, &requests));
+        let _ = thread.spawn(move || {
+            shared.read(number, &stream, &requests);
+            let mut newest = lock(&shared.newest);
+            if newest.0 == number {
+                newest.1 = None;
+            }
+        });
     }
 
     fn read(

@@ -56,7 +56,7 @@ pub(super) fn serve(listener: std::os::unix::net::UnixListener) -> Result<(), Fa
     let mut lambdas = Vec::new();
     let mut wanted = WantedState {
         spec: &spec,
-        installation: Installation::running(),
+        installation: Installation::of(&context.parts),
         desired: DesiredState::default(),
         is_new: true,
         unusable: Vec::new(),
@@ -188,7 +188,9 @@ impl WantedState<'_> {
             if ends || stop.load(Ordering::Relaxed) {
                 return Ok(GroupEnd::Complete);
             }
-            if (board.lacks_service() || group.lambdas.iter().any(SupervisedLambda::will_start))
+            // Without an orchestrator, there would be no next supervisor.
+            if connection.is_open()
+                && (board.lacks_service() || group.lambdas.iter().any(SupervisedLambda::will_start))
                 && self.installation.is_replaced()
             {
                 let text = "the programs were replaced by an upgrade, and one of them has to \
