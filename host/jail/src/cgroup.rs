@@ -2,8 +2,8 @@
 //! (`Delegate=yes` of systemd).
 //!
 //! It bounds what no limit of a single process can: memory and number of all processes of a lambda
-//! together, including the kernel's memory for them, and their CPU time. Version 2 only. The kernel allows processes in
-//! leaves only: the supervisor itself must not live in the delegated folder.
+//! together, including the kernel's memory for them, and their CPU time. Version 2 only. The kernel
+//! allows processes in leaves only: the supervisor itself must not live in the delegated folder.
 
 use std::fs::{self, OpenOptions};
 use std::io;

@@ -75,8 +75,8 @@ pub struct LiveStatus {
     pub cpu_s: f64,
 }
 
-/// Number of faults from which on a lambda can be [faulty](LiveStatus::faulty): fewer are too few to
-/// judge it by.
+/// Number of faults from which on a lambda can be [faulty](LiveStatus::faulty): fewer are too few
+/// to judge it by.
 const FAULTS_MIN: u64 = 10;
 /// Number of its wakes, of which one ended with a fault, in a lambda that is faulty: at least half.
 const FAULTY_ONE_OF: u64 = 2;

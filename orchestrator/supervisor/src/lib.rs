@@ -3,7 +3,7 @@
 //!
 //! - `spec`: what a run consists of. `observer`: its events, for those who watch it.
 //! - `grants`, `arguments`: topics and arguments of the processes.
-//! - `process`, `output`, `lines`: one process, and the threads that read its output.
+//! - `process`, `output`, `lines`, `byte_rate`: one process, and the threads that read its output.
 //! - `ingress`, `recorder`, `inference`: the processes that all lambdas share, each over its
 //!   restarts (`service_restarts`). `last_error`: the message that explains an end.
 //! - `supervised`, `lambda_state`: one lambda over all its restarts, with `summary`.
@@ -17,6 +17,7 @@
 //! that fails ends the run, unless it is that of one lambda of several, or the run is a vehicle's.
 
 mod arguments;
+mod byte_rate;
 mod crash_loop;
 mod drive;
 mod event_log;

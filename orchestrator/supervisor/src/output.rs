@@ -12,6 +12,7 @@ use gleaner_protocol::ingress::IngressReport;
 use gleaner_protocol::link::RecorderReport;
 use serde::de::DeserializeOwned;
 
+use crate::byte_rate::ByteRate;
 use crate::inference::InferenceEvent;
 use crate::lines::{next_report, pass_on};
 
@@ -87,11 +88,29 @@ pub(crate) fn forward(
         let (send, prefix) = (send(sender.clone()), prefix.to_owned());
         thread::spawn(move || {
             let mut begins_line = true;
+            // Gleaner's other programs write what they choose.
+            let mut rate = matches!(from, ChildId::Lambda { .. }).then(ByteRate::new);
+            let dropped = |bytes: u64, begins_line: bool| {
+                let end = if begins_line { "" } else { "\n" };
+                let text = format!("{end}{prefix}{bytes} bytes of standard error were dropped\n");
+                send(OutputPiece::Stderr(text.into_bytes()));
+            };
             pass_on(stderr, &AtomicBool::new(false), |text| {
+                match rate.as_mut().map_or(Some(0), |rate| rate.take(text.len())) {
+                    None => return,
+                    Some(0) => {}
+                    Some(bytes) => {
+                        dropped(bytes, begins_line);
+                        begins_line = true;
+                    }
+                }
                 let prefix = if begins_line { prefix.as_bytes() } else { b"" };
                 send(OutputPiece::Stderr([prefix, text].concat()));
                 begins_line = text.ends_with(b"\n");
             });
+            if let Some(bytes @ 1..) = rate.as_mut().map(ByteRate::take_dropped) {
+                dropped(bytes, begins_line);
+            }
             send(OutputPiece::Closed);
         });
     }
