@@ -80,8 +80,17 @@ impl WriteSteps for DiskSteps {
     }
 
     fn sync_folder(&self, folder: &Path) -> io::Result<()> {
-        File::open(folder)?.sync_all()
+        sync_folder(folder)
     }
+}
+
+/// Makes the names in `folder` durable.
+///
+/// # Errors
+///
+/// Those of the file system.
+pub fn sync_folder(folder: &Path) -> io::Result<()> {
+    File::open(folder)?.sync_all()
 }
 
 /// Writes `content` to the file `path` atomically, by way of a temporary file `PATH.part`: after a

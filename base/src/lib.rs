@@ -9,6 +9,7 @@ mod failure;
 mod line_pieces;
 mod open_files;
 mod plain_file;
+mod rate_limit;
 pub mod safe_file;
 mod shortage;
 #[cfg(test)]
@@ -17,12 +18,13 @@ pub mod text;
 mod time;
 pub mod units;
 
-pub use atomic_write::{DiskSteps, WriteSteps, write_atomically, write_atomically_by};
+pub use atomic_write::{DiskSteps, WriteSteps, sync_folder, write_atomically, write_atomically_by};
 pub use exit::Exit;
 pub use failure::{Explain, Failure, chain};
 pub use line_pieces::{LinePiece, each_piece};
 pub use open_files::raise_open_files;
 pub use plain_file::{NotPlain, PlainFile};
+pub use rate_limit::RateLimit;
 pub use shortage::is_shortage;
 pub use text::{excerpt, grouped, hex, visible};
 pub use time::{UtcTime, nanoseconds};

@@ -18,3 +18,5 @@ pub mod program;
 pub mod replay;
 pub mod schedule;
 pub mod session_setup;
+#[cfg(test)]
+mod test_decision;

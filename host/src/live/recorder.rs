@@ -136,12 +136,13 @@ mod tests {
     use std::os::unix::net::UnixStream;
 
     use gleaner_journal::TimeRange;
+    use gleaner_lambda::BuildDir;
     use gleaner_lambda::manifest::Manifest;
-    use gleaner_lambda::{BuildDir, Cause, Trigger, TriggerKind};
 
     use super::*;
     use crate::api::data::Tick;
     use crate::journal::LambdaIdentity;
+    use crate::test_decision::triggered;
 
     const MANIFEST: &str = "schedule.period = '1s'\n\
         [lambda]\nname = 'a'\nversion = '0.1.0'\nkind = 'wasm'\nentry = 'a.wasm'\n";
@@ -164,26 +165,7 @@ mod tests {
 
     fn wake(sender: &mut RecorderSender, at_ns: i64) {
         sender.begin(&Wake::Tick(Tick { at_ns, missed: 0 }));
-        let trigger = Trigger {
-            kind: TriggerKind::Event,
-            label: "x".to_owned(),
-            score: None,
-            attributes: serde_json::Map::new(),
-        };
-        let decision = Decision {
-            at_ns,
-            cause: Cause::Tick,
-            input: None,
-            topic: None,
-            writer: None,
-            seq: None,
-            triggers: vec![trigger],
-            fault: None,
-            fuel: None,
-            run_ns: 0,
-            model_ns: 0,
-        };
-        sender.end(&decision, LogDigest::default(), at_ns).unwrap();
+        sender.end(&triggered(at_ns), LogDigest::default(), at_ns).unwrap();
         sender.poll().unwrap();
     }
 

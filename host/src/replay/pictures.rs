@@ -195,11 +195,11 @@ fn remove(folder: &Path) -> Result<(), OutputError> {
 
 #[cfg(test)]
 mod tests {
-    use gleaner_lambda::{Cause, TriggerKind};
     use gleaner_messages::Endian;
     use gleaner_transport::Guid;
 
     use super::*;
+    use crate::test_decision::triggered;
 
     /// A grey image of 8x8 pixels as `sensor_msgs/msg/Image`, in CDR.
     fn image(grey: u8) -> Vec<u8> {
@@ -226,25 +226,6 @@ mod tests {
         SampleMeta { at_ns, publish_ns: 0, writer, seq: at_ns as u64, endian, options: [0; 2] }
     }
 
-    fn decision(at_ns: i64) -> Decision {
-        let attributes = serde_json::Map::new();
-        let trigger =
-            Trigger { kind: TriggerKind::Event, label: "x".to_owned(), score: None, attributes };
-        Decision {
-            at_ns,
-            cause: Cause::Tick,
-            input: None,
-            topic: None,
-            writer: None,
-            seq: None,
-            triggers: vec![trigger],
-            fault: None,
-            fuel: None,
-            run_ns: 0,
-            model_ns: 0,
-        }
-    }
-
     #[test]
     fn pictures_are_spread_over_all_triggers_and_replace_earlier_ones() {
         let out = tempfile::tempdir().unwrap();
@@ -255,11 +236,11 @@ mod tests {
         }
         let camera = RecordedCamera::new("/cam", "sensor_msgs/msg/Image");
         let mut pictures = TriggerPictures::new(&[], Some(camera.clone()));
-        pictures.wake(&Decision { triggers: Vec::new(), ..decision(0) });
-        pictures.wake(&decision(0));
+        pictures.wake(&Decision { triggers: Vec::new(), ..triggered(0) });
+        pictures.wake(&triggered(0));
         for n in 1..1000 {
             camera.see(&meta(10 * n), &image(n as u8));
-            pictures.wake(&decision(10 * n + 1));
+            pictures.wake(&triggered(10 * n + 1));
         }
         let (written, omitted) = pictures.write(out.path()).unwrap();
         assert!(
@@ -293,7 +274,7 @@ mod tests {
         let camera = RecordedCamera::new("/cam", "sensor_msgs/msg/Image");
         let mut pictures = TriggerPictures::new(&[], Some(camera.clone()));
         camera.see(&meta(1), b"no image");
-        pictures.wake(&decision(2));
+        pictures.wake(&triggered(2));
         assert_eq!(pictures.write(out.path()).unwrap(), (Vec::new(), 1));
         assert!(!out.path().join(FOLDER).exists());
     }

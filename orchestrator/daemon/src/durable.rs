@@ -1,7 +1,6 @@
 //! A small file that survives kills, power cuts and changed bytes: two copies, each with a
 //! checksum, each replaced as a whole.
 
-use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -116,11 +115,6 @@ fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, String> {
         return Err("its checksum is wrong".to_owned());
     }
     serde_json::from_str(json).map(Some).map_err(|error| error.to_string())
-}
-
-/// Makes the entries of `folder` durable.
-pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
-    fs::File::open(folder)?.sync_all()
 }
 
 #[cfg(test)]

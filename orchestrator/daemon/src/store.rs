@@ -11,7 +11,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use gleaner_base::{Exit, Failure, PlainFile, hex, safe_file};
+use gleaner_base::{Exit, Failure, PlainFile, hex, safe_file, sync_folder};
 use gleaner_lambda::BuildDir;
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::Sha256;
@@ -19,7 +19,6 @@ use gleaner_protocol::vehicle_api::MissingObject;
 use gleaner_trust::{Payload, Revision, Trusted, check_files, revision_of_digest};
 use sha2::Digest;
 
-use crate::durable::sync_folder;
 use crate::layout::VehicleFolders;
 
 /// Name of the envelope in the folder of a revision.

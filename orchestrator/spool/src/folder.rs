@@ -7,6 +7,7 @@ use std::os::unix::fs::{DirBuilderExt, FileExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use gleaner_base::safe_file::UnsafePath;
+use gleaner_base::sync_folder;
 use rustix::fs::{
     AtFlags, Dir, FileType, FlockOperation, Mode, OFlags, Stat, fchmod, flock, fstat, openat,
     statat, unlinkat,
@@ -165,10 +166,6 @@ fn created(path: &Path, mode: u32, sync: &dyn Fn(&Path) -> io::Result<()>) -> io
 
 fn parent_of(path: &Path) -> &Path {
     path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
-}
-
-fn sync_folder(path: &Path) -> io::Result<()> {
-    File::open(path)?.sync_all()
 }
 
 fn foreign(uid: u32) -> io::Error {

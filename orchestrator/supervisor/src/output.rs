@@ -5,6 +5,7 @@ use std::process::Child;
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::SyncSender;
 use std::thread;
+use std::time::Instant;
 
 use gleaner_base::visible;
 use gleaner_protocol::Report;
@@ -96,7 +97,7 @@ pub(crate) fn forward(
                 send(OutputPiece::Stderr(text.into_bytes()));
             };
             pass_on(stderr, &AtomicBool::new(false), |text| {
-                match rate.as_mut().map_or(Some(0), |rate| rate.take(text.len())) {
+                match rate.as_mut().map_or(Some(0), |rate| rate.take(text.len(), Instant::now())) {
                     None => return,
                     Some(0) => {}
                     Some(bytes) => {

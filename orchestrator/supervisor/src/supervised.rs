@@ -189,8 +189,7 @@ impl SupervisedLambda {
     pub(crate) fn is_settled(&self) -> bool {
         match &self.state {
             LambdaState::Running(process) => process.is_ready,
-            LambdaState::Due(_) | LambdaState::Checking(_) | LambdaState::Checked => false,
-            LambdaState::NotStarted | LambdaState::Quarantined | LambdaState::Ended(_) => true,
+            state => !state.will_start(),
         }
     }
 

@@ -15,7 +15,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};
 use gleaner_base::text::shell_word;
-use gleaner_base::{ByteSize, Exit, Explain, NotPlain, PlainFile, excerpt};
+use gleaner_base::{ByteSize, Exit, Explain, NotPlain, PlainFile, excerpt, sync_folder};
 use gleaner_lambda::manifest::Sha256;
 use rustix::fs::{AtFlags, CWD, OFlags, linkat};
 use rustix::io::Errno;
@@ -70,7 +70,7 @@ impl SecretKey {
             io::ErrorKind::AlreadyExists => KeyError::Exists { path: path.to_owned() },
             _ => KeyError::Create { path: path.to_owned(), source },
         })?;
-        File::open(folder).and_then(|folder| folder.sync_all()).map_err(|source| {
+        sync_folder(folder).map_err(|source| {
             // It may be gone after a power cut. This error matters more than one of removing it.
             let _ = fs::remove_file(path);
             KeyError::Create { path: path.to_owned(), source }

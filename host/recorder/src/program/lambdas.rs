@@ -3,6 +3,7 @@
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::Instant;
 
+use gleaner_base::RateLimit;
 use gleaner_journal::JournalEntry;
 use gleaner_lambda::manifest::RecordSpec;
 use gleaner_protocol::RecordingCounts;
@@ -11,7 +12,6 @@ use gleaner_vitals::IntervalDurations;
 use tracing::warn;
 
 use super::connections::LambdaEvent;
-use super::rate_limit::RateLimit;
 use crate::{LambdaId, LambdaSpec, RecordError, Recorder, TopicId, lambda_digest};
 
 /// Maximum number of messages of one lambda before the next one's turn.

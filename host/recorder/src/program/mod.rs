@@ -6,7 +6,7 @@
 //! - `topics`, `samples`: the recorded topics, which the ingress shares: descriptions, and samples
 //!   in the order of their stamps.
 //! - `background`: a thread that searches definitions, and checks the disk.
-//! - `roster`, `lambdas`: the announced and connected lambdas, and their rate limits: `rate_limit`.
+//! - `roster`, `lambdas`: the announced and connected lambdas, and their rate limits.
 //! - `commands`: recordings requested over a topic.
 //! - `event_loop`: owns the recorder, and never blocks on a disk, a lambda or the network.
 //! - `status`, `report_writer`: reports to the starter, and the thread that writes them, as the
@@ -21,7 +21,6 @@ mod commands;
 mod connections;
 mod event_loop;
 mod lambdas;
-mod rate_limit;
 mod report_writer;
 mod roster;
 mod samples;

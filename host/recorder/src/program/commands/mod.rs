@@ -11,14 +11,13 @@ mod request;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use gleaner_base::visible;
+use gleaner_base::{RateLimit, visible};
 use gleaner_feed::FedTopic;
 use gleaner_lambda::TriggerKind;
 use gleaner_protocol::link::CommandStatus;
 use gleaner_transport::{ReceptionStatus, SampleMeta};
 use tracing::warn;
 
-use super::rate_limit::RateLimit;
 use super::samples::FedSamples;
 use crate::{Commanded, LambdaId, RecordError, Recorder};
 use request::{CommandError, CommandRequest};

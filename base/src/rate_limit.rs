@@ -1,4 +1,4 @@
-//! Limits the rate of requests: a token bucket.
+//! Limits the rate of something: a token bucket.
 
 use std::time::Instant;
 
@@ -12,6 +12,7 @@ pub struct RateLimit {
 }
 
 impl RateLimit {
+    /// Creates a full bucket.
     pub const fn of(per_s: f64, burst: f64) -> RateLimit {
         RateLimit { per_s, burst, left: burst, since: None }
     }
