@@ -128,9 +128,12 @@ impl RecorderProcess {
         }
     }
 
-    /// As [`stop`](Self::stop), for this reason; another one is started.
+    /// Requests it to end for this reason; another one is started, which the lambdas join.
     pub(crate) fn replace(&mut self, why: String) {
-        self.stop();
+        if let Some((_, control)) = &mut self.process {
+            // Fails if it has ended.
+            let _ = control.give_way();
+        }
         self.restarts.is_replaced(why);
     }
 

@@ -114,13 +114,16 @@ impl ServiceRestarts {
         }
     }
 
-    /// Notes its end: another one is to be started after the returned delay.
+    /// Notes its end: another one is to be started after the returned delay, which is zero if it
+    /// was replaced.
     pub(crate) fn ended(&mut self, status: ExitStatus) -> Duration {
-        let has_failed = match &self.requested {
-            Some(requested) => requested.has_failed,
-            None => !was_killed(status),
+        let ran = self.started.elapsed();
+        let delay = match &self.requested {
+            Some(requested) if !requested.has_failed => Duration::ZERO,
+            Some(_) => self.delays.after(ran, false),
+            None => self.delays.after(ran, was_killed(status)),
         };
-        self.restart_after(self.started.elapsed(), has_failed)
+        self.restart_after(delay)
     }
 
     /// Notes that it could not be started; returns the reason, and the delay before another
@@ -128,11 +131,11 @@ impl ServiceRestarts {
     pub(crate) fn not_started(&mut self, failure: &Failure) -> (String, Duration) {
         let texts = std::iter::once(&failure.message).chain(&failure.causes);
         let texts: Vec<_> = texts.map(|text| text.lines().collect::<Vec<_>>().join(" ")).collect();
-        (texts.join(": "), self.restart_after(Duration::ZERO, true))
+        let delay = self.delays.after(Duration::ZERO, false);
+        (texts.join(": "), self.restart_after(delay))
     }
 
-    fn restart_after(&mut self, ran: Duration, has_failed: bool) -> Duration {
-        let delay = self.delays.after(ran, !has_failed);
+    fn restart_after(&mut self, delay: Duration) -> Duration {
         self.is_ready = false;
         self.again_at = Some(Instant::now() + delay);
         delay
@@ -162,6 +165,14 @@ mod tests {
         restarts.is_replaced("it needs more".to_owned());
         restarts.fails("it is silent".to_owned());
         assert_eq!(restarts.reason("the recorder", failed), "it needs more");
+    }
+
+    #[test]
+    fn a_process_that_was_replaced_is_followed_at_once() {
+        let mut restarts = ServiceRestarts::first();
+        restarts.is_replaced("it needs more".to_owned());
+        assert_eq!(restarts.ended(ExitStatus::from_raw(0)), Duration::ZERO);
+        assert!(restarts.is_due());
     }
 
     #[test]

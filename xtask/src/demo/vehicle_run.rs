@@ -47,13 +47,16 @@ const REPEATED: &str = "hello-rust";
 pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     let vehicle = DemoVehicle::start(checkout)?;
     println!("keys and a trust root are made, and gleaner-orchestrator runs\n");
-    // The last example records larger samples than the others: deployed later, it would start the
-    // recorder again.
-    let lambdas = EXAMPLES.iter().rev().flat_map(|it| LANGUAGES.map(|language| (it, language)));
+    let lambdas = EXAMPLES.iter().flat_map(|it| LANGUAGES.map(|language| (it, language)));
     let mut ids = Vec::new();
     for (example, language) in lambdas {
         ids.push(deploy(checkout, &vehicle, example, language)?);
     }
+    // It is started again for a lambda that records larger samples than those before.
+    vehicle.until("the recorder to be ready", |status| {
+        let recorder = status.supervisor.as_ref()?.recorder.as_ref()?;
+        recorder.is_ready.then_some(())
+    })?;
     let player = play(checkout)?;
     println!("\nplaying {PLAYED_S} s of {DRIVE} over DDS");
     kill(&vehicle)?;

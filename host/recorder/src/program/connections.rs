@@ -31,6 +31,8 @@ pub enum LoopEvent {
     Refused,
     /// The loop has to end: the starter sent stop, has ended, or made a protocol error.
     Stop,
+    /// The loop has to end, and the lambdas join another recorder.
+    GiveWay,
     /// Definitions of a topic on this machine, by the id of its grant.
     Definitions { id: u32, text: Option<Arc<str>> },
     /// The checks of each second.
@@ -75,6 +77,7 @@ pub fn starter(control: OwnedFd, events: SyncSender<LoopEvent>, bell: FeedBell) 
                         LoopEvent::Registered(Box::new(registration))
                     }),
                 Ok(Some(ControlMessage::Stop) | None) => LoopEvent::Stop,
+                Ok(Some(ControlMessage::GiveWay)) => LoopEvent::GiveWay,
                 Err(error) => {
                     warn!(
                         error = &error as &dyn std::error::Error,
@@ -83,7 +86,7 @@ pub fn starter(control: OwnedFd, events: SyncSender<LoopEvent>, bell: FeedBell) 
                     LoopEvent::Stop
                 }
             };
-            let is_last = matches!(event, LoopEvent::Stop);
+            let is_last = matches!(event, LoopEvent::Stop | LoopEvent::GiveWay);
             if events.send(event).is_err() || is_last {
                 return bell.ring();
             }

@@ -213,6 +213,10 @@ impl RecorderLoop {
                 }
                 LoopEvent::Refused => self.roster.count_refused(),
                 LoopEvent::Stop => self.is_ending = true,
+                LoopEvent::GiveWay => {
+                    self.roster.accept_no_more();
+                    self.is_ending = true;
+                }
                 LoopEvent::Definitions { id, text } => self.topics.found_locally(id, text),
                 LoopEvent::Health(health) => {
                     self.health = health;
@@ -293,7 +297,8 @@ impl RecorderLoop {
 
     /// Takes the remaining samples and wakes, and completes open clips.
     fn finish(&mut self) -> Result<(), Failure> {
-        // The processes of lambdas have ended, or will: their last messages are still in transit.
+        // The processes of lambdas have ended or will, or were told that no more is accepted: their
+        // last messages are still in transit.
         let until = Instant::now() + FINISH_TIMEOUT;
         while self.roster.len() > 0 && Instant::now() < until {
             let seen = self.bell.value();

@@ -82,6 +82,11 @@ impl ConnectedLambda {
         &self.name
     }
 
+    /// Accepts no further messages than those that were sent.
+    pub fn accept_no_more(&self) {
+        self.replies.accept_no_more();
+    }
+
     /// Handles queued messages of the lambda, at most [`MESSAGES_PER_TURN`].
     pub fn poll(
         &mut self,

@@ -47,6 +47,11 @@ impl Roster {
         self.lambdas.len()
     }
 
+    /// Accepts no further messages of lambdas than those that were sent.
+    pub fn accept_no_more(&self) {
+        self.lambdas.iter().for_each(ConnectedLambda::accept_no_more);
+    }
+
     pub fn counted(&self) -> &RecordingCounts {
         &self.counted
     }

@@ -71,13 +71,22 @@ impl ControlClient {
         Ok(lambda_end.into())
     }
 
-    /// Requests the recorder to complete open clips and exit.
+    /// Requests the recorder to complete open clips and exit once the lambdas have ended.
     ///
     /// # Errors
     ///
     /// [`LinkError::Gone`] if it has ended.
     pub fn stop(&mut self) -> Result<(), LinkError> {
         outgoing::send_frame(&self.socket, &frame::encode(tag::STOP, &[]), &[], RECORDER)
+    }
+
+    /// As [`stop`](Self::stop), while the lambdas run on: they join another recorder.
+    ///
+    /// # Errors
+    ///
+    /// [`LinkError::Gone`] if it has ended.
+    pub fn give_way(&mut self) -> Result<(), LinkError> {
+        outgoing::send_frame(&self.socket, &frame::encode(tag::GIVE_WAY, &[]), &[], RECORDER)
     }
 }
 
@@ -86,8 +95,10 @@ impl ControlClient {
 pub enum ControlMessage {
     /// Add a lambda, with its socket.
     Add(Box<AddLambda>, OwnedFd),
-    /// Complete open clips and exit.
+    /// Complete open clips and exit once the lambdas have ended.
     Stop,
+    /// Complete open clips and exit: the lambdas join another recorder.
+    GiveWay,
 }
 
 /// The recorder's end of the control connection.
@@ -112,6 +123,7 @@ impl ControlServer {
         let Some(mut received) = self.frames.wait(&self.socket)? else { return Ok(None) };
         match received.tag {
             tag::STOP => Ok(Some(ControlMessage::Stop)),
+            tag::GIVE_WAY => Ok(Some(ControlMessage::GiveWay)),
             tag::ADD => {
                 let add = received.json(STARTER)?;
                 Ok(Some(ControlMessage::Add(add, received.descriptor()?)))

@@ -29,6 +29,8 @@ pub(crate) mod tag {
     pub(crate) const MODEL_FILE: u8 = 7;
     /// Starter to gleaner-inference: a lambda, as JSON, with its socket.
     pub(crate) const ADD_CLIENT: u8 = 8;
+    /// Starter to recorder: as `STOP`, while the lambdas run on, with another recorder.
+    pub(crate) const GIVE_WAY: u8 = 9;
     /// Lambda to recorder: the header of its journal, as JSON. Sent once, first.
     pub(crate) const HELLO: u8 = 16;
     /// Lambda to recorder: `i64` time of the decision, `u32` number of missing wakes before it, and
@@ -57,6 +59,7 @@ pub(crate) fn name(tag: u8) -> &'static str {
     match tag {
         tag::ADD => "add",
         tag::STOP => "stop",
+        tag::GIVE_WAY => "give way",
         tag::HELLO => "hello",
         tag::WAKE => "wake",
         tag::BYE => "bye",

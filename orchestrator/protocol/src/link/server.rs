@@ -152,6 +152,13 @@ impl LambdaReplies {
         self.send(tag::OPENED, &wait_ns.to_le_bytes());
     }
 
+    /// Accepts no further messages: the lambda keeps them for another recorder. Its reader gets
+    /// those that were sent before, and then the end.
+    pub fn accept_no_more(&self) {
+        // It fails only if the other side closed it first.
+        let _ = self.socket.shutdown(std::net::Shutdown::Read);
+    }
+
     /// Closes the connection, so that its reader reaches the end.
     pub fn close(&self) {
         // It fails only if the other side closed it first.

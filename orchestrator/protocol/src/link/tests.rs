@@ -85,6 +85,7 @@ fn each_lambda_is_added_with_a_socket_of_its_own() {
     let (mut client, stdin) = ControlClient::pair().unwrap();
     let mut server = ControlServer::new(stdin);
     let lambdas = ["first", "second", "third"].map(|name| (name, client.add(&add(name)).unwrap()));
+    client.give_way().unwrap();
     client.stop().unwrap();
     drop(client);
     for (name, lambda_end) in lambdas {
@@ -98,6 +99,7 @@ fn each_lambda_is_added_with_a_socket_of_its_own() {
         UnixStream::from(recorder_end).read_to_string(&mut read).unwrap();
         assert_eq!(read, name);
     }
+    assert!(matches!(server.receive(), Ok(Some(ControlMessage::GiveWay))));
     assert!(matches!(server.receive(), Ok(Some(ControlMessage::Stop))));
     assert!(matches!(server.receive(), Ok(None)), "the starter has ended");
 }
@@ -267,6 +269,40 @@ fn a_recorder_that_does_not_read_loses_wakes_but_does_not_block_the_lambda() {
     }
     assert_eq!((triggers, lost), (all / 1000, dropped.wakes_dropped));
     assert_eq!(lambda.join().unwrap(), dropped);
+}
+
+#[test]
+fn a_recorder_that_gives_way_has_all_wakes_or_leaves_them_to_the_next() {
+    let (mut lambda, mut link, mut replies) = connected();
+    replies.ready();
+    lambda.hello(&header("hello"), TIMEOUT).unwrap();
+    let sent = (0..10).map(|at| lambda.wake(&entry(at, Some("here")), at));
+    sent.collect::<Result<(), LinkError>>().unwrap();
+    replies.accept_no_more();
+    let ended = lambda.wake(&entry(10, Some("here")), 10).unwrap_err();
+    assert!(matches!(ended, LinkError::Gone { .. }), "{ended}");
+    assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
+    for expected in 0..10 {
+        let received = link.receive().unwrap();
+        let Some(LambdaMessage::Wake { entry, .. }) = received else { panic!() };
+        assert_eq!(entry.at_ns, expected);
+    }
+    assert!(matches!(link.receive(), Ok(None)), "the end, without the lambda's doing");
+    let (lambda_end, recorder_end) = UnixStream::pair().unwrap();
+    let (mut link, mut replies) = LambdaLink::new(recorder_end.into()).unwrap();
+    lambda.rejoin(lambda_end.into(), &header("hello")).unwrap();
+    replies.ready();
+    while lambda.poll().unwrap().is_empty() {
+        thread::yield_now();
+    }
+    let losses = LinkLosses { recorders_ended: 1, ..Default::default() };
+    assert_eq!(lambda.bye(TIMEOUT), losses);
+    assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
+    let received = link.receive().unwrap();
+    assert!(
+        matches!(&received, Some(LambdaMessage::Wake { entry, missing: 0, .. }) if entry.at_ns == 10),
+        "{received:?}"
+    );
 }
 
 #[test]

@@ -209,7 +209,11 @@ impl RunObserver for Board {
             }
             RestartedPart::Lambda(lambda) => Some(lambda),
         };
-        self.event(EventKind::Failed, lambda, &failed(reason, delay));
+        // A process that was replaced has not failed.
+        match delay.is_zero() {
+            true => self.event(EventKind::Started, lambda, reason),
+            false => self.event(EventKind::Failed, lambda, &failed(reason, delay)),
+        }
     }
 
     fn warn(&mut self, text: &str) {
