@@ -75,6 +75,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-transport",
         ],
     ),
+    ("gleaner-fleet", &["gleaner-base", "gleaner-protocol"]),
     (
         "gleaner-host",
         &[

@@ -21,6 +21,8 @@ mod grants;
 mod incoming;
 mod outgoing;
 mod queue;
+#[cfg(test)]
+mod rejoin_tests;
 mod report;
 mod server;
 #[cfg(test)]

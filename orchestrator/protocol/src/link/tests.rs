@@ -16,9 +16,9 @@ use gleaner_journal::{
 use gleaner_lambda::manifest::{LambdaKind, Limits};
 use gleaner_lambda::{Fault, FaultKind, Trigger, TriggerKind};
 
-const TIMEOUT: Duration = Duration::from_secs(60);
+pub(super) const TIMEOUT: Duration = Duration::from_secs(60);
 
-fn header(lambda: &str) -> JournalHeader {
+pub(super) fn header(lambda: &str) -> JournalHeader {
     let input = JournalInput {
         name: "imu".to_owned(),
         topic: "/imu".to_owned(),
@@ -46,7 +46,7 @@ fn header(lambda: &str) -> JournalHeader {
     }
 }
 
-fn entry(at_ns: i64, label: Option<&str>) -> JournalEntry {
+pub(super) fn entry(at_ns: i64, label: Option<&str>) -> JournalEntry {
     let trigger = |label: &str| Trigger {
         kind: TriggerKind::Event,
         label: label.to_owned(),
@@ -65,7 +65,7 @@ fn entry(at_ns: i64, label: Option<&str>) -> JournalEntry {
 }
 
 /// Returns the lambda's end of a connection, and both halves of the recorder's end.
-fn connected() -> (RecorderLink, LambdaLink, LambdaReplies) {
+pub(super) fn connected() -> (RecorderLink, LambdaLink, LambdaReplies) {
     let (lambda_end, recorder_end) = UnixStream::pair().unwrap();
     let (link, replies) = LambdaLink::new(recorder_end.into()).unwrap();
     (RecorderLink::new(lambda_end.into()), link, replies)
@@ -269,71 +269,6 @@ fn a_recorder_that_does_not_read_loses_wakes_but_does_not_block_the_lambda() {
     }
     assert_eq!((triggers, lost), (all / 1000, dropped.wakes_dropped));
     assert_eq!(lambda.join().unwrap(), dropped);
-}
-
-#[test]
-fn a_recorder_that_gives_way_has_all_wakes_or_leaves_them_to_the_next() {
-    let (mut lambda, mut link, mut replies) = connected();
-    replies.ready();
-    lambda.hello(&header("hello"), TIMEOUT).unwrap();
-    let sent = (0..10).map(|at| lambda.wake(&entry(at, Some("here")), at));
-    sent.collect::<Result<(), LinkError>>().unwrap();
-    replies.accept_no_more();
-    let ended = lambda.wake(&entry(10, Some("here")), 10).unwrap_err();
-    assert!(matches!(ended, LinkError::Gone { .. }), "{ended}");
-    assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
-    for expected in 0..10 {
-        let received = link.receive().unwrap();
-        let Some(LambdaMessage::Wake { entry, .. }) = received else { panic!() };
-        assert_eq!(entry.at_ns, expected);
-    }
-    assert!(matches!(link.receive(), Ok(None)), "the end, without the lambda's doing");
-    let (lambda_end, recorder_end) = UnixStream::pair().unwrap();
-    let (mut link, mut replies) = LambdaLink::new(recorder_end.into()).unwrap();
-    lambda.rejoin(lambda_end.into(), &header("hello")).unwrap();
-    replies.ready();
-    while lambda.poll().unwrap().is_empty() {
-        thread::yield_now();
-    }
-    let losses = LinkLosses { recorders_ended: 1, ..Default::default() };
-    assert_eq!(lambda.bye(TIMEOUT), losses);
-    assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
-    let received = link.receive().unwrap();
-    assert!(
-        matches!(&received, Some(LambdaMessage::Wake { entry, missing: 0, .. }) if entry.at_ns == 10),
-        "{received:?}"
-    );
-}
-
-#[test]
-fn wakes_wait_for_the_next_recorder() {
-    let (mut lambda, link, mut replies) = connected();
-    replies.ready();
-    lambda.hello(&header("hello"), TIMEOUT).unwrap();
-    drop((link, replies));
-    let ended = lambda.wake(&entry(0, Some("here")), 0).unwrap_err();
-    assert!(matches!(ended, LinkError::Gone { .. }), "{ended}");
-    lambda.drop_queued();
-    lambda.wake(&entry(1, Some("here")), 0).unwrap();
-    lambda.wake(&entry(2, Some("here")), 0).unwrap();
-    assert!(lambda.poll().unwrap().is_empty() && !lambda.is_joined());
-    let (lambda_end, recorder_end) = UnixStream::pair().unwrap();
-    let (mut link, mut replies) = LambdaLink::new(recorder_end.into()).unwrap();
-    lambda.rejoin(lambda_end.into(), &header("hello")).unwrap();
-    assert!(lambda.poll().unwrap().is_empty() && !lambda.is_joined());
-    assert!(matches!(link.receive(), Ok(Some(LambdaMessage::Hello(_)))));
-    replies.ready();
-    while lambda.poll().unwrap().is_empty() {
-        thread::yield_now();
-    }
-    assert!(lambda.is_joined());
-    let losses = LinkLosses { recorders_ended: 1, triggers_lost: 1, ..Default::default() };
-    assert_eq!(lambda.bye(TIMEOUT), losses);
-    for expected in [(1, 1), (2, 0)] {
-        let received = link.receive().unwrap();
-        let Some(LambdaMessage::Wake { entry, missing, .. }) = received else { panic!() };
-        assert_eq!((entry.at_ns, missing), expected);
-    }
 }
 
 #[test]

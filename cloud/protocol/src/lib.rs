@@ -1,0 +1,22 @@
+//! Messages between vehicles, people and the cloud.
+//!
+//! `frame` has the frames of the control channel: one WebSocket per vehicle, opened by it.
+//! `enrolment` has the messages by which a vehicle gets its certificate, and `people` those of the
+//! API for people. Nothing here opens a connection.
+//!
+//! A vehicle is given the complete wanted state, never a change of it: a list of deployments, each
+//! by the digest of its signed envelope. It fetches envelopes and files that it lacks by HTTPS from
+//! the same address, and verifies all of them by its own trust root. What it has recorded goes up
+//! in batches, and counts as delivered once the cloud has acknowledged it.
+
+mod enrolment;
+mod frame;
+pub mod people;
+
+pub use enrolment::{
+    CERTIFICATE_NAME, EnrolReply, EnrolRequest, Enrolment, EnrolmentError, RenewRequest,
+};
+pub use frame::{
+    Ack, Body, Cursor, Desired, FRAME_MAX, Frame, FrameError, GoAway, Hello, LINES_MAX, PROTOCOL,
+    Ping, Pong, Records, Reported, Wanted, Welcome, compress, decompress, desired_digest,
+};

@@ -1,0 +1,223 @@
+//! Messages of the API for people: JSON over HTTP, each request with a token.
+//!
+//! | request | role | answer |
+//! |---|---|---|
+//! | `POST /v1/login` | none | [`Session`], of a [`Login`] |
+//! | `GET /v1/me` | viewer | [`User`] |
+//! | `GET /v1/users` | admin | [`User`] of each |
+//! | `POST /v1/users` | admin | [`Invitation`], of a [`NewUser`] |
+//! | `DELETE /v1/users/NAME` | admin | nothing |
+//! | `GET /v1/vehicles` | viewer | [`VehicleSummary`] of each |
+//! | `POST /v1/vehicles` | admin | [`Enrolment`](crate::Enrolment), of a [`NewVehicle`] |
+//! | `DELETE /v1/vehicles/NAME` | admin | nothing, once it is cut off |
+//! | `GET /v1/vehicles/NAME/status` | viewer | [`VehicleStatus`](gleaner_protocol::vehicle_api::VehicleStatus) |
+//! | `GET /v1/vehicles/NAME/events`, `.../lambdas/ID/records` | viewer | a line of JSON per record |
+//! | `PUT /v1/objects/SHA256` | deployer | nothing |
+//! | `POST /v1/deployments` | deployer | `DeployReply`, of a `DeployRequest` as on a vehicle |
+//! | `GET /v1/deployments` | viewer | [`FleetDeployment`] of each |
+//! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | operator | [`FleetDeployment`] |
+//! | `DELETE /v1/deployments/ID` | deployer | nothing |
+//! | `GET /v1/audit` | admin | [`AuditEntry`] of each, the newest first |
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+/// The rights of a user. Each has those of the ones before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Role {
+    /// May read everything but the audit trail and users.
+    Viewer,
+    /// May start, stop and roll back deployments.
+    Operator,
+    /// May add and remove deployments.
+    Deployer,
+    /// May add and remove vehicles and users, and read the audit trail.
+    Admin,
+}
+
+impl Role {
+    /// Returns its name.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Role::Viewer => "viewer",
+            Role::Operator => "operator",
+            Role::Deployer => "deployer",
+            Role::Admin => "admin",
+        }
+    }
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+impl FromStr for Role {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let all = [Role::Viewer, Role::Operator, Role::Deployer, Role::Admin];
+        all.into_iter().find(|role| role.as_str() == text).ok_or_else(|| {
+            let text = gleaner_base::excerpt(text);
+            format!("`{text}` is no role: they are viewer, operator, deployer and admin")
+        })
+    }
+}
+
+/// A request for a token, by the one-time code of an invitation.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Login {
+    /// The code.
+    pub code: String,
+}
+
+/// A token of a user. It is not shown again.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Session {
+    /// The user.
+    pub user: User,
+    /// The token, for the header `Authorization: Bearer TOKEN`.
+    pub token: String,
+    /// End of the token, in s since 1970.
+    pub expires: u64,
+}
+
+/// A user.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct User {
+    /// The name.
+    pub name: String,
+    /// The rights.
+    pub role: Role,
+}
+
+/// A request to add a user, or to invite one again.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NewUser {
+    /// The name.
+    pub name: String,
+    /// The rights.
+    pub role: Role,
+}
+
+/// An invitation of a user.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Invitation {
+    /// The user.
+    pub user: User,
+    /// The code, which works once.
+    pub code: String,
+    /// End of the code, in s since 1970.
+    pub expires: u64,
+}
+
+/// A request to enrol a vehicle.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NewVehicle {
+    /// The name.
+    pub name: String,
+}
+
+/// A vehicle in a list.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct VehicleSummary {
+    /// The name.
+    pub name: String,
+    /// The labels that it has reported.
+    pub labels: BTreeMap<String, String>,
+    /// Its state.
+    pub state: VehicleState,
+    /// Time of its last sign of life, in s since 1970; absent before the first one.
+    pub seen: Option<u64>,
+    /// Version of its orchestrator.
+    pub version: Option<String>,
+    /// Number of its wanted state.
+    pub wanted: u64,
+    /// Number of the newest wanted state that it has handled.
+    pub handled: u64,
+    /// The reasons why parts of its wanted state are not applied.
+    pub problems: Vec<String>,
+    /// Number of its deployments that run.
+    pub running: u64,
+    /// Number of its deployments.
+    pub deployments: u64,
+}
+
+/// The state of a vehicle, as the cloud sees it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum VehicleState {
+    /// It was invited, and has not connected yet.
+    Invited,
+    /// It is connected.
+    Online,
+    /// It is not connected.
+    Offline,
+    /// It was cut off.
+    Revoked,
+}
+
+/// A deployment of the fleet.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FleetDeployment {
+    /// Its id.
+    pub id: String,
+    /// Number of its release.
+    pub release: u64,
+    /// Digest of its revision.
+    pub revision: String,
+    /// Digest of its fallback.
+    pub fallback: Option<String>,
+    /// Labels that a vehicle must have.
+    pub selector: BTreeMap<String, String>,
+    /// False if it is stopped.
+    pub is_wanted: bool,
+    /// Number of vehicles that should run it.
+    pub vehicles: u64,
+    /// Number of these that run it.
+    pub running: u64,
+    /// Number of these that refuse it, or whose lambda has failed.
+    pub failed: u64,
+}
+
+/// An entry of the audit trail.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AuditEntry {
+    /// Number of the entry.
+    pub seq: u64,
+    /// Time, in ms since 1970.
+    pub time_ms: i64,
+    /// The user, or the vehicle.
+    pub actor: String,
+    /// The action.
+    pub action: String,
+    /// The thing that it was done to.
+    pub subject: String,
+    /// SHA-256 over the hash of the entry before it and this entry.
+    pub hash: String,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn roles_are_parsed_and_ordered() {
+        let all = ["viewer", "operator", "deployer", "admin"];
+        let roles: Vec<Role> = all.iter().map(|role| role.parse().unwrap()).collect();
+        assert!(roles.is_sorted());
+        assert_eq!(roles.iter().map(ToString::to_string).collect::<Vec<_>>(), all);
+        assert_eq!(
+            "root".parse::<Role>().unwrap_err(),
+            "`root` is no role: they are viewer, operator, deployer and admin"
+        );
+    }
+}
