@@ -132,6 +132,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         "gleaner-orchestrator",
         &[
             "gleaner-base",
+            "gleaner-fleet",
             "gleaner-lambda",
             "gleaner-parts",
             "gleaner-protocol",

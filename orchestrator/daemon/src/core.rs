@@ -18,7 +18,7 @@ use crate::admission::{self, Budgets, LambdaDemand, Measurements};
 use crate::checked::SignedDeployment;
 use crate::durable::DurableFile;
 use crate::layout::VehicleFolders;
-use crate::state::{Deployed, VehicleState};
+use crate::state::{CloudWish, Deployed, VehicleState};
 use crate::store::{self, RevisionStore};
 use crate::trust::VehicleTrust;
 
@@ -221,6 +221,22 @@ impl Core {
             let version = &fallback.payload().version;
             Ok((EventKind::RolledBack, format!("runs its fallback {version}: {reason}")))
         })
+    }
+
+    /// Notes that a wish of the cloud was followed.
+    ///
+    /// # Errors
+    ///
+    /// A failure if there is no such deployment, or the disk is full.
+    pub(crate) fn note_wish(&self, id: &ItemName, wish: &CloudWish) -> Result<(), Failure> {
+        let mut inner = self.lock();
+        let mut state = inner.state.clone();
+        let deployed = state.deployments.get_mut(id);
+        let deployed = deployed.ok_or_else(|| inner.unknown(id.as_str()))?;
+        deployed.cloud = Some(wish.clone());
+        self.change(&mut inner, state)?;
+        self.publish(&mut inner);
+        Ok(())
     }
 
     fn update(

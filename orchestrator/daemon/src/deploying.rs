@@ -14,20 +14,25 @@ use crate::checked::SignedDeployment;
 use crate::compile;
 use crate::core::{Core, Inner};
 use crate::spools;
-use crate::state::{Deployed, VehicleState};
+use crate::state::{CloudWish, Deployed, VehicleState};
 use crate::store::KnownFiles;
 
 /// Maximum number of deployments that wait for files.
 const OFFERS_MAX: usize = LAMBDAS_MAX;
 
 impl Core {
-    /// Checks a deployment and runs it, or returns the files that are missing for it.
+    /// Checks a deployment and runs it, or returns the files that are missing for it. `wish` is
+    /// that of the cloud if it comes from there.
     ///
     /// # Errors
     ///
     /// A failure with the reason; what ran before goes on.
-    pub(crate) fn deploy(&self, request: &DeployRequest) -> Result<DeployReply, Failure> {
-        let reply = self.try_deploy(request);
+    pub(crate) fn deploy(
+        &self,
+        request: &DeployRequest,
+        wish: Option<&CloudWish>,
+    ) -> Result<DeployReply, Failure> {
+        let reply = self.try_deploy(request, wish);
         if let Err(failure) = &reply {
             self.event(EventKind::Refused, None, &failure.to_string());
             // What has expired once stays expired, also if the clock is reset soon.
@@ -36,7 +41,11 @@ impl Core {
         reply
     }
 
-    fn try_deploy(&self, request: &DeployRequest) -> Result<DeployReply, Failure> {
+    fn try_deploy(
+        &self,
+        request: &DeployRequest,
+        wish: Option<&CloudWish>,
+    ) -> Result<DeployReply, Failure> {
         let deploying = || self.deploying.lock().unwrap_or_else(PoisonError::into_inner);
         let changing = deploying();
         let inner = self.lock();
@@ -97,7 +106,7 @@ impl Core {
         verify(&inner)?;
         inner.check_name(&signed)?;
         admit(&inner)?;
-        let accepted = self.accept(&mut inner, signed, &request.deployment, manifests)?;
+        let accepted = self.accept(&mut inner, signed, (&request.deployment, wish), manifests)?;
         self.collect(&mut inner);
         Ok(accepted)
     }
@@ -140,12 +149,15 @@ impl Core {
         &self,
         inner: &mut Inner,
         signed: SignedDeployment,
-        envelope: &str,
+        (envelope, wish): (&str, Option<&CloudWish>),
         manifests: Vec<(Sha256, Manifest)>,
     ) -> Result<DeployReply, Failure> {
         let id = signed.id().clone();
         let before = inner.state.deployments.get(&id);
-        let is_same = before.is_some_and(|before| before.envelope == *envelope && before.is_wanted);
+        let is_noted = |before: &Deployed| wish.is_none() || before.cloud.as_ref() == wish;
+        let is_same = before.is_some_and(|before| {
+            before.envelope == *envelope && before.is_wanted && is_noted(before)
+        });
         if !is_same {
             let running = before.map(|_| inner.signed.get(&id)).and_then(|it| it?.as_ref().ok());
             let history = match (before, running) {
@@ -167,6 +179,7 @@ impl Core {
                 is_proven: kept.is_some_and(|kept| kept.is_proven),
                 failed: kept.and_then(|kept| kept.failed.clone()),
                 history,
+                cloud: wish.or(kept.and_then(|kept| kept.cloud.as_ref())).cloned(),
             };
             let revision = signed.revision.payload();
             let text = format!(

@@ -21,7 +21,9 @@ use tokio::sync::watch;
 
 use crate::api::Api;
 use crate::clock_jumps::ClockJumps;
+use crate::cloud::{Cloud, CloudLink};
 use crate::core::Core;
+use crate::durable::DurableFile;
 use crate::layout::VehicleFolders;
 use crate::link::SupervisorLink;
 
@@ -188,7 +190,14 @@ async fn serve(
     let mut link = tokio::spawn(link.keep());
     let measuring = Arc::clone(&core);
     tokio::task::spawn_blocking(move || measuring.measure_speed());
-    let api = Api { core: Arc::clone(&core), layout, name, key, started: Instant::now() };
+    let (cloud, damage) = Cloud::load(DurableFile::new(layout.cloud()));
+    if let Some(damage) = damage {
+        let text = format!("the file of the enrolment is damaged: {damage}");
+        core.event(EventKind::Warning, None, &text);
+    }
+    let (core, started) = (Arc::clone(&core), Instant::now());
+    let api = Api { core: Arc::clone(&core), layout, name, key, started, cloud };
+    tokio::spawn(CloudLink { api: api.clone() }.keep());
     if let Some(address) = metrics {
         serve_metrics(address, &api).await;
     }
