@@ -114,6 +114,7 @@ impl Api {
             capacity: self.core.capacity(),
             events_lost: self.core.events.lost(),
             supervisor,
+            cloud: None,
         }
     }
 

@@ -38,6 +38,28 @@ pub struct VehicleStatus {
     pub events_lost: u64,
     /// The processes; absent while the supervisor cannot be reached.
     pub supervisor: Option<SupervisorStatus>,
+    /// The connection to a cloud; absent if the vehicle is not enrolled.
+    #[serde(default)]
+    pub cloud: Option<CloudStatus>,
+}
+
+/// The status of the connection to a cloud.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CloudStatus {
+    /// Address of the cloud for vehicles: `HOST:PORT`.
+    pub address: String,
+    /// Its state: `connecting`, `connected` or `refused`.
+    pub state: String,
+    /// The reason why it is not connected.
+    pub reason: Option<String>,
+    /// Time since the state began, in s.
+    pub since_s: f64,
+    /// Number of the newest wanted state of the cloud that was handled.
+    pub generation: u64,
+    /// Number of records that the cloud has not acknowledged yet.
+    pub unsent: u64,
+    /// End of the certificate of the vehicle, in s since 1970.
+    pub certificate_expires: u64,
 }
 
 /// The status of a program.
