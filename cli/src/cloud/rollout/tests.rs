@@ -32,8 +32,8 @@ fn status(deployments: &[Value]) -> VehicleStatus {
 
 fn lambda(phase: &str, attempt: u64) -> Value {
     json!({
-        "id": "brake", "lambda": "brake", "attempt": attempt, "phase": phase, "phase_s": 1.0,
-        "restarts": 0, "last_end": "exit code 1",
+        "id": "brake", "name": "brake", "revision": "new", "attempt": attempt, "phase": phase,
+        "phase_s": 1.0, "restarts": 0, "last_end": "exit code 1", "layers": [],
     })
 }
 
@@ -117,8 +117,11 @@ fn a_stop_and_a_removal_wait_for_the_end_of_the_lambda() {
 }
 
 fn supervisor() -> SupervisorStatus {
-    let ingress = json!({ "pid": null, "is_ready": true, "restarts": 0, "last_end": null });
-    serde_json::from_value(json!({ "ingress": ingress, "lambdas": [] })).unwrap()
+    let status = json!({
+        "generation": 1, "up_s": 1.0, "lambdas": [], "clips": 0, "events_lost": 0,
+        "ingress": { "is_ready": true, "restarts": 0 },
+    });
+    serde_json::from_value(status).unwrap()
 }
 
 #[test]

@@ -144,8 +144,7 @@ fn a_connection_that_ends_within_an_answer_is_lost() {
 fn a_cloud_that_is_gone_or_never_stops_is_an_error() {
     let cloud = OneAnswer::new();
     let failure = thread::scope(|scope| {
-        let served =
-            scope.spawn(|| serve_without_end(cloud.0.accept().unwrap().0, "200 OK"));
+        let served = scope.spawn(|| serve_without_end(cloud.0.accept().unwrap().0, "200 OK"));
         let client = cloud.client("t");
         let failure = get(&client).unwrap_err().to_string();
         drop(client);
