@@ -87,8 +87,6 @@ fn commands_of_the_cloud_itself_are_passed_on_with_their_exit_status() {
     let user = CloudUser::new();
     let home = user.path("home");
     fs::create_dir(&home).unwrap();
-    let text = user.fails(2, &["cloud", "serve", "--state", "dir"]);
-    assert!(text.contains("gleaner-cloud"), "{text}");
     let program = home.join("gleaner-cloud");
     fs::write(&program, "#!/bin/sh\necho \"$@\"\nexit 7\n").unwrap();
     fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
