@@ -4,8 +4,9 @@
 //! for `check`, `replay` and `verify`, `run` runs lambdas live by `gleaner-supervisor`, `engines`
 //! builds engines of models ahead, `signing` makes keys and signs builds, `vehicle` deploys builds
 //! and shows what runs, `cloud` does so for the vehicles of a cloud, whose address and token are in
-//! `account`, and `delegate` passes commands on to another program. `render` formats results as text, `report` writes the report page, `diff` compares two runs, and `dev` repeats
-//! all of this whenever a source is saved. `generated` prints shell completions and man pages.
+//! `account`, and `delegate` passes commands on to another program. `render` formats results as
+//! text, `report` writes the report page, `diff` compares two runs, and `dev` repeats all of this
+//! whenever a source is saved. `generated` prints shell completions and man pages.
 //!
 //! No lambda runs in this process, and it links neither a WebAssembly engine nor Python: it starts
 //! the other programs and exchanges `gleaner-protocol` messages with them. `gleaner-report` reads

@@ -98,7 +98,8 @@ fn deployments(client: &VehicleClient) -> Result<Vec<FleetDeployment>, Failure> 
     client.get("/v1/deployments")
 }
 
-/// Returns the newest release of a deployment that a vehicle has or had: it accepts only later ones.
+/// Returns the newest release of a deployment that a vehicle has or had. It accepts only later
+/// ones.
 fn newest_on_vehicles(client: &VehicleClient, id: &str) -> Result<u64, Failure> {
     let vehicles: Vec<VehicleSummary> = client.get("/v1/vehicles")?;
     let release = |status: VehicleStatus| {
