@@ -36,7 +36,7 @@ pub(super) fn enrol(args: &EnrolArgs) -> Result<Exit, Failure> {
         let state = cloud.as_ref().map(|cloud| &*cloud.state);
         if state == Some("connected") {
             return show(args.vehicle.json, &cloud, |cloud| {
-                vehicle::cloud(cloud.as_ref(), Paint::of_stdout()).trim_start().to_owned()
+                vehicle::cloud_line(cloud.as_ref(), Paint::of_stdout()).trim_start().to_owned()
             });
         }
         let address = visible(&enrolment.address);

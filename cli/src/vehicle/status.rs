@@ -39,7 +39,7 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         }
         Some(trust) => format!("  trust root {}\n", trust.version),
     };
-    text += &cloud(status.cloud.as_ref(), paint);
+    text += &cloud_line(status.cloud.as_ref(), paint);
     for capacity in &status.capacity {
         text += &format!("  {} ({})\n", shared(capacity), visible(&capacity.source));
     }
@@ -81,7 +81,7 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
 }
 
 /// Returns the line of the connection to a cloud, if there is one.
-pub(crate) fn cloud(status: Option<&CloudStatus>, paint: Paint) -> String {
+pub(crate) fn cloud_line(status: Option<&CloudStatus>, paint: Paint) -> String {
     let Some(status) = status else { return String::new() };
     let state = match &*status.state {
         "connected" => paint.green("connected"),
