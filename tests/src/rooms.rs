@@ -52,6 +52,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         &[
             "gleaner-artifacts",
             "gleaner-base",
+            "gleaner-fleet",
             "gleaner-journal",
             "gleaner-lambda",
             "gleaner-parts",

@@ -25,7 +25,7 @@ pub(crate) fn events(args: &StreamArgs) -> Result<Exit, Failure> {
 }
 
 fn show(path: &str, args: &StreamArgs) -> Result<Exit, Failure> {
-    let client = VehicleClient::new(&args.vehicle)?;
+    let client = VehicleClient::of(&args.vehicle, &args.on)?;
     let path = format!("{path}?last={}&follow={}", args.last, args.follow);
     let paint = Paint::of_stdout();
     if args.follow {
