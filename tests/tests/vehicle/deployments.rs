@@ -248,6 +248,25 @@ pub fn quarantined() {
     assert_eq!(events(&vehicle, EventKind::Quarantined).len(), 2);
 }
 
+pub fn killed_by_itself() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let code = "def __init__(self, ctx):\n\
+                \u{20}   import os, threading\n\
+                \u{20}   threading.Timer(0.2, os.kill, (os.getpid(), 9)).start()\n\
+                def on_tick(self, ctx):\n    pass";
+    let lambda = PythonLambda::new("killer", code);
+    vehicle.deploy(lambda.path(), &[]);
+    let status = vehicle.until("the quarantine", |vehicle| {
+        let status = vehicle.deployment("killer").status;
+        status.filter(|status| status.phase == LambdaPhase::Quarantined)
+    });
+    let reason = status.last_end.unwrap_or_default();
+    assert!(reason.contains("killed 15 times in a row"), "{reason}");
+    assert!(reason.contains("signal 9 (SIGKILL), by another program or by the lambda"), "{reason}");
+    assert_eq!(status.restarts, 14);
+}
+
 pub fn at_once() {
     let mut vehicle = TestVehicle::new();
     vehicle.start();

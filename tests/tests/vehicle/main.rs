@@ -20,13 +20,14 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 22] = [
+const CASES: [Case; 23] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_supervisor_that_ends_after_sighup_is_no_zombie", deployments::reaped),
     ("after_an_upgrade_old_and_new_programs_do_not_mix", deployments::upgraded),
     ("a_stopped_deployment_stays_stopped", deployments::stopped),
     ("a_failed_revision_is_replaced_by_its_fallback_for_good", deployments::fallback),
     ("a_lambda_without_a_fallback_is_quarantined_alone", deployments::quarantined),
+    ("a_lambda_that_kills_itself_between_wakes_is_quarantined", deployments::killed_by_itself),
     ("a_revision_whose_wakes_fault_fails_its_probation", faults::probation),
     ("a_proven_lambda_whose_wakes_fault_runs_on_with_a_warning", faults::proven),
     ("a_lambda_decides_without_a_recorder_and_joins_the_next_one", recorder::missing),
