@@ -238,6 +238,11 @@ pub fn quarantined() {
     let killer = PythonLambda::new("killer", code);
     let said = text(&vehicle.deploy(killer.path(), &[]));
     assert!(said.contains("it failed 3 times in a row before it was ready"), "{said}");
+    // An exit code that the lambda chose is not one of the runtime.
+    let code = "def __init__(self, ctx):\n    import os\n    os._exit(2)";
+    let said = text(&vehicle.deploy(PythonLambda::new("quitter", code).path(), &[]));
+    assert!(said.contains("it failed 3 times in a row before it was ready"), "{said}");
+    assert!(said.contains("code ended its process with exit code 2 in its constructor"), "{said}");
     let status = vehicle.deployment("broken").status.expect("it is known");
     assert_eq!((status.phase, status.restarts), (LambdaPhase::Quarantined, 2));
     // Its log has the cause, also of the first process.
@@ -245,7 +250,7 @@ pub fn quarantined() {
     let starts = log.iter().filter(|line| line.kind == "started").count();
     assert_eq!(starts, 3, "{log:?}");
     assert_eq!(vehicle.deployment("other").status.expect("it runs").restarts, 0);
-    assert_eq!(events(&vehicle, EventKind::Quarantined).len(), 2);
+    assert_eq!(events(&vehicle, EventKind::Quarantined).len(), 3);
 }
 
 pub fn killed_by_itself() {
