@@ -219,6 +219,12 @@ pub fn fallback() {
     let revisions = files(&vehicle.path("state/revisions"));
     assert_eq!(revisions.len(), 4, "one of `other`, the newest, and two before: {revisions:?}");
     assert!(files(&vehicle.path("state/objects")).is_empty());
+    // A fallback that is taken while a deployment waits is a failure of it.
+    lambda.write("guard", "0.7.0", "def __init__(self, ctx):\n    raise ValueError('no')");
+    let said = text(&vehicle.deploy(lambda.path(), &[]));
+    assert!(said.contains("exit status: 6"), "{said}");
+    assert!(said.contains("deployment `guard` runs its fallback 0.6.0"), "{said}");
+    assert!(said.contains("0.7.0 failed: it failed 3 times in a row"), "{said}");
 }
 
 pub fn quarantined() {
