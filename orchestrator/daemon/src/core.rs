@@ -7,7 +7,6 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_lambda::{Manifest, Vehicle};
-use gleaner_protocol::LiveStatus;
 use gleaner_protocol::supervision::{
     DesiredState, EventKind, LambdaPhase, SupervisorStatus, VehicleEvent,
 };
@@ -267,7 +266,7 @@ impl Core {
             let has_run = lambda.phase_s >= self.vehicle.deployments.probation.as_secs_f64();
             let failure = match lambda.phase {
                 LambdaPhase::Quarantined => Some(lambda.last_end.clone().unwrap_or_default()),
-                _ => lambda.live.as_deref().and_then(LiveStatus::faulty),
+                _ => lambda.recent.faulty(),
             };
             match failure {
                 Some(reason) => {

@@ -284,7 +284,7 @@ impl SupervisedLambda {
         drive_ended: bool,
         observer: &mut dyn RunObserver,
     ) {
-        let Self { lambda, state, was_ready, since, .. } = self;
+        let Self { lambda, state, was_ready, since, earlier, .. } = self;
         let LambdaState::Running(process) = state else { return };
         observer.lambda(lambda, &report);
         match report {
@@ -301,6 +301,7 @@ impl SupervisedLambda {
             Report::Live(live) => {
                 process.has_faulted |= live.faults > 0;
                 process.after_drive += u32::from(drive_ended);
+                earlier.observe(&live);
                 process.last = Some(live);
                 self.warn(observer);
             }
@@ -365,6 +366,7 @@ impl SupervisedLambda {
             restarts: self.restarts,
             last_end: self.last_end.clone(),
             live: self.earlier.with(last).map(Box::new),
+            recent: self.earlier.recent(),
             layers: process.map(|process| process.layers.clone()).unwrap_or_default(),
         })
     }
