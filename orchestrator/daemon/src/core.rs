@@ -130,7 +130,7 @@ impl Core {
             event,
             lambda: lambda.map(ItemName::to_string),
             revision: None,
-            text: gleaner_base::visible(text),
+            text: gleaner_base::in_one_line(text),
         });
     }
 
