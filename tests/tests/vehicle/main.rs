@@ -20,7 +20,7 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 23] = [
+const CASES: [Case; 25] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_supervisor_that_ends_after_sighup_is_no_zombie", deployments::reaped),
     ("after_an_upgrade_old_and_new_programs_do_not_mix", deployments::upgraded),
@@ -35,6 +35,8 @@ const CASES: [Case; 23] = [
     ("what_is_not_signed_for_this_vehicle_is_refused", refused::signatures),
     ("a_file_that_was_changed_later_does_not_start", refused::changed_file),
     ("a_removed_deployment_is_gone_and_its_releases_stay_known", deployments::removed),
+    ("revisions_outlive_a_lost_state", refused::lost_state),
+    ("a_deployment_that_could_not_be_read_is_verified_again", refused::retried),
     ("what_does_not_fit_is_refused_with_both_numbers", refused::memory),
     ("a_lambda_that_states_too_much_is_refused_and_others_run_on", refused::cpu),
     ("a_lambda_runs_with_its_wheels_and_not_with_changed_ones", wheels::runs),
