@@ -264,7 +264,7 @@ fn wait(
     client: &VehicleClient,
     args: &VehicleArgs,
     id: &str,
-    attempt: u64,
+    requested: u64,
     timeout: Duration,
 ) -> Result<Exit, Failure> {
     let started = Instant::now();
@@ -279,11 +279,15 @@ fn wait(
             return Err(failure);
         }
         // Of a fallback that is about to start, the attempt is a later one.
-        let attempt = attempt.max(deployment.attempt);
+        let attempt = requested.max(deployment.attempt);
         let newer = |lambda: &&LambdaStatus| lambda.attempt >= attempt;
         let lambda = deployment.status.as_ref().filter(newer);
         match lambda.map(|lambda| lambda.phase) {
-            Some(LambdaPhase::Running) => return running(args, deployment, started.elapsed()),
+            Some(LambdaPhase::Running) => {
+                // Another attempt than the one that was requested: the fallback took its place.
+                let has_failed = deployment.attempt > requested;
+                return running(args, deployment, started.elapsed(), has_failed);
+            }
             Some(LambdaPhase::Quarantined) => {
                 let mut failure = Failure::new(
                     Exit::LambdaFaulted,
@@ -311,25 +315,33 @@ fn wait(
     }
 }
 
+/// Shows the revision that runs. It is a failure if the fallback was taken as the revision
+/// `has_failed`; a rollback that a user requested is none.
 fn running(
     args: &VehicleArgs,
     deployment: &DeploymentStatus,
     after: Duration,
+    has_failed: bool,
 ) -> Result<Exit, Failure> {
-    let fallback = deployment.fallback.as_ref();
-    // Another attempt than the one that was requested: the fallback came to its place.
-    let failed = deployment.failed.as_deref().filter(|_| deployment.runs_fallback);
-    let version = fallback.filter(|_| deployment.runs_fallback).unwrap_or(&deployment.revision);
+    let DeploymentStatus { id, revision, fallback, failed, runs_fallback, .. } = deployment;
+    let fallback = fallback.as_ref().filter(|_| *runs_fallback);
+    let version = &fallback.unwrap_or(revision).version;
+    let reason = failed.as_deref().filter(|_| fallback.is_some());
     if args.json {
         print(&json_line(deployment))?;
-    } else {
-        let (ms, version) = (after.as_millis(), &version.version);
-        print(&match failed {
-            Some(reason) => format!("running its fallback {version}: {reason}\n"),
-            None => format!("running {version} after {ms} ms\n"),
-        })?;
     }
-    // A rollback that a user asked for is no failure.
+    match reason {
+        Some(reason) if has_failed => {
+            let message = format!("deployment `{id}` runs its fallback {version}");
+            let mut failure = Failure::new(Exit::LambdaFaulted, message);
+            failure.causes = vec![format!("{} failed: {reason}", revision.version)];
+            let help = "repair the lambda and deploy it again";
+            return Err(failure.with_help(format!("{help}; `gleaner logs {id}` shows its log")));
+        }
+        _ if args.json => {}
+        Some(reason) => print(&format!("running its fallback {version}: {reason}\n"))?,
+        None => print(&format!("running {version} after {} ms\n", after.as_millis()))?,
+    }
     Ok(Exit::Ok)
 }
 

@@ -1,6 +1,6 @@
 //! `gleaner status`: what runs on a vehicle.
 
-use gleaner_base::{Exit, Failure, UtcTime, format_duration, visible};
+use gleaner_base::{Exit, Failure, UtcTime, format_duration, in_one_line, visible};
 use gleaner_protocol::LossOutcome;
 use gleaner_protocol::link::RecorderStatus;
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus};
@@ -147,7 +147,8 @@ pub(super) fn reasons(deployment: &DeploymentStatus) -> Vec<String> {
         ("uses more than it states", exceeds.as_ref()),
         ("last end", last_end),
     ];
-    let line = |(what, why): (&str, Option<&String>)| Some(format!("{what}: {}", visible(why?)));
+    let line =
+        |(what, why): (&str, Option<&String>)| Some(format!("{what}: {}", in_one_line(why?)));
     let warnings = deployment.status.iter().flat_map(LambdaStatus::warnings).flatten();
     all.into_iter().filter_map(line).chain(warnings).collect()
 }
@@ -164,7 +165,7 @@ fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> St
     let Some(status) = status else { return String::new() };
     let state = if status.is_ready { paint.green("ready") } else { paint.red("not ready") };
     let restarts = match &status.last_end {
-        Some(reason) => format!(", restarts {}: {}", status.restarts, visible(reason)),
+        Some(reason) => format!(", restarts {}: {}", status.restarts, in_one_line(reason)),
         None => String::new(),
     };
     format!("  {name} {state}{restarts}\n")

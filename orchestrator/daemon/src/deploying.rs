@@ -111,6 +111,70 @@ impl Core {
         Ok(accepted)
     }
 
+    /// Verifies all deployments of the state again.
+    pub(crate) fn verify(&self, inner: &mut Inner) {
+        (inner.signed, inner.manifests) = (BTreeMap::new(), BTreeMap::new());
+        self.verify_others(inner, &BTreeMap::new());
+    }
+
+    /// Verifies those deployments again that are refused: this machine may have lacked memory or
+    /// open files, or its disk may have failed.
+    pub(crate) fn verify_refused(&self) {
+        let mut inner = self.lock();
+        let all = std::mem::take(&mut inner.signed);
+        let refused: BTreeMap<_, _>;
+        (inner.signed, refused) = all.into_iter().partition(|(_, signed)| signed.is_ok());
+        if refused.is_empty() {
+            return;
+        }
+        self.verify_others(&mut inner, &refused);
+        for id in refused.keys().filter(|id| inner.signed[*id].is_ok()) {
+            self.event(EventKind::Deployed, Some(id), "accepted: it is not refused any more");
+        }
+        self.publish(&mut inner);
+    }
+
+    /// Verifies the deployments that were not verified yet. A refusal is an event, unless it is as
+    /// in `before`.
+    fn verify_others(
+        &self,
+        inner: &mut Inner,
+        before: &BTreeMap<ItemName, Result<SignedDeployment, String>>,
+    ) {
+        let Inner { state, trust, signed, manifests, .. } = inner;
+        for (id, deployed) in &state.deployments {
+            if signed.contains_key(id) {
+                continue;
+            }
+            let checked = trust.verifier().and_then(|verifier| {
+                let find = |digest: &Sha256| self.store.envelope(digest).ok();
+                let envelope = deployed.envelope.as_bytes();
+                let mut signed = SignedDeployment::verify(&verifier, envelope, find)?;
+                manifests.insert(id.clone(), self.check_manifests(&mut signed)?);
+                Ok(signed)
+            });
+            let checked = checked.map_err(|failure| failure.to_string());
+            if let Err(reason) = &checked
+                && before.get(id).and_then(|it| it.as_ref().err()) != Some(reason)
+            {
+                self.event(EventKind::Refused, Some(id), reason);
+            }
+            signed.insert(id.clone(), checked);
+        }
+    }
+
+    /// Checks the manifests of a deployment, and returns them with the limits that apply here.
+    pub(crate) fn check_manifests(
+        &self,
+        signed: &mut SignedDeployment,
+    ) -> Result<Vec<(Sha256, Manifest)>, Failure> {
+        let mut manifests = signed.check_manifests(&self.store)?;
+        for (_, manifest) in &mut manifests {
+            manifest.limits = manifest.limits.tightened_by(&self.vehicle.limits).0;
+        }
+        Ok(manifests)
+    }
+
     /// Removes a deployment, and lets its lambda end. What the vehicle has accepted stays
     /// remembered: no earlier release of it is accepted afterwards.
     ///

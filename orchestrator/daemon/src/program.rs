@@ -52,6 +52,8 @@ struct Args {
 /// Interval at which the trusted time is moved; also at the end, after a jump of the clock and with
 /// a refusal. Each time is a write of the state.
 const TIME_INTERVAL: Duration = Duration::from_secs(600);
+/// Interval at which refused deployments are verified again.
+const REFUSED_INTERVAL: Duration = Duration::from_secs(10);
 /// Interval at which the watchdog is reset, and the clock is looked at.
 const WATCHDOG_INTERVAL: Duration = Duration::from_secs(3);
 
@@ -205,6 +207,7 @@ async fn serve(
     let _ = sd_notify::notify(&[sd_notify::NotifyState::Ready]);
     let mut watchdog = tokio::time::interval(WATCHDOG_INTERVAL);
     let mut time = tokio::time::interval(TIME_INTERVAL);
+    let mut refused = tokio::time::interval(REFUSED_INTERVAL);
     let mut jumps = ClockJumps::new();
     loop {
         tokio::select! {
@@ -222,6 +225,7 @@ async fn serve(
                 }
             }
             _ = time.tick() => core.observe_time(),
+            _ = refused.tick() => core.verify_refused(),
             ended = &mut link => {
                 // It ends only when it is to stop, or with a failure.
                 return ended
