@@ -20,24 +20,14 @@ impl Change<'_> {
         subject: &str,
     ) -> CloudResult<u64> {
         let last: Option<(i64, String)> =
-            sqlx::query_as("SELECT seq, hash FROM audit ORDER BY seq DESC LIMIT 1")
-                .fetch_optional(&mut *self.tx)
-                .await?;
+            row!(&mut *self.tx; "SELECT seq, hash FROM audit ORDER BY seq DESC LIMIT 1");
         let (seq, before) = last.map_or((1, String::new()), |(seq, hash)| (seq + 1, hash));
         let time_ms = now_ms();
         let hash = hash(&before, seq, time_ms, [actor, action, subject]);
-        sqlx::query(
+        run!(&mut *self.tx;
             "INSERT INTO audit (seq, time_ms, actor, action, subject, hash)
-             VALUES ($1, $2, $3, $4, $5, $6)",
-        )
-        .bind(seq)
-        .bind(time_ms)
-        .bind(actor)
-        .bind(action)
-        .bind(subject)
-        .bind(hash)
-        .execute(&mut *self.tx)
-        .await?;
+             VALUES ($1, $2, $3, $4, $5, $6)";
+            seq, time_ms, actor, action, subject, hash);
         Ok(unsigned(seq))
     }
 }
@@ -45,13 +35,10 @@ impl Change<'_> {
 impl Store {
     /// Returns the newest entries, the newest first.
     pub(crate) async fn audit(&self) -> CloudResult<Vec<AuditEntry>> {
-        let rows: Vec<Row> = sqlx::query_as(
+        let rows: Vec<Row> = rows!(&self.pool;
             "SELECT seq, time_ms, actor, action, subject, hash FROM audit
-             ORDER BY seq DESC LIMIT $1",
-        )
-        .bind(ENTRIES_MAX)
-        .fetch_all(&self.pool)
-        .await?;
+             ORDER BY seq DESC LIMIT $1";
+            ENTRIES_MAX);
         let entry = |(seq, time_ms, actor, action, subject, hash)| AuditEntry {
             seq: unsigned(seq),
             time_ms,
@@ -67,14 +54,10 @@ impl Store {
     pub(crate) async fn first_changed_entry(&self) -> CloudResult<Option<u64>> {
         let (mut before, mut next) = (String::new(), 1);
         loop {
-            let rows: Vec<Row> = sqlx::query_as(
+            let rows: Vec<Row> = rows!(&self.pool;
                 "SELECT seq, time_ms, actor, action, subject, hash FROM audit
-                 WHERE seq >= $1 ORDER BY seq LIMIT $2",
-            )
-            .bind(next)
-            .bind(ENTRIES_MAX)
-            .fetch_all(&self.pool)
-            .await?;
+                 WHERE seq >= $1 ORDER BY seq LIMIT $2";
+                next, ENTRIES_MAX);
             if rows.is_empty() {
                 return Ok(None);
             }

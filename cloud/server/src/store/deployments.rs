@@ -53,10 +53,7 @@ impl Store {
         let sha256 = gleaner_trust::sha256(envelope.as_bytes()).to_string();
         let mut change = self.change().await?;
         let before: Option<(i64, String)> =
-            sqlx::query_as("SELECT number, sha256 FROM deployments WHERE id = $1")
-                .bind(id)
-                .fetch_optional(&mut *change.tx)
-                .await?;
+            row!(&mut *change.tx; "SELECT number, sha256 FROM deployments WHERE id = $1"; id);
         if let Some((stored, digest)) = &before
             && *digest != sha256
             && int(*release) <= *stored
@@ -65,40 +62,26 @@ impl Store {
             return Err(CloudError::denied(message, "sign it again with a higher release"));
         }
         for (digest, envelope) in &offered.revisions {
-            sqlx::query(
+            run!(&mut *change.tx;
                 "INSERT INTO revisions (digest, envelope) VALUES ($1, $2)
-                 ON CONFLICT (digest) DO NOTHING",
-            )
-            .bind(digest)
-            .bind(envelope)
-            .execute(&mut *change.tx)
-            .await?;
+                 ON CONFLICT (digest) DO NOTHING";
+                digest, envelope);
         }
         let is_same = before.is_some_and(|(_, digest)| digest == sha256);
         if is_same {
-            sqlx::query("UPDATE deployments SET is_wanted = 1 WHERE id = $1")
-                .bind(id)
-                .execute(&mut *change.tx)
-                .await?;
+            run!(&mut *change.tx; "UPDATE deployments SET is_wanted = 1 WHERE id = $1"; id);
         } else {
-            sqlx::query(
+            run!(&mut *change.tx;
                 "INSERT INTO deployments (id, number, sha256, envelope, revision, fallback,
-                     selector, is_wanted, rollback_request)
+                 selector, is_wanted, rollback_request)
                  VALUES ($1, $2, $3, $4, $5, $6, $7, 1, 0)
                  ON CONFLICT (id) DO UPDATE SET number = excluded.number,
-                     sha256 = excluded.sha256, envelope = excluded.envelope,
-                     revision = excluded.revision, fallback = excluded.fallback,
-                     selector = excluded.selector, is_wanted = 1, rollback_request = 0",
-            )
-            .bind(id)
-            .bind(int(*release))
-            .bind(&sha256)
-            .bind(envelope)
-            .bind(&offered.revision)
-            .bind(offered.fallback.as_deref().unwrap_or_default())
-            .bind(serde_json::to_string(&offered.selector).unwrap_or_default())
-            .execute(&mut *change.tx)
-            .await?;
+                 sha256 = excluded.sha256, envelope = excluded.envelope,
+                 revision = excluded.revision, fallback = excluded.fallback,
+                 selector = excluded.selector, is_wanted = 1, rollback_request = 0";
+                id, int(*release), &sha256, envelope, &offered.revision,
+                offered.fallback.as_deref().unwrap_or_default(),
+                serde_json::to_string(&offered.selector).unwrap_or_default());
         }
         let number = change.note(actor, &format!("deploy release {release}"), id).await?;
         let changed = change.refresh("").await?;
@@ -114,10 +97,8 @@ impl Store {
         is_wanted: bool,
     ) -> CloudResult<ChangedVehicles> {
         let mut change = self.change().await?;
-        let set = sqlx::query("UPDATE deployments SET is_wanted = $2 WHERE id = $1")
-            .bind(id)
-            .bind(i64::from(is_wanted));
-        let found = set.execute(&mut *change.tx).await?.rows_affected();
+        let sql = "UPDATE deployments SET is_wanted = $2 WHERE id = $1";
+        let found = run!(&mut *change.tx; sql; id, i64::from(is_wanted)).rows_affected();
         change.finish(found, actor, if is_wanted { "start" } else { "stop" }, id).await
     }
 
@@ -126,12 +107,12 @@ impl Store {
         let mut change = self.change().await?;
         // Numbers of the audit trail grow for ever: a request is new also for a vehicle that
         // followed one of a deployment of this id that was removed since.
-        let set = sqlx::query(
+        let found = run!(&mut *change.tx;
             "UPDATE deployments SET rollback_request =
-                 (SELECT COALESCE(MAX(seq), 0) + 1 FROM audit)
-             WHERE id = $1 AND fallback <> ''",
-        );
-        let found = set.bind(id).execute(&mut *change.tx).await?.rows_affected();
+             (SELECT COALESCE(MAX(seq), 0) + 1 FROM audit)
+             WHERE id = $1 AND fallback <> ''";
+            id)
+        .rows_affected();
         if found == 0 && self.deployment_exists(id).await? {
             let message = format!("deployment `{id}` has no fallback");
             return Err(CloudError::usage(message, "deploy the former revision again"));
@@ -146,41 +127,31 @@ impl Store {
         id: &str,
     ) -> CloudResult<ChangedVehicles> {
         let mut change = self.change().await?;
-        let removed = sqlx::query("DELETE FROM deployments WHERE id = $1").bind(id);
-        let found = removed.execute(&mut *change.tx).await?.rows_affected();
+        let found = run!(&mut *change.tx; "DELETE FROM deployments WHERE id = $1"; id);
+        let found = found.rows_affected();
         change.finish(found, actor, "remove deployment", id).await
     }
 
     async fn deployment_exists(&self, id: &str) -> CloudResult<bool> {
-        let row: Option<(String,)> = sqlx::query_as("SELECT id FROM deployments WHERE id = $1")
-            .bind(id)
-            .fetch_optional(&self.pool)
-            .await?;
+        let row: Option<(String,)> =
+            row!(&self.pool; "SELECT id FROM deployments WHERE id = $1"; id);
         Ok(row.is_some())
     }
 
     /// Returns all deployments, with the number of vehicles that should run them and do.
     pub(crate) async fn deployments(&self) -> CloudResult<Vec<FleetDeployment>> {
         type Row = (String, i64, String, String, String, i64);
-        let rows: Vec<Row> = sqlx::query_as(
+        let rows: Vec<Row> = rows!(&self.pool;
             "SELECT id, number, revision, fallback, selector, is_wanted FROM deployments
-             ORDER BY id",
-        )
-        .fetch_all(&self.pool)
-        .await?;
-        let vehicles: Vec<(String, String, i64, i64)> = sqlx::query_as(
-            "SELECT name, labels, generation, handled FROM vehicles WHERE is_revoked = 0",
-        )
-        .fetch_all(&self.pool)
-        .await?;
+             ORDER BY id");
+        let vehicles: Vec<(String, String, i64, i64)> = rows!(&self.pool;
+            "SELECT name, labels, generation, handled FROM vehicles WHERE is_revoked = 0");
         let vehicles: Vec<(String, TextMap, bool)> = vehicles
             .into_iter()
             .map(|(name, labels, generation, handled)| (name, map(&labels), handled >= generation))
             .collect();
         let reported: Vec<(String, String, i64, String)> =
-            sqlx::query_as("SELECT vehicle, deployment, number, state FROM reported")
-                .fetch_all(&self.pool)
-                .await?;
+            rows!(&self.pool; "SELECT vehicle, deployment, number, state FROM reported");
         let reported: BTreeMap<_, _> = reported
             .into_iter()
             .map(|(vehicle, id, number, state)| ((vehicle, id), (number, state)))
@@ -224,15 +195,15 @@ impl Store {
 
     /// Returns the envelope of a deployment with this SHA-256.
     pub(crate) async fn envelope(&self, sha256: &str) -> CloudResult<Option<String>> {
-        let row = sqlx::query_as("SELECT envelope FROM deployments WHERE sha256 = $1").bind(sha256);
-        let row: Option<(String,)> = row.fetch_optional(&self.pool).await?;
+        let sql = "SELECT envelope FROM deployments WHERE sha256 = $1";
+        let row: Option<(String,)> = row!(&self.pool; sql; sha256);
         Ok(row.map(|(envelope,)| envelope))
     }
 
     /// Returns the envelope of a revision with this digest.
     pub(crate) async fn revision(&self, digest: &str) -> CloudResult<Option<String>> {
-        let row = sqlx::query_as("SELECT envelope FROM revisions WHERE digest = $1").bind(digest);
-        let row: Option<(String,)> = row.fetch_optional(&self.pool).await?;
+        let sql = "SELECT envelope FROM revisions WHERE digest = $1";
+        let row: Option<(String,)> = row!(&self.pool; sql; digest);
         Ok(row.map(|(envelope,)| envelope))
     }
 
@@ -240,12 +211,9 @@ impl Store {
     pub(crate) async fn wants(&self, name: &str) -> CloudResult<VehicleWants> {
         // One transaction: the number and the deployments are of the same moment.
         let mut tx = self.pool.begin().await?;
-        let row: Option<(i64, String)> = sqlx::query_as(
-            "SELECT generation, labels FROM vehicles WHERE name = $1 AND is_revoked = 0",
-        )
-        .bind(name)
-        .fetch_optional(&mut *tx)
-        .await?;
+        let row: Option<(i64, String)> = row!(&mut *tx;
+            "SELECT generation, labels FROM vehicles WHERE name = $1 AND is_revoked = 0";
+            name);
         let (generation, labels) = row.ok_or_else(ended)?;
         let deployments = wanted_by(&map(&labels), &wishes(&mut tx).await?);
         Ok(VehicleWants { generation: unsigned(generation), deployments })
@@ -274,24 +242,17 @@ impl Change<'_> {
     /// changed; returns these vehicles.
     pub(super) async fn refresh(&mut self, only: &str) -> CloudResult<ChangedVehicles> {
         let wishes = wishes(&mut self.tx).await?;
-        let vehicles: Vec<(String, String, String)> = sqlx::query_as(
+        let vehicles: Vec<(String, String, String)> = rows!(&mut *self.tx;
             "SELECT name, labels, digest FROM vehicles
-             WHERE is_revoked = 0 AND ($1 = '' OR name = $1)",
-        )
-        .bind(only)
-        .fetch_all(&mut *self.tx)
-        .await?;
+             WHERE is_revoked = 0 AND ($1 = '' OR name = $1)";
+            only);
         let mut changed = Vec::new();
         for (name, labels, before) in vehicles {
             let digest = desired_digest(&wanted_by(&map(&labels), &wishes));
             if digest != before {
-                sqlx::query(
-                    "UPDATE vehicles SET generation = generation + 1, digest = $2 WHERE name = $1",
-                )
-                .bind(&name)
-                .bind(digest)
-                .execute(&mut *self.tx)
-                .await?;
+                run!(&mut *self.tx;
+                    "UPDATE vehicles SET generation = generation + 1, digest = $2 WHERE name = $1";
+                    &name, digest);
                 changed.push(name);
             }
         }
@@ -300,11 +261,8 @@ impl Change<'_> {
 }
 
 async fn wishes(tx: &mut sqlx::Transaction<'static, sqlx::Any>) -> CloudResult<Vec<FleetWish>> {
-    let rows: Vec<(String, String, String, i64, i64)> = sqlx::query_as(
-        "SELECT id, sha256, selector, is_wanted, rollback_request FROM deployments ORDER BY id",
-    )
-    .fetch_all(&mut **tx)
-    .await?;
+    let rows: Vec<(String, String, String, i64, i64)> = rows!(&mut **tx;
+        "SELECT id, sha256, selector, is_wanted, rollback_request FROM deployments ORDER BY id");
     let wish = |(id, envelope, selector, is_wanted, rollback): (_, _, String, i64, i64)| {
         let rollback = unsigned(rollback);
         let wanted = Wanted { id, envelope, is_wanted: is_wanted != 0, rollback };

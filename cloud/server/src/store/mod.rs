@@ -4,6 +4,34 @@
 //! turn, so that SQLite has one writer in this process; each is one transaction, with its entry of
 //! the audit trail.
 
+/// Runs a statement with these values; returns its result.
+macro_rules! run {
+    ($on:expr; $sql:expr $(; $($value:expr),+)?) => {
+        sqlx::query($sql)$($(.bind($value))+)?.execute($on).await?
+    };
+}
+
+/// Runs a query with these values; returns its row, if there is one.
+macro_rules! row {
+    ($on:expr; $sql:expr $(; $($value:expr),+)?) => {
+        sqlx::query_as($sql)$($(.bind($value))+)?.fetch_optional($on).await?
+    };
+}
+
+/// Runs a query with these values; returns its only row.
+macro_rules! one {
+    ($on:expr; $sql:expr $(; $($value:expr),+)?) => {
+        sqlx::query_as($sql)$($(.bind($value))+)?.fetch_one($on).await?
+    };
+}
+
+/// Runs a query with these values; returns its rows.
+macro_rules! rows {
+    ($on:expr; $sql:expr $(; $($value:expr),+)?) => {
+        sqlx::query_as($sql)$($(.bind($value))+)?.fetch_all($on).await?
+    };
+}
+
 mod audit;
 mod deployments;
 mod records;
@@ -83,9 +111,8 @@ impl Store {
         sqlx::raw_sql("CREATE TABLE IF NOT EXISTS migrations (version BIGINT PRIMARY KEY)")
             .execute(&mut *change.tx)
             .await?;
-        let (version,): (i64,) = sqlx::query_as("SELECT COALESCE(MAX(version), 0) FROM migrations")
-            .fetch_one(&mut *change.tx)
-            .await?;
+        let (version,): (i64,) =
+            one!(&mut *change.tx; "SELECT COALESCE(MAX(version), 0) FROM migrations");
         let newest = MIGRATIONS.len();
         let version = usize::try_from(version).unwrap_or(usize::MAX);
         if version > newest {
@@ -95,10 +122,8 @@ impl Store {
         }
         for (index, sql) in MIGRATIONS.iter().enumerate().skip(version) {
             sqlx::raw_sql(*sql).execute(&mut *change.tx).await?;
-            sqlx::query("INSERT INTO migrations (version) VALUES ($1)")
-                .bind(int(index as u64 + 1))
-                .execute(&mut *change.tx)
-                .await?;
+            let version = int(index as u64 + 1);
+            run!(&mut *change.tx; "INSERT INTO migrations (version) VALUES ($1)"; version);
         }
         change.commit().await
     }
@@ -114,7 +139,7 @@ impl Store {
 
     /// Writes a copy of the database to a new file.
     pub(crate) async fn copy_to(&self, file: &str) -> CloudResult<()> {
-        sqlx::query("VACUUM INTO $1").bind(file).execute(&self.pool).await?;
+        run!(&self.pool; "VACUUM INTO $1"; file);
         Ok(())
     }
 

@@ -54,15 +54,10 @@ impl Store {
     ) -> CloudResult<Ack> {
         let Cursor { stream, life, next, .. } = &batch.cursor;
         let mut change = self.change().await?;
-        let arrived: Option<(i64,)> = sqlx::query_as(
+        let arrived: Option<(i64,)> = row!(&mut *change.tx;
             "UPDATE vehicles SET arrived = arrived + $3
-             WHERE name = $1 AND epoch = $2 AND is_revoked = 0 RETURNING arrived",
-        )
-        .bind(name)
-        .bind(int(epoch))
-        .bind(int(batch.lines.len() as u64))
-        .fetch_optional(&mut *change.tx)
-        .await?;
+             WHERE name = $1 AND epoch = $2 AND is_revoked = 0 RETURNING arrived";
+            name, int(epoch), int(batch.lines.len() as u64));
         let (arrived,) = arrived.ok_or_else(ended)?;
         let known = change.stored_next(name, stream, *life).await?;
         let first = arrived - int(batch.lines.len() as u64);
@@ -72,14 +67,12 @@ impl Store {
             if mark.is_empty() && *seq < known {
                 continue;
             }
-            let row = sqlx::query(
+            let inserted = run!(&mut *change.tx;
                 "INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
                  VALUES ($1, $2, $3, $4, $5, $6, $7, $8)
-                 ON CONFLICT (vehicle, stream, life, seq, mark) DO NOTHING",
-            );
-            let row = row.bind(name).bind(stream).bind(int(*life)).bind(int(*seq)).bind(mark);
-            let row = row.bind(arrival).bind(line).bind(int(line.len() as u64));
-            if row.execute(&mut *change.tx).await?.rows_affected() > 0 {
+                 ON CONFLICT (vehicle, stream, life, seq, mark) DO NOTHING";
+                name, stream, int(*life), int(*seq), mark, arrival, line, int(line.len() as u64));
+            if inserted.rows_affected() > 0 {
                 added += 1;
                 bytes += int(line.len() as u64);
             }
@@ -92,13 +85,10 @@ impl Store {
 
     /// Returns the positions of all streams of a vehicle.
     pub(crate) async fn cursors(&self, name: &str) -> CloudResult<Vec<Cursor>> {
-        let rows: Vec<(String, i64, i64, i64, String, i64)> = sqlx::query_as(
+        let rows: Vec<(String, i64, i64, i64, String, i64)> = rows!(&self.pool;
             "SELECT stream, life, next, seq, boot, boot_ns FROM streams WHERE vehicle = $1
-             ORDER BY stream",
-        )
-        .bind(name)
-        .fetch_all(&self.pool)
-        .await?;
+             ORDER BY stream";
+            name);
         let cursor = |(stream, life, next, seq, boot, boot_ns)| Cursor {
             stream,
             life: unsigned(life),
@@ -118,16 +108,10 @@ impl Store {
         streams: [&str; 2],
         last: usize,
     ) -> CloudResult<i64> {
-        let row: Option<(i64,)> = sqlx::query_as(
+        let row: Option<(i64,)> = row!(&self.pool;
             "SELECT arrival FROM records WHERE vehicle = $1 AND stream IN ($2, $3)
-             ORDER BY arrival DESC LIMIT 1 OFFSET $4",
-        )
-        .bind(vehicle)
-        .bind(streams[0])
-        .bind(streams[1])
-        .bind(int(last as u64))
-        .fetch_optional(&self.pool)
-        .await?;
+             ORDER BY arrival DESC LIMIT 1 OFFSET $4";
+            vehicle, streams[0], streams[1], int(last as u64));
         Ok(row.map_or(0, |(arrival,)| arrival))
     }
 
@@ -141,19 +125,11 @@ impl Store {
         after: i64,
         most: i64,
     ) -> CloudResult<RecordPage> {
-        let rows: Vec<(i64, String)> = sqlx::query_as(
+        let rows: Vec<(i64, String)> = rows!(&self.pool;
             "SELECT arrival, line FROM records
              WHERE vehicle = $1 AND stream IN ($2, $3) AND arrival > $4 AND seq >= $5
-             ORDER BY arrival LIMIT $6",
-        )
-        .bind(vehicle)
-        .bind(streams[0])
-        .bind(streams[1])
-        .bind(after)
-        .bind(int(from))
-        .bind(most)
-        .fetch_all(&self.pool)
-        .await?;
+             ORDER BY arrival LIMIT $6";
+            vehicle, streams[0], streams[1], after, int(from), most);
         let arrival = rows.last().map_or(after, |(arrival, _)| *arrival);
         Ok(RecordPage { lines: rows.into_iter().map(|(_, line)| line).collect(), arrival })
     }
@@ -170,21 +146,13 @@ impl Store {
         streams: [&str; 2],
         from: u64,
     ) -> CloudResult<Vec<String>> {
-        let exists: Option<(String,)> = sqlx::query_as("SELECT name FROM vehicles WHERE name = $1")
-            .bind(vehicle)
-            .fetch_optional(&self.pool)
-            .await?;
+        let exists: Option<(String,)> =
+            row!(&self.pool; "SELECT name FROM vehicles WHERE name = $1"; vehicle);
         exists.ok_or_else(|| unknown(vehicle))?;
-        let rows: Vec<(String, i64, i64)> = sqlx::query_as(
+        let rows: Vec<(String, i64, i64)> = rows!(&self.pool;
             "SELECT stream, removed, removed_to FROM streams
-             WHERE vehicle = $1 AND stream IN ($2, $3) AND removed > 0 AND removed_to >= $4",
-        )
-        .bind(vehicle)
-        .bind(streams[0])
-        .bind(streams[1])
-        .bind(int(from))
-        .fetch_all(&self.pool)
-        .await?;
+             WHERE vehicle = $1 AND stream IN ($2, $3) AND removed > 0 AND removed_to >= $4";
+            vehicle, streams[0], streams[1], int(from));
         let line = |(stream, removed, to): (String, i64, i64)| {
             let record = json!({ "to": to, "reason": "Retention", "records": removed });
             let line = StreamLine {
@@ -205,12 +173,9 @@ impl Store {
 impl Change<'_> {
     /// Returns the number of the next record of this life of a stream.
     async fn stored_next(&mut self, name: &str, stream: &str, life: u64) -> CloudResult<u64> {
-        let row: Option<(i64, i64)> =
-            sqlx::query_as("SELECT life, next FROM streams WHERE vehicle = $1 AND stream = $2")
-                .bind(name)
-                .bind(stream)
-                .fetch_optional(&mut *self.tx)
-                .await?;
+        let row: Option<(i64, i64)> = row!(&mut *self.tx;
+            "SELECT life, next FROM streams WHERE vehicle = $1 AND stream = $2";
+            name, stream);
         if let Some((stored, next)) = row {
             return match unsigned(stored) {
                 stored if stored == life => Ok(unsigned(next)),
@@ -221,10 +186,8 @@ impl Change<'_> {
                 }
             };
         }
-        let (streams,): (i64,) = sqlx::query_as("SELECT COUNT(*) FROM streams WHERE vehicle = $1")
-            .bind(name)
-            .fetch_one(&mut *self.tx)
-            .await?;
+        let (streams,): (i64,) =
+            one!(&mut *self.tx; "SELECT COUNT(*) FROM streams WHERE vehicle = $1"; name);
         if streams >= STREAMS_MAX {
             let message = format!("the vehicle has {streams} streams; no more are stored");
             return Err(CloudError::usage(message, "deploy under ids that were used before"));
@@ -240,49 +203,25 @@ impl Change<'_> {
         (added, bytes): (i64, i64),
         moves: bool,
     ) -> CloudResult<()> {
-        sqlx::query(
+        run!(&mut *self.tx;
             "INSERT INTO streams (vehicle, stream, life, next, seq, boot, boot_ns)
-             VALUES ($1, $2, $3, 0, 0, '', 0) ON CONFLICT (vehicle, stream) DO NOTHING",
-        )
-        .bind(name)
-        .bind(&cursor.stream)
-        .bind(int(cursor.life))
-        .execute(&mut *self.tx)
-        .await?;
-        sqlx::query(
+             VALUES ($1, $2, $3, 0, 0, '', 0) ON CONFLICT (vehicle, stream) DO NOTHING";
+            name, &cursor.stream, int(cursor.life));
+        run!(&mut *self.tx;
             "UPDATE streams SET kept = kept + $3, kept_bytes = kept_bytes + $4
-             WHERE vehicle = $1 AND stream = $2",
-        )
-        .bind(name)
-        .bind(&cursor.stream)
-        .bind(added)
-        .bind(bytes)
-        .execute(&mut *self.tx)
-        .await?;
+             WHERE vehicle = $1 AND stream = $2";
+            name, &cursor.stream, added, bytes);
         if moves {
-            sqlx::query(
-                "UPDATE streams SET life = $3, next = $4 WHERE vehicle = $1 AND stream = $2",
-            )
-            .bind(name)
-            .bind(&cursor.stream)
-            .bind(int(cursor.life))
-            .bind(int(cursor.next))
-            .execute(&mut *self.tx)
-            .await?;
+            run!(&mut *self.tx;
+                "UPDATE streams SET life = $3, next = $4 WHERE vehicle = $1 AND stream = $2";
+                name, &cursor.stream, int(cursor.life), int(cursor.next));
         }
         // A batch of nothing but gaps leaves the last record as it was.
         if moves && !cursor.boot.is_empty() {
-            sqlx::query(
+            run!(&mut *self.tx;
                 "UPDATE streams SET seq = $3, boot = $4, boot_ns = $5
-                 WHERE vehicle = $1 AND stream = $2",
-            )
-            .bind(name)
-            .bind(&cursor.stream)
-            .bind(int(cursor.seq))
-            .bind(&cursor.boot)
-            .bind(int(cursor.boot_ns))
-            .execute(&mut *self.tx)
-            .await?;
+                 WHERE vehicle = $1 AND stream = $2";
+                name, &cursor.stream, int(cursor.seq), &cursor.boot, int(cursor.boot_ns));
         }
         Ok(())
     }
@@ -295,27 +234,18 @@ impl Change<'_> {
         retention: Retention,
     ) -> CloudResult<()> {
         loop {
-            let (kept, kept_bytes): (i64, i64) = sqlx::query_as(
-                "SELECT kept, kept_bytes FROM streams WHERE vehicle = $1 AND stream = $2",
-            )
-            .bind(name)
-            .bind(stream)
-            .fetch_one(&mut *self.tx)
-            .await?;
+            let (kept, kept_bytes): (i64, i64) = one!(&mut *self.tx;
+                "SELECT kept, kept_bytes FROM streams WHERE vehicle = $1 AND stream = $2";
+                name, stream);
             let mut records = kept - int(retention.records);
             let mut bytes = kept_bytes - int(retention.bytes);
             if records <= 0 && bytes <= 0 {
                 return Ok(());
             }
-            let oldest: Vec<(i64, i64, i64)> = sqlx::query_as(
+            let oldest: Vec<(i64, i64, i64)> = rows!(&mut *self.tx;
                 "SELECT arrival, seq, bytes FROM records WHERE vehicle = $1 AND stream = $2
-                 ORDER BY arrival LIMIT $3",
-            )
-            .bind(name)
-            .bind(stream)
-            .bind(STEP)
-            .fetch_all(&mut *self.tx)
-            .await?;
+                 ORDER BY arrival LIMIT $3";
+                name, stream, STEP);
             let (mut removed, mut removed_bytes, mut last) = (0, 0, (0, 0));
             for (arrival, seq, length) in oldest {
                 if records <= 0 && bytes <= 0 {
@@ -330,24 +260,14 @@ impl Change<'_> {
             if removed == 0 {
                 return Ok(());
             }
-            sqlx::query("DELETE FROM records WHERE vehicle = $1 AND stream = $2 AND arrival <= $3")
-                .bind(name)
-                .bind(stream)
-                .bind(last.0)
-                .execute(&mut *self.tx)
-                .await?;
-            sqlx::query(
+            run!(&mut *self.tx;
+                "DELETE FROM records WHERE vehicle = $1 AND stream = $2 AND arrival <= $3";
+                name, stream, last.0);
+            run!(&mut *self.tx;
                 "UPDATE streams SET kept = kept - $3, kept_bytes = kept_bytes - $4,
-                     removed = removed + $3, removed_to = $5
-                 WHERE vehicle = $1 AND stream = $2",
-            )
-            .bind(name)
-            .bind(stream)
-            .bind(removed)
-            .bind(removed_bytes)
-            .bind(last.1)
-            .execute(&mut *self.tx)
-            .await?;
+                 removed = removed + $3, removed_to = $5
+                 WHERE vehicle = $1 AND stream = $2";
+                name, stream, removed, removed_bytes, last.1);
         }
     }
 }

@@ -56,17 +56,10 @@ impl Change<'_> {
         })?;
         let secret = format!("{}{}", kind.prefix(), gleaner_base::hex(&bytes));
         let expires = now() + kind.lifetime_s();
-        sqlx::query("DELETE FROM secrets WHERE expires <= $1")
-            .bind(now())
-            .execute(&mut *self.tx)
-            .await?;
-        sqlx::query("INSERT INTO secrets (hash, kind, subject, expires) VALUES ($1, $2, $3, $4)")
-            .bind(hash(&secret))
-            .bind(kind.as_str())
-            .bind(subject)
-            .bind(expires)
-            .execute(&mut *self.tx)
-            .await?;
+        run!(&mut *self.tx; "DELETE FROM secrets WHERE expires <= $1"; now());
+        run!(&mut *self.tx;
+            "INSERT INTO secrets (hash, kind, subject, expires) VALUES ($1, $2, $3, $4)";
+            hash(&secret), kind.as_str(), subject, expires);
         Ok((secret, expires))
     }
 
@@ -76,15 +69,10 @@ impl Change<'_> {
         kind: SecretKind,
         secret: &str,
     ) -> CloudResult<Option<String>> {
-        let subject: Option<(String,)> = sqlx::query_as(
+        let subject: Option<(String,)> = row!(&mut *self.tx;
             "DELETE FROM secrets WHERE hash = $1 AND kind = $2 AND expires > $3
-             RETURNING subject",
-        )
-        .bind(hash(secret))
-        .bind(kind.as_str())
-        .bind(now())
-        .fetch_optional(&mut *self.tx)
-        .await?;
+             RETURNING subject";
+            hash(secret), kind.as_str(), now());
         Ok(subject.map(|(subject,)| subject))
     }
 
@@ -94,11 +82,9 @@ impl Change<'_> {
         kind: SecretKind,
         subject: &str,
     ) -> CloudResult<()> {
-        sqlx::query("DELETE FROM secrets WHERE kind = $1 AND subject = $2")
-            .bind(kind.as_str())
-            .bind(subject)
-            .execute(&mut *self.tx)
-            .await?;
+        run!(&mut *self.tx;
+            "DELETE FROM secrets WHERE kind = $1 AND subject = $2";
+            kind.as_str(), subject);
         Ok(())
     }
 }
@@ -106,13 +92,10 @@ impl Change<'_> {
 impl Store {
     /// Returns the name and the role of the user with this token.
     pub(super) async fn user_row(&self, token: &str) -> CloudResult<Option<(String, String)>> {
-        let row = sqlx::query_as(
+        Ok(row!(&self.pool;
             "SELECT users.name, users.role FROM secrets JOIN users ON users.name = secrets.subject
-             WHERE secrets.hash = $1 AND secrets.kind = 'token' AND secrets.expires > $2",
-        )
-        .bind(hash(token))
-        .bind(now());
-        Ok(row.fetch_optional(&self.pool).await?)
+             WHERE secrets.hash = $1 AND secrets.kind = 'token' AND secrets.expires > $2";
+            hash(token), now()))
     }
 }
 

@@ -24,14 +24,10 @@ impl Store {
             return Err(CloudError::usage(message, help));
         }
         let mut change = self.change().await?;
-        sqlx::query(
+        run!(&mut *change.tx;
             "INSERT INTO users (name, role) VALUES ($1, $2)
-             ON CONFLICT (name) DO UPDATE SET role = excluded.role",
-        )
-        .bind(&name)
-        .bind(role.as_str())
-        .execute(&mut *change.tx)
-        .await?;
+             ON CONFLICT (name) DO UPDATE SET role = excluded.role";
+            &name, role.as_str());
         change.drop_secrets(SecretKind::Code, &name).await?;
         let (code, expires) = change.add_secret(SecretKind::Code, &name).await?;
         change.note(actor, &format!("invite as {role}"), &name).await?;
@@ -41,13 +37,10 @@ impl Store {
 
     /// Invites an administrator, unless one has a valid token.
     pub(crate) async fn invite_first(&self) -> CloudResult<Option<Invitation>> {
-        let (tokens,): (i64,) = sqlx::query_as(
+        let (tokens,): (i64,) = one!(&self.pool;
             "SELECT COUNT(*) FROM secrets JOIN users ON users.name = secrets.subject
-             WHERE secrets.kind = 'token' AND users.role = 'admin' AND secrets.expires > $1",
-        )
-        .bind(now())
-        .fetch_one(&self.pool)
-        .await?;
+             WHERE secrets.kind = 'token' AND users.role = 'admin' AND secrets.expires > $1";
+            now());
         match tokens {
             0 => {
                 let admin = NewUser { name: ADMIN.to_owned(), role: Role::Admin };
@@ -61,10 +54,8 @@ impl Store {
     pub(crate) async fn login(&self, code: &str) -> CloudResult<Option<Session>> {
         let mut change = self.change().await?;
         let Some(name) = change.take_secret(SecretKind::Code, code).await? else { return Ok(None) };
-        let (role,): (String,) = sqlx::query_as("SELECT role FROM users WHERE name = $1")
-            .bind(&name)
-            .fetch_one(&mut *change.tx)
-            .await?;
+        let (role,): (String,) =
+            one!(&mut *change.tx; "SELECT role FROM users WHERE name = $1"; &name);
         let (token, expires) = change.add_secret(SecretKind::Token, &name).await?;
         change.note(&name, "login", &name).await?;
         change.commit().await?;
@@ -78,19 +69,14 @@ impl Store {
 
     /// Returns all users.
     pub(crate) async fn users(&self) -> CloudResult<Vec<User>> {
-        let rows: Vec<_> = sqlx::query_as("SELECT name, role FROM users ORDER BY name")
-            .fetch_all(&self.pool)
-            .await?;
+        let rows: Vec<_> = rows!(&self.pool; "SELECT name, role FROM users ORDER BY name");
         rows.into_iter().map(user).collect()
     }
 
     /// Removes a user, and the tokens of the user.
     pub(crate) async fn remove_user(&self, actor: &str, name: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        let removed = sqlx::query("DELETE FROM users WHERE name = $1")
-            .bind(name)
-            .execute(&mut *change.tx)
-            .await?;
+        let removed = run!(&mut *change.tx; "DELETE FROM users WHERE name = $1"; name);
         if removed.rows_affected() == 0 {
             let message = format!("there is no user `{}`", excerpt(name));
             return Err(CloudError::missing(message, "list the users, and use one of their names"));

@@ -44,13 +44,10 @@ impl Store {
             );
         }
         let mut change = self.change().await?;
-        sqlx::query(
+        run!(&mut *change.tx;
             "INSERT INTO vehicles (name) VALUES ($1)
-             ON CONFLICT (name) DO UPDATE SET is_revoked = 0",
-        )
-        .bind(name)
-        .execute(&mut *change.tx)
-        .await?;
+             ON CONFLICT (name) DO UPDATE SET is_revoked = 0";
+            name);
         change.drop_secrets(SecretKind::Enrolment, name).await?;
         let (token, _) = change.add_secret(SecretKind::Enrolment, name).await?;
         change.note(actor, "invite vehicle", name).await?;
@@ -100,10 +97,8 @@ impl Store {
     /// Cuts a vehicle off: none of its certificates and tokens is accepted from now on.
     pub(crate) async fn revoke(&self, actor: &str, name: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        let revoked = sqlx::query("UPDATE vehicles SET is_revoked = 1 WHERE name = $1")
-            .bind(name)
-            .execute(&mut *change.tx)
-            .await?;
+        let revoked =
+            run!(&mut *change.tx; "UPDATE vehicles SET is_revoked = 1 WHERE name = $1"; name);
         if revoked.rows_affected() == 0 {
             return Err(unknown(name));
         }
@@ -115,31 +110,21 @@ impl Store {
 
     /// Returns the vehicle with the certificate of this SHA-256, if it is valid.
     pub(crate) async fn vehicle_of(&self, sha256: &str) -> CloudResult<Option<String>> {
-        let name: Option<(String,)> = sqlx::query_as(
+        let name: Option<(String,)> = row!(&self.pool;
             "SELECT vehicles.name FROM certificates
              JOIN vehicles ON vehicles.name = certificates.vehicle
-             WHERE sha256 = $1 AND expires > $2 AND is_revoked = 0",
-        )
-        .bind(sha256)
-        .bind(now())
-        .fetch_optional(&self.pool)
-        .await?;
+             WHERE sha256 = $1 AND expires > $2 AND is_revoked = 0";
+            sha256, now());
         Ok(name.map(|(name,)| name))
     }
 
     /// Begins a connection of a vehicle; returns its number.
     pub(crate) async fn connect(&self, name: &str, hello: &Hello) -> CloudResult<u64> {
         let mut change = self.change().await?;
-        let epoch: Option<(i64,)> = sqlx::query_as(
+        let epoch: Option<(i64,)> = row!(&mut *change.tx;
             "UPDATE vehicles SET epoch = epoch + 1, version = $2, clip_key = $3, seen = $4
-             WHERE name = $1 AND is_revoked = 0 RETURNING epoch",
-        )
-        .bind(name)
-        .bind(excerpt(&hello.version))
-        .bind(excerpt(&hello.key))
-        .bind(now())
-        .fetch_optional(&mut *change.tx)
-        .await?;
+             WHERE name = $1 AND is_revoked = 0 RETURNING epoch";
+            name, excerpt(&hello.version), excerpt(&hello.key), now());
         let (epoch,) = epoch.ok_or_else(ended)?;
         change.commit().await?;
         Ok(unsigned(epoch))
@@ -159,40 +144,22 @@ impl Store {
             deployments.iter().map(|it| (&it.id, (it.release, state(it)))).collect();
         let running = states.values().filter(|(_, state)| *state == RUNNING).count();
         let mut change = self.change().await?;
-        let stored = sqlx::query(
+        let stored = run!(&mut *change.tx;
             "UPDATE vehicles SET handled = $3, problems = $4, status = $5, labels = $6,
-                 deployments = $7, running = $8, version = $9
-             WHERE name = $1 AND epoch = $2 AND is_revoked = 0",
-        )
-        .bind(name)
-        .bind(int(epoch))
-        .bind(int(report.handled))
-        .bind(json(&report.problems))
-        .bind(&report.json)
-        .bind(json(&report.status.labels))
-        .bind(int(states.len() as u64))
-        .bind(int(running as u64))
-        .bind(excerpt(&report.status.orchestrator.version))
-        .execute(&mut *change.tx)
-        .await?;
+             deployments = $7, running = $8, version = $9
+             WHERE name = $1 AND epoch = $2 AND is_revoked = 0";
+            name, int(epoch), int(report.handled), json(&report.problems), &report.json,
+            json(&report.status.labels), int(states.len() as u64), int(running as u64),
+            excerpt(&report.status.orchestrator.version));
         if stored.rows_affected() == 0 {
             return Err(ended());
         }
-        sqlx::query("DELETE FROM reported WHERE vehicle = $1")
-            .bind(name)
-            .execute(&mut *change.tx)
-            .await?;
+        run!(&mut *change.tx; "DELETE FROM reported WHERE vehicle = $1"; name);
         for (id, (number, state)) in states {
-            sqlx::query(
+            run!(&mut *change.tx;
                 "INSERT INTO reported (vehicle, deployment, number, state)
-                 VALUES ($1, $2, $3, $4)",
-            )
-            .bind(name)
-            .bind(id)
-            .bind(int(number))
-            .bind(state)
-            .execute(&mut *change.tx)
-            .await?;
+                 VALUES ($1, $2, $3, $4)";
+                name, id, int(number), state);
         }
         let changed = change.refresh(name).await?;
         change.commit().await?;
@@ -205,13 +172,10 @@ impl Store {
         is_online: impl Fn(&str) -> bool,
     ) -> CloudResult<Vec<VehicleSummary>> {
         type Row = (String, i64, i64, i64, String, String, i64, i64, String, i64, i64);
-        let rows: Vec<Row> = sqlx::query_as(
+        let rows: Vec<Row> = rows!(&self.pool;
             "SELECT name, is_revoked, epoch, seen, version, labels, generation, handled, problems,
-                 running, deployments
-             FROM vehicles ORDER BY name",
-        )
-        .fetch_all(&self.pool)
-        .await?;
+             running, deployments
+             FROM vehicles ORDER BY name");
         let summary = |row: Row| {
             let (name, is_revoked, epoch, seen, version, labels, wanted, handled, problems, ..) =
                 row;
@@ -240,10 +204,7 @@ impl Store {
     /// Returns the newest status of a vehicle, as JSON.
     pub(crate) async fn status(&self, name: &str) -> CloudResult<String> {
         let status: Option<(String,)> =
-            sqlx::query_as("SELECT status FROM vehicles WHERE name = $1")
-                .bind(name)
-                .fetch_optional(&self.pool)
-                .await?;
+            row!(&self.pool; "SELECT status FROM vehicles WHERE name = $1"; name);
         match status {
             None => Err(unknown(name)),
             Some((status,)) if status.is_empty() => Err(CloudError::missing(
@@ -261,11 +222,7 @@ impl Store {
         }
         let mut change = self.change().await?;
         for (name, time) in times {
-            sqlx::query("UPDATE vehicles SET seen = $2 WHERE name = $1")
-                .bind(name)
-                .bind(time)
-                .execute(&mut *change.tx)
-                .await?;
+            run!(&mut *change.tx; "UPDATE vehicles SET seen = $2 WHERE name = $1"; name, time);
         }
         change.commit().await
     }
@@ -273,22 +230,17 @@ impl Store {
 
 impl Change<'_> {
     async fn add_certificate(&mut self, name: &str, issued: &Issued) -> CloudResult<()> {
-        sqlx::query("INSERT INTO certificates (sha256, vehicle, expires) VALUES ($1, $2, $3)")
-            .bind(&issued.sha256)
-            .bind(name)
-            .bind(int(issued.expires))
-            .execute(&mut *self.tx)
-            .await?;
+        run!(&mut *self.tx;
+            "INSERT INTO certificates (sha256, vehicle, expires) VALUES ($1, $2, $3)";
+            &issued.sha256, name, int(issued.expires));
         Ok(())
     }
 
     /// Removes all certificates of a vehicle but `kept`.
     async fn drop_certificates(&mut self, name: &str, kept: &str) -> CloudResult<()> {
-        sqlx::query("DELETE FROM certificates WHERE vehicle = $1 AND sha256 <> $2")
-            .bind(name)
-            .bind(kept)
-            .execute(&mut *self.tx)
-            .await?;
+        run!(&mut *self.tx;
+            "DELETE FROM certificates WHERE vehicle = $1 AND sha256 <> $2";
+            name, kept);
         Ok(())
     }
 }
