@@ -33,6 +33,13 @@ pub(crate) struct Peer {
     _slot: OwnedSemaphorePermit,
 }
 
+impl Peer {
+    #[cfg(test)]
+    pub(crate) fn of_test(address: IpAddr, slot: OwnedSemaphorePermit) -> Self {
+        Self { address, certificate: None, _slot: slot }
+    }
+}
+
 /// A listener and what serves its connections.
 pub(crate) struct Entrance {
     pub(crate) listener: TcpListener,

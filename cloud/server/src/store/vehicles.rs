@@ -89,6 +89,10 @@ impl Store {
     ) -> CloudResult<()> {
         let mut change = self.change().await?;
         change.drop_certificates(name, current).await?;
+        // The vehicle may have been cut off since the request came.
+        let is_valid: Option<(String,)> = row!(&mut *change.tx;
+            "SELECT sha256 FROM certificates WHERE sha256 = $1"; current);
+        is_valid.ok_or_else(ended)?;
         change.add_certificate(name, issued).await?;
         change.note(name, "renew", name).await?;
         change.commit().await
