@@ -13,9 +13,9 @@ use gleaner_lambda::manifest::Sha256;
 use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest};
 use gleaner_trust::{Refusal, Revision, unverified_deployment, unverified_revision};
 
-use super::{digest, parsed};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
+use crate::request::{digest, parsed};
 use crate::store::OfferedDeployment;
 
 /// Stores a deployment, or answers with the files that are missing for it.

@@ -24,11 +24,11 @@ use gleaner_fleet::Enrolment;
 use gleaner_fleet::people::{
     FleetDeployment, Invitation, Login, NewUser, NewVehicle, Role, Session, User,
 };
-use serde::de::DeserializeOwned;
 
 use crate::accept::Peer;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
+use crate::request::parsed;
 
 /// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
 /// text in JSON.
@@ -123,14 +123,6 @@ async fn user(cloud: &Cloud, role: Role, peer: &Peer, headers: &HeaderMap) -> Cl
         return Err(CloudError::denied(message, "let an administrator invite you with that role"));
     }
     Ok(user)
-}
-
-/// Parses the body of a request.
-pub(crate) fn parsed<T: DeserializeOwned>(body: &Bytes, what: &str) -> CloudResult<T> {
-    serde_json::from_slice(body).map_err(|error| {
-        let help = "use a version of gleaner that fits the one of the cloud";
-        CloudError::usage(format!("the request is no {what}"), help).because(error)
-    })
 }
 
 async fn login(
@@ -248,11 +240,4 @@ async fn remove_deployment(
 
 async fn audit(State(cloud): State<Arc<Cloud>>) -> CloudResult<Response> {
     Ok(Json(cloud.store.audit().await?).into_response())
-}
-
-/// Parses a SHA-256 in a path.
-pub(crate) fn digest(text: &str) -> CloudResult<gleaner_lambda::manifest::Sha256> {
-    text.parse().map_err(|_| {
-        CloudError::usage("the path has no SHA-256", "use 64 hexadecimal digits, in lower case")
-    })
 }

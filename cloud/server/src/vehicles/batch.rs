@@ -34,7 +34,9 @@ pub(super) fn parse(records: &Records) -> CloudResult<Batch> {
     let mut batch = Batch { lines: Vec::new(), cursor };
     for text in lines.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()) {
         let line = serde_json::from_slice::<StreamLine>(text).map_err(|error| error.to_string());
-        let line = line.and_then(|line| match line.stream == *stream && line.seq < *next {
+        // A torn end may have the number of the next record.
+        let is_before = |line: &StreamLine| is_mark(line) || line.seq < *next;
+        let line = line.and_then(|line| match line.stream == *stream && is_before(&line) {
             true => Ok(line),
             false => Err(format!("it is record {} of `{}`", line.seq, excerpt(&line.stream))),
         });
@@ -43,12 +45,11 @@ pub(super) fn parse(records: &Records) -> CloudResult<Batch> {
             (Ok(line), Ok(text)) => (line, text.to_owned()),
             (line, _) => damaged(stream, &line.err().unwrap_or_default(), text),
         };
-        let is_mark = MARKS.contains(&&*line.kind);
-        let mark = match is_mark {
+        let mark = match is_mark(&line) {
             true => gleaner_trust::sha256(text.as_bytes()).to_string(),
             false => String::new(),
         };
-        if !is_mark {
+        if mark.is_empty() {
             let Cursor { seq, boot, boot_ns, .. } = &mut batch.cursor;
             (*seq, *boot_ns) = (line.seq, line.boot_ns);
             boot.clone_from(&line.boot);
@@ -56,6 +57,10 @@ pub(super) fn parse(records: &Records) -> CloudResult<Batch> {
         batch.lines.push((line.seq, mark, text));
     }
     Ok(batch)
+}
+
+fn is_mark(line: &StreamLine) -> bool {
+    MARKS.contains(&&*line.kind)
 }
 
 fn damaged(stream: &str, reason: &str, line: &[u8]) -> (StreamLine, String) {

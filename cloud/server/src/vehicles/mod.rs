@@ -27,7 +27,7 @@ use crate::accept::Peer;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::objects::octets;
-use crate::people::{digest, parsed};
+use crate::request::{digest, parsed};
 use crate::store::Issued;
 
 /// Maximum length of the body of a request.
