@@ -63,6 +63,17 @@ pub const CRATES: &[(&str, &[&str])] = &[
             "gleaner-wheels",
         ],
     ),
+    (
+        "gleaner-cloud",
+        &[
+            "gleaner-base",
+            "gleaner-fleet",
+            "gleaner-lambda",
+            "gleaner-protocol",
+            "gleaner-trust",
+            "gleaner-vitals",
+        ],
+    ),
     ("gleaner-compile", &["gleaner-artifacts", "gleaner-base", "gleaner-jail", "gleaner-lambda"]),
     ("gleaner-dds", &["gleaner-base", "gleaner-messages", "gleaner-protocol", "gleaner-transport"]),
     ("gleaner-drives", &["gleaner-base", "gleaner-messages", "gleaner-transport"]),
@@ -227,6 +238,8 @@ pub const CRATES: &[(&str, &[&str])] = &[
 /// Crates that must not be linked into a crate, with any of its features.
 pub const WITHOUT: &[(&str, &[&str])] = &[
     ("gleaner-cli", &["wasmtime", "pyo3", "rustdds"]),
+    // It stores and forwards what was signed, and runs none of it.
+    ("gleaner-cloud", &["wasmtime", "pyo3", "rustdds", "ort"]),
     ("gleaner-dds", &["mcap", "rusqlite"]),
     ("gleaner-drives", &["pyo3", "rustdds"]),
     // The runtime loads native code; only `gleaner-compile` generates it.

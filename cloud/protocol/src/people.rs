@@ -18,6 +18,9 @@
 //! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | operator | [`FleetDeployment`] |
 //! | `DELETE /v1/deployments/ID` | deployer | nothing |
 //! | `GET /v1/audit` | admin | [`AuditEntry`] of each, the newest first |
+//!
+//! In the answer to a deployment, `attempt` is 0, as each vehicle counts its own, and `generation`
+//! is the number of its entry in the audit trail. The audit trail is answered up to 1,000 entries.
 
 use std::collections::BTreeMap;
 use std::fmt;

@@ -248,6 +248,15 @@ pub fn unverified_revision(envelope: &[u8]) -> Result<(Revision, Sha256), Refusa
     Ok((envelope.payload()?, envelope.digest()))
 }
 
+/// Reads the deployment in `envelope`, as [`unverified_revision`] does a revision.
+///
+/// # Errors
+///
+/// Those of the format.
+pub fn unverified_deployment(envelope: &[u8]) -> Result<Deployment, Refusal> {
+    Unverified::<Deployment>::parse(envelope)?.payload()
+}
+
 /// Opens the trust root that is installed on a vehicle: its own keys must have signed it, and it
 /// may not be older than one before. The first one is trusted as installed.
 ///

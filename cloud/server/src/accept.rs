@@ -1,0 +1,137 @@
+//! Accepts connections, with TLS or without, within bounds of their number and of time.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Router;
+use hyper::Request;
+use hyper::body::Incoming;
+use hyper::server::conn::http1;
+use hyper::service::{Service, service_fn};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use rustls::ServerConfig;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::time::{sleep, timeout};
+use tokio_rustls::TlsAcceptor;
+
+/// Time for a TLS handshake, and for the headers of a request.
+const HANDSHAKE: Duration = Duration::from_secs(10);
+const HEADERS: Duration = Duration::from_secs(30);
+/// Time for open requests when the server stops.
+const DRAIN: Duration = Duration::from_secs(10);
+
+/// The other side of a connection; it counts as open as long as this lives.
+#[derive(Debug)]
+pub(crate) struct Peer {
+    pub(crate) address: IpAddr,
+    /// SHA-256 of its certificate, which an authority of ours has signed.
+    pub(crate) certificate: Option<String>,
+    _slot: OwnedSemaphorePermit,
+}
+
+impl Peer {
+    #[cfg(test)]
+    pub(crate) fn of_test(address: IpAddr, slot: OwnedSemaphorePermit) -> Self {
+        Self { address, certificate: None, _slot: slot }
+    }
+}
+
+/// A listener and what serves its connections.
+pub(crate) struct Entrance {
+    pub(crate) listener: TcpListener,
+    pub(crate) router: Router,
+    /// The TLS settings; they change with the server's certificate.
+    pub(crate) tls: Option<watch::Receiver<Arc<ServerConfig>>>,
+    /// Maximum number of open connections.
+    pub(crate) most: u32,
+    pub(crate) stop: watch::Receiver<bool>,
+}
+
+impl Entrance {
+    /// Accepts connections until the server stops, and then waits for the open ones.
+    pub(crate) async fn serve(self) {
+        let Self { listener, router, tls, most, mut stop } = self;
+        let slots = Arc::new(Semaphore::new(most as usize));
+        let stopping = stop.clone();
+        let stopped = async move {
+            let _ = stop.wait_for(|is_stopping| *is_stopping).await;
+        };
+        tokio::pin!(stopped);
+        loop {
+            let accepted = tokio::select! {
+                accepted = listener.accept() => accepted,
+                () = &mut stopped => break,
+            };
+            let (stream, address) = match accepted {
+                Ok(accepted) => accepted,
+                Err(error) => {
+                    // Without file descriptors, this would be repeated without a pause.
+                    tracing::warn!(%error, "a connection cannot be accepted");
+                    sleep(Duration::from_millis(100)).await;
+                    continue;
+                }
+            };
+            let Ok(slot) = Arc::clone(&slots).try_acquire_owned() else {
+                tracing::warn!(most, "a connection is refused: too many are open");
+                continue;
+            };
+            let tls = tls.as_ref().map(|tls| TlsAcceptor::from(Arc::clone(&tls.borrow())));
+            let peer = Peer { address: address.ip(), certificate: None, _slot: slot };
+            tokio::spawn(connection(stream, tls, peer, router.clone(), stopping.clone()));
+        }
+        drop(listener);
+        if timeout(DRAIN, slots.acquire_many(most)).await.is_err() {
+            tracing::warn!("connections were cut that did not end in time");
+        }
+    }
+}
+
+async fn connection(
+    stream: TcpStream,
+    tls: Option<TlsAcceptor>,
+    mut peer: Peer,
+    router: Router,
+    stop: watch::Receiver<bool>,
+) {
+    let _ = stream.set_nodelay(true);
+    let Some(tls) = tls else {
+        return requests(stream, peer, router, stop).await;
+    };
+    let Ok(Ok(stream)) = timeout(HANDSHAKE, tls.accept(stream)).await else {
+        tracing::debug!(address = %peer.address, "a TLS handshake failed");
+        return;
+    };
+    let certificates = stream.get_ref().1.peer_certificates();
+    let certificate = certificates.and_then(|all| all.first());
+    peer.certificate = certificate.map(|it| gleaner_trust::sha256(it).to_string());
+    requests(stream, peer, router, stop).await;
+}
+
+async fn requests(
+    stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    peer: Peer,
+    router: Router,
+    mut stop: watch::Receiver<bool>,
+) {
+    let (peer, router) = (Arc::new(peer), TowerToHyperService::new(router));
+    let service = service_fn(move |mut request: Request<Incoming>| {
+        request.extensions_mut().insert(Arc::clone(&peer));
+        router.call(request)
+    });
+    let connection = http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEADERS)
+        .serve_connection(TokioIo::new(stream), service)
+        .with_upgrades();
+    tokio::pin!(connection);
+    // Errors are the ends of connections by their other sides.
+    tokio::select! {
+        _ = connection.as_mut() => return,
+        _ = stop.wait_for(|is_stopping| *is_stopping) => connection.as_mut().graceful_shutdown(),
+    }
+    let _ = connection.await;
+}

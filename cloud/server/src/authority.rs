@@ -1,0 +1,180 @@
+//! Certificates: one authority signs the server's, another one those of vehicles. With one, a
+//! vehicle could pass for the server.
+
+use std::fs;
+use std::io;
+use std::net::IpAddr;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use gleaner_base::{Exit, Failure, excerpt};
+use gleaner_fleet::CERTIFICATE_NAME;
+use rcgen::string::Ia5String;
+use rcgen::{
+    BasicConstraints, CertificateParams, CertificateSigningRequestParams, DistinguishedName,
+    DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose, SanType,
+};
+use rustls::RootCertStore;
+use rustls::ServerConfig;
+use rustls::crypto::{CryptoProvider, ring};
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, PrivatePkcs8KeyDer};
+use rustls::server::WebPkiClientVerifier;
+
+use crate::error::{CloudError, CloudResult};
+use crate::folder::{DataFolder, write_private};
+use crate::store::{Issued, now};
+
+const DAY_S: u64 = 86_400;
+/// Lifetime of the certificate of a vehicle, and its age from which the next one may be requested.
+const VEHICLE_S: u64 = 30 * DAY_S;
+const RENEW_S: u64 = 20 * DAY_S;
+/// Lifetime of the server's certificate. A server makes one at its start, and then every 30 days.
+const SERVER_S: u64 = 365 * DAY_S;
+/// Lifetime of the authorities.
+const AUTHORITY_S: u64 = 20 * 365 * DAY_S;
+/// Time by which certificates begin before they are made: the clock of a vehicle may be behind.
+const BEFORE_S: u64 = 10 * 365 * DAY_S;
+
+/// Both authorities.
+pub(crate) struct Authorities {
+    server: Authority,
+    vehicles: Authority,
+}
+
+struct Authority {
+    pem: String,
+    issuer: Issuer<'static, KeyPair>,
+}
+
+impl Authorities {
+    /// Loads the authorities, or makes them at the first start.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the file.
+    pub(crate) fn open(folder: &DataFolder) -> Result<Self, Failure> {
+        let folder = folder.authorities();
+        let open = |name: &str| {
+            Authority::open(&folder, name).map_err(|error| {
+                let action = format!("cannot open the authority `{}`", folder.join(name).display());
+                Failure::caused_by(Exit::Internal, action, &error)
+                    .with_help("restore the folder `ca` from a backup")
+            })
+        };
+        Ok(Self { server: open("server")?, vehicles: open("vehicles")? })
+    }
+
+    /// Returns the certificate of the authority that signs the server's, as PEM.
+    pub(crate) fn server_pem(&self) -> &str {
+        &self.server.pem
+    }
+
+    /// Makes the certificate of a vehicle from its request.
+    ///
+    /// # Errors
+    ///
+    /// An error if the request cannot be used.
+    pub(crate) fn issue(&self, vehicle: &str, csr: &str) -> CloudResult<Issued> {
+        let refused = |error: rcgen::Error| {
+            let help = "send a certificate request as PEM, with a key of ECDSA P-256";
+            CloudError::usage("the request for a certificate is refused", help)
+                .because(excerpt(&error.to_string()))
+        };
+        let mut request = CertificateSigningRequestParams::from_pem(csr).map_err(refused)?;
+        // Nothing of the request counts but its key.
+        request.params = params(vehicle, VEHICLE_S);
+        let name = Ia5String::try_from(format!("{CERTIFICATE_NAME}{vehicle}")).map_err(refused)?;
+        request.params.subject_alt_names = vec![SanType::URI(name)];
+        request.params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
+        let certificate = request.signed_by(&self.vehicles.issuer).map_err(refused)?;
+        let start = u64::try_from(now()).unwrap_or(0);
+        Ok(Issued {
+            certificate: certificate.pem(),
+            sha256: gleaner_trust::sha256(certificate.der()).to_string(),
+            renew: start + RENEW_S,
+            expires: start + VEHICLE_S,
+        })
+    }
+
+    /// Returns the TLS settings of the vehicles' listener, with a new certificate for `host`.
+    ///
+    /// # Errors
+    ///
+    /// A failure if `host` cannot be in a certificate.
+    pub(crate) fn server_config(&self, host: &str) -> Result<Arc<ServerConfig>, Failure> {
+        let failed = |error: &dyn std::error::Error| {
+            let action = format!("cannot make a certificate for `{}`", excerpt(host));
+            let mut failure = Failure::new(Exit::Usage, action);
+            failure.causes = vec![error.to_string()];
+            failure.with_help("name a host and a port with --name, as in cloud.example.org:8443")
+        };
+        let key = KeyPair::generate().map_err(|error| failed(&error))?;
+        let mut params = params(host, SERVER_S);
+        for name in [host, "localhost", "127.0.0.1"] {
+            params.subject_alt_names.push(match name.parse::<IpAddr>() {
+                Ok(address) => SanType::IpAddress(address),
+                Err(_) => SanType::DnsName(name.try_into().map_err(|error| failed(&error))?),
+            });
+        }
+        params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
+        let certificate = params.signed_by(&key, &self.server.issuer);
+        let certificate = certificate.map_err(|error| failed(&error))?;
+        let key = PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(key.serialize_der()));
+        self.tls(certificate.der().clone(), key).map_err(|error| failed(&*error))
+    }
+
+    fn tls(
+        &self,
+        certificate: CertificateDer<'static>,
+        key: PrivateKeyDer<'static>,
+    ) -> Result<Arc<ServerConfig>, Box<dyn std::error::Error>> {
+        // Named, as rustls panics if a program links two.
+        let provider: Arc<CryptoProvider> = Arc::new(ring::default_provider());
+        let mut roots = RootCertStore::empty();
+        roots.add(CertificateDer::from_pem_slice(self.vehicles.pem.as_bytes())?)?;
+        let verifier =
+            WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
+                .allow_unauthenticated()
+                .build()?;
+        let config = ServerConfig::builder_with_provider(provider)
+            .with_protocol_versions(&[&rustls::version::TLS13])?
+            .with_client_cert_verifier(verifier)
+            .with_single_cert(vec![certificate], key)?;
+        Ok(Arc::new(config))
+    }
+}
+
+impl Authority {
+    fn open(folder: &Path, name: &str) -> io::Result<Self> {
+        let (key_path, path) =
+            (folder.join(format!("{name}.key")), folder.join(format!("{name}.pem")));
+        if !path.exists() {
+            let key = KeyPair::generate().map_err(io::Error::other)?;
+            let mut params = params(&format!("gleaner {name}"), AUTHORITY_S);
+            params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+            params.key_usages = vec![KeyUsagePurpose::KeyCertSign];
+            let certificate = params.self_signed(&key).map_err(io::Error::other)?;
+            // The certificate is last: with it, the authority is complete.
+            write_private(&key_path, key.serialize_pem().as_bytes())?;
+            write_private(&path, certificate.pem().as_bytes())?;
+        }
+        let key = KeyPair::from_pem(&fs::read_to_string(key_path)?).map_err(io::Error::other)?;
+        let pem = fs::read_to_string(path)?;
+        let issuer = Issuer::from_ca_cert_pem(&pem, key).map_err(io::Error::other)?;
+        Ok(Self { pem, issuer })
+    }
+}
+
+/// Returns the parameters of a certificate that begins before now.
+fn params(name: &str, lifetime_s: u64) -> CertificateParams {
+    let now = SystemTime::now();
+    let mut params = CertificateParams::default();
+    params.distinguished_name = DistinguishedName::new();
+    params.distinguished_name.push(DnType::CommonName, name);
+    params.not_before = (now - Duration::from_secs(BEFORE_S)).into();
+    params.not_after = (now + Duration::from_secs(lifetime_s)).into();
+    params.use_authority_key_identifier_extension = true;
+    params
+}

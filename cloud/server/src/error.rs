@@ -1,0 +1,95 @@
+//! Errors, as people and vehicles get them.
+
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use gleaner_base::{Exit, Failure};
+use gleaner_protocol::vehicle_api::Problem;
+
+/// A failure with its HTTP status.
+#[derive(Debug)]
+pub(crate) struct CloudError {
+    status: StatusCode,
+    failure: Failure,
+}
+
+/// A result of this crate.
+pub(crate) type CloudResult<T> = Result<T, CloudError>;
+
+impl CloudError {
+    /// Creates an error: a wrong request.
+    pub(crate) fn usage(message: impl Into<String>, help: &str) -> Self {
+        Self::with(StatusCode::BAD_REQUEST, Exit::Usage, message, help)
+    }
+
+    /// Creates an error: a thing that does not exist.
+    pub(crate) fn missing(message: impl Into<String>, help: &str) -> Self {
+        Self::with(StatusCode::NOT_FOUND, Exit::Usage, message, help)
+    }
+
+    /// Creates an error: a request without a valid token, code or certificate.
+    pub(crate) fn unknown(message: impl Into<String>, help: &str) -> Self {
+        Self::with(StatusCode::UNAUTHORIZED, Exit::Denied, message, help)
+    }
+
+    /// Creates an error: something that is not permitted.
+    pub(crate) fn denied(message: impl Into<String>, help: &str) -> Self {
+        Self::with(StatusCode::FORBIDDEN, Exit::Denied, message, help)
+    }
+
+    /// Creates an error: a limit is reached for now.
+    pub(crate) fn busy(message: impl Into<String>, help: &str) -> Self {
+        Self::with(StatusCode::TOO_MANY_REQUESTS, Exit::Unreachable, message, help)
+    }
+
+    fn with(status: StatusCode, exit: Exit, message: impl Into<String>, help: &str) -> Self {
+        Self { status, failure: Failure::new(exit, message).with_help(help) }
+    }
+
+    /// Adds the cause.
+    pub(crate) fn because(mut self, cause: impl ToString) -> Self {
+        self.failure.causes.push(cause.to_string());
+        self
+    }
+
+    /// Returns the message with its causes, for a frame that ends a connection.
+    pub(crate) fn reason(&self) -> String {
+        let parts = std::iter::once(&self.failure.message).chain(&self.failure.causes);
+        parts.cloned().collect::<Vec<_>>().join(": ")
+    }
+}
+
+impl From<Failure> for CloudError {
+    fn from(failure: Failure) -> Self {
+        let status = match failure.exit {
+            Exit::Usage => StatusCode::BAD_REQUEST,
+            Exit::Denied => StatusCode::FORBIDDEN,
+            Exit::Unreachable => StatusCode::SERVICE_UNAVAILABLE,
+            _ => StatusCode::INTERNAL_SERVER_ERROR,
+        };
+        Self { status, failure }
+    }
+}
+
+impl From<sqlx::Error> for CloudError {
+    fn from(error: sqlx::Error) -> Self {
+        let action = "the database cannot be used";
+        let help = "check that the disk of the data folder has room, and the log of the cloud";
+        Failure::caused_by(Exit::Internal, action, &error).with_help(help).into()
+    }
+}
+
+impl From<CloudError> for Failure {
+    fn from(error: CloudError) -> Self {
+        error.failure
+    }
+}
+
+impl IntoResponse for CloudError {
+    fn into_response(self) -> Response {
+        if self.status.is_server_error() {
+            tracing::error!("{}", self.reason());
+        }
+        let text = serde_json::to_string(&Problem::from(self.failure)).unwrap_or_default();
+        (self.status, [(header::CONTENT_TYPE, "application/problem+json")], text).into_response()
+    }
+}

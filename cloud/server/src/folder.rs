@@ -1,0 +1,97 @@
+//! The data folder: private, and of one process at a time.
+
+use std::fs::{self, DirBuilder, File, OpenOptions, Permissions};
+use std::io::{self, Write};
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+use gleaner_base::{Exit, Failure, sync_folder};
+use rustix::fs::{FlockOperation, flock};
+
+/// The data folder.
+#[derive(Debug, Clone)]
+pub(crate) struct DataFolder(PathBuf);
+
+impl DataFolder {
+    /// Creates the folder, as far as it does not exist, and makes it private.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the folder.
+    pub(crate) fn create(path: &Path) -> Result<Self, Failure> {
+        let folder = Self(path.to_owned());
+        for path in [path, &folder.objects(), &folder.authorities()] {
+            DirBuilder::new()
+                .recursive(true)
+                .mode(0o700)
+                .create(path)
+                .and_then(|()| fs::set_permissions(path, Permissions::from_mode(0o700)))
+                .map_err(|error| {
+                    let action = format!("cannot create the folder `{}`", path.display());
+                    Failure::caused_by(Exit::Usage, action, &error)
+                        .with_help("choose a folder of this user with --data")
+                })?;
+        }
+        Ok(folder)
+    }
+
+    /// Opens a folder that a server has created.
+    ///
+    /// # Errors
+    ///
+    /// A failure if it has no database.
+    pub(crate) fn existing(path: &Path) -> Result<Self, Failure> {
+        let folder = Self(path.to_owned());
+        if folder.database().is_file() {
+            return Ok(folder);
+        }
+        let message = format!("`{}` is no data folder of a cloud", path.display());
+        Err(Failure::new(Exit::Usage, message)
+            .with_help("name the folder of `gleaner-cloud serve` with --data"))
+    }
+
+    /// Locks the folder for this process.
+    ///
+    /// # Errors
+    ///
+    /// A failure if another server has it.
+    pub(crate) fn lock(&self) -> Result<File, Failure> {
+        let path = self.0.join("lock");
+        let mut options = OpenOptions::new();
+        let file = options.write(true).create(true).truncate(false).mode(0o600).open(&path);
+        let file = file.map_err(|error| {
+            let action = format!("cannot open `{}`", path.display());
+            Failure::caused_by(Exit::Internal, action, &error)
+        })?;
+        if flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
+            let message = format!("another gleaner-cloud uses `{}`", self.0.display());
+            return Err(Failure::new(Exit::Usage, message)
+                .with_help("stop that one first, or choose another folder with --data"));
+        }
+        Ok(file)
+    }
+
+    pub(crate) fn database(&self) -> PathBuf {
+        self.0.join("cloud.db")
+    }
+
+    pub(crate) fn objects(&self) -> PathBuf {
+        self.0.join("objects")
+    }
+
+    /// Folder of the keys and certificates of the authorities.
+    pub(crate) fn authorities(&self) -> PathBuf {
+        self.0.join("ca")
+    }
+}
+
+/// Writes a file that only this user can read; durable, and whole or not at all.
+pub(crate) fn write_private(path: &Path, content: &[u8]) -> io::Result<()> {
+    let part = path.with_extension("part");
+    let mut options = OpenOptions::new();
+    let mut file = options.write(true).create(true).truncate(true).mode(0o600).open(&part)?;
+    file.write_all(content)?;
+    file.sync_all()?;
+    fs::rename(&part, path)?;
+    path.parent().map_or(Ok(()), sync_folder)
+}

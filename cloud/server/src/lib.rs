@@ -1,0 +1,27 @@
+//! The cloud of a fleet, as one process: vehicles connect to it, and people deploy by it.
+//!
+//! `store` is the database and `objects` the folder of files; together with the certificates of
+//! `authority` they are all that survives a restart. `accept` accepts connections for both
+//! listeners: `people` answers requests of people, and `vehicles` those of vehicles, each of which
+//! keeps one connection open. `hub` knows these connections, and wakes them after a change.
+//!
+//! Nothing here runs a lambda, or decides what a vehicle runs: each vehicle verifies signatures by
+//! its own trust root.
+
+mod accept;
+mod attempts;
+mod authority;
+mod cloud;
+mod error;
+mod folder;
+mod hub;
+mod objects;
+mod people;
+mod program;
+mod request;
+mod server;
+mod store;
+mod vehicles;
+
+pub use program::main;
+pub use server::{CloudServer, ServeOptions};

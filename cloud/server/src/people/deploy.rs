@@ -1,0 +1,93 @@
+//! Receives deployments and their files.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use axum::Json;
+use axum::body::{Body, Bytes};
+use axum::extract::{Extension, Path, State};
+use axum::http::StatusCode;
+use gleaner_base::Failure;
+use gleaner_fleet::people::User;
+use gleaner_lambda::manifest::Sha256;
+use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest};
+use gleaner_trust::{Refusal, Revision, unverified_deployment, unverified_revision};
+
+use crate::cloud::Cloud;
+use crate::error::{CloudError, CloudResult};
+use crate::request::{digest, parsed};
+use crate::store::OfferedDeployment;
+
+/// Stores a deployment, or answers with the files that are missing for it.
+pub(super) async fn deploy(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(actor): Extension<User>,
+    body: Bytes,
+) -> CloudResult<Json<DeployReply>> {
+    let request: DeployRequest = parsed(&body, "deployment")?;
+    let refused = |what: &str| {
+        let action = format!("the {what} is refused");
+        move |refusal: Refusal| CloudError::from(Failure::because(action, &refusal))
+    };
+    let deployment =
+        unverified_deployment(request.deployment.as_bytes()).map_err(refused("deployment"))?;
+    let mut sent = BTreeMap::new();
+    for envelope in request.revisions.into_iter().take(2) {
+        let (revision, digest) =
+            unverified_revision(envelope.as_bytes()).map_err(refused("revision"))?;
+        sent.insert(digest, (revision, envelope));
+    }
+    let named: Vec<&Sha256> =
+        [Some(&deployment.revision), deployment.fallback.as_ref()].into_iter().flatten().collect();
+    let mut revisions: Vec<Revision> = Vec::new();
+    let mut envelopes = BTreeMap::new();
+    for digest in named {
+        let (revision, envelope) = match sent.remove(digest) {
+            Some(sent) => sent,
+            None => stored(&cloud, digest).await?,
+        };
+        revisions.push(revision);
+        envelopes.insert(digest.to_string(), envelope);
+    }
+    let id = deployment.id.to_string();
+    let objects = cloud.objects.missing(&revisions);
+    cloud.objects.offer(&id, &objects)?;
+    if !objects.is_empty() {
+        return Ok(Json(DeployReply::Missing { objects }));
+    }
+    let selector = deployment.selector.into_iter().map(|(name, it)| (name.to_string(), it));
+    let offered = OfferedDeployment {
+        id: id.clone(),
+        release: deployment.release,
+        envelope: request.deployment,
+        revision: deployment.revision.to_string(),
+        fallback: deployment.fallback.map(|it| it.to_string()),
+        selector: selector.collect(),
+        revisions: envelopes,
+    };
+    let (generation, changed) = cloud.store.deploy(&actor.name, &offered).await?;
+    cloud.hub.wake(&changed);
+    Ok(Json(DeployReply::Accepted { id, attempt: 0, generation }))
+}
+
+async fn stored(cloud: &Cloud, digest: &Sha256) -> CloudResult<(Revision, String)> {
+    let missing = || {
+        let message = format!("the deployment names revision {digest}, which was not sent");
+        CloudError::usage(message, "send its file, too, as the revision or the fallback")
+    };
+    let envelope = cloud.store.revision(digest.as_str()).await?.ok_or_else(missing)?;
+    let parsed = unverified_revision(envelope.as_bytes());
+    let (revision, _) =
+        parsed.map_err(|error| Failure::because("a stored revision is damaged", &error))?;
+    Ok((revision, envelope))
+}
+
+/// Receives a file that a deployment needs.
+pub(super) async fn object(
+    State(cloud): State<Arc<Cloud>>,
+    Path(sha256): Path<String>,
+    body: Body,
+) -> CloudResult<StatusCode> {
+    cloud.objects.receive(&digest(&sha256)?, body).await?;
+    Ok(StatusCode::NO_CONTENT)
+}

@@ -1,0 +1,150 @@
+//! The command line of the program.
+
+use std::io::Write;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use gleaner_base::{Exit, Failure};
+use gleaner_fleet::people::{NewUser, Role};
+use gleaner_vitals::log;
+use tokio::signal::unix::{SignalKind, signal};
+
+use crate::folder::DataFolder;
+use crate::server::{CloudServer, ServeOptions};
+use crate::store::{CONSOLE, Store};
+
+/// The cloud of a fleet: vehicles connect to it, and people deploy by it.
+#[derive(Parser, Debug)]
+#[command(name = "gleaner-cloud", version)]
+struct Args {
+    #[command(subcommand)]
+    command: CloudCommand,
+}
+
+#[derive(Subcommand, Debug)]
+enum CloudCommand {
+    /// Serve people and vehicles until SIGTERM
+    Serve {
+        /// Folder of everything that survives a restart
+        #[arg(long, value_name = "DIR")]
+        data: PathBuf,
+        /// Address of the API for people, without TLS
+        #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
+        people: SocketAddr,
+        /// Address for vehicles, with TLS
+        #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8443")]
+        vehicles: SocketAddr,
+        /// Address for vehicles as enrolments state it, if it differs from --vehicles
+        #[arg(long, value_name = "HOST:PORT")]
+        name: Option<String>,
+        /// Serve people without TLS also at an address that other machines can reach
+        #[arg(long)]
+        insecure_people: bool,
+    },
+    /// Print a one-time code for a user; a server may run meanwhile
+    Invite {
+        /// Name of the user
+        name: String,
+        /// Role of the user: viewer, operator, deployer or admin
+        #[arg(long, value_name = "ROLE")]
+        role: Role,
+        /// Folder of the server
+        #[arg(long, value_name = "DIR")]
+        data: PathBuf,
+    },
+    /// Write a copy of the database; a server may run meanwhile
+    Backup {
+        /// File to write, which must not exist
+        file: PathBuf,
+        /// Folder of the server
+        #[arg(long, value_name = "DIR")]
+        data: PathBuf,
+    },
+}
+
+/// Runs the program.
+pub fn main() -> ExitCode {
+    log::init_service();
+    // Each connection takes one; the usual limit is low.
+    gleaner_base::raise_open_files();
+    let args = Args::parse();
+    match run(args.command) {
+        Ok(()) => Exit::Ok.into(),
+        Err(failure) => {
+            log::failure(&failure);
+            failure.exit.into()
+        }
+    }
+}
+
+fn run(command: CloudCommand) -> Result<(), Failure> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(|error| Failure::caused_by(Exit::Internal, "cannot start threads", &error))?;
+    let done = runtime.block_on(async {
+        match command {
+            CloudCommand::Serve { data, people, vehicles, name, insecure_people } => {
+                let is_insecure = insecure_people;
+                serve(ServeOptions { data, people, vehicles, name, is_insecure }).await
+            }
+            CloudCommand::Invite { name, role, data } => {
+                invite(NewUser { name, role }, &data).await
+            }
+            CloudCommand::Backup { file, data } => backup(&file, &data).await,
+        }
+    });
+    runtime.shutdown_background();
+    done
+}
+
+async fn serve(options: ServeOptions) -> Result<(), Failure> {
+    let failed =
+        |error| Failure::caused_by(Exit::Internal, "cannot handle SIGTERM and SIGINT", &error);
+    let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;
+    let server = CloudServer::start(&options).await?;
+    let address = format!("http://{}", server.people);
+    let mut text = format!("people:   {address}\nvehicles: {}\n", server.vehicles);
+    if let Some(code) = &server.code {
+        text += &format!("first:    gleaner login {address} --code {code}\n");
+    }
+    print(&text);
+    tokio::select! {
+        _ = terminate.recv() => {}
+        _ = interrupt.recv() => {}
+    }
+    server.stop().await;
+    Ok(())
+}
+
+async fn invite(new: NewUser, data: &Path) -> Result<(), Failure> {
+    let store = Store::open(&DataFolder::existing(data)?.database()).await?;
+    let invitation = store.invite(CONSOLE, new).await?;
+    store.close().await;
+    print(&format!("{}\n", invitation.code));
+    Ok(())
+}
+
+async fn backup(file: &Path, data: &Path) -> Result<(), Failure> {
+    let refused = |reason: &str, help: &str| {
+        let message = format!("`{}` {reason}", file.display());
+        Failure::new(Exit::Usage, message).with_help(help)
+    };
+    if file.exists() {
+        return Err(refused("exists already", "choose another file, or remove it first"));
+    }
+    let name = file.to_str().ok_or_else(|| refused("is not UTF-8", "choose another name"))?;
+    let store = Store::open(&DataFolder::existing(data)?.database()).await?;
+    store.copy_to(name).await?;
+    store.close().await;
+    Ok(())
+}
+
+fn print(text: &str) {
+    let mut out = std::io::stdout();
+    // A starter that does not read must not keep the server from serving.
+    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+}

@@ -1,0 +1,178 @@
+//! The start and the end of the server.
+
+use std::fs::File;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use gleaner_base::{Exit, Failure};
+use tokio::net::TcpListener;
+use tokio::sync::{Semaphore, watch};
+use tokio::task::{JoinHandle, JoinSet};
+use tokio::time::{MissedTickBehavior, interval};
+
+use crate::accept::Entrance;
+use crate::attempts::WrongSecrets;
+use crate::authority::Authorities;
+use crate::cloud::{Cloud, READERS_MAX};
+use crate::folder::DataFolder;
+use crate::hub::Hub;
+use crate::objects::Objects;
+use crate::store::{Retention, Store};
+use crate::{people, vehicles};
+
+/// Maximum number of open connections of people, and of vehicles.
+const PEOPLE_MAX: u32 = 1000;
+const VEHICLES_MAX: u32 = 20_000;
+/// Interval at which times of signs of life are stored.
+const SEEN_INTERVAL: Duration = Duration::from_secs(30);
+/// Interval at which the server's certificate is made again.
+const CERTIFICATE_INTERVAL: Duration = Duration::from_secs(30 * 86_400);
+
+/// Settings of the server.
+#[derive(Debug, Clone)]
+pub struct ServeOptions {
+    /// Folder of everything that survives a restart.
+    pub data: PathBuf,
+    /// Address of the API for people.
+    pub people: SocketAddr,
+    /// Address for vehicles.
+    pub vehicles: SocketAddr,
+    /// Address for vehicles as enrolments state it, `HOST:PORT`; without one, `vehicles`.
+    pub name: Option<String>,
+    /// Permission to serve people, without TLS, at an address that other machines can reach.
+    pub is_insecure: bool,
+}
+
+/// A server that runs.
+pub struct CloudServer {
+    /// Address of the API for people.
+    pub people: SocketAddr,
+    /// Address for vehicles.
+    pub vehicles: SocketAddr,
+    /// The one-time code of an administrator, unless one has a valid token.
+    pub code: Option<String>,
+    cloud: Arc<Cloud>,
+    stop: watch::Sender<bool>,
+    entrances: JoinSet<()>,
+    chores: JoinHandle<()>,
+    _lock: File,
+}
+
+impl CloudServer {
+    /// Starts a server.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the folder, the file or the address that cannot be used.
+    pub async fn start(options: &ServeOptions) -> Result<Self, Failure> {
+        if !options.people.ip().is_loopback() && !options.is_insecure {
+            let message = format!("people are not served at {} without TLS", options.people);
+            return Err(Failure::new(Exit::Denied, message).with_help(
+                "use a loopback address and put a proxy with TLS before it, or add \
+                 --insecure-people in a network that you trust",
+            ));
+        }
+        let folder = DataFolder::create(&options.data)?;
+        let lock = folder.lock()?;
+        let authorities = Authorities::open(&folder)?;
+        let store = Store::open(&folder.database()).await?;
+        if let Some(seq) = store.first_changed_entry().await? {
+            tracing::error!(seq, "the audit trail was changed: an entry is not as it was written");
+        }
+        let people_listener = listen(options.people, "--people").await?;
+        let vehicles_listener = listen(options.vehicles, "--vehicles").await?;
+        let (people, vehicles) =
+            (local(&people_listener, "--people")?, local(&vehicles_listener, "--vehicles")?);
+        let address = options.name.clone().unwrap_or_else(|| vehicles.to_string());
+        let host = host(&address)?.to_owned();
+        let (tls, tls_config) = watch::channel(authorities.server_config(&host)?);
+        let code = store.invite_first().await?.map(|invitation| invitation.code);
+        let cloud = Arc::new(Cloud {
+            store,
+            objects: Objects::open(folder.objects())?,
+            hub: Hub::default(),
+            authorities,
+            wrong_secrets: WrongSecrets::default(),
+            readers: Arc::new(Semaphore::new(READERS_MAX)),
+            retention: Retention::DEFAULT,
+            address,
+        });
+        let (stop, stopped) = watch::channel(false);
+        let mut entrances = JoinSet::new();
+        let entrance = Entrance {
+            listener: people_listener,
+            router: people::router(&cloud),
+            tls: None,
+            most: PEOPLE_MAX,
+            stop: stopped.clone(),
+        };
+        entrances.spawn(entrance.serve());
+        let entrance = Entrance {
+            listener: vehicles_listener,
+            router: vehicles::router(&cloud),
+            tls: Some(tls_config),
+            most: VEHICLES_MAX,
+            stop: stopped,
+        };
+        entrances.spawn(entrance.serve());
+        let working = Arc::clone(&cloud);
+        let chores = tokio::spawn(async move {
+            let mut seen = interval(SEEN_INTERVAL);
+            seen.set_missed_tick_behavior(MissedTickBehavior::Delay);
+            let mut certificate = interval(CERTIFICATE_INTERVAL);
+            loop {
+                tokio::select! {
+                    _ = seen.tick() => store_seen(&working).await,
+                    _ = certificate.tick() => match working.authorities.server_config(&host) {
+                        Ok(config) => drop(tls.send_replace(config)),
+                        Err(failure) => tracing::error!("{failure}"),
+                    },
+                }
+            }
+        });
+        Ok(Self { people, vehicles, code, cloud, stop, entrances, chores, _lock: lock })
+    }
+
+    /// Stops the server: vehicles are asked to come back later, and open requests are answered.
+    pub async fn stop(self) {
+        let Self { cloud, stop, entrances, chores, .. } = self;
+        chores.abort();
+        stop.send_replace(true);
+        cloud.hub.stop();
+        entrances.join_all().await;
+        store_seen(&cloud).await;
+        cloud.store.close().await;
+    }
+}
+
+async fn store_seen(cloud: &Cloud) {
+    if let Err(error) = cloud.store.seen(&cloud.hub.take_seen()).await {
+        tracing::warn!(reason = error.reason(), "the last signs of life are not stored");
+    }
+}
+
+async fn listen(address: SocketAddr, option: &str) -> Result<TcpListener, Failure> {
+    TcpListener::bind(address).await.map_err(|error| {
+        Failure::caused_by(Exit::Usage, format!("cannot listen on {address}"), &error)
+            .with_help(format!("choose another address with {option}"))
+    })
+}
+
+fn local(listener: &TcpListener, option: &str) -> Result<SocketAddr, Failure> {
+    listener.local_addr().map_err(|error| {
+        Failure::caused_by(Exit::Internal, format!("{option} has no address"), &error)
+    })
+}
+
+/// Returns the host of `HOST:PORT`.
+fn host(address: &str) -> Result<&str, Failure> {
+    let parts = address.rsplit_once(':').filter(|(_, port)| port.parse::<u16>().is_ok());
+    let host = parts.map(|(host, _)| host.trim_start_matches('[').trim_end_matches(']'));
+    host.filter(|host| !host.is_empty()).ok_or_else(|| {
+        let shown = gleaner_base::excerpt(address);
+        Failure::new(Exit::Usage, format!("`{shown}` is no address of a cloud"))
+            .with_help("name a host and a port with --name, as in cloud.example.org:8443")
+    })
+}

@@ -1,0 +1,104 @@
+//! Secrets: stored as their SHA-256, found by it, and valid for a while. With 256 random bits, a
+//! plain hash cannot be searched.
+
+use super::{Change, Store, now};
+use crate::error::{CloudError, CloudResult};
+
+const DAY_S: i64 = 86_400;
+
+/// The use of a secret.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum SecretKind {
+    /// One-time code of a user.
+    Code,
+    /// Token of a user.
+    Token,
+    /// One-time token of a vehicle.
+    Enrolment,
+}
+
+impl SecretKind {
+    fn as_str(self) -> &'static str {
+        match self {
+            SecretKind::Code => "code",
+            SecretKind::Token => "token",
+            SecretKind::Enrolment => "enrolment",
+        }
+    }
+
+    /// Returns the start of its text, by which tools find secrets in files.
+    fn prefix(self) -> &'static str {
+        match self {
+            SecretKind::Code => "glc_",
+            SecretKind::Token => "gln_",
+            SecretKind::Enrolment => "gle_",
+        }
+    }
+
+    fn lifetime_s(self) -> i64 {
+        match self {
+            SecretKind::Code | SecretKind::Enrolment => DAY_S,
+            SecretKind::Token => 90 * DAY_S,
+        }
+    }
+}
+
+impl Change<'_> {
+    /// Makes a secret of `subject`; returns it, and its end.
+    pub(super) async fn add_secret(
+        &mut self,
+        kind: SecretKind,
+        subject: &str,
+    ) -> CloudResult<(String, i64)> {
+        let mut bytes = [0; 32];
+        getrandom::fill(&mut bytes).map_err(|error| {
+            CloudError::busy("no secret can be made", "try again").because(error)
+        })?;
+        let secret = format!("{}{}", kind.prefix(), gleaner_base::hex(&bytes));
+        let expires = now() + kind.lifetime_s();
+        run!(&mut *self.tx; "DELETE FROM secrets WHERE expires <= $1"; now());
+        run!(&mut *self.tx;
+            "INSERT INTO secrets (hash, kind, subject, expires) VALUES ($1, $2, $3, $4)";
+            hash(&secret), kind.as_str(), subject, expires);
+        Ok((secret, expires))
+    }
+
+    /// Removes a valid secret; returns its subject.
+    pub(super) async fn take_secret(
+        &mut self,
+        kind: SecretKind,
+        secret: &str,
+    ) -> CloudResult<Option<String>> {
+        let subject: Option<(String,)> = row!(&mut *self.tx;
+            "DELETE FROM secrets WHERE hash = $1 AND kind = $2 AND expires > $3
+             RETURNING subject";
+            hash(secret), kind.as_str(), now());
+        Ok(subject.map(|(subject,)| subject))
+    }
+
+    /// Removes the secrets of `subject`.
+    pub(super) async fn drop_secrets(
+        &mut self,
+        kind: SecretKind,
+        subject: &str,
+    ) -> CloudResult<()> {
+        run!(&mut *self.tx;
+            "DELETE FROM secrets WHERE kind = $1 AND subject = $2";
+            kind.as_str(), subject);
+        Ok(())
+    }
+}
+
+impl Store {
+    /// Returns the name and the role of the user with this token.
+    pub(super) async fn user_row(&self, token: &str) -> CloudResult<Option<(String, String)>> {
+        Ok(row!(&self.pool;
+            "SELECT users.name, users.role FROM secrets JOIN users ON users.name = secrets.subject
+             WHERE secrets.hash = $1 AND secrets.kind = 'token' AND secrets.expires > $2";
+            hash(token), now()))
+    }
+}
+
+fn hash(secret: &str) -> String {
+    gleaner_trust::sha256(secret.as_bytes()).to_string()
+}

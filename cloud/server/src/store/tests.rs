@@ -1,0 +1,247 @@
+use gleaner_fleet::people::{NewUser, Role};
+use gleaner_fleet::{Cursor, Hello};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use super::*;
+
+const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20 };
+
+async fn store() -> (TempDir, Store) {
+    let folder = TempDir::new().unwrap();
+    let store = Store::open(&folder.path().join("cloud.db")).await.unwrap();
+    (folder, store)
+}
+
+async fn connected(store: &Store, name: &str) -> u64 {
+    store.invite_vehicle("ann", name).await.unwrap();
+    store.connect(name, &Hello::default()).await.unwrap()
+}
+
+fn offered(id: &str, release: u64, fleet: &str) -> OfferedDeployment {
+    OfferedDeployment {
+        id: id.to_owned(),
+        release,
+        envelope: format!("envelope {release} of {id} for {fleet}"),
+        revision: "r".to_owned(),
+        fallback: None,
+        selector: [("fleet".to_owned(), fleet.to_owned())].into(),
+        revisions: [("r".to_owned(), "a revision".to_owned())].into(),
+    }
+}
+
+fn report(labels: Value, deployments: Value) -> VehicleReport {
+    let program = json!({ "version": "1.2", "pid": 1, "up_s": 1.0, "rss_bytes": 1, "cpu_s": 1.0 });
+    let status = json!({
+        "vehicle": "car-7", "key": "k", "labels": labels, "orchestrator": program, "trust": null,
+        "generation": 1, "deployments": deployments, "capacity": [], "supervisor": null,
+    });
+    VehicleReport {
+        handled: 1,
+        problems: vec!["no room".to_owned()],
+        json: status.to_string(),
+        status: serde_json::from_value(status).unwrap(),
+    }
+}
+
+fn batch(life: u64, seqs: std::ops::Range<u64>) -> Batch {
+    let line = |seq| (seq, String::new(), format!("line {seq}"));
+    let cursor = Cursor {
+        stream: "events".to_owned(),
+        life,
+        next: seqs.end,
+        seq: seqs.end - 1,
+        boot: "b".to_owned(),
+        boot_ns: 7,
+    };
+    Batch { lines: seqs.map(line).collect(), cursor }
+}
+
+async fn lines(store: &Store) -> Vec<String> {
+    let streams = ["events"; 2];
+    let mut lines = store.removed("car-7", streams, 0).await.unwrap();
+    lines.extend(store.page("car-7", streams, 0, 0, 1000).await.unwrap().lines);
+    lines
+}
+
+#[tokio::test]
+async fn records_that_come_again_are_stored_once() {
+    let (_folder, store) = store().await;
+    let epoch = connected(&store, "car-7").await;
+    for _ in 0..2 {
+        let ack = store.append("car-7", epoch, &batch(1, 0..3), KEPT).await.unwrap();
+        assert_eq!((ack.life, ack.next), (1, 3));
+    }
+    // A part of it again, and more.
+    store.append("car-7", epoch, &batch(1, 2..4), KEPT).await.unwrap();
+    assert_eq!(lines(&store).await, ["line 0", "line 1", "line 2", "line 3"]);
+    let cursor = batch(1, 2..4).cursor;
+    assert_eq!(store.cursors("car-7").await.unwrap(), [cursor]);
+    // The vehicle has lost its records, and begins again.
+    store.append("car-7", epoch, &batch(2, 0..1), KEPT).await.unwrap();
+    assert_eq!(lines(&store).await.len(), 5);
+    assert!(store.append("car-7", epoch, &batch(1, 4..5), KEPT).await.is_err());
+}
+
+#[tokio::test]
+async fn a_connection_that_was_replaced_or_cut_off_stores_nothing() {
+    let (_folder, store) = store().await;
+    let old = connected(&store, "car-7").await;
+    let new = store.connect("car-7", &Hello::default()).await.unwrap();
+    assert!(store.append("car-7", old, &batch(1, 0..1), KEPT).await.is_err());
+    assert!(store.report("car-7", old, &report(json!({}), json!([]))).await.is_err());
+    assert!(store.append("car-7", new, &batch(1, 0..1), KEPT).await.is_ok());
+    store.revoke("ann", "car-7").await.unwrap();
+    assert!(store.append("car-7", new, &batch(1, 1..2), KEPT).await.is_err());
+    assert!(store.connect("car-7", &Hello::default()).await.is_err());
+    assert!(store.wants("car-7").await.is_err());
+    assert_eq!(lines(&store).await, ["line 0"]);
+}
+
+#[tokio::test]
+async fn records_above_the_bounds_are_removed_and_counted() {
+    let (_folder, store) = store().await;
+    let epoch = connected(&store, "car-7").await;
+    let few = Retention { records: 3, bytes: 1 << 20 };
+    store.append("car-7", epoch, &batch(1, 0..4), few).await.unwrap();
+    store.append("car-7", epoch, &batch(1, 4..5), few).await.unwrap();
+    let kept = lines(&store).await;
+    let gap: Value = serde_json::from_str(&kept[0]).unwrap();
+    assert_eq!((&gap["kind"], &gap["record"]["to"]), (&json!("gap"), &json!(1)));
+    assert_eq!(gap["record"]["records"], 2);
+    assert_eq!(kept[1..], ["line 2", "line 3", "line 4"]);
+    // Sent again, a record that was removed does not come back.
+    store.append("car-7", epoch, &batch(1, 0..2), few).await.unwrap();
+    assert_eq!(lines(&store).await, kept);
+    let short = Retention { records: 3, bytes: 12 };
+    store.append("car-7", epoch, &batch(1, 5..6), short).await.unwrap();
+    assert_eq!(lines(&store).await[1..], ["line 4", "line 5"]);
+}
+
+#[tokio::test]
+async fn a_wanted_state_gets_another_number_only_when_it_changes() {
+    let (_folder, store) = store().await;
+    let epoch = connected(&store, "car-7").await;
+    let generation = async || store.wants("car-7").await.unwrap().generation;
+    assert_eq!(generation().await, 1);
+    let (_, changed) = store.deploy("ann", &offered("a", 1, "test")).await.unwrap();
+    assert_eq!((changed.len(), generation().await), (0, 1), "its labels do not fit");
+    assert!(
+        store.report("car-7", epoch, &report(json!({"fleet": "test"}), json!([]))).await.unwrap()
+    );
+    let wants = store.wants("car-7").await.unwrap();
+    assert_eq!((wants.generation, &*wants.deployments[0].id), (2, "a"));
+    store.deploy("ann", &offered("b", 1, "other")).await.unwrap();
+    store.deploy("ann", &offered("a", 1, "test")).await.unwrap();
+    assert_eq!(generation().await, 2);
+    assert_eq!(store.set_wanted("ann", "a", false).await.unwrap(), ["car-7"]);
+    assert!(!store.wants("car-7").await.unwrap().deployments[0].is_wanted);
+    store.deploy("ann", &offered("a", 1, "test")).await.unwrap();
+    assert!(store.wants("car-7").await.unwrap().deployments[0].is_wanted);
+    assert_eq!(generation().await, 4);
+    store.remove_deployment("ann", "a").await.unwrap();
+    let wants = store.wants("car-7").await.unwrap();
+    assert_eq!((wants.generation, wants.deployments.len()), (5, 0));
+}
+
+#[tokio::test]
+async fn a_release_is_replaced_only_by_a_higher_one() {
+    let (_folder, store) = store().await;
+    store.deploy("ann", &offered("a", 5, "test")).await.unwrap();
+    for release in [4, 5] {
+        let refused = store.deploy("ann", &offered("a", release, "other")).await.unwrap_err();
+        let expected = format!("deployment `a` has release 5; this is {release}");
+        assert_eq!(refused.reason(), expected);
+    }
+    store.deploy("ann", &offered("a", 6, "test")).await.unwrap();
+    assert_eq!(store.deployment("a").await.unwrap().release, 6);
+    let refused = store.roll_back("ann", "a").await.unwrap_err();
+    assert_eq!(refused.reason(), "deployment `a` has no fallback");
+    let with_fallback = OfferedDeployment { fallback: Some("r".into()), ..offered("a", 7, "test") };
+    store.deploy("ann", &with_fallback).await.unwrap();
+    store.roll_back("ann", "a").await.unwrap();
+    assert!(store.roll_back("ann", "b").await.unwrap_err().reason().contains("no deployment `b`"));
+}
+
+#[tokio::test]
+async fn vehicles_of_a_deployment_are_counted_by_what_they_report() {
+    let (_folder, store) = store().await;
+    let epoch = connected(&store, "car-7").await;
+    connected(&store, "car-8").await;
+    let deployment = OfferedDeployment { selector: [].into(), ..offered("a", 1, "test") };
+    store.deploy("ann", &deployment).await.unwrap();
+    let counts = async || {
+        let a = store.deployment("a").await.unwrap();
+        (a.vehicles, a.running, a.failed)
+    };
+    assert_eq!(counts().await, (2, 0, 0));
+    let status = |refused: Value, phase: &str| {
+        json!([{
+            "id": "a", "release": 1, "attempt": 1, "lambda": "a",
+            "revision": { "digest": "r", "version": "1", "release": 1 }, "fallback": null,
+            "grants": { "topics": [], "models": [], "record": false }, "is_wanted": true,
+            "runs_fallback": false, "is_proven": false, "failed": null, "refused": refused,
+            "stale": null,
+            "status": { "id": "a", "name": "a", "revision": "r", "attempt": 1, "phase": phase,
+                "phase_s": 1.0, "pid": null, "restarts": 0, "last_end": null, "live": null,
+                "layers": [] },
+        }])
+    };
+    for (refused, phase, expected) in
+        [(Value::Null, "running", (2, 1, 0)), (json!("no room"), "waiting", (2, 0, 1))]
+    {
+        store.report("car-7", epoch, &report(json!({}), status(refused, phase))).await.unwrap();
+        assert_eq!(counts().await, expected);
+    }
+    // It has handled the wanted state that has the deployment, and does not have it.
+    let handled = VehicleReport { handled: 2, ..report(json!({}), json!([])) };
+    store.report("car-7", epoch, &handled).await.unwrap();
+    assert_eq!(counts().await, (2, 0, 1));
+    let all = store.vehicles(|name| name == "car-7").await.unwrap();
+    assert_eq!((all[0].wanted, all[0].handled, &*all[0].problems[0]), (2, 2, "no room"));
+}
+
+#[tokio::test]
+async fn codes_work_once_and_tokens_until_their_end() {
+    let (_folder, store) = store().await;
+    let new = NewUser { name: "ann".to_owned(), role: Role::Deployer };
+    let first = store.invite("console", new.clone()).await.unwrap();
+    let code = store.invite("console", new).await.unwrap().code;
+    assert!(store.login(&first.code).await.unwrap().is_none(), "a later code replaces it");
+    let session = store.login(&code).await.unwrap().unwrap();
+    assert!(store.login(&code).await.unwrap().is_none());
+    assert_eq!(store.user(&session.token).await.unwrap(), Some(session.user));
+    assert!(store.user(&code).await.unwrap().is_none(), "a code is no token");
+    assert!(store.invite_first().await.unwrap().is_some(), "ann is no administrator");
+    store.execute("UPDATE secrets SET expires = 1000").await;
+    assert!(store.user(&session.token).await.unwrap().is_none());
+    assert!(
+        store.invite("console", NewUser { name: "../x".into(), role: Role::Viewer }).await.is_err()
+    );
+}
+
+#[tokio::test]
+async fn a_changed_entry_of_the_audit_trail_is_detected() {
+    let (_folder, store) = store().await;
+    for name in ["car-1", "car-2", "car-3"] {
+        store.invite_vehicle("ann", name).await.unwrap();
+    }
+    assert_eq!(store.first_changed_entry().await.unwrap(), None);
+    assert_eq!(store.audit().await.unwrap()[0].subject, "car-3");
+    store.execute("UPDATE audit SET actor = 'bob' WHERE seq = 2").await;
+    assert_eq!(store.first_changed_entry().await.unwrap(), Some(2));
+    store.execute("UPDATE audit SET actor = 'ann' WHERE seq = 2").await;
+    assert_eq!(store.first_changed_entry().await.unwrap(), None);
+    store.execute("DELETE FROM audit WHERE seq = 1").await;
+    assert_eq!(store.first_changed_entry().await.unwrap(), Some(1));
+}
+
+#[tokio::test]
+async fn the_database_of_a_later_version_is_refused() {
+    let (folder, store) = store().await;
+    store.execute("INSERT INTO migrations (version) VALUES (99)").await;
+    store.close().await;
+    let refused = Store::open(&folder.path().join("cloud.db")).await.unwrap_err();
+    assert_eq!(refused.message, "the database has version 99; this program has 1");
+    assert!(refused.help.is_some());
+}

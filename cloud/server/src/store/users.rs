@@ -1,0 +1,98 @@
+//! Users, their invitations and their tokens.
+
+use gleaner_base::excerpt;
+use gleaner_fleet::people::{Invitation, NewUser, Role, Session, User};
+use gleaner_lambda::manifest::ItemName;
+
+use super::secrets::SecretKind;
+use super::{Store, now, unsigned};
+use crate::error::{CloudError, CloudResult};
+
+/// Actor of changes that the program itself makes, for a person at its machine.
+pub(crate) const CONSOLE: &str = "console";
+
+/// Name of the user that the first start invites.
+const ADMIN: &str = "admin";
+
+impl Store {
+    /// Adds a user, or invites one again with this role: codes before it do not work any more.
+    pub(crate) async fn invite(&self, actor: &str, new: NewUser) -> CloudResult<Invitation> {
+        let NewUser { name, role } = new;
+        if name.parse::<ItemName>().is_err() || name == CONSOLE {
+            let message = format!("`{}` cannot be the name of a user", excerpt(&name));
+            let help = "use lower-case letters, digits and `-`, as in ann-lee; not `console`";
+            return Err(CloudError::usage(message, help));
+        }
+        let mut change = self.change().await?;
+        run!(&mut *change.tx;
+            "INSERT INTO users (name, role) VALUES ($1, $2)
+             ON CONFLICT (name) DO UPDATE SET role = excluded.role";
+            &name, role.as_str());
+        change.drop_secrets(SecretKind::Code, &name).await?;
+        let (code, expires) = change.add_secret(SecretKind::Code, &name).await?;
+        change.note(actor, &format!("invite as {role}"), &name).await?;
+        change.commit().await?;
+        Ok(Invitation { user: User { name, role }, code, expires: unsigned(expires) })
+    }
+
+    /// Invites an administrator, unless one has a valid token.
+    pub(crate) async fn invite_first(&self) -> CloudResult<Option<Invitation>> {
+        let (tokens,): (i64,) = one!(&self.pool;
+            "SELECT COUNT(*) FROM secrets JOIN users ON users.name = secrets.subject
+             WHERE secrets.kind = 'token' AND users.role = 'admin' AND secrets.expires > $1";
+            now());
+        match tokens {
+            0 => {
+                let admin = NewUser { name: ADMIN.to_owned(), role: Role::Admin };
+                self.invite(CONSOLE, admin).await.map(Some)
+            }
+            _ => Ok(None),
+        }
+    }
+
+    /// Exchanges a code for a token; `None` if the code is wrong, used or too old.
+    pub(crate) async fn login(&self, code: &str) -> CloudResult<Option<Session>> {
+        let mut change = self.change().await?;
+        let Some(name) = change.take_secret(SecretKind::Code, code).await? else { return Ok(None) };
+        let (role,): (String,) =
+            one!(&mut *change.tx; "SELECT role FROM users WHERE name = $1"; &name);
+        let (token, expires) = change.add_secret(SecretKind::Token, &name).await?;
+        change.note(&name, "login", &name).await?;
+        change.commit().await?;
+        Ok(Some(Session { user: user((name, role))?, token, expires: unsigned(expires) }))
+    }
+
+    /// Returns the user with this token.
+    pub(crate) async fn user(&self, token: &str) -> CloudResult<Option<User>> {
+        self.user_row(token).await?.map(user).transpose()
+    }
+
+    /// Returns all users.
+    pub(crate) async fn users(&self) -> CloudResult<Vec<User>> {
+        let rows: Vec<_> = rows!(&self.pool; "SELECT name, role FROM users ORDER BY name");
+        rows.into_iter().map(user).collect()
+    }
+
+    /// Removes a user, and the tokens of the user.
+    pub(crate) async fn remove_user(&self, actor: &str, name: &str) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        let removed = run!(&mut *change.tx; "DELETE FROM users WHERE name = $1"; name);
+        if removed.rows_affected() == 0 {
+            let message = format!("there is no user `{}`", excerpt(name));
+            return Err(CloudError::missing(message, "list the users, and use one of their names"));
+        }
+        for kind in [SecretKind::Code, SecretKind::Token] {
+            change.drop_secrets(kind, name).await?;
+        }
+        change.note(actor, "remove user", name).await?;
+        change.commit().await
+    }
+}
+
+fn user((name, role): (String, String)) -> CloudResult<User> {
+    let role = role.parse().map_err(|error: String| {
+        CloudError::denied(format!("the role of user `{name}` is damaged"), "invite the user again")
+            .because(error)
+    })?;
+    Ok(User { name, role })
+}

@@ -1,0 +1,282 @@
+//! Vehicles: their certificates, their connections and what they have reported.
+
+use std::collections::BTreeMap;
+
+use gleaner_base::excerpt;
+use gleaner_fleet::Hello;
+use gleaner_fleet::people::{VehicleState, VehicleSummary};
+use gleaner_protocol::supervision::LambdaPhase;
+use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
+use gleaner_trust::VehicleName;
+
+use super::secrets::SecretKind;
+use super::{Change, Store, int, now, unsigned};
+use crate::error::{CloudError, CloudResult};
+
+/// Maximum number of deployments in a report that count.
+const DEPLOYMENTS_MAX: usize = 1000;
+
+/// A certificate that was made for a vehicle.
+#[derive(Debug)]
+pub(crate) struct Issued {
+    pub(crate) certificate: String,
+    pub(crate) sha256: String,
+    pub(crate) renew: u64,
+    pub(crate) expires: u64,
+}
+
+/// A report of a vehicle.
+#[derive(Debug)]
+pub(crate) struct VehicleReport {
+    pub(crate) handled: u64,
+    pub(crate) problems: Vec<String>,
+    pub(crate) status: VehicleStatus,
+    pub(crate) json: String,
+}
+
+impl Store {
+    /// Adds a vehicle, or lets one enrol again; returns the one-time token. One that is connected
+    /// stays so until the token is used.
+    pub(crate) async fn invite_vehicle(&self, actor: &str, name: &str) -> CloudResult<String> {
+        if let Err(reason) = name.parse::<VehicleName>() {
+            return Err(
+                CloudError::usage("no vehicle can be enrolled", "use another name").because(reason)
+            );
+        }
+        let mut change = self.change().await?;
+        run!(&mut *change.tx;
+            "INSERT INTO vehicles (name) VALUES ($1)
+             ON CONFLICT (name) DO UPDATE SET is_revoked = 0";
+            name);
+        change.drop_secrets(SecretKind::Enrolment, name).await?;
+        let (token, _) = change.add_secret(SecretKind::Enrolment, name).await?;
+        change.note(actor, "invite vehicle", name).await?;
+        change.refresh(name).await?;
+        change.commit().await?;
+        Ok(token)
+    }
+
+    /// Gives a vehicle its certificate for the token, and drops former ones: the vehicle may have
+    /// another disk, and the former one another owner. `None` if the token is wrong, used or too
+    /// old.
+    pub(crate) async fn enrol(
+        &self,
+        name: &str,
+        token: &str,
+        issue: impl FnOnce() -> CloudResult<Issued>,
+    ) -> CloudResult<Option<Issued>> {
+        let mut change = self.change().await?;
+        let subject = change.take_secret(SecretKind::Enrolment, token).await?;
+        // Dropped, the change keeps the token for the vehicle that it is for.
+        if subject.as_deref() != Some(name) {
+            return Ok(None);
+        }
+        let issued = issue()?;
+        change.drop_certificates(name, "").await?;
+        change.add_certificate(name, &issued).await?;
+        change.note(name, "enrol", name).await?;
+        change.commit().await?;
+        Ok(Some(issued))
+    }
+
+    /// Stores the next certificate of a vehicle. The current one stays valid until its end, and
+    /// others do not.
+    pub(crate) async fn renew(
+        &self,
+        name: &str,
+        current: &str,
+        issued: &Issued,
+    ) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        change.drop_certificates(name, current).await?;
+        // The vehicle may have been cut off since the request came.
+        let is_valid: Option<(String,)> = row!(&mut *change.tx;
+            "SELECT sha256 FROM certificates WHERE sha256 = $1"; current);
+        is_valid.ok_or_else(ended)?;
+        change.add_certificate(name, issued).await?;
+        change.note(name, "renew", name).await?;
+        change.commit().await
+    }
+
+    /// Cuts a vehicle off: none of its certificates and tokens is accepted from now on.
+    pub(crate) async fn revoke(&self, actor: &str, name: &str) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        let revoked =
+            run!(&mut *change.tx; "UPDATE vehicles SET is_revoked = 1 WHERE name = $1"; name);
+        if revoked.rows_affected() == 0 {
+            return Err(unknown(name));
+        }
+        change.drop_secrets(SecretKind::Enrolment, name).await?;
+        change.drop_certificates(name, "").await?;
+        change.note(actor, "revoke vehicle", name).await?;
+        change.commit().await
+    }
+
+    /// Returns the vehicle with the certificate of this SHA-256, if it is valid.
+    pub(crate) async fn vehicle_of(&self, sha256: &str) -> CloudResult<Option<String>> {
+        let name: Option<(String,)> = row!(&self.pool;
+            "SELECT vehicles.name FROM certificates
+             JOIN vehicles ON vehicles.name = certificates.vehicle
+             WHERE sha256 = $1 AND expires > $2 AND is_revoked = 0";
+            sha256, now());
+        Ok(name.map(|(name,)| name))
+    }
+
+    /// Begins a connection of a vehicle; returns its number.
+    pub(crate) async fn connect(&self, name: &str, hello: &Hello) -> CloudResult<u64> {
+        let mut change = self.change().await?;
+        let epoch: Option<(i64,)> = row!(&mut *change.tx;
+            "UPDATE vehicles SET epoch = epoch + 1, version = $2, clip_key = $3, seen = $4
+             WHERE name = $1 AND is_revoked = 0 RETURNING epoch";
+            name, excerpt(&hello.version), excerpt(&hello.key), now());
+        let (epoch,) = epoch.ok_or_else(ended)?;
+        change.commit().await?;
+        Ok(unsigned(epoch))
+    }
+
+    /// Stores a report, if the connection still counts; returns whether the vehicle's wanted state
+    /// has changed with its labels.
+    pub(crate) async fn report(
+        &self,
+        name: &str,
+        epoch: u64,
+        report: &VehicleReport,
+    ) -> CloudResult<bool> {
+        let deployments = &report.status.deployments;
+        let deployments = &deployments[..deployments.len().min(DEPLOYMENTS_MAX)];
+        let states: BTreeMap<_, _> =
+            deployments.iter().map(|it| (&it.id, (it.release, state(it)))).collect();
+        let running = states.values().filter(|(_, state)| *state == RUNNING).count();
+        let mut change = self.change().await?;
+        let stored = run!(&mut *change.tx;
+            "UPDATE vehicles SET handled = $3, problems = $4, status = $5, labels = $6,
+             deployments = $7, running = $8, version = $9
+             WHERE name = $1 AND epoch = $2 AND is_revoked = 0";
+            name, int(epoch), int(report.handled), json(&report.problems), &report.json,
+            json(&report.status.labels), int(states.len() as u64), int(running as u64),
+            excerpt(&report.status.orchestrator.version));
+        if stored.rows_affected() == 0 {
+            return Err(ended());
+        }
+        run!(&mut *change.tx; "DELETE FROM reported WHERE vehicle = $1"; name);
+        for (id, (number, state)) in states {
+            run!(&mut *change.tx;
+                "INSERT INTO reported (vehicle, deployment, number, state)
+                 VALUES ($1, $2, $3, $4)";
+                name, id, int(number), state);
+        }
+        let changed = change.refresh(name).await?;
+        change.commit().await?;
+        Ok(!changed.is_empty())
+    }
+
+    /// Returns all vehicles, those that are in `online` as connected.
+    pub(crate) async fn vehicles(
+        &self,
+        is_online: impl Fn(&str) -> bool,
+    ) -> CloudResult<Vec<VehicleSummary>> {
+        type Row = (String, i64, i64, i64, String, String, i64, i64, String, i64, i64);
+        let rows: Vec<Row> = rows!(&self.pool;
+            "SELECT name, is_revoked, epoch, seen, version, labels, generation, handled, problems,
+             running, deployments
+             FROM vehicles ORDER BY name");
+        let summary = |row: Row| {
+            let (name, is_revoked, epoch, seen, version, labels, wanted, handled, problems, ..) =
+                row;
+            let state = match () {
+                () if is_revoked != 0 => VehicleState::Revoked,
+                () if is_online(&name) => VehicleState::Online,
+                () if epoch == 0 => VehicleState::Invited,
+                () => VehicleState::Offline,
+            };
+            VehicleSummary {
+                labels: serde_json::from_str(&labels).unwrap_or_default(),
+                state,
+                seen: (seen > 0).then_some(unsigned(seen)),
+                version: (!version.is_empty()).then_some(version),
+                wanted: unsigned(wanted),
+                handled: unsigned(handled),
+                problems: serde_json::from_str(&problems).unwrap_or_default(),
+                running: unsigned(row.9),
+                deployments: unsigned(row.10),
+                name,
+            }
+        };
+        Ok(rows.into_iter().map(summary).collect())
+    }
+
+    /// Returns the newest status of a vehicle, as JSON.
+    pub(crate) async fn status(&self, name: &str) -> CloudResult<String> {
+        let status: Option<(String,)> =
+            row!(&self.pool; "SELECT status FROM vehicles WHERE name = $1"; name);
+        match status {
+            None => Err(unknown(name)),
+            Some((status,)) if status.is_empty() => Err(CloudError::missing(
+                format!("vehicle `{name}` has not reported yet"),
+                "enrol it, and start its orchestrator",
+            )),
+            Some((status,)) => Ok(status),
+        }
+    }
+
+    /// Stores the times of the last signs of life.
+    pub(crate) async fn seen(&self, times: &BTreeMap<String, i64>) -> CloudResult<()> {
+        if times.is_empty() {
+            return Ok(());
+        }
+        let mut change = self.change().await?;
+        for (name, time) in times {
+            run!(&mut *change.tx; "UPDATE vehicles SET seen = $2 WHERE name = $1"; name, time);
+        }
+        change.commit().await
+    }
+}
+
+impl Change<'_> {
+    async fn add_certificate(&mut self, name: &str, issued: &Issued) -> CloudResult<()> {
+        run!(&mut *self.tx;
+            "INSERT INTO certificates (sha256, vehicle, expires) VALUES ($1, $2, $3)";
+            &issued.sha256, name, int(issued.expires));
+        Ok(())
+    }
+
+    /// Removes all certificates of a vehicle but `kept`.
+    async fn drop_certificates(&mut self, name: &str, kept: &str) -> CloudResult<()> {
+        run!(&mut *self.tx;
+            "DELETE FROM certificates WHERE vehicle = $1 AND sha256 <> $2";
+            name, kept);
+        Ok(())
+    }
+}
+
+/// State of a deployment that runs as it should.
+pub(super) const RUNNING: &str = "running";
+/// State of a deployment that was refused, or whose lambda or revision has failed.
+pub(super) const FAILED: &str = "failed";
+
+fn state(deployment: &DeploymentStatus) -> &'static str {
+    let phase = deployment.status.as_ref().map(|status| status.phase);
+    let has_failed = deployment.failed.is_some() || deployment.refused.is_some();
+    match phase {
+        _ if has_failed => FAILED,
+        Some(LambdaPhase::Quarantined) => FAILED,
+        Some(LambdaPhase::Running) => RUNNING,
+        _ => "other",
+    }
+}
+
+/// Returns the error of a connection that does not count any more.
+pub(super) fn ended() -> CloudError {
+    let message = "this connection does not count: the vehicle has a newer one, or was cut off";
+    CloudError::denied(message, "connect again")
+}
+
+/// Returns the error of a vehicle that does not exist.
+pub(super) fn unknown(name: &str) -> CloudError {
+    let message = format!("there is no vehicle `{}`", excerpt(name));
+    CloudError::missing(message, "`gleaner vehicles` lists all")
+}
+
+fn json(value: &impl serde::Serialize) -> String {
+    serde_json::to_string(value).unwrap_or_default()
+}

@@ -1,0 +1,112 @@
+//! Parses the records that a vehicle sends.
+
+use gleaner_base::excerpt;
+use gleaner_fleet::{Cursor, Records, decompress};
+use gleaner_lambda::manifest::ItemName;
+use gleaner_protocol::vehicle_api::StreamLine;
+use serde_json::json;
+
+use crate::error::{CloudError, CloudResult};
+use crate::store::Batch;
+
+/// Kinds of lines that are no records: gaps and damage.
+const MARKS: [&str; 3] = ["gap", "torn", "damaged"];
+
+/// Parses records. A line that cannot be parsed is replaced by one that says so: refused, the
+/// vehicle would send it for ever.
+///
+/// # Errors
+///
+/// An error if the stream has no name of one, or the lines cannot be decompressed.
+pub(super) fn parse(records: &Records) -> CloudResult<Batch> {
+    let Records { stream, life, next, lines } = records;
+    let lambda = stream.strip_prefix("lambdas/").map(str::parse::<ItemName>);
+    if !matches!(&**stream, "events" | "orchestrator") && !matches!(lambda, Some(Ok(_))) {
+        let message = format!("`{}` is no stream", excerpt(stream));
+        let help = "the streams are `events`, `orchestrator` and `lambdas/ID`";
+        return Err(CloudError::usage(message, help));
+    }
+    let lines = decompress(lines).map_err(|error| {
+        let help = "use a version of gleaner that fits the one of the cloud";
+        CloudError::usage(format!("records of `{stream}` cannot be used"), help).because(error)
+    })?;
+    let cursor = Cursor { stream: stream.clone(), life: *life, next: *next, ..Cursor::default() };
+    let mut batch = Batch { lines: Vec::new(), cursor };
+    for text in lines.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()) {
+        let line = serde_json::from_slice::<StreamLine>(text).map_err(|error| error.to_string());
+        // A torn end may have the number of the next record.
+        let is_before = |line: &StreamLine| is_mark(line) || line.seq < *next;
+        let line = line.and_then(|line| match line.stream == *stream && is_before(&line) {
+            true => Ok(line),
+            false => Err(format!("it is record {} of `{}`", line.seq, excerpt(&line.stream))),
+        });
+        // Parsed as JSON, the line is UTF-8.
+        let (line, text) = match (line, std::str::from_utf8(text)) {
+            (Ok(line), Ok(text)) => (line, text.to_owned()),
+            (line, _) => damaged(stream, &line.err().unwrap_or_default(), text),
+        };
+        let mark = match is_mark(&line) {
+            true => gleaner_trust::sha256(text.as_bytes()).to_string(),
+            false => String::new(),
+        };
+        if mark.is_empty() {
+            let Cursor { seq, boot, boot_ns, .. } = &mut batch.cursor;
+            (*seq, *boot_ns) = (line.seq, line.boot_ns);
+            boot.clone_from(&line.boot);
+        }
+        batch.lines.push((line.seq, mark, text));
+    }
+    Ok(batch)
+}
+
+fn is_mark(line: &StreamLine) -> bool {
+    MARKS.contains(&&*line.kind)
+}
+
+fn damaged(stream: &str, reason: &str, line: &[u8]) -> (StreamLine, String) {
+    let text = format!("the cloud cannot read a line of {} bytes: {reason}", line.len());
+    let line = StreamLine {
+        stream: stream.to_owned(),
+        seq: 0,
+        time_ns: 0,
+        boot_ns: 0,
+        boot: String::new(),
+        kind: "damaged".to_owned(),
+        record: json!({ "text": excerpt(&text) }),
+    };
+    let text = serde_json::to_string(&line).unwrap_or_default();
+    (line, text)
+}
+
+#[cfg(test)]
+mod tests {
+    use gleaner_fleet::compress;
+
+    use super::*;
+
+    fn line(seq: u64, kind: &str) -> String {
+        json!({ "stream": "events", "seq": seq, "time_ns": 1, "boot_ns": seq, "boot": "b",
+                "kind": kind, "record": {} })
+        .to_string()
+    }
+
+    #[test]
+    fn lines_that_are_no_records_are_replaced_and_gaps_are_marked() {
+        let text =
+            format!("{}\n{}\nnonsense\n{}\n", line(4, "event"), line(5, "gap"), line(9, "x"));
+        let records = Records {
+            stream: "events".to_owned(),
+            life: 1,
+            next: 9,
+            lines: compress(text.as_bytes()),
+        };
+        let batch = parse(&records).unwrap();
+        let marks: Vec<_> =
+            batch.lines.iter().map(|(seq, mark, _)| (*seq, !mark.is_empty())).collect();
+        assert_eq!(marks, [(4, false), (5, true), (0, true), (0, true)]);
+        assert!(batch.lines[2].2.contains("cannot read a line of 8 bytes"), "{:?}", batch.lines);
+        assert_eq!((batch.cursor.next, batch.cursor.seq), (9, 4));
+        let other = Records { stream: "lambdas/../x".to_owned(), ..records };
+        assert!(parse(&other).is_err());
+    }
+}

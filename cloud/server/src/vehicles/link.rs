@@ -1,0 +1,217 @@
+//! The control channel of a vehicle, from its first frame to its end.
+
+use std::time::{Duration, Instant};
+
+use axum::body::Bytes;
+use axum::extract::ws::{Message, WebSocket};
+use gleaner_base::{RateLimit, visible};
+use gleaner_fleet::{
+    Body, Cursor, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Reported, Welcome,
+    decompress,
+};
+use gleaner_protocol::vehicle_api::VehicleStatus;
+use tokio::sync::watch;
+use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
+
+use super::batch;
+use crate::cloud::Cloud;
+use crate::error::{CloudError, CloudResult};
+use crate::hub::LinkOrders;
+use crate::store::{VehicleReport, now_ms};
+
+/// Interval of signs of life, in s; without one for three of them, the connection is dead.
+const PING_S: u32 = 20;
+/// Time for the first frame.
+const HELLO: Duration = Duration::from_secs(10);
+/// Time for a frame to a vehicle.
+const SEND: Duration = Duration::from_secs(60);
+/// Time after which a vehicle connects again that has sent something wrong, in ms.
+const WRONG_MS: u64 = 60_000;
+/// Frames of a vehicle that are written to the disk: more wait.
+const WRITES: RateLimit = RateLimit::of(20.0, 100.0);
+/// Number of the problems of a report that count, and of the characters of each.
+const PROBLEMS_MAX: usize = 100;
+const PROBLEM_MAX: usize = 1000;
+
+/// The connection of a vehicle.
+struct VehicleLink<'c> {
+    cloud: &'c Cloud,
+    name: &'c str,
+    socket: WebSocket,
+    epoch: u64,
+    /// Number of the wanted state that was sent last.
+    sent: u64,
+    writes: RateLimit,
+}
+
+/// Serves a connection until its end.
+pub(super) async fn serve(cloud: &Cloud, name: &str, socket: WebSocket) {
+    let mut link = VehicleLink { cloud, name, socket, epoch: 0, sent: 0, writes: WRITES };
+    let end = match link.run().await {
+        Ok(end) => end,
+        Err(error) => {
+            tracing::warn!(vehicle = name, reason = error.reason(), "a connection was ended");
+            Some(GoAway { after_ms: WRONG_MS, reason: error.reason() })
+        }
+    };
+    cloud.hub.remove(name, link.epoch);
+    if let Some(end) = end {
+        // The vehicle may be gone.
+        let _ = link.send(Body::GoAway(end)).await;
+        let _ = timeout(SEND, link.socket.send(Message::Close(None))).await;
+    }
+}
+
+impl VehicleLink<'_> {
+    /// Serves the connection; returns the reason of its end, unless it was the vehicle.
+    async fn run(&mut self) -> CloudResult<Option<GoAway>> {
+        let Ok(hello) = timeout(HELLO, self.receive()).await else { return Ok(None) };
+        let hello = match hello? {
+            None => return Ok(None),
+            Some(Body::Hello(hello)) if hello.protocol == PROTOCOL => hello,
+            Some(Body::Hello(Hello { protocol, .. })) => {
+                let message = format!("the channel has version {PROTOCOL}, not {protocol}");
+                return Err(wrong(message));
+            }
+            Some(_) => return Err(wrong("the first frame is no hello")),
+        };
+        self.epoch = self.cloud.store.connect(self.name, &hello).await?;
+        let Some(mut orders) = self.cloud.hub.add(self.name, self.epoch) else {
+            return Ok(Some(GoAway { after_ms: 0, reason: "there is a newer one".to_owned() }));
+        };
+        let cursors: Vec<Cursor> = self.cloud.store.cursors(self.name).await?;
+        let cursors = cursors.into_iter().filter(|it| hello.streams.contains(&it.stream));
+        let welcome = Welcome {
+            epoch: self.epoch,
+            time_ms: now_ms(),
+            ping_s: PING_S,
+            cursors: cursors.collect(),
+        };
+        self.send(Body::Welcome(welcome)).await?;
+        self.send_wanted().await?;
+        self.serve_frames(&mut orders).await
+    }
+
+    async fn serve_frames(
+        &mut self,
+        orders: &mut watch::Receiver<LinkOrders>,
+    ) -> CloudResult<Option<GoAway>> {
+        let period = Duration::from_secs(PING_S.into());
+        let (mut pings, mut received, mut number) = (interval(period), Instant::now(), 0);
+        pings.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            // An order may be older than this loop.
+            let end = orders.borrow_and_update().end.clone();
+            if end.is_some() {
+                return Ok(end);
+            }
+            tokio::select! {
+                body = self.receive() => {
+                    let Some(body) = body? else { return Ok(None) };
+                    received = Instant::now();
+                    self.cloud.hub.saw(self.name);
+                    self.handle(body).await?;
+                }
+                changed = orders.changed() => match changed {
+                    Ok(()) if orders.borrow().end.is_some() => {}
+                    Ok(()) => self.send_wanted().await?,
+                    // It was removed from the hub, which has set the end before.
+                    Err(_) => return Ok(orders.borrow().end.clone()),
+                },
+                _ = pings.tick() => {
+                    if received.elapsed() > 3 * period {
+                        return Ok(Some(GoAway { after_ms: 0, reason: "no sign of life".into() }));
+                    }
+                    number += 1;
+                    self.send(Body::Ping(Ping { number })).await?;
+                }
+            }
+        }
+    }
+
+    async fn handle(&mut self, body: Body) -> CloudResult<()> {
+        if matches!(body, Body::Reported(_) | Body::Records(_)) {
+            while !self.writes.take(1.0, Instant::now()) {
+                sleep(Duration::from_millis(100)).await;
+            }
+        }
+        match body {
+            Body::Ping(Ping { number }) => self.send(Body::Pong(Pong { number })).await,
+            Body::Pong(_) => Ok(()),
+            Body::Reported(reported) => {
+                let report = report(reported)?;
+                if self.cloud.store.report(self.name, self.epoch, &report).await? {
+                    self.send_wanted().await?;
+                }
+                Ok(())
+            }
+            Body::Records(records) => {
+                let (store, retention) = (&self.cloud.store, self.cloud.retention);
+                let batch = batch::parse(&records)?;
+                let ack = store.append(self.name, self.epoch, &batch, retention).await?;
+                self.cloud.hub.arrived(self.name);
+                self.send(Body::Ack(ack)).await
+            }
+            Body::Hello(_)
+            | Body::Welcome(_)
+            | Body::Desired(_)
+            | Body::Ack(_)
+            | Body::GoAway(_) => Err(wrong("a frame came that a vehicle does not send")),
+        }
+    }
+
+    /// Sends the wanted state, unless it was sent.
+    async fn send_wanted(&mut self) -> CloudResult<()> {
+        let wants = self.cloud.store.wants(self.name).await?;
+        if wants.generation == self.sent {
+            return Ok(());
+        }
+        self.sent = wants.generation;
+        let desired = Desired { generation: wants.generation, deployments: wants.deployments };
+        self.send(Body::Desired(desired)).await
+    }
+
+    /// Receives the content of a frame; `None` at the end. One without content is of a later
+    /// version, and skipped.
+    async fn receive(&mut self) -> CloudResult<Option<Body>> {
+        loop {
+            let bytes = match self.socket.recv().await {
+                Some(Ok(Message::Binary(bytes))) => bytes,
+                Some(Ok(Message::Ping(_) | Message::Pong(_))) => continue,
+                Some(Ok(Message::Text(_))) => return Err(wrong("a frame of text came")),
+                Some(Ok(Message::Close(_))) | None => return Ok(None),
+                Some(Err(error)) => {
+                    tracing::debug!(vehicle = self.name, %error, "a connection has ended");
+                    return Ok(None);
+                }
+            };
+            let frame = Frame::decoded(&bytes).map_err(|error| wrong(error.to_string()))?;
+            if frame.body.is_some() {
+                return Ok(frame.body);
+            }
+        }
+    }
+
+    async fn send(&mut self, body: Body) -> CloudResult<()> {
+        let frame = Message::Binary(Bytes::from(Frame::encoded(body)));
+        match timeout(SEND, self.socket.send(frame)).await {
+            Ok(Ok(())) => Ok(()),
+            _ => Err(wrong("a frame cannot be sent")),
+        }
+    }
+}
+
+fn report(reported: Reported) -> CloudResult<VehicleReport> {
+    let json = decompress(&reported.status).map_err(|error| wrong(error.to_string()))?;
+    let json = String::from_utf8(json).map_err(|error| wrong(error.to_string()))?;
+    let status: VehicleStatus =
+        serde_json::from_str(&json).map_err(|error| wrong(format!("a status is none: {error}")))?;
+    let problems = reported.problems.iter().take(PROBLEMS_MAX);
+    let short = |problem: &String| problem.chars().take(PROBLEM_MAX).collect::<String>();
+    let problems = problems.map(|problem| visible(&short(problem))).collect();
+    Ok(VehicleReport { handled: reported.generation, problems, status, json })
+}
+
+fn wrong(message: impl Into<String>) -> CloudError {
+    CloudError::usage(message, "use a version of gleaner that fits the one of the cloud")
+}

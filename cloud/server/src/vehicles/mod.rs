@@ -1,0 +1,168 @@
+//! The listener for vehicles: HTTPS, each request but the first with the vehicle's certificate.
+//!
+//! | request | answer |
+//! |---|---|
+//! | `POST /v1/enrol` | [`EnrolReply`], of an [`EnrolRequest`]; without a certificate |
+//! | `POST /v1/renew` | [`EnrolReply`], of a [`RenewRequest`] |
+//! | `GET /v1/link` | the control channel, a WebSocket |
+//! | `GET /v1/deployments/SHA256` | the envelope of a deployment |
+//! | `GET /v1/revisions/DIGEST` | the envelope of a revision |
+//! | `GET /v1/objects/SHA256` | a file of a revision |
+
+mod batch;
+mod link;
+
+use std::sync::Arc;
+
+use axum::body::Bytes;
+use axum::extract::ws::WebSocketUpgrade;
+use axum::extract::{DefaultBodyLimit, Extension, Path, Request, State};
+use axum::middleware::{Next, from_fn_with_state};
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post};
+use axum::{Json, Router};
+use gleaner_fleet::{EnrolReply, EnrolRequest, FRAME_MAX, RenewRequest};
+
+use crate::accept::Peer;
+use crate::cloud::Cloud;
+use crate::error::{CloudError, CloudResult};
+use crate::objects::octets;
+use crate::request::{digest, parsed};
+use crate::store::Issued;
+
+/// Maximum length of the body of a request.
+const BODY_MAX: usize = 64 << 10;
+/// Buffer for reading frames: with the default of 128 KiB, idle vehicles would take ten times the
+/// memory.
+const READ_BUFFER: usize = 4096;
+
+/// The vehicle that sends a request, by its certificate.
+#[derive(Debug, Clone)]
+struct KnownVehicle {
+    name: String,
+    certificate: String,
+}
+
+/// Returns the routes.
+pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
+    Router::new()
+        .route("/v1/renew", post(renew))
+        .route("/v1/link", get(link))
+        .route("/v1/deployments/{sha256}", get(deployment))
+        .route("/v1/revisions/{digest}", get(revision))
+        .route("/v1/objects/{sha256}", get(object))
+        .route_layer(from_fn_with_state(Arc::clone(cloud), guard))
+        .route("/v1/enrol", post(enrol))
+        .fallback(async || CloudError::missing("there is nothing under this path", "see the docs"))
+        .layer(DefaultBodyLimit::max(BODY_MAX))
+        .with_state(Arc::clone(cloud))
+}
+
+/// Lets requests pass whose certificate is that of a vehicle which is not cut off. The authority
+/// signs no other names than those of vehicles; the fingerprint settles which one, and whether the
+/// certificate still counts.
+async fn guard(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(peer): Extension<Arc<Peer>>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    let help = "enrol the vehicle: `gleaner vehicles enrol NAME --to FILE`, and there `gleaner \
+                enrol FILE`";
+    let Some(certificate) = peer.certificate.clone() else {
+        return CloudError::unknown("the request has no certificate", help).into_response();
+    };
+    match cloud.store.vehicle_of(&certificate).await {
+        Ok(Some(name)) => {
+            request.extensions_mut().insert(KnownVehicle { name, certificate });
+            next.run(request).await
+        }
+        Ok(None) => {
+            let message =
+                "the certificate is not valid: it has expired, or the vehicle was cut off";
+            CloudError::unknown(message, help).into_response()
+        }
+        Err(error) => error.into_response(),
+    }
+}
+
+async fn enrol(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(peer): Extension<Arc<Peer>>,
+    body: Bytes,
+) -> CloudResult<Json<EnrolReply>> {
+    cloud.wrong_secrets.check(peer.address)?;
+    let EnrolRequest { vehicle, token, csr } = parsed(&body, "enrolment")?;
+    let issue = || cloud.authorities.issue(&vehicle, &csr);
+    let Some(issued) = cloud.store.enrol(&vehicle, &token, issue).await? else {
+        cloud.wrong_secrets.count(peer.address);
+        let help = "an enrolment works once, for 24 hours, and for its own vehicle: make another \
+                    one with `gleaner vehicles enrol NAME --to FILE`";
+        return Err(CloudError::unknown("the enrolment is not valid", help));
+    };
+    cloud.hub.end(&vehicle, "the vehicle was enrolled again");
+    Ok(Json(reply(issued)))
+}
+
+async fn renew(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(vehicle): Extension<KnownVehicle>,
+    body: Bytes,
+) -> CloudResult<Json<EnrolReply>> {
+    let RenewRequest { csr } = parsed(&body, "request for a certificate")?;
+    let issued = cloud.authorities.issue(&vehicle.name, &csr)?;
+    cloud.store.renew(&vehicle.name, &vehicle.certificate, &issued).await?;
+    Ok(Json(reply(issued)))
+}
+
+fn reply(Issued { certificate, renew, expires, .. }: Issued) -> EnrolReply {
+    EnrolReply { certificate, renew, expires }
+}
+
+async fn link(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(vehicle): Extension<KnownVehicle>,
+    Extension(peer): Extension<Arc<Peer>>,
+    upgrade: WebSocketUpgrade,
+) -> Response {
+    upgrade
+        .read_buffer_size(READ_BUFFER)
+        .write_buffer_size(0)
+        .max_message_size(FRAME_MAX)
+        .max_frame_size(FRAME_MAX)
+        .on_upgrade(async move |socket| {
+            link::serve(&cloud, &vehicle.name, socket).await;
+            drop(peer);
+        })
+}
+
+async fn deployment(
+    State(cloud): State<Arc<Cloud>>,
+    Path(sha256): Path<String>,
+) -> CloudResult<Response> {
+    let envelope = cloud.store.envelope(digest(&sha256)?.as_str()).await?;
+    found(envelope, "deployment", &sha256)
+}
+
+async fn revision(
+    State(cloud): State<Arc<Cloud>>,
+    Path(sha256): Path<String>,
+) -> CloudResult<Response> {
+    let envelope = cloud.store.revision(digest(&sha256)?.as_str()).await?;
+    found(envelope, "revision", &sha256)
+}
+
+fn found(envelope: Option<String>, what: &str, digest: &str) -> CloudResult<Response> {
+    let missing = || {
+        let help = "wait for the next wanted state: it was replaced or removed meanwhile";
+        CloudError::missing(format!("there is no {what} {digest}"), help)
+    };
+    Ok(([octets()], envelope.ok_or_else(missing)?).into_response())
+}
+
+async fn object(
+    State(cloud): State<Arc<Cloud>>,
+    Path(sha256): Path<String>,
+) -> CloudResult<Response> {
+    cloud.objects.send(&digest(&sha256)?).await
+}

@@ -1,0 +1,66 @@
+//! A vehicle with a valid certificate sends what it should not.
+
+use gleaner_fleet::{Body, FRAME_MAX, Frame, Hello, LINES_MAX, Records, Reported, compress};
+use hyper::{Method, StatusCode};
+use serde_json::Value;
+use tempfile::TempDir;
+
+use crate::start;
+
+#[tokio::test]
+async fn a_hostile_frame_ends_its_own_connection_only() {
+    let folder = TempDir::new().unwrap();
+    let (server, admin) = start(&folder).await;
+    let (good, _) = admin.enrol("good").await;
+    let (bad, _) = admin.enrol("bad").await;
+    let (mut other, ..) = good.connect().await;
+    let bomb = compress(&vec![b' '; LINES_MAX as usize + 1]);
+    let records = |stream: &str, lines| {
+        let stream = stream.to_owned();
+        Frame::encoded(Body::Records(Records { stream, life: 1, next: 1, lines }))
+    };
+    let status =
+        |status| Frame::encoded(Body::Reported(Reported { status, ..Reported::default() }));
+    let frames = [
+        (vec![0x0a, 0xff], "a frame cannot be decoded"),
+        (records("events", bomb.clone()), "it has more than 8388608 bytes"),
+        (records("../events", compress(b"")), "is no stream"),
+        (records("events", b"no zstd".to_vec()), "cannot be used"),
+        (status(bomb), "it has more than 8388608 bytes"),
+        (status(compress(b"{}")), "a status is none"),
+        (Frame::encoded(Body::Hello(Hello::default())), "a vehicle does not send"),
+    ];
+    for (frame, expected) in frames {
+        let (mut link, ..) = bad.connect().await;
+        link.send_bytes(frame).await;
+        let reason = link.end().await.unwrap();
+        assert!(reason.contains(expected), "{reason}");
+    }
+    let (mut link, ..) = bad.connect().await;
+    link.send_bytes(vec![0; FRAME_MAX + 1]).await;
+    link.end().await;
+    let mut link = bad.link().await.unwrap();
+    link.send(Body::Hello(Hello { protocol: 99, ..Hello::default() })).await;
+    let reason = link.end().await.unwrap();
+    assert_eq!(reason, "the channel has version 1, not 99");
+    other.settle().await;
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn requests_without_a_right_are_refused() {
+    let folder = TempDir::new().unwrap();
+    let (server, admin) = start(&folder).await;
+    let (vehicle, _) = admin.enrol("car-7").await;
+    let (status, _) = vehicle.get("/v1/objects/..%2f..%2fcloud.db").await;
+    assert_eq!(status, StatusCode::BAD_REQUEST);
+    let (status, _) = vehicle.get(&format!("/v1/objects/{}", "0".repeat(64))).await;
+    assert_eq!(status, StatusCode::NOT_FOUND);
+    // No deployment needs it.
+    let object = format!("/v1/objects/{}", "0".repeat(64));
+    let refused = admin.open(Method::PUT, &object, b"x").await.status();
+    assert_eq!(refused, StatusCode::BAD_REQUEST);
+    let all = admin.call(Method::GET, "/v1/users", Value::Null).await;
+    assert_eq!(all.as_array().map(Vec::len), Some(1));
+    server.stop().await;
+}

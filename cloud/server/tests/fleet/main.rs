@@ -1,0 +1,176 @@
+//! People and vehicles use a cloud together, over its two addresses.
+
+mod fake;
+mod hostile;
+mod restarts;
+
+use std::path::Path;
+
+use fake::{FakeVehicle, Person, csr, soon};
+use gleaner_cloud::{CloudServer, ServeOptions};
+use gleaner_fleet::{Body, RenewRequest, Reported, compress};
+use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
+use http_body_util::BodyExt;
+use hyper::{Method, StatusCode};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+fn options(folder: &Path) -> ServeOptions {
+    let any = ([127, 0, 0, 1], 0).into();
+    let data = folder.join("data");
+    ServeOptions { data, people: any, vehicles: any, name: None, is_insecure: false }
+}
+
+/// Starts a cloud; returns it with its administrator.
+async fn start(folder: &TempDir) -> (CloudServer, Person) {
+    let server = CloudServer::start(&options(folder.path())).await.unwrap();
+    let admin = Person::login(server.people, server.code.as_ref().unwrap()).await;
+    (server, admin)
+}
+
+/// A signed deployment of a lambda with one file.
+struct Signed {
+    deployment: String,
+    revision: String,
+    digest: String,
+    file: &'static [u8],
+}
+
+fn signed(release: u64) -> Signed {
+    let (key, file) = (SecretKey::generate().unwrap(), b"content");
+    let revision = Revision {
+        name: "brake-dark".parse().unwrap(),
+        version: "1.0.0".parse().unwrap(),
+        kind: serde_json::from_value(json!("wasm")).unwrap(),
+        release: 1,
+        created: 1,
+        files: vec![RevisionFile {
+            path: "lambda.toml".parse().unwrap(),
+            bytes: file.len() as u64,
+            sha256: sha256(file),
+        }],
+    };
+    let digest = sha256(&serde_json::to_vec(&revision).unwrap());
+    let deployment = Deployment {
+        id: "brake-dark".parse().unwrap(),
+        release,
+        selector: [("fleet".parse().unwrap(), "test".to_owned())].into(),
+        revision: digest.clone(),
+        fallback: None,
+        config: [].into(),
+        grants: Grants::default(),
+        created: 1,
+        expires: 2,
+    };
+    let text = |envelope: Vec<u8>| String::from_utf8(envelope).unwrap();
+    Signed {
+        deployment: text(seal(&deployment, &[&key]).unwrap()),
+        revision: text(seal(&revision, &[&key]).unwrap()),
+        digest: digest.to_string(),
+        file,
+    }
+}
+
+/// Deploys, with the file if it is missing; returns the digest of the envelope.
+async fn deploy(person: &Person, signed: &Signed) -> String {
+    let request = json!({ "deployment": signed.deployment, "revisions": [signed.revision] });
+    let reply = person.call(Method::POST, "/v1/deployments", request.clone()).await;
+    if reply["result"] == "missing" {
+        let object = format!("/v1/objects/{}", reply["objects"][0]["sha256"].as_str().unwrap());
+        let refused = person.open(Method::PUT, &object, b"another").await.status();
+        assert_eq!(refused, StatusCode::FORBIDDEN);
+        let sent = person.open(Method::PUT, &object, signed.file).await.status();
+        assert_eq!(sent, StatusCode::NO_CONTENT);
+        let reply = person.call(Method::POST, "/v1/deployments", request).await;
+        assert_eq!(reply["result"], "accepted", "{reply}");
+    }
+    sha256(signed.deployment.as_bytes()).to_string()
+}
+
+fn reported(generation: u64) -> Body {
+    let program = json!({ "version": "1.2", "pid": 1, "up_s": 1.0, "rss_bytes": 1, "cpu_s": 1.0 });
+    let status = json!({
+        "vehicle": "car-7", "key": "k", "labels": { "fleet": "test" }, "orchestrator": program,
+        "trust": null, "generation": 1, "deployments": [], "capacity": [], "supervisor": null,
+    });
+    let status = compress(status.to_string().as_bytes());
+    Body::Reported(Reported { generation, status, problems: vec!["no room".to_owned()] })
+}
+
+#[tokio::test]
+async fn a_vehicle_enrols_gets_what_is_deployed_and_is_cut_off() {
+    let folder = TempDir::new().unwrap();
+    let (server, admin) = start(&folder).await;
+    let (vehicle, enrolment) = admin.enrol("car-7").await;
+    assert_eq!(admin.vehicle("car-7").await["state"], "invited");
+    assert_eq!(FakeVehicle::enrol(&enrolment).await.0, StatusCode::UNAUTHORIZED, "it works once");
+    let (mut link, welcome, desired) = vehicle.connect().await;
+    assert_eq!((welcome.epoch, desired.generation, desired.deployments.len()), (1, 1, 0));
+
+    // What its labels select comes once they are reported, and with each change afterwards.
+    let first = signed(1);
+    let envelope = deploy(&admin, &first).await;
+    link.send(reported(1)).await;
+    let Some(Body::Desired(desired)) = link.next().await else { panic!("no wanted state") };
+    assert_eq!((desired.generation, &desired.deployments[0].envelope), (2, &envelope));
+    for (path, expected) in [
+        (format!("/v1/deployments/{envelope}"), first.deployment.as_bytes()),
+        (format!("/v1/revisions/{}", first.digest), first.revision.as_bytes()),
+        (format!("/v1/objects/{}", sha256(first.file)), first.file),
+    ] {
+        assert_eq!(vehicle.get(&path).await, (StatusCode::OK, expected.to_vec()), "{path}");
+    }
+    admin.call(Method::POST, "/v1/deployments/brake-dark/stop", Value::Null).await;
+    let Some(Body::Desired(desired)) = link.next().await else { panic!("no wanted state") };
+    assert!(desired.generation == 3 && !desired.deployments[0].is_wanted);
+    link.send(reported(3)).await;
+    link.settle().await;
+    let summary = admin.vehicle("car-7").await;
+    assert_eq!((&summary["state"], &summary["handled"]), (&json!("online"), &json!(3)));
+    assert_eq!(summary["problems"], json!(["no room"]));
+    let status = admin.call(Method::GET, "/v1/vehicles/car-7/status", Value::Null).await;
+    assert_eq!(status["labels"]["fleet"], "test");
+
+    // Records that come twice are stored once, and readers that follow get them at once.
+    link.record(0..2).await;
+    let path = "/v1/vehicles/car-7/events?follow=true&last=1";
+    let mut followed = admin.open(Method::GET, path, b"").await.into_body();
+    let mut piece = async || soon(followed.frame()).await.unwrap().unwrap().into_data().unwrap();
+    assert!(String::from_utf8_lossy(&piece().await).contains("\"seq\":1"));
+    link.record(0..2).await;
+    link.record(2..3).await;
+    assert!(String::from_utf8_lossy(&piece().await).contains("\"seq\":2"));
+    assert_eq!(admin.lines("/v1/vehicles/car-7/events").await.len(), 3);
+
+    // The next certificate, and the end of both.
+    let renew = RenewRequest { csr: csr(&rcgen::KeyPair::generate().unwrap()) };
+    assert_eq!(vehicle.post("/v1/renew", &renew).await, StatusCode::OK);
+    admin.call(Method::DELETE, "/v1/vehicles/car-7", Value::Null).await;
+    assert_eq!(link.end().await.as_deref(), Some("the vehicle was cut off"));
+    assert!(vehicle.link().await.is_err());
+    assert_eq!(vehicle.post("/v1/renew", &renew).await, StatusCode::UNAUTHORIZED);
+    assert_eq!(admin.vehicle("car-7").await["state"], "revoked");
+    let audit = admin.call(Method::GET, "/v1/audit", Value::Null).await;
+    assert_eq!(
+        (&audit[0]["action"], &audit[0]["actor"]),
+        (&json!("revoke vehicle"), &json!("admin"))
+    );
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_newer_connection_takes_the_place_of_an_older_one() {
+    let folder = TempDir::new().unwrap();
+    let (server, admin) = start(&folder).await;
+    let (vehicle, _) = admin.enrol("car-7").await;
+    let (mut older, ..) = vehicle.connect().await;
+    let (mut newer, welcome, _) = vehicle.connect().await;
+    assert_eq!(welcome.epoch, 2);
+    assert_eq!(older.end().await.as_deref(), Some("the vehicle has a newer connection"));
+    drop(older);
+    newer.settle().await;
+    assert_eq!(admin.vehicle("car-7").await["state"], "online");
+    // Vehicles are asked to come back at different times.
+    let (stopped, reason) = tokio::join!(server.stop(), newer.end());
+    assert_eq!((stopped, reason.as_deref()), ((), Some("the cloud stops")));
+}

@@ -1,0 +1,118 @@
+//! The cloud stops or is killed, and starts again on the same folder.
+
+use std::io::{BufRead, BufReader};
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use gleaner_cloud::CloudServer;
+use hyper::Method;
+use serde_json::Value;
+use tempfile::TempDir;
+
+use crate::fake::{Person, cursor_after};
+use crate::{deploy, options, reported, signed, start};
+
+#[tokio::test]
+async fn a_restart_keeps_everything() {
+    let folder = TempDir::new().unwrap();
+    let (server, admin) = start(&folder).await;
+    let second = CloudServer::start(&options(folder.path())).await.err().unwrap();
+    assert!(second.message.starts_with("another gleaner-cloud uses"), "{second}");
+    let (mut vehicle, _) = admin.enrol("car-7").await;
+    let (mut link, _, before) = vehicle.connect().await;
+    link.record(0..2).await;
+    let envelope = deploy(&admin, &signed(1)).await;
+    link.send(reported(before.generation)).await;
+    assert!(link.next().await.is_some(), "a wanted state");
+    link.settle().await;
+    let listed = admin.call(Method::GET, "/v1/deployments", Value::Null).await;
+    server.stop().await;
+
+    let server = CloudServer::start(&options(folder.path())).await.unwrap();
+    assert_eq!(server.code, None, "an administrator has a token");
+    let admin = admin.at(server.people);
+    vehicle.address = server.vehicles.to_string();
+    assert_eq!(admin.vehicle("car-7").await["state"], "offline");
+    assert_eq!(admin.call(Method::GET, "/v1/deployments", Value::Null).await, listed);
+    let (_link, welcome, desired) = vehicle.connect().await;
+    assert_eq!((welcome.epoch, welcome.cursors), (2, vec![cursor_after(2)]));
+    assert_eq!(desired.generation, before.generation + 1, "unchanged by the restart");
+    assert_eq!(desired.deployments[0].envelope, envelope);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn a_kill_loses_nothing_that_was_acknowledged() {
+    let folder = TempDir::new().unwrap();
+    let mut program = Program::start(folder.path());
+    let admin = Person::login(program.people, program.code.as_ref().unwrap()).await;
+    let (mut vehicle, _) = admin.enrol("car-7").await;
+    for round in 0..5 {
+        let (mut link, welcome, _) = vehicle.connect().await;
+        let expected = (round > 0).then(|| cursor_after(round * 3));
+        assert_eq!(welcome.cursors, expected.into_iter().collect::<Vec<_>>());
+        for seq in round * 3..round * 3 + 3 {
+            link.record(seq..seq + 1).await;
+        }
+        drop(program);
+        program = Program::start(folder.path());
+        vehicle.address = program.vehicles.to_string();
+    }
+    let admin = admin.at(program.people);
+    assert_eq!(admin.lines("/v1/vehicles/car-7/events").await.len(), 15);
+    let invited = Command::new(env!("CARGO_BIN_EXE_gleaner-cloud"))
+        .args(["invite", "ann", "--role", "viewer", "--data"])
+        .arg(folder.path().join("data"))
+        .output()
+        .unwrap();
+    let code = String::from_utf8(invited.stdout).unwrap();
+    let ann = Person::login(program.people, code.trim()).await;
+    assert_eq!(ann.call(Method::GET, "/v1/me", Value::Null).await["role"], "viewer");
+    let copy = folder.path().join("copy.db");
+    let backup = Command::new(env!("CARGO_BIN_EXE_gleaner-cloud"))
+        .arg("backup")
+        .arg(&copy)
+        .arg("--data")
+        .arg(folder.path().join("data"))
+        .status();
+    assert!(backup.unwrap().success() && copy.is_file());
+}
+
+/// The program, killed when it is dropped.
+struct Program {
+    child: Child,
+    people: SocketAddr,
+    vehicles: SocketAddr,
+    code: Option<String>,
+}
+
+impl Program {
+    fn start(folder: &Path) -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_gleaner-cloud"))
+            .args(["serve", "--people", "127.0.0.1:0", "--vehicles", "127.0.0.1:0", "--data"])
+            .arg(folder.join("data"))
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        let mut value = |name: &str| {
+            let line = lines.next().unwrap().unwrap();
+            line.strip_prefix(name).unwrap().trim().to_owned()
+        };
+        let people = value("people:").strip_prefix("http://").unwrap().parse().unwrap();
+        let vehicles = value("vehicles:").parse().unwrap();
+        // The third line is there only without an administrator.
+        let is_first = !folder.join("started").exists();
+        std::fs::write(folder.join("started"), "").unwrap();
+        let code = is_first.then(|| value("first:").rsplit(' ').next().unwrap().to_owned());
+        Self { child, people, vehicles, code }
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
