@@ -5,6 +5,8 @@ use std::collections::BTreeMap;
 use gleaner_base::excerpt;
 use gleaner_fleet::people::FleetDeployment;
 use gleaner_fleet::{Wanted, desired_digest};
+use gleaner_protocol::vehicle_api::GrantStatus;
+use gleaner_trust::{Grants, unverified_deployment};
 
 use super::vehicles::{FAILED, RUNNING, ended};
 use super::{Change, Store, int, unsigned};
@@ -140,9 +142,9 @@ impl Store {
 
     /// Returns all deployments, with the number of vehicles that should run them and do.
     pub(crate) async fn deployments(&self) -> CloudResult<Vec<FleetDeployment>> {
-        type Row = (String, i64, String, String, String, i64);
+        type Row = (String, i64, String, String, String, i64, String);
         let rows: Vec<Row> = rows!(&self.pool;
-            "SELECT id, number, revision, fallback, selector, is_wanted FROM deployments
+            "SELECT id, number, revision, fallback, selector, is_wanted, envelope FROM deployments
              ORDER BY id");
         let vehicles: Vec<(String, String, i64, i64)> = rows!(&self.pool;
             "SELECT name, labels, generation, handled FROM vehicles WHERE is_revoked = 0");
@@ -156,12 +158,13 @@ impl Store {
             .into_iter()
             .map(|(vehicle, id, number, state)| ((vehicle, id), (number, state)))
             .collect();
-        let deployment = |(id, number, revision, fallback, selector, is_wanted): Row| {
+        let deployment = |(id, number, revision, fallback, selector, is_wanted, envelope): Row| {
             let mut deployment = FleetDeployment {
                 id,
                 release: unsigned(number),
                 revision,
                 fallback: (!fallback.is_empty()).then_some(fallback),
+                grants: grants(&envelope),
                 selector: map(&selector),
                 is_wanted: is_wanted != 0,
                 vehicles: 0,
@@ -287,4 +290,16 @@ fn map(json: &str) -> TextMap {
 fn unknown(id: &str) -> CloudError {
     let message = format!("there is no deployment `{}`", excerpt(id));
     CloudError::missing(message, "list the deployments, and use one of their ids")
+}
+/// Returns the rights in an envelope, which was parsed when it was stored.
+fn grants(envelope: &str) -> GrantStatus {
+    let Ok(deployment) = unverified_deployment(envelope.as_bytes()) else {
+        return GrantStatus::default();
+    };
+    let Grants { topics, models, record } = deployment.grants;
+    GrantStatus {
+        topics: topics.iter().map(ToString::to_string).collect(),
+        models: models.iter().map(ToString::to_string).collect(),
+        record,
+    }
 }
