@@ -9,6 +9,8 @@ use clap::{Parser, Subcommand};
 use gleaner_base::{Exit, Failure};
 use gleaner_fleet::people::{NewUser, Role};
 use gleaner_vitals::log;
+use rustix::fs::Mode;
+use rustix::process::umask;
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::folder::DataFolder;
@@ -69,6 +71,8 @@ pub fn main() -> ExitCode {
     log::init_service();
     // Each connection takes one; the usual limit is low.
     gleaner_base::raise_open_files();
+    // The database and its copies are for this user only, wherever they are.
+    umask(Mode::RWXG | Mode::RWXO);
     let args = Args::parse();
     match run(args.command) {
         Ok(()) => Exit::Ok.into(),

@@ -2,11 +2,13 @@
 
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use gleaner_cloud::CloudServer;
 use hyper::Method;
+use rustix::process::Pid;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -76,7 +78,11 @@ async fn a_kill_loses_nothing_that_was_acknowledged() {
         .arg("--data")
         .arg(folder.path().join("data"))
         .status();
-    assert!(backup.unwrap().success() && copy.is_file());
+    assert!(backup.unwrap().success());
+    assert_eq!(std::fs::metadata(copy).unwrap().permissions().mode() & 0o777, 0o600);
+    let pid = Pid::from_child(&program.child);
+    rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
+    assert!(program.child.wait().unwrap().success());
 }
 
 /// The program, killed when it is dropped.
