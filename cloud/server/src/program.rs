@@ -15,7 +15,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use crate::folder::DataFolder;
 use crate::server::{CloudServer, ServeOptions};
-use crate::store::{CONSOLE, Store};
+use crate::store::{CONSOLE, CloudStore};
 
 /// The cloud of a fleet: vehicles connect to it, and people deploy by it.
 #[derive(Parser, Debug)]
@@ -125,7 +125,7 @@ async fn serve(options: ServeOptions) -> Result<(), Failure> {
 }
 
 async fn invite(new: NewUser, data: &Path) -> Result<(), Failure> {
-    let store = Store::open(&DataFolder::existing(data)?.database()).await?;
+    let store = CloudStore::open(&DataFolder::existing(data)?.database()).await?;
     let invitation = store.invite(CONSOLE, new).await?;
     store.close().await;
     print(&format!("{}\n", invitation.code));
@@ -141,7 +141,7 @@ async fn backup(file: &Path, data: &Path) -> Result<(), Failure> {
         return Err(refused("exists already", "choose another file, or remove it first"));
     }
     let name = file.to_str().ok_or_else(|| refused("is not UTF-8", "choose another name"))?;
-    let store = Store::open(&DataFolder::existing(data)?.database()).await?;
+    let store = CloudStore::open(&DataFolder::existing(data)?.database()).await?;
     store.copy_to(name).await?;
     store.close().await;
     Ok(())

@@ -7,7 +7,7 @@ use gleaner_fleet::people::FleetDeployment;
 use gleaner_fleet::{Wanted, desired_digest};
 
 use super::vehicles::{FAILED, RUNNING, ended};
-use super::{Change, Store, int, unsigned};
+use super::{Change, CloudStore, int, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 type TextMap = BTreeMap<String, String>;
@@ -41,7 +41,7 @@ struct FleetWish {
     wanted: Wanted,
 }
 
-impl Store {
+impl CloudStore {
     /// Stores a deployment and its revisions; returns the number of the change. The same envelope
     /// again starts it, if it was stopped.
     pub(crate) async fn deploy(

@@ -67,7 +67,7 @@ const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
 
 /// The database.
 #[derive(Debug)]
-pub(crate) struct Store {
+pub(crate) struct CloudStore {
     pool: AnyPool,
     turn: Mutex<()>,
 }
@@ -78,7 +78,7 @@ pub(crate) struct Change<'s> {
     _turn: MutexGuard<'s, ()>,
 }
 
-impl Store {
+impl CloudStore {
     /// Opens the database in this file, and brings it to the newest version.
     ///
     /// # Errors

@@ -5,7 +5,7 @@ use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::json;
 
 use super::vehicles::{ended, unknown};
-use super::{Change, Store, int, unsigned};
+use super::{Change, CloudStore, int, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of streams of a vehicle: two, and one for each lambda that it ever had.
@@ -42,7 +42,7 @@ pub(crate) struct RecordPage {
     pub(crate) arrival: i64,
 }
 
-impl Store {
+impl CloudStore {
     /// Stores records and the position after them, if the connection still counts. Records that
     /// are stored already are skipped.
     pub(crate) async fn append(

@@ -7,13 +7,13 @@ use super::*;
 
 const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20 };
 
-async fn store() -> (TempDir, Store) {
+async fn store() -> (TempDir, CloudStore) {
     let folder = TempDir::new().unwrap();
-    let store = Store::open(&folder.path().join("cloud.db")).await.unwrap();
+    let store = CloudStore::open(&folder.path().join("cloud.db")).await.unwrap();
     (folder, store)
 }
 
-async fn connected(store: &Store, name: &str) -> u64 {
+async fn connected(store: &CloudStore, name: &str) -> u64 {
     store.invite_vehicle("ann", name).await.unwrap();
     store.connect(name, &Hello::default()).await.unwrap()
 }
@@ -57,7 +57,7 @@ fn batch(life: u64, seqs: std::ops::Range<u64>) -> Batch {
     Batch { lines: seqs.map(line).collect(), cursor }
 }
 
-async fn lines(store: &Store) -> Vec<String> {
+async fn lines(store: &CloudStore) -> Vec<String> {
     let streams = ["events"; 2];
     let mut lines = store.removed("car-7", streams, 0).await.unwrap();
     lines.extend(store.page("car-7", streams, 0, 0, 1000).await.unwrap().lines);
@@ -241,7 +241,7 @@ async fn the_database_of_a_later_version_is_refused() {
     let (folder, store) = store().await;
     store.execute("INSERT INTO migrations (version) VALUES (99)").await;
     store.close().await;
-    let refused = Store::open(&folder.path().join("cloud.db")).await.unwrap_err();
+    let refused = CloudStore::open(&folder.path().join("cloud.db")).await.unwrap_err();
     assert_eq!(refused.message, "the database has version 99; this program has 1");
     assert!(refused.help.is_some());
 }

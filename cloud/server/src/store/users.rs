@@ -5,7 +5,7 @@ use gleaner_fleet::people::{Invitation, NewUser, Role, Session, User};
 use gleaner_lambda::manifest::ItemName;
 
 use super::secrets::SecretKind;
-use super::{Store, now, unsigned};
+use super::{CloudStore, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Actor of changes that the program itself makes, for a person at its machine.
@@ -14,7 +14,7 @@ pub(crate) const CONSOLE: &str = "console";
 /// Name of the user that the first start invites.
 const ADMIN: &str = "admin";
 
-impl Store {
+impl CloudStore {
     /// Adds a user, or invites one again with this role: codes before it do not work any more.
     pub(crate) async fn invite(&self, actor: &str, new: NewUser) -> CloudResult<Invitation> {
         let NewUser { name, role } = new;

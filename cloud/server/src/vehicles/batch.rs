@@ -12,7 +12,7 @@ use crate::store::Batch;
 /// Kinds of lines that are no records: gaps and damage.
 const MARKS: [&str; 3] = ["gap", "torn", "damaged"];
 
-/// Parses records. A line that cannot be parsed is replaced by one that says so: refused, the
+/// Parses records. A line that cannot be parsed is replaced by one with the reason: refused, the
 /// vehicle would send it for ever.
 ///
 /// # Errors

@@ -47,7 +47,7 @@ async fn a_restart_keeps_everything() {
 #[tokio::test]
 async fn a_kill_loses_nothing_that_was_acknowledged() {
     let folder = TempDir::new().unwrap();
-    let mut program = Program::start(folder.path());
+    let mut program = CloudProgram::start(folder.path());
     let admin = Person::login(program.people, program.code.as_ref().unwrap()).await;
     let (mut vehicle, _) = admin.enrol("car-7").await;
     for round in 0..5 {
@@ -58,7 +58,7 @@ async fn a_kill_loses_nothing_that_was_acknowledged() {
             link.record(seq..seq + 1).await;
         }
         drop(program);
-        program = Program::start(folder.path());
+        program = CloudProgram::start(folder.path());
         vehicle.address = program.vehicles.to_string();
     }
     let admin = admin.at(program.people);
@@ -86,14 +86,14 @@ async fn a_kill_loses_nothing_that_was_acknowledged() {
 }
 
 /// The program, killed when it is dropped.
-struct Program {
+struct CloudProgram {
     child: Child,
     people: SocketAddr,
     vehicles: SocketAddr,
     code: Option<String>,
 }
 
-impl Program {
+impl CloudProgram {
     fn start(folder: &Path) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_gleaner-cloud"))
             .args(["serve", "--people", "127.0.0.1:0", "--vehicles", "127.0.0.1:0", "--data"])
@@ -116,7 +116,7 @@ impl Program {
     }
 }
 
-impl Drop for Program {
+impl Drop for CloudProgram {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
