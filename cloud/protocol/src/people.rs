@@ -29,6 +29,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
 
+use gleaner_protocol::vehicle_api::GrantStatus;
 use serde::{Deserialize, Serialize};
 
 /// The rights of a user. Each has those of the ones before.
@@ -182,6 +183,9 @@ pub struct FleetDeployment {
     pub revision: String,
     /// Digest of its fallback.
     pub fallback: Option<String>,
+    /// Rights of its lambda, which the next deployment grants as well: its fallback needs them.
+    #[serde(default)]
+    pub grants: GrantStatus,
     /// Labels that a vehicle must have.
     pub selector: BTreeMap<String, String>,
     /// False if it is stopped.

@@ -53,7 +53,7 @@ use tokio::sync::{Mutex, MutexGuard};
 use crate::error::{CloudError, CloudResult};
 
 pub(crate) use deployments::OfferedDeployment;
-pub(crate) use records::{Batch, Retention};
+pub(crate) use records::{Batch, Retention, name_in_lines};
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::{Issued, VehicleReport};
 

@@ -156,7 +156,7 @@ impl CloudStore {
         let line = |(stream, removed, to): (String, i64, i64)| {
             let record = json!({ "to": to, "reason": "Retention", "records": removed });
             let line = StreamLine {
-                stream,
+                stream: name_in_lines(&stream).to_owned(),
                 seq: 0,
                 time_ns: 0,
                 boot_ns: 0,
@@ -168,6 +168,11 @@ impl CloudStore {
         };
         Ok(rows.into_iter().map(line).collect())
     }
+}
+
+/// Returns the name of a stream in its lines: of a lambda's records, the id of its deployment.
+pub(crate) fn name_in_lines(stream: &str) -> &str {
+    stream.strip_prefix("lambdas/").unwrap_or(stream)
 }
 
 impl Change<'_> {

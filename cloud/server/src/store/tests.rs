@@ -1,5 +1,6 @@
 use gleaner_fleet::people::{NewUser, Role};
 use gleaner_fleet::{Cursor, Hello};
+use gleaner_protocol::vehicle_api::GrantStatus;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -25,6 +26,7 @@ fn offered(id: &str, release: u64, fleet: &str) -> OfferedDeployment {
         envelope: format!("envelope {release} of {id} for {fleet}"),
         revision: "r".to_owned(),
         fallback: None,
+        grants: GrantStatus { record: true, ..GrantStatus::default() },
         selector: [("fleet".to_owned(), fleet.to_owned())].into(),
         revisions: [("r".to_owned(), "a revision".to_owned())].into(),
     }
@@ -154,7 +156,8 @@ async fn a_release_is_replaced_only_by_a_higher_one() {
         assert_eq!(refused.reason(), expected);
     }
     store.deploy("ann", &offered("a", 6, "test")).await.unwrap();
-    assert_eq!(store.deployment("a").await.unwrap().release, 6);
+    let stored = store.deployment("a").await.unwrap();
+    assert!(stored.release == 6 && stored.grants.record);
     let refused = store.roll_back("ann", "a").await.unwrap_err();
     assert_eq!(refused.reason(), "deployment `a` has no fallback");
     let with_fallback = OfferedDeployment { fallback: Some("r".into()), ..offered("a", 7, "test") };

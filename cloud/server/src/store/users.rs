@@ -2,7 +2,6 @@
 
 use gleaner_base::excerpt;
 use gleaner_fleet::people::{Invitation, NewUser, Role, Session, User};
-use gleaner_lambda::manifest::ItemName;
 
 use super::secrets::SecretKind;
 use super::{CloudStore, now, unsigned};
@@ -18,9 +17,10 @@ impl CloudStore {
     /// Adds a user, or invites one again with this role: codes before it do not work any more.
     pub(crate) async fn invite(&self, actor: &str, new: NewUser) -> CloudResult<Invitation> {
         let NewUser { name, role } = new;
-        if name.parse::<ItemName>().is_err() || name == CONSOLE {
+        let allowed = |c: char| c.is_ascii_alphanumeric() || "._-@+".contains(c);
+        if !(1..=64).contains(&name.len()) || !name.chars().all(allowed) || name == CONSOLE {
             let message = format!("`{}` cannot be the name of a user", excerpt(&name));
-            let help = "use lower-case letters, digits and `-`, as in ann-lee; not `console`";
+            let help = "use 1 to 64 letters, digits and `._-@+`, as in ann-lee; not `console`";
             return Err(CloudError::usage(message, help));
         }
         let mut change = self.change().await?;

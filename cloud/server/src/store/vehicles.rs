@@ -277,6 +277,7 @@ pub(super) fn unknown(name: &str) -> CloudError {
     CloudError::missing(message, "`gleaner vehicles` lists all")
 }
 
-fn json(value: &impl serde::Serialize) -> String {
+/// Returns a value as JSON.
+pub(super) fn json(value: &impl serde::Serialize) -> String {
     serde_json::to_string(value).unwrap_or_default()
 }
