@@ -26,6 +26,6 @@ pub use open_files::raise_open_files;
 pub use plain_file::{NotPlain, PlainFile};
 pub use rate_limit::RateLimit;
 pub use shortage::is_shortage;
-pub use text::{excerpt, grouped, hex, visible};
+pub use text::{excerpt, grouped, hex, in_one_line, visible};
 pub use time::{UtcTime, nanoseconds};
 pub use units::{ByteSize, UnitError, format_duration, parse_duration};

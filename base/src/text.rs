@@ -44,6 +44,30 @@ pub fn excerpt(text: &str) -> String {
     }
 }
 
+/// Formats a text of several lines as one, safe to print. Of a Python traceback, the last line
+/// counts: the type and the message of the exception.
+pub fn in_one_line(text: &str) -> String {
+    let mut parts: Vec<String> = Vec::new();
+    // The text before a traceback, while its lines follow.
+    let mut traced: Option<&str> = None;
+    for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {
+        // The next part of a failure.
+        if line.starts_with("cause: ") || line.starts_with("help: ") {
+            traced = None;
+        }
+        if let Some(before) = traced {
+            parts.pop();
+            parts.push(format!("{before}{line}"));
+        } else if let Some((before, _)) = line.split_once("Traceback (most recent call last)") {
+            traced = Some(before);
+            parts.push(line.to_owned());
+        } else {
+            parts.push(line.to_owned());
+        }
+    }
+    visible(&parts.join("; "))
+}
+
 /// Returns `path` as one word of a shell command, quoted where necessary.
 pub fn shell_word(path: &Path) -> String {
     let text = path.to_string_lossy();
@@ -75,6 +99,18 @@ pub fn grouped(count: impl Display) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_traceback_in_one_line_is_the_last_exception() {
+        assert_eq!(in_one_line("one"), "one");
+        assert_eq!(in_one_line("error: a\n  cause: b\u{1b}\n\n"), "error: a; cause: b\\u{1b}");
+        let text = "cannot start `a`\n  cause: in init: Traceback (most recent call last):\n\
+                    \u{20}          File \"main.py\", line 5\n         ValueError: no\n\n\
+                    \u{20}        Traceback (most recent call last):\n           File \"main.py\"\n\
+                    \u{20}        KeyError: 'x'\n  help:  repair it";
+        let expected = "cannot start `a`; cause: in init: KeyError: 'x'; help:  repair it";
+        assert_eq!(in_one_line(text), expected);
+    }
 
     #[test]
     fn the_nearest_word_is_returned_only_if_it_is_similar() {

@@ -14,9 +14,9 @@ use crate::args::{InspectArgs, TopicsArgs};
 use crate::render;
 use crate::stdout::print;
 
-/// Replaces this process by `gleaner-player`.
-pub(crate) fn play(arguments: &[OsString]) -> Result<Exit, Failure> {
-    let program = Parts::find()?.program("gleaner-player")?;
+/// Replaces this process by the program `name`, such as `gleaner-player`.
+pub(crate) fn replace(name: &str, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let program = Parts::find()?.program(name)?;
     let error = Command::new(&program).args(arguments).exec();
     Err(Failure::caused_by(Exit::Internal, format!("cannot start `{}`", program.display()), &error))
 }

@@ -13,6 +13,7 @@ pub mod bag;
 pub mod budget;
 pub mod calls;
 pub mod drive;
+pub mod fleet;
 pub mod image;
 pub mod ingress;
 mod input;
@@ -50,7 +51,7 @@ pub struct Target {
 }
 
 /// All targets.
-pub const TARGETS: [Target; 12] = [
+pub const TARGETS: [Target; 13] = [
     Target {
         name: "message",
         check: Some(message::check),
@@ -78,6 +79,13 @@ pub const TARGETS: [Target; 12] = [
         longest: 4 << 10,
         seeds: seeds::image::all,
         words: seeds::image::WORDS,
+    },
+    Target {
+        name: "fleet",
+        check: Some(fleet::check),
+        longest: 2 << 10,
+        seeds: seeds::fleet::all,
+        words: seeds::fleet::WORDS,
     },
     Target {
         name: "journal",

@@ -1,6 +1,7 @@
 //! Shared by the suites: paths of the checkout, replays, and drives made for tests.
 
 pub mod bag;
+pub mod cloud;
 pub mod drive;
 pub mod fake_messages;
 pub mod live;

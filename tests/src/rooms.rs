@@ -52,6 +52,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         &[
             "gleaner-artifacts",
             "gleaner-base",
+            "gleaner-fleet",
             "gleaner-journal",
             "gleaner-lambda",
             "gleaner-parts",
@@ -143,6 +144,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         "gleaner-orchestrator",
         &[
             "gleaner-base",
+            "gleaner-fleet",
             "gleaner-lambda",
             "gleaner-parts",
             "gleaner-protocol",

@@ -20,9 +20,9 @@ use crate::steps::{self, Steps};
 
 /// The fuzz targets. Their other properties are in `gleaner-fuzz`, which would take too long to
 /// build for this list.
-const TARGETS: [&str; 12] = [
+const TARGETS: [&str; 13] = [
     "message", "drive", "bag", "image", "journal", "link", "ingress", "manifest", "trust", "model",
-    "spool", CALLS,
+    "spool", "fleet", CALLS,
 ];
 
 /// The target that runs a lambda. It needs that lambda compiled, and the host, which takes minutes
@@ -39,7 +39,7 @@ const FLAGS: &str = "-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-leve
                      -Cllvm-args=-sanitizer-coverage-trace-compares -Cdebug-assertions -Coverflow-checks --cfg fuzzing";
 
 const USAGE: &str = "usage: cargo xtask fuzz [TARGET...] [--seconds N] [--seed N]
-targets: message, drive, bag, image, journal, link, ingress, manifest, trust, model, spool, calls [default: all]
+targets: message, drive, bag, image, journal, link, ingress, manifest, trust, model, spool, fleet, calls [default: all]
 --seconds N  time for each target [default: 60]; targets run in parallel, one per core
 --seed N     makes runs of the same programs with the same inputs reproducible";
 

@@ -1,5 +1,7 @@
 //! Defines the command line, and checks arguments as far as possible without opening files.
 
+mod authoring;
+mod cloud;
 mod signing;
 mod vehicle;
 mod verify;
@@ -8,15 +10,19 @@ use std::ffi::OsString;
 use std::net::IpAddr;
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, Parser, Subcommand};
 use clap_complete::Shell;
-use gleaner_lambda::manifest::LambdaKind;
 use gleaner_protocol::DriveTime;
 
+pub use authoring::{BuildArgs, Language, NewArgs};
+pub use cloud::{
+    AuditArgs, CloudCommand, EnrolArgs, ListArgs, LoginArgs, NewVehicleArgs, RemoveArgs, UserArgs,
+    UsersArgs, UsersCommand, VehiclesArgs, VehiclesCommand,
+};
 pub use signing::{KeysArgs, KeysCommand, PublishArgs, SignArgs};
 pub use vehicle::{
-    ChangeArgs, DeployArgs, LogsArgs, StatusArgs, StreamArgs, TopArgs, TrustArgs, TrustCommand,
-    TrustInstallArgs, VehicleArgs,
+    ChangeArgs, DeployArgs, LogsArgs, OnArgs, StatusArgs, StreamArgs, TopArgs, TrustArgs,
+    TrustCommand, TrustInstallArgs, VehicleArgs,
 };
 pub use verify::VerifyArgs;
 
@@ -82,7 +88,8 @@ pub enum CliCommand {
     /// Sign or install a trust root: the keys that a vehicle accepts
     #[command(subcommand)]
     Trust(TrustCommand),
-    /// Sign a deployment of a published lambda, send it to a vehicle, and wait until it runs
+    /// Sign a deployment of a published lambda, send it to a vehicle or a fleet, and wait until it
+    /// runs
     Deploy(DeployArgs),
     /// Run the fallback of a deployment
     Rollback(ChangeArgs),
@@ -103,6 +110,9 @@ pub enum CliCommand {
     Logs(LogsArgs),
     /// Show what happened on a vehicle
     Events(StreamArgs),
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    Cloud(CloudCommand),
     /// Check whether lambdas can run well on this machine
     Doctor(DoctorArgs),
     /// Print a completion script for a shell
@@ -278,56 +288,6 @@ pub struct DoctorArgs {
     /// Print the findings as JSON, one object per line
     #[arg(long)]
     pub json: bool,
-}
-
-/// Arguments of `gleaner new`.
-#[derive(Args, Debug)]
-pub struct NewArgs {
-    /// The folder to create; its name becomes the name of the lambda
-    #[arg(value_name = "DIR")]
-    pub path: PathBuf,
-    /// The language of the lambda
-    #[arg(long, value_enum, default_value = "rust")]
-    pub kind: Language,
-    /// Only replace the SDK in an existing lambda's folder by that of this gleaner
-    #[arg(long, conflicts_with = "kind")]
-    pub update: bool,
-}
-
-/// Language of a lambda.
-#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
-#[allow(missing_docs)]
-pub enum Language {
-    Rust,
-    Python,
-}
-
-impl From<Language> for LambdaKind {
-    fn from(language: Language) -> Self {
-        match language {
-            Language::Rust => Self::Wasm,
-            Language::Python => Self::Python,
-        }
-    }
-}
-
-/// Arguments of `gleaner build`.
-#[derive(Args, Debug, Default)]
-pub struct BuildArgs {
-    /// Compile a Rust lambda in a sandbox: its build scripts and macros reach no network and only
-    /// its own files; see docs/security.md
-    #[arg(long)]
-    pub sandboxed: bool,
-    /// Version of the Python that runs the lambda, such as 3.11, for wheels of its
-    /// requirements.txt; by default that of this machine
-    #[arg(long, value_name = "3.N")]
-    pub python_version: Option<String>,
-    /// Platform of that Python, such as manylinux_2_28_aarch64; by default that of this machine
-    #[arg(long, value_name = "PLATFORM")]
-    pub python_platform: Option<String>,
-    /// The lambda's folder, with its lambda.toml
-    #[arg(value_name = "DIR")]
-    pub lambda: PathBuf,
 }
 
 /// Arguments of `gleaner check`.

@@ -53,3 +53,42 @@ fn numbers_and_addresses_are_refused_with_an_example() {
         assert!(error.to_string().contains(message), "{error}");
     }
 }
+
+#[test]
+fn a_deployment_is_for_this_machine_or_for_a_fleet() {
+    let deploy = |more: &[&str]| {
+        let line = ["gleaner", "deploy", "dir", "--key", "k"].iter().chain(more);
+        match Cli::try_parse_from(line).map_err(|error| error.to_string())?.command {
+            CliCommand::Deploy(args) => Ok(args),
+            other => Err(format!("{other:?}")),
+        }
+    };
+    let fleet = deploy(&["--fleet", "--selector", "site=berlin", "--label", "type=van"]).unwrap();
+    assert!(fleet.fleet && !fleet.local);
+    assert_eq!(fleet.label, ["site=berlin", "type=van"]);
+    assert!(deploy(&["--local"]).unwrap().local);
+    assert!(deploy(&[]).unwrap_err().contains("--local"));
+    assert!(deploy(&["--local", "--fleet"]).unwrap_err().contains("cannot be used with"));
+    assert!(deploy(&["--fleet", "--run-dir", "d"]).unwrap_err().contains("cannot be used with"));
+}
+
+#[test]
+fn arguments_for_a_cloud_are_checked_before_any_request() {
+    for (line, message) in [
+        (&["users", "invite", "ada", "--role", "root"][..], "viewer, operator, deployer and admin"),
+        (&["users", "invite", "ada"], "--role"),
+        (&["users", "remove", "a/b"], "as in ada"),
+        (&["vehicles", "revoke", "a b"], "as in car-7"),
+        (&["vehicles", "enrol", "car-7"], "--to"),
+        (&["login", "http://127.0.0.1:8080"], "--code"),
+        (&["status", "--on", "a/b"], "as in car-7"),
+        (&["events", "--on", "car-7", "--run-dir", "d"], "cannot be used with"),
+        (&["deploy", "dir", "--key", "k", "--fleet", "--on", "car-7"], "unexpected argument"),
+    ] {
+        let error = Cli::try_parse_from(["gleaner"].iter().chain(line)).unwrap_err().to_string();
+        assert!(error.contains(message), "{error}");
+    }
+    for line in [&["users", "--json"][..], &["users", "remove", "ada", "--json"]] {
+        assert!(Cli::try_parse_from(["gleaner"].iter().chain(line)).is_ok(), "{line:?}");
+    }
+}

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use gleaner_base::parse_duration;
+use gleaner_trust::VehicleName;
 
 /// The orchestrator to talk to.
 #[derive(Args, Debug, Clone)]
@@ -17,6 +18,14 @@ pub struct VehicleArgs {
     pub json: bool,
 }
 
+/// The vehicle to look at.
+#[derive(Args, Debug, Clone, Default)]
+pub struct OnArgs {
+    /// Name of a vehicle of the cloud, instead of this machine
+    #[arg(long = "on", value_name = "VEHICLE", conflicts_with = "run_dir")]
+    pub vehicle: Option<VehicleName>,
+}
+
 /// Arguments of `gleaner deploy`.
 #[derive(Args, Debug)]
 pub struct DeployArgs {
@@ -24,8 +33,11 @@ pub struct DeployArgs {
     #[arg(value_name = "DIR")]
     pub lambda: PathBuf,
     /// Deploy to the orchestrator of this machine
-    #[arg(long, required = true)]
+    #[arg(long, required_unless_present = "fleet")]
     pub local: bool,
+    /// Deploy to all vehicles of the cloud that have the labels
+    #[arg(long, conflicts_with_all = ["local", "run_dir"])]
+    pub fleet: bool,
     /// The key file of the deployer, made by `gleaner keys new FILE`
     #[arg(long, value_name = "FILE")]
     pub key: PathBuf,
@@ -35,14 +47,15 @@ pub struct DeployArgs {
     /// Id of the deployment [default: the name of the lambda]
     #[arg(long, value_name = "ID")]
     pub id: Option<String>,
-    /// Number of the release, higher than all before [default: the next one on this vehicle]
+    /// Number of the release, higher than all before [default: the next one of the
+    /// deployment]
     #[arg(long, value_name = "N")]
     pub release: Option<u64>,
     /// Override a key of the config table, as in brake_mps2=-1.4
     #[arg(long, value_name = "KEY=VALUE", value_parser = super::assignment)]
     pub set: Vec<String>,
     /// Select only vehicles with this label, as in site=berlin
-    #[arg(long, value_name = "NAME=VALUE", value_parser = super::assignment)]
+    #[arg(long, visible_alias = "selector", value_name = "NAME=VALUE", value_parser = super::assignment)]
     pub label: Vec<String>,
     /// Digest of the revision that runs if this one fails, or `none` [default: the one that runs
     /// now]
@@ -59,7 +72,7 @@ pub struct DeployArgs {
     pub vehicle: VehicleArgs,
 }
 
-/// Arguments of `gleaner rollback`, `start` and `stop`.
+/// Arguments of `gleaner rollback`, `start`, `stop` and `remove`.
 #[derive(Args, Debug)]
 pub struct ChangeArgs {
     /// Id of the deployment
@@ -68,6 +81,9 @@ pub struct ChangeArgs {
     /// Longest wait for the lambda to run, or to end
     #[arg(long, value_name = "DURATION", default_value = "1min", value_parser = parse_duration)]
     pub timeout: Duration,
+    /// Change the deployment of the cloud, on all its vehicles
+    #[arg(long, conflicts_with = "run_dir")]
+    pub fleet: bool,
     /// The orchestrator
     #[command(flatten)]
     pub vehicle: VehicleArgs,
@@ -76,6 +92,9 @@ pub struct ChangeArgs {
 /// Arguments of `gleaner status`.
 #[derive(Args, Debug)]
 pub struct StatusArgs {
+    /// The vehicle
+    #[command(flatten)]
+    pub on: OnArgs,
     /// The orchestrator
     #[command(flatten)]
     pub vehicle: VehicleArgs,
@@ -87,6 +106,9 @@ pub struct TopArgs {
     /// Print a table after two polls, and end; with --json, one object
     #[arg(long)]
     pub once: bool,
+    /// The vehicle
+    #[command(flatten)]
+    pub on: OnArgs,
     /// The orchestrator
     #[command(flatten)]
     pub vehicle: VehicleArgs,
@@ -101,6 +123,9 @@ pub struct StreamArgs {
     /// Number of the newest lines to begin with
     #[arg(long, short = 'n', value_name = "N", default_value_t = 100)]
     pub last: usize,
+    /// The vehicle
+    #[command(flatten)]
+    pub on: OnArgs,
     /// The orchestrator
     #[command(flatten)]
     pub vehicle: VehicleArgs,

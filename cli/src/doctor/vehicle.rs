@@ -33,11 +33,12 @@ const DAY: u64 = 86_400;
 
 /// Returns the findings on the vehicle's service; one if this machine has none.
 pub(super) fn findings() -> Vec<Finding> {
-    let client = match VehicleClient::new(&VehicleArgs { run_dir: None, json: false }) {
+    let args = VehicleArgs { run_dir: None, json: false };
+    let client = match VehicleClient::new(&args) {
         Ok(client) => client,
         Err(failure) => return vec![unreachable("gleaner-orchestrator", failure)],
     };
-    let socket = client.socket().to_owned();
+    let socket = VehicleClient::socket(&args);
     let unit = systemctl("is-enabled");
     let state = fs::metadata(STATE).ok();
     // The folder of the socket may be closed for this user.
@@ -55,7 +56,7 @@ pub(super) fn findings() -> Vec<Finding> {
         let [free, whole] = [disk.f_bavail, disk.f_blocks].map(|it| it * disk.f_frsize);
         space(free, whole)
     }));
-    match answer(client) {
+    match answer(client, &socket) {
         Ok(status) => findings.extend(running(&status)),
         Err(failure) => findings.push(unreachable("gleaner-orchestrator", failure)),
     }
@@ -209,13 +210,13 @@ fn unreachable(subject: &'static str, failure: Failure) -> Finding {
 }
 
 /// Requests the status. A program that hangs must not make this one hang.
-fn answer(client: VehicleClient) -> Result<VehicleStatus, Failure> {
+fn answer(client: VehicleClient, socket: &Path) -> Result<VehicleStatus, Failure> {
     let (sender, receiver) = mpsc::channel();
-    let socket = client.socket().display().to_string();
     // Its answer is dropped if it comes too late.
     thread::spawn(move || drop(sender.send(client.status())));
     receiver.recv_timeout(ANSWER).unwrap_or_else(|_| {
-        let message = format!("no answer at `{socket}` within {}", format_duration(ANSWER));
+        let message =
+            format!("no answer at `{}` within {}", socket.display(), format_duration(ANSWER));
         Err(Failure::new(gleaner_base::Exit::Unreachable, message))
     })
 }

@@ -1,5 +1,7 @@
-//! The connection to `gleaner-orchestrator`: requests over its socket.
+//! The connection to a vehicle or a cloud: requests to `gleaner-orchestrator` over its socket, or
+//! to a cloud, whose API has that of each vehicle below `/v1/vehicles/NAME`.
 
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -9,61 +11,110 @@ use gleaner_protocol::vehicle_api::{API_SOCKET, Problem, VehicleStatus};
 use http_body_util::{BodyExt, Either, Full, LengthLimitError, Limited};
 use hyper::body::Incoming;
 use hyper::client::conn::http1;
-use hyper::{Method, Request, Response};
+use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::TokioIo;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use tokio::net::UnixStream;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpStream, UnixStream};
+use tokio::time::timeout;
 
 use super::file_body::FileBody;
-use crate::args::VehicleArgs;
+use crate::account::{CloudAccount, LOGIN_HELP};
+use crate::args::{OnArgs, VehicleArgs};
 
 /// Folder of the socket without another choice.
 const RUN_DIR: &str = "/run/gleaner";
 
-/// Longest wait for a status, which takes some milliseconds.
-const STATUS_TIMEOUT: Duration = Duration::from_secs(10);
+/// Longest wait for a connection to a cloud, and for an answer without effect, such as a status,
+/// which takes some milliseconds.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Longest answer, and longest line of one: that of a thousand lambdas takes some MiB.
 const ANSWER_MAX: ByteSize = ByteSize::mib(64);
 
-/// A client of one orchestrator.
+/// The body of a request.
+type Content = Either<Full<Bytes>, FileBody>;
+
+/// A program that answers requests.
+enum Endpoint {
+    /// The orchestrator of this machine, at its socket.
+    Orchestrator(PathBuf),
+    /// A cloud; without a token, only for a login.
+    Cloud(CloudAccount),
+}
+
+/// A client of one vehicle or one cloud.
 pub(crate) struct VehicleClient {
-    socket: PathBuf,
+    endpoint: Endpoint,
+    /// Start of the paths of all requests, in place of `/v1`.
+    root: String,
     runtime: tokio::runtime::Runtime,
 }
 
 impl VehicleClient {
-    /// Creates a client. It connects with each request.
+    /// Creates a client of the orchestrator of this machine. It connects with each request.
     pub(crate) fn new(args: &VehicleArgs) -> Result<Self, Failure> {
-        let variable = || std::env::var_os("GLEANER_RUN").filter(|it| !it.is_empty());
-        let chosen = args.run_dir.clone().or_else(|| variable().map(PathBuf::from));
+        Self::to(Endpoint::Orchestrator(Self::socket(args)), "/v1".to_owned())
+    }
+
+    /// Creates a client of the vehicle that was chosen: one of the cloud, or this machine.
+    pub(crate) fn of(args: &VehicleArgs, on: &OnArgs) -> Result<Self, Failure> {
+        match &on.vehicle {
+            Some(name) => {
+                Self::to(Endpoint::Cloud(CloudAccount::load()?), format!("/v1/vehicles/{name}"))
+            }
+            None => Self::new(args),
+        }
+    }
+
+    /// Creates a client of a cloud.
+    pub(crate) fn of_cloud(account: CloudAccount) -> Result<Self, Failure> {
+        Self::to(Endpoint::Cloud(account), "/v1".to_owned())
+    }
+
+    fn to(endpoint: Endpoint, root: String) -> Result<Self, Failure> {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
             .map_err(|it| Failure::caused_by(Exit::Internal, "cannot prepare a connection", &it))?;
-        Ok(Self { socket: chosen.unwrap_or_else(|| RUN_DIR.into()).join(API_SOCKET), runtime })
+        Ok(Self { endpoint, root, runtime })
     }
 
-    /// The path of the socket.
-    pub(crate) fn socket(&self) -> &Path {
-        &self.socket
+    /// Returns the path of the socket of the orchestrator.
+    pub(crate) fn socket(args: &VehicleArgs) -> PathBuf {
+        let variable = || std::env::var_os("GLEANER_RUN").filter(|it| !it.is_empty());
+        let chosen = args.run_dir.clone().or_else(|| variable().map(PathBuf::from));
+        chosen.unwrap_or_else(|| RUN_DIR.into()).join(API_SOCKET)
+    }
+
+    /// Returns the name of the receiver of requests, for messages.
+    pub(crate) fn receiver(&self) -> &'static str {
+        match self.endpoint {
+            Endpoint::Orchestrator(_) => "the vehicle",
+            Endpoint::Cloud(_) => "the cloud",
+        }
     }
 
     /// Returns the status of the vehicle.
     pub(crate) fn status(&self) -> Result<VehicleStatus, Failure> {
+        self.get("/v1/status")
+    }
+
+    /// Returns the answer to a request without effect.
+    pub(crate) fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, Failure> {
         self.runtime.block_on(async {
-            let answer = self.json(Method::GET, "/v1/status", Bytes::new());
-            tokio::time::timeout(STATUS_TIMEOUT, answer).await.unwrap_or_else(|_| {
-                let seconds = STATUS_TIMEOUT.as_secs();
-                let message = format!("gleaner-orchestrator has not answered for {seconds} s");
+            let answer = self.json(Method::GET, path, Bytes::new());
+            timeout(ANSWER_TIMEOUT, answer).await.unwrap_or_else(|_| {
+                let seconds = ANSWER_TIMEOUT.as_secs();
+                let message = format!("{} has not answered for {seconds} s", self.program());
                 Err(Failure::new(Exit::Unreachable, message))
             })
         })
     }
 
     /// Sends a request with a body of JSON, and returns the answer.
-    pub(super) fn post<T: DeserializeOwned>(
+    pub(crate) fn post<T: DeserializeOwned>(
         &self,
         path: &str,
         body: &impl Serialize,
@@ -73,7 +124,7 @@ impl VehicleClient {
     }
 
     /// Sends a request to remove something.
-    pub(super) fn delete(&self, path: &str) -> Result<(), Failure> {
+    pub(crate) fn delete(&self, path: &str) -> Result<(), Failure> {
         self.runtime.block_on(async {
             let body = Either::Left(Full::default());
             self.request(Method::DELETE, path, body).await.map(drop)
@@ -81,7 +132,7 @@ impl VehicleClient {
     }
 
     /// Sends bytes.
-    pub(super) fn put(&self, path: &str, body: Vec<u8>) -> Result<(), Failure> {
+    pub(crate) fn put(&self, path: &str, body: Vec<u8>) -> Result<(), Failure> {
         self.runtime.block_on(async {
             let body = Either::Left(Full::new(body.into()));
             self.request(Method::PUT, path, body).await.map(drop)
@@ -133,7 +184,7 @@ impl VehicleClient {
         let body = self.whole(answer.into_body()).await?;
         serde_json::from_slice(&body).map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot parse the answer", &error)
-                .with_help("use the `gleaner` of the version of gleaner-orchestrator")
+                .with_help(format!("use the `gleaner` of the version of {}", self.program()))
         })
     }
 
@@ -142,28 +193,70 @@ impl VehicleClient {
         &self,
         method: Method,
         path: &str,
-        body: Either<Full<Bytes>, FileBody>,
+        body: Content,
     ) -> Result<Response<Incoming>, Failure> {
-        let stream = UnixStream::connect(&self.socket)
-            .await
-            .map_err(|error| unreachable(&self.socket, &error))?;
-        let (mut sender, connection) =
-            http1::handshake(TokioIo::new(stream)).await.map_err(|error| self.lost(&error))?;
-        tokio::spawn(connection);
-        let request = Request::builder().method(method).uri(path).header("host", "vehicle");
+        let (mut sender, host, token) = match &self.endpoint {
+            Endpoint::Orchestrator(socket) => {
+                let stream = UnixStream::connect(socket).await;
+                let stream = stream.map_err(|error| unreachable(socket, &error))?;
+                (self.handshake(stream).await?, "vehicle".to_owned(), "")
+            }
+            Endpoint::Cloud(CloudAccount { url, token }) => {
+                let stream = timeout(ANSWER_TIMEOUT, TcpStream::connect(url.address())).await;
+                let stream = stream.unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()));
+                let stream = stream.map_err(|error| {
+                    let action = format!("cannot reach the cloud at {url}");
+                    Failure::caused_by(Exit::Unreachable, action, &error)
+                        .with_help("check that it runs, and that this is its address for people")
+                })?;
+                (self.handshake(stream).await?, url.authority(), token.as_str())
+            }
+        };
+        let path = match path.strip_prefix("/v1") {
+            Some(rest) => format!("{}{rest}", self.root),
+            None => path.to_owned(),
+        };
+        let mut request = Request::builder().method(&method).uri(&path).header("host", host);
+        if method == Method::POST {
+            request = request.header("content-type", "application/json");
+        }
+        if !token.is_empty() {
+            request = request.header("authorization", format!("Bearer {token}"));
+        }
         let request = request.body(body).map_err(|error| {
             Failure::caused_by(Exit::Usage, format!("`{path}` is no request"), &error)
         })?;
         let answer = sender.send_request(request).await.map_err(|error| self.lost(&error))?;
-        if answer.status().is_success() {
+        let status = answer.status();
+        if status.is_success() {
             return Ok(answer);
         }
-        let status = answer.status();
         let problem = serde_json::from_slice::<Problem>(&self.whole(answer.into_body()).await?);
-        Err(problem.map_or_else(
-            |_| Failure::new(Exit::Internal, format!("gleaner-orchestrator answers {status}")),
+        let failure = problem.map_or_else(
+            |_| {
+                let exit = match status {
+                    StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => Exit::Denied,
+                    _ => Exit::Internal,
+                };
+                Failure::new(exit, format!("{} answers {status}", self.program()))
+            },
             Failure::from,
-        ))
+        );
+        // Without a token, it is the code of a login that was refused.
+        Err(match status == StatusCode::UNAUTHORIZED && !token.is_empty() {
+            true => failure.with_help(LOGIN_HELP),
+            false => failure,
+        })
+    }
+
+    async fn handshake<S>(&self, stream: S) -> Result<http1::SendRequest<Content>, Failure>
+    where
+        S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    {
+        let (sender, connection) =
+            http1::handshake(TokioIo::new(stream)).await.map_err(|error| self.lost(&error))?;
+        tokio::spawn(connection);
+        Ok(sender)
     }
 
     /// Reads an answer up to its maximum length.
@@ -178,23 +271,36 @@ impl VehicleClient {
     }
 
     fn too_long(&self) -> Failure {
-        let socket = self.socket.display();
-        let message = format!("an answer at `{socket}` has more than {ANSWER_MAX}");
-        Failure::new(Exit::Internal, message).with_help(
-            "check that gleaner-orchestrator serves this socket, in the version of `gleaner`",
-        )
+        let message = format!("an answer at `{}` has more than {ANSWER_MAX}", self.place());
+        let program = self.program();
+        Failure::new(Exit::Internal, message)
+            .with_help(format!("check that {program} answers there, in the version of `gleaner`"))
     }
 
     fn lost(&self, error: &dyn std::error::Error) -> Failure {
-        let action = format!("lost the connection to `{}`", self.socket.display());
+        let action = format!("lost the connection to `{}`", self.place());
         Failure::caused_by(Exit::Unreachable, action, error)
+    }
+
+    fn place(&self) -> String {
+        match &self.endpoint {
+            Endpoint::Orchestrator(socket) => socket.display().to_string(),
+            Endpoint::Cloud(account) => account.url.to_string(),
+        }
+    }
+
+    fn program(&self) -> &'static str {
+        match self.endpoint {
+            Endpoint::Orchestrator(_) => "gleaner-orchestrator",
+            Endpoint::Cloud(_) => "gleaner-cloud",
+        }
     }
 }
 
 fn unreachable(socket: &Path, error: &std::io::Error) -> Failure {
     let action = format!("cannot reach gleaner-orchestrator at `{}`", socket.display());
     let help = match error.kind() {
-        std::io::ErrorKind::PermissionDenied => {
+        ErrorKind::PermissionDenied => {
             "join the group of the service, `sudo usermod -aG gleaner $USER`, or use sudo"
         }
         _ => {
@@ -206,51 +312,4 @@ fn unreachable(socket: &Path, error: &std::io::Error) -> Failure {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::io::{Read, Write};
-    use std::os::unix::net::UnixListener;
-    use std::thread;
-
-    use super::*;
-
-    /// Serves an answer that never ends, to one request.
-    fn serve_without_end(listener: &UnixListener, status: &str) {
-        let (mut stream, _) = listener.accept().unwrap();
-        let (mut request, mut byte) = (Vec::new(), [0]);
-        while !request.ends_with(b"\r\n\r\n") {
-            stream.read_exact(&mut byte).unwrap();
-            request.push(byte[0]);
-        }
-        let head = format!("HTTP/1.1 {status}\r\ncontent-type: application/json\r\n\r\n");
-        stream.write_all(head.as_bytes()).unwrap();
-        let piece = vec![b' '; 1 << 20];
-        while stream.write_all(&piece).is_ok() {}
-    }
-
-    #[test]
-    fn an_answer_without_end_is_refused_with_its_socket_and_the_maximum() {
-        let folder = tempfile::tempdir().unwrap();
-        let listener = UnixListener::bind(folder.path().join(API_SOCKET)).unwrap();
-        let args = VehicleArgs { run_dir: Some(folder.path().to_owned()), json: true };
-        type Request = fn(&VehicleClient) -> Result<(), Failure>;
-        let requests: [(&str, Request); 3] = [
-            ("200 OK", |client| client.status().map(drop)),
-            ("500 Internal Server Error", |client| client.delete("/v1/deployments/id")),
-            ("200 OK", |client| client.lines("/v1/events", |_| Ok(()))),
-        ];
-        for (status, request) in requests {
-            let failure = thread::scope(|scope| {
-                let served = scope.spawn(|| serve_without_end(&listener, status));
-                let client = VehicleClient::new(&args).unwrap();
-                let failure = request(&client).unwrap_err().to_string();
-                // It closes the connection.
-                drop(client);
-                served.join().unwrap();
-                failure
-            });
-            for part in ["control.sock` has more than 64 MiB", "help:"] {
-                assert!(failure.contains(part), "{failure}");
-            }
-        }
-    }
-}
+mod tests;

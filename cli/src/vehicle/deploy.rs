@@ -12,7 +12,7 @@ use gleaner_lambda::manifest::{ConfigSet, ConfigValue, ItemName, Sha256, TopicNa
 use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus};
 use gleaner_protocol::vehicle_api::{
-    Changed, DeployReply, DeployRequest, DeploymentStatus, MissingObject,
+    Changed, DeployReply, DeployRequest, DeploymentStatus, GrantStatus, MissingObject,
 };
 use gleaner_report::format::counted;
 use gleaner_trust::{
@@ -32,12 +32,19 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 const ROUNDS: u32 = 5;
 
 /// A revision on this machine.
-struct LocalRevision {
+pub(crate) struct LocalRevision {
     envelope: String,
     revision: Revision,
     digest: Sha256,
     build: BuildDir,
     manifest: Manifest,
+}
+
+/// The deployment that another one replaces.
+pub(crate) struct Former<'a> {
+    /// Digest of the revision that runs.
+    pub(crate) runs: Option<&'a str>,
+    pub(crate) grants: &'a GrantStatus,
 }
 
 /// Runs `gleaner deploy`.
@@ -46,39 +53,14 @@ pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
     let local = LocalRevision::load(args)?;
     let client = VehicleClient::new(&args.vehicle)?;
     let status = client.status()?;
-    let id = args.id.clone().unwrap_or_else(|| local.revision.name.to_string());
+    let id = local.id(args);
     let removed = status.removed.get(&id).copied();
     let before = status.deployments.into_iter().find(|deployment| deployment.id == id);
     let newest = before.as_ref().map(|before| before.release).or(removed);
-    let deployment = deployment(args, &local, &id, before.as_ref(), newest.unwrap_or(0))?;
-    let release = deployment.release;
-    let sealed = seal(&deployment, &[&key])
-        .map_err(|refusal| Failure::because("cannot sign the deployment", &refusal))?;
-    let request = DeployRequest {
-        deployment: String::from_utf8(sealed).expect("an envelope is JSON"),
-        revisions: vec![local.envelope.clone()],
-    };
-    let (mut sent, mut rounds) = (0, 0);
-    let attempt = loop {
-        match client.post("/v1/deployments", &request)? {
-            DeployReply::Accepted { attempt, .. } => break attempt,
-            DeployReply::Missing { objects } if rounds < ROUNDS => {
-                objects.iter().try_for_each(|object| local.send(&client, object))?;
-                (sent, rounds) = (sent.max(objects.len()), rounds + 1);
-            }
-            DeployReply::Missing { objects } => {
-                let count = counted(objects.len() as u64, "file");
-                let message = format!("the vehicle lacks {count} although all were sent");
-                return Err(Failure::new(Exit::Internal, message)
-                    .with_help("another deployment may have come between: try again"));
-            }
-        }
-    };
-    if !args.vehicle.json {
-        let Revision { name, version, .. } = &local.revision;
-        let files = counted(sent as u64, "file");
-        print(&format!("deployed {name} {version} as `{id}` (release {release}, {files} sent)\n"))?;
-    }
+    let before = before.as_ref();
+    let former = before.map(|before| Former { runs: runs(before), grants: &before.grants });
+    let deployment = deployment(args, &local, &id, former, newest.unwrap_or(0))?;
+    let attempt = local.deploy(&client, args, &deployment, &key)?;
     wait(&client, &args.vehicle, &id, attempt, args.timeout)
 }
 
@@ -100,7 +82,7 @@ pub(crate) fn remove(args: &ChangeArgs) -> Result<Exit, Failure> {
 }
 
 /// Returns the path of a deployment in requests.
-fn path(id: &str) -> Result<String, Failure> {
+pub(crate) fn path(id: &str) -> Result<String, Failure> {
     if id.parse::<ItemName>().is_err() {
         let id = gleaner_base::excerpt(id);
         return Err(Failure::new(Exit::Usage, format!("`{id}` is no id of a deployment"))
@@ -110,7 +92,7 @@ fn path(id: &str) -> Result<String, Failure> {
 }
 
 impl LocalRevision {
-    fn load(args: &DeployArgs) -> Result<Self, Failure> {
+    pub(crate) fn load(args: &DeployArgs) -> Result<Self, Failure> {
         let path = args.revision.clone().unwrap_or_else(|| args.lambda.join("revision.json"));
         let read = PlainFile::named(&path, Revision::MAX).and_then(PlainFile::read_whole);
         let bytes = read.map_err(|error| {
@@ -131,10 +113,58 @@ impl LocalRevision {
         Ok(Self { envelope, revision, digest, build, manifest })
     }
 
+    /// Returns the id of its deployment.
+    pub(crate) fn id(&self, args: &DeployArgs) -> String {
+        args.id.clone().unwrap_or_else(|| self.revision.name.to_string())
+    }
+
+    /// Signs a deployment and sends it with all missing files; returns its attempt.
+    pub(crate) fn deploy(
+        &self,
+        client: &VehicleClient,
+        args: &DeployArgs,
+        deployment: &Deployment,
+        key: &SecretKey,
+    ) -> Result<u64, Failure> {
+        let sealed = seal(deployment, &[key])
+            .map_err(|refusal| Failure::because("cannot sign the deployment", &refusal))?;
+        let request = DeployRequest {
+            deployment: String::from_utf8(sealed).expect("an envelope is JSON"),
+            revisions: vec![self.envelope.clone()],
+        };
+        let (mut sent, mut rounds) = (0, 0);
+        let attempt = loop {
+            match client.post("/v1/deployments", &request)? {
+                DeployReply::Accepted { attempt, .. } => break attempt,
+                DeployReply::Missing { objects } if rounds < ROUNDS => {
+                    objects.iter().try_for_each(|object| self.send(client, object))?;
+                    (sent, rounds) = (sent.max(objects.len()), rounds + 1);
+                }
+                DeployReply::Missing { objects } => {
+                    let (receiver, count) =
+                        (client.receiver(), counted(objects.len() as u64, "file"));
+                    let message = format!("{receiver} lacks {count} although all were sent");
+                    return Err(Failure::new(Exit::Internal, message)
+                        .with_help("another deployment may have come between: try again"));
+                }
+            }
+        };
+        if !args.vehicle.json {
+            let Revision { name, version, .. } = &self.revision;
+            let (release, files) = (deployment.release, counted(sent as u64, "file"));
+            print(&format!(
+                "deployed {name} {version} as `{}` (release {release}, {files} sent)\n",
+                deployment.id
+            ))?;
+        }
+        Ok(attempt)
+    }
+
     fn send(&self, client: &VehicleClient, object: &MissingObject) -> Result<(), Failure> {
         let file = self.revision.files.iter().find(|file| file.sha256 == *object.sha256);
         let Some(file) = file else {
-            let message = format!("the vehicle lacks the file {} of the fallback", object.sha256);
+            let (receiver, sha256) = (client.receiver(), &object.sha256);
+            let message = format!("{receiver} lacks the file {sha256} of the fallback");
             return Err(Failure::new(Exit::Usage, message)
                 .with_help("deploy with `--fallback none`, or deploy the fallback first"));
         };
@@ -146,17 +176,18 @@ impl LocalRevision {
     }
 }
 
-fn deployment(
+/// Returns the deployment of a revision, after the release `newest`.
+pub(crate) fn deployment(
     args: &DeployArgs,
     local: &LocalRevision,
     id: &str,
-    before: Option<&DeploymentStatus>,
+    former: Option<Former<'_>>,
     newest: u64,
 ) -> Result<Deployment, Failure> {
     let fallback = match args.fallback.as_deref() {
         Some("none") => None,
         Some(digest) => Some(parse::<Sha256>("--fallback", digest)?),
-        None => before.and_then(|before| runs(before)?.parse().ok()),
+        None => former.as_ref().and_then(|former| former.runs?.parse().ok()),
     };
     let created = now();
     let release = args.release.unwrap_or(newest + 1);
@@ -171,7 +202,7 @@ fn deployment(
         revision: local.digest.clone(),
         fallback: fallback.filter(|fallback| *fallback != local.digest),
         config: config(&local.manifest, &args.set)?,
-        grants: grants(&local.manifest, before),
+        grants: grants(&local.manifest, former.map(|former| former.grants)),
         created,
         expires: created.saturating_add(args.expires.as_secs()),
     })
@@ -185,10 +216,9 @@ fn runs(deployment: &DeploymentStatus) -> Option<&str> {
 }
 
 /// Returns what the manifest asks for, and what its fallback had.
-fn grants(manifest: &Manifest, before: Option<&DeploymentStatus>) -> Grants {
+fn grants(manifest: &Manifest, granted: Option<&GrantStatus>) -> Grants {
     let inputs = manifest.inputs.iter().map(|input| &input.topic);
     let recorded = manifest.record.iter().flat_map(|record| &record.topics);
-    let granted = before.map(|before| &before.grants);
     let topics = granted.into_iter().flat_map(|granted| &granted.topics);
     let topics = topics.filter_map(|topic| topic.parse::<TopicName>().ok());
     let models = granted.into_iter().flat_map(|granted| &granted.models);
@@ -234,7 +264,7 @@ fn wait(
     client: &VehicleClient,
     args: &VehicleArgs,
     id: &str,
-    attempt: u64,
+    requested: u64,
     timeout: Duration,
 ) -> Result<Exit, Failure> {
     let started = Instant::now();
@@ -249,11 +279,15 @@ fn wait(
             return Err(failure);
         }
         // Of a fallback that is about to start, the attempt is a later one.
-        let attempt = attempt.max(deployment.attempt);
+        let attempt = requested.max(deployment.attempt);
         let newer = |lambda: &&LambdaStatus| lambda.attempt >= attempt;
         let lambda = deployment.status.as_ref().filter(newer);
         match lambda.map(|lambda| lambda.phase) {
-            Some(LambdaPhase::Running) => return running(args, deployment, started.elapsed()),
+            Some(LambdaPhase::Running) => {
+                // Another attempt than the one that was requested: the fallback took its place.
+                let has_failed = deployment.attempt > requested;
+                return running(args, deployment, started.elapsed(), has_failed);
+            }
             Some(LambdaPhase::Quarantined) => {
                 let mut failure = Failure::new(
                     Exit::LambdaFaulted,
@@ -281,25 +315,33 @@ fn wait(
     }
 }
 
+/// Shows the revision that runs. It is a failure if the fallback was taken as the revision
+/// `has_failed`; a rollback that a user requested is none.
 fn running(
     args: &VehicleArgs,
     deployment: &DeploymentStatus,
     after: Duration,
+    has_failed: bool,
 ) -> Result<Exit, Failure> {
-    let fallback = deployment.fallback.as_ref();
-    // Another attempt than the one that was requested: the fallback came to its place.
-    let failed = deployment.failed.as_deref().filter(|_| deployment.runs_fallback);
-    let version = fallback.filter(|_| deployment.runs_fallback).unwrap_or(&deployment.revision);
+    let DeploymentStatus { id, revision, fallback, failed, runs_fallback, .. } = deployment;
+    let fallback = fallback.as_ref().filter(|_| *runs_fallback);
+    let version = &fallback.unwrap_or(revision).version;
+    let reason = failed.as_deref().filter(|_| fallback.is_some());
     if args.json {
         print(&json_line(deployment))?;
-    } else {
-        let (ms, version) = (after.as_millis(), &version.version);
-        print(&match failed {
-            Some(reason) => format!("running its fallback {version}: {reason}\n"),
-            None => format!("running {version} after {ms} ms\n"),
-        })?;
     }
-    // A rollback that a user asked for is no failure.
+    match reason {
+        Some(reason) if has_failed => {
+            let message = format!("deployment `{id}` runs its fallback {version}");
+            let mut failure = Failure::new(Exit::LambdaFaulted, message);
+            failure.causes = vec![format!("{} failed: {reason}", revision.version)];
+            let help = "repair the lambda and deploy it again";
+            return Err(failure.with_help(format!("{help}; `gleaner logs {id}` shows its log")));
+        }
+        _ if args.json => {}
+        Some(reason) => print(&format!("running its fallback {version}: {reason}\n"))?,
+        None => print(&format!("running {version} after {} ms\n", after.as_millis()))?,
+    }
     Ok(Exit::Ok)
 }
 

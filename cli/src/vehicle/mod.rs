@@ -1,6 +1,6 @@
-//! The commands for a vehicle: they talk to its `gleaner-orchestrator`.
+//! The commands for a vehicle: they send requests to its `gleaner-orchestrator`, or to its cloud.
 //!
-//! - `client`, `file_body`: requests over its socket.
+//! - `client`, `file_body`: requests over its socket, or to a cloud.
 //! - `deploy`: signs a deployment, sends it and waits; starts, stops, rolls back and removes.
 //! - `trust`: trust roots. `status`, `stream`: what runs, and what happened.
 //! - `top`: what each lambda costs, each second.
@@ -14,8 +14,8 @@ mod top;
 mod trust;
 
 pub(crate) use client::VehicleClient;
-pub(crate) use deploy::{change, deploy, remove};
-pub(crate) use status::status;
+pub(crate) use deploy::{Former, LocalRevision, change, deploy, deployment, path, remove};
+pub(crate) use status::{cloud_line, status};
 pub(crate) use stream::{events, logs};
 pub(crate) use top::top;
 pub(crate) use trust::trust;

@@ -1,11 +1,11 @@
 //! `gleaner status`: what runs on a vehicle.
 
-use gleaner_base::{Exit, Failure, format_duration, visible};
+use gleaner_base::{Exit, Failure, UtcTime, format_duration, in_one_line, visible};
 use gleaner_protocol::LossOutcome;
 use gleaner_protocol::link::RecorderStatus;
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus};
-use gleaner_protocol::vehicle_api::{Capacity, DeploymentStatus, VehicleStatus};
-use gleaner_report::format::{grouped, size};
+use gleaner_protocol::vehicle_api::{Capacity, CloudStatus, DeploymentStatus, VehicleStatus};
+use gleaner_report::format::{counted, grouped, size};
 
 use super::client::VehicleClient;
 use crate::args::StatusArgs;
@@ -18,7 +18,7 @@ pub(super) const NO_DEPLOYMENTS: &str =
 
 /// Runs `gleaner status`.
 pub(crate) fn status(args: &StatusArgs) -> Result<Exit, Failure> {
-    let status = VehicleClient::new(&args.vehicle)?.status()?;
+    let status = VehicleClient::of(&args.vehicle, &args.on)?.status()?;
     print(&match args.vehicle.json {
         true => json_line(&status),
         false => text(&status, Paint::of_stdout()),
@@ -39,6 +39,7 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         }
         Some(trust) => format!("  trust root {}\n", trust.version),
     };
+    text += &cloud_line(status.cloud.as_ref(), paint);
     for capacity in &status.capacity {
         text += &format!("  {} ({})\n", shared(capacity), visible(&capacity.source));
     }
@@ -77,6 +78,26 @@ pub(super) fn text(status: &VehicleStatus, paint: Paint) -> String {
         }
     }
     text
+}
+
+/// Returns the line of the connection to a cloud, if there is one.
+pub(crate) fn cloud_line(status: Option<&CloudStatus>, paint: Paint) -> String {
+    let Some(status) = status else { return String::new() };
+    let state = match &*status.state {
+        "connected" => paint.green("connected"),
+        "refused" => paint.red("refused"),
+        state => paint.yellow(&visible(state)),
+    };
+    let reason = status.reason.iter().map(|reason| format!(": {}", visible(reason)));
+    let since = std::time::Duration::from_secs(status.since_s.max(0.0) as u64);
+    format!(
+        "  cloud {} {state} for {}{}; {} not sent, certificate until {}\n",
+        visible(&status.address),
+        format_duration(since),
+        reason.collect::<String>(),
+        counted(status.unsent, "record"),
+        UtcTime::of(status.certificate_expires.try_into().unwrap_or(i64::MAX)),
+    )
 }
 
 /// Formats a resource that lambdas share: `memory 1.2 MiB of 8.0 MiB asked for, 0.9 MiB used`.
@@ -126,7 +147,8 @@ pub(super) fn reasons(deployment: &DeploymentStatus) -> Vec<String> {
         ("uses more than it states", exceeds.as_ref()),
         ("last end", last_end),
     ];
-    let line = |(what, why): (&str, Option<&String>)| Some(format!("{what}: {}", visible(why?)));
+    let line =
+        |(what, why): (&str, Option<&String>)| Some(format!("{what}: {}", in_one_line(why?)));
     let warnings = deployment.status.iter().flat_map(LambdaStatus::warnings).flatten();
     all.into_iter().filter_map(line).chain(warnings).collect()
 }
@@ -143,7 +165,7 @@ fn service<S>(name: &str, status: Option<&ProcessStatus<S>>, paint: Paint) -> St
     let Some(status) = status else { return String::new() };
     let state = if status.is_ready { paint.green("ready") } else { paint.red("not ready") };
     let restarts = match &status.last_end {
-        Some(reason) => format!(", restarts {}: {}", status.restarts, visible(reason)),
+        Some(reason) => format!(", restarts {}: {}", status.restarts, in_one_line(reason)),
         None => String::new(),
     };
     format!("  {name} {state}{restarts}\n")

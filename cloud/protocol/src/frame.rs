@@ -258,6 +258,9 @@ impl Frame {
     }
 }
 
+/// Longest window of the compression, as a power of two: a decoder takes that much memory.
+const WINDOW_LOG: u32 = 23;
+
 /// Compresses a part of a frame.
 pub fn compress(bytes: &[u8]) -> Vec<u8> {
     // It writes to memory, which does not fail.
@@ -271,7 +274,9 @@ pub fn compress(bytes: &[u8]) -> Vec<u8> {
 /// [`FrameError::Compressed`] if it is damaged or longer.
 pub fn decompress(bytes: &[u8]) -> Result<Vec<u8>, FrameError> {
     let failed = |reason: String| FrameError::Compressed { reason };
-    let decoder = zstd::stream::Decoder::new(bytes).map_err(|error| failed(error.to_string()))?;
+    let mut decoder =
+        zstd::stream::Decoder::new(bytes).map_err(|error| failed(error.to_string()))?;
+    decoder.window_log_max(WINDOW_LOG).map_err(|error| failed(error.to_string()))?;
     let mut whole = Vec::new();
     let read = decoder.take(LINES_MAX + 1).read_to_end(&mut whole);
     read.map_err(|error| failed(error.to_string()))?;

@@ -4,6 +4,7 @@
 pub mod bag;
 pub mod calls;
 pub mod drive;
+pub mod fleet;
 pub mod image;
 pub mod ingress;
 pub mod journal;

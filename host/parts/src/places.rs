@@ -63,7 +63,7 @@ impl Places {
 
 /// Returns whether `home` or its `lib/gleaner` has a part of an installation.
 pub(super) fn has_parts(home: &Path) -> bool {
-    let parts = ["gleaner-runtime", "lib_gleaner.so", "start.py"];
+    let parts = ["gleaner-cloud", "gleaner-runtime", "lib_gleaner.so", "start.py"];
     [home.join("lib/gleaner"), home.to_owned()]
         .iter()
         .any(|folder| parts.iter().any(|part| folder.join(part).is_file()))

@@ -8,6 +8,7 @@
 //! | `DELETE /v1/deployments/ID` | nothing, once it is removed |
 //! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | [`Changed`] |
 //! | `PUT /v1/trust` | nothing, of a trust root's envelope |
+//! | `PUT /v1/cloud`, `DELETE` | nothing, of an enrolment; nothing, once it is ended |
 //! | `GET /v1/events`, `GET /v1/lambdas/ID/records` | a [`StreamLine`] per line |
 //! | `GET /metrics` | counts for Prometheus |
 //!
@@ -22,7 +23,6 @@ use axum::extract::{DefaultBodyLimit, Path, Query, State};
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{delete, get, post, put};
-use futures_util::StreamExt;
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_protocol::vehicle_api::{
@@ -31,13 +31,12 @@ use gleaner_protocol::vehicle_api::{
 use gleaner_trust::{PublicKey, VehicleName};
 use gleaner_vitals::usage;
 use serde::Deserialize;
-use sha2::Digest;
-use tokio::io::AsyncWriteExt;
 
+use crate::cloud::Cloud;
 use crate::core::Core;
 use crate::layout::VehicleFolders;
 use crate::metrics;
-use crate::store::begin_object;
+use crate::objects;
 use crate::streams;
 
 /// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
@@ -52,6 +51,7 @@ pub(crate) struct Api {
     pub(crate) name: VehicleName,
     pub(crate) key: PublicKey,
     pub(crate) started: Instant,
+    pub(crate) cloud: Cloud,
 }
 
 /// Choice of the records of a stream.
@@ -79,6 +79,7 @@ impl Api {
             .route("/v1/deployments/{id}", delete(remove))
             .route("/v1/deployments/{id}/{change}", post(change))
             .route("/v1/trust", put(trust))
+            .route("/v1/cloud", put(enrol).delete(leave))
             .route("/v1/events", get(events))
             .route("/v1/lambdas/{id}/records", get(records))
             .route("/metrics", get(prometheus))
@@ -114,6 +115,7 @@ impl Api {
             capacity: self.core.capacity(),
             events_lost: self.core.events.lost(),
             supervisor,
+            cloud: self.cloud.status(),
         }
     }
 
@@ -141,7 +143,7 @@ async fn prometheus(State(api): State<Api>) -> Response {
 async fn deploy(State(api): State<Api>, body: Bytes) -> Reply<axum::Json<DeployReply>> {
     let request: DeployRequest = serde_json::from_slice(&body)
         .map_err(|error| Failure::caused_by(Exit::Usage, "the request is no deployment", &error))?;
-    Ok(axum::Json(api.blocking(move |core| core.deploy(&request)).await?))
+    Ok(axum::Json(api.blocking(move |core| core.deploy(&request, None)).await?))
 }
 
 /// Receives a file. It counts only if its digest is right.
@@ -153,37 +155,7 @@ async fn object(
     let wanted: Sha256 = sha256
         .parse()
         .map_err(|_| Failure::new(Exit::Usage, "the path has no SHA-256 of 64 digits"))?;
-    let length = api.core.expected(&wanted)?;
-    let path = api.core.store.object(&wanted);
-    let failed = |error: std::io::Error| {
-        Failure::caused_by(Exit::Internal, format!("cannot receive the file {sha256}"), &error)
-    };
-    let refused = |why: String| {
-        let mut failure = Failure::new(Exit::Denied, format!("the file {sha256} is refused"));
-        failure.causes = vec![why];
-        failure
-    };
-    let (file, part) = begin_object(&path).map_err(failed)?;
-    let mut file = tokio::fs::File::from_std(file);
-    let (mut digest, mut received, mut body) = (sha2::Sha256::new(), 0, body.into_data_stream());
-    while let Some(piece) = body.next().await {
-        let piece = piece.map_err(|error| failed(std::io::Error::other(error)))?;
-        received += piece.len() as u64;
-        if received > length {
-            return Err(refused(format!("it is longer than {length} bytes")).into());
-        }
-        digest.update(&piece);
-        file.write_all(&piece).await.map_err(failed)?;
-    }
-    let found = gleaner_base::hex(&digest.finalize());
-    if received != length || found != wanted.as_str() {
-        let why = format!("it has {received} of {length} bytes, and the SHA-256 {found}");
-        return Err(refused(why).into());
-    }
-    // The last write goes on in the background, and only this returns its error.
-    file.flush().await.map_err(failed)?;
-    file.sync_all().await.map_err(failed)?;
-    tokio::fs::rename(&part, &path).await.map_err(failed)?;
+    objects::receive(&api.core, &wanted, body.into_data_stream()).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
@@ -211,6 +183,16 @@ async fn remove(State(api): State<Api>, Path(id): Path<String>) -> Reply<StatusC
 
 async fn trust(State(api): State<Api>, body: Bytes) -> Reply<StatusCode> {
     api.blocking(move |core| core.install_root(&body)).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+async fn enrol(State(api): State<Api>, body: Bytes) -> Reply<StatusCode> {
+    api.cloud.enrol(&api.core, &api.name, &body).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+async fn leave(State(api): State<Api>) -> Reply<StatusCode> {
+    api.cloud.leave()?;
     Ok(StatusCode::NO_CONTENT)
 }
 

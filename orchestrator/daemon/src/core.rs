@@ -7,7 +7,6 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use gleaner_base::{Exit, Failure};
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_lambda::{Manifest, Vehicle};
-use gleaner_protocol::LiveStatus;
 use gleaner_protocol::supervision::{
     DesiredState, EventKind, LambdaPhase, SupervisorStatus, VehicleEvent,
 };
@@ -18,7 +17,7 @@ use crate::admission::{self, Budgets, LambdaDemand, Measurements};
 use crate::checked::SignedDeployment;
 use crate::durable::DurableFile;
 use crate::layout::VehicleFolders;
-use crate::state::{Deployed, VehicleState};
+use crate::state::{CloudWish, Deployed, VehicleState};
 use crate::store::{self, RevisionStore};
 use crate::trust::VehicleTrust;
 
@@ -56,6 +55,8 @@ pub(crate) struct Inner {
     /// True after a removal, until its files are removed; and at the start, as an earlier process
     /// may not have come to that.
     pub(crate) has_removed: bool,
+    /// True if the state was missing at the start, and revisions were not: none is removed.
+    keeps_revisions: bool,
     /// Use of resources so far.
     pub(crate) measured: Measurements,
     pub(crate) status: Option<SupervisorStatus>,
@@ -71,6 +72,8 @@ impl Core {
         let events = EventLog::open(&layout.spool(), "orchestrator")?;
         let state_file = DurableFile::new(layout.state_file());
         let loaded = state_file.load::<VehicleState>()?;
+        let store = RevisionStore::open(layout)?;
+        let keeps_revisions = loaded.value.is_none() && store.has_any()?;
         let state = loaded.value.unwrap_or_default();
         let labels = vehicle.identity.labels.clone();
         let (measured, measured_damage) = Measurements::load(DurableFile::new(layout.measured()));
@@ -84,11 +87,12 @@ impl Core {
             manifests: BTreeMap::new(),
             compiling: Vec::new(),
             has_removed: true,
+            keeps_revisions,
             measured,
             status: None,
         };
         let core = Self {
-            store: RevisionStore::open(layout)?,
+            store,
             spools: layout.spool().join("lambdas"),
             records: layout.records(),
             cache: layout.cache(),
@@ -107,6 +111,14 @@ impl Core {
                 let text = format!("the file of the {file} is damaged: {damage}");
                 core.event(EventKind::Warning, None, &text);
             }
+        }
+        if keeps_revisions {
+            let text = format!(
+                "`{}` and its copy are missing, so nothing is deployed; revisions are kept until \
+                 the next start: restore the file from a backup before, or deploy again",
+                layout.state_file().display()
+            );
+            core.event(EventKind::Warning, None, &text);
         }
         let mut inner = core.lock();
         inner.trust.observe_time();
@@ -131,7 +143,7 @@ impl Core {
             event,
             lambda: lambda.map(ItemName::to_string),
             revision: None,
-            text: gleaner_base::visible(text),
+            text: gleaner_base::in_one_line(text),
         });
     }
 
@@ -223,6 +235,22 @@ impl Core {
         })
     }
 
+    /// Notes that a wish of the cloud was followed.
+    ///
+    /// # Errors
+    ///
+    /// A failure if there is no such deployment, or the disk is full.
+    pub(crate) fn note_wish(&self, id: &ItemName, wish: &CloudWish) -> Result<(), Failure> {
+        let mut inner = self.lock();
+        let mut state = inner.state.clone();
+        let deployed = state.deployments.get_mut(id);
+        let deployed = deployed.ok_or_else(|| inner.unknown(id.as_str()))?;
+        deployed.cloud = Some(wish.clone());
+        self.change(&mut inner, state)?;
+        self.publish(&mut inner);
+        Ok(())
+    }
+
     fn update(
         &self,
         id: &str,
@@ -267,7 +295,7 @@ impl Core {
             let has_run = lambda.phase_s >= self.vehicle.deployments.probation.as_secs_f64();
             let failure = match lambda.phase {
                 LambdaPhase::Quarantined => Some(lambda.last_end.clone().unwrap_or_default()),
-                _ => lambda.live.as_deref().and_then(LiveStatus::faulty),
+                _ => lambda.recent.faulty(),
             };
             match failure {
                 Some(reason) => {
@@ -309,7 +337,8 @@ impl Core {
     fn collect_removed(&self) {
         let Ok(_changing) = self.deploying.try_lock() else { return };
         let mut inner = self.lock();
-        let Some(status) = inner.status.as_ref().filter(|_| inner.has_removed) else { return };
+        let is_due = inner.has_removed && !inner.keeps_revisions;
+        let Some(status) = inner.status.as_ref().filter(|_| is_due) else { return };
         let is_deployed = |inner: &Inner, id: &str| {
             id.parse::<ItemName>().is_ok_and(|id| inner.state.deployments.contains_key(&id))
         };
@@ -361,37 +390,6 @@ impl Core {
         self.lock().status = None;
     }
 
-    /// Verifies all deployments of the state again.
-    pub(crate) fn verify(&self, inner: &mut Inner) {
-        let (mut signed, mut manifests) = (BTreeMap::new(), BTreeMap::new());
-        for (id, deployed) in &inner.state.deployments {
-            let checked = inner.trust.verifier().and_then(|verifier| {
-                let find = |digest: &Sha256| self.store.envelope(digest).ok();
-                let envelope = deployed.envelope.as_bytes();
-                let mut signed = SignedDeployment::verify(&verifier, envelope, find)?;
-                manifests.insert(id.clone(), self.check_manifests(&mut signed)?);
-                Ok(signed)
-            });
-            if let Err(failure) = &checked {
-                self.event(EventKind::Refused, Some(id), &failure.to_string());
-            }
-            signed.insert(id.clone(), checked.map_err(|failure| failure.to_string()));
-        }
-        (inner.signed, inner.manifests) = (signed, manifests);
-    }
-
-    /// Checks the manifests of a deployment, and returns them with the limits that apply here.
-    pub(crate) fn check_manifests(
-        &self,
-        signed: &mut SignedDeployment,
-    ) -> Result<Vec<(Sha256, Manifest)>, Failure> {
-        let mut manifests = signed.check_manifests(&self.store)?;
-        for (_, manifest) in &mut manifests {
-            manifest.limits = manifest.limits.tightened_by(&self.vehicle.limits).0;
-        }
-        Ok(manifests)
-    }
-
     /// Writes the state as it is, with the next generation, and publishes what is wanted.
     pub(crate) fn save(&self, inner: &mut Inner) -> Result<(), Failure> {
         let state = inner.state.clone();
@@ -424,6 +422,9 @@ impl Core {
 
     /// Removes revisions that no deployment names, nor ran before.
     pub(crate) fn collect(&self, inner: &mut Inner) {
+        if inner.keeps_revisions {
+            return;
+        }
         let mut kept: BTreeSet<_> = inner.compiling.iter().cloned().collect();
         for (id, deployed) in &inner.state.deployments {
             match inner.signed.get(id) {

@@ -14,20 +14,25 @@ use crate::checked::SignedDeployment;
 use crate::compile;
 use crate::core::{Core, Inner};
 use crate::spools;
-use crate::state::{Deployed, VehicleState};
+use crate::state::{CloudWish, Deployed, VehicleState};
 use crate::store::KnownFiles;
 
 /// Maximum number of deployments that wait for files.
 const OFFERS_MAX: usize = LAMBDAS_MAX;
 
 impl Core {
-    /// Checks a deployment and runs it, or returns the files that are missing for it.
+    /// Checks a deployment and runs it, or returns the files that are missing for it. `wish` is
+    /// that of the cloud if it comes from there.
     ///
     /// # Errors
     ///
     /// A failure with the reason; what ran before goes on.
-    pub(crate) fn deploy(&self, request: &DeployRequest) -> Result<DeployReply, Failure> {
-        let reply = self.try_deploy(request);
+    pub(crate) fn deploy(
+        &self,
+        request: &DeployRequest,
+        wish: Option<&CloudWish>,
+    ) -> Result<DeployReply, Failure> {
+        let reply = self.try_deploy(request, wish);
         if let Err(failure) = &reply {
             self.event(EventKind::Refused, None, &failure.to_string());
             // What has expired once stays expired, also if the clock is reset soon.
@@ -36,7 +41,11 @@ impl Core {
         reply
     }
 
-    fn try_deploy(&self, request: &DeployRequest) -> Result<DeployReply, Failure> {
+    fn try_deploy(
+        &self,
+        request: &DeployRequest,
+        wish: Option<&CloudWish>,
+    ) -> Result<DeployReply, Failure> {
         let deploying = || self.deploying.lock().unwrap_or_else(PoisonError::into_inner);
         let changing = deploying();
         let inner = self.lock();
@@ -97,9 +106,73 @@ impl Core {
         verify(&inner)?;
         inner.check_name(&signed)?;
         admit(&inner)?;
-        let accepted = self.accept(&mut inner, signed, &request.deployment, manifests)?;
+        let accepted = self.accept(&mut inner, signed, (&request.deployment, wish), manifests)?;
         self.collect(&mut inner);
         Ok(accepted)
+    }
+
+    /// Verifies all deployments of the state again.
+    pub(crate) fn verify(&self, inner: &mut Inner) {
+        (inner.signed, inner.manifests) = (BTreeMap::new(), BTreeMap::new());
+        self.verify_others(inner, &BTreeMap::new());
+    }
+
+    /// Verifies those deployments again that are refused: this machine may have lacked memory or
+    /// open files, or its disk may have failed.
+    pub(crate) fn verify_refused(&self) {
+        let mut inner = self.lock();
+        let all = std::mem::take(&mut inner.signed);
+        let refused: BTreeMap<_, _>;
+        (inner.signed, refused) = all.into_iter().partition(|(_, signed)| signed.is_ok());
+        if refused.is_empty() {
+            return;
+        }
+        self.verify_others(&mut inner, &refused);
+        for id in refused.keys().filter(|id| inner.signed[*id].is_ok()) {
+            self.event(EventKind::Deployed, Some(id), "accepted: it is not refused any more");
+        }
+        self.publish(&mut inner);
+    }
+
+    /// Verifies the deployments that were not verified yet. A refusal is an event, unless it is as
+    /// in `before`.
+    fn verify_others(
+        &self,
+        inner: &mut Inner,
+        before: &BTreeMap<ItemName, Result<SignedDeployment, String>>,
+    ) {
+        let Inner { state, trust, signed, manifests, .. } = inner;
+        for (id, deployed) in &state.deployments {
+            if signed.contains_key(id) {
+                continue;
+            }
+            let checked = trust.verifier().and_then(|verifier| {
+                let find = |digest: &Sha256| self.store.envelope(digest).ok();
+                let envelope = deployed.envelope.as_bytes();
+                let mut signed = SignedDeployment::verify(&verifier, envelope, find)?;
+                manifests.insert(id.clone(), self.check_manifests(&mut signed)?);
+                Ok(signed)
+            });
+            let checked = checked.map_err(|failure| failure.to_string());
+            if let Err(reason) = &checked
+                && before.get(id).and_then(|it| it.as_ref().err()) != Some(reason)
+            {
+                self.event(EventKind::Refused, Some(id), reason);
+            }
+            signed.insert(id.clone(), checked);
+        }
+    }
+
+    /// Checks the manifests of a deployment, and returns them with the limits that apply here.
+    pub(crate) fn check_manifests(
+        &self,
+        signed: &mut SignedDeployment,
+    ) -> Result<Vec<(Sha256, Manifest)>, Failure> {
+        let mut manifests = signed.check_manifests(&self.store)?;
+        for (_, manifest) in &mut manifests {
+            manifest.limits = manifest.limits.tightened_by(&self.vehicle.limits).0;
+        }
+        Ok(manifests)
     }
 
     /// Removes a deployment, and lets its lambda end. What the vehicle has accepted stays
@@ -140,12 +213,15 @@ impl Core {
         &self,
         inner: &mut Inner,
         signed: SignedDeployment,
-        envelope: &str,
+        (envelope, wish): (&str, Option<&CloudWish>),
         manifests: Vec<(Sha256, Manifest)>,
     ) -> Result<DeployReply, Failure> {
         let id = signed.id().clone();
         let before = inner.state.deployments.get(&id);
-        let is_same = before.is_some_and(|before| before.envelope == *envelope && before.is_wanted);
+        let is_noted = |before: &Deployed| wish.is_none() || before.cloud.as_ref() == wish;
+        let is_same = before.is_some_and(|before| {
+            before.envelope == *envelope && before.is_wanted && is_noted(before)
+        });
         if !is_same {
             let running = before.map(|_| inner.signed.get(&id)).and_then(|it| it?.as_ref().ok());
             let history = match (before, running) {
@@ -167,6 +243,7 @@ impl Core {
                 is_proven: kept.is_some_and(|kept| kept.is_proven),
                 failed: kept.and_then(|kept| kept.failed.clone()),
                 history,
+                cloud: wish.or(kept.and_then(|kept| kept.cloud.as_ref())).cloned(),
             };
             let revision = signed.revision.payload();
             let text = format!(

@@ -83,6 +83,24 @@ impl DurableFile {
         self.save_by(&DiskSteps, value)
     }
 
+    /// Removes both copies.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the file; it may be gone already.
+    pub(crate) fn remove(&self) -> Result<(), Failure> {
+        for path in &self.paths {
+            match std::fs::remove_file(path) {
+                Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                    let action = format!("cannot remove `{}`", path.display());
+                    return Err(Failure::caused_by(Exit::Internal, action, &error));
+                }
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
     fn save_by(&self, steps: &impl WriteSteps, value: &impl Serialize) -> Result<(), Failure> {
         let json = serde_json::to_string(value).expect("plain data");
         let text = format!("{}\n{json}\n", hex(&Sha256::digest(&json)));

@@ -116,6 +116,11 @@ impl VehicleFolders {
         self.state.join("state.json")
     }
 
+    /// The enrolment at the cloud.
+    pub(crate) fn cloud(&self) -> PathBuf {
+        self.state.join("cloud.json")
+    }
+
     /// File of the measurements.
     pub(crate) fn measured(&self) -> PathBuf {
         self.state.join("measured.json")

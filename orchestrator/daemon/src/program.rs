@@ -21,7 +21,9 @@ use tokio::sync::watch;
 
 use crate::api::Api;
 use crate::clock_jumps::ClockJumps;
+use crate::cloud::{Cloud, CloudLink};
 use crate::core::Core;
+use crate::durable::DurableFile;
 use crate::layout::VehicleFolders;
 use crate::link::SupervisorLink;
 
@@ -50,6 +52,8 @@ struct Args {
 /// Interval at which the trusted time is moved; also at the end, after a jump of the clock and with
 /// a refusal. Each time is a write of the state.
 const TIME_INTERVAL: Duration = Duration::from_secs(600);
+/// Interval at which refused deployments are verified again.
+const REFUSED_INTERVAL: Duration = Duration::from_secs(10);
 /// Interval at which the watchdog is reset, and the clock is looked at.
 const WATCHDOG_INTERVAL: Duration = Duration::from_secs(3);
 
@@ -188,7 +192,14 @@ async fn serve(
     let mut link = tokio::spawn(link.keep());
     let measuring = Arc::clone(&core);
     tokio::task::spawn_blocking(move || measuring.measure_speed());
-    let api = Api { core: Arc::clone(&core), layout, name, key, started: Instant::now() };
+    let (cloud, damage) = Cloud::load(DurableFile::new(layout.cloud()));
+    if let Some(damage) = damage {
+        let text = format!("the file of the enrolment is damaged: {damage}");
+        core.event(EventKind::Warning, None, &text);
+    }
+    let (core, started) = (Arc::clone(&core), Instant::now());
+    let api = Api { core: Arc::clone(&core), layout, name, key, started, cloud };
+    tokio::spawn(CloudLink { api: api.clone() }.keep());
     if let Some(address) = metrics {
         serve_metrics(address, &api).await;
     }
@@ -196,6 +207,7 @@ async fn serve(
     let _ = sd_notify::notify(&[sd_notify::NotifyState::Ready]);
     let mut watchdog = tokio::time::interval(WATCHDOG_INTERVAL);
     let mut time = tokio::time::interval(TIME_INTERVAL);
+    let mut refused = tokio::time::interval(REFUSED_INTERVAL);
     let mut jumps = ClockJumps::new();
     loop {
         tokio::select! {
@@ -213,6 +225,7 @@ async fn serve(
                 }
             }
             _ = time.tick() => core.observe_time(),
+            _ = refused.tick() => core.verify_refused(),
             ended = &mut link => {
                 // It ends only when it is to stop, or with a failure.
                 return ended

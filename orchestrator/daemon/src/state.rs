@@ -62,6 +62,22 @@ pub(crate) struct Deployed {
     pub(crate) failed: Option<String>,
     /// Revisions that ran before, the newest first.
     pub(crate) history: Vec<Sha256>,
+    /// What the cloud wanted last; `None` of a local deployment.
+    #[serde(default)]
+    pub(crate) cloud: Option<CloudWish>,
+}
+
+/// What the cloud wants of a deployment. It is followed once: what is changed locally afterwards
+/// stays until the cloud wants something else.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct CloudWish {
+    /// SHA-256 of the envelope.
+    pub(crate) envelope: String,
+    /// False if it is to be stopped.
+    pub(crate) is_wanted: bool,
+    /// Number of the request to run its fallback.
+    pub(crate) rollback: u64,
 }
 
 impl Deployed {

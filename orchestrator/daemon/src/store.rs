@@ -53,6 +53,15 @@ impl RevisionStore {
         Ok(store)
     }
 
+    /// Returns whether it has revisions.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the folder.
+    pub(crate) fn has_any(&self) -> Result<bool, Failure> {
+        Ok(!entries(&self.revisions)?.is_empty())
+    }
+
     /// Returns the folder of a revision, which has its `build/`.
     pub(crate) fn folder(&self, digest: &Sha256) -> PathBuf {
         self.revisions.join(digest.as_str())

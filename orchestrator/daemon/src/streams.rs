@@ -223,7 +223,8 @@ fn send_piece(lines: &mut VecDeque<StreamLine>, to: &mpsc::Sender<Bytes>) -> boo
     to.blocking_send(text.into()).is_ok()
 }
 
-fn line(stream: &str, item: Result<SpoolItem, gleaner_spool::SpoolError>) -> StreamLine {
+/// Returns the line of an item of a stream.
+pub(crate) fn line(stream: &str, item: Result<SpoolItem, gleaner_spool::SpoolError>) -> StreamLine {
     let line = |seq, kind: &str, record| StreamLine {
         stream: stream.to_owned(),
         seq,

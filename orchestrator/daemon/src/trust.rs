@@ -81,6 +81,11 @@ impl VehicleTrust {
         self.floors.observe(clock(), self.built);
     }
 
+    /// Returns the trusted time, in s since 1970.
+    pub(crate) fn now(&self) -> u64 {
+        self.floors.now(clock(), self.built)
+    }
+
     /// Returns what was accepted, to persist it.
     pub(crate) fn floors(&self) -> &Floors {
         &self.floors
@@ -106,8 +111,7 @@ impl VehicleTrust {
             return Err(Failure::new(Exit::Denied, message)
                 .with_help("install one: `gleaner trust install FILE`"));
         };
-        let now = self.floors.now(clock(), self.built);
-        Ok(Verifier { root, floors: &self.floors, labels: &self.labels, now })
+        Ok(Verifier { root, floors: &self.floors, labels: &self.labels, now: self.now() })
     }
 
     /// Remembers an accepted deployment.
@@ -131,7 +135,7 @@ impl VehicleTrust {
 
     pub(crate) fn status(&self) -> Option<TrustStatus> {
         let root = self.root.as_ref()?;
-        let is_expired = self.floors.now(clock(), self.built) >= root.expires;
+        let is_expired = self.now() >= root.expires;
         Some(TrustStatus { version: root.version, expires: root.expires, is_expired })
     }
 }

@@ -1,7 +1,9 @@
 //! The record of a runtime's end: `gleaner-shim` writes it, the supervisor reads it.
 
 use std::io::{self, Read, Write};
+use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
+use std::process::ExitStatus;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -215,7 +217,11 @@ impl ExitRecord {
             (None, true, ..) => {
                 Some("was killed by the kernel: its control group had no memory left".to_owned())
             }
-            (None, false, Some(signal), _) => Some(format!("was ended by signal {signal}")),
+            // Of the library: `signal: 9 (SIGKILL)`.
+            (None, false, Some(signal), _) => {
+                let named = ExitStatus::from_raw(signal).to_string();
+                Some(format!("was ended by {}", named.replacen(':', "", 1)))
+            }
             (None, false, None, Some(0)) => None,
             (None, false, None, code) => {
                 Some(format!("ended by itself, with exit code {}", code.unwrap_or(-1)))
@@ -356,7 +362,7 @@ mod tests {
     fn the_sentence_states_the_cause_of_the_end() {
         assert_eq!(record().sentence().unwrap(), "was in one wake for 0.35 s; the limit is 0.35 s");
         let crashed = ExitRecord { killed: None, signal: Some(11), ..record() };
-        assert_eq!(crashed.sentence().unwrap(), "was ended by signal 11");
+        assert_eq!(crashed.sentence().unwrap(), "was ended by signal 11 (SIGSEGV)");
         let out_of_memory = |signal| {
             ExitRecord { out_of_memory: true, signal: Some(signal), ..crashed.clone() }
                 .sentence()

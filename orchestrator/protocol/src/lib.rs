@@ -32,7 +32,7 @@ pub use exit_record::{ExitRecord, KillReason, Killed, Phase, SHUTDOWN_TIMEOUT};
 pub use handover::{Handover, HandoverReceiver, PASSES_INFERENCE};
 pub use isolation::{Holds, LAYERS_ENV, Layer, SHIM_ENV};
 pub use live_status::{
-    DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus, ReceptionGaps,
+    DurationStats, LinkLosses, LiveStatus, LiveTopic, NetworkStatus, ReceptionGaps, WakeCounts,
 };
 pub use recording::{LossCount, LossOutcome, RecordingCounts};
 pub use report::{ReplaySummary, Report, Round, TopicReport, Verified};

@@ -75,11 +75,53 @@ pub struct LiveStatus {
     pub cpu_s: f64,
 }
 
-/// Number of faults from which on a lambda can be [faulty](LiveStatus::faulty): fewer are too few
+/// Numbers of wakes of a lambda, in some time.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WakeCounts {
+    /// Number of wakes.
+    pub wakes: u64,
+    /// Wakes that ended in a fault.
+    pub faults: u64,
+    /// Number of wakes skipped by the back-off after repeated faults.
+    pub backed_off: u64,
+}
+
+/// Number of faults from which on a lambda can be [faulty](WakeCounts::faulty): fewer are too few
 /// to judge it by.
 const FAULTS_MIN: u64 = 10;
 /// Number of its wakes, of which one ended with a fault, in a lambda that is faulty: at least half.
 const FAULTY_ONE_OF: u64 = 2;
+
+impl WakeCounts {
+    /// Returns the wakes since those of `before`.
+    #[must_use]
+    pub fn since(self, before: Self) -> Self {
+        Self {
+            wakes: self.wakes.saturating_sub(before.wakes),
+            faults: self.faults.saturating_sub(before.faults),
+            backed_off: self.backed_off.saturating_sub(before.backed_off),
+        }
+    }
+
+    /// Returns the number of all wakes, with those that were skipped.
+    pub fn all(self) -> u64 {
+        self.wakes.saturating_add(self.backed_off)
+    }
+
+    /// Returns a sentence with the numbers if the lambda is faulty: at least 10 of its wakes ended
+    /// with a fault, and these are at least half of all. Those that were skipped after faults count
+    /// as such. Its probation has failed then.
+    pub fn faulty(self) -> Option<String> {
+        let Self { wakes, faults, backed_off } = self;
+        let failed = faults.saturating_add(backed_off);
+        let is_faulty = faults >= FAULTS_MIN && failed.saturating_mul(FAULTY_ONE_OF) >= self.all();
+        let skipped = match backed_off {
+            0 => String::new(),
+            _ => format!(", and {backed_off} were skipped after them"),
+        };
+        is_faulty.then(|| format!("{faults} of its last {wakes} wakes ended with a fault{skipped}"))
+    }
+}
 
 impl LiveStatus {
     /// Returns the status of a lambda before its first wake: all counts are 0.
@@ -115,19 +157,9 @@ impl LiveStatus {
         }
     }
 
-    /// Returns a sentence with the numbers if the lambda is faulty: at least 10 of its wakes ended
-    /// with a fault, and these are at least half of all. Those that were skipped after faults count
-    /// as such. Its probation has failed then.
-    pub fn faulty(&self) -> Option<String> {
-        let Self { wakes, faults, backed_off, .. } = self;
-        let failed = faults.saturating_add(*backed_off);
-        let all = wakes.saturating_add(*backed_off);
-        let is_faulty = *faults >= FAULTS_MIN && failed.saturating_mul(FAULTY_ONE_OF) >= all;
-        let skipped = match backed_off {
-            0 => String::new(),
-            _ => format!(", and {backed_off} were skipped after them"),
-        };
-        is_faulty.then(|| format!("{faults} of its {wakes} wakes ended with a fault{skipped}"))
+    /// Returns its numbers of wakes.
+    pub fn wake_counts(&self) -> WakeCounts {
+        WakeCounts { wakes: self.wakes, faults: self.faults, backed_off: self.backed_off }
     }
 
     /// Adds the counts of `before`, an earlier process of the same lambda. Durations, rates and
@@ -365,11 +397,9 @@ mod tests {
 
     #[test]
     fn ten_faults_that_are_half_of_all_wakes_make_a_lambda_faulty() {
-        let faulty = |wakes, faults, backed_off| {
-            LiveStatus { wakes, faults, backed_off, ..live(0, None) }.faulty()
-        };
+        let faulty = |wakes, faults, backed_off| WakeCounts { wakes, faults, backed_off }.faulty();
         assert_eq!([faulty(9, 9, 0), faulty(21, 10, 0), faulty(1000, 499, 1)], [const { None }; 3]);
-        assert_eq!(faulty(20, 10, 0).unwrap(), "10 of its 20 wakes ended with a fault");
+        assert_eq!(faulty(20, 10, 0).unwrap(), "10 of its last 20 wakes ended with a fault");
         let text = faulty(176, 76, 6218).unwrap();
         assert!(text.ends_with("a fault, and 6218 were skipped after them"), "{text}");
         assert!(faulty(u64::MAX, u64::MAX, u64::MAX).is_some());

@@ -38,6 +38,28 @@ pub struct VehicleStatus {
     pub events_lost: u64,
     /// The processes; absent while the supervisor cannot be reached.
     pub supervisor: Option<SupervisorStatus>,
+    /// The connection to the cloud; absent unless the vehicle is enrolled.
+    #[serde(default)]
+    pub cloud: Option<CloudStatus>,
+}
+
+/// The connection of a vehicle to the cloud.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CloudStatus {
+    /// Address of the cloud: `HOST:PORT`.
+    pub address: String,
+    /// Its state: `connecting`, `connected`, or `refused` by the cloud.
+    pub state: String,
+    /// The reason why it is not connected, as far as it is known.
+    pub reason: Option<String>,
+    /// Time in this state, in s.
+    pub since_s: f64,
+    /// Number of the newest wanted state of the cloud that was handled.
+    pub generation: u64,
+    /// Number of records that were sent, and that the cloud has not acknowledged.
+    pub unsent: u64,
+    /// End of the vehicle's certificate, in s since 1970.
+    pub certificate_expires: u64,
 }
 
 /// The status of a program.

@@ -104,6 +104,12 @@ impl<S: SpoolStorage> SpoolReader<S> {
         self.limit = limit;
     }
 
+    /// Returns the number of the next item; `None` before the first one was found, of a reader that
+    /// begins with the oldest.
+    pub fn position(&self) -> Option<u64> {
+        self.expected
+    }
+
     fn advance(&mut self) -> Result<Option<SpoolItem>, SpoolError> {
         loop {
             if self.expected.is_some_and(|expected| expected >= self.limit) {

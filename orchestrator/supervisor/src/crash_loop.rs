@@ -9,12 +9,18 @@ const ENDS_MAX: usize = 5;
 const UNREADY_MAX: u32 = 3;
 const WINDOW: Duration = Duration::from_secs(600);
 
-/// The ends of a lambda for reasons of its own.
+/// Number of kills in a row, each within [`SOON`] of being ready or before, after which the lambda
+/// is not started again. A user or the kernel does not do that; a thread of the lambda can.
+const KILLS_MAX: u32 = 15;
+const SOON: Duration = Duration::from_secs(1);
+
+/// The ends of a lambda, for reasons of its own or by kills.
 #[derive(Debug, Default)]
 pub(crate) struct CrashLoop {
     /// Times of the last ends, at most [`ENDS_MAX`].
     ends: VecDeque<Instant>,
     unready: u32,
+    kills: u32,
 }
 
 impl CrashLoop {
@@ -31,6 +37,14 @@ impl CrashLoop {
         let minutes = WINDOW.as_secs() / 60;
         let is_loop = self.ends.len() >= ENDS_MAX;
         is_loop.then(|| format!("it failed {ENDS_MAX} times within {minutes} minutes"))
+    }
+
+    /// Counts a kill by an unknown sender, after the lambda was ready for this time. Returns the
+    /// reason if it is not to be started again.
+    pub(crate) fn killed(&mut self, ready_for: Duration) -> Option<String> {
+        self.kills = if ready_for < SOON { self.kills + 1 } else { 0 };
+        let is_loop = self.kills >= KILLS_MAX;
+        is_loop.then(|| format!("it was killed {KILLS_MAX} times in a row, within a second each"))
     }
 }
 
@@ -55,5 +69,19 @@ mod tests {
         assert_eq!(quarantined_at(&often), Some(4));
         let rarely = [0, 200, 400, 600, 801, 1002].map(|second| (second, true));
         assert_eq!(quarantined_at(&rarely), None);
+    }
+
+    #[test]
+    fn only_kills_in_a_row_that_come_soon_are_a_loop() {
+        let last = |kills: &[u64]| {
+            let mut crashes = CrashLoop::default();
+            let ends = kills.iter().map(|ms| crashes.killed(Duration::from_millis(*ms)));
+            ends.last().flatten().is_some()
+        };
+        assert!(last(&[300; 15]) && !last(&[300; 14]));
+        let mut one_later = [300; 28];
+        one_later[13] = 1000;
+        assert!(!last(&one_later));
+        assert!(!last(&[1000; 100]), "chaos, once every few seconds");
     }
 }

@@ -110,15 +110,28 @@ impl LambdaProcess {
             Some(exit @ (Exit::Ok | Exit::LambdaFaulted)) if requested && self.has_ended => {
                 ProcessEnd::Complete(exit)
             }
-            Some(exit) if !self.is_ready && exit != Exit::Ok => ProcessEnd::NotStarted(exit),
+            // Our programs print an error before; another code is one that the lambda's code chose.
+            Some(exit) if !self.is_ready && exit != Exit::Ok && self.error.message().is_some() => {
+                ProcessEnd::NotStarted(exit)
+            }
             _ => {
-                let reason = record.as_ref().and_then(ExitRecord::sentence);
+                let reason = match record.as_ref() {
+                    Some(ExitRecord {
+                        phase: Some(Phase::Init),
+                        code: Some(code),
+                        killed: None,
+                        ..
+                    }) => format!(
+                        "the lambda's code ended its process with exit code {code} in its \
+                         constructor"
+                    ),
+                    record => record.and_then(ExitRecord::sentence).map_or_else(
+                        || ended("the lambda's process", status),
+                        |reason| format!("the lambda's process {reason}"),
+                    ),
+                };
                 let faulted =
                     self.has_faulted || record.is_some_and(|record| record.is_caused_by_lambda());
-                let reason = reason.map_or_else(
-                    || ended("the lambda's process", status),
-                    |reason| format!("the lambda's process {reason}"),
-                );
                 ProcessEnd::Broken { reason, faulted }
             }
         }

@@ -1,7 +1,9 @@
 //! The last message that a process writes to standard error: it explains its end.
 
-/// Maximum length of a message that is kept, in bytes.
-const MAX: usize = 2048;
+use gleaner_base::in_one_line;
+
+/// Maximum length of a message that is kept, in bytes. A traceback ends with what counts.
+const MAX: usize = 8192;
 
 /// The last error message of a process, and its last line.
 #[derive(Debug, Default)]
@@ -18,6 +20,8 @@ impl LastError {
         let text = text.strip_prefix(prefix).unwrap_or(&text).trim_end();
         if text.starts_with("error: ") {
             text.clone_into(&mut self.message);
+        } else if text.trim_start().starts_with("help: ") && text.contains("--out ") {
+            // An option of a command line, which the reader of a reason has not typed.
         } else if self.message.is_empty() {
             self.line = text.chars().take(MAX).collect();
         } else if self.message.len() < MAX {
@@ -32,9 +36,8 @@ impl LastError {
 
     /// Returns the error message, or else the last line, in one line.
     pub(crate) fn in_one_line(&self) -> Option<String> {
-        let text = self.message().unwrap_or(&self.line);
-        let lines: Vec<_> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
-        (!lines.is_empty()).then(|| lines.join("; "))
+        let text = in_one_line(self.message().unwrap_or(&self.line));
+        (!text.is_empty()).then_some(text)
     }
 }
 
@@ -54,8 +57,9 @@ mod tests {
         assert_eq!(after(&["one\n", "a: two\n"]).unwrap(), "two");
         let message = ["a: error: cannot open `x`\n", "a:   cause: the disk is full\n"];
         let expected = "cannot open `x`; cause: the disk is full";
-        assert_eq!(after(&[&["before\n"], &message[..]].concat()).unwrap(), expected);
-        let long = "x".repeat(5000);
+        let help = "a:   help:  choose another folder: --out DIR\n";
+        assert_eq!(after(&[&["before\n"], &message[..], &[help]].concat()).unwrap(), expected);
+        let long = "x".repeat(10_000);
         assert!(after(&[&long]).unwrap().len() <= MAX);
     }
 }

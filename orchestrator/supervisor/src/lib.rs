@@ -6,7 +6,8 @@
 //! - `process`, `output`, `lines`, `byte_rate`: one process, and the threads that read its output.
 //! - `ingress`, `recorder`, `inference`: the processes that all lambdas share, each over its
 //!   restarts (`service_restarts`). `last_error`: the message that explains an end.
-//! - `supervised`, `lambda_state`: one lambda over all its restarts, with `summary`.
+//! - `supervised`, `lambda_state`: one lambda over all its restarts, with `summary` and
+//!   `recent_wakes`.
 //! - `process_group`: all processes, `group_end`: their end, and `drive`: a drive that the ingress
 //!   plays.
 //! - `failures`: the result of a run in which processes failed.
@@ -39,6 +40,7 @@ mod process_group;
 #[cfg(test)]
 #[path = "../../../tests/src/random.rs"]
 mod random;
+mod recent_wakes;
 mod reconcile;
 mod recorder;
 mod restart_delay;

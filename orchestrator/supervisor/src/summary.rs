@@ -3,12 +3,15 @@
 //! Each process counts only its own events, and `gleaner-shim` writes only those of one process.
 
 use std::path::Path;
+use std::time::Instant;
 
 use gleaner_base::{Exit, Failure, PlainFile, write_atomically};
 use gleaner_lambda::results::SUMMARY_MAX;
 use gleaner_protocol::ingress::IngressStatus;
 use gleaner_protocol::link::RecorderStatus;
-use gleaner_protocol::{LiveStatus, NetworkStatus};
+use gleaner_protocol::{LiveStatus, NetworkStatus, WakeCounts};
+
+use crate::recent_wakes::RecentWakes;
 
 /// Sums of the counts of all ingresses and all recorders of a run.
 #[derive(Default)]
@@ -63,11 +66,25 @@ impl RunCounts {
 #[derive(Default)]
 pub(crate) struct EarlierCounts {
     live: Option<LiveStatus>,
+    /// Those of the last minutes, with the current process.
+    recent: RecentWakes,
     /// Wakes during which their process ended, so that it did not count them.
     lost_wakes: u64,
 }
 
 impl EarlierCounts {
+    /// Notes the counts of the current process, `last`.
+    pub(crate) fn observe(&mut self, last: &LiveStatus) {
+        if let Some(all) = self.with(Some(last)) {
+            self.recent.add(all.wake_counts(), Instant::now());
+        }
+    }
+
+    /// Returns the wakes of the last minutes.
+    pub(crate) fn recent(&self) -> WakeCounts {
+        self.recent.get()
+    }
+
     /// Adds the last status of an ended process. If it failed, up to a second of counts is missing.
     pub(crate) fn add(&mut self, last: Option<LiveStatus>, has_lost_wake: bool) {
         self.lost_wakes += u64::from(has_lost_wake);
@@ -97,7 +114,7 @@ impl EarlierCounts {
         counts: &RunCounts,
         out: &Path,
     ) -> Result<(), Failure> {
-        let Self { live, lost_wakes } = self;
+        let Self { live, lost_wakes, .. } = self;
         let recording = counts.recorder();
         // Not the path in the report, which comes from the lambda's process.
         let path = out.join("summary.json");

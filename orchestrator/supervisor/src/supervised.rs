@@ -284,14 +284,13 @@ impl SupervisedLambda {
         drive_ended: bool,
         observer: &mut dyn RunObserver,
     ) {
-        let Self { lambda, state: LambdaState::Running(process), was_ready, .. } = self else {
-            return;
-        };
+        let Self { lambda, state, was_ready, since, earlier, .. } = self;
+        let LambdaState::Running(process) = state else { return };
         observer.lambda(lambda, &report);
         match report {
             Report::Ready => {
                 process.is_ready = true;
-                *was_ready = true;
+                (*was_ready, *since) = (true, Instant::now());
             }
             Report::Isolation { layers } => process.layers = layers,
             Report::Decision(decision) => {
@@ -302,6 +301,7 @@ impl SupervisedLambda {
             Report::Live(live) => {
                 process.has_faulted |= live.faults > 0;
                 process.after_drive += u32::from(drive_ended);
+                earlier.observe(&live);
                 process.last = Some(live);
                 self.warn(observer);
             }
@@ -366,6 +366,7 @@ impl SupervisedLambda {
             restarts: self.restarts,
             last_end: self.last_end.clone(),
             live: self.earlier.with(last).map(Box::new),
+            recent: self.earlier.recent(),
             layers: process.map(|process| process.layers.clone()).unwrap_or_default(),
         })
     }
@@ -418,9 +419,11 @@ impl SupervisedLambda {
             }
             ProcessEnd::Broken { reason, faulted } => (reason, faulted),
         };
-        let shown = format!("{prefix}{reason}");
         let (ran, is_ready) = (process.started.elapsed(), process.is_ready);
         let is_outside = is_kept && process.was_killed_from_outside(&self.lambda, status);
+        let sender = if is_outside { ", by another program or by the lambda itself" } else { "" };
+        let reason = format!("{reason}{sender}");
+        let shown = format!("{prefix}{reason}");
         self.add_earlier(*process);
         failures.add(shown.clone(), faulted);
         if is_ending {
@@ -428,15 +431,16 @@ impl SupervisedLambda {
             return;
         }
         if is_kept {
-            let quarantine = match is_outside || is_unusable {
-                true => is_unusable.then(|| reason.clone()),
-                false => self
-                    .crashes
-                    .ended(Instant::now(), is_ready)
-                    .map(|why| format!("{why}; the last time, {reason}")),
+            let ready_for = if is_ready { self.since.elapsed() } else { Duration::ZERO };
+            let is_loop = match is_outside {
+                true => self.crashes.killed(ready_for),
+                false => self.crashes.ended(Instant::now(), is_ready),
             };
-            if let Some(reason) = quarantine {
+            if is_unusable {
                 return self.quarantine(reason);
+            }
+            if let Some(why) = is_loop {
+                return self.quarantine(format!("{why}; the last time, {reason}"));
             }
             self.last_end = Some(reason);
         }

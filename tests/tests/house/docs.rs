@@ -192,6 +192,9 @@ fn python_on_pages_compiles() {
     assert_eq!(String::from_utf8_lossy(&output.stdout), "");
 }
 
+/// Commands that are passed on to another program.
+const PASSED_ON: [&str; 2] = ["cloud", "play"];
+
 #[test]
 fn every_command_on_pages_exists_with_its_flags() {
     let mut helps = BTreeMap::new();
@@ -209,23 +212,25 @@ fn every_command_on_pages_exists_with_its_flags() {
                     .next()
                     .unwrap_or_default()
                     .replace(['[', ']'], " ");
-                let mut words = command.split_whitespace();
+                let mut words = command.split_whitespace().peekable();
                 if words.next() != Some("gleaner") {
                     continue;
                 }
                 seen += 1;
                 let mut name = words.next().unwrap_or_default().to_owned();
                 // These have commands of their own.
-                if ["keys", "trust"].contains(&&*name) {
-                    name = format!("{name} {}", words.next().unwrap_or_default());
+                if ["keys", "trust", "users", "vehicles"].contains(&&*name)
+                    && let Some(second) = words.next_if(|word| !word.starts_with("--"))
+                {
+                    name = format!("{name} {second}");
                 }
                 let help = helps.entry(name.clone()).or_insert_with(|| help(&name));
                 match help {
                     None => {
                         problems.push(format!("{}: `gleaner {name}` does not exist", page.path))
                     }
-                    // The arguments of `play` are the player's, which may not be built.
-                    Some(_) if name == "play" => {}
+                    // The arguments are those of another program, which may not be built.
+                    Some(_) if PASSED_ON.contains(&&*name) => {}
                     Some(help) => {
                         let flags = words.filter(|word| word.starts_with("--"));
                         let flags =
@@ -252,7 +257,7 @@ fn help(name: &str) -> Option<String> {
     if name.starts_with("--") {
         return Some(name.to_owned());
     }
-    if name == "play" {
+    if PASSED_ON.contains(&name) {
         return Some(String::new());
     }
     let output = Command::new(program("gleaner")).args(name.split(" ")).arg("--help").output();

@@ -161,7 +161,9 @@ fn a_killed_lambda_is_restarted_alone_and_the_others_lose_nothing() {
     assert_eq!(finished.status.code(), Some(FAULTED), "{}", finished.stderr);
     let stderr = &finished.stderr;
     assert!(
-        stderr.contains("killed: the lambda's process was ended by signal 9; restarting in 1 s"),
+        stderr.contains(
+            "killed: the lambda's process was ended by signal 9 (SIGKILL); restarting in 1 s"
+        ),
         "{stderr}"
     );
     let (kept, killed) = (finished.ended_of("kept").unwrap(), finished.ended_of("killed").unwrap());

@@ -65,7 +65,10 @@ fn a_process_that_is_killed_leaves_a_fault_and_all_results_before_it() {
     let journal = folder.path().join("drive.journal");
     let journaled = ["--all", "--journal", journal.to_str().unwrap()];
     let run = misbehave(&folder, "kill_itself", "", &journaled);
-    assert_eq!(killed(run.must_exit(FAULTED)), (3, "the lambda's process was ended by signal 9"));
+    assert_eq!(
+        killed(run.must_exit(FAULTED)),
+        (3, "the lambda's process was ended by signal 9 (SIGKILL)")
+    );
     // The journal has no end, and holds the wake in which the process died; verifying repeats it.
     let (lambda, drive) = (root().join("tests/lambdas/misbehave/python"), imu_only(&folder, 1));
     let args = [

@@ -219,6 +219,12 @@ pub fn fallback() {
     let revisions = files(&vehicle.path("state/revisions"));
     assert_eq!(revisions.len(), 4, "one of `other`, the newest, and two before: {revisions:?}");
     assert!(files(&vehicle.path("state/objects")).is_empty());
+    // A fallback that is taken while a deployment waits is a failure of it.
+    lambda.write("guard", "0.7.0", "def __init__(self, ctx):\n    raise ValueError('no')");
+    let said = text(&vehicle.deploy(lambda.path(), &[]));
+    assert!(said.contains("exit status: 6"), "{said}");
+    assert!(said.contains("deployment `guard` runs its fallback 0.6.0"), "{said}");
+    assert!(said.contains("0.7.0 failed: it failed 3 times in a row"), "{said}");
 }
 
 pub fn quarantined() {
@@ -238,6 +244,11 @@ pub fn quarantined() {
     let killer = PythonLambda::new("killer", code);
     let said = text(&vehicle.deploy(killer.path(), &[]));
     assert!(said.contains("it failed 3 times in a row before it was ready"), "{said}");
+    // An exit code that the lambda chose is not one of the runtime.
+    let code = "def __init__(self, ctx):\n    import os\n    os._exit(2)";
+    let said = text(&vehicle.deploy(PythonLambda::new("quitter", code).path(), &[]));
+    assert!(said.contains("it failed 3 times in a row before it was ready"), "{said}");
+    assert!(said.contains("code ended its process with exit code 2 in its constructor"), "{said}");
     let status = vehicle.deployment("broken").status.expect("it is known");
     assert_eq!((status.phase, status.restarts), (LambdaPhase::Quarantined, 2));
     // Its log has the cause, also of the first process.
@@ -245,7 +256,26 @@ pub fn quarantined() {
     let starts = log.iter().filter(|line| line.kind == "started").count();
     assert_eq!(starts, 3, "{log:?}");
     assert_eq!(vehicle.deployment("other").status.expect("it runs").restarts, 0);
-    assert_eq!(events(&vehicle, EventKind::Quarantined).len(), 2);
+    assert_eq!(events(&vehicle, EventKind::Quarantined).len(), 3);
+}
+
+pub fn killed_by_itself() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let code = "def __init__(self, ctx):\n\
+                \u{20}   import os, threading\n\
+                \u{20}   threading.Timer(0.2, os.kill, (os.getpid(), 9)).start()\n\
+                def on_tick(self, ctx):\n    pass";
+    let lambda = PythonLambda::new("killer", code);
+    vehicle.deploy(lambda.path(), &[]);
+    let status = vehicle.until("the quarantine", |vehicle| {
+        let status = vehicle.deployment("killer").status;
+        status.filter(|status| status.phase == LambdaPhase::Quarantined)
+    });
+    let reason = status.last_end.unwrap_or_default();
+    assert!(reason.contains("killed 15 times in a row"), "{reason}");
+    assert!(reason.contains("signal 9 (SIGKILL), by another program or by the lambda"), "{reason}");
+    assert_eq!(status.restarts, 14);
 }
 
 pub fn at_once() {

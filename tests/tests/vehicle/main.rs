@@ -1,6 +1,7 @@
 //! The daemon of a vehicle, with real lambdas: what is deployed runs, whatever is killed.
 
 mod chaos;
+mod cloud;
 mod deployments;
 mod faults;
 mod recorder;
@@ -20,13 +21,14 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 22] = [
+const CASES: [Case; 28] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_supervisor_that_ends_after_sighup_is_no_zombie", deployments::reaped),
     ("after_an_upgrade_old_and_new_programs_do_not_mix", deployments::upgraded),
     ("a_stopped_deployment_stays_stopped", deployments::stopped),
     ("a_failed_revision_is_replaced_by_its_fallback_for_good", deployments::fallback),
     ("a_lambda_without_a_fallback_is_quarantined_alone", deployments::quarantined),
+    ("a_lambda_that_kills_itself_between_wakes_is_quarantined", deployments::killed_by_itself),
     ("a_revision_whose_wakes_fault_fails_its_probation", faults::probation),
     ("a_proven_lambda_whose_wakes_fault_runs_on_with_a_warning", faults::proven),
     ("a_lambda_decides_without_a_recorder_and_joins_the_next_one", recorder::missing),
@@ -34,6 +36,8 @@ const CASES: [Case; 22] = [
     ("what_is_not_signed_for_this_vehicle_is_refused", refused::signatures),
     ("a_file_that_was_changed_later_does_not_start", refused::changed_file),
     ("a_removed_deployment_is_gone_and_its_releases_stay_known", deployments::removed),
+    ("revisions_outlive_a_lost_state", refused::lost_state),
+    ("a_deployment_that_could_not_be_read_is_verified_again", refused::retried),
     ("what_does_not_fit_is_refused_with_both_numbers", refused::memory),
     ("a_lambda_that_states_too_much_is_refused_and_others_run_on", refused::cpu),
     ("a_lambda_runs_with_its_wheels_and_not_with_changed_ones", wheels::runs),
@@ -42,6 +46,9 @@ const CASES: [Case; 22] = [
     ("top_restores_the_terminal", top::terminal),
     ("top_ends_with_a_terminal_that_sends_no_signal", top::lost_terminal),
     ("what_follows_ends_with_its_reader_although_nothing_happens", top::readers),
+    ("a_vehicle_runs_what_the_cloud_wants_and_sends_its_records", cloud::follows),
+    ("a_cloud_that_is_killed_loses_nothing", cloud::killed),
+    ("a_vehicle_refuses_what_no_trusted_key_signed_and_runs_without_a_cloud", cloud::refused),
     ("processes_are_killed_at_random", chaos::killed_at_random),
 ];
 

@@ -5,10 +5,10 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::os::unix::fs::PermissionsExt;
 
-use gleaner_protocol::supervision::LambdaPhase;
+use gleaner_protocol::supervision::{EventKind, LambdaPhase};
 use gleaner_tests::vehicle::{TestVehicle, text};
 
-use super::{PythonLambda, files, ticker};
+use super::{PythonLambda, events, files, ticker};
 
 pub fn signatures() {
     let mut vehicle = TestVehicle::new();
@@ -70,6 +70,48 @@ pub fn changed_file() {
     // Its deployment brings the file back; the others are still there.
     let deployed = text(&vehicle.deploy(lambda.path(), &[]));
     assert!(deployed.contains("1 file sent") && deployed.contains("running"), "{deployed}");
+}
+
+pub fn lost_state() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let lambda = ticker("rust", "ticker");
+    let deployed = vehicle.deploy(lambda.path(), &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.stop();
+    let copies = ["state/state.json", "state/state.json.copy"].map(|name| vehicle.path(name));
+    let backup = fs::read(&copies[0]).expect("it is durable");
+    copies.iter().for_each(|copy| fs::remove_file(copy).expect("it is there"));
+    vehicle.start();
+    vehicle.until("a status", |vehicle| vehicle.try_status()?.supervisor);
+    assert!(vehicle.status().deployments.is_empty());
+    let warnings = events(&vehicle, EventKind::Warning);
+    let is_named = |text: &String| text.contains("state.json` and its copy are missing");
+    assert!(warnings.iter().any(is_named), "{warnings:?}");
+    assert_eq!(files(&vehicle.path("state/revisions")).len(), 1);
+    vehicle.stop();
+    copies.iter().for_each(|copy| fs::write(copy, &backup).expect("our folder"));
+    vehicle.start();
+    vehicle.until_running(&["ticker"]);
+}
+
+pub fn retried() {
+    let mut vehicle = TestVehicle::new();
+    vehicle.start();
+    let lambda = ticker("rust", "ticker");
+    let deployed = vehicle.deploy(lambda.path(), &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.stop();
+    // In place of a disk that fails, or a machine without memory or open files.
+    let revision = files(&vehicle.path("state/revisions")).remove(0);
+    let hidden = vehicle.path("hidden");
+    fs::rename(&revision, &hidden).expect("our folder");
+    vehicle.start();
+    let reason = vehicle.deployment("ticker").refused.expect("its files cannot be read");
+    fs::rename(&hidden, &revision).expect("our folder");
+    vehicle.until_running(&["ticker"]);
+    let refusals = events(&vehicle, EventKind::Refused);
+    assert_eq!(refusals.len(), 1, "{reason}: {refusals:?}");
 }
 
 pub fn memory() {

@@ -34,7 +34,7 @@ const POLLS_KEPT: usize = 4;
 
 /// Runs `gleaner top`.
 pub(crate) fn top(args: &TopArgs) -> Result<Exit, Failure> {
-    let client = VehicleClient::new(&args.vehicle)?;
+    let client = VehicleClient::of(&args.vehicle, &args.on)?;
     if !args.once && !args.vehicle.json && !stdout().is_terminal() {
         return Err(Failure::new(Exit::Usage, "`gleaner top` needs a terminal")
             .with_help("`--once` prints a table, and `--json` an object for each poll"));

@@ -17,14 +17,16 @@ pub struct Reporter {
     reports: ReportWriter,
     /// Clips so far.
     clips: u64,
-    /// Triggers so far that were suppressed.
+    /// Triggers so far that were suppressed, and reported.
     disk_suppressed: u64,
+    /// Set while recording is suspended, once a suppressed trigger was reported.
+    is_suspended: bool,
     status_at: Option<Instant>,
 }
 
 impl Reporter {
     pub fn new(reports: ReportWriter) -> Reporter {
-        Reporter { reports, clips: 0, disk_suppressed: 0, status_at: None }
+        Reporter { reports, clips: 0, disk_suppressed: 0, is_suspended: false, status_at: None }
     }
 
     pub fn send(&mut self, report: RecorderReport) {
@@ -68,16 +70,20 @@ impl Reporter {
             return false;
         }
         self.status_at = Some(Instant::now());
-        let disk_suppressed = counts.recording.disk_suppressed - self.disk_suppressed;
-        if disk_suppressed > 0 {
+        let triggers = counts.recording.disk_suppressed - self.disk_suppressed;
+        // The first at once; those after them in one sum, at the end of the suspension.
+        let is_over = is_last || !recorder.is_held();
+        if triggers > 0 && (is_over || !self.is_suspended) {
             self.disk_suppressed = counts.recording.disk_suppressed;
-            let reason = "too little free disk space".to_owned();
-            self.reports.send(RecorderReport::Loss(Loss::DiskSuppressed {
-                at_ns,
-                triggers: disk_suppressed,
-                reason,
-            }));
+            let reason = match self.is_suspended {
+                true => "too little free disk space until now",
+                false => "too little free disk space",
+            };
+            let loss = Loss::DiskSuppressed { at_ns, triggers, reason: reason.to_owned() };
+            self.reports.send(RecorderReport::Loss(loss));
+            self.is_suspended = true;
         }
+        self.is_suspended &= !is_over;
         true
     }
 }

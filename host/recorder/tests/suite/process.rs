@@ -206,14 +206,20 @@ fn a_full_disk_is_reported_and_no_clip_is_begun() {
         _ => None,
     });
     assert_eq!(triggers, 1);
+    // Those that follow are reported in one sum, at the end.
+    for count in [2, 3] {
+        link.wake(&entry(running.clock.now(), &[Event]), monotonic(running.clock)).unwrap();
+        running.status(|status| status.recording.disk_suppressed == count);
+    }
     running.starter.control.stop().unwrap();
     let (last, ended) = running.ended();
-    assert_eq!((last.recording.disk_suppressed, last.recording.clips, ended), (1, 0, Ok(())));
-    assert!(
-        fs::read_to_string(scratch.0.join("losses.jsonl"))
-            .unwrap()
-            .contains(r#""loss":"disk_suppressed""#)
-    );
+    assert_eq!((last.recording.disk_suppressed, last.recording.clips, ended), (3, 0, Ok(())));
+    let losses = fs::read_to_string(scratch.0.join("losses.jsonl")).unwrap();
+    let losses: Vec<serde_json::Value> =
+        losses.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let triggers: Vec<_> = losses.iter().map(|loss| (&loss["loss"], &loss["triggers"])).collect();
+    let of = "disk_suppressed".into();
+    assert_eq!(triggers, [(&of, &1.into()), (&of, &2.into())]);
 }
 
 /// A clip whose recorder died.

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use gleaner_base::{ByteSize, Failure};
 use gleaner_lambda::manifest::{ItemName, LambdaKind, Sha256};
 use gleaner_lambda::{Manifest, Vehicle};
-use gleaner_protocol::LiveStatus;
 use gleaner_protocol::inference::{InferenceStatus, LoadedModel, ModelState};
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus, SupervisorStatus};
+use gleaner_protocol::{LiveStatus, WakeCounts};
 
 use super::demand::DemandModel;
 use super::measured::MeasuredUse;
@@ -236,6 +236,7 @@ fn status(up_s: f64, cpu_s: f64, wakes: u64, restarts: u32, runs: u64) -> Superv
         restarts,
         last_end: None,
         live: Some(Box::new(live)),
+        recent: WakeCounts::default(),
         layers: Vec::new(),
     };
     let model = LoadedModel {

@@ -7,6 +7,7 @@ use std::path::Path;
 use gleaner_trust::SecretKey;
 
 use super::*;
+use crate::durable::DurableFile;
 
 /// Sends a request; returns the whole answer.
 fn answer(socket: &Path, method: &str, path: &str) -> String {
@@ -27,7 +28,8 @@ fn odd_ids_are_refused_and_leave_all_files() {
     let key = SecretKey::generate().unwrap().public();
     let socket = layout.control_socket();
     let name = "car".parse().unwrap();
-    let api = Api { core, layout, name, key, started: Instant::now() };
+    let (cloud, _) = Cloud::load(DurableFile::new(layout.cloud()));
+    let api = Api { core, layout, name, key, started: Instant::now(), cloud };
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
     let _entered = runtime.enter();
     let listener = tokio::net::UnixListener::bind(&socket).unwrap();

@@ -29,6 +29,7 @@ fn state(generation: u64) -> VehicleState {
         is_proven: false,
         failed: None,
         history: Vec::new(),
+        cloud: None,
     };
     let deployments = BTreeMap::from([("id".parse().unwrap(), deployed)]);
     VehicleState { generation, deployments, ..VehicleState::default() }

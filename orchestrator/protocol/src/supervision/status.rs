@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::inference::InferenceStatus;
 use crate::ingress::IngressStatus;
 use crate::link::RecorderStatus;
-use crate::{Layer, LiveStatus};
+use crate::{Layer, LiveStatus, WakeCounts};
 
 /// A report of the supervisor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -130,6 +130,9 @@ pub struct LambdaStatus {
     pub last_end: Option<String>,
     /// Counts of its process, with those of earlier ones.
     pub live: Option<Box<LiveStatus>>,
+    /// Wakes of the last minutes.
+    #[serde(default)]
+    pub recent: WakeCounts,
     /// The layers around its process, as tested.
     pub layers: Vec<Layer>,
 }
@@ -146,7 +149,7 @@ impl LambdaStatus {
                 link.absent_s, link.triggers_lost, link.wakes_dropped
             )
         });
-        [live.faulty(), unrecorded]
+        [self.recent.faulty(), unrecorded]
     }
 }
 

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::Builder;
 use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure, format_duration, visible};
+use gleaner_base::{Exit, Failure, format_duration, in_one_line};
 use gleaner_lambda::Clip;
 use gleaner_protocol::Report;
 use gleaner_protocol::inference::InferenceReport;
@@ -65,7 +65,7 @@ impl Board {
             event,
             lambda: deployment.map(|deployment| deployment.id.clone()),
             revision: deployment.map(|deployment| deployment.revision.clone()),
-            text: visible(text),
+            text: in_one_line(text),
         });
     }
 
@@ -209,6 +209,8 @@ impl RunObserver for Board {
             }
             RestartedPart::Lambda(lambda) => Some(lambda),
         };
+        // The event has the id.
+        let reason = lambda.and_then(|it| reason.strip_prefix(&it.prefix)).unwrap_or(reason);
         // A process that was replaced has not failed.
         match delay.is_zero() {
             true => self.event(EventKind::Started, lambda, reason),

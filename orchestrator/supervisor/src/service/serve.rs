@@ -365,6 +365,7 @@ impl WantedState<'_> {
                 restarts: 0,
                 last_end: Some(failure.reason.clone()),
                 live: None,
+                recent: gleaner_protocol::WakeCounts::default(),
                 layers: Vec::new(),
             },
         ));

@@ -1,0 +1,51 @@
+//! `gleaner login`, `logout` and `whoami`: the address of a cloud and the token for it.
+
+use gleaner_base::{Exit, Failure, visible};
+use gleaner_fleet::people::{Login, Session, User};
+use serde_json::json;
+
+use super::{date, show};
+use crate::account::{CloudAccount, CloudUrl};
+use crate::args::{ListArgs, LoginArgs};
+use crate::vehicle::VehicleClient;
+
+/// Runs `gleaner login`.
+pub(super) fn login(args: &LoginArgs) -> Result<Exit, Failure> {
+    let url: CloudUrl = args.url.parse().map_err(|reason: String| {
+        Failure::new(Exit::Usage, reason).with_help("the cloud shows its address when it starts")
+    })?;
+    if let Some(warning) = url.warning() {
+        eprintln!("{warning}");
+    }
+    let account = CloudAccount { url: url.clone(), token: String::new() };
+    let login = Login { code: args.code.clone() };
+    let session: Session = VehicleClient::of_cloud(account)?.post("/v1/login", &login)?;
+    let file = CloudAccount { url: url.clone(), token: session.token }.save()?;
+    let (user, file, url) = (session.user, file.display().to_string(), url.to_string());
+    // The token itself is not shown.
+    let result = json!({ "user": user, "url": url, "file": file, "expires": session.expires });
+    show(args.json, &result, |_| {
+        let (name, until) = (visible(&user.name), date(session.expires));
+        format!("logged in to {url} as {name} ({}) until {until}\n", user.role)
+    })
+}
+
+/// Runs `gleaner logout`.
+pub(super) fn logout(args: &ListArgs) -> Result<Exit, Failure> {
+    let removed = CloudAccount::remove()?;
+    show(args.json, &json!({ "removed": removed }), |_| {
+        let text = match removed {
+            true => "removed the token; the cloud accepts it until it expires\n",
+            false => "there was no token\n",
+        };
+        text.to_owned()
+    })
+}
+
+/// Runs `gleaner whoami`.
+pub(super) fn whoami(args: &ListArgs) -> Result<Exit, Failure> {
+    let account = CloudAccount::load()?;
+    let url = account.url.clone();
+    let user: User = VehicleClient::of_cloud(account)?.get("/v1/me")?;
+    show(args.json, &user, |user| format!("{} ({}) at {url}\n", visible(&user.name), user.role))
+}

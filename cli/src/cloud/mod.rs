@@ -1,0 +1,60 @@
+//! The commands for a cloud: they send requests to its `gleaner-cloud`.
+//!
+//! - `login`: the address and the token. `people`: users, and the audit trail.
+//! - `vehicles`: lists, enrols and revokes vehicles. `enrol`: connects this one.
+//! - `fleet`: deployments of the cloud, signed here. `rollout`: waits for all their vehicles.
+
+mod enrol;
+mod fleet;
+mod login;
+mod people;
+mod rollout;
+mod vehicles;
+
+use gleaner_base::{Exit, Failure};
+use serde::Serialize;
+
+use crate::account::CloudAccount;
+use crate::args::CloudCommand;
+use crate::delegate;
+use crate::render::json_line;
+use crate::stdout::print;
+use crate::vehicle::VehicleClient;
+
+pub(crate) use fleet::{Change, change, deploy};
+
+/// Runs a command for the cloud.
+pub(crate) fn run(command: &CloudCommand) -> Result<Exit, Failure> {
+    match command {
+        CloudCommand::Cloud { arguments } => delegate::replace("gleaner-cloud", arguments),
+        CloudCommand::Login(args) => login::login(args),
+        CloudCommand::Logout(args) => login::logout(args),
+        CloudCommand::Whoami(args) => login::whoami(args),
+        CloudCommand::Users(args) => people::users(args),
+        CloudCommand::Vehicles(args) => vehicles::vehicles(args),
+        CloudCommand::Fleet(args) => fleet::list(args),
+        CloudCommand::Audit(args) => people::audit(args),
+        CloudCommand::Enrol(args) => enrol::enrol(args),
+        CloudCommand::Unenrol(args) => enrol::unenrol(args),
+    }
+}
+
+/// Returns a client of the cloud that the user has logged in to.
+fn client() -> Result<VehicleClient, Failure> {
+    VehicleClient::of_cloud(CloudAccount::load()?)
+}
+
+/// Prints a result as JSON or as text.
+fn show<T: Serialize>(
+    json: bool,
+    result: &T,
+    text: impl Fn(&T) -> String,
+) -> Result<Exit, Failure> {
+    print(&if json { json_line(result) } else { text(result) })?;
+    Ok(Exit::Ok)
+}
+
+/// Formats a time in s since 1970.
+fn date(seconds: u64) -> String {
+    gleaner_base::UtcTime::of(seconds.try_into().unwrap_or(i64::MAX)).to_string()
+}

@@ -1,0 +1,283 @@
+//! Waits until all vehicles of a deployment have followed a change, or reports why not.
+
+use std::collections::BTreeMap;
+use std::thread;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use gleaner_base::{Exit, Failure, visible};
+use gleaner_fleet::people::{VehicleState, VehicleSummary};
+use gleaner_protocol::supervision::LambdaPhase;
+use gleaner_protocol::vehicle_api::VehicleStatus;
+use gleaner_report::format::counted;
+use serde_json::json;
+
+use super::vehicles;
+use crate::render::json_line;
+use crate::stdout::print;
+use crate::vehicle::VehicleClient;
+
+/// Interval of looks at the vehicles.
+const POLL_INTERVAL: Duration = Duration::from_millis(500);
+
+/// Maximum number of vehicles in an error; `--json` has all.
+const SHOWN: usize = 20;
+
+/// A change of a deployment on the way to its vehicles.
+pub(super) struct Rollout {
+    /// Id of the deployment.
+    pub(super) id: String,
+    /// Labels of its vehicles.
+    pub(super) selector: BTreeMap<String, String>,
+    /// The state that each should reach.
+    pub(super) goal: Goal,
+}
+
+/// The state of a deployment that a change requests.
+#[derive(Clone, Copy, PartialEq)]
+pub(super) enum Goal {
+    /// The revision of this release runs.
+    Revision { release: u64 },
+    /// It runs.
+    Running,
+    /// The fallback runs.
+    Fallback,
+    /// It does not run.
+    Stopped,
+    /// It is gone.
+    Removed,
+}
+
+impl Goal {
+    fn in_words(self) -> &'static str {
+        match self {
+            Self::Revision { .. } | Self::Running => "runs",
+            Self::Fallback => "runs its fallback",
+            Self::Stopped => "is stopped",
+            Self::Removed => "is removed",
+        }
+    }
+}
+
+/// The state of a vehicle on the way to the goal, with a reason or a remark.
+#[derive(Clone, Debug, PartialEq)]
+enum Standing {
+    Done(String),
+    Pending(String),
+    Failed(Exit, String),
+}
+
+impl Standing {
+    fn parts(&self) -> (&'static str, &str) {
+        match self {
+            Self::Done(text) => ("done", text),
+            Self::Pending(text) => ("pending", text),
+            Self::Failed(_, text) => ("failed", text),
+        }
+    }
+
+    fn is_done(&self) -> bool {
+        matches!(self, Self::Done(_))
+    }
+}
+
+impl Rollout {
+    /// Waits until no vehicle is on the way any more, and shows the result.
+    ///
+    /// # Errors
+    ///
+    /// A [`Failure`] with the reason of each vehicle that has not reached the goal.
+    pub(super) fn wait(
+        &self,
+        client: &VehicleClient,
+        json: bool,
+        timeout: Duration,
+    ) -> Result<Exit, Failure> {
+        let started = Instant::now();
+        let mut standings: BTreeMap<String, Standing> = BTreeMap::new();
+        loop {
+            let vehicles: Vec<VehicleSummary> = client.get("/v1/vehicles")?;
+            let mut former = std::mem::take(&mut standings);
+            for vehicle in vehicles.iter().filter(|vehicle| self.selects(vehicle)) {
+                let standing = match former.remove(&vehicle.name).filter(Standing::is_done) {
+                    Some(done) => done,
+                    None => {
+                        let standing = self.standing(client, vehicle)?;
+                        if standing.is_done() && !json {
+                            let (name, (_, text)) = (visible(&vehicle.name), standing.parts());
+                            print(&format!("{name}: {text}\n"))?;
+                        }
+                        standing
+                    }
+                };
+                standings.insert(vehicle.name.clone(), standing);
+            }
+            let is_on_the_way = |it: &Standing| matches!(it, Standing::Pending(_));
+            if !standings.values().any(is_on_the_way) || started.elapsed() >= timeout {
+                return self.result(&standings, json);
+            }
+            thread::sleep(POLL_INTERVAL);
+        }
+    }
+
+    /// Returns whether the deployment is for a vehicle. The labels of one that has never connected
+    /// are unknown.
+    fn selects(&self, vehicle: &VehicleSummary) -> bool {
+        matches!(vehicle.state, VehicleState::Online | VehicleState::Offline)
+            && self.selector.iter().all(|(name, value)| vehicle.labels.get(name) == Some(value))
+    }
+
+    fn standing(
+        &self,
+        client: &VehicleClient,
+        vehicle: &VehicleSummary,
+    ) -> Result<Standing, Failure> {
+        let standing = if vehicle.handled < vehicle.wanted {
+            Standing::Pending("it has not handled the change yet".to_owned())
+        } else {
+            match client.get(&format!("/v1/vehicles/{}/status", vehicle.name)) {
+                Ok(status) => self.judge(&status, &vehicle.problems),
+                Err(failure) if [Exit::Unreachable, Exit::Denied].contains(&failure.exit) => {
+                    return Err(failure);
+                }
+                Err(failure) => Standing::Pending(visible(&failure.message)),
+            }
+        };
+        Ok(match standing {
+            Standing::Pending(reason) if vehicle.state == VehicleState::Offline => {
+                let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+                let seen = vehicle.seen.map(|seen| vehicles::seen_before(now.as_secs(), seen));
+                let seen = seen.map(|seen| format!(", seen {seen}")).unwrap_or_default();
+                Standing::Pending(format!("it is offline{seen}; {reason}"))
+            }
+            standing => standing,
+        })
+    }
+
+    /// Compares a status, and the problems with the wanted state, with the goal.
+    fn judge(&self, status: &VehicleStatus, problems: &[String]) -> Standing {
+        let pending = |text: &str| Standing::Pending(text.to_owned());
+        let standing = match self.goal {
+            Goal::Stopped | Goal::Removed => {
+                let found = status.deployments.iter().find(|it| it.id == self.id);
+                let is_applied = found.is_none_or(|it| self.goal == Goal::Stopped && !it.is_wanted);
+                let lambdas = status.supervisor.as_ref().map(|supervisor| &supervisor.lambdas);
+                match lambdas.map(|lambdas| lambdas.iter().any(|it| it.id == self.id)) {
+                    _ if !is_applied => pending("it has not followed the change yet"),
+                    Some(false) => Standing::Done(self.goal.in_words().to_owned()),
+                    Some(true) => pending("its lambda still ends"),
+                    None => pending("its supervisor does not report"),
+                }
+            }
+            _ => self.judge_running(status),
+        };
+        let mine = format!("`{}`", self.id);
+        match (standing, problems.iter().find(|problem| problem.contains(&mine))) {
+            (Standing::Pending(_), Some(problem)) => {
+                Standing::Failed(Exit::Denied, visible(problem))
+            }
+            (standing, _) => standing,
+        }
+    }
+
+    fn judge_running(&self, status: &VehicleStatus) -> Standing {
+        let pending = |text: &str| Standing::Pending(text.to_owned());
+        let Some(it) = status.deployments.iter().find(|it| it.id == self.id) else {
+            return pending("it does not have the deployment yet");
+        };
+        if let Goal::Revision { release } = self.goal {
+            let text = format!("it has release {}", it.release);
+            match it.release.cmp(&release) {
+                std::cmp::Ordering::Less => return Standing::Pending(text),
+                std::cmp::Ordering::Greater => return Standing::Failed(Exit::Differs, text),
+                std::cmp::Ordering::Equal => {}
+            }
+        }
+        if let Some(refused) = &it.refused {
+            return Standing::Failed(Exit::Denied, format!("it refuses it: {}", visible(refused)));
+        }
+        let fallback = it.fallback.as_ref().filter(|_| it.runs_fallback);
+        let version = visible(&fallback.unwrap_or(&it.revision).version);
+        match (self.goal, fallback) {
+            (Goal::Revision { .. }, Some(_)) => {
+                let reason = it.failed.as_deref().map(|it| format!(": {}", visible(it)));
+                let reason = reason.unwrap_or_default();
+                let text = format!("it runs its fallback {version}{reason}");
+                return Standing::Failed(Exit::LambdaFaulted, text);
+            }
+            (Goal::Fallback, None) if it.fallback.is_none() => {
+                return Standing::Failed(Exit::Differs, "it has no fallback".to_owned());
+            }
+            (Goal::Fallback, None) => return pending("it runs its revision"),
+            _ if !it.is_wanted => return pending("it is stopped"),
+            _ => {}
+        }
+        let lambda = it.status.as_ref().filter(|lambda| lambda.attempt >= it.attempt);
+        match lambda.map(|lambda| lambda.phase) {
+            Some(LambdaPhase::Running) => Standing::Done(format!("runs {version}")),
+            Some(LambdaPhase::Quarantined) => {
+                let end = lambda.and_then(|it| it.last_end.as_deref()).map(visible);
+                let reason = end.map(|end| format!(": {end}")).unwrap_or_default();
+                let text = format!("it does not run, and is not started again{reason}");
+                Standing::Failed(Exit::LambdaFaulted, text)
+            }
+            Some(phase) => Standing::Pending(format!("its lambda is {}", phase.as_str())),
+            None => pending("its lambda has not started"),
+        }
+    }
+
+    fn result(&self, standings: &BTreeMap<String, Standing>, json: bool) -> Result<Exit, Failure> {
+        let done = standings.values().filter(|it| it.is_done()).count();
+        let all = counted(standings.len() as u64, "vehicle");
+        let (id, words) = (&self.id, self.goal.in_words());
+        if json {
+            let vehicles = standings.iter().map(|(name, standing)| {
+                let (state, reason) = standing.parts();
+                json!({ "name": name, "state": state, "reason": reason })
+            });
+            let vehicles = vehicles.collect::<Vec<_>>();
+            print(&json_line(
+                &json!({ "id": id, "selector": self.selector, "vehicles": vehicles }),
+            ))?;
+        }
+        let text = match done == standings.len() {
+            true if standings.is_empty() => {
+                "no vehicle has the labels yet: one that connects with them follows\n".to_owned()
+            }
+            true => format!("`{id}` {words} on {all}\n"),
+            false => return Err(self.failure(standings, &format!("{done} of {all}"))),
+        };
+        if !json {
+            print(&text)?;
+        }
+        Ok(Exit::Ok)
+    }
+
+    fn failure(&self, standings: &BTreeMap<String, Standing>, count: &str) -> Failure {
+        let others = || standings.iter().filter(|(_, standing)| !standing.is_done());
+        let exits = || {
+            others().filter_map(|(_, it)| match it {
+                Standing::Failed(exit, _) => Some(*exit),
+                _ => None,
+            })
+        };
+        let exit = [Exit::Denied, Exit::LambdaFaulted]
+            .into_iter()
+            .find(|exit| exits().any(|it| it == *exit))
+            .unwrap_or(Exit::Differs);
+        let message = format!("`{}` {} on {count}", self.id, self.goal.in_words());
+        let mut failure = Failure::new(exit, message);
+        let cause = |(name, standing): (&String, &Standing)| {
+            format!("{}: {}", visible(name), standing.parts().1)
+        };
+        failure.causes = others().take(SHOWN).map(cause).collect();
+        if let Some(more) = others().count().checked_sub(SHOWN).filter(|more| *more > 0) {
+            failure.causes.push(format!("{more} more: --json lists all"));
+        }
+        failure.with_help(
+            "vehicles that are only late go on: `gleaner vehicles`, and `gleaner status --on NAME`",
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,115 @@
+//! `login`, `logout`, `whoami`, `users` and `audit`.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+
+use serde_json::json;
+
+use crate::fake::problem;
+use crate::{CloudUser, fails};
+
+#[test]
+fn a_login_stores_the_token_for_its_user_alone_until_the_logout() {
+    let user = CloudUser::logged_in();
+    let seen = user.cloud.seen();
+    assert_eq!(seen[0].body, br#"{"code":"c0de"}"#);
+    let file = user.path("config/gleaner/cloud.json");
+    let mode = |path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+    assert_eq!((mode(file.clone()), mode(user.path("config/gleaner"))), (0o600, 0o700));
+    user.cloud.answers("GET /v1/me", &[(200, json!({ "name": "ada", "role": "admin" }))]);
+    assert_eq!(user.done(&["whoami"]), format!("ada (admin) at {}\n", user.cloud.url()));
+    assert_eq!(user.json(&["whoami"]), json!({ "name": "ada", "role": "admin" }));
+    assert_eq!(user.cloud.seen()[0].authorization.as_deref(), Some("Bearer gln_1"));
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o644)).unwrap();
+    let text = user.fails(3, &["whoami"]);
+    assert!(text.contains("other users can read the token") && text.contains("chmod 600"));
+    assert!(user.done(&["logout"]).starts_with("removed the token"));
+    assert!(!file.exists() && user.cloud.seen().is_empty());
+    assert_eq!(user.json(&["logout"]), json!({ "removed": false }));
+    let text = user.fails(3, &["whoami"]);
+    assert!(text.contains("there is no token for a cloud") && text.contains("`gleaner login URL"));
+}
+
+#[test]
+fn a_refused_code_and_a_bad_address_leave_no_file() {
+    let user = CloudUser::new();
+    user.cloud.answers("POST /v1/login", &[(401, problem(3, "the code is not valid"))]);
+    let text = user.fails(3, &["login", &user.cloud.url(), "--code", "x"]);
+    assert!(text.contains("the code is not valid") && text.contains("a help"), "{text}");
+    user.fails(2, &["login", "https://127.0.0.1:1", "--code", "x"]);
+    user.fails(2, &["login", "127.0.0.1", "--code", "x"]);
+    let text = user.fails(5, &["login", "http://127.0.0.1:1", "--code", "x"]);
+    assert!(text.contains("cannot reach the cloud at http://127.0.0.1:1"), "{text}");
+    assert!(!user.path("config").exists());
+}
+
+#[test]
+fn the_environment_outweighs_the_file_and_no_token_reaches_another_cloud() {
+    let user = CloudUser::logged_in();
+    user.cloud.answers("GET /v1/me", &[(200, json!({ "name": "ci", "role": "deployer" }))]);
+    user.cloud.seen();
+    let mut whoami = user.command(&["whoami"]);
+    assert!(whoami.env("GLEANER_CLOUD_TOKEN", "gln_2").status().unwrap().success());
+    assert_eq!(user.cloud.seen()[0].authorization.as_deref(), Some("Bearer gln_2"));
+    let elsewhere = CloudUser::new();
+    let mut whoami = user.command(&["whoami"]);
+    whoami.env("GLEANER_CLOUD", elsewhere.cloud.url());
+    let text = fails(whoami, 3);
+    assert!(text.contains("there is no token for") && text.contains("GLEANER_CLOUD_TOKEN"));
+    assert!(elsewhere.cloud.seen().is_empty());
+    let mut whoami = elsewhere.command(&["whoami"]);
+    whoami.env("GLEANER_CLOUD", user.cloud.url()).env("GLEANER_CLOUD_TOKEN", "gln_3");
+    assert!(whoami.status().unwrap().success());
+    let mut whoami = user.command(&["whoami"]);
+    whoami.env("GLEANER_CLOUD", "cloud.example");
+    assert!(fails(whoami, 2).contains("cannot use GLEANER_CLOUD"));
+}
+
+#[test]
+fn a_refused_token_is_an_error_that_names_the_login() {
+    let user = CloudUser::logged_in();
+    user.cloud.answers("GET /v1/vehicles", &[(401, problem(3, "the token has expired"))]);
+    let text = user.fails(3, &["vehicles"]);
+    assert!(text.contains("the token has expired") && text.contains("`gleaner login URL"));
+    user.cloud.answers("GET /v1/users", &[(403, problem(3, "`ada` is no admin"))]);
+    let text = user.fails(3, &["users"]);
+    assert!(text.contains("`ada` is no admin") && text.contains("help:  a help"), "{text}");
+}
+
+#[test]
+fn users_are_listed_invited_and_removed() {
+    let user = CloudUser::logged_in();
+    let users = json!([{ "name": "ada", "role": "admin" }, { "name": "bob", "role": "viewer" }]);
+    user.cloud.answers("GET /v1/users", &[(200, users.clone())]);
+    assert_eq!(user.done(&["users"]), "name  role\nada   admin\nbob   viewer\n");
+    assert_eq!(user.json(&["users"]), users);
+    let invitation = json!({
+        "user": { "name": "bob", "role": "viewer" }, "code": "c0de", "expires": 4102444800_u64,
+    });
+    user.cloud.answers("POST /v1/users", &[(200, invitation.clone())]);
+    user.cloud.seen();
+    let text = user.done(&["users", "invite", "bob", "--role", "viewer"]);
+    assert!(text.ends_with(&format!("gleaner login {} --code c0de\n", user.cloud.url())), "{text}");
+    assert_eq!(user.cloud.seen()[0].body, br#"{"name":"bob","role":"viewer"}"#);
+    assert_eq!(user.json(&["users", "invite", "bob", "--role", "viewer"]), invitation);
+    user.cloud.answers("DELETE /v1/users/bob", &[(204, json!(null))]);
+    assert_eq!(user.done(&["users", "remove", "bob"]), "removed bob\n");
+    for bad in [&["users", "remove", "../x"][..], &["users", "invite", "bob", "--role", "root"]] {
+        assert_eq!(user.command(bad).output().unwrap().status.code(), Some(2));
+    }
+}
+
+#[test]
+fn the_audit_trail_shows_the_newest_entries() {
+    let user = CloudUser::logged_in();
+    let entry = |seq: u64| {
+        json!({
+            "seq": seq, "time_ms": 1_533_198_891_500_i64, "actor": "ada", "action": "deploy",
+            "subject": format!("brake-{seq}"), "hash": "h",
+        })
+    };
+    user.cloud.answers("GET /v1/audit?last=1", &[(200, json!([entry(2), entry(1)]))]);
+    let text = user.done(&["audit", "-n", "1"]);
+    assert!(text.ends_with("2018-08-02T08:34:51Z  ada  deploy  brake-2\n"), "{text}");
+    assert_eq!(user.json(&["audit", "--last", "1"]), json!([entry(2)]));
+}

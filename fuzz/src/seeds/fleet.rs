@@ -1,0 +1,67 @@
+//! Seeds: a frame of each kind, and an enrolment.
+
+use gleaner_fleet::{
+    Ack, Body, Cursor, Desired, Enrolment, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records,
+    Reported, Wanted, Welcome, compress,
+};
+
+use crate::fleet::mode;
+
+/// Keys of an enrolment.
+pub const WORDS: &[&str] =
+    &["gleaner_enrolment", "address", "vehicle", "authority", "token", "events", "lambdas/"];
+
+/// All seeds.
+pub fn all() -> Vec<Vec<u8>> {
+    let cursor = Cursor {
+        stream: "lambdas/brake".to_owned(),
+        life: 1,
+        next: 300,
+        seq: 299,
+        boot: "00112233445566778899aabbccddeeff".to_owned(),
+        boot_ns: 12_345_678_901,
+    };
+    let wanted = |id: &str, rollback| Wanted {
+        id: id.to_owned(),
+        envelope: "5".repeat(64),
+        is_wanted: rollback == 0,
+        rollback,
+    };
+    let records = Records {
+        stream: "events".to_owned(),
+        life: 2,
+        next: 9,
+        lines: compress(b"{\"stream\":\"events\",\"seq\":8}\n"),
+    };
+    let frames = [
+        Body::Hello(Hello {
+            protocol: PROTOCOL,
+            version: "0.1.0".to_owned(),
+            key: "key".to_owned(),
+            streams: vec!["events".to_owned()],
+        }),
+        Body::Welcome(Welcome { epoch: 5, time_ms: -1, ping_s: 20, cursors: vec![cursor] }),
+        Body::Desired(Desired { generation: 7, deployments: vec![wanted("a", 0), wanted("b", 1)] }),
+        Body::Reported(Reported {
+            generation: 7,
+            status: compress(b"{}"),
+            problems: vec!["a: refused".to_owned()],
+        }),
+        Body::Records(records),
+        Body::Ack(Ack { stream: "events".to_owned(), life: 2, next: 9 }),
+        Body::Ping(Ping { number: 1 }),
+        Body::Pong(Pong { number: 1 }),
+        Body::GoAway(GoAway { after_ms: 1000, reason: "revoked".to_owned() }),
+    ];
+    let enrolment = Enrolment {
+        gleaner_enrolment: 1,
+        address: "127.0.0.1:8443".to_owned(),
+        vehicle: "car-7".to_owned(),
+        authority: "a certificate".to_owned(),
+        token: "secret".to_owned(),
+    };
+    let enrolment = serde_json::to_vec(&enrolment).expect("it is plain data");
+    let seed = |mode: u8, bytes: Vec<u8>| [vec![mode], bytes].concat();
+    let frames = frames.into_iter().map(|body| seed(mode::FRAME, Frame::encoded(body)));
+    frames.chain([seed(mode::ENROLMENT, enrolment)]).collect()
+}

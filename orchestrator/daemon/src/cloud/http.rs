@@ -1,0 +1,180 @@
+//! HTTPS to the cloud: one connection for each request. Requests are rare.
+
+use std::future::Future;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::body::Bytes;
+use futures_util::{Stream, StreamExt, TryStreamExt};
+use gleaner_base::{Exit, Failure};
+use gleaner_protocol::vehicle_api::Problem;
+use http_body_util::{BodyDataStream, Full};
+use hyper::body::Incoming;
+use hyper::client::conn::http1;
+use hyper::{Method, Request, Response, StatusCode, header};
+use hyper_util::rt::TokioIo;
+use rustls::ClientConfig;
+use rustls::pki_types::ServerName;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
+
+/// Time to connect, and to wait for the head of an answer or for the next piece of its body.
+pub(super) const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Longest answer without a file.
+const ANSWER_MAX: u64 = 64 << 10;
+
+/// The cloud at one address.
+#[derive(Clone)]
+pub(super) struct CloudHttp {
+    pub(super) address: String,
+    pub(super) tls: Arc<ClientConfig>,
+}
+
+impl CloudHttp {
+    /// Connects.
+    ///
+    /// # Errors
+    ///
+    /// A failure if the cloud cannot be reached, or its certificate is not the expected one.
+    pub(super) async fn connect(&self) -> Result<TlsStream<TcpStream>, Failure> {
+        let host = self.address.rsplit_once(':').map_or(&*self.address, |(host, _)| host);
+        let host = host.trim_start_matches('[').trim_end_matches(']').to_owned();
+        let name = ServerName::try_from(host)
+            .map_err(|error| self.unreachable("its name is invalid", &error))?;
+        let connected = self.in_time("it did not accept a connection", async {
+            let stream = TcpStream::connect(&self.address).await?;
+            stream.set_nodelay(true)?;
+            TlsConnector::from(Arc::clone(&self.tls)).connect(name, stream).await
+        });
+        connected.await?.map_err(|error| self.unreachable("it cannot be connected to", &error))
+    }
+
+    /// Sends a request with a body of JSON, and returns the answer.
+    ///
+    /// # Errors
+    ///
+    /// A failure if there is none, or it is an error.
+    pub(super) async fn post<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &impl Serialize,
+    ) -> Result<T, Failure> {
+        let body = serde_json::to_vec(body).expect("a request is plain data");
+        let answer = self.request(Method::POST, path, body).await?;
+        let whole = self.whole(answer, ANSWER_MAX).await?;
+        serde_json::from_slice(&whole)
+            .map_err(|error| self.unreachable("its answer cannot be parsed", &error))
+    }
+
+    /// Returns the content under a path, at most `most` bytes.
+    ///
+    /// # Errors
+    ///
+    /// A failure if there is none, or it is longer.
+    pub(super) async fn get(&self, path: &str, most: u64) -> Result<Vec<u8>, Failure> {
+        let answer = self.request(Method::GET, path, Vec::new()).await?;
+        self.whole(answer, most).await
+    }
+
+    /// Returns the pieces of the content under a path. Each comes in time, or is an error.
+    ///
+    /// # Errors
+    ///
+    /// A failure if there is none.
+    pub(super) async fn pieces(
+        &self,
+        path: &str,
+    ) -> Result<impl Stream<Item = Result<Bytes, std::io::Error>> + Unpin + use<>, Failure> {
+        let answer = self.request(Method::GET, path, Vec::new()).await?;
+        Ok(Box::pin(in_time(answer)))
+    }
+
+    async fn request(
+        &self,
+        method: Method,
+        path: &str,
+        body: Vec<u8>,
+    ) -> Result<Response<Incoming>, Failure> {
+        let failed = |error: hyper::Error| self.unreachable("the connection was lost", &error);
+        let stream = TokioIo::new(self.connect().await?);
+        let (mut sender, connection) =
+            self.in_time("it did not answer", http1::handshake(stream)).await?.map_err(failed)?;
+        tokio::spawn(connection);
+        let request = Request::builder()
+            .method(method)
+            .uri(path)
+            .header(header::HOST, &self.address)
+            .header(header::CONTENT_TYPE, "application/json")
+            .body(Full::new(Bytes::from(body)))
+            .map_err(|error| self.unreachable("a request to it is invalid", &error))?;
+        let answer = self.in_time("it did not answer", sender.send_request(request)).await?;
+        let answer = answer.map_err(failed)?;
+        if answer.status().is_success() {
+            return Ok(answer);
+        }
+        Err(self.refused(answer).await)
+    }
+
+    async fn refused(&self, answer: Response<Incoming>) -> Failure {
+        let status = answer.status();
+        let exit = match status {
+            StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => Exit::Denied,
+            _ => Exit::Unreachable,
+        };
+        let mut failure =
+            Failure::new(exit, format!("the cloud at {} refuses a request", self.address));
+        failure.causes = vec![match self.whole(answer, ANSWER_MAX).await {
+            Ok(body) => match serde_json::from_slice::<Problem>(&body) {
+                Ok(problem) => gleaner_base::excerpt(&Failure::from(problem).to_string()),
+                Err(_) => format!("it answers {status}"),
+            },
+            Err(_) => format!("it answers {status}"),
+        }];
+        failure
+    }
+
+    async fn whole(&self, answer: Response<Incoming>, most: u64) -> Result<Vec<u8>, Failure> {
+        let mut pieces = Box::pin(in_time(answer));
+        let mut whole = Vec::new();
+        while let Some(piece) = pieces.next().await {
+            let piece = piece.map_err(|it| self.unreachable("the connection was lost", &it))?;
+            whole.extend_from_slice(&piece);
+            if whole.len() as u64 > most {
+                let long = std::io::Error::other(format!("it has more than {most} bytes"));
+                return Err(self.unreachable("its answer is too long", &long));
+            }
+        }
+        Ok(whole)
+    }
+
+    async fn in_time<T>(&self, what: &str, work: impl Future<Output = T>) -> Result<T, Failure> {
+        timeout(PATIENCE, work).await.map_err(|error| self.unreachable(what, &error))
+    }
+
+    pub(super) fn unreachable(
+        &self,
+        what: &str,
+        error: &(dyn std::error::Error + 'static),
+    ) -> Failure {
+        let mut failure =
+            Failure::new(Exit::Unreachable, format!("cannot use the cloud at {}", self.address));
+        let error = gleaner_base::visible(&gleaner_base::chain(error));
+        failure.causes = vec![format!("{what}: {error}")];
+        failure
+    }
+}
+
+/// Returns the pieces of a body; one that does not come in time is an error.
+fn in_time(answer: Response<Incoming>) -> impl Stream<Item = Result<Bytes, std::io::Error>> {
+    let pieces = BodyDataStream::new(answer.into_body()).map_err(std::io::Error::other);
+    futures_util::stream::unfold(Box::pin(pieces), async |mut pieces| {
+        let next = timeout(PATIENCE, pieces.next()).await;
+        let piece = next.unwrap_or_else(|late| Some(Err(std::io::Error::other(late))))?;
+        Some((piece, pieces))
+    })
+}

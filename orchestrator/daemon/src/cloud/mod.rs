@@ -1,0 +1,137 @@
+//! The connection of the vehicle to the cloud.
+//!
+//! - `settings`: address, authority, key and certificate of an enrolled vehicle.
+//! - `http`: HTTPS to the cloud. `enrolling`: gets the first certificate, and later ones.
+//! - `link`: keeps a connection, and `session` exchanges frames over one.
+//! - `plan`: the steps from what runs to what the cloud wants; `reconcile` takes them.
+//! - `uplink`: sends records that the cloud does not have, `resume` finds where to go on.
+//!
+//! Without a connection everything runs on, and records wait in their spools. What the cloud wants
+//! is verified as a deployment by a user is: it can run nothing that no trusted key has signed.
+
+mod enrolling;
+mod http;
+mod link;
+mod plan;
+mod reconcile;
+mod resume;
+mod session;
+mod settings;
+mod uplink;
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use gleaner_base::{Exit, Failure};
+use gleaner_protocol::vehicle_api::CloudStatus;
+use tokio::sync::watch;
+
+use crate::durable::DurableFile;
+use settings::CloudSettings;
+
+pub(crate) use link::CloudLink;
+
+/// The enrolment and the state of the connection, shared by the API and the link.
+#[derive(Clone)]
+pub(crate) struct Cloud {
+    shared: Arc<Mutex<Shared>>,
+    settings: watch::Sender<Option<CloudSettings>>,
+    file: Arc<DurableFile>,
+}
+
+struct Shared {
+    state: LinkState,
+    reason: Option<String>,
+    since: Instant,
+    generation: u64,
+    unsent: u64,
+}
+
+/// State of the connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum LinkState {
+    Connecting,
+    Connected,
+    Refused,
+}
+
+impl LinkState {
+    fn as_str(self) -> &'static str {
+        match self {
+            LinkState::Connecting => "connecting",
+            LinkState::Connected => "connected",
+            LinkState::Refused => "refused",
+        }
+    }
+}
+
+impl Cloud {
+    /// Loads the enrolment. Also returns a warning if its file, or one of its copies, is damaged.
+    pub(crate) fn load(file: DurableFile) -> (Self, Option<String>) {
+        let (settings, damage) = match file.load::<CloudSettings>() {
+            Ok(loaded) => (loaded.value, loaded.damage),
+            Err(failure) => (None, Some(failure.to_string())),
+        };
+        let shared = Shared {
+            state: LinkState::Connecting,
+            reason: None,
+            since: Instant::now(),
+            generation: 0,
+            unsent: 0,
+        };
+        let cloud = Self {
+            shared: Arc::new(Mutex::new(shared)),
+            settings: watch::Sender::new(settings),
+            file: Arc::new(file),
+        };
+        (cloud, damage)
+    }
+
+    /// Returns the state of the connection; `None` unless the vehicle is enrolled.
+    pub(crate) fn status(&self) -> Option<CloudStatus> {
+        let settings = self.settings.borrow().clone()?;
+        let shared = self.lock();
+        Some(CloudStatus {
+            address: settings.address,
+            state: shared.state.as_str().to_owned(),
+            reason: shared.reason.clone(),
+            since_s: shared.since.elapsed().as_secs_f64(),
+            generation: shared.generation,
+            unsent: shared.unsent,
+            certificate_expires: settings.expires,
+        })
+    }
+
+    /// Ends the enrolment: the vehicle does not connect any more. What runs goes on.
+    ///
+    /// # Errors
+    ///
+    /// A failure if it is not enrolled, or the file cannot be removed.
+    pub(crate) fn leave(&self) -> Result<(), Failure> {
+        if self.settings.borrow().is_none() {
+            return Err(Failure::new(Exit::Usage, "this vehicle is not enrolled at a cloud"));
+        }
+        self.file.remove()?;
+        self.settings.send_replace(None);
+        Ok(())
+    }
+
+    /// Makes an enrolment durable, and lets the link use it.
+    fn set(&self, settings: CloudSettings) -> Result<(), Failure> {
+        self.file.save(&settings)?;
+        self.settings.send_replace(Some(settings));
+        Ok(())
+    }
+
+    fn set_state(&self, state: LinkState, reason: Option<String>) {
+        let mut shared = self.lock();
+        if shared.state != state {
+            shared.since = Instant::now();
+        }
+        (shared.state, shared.reason) = (state, reason);
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Shared> {
+        self.shared.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

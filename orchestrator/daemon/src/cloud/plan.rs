@@ -1,0 +1,157 @@
+//! The steps from what a vehicle runs to what the cloud wants.
+
+use std::collections::BTreeMap;
+
+use gleaner_fleet::Wanted;
+use gleaner_lambda::manifest::ItemName;
+
+use crate::state::{CloudWish, Deployed};
+
+/// A step.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Step {
+    /// Remove what the cloud deployed, and does not want any more.
+    Remove(ItemName),
+    /// Deploy it, and run its fallback if `rolls_back`.
+    Deploy { id: ItemName, wish: CloudWish, rolls_back: bool },
+    /// Stop it.
+    Stop(ItemName, CloudWish),
+    /// Run its fallback.
+    RollBack(ItemName, CloudWish),
+}
+
+impl Step {
+    /// The deployment that it changes.
+    pub(super) fn id(&self) -> &ItemName {
+        match self {
+            Step::Remove(id) | Step::Stop(id, _) | Step::RollBack(id, _) => id,
+            Step::Deploy { id, .. } => id,
+        }
+    }
+}
+
+/// Returns the steps, and the reasons why parts of the wanted state are ignored.
+///
+/// What a user deployed locally is never stopped or removed, and what a user changed locally after
+/// the cloud's last wish for a deployment stays until the cloud wants something else of it.
+pub(super) fn plan(
+    wanted: &[Wanted],
+    deployed: &BTreeMap<ItemName, Deployed>,
+) -> (Vec<Step>, Vec<String>) {
+    let (mut steps, mut ignored, mut named) = (Vec::new(), Vec::new(), Vec::new());
+    for item in wanted {
+        let Ok(id) = item.id.parse::<ItemName>() else {
+            ignored.push(format!("`{}` is no id of a deployment", gleaner_base::excerpt(&item.id)));
+            continue;
+        };
+        let Wanted { envelope, is_wanted, rollback, .. } = item.clone();
+        let wish = CloudWish { envelope, is_wanted, rollback };
+        let followed = deployed.get(&id).and_then(|it| it.cloud.as_ref());
+        let same = followed.filter(|before| before.envelope == wish.envelope);
+        let step = match (followed, same) {
+            _ if followed == Some(&wish) => None,
+            (_, Some(same)) if same.is_wanted && wish.is_wanted => {
+                let is_new = wish.rollback > same.rollback;
+                is_new.then(|| Step::RollBack(id.clone(), wish))
+            }
+            _ if wish.is_wanted => {
+                let rolls_back = wish.rollback > same.map_or(0, |same| same.rollback);
+                Some(Step::Deploy { id: id.clone(), wish, rolls_back })
+            }
+            (Some(_), _) => Some(Step::Stop(id.clone(), wish)),
+            // It never ran by the cloud, and is not to.
+            (None, _) => None,
+        };
+        steps.extend(step);
+        named.push(id);
+    }
+    let gone = deployed.iter().filter(|(id, it)| it.cloud.is_some() && !named.contains(id));
+    let gone = gone.map(|(id, _)| Step::Remove(id.clone()));
+    // Their memory is free for what is new.
+    let steps = gone.chain(steps).collect();
+    (steps, ignored)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn wanted(id: &str, envelope: &str, is_wanted: bool, rollback: u64) -> Wanted {
+        Wanted { id: id.to_owned(), envelope: envelope.to_owned(), is_wanted, rollback }
+    }
+
+    fn wish(envelope: &str, is_wanted: bool, rollback: u64) -> CloudWish {
+        CloudWish { envelope: envelope.to_owned(), is_wanted, rollback }
+    }
+
+    fn deployed(cloud: Option<CloudWish>) -> Deployed {
+        Deployed {
+            envelope: String::new(),
+            lambda: "x".parse().unwrap(),
+            release: 1,
+            attempt: 1,
+            is_wanted: true,
+            runs_fallback: false,
+            is_proven: false,
+            failed: None,
+            history: Vec::new(),
+            cloud,
+        }
+    }
+
+    fn steps(wanted: &[Wanted], state: &[(&str, Option<CloudWish>)]) -> Vec<Step> {
+        let state = state.iter().map(|(id, cloud)| (id.parse().unwrap(), deployed(cloud.clone())));
+        let (steps, ignored) = plan(wanted, &state.collect());
+        assert_eq!(ignored, Vec::<String>::new());
+        steps
+    }
+
+    fn id(id: &str) -> ItemName {
+        id.parse().unwrap()
+    }
+
+    #[test]
+    fn a_new_deployment_is_deployed_and_one_that_was_followed_is_left_alone() {
+        let deploy = Step::Deploy { id: id("a"), wish: wish("1", true, 0), rolls_back: false };
+        assert_eq!(steps(&[wanted("a", "1", true, 0)], &[]), vec![deploy.clone()]);
+        assert_eq!(
+            steps(&[wanted("a", "1", true, 0)], &[("a", Some(wish("0", true, 2)))]),
+            [deploy]
+        );
+        assert_eq!(steps(&[wanted("a", "1", true, 0)], &[("a", Some(wish("1", true, 0)))]), []);
+        assert_eq!(steps(&[wanted("a", "1", false, 0)], &[]), []);
+    }
+
+    #[test]
+    fn a_fallback_is_run_once_for_each_request() {
+        let rolled = [("a", Some(wish("1", true, 1)))];
+        assert_eq!(steps(&[wanted("a", "1", true, 1)], &rolled), []);
+        let again = Step::RollBack(id("a"), wish("1", true, 2));
+        assert_eq!(steps(&[wanted("a", "1", true, 2)], &rolled), [again]);
+        let new = Step::Deploy { id: id("a"), wish: wish("1", true, 1), rolls_back: true };
+        assert_eq!(steps(&[wanted("a", "1", true, 1)], &[]), [new]);
+    }
+
+    #[test]
+    fn what_is_stopped_is_started_by_its_deployment() {
+        let running = [("a", Some(wish("1", true, 0)))];
+        let stop = Step::Stop(id("a"), wish("1", false, 0));
+        assert_eq!(steps(&[wanted("a", "1", false, 0)], &running), [stop]);
+        let stopped = [("a", Some(wish("1", false, 0)))];
+        let start = Step::Deploy { id: id("a"), wish: wish("1", true, 0), rolls_back: false };
+        assert_eq!(steps(&[wanted("a", "1", true, 0)], &stopped), [start]);
+    }
+
+    #[test]
+    fn only_what_the_cloud_deployed_is_removed_and_stopped() {
+        let state = [("a", Some(wish("1", true, 0))), ("local", None)];
+        assert_eq!(steps(&[], &state), [Step::Remove(id("a"))]);
+        assert_eq!(steps(&[wanted("local", "1", false, 0)], &[("local", None)]), []);
+    }
+
+    #[test]
+    fn an_invalid_id_is_named() {
+        let (steps, ignored) = plan(&[wanted("../x", "1", true, 0)], &BTreeMap::new());
+        assert_eq!((steps, ignored), (vec![], vec!["`../x` is no id of a deployment".to_owned()]));
+    }
+}

@@ -1,0 +1,188 @@
+//! Lets the vehicle run what the cloud wants, step by step. The newest wish counts: between two
+//! steps an older one is given up.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use gleaner_base::{Exit, Failure};
+use gleaner_fleet::Desired;
+use gleaner_lambda::manifest::{ItemName, Sha256};
+use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest};
+use gleaner_trust::{Deployment, Payload, Revision, sha256};
+use tokio::sync::watch;
+use tokio::time::sleep;
+
+use super::http::CloudHttp;
+use super::plan::{Step, plan};
+use crate::core::Core;
+use crate::objects;
+use crate::state::CloudWish;
+
+/// Pause before the steps that failed are taken again; it doubles up to the longest. A deployment
+/// that is refused makes an event each time.
+const PAUSE: Duration = Duration::from_secs(10);
+const PAUSE_MAX: Duration = Duration::from_secs(1800);
+/// Number of times that missing files are fetched: another deployment may remove some in between.
+const ROUNDS: u32 = 5;
+
+/// A wanted state, and the cloud that has its files.
+#[derive(Clone)]
+pub(super) struct Order {
+    pub(super) desired: Desired,
+    pub(super) http: CloudHttp,
+}
+
+/// What became of a wanted state.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(super) struct Handled {
+    /// Its number.
+    pub(super) generation: u64,
+    /// The reasons why parts of it are not applied.
+    pub(super) problems: Vec<String>,
+}
+
+/// The task that follows the wanted states.
+pub(super) struct Reconciler {
+    pub(super) core: Arc<Core>,
+    pub(super) orders: watch::Receiver<Option<Order>>,
+    pub(super) handled: watch::Sender<Handled>,
+}
+
+impl Reconciler {
+    /// Runs until the sender of wanted states is dropped.
+    pub(super) async fn run(mut self) {
+        let (mut pause, mut before) = (PAUSE, None);
+        loop {
+            let order = self.orders.borrow_and_update().clone();
+            let Some(Order { desired, http }) = order else {
+                if self.orders.changed().await.is_err() {
+                    return;
+                }
+                continue;
+            };
+            if before.as_ref() != Some(&desired) {
+                pause = PAUSE;
+            }
+            let problems = self.follow(&desired, &http).await;
+            let is_done = problems.is_empty();
+            self.handled.send_replace(Handled { generation: desired.generation, problems });
+            before = Some(desired);
+            // The same state comes with each connection: it does not shorten the pause.
+            let late = async {
+                match is_done {
+                    true => std::future::pending().await,
+                    false => sleep(pause).await,
+                }
+            };
+            let is_other = |order: &Option<Order>| {
+                order.as_ref().map(|order| &order.desired) != before.as_ref()
+            };
+            tokio::select! {
+                changed = self.orders.wait_for(is_other) => if changed.is_err() { return },
+                () = late => pause = (pause * 2).min(PAUSE_MAX),
+            }
+        }
+    }
+
+    async fn follow(&self, desired: &Desired, http: &CloudHttp) -> Vec<String> {
+        let deployed = self.core.lock().state.deployments.clone();
+        let (steps, mut problems) = plan(&desired.deployments, &deployed);
+        for step in steps {
+            if self.orders.has_changed().unwrap_or(true) {
+                let is_same = |order: &Order| order.desired == *desired;
+                if !self.orders.borrow().as_ref().is_some_and(is_same) {
+                    break;
+                }
+            }
+            let id = step.id().clone();
+            if let Err(failure) = self.take(step, http).await {
+                // One that fails blocks no other one.
+                problems.push(format!("{id}: {failure}"));
+            }
+        }
+        problems
+    }
+
+    async fn take(&self, step: Step, http: &CloudHttp) -> Result<(), Failure> {
+        match step {
+            Step::Remove(id) => self.blocking(move |core| core.remove(id.as_str())).await,
+            Step::Stop(id, wish) => {
+                self.blocking(move |core| {
+                    core.set_wanted(id.as_str(), false)?;
+                    core.note_wish(&id, &wish)
+                })
+                .await
+            }
+            Step::RollBack(id, wish) => self.roll_back(id, wish).await,
+            Step::Deploy { id, wish, rolls_back } => {
+                self.deploy(&wish, http).await?;
+                if rolls_back { self.roll_back(id, wish).await } else { Ok(()) }
+            }
+        }
+    }
+
+    async fn roll_back(&self, id: ItemName, wish: CloudWish) -> Result<(), Failure> {
+        self.blocking(move |core| {
+            let deployed = core.lock().state.deployments.get(&id).cloned();
+            if !deployed.is_some_and(|it| it.runs_fallback) {
+                core.roll_back(id.as_str(), "rolled back by the cloud")?;
+            }
+            core.note_wish(&id, &wish)
+        })
+        .await
+    }
+
+    async fn deploy(&self, wish: &CloudWish, http: &CloudHttp) -> Result<(), Failure> {
+        let path = format!("/v1/deployments/{}", wish.envelope);
+        let envelope = http.get(&path, Deployment::MAX.bytes()).await?;
+        if sha256(&envelope).as_str() != wish.envelope {
+            let message = "the cloud sent another deployment than it wants";
+            return Err(Failure::new(Exit::Denied, message));
+        }
+        let refused = |refusal| Failure::because("the deployment is refused", &refusal);
+        let wanted = self.core.trust(|trust| {
+            trust.verifier()?.deployment(&envelope).map_err(refused).map(|it| it.payload().clone())
+        })?;
+        let mut revisions = Vec::new();
+        for digest in std::iter::once(&wanted.revision).chain(&wanted.fallback) {
+            if !self.core.store.has(digest) {
+                let path = format!("/v1/revisions/{digest}");
+                revisions.push(text(http.get(&path, Revision::MAX.bytes()).await?)?);
+            }
+        }
+        let request = Arc::new(DeployRequest { deployment: text(envelope)?, revisions });
+        for _ in 0..ROUNDS {
+            let (sent, wish) = (Arc::clone(&request), wish.clone());
+            match self.blocking(move |core| core.deploy(&sent, Some(&wish))).await? {
+                DeployReply::Accepted { .. } => return Ok(()),
+                DeployReply::Missing { objects } => {
+                    for object in objects {
+                        let digest: Sha256 = object.sha256.parse().map_err(|error| {
+                            Failure::caused_by(Exit::Internal, "a digest is invalid", &error)
+                        })?;
+                        let pieces = http.pieces(&format!("/v1/objects/{digest}")).await?;
+                        objects::receive(&self.core, &digest, pieces).await?;
+                    }
+                }
+            }
+        }
+        Err(Failure::new(Exit::Internal, "files are missing again after they were fetched"))
+    }
+
+    /// Calls `work`, which waits for the disk, in a thread for that.
+    async fn blocking<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Core) -> Result<T, Failure> + Send + 'static,
+    ) -> Result<T, Failure> {
+        let core = Arc::clone(&self.core);
+        let done = tokio::task::spawn_blocking(move || work(&core)).await;
+        done.map_err(|_| Failure::new(Exit::Internal, "a step of the cloud was interrupted"))?
+    }
+}
+
+/// Envelopes are text.
+fn text(bytes: Vec<u8>) -> Result<String, Failure> {
+    String::from_utf8(bytes).map_err(|error| {
+        Failure::caused_by(Exit::Denied, "the cloud sent an envelope that is no text", &error)
+    })
+}

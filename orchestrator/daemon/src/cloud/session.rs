@@ -1,0 +1,216 @@
+//! One connection to the cloud: frames in both directions, until it ends.
+
+use std::collections::BTreeMap;
+use std::sync::mpsc as sync_mpsc;
+use std::time::Duration;
+
+use futures_util::{SinkExt, StreamExt};
+use gleaner_base::{Exit, Failure};
+use gleaner_fleet::{
+    Body, FRAME_MAX, Frame, Hello, PROTOCOL, Ping, Pong, Reported, Welcome, compress,
+};
+use tokio::net::TcpStream;
+use tokio::sync::{mpsc, watch};
+use tokio::time::{Instant, interval, sleep_until, timeout};
+use tokio_rustls::client::TlsStream;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
+
+use super::LinkState;
+use super::http::{CloudHttp, PATIENCE};
+use super::reconcile::{Handled, Order};
+use super::settings::CloudSettings;
+use super::uplink::Uplink;
+use crate::api::Api;
+
+/// Interval of looks whether the status is to be reported.
+const STATUS_INTERVAL: Duration = Duration::from_secs(5);
+/// Longest time between two reports.
+const REPORT_MAX: Duration = Duration::from_secs(60);
+/// Bounds of the interval of signs of life, in s, whatever the cloud asks for.
+const PING_S: std::ops::RangeInclusive<u32> = 5..=300;
+
+/// A connection that is open.
+pub(super) struct Session<'s> {
+    pub(super) api: &'s Api,
+    pub(super) http: &'s CloudHttp,
+    pub(super) orders: &'s watch::Sender<Option<Order>>,
+    pub(super) handled: watch::Receiver<Handled>,
+    /// Time at which it ends, as the certificate is to be renewed.
+    pub(super) until: std::time::Instant,
+}
+
+/// The end of a connection.
+#[derive(Debug)]
+pub(super) enum SessionEnd {
+    /// The cloud asks to connect again after this time, for this reason.
+    Away(Duration, String),
+    /// The enrolment was changed or ended, or the certificate is to be renewed.
+    Changed,
+}
+
+type Socket = WebSocketStream<TlsStream<TcpStream>>;
+
+impl Session<'_> {
+    /// Exchanges frames until the connection ends.
+    pub(super) async fn run(
+        mut self,
+        mut settings: watch::Receiver<Option<CloudSettings>>,
+    ) -> Result<SessionEnd, Failure> {
+        let mut socket = self.open().await?;
+        let Welcome { ping_s, cursors, .. } = self.welcome(&mut socket).await?;
+        self.api.cloud.set_state(LinkState::Connected, None);
+        let (out, mut outgoing) = mpsc::channel(4);
+        let (acks, received_acks) = sync_mpsc::channel();
+        let cursors = cursors.into_iter().map(|cursor| (cursor.stream.clone(), cursor));
+        let uplink = Uplink {
+            spool: self.api.layout.spool(),
+            cloud: self.api.cloud.clone(),
+            cursors: cursors.collect::<BTreeMap<_, _>>(),
+            out,
+            acks: received_acks,
+        };
+        tokio::task::spawn_blocking(move || uplink.run());
+        let ping = Duration::from_secs((*PING_S.start()).max(ping_s.min(*PING_S.end())).into());
+        let (mut pings, mut looks) = (interval(ping), interval(STATUS_INTERVAL));
+        let mut last_heard = Instant::now();
+        let (mut reported, mut report_at) = (String::new(), Instant::now());
+        loop {
+            tokio::select! {
+                message = socket.next() => {
+                    last_heard = Instant::now();
+                    match self.frame(message)? {
+                        None => {}
+                        Some(Body::Desired(desired)) => {
+                            let order = Order { desired, http: self.http.clone() };
+                            self.orders.send_replace(Some(order));
+                        }
+                        Some(Body::Ack(ack)) => {
+                            let _ = acks.send(ack);
+                        }
+                        Some(Body::Ping(Ping { number })) => {
+                            self.send(&mut socket, Body::Pong(Pong { number })).await?;
+                        }
+                        Some(Body::GoAway(away)) => {
+                            // Not for ever, whatever the cloud asks for.
+                            let after = Duration::from_millis(away.after_ms.min(3_600_000));
+                            return Ok(SessionEnd::Away(after, away.reason));
+                        }
+                        Some(_) => {}
+                    }
+                }
+                Some(body) = outgoing.recv() => self.send(&mut socket, body).await?,
+                _ = pings.tick() => {
+                    self.send(&mut socket, Body::Ping(Ping::default())).await?;
+                }
+                () = sleep_until(last_heard + 3 * ping) => {
+                    return Err(self.lost(&format!("it was silent for {} s", 3 * ping.as_secs())));
+                }
+                changed = self.handled.changed() => {
+                    // The reconciler runs as long as the link.
+                    let _ = changed;
+                    looks.reset_immediately();
+                }
+                _ = looks.tick() => {
+                    let (essence, body) = self.report();
+                    if essence != reported || Instant::now() >= report_at {
+                        (reported, report_at) = (essence, Instant::now() + REPORT_MAX);
+                        self.send(&mut socket, body).await?;
+                    }
+                }
+                () = sleep_until(self.until.into()) => return Ok(SessionEnd::Changed),
+                _ = settings.changed() => return Ok(SessionEnd::Changed),
+            }
+        }
+    }
+
+    async fn open(&self) -> Result<Socket, Failure> {
+        let stream = self.http.connect().await?;
+        let request = format!("wss://{}/v1/link", self.http.address);
+        let request = request.into_client_request().map_err(|error| self.broken(&error))?;
+        let config = WebSocketConfig::default()
+            .read_buffer_size(4096)
+            .write_buffer_size(0)
+            .max_message_size(Some(FRAME_MAX))
+            .max_frame_size(Some(FRAME_MAX));
+        let upgraded = tokio_tungstenite::client_async_with_config(request, stream, Some(config));
+        let upgraded = timeout(PATIENCE, upgraded).await.map_err(|late| self.broken(&late))?;
+        upgraded.map(|(socket, _)| socket).map_err(|error| match &error {
+            tokio_tungstenite::tungstenite::Error::Http(answer)
+                if matches!(answer.status().as_u16(), 401 | 403) =>
+            {
+                let message = format!("the cloud at {} refuses this vehicle", self.http.address);
+                Failure::new(Exit::Denied, message)
+                    .with_help("it may have been revoked there: enrol it again")
+            }
+            _ => self.broken(&error),
+        })
+    }
+
+    async fn welcome(&self, socket: &mut Socket) -> Result<Welcome, Failure> {
+        let hello = Hello {
+            protocol: PROTOCOL,
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            key: self.api.key.to_string(),
+            streams: Vec::new(),
+        };
+        self.send(socket, Body::Hello(hello)).await?;
+        let first = timeout(PATIENCE, socket.next()).await.map_err(|late| self.broken(&late))?;
+        match self.frame(first)? {
+            Some(Body::Welcome(welcome)) => Ok(welcome),
+            Some(Body::GoAway(away)) => Err(self.lost(&away.reason)),
+            _ => Err(self.lost("it did not begin with `Welcome`")),
+        }
+    }
+
+    /// Returns the content of a received frame; `None` of one that is of a later version.
+    fn frame(
+        &self,
+        message: Option<Result<Message, tokio_tungstenite::tungstenite::Error>>,
+    ) -> Result<Option<Body>, Failure> {
+        match message {
+            None | Some(Ok(Message::Close(_))) => Err(self.lost("it closed the connection")),
+            Some(Err(error)) => Err(self.broken(&error)),
+            Some(Ok(Message::Binary(bytes))) => {
+                Ok(Frame::decoded(&bytes).map_err(|error| self.broken(&error))?.body)
+            }
+            Some(Ok(_)) => Ok(None),
+        }
+    }
+
+    async fn send(&self, socket: &mut Socket, body: Body) -> Result<(), Failure> {
+        let message = Message::Binary(Frame::encoded(body).into());
+        let sent = timeout(PATIENCE, socket.send(message)).await;
+        sent.map_err(|late| self.broken(&late))?.map_err(|error| self.broken(&error))
+    }
+
+    /// Returns the report, and what of it is worth one at once.
+    fn report(&mut self) -> (String, Body) {
+        let status = self.api.status();
+        let Handled { generation, problems } = self.handled.borrow_and_update().clone();
+        self.api.cloud.lock().generation = generation;
+        let lambdas = status.deployments.iter().map(|it| {
+            let lambda = it.status.as_ref();
+            let phase = lambda.map(|lambda| (lambda.phase, lambda.restarts));
+            (&it.id, it.release, it.is_wanted, it.runs_fallback, it.is_proven, &it.refused, phase)
+        });
+        let lambdas: Vec<_> = lambdas.collect();
+        let essence = format!("{generation} {problems:?} {:?} {lambdas:?}", status.labels);
+        let status = compress(&serde_json::to_vec(&status).expect("a status is plain data"));
+        (essence, Body::Reported(Reported { generation, status, problems }))
+    }
+
+    fn lost(&self, why: &str) -> Failure {
+        let why = gleaner_base::excerpt(why);
+        let mut failure =
+            Failure::new(Exit::Unreachable, format!("lost the cloud at {}", self.http.address));
+        failure.causes = vec![why];
+        failure
+    }
+
+    fn broken(&self, error: &(dyn std::error::Error + 'static)) -> Failure {
+        self.http.unreachable("the connection failed", error)
+    }
+}

@@ -1,0 +1,57 @@
+//! Receives files that deployments need, from users and from the cloud.
+
+use std::error::Error;
+use std::io;
+
+use axum::body::Bytes;
+use futures_util::{Stream, StreamExt};
+use gleaner_base::{Exit, Failure};
+use gleaner_lambda::manifest::Sha256;
+use sha2::Digest;
+use tokio::io::AsyncWriteExt;
+
+use crate::core::Core;
+use crate::store::begin_object;
+
+/// Receives the file with the digest `wanted`. It counts only if its digest is right.
+///
+/// # Errors
+///
+/// A failure if no deployment needs it, it is another file, or it cannot be written.
+pub(crate) async fn receive<E: Error + Send + Sync + 'static>(
+    core: &Core,
+    wanted: &Sha256,
+    mut pieces: impl Stream<Item = Result<Bytes, E>> + Unpin,
+) -> Result<(), Failure> {
+    let length = core.expected(wanted)?;
+    let path = core.store.object(wanted);
+    let failed = |error: io::Error| {
+        Failure::caused_by(Exit::Internal, format!("cannot receive the file {wanted}"), &error)
+    };
+    let refused = |why: String| {
+        let mut failure = Failure::new(Exit::Denied, format!("the file {wanted} is refused"));
+        failure.causes = vec![why];
+        failure
+    };
+    let (file, part) = begin_object(&path).map_err(failed)?;
+    let mut file = tokio::fs::File::from_std(file);
+    let (mut digest, mut received) = (sha2::Sha256::new(), 0);
+    while let Some(piece) = pieces.next().await {
+        let piece = piece.map_err(|error| failed(io::Error::other(error)))?;
+        received += piece.len() as u64;
+        if received > length {
+            return Err(refused(format!("it is longer than {length} bytes")));
+        }
+        digest.update(&piece);
+        file.write_all(&piece).await.map_err(failed)?;
+    }
+    let found = gleaner_base::hex(&digest.finalize());
+    if received != length || found != wanted.as_str() {
+        let why = format!("it has {received} of {length} bytes, and the SHA-256 {found}");
+        return Err(refused(why));
+    }
+    // The last write goes on in the background, and only this returns its error.
+    file.flush().await.map_err(failed)?;
+    file.sync_all().await.map_err(failed)?;
+    tokio::fs::rename(&part, &path).await.map_err(failed)
+}

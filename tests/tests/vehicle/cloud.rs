@@ -1,0 +1,146 @@
+//! A vehicle and a cloud, with real programs on both sides.
+
+use std::collections::BTreeSet;
+
+use gleaner_fleet::people::VehicleState;
+use gleaner_protocol::supervision::LambdaPhase;
+use gleaner_protocol::vehicle_api::StreamLine;
+use gleaner_tests::LambdaCopy;
+use gleaner_tests::cloud::TestCloud;
+use gleaner_tests::vehicle::{TestVehicle, text};
+
+use super::ticker;
+
+const NAME: &str = "car-7";
+
+/// Starts a vehicle that is enrolled at a cloud.
+fn enrolled() -> (TestCloud, TestVehicle) {
+    let cloud = TestCloud::new();
+    let mut vehicle = TestVehicle::new();
+    let labels = "[vehicle]\nname = \"car-7\"\n[vehicle.labels]\ntown = \"oslo\"\n";
+    std::fs::write(vehicle.path("vehicle.toml"), labels).expect("a file");
+    vehicle.start();
+    cloud.enrol(&vehicle, NAME);
+    (cloud, vehicle)
+}
+
+/// Publishes a lambda, and deploys it in the fleet with further arguments.
+fn deploy(
+    (cloud, vehicle): (&TestCloud, &TestVehicle),
+    lambda: &LambdaCopy,
+    key: &str,
+    args: &[&str],
+) -> std::process::Output {
+    let published = vehicle.publish(lambda.path(), "publisher");
+    assert!(published.status.success(), "{}", text(&published));
+    let folder = lambda.path().to_str().expect("a plain path");
+    let key = vehicle.key(key);
+    cloud.gleaner(&[&["deploy", folder, "--fleet", "--key", &key], args].concat())
+}
+
+/// Returns the phase of a lambda.
+fn phase(vehicle: &TestVehicle, id: &str) -> Option<LambdaPhase> {
+    let deployments = vehicle.try_status()?.deployments;
+    let deployment = deployments.into_iter().find(|it| it.id == id)?;
+    deployment.status.map(|lambda| lambda.phase)
+}
+
+/// Waits until the cloud has the same events as the vehicle, none of them twice.
+fn until_all_events(cloud: &TestCloud, vehicle: &TestVehicle) {
+    let key = |line: &StreamLine| (line.stream.clone(), line.seq, line.kind.clone());
+    let of = |lines: Vec<StreamLine>| {
+        let (all, count): (BTreeSet<_>, _) = (lines.iter().map(key).collect(), lines.len());
+        assert_eq!(all.len(), count, "an event is there twice");
+        all
+    };
+    vehicle.until("all events at the cloud", |vehicle| {
+        let wanted = of(vehicle.records(None));
+        (of(cloud.records(NAME, None)) == wanted).then_some(())
+    });
+}
+
+pub fn follows() {
+    let (cloud, mut vehicle) = enrolled();
+    assert!(cloud.vehicle(NAME).state == VehicleState::Online);
+    let lambda = ticker("rust", "ticks");
+    let other = deploy((&cloud, &vehicle), &lambda, "deployer", &["--selector", "town=bergen"]);
+    assert!(other.status.success() && text(&other).contains("no vehicle"), "{}", text(&other));
+    assert_eq!(phase(&vehicle, "ticks"), None, "it is for vehicles elsewhere");
+    let deployed = deploy((&cloud, &vehicle), &lambda, "deployer", &["--selector", "town=oslo"]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    assert_eq!(phase(&vehicle, "ticks"), Some(LambdaPhase::Running));
+    let status = cloud.succeeds(&["status", "--on", NAME]);
+    assert!(status.contains("ticks"), "{status}");
+    // Its decisions have triggers, which are sent as they are made.
+    vehicle.until("decisions at the cloud", |_| {
+        let lines = cloud.records(NAME, Some("ticks"));
+        lines.iter().any(|line| line.kind == "decision").then_some(())
+    });
+    cloud.succeeds(&["stop", "ticks", "--fleet"]);
+    vehicle.until("the lambda to stop", |vehicle| {
+        (!vehicle.deployment("ticks").is_wanted).then_some(())
+    });
+    // What is changed at the vehicle stays, also after a restart there.
+    vehicle.succeeds(&["start", "ticks"]);
+    vehicle.kill_orchestrator();
+    vehicle.start();
+    vehicle.until("the connection", |vehicle| {
+        (vehicle.try_status()?.cloud?.state == "connected").then_some(())
+    });
+    vehicle.until_running(&["ticks"]);
+    let local = ticker("rust", "local");
+    let deployed = vehicle.deploy(local.path(), &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    cloud.succeeds(&["remove", "ticks", "--fleet"]);
+    vehicle.until("the removal", |vehicle| {
+        let ids = vehicle.status().deployments.into_iter().map(|it| it.id);
+        (ids.collect::<Vec<_>>() == ["local"]).then_some(())
+    });
+    until_all_events(&cloud, &vehicle);
+    vehicle.stop();
+}
+
+pub fn killed() {
+    let (mut cloud, vehicle) = enrolled();
+    let lambda = ticker("rust", "ticks");
+    let deployed = deploy((&cloud, &vehicle), &lambda, "deployer", &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    for round in 0..3 {
+        cloud.kill();
+        let change = if round % 2 == 0 { "stop" } else { "start" };
+        vehicle.succeeds(&[change, "ticks"]);
+        assert!(cloud.start().is_none(), "its user is still logged in");
+        vehicle.until("the connection", |_| {
+            (cloud.vehicle(NAME).state == VehicleState::Online).then_some(())
+        });
+        until_all_events(&cloud, &vehicle);
+    }
+    assert_eq!(cloud.vehicle(NAME).problems, Vec::<String>::new());
+}
+
+pub fn refused() {
+    let (cloud, vehicle) = enrolled();
+    let lambda = ticker("rust", "ticks");
+    let deployed = deploy((&cloud, &vehicle), &lambda, "deployer", &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    let before = vehicle.deployment("ticks").attempt;
+    // The cloud accepts it, as it knows no keys.
+    let other = ticker("rust", "other");
+    let refused = deploy((&cloud, &vehicle), &other, "stranger", &["--timeout", "20s"]);
+    assert!(!refused.status.success(), "{}", text(&refused));
+    assert!(text(&refused).contains("other: the deployment is refused"), "{}", text(&refused));
+    assert_eq!(phase(&vehicle, "other"), None);
+    let deployment = vehicle.deployment("ticks");
+    assert_eq!((deployment.attempt, deployment.is_wanted), (before, true), "it runs on");
+    // Its name cannot be used by another vehicle.
+    let second = TestVehicle::new();
+    let file = cloud.path("car-7.enrolment");
+    let again = second.gleaner(&["enrol", file.to_str().expect("a plain path")]);
+    assert!(!again.status.success());
+    cloud.succeeds(&["vehicles", "revoke", NAME]);
+    vehicle
+        .until("the refusal", |vehicle| (vehicle.status().cloud?.state == "refused").then_some(()));
+    assert_eq!(phase(&vehicle, "ticks"), Some(LambdaPhase::Running), "it runs on without a cloud");
+    vehicle.succeeds(&["unenrol"]);
+    assert_eq!(vehicle.status().cloud, None);
+}
