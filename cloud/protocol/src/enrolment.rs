@@ -8,7 +8,7 @@ pub const CERTIFICATE_NAME: &str = "spiffe://gleaner/vehicle/";
 /// Longest file with an enrolment.
 const ENROLMENT_MAX: usize = 64 << 10;
 
-/// What a vehicle needs to connect for the first time: the content of the file that
+/// The means to connect for the first time: the content of the file that
 /// `gleaner vehicles enrol` writes. It is a secret until it was used.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

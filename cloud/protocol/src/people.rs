@@ -10,8 +10,9 @@
 //! | `GET /v1/vehicles` | viewer | [`VehicleSummary`] of each |
 //! | `POST /v1/vehicles` | admin | [`Enrolment`](crate::Enrolment), of a [`NewVehicle`] |
 //! | `DELETE /v1/vehicles/NAME` | admin | nothing, once it is cut off |
-//! | `GET /v1/vehicles/NAME/status` | viewer | [`VehicleStatus`](gleaner_protocol::vehicle_api::VehicleStatus) |
-//! | `GET /v1/vehicles/NAME/events`, `.../lambdas/ID/records` | viewer | a line of JSON per record |
+//! | `GET /v1/vehicles/NAME/status` | viewer | [`VehicleStatus`] |
+//! | `GET /v1/vehicles/NAME/events` | viewer | a line of JSON per record |
+//! | `GET /v1/vehicles/NAME/lambdas/ID/records` | viewer | a line of JSON per record |
 //! | `PUT /v1/objects/SHA256` | deployer | nothing |
 //! | `POST /v1/deployments` | deployer | `DeployReply`, of a `DeployRequest` as on a vehicle |
 //! | `GET /v1/deployments` | viewer | [`FleetDeployment`] of each |
@@ -21,6 +22,8 @@
 //!
 //! In the answer to a deployment, `attempt` is 0, as each vehicle counts its own, and `generation`
 //! is the number of its entry in the audit trail. The audit trail is answered up to 1,000 entries.
+//!
+//! [`VehicleStatus`]: gleaner_protocol::vehicle_api::VehicleStatus
 
 use std::collections::BTreeMap;
 use std::fmt;

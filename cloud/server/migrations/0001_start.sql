@@ -52,6 +52,7 @@ CREATE TABLE deployments (
     envelope TEXT NOT NULL,
     revision TEXT NOT NULL REFERENCES revisions (digest),
     fallback TEXT NOT NULL,
+    grants TEXT NOT NULL,
     selector TEXT NOT NULL,
     is_wanted BIGINT NOT NULL,
     rollback_request BIGINT NOT NULL

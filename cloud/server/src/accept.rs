@@ -26,14 +26,14 @@ const DRAIN: Duration = Duration::from_secs(10);
 
 /// The other side of a connection; it counts as open as long as this lives.
 #[derive(Debug)]
-pub(crate) struct Peer {
+pub(crate) struct PeerConnection {
     pub(crate) address: IpAddr,
-    /// SHA-256 of its certificate, which an authority of ours has signed.
+    /// SHA-256 of its certificate, which the authority of vehicles has signed.
     pub(crate) certificate: Option<String>,
     _slot: OwnedSemaphorePermit,
 }
 
-impl Peer {
+impl PeerConnection {
     #[cfg(test)]
     pub(crate) fn of_test(address: IpAddr, slot: OwnedSemaphorePermit) -> Self {
         Self { address, certificate: None, _slot: slot }
@@ -80,7 +80,7 @@ impl Entrance {
                 continue;
             };
             let tls = tls.as_ref().map(|tls| TlsAcceptor::from(Arc::clone(&tls.borrow())));
-            let peer = Peer { address: address.ip(), certificate: None, _slot: slot };
+            let peer = PeerConnection { address: address.ip(), certificate: None, _slot: slot };
             tokio::spawn(connection(stream, tls, peer, router.clone(), stopping.clone()));
         }
         drop(listener);
@@ -93,7 +93,7 @@ impl Entrance {
 async fn connection(
     stream: TcpStream,
     tls: Option<TlsAcceptor>,
-    mut peer: Peer,
+    mut peer: PeerConnection,
     router: Router,
     stop: watch::Receiver<bool>,
 ) {
@@ -113,7 +113,7 @@ async fn connection(
 
 async fn requests(
     stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    peer: Peer,
+    peer: PeerConnection,
     router: Router,
     mut stop: watch::Receiver<bool>,
 ) {

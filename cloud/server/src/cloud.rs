@@ -1,4 +1,4 @@
-//! What the handlers of both listeners share.
+//! The state that the handlers of both listeners share.
 
 use std::sync::Arc;
 
@@ -8,14 +8,14 @@ use crate::attempts::WrongSecrets;
 use crate::authority::Authorities;
 use crate::hub::Hub;
 use crate::objects::Objects;
-use crate::store::{Retention, Store};
+use crate::store::{CloudStore, Retention};
 
 /// Maximum number of streams of records that people read at a time.
 pub(crate) const READERS_MAX: usize = 64;
 
 /// The state of the server.
 pub(crate) struct Cloud {
-    pub(crate) store: Store,
+    pub(crate) store: CloudStore,
     pub(crate) objects: Objects,
     pub(crate) hub: Hub,
     pub(crate) authorities: Authorities,

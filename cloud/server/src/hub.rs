@@ -11,6 +11,10 @@ use crate::store::now;
 /// Latest time after which vehicles connect again when the server stops, in ms.
 const RECONNECT_MS: u64 = 30_000;
 
+/// Time after which a replaced connection may be opened again, in ms: two machines with the same
+/// certificate would take turns without it.
+const TAKEN_MS: u64 = 10_000;
+
 /// Wishes for the connection of a vehicle.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct LinkOrders {
@@ -58,7 +62,7 @@ impl Hub {
         let (orders, receiver) = watch::channel(LinkOrders { changes: 0, end });
         let before = state.links.insert(name.to_owned(), OpenLink { epoch, orders });
         if let Some(before) = before {
-            before.end(0, "the vehicle has a newer connection");
+            before.end(TAKEN_MS, "the vehicle has a newer connection");
         }
         Some(receiver)
     }

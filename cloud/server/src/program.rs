@@ -9,11 +9,13 @@ use clap::{Parser, Subcommand};
 use gleaner_base::{Exit, Failure};
 use gleaner_fleet::people::{NewUser, Role};
 use gleaner_vitals::log;
+use rustix::fs::Mode;
+use rustix::process::umask;
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::folder::DataFolder;
 use crate::server::{CloudServer, ServeOptions};
-use crate::store::{CONSOLE, Store};
+use crate::store::{CONSOLE, CloudStore};
 
 /// The cloud of a fleet: vehicles connect to it, and people deploy by it.
 #[derive(Parser, Debug)]
@@ -69,6 +71,8 @@ pub fn main() -> ExitCode {
     log::init_service();
     // Each connection takes one; the usual limit is low.
     gleaner_base::raise_open_files();
+    // The database and its copies are for this user only, wherever they are.
+    umask(Mode::RWXG | Mode::RWXO);
     let args = Args::parse();
     match run(args.command) {
         Ok(()) => Exit::Ok.into(),
@@ -121,7 +125,7 @@ async fn serve(options: ServeOptions) -> Result<(), Failure> {
 }
 
 async fn invite(new: NewUser, data: &Path) -> Result<(), Failure> {
-    let store = Store::open(&DataFolder::existing(data)?.database()).await?;
+    let store = CloudStore::open(&DataFolder::existing(data)?.database()).await?;
     let invitation = store.invite(CONSOLE, new).await?;
     store.close().await;
     print(&format!("{}\n", invitation.code));
@@ -137,7 +141,7 @@ async fn backup(file: &Path, data: &Path) -> Result<(), Failure> {
         return Err(refused("exists already", "choose another file, or remove it first"));
     }
     let name = file.to_str().ok_or_else(|| refused("is not UTF-8", "choose another name"))?;
-    let store = Store::open(&DataFolder::existing(data)?.database()).await?;
+    let store = CloudStore::open(&DataFolder::existing(data)?.database()).await?;
     store.copy_to(name).await?;
     store.close().await;
     Ok(())

@@ -19,7 +19,7 @@ use crate::cloud::{Cloud, READERS_MAX};
 use crate::folder::DataFolder;
 use crate::hub::Hub;
 use crate::objects::Objects;
-use crate::store::{Retention, Store};
+use crate::store::{CloudStore, Retention};
 use crate::{people, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles.
@@ -77,7 +77,7 @@ impl CloudServer {
         let folder = DataFolder::create(&options.data)?;
         let lock = folder.lock()?;
         let authorities = Authorities::open(&folder)?;
-        let store = Store::open(&folder.database()).await?;
+        let store = CloudStore::open(&folder.database()).await?;
         if let Some(seq) = store.first_changed_entry().await? {
             tracing::error!(seq, "the audit trail was changed: an entry is not as it was written");
         }

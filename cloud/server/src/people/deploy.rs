@@ -10,7 +10,7 @@ use axum::http::StatusCode;
 use gleaner_base::Failure;
 use gleaner_fleet::people::User;
 use gleaner_lambda::manifest::Sha256;
-use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest};
+use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest, GrantStatus};
 use gleaner_trust::{Refusal, Revision, unverified_deployment, unverified_revision};
 
 use crate::cloud::Cloud;
@@ -55,6 +55,12 @@ pub(super) async fn deploy(
     if !objects.is_empty() {
         return Ok(Json(DeployReply::Missing { objects }));
     }
+    let grants = deployment.grants;
+    let grants = GrantStatus {
+        topics: grants.topics.iter().map(ToString::to_string).collect(),
+        models: grants.models.iter().map(ToString::to_string).collect(),
+        record: grants.record,
+    };
     let selector = deployment.selector.into_iter().map(|(name, it)| (name.to_string(), it));
     let offered = OfferedDeployment {
         id: id.clone(),
@@ -62,6 +68,7 @@ pub(super) async fn deploy(
         envelope: request.deployment,
         revision: deployment.revision.to_string(),
         fallback: deployment.fallback.map(|it| it.to_string()),
+        grants,
         selector: selector.collect(),
         revisions: envelopes,
     };

@@ -25,7 +25,7 @@ use gleaner_fleet::people::{
     FleetDeployment, Invitation, Login, NewUser, NewVehicle, Role, Session, User,
 };
 
-use crate::accept::Peer;
+use crate::accept::PeerConnection;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::request::parsed;
@@ -93,7 +93,7 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
 /// Lets requests pass whose token is of a user with the role.
 async fn guard(
     State((cloud, role)): State<(Arc<Cloud>, Role)>,
-    Extension(peer): Extension<Arc<Peer>>,
+    Extension(peer): Extension<Arc<PeerConnection>>,
     mut request: Request,
     next: Next,
 ) -> Response {
@@ -106,7 +106,12 @@ async fn guard(
     }
 }
 
-async fn user(cloud: &Cloud, role: Role, peer: &Peer, headers: &HeaderMap) -> CloudResult<User> {
+async fn user(
+    cloud: &Cloud,
+    role: Role,
+    peer: &PeerConnection,
+    headers: &HeaderMap,
+) -> CloudResult<User> {
     let help = "log in again: `gleaner login URL --code CODE`; an administrator gives you a code";
     let header = headers.get(header::AUTHORIZATION).and_then(|it| it.to_str().ok());
     let token = header
@@ -127,7 +132,7 @@ async fn user(cloud: &Cloud, role: Role, peer: &Peer, headers: &HeaderMap) -> Cl
 
 async fn login(
     State(cloud): State<Arc<Cloud>>,
-    Extension(peer): Extension<Arc<Peer>>,
+    Extension(peer): Extension<Arc<PeerConnection>>,
     body: Bytes,
 ) -> CloudResult<Json<Session>> {
     cloud.wrong_secrets.check(peer.address)?;

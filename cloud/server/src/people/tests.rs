@@ -11,14 +11,14 @@ use crate::authority::Authorities;
 use crate::folder::DataFolder;
 use crate::hub::Hub;
 use crate::objects::Objects;
-use crate::store::{Retention, Store};
+use crate::store::{CloudStore, Retention};
 
 const ROLES: [Role; 4] = [Role::Viewer, Role::Operator, Role::Deployer, Role::Admin];
 
 async fn cloud(folder: &TempDir) -> Arc<Cloud> {
     let data = DataFolder::create(&folder.path().join("data")).unwrap();
     Arc::new(Cloud {
-        store: Store::open(&data.database()).await.unwrap(),
+        store: CloudStore::open(&data.database()).await.unwrap(),
         objects: Objects::open(data.objects()).unwrap(),
         hub: Hub::default(),
         authorities: Authorities::open(&data).unwrap(),
@@ -37,7 +37,7 @@ async fn status_of(
     token: Option<&str>,
 ) -> StatusCode {
     let slots = Arc::new(Semaphore::new(1));
-    let peer = Peer::of_test([127, 0, 0, 1].into(), slots.try_acquire_owned().unwrap());
+    let peer = PeerConnection::of_test([127, 0, 0, 1].into(), slots.try_acquire_owned().unwrap());
     let mut request = Request::builder().method(method).uri(path).extension(Arc::new(peer));
     if let Some(token) = token {
         request = request.header(header::AUTHORIZATION, format!("Bearer {token}"));

@@ -3,7 +3,7 @@
 
 use gleaner_fleet::people::AuditEntry;
 
-use super::{Change, Store, int, now_ms, unsigned};
+use super::{Change, CloudStore, int, now_ms, unsigned};
 use crate::error::CloudResult;
 
 /// Maximum number of entries in an answer.
@@ -32,7 +32,7 @@ impl Change<'_> {
     }
 }
 
-impl Store {
+impl CloudStore {
     /// Returns the newest entries, the newest first.
     pub(crate) async fn audit(&self) -> CloudResult<Vec<AuditEntry>> {
         let rows: Vec<Row> = rows!(&self.pool;

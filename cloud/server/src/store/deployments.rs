@@ -6,11 +6,13 @@ use gleaner_base::excerpt;
 use gleaner_fleet::people::FleetDeployment;
 use gleaner_fleet::{Wanted, desired_digest};
 use gleaner_protocol::vehicle_api::GrantStatus;
-use gleaner_trust::{Grants, unverified_deployment};
 
-use super::vehicles::{FAILED, RUNNING, ended};
-use super::{Change, Store, int, unsigned};
+use super::vehicles::{FAILED, RUNNING, ended, json};
+use super::{Change, CloudStore, int, unsigned};
 use crate::error::{CloudError, CloudResult};
+
+/// Maximum number of deployments: all of them fit into one frame for a vehicle.
+const DEPLOYMENTS_MAX: i64 = 4000;
 
 type TextMap = BTreeMap<String, String>;
 
@@ -22,6 +24,7 @@ pub(crate) struct OfferedDeployment {
     pub(crate) envelope: String,
     pub(crate) revision: String,
     pub(crate) fallback: Option<String>,
+    pub(crate) grants: GrantStatus,
     pub(crate) selector: TextMap,
     /// The envelope of each revision, by its digest.
     pub(crate) revisions: BTreeMap<String, String>,
@@ -43,7 +46,7 @@ struct FleetWish {
     wanted: Wanted,
 }
 
-impl Store {
+impl CloudStore {
     /// Stores a deployment and its revisions; returns the number of the change. The same envelope
     /// again starts it, if it was stopped.
     pub(crate) async fn deploy(
@@ -63,6 +66,11 @@ impl Store {
             let message = format!("deployment `{id}` has release {stored}; this is {release}");
             return Err(CloudError::denied(message, "sign it again with a higher release"));
         }
+        let (count,): (i64,) = one!(&mut *change.tx; "SELECT COUNT(*) FROM deployments");
+        if before.is_none() && count >= DEPLOYMENTS_MAX {
+            let message = format!("the fleet has {count} deployments; no more are stored");
+            return Err(CloudError::denied(message, "remove some that are not needed any more"));
+        }
         for (digest, envelope) in &offered.revisions {
             run!(&mut *change.tx;
                 "INSERT INTO revisions (digest, envelope) VALUES ($1, $2)
@@ -75,15 +83,16 @@ impl Store {
         } else {
             run!(&mut *change.tx;
                 "INSERT INTO deployments (id, number, sha256, envelope, revision, fallback,
-                 selector, is_wanted, rollback_request)
-                 VALUES ($1, $2, $3, $4, $5, $6, $7, 1, 0)
+                 grants, selector, is_wanted, rollback_request)
+                 VALUES ($1, $2, $3, $4, $5, $6, $7, $8, 1, 0)
                  ON CONFLICT (id) DO UPDATE SET number = excluded.number,
                  sha256 = excluded.sha256, envelope = excluded.envelope,
                  revision = excluded.revision, fallback = excluded.fallback,
-                 selector = excluded.selector, is_wanted = 1, rollback_request = 0";
+                 grants = excluded.grants, selector = excluded.selector, is_wanted = 1,
+                 rollback_request = 0";
                 id, int(*release), &sha256, envelope, &offered.revision,
                 offered.fallback.as_deref().unwrap_or_default(),
-                serde_json::to_string(&offered.selector).unwrap_or_default());
+                json(&offered.grants), json(&offered.selector));
         }
         let number = change.note(actor, &format!("deploy release {release}"), id).await?;
         let changed = change.refresh("").await?;
@@ -142,9 +151,9 @@ impl Store {
 
     /// Returns all deployments, with the number of vehicles that should run them and do.
     pub(crate) async fn deployments(&self) -> CloudResult<Vec<FleetDeployment>> {
-        type Row = (String, i64, String, String, String, i64, String);
+        type Row = (String, i64, String, String, String, String, i64);
         let rows: Vec<Row> = rows!(&self.pool;
-            "SELECT id, number, revision, fallback, selector, is_wanted, envelope FROM deployments
+            "SELECT id, number, revision, fallback, grants, selector, is_wanted FROM deployments
              ORDER BY id");
         let vehicles: Vec<(String, String, i64, i64)> = rows!(&self.pool;
             "SELECT name, labels, generation, handled FROM vehicles WHERE is_revoked = 0");
@@ -158,13 +167,13 @@ impl Store {
             .into_iter()
             .map(|(vehicle, id, number, state)| ((vehicle, id), (number, state)))
             .collect();
-        let deployment = |(id, number, revision, fallback, selector, is_wanted, envelope): Row| {
+        let deployment = |(id, number, revision, fallback, grants, selector, is_wanted): Row| {
             let mut deployment = FleetDeployment {
                 id,
                 release: unsigned(number),
                 revision,
                 fallback: (!fallback.is_empty()).then_some(fallback),
-                grants: grants(&envelope),
+                grants: serde_json::from_str(&grants).unwrap_or_default(),
                 selector: map(&selector),
                 is_wanted: is_wanted != 0,
                 vehicles: 0,
@@ -181,7 +190,7 @@ impl Store {
                     Some((_, state)) if state == RUNNING => deployment.running += 1,
                     Some((_, state)) if state == FAILED => deployment.failed += 1,
                     // It has handled its wanted state, and has not accepted this.
-                    None if *has_handled => deployment.failed += 1,
+                    None if *has_handled && deployment.is_wanted => deployment.failed += 1,
                     _ => {}
                 }
             }
@@ -290,16 +299,4 @@ fn map(json: &str) -> TextMap {
 fn unknown(id: &str) -> CloudError {
     let message = format!("there is no deployment `{}`", excerpt(id));
     CloudError::missing(message, "list the deployments, and use one of their ids")
-}
-/// Returns the rights in an envelope, which was parsed when it was stored.
-fn grants(envelope: &str) -> GrantStatus {
-    let Ok(deployment) = unverified_deployment(envelope.as_bytes()) else {
-        return GrantStatus::default();
-    };
-    let Grants { topics, models, record } = deployment.grants;
-    GrantStatus {
-        topics: topics.iter().map(ToString::to_string).collect(),
-        models: models.iter().map(ToString::to_string).collect(),
-        record,
-    }
 }

@@ -53,7 +53,7 @@ use tokio::sync::{Mutex, MutexGuard};
 use crate::error::{CloudError, CloudResult};
 
 pub(crate) use deployments::OfferedDeployment;
-pub(crate) use records::{Batch, Retention};
+pub(crate) use records::{Batch, Retention, name_in_lines};
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::{Issued, VehicleReport};
 
@@ -67,7 +67,7 @@ const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
 
 /// The database.
 #[derive(Debug)]
-pub(crate) struct Store {
+pub(crate) struct CloudStore {
     pool: AnyPool,
     turn: Mutex<()>,
 }
@@ -78,7 +78,7 @@ pub(crate) struct Change<'s> {
     _turn: MutexGuard<'s, ()>,
 }
 
-impl Store {
+impl CloudStore {
     /// Opens the database in this file, and brings it to the newest version.
     ///
     /// # Errors

@@ -5,7 +5,7 @@ use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::json;
 
 use super::vehicles::{ended, unknown};
-use super::{Change, Store, int, unsigned};
+use super::{Change, CloudStore, int, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of streams of a vehicle: two, and one for each lambda that it ever had.
@@ -42,7 +42,7 @@ pub(crate) struct RecordPage {
     pub(crate) arrival: i64,
 }
 
-impl Store {
+impl CloudStore {
     /// Stores records and the position after them, if the connection still counts. Records that
     /// are stored already are skipped.
     pub(crate) async fn append(
@@ -156,7 +156,7 @@ impl Store {
         let line = |(stream, removed, to): (String, i64, i64)| {
             let record = json!({ "to": to, "reason": "Retention", "records": removed });
             let line = StreamLine {
-                stream,
+                stream: name_in_lines(&stream).to_owned(),
                 seq: 0,
                 time_ns: 0,
                 boot_ns: 0,
@@ -168,6 +168,11 @@ impl Store {
         };
         Ok(rows.into_iter().map(line).collect())
     }
+}
+
+/// Returns the name of a stream in its lines: of a lambda's records, the id of its deployment.
+pub(crate) fn name_in_lines(stream: &str) -> &str {
+    stream.strip_prefix("lambdas/").unwrap_or(stream)
 }
 
 impl Change<'_> {

@@ -1,7 +1,7 @@
 //! Secrets: stored as their SHA-256, found by it, and valid for a while. With 256 random bits, a
 //! plain hash cannot be searched.
 
-use super::{Change, Store, now};
+use super::{Change, CloudStore, now};
 use crate::error::{CloudError, CloudResult};
 
 const DAY_S: i64 = 86_400;
@@ -89,7 +89,7 @@ impl Change<'_> {
     }
 }
 
-impl Store {
+impl CloudStore {
     /// Returns the name and the role of the user with this token.
     pub(super) async fn user_row(&self, token: &str) -> CloudResult<Option<(String, String)>> {
         Ok(row!(&self.pool;

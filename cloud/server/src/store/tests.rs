@@ -1,5 +1,6 @@
 use gleaner_fleet::people::{NewUser, Role};
 use gleaner_fleet::{Cursor, Hello};
+use gleaner_protocol::vehicle_api::GrantStatus;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -7,13 +8,13 @@ use super::*;
 
 const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20 };
 
-async fn store() -> (TempDir, Store) {
+async fn store() -> (TempDir, CloudStore) {
     let folder = TempDir::new().unwrap();
-    let store = Store::open(&folder.path().join("cloud.db")).await.unwrap();
+    let store = CloudStore::open(&folder.path().join("cloud.db")).await.unwrap();
     (folder, store)
 }
 
-async fn connected(store: &Store, name: &str) -> u64 {
+async fn connected(store: &CloudStore, name: &str) -> u64 {
     store.invite_vehicle("ann", name).await.unwrap();
     store.connect(name, &Hello::default()).await.unwrap()
 }
@@ -25,6 +26,7 @@ fn offered(id: &str, release: u64, fleet: &str) -> OfferedDeployment {
         envelope: format!("envelope {release} of {id} for {fleet}"),
         revision: "r".to_owned(),
         fallback: None,
+        grants: GrantStatus { record: true, ..GrantStatus::default() },
         selector: [("fleet".to_owned(), fleet.to_owned())].into(),
         revisions: [("r".to_owned(), "a revision".to_owned())].into(),
     }
@@ -57,7 +59,7 @@ fn batch(life: u64, seqs: std::ops::Range<u64>) -> Batch {
     Batch { lines: seqs.map(line).collect(), cursor }
 }
 
-async fn lines(store: &Store) -> Vec<String> {
+async fn lines(store: &CloudStore) -> Vec<String> {
     let streams = ["events"; 2];
     let mut lines = store.removed("car-7", streams, 0).await.unwrap();
     lines.extend(store.page("car-7", streams, 0, 0, 1000).await.unwrap().lines);
@@ -154,7 +156,8 @@ async fn a_release_is_replaced_only_by_a_higher_one() {
         assert_eq!(refused.reason(), expected);
     }
     store.deploy("ann", &offered("a", 6, "test")).await.unwrap();
-    assert_eq!(store.deployment("a").await.unwrap().release, 6);
+    let stored = store.deployment("a").await.unwrap();
+    assert!(stored.release == 6 && stored.grants.record);
     let refused = store.roll_back("ann", "a").await.unwrap_err();
     assert_eq!(refused.reason(), "deployment `a` has no fallback");
     let with_fallback = OfferedDeployment { fallback: Some("r".into()), ..offered("a", 7, "test") };
@@ -241,7 +244,7 @@ async fn the_database_of_a_later_version_is_refused() {
     let (folder, store) = store().await;
     store.execute("INSERT INTO migrations (version) VALUES (99)").await;
     store.close().await;
-    let refused = Store::open(&folder.path().join("cloud.db")).await.unwrap_err();
+    let refused = CloudStore::open(&folder.path().join("cloud.db")).await.unwrap_err();
     assert_eq!(refused.message, "the database has version 99; this program has 1");
     assert!(refused.help.is_some());
 }

@@ -2,10 +2,9 @@
 
 use gleaner_base::excerpt;
 use gleaner_fleet::people::{Invitation, NewUser, Role, Session, User};
-use gleaner_lambda::manifest::ItemName;
 
 use super::secrets::SecretKind;
-use super::{Store, now, unsigned};
+use super::{CloudStore, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Actor of changes that the program itself makes, for a person at its machine.
@@ -14,13 +13,14 @@ pub(crate) const CONSOLE: &str = "console";
 /// Name of the user that the first start invites.
 const ADMIN: &str = "admin";
 
-impl Store {
+impl CloudStore {
     /// Adds a user, or invites one again with this role: codes before it do not work any more.
     pub(crate) async fn invite(&self, actor: &str, new: NewUser) -> CloudResult<Invitation> {
         let NewUser { name, role } = new;
-        if name.parse::<ItemName>().is_err() || name == CONSOLE {
+        let allowed = |c: char| c.is_ascii_alphanumeric() || "._-@+".contains(c);
+        if !(1..=64).contains(&name.len()) || !name.chars().all(allowed) || name == CONSOLE {
             let message = format!("`{}` cannot be the name of a user", excerpt(&name));
-            let help = "use lower-case letters, digits and `-`, as in ann-lee; not `console`";
+            let help = "use 1 to 64 letters, digits and `._-@+`, as in ann-lee; not `console`";
             return Err(CloudError::usage(message, help));
         }
         let mut change = self.change().await?;

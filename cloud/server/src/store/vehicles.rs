@@ -10,7 +10,7 @@ use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
 use gleaner_trust::VehicleName;
 
 use super::secrets::SecretKind;
-use super::{Change, Store, int, now, unsigned};
+use super::{Change, CloudStore, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of deployments in a report that count.
@@ -34,7 +34,7 @@ pub(crate) struct VehicleReport {
     pub(crate) json: String,
 }
 
-impl Store {
+impl CloudStore {
     /// Adds a vehicle, or lets one enrol again; returns the one-time token. One that is connected
     /// stays so until the token is used.
     pub(crate) async fn invite_vehicle(&self, actor: &str, name: &str) -> CloudResult<String> {
@@ -277,6 +277,7 @@ pub(super) fn unknown(name: &str) -> CloudError {
     CloudError::missing(message, "`gleaner vehicles` lists all")
 }
 
-fn json(value: &impl serde::Serialize) -> String {
+/// Returns a value as JSON.
+pub(super) fn json(value: &impl serde::Serialize) -> String {
     serde_json::to_string(value).unwrap_or_default()
 }

@@ -7,12 +7,12 @@ use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::json;
 
 use crate::error::{CloudError, CloudResult};
-use crate::store::Batch;
+use crate::store::{Batch, name_in_lines};
 
 /// Kinds of lines that are no records: gaps and damage.
 const MARKS: [&str; 3] = ["gap", "torn", "damaged"];
 
-/// Parses records. A line that cannot be parsed is replaced by one that says so: refused, the
+/// Parses records. A line that cannot be parsed is replaced by one with the reason: refused, the
 /// vehicle would send it for ever.
 ///
 /// # Errors
@@ -30,20 +30,21 @@ pub(super) fn parse(records: &Records) -> CloudResult<Batch> {
         let help = "use a version of gleaner that fits the one of the cloud";
         CloudError::usage(format!("records of `{stream}` cannot be used"), help).because(error)
     })?;
+    let name = name_in_lines(stream);
     let cursor = Cursor { stream: stream.clone(), life: *life, next: *next, ..Cursor::default() };
     let mut batch = Batch { lines: Vec::new(), cursor };
     for text in lines.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()) {
         let line = serde_json::from_slice::<StreamLine>(text).map_err(|error| error.to_string());
         // A torn end may have the number of the next record.
         let is_before = |line: &StreamLine| is_mark(line) || line.seq < *next;
-        let line = line.and_then(|line| match line.stream == *stream && is_before(&line) {
+        let line = line.and_then(|line| match line.stream == name && is_before(&line) {
             true => Ok(line),
             false => Err(format!("it is record {} of `{}`", line.seq, excerpt(&line.stream))),
         });
         // Parsed as JSON, the line is UTF-8.
         let (line, text) = match (line, std::str::from_utf8(text)) {
             (Ok(line), Ok(text)) => (line, text.to_owned()),
-            (line, _) => damaged(stream, &line.err().unwrap_or_default(), text),
+            (line, _) => damaged(name, &line.err().unwrap_or_default(), text),
         };
         let mark = match is_mark(&line) {
             true => gleaner_trust::sha256(text.as_bytes()).to_string(),
@@ -106,6 +107,11 @@ mod tests {
         assert_eq!(marks, [(4, false), (5, true), (0, true), (0, true)]);
         assert!(batch.lines[2].2.contains("cannot read a line of 8 bytes"), "{:?}", batch.lines);
         assert_eq!((batch.cursor.next, batch.cursor.seq), (9, 4));
+        // Lines of a lambda have its id, as on the vehicle.
+        let text = line(4, "log").replace("events", "brake");
+        let stream = "lambdas/brake".to_owned();
+        let lambda = Records { stream, lines: compress(text.as_bytes()), ..records.clone() };
+        assert_eq!(parse(&lambda).unwrap().lines, [(4, String::new(), text)]);
         let other = Records { stream: "lambdas/../x".to_owned(), ..records };
         assert!(parse(&other).is_err());
     }

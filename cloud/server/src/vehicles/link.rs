@@ -6,8 +6,7 @@ use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
 use gleaner_base::{RateLimit, visible};
 use gleaner_fleet::{
-    Body, Cursor, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Reported, Welcome,
-    decompress,
+    Body, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Reported, Welcome, decompress,
 };
 use gleaner_protocol::vehicle_api::VehicleStatus;
 use tokio::sync::watch;
@@ -32,6 +31,8 @@ const WRITES: RateLimit = RateLimit::of(20.0, 100.0);
 /// Number of the problems of a report that count, and of the characters of each.
 const PROBLEMS_MAX: usize = 100;
 const PROBLEM_MAX: usize = 1000;
+/// Number of labels of a vehicle, and of the bytes of a name or value.
+const LABEL_MAX: usize = 256;
 
 /// The connection of a vehicle.
 struct VehicleLink<'c> {
@@ -79,13 +80,11 @@ impl VehicleLink<'_> {
         let Some(mut orders) = self.cloud.hub.add(self.name, self.epoch) else {
             return Ok(Some(GoAway { after_ms: 0, reason: "there is a newer one".to_owned() }));
         };
-        let cursors: Vec<Cursor> = self.cloud.store.cursors(self.name).await?;
-        let cursors = cursors.into_iter().filter(|it| hello.streams.contains(&it.stream));
         let welcome = Welcome {
             epoch: self.epoch,
             time_ms: now_ms(),
             ping_s: PING_S,
-            cursors: cursors.collect(),
+            cursors: self.cloud.store.cursors(self.name).await?,
         };
         self.send(Body::Welcome(welcome)).await?;
         self.send_wanted().await?;
@@ -206,6 +205,11 @@ fn report(reported: Reported) -> CloudResult<VehicleReport> {
     let json = String::from_utf8(json).map_err(|error| wrong(error.to_string()))?;
     let status: VehicleStatus =
         serde_json::from_str(&json).map_err(|error| wrong(format!("a status is none: {error}")))?;
+    let is_long = |text: &String| text.len() > LABEL_MAX;
+    let mut labels = status.labels.iter();
+    if labels.len() > LABEL_MAX || labels.any(|(name, value)| is_long(name) || is_long(value)) {
+        return Err(wrong(format!("a vehicle has at most {LABEL_MAX} labels, each as short")));
+    }
     let problems = reported.problems.iter().take(PROBLEMS_MAX);
     let short = |problem: &String| problem.chars().take(PROBLEM_MAX).collect::<String>();
     let problems = problems.map(|problem| visible(&short(problem))).collect();

@@ -23,7 +23,7 @@ use axum::routing::{get, post};
 use axum::{Json, Router};
 use gleaner_fleet::{EnrolReply, EnrolRequest, FRAME_MAX, RenewRequest};
 
-use crate::accept::Peer;
+use crate::accept::PeerConnection;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::objects::octets;
@@ -63,7 +63,7 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
 /// certificate still counts.
 async fn guard(
     State(cloud): State<Arc<Cloud>>,
-    Extension(peer): Extension<Arc<Peer>>,
+    Extension(peer): Extension<Arc<PeerConnection>>,
     mut request: Request,
     next: Next,
 ) -> Response {
@@ -88,7 +88,7 @@ async fn guard(
 
 async fn enrol(
     State(cloud): State<Arc<Cloud>>,
-    Extension(peer): Extension<Arc<Peer>>,
+    Extension(peer): Extension<Arc<PeerConnection>>,
     body: Bytes,
 ) -> CloudResult<Json<EnrolReply>> {
     cloud.wrong_secrets.check(peer.address)?;
@@ -122,7 +122,7 @@ fn reply(Issued { certificate, renew, expires, .. }: Issued) -> EnrolReply {
 async fn link(
     State(cloud): State<Arc<Cloud>>,
     Extension(vehicle): Extension<KnownVehicle>,
-    Extension(peer): Extension<Arc<Peer>>,
+    Extension(peer): Extension<Arc<PeerConnection>>,
     upgrade: WebSocketUpgrade,
 ) -> Response {
     upgrade

@@ -2,11 +2,13 @@
 
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use gleaner_cloud::CloudServer;
 use hyper::Method;
+use rustix::process::Pid;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -45,7 +47,7 @@ async fn a_restart_keeps_everything() {
 #[tokio::test]
 async fn a_kill_loses_nothing_that_was_acknowledged() {
     let folder = TempDir::new().unwrap();
-    let mut program = Program::start(folder.path());
+    let mut program = CloudProgram::start(folder.path());
     let admin = Person::login(program.people, program.code.as_ref().unwrap()).await;
     let (mut vehicle, _) = admin.enrol("car-7").await;
     for round in 0..5 {
@@ -56,7 +58,7 @@ async fn a_kill_loses_nothing_that_was_acknowledged() {
             link.record(seq..seq + 1).await;
         }
         drop(program);
-        program = Program::start(folder.path());
+        program = CloudProgram::start(folder.path());
         vehicle.address = program.vehicles.to_string();
     }
     let admin = admin.at(program.people);
@@ -76,18 +78,22 @@ async fn a_kill_loses_nothing_that_was_acknowledged() {
         .arg("--data")
         .arg(folder.path().join("data"))
         .status();
-    assert!(backup.unwrap().success() && copy.is_file());
+    assert!(backup.unwrap().success());
+    assert_eq!(std::fs::metadata(copy).unwrap().permissions().mode() & 0o777, 0o600);
+    let pid = Pid::from_child(&program.child);
+    rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
+    assert!(program.child.wait().unwrap().success());
 }
 
 /// The program, killed when it is dropped.
-struct Program {
+struct CloudProgram {
     child: Child,
     people: SocketAddr,
     vehicles: SocketAddr,
     code: Option<String>,
 }
 
-impl Program {
+impl CloudProgram {
     fn start(folder: &Path) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_gleaner-cloud"))
             .args(["serve", "--people", "127.0.0.1:0", "--vehicles", "127.0.0.1:0", "--data"])
@@ -110,7 +116,7 @@ impl Program {
     }
 }
 
-impl Drop for Program {
+impl Drop for CloudProgram {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
