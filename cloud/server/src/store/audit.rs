@@ -3,7 +3,7 @@
 
 use gleaner_fleet::people::AuditEntry;
 
-use super::{Change, CloudStore, int, now_ms, unsigned};
+use super::{CloudStore, StoreChange, int, now_ms, unsigned};
 use crate::error::CloudResult;
 
 /// Maximum number of entries in an answer.
@@ -11,7 +11,7 @@ const ENTRIES_MAX: i64 = 1000;
 
 type Row = (i64, i64, String, String, String, String);
 
-impl Change<'_> {
+impl StoreChange<'_> {
     /// Adds an entry; returns its number.
     pub(crate) async fn note(
         &mut self,

@@ -8,7 +8,7 @@ use gleaner_fleet::{Wanted, desired_digest};
 use gleaner_protocol::vehicle_api::GrantStatus;
 
 use super::vehicles::{FAILED, RUNNING, ended, json};
-use super::{Change, CloudStore, int, unsigned};
+use super::{CloudStore, StoreChange, int, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of deployments: all of them fit into one frame for a vehicle.
@@ -232,7 +232,7 @@ impl CloudStore {
     }
 }
 
-impl Change<'_> {
+impl StoreChange<'_> {
     /// Commits a change of `found` deployments.
     async fn finish(
         mut self,

@@ -53,7 +53,7 @@ use tokio::sync::{Mutex, MutexGuard};
 use crate::error::{CloudError, CloudResult};
 
 pub(crate) use deployments::OfferedDeployment;
-pub(crate) use records::{Batch, Retention, name_in_lines};
+pub(crate) use records::{Retention, StreamBatch, name_in_lines};
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::{Issued, VehicleReport};
 
@@ -73,7 +73,7 @@ pub(crate) struct CloudStore {
 }
 
 /// A change that is not committed yet; dropped, it is undone.
-pub(crate) struct Change<'s> {
+pub(crate) struct StoreChange<'s> {
     tx: Transaction<'static, Any>,
     _turn: MutexGuard<'s, ()>,
 }
@@ -129,12 +129,12 @@ impl CloudStore {
     }
 
     /// Begins a change, once no other one is in progress.
-    pub(crate) async fn change(&self) -> CloudResult<Change<'_>> {
+    pub(crate) async fn change(&self) -> CloudResult<StoreChange<'_>> {
         let turn = self.turn.lock().await;
         // A program beside this one, such as `invite`, writes too: a transaction that became a
         // writer only later would fail instead of waiting for it.
         let tx = self.pool.begin_with("BEGIN IMMEDIATE").await?;
-        Ok(Change { tx, _turn: turn })
+        Ok(StoreChange { tx, _turn: turn })
     }
 
     /// Writes a copy of the database to a new file.
@@ -149,7 +149,7 @@ impl CloudStore {
     }
 }
 
-impl Change<'_> {
+impl StoreChange<'_> {
     /// Makes the change durable.
     pub(crate) async fn commit(self) -> CloudResult<()> {
         Ok(self.tx.commit().await?)

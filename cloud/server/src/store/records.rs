@@ -5,7 +5,7 @@ use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::json;
 
 use super::vehicles::{ended, unknown};
-use super::{Change, CloudStore, int, unsigned};
+use super::{CloudStore, StoreChange, int, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of streams of a vehicle: two, and one for each lambda that it ever had.
@@ -27,7 +27,7 @@ impl Retention {
 
 /// Records of a stream that a vehicle has sent.
 #[derive(Debug)]
-pub(crate) struct Batch {
+pub(crate) struct StreamBatch {
     /// Number, mark and text of each line; the mark is empty for records.
     pub(crate) lines: Vec<(u64, String, String)>,
     /// The position after them.
@@ -49,7 +49,7 @@ impl CloudStore {
         &self,
         name: &str,
         epoch: u64,
-        batch: &Batch,
+        batch: &StreamBatch,
         retention: Retention,
     ) -> CloudResult<Ack> {
         let Cursor { stream, life, next, .. } = &batch.cursor;
@@ -175,7 +175,7 @@ pub(crate) fn name_in_lines(stream: &str) -> &str {
     stream.strip_prefix("lambdas/").unwrap_or(stream)
 }
 
-impl Change<'_> {
+impl StoreChange<'_> {
     /// Returns the number of the next record of this life of a stream.
     async fn stored_next(&mut self, name: &str, stream: &str, life: u64) -> CloudResult<u64> {
         let row: Option<(i64, i64)> = row!(&mut *self.tx;

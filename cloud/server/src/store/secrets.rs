@@ -1,7 +1,7 @@
 //! Secrets: stored as their SHA-256, found by it, and valid for a while. With 256 random bits, a
 //! plain hash cannot be searched.
 
-use super::{Change, CloudStore, now};
+use super::{CloudStore, StoreChange, now};
 use crate::error::{CloudError, CloudResult};
 
 const DAY_S: i64 = 86_400;
@@ -43,7 +43,7 @@ impl SecretKind {
     }
 }
 
-impl Change<'_> {
+impl StoreChange<'_> {
     /// Makes a secret of `subject`; returns it, and its end.
     pub(super) async fn add_secret(
         &mut self,

@@ -46,7 +46,7 @@ fn report(labels: Value, deployments: Value) -> VehicleReport {
     }
 }
 
-fn batch(life: u64, seqs: std::ops::Range<u64>) -> Batch {
+fn batch(life: u64, seqs: std::ops::Range<u64>) -> StreamBatch {
     let line = |seq| (seq, String::new(), format!("line {seq}"));
     let cursor = Cursor {
         stream: "events".to_owned(),
@@ -56,7 +56,7 @@ fn batch(life: u64, seqs: std::ops::Range<u64>) -> Batch {
         boot: "b".to_owned(),
         boot_ns: 7,
     };
-    Batch { lines: seqs.map(line).collect(), cursor }
+    StreamBatch { lines: seqs.map(line).collect(), cursor }
 }
 
 async fn lines(store: &CloudStore) -> Vec<String> {

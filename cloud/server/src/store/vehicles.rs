@@ -10,7 +10,7 @@ use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
 use gleaner_trust::VehicleName;
 
 use super::secrets::SecretKind;
-use super::{Change, CloudStore, int, now, unsigned};
+use super::{CloudStore, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of deployments in a report that count.
@@ -232,7 +232,7 @@ impl CloudStore {
     }
 }
 
-impl Change<'_> {
+impl StoreChange<'_> {
     async fn add_certificate(&mut self, name: &str, issued: &Issued) -> CloudResult<()> {
         run!(&mut *self.tx;
             "INSERT INTO certificates (sha256, vehicle, expires) VALUES ($1, $2, $3)";

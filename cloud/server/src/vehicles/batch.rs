@@ -7,7 +7,7 @@ use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::json;
 
 use crate::error::{CloudError, CloudResult};
-use crate::store::{Batch, name_in_lines};
+use crate::store::{StreamBatch, name_in_lines};
 
 /// Kinds of lines that are no records: gaps and damage.
 const MARKS: [&str; 3] = ["gap", "torn", "damaged"];
@@ -18,7 +18,7 @@ const MARKS: [&str; 3] = ["gap", "torn", "damaged"];
 /// # Errors
 ///
 /// An error if the stream has no name of one, or the lines cannot be decompressed.
-pub(super) fn parse(records: &Records) -> CloudResult<Batch> {
+pub(super) fn parse(records: &Records) -> CloudResult<StreamBatch> {
     let Records { stream, life, next, lines } = records;
     let lambda = stream.strip_prefix("lambdas/").map(str::parse::<ItemName>);
     if !matches!(&**stream, "events" | "orchestrator") && !matches!(lambda, Some(Ok(_))) {
@@ -32,7 +32,7 @@ pub(super) fn parse(records: &Records) -> CloudResult<Batch> {
     })?;
     let name = name_in_lines(stream);
     let cursor = Cursor { stream: stream.clone(), life: *life, next: *next, ..Cursor::default() };
-    let mut batch = Batch { lines: Vec::new(), cursor };
+    let mut batch = StreamBatch { lines: Vec::new(), cursor };
     for text in lines.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()) {
         let line = serde_json::from_slice::<StreamLine>(text).map_err(|error| error.to_string());
         // A torn end may have the number of the next record.
