@@ -8,7 +8,8 @@
 //! - `bounded_process`: programs that must end within a time.
 //! - `link`: starts `gleaner-supervisor`, which runs all other processes, and sends it the wanted
 //!   state.
-//! - `api`, `streams`, `metrics`: the socket for users. `objects`: files that they and the cloud send.
+//! - `api`, `streams`, `metrics`: the socket for users. `objects`: files that they and the cloud
+//!   send.
 //! - `cloud`: the connection to the cloud, if the vehicle is enrolled.
 //!
 //! Lambdas do not depend on it: it can end and start again while they run.

@@ -62,12 +62,12 @@ pub(crate) struct Deployed {
     pub(crate) failed: Option<String>,
     /// Revisions that ran before, the newest first.
     pub(crate) history: Vec<Sha256>,
-    /// What the cloud wanted last; `None` of a local deployment.
+    /// The last wish of the cloud; `None` of a local deployment.
     #[serde(default)]
     pub(crate) cloud: Option<CloudWish>,
 }
 
-/// What the cloud wants of a deployment. It is followed once: what is changed locally afterwards
+/// A wish of the cloud for a deployment. It is followed once: what is changed locally afterwards
 /// stays until the cloud wants something else.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -297,8 +297,8 @@ impl RecorderLoop {
 
     /// Takes the remaining samples and wakes, and completes open clips.
     fn finish(&mut self) -> Result<(), Failure> {
-        // The processes of lambdas have ended or will, or were told that no more is accepted: their
-        // last messages are still in transit.
+        // The processes of lambdas have ended or will, or can send no more: their last messages are
+        // still in transit.
         let until = Instant::now() + FINISH_TIMEOUT;
         while self.roster.len() > 0 && Instant::now() < until {
             let seen = self.bell.value();

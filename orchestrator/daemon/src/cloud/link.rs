@@ -11,7 +11,7 @@ use tokio::time::timeout;
 use super::LinkState;
 use super::http::CloudHttp;
 use super::reconcile::{Handled, Reconciler};
-use super::session::{Session, SessionEnd};
+use super::session::{CloudSession, SessionEnd};
 use super::settings::{CloudSettings, tls};
 use crate::api::Api;
 
@@ -56,7 +56,7 @@ impl CloudLink {
                 self.renew_if_due(&http, &current, &mut renewed_at).await;
                 let until = self.renewal(&current, renewed_at);
                 let (api, handled) = (&self.api, results.clone());
-                let session = Session { api, http: &http, orders: &orders, handled, until };
+                let session = CloudSession { api, http: &http, orders: &orders, handled, until };
                 session.run(settings.clone()).await
             };
             let ended = connected.await;

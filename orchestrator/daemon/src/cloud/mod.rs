@@ -34,12 +34,13 @@ pub(crate) use link::CloudLink;
 /// The enrolment and the state of the connection, shared by the API and the link.
 #[derive(Clone)]
 pub(crate) struct Cloud {
-    shared: Arc<Mutex<Shared>>,
+    shared: Arc<Mutex<LinkView>>,
     settings: watch::Sender<Option<CloudSettings>>,
     file: Arc<DurableFile>,
 }
 
-struct Shared {
+/// The connection, as users see it.
+struct LinkView {
     state: LinkState,
     reason: Option<String>,
     since: Instant,
@@ -72,7 +73,7 @@ impl Cloud {
             Ok(loaded) => (loaded.value, loaded.damage),
             Err(failure) => (None, Some(failure.to_string())),
         };
-        let shared = Shared {
+        let shared = LinkView {
             state: LinkState::Connecting,
             reason: None,
             since: Instant::now(),
@@ -131,7 +132,7 @@ impl Cloud {
         (shared.state, shared.reason) = (state, reason);
     }
 
-    fn lock(&self) -> MutexGuard<'_, Shared> {
+    fn lock(&self) -> MutexGuard<'_, LinkView> {
         self.shared.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -32,7 +32,7 @@ pub(super) struct Order {
     pub(super) http: CloudHttp,
 }
 
-/// What became of a wanted state.
+/// The outcome of a wanted state.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Handled {
     /// Its number.

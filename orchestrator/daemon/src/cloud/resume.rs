@@ -55,7 +55,7 @@ mod tests {
         }
     }
 
-    /// What the cloud has of the stream if it has the first `next` records.
+    /// Returns the cursor of a cloud that has the first `next` records of the stream.
     fn cursor(next: u64, boot_ns: u64) -> Cursor {
         let (boot, stream) = (hex(&BOOT.0), "s".to_owned());
         Cursor { stream, life: 3, next, seq: next - 1, boot, boot_ns }

@@ -33,7 +33,7 @@ const REPORT_MAX: Duration = Duration::from_secs(60);
 const PING_S: std::ops::RangeInclusive<u32> = 5..=300;
 
 /// A connection that is open.
-pub(super) struct Session<'s> {
+pub(super) struct CloudSession<'s> {
     pub(super) api: &'s Api,
     pub(super) http: &'s CloudHttp,
     pub(super) orders: &'s watch::Sender<Option<Order>>,
@@ -53,7 +53,7 @@ pub(super) enum SessionEnd {
 
 type Socket = WebSocketStream<TlsStream<TcpStream>>;
 
-impl Session<'_> {
+impl CloudSession<'_> {
     /// Exchanges frames until the connection ends.
     pub(super) async fn run(
         mut self,

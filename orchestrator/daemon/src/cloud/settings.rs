@@ -1,4 +1,4 @@
-//! What an enrolled vehicle keeps: where the cloud is, and who the vehicle is there.
+//! The enrolment that a vehicle keeps: where the cloud is, and who the vehicle is there.
 
 use std::fmt;
 use std::sync::Arc;

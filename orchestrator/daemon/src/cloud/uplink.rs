@@ -31,7 +31,7 @@ const RATE: RateLimit = RateLimit::of(262_144.0, 2_097_152.0);
 pub(super) struct Uplink {
     pub(super) spool: PathBuf,
     pub(super) cloud: Cloud,
-    /// What the cloud has of each stream.
+    /// The last record of each stream that the cloud has.
     pub(super) cursors: BTreeMap<String, Cursor>,
     /// To the connection; it closes this with its end.
     pub(super) out: Sender<Body>,
