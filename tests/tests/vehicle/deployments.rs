@@ -240,13 +240,15 @@ pub fn quarantined() {
     assert!(said.contains("deployment `broken` does not run"), "{said}");
     assert!(said.contains("it failed 3 times in a row before it was ready"), "{said}");
     // One that kills itself looks as if another program had killed it, but for the time.
-    let code = "def __init__(self, ctx):\n    import os\n    os.kill(os.getpid(), 9)";
-    let killer = PythonLambda::new("killer", code);
-    let said = text(&vehicle.deploy(killer.path(), &[]));
+    let ending = |name, how| {
+        let code = format!("def __init__(self, ctx):\n    import os\n    {how}\n{HARMLESS}");
+        text(&vehicle.deploy(PythonLambda::new(name, &code).path(), &[]))
+    };
+    let said = ending("killer", "os.kill(os.getpid(), 9)");
     assert!(said.contains("it failed 3 times in a row before it was ready"), "{said}");
+    assert!(said.contains("was ended by signal 9 (SIGKILL)"), "{said}");
     // An exit code that the lambda chose is not one of the runtime.
-    let code = "def __init__(self, ctx):\n    import os\n    os._exit(2)";
-    let said = text(&vehicle.deploy(PythonLambda::new("quitter", code).path(), &[]));
+    let said = ending("quitter", "os._exit(2)");
     assert!(said.contains("it failed 3 times in a row before it was ready"), "{said}");
     assert!(said.contains("code ended its process with exit code 2 in its constructor"), "{said}");
     let status = vehicle.deployment("broken").status.expect("it is known");
