@@ -66,9 +66,6 @@ pub struct Hello {
     /// Public key that verifies its clips.
     #[prost(string, tag = "3")]
     pub key: String,
-    /// Streams that it has.
-    #[prost(string, repeated, tag = "4")]
-    pub streams: Vec<String>,
 }
 
 /// The answer to [`Hello`].

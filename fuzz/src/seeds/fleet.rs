@@ -38,7 +38,6 @@ pub fn all() -> Vec<Vec<u8>> {
             protocol: PROTOCOL,
             version: "0.1.0".to_owned(),
             key: "key".to_owned(),
-            streams: vec!["events".to_owned()],
         }),
         Body::Welcome(Welcome { epoch: 5, time_ms: -1, ping_s: 20, cursors: vec![cursor] }),
         Body::Desired(Desired { generation: 7, deployments: vec![wanted("a", 0), wanted("b", 1)] }),

@@ -116,13 +116,13 @@ impl CloudStore {
     /// Requests each vehicle to run the fallback of a deployment.
     pub(crate) async fn roll_back(&self, actor: &str, id: &str) -> CloudResult<ChangedVehicles> {
         let mut change = self.change().await?;
-        // Numbers of the audit trail grow for ever: a request is new also for a vehicle that
-        // followed one of a deployment of this id that was removed since.
+        // Numbers are times: a request is new also for a vehicle that followed one of a deployment
+        // of this id that was removed since, or that a restored backup does not have.
         let found = run!(&mut *change.tx;
             "UPDATE deployments SET rollback_request =
-             (SELECT COALESCE(MAX(seq), 0) + 1 FROM audit)
+             CASE WHEN rollback_request < $2 THEN $2 ELSE rollback_request + 1 END
              WHERE id = $1 AND fallback <> ''";
-            id)
+            id, now_ms())
         .rows_affected();
         if found == 0 && self.deployment_exists(id).await? {
             let message = format!("deployment `{id}` has no fallback");

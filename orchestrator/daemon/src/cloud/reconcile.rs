@@ -97,7 +97,7 @@ impl Reconciler {
             let id = step.id().clone();
             if let Err(failure) = self.take(step, http).await {
                 // One that fails blocks no other one.
-                problems.push(format!("{id}: {failure}"));
+                problems.push(format!("`{id}`: {failure}"));
             }
         }
         problems

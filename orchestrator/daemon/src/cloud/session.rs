@@ -154,7 +154,6 @@ impl CloudSession<'_> {
             protocol: PROTOCOL,
             version: env!("CARGO_PKG_VERSION").to_owned(),
             key: self.api.key.to_string(),
-            streams: Vec::new(),
         };
         self.send(socket, Body::Hello(hello)).await?;
         let first = timeout(PATIENCE, socket.next()).await.map_err(|late| self.broken(&late))?;
