@@ -240,9 +240,13 @@ impl Rollout {
             ))?;
         }
         let text = match done == standings.len() {
-            true if standings.is_empty() => {
-                "no vehicle has the labels yet: one that connects with them follows\n".to_owned()
+            true if standings.is_empty() => match self.goal {
+                Goal::Revision { .. } => {
+                    "no vehicle has the labels yet: one that connects with them gets it\n"
+                }
+                _ => "no vehicle has the labels: there is nothing to wait for\n",
             }
+            .to_owned(),
             true => format!("`{id}` {words} on {all}\n"),
             false => return Err(self.failure(standings, &format!("{done} of {all}"))),
         };
