@@ -8,7 +8,7 @@ use gleaner_fleet::{Wanted, desired_digest};
 use gleaner_protocol::vehicle_api::GrantStatus;
 
 use super::vehicles::{FAILED, RUNNING, ended, json};
-use super::{CloudStore, StoreChange, int, unsigned};
+use super::{CloudStore, StoreChange, int, now_ms, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of deployments: all of them fit into one frame for a vehicle.
