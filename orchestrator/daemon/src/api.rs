@@ -43,6 +43,9 @@ use crate::streams;
 /// text in JSON.
 const BODY_MAX: usize = 12 << 20;
 
+/// The users of the socket, in events.
+const USER: &str = "a user";
+
 /// State of the handlers.
 #[derive(Clone)]
 pub(crate) struct Api {
@@ -164,8 +167,8 @@ async fn change(
     Path((id, change)): Path<(String, String)>,
 ) -> Reply<axum::Json<Changed>> {
     let changed = api.blocking(move |core| match &*change {
-        "start" => core.set_wanted(&id, true),
-        "stop" => core.set_wanted(&id, false),
+        "start" => core.set_wanted(&id, true, USER),
+        "stop" => core.set_wanted(&id, false, USER),
         "rollback" => core.roll_back(&id, "rolled back by a user"),
         other => {
             let other = gleaner_base::excerpt(other);
@@ -177,7 +180,7 @@ async fn change(
 }
 
 async fn remove(State(api): State<Api>, Path(id): Path<String>) -> Reply<StatusCode> {
-    api.blocking(move |core| core.remove(&id)).await?;
+    api.blocking(move |core| core.remove(&id, USER)).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 

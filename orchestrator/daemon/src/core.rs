@@ -181,12 +181,12 @@ impl Core {
         self.save(&mut inner)
     }
 
-    /// Stops a lambda, or starts it, also after a quarantine.
+    /// Stops a lambda, or starts it, also after a quarantine. `by` is who wants it.
     ///
     /// # Errors
     ///
     /// A failure if there is no such deployment, or the disk is full.
-    pub(crate) fn set_wanted(&self, id: &str, is_wanted: bool) -> Result<u64, Failure> {
+    pub(crate) fn set_wanted(&self, id: &str, is_wanted: bool, by: &str) -> Result<u64, Failure> {
         self.update(id, |inner, deployed, signed| {
             if is_wanted
                 && !deployed.is_wanted
@@ -197,9 +197,9 @@ impl Core {
             deployed.is_wanted = is_wanted;
             deployed.attempt += u64::from(is_wanted);
             Ok(if is_wanted {
-                (EventKind::Started, "started by a user".to_owned())
+                (EventKind::Started, format!("started by {by}"))
             } else {
-                (EventKind::Stopped, "stopped by a user".to_owned())
+                (EventKind::Stopped, format!("stopped by {by}"))
             })
         })
     }

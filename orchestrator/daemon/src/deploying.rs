@@ -175,13 +175,13 @@ impl Core {
         Ok(manifests)
     }
 
-    /// Removes a deployment, and lets its lambda end. What the vehicle has accepted stays
-    /// remembered: no earlier release of it is accepted afterwards.
+    /// Removes a deployment, as `by` wants it, and lets its lambda end. What the vehicle has
+    /// accepted stays remembered: no earlier release of it is accepted afterwards.
     ///
     /// # Errors
     ///
     /// A failure if there is no such deployment, or the disk is full.
-    pub(crate) fn remove(&self, id: &str) -> Result<(), Failure> {
+    pub(crate) fn remove(&self, id: &str, by: &str) -> Result<(), Failure> {
         let _changing = self.deploying.lock().unwrap_or_else(PoisonError::into_inner);
         let mut inner = self.lock();
         let mut state = inner.state.clone();
@@ -195,7 +195,7 @@ impl Core {
         inner.expected.remove(&name);
         self.publish(&mut inner);
         inner.has_removed = true;
-        self.event(EventKind::Stopped, Some(&name), "removed by a user");
+        self.event(EventKind::Stopped, Some(&name), &format!("removed by {by}"));
         let running = inner.status.iter().flat_map(|status| &status.lambdas);
         let running = running.map(|lambda| lambda.id.clone());
         let VehicleState { deployments, removed, .. } = &inner.state;

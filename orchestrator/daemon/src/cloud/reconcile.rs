@@ -25,6 +25,9 @@ const PAUSE_MAX: Duration = Duration::from_secs(1800);
 /// Number of times that missing files are fetched: another deployment may remove some in between.
 const ROUNDS: u32 = 5;
 
+/// The cloud, in events.
+const CLOUD: &str = "the cloud";
+
 /// A wanted state, and the cloud that has its files.
 #[derive(Clone)]
 pub(super) struct Order {
@@ -105,10 +108,10 @@ impl Reconciler {
 
     async fn take(&self, step: Step, http: &CloudHttp) -> Result<(), Failure> {
         match step {
-            Step::Remove(id) => self.blocking(move |core| core.remove(id.as_str())).await,
+            Step::Remove(id) => self.blocking(move |core| core.remove(id.as_str(), CLOUD)).await,
             Step::Stop(id, wish) => {
                 self.blocking(move |core| {
-                    core.set_wanted(id.as_str(), false)?;
+                    core.set_wanted(id.as_str(), false, CLOUD)?;
                     core.note_wish(&id, &wish)
                 })
                 .await

@@ -26,7 +26,7 @@ use super::uplink::Uplink;
 use crate::api::Api;
 
 /// Interval of looks whether the status is to be reported.
-const STATUS_INTERVAL: Duration = Duration::from_secs(5);
+const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// Longest time between two reports.
 const REPORT_MAX: Duration = Duration::from_secs(60);
 /// Bounds of the interval of signs of life, in s, whatever the cloud asks for.
@@ -190,13 +190,16 @@ impl CloudSession<'_> {
         let status = self.api.status();
         let Handled { generation, problems } = self.handled.borrow_and_update().clone();
         self.api.cloud.lock().generation = generation;
-        let lambdas = status.deployments.iter().map(|it| {
-            let lambda = it.status.as_ref();
-            let phase = lambda.map(|lambda| (lambda.phase, lambda.restarts));
-            (&it.id, it.release, it.is_wanted, it.runs_fallback, it.is_proven, &it.refused, phase)
+        let deployments = status.deployments.iter().map(|it| {
+            (&it.id, it.release, it.is_wanted, it.runs_fallback, it.is_proven, &it.refused)
         });
+        let deployments: Vec<_> = deployments.collect();
+        // Those that still end, too.
+        let lambdas = status.supervisor.iter().flat_map(|supervisor| &supervisor.lambdas);
+        let lambdas = lambdas.map(|it| (&it.id, &it.revision, it.phase, it.restarts));
         let lambdas: Vec<_> = lambdas.collect();
-        let essence = format!("{generation} {problems:?} {:?} {lambdas:?}", status.labels);
+        let labels = &status.labels;
+        let essence = format!("{generation} {problems:?} {labels:?} {deployments:?} {lambdas:?}");
         let status = compress(&serde_json::to_vec(&status).expect("a status is plain data"));
         (essence, Body::Reported(Reported { generation, status, problems }))
     }
