@@ -1,7 +1,7 @@
 //! `gleaner login`, `logout` and `whoami`: the address of a cloud and the token for it.
 
 use gleaner_base::{Exit, Failure, visible};
-use gleaner_fleet::people::{Login, Session, User};
+use gleaner_fleet::people::{Login, User, UserToken};
 use serde_json::json;
 
 use super::{date, show};
@@ -19,7 +19,7 @@ pub(super) fn login(args: &LoginArgs) -> Result<Exit, Failure> {
     }
     let account = CloudAccount { url: url.clone(), token: String::new() };
     let login = Login { code: args.code.clone() };
-    let session: Session = VehicleClient::of_cloud(account)?.post("/v1/login", &login)?;
+    let session: UserToken = VehicleClient::of_cloud(account)?.post("/v1/login", &login)?;
     let file = CloudAccount { url: url.clone(), token: session.token }.save()?;
     let (user, file, url) = (session.user, file.display().to_string(), url.to_string());
     // The token itself is not shown.

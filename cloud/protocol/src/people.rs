@@ -2,7 +2,7 @@
 //!
 //! | request | role | answer |
 //! |---|---|---|
-//! | `POST /v1/login` | none | [`Session`], of a [`Login`] |
+//! | `POST /v1/login` | none | [`UserToken`], of a [`Login`] |
 //! | `GET /v1/me` | viewer | [`User`] |
 //! | `GET /v1/users` | admin | [`User`] of each |
 //! | `POST /v1/users` | admin | [`Invitation`], of a [`NewUser`] |
@@ -86,7 +86,7 @@ pub struct Login {
 
 /// A token of a user. It is not shown again.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Session {
+pub struct UserToken {
     /// The user.
     pub user: User,
     /// The token, for the header `Authorization: Bearer TOKEN`.

@@ -22,7 +22,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, delete, get, post, put};
 use gleaner_fleet::Enrolment;
 use gleaner_fleet::people::{
-    FleetDeployment, Invitation, Login, NewUser, NewVehicle, Role, Session, User,
+    FleetDeployment, Invitation, Login, NewUser, NewVehicle, Role, User, UserToken,
 };
 
 use crate::accept::PeerConnection;
@@ -134,7 +134,7 @@ async fn login(
     State(cloud): State<Arc<Cloud>>,
     Extension(peer): Extension<Arc<PeerConnection>>,
     body: Bytes,
-) -> CloudResult<Json<Session>> {
+) -> CloudResult<Json<UserToken>> {
     cloud.wrong_secrets.check(peer.address)?;
     let Login { code } = parsed(&body, "login")?;
     let session = cloud.store.login(&code).await?;

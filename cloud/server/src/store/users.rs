@@ -1,7 +1,7 @@
 //! Users, their invitations and their tokens.
 
 use gleaner_base::excerpt;
-use gleaner_fleet::people::{Invitation, NewUser, Role, Session, User};
+use gleaner_fleet::people::{Invitation, NewUser, Role, User, UserToken};
 
 use super::secrets::SecretKind;
 use super::{CloudStore, now, unsigned};
@@ -51,7 +51,7 @@ impl CloudStore {
     }
 
     /// Exchanges a code for a token; `None` if the code is wrong, used or too old.
-    pub(crate) async fn login(&self, code: &str) -> CloudResult<Option<Session>> {
+    pub(crate) async fn login(&self, code: &str) -> CloudResult<Option<UserToken>> {
         let mut change = self.change().await?;
         let Some(name) = change.take_secret(SecretKind::Code, code).await? else { return Ok(None) };
         let (role,): (String,) =
@@ -59,7 +59,7 @@ impl CloudStore {
         let (token, expires) = change.add_secret(SecretKind::Token, &name).await?;
         change.note(&name, "login", &name).await?;
         change.commit().await?;
-        Ok(Some(Session { user: user((name, role))?, token, expires: unsigned(expires) }))
+        Ok(Some(UserToken { user: user((name, role))?, token, expires: unsigned(expires) }))
     }
 
     /// Returns the user with this token.
