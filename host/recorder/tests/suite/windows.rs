@@ -202,3 +202,22 @@ fn consecutive_clips_contain_together_what_one_would() {
         assert_eq!(groups, expected(&plan), "seed {seed}");
     }
 }
+
+#[test]
+fn triggers_without_messages_make_clips_of_the_longest_length() {
+    let scratch = TestDir::new();
+    let mut recorder =
+        scratch.recorder(|settings| settings.max_length = Duration::from_millis(500));
+    let topic = recorder.add_topic(topic("/silent")).unwrap();
+    let lambda = recorder.add_lambda(member("l", (100, 100, 0), &[topic]));
+    for step in 0..20 {
+        let at = T0 + step * 100 * MS;
+        recorder.advance(at).unwrap();
+        recorder.wake(lambda, &entry(at, &[Event])).unwrap();
+    }
+    let before = recorder.clips().len();
+    assert!(before >= 3, "{before}");
+    recorder.finish(T0 + 2000 * MS).unwrap();
+    let triggers: u64 = recorder.clips().iter().map(|clip| clip.triggers).sum();
+    assert_eq!(triggers, 20);
+}

@@ -279,7 +279,7 @@ impl ClipsInProgress {
         let (Some(clip), Some(group)) = (&mut self.open, windows.open()) else {
             return Ok(());
         };
-        if !clip.is_empty() {
+        if !clip.has_nothing() {
             let next = clip.next(group, self.disk.new_clip());
             let full = std::mem::replace(clip, next);
             self.end(full, before, CloseReason::Full(boundary), material)?;
@@ -340,7 +340,7 @@ impl ClipsInProgress {
         }
         let before = group.clone();
         group.roll(boundary);
-        if !clip.is_empty() {
+        if !clip.has_nothing() {
             let next = clip.next(&group, self.disk.new_clip());
             let full = std::mem::replace(&mut clip, next);
             self.end(full, &before, CloseReason::Full(boundary), material)?;

@@ -125,9 +125,14 @@ impl OpenClip {
         self.messages == 0
     }
 
+    /// Returns whether it has no message and no trigger.
+    pub fn has_nothing(&self) -> bool {
+        self.is_empty() && self.triggers == 0
+    }
+
     /// Returns whether it has nothing, although the previous clip announced a continuation.
     pub fn is_pointless(&self) -> bool {
-        self.continues && self.is_empty() && self.triggers == 0
+        self.continues && self.has_nothing()
     }
 
     pub fn tally(&mut self, topic: usize) -> &mut TopicTally {
