@@ -14,6 +14,12 @@ pub const FRAME_MAX: usize = 1 << 20;
 /// Maximum length of lines and of a status once they are decompressed.
 pub const LINES_MAX: u64 = 8 << 20;
 
+/// Maximum number of records in a frame.
+pub const RECORDS_MAX: usize = 4000;
+
+/// Maximum number of deployments in a wanted state.
+pub const WANTED_MAX: usize = 4000;
+
 /// A frame.
 #[derive(Clone, PartialEq, Message)]
 pub struct Frame {

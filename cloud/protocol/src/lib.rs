@@ -18,5 +18,6 @@ pub use enrolment::{
 };
 pub use frame::{
     Ack, Body, Cursor, Desired, FRAME_MAX, Frame, FrameError, GoAway, Hello, LINES_MAX, PROTOCOL,
-    Ping, Pong, Records, Reported, Wanted, Welcome, compress, decompress, desired_digest,
+    Ping, Pong, RECORDS_MAX, Records, Reported, WANTED_MAX, Wanted, Welcome, compress, decompress,
+    desired_digest,
 };

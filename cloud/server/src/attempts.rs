@@ -19,22 +19,10 @@ const ADDRESSES_MAX: usize = 10_000;
 pub(crate) struct WrongSecrets(Mutex<HashMap<IpAddr, RateLimit>>);
 
 impl WrongSecrets {
-    /// Refuses an address that has sent too many.
-    pub(crate) fn check(&self, address: IpAddr) -> CloudResult<()> {
-        let limits = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        // A copy: only a wrong secret takes something.
-        let mut limit = limits.get(&address).copied().unwrap_or(LIMIT);
-        match limit.take(1.0, Instant::now()) {
-            true => Ok(()),
-            false => Err(CloudError::busy(
-                "too many wrong codes and tokens came from your address",
-                "wait a minute, and use the newest code or token",
-            )),
-        }
-    }
-
-    /// Counts a wrong one.
-    pub(crate) fn count(&self, address: IpAddr) {
+    /// Counts a wrong one; it is an error of its own if the address has sent too many. Those that
+    /// are right are never refused: others at the address, such as all behind a proxy, may use
+    /// them.
+    pub(crate) fn count(&self, address: IpAddr) -> CloudResult<()> {
         let now = Instant::now();
         let mut limits = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if limits.len() >= ADDRESSES_MAX {
@@ -42,7 +30,13 @@ impl WrongSecrets {
         }
         // With this many at once, further ones share the limit of one address.
         let key = if limits.len() < ADDRESSES_MAX { address } else { IpAddr::from([0; 4]) };
-        limits.entry(key).or_insert(LIMIT).take(1.0, now);
+        match limits.entry(key).or_insert(LIMIT).take(1.0, now) {
+            true => Ok(()),
+            false => Err(CloudError::busy(
+                "too many wrong codes and tokens came from your address",
+                "wait a minute, and use the newest code or token",
+            )),
+        }
     }
 }
 
@@ -54,10 +48,9 @@ mod tests {
     fn wrong_secrets_of_one_address_do_not_stop_another() {
         let (wrong, one, other) = (WrongSecrets::default(), [10, 0, 0, 1], [10, 0, 0, 2]);
         for _ in 0..10 {
-            assert!(wrong.check(one.into()).is_ok());
-            wrong.count(one.into());
+            assert!(wrong.count(one.into()).is_ok());
         }
-        assert!(wrong.check(one.into()).is_err());
-        assert!(wrong.check(other.into()).is_ok());
+        assert!(wrong.count(one.into()).is_err());
+        assert!(wrong.count(other.into()).is_ok());
     }
 }

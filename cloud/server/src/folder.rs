@@ -20,6 +20,14 @@ impl DataFolder {
     /// A failure that names the folder.
     pub(crate) fn create(path: &Path) -> Result<Self, Failure> {
         let folder = Self(path.to_owned());
+        let is_of_others = !folder.database().exists()
+            && !folder.0.join("lock").exists()
+            && fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_some());
+        if is_of_others {
+            let message = format!("`{}` is not empty, and no data folder", path.display());
+            return Err(Failure::new(Exit::Usage, message)
+                .with_help("choose an empty folder, or one that does not exist, with --data"));
+        }
         for path in [path, &folder.objects(), &folder.authorities()] {
             DirBuilder::new()
                 .recursive(true)

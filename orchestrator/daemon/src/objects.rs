@@ -2,6 +2,7 @@
 
 use std::error::Error;
 use std::io;
+use std::path::PathBuf;
 
 use axum::body::Bytes;
 use futures_util::{Stream, StreamExt};
@@ -34,6 +35,7 @@ pub(crate) async fn receive<E: Error + Send + Sync + 'static>(
         failure
     };
     let (file, part) = begin_object(&path).map_err(failed)?;
+    let part = UnfinishedFile(part);
     let mut file = tokio::fs::File::from_std(file);
     let (mut digest, mut received) = (sha2::Sha256::new(), 0);
     while let Some(piece) = pieces.next().await {
@@ -53,5 +55,15 @@ pub(crate) async fn receive<E: Error + Send + Sync + 'static>(
     // The last write goes on in the background, and only this returns its error.
     file.flush().await.map_err(failed)?;
     file.sync_all().await.map_err(failed)?;
-    tokio::fs::rename(&part, &path).await.map_err(failed)
+    tokio::fs::rename(&part.0, &path).await.map_err(failed)
+}
+
+/// A file that is being received. One that stays unfinished is removed.
+struct UnfinishedFile(PathBuf);
+
+impl Drop for UnfinishedFile {
+    fn drop(&mut self) {
+        // Of a complete one, this name is gone.
+        let _ = std::fs::remove_file(&self.0);
+    }
 }

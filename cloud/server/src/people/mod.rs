@@ -17,7 +17,7 @@ use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{DefaultBodyLimit, Extension, Path, Request, State};
 use axum::http::{HeaderMap, Method, StatusCode, header};
-use axum::middleware::{Next, from_fn_with_state};
+use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, delete, get, post, put};
 use gleaner_fleet::Enrolment;
@@ -28,11 +28,14 @@ use gleaner_fleet::people::{
 use crate::accept::PeerConnection;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
-use crate::request::parsed;
+use crate::request::{in_time, parsed};
 
 /// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
 /// text in JSON.
 const BODY_MAX: usize = 12 << 20;
+
+/// Maximum length of a request without a token.
+const LOGIN_MAX: usize = 4 << 10;
 
 /// A request that the API answers.
 pub(crate) struct Endpoint {
@@ -54,7 +57,12 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
     let send = |path, role, handler| endpoint(Method::POST, path, Some(role), handler);
     let remove = |path, role, handler| endpoint(Method::DELETE, path, Some(role), handler);
     vec![
-        endpoint(Method::POST, "/v1/login", None, post(login)),
+        endpoint(
+            Method::POST,
+            "/v1/login",
+            None,
+            post(login).layer(DefaultBodyLimit::max(LOGIN_MAX)),
+        ),
         read("/v1/me", Viewer, get(me)),
         read("/v1/users", Admin, get(users)),
         send("/v1/users", Admin, post(invite)),
@@ -82,7 +90,10 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
             None => handler,
             Some(role) => handler.route_layer(from_fn_with_state((Arc::clone(cloud), role), guard)),
         };
-        router = router.route(path, guarded);
+        // A file may take its time.
+        let is_file = path.starts_with("/v1/objects");
+        let timed = if is_file { guarded } else { guarded.layer(from_fn(in_time)) };
+        router = router.route(path, timed);
     }
     router
         .fallback(async || CloudError::missing("there is nothing under this path", "see the docs"))
@@ -117,9 +128,8 @@ async fn user(
     let token = header
         .and_then(|it| it.strip_prefix("Bearer "))
         .ok_or_else(|| CloudError::unknown("the request has no token", help))?;
-    cloud.wrong_secrets.check(peer.address)?;
     let Some(user) = cloud.store.user(token).await? else {
-        cloud.wrong_secrets.count(peer.address);
+        cloud.wrong_secrets.count(peer.address)?;
         return Err(CloudError::unknown("the token is not valid, or has expired", help));
     };
     if user.role < role {
@@ -135,15 +145,14 @@ async fn login(
     Extension(peer): Extension<Arc<PeerConnection>>,
     body: Bytes,
 ) -> CloudResult<Json<UserToken>> {
-    cloud.wrong_secrets.check(peer.address)?;
     let Login { code } = parsed(&body, "login")?;
-    let session = cloud.store.login(&code).await?;
-    session.map(Json).ok_or_else(|| {
-        cloud.wrong_secrets.count(peer.address);
+    let Some(token) = cloud.store.login(&code).await? else {
+        cloud.wrong_secrets.count(peer.address)?;
         let help = "a code works once, for 24 hours: let an administrator invite you again, or run \
                     `gleaner-cloud invite NAME --role ROLE --data DIR` beside the cloud";
-        CloudError::unknown("the code is not valid", help)
-    })
+        return Err(CloudError::unknown("the code is not valid", help));
+    };
+    Ok(Json(token))
 }
 
 async fn me(Extension(user): Extension<User>) -> Json<User> {

@@ -95,4 +95,9 @@ async fn wrong_tokens_are_limited_and_the_user_is_removed_with_the_token() {
         assert_eq!(me(&token).await, StatusCode::UNAUTHORIZED);
     }
     assert_eq!(me(&token).await, StatusCode::TOO_MANY_REQUESTS);
+    // Others at the address are not refused.
+    let new = NewUser { name: "bea".to_owned(), role: Role::Viewer };
+    let code = cloud.store.invite("console", new).await.unwrap().code;
+    let other = cloud.store.login(&code).await.unwrap().unwrap().token;
+    assert_eq!(me(&other).await, StatusCode::OK);
 }

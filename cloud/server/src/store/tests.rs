@@ -14,9 +14,20 @@ async fn store() -> (TempDir, CloudStore) {
     (folder, store)
 }
 
+/// Enrols a vehicle, which then has this certificate.
+async fn enrolled(store: &CloudStore, name: &str, certificate: &str) {
+    let token = store.invite_vehicle("ann", name).await.unwrap();
+    let issued = || {
+        let (sha256, expires) = (certificate.to_owned(), unsigned(now()) + 60);
+        Ok(Issued { certificate: String::new(), sha256, renew: expires, expires })
+    };
+    assert!(store.enrol(name, &token, issued).await.unwrap().is_some());
+}
+
 async fn connected(store: &CloudStore, name: &str) -> u64 {
-    store.invite_vehicle("ann", name).await.unwrap();
-    store.connect(name, &Hello::default()).await.unwrap()
+    // Its certificate has its name.
+    enrolled(store, name, name).await;
+    store.connect(name, name, &Hello::default()).await.unwrap()
 }
 
 fn offered(id: &str, release: u64, fleet: &str) -> OfferedDeployment {
@@ -89,15 +100,19 @@ async fn records_that_come_again_are_stored_once() {
 async fn a_connection_that_was_replaced_or_cut_off_stores_nothing() {
     let (_folder, store) = store().await;
     let old = connected(&store, "car-7").await;
-    let new = store.connect("car-7", &Hello::default()).await.unwrap();
+    let new = store.connect("car-7", "car-7", &Hello::default()).await.unwrap();
     assert!(store.append("car-7", old, &batch(1, 0..1), KEPT).await.is_err());
     assert!(store.report("car-7", old, &report(json!({}), json!([]))).await.is_err());
     assert!(store.append("car-7", new, &batch(1, 0..1), KEPT).await.is_ok());
     store.revoke("ann", "car-7").await.unwrap();
     assert!(store.append("car-7", new, &batch(1, 1..2), KEPT).await.is_err());
-    assert!(store.connect("car-7", &Hello::default()).await.is_err());
+    assert!(store.connect("car-7", "car-7", &Hello::default()).await.is_err());
     assert!(store.wants("car-7").await.is_err());
     assert_eq!(lines(&store).await, ["line 0"]);
+    // The earlier certificate does not count again.
+    enrolled(&store, "car-7", "second").await;
+    assert!(store.connect("car-7", "car-7", &Hello::default()).await.is_err());
+    assert!(store.connect("car-7", "second", &Hello::default()).await.is_ok());
 }
 
 #[tokio::test]

@@ -122,13 +122,21 @@ impl CloudStore {
         Ok(name.map(|(name,)| name))
     }
 
-    /// Begins a connection of a vehicle; returns its number.
-    pub(crate) async fn connect(&self, name: &str, hello: &Hello) -> CloudResult<u64> {
+    /// Begins a connection of a vehicle; returns its number. `certificate` is the SHA-256 of its
+    /// certificate, which may have been replaced since the request was let in.
+    pub(crate) async fn connect(
+        &self,
+        name: &str,
+        certificate: &str,
+        hello: &Hello,
+    ) -> CloudResult<u64> {
         let mut change = self.change().await?;
         let epoch: Option<(i64,)> = row!(&mut *change.tx;
             "UPDATE vehicles SET epoch = epoch + 1, version = $2, clip_key = $3, seen = $4
-             WHERE name = $1 AND is_revoked = 0 RETURNING epoch";
-            name, excerpt(&hello.version), excerpt(&hello.key), now());
+             WHERE name = $1 AND is_revoked = 0 AND EXISTS
+             (SELECT 1 FROM certificates WHERE sha256 = $5 AND vehicle = $1 AND expires > $4)
+             RETURNING epoch";
+            name, excerpt(&hello.version), excerpt(&hello.key), now(), certificate);
         let (epoch,) = epoch.ok_or_else(ended)?;
         change.commit().await?;
         Ok(unsigned(epoch))

@@ -1,7 +1,7 @@
 //! Parses the records that a vehicle sends.
 
 use gleaner_base::excerpt;
-use gleaner_fleet::{Cursor, Records, decompress};
+use gleaner_fleet::{Cursor, RECORDS_MAX, Records, decompress};
 use gleaner_lambda::manifest::ItemName;
 use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::json;
@@ -30,10 +30,16 @@ pub(super) fn parse(records: &Records) -> CloudResult<StreamBatch> {
         let help = "use a version of gleaner that fits the one of the cloud";
         CloudError::usage(format!("records of `{stream}` cannot be used"), help).because(error)
     })?;
+    let of_lines = || lines.split(|byte| *byte == b'\n').filter(|line| !line.is_empty());
+    if of_lines().take(RECORDS_MAX + 1).count() > RECORDS_MAX {
+        let message = format!("a frame has more than {RECORDS_MAX} records of `{stream}`");
+        let help = "use a version of gleaner that fits the one of the cloud";
+        return Err(CloudError::usage(message, help));
+    }
     let name = name_in_lines(stream);
     let cursor = Cursor { stream: stream.clone(), life: *life, next: *next, ..Cursor::default() };
     let mut batch = StreamBatch { lines: Vec::new(), cursor };
-    for text in lines.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()) {
+    for text in of_lines() {
         let line = serde_json::from_slice::<StreamLine>(text).map_err(|error| error.to_string());
         // A torn end may have the number of the next record.
         let is_before = |line: &StreamLine| is_mark(line) || line.seq < *next;
@@ -112,7 +118,11 @@ mod tests {
         let stream = "lambdas/brake".to_owned();
         let lambda = Records { stream, lines: compress(text.as_bytes()), ..records.clone() };
         assert_eq!(parse(&lambda).unwrap().lines, [(4, String::new(), text)]);
-        let other = Records { stream: "lambdas/../x".to_owned(), ..records };
+        let other = Records { stream: "lambdas/../x".to_owned(), ..records.clone() };
         assert!(parse(&other).is_err());
+        // A small frame must not become a large transaction.
+        let many = Records { lines: compress(&b"x\n".repeat(RECORDS_MAX + 1)), ..records };
+        let refused = parse(&many).unwrap_err().reason();
+        assert!(refused.contains("more than 4000 records of `events`"), "{refused}");
     }
 }

@@ -38,6 +38,8 @@ const LABEL_MAX: usize = 256;
 struct VehicleLink<'c> {
     cloud: &'c Cloud,
     name: &'c str,
+    /// SHA-256 of its certificate.
+    certificate: &'c str,
     socket: WebSocket,
     epoch: u64,
     /// Number of the wanted state that was sent last.
@@ -46,8 +48,9 @@ struct VehicleLink<'c> {
 }
 
 /// Serves a connection until its end.
-pub(super) async fn serve(cloud: &Cloud, name: &str, socket: WebSocket) {
-    let mut link = VehicleLink { cloud, name, socket, epoch: 0, sent: 0, writes: WRITES };
+pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), socket: WebSocket) {
+    let mut link =
+        VehicleLink { cloud, name, certificate, socket, epoch: 0, sent: 0, writes: WRITES };
     let end = match link.run().await {
         Ok(end) => end,
         Err(error) => {
@@ -76,7 +79,7 @@ impl VehicleLink<'_> {
             }
             Some(_) => return Err(wrong("the first frame is no hello")),
         };
-        self.epoch = self.cloud.store.connect(self.name, &hello).await?;
+        self.epoch = self.cloud.store.connect(self.name, self.certificate, &hello).await?;
         let Some(mut orders) = self.cloud.hub.add(self.name, self.epoch) else {
             return Ok(Some(GoAway { after_ms: 0, reason: "there is a newer one".to_owned() }));
         };

@@ -17,7 +17,7 @@ use std::sync::Arc;
 use axum::body::Bytes;
 use axum::extract::ws::WebSocketUpgrade;
 use axum::extract::{DefaultBodyLimit, Extension, Path, Request, State};
-use axum::middleware::{Next, from_fn_with_state};
+use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Json, Router};
@@ -27,7 +27,7 @@ use crate::accept::PeerConnection;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::objects::octets;
-use crate::request::{digest, parsed};
+use crate::request::{digest, in_time, parsed};
 use crate::store::Issued;
 
 /// Maximum length of the body of a request.
@@ -46,13 +46,13 @@ struct KnownVehicle {
 /// Returns the routes.
 pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
     Router::new()
-        .route("/v1/renew", post(renew))
+        .route("/v1/renew", post(renew).layer(from_fn(in_time)))
         .route("/v1/link", get(link))
         .route("/v1/deployments/{sha256}", get(deployment))
         .route("/v1/revisions/{digest}", get(revision))
         .route("/v1/objects/{sha256}", get(object))
         .route_layer(from_fn_with_state(Arc::clone(cloud), guard))
-        .route("/v1/enrol", post(enrol))
+        .route("/v1/enrol", post(enrol).layer(from_fn(in_time)))
         .fallback(async || CloudError::missing("there is nothing under this path", "see the docs"))
         .layer(DefaultBodyLimit::max(BODY_MAX))
         .with_state(Arc::clone(cloud))
@@ -91,11 +91,10 @@ async fn enrol(
     Extension(peer): Extension<Arc<PeerConnection>>,
     body: Bytes,
 ) -> CloudResult<Json<EnrolReply>> {
-    cloud.wrong_secrets.check(peer.address)?;
     let EnrolRequest { vehicle, token, csr } = parsed(&body, "enrolment")?;
     let issue = || cloud.authorities.issue(&vehicle, &csr);
     let Some(issued) = cloud.store.enrol(&vehicle, &token, issue).await? else {
-        cloud.wrong_secrets.count(peer.address);
+        cloud.wrong_secrets.count(peer.address)?;
         let help = "an enrolment works once, for 24 hours, and for its own vehicle: make another \
                     one with `gleaner vehicles enrol NAME --to FILE`";
         return Err(CloudError::unknown("the enrolment is not valid", help));
@@ -131,7 +130,7 @@ async fn link(
         .max_message_size(FRAME_MAX)
         .max_frame_size(FRAME_MAX)
         .on_upgrade(async move |socket| {
-            link::serve(&cloud, &vehicle.name, socket).await;
+            link::serve(&cloud, (&vehicle.name, &vehicle.certificate), socket).await;
             drop(peer);
         })
 }

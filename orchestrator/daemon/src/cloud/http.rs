@@ -65,8 +65,11 @@ impl CloudHttp {
         body: &impl Serialize,
     ) -> Result<T, Failure> {
         let body = serde_json::to_vec(body).expect("a request is plain data");
-        let answer = self.request(Method::POST, path, body).await?;
-        let whole = self.whole(answer, ANSWER_MAX).await?;
+        let whole = self.in_time("it did not answer in full", async {
+            let answer = self.request(Method::POST, path, body).await?;
+            self.whole(answer, ANSWER_MAX).await
+        });
+        let whole = whole.await??;
         serde_json::from_slice(&whole)
             .map_err(|error| self.unreachable("its answer cannot be parsed", &error))
     }

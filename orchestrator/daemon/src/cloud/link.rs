@@ -59,7 +59,13 @@ impl CloudLink {
                 let session = CloudSession { api, http: &http, orders: &orders, handled, until };
                 session.run(settings.clone()).await
             };
-            let ended = connected.await;
+            let mut others = settings.clone();
+            // Another enrolment does not wait for a cloud that does not answer.
+            let ended = tokio::select! {
+                ended = connected => ended,
+                _ = others.changed() => Ok(SessionEnd::Changed),
+            };
+            self.api.cloud.has_ended();
             if started.elapsed() >= STAYS {
                 pause = PAUSE;
             }

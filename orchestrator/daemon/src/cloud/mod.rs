@@ -124,6 +124,13 @@ impl Cloud {
         Ok(())
     }
 
+    /// Notes the end of a connection.
+    fn has_ended(&self) {
+        if self.lock().state == LinkState::Connected {
+            self.set_state(LinkState::Connecting, None);
+        }
+    }
+
     fn set_state(&self, state: LinkState, reason: Option<String>) {
         let mut shared = self.lock();
         if shared.state != state {

@@ -67,8 +67,9 @@ pub(super) fn plan(
     }
     let gone = deployed.iter().filter(|(id, it)| it.cloud.is_some() && !named.contains(id));
     let gone = gone.map(|(id, _)| Step::Remove(id.clone()));
-    // Their memory is free for what is new.
-    let steps = gone.chain(steps).collect();
+    let mut steps: Vec<_> = gone.chain(steps).collect();
+    // What ends does not wait for the files of what is new, and leaves its memory to that.
+    steps.sort_by_key(|step| matches!(step, Step::Deploy { .. }));
     (steps, ignored)
 }
 
@@ -140,6 +141,13 @@ mod tests {
         let stopped = [("a", Some(wish("1", false, 0)))];
         let start = Step::Deploy { id: id("a"), wish: wish("1", true, 0), rolls_back: false };
         assert_eq!(steps(&[wanted("a", "1", true, 0)], &stopped), [start]);
+    }
+
+    #[test]
+    fn what_ends_does_not_wait_for_what_is_new() {
+        let wanted = [wanted("a", "1", true, 0), wanted("b", "1", false, 0)];
+        let steps = steps(&wanted, &[("b", Some(wish("1", true, 0)))]);
+        assert_eq!(steps.iter().map(Step::id).collect::<Vec<_>>(), [&id("b"), &id("a")]);
     }
 
     #[test]

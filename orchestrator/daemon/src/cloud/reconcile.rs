@@ -91,14 +91,17 @@ impl Reconciler {
         let deployed = self.core.lock().state.deployments.clone();
         let (steps, mut problems) = plan(&desired.deployments, &deployed);
         for step in steps {
-            if self.orders.has_changed().unwrap_or(true) {
-                let is_same = |order: &Order| order.desired == *desired;
-                if !self.orders.borrow().as_ref().is_some_and(is_same) {
-                    break;
-                }
-            }
             let id = step.id().clone();
-            if let Err(failure) = self.take(step, http).await {
+            let mut orders = self.orders.clone();
+            let is_other = |order: &Option<Order>| {
+                order.as_ref().is_none_or(|order| order.desired != *desired)
+            };
+            // A newer state does not wait for the files of an older one.
+            let taken = tokio::select! {
+                taken = self.take(step, http) => taken,
+                _ = orders.wait_for(is_other) => break,
+            };
+            if let Err(failure) = taken {
                 // One that fails blocks no other one.
                 problems.push(format!("`{id}`: {failure}"));
             }
@@ -118,7 +121,7 @@ impl Reconciler {
             }
             Step::RollBack(id, wish) => self.roll_back(id, wish).await,
             Step::Deploy { id, wish, rolls_back } => {
-                self.deploy(&wish, http).await?;
+                self.deploy(&id, &wish, http).await?;
                 if rolls_back { self.roll_back(id, wish).await } else { Ok(()) }
             }
         }
@@ -135,7 +138,12 @@ impl Reconciler {
         .await
     }
 
-    async fn deploy(&self, wish: &CloudWish, http: &CloudHttp) -> Result<(), Failure> {
+    async fn deploy(
+        &self,
+        id: &ItemName,
+        wish: &CloudWish,
+        http: &CloudHttp,
+    ) -> Result<(), Failure> {
         let path = format!("/v1/deployments/{}", wish.envelope);
         let envelope = http.get(&path, Deployment::MAX.bytes()).await?;
         if sha256(&envelope).as_str() != wish.envelope {
@@ -146,6 +154,10 @@ impl Reconciler {
         let wanted = self.core.trust(|trust| {
             trust.verifier()?.deployment(&envelope).map_err(refused).map(|it| it.payload().clone())
         })?;
+        if wanted.id != *id {
+            let message = format!("the cloud names deployment `{}` `{id}`", wanted.id);
+            return Err(Failure::new(Exit::Denied, message));
+        }
         let mut revisions = Vec::new();
         for digest in std::iter::once(&wanted.revision).chain(&wanted.fallback) {
             if !self.core.store.has(digest) {

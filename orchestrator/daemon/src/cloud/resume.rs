@@ -28,7 +28,7 @@ pub(super) fn resume(
             Some(SpoolItem::Torn(_)) | None => false,
         };
         if !is_same {
-            return oldest(life + 1);
+            return oldest(life.saturating_add(1));
         }
     }
     Ok((*life, SpoolReader::open(folder, stream, Some(*next))?))

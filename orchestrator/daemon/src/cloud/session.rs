@@ -5,9 +5,9 @@ use std::sync::mpsc as sync_mpsc;
 use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, excerpt};
 use gleaner_fleet::{
-    Body, FRAME_MAX, Frame, Hello, PROTOCOL, Ping, Pong, Reported, Welcome, compress,
+    Body, FRAME_MAX, Frame, Hello, PROTOCOL, Ping, Pong, Reported, WANTED_MAX, Welcome, compress,
 };
 use tokio::net::TcpStream;
 use tokio::sync::{mpsc, watch};
@@ -29,6 +29,9 @@ use crate::api::Api;
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// Longest time between two reports.
 const REPORT_MAX: Duration = Duration::from_secs(60);
+/// Maximum number of problems in a report, and of characters of each.
+const PROBLEMS_MAX: usize = 100;
+const PROBLEM_MAX: usize = 1000;
 /// Bounds of the interval of signs of life, in s, whatever the cloud asks for.
 const PING_S: std::ops::RangeInclusive<u32> = 5..=300;
 
@@ -84,6 +87,10 @@ impl CloudSession<'_> {
                     match self.frame(message)? {
                         None => {}
                         Some(Body::Desired(desired)) => {
+                            if desired.deployments.len() > WANTED_MAX {
+                                let why = format!("it wants more than {WANTED_MAX} deployments");
+                                return Err(self.lost(&why));
+                            }
                             let order = Order { desired, http: self.http.clone() };
                             self.orders.send_replace(Some(order));
                         }
@@ -96,7 +103,7 @@ impl CloudSession<'_> {
                         Some(Body::GoAway(away)) => {
                             // Not for ever, whatever the cloud asks for.
                             let after = Duration::from_millis(away.after_ms.min(3_600_000));
-                            return Ok(SessionEnd::Away(after, away.reason));
+                            return Ok(SessionEnd::Away(after, excerpt(&away.reason)));
                         }
                         Some(_) => {}
                     }
@@ -189,6 +196,8 @@ impl CloudSession<'_> {
     fn report(&mut self) -> (String, Body) {
         let status = self.api.status();
         let Handled { generation, problems } = self.handled.borrow_and_update().clone();
+        let all = problems.iter().take(PROBLEMS_MAX);
+        let problems: Vec<String> = all.map(|it| it.chars().take(PROBLEM_MAX).collect()).collect();
         self.api.cloud.lock().generation = generation;
         let deployments = status.deployments.iter().map(|it| {
             (&it.id, it.release, it.is_wanted, it.runs_fallback, it.is_proven, &it.refused)
@@ -205,7 +214,7 @@ impl CloudSession<'_> {
     }
 
     fn lost(&self, why: &str) -> Failure {
-        let why = gleaner_base::excerpt(why);
+        let why = excerpt(why);
         let mut failure =
             Failure::new(Exit::Unreachable, format!("lost the cloud at {}", self.http.address));
         failure.causes = vec![why];

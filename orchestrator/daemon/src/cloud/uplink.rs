@@ -11,7 +11,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use gleaner_base::{RateLimit, chain};
-use gleaner_fleet::{Ack, Body, Cursor, FRAME_MAX, Records, compress};
+use gleaner_fleet::{Ack, Body, Cursor, FRAME_MAX, RECORDS_MAX, Records, compress};
 use gleaner_spool::{SpoolItem, SpoolReader};
 use serde_json::json;
 use tokio::sync::mpsc::Sender;
@@ -130,7 +130,7 @@ impl SentStream {
     fn batch(&mut self, name: &str) -> Option<Batch> {
         let name = last_part(name);
         let (mut text, mut count) = (Vec::new(), 0);
-        while text.len() < BATCH && !self.is_unreadable {
+        while text.len() < BATCH && count < RECORDS_MAX as u64 && !self.is_unreadable {
             let item = match self.reader.next() {
                 // A commit in progress, or one that a power cut interrupted: a gap follows.
                 None | Some(Ok(SpoolItem::Torn(_))) => break,
