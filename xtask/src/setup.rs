@@ -15,8 +15,9 @@ pub(crate) const STEPS: usize = 4;
 pub(crate) const TARGET: &str = "wasm32-wasip2";
 
 /// The packages with installed programs: no benches, no tests, no lambdas.
-pub(crate) const PROGRAMS: [&str; 10] = [
+pub(crate) const PROGRAMS: [&str; 11] = [
     "gleaner-cli",
+    "gleaner-cloud",
     "gleaner-compile",
     "gleaner-host",
     "gleaner-inference",
