@@ -2,7 +2,7 @@
 //!
 //! `frame` has the frames of the control channel: one WebSocket per vehicle, opened by it.
 //! `enrolment` has the messages by which a vehicle gets its certificate, and `people` those of the
-//! API for people. Nothing here opens a connection.
+//! API for people. `object` checks files that are sent. Nothing here opens a connection.
 //!
 //! A vehicle is given the complete wanted state, never a change of it: a list of deployments, each
 //! by the digest of its signed envelope. It fetches envelopes and files that it lacks by HTTPS from
@@ -11,6 +11,7 @@
 
 mod enrolment;
 mod frame;
+mod object;
 pub mod people;
 
 pub use enrolment::{
@@ -21,3 +22,4 @@ pub use frame::{
     Ping, Pong, RECORDS_MAX, Records, Reported, WANTED_MAX, Wanted, Welcome, compress, decompress,
     desired_digest,
 };
+pub use object::{AnnouncedFile, UnfinishedFile};

@@ -13,10 +13,10 @@ use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt;
 use gleaner_base::{Exit, Failure, sync_folder};
+use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use gleaner_lambda::manifest::Sha256;
 use gleaner_protocol::vehicle_api::MissingObject;
 use gleaner_trust::Revision;
-use sha2::Digest;
 use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
@@ -103,21 +103,7 @@ impl Objects {
         let length = self.expected(sha256)?;
         let number = self.parts.fetch_add(1, Ordering::Relaxed);
         let part = self.folder.join(format!("{sha256}.{number}.part"));
-        let received = self.receive_part(sha256, length, &part, body).await;
-        if received.is_err() {
-            // The next start removes it otherwise.
-            let _ = fs::remove_file(&part);
-        }
-        received
-    }
-
-    async fn receive_part(
-        &self,
-        sha256: &Sha256,
-        length: u64,
-        part: &PathBuf,
-        body: Body,
-    ) -> CloudResult<()> {
+        let part = UnfinishedFile(part);
         let failed = |error: io::Error| {
             Failure::caused_by(Exit::Internal, format!("cannot receive the file {sha256}"), &error)
         };
@@ -125,26 +111,18 @@ impl Objects {
             let help = "send the file again, as it was published";
             CloudError::denied(format!("the file {sha256} is refused"), help).because(reason)
         };
-        let mut file = File::create_new(part).await.map_err(failed)?;
-        let (mut digest, mut received) = (sha2::Sha256::new(), 0);
+        let mut file = File::create_new(&part.0).await.map_err(failed)?;
+        let mut announced = AnnouncedFile::new(length, sha256.as_str());
         let mut body = body.into_data_stream();
         while let Some(piece) = body.next().await {
             let piece = piece.map_err(|error| failed(io::Error::other(error)))?;
-            received += piece.len() as u64;
-            if received > length {
-                return Err(refused(format!("it is longer than {length} bytes")));
-            }
-            digest.update(&piece);
+            announced.add(&piece).map_err(refused)?;
             file.write_all(&piece).await.map_err(failed)?;
         }
-        let found = gleaner_base::hex(&digest.finalize());
-        if received != length || found != sha256.as_str() {
-            let reason = format!("it has {received} of {length} bytes, and the SHA-256 {found}");
-            return Err(refused(reason));
-        }
+        announced.finish().map_err(refused)?;
         file.flush().await.map_err(failed)?;
         file.sync_all().await.map_err(failed)?;
-        tokio::fs::rename(part, self.folder.join(sha256.as_str())).await.map_err(failed)?;
+        tokio::fs::rename(&part.0, self.folder.join(sha256.as_str())).await.map_err(failed)?;
         let folder = self.folder.clone();
         let synced = tokio::task::spawn_blocking(move || sync_folder(&folder)).await;
         Ok(synced.map_err(io::Error::other).and_then(|it| it).map_err(failed)?)

@@ -2,13 +2,12 @@
 
 use std::error::Error;
 use std::io;
-use std::path::PathBuf;
 
 use axum::body::Bytes;
 use futures_util::{Stream, StreamExt};
 use gleaner_base::{Exit, Failure};
+use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use gleaner_lambda::manifest::Sha256;
-use sha2::Digest;
 use tokio::io::AsyncWriteExt;
 
 use crate::core::Core;
@@ -37,33 +36,15 @@ pub(crate) async fn receive<E: Error + Send + Sync + 'static>(
     let (file, part) = begin_object(&path).map_err(failed)?;
     let part = UnfinishedFile(part);
     let mut file = tokio::fs::File::from_std(file);
-    let (mut digest, mut received) = (sha2::Sha256::new(), 0);
+    let mut announced = AnnouncedFile::new(length, wanted.as_str());
     while let Some(piece) = pieces.next().await {
         let piece = piece.map_err(|error| failed(io::Error::other(error)))?;
-        received += piece.len() as u64;
-        if received > length {
-            return Err(refused(format!("it is longer than {length} bytes")));
-        }
-        digest.update(&piece);
+        announced.add(&piece).map_err(refused)?;
         file.write_all(&piece).await.map_err(failed)?;
     }
-    let found = gleaner_base::hex(&digest.finalize());
-    if received != length || found != wanted.as_str() {
-        let why = format!("it has {received} of {length} bytes, and the SHA-256 {found}");
-        return Err(refused(why));
-    }
+    announced.finish().map_err(refused)?;
     // The last write goes on in the background, and only this returns its error.
     file.flush().await.map_err(failed)?;
     file.sync_all().await.map_err(failed)?;
     tokio::fs::rename(&part.0, &path).await.map_err(failed)
-}
-
-/// A file that is being received. One that stays unfinished is removed.
-struct UnfinishedFile(PathBuf);
-
-impl Drop for UnfinishedFile {
-    fn drop(&mut self) {
-        // Of a complete one, this name is gone.
-        let _ = std::fs::remove_file(&self.0);
-    }
 }

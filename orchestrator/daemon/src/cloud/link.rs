@@ -37,7 +37,7 @@ impl CloudLink {
         let (orders, received) = watch::channel(None);
         let (handled, results) = watch::channel(Handled::default());
         let core = Arc::clone(&self.api.core);
-        tokio::spawn(Reconciler { core, orders: received, handled }.run());
+        tokio::spawn(Reconciler { core, orders: received, handled, step: Arc::default() }.run());
         let mut settings = self.api.cloud.settings.subscribe();
         let (mut pause, mut renewed_at) = (PAUSE, None);
         loop {

@@ -32,8 +32,8 @@ impl Step {
 
 /// Returns the steps, and the reasons why parts of the wanted state are ignored.
 ///
-/// What a user deployed locally is never stopped or removed, and what a user changed locally after
-/// the cloud's last wish for a deployment stays until the cloud wants something else of it.
+/// A local deployment is never stopped or removed. A local change after the cloud's last wish for a
+/// deployment stays until the cloud wants something else of it.
 pub(super) fn plan(
     wanted: &[Wanted],
     deployed: &BTreeMap<ItemName, Deployed>,

@@ -9,7 +9,7 @@ use gleaner_fleet::Desired;
 use gleaner_lambda::manifest::{ItemName, Sha256};
 use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest};
 use gleaner_trust::{Deployment, Payload, Revision, sha256};
-use tokio::sync::watch;
+use tokio::sync::{Mutex, watch};
 use tokio::time::sleep;
 
 use super::http::CloudHttp;
@@ -49,6 +49,15 @@ pub(super) struct Reconciler {
     pub(super) core: Arc<Core>,
     pub(super) orders: watch::Receiver<Option<Order>>,
     pub(super) handled: watch::Sender<Handled>,
+    /// Held by the thread that takes a step.
+    pub(super) step: Arc<Mutex<()>>,
+}
+
+impl Order {
+    /// Returns whether `order` is no order, or one of another state.
+    fn is_other(order: Option<&Self>, desired: &Desired) -> bool {
+        order.is_none_or(|order| order.desired != *desired)
+    }
 }
 
 impl Reconciler {
@@ -67,9 +76,9 @@ impl Reconciler {
                 pause = PAUSE;
             }
             let problems = self.follow(&desired, &http).await;
-            let is_done = problems.is_empty();
-            self.handled.send_replace(Handled { generation: desired.generation, problems });
-            before = Some(desired);
+            let (is_done, generation) = (problems.is_empty(), desired.generation);
+            self.handled.send_replace(Handled { generation, problems });
+            let desired = &*before.insert(desired);
             // The same state comes with each connection: it does not shorten the pause.
             let late = async {
                 match is_done {
@@ -77,29 +86,28 @@ impl Reconciler {
                     false => sleep(pause).await,
                 }
             };
-            let is_other = |order: &Option<Order>| {
-                order.as_ref().map(|order| &order.desired) != before.as_ref()
-            };
+            let other = self.orders.wait_for(|order| Order::is_other(order.as_ref(), desired));
             tokio::select! {
-                changed = self.orders.wait_for(is_other) => if changed.is_err() { return },
+                changed = other => if changed.is_err() { return },
                 () = late => pause = (pause * 2).min(PAUSE_MAX),
             }
         }
     }
 
     async fn follow(&self, desired: &Desired, http: &CloudHttp) -> Vec<String> {
+        // A step of an earlier state, which was given up, may still end in its thread: what it
+        // changes counts for the plan.
+        let ended = self.step.lock().await;
         let deployed = self.core.lock().state.deployments.clone();
+        drop(ended);
         let (steps, mut problems) = plan(&desired.deployments, &deployed);
         for step in steps {
             let id = step.id().clone();
             let mut orders = self.orders.clone();
-            let is_other = |order: &Option<Order>| {
-                order.as_ref().is_none_or(|order| order.desired != *desired)
-            };
             // A newer state does not wait for the files of an older one.
             let taken = tokio::select! {
                 taken = self.take(step, http) => taken,
-                _ = orders.wait_for(is_other) => break,
+                _ = orders.wait_for(|order| Order::is_other(order.as_ref(), desired)) => break,
             };
             if let Err(failure) = taken {
                 // One that fails blocks no other one.
@@ -190,7 +198,13 @@ impl Reconciler {
         work: impl FnOnce(&Core) -> Result<T, Failure> + Send + 'static,
     ) -> Result<T, Failure> {
         let core = Arc::clone(&self.core);
-        let done = tokio::task::spawn_blocking(move || work(&core)).await;
+        let step = Arc::clone(&self.step).lock_owned().await;
+        let done = tokio::task::spawn_blocking(move || {
+            let done = work(&core);
+            drop(step);
+            done
+        })
+        .await;
         done.map_err(|_| Failure::new(Exit::Internal, "a step of the cloud was interrupted"))?
     }
 }

@@ -1,0 +1,100 @@
+//! Files that are sent to a vehicle or to the cloud, as both check them.
+
+use std::fs;
+use std::path::PathBuf;
+
+use sha2::{Digest, Sha256};
+
+/// A file that is compared, piece by piece, with the length and the SHA-256 that were announced.
+#[derive(Debug)]
+pub struct AnnouncedFile<'f> {
+    length: u64,
+    sha256: &'f str,
+    received: u64,
+    digest: Sha256,
+}
+
+impl<'f> AnnouncedFile<'f> {
+    /// Begins with none of `length` bytes; `sha256` has lower-case hexadecimal digits.
+    pub fn new(length: u64, sha256: &'f str) -> Self {
+        Self { length, sha256, received: 0, digest: Sha256::new() }
+    }
+
+    /// Adds the next piece.
+    ///
+    /// # Errors
+    ///
+    /// The reason, if the file is longer than announced.
+    pub fn add(&mut self, piece: &[u8]) -> Result<(), String> {
+        self.received += piece.len() as u64;
+        if self.received > self.length {
+            return Err(format!("it is longer than {} bytes", self.length));
+        }
+        self.digest.update(piece);
+        Ok(())
+    }
+
+    /// Ends the file.
+    ///
+    /// # Errors
+    ///
+    /// The reason, if it is shorter than announced, or another one.
+    pub fn finish(self) -> Result<(), String> {
+        let Self { length, sha256, received, digest } = self;
+        let found = gleaner_base::hex(&digest.finalize());
+        match received == length && found == sha256 {
+            true => Ok(()),
+            false => Err(format!("it has {received} of {length} bytes, and the SHA-256 {found}")),
+        }
+    }
+}
+
+/// The path of a file that is being received. Dropping it removes the file, unless that has its
+/// final name by then.
+#[derive(Debug)]
+pub struct UnfinishedFile(pub PathBuf);
+
+impl Drop for UnfinishedFile {
+    fn drop(&mut self) {
+        // The next start removes what stays.
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// SHA-256 of `ab`.
+    const AB: &str = "fb8e20fc2e4c3f248c60c39bd652f3c1347298bb977b8b4d5903b85055620603";
+
+    fn compared(length: u64, pieces: &[&str]) -> Result<(), String> {
+        let mut file = AnnouncedFile::new(length, AB);
+        pieces.iter().try_for_each(|piece| file.add(piece.as_bytes()))?;
+        file.finish()
+    }
+
+    #[test]
+    fn only_the_announced_file_is_accepted() {
+        assert_eq!(compared(2, &["a", "b"]), Ok(()));
+        assert_eq!(compared(2, &["ab", "c"]), Err("it is longer than 2 bytes".to_owned()));
+        assert!(compared(2, &["a"]).unwrap_err().starts_with("it has 1 of 2 bytes"));
+        assert!(compared(3, &["ab"]).unwrap_err().starts_with("it has 2 of 3 bytes"));
+        assert!(compared(2, &["ba"]).unwrap_err().contains("the SHA-256"));
+    }
+
+    #[test]
+    fn an_unfinished_file_is_removed_and_a_finished_one_stays() {
+        let folder = tempfile::tempdir().unwrap();
+        let [part, whole] = ["part", "whole"].map(|name| folder.path().join(name));
+        for is_finished in [false, true] {
+            fs::write(&part, "x").unwrap();
+            let unfinished = UnfinishedFile(part.clone());
+            if is_finished {
+                fs::rename(&unfinished.0, &whole).unwrap();
+            }
+            drop(unfinished);
+            assert_eq!((part.exists(), whole.exists()), (false, is_finished));
+        }
+    }
+}
