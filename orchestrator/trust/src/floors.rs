@@ -173,7 +173,7 @@ impl Floors {
         match self.lambdas.get(name) {
             Some(floor) if release == floor.release && *fallback.digest() != floor.digest => {
                 let (accepted, found) = (floor.digest.clone(), fallback.digest().clone());
-                Err(Refusal::SameRelease { what: lambda(name), accepted, found })
+                Err(Refusal::SameRelease { what: lambda(name), release, accepted, found })
             }
             _ => Ok(()),
         }
@@ -197,7 +197,7 @@ fn check<K: Ord>(
         }
         Some(floor) if release == floor.release && *digest != floor.digest => {
             let (accepted, found) = (floor.digest.clone(), digest.clone());
-            Err(Refusal::SameRelease { what: what(), accepted, found })
+            Err(Refusal::SameRelease { what: what(), release, accepted, found })
         }
         None if floors.len() >= NAMES_MAX => Err(Refusal::TooManyFloors { count: floors.len() }),
         _ => Ok(()),

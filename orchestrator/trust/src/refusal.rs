@@ -35,8 +35,8 @@ pub enum Refusal {
     RolledBack { what: String, found: u64, floor: u64 },
     #[error("the trust root has version {found}; version {floor} was accepted before")]
     OldRoot { found: u64, floor: u64 },
-    #[error("{what} was accepted before as {accepted}; with the same release, this is {found}")]
-    SameRelease { what: String, accepted: Sha256, found: Sha256 },
+    #[error("{what} was accepted before with release {release} as {accepted}; this is {found}")]
+    SameRelease { what: String, release: u64, accepted: Sha256, found: Sha256 },
     #[error("the {what} expired at {}; the trusted time is {}", date(*expires), date(*now))]
     Expired { what: &'static str, expires: u64, now: u64 },
     #[error("the deployment names {role} {wanted}; this is {}", or(found))]
