@@ -9,7 +9,7 @@ use gleaner_base::parse_duration;
 use gleaner_fleet::people::Role;
 use gleaner_trust::VehicleName;
 
-use super::VehicleArgs;
+use super::{FleetArgs, VehicleArgs};
 
 /// Commands of `gleaner` for the cloud.
 #[derive(Subcommand, Debug)]
@@ -31,8 +31,8 @@ pub enum CloudCommand {
     Users(UsersArgs),
     /// List, enrol or revoke the vehicles of the cloud
     Vehicles(VehiclesArgs),
-    /// List the deployments of the cloud
-    Fleet(ListArgs),
+    /// List the deployments of the cloud, or change their waves
+    Fleet(FleetArgs),
     /// List who changed what in the cloud, the newest first
     Audit(AuditArgs),
     /// Connect this vehicle to a cloud

@@ -5,6 +5,7 @@ mod cloud;
 mod signing;
 mod vehicle;
 mod verify;
+mod waves;
 
 use std::ffi::OsString;
 use std::net::IpAddr;
@@ -25,6 +26,7 @@ pub use vehicle::{
     TrustCommand, TrustInstallArgs, VehicleArgs,
 };
 pub use verify::VerifyArgs;
+pub use waves::{FleetArgs, FleetCommand, WaveArgs};
 
 /// Run small functions (lambdas) next to the sensors of a vehicle, and keep the data worth keeping
 #[derive(Parser, Debug)]

@@ -7,6 +7,8 @@ use clap::{Args, Subcommand};
 use gleaner_base::parse_duration;
 use gleaner_trust::VehicleName;
 
+use super::WaveArgs;
+
 /// The orchestrator to talk to.
 #[derive(Args, Debug, Clone)]
 pub struct VehicleArgs {
@@ -64,6 +66,9 @@ pub struct DeployArgs {
     /// Time after which a vehicle no longer accepts the deployment for the first time
     #[arg(long, value_name = "DURATION", default_value = "90d", value_parser = days)]
     pub expires: Duration,
+    /// The waves, for a fleet
+    #[command(flatten)]
+    pub waves: WaveArgs,
     /// Longest wait for the lambda to run
     #[arg(long, value_name = "DURATION", default_value = "1min", value_parser = parse_duration)]
     pub timeout: Duration,

@@ -7,8 +7,8 @@ use gleaner_trust::SecretKey;
 use serde_json::{Value, json};
 
 use super::rollout::{Goal, Rollout};
-use super::{client, show};
-use crate::args::{ChangeArgs, DeployArgs, ListArgs};
+use super::{client, show, waves};
+use crate::args::{ChangeArgs, DeployArgs, FleetArgs, FleetCommand};
 use crate::render::table;
 use crate::vehicle::{Former, LocalRevision, VehicleClient, deployment, path};
 
@@ -22,8 +22,23 @@ pub(crate) enum Change {
 }
 
 /// Runs `gleaner fleet`.
-pub(super) fn list(args: &ListArgs) -> Result<Exit, Failure> {
-    show(args.json, &deployments(&client()?)?, |deployments| {
+pub(super) fn fleet(args: &FleetArgs) -> Result<Exit, Failure> {
+    let (id, change) = match &args.command {
+        None => return list(args.json),
+        Some(FleetCommand::Pause(args)) => (&args.id, "pause"),
+        Some(FleetCommand::Resume(args)) => (&args.id, "resume"),
+        Some(FleetCommand::Abort(args)) => (&args.id, "abort"),
+    };
+    let path = format!("{}/{change}", path(id)?);
+    let deployment: FleetDeployment = client()?.post(&path, &json!({}))?;
+    show(args.json, &deployment, |deployment| {
+        let waves = deployment.waves.as_ref().map(waves::in_words);
+        format!("{}: {}\n", visible(&deployment.id), waves.unwrap_or_default())
+    })
+}
+
+fn list(json: bool) -> Result<Exit, Failure> {
+    show(json, &deployments(&client()?)?, |deployments| {
         if deployments.is_empty() {
             return "nothing is deployed: `gleaner deploy --fleet DIR --key FILE`\n".to_owned();
         }
@@ -46,7 +61,11 @@ pub(super) fn list(args: &ListArgs) -> Result<Exit, Failure> {
             ]
         });
         let rows = std::iter::once(head.map(str::to_owned)).chain(rows);
-        table(rows.collect(), &[1, 5, 6, 7])
+        let mut text = table(rows.collect(), &[1, 5, 6, 7]);
+        for (it, waves) in deployments.iter().filter_map(|it| Some((it, it.waves.as_ref()?))) {
+            text += &format!("{}: {}\n", visible(&it.id), waves::in_words(waves));
+        }
+        text
     })
 }
 
@@ -71,7 +90,11 @@ pub(crate) fn deploy(args: &DeployArgs) -> Result<Exit, Failure> {
     local.deploy(&client, args, &deployment, &key)?;
     let selector = deployment.selector.iter();
     let selector = selector.map(|(name, value)| (name.to_string(), value.clone())).collect();
-    let goal = Goal::Revision { release: deployment.release };
+    let release = deployment.release;
+    if args.waves.plan().is_some() && !waves::wait(&client, &id, release, args)? {
+        return Ok(Exit::Ok);
+    }
+    let goal = Goal::Revision { release };
     Rollout { id, selector, goal }.wait(&client, args.vehicle.json, args.timeout)
 }
 
@@ -94,7 +117,7 @@ pub(crate) fn change(args: &ChangeArgs, change: Change) -> Result<Exit, Failure>
     Rollout { id, selector, goal: goal? }.wait(&client, args.vehicle.json, args.timeout)
 }
 
-fn deployments(client: &VehicleClient) -> Result<Vec<FleetDeployment>, Failure> {
+pub(super) fn deployments(client: &VehicleClient) -> Result<Vec<FleetDeployment>, Failure> {
     client.get("/v1/deployments")
 }
 

@@ -2,7 +2,8 @@
 //!
 //! - `login`: the address and the token. `people`: users, and the audit trail.
 //! - `vehicles`: lists, enrols and revokes vehicles. `enrol`: connects this one.
-//! - `fleet`: deployments of the cloud, signed here. `rollout`: waits for all their vehicles.
+//! - `fleet`: deployments of the cloud, signed here. `rollout`: waits for all their vehicles, and
+//!   `waves` for the waves before.
 
 mod enrol;
 mod fleet;
@@ -10,6 +11,7 @@ mod login;
 mod people;
 mod rollout;
 mod vehicles;
+mod waves;
 
 use gleaner_base::{Exit, Failure};
 use serde::Serialize;
@@ -32,7 +34,7 @@ pub(crate) fn run(command: &CloudCommand) -> Result<Exit, Failure> {
         CloudCommand::Whoami(args) => login::whoami(args),
         CloudCommand::Users(args) => people::users(args),
         CloudCommand::Vehicles(args) => vehicles::vehicles(args),
-        CloudCommand::Fleet(args) => fleet::list(args),
+        CloudCommand::Fleet(args) => fleet::fleet(args),
         CloudCommand::Audit(args) => people::audit(args),
         CloudCommand::Enrol(args) => enrol::enrol(args),
         CloudCommand::Unenrol(args) => enrol::unenrol(args),

@@ -7,12 +7,13 @@ use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure, PlainFile, format_duration};
+use gleaner_fleet::people::FleetDeployRequest;
 use gleaner_lambda::layout::FILE_MAX;
 use gleaner_lambda::manifest::{ConfigSet, ConfigValue, ItemName, Sha256, TopicName};
 use gleaner_lambda::{BuildDir, Manifest};
 use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus};
 use gleaner_protocol::vehicle_api::{
-    Changed, DeployReply, DeployRequest, DeploymentStatus, GrantStatus, MissingObject,
+    Changed, DeployReply, DeploymentStatus, GrantStatus, MissingObject,
 };
 use gleaner_report::format::counted;
 use gleaner_trust::{
@@ -128,9 +129,11 @@ impl LocalRevision {
     ) -> Result<u64, Failure> {
         let sealed = seal(deployment, &[key])
             .map_err(|refusal| Failure::because("cannot sign the deployment", &refusal))?;
-        let request = DeployRequest {
+        // Without waves, it is the request that a vehicle takes.
+        let request = FleetDeployRequest {
             deployment: String::from_utf8(sealed).expect("an envelope is JSON"),
             revisions: vec![self.envelope.clone()],
+            waves: args.waves.plan(),
         };
         let (mut sent, mut rounds) = (0, 0);
         let attempt = loop {

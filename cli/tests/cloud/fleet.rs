@@ -226,3 +226,77 @@ fn a_deployment_of_a_fleet_is_listed_changed_and_removed() {
     let text = user.fails(2, &["stop", "other", "--fleet"]);
     assert!(text.contains("the cloud has no deployment `other`"), "{text}");
 }
+
+/// The deployment in the cloud, with waves in this state.
+fn in_waves(release: u64, wave: u64, state: &str, reason: &str) -> Value {
+    let mut deployment = in_cloud(release);
+    deployment["waves"] = json!({
+        "plan": {
+            "shares": [5, 50], "success": 90, "failures": 5, "soak_s": 600, "deadline_s": 86_400,
+            "on_failure": "pause",
+        },
+        "wave": wave, "waves": 3, "state": state, "reason": reason, "since": 1, "vehicles": 4,
+        "running": 3, "failed": 1,
+    });
+    deployment
+}
+
+#[test]
+fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
+    let user = CloudUser::with_lambda();
+    let deployments = |all: &[Value]| {
+        let answers = all.iter().map(|it| (200, json!([it]))).collect::<Vec<_>>();
+        user.cloud.answers("GET /v1/deployments", &answers);
+    };
+    let waves = ["--wave", "5%", "--canary", "50", "--success", "90%"];
+    let deploy = [&DEPLOY[..], &waves].concat();
+    deployments(&[in_cloud(6), in_waves(7, 1, "running", "")]);
+    let text = user.done(&deploy);
+    let expected = "wave 1 of 3; it runs on 3 of 4 vehicles, and 1 failed\n\
+                    the next wave opens after 10min once 90 % run it: `gleaner fleet` shows them\n";
+    assert!(text.ends_with(expected), "{text}");
+    let seen = user.cloud.seen();
+    let sent = seen.iter().rfind(|it| it.line == "POST /v1/deployments").unwrap();
+    let sent: Value = serde_json::from_slice(&sent.body).unwrap();
+    assert_eq!(sent["waves"], in_waves(7, 1, "", "")["waves"]["plan"]);
+    // Watched, it waits for the last wave, and then for all vehicles.
+    let watch = [&deploy[..], &["--watch"]].concat();
+    user.vehicles(&[("car-7", "online", json!({}))]);
+    user.statuses("car-7", &[on_vehicle(7, "running")]);
+    deployments(&[in_cloud(6), in_waves(7, 2, "running", ""), in_cloud(7)]);
+    let text = user.done(&watch);
+    assert!(
+        text.contains("wave 2 of 3") && text.ends_with("`brake` runs on 1 vehicle\n"),
+        "{text}"
+    );
+    deployments(&[in_cloud(6), in_waves(7, 1, "paused", "wave 1: it failed on 1 of 4 vehicles")]);
+    let text = user.fails(4, &watch);
+    assert!(text.contains("wave 1 of 3, paused: wave 1: it failed on 1 of 4 vehicles"), "{text}");
+    assert!(text.contains("gleaner fleet resume ID"), "{text}");
+    deployments(&[in_cloud(6), in_cloud(8)]);
+    let text = user.fails(4, &watch);
+    assert!(text.contains("release 7 of `brake` was replaced or removed meanwhile"), "{text}");
+    for (options, reason) in
+        [(&["--success", "90%"][..], "--wave"), (&["--wave", "101%"], "`101%` is no share")]
+    {
+        let text = user.command(&[&DEPLOY[..], options].concat()).output().unwrap();
+        assert_eq!(text.status.code(), Some(2));
+        let text = String::from_utf8(text.stderr).unwrap();
+        assert!(text.contains(reason), "{text}");
+    }
+}
+
+#[test]
+fn waves_are_listed_paused_resumed_and_aborted() {
+    let user = CloudUser::logged_in();
+    let paused = in_waves(6, 2, "paused", "paused by ada");
+    let line =
+        "brake: wave 2 of 3, paused: paused by ada; it runs on 3 of 4 vehicles, and 1 failed\n";
+    user.cloud.answers("GET /v1/deployments", &[(200, json!([paused]))]);
+    assert!(user.done(&["fleet"]).ends_with(line));
+    for change in ["pause", "resume", "abort"] {
+        let request = format!("POST /v1/deployments/brake/{change}");
+        user.cloud.answers(&request, &[(200, paused.clone())]);
+        assert_eq!(user.done(&["fleet", change, "brake"]), line);
+    }
+}

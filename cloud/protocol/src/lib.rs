@@ -2,7 +2,8 @@
 //!
 //! `frame` has the frames of the control channel: one WebSocket per vehicle, opened by it.
 //! `enrolment` has the messages by which a vehicle gets its certificate, and `people` those of the
-//! API for people. `object` checks files that are sent. Nothing here opens a connection.
+//! API for people; `waves` is the part of it by which a release reaches vehicles step by step.
+//! `object` checks files that are sent. Nothing here opens a connection.
 //!
 //! A vehicle is given the complete wanted state, never a change of it: a list of deployments, each
 //! by the digest of its signed envelope. It fetches envelopes and files that it lacks by HTTPS from
@@ -13,6 +14,7 @@ mod enrolment;
 mod frame;
 mod object;
 pub mod people;
+pub mod waves;
 
 pub use enrolment::{
     CERTIFICATE_NAME, EnrolReply, EnrolRequest, Enrolment, EnrolmentError, RenewRequest,

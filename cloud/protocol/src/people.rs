@@ -14,9 +14,10 @@
 //! | `GET /v1/vehicles/NAME/events` | viewer | a line of JSON per record |
 //! | `GET /v1/vehicles/NAME/lambdas/ID/records` | viewer | a line of JSON per record |
 //! | `PUT /v1/objects/SHA256` | deployer | nothing |
-//! | `POST /v1/deployments` | deployer | `DeployReply`, of a `DeployRequest` as on a vehicle |
+//! | `POST /v1/deployments` | deployer | `DeployReply`, of a [`FleetDeployRequest`] |
 //! | `GET /v1/deployments` | viewer | [`FleetDeployment`] of each |
 //! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | operator | [`FleetDeployment`] |
+//! | `POST /v1/deployments/ID/pause`, `resume`, `abort` | operator | [`FleetDeployment`] |
 //! | `DELETE /v1/deployments/ID` | deployer | nothing |
 //! | `GET /v1/audit` | admin | [`AuditEntry`] of each, the newest first |
 //!
@@ -31,6 +32,8 @@ use std::str::FromStr;
 
 use gleaner_protocol::vehicle_api::GrantStatus;
 use serde::{Deserialize, Serialize};
+
+use crate::waves::{WavePlan, WaveProgress};
 
 /// The rights of a user. Each has those of the ones before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -172,6 +175,19 @@ pub enum VehicleState {
     Revoked,
 }
 
+/// A deployment for the fleet: as for one vehicle, and with a plan of its waves.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FleetDeployRequest {
+    /// The envelope of the deployment.
+    pub deployment: String,
+    /// The envelopes of its revision and its fallback; one that the cloud has may be left out.
+    pub revisions: Vec<String>,
+    /// The plan; without one, the deployment reaches all its vehicles at once.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub waves: Option<WavePlan>,
+}
+
 /// A deployment of the fleet.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FleetDeployment {
@@ -196,6 +212,9 @@ pub struct FleetDeployment {
     pub running: u64,
     /// Number of these that refuse it, or whose lambda has failed.
     pub failed: u64,
+    /// The progress of its waves; absent once the release is for all these vehicles.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub waves: Option<WaveProgress>,
 }
 
 /// An entry of the audit trail.

@@ -27,6 +27,8 @@ const PEOPLE_MAX: u32 = 1000;
 const VEHICLES_MAX: u32 = 20_000;
 /// Interval at which times of signs of life are stored.
 const SEEN_INTERVAL: Duration = Duration::from_secs(30);
+/// Interval at which waves of releases are looked at.
+const WAVES_INTERVAL: Duration = Duration::from_secs(2);
 /// Interval at which the server's certificate is made again.
 const CERTIFICATE_INTERVAL: Duration = Duration::from_secs(30 * 86_400);
 
@@ -122,9 +124,12 @@ impl CloudServer {
             let mut seen = interval(SEEN_INTERVAL);
             seen.set_missed_tick_behavior(MissedTickBehavior::Delay);
             let mut certificate = interval(CERTIFICATE_INTERVAL);
+            let mut waves = interval(WAVES_INTERVAL);
+            waves.set_missed_tick_behavior(MissedTickBehavior::Delay);
             loop {
                 tokio::select! {
                     _ = seen.tick() => store_seen(&working).await,
+                    _ = waves.tick() => advance_waves(&working).await,
                     _ = certificate.tick() => match working.authorities.server_config(&host) {
                         Ok(config) => drop(tls.send_replace(config)),
                         Err(failure) => tracing::error!("{failure}"),
@@ -150,6 +155,13 @@ impl CloudServer {
 async fn store_seen(cloud: &Cloud) {
     if let Err(error) = cloud.store.seen(&cloud.hub.take_seen()).await {
         tracing::warn!(reason = error.reason(), "the last signs of life are not stored");
+    }
+}
+
+async fn advance_waves(cloud: &Cloud) {
+    match cloud.store.advance_waves().await {
+        Ok(changed) => cloud.hub.wake(&changed),
+        Err(error) => tracing::warn!(reason = error.reason(), "waves do not go on"),
     }
 }
 

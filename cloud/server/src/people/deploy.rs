@@ -8,9 +8,9 @@ use axum::body::{Body, Bytes};
 use axum::extract::{Extension, Path, State};
 use axum::http::StatusCode;
 use gleaner_base::Failure;
-use gleaner_fleet::people::User;
+use gleaner_fleet::people::{FleetDeployRequest, User};
 use gleaner_lambda::manifest::Sha256;
-use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest, GrantStatus};
+use gleaner_protocol::vehicle_api::{DeployReply, GrantStatus};
 use gleaner_trust::{Refusal, Revision, unverified_deployment, unverified_revision};
 
 use crate::cloud::Cloud;
@@ -24,7 +24,7 @@ pub(super) async fn deploy(
     Extension(actor): Extension<User>,
     body: Bytes,
 ) -> CloudResult<Json<DeployReply>> {
-    let request: DeployRequest = parsed(&body, "deployment")?;
+    let request: FleetDeployRequest = parsed(&body, "deployment")?;
     let refused = |what: &str| {
         let action = format!("the {what} is refused");
         move |refusal: Refusal| CloudError::from(Failure::because(action, &refusal))
@@ -71,6 +71,7 @@ pub(super) async fn deploy(
         grants,
         selector: selector.collect(),
         revisions: envelopes,
+        waves: request.waves,
     };
     let (generation, changed) = cloud.store.deploy(&actor.name, &offered).await?;
     cloud.hub.wake(&changed);

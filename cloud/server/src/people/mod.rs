@@ -24,6 +24,7 @@ use gleaner_fleet::Enrolment;
 use gleaner_fleet::people::{
     FleetDeployment, Invitation, Login, NewUser, NewVehicle, Role, User, UserToken,
 };
+use gleaner_fleet::waves::WaveState;
 
 use crate::accept::PeerConnection;
 use crate::cloud::Cloud;
@@ -233,9 +234,13 @@ async fn change(
         "start" => cloud.store.set_wanted(&actor.name, &id, true).await?,
         "stop" => cloud.store.set_wanted(&actor.name, &id, false).await?,
         "rollback" => cloud.store.roll_back(&actor.name, &id).await?,
+        "pause" => cloud.store.steer_waves(&actor.name, &id, WaveState::Paused).await?,
+        "resume" => cloud.store.steer_waves(&actor.name, &id, WaveState::Running).await?,
+        "abort" => cloud.store.steer_waves(&actor.name, &id, WaveState::Aborted).await?,
         other => {
             let message = format!("`{}` is no change", gleaner_base::excerpt(other));
-            return Err(CloudError::usage(message, "use `start`, `stop` or `rollback`"));
+            let help = "use `start`, `stop`, `rollback`, `pause`, `resume` or `abort`";
+            return Err(CloudError::usage(message, help));
         }
     };
     cloud.hub.wake(&changed);

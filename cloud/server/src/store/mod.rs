@@ -40,6 +40,8 @@ mod secrets;
 mod tests;
 mod users;
 mod vehicles;
+mod wants;
+mod waves;
 
 use std::path::Path;
 use std::str::FromStr;
@@ -58,7 +60,10 @@ pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::{Issued, VehicleReport};
 
 /// The migrations, oldest first: the version of a database is the number of those that it has.
-const MIGRATIONS: &[&str] = &[include_str!("../../migrations/0001_start.sql")];
+const MIGRATIONS: &[&str] = &[
+    include_str!("../../migrations/0001_start.sql"),
+    include_str!("../../migrations/0002_releases.sql"),
+];
 
 /// Settings of each connection to SQLite. In the mode WAL, readers and the writer do not wait for
 /// each other; FULL makes each commit durable before it returns.

@@ -8,7 +8,7 @@ use super::*;
 
 const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20 };
 
-async fn store() -> (TempDir, CloudStore) {
+pub(super) async fn store() -> (TempDir, CloudStore) {
     let folder = TempDir::new().unwrap();
     let store = CloudStore::open(&folder.path().join("cloud.db")).await.unwrap();
     (folder, store)
@@ -24,13 +24,13 @@ async fn enrolled(store: &CloudStore, name: &str, certificate: &str) {
     assert!(store.enrol(name, &token, issued).await.unwrap().is_some());
 }
 
-async fn connected(store: &CloudStore, name: &str) -> u64 {
+pub(super) async fn connected(store: &CloudStore, name: &str) -> u64 {
     // Its certificate has its name.
     enrolled(store, name, name).await;
     store.connect(name, name, &Hello::default()).await.unwrap()
 }
 
-fn offered(id: &str, release: u64, fleet: &str) -> OfferedDeployment {
+pub(super) fn offered(id: &str, release: u64, fleet: &str) -> OfferedDeployment {
     OfferedDeployment {
         id: id.to_owned(),
         release,
@@ -40,10 +40,11 @@ fn offered(id: &str, release: u64, fleet: &str) -> OfferedDeployment {
         grants: GrantStatus { record: true, ..GrantStatus::default() },
         selector: [("fleet".to_owned(), fleet.to_owned())].into(),
         revisions: [("r".to_owned(), "a revision".to_owned())].into(),
+        waves: None,
     }
 }
 
-fn report(labels: Value, deployments: Value) -> VehicleReport {
+pub(super) fn report(labels: Value, deployments: Value) -> VehicleReport {
     let program = json!({ "version": "1.2", "pid": 1, "up_s": 1.0, "rss_bytes": 1, "cpu_s": 1.0 });
     let status = json!({
         "vehicle": "car-7", "key": "k", "labels": labels, "orchestrator": program, "trust": null,
@@ -260,6 +261,7 @@ async fn the_database_of_a_later_version_is_refused() {
     store.execute("INSERT INTO migrations (version) VALUES (99)").await;
     store.close().await;
     let refused = CloudStore::open(&folder.path().join("cloud.db")).await.unwrap_err();
-    assert_eq!(refused.message, "the database has version 99; this program has 1");
+    let expected = format!("the database has version 99; this program has {}", MIGRATIONS.len());
+    assert_eq!(refused.message, expected);
     assert!(refused.help.is_some());
 }

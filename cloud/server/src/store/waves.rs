@@ -1,0 +1,379 @@
+//! Waves: a release opens to more vehicles only once those before have shown that it works.
+//!
+//! Each step is one transaction with the counts that it follows from, so that it is taken once.
+
+use gleaner_fleet::waves::{OnFailure, WavePlan, WaveProgress, WaveState};
+use sha2::{Digest, Sha256};
+use sqlx::any::AnyRow;
+use sqlx::{FromRow, Row};
+
+use super::deployments::{COMPLETE, unknown};
+use super::vehicles::{FAILED, RUNNING};
+use super::wants::{ChangedVehicles, TextMap, map, selects};
+use super::{CloudStore, StoreChange, now, unsigned};
+use crate::error::{CloudError, CloudResult};
+
+/// Actor of steps that the cloud takes by a plan.
+const WAVES: &str = "waves";
+
+/// Time after which a wave does not wait for vehicles that have not shown up since it opened, in s.
+/// It covers several intervals at which signs of life are stored.
+const AWAY_S: i64 = 120;
+
+type Tx = sqlx::Transaction<'static, sqlx::Any>;
+
+/// A release, as it is stored.
+#[derive(Debug)]
+pub(super) struct Release {
+    pub(super) deployment: String,
+    pub(super) number: i64,
+    pub(super) sha256: String,
+    pub(super) revision: String,
+    pub(super) fallback: String,
+    pub(super) grants: String,
+    pub(super) selector: String,
+    pub(super) state: String,
+    plan: String,
+    wave: i64,
+    since: i64,
+    reason: String,
+    forgiven: i64,
+    pub(super) is_wanted: i64,
+}
+
+/// Numbers of vehicles of a release, or of its waves.
+#[derive(Debug, Default, Clone, Copy, PartialEq)]
+pub(super) struct VehicleCount {
+    pub(super) vehicles: u64,
+    pub(super) running: u64,
+    pub(super) failed: u64,
+    /// Those without the release that have not shown up since the wave opened.
+    away: u64,
+}
+
+/// A step of the waves of a release.
+#[derive(Debug, PartialEq)]
+enum WaveStep {
+    Wait,
+    /// Opens this wave, to vehicles that came since, too.
+    Open(i64),
+    /// Opens the release to all.
+    Complete,
+    Pause(String),
+    Rollback(String),
+}
+
+impl FromRow<'_, AnyRow> for Release {
+    fn from_row(row: &AnyRow) -> sqlx::Result<Self> {
+        Ok(Self {
+            deployment: row.try_get("deployment")?,
+            number: row.try_get("number")?,
+            sha256: row.try_get("sha256")?,
+            revision: row.try_get("revision")?,
+            fallback: row.try_get("fallback")?,
+            grants: row.try_get("grants")?,
+            selector: row.try_get("selector")?,
+            state: row.try_get("state")?,
+            plan: row.try_get("plan")?,
+            wave: row.try_get("wave")?,
+            since: row.try_get("since")?,
+            reason: row.try_get("reason")?,
+            forgiven: row.try_get("forgiven")?,
+            is_wanted: row.try_get("is_wanted")?,
+        })
+    }
+}
+
+/// Returns the newest release of the deployment `only`, or of each if it is empty.
+pub(super) async fn newest_releases(tx: &mut Tx, only: &str) -> CloudResult<Vec<Release>> {
+    Ok(rows!(&mut **tx;
+        "SELECT deployment, number, sha256, revision, fallback, grants, selector, state, plan, wave,
+         since, reason, forgiven, is_wanted
+         FROM releases JOIN deployments ON deployments.id = releases.deployment
+         WHERE number = (SELECT MAX(number) FROM releases AS other
+                         WHERE other.deployment = releases.deployment)
+         AND ($1 = '' OR deployment = $1)
+         ORDER BY deployment";
+        only))
+}
+
+impl CloudStore {
+    /// Takes the steps that are due; returns the vehicles whose wanted state has changed.
+    pub(crate) async fn advance_waves(&self) -> CloudResult<ChangedVehicles> {
+        let (running,): (i64,) =
+            one!(&self.pool; "SELECT COUNT(*) FROM releases WHERE state = 'running'");
+        if running == 0 {
+            return Ok(Vec::new());
+        }
+        let mut change = self.change().await?;
+        let mut has_changed = false;
+        for release in newest_releases(&mut change.tx, "").await? {
+            if release.state != "running" || release.is_wanted == 0 {
+                continue;
+            }
+            let count = release.count(&mut change.tx, true).await?;
+            let step = release.next(&count, now())?;
+            has_changed |= change.take_step(&release, step).await?;
+        }
+        if !has_changed {
+            return Ok(Vec::new());
+        }
+        let changed = change.refresh("").await?;
+        change.commit().await?;
+        Ok(changed)
+    }
+
+    /// Pauses, resumes or aborts the waves of the newest release.
+    pub(crate) async fn steer_waves(
+        &self,
+        actor: &str,
+        id: &str,
+        state: WaveState,
+    ) -> CloudResult<ChangedVehicles> {
+        let mut change = self.change().await?;
+        let newest = change.newest(id).await?.ok_or_else(|| unknown(id))?;
+        let refused = match (&*newest.state, state) {
+            (COMPLETE, _) => Some("is open to all its vehicles"),
+            ("aborted", WaveState::Running | WaveState::Paused) => Some("was aborted"),
+            _ => None,
+        };
+        if let Some(reason) = refused {
+            let message = format!("release {} of `{id}` {reason}", newest.number);
+            return Err(CloudError::usage(message, "deploy a release with waves"));
+        }
+        let (name, reason, action) = match state {
+            WaveState::Running => ("running", String::new(), "resume waves"),
+            WaveState::Paused => ("paused", format!("paused by {actor}"), "pause waves"),
+            WaveState::Aborted => ("aborted", format!("aborted by {actor}"), "abort waves"),
+        };
+        if name != newest.state {
+            // Who resumes waves has seen the failures so far; more count.
+            let failed = match state {
+                WaveState::Running => newest.count(&mut change.tx, true).await?.failed,
+                _ => unsigned(newest.forgiven),
+            };
+            run!(&mut *change.tx;
+                "UPDATE releases SET state = $3, since = $4, reason = $5, forgiven = $6
+                 WHERE deployment = $1 AND number = $2";
+                id, newest.number, name, now(), reason, super::int(failed));
+        }
+        change.finish(1, actor, action, id).await
+    }
+}
+
+impl StoreChange<'_> {
+    /// Returns the newest release of a deployment.
+    pub(super) async fn newest(&mut self, id: &str) -> CloudResult<Option<Release>> {
+        // The empty text would mean all.
+        if id.is_empty() {
+            return Ok(None);
+        }
+        Ok(newest_releases(&mut self.tx, id).await?.pop())
+    }
+
+    /// Takes a step; returns whether anything has changed.
+    async fn take_step(&mut self, release: &Release, step: WaveStep) -> CloudResult<bool> {
+        let Release { deployment, number, .. } = release;
+        let action = match step {
+            WaveStep::Wait => return Ok(false),
+            WaveStep::Open(wave) => {
+                let added = self.open_wave(deployment, *number, wave).await?;
+                // One that waits for its first vehicle is open already.
+                if wave == release.wave {
+                    return Ok(added > 0);
+                }
+                format!("open wave {wave} of release {number}")
+            }
+            WaveStep::Complete => {
+                self.complete(deployment, *number).await?;
+                format!("open release {number} to all")
+            }
+            WaveStep::Pause(reason) => {
+                run!(&mut *self.tx;
+                    "UPDATE releases SET state = 'paused', since = $3, reason = $4
+                     WHERE deployment = $1 AND number = $2 AND state = 'running'";
+                    deployment, number, now(), &reason);
+                format!("pause release {number}: {reason}")
+            }
+            WaveStep::Rollback(reason) => {
+                self.request_fallback(deployment, *number, &reason).await?;
+                format!("roll back release {number}: {reason}")
+            }
+        };
+        self.note(WAVES, &action, deployment).await?;
+        Ok(true)
+    }
+
+    /// Opens a wave of the newest release: adds as many vehicles as its plan says, and returns their
+    /// number.
+    pub(super) async fn open_wave(
+        &mut self,
+        id: &str,
+        number: i64,
+        wave: i64,
+    ) -> CloudResult<usize> {
+        let release = self.newest(id).await?.ok_or_else(|| unknown(id))?;
+        let (selector, share) = (map(&release.selector), release.share(wave)?);
+        let vehicles: Vec<(String, String, i64)> = rows!(&mut *self.tx;
+            "SELECT name, labels, (SELECT COUNT(*) FROM wave_members
+             WHERE vehicle = name AND deployment = $1 AND number = $2)
+             FROM vehicles WHERE is_revoked = 0 AND epoch > 0";
+            id, number);
+        let chosen = vehicles.iter().filter(|(_, labels, _)| selects(&selector, &map(labels)));
+        let (members, others): (Vec<_>, Vec<_>) =
+            chosen.partition(|(.., is_member)| *is_member > 0);
+        let target = ((members.len() + others.len()) * share).div_ceil(100);
+        // By a hash: another choice for each release, and the same one for each process.
+        let mut others: Vec<_> =
+            others.iter().map(|(name, ..)| (order(id, number, name), name)).collect();
+        others.sort_unstable();
+        others.truncate(target.saturating_sub(members.len()));
+        for (_, name) in &others {
+            run!(&mut *self.tx;
+                "INSERT INTO wave_members (vehicle, deployment, number) VALUES ($1, $2, $3)";
+                name, id, number);
+        }
+        // A wave that waits for its first vehicle began when it was opened.
+        run!(&mut *self.tx;
+            "UPDATE releases SET since = CASE WHEN wave = $3 THEN since ELSE $4 END, wave = $3
+             WHERE deployment = $1 AND number = $2 AND state = 'running'";
+            id, number, wave, now());
+        Ok(others.len())
+    }
+
+    /// Opens a release to all its vehicles, and drops older ones.
+    pub(super) async fn complete(&mut self, id: &str, number: i64) -> CloudResult<()> {
+        run!(&mut *self.tx;
+            "UPDATE releases SET state = 'complete', plan = '', reason = ''
+             WHERE deployment = $1 AND number = $2";
+            id, number);
+        run!(&mut *self.tx;
+            "DELETE FROM releases WHERE deployment = $1 AND number < $2"; id, number);
+        run!(&mut *self.tx; "DELETE FROM wave_members WHERE deployment = $1"; id);
+        Ok(())
+    }
+}
+
+impl Release {
+    fn plan(&self) -> CloudResult<WavePlan> {
+        serde_json::from_str(&self.plan).map_err(|error| {
+            let message =
+                format!("the stored plan of the waves of `{}` is damaged", self.deployment);
+            CloudError::usage(message, "deploy a higher release").because(error)
+        })
+    }
+
+    /// Returns the share of the vehicles that a wave reaches, in percent.
+    fn share(&self, wave: i64) -> CloudResult<usize> {
+        let shares = self.plan()?.shares;
+        let index = usize::try_from(wave).unwrap_or(0).saturating_sub(1);
+        Ok(shares.get(index).copied().unwrap_or(100).into())
+    }
+
+    /// Counts its vehicles, or those of them that its waves have reached.
+    pub(super) async fn count(&self, tx: &mut Tx, only_members: bool) -> CloudResult<VehicleCount> {
+        // Grouped by labels, of which there are few: SQL cannot compare them with the selector.
+        let groups: Vec<(String, String, i64)> = rows!(&mut **tx;
+            "SELECT labels,
+             CASE WHEN reported.number = $2 THEN reported.state
+                  WHEN handled >= generation THEN 'refused'
+                  WHEN seen < $3 THEN 'away'
+                  ELSE 'late' END AS standing,
+             COUNT(*)
+             FROM vehicles LEFT JOIN reported
+             ON reported.vehicle = vehicles.name AND reported.deployment = $1
+             WHERE is_revoked = 0 AND epoch > 0 AND ($4 = 0 OR EXISTS
+             (SELECT 1 FROM wave_members WHERE wave_members.deployment = $1
+              AND wave_members.number = $2 AND wave_members.vehicle = vehicles.name))
+             GROUP BY 1, 2";
+            &self.deployment, self.number, self.since, i64::from(only_members));
+        let (selector, mut count) = (map(&self.selector), VehicleCount::default());
+        for (labels, standing, vehicles) in groups {
+            let labels: TextMap = map(&labels);
+            if !selects(&selector, &labels) {
+                continue;
+            }
+            let vehicles = unsigned(vehicles);
+            count.vehicles += vehicles;
+            match &*standing {
+                RUNNING => count.running += vehicles,
+                FAILED => count.failed += vehicles,
+                // It has handled its wanted state, and has not accepted this.
+                "refused" if self.is_wanted != 0 => count.failed += vehicles,
+                "away" => count.away += vehicles,
+                _ => {}
+            }
+        }
+        Ok(count)
+    }
+
+    /// Returns the progress of its waves, unless it is open to all.
+    pub(super) async fn progress(&self, tx: &mut Tx) -> CloudResult<Option<WaveProgress>> {
+        let state = match &*self.state {
+            "running" => WaveState::Running,
+            "paused" => WaveState::Paused,
+            "aborted" => WaveState::Aborted,
+            _ => return Ok(None),
+        };
+        let (plan, count) = (self.plan()?, self.count(tx, true).await?);
+        Ok(Some(WaveProgress {
+            wave: unsigned(self.wave),
+            waves: plan.shares.len() as u64 + 1,
+            plan,
+            state,
+            reason: self.reason.clone(),
+            since: unsigned(self.since),
+            vehicles: count.vehicles,
+            running: count.running,
+            failed: count.failed,
+        }))
+    }
+
+    /// Returns the step that is due, at the time `now`, with these vehicles in its waves.
+    fn next(&self, count: &VehicleCount, now: i64) -> CloudResult<WaveStep> {
+        let plan = self.plan()?;
+        let open_s = unsigned(now.saturating_sub(self.since));
+        let VehicleCount { vehicles, running, failed, away } = *count;
+        let share = |part: u64, percent: u8| part * 100 > vehicles * u64::from(percent);
+        let new = failed.saturating_sub(unsigned(self.forgiven));
+        if new > 0 && share(new, plan.failures) {
+            let reason =
+                format!("wave {}: it failed on {failed} of {vehicles} vehicles", self.wave);
+            return Ok(match plan.on_failure {
+                OnFailure::Rollback if !self.fallback.is_empty() => WaveStep::Rollback(reason),
+                _ => WaveStep::Pause(reason),
+            });
+        }
+        if vehicles == 0 {
+            // No vehicle has the labels yet.
+            return Ok(WaveStep::Open(self.wave));
+        }
+        // A wave does not wait for vehicles that are switched off: they get the release later.
+        let expected = match open_s > unsigned(AWAY_S) {
+            true => vehicles - away,
+            false => vehicles,
+        };
+        let has_succeeded = running > 0 && running * 100 >= expected * u64::from(plan.success);
+        Ok(match () {
+            () if has_succeeded && open_s >= plan.soak_s => {
+                match (self.wave as usize) < plan.shares.len() {
+                    true => WaveStep::Open(self.wave + 1),
+                    false => WaveStep::Complete,
+                }
+            }
+            () if !has_succeeded && open_s >= plan.deadline_s => WaveStep::Pause(format!(
+                "wave {}: {running} of {vehicles} vehicles run it at the deadline",
+                self.wave
+            )),
+            () => WaveStep::Wait,
+        })
+    }
+}
+
+/// Returns the place of a vehicle in the order of a release's waves.
+fn order(id: &str, number: i64, vehicle: &str) -> [u8; 32] {
+    Sha256::digest(format!("{id} {number} {vehicle}")).into()
+}
+
+#[cfg(test)]
+mod tests;
