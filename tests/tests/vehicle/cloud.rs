@@ -66,8 +66,11 @@ pub fn follows() {
     let other = deploy((&cloud, &vehicle), &lambda, "deployer", &["--selector", "town=bergen"]);
     assert!(other.status.success() && text(&other).contains("no vehicle"), "{}", text(&other));
     assert_eq!(phase(&vehicle, "ticks"), None, "it is for vehicles elsewhere");
-    let deployed = deploy((&cloud, &vehicle), &lambda, "deployer", &["--selector", "town=oslo"]);
-    assert!(deployed.status.success(), "{}", text(&deployed));
+    // The wave has the only vehicle, so that the last one has no others.
+    let waves = ["--selector", "town=oslo", "--wave", "50%", "--soak", "1s", "--watch"];
+    let deployed = deploy((&cloud, &vehicle), &lambda, "deployer", &waves);
+    let shown = text(&deployed);
+    assert!(deployed.status.success() && shown.contains("wave 1 of 2"), "{shown}");
     assert_eq!(phase(&vehicle, "ticks"), Some(LambdaPhase::Running));
     let status = cloud.succeeds(&["status", "--on", NAME]);
     assert!(status.contains("ticks"), "{status}");
