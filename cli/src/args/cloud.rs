@@ -55,9 +55,10 @@ pub struct LoginArgs {
     /// Address of the cloud, as in http://127.0.0.1:8080
     #[arg(value_name = "URL")]
     pub url: String,
-    /// The code of the invitation, which works once
+    /// The code of the invitation, which works once [default: a line of standard input, as other
+    /// users of this machine see arguments]
     #[arg(long, value_name = "CODE")]
-    pub code: String,
+    pub code: Option<String>,
     /// Print the result as JSON
     #[arg(long)]
     pub json: bool,

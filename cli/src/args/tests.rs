@@ -80,7 +80,6 @@ fn arguments_for_a_cloud_are_checked_before_any_request() {
         (&["users", "remove", "a/b"], "as in ada"),
         (&["vehicles", "revoke", "a b"], "as in car-7"),
         (&["vehicles", "enrol", "car-7"], "--to"),
-        (&["login", "http://127.0.0.1:8080"], "--code"),
         (&["status", "--on", "a/b"], "as in car-7"),
         (&["events", "--on", "car-7", "--run-dir", "d"], "cannot be used with"),
         (&["deploy", "dir", "--key", "k", "--fleet", "--on", "car-7"], "unexpected argument"),

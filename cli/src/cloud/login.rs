@@ -1,5 +1,7 @@
 //! `gleaner login`, `logout` and `whoami`: the address of a cloud and the token for it.
 
+use std::io::{BufRead, IsTerminal, Read, stdin};
+
 use gleaner_base::{Exit, Failure, visible};
 use gleaner_fleet::people::{Login, User, UserToken};
 use serde_json::json;
@@ -18,7 +20,7 @@ pub(super) fn login(args: &LoginArgs) -> Result<Exit, Failure> {
         eprintln!("{warning}");
     }
     let account = CloudAccount { url: url.clone(), token: String::new() };
-    let login = Login { code: args.code.clone() };
+    let login = Login { code: args.code.clone().map_or_else(read_code, Ok)? };
     let session: UserToken = VehicleClient::of_cloud(account)?.post("/v1/login", &login)?;
     let file = CloudAccount { url: url.clone(), token: session.token }.save()?;
     let (user, file, url) = (session.user, file.display().to_string(), url.to_string());
@@ -28,6 +30,23 @@ pub(super) fn login(args: &LoginArgs) -> Result<Exit, Failure> {
         let (name, until) = (visible(&user.name), date(session.expires));
         format!("logged in to {url} as {name} ({}) until {until}\n", user.role)
     })
+}
+
+/// Reads a code from standard input.
+fn read_code() -> Result<String, Failure> {
+    if stdin().is_terminal() {
+        eprint!("code: ");
+    }
+    let mut line = String::new();
+    // A code is far shorter.
+    stdin().lock().take(1024).read_line(&mut line).map_err(|error| {
+        Failure::caused_by(Exit::Usage, "cannot read a code from standard input", &error)
+    })?;
+    match line.trim() {
+        "" => Err(Failure::new(Exit::Usage, "there is no code on standard input")
+            .with_help("write the code of the invitation there, or name it with --code CODE")),
+        code => Ok(code.to_owned()),
+    }
 }
 
 /// Runs `gleaner logout`.

@@ -44,6 +44,19 @@ fn a_refused_code_and_a_bad_address_leave_no_file() {
 }
 
 #[test]
+fn a_code_can_come_from_standard_input_where_other_users_do_not_see_it() {
+    let user = CloudUser::new();
+    user.cloud.answers("POST /v1/login", &[(401, problem(3, "the code is not valid"))]);
+    fs::write(user.path("code"), "c0de\n").unwrap();
+    let mut login = user.command(&["login", &user.cloud.url()]);
+    login.stdin(fs::File::open(user.path("code")).unwrap());
+    fails(login, 3);
+    assert_eq!(user.cloud.seen()[0].body, br#"{"code":"c0de"}"#);
+    let text = user.fails(2, &["login", &user.cloud.url()]);
+    assert!(text.contains("there is no code on standard input"), "{text}");
+}
+
+#[test]
 fn the_environment_outweighs_the_file_and_no_token_reaches_another_cloud() {
     let user = CloudUser::logged_in();
     user.cloud.answers("GET /v1/me", &[(200, json!({ "name": "ci", "role": "deployer" }))]);
