@@ -1,8 +1,8 @@
 //! The database: what must survive a restart, apart from files.
 //!
 //! All SQL is in this room, in the dialect that SQLite and PostgreSQL share. Changes wait for their
-//! turn, so that SQLite has one writer in this process; each is one transaction, with its entry of
-//! the audit trail.
+//! turn, so that SQLite has one writer in this process. A change of a person is one transaction,
+//! with its entry of the audit trail; `writer` commits what vehicles send together.
 
 /// Runs a statement with these values; returns its result.
 macro_rules! run {
@@ -40,9 +40,11 @@ mod secrets;
 mod tests;
 mod users;
 mod vehicles;
+mod writer;
 
 use std::path::Path;
 use std::str::FromStr;
+use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure};
@@ -50,6 +52,7 @@ use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
 use sqlx::{Any, AnyPool, Transaction};
 use tokio::sync::{Mutex, MutexGuard};
 
+use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
 
 pub(crate) use deployments::OfferedDeployment;
@@ -66,10 +69,10 @@ const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
                        PRAGMA foreign_keys = ON; PRAGMA busy_timeout = 10000;";
 
 /// The database.
-#[derive(Debug)]
 pub(crate) struct CloudStore {
     pool: AnyPool,
-    turn: Mutex<()>,
+    turn: Arc<Mutex<()>>,
+    writes: WriteQueue,
 }
 
 /// A change that is not committed yet; dropped, it is undone.
@@ -101,7 +104,9 @@ impl CloudStore {
             })
         });
         let pool = pool.connect_with(options.map_err(failed)?).await.map_err(failed)?;
-        let store = Self { pool, turn: Mutex::new(()) };
+        let turn = Arc::default();
+        let writes = WriteQueue::start(pool.clone(), Arc::clone(&turn));
+        let store = Self { pool, turn, writes };
         store.migrate().await?;
         Ok(store)
     }
@@ -130,11 +135,7 @@ impl CloudStore {
 
     /// Begins a change, once no other one is in progress.
     pub(crate) async fn change(&self) -> CloudResult<StoreChange<'_>> {
-        let turn = self.turn.lock().await;
-        // A program beside this one, such as `invite`, writes too: a transaction that became a
-        // writer only later would fail instead of waiting for it.
-        let tx = self.pool.begin_with("BEGIN IMMEDIATE").await?;
-        Ok(StoreChange { tx, _turn: turn })
+        begin(&self.pool, &self.turn).await
     }
 
     /// Writes a copy of the database to a new file.
@@ -154,6 +155,34 @@ impl StoreChange<'_> {
     pub(crate) async fn commit(self) -> CloudResult<()> {
         Ok(self.tx.commit().await?)
     }
+}
+
+async fn begin<'s>(pool: &AnyPool, turn: &'s Mutex<()>) -> CloudResult<StoreChange<'s>> {
+    let turn = turn.lock().await;
+    // A program beside this one, such as `invite`, writes too: a transaction that became a writer
+    // only later would fail instead of waiting for it.
+    let tx = pool.begin_with("BEGIN IMMEDIATE").await?;
+    Ok(StoreChange { tx, _turn: turn })
+}
+
+/// Returns the placeholders of `rows` rows: each has `own` values of its own after `shared` ones.
+fn placeholders(rows: usize, shared: usize, own: usize) -> String {
+    let row = |row| {
+        let first = shared + row * own + 1;
+        let all: Vec<_> = (1..=shared).chain(first..first + own).map(|it| format!("${it}")).collect();
+        format!("({})", all.join(", "))
+    };
+    (0..rows).map(row).collect::<Vec<_>>().join(", ")
+}
+
+/// Splits rows into parts of few different lengths: for each, a statement is prepared once.
+fn parts<T>(mut rows: &[T]) -> impl Iterator<Item = &[T]> {
+    std::iter::from_fn(move || {
+        let length = [64, 16, 4, 1].into_iter().find(|length| *length <= rows.len())?;
+        let (part, rest) = rows.split_at(length);
+        rows = rest;
+        Some(part)
+    })
 }
 
 /// Returns the time, in s since 1970.
