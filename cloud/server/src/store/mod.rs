@@ -49,7 +49,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure};
 use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
-use sqlx::{Any, AnyPool, Transaction};
+use sqlx::{Any, AnyPool, Connection, Transaction};
 use tokio::sync::{Mutex, MutexGuard};
 
 use self::writer::WriteQueue;
@@ -97,12 +97,22 @@ impl CloudStore {
         let escaped = path.display().to_string().replace('%', "%25");
         let escaped = escaped.replace('?', "%3f").replace('#', "%23");
         let options = AnyConnectOptions::from_str(&format!("sqlite://{escaped}?mode=rwc"));
-        let pool = AnyPoolOptions::new().max_connections(8).after_connect(|connection, _| {
-            Box::pin(async move {
-                sqlx::raw_sql(PRAGMAS).execute(connection).await?;
-                Ok(())
+        let pool = AnyPoolOptions::new()
+            .max_connections(8)
+            // Each was in order when it was returned.
+            .test_before_acquire(false)
+            // SQLite itself undoes a transaction, for example on a full disk. Its connection still
+            // counts it, and could begin no other one.
+            .before_acquire(|connection, _| {
+                let is_usable = !connection.is_in_transaction();
+                Box::pin(async move { Ok(is_usable) })
             })
-        });
+            .after_connect(|connection, _| {
+                Box::pin(async move {
+                    sqlx::raw_sql(PRAGMAS).execute(connection).await?;
+                    Ok(())
+                })
+            });
         let pool = pool.connect_with(options.map_err(failed)?).await.map_err(failed)?;
         let turn = Arc::default();
         let writes = WriteQueue::start(pool.clone(), Arc::clone(&turn));
