@@ -33,7 +33,8 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   test     run all tests; the last line is `N passed, M failed, K skipped`
   bless    write the examples' decisions to expected.txt, and the generated files
   docs     fetch mdBook and build the pages as a book in target/book
-  bench    run the benchmarks; further arguments are passed to gleaner-bench
+  bench    run the benchmarks; further arguments are passed to gleaner-bench, with --fleet to
+           gleaner-fleet-bench
   peers    build test programs on other DDS implementations; --install fetches their packages first
   player   fetch the tools for gleaner-player, which plays drives with Cyclone DDS, and build it
   fuzz     fuzz parsers of untrusted input; [TARGET...] [--seconds N] [--seed N]
@@ -70,6 +71,9 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "test" => suites::run(&checkout),
         "bless" => bless::run(&checkout),
         "docs" => docs::run(&checkout),
+        "bench" if rest.iter().any(|argument| argument == "--fleet") => {
+            fleet_bench(&checkout, rest)
+        }
         "bench" => bench(&checkout, rest),
         "fuzz" => fuzz::run(&checkout, rest),
         "peers" => peers::build(&checkout, rest),
@@ -82,6 +86,22 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         }
         _ => Err(Failure::new(Exit::Usage, "no such command").with_help(USAGE)),
     }
+}
+
+/// Measures the cloud under a simulated fleet: without lambdas, and on all cores.
+fn fleet_bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let mut steps = Steps::of(2);
+    steps.begin("programs (the first time this takes minutes)");
+    setup::programs(checkout)?;
+    let mut build = checkout.cargo();
+    steps::run(
+        build.args(["build", "--release", "--bin", "gleaner-fleet-bench"]),
+        "see the first error above",
+    )?;
+    steps.begin("measurements");
+    let mut bench = checkout.command(checkout.program("gleaner-fleet-bench"));
+    bench.args(arguments.iter().filter(|argument| *argument != "--fleet"));
+    steps::run(&mut bench, "see the messages above").map(|()| Exit::Ok)
 }
 
 fn bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {

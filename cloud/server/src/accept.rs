@@ -17,7 +17,15 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use tokio::time::{sleep, timeout};
 use tokio_rustls::TlsAcceptor;
+use tokio_rustls::server::TlsStream;
 
+/// Maximum number of TLS handshakes at a time. After a restart all vehicles come at once: with all
+/// of them in progress, each would take longer than its time, and none would end.
+const HANDSHAKES: usize = 256;
+/// Time to wait for a handshake, which is as long as vehicles wait.
+const HANDSHAKE_TURN: Duration = Duration::from_secs(30);
+/// Time after which one that goes on does not count: those that stall keep no others out.
+const HANDSHAKE_COUNTS: Duration = Duration::from_secs(1);
 /// Time for a TLS handshake, and for the headers of a request.
 const HANDSHAKE: Duration = Duration::from_secs(10);
 const HEADERS: Duration = Duration::from_secs(30);
@@ -56,6 +64,7 @@ impl Entrance {
     pub(crate) async fn serve(self) {
         let Self { listener, router, tls, most, mut stop } = self;
         let slots = Arc::new(Semaphore::new(most as usize));
+        let handshakes = Arc::new(Semaphore::new(HANDSHAKES));
         let stopping = stop.clone();
         let stopped = async move {
             let _ = stop.wait_for(|is_stopping| *is_stopping).await;
@@ -79,7 +88,10 @@ impl Entrance {
                 tracing::warn!(most, "a connection is refused: too many are open");
                 continue;
             };
-            let tls = tls.as_ref().map(|tls| TlsAcceptor::from(Arc::clone(&tls.borrow())));
+            let tls = tls.as_ref().map(|tls| Handshake {
+                acceptor: TlsAcceptor::from(Arc::clone(&tls.borrow())),
+                turns: Arc::clone(&handshakes),
+            });
             let peer = PeerConnection { address: address.ip(), certificate: None, _slot: slot };
             tokio::spawn(connection(stream, tls, peer, router.clone(), stopping.clone()));
         }
@@ -90,9 +102,32 @@ impl Entrance {
     }
 }
 
+/// A TLS handshake that is due.
+struct Handshake {
+    acceptor: TlsAcceptor,
+    turns: Arc<Semaphore>,
+}
+
+impl Handshake {
+    /// Returns the stream; `None` if the other side is too slow, or wrong.
+    async fn done(self, stream: TcpStream) -> Option<TlsStream<TcpStream>> {
+        let turn = timeout(HANDSHAKE_TURN, self.turns.acquire()).await.ok()?;
+        let handshake = timeout(HANDSHAKE, self.acceptor.accept(stream));
+        tokio::pin!(handshake);
+        let accepted = match timeout(HANDSHAKE_COUNTS, handshake.as_mut()).await {
+            Ok(accepted) => accepted,
+            Err(_) => {
+                drop(turn);
+                handshake.await
+            }
+        };
+        accepted.ok()?.ok()
+    }
+}
+
 async fn connection(
     stream: TcpStream,
-    tls: Option<TlsAcceptor>,
+    tls: Option<Handshake>,
     mut peer: PeerConnection,
     router: Router,
     stop: watch::Receiver<bool>,
@@ -101,7 +136,8 @@ async fn connection(
     let Some(tls) = tls else {
         return requests(stream, peer, router, stop).await;
     };
-    let Ok(Ok(stream)) = timeout(HANDSHAKE, tls.accept(stream)).await else {
+    // In a box, as a connection that waits or is upgraded does not need the room.
+    let Some(stream) = Box::pin(tls.done(stream)).await else {
         tracing::debug!(address = %peer.address, "a TLS handshake failed");
         return;
     };

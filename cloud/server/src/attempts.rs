@@ -1,6 +1,7 @@
-//! Limits how many wrong secrets an address may send.
+//! Limits how often an address or a vehicle may do something.
 
 use std::collections::HashMap;
+use std::hash::Hash;
 use std::net::IpAddr;
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
@@ -9,33 +10,108 @@ use gleaner_base::RateLimit;
 
 use crate::error::{CloudError, CloudResult};
 
-/// Wrong secrets of an address: ten at once, then one in six seconds.
-const LIMIT: RateLimit = RateLimit::of(1.0 / 6.0, 10.0);
-/// Maximum number of addresses that are remembered.
-const ADDRESSES_MAX: usize = 10_000;
+/// Maximum number of keys that are remembered. With this many at once, further ones share a limit.
+const KEYS_MAX: usize = 20_000;
 
-/// Wrong secrets of each address.
-#[derive(Debug, Default)]
-pub(crate) struct WrongSecrets(Mutex<HashMap<IpAddr, RateLimit>>);
+/// A limit for each of many keys.
+#[derive(Debug)]
+struct LimitOfEach<K> {
+    limit: RateLimit,
+    /// What fills a limit completely: a key with that much left needs not be remembered.
+    burst: f64,
+    limits: Mutex<HashMap<Option<K>, RateLimit>>,
+}
+
+impl<K: Hash + Eq> LimitOfEach<K> {
+    fn new(per_s: f64, burst: f64) -> Self {
+        Self { limit: RateLimit::of(per_s, burst), burst, limits: Mutex::default() }
+    }
+
+    /// Counts an attempt; returns whether it is within the limit.
+    fn take(&self, key: K) -> bool {
+        let now = Instant::now();
+        let mut limits = self.limits.lock().unwrap_or_else(PoisonError::into_inner);
+        if limits.len() >= KEYS_MAX {
+            limits.retain(|_, limit| {
+                let mut limit = *limit;
+                !limit.take(self.burst, now)
+            });
+        }
+        let key = (limits.len() < KEYS_MAX).then_some(key);
+        limits.entry(key).or_insert(self.limit).take(1.0, now)
+    }
+}
+
+/// Wrong secrets of each address: ten at once, then one in six seconds.
+#[derive(Debug)]
+pub(crate) struct WrongSecrets(LimitOfEach<IpAddr>);
+
+impl Default for WrongSecrets {
+    fn default() -> Self {
+        Self(LimitOfEach::new(1.0 / 6.0, 10.0))
+    }
+}
 
 impl WrongSecrets {
     /// Counts a wrong one; it is an error of its own if the address has sent too many. Those that
     /// are right are never refused: others at the address, such as all behind a proxy, may use
     /// them.
     pub(crate) fn count(&self, address: IpAddr) -> CloudResult<()> {
-        let now = Instant::now();
-        let mut limits = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if limits.len() >= ADDRESSES_MAX {
-            limits.retain(|_, limit| !limit.clone().take(10.0, now));
-        }
-        // With this many at once, further ones share the limit of one address.
-        let key = if limits.len() < ADDRESSES_MAX { address } else { IpAddr::from([0; 4]) };
-        match limits.entry(key).or_insert(LIMIT).take(1.0, now) {
+        let help = "wait a minute, and use the newest code or token";
+        match self.0.take(address) {
             true => Ok(()),
             false => Err(CloudError::busy(
                 "too many wrong codes and tokens came from your address",
-                "wait a minute, and use the newest code or token",
+                help,
             )),
+        }
+    }
+}
+
+/// What each vehicle may do: a vehicle in a loop must cost little.
+#[derive(Debug)]
+pub(crate) struct VehicleLimits {
+    /// Requests, which fetch a file each.
+    requests: LimitOfEach<String>,
+    /// Control channels. Healthy vehicles pause longer each time.
+    links: LimitOfEach<String>,
+    /// Certificates, each with an entry in the audit trail. Vehicles try once in an hour.
+    renewals: LimitOfEach<String>,
+}
+
+impl Default for VehicleLimits {
+    fn default() -> Self {
+        Self {
+            requests: LimitOfEach::new(10.0, 1000.0),
+            links: LimitOfEach::new(0.2, 20.0),
+            renewals: LimitOfEach::new(1.0 / 3600.0, 3.0),
+        }
+    }
+}
+
+impl VehicleLimits {
+    /// Counts a request of a vehicle.
+    pub(crate) fn request(&self, vehicle: &str) -> CloudResult<()> {
+        within(&self.requests, vehicle, "requests")
+    }
+
+    /// Counts a control channel of a vehicle.
+    pub(crate) fn link(&self, vehicle: &str) -> CloudResult<()> {
+        within(&self.links, vehicle, "connections")
+    }
+
+    /// Counts a request of a vehicle for another certificate.
+    pub(crate) fn renewal(&self, vehicle: &str) -> CloudResult<()> {
+        within(&self.renewals, vehicle, "requests for a certificate")
+    }
+}
+
+fn within(limits: &LimitOfEach<String>, vehicle: &str, what: &str) -> CloudResult<()> {
+    match limits.take(vehicle.to_owned()) {
+        true => Ok(()),
+        false => {
+            let message = format!("vehicle `{vehicle}` has sent too many {what}");
+            Err(CloudError::busy(message, "wait, and pause longer after each attempt"))
         }
     }
 }
@@ -52,5 +128,13 @@ mod tests {
         }
         assert!(wrong.count(one.into()).is_err());
         assert!(wrong.count(other.into()).is_ok());
+    }
+
+    #[test]
+    fn a_vehicle_in_a_loop_is_refused_and_others_are_not() {
+        let limits = VehicleLimits::default();
+        let renewed = (0..10).filter(|_| limits.renewal("car-7").is_ok()).count();
+        assert_eq!(renewed, 3);
+        assert!(limits.renewal("car-8").is_ok() && limits.link("car-7").is_ok());
     }
 }

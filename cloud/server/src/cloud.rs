@@ -4,14 +4,15 @@ use std::sync::Arc;
 
 use tokio::sync::Semaphore;
 
-use crate::attempts::WrongSecrets;
+use crate::attempts::{VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
 use crate::hub::Hub;
 use crate::objects::Objects;
+use crate::readers::Readers;
 use crate::store::{CloudStore, Retention};
 
-/// Maximum number of streams of records that people read at a time.
-pub(crate) const READERS_MAX: usize = 64;
+/// Maximum number of frames of vehicles that are parsed and stored at a time: each may have 8 MiB.
+pub(crate) const STORED_FRAMES_MAX: usize = 64;
 
 /// The state of the server.
 pub(crate) struct Cloud {
@@ -20,7 +21,10 @@ pub(crate) struct Cloud {
     pub(crate) hub: Hub,
     pub(crate) authorities: Authorities,
     pub(crate) wrong_secrets: WrongSecrets,
-    pub(crate) readers: Arc<Semaphore>,
+    pub(crate) limits: VehicleLimits,
+    pub(crate) readers: Arc<Readers>,
+    /// Frames of vehicles that are parsed and stored at a time.
+    pub(crate) stored_frames: Semaphore,
     pub(crate) retention: Retention,
     /// Address for vehicles, as enrolments state it.
     pub(crate) address: String,

@@ -51,6 +51,11 @@ impl CloudError {
         self
     }
 
+    /// Returns whether it is an error of the cloud, not of the request.
+    pub(crate) fn is_internal(&self) -> bool {
+        self.status.is_server_error()
+    }
+
     /// Returns the message with its causes, for a frame that ends a connection.
     pub(crate) fn reason(&self) -> String {
         let parts = std::iter::once(&self.failure.message).chain(&self.failure.causes);

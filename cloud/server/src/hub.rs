@@ -107,7 +107,11 @@ impl Hub {
 
     /// Notes a sign of life.
     pub(crate) fn saw(&self, name: &str) {
-        self.lock().seen.insert(name.to_owned(), now());
+        let mut state = self.lock();
+        match state.seen.get_mut(name) {
+            Some(time) => *time = now(),
+            None => drop(state.seen.insert(name.to_owned(), now())),
+        }
     }
 
     /// Returns the signs of life since the last call.

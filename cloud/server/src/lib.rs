@@ -18,6 +18,7 @@ mod hub;
 mod objects;
 mod people;
 mod program;
+mod readers;
 mod request;
 mod server;
 mod store;

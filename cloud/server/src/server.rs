@@ -13,9 +13,9 @@ use tokio::task::{JoinHandle, JoinSet};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::accept::Entrance;
-use crate::attempts::WrongSecrets;
+use crate::attempts::{VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
-use crate::cloud::{Cloud, READERS_MAX};
+use crate::cloud::{Cloud, STORED_FRAMES_MAX};
 use crate::folder::DataFolder;
 use crate::hub::Hub;
 use crate::objects::Objects;
@@ -97,7 +97,9 @@ impl CloudServer {
             hub: Hub::default(),
             authorities,
             wrong_secrets: WrongSecrets::default(),
-            readers: Arc::new(Semaphore::new(READERS_MAX)),
+            limits: VehicleLimits::default(),
+            readers: Arc::default(),
+            stored_frames: Semaphore::new(STORED_FRAMES_MAX),
             retention: Retention::DEFAULT,
             address,
         });

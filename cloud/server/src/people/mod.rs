@@ -179,6 +179,7 @@ async fn remove_user(
     Path(name): Path<String>,
 ) -> CloudResult<StatusCode> {
     cloud.store.remove_user(&actor.name, &name).await?;
+    cloud.readers.end(&name);
     Ok(StatusCode::NO_CONTENT)
 }
 

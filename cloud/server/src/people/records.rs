@@ -3,15 +3,17 @@
 use std::sync::Arc;
 
 use axum::body::Body;
-use axum::extract::{Path, Query, State};
+use axum::extract::{Extension, Path, Query, State};
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use futures_util::stream::try_unfold;
+use gleaner_fleet::people::User;
 use serde::Deserialize;
-use tokio::sync::{OwnedSemaphorePermit, watch};
+use tokio::sync::watch;
 
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
+use crate::readers::ReaderSlot;
 
 /// Number of lines in a piece.
 const PIECE: i64 = 256;
@@ -40,11 +42,12 @@ struct RecordReader {
     /// Lines to send first.
     first: Vec<String>,
     arrivals: Option<watch::Receiver<()>>,
-    _slot: OwnedSemaphorePermit,
+    slot: ReaderSlot,
 }
 
 pub(super) async fn events(
     State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<User>,
     Path(name): Path<String>,
     Query(query): Query<RecordQuery>,
 ) -> CloudResult<Response> {
@@ -52,27 +55,26 @@ pub(super) async fn events(
         let message = "`from` counts records of one stream, and these are several";
         return Err(CloudError::usage(message, "use `last`"));
     }
-    lines(cloud, name, ["events".to_owned(), "orchestrator".to_owned()], query).await
+    lines((cloud, user), name, ["events".to_owned(), "orchestrator".to_owned()], query).await
 }
 
 pub(super) async fn lambda(
     State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<User>,
     Path((name, id)): Path<(String, String)>,
     Query(query): Query<RecordQuery>,
 ) -> CloudResult<Response> {
     let stream = format!("lambdas/{id}");
-    lines(cloud, name, [stream.clone(), stream], query).await
+    lines((cloud, user), name, [stream.clone(), stream], query).await
 }
 
 async fn lines(
-    cloud: Arc<Cloud>,
+    (cloud, user): (Arc<Cloud>, User),
     vehicle: String,
     streams: [String; 2],
     query: RecordQuery,
 ) -> CloudResult<Response> {
-    let slot = Arc::clone(&cloud.readers).try_acquire_owned().map_err(|_| {
-        CloudError::busy("too many streams are read already", "end another `gleaner logs -f`")
-    })?;
+    let slot = cloud.readers.open(&user.name)?;
     // Before the first look, so that nothing arrives in between.
     let arrivals = query.follow.then(|| cloud.hub.arrivals(&vehicle));
     let names = [&*streams[0], &*streams[1]];
@@ -85,8 +87,7 @@ async fn lines(
     if arrival > 0 {
         first.clear();
     }
-    let reader =
-        RecordReader { cloud, vehicle, streams, from, arrival, first, arrivals, _slot: slot };
+    let reader = RecordReader { cloud, vehicle, streams, from, arrival, first, arrivals, slot };
     let pieces = try_unfold(reader, RecordReader::next);
     Ok(([(header::CONTENT_TYPE, "application/x-ndjson")], Body::from_stream(pieces))
         .into_response())
@@ -96,6 +97,9 @@ impl RecordReader {
     /// Returns the next piece; `None` at the end.
     async fn next(mut self) -> Result<Option<(String, Self)>, std::io::Error> {
         loop {
+            if self.slot.has_ended() {
+                return Ok(None);
+            }
             let mut lines = std::mem::take(&mut self.first);
             let names = self.streams.each_ref().map(|name| &**name);
             let store = &self.cloud.store;
@@ -109,8 +113,11 @@ impl RecordReader {
             }
             // It closes when the server stops.
             let Some(arrivals) = &mut self.arrivals else { return Ok(None) };
-            if arrivals.changed().await.is_err() {
-                return Ok(None);
+            tokio::select! {
+                changed = arrivals.changed() => if changed.is_err() {
+                    return Ok(None);
+                },
+                () = self.slot.ended() => return Ok(None),
             }
         }
     }

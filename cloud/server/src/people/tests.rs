@@ -6,7 +6,7 @@ use tempfile::TempDir;
 use tokio::sync::Semaphore;
 
 use super::*;
-use crate::attempts::WrongSecrets;
+use crate::attempts::{VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
 use crate::folder::DataFolder;
 use crate::hub::Hub;
@@ -23,7 +23,9 @@ async fn cloud(folder: &TempDir) -> Arc<Cloud> {
         hub: Hub::default(),
         authorities: Authorities::open(&data).unwrap(),
         wrong_secrets: WrongSecrets::default(),
-        readers: Arc::new(Semaphore::new(4)),
+        limits: VehicleLimits::default(),
+        readers: Arc::default(),
+        stored_frames: Semaphore::new(4),
         retention: Retention::DEFAULT,
         address: "127.0.0.1:8443".to_owned(),
     })

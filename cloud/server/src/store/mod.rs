@@ -1,8 +1,8 @@
 //! The database: what must survive a restart, apart from files.
 //!
 //! All SQL is in this room, in the dialect that SQLite and PostgreSQL share. Changes wait for their
-//! turn, so that SQLite has one writer in this process; each is one transaction, with its entry of
-//! the audit trail.
+//! turn, so that SQLite has one writer in this process. A change of a person is one transaction,
+//! with its entry of the audit trail; `writer` commits what vehicles send together.
 
 /// Runs a statement with these values; returns its result.
 macro_rules! run {
@@ -42,16 +42,19 @@ mod users;
 mod vehicles;
 mod wants;
 mod waves;
+mod writer;
 
 use std::path::Path;
 use std::str::FromStr;
+use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure};
 use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
-use sqlx::{Any, AnyPool, Transaction};
+use sqlx::{Any, AnyPool, Connection, Transaction};
 use tokio::sync::{Mutex, MutexGuard};
 
+use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
 
 pub(crate) use deployments::OfferedDeployment;
@@ -71,10 +74,10 @@ const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
                        PRAGMA foreign_keys = ON; PRAGMA busy_timeout = 10000;";
 
 /// The database.
-#[derive(Debug)]
 pub(crate) struct CloudStore {
     pool: AnyPool,
-    turn: Mutex<()>,
+    turn: Arc<Mutex<()>>,
+    writes: WriteQueue,
 }
 
 /// A change that is not committed yet; dropped, it is undone.
@@ -99,14 +102,26 @@ impl CloudStore {
         let escaped = path.display().to_string().replace('%', "%25");
         let escaped = escaped.replace('?', "%3f").replace('#', "%23");
         let options = AnyConnectOptions::from_str(&format!("sqlite://{escaped}?mode=rwc"));
-        let pool = AnyPoolOptions::new().max_connections(8).after_connect(|connection, _| {
-            Box::pin(async move {
-                sqlx::raw_sql(PRAGMAS).execute(connection).await?;
-                Ok(())
+        let pool = AnyPoolOptions::new()
+            .max_connections(8)
+            // Each was in order when it was returned.
+            .test_before_acquire(false)
+            // SQLite itself undoes a transaction, for example on a full disk. Its connection still
+            // counts it, and could begin no other one.
+            .before_acquire(|connection, _| {
+                let is_usable = !connection.is_in_transaction();
+                Box::pin(async move { Ok(is_usable) })
             })
-        });
+            .after_connect(|connection, _| {
+                Box::pin(async move {
+                    sqlx::raw_sql(PRAGMAS).execute(connection).await?;
+                    Ok(())
+                })
+            });
         let pool = pool.connect_with(options.map_err(failed)?).await.map_err(failed)?;
-        let store = Self { pool, turn: Mutex::new(()) };
+        let turn = Arc::default();
+        let writes = WriteQueue::start(pool.clone(), Arc::clone(&turn));
+        let store = Self { pool, turn, writes };
         store.migrate().await?;
         Ok(store)
     }
@@ -135,11 +150,7 @@ impl CloudStore {
 
     /// Begins a change, once no other one is in progress.
     pub(crate) async fn change(&self) -> CloudResult<StoreChange<'_>> {
-        let turn = self.turn.lock().await;
-        // A program beside this one, such as `invite`, writes too: a transaction that became a
-        // writer only later would fail instead of waiting for it.
-        let tx = self.pool.begin_with("BEGIN IMMEDIATE").await?;
-        Ok(StoreChange { tx, _turn: turn })
+        begin(&self.pool, &self.turn).await
     }
 
     /// Writes a copy of the database to a new file.
@@ -159,6 +170,35 @@ impl StoreChange<'_> {
     pub(crate) async fn commit(self) -> CloudResult<()> {
         Ok(self.tx.commit().await?)
     }
+}
+
+async fn begin<'s>(pool: &AnyPool, turn: &'s Mutex<()>) -> CloudResult<StoreChange<'s>> {
+    let turn = turn.lock().await;
+    // A program beside this one, such as `invite`, writes too: a transaction that became a writer
+    // only later would fail instead of waiting for it.
+    let tx = pool.begin_with("BEGIN IMMEDIATE").await?;
+    Ok(StoreChange { tx, _turn: turn })
+}
+
+/// Returns the placeholders of `rows` rows: each has `own` values of its own after `shared` ones.
+fn placeholders(rows: usize, shared: usize, own: usize) -> String {
+    let row = |row| {
+        let first = shared + row * own + 1;
+        let all: Vec<_> =
+            (1..=shared).chain(first..first + own).map(|it| format!("${it}")).collect();
+        format!("({})", all.join(", "))
+    };
+    (0..rows).map(row).collect::<Vec<_>>().join(", ")
+}
+
+/// Splits rows into parts of few different lengths: for each, a statement is prepared once.
+fn parts<T>(mut rows: &[T]) -> impl Iterator<Item = &[T]> {
+    std::iter::from_fn(move || {
+        let length = [64, 16, 4, 1].into_iter().find(|length| *length <= rows.len())?;
+        let (part, rest) = rows.split_at(length);
+        rows = rest;
+        Some(part)
+    })
 }
 
 /// Returns the time, in s since 1970.

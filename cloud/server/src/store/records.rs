@@ -3,26 +3,33 @@
 use gleaner_fleet::{Ack, Cursor};
 use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::json;
+use sqlx::AssertSqlSafe;
 
 use super::vehicles::{ended, unknown};
-use super::{CloudStore, StoreChange, int, unsigned};
+use super::writer::VehicleWrite;
+use super::{CloudStore, StoreChange, int, parts, placeholders, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of streams of a vehicle: two, and one for each lambda that it ever had.
 const STREAMS_MAX: i64 = 1000;
+/// A stream that grows across a multiple of this, in bytes, is a reason to add up all of its vehicle.
+const SUM_STEP: i64 = 64 << 10;
 /// Number of the oldest records that are looked at in one step of making room.
 const STEP: i64 = 1000;
 
-/// Bounds of what is kept of each stream of each vehicle.
+/// Bounds of what is kept of each stream of each vehicle, and of all of them.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Retention {
     pub(crate) records: u64,
     pub(crate) bytes: u64,
+    /// Bound of all streams of a vehicle together.
+    pub(crate) vehicle_bytes: u64,
 }
 
 impl Retention {
     /// The bounds of the program.
-    pub(crate) const DEFAULT: Retention = Retention { records: 100_000, bytes: 64 << 20 };
+    pub(crate) const DEFAULT: Retention =
+        Retention { records: 100_000, bytes: 64 << 20, vehicle_bytes: 512 << 20 };
 }
 
 /// Records of a stream that a vehicle has sent.
@@ -42,6 +49,52 @@ pub(crate) struct RecordPage {
     pub(crate) arrival: i64,
 }
 
+/// A batch to store, if the connection still counts.
+struct Append {
+    name: String,
+    epoch: u64,
+    batch: StreamBatch,
+    retention: Retention,
+}
+
+/// What is known of a stream.
+struct StoredStream {
+    cursor: Cursor,
+    kept: i64,
+    kept_bytes: i64,
+}
+
+impl VehicleWrite for Append {
+    type Done = Ack;
+
+    async fn apply(&self, change: &mut StoreChange<'_>) -> CloudResult<Ack> {
+        let Self { name, epoch, batch, retention } = self;
+        let Cursor { stream, life, next, .. } = &batch.cursor;
+        let count = int(batch.lines.len() as u64);
+        let arrived: Option<(i64,)> = row!(&mut *change.tx;
+            "UPDATE vehicles SET arrived = arrived + $3
+             WHERE name = $1 AND epoch = $2 AND is_revoked = 0 RETURNING arrived";
+            name, int(*epoch), count);
+        let (arrived,) = arrived.ok_or_else(ended)?;
+        let stored = change.stored_stream(name, stream, *life).await?;
+        let known = stored.cursor.next;
+        // Those before the position were stored, and may have made room since.
+        let arrivals = (arrived - count + 1..).zip(&batch.lines);
+        let lines: Vec<_> =
+            arrivals.filter(|(_, (seq, mark, _))| !mark.is_empty() || *seq >= known).collect();
+        let (added, bytes) = change.insert_lines(name, &batch.cursor, &lines).await?;
+        let (kept, kept_bytes) = (stored.kept + added, stored.kept_bytes + bytes);
+        let cursor = moved(stored.cursor, &batch.cursor);
+        change.set_stream(name, &cursor, (kept, kept_bytes)).await?;
+        let excess = (kept - int(retention.records), kept_bytes - int(retention.bytes));
+        change.make_room(name, stream, excess).await?;
+        if stored.kept == 0 || kept_bytes / SUM_STEP > stored.kept_bytes / SUM_STEP {
+            change.make_room_of_all(name, int(retention.vehicle_bytes)).await?;
+        }
+        Ok(Ack { stream: stream.clone(), life: *life, next: known.max(*next) })
+    }
+}
+
 impl CloudStore {
     /// Stores records and the position after them, if the connection still counts. Records that
     /// are stored already are skipped.
@@ -49,38 +102,10 @@ impl CloudStore {
         &self,
         name: &str,
         epoch: u64,
-        batch: &StreamBatch,
+        batch: StreamBatch,
         retention: Retention,
     ) -> CloudResult<Ack> {
-        let Cursor { stream, life, next, .. } = &batch.cursor;
-        let mut change = self.change().await?;
-        let arrived: Option<(i64,)> = row!(&mut *change.tx;
-            "UPDATE vehicles SET arrived = arrived + $3
-             WHERE name = $1 AND epoch = $2 AND is_revoked = 0 RETURNING arrived";
-            name, int(epoch), int(batch.lines.len() as u64));
-        let (arrived,) = arrived.ok_or_else(ended)?;
-        let known = change.stored_next(name, stream, *life).await?;
-        let first = arrived - int(batch.lines.len() as u64);
-        let (mut added, mut bytes) = (0, 0);
-        for (arrival, (seq, mark, line)) in (first + 1..).zip(&batch.lines) {
-            // Those before the position were stored, and may have made room since.
-            if mark.is_empty() && *seq < known {
-                continue;
-            }
-            let inserted = run!(&mut *change.tx;
-                "INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
-                 VALUES ($1, $2, $3, $4, $5, $6, $7, $8)
-                 ON CONFLICT (vehicle, stream, life, seq, mark) DO NOTHING";
-                name, stream, int(*life), int(*seq), mark, arrival, line, int(line.len() as u64));
-            if inserted.rows_affected() > 0 {
-                added += 1;
-                bytes += int(line.len() as u64);
-            }
-        }
-        change.move_cursor(name, &batch.cursor, (added, bytes), *next > known).await?;
-        change.make_room(name, stream, retention).await?;
-        change.commit().await?;
-        Ok(Ack { stream: stream.clone(), life: *life, next: known.max(*next) })
+        self.write(Append { name: name.to_owned(), epoch, batch, retention }).await
     }
 
     /// Returns the positions of all streams of a vehicle.
@@ -175,75 +200,127 @@ pub(crate) fn name_in_lines(stream: &str) -> &str {
     stream.strip_prefix("lambdas/").unwrap_or(stream)
 }
 
+/// Returns the position of a stream after a batch that ends at `next`.
+fn moved(stored: Cursor, next: &Cursor) -> Cursor {
+    if next.next <= stored.next {
+        return stored;
+    }
+    // A batch of nothing but gaps leaves the last record as it was.
+    match next.boot.is_empty() {
+        true => Cursor { life: next.life, next: next.next, ..stored },
+        false => next.clone(),
+    }
+}
+
 impl StoreChange<'_> {
-    /// Returns the number of the next record of this life of a stream.
-    async fn stored_next(&mut self, name: &str, stream: &str, life: u64) -> CloudResult<u64> {
-        let row: Option<(i64, i64)> = row!(&mut *self.tx;
-            "SELECT life, next FROM streams WHERE vehicle = $1 AND stream = $2";
+    /// Returns what is stored of a stream; nothing of an earlier life counts as its position.
+    async fn stored_stream(
+        &mut self,
+        name: &str,
+        stream: &str,
+        life: u64,
+    ) -> CloudResult<StoredStream> {
+        let row: Option<(i64, i64, i64, String, i64, i64, i64)> = row!(&mut *self.tx;
+            "SELECT life, next, seq, boot, boot_ns, kept, kept_bytes FROM streams
+             WHERE vehicle = $1 AND stream = $2";
             name, stream);
-        if let Some((stored, next)) = row {
-            return match unsigned(stored) {
-                stored if stored == life => Ok(unsigned(next)),
-                stored if stored < life => Ok(0),
-                stored => {
-                    let message = format!("stream `{stream}` has life {stored}; this is {life}");
-                    Err(CloudError::usage(message, "begin the next life of the stream"))
-                }
-            };
+        let mut cursor = Cursor { stream: stream.to_owned(), life, ..Cursor::default() };
+        let Some((stored, next, seq, boot, boot_ns, kept, kept_bytes)) = row else {
+            let (streams,): (i64,) =
+                one!(&mut *self.tx; "SELECT COUNT(*) FROM streams WHERE vehicle = $1"; name);
+            if streams >= STREAMS_MAX {
+                let message = format!("the vehicle has {streams} streams; no more are stored");
+                return Err(CloudError::usage(message, "deploy under ids that were used before"));
+            }
+            return Ok(StoredStream { cursor, kept: 0, kept_bytes: 0 });
+        };
+        let stored = unsigned(stored);
+        if stored > life {
+            let message = format!("stream `{stream}` has life {stored}; this is {life}");
+            return Err(CloudError::usage(message, "begin the next life of the stream"));
         }
-        let (streams,): (i64,) =
-            one!(&mut *self.tx; "SELECT COUNT(*) FROM streams WHERE vehicle = $1"; name);
-        if streams >= STREAMS_MAX {
-            let message = format!("the vehicle has {streams} streams; no more are stored");
-            return Err(CloudError::usage(message, "deploy under ids that were used before"));
+        (cursor.seq, cursor.boot, cursor.boot_ns) = (unsigned(seq), boot, unsigned(boot_ns));
+        if stored == life {
+            cursor.next = unsigned(next);
         }
-        Ok(0)
+        Ok(StoredStream { cursor, kept, kept_bytes })
     }
 
-    /// Stores the position after records, and counts those that were added.
-    async fn move_cursor(
+    /// Inserts lines with their arrivals; returns the number and the bytes of those that were not
+    /// there already.
+    async fn insert_lines(
         &mut self,
         name: &str,
         cursor: &Cursor,
-        (added, bytes): (i64, i64),
-        moves: bool,
+        lines: &[(i64, &(u64, String, String))],
+    ) -> CloudResult<(i64, i64)> {
+        let (mut added, mut bytes) = (0, 0);
+        for part in parts(lines) {
+            let sql = format!(
+                "INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
+                 VALUES {} ON CONFLICT (vehicle, stream, life, seq, mark) DO NOTHING
+                 RETURNING bytes",
+                placeholders(part.len(), 3, 5)
+            );
+            let mut query = sqlx::query_as::<_, (i64,)>(AssertSqlSafe(sql))
+                .bind(name)
+                .bind(&cursor.stream)
+                .bind(int(cursor.life));
+            for (arrival, (seq, mark, line)) in part {
+                let length = int(line.len() as u64);
+                query = query.bind(int(*seq)).bind(mark).bind(arrival).bind(line).bind(length);
+            }
+            let inserted: Vec<(i64,)> = query.fetch_all(&mut *self.tx).await?;
+            added += int(inserted.len() as u64);
+            bytes += inserted.iter().map(|(length,)| length).sum::<i64>();
+        }
+        Ok((added, bytes))
+    }
+
+    /// Stores the position of a stream, and what is kept of it.
+    async fn set_stream(
+        &mut self,
+        name: &str,
+        cursor: &Cursor,
+        (kept, kept_bytes): (i64, i64),
     ) -> CloudResult<()> {
         run!(&mut *self.tx;
-            "INSERT INTO streams (vehicle, stream, life, next, seq, boot, boot_ns)
-             VALUES ($1, $2, $3, 0, 0, '', 0) ON CONFLICT (vehicle, stream) DO NOTHING";
-            name, &cursor.stream, int(cursor.life));
-        run!(&mut *self.tx;
-            "UPDATE streams SET kept = kept + $3, kept_bytes = kept_bytes + $4
-             WHERE vehicle = $1 AND stream = $2";
-            name, &cursor.stream, added, bytes);
-        if moves {
-            run!(&mut *self.tx;
-                "UPDATE streams SET life = $3, next = $4 WHERE vehicle = $1 AND stream = $2";
-                name, &cursor.stream, int(cursor.life), int(cursor.next));
-        }
-        // A batch of nothing but gaps leaves the last record as it was.
-        if moves && !cursor.boot.is_empty() {
-            run!(&mut *self.tx;
-                "UPDATE streams SET seq = $3, boot = $4, boot_ns = $5
-                 WHERE vehicle = $1 AND stream = $2";
-                name, &cursor.stream, int(cursor.seq), &cursor.boot, int(cursor.boot_ns));
+            "INSERT INTO streams (vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9)
+             ON CONFLICT (vehicle, stream) DO UPDATE SET life = excluded.life,
+             next = excluded.next, seq = excluded.seq, boot = excluded.boot,
+             boot_ns = excluded.boot_ns, kept = excluded.kept, kept_bytes = excluded.kept_bytes";
+            name, &cursor.stream, int(cursor.life), int(cursor.next), int(cursor.seq),
+            &cursor.boot, int(cursor.boot_ns), kept, kept_bytes);
+        Ok(())
+    }
+
+    /// Removes records of the largest streams of a vehicle while all have more than `most` bytes.
+    async fn make_room_of_all(&mut self, name: &str, most: i64) -> CloudResult<()> {
+        // Each step removes the excess, or all of a stream.
+        for _ in 0..STREAMS_MAX {
+            let streams: Vec<(String, i64)> = rows!(&mut *self.tx;
+                "SELECT stream, kept_bytes FROM streams WHERE vehicle = $1
+                 ORDER BY kept_bytes DESC";
+                name);
+            let excess = streams.iter().map(|(_, bytes)| bytes).sum::<i64>() - most;
+            let Some((stream, bytes)) = streams.first() else { break };
+            if excess <= 0 {
+                break;
+            }
+            self.make_room(name, stream, (0, excess.min(*bytes))).await?;
         }
         Ok(())
     }
 
-    /// Removes the oldest records of a stream that are above the bounds, and counts them.
+    /// Removes the oldest of a stream, as many records and bytes as are too many, and counts them.
     async fn make_room(
         &mut self,
         name: &str,
         stream: &str,
-        retention: Retention,
+        (mut records, mut bytes): (i64, i64),
     ) -> CloudResult<()> {
         loop {
-            let (kept, kept_bytes): (i64, i64) = one!(&mut *self.tx;
-                "SELECT kept, kept_bytes FROM streams WHERE vehicle = $1 AND stream = $2";
-                name, stream);
-            let mut records = kept - int(retention.records);
-            let mut bytes = kept_bytes - int(retention.bytes);
             if records <= 0 && bytes <= 0 {
                 return Ok(());
             }

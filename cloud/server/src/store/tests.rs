@@ -6,7 +6,7 @@ use tempfile::TempDir;
 
 use super::*;
 
-const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20 };
+const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20, vehicle_bytes: 1 << 20 };
 
 pub(super) async fn store() -> (TempDir, CloudStore) {
     let folder = TempDir::new().unwrap();
@@ -50,12 +50,8 @@ pub(super) fn report(labels: Value, deployments: Value) -> VehicleReport {
         "vehicle": "car-7", "key": "k", "labels": labels, "orchestrator": program, "trust": null,
         "generation": 1, "deployments": deployments, "capacity": [], "supervisor": null,
     });
-    VehicleReport {
-        handled: 1,
-        problems: vec!["no room".to_owned()],
-        json: status.to_string(),
-        status: serde_json::from_value(status).unwrap(),
-    }
+    let json = status.to_string();
+    VehicleReport::new(1, vec!["no room".to_owned()], serde_json::from_value(status).unwrap(), json)
 }
 
 fn batch(life: u64, seqs: std::ops::Range<u64>) -> StreamBatch {
@@ -83,18 +79,18 @@ async fn records_that_come_again_are_stored_once() {
     let (_folder, store) = store().await;
     let epoch = connected(&store, "car-7").await;
     for _ in 0..2 {
-        let ack = store.append("car-7", epoch, &batch(1, 0..3), KEPT).await.unwrap();
+        let ack = store.append("car-7", epoch, batch(1, 0..3), KEPT).await.unwrap();
         assert_eq!((ack.life, ack.next), (1, 3));
     }
     // A part of it again, and more.
-    store.append("car-7", epoch, &batch(1, 2..4), KEPT).await.unwrap();
+    store.append("car-7", epoch, batch(1, 2..4), KEPT).await.unwrap();
     assert_eq!(lines(&store).await, ["line 0", "line 1", "line 2", "line 3"]);
     let cursor = batch(1, 2..4).cursor;
     assert_eq!(store.cursors("car-7").await.unwrap(), [cursor]);
     // The vehicle has lost its records, and begins again.
-    store.append("car-7", epoch, &batch(2, 0..1), KEPT).await.unwrap();
+    store.append("car-7", epoch, batch(2, 0..1), KEPT).await.unwrap();
     assert_eq!(lines(&store).await.len(), 5);
-    assert!(store.append("car-7", epoch, &batch(1, 4..5), KEPT).await.is_err());
+    assert!(store.append("car-7", epoch, batch(1, 4..5), KEPT).await.is_err());
 }
 
 #[tokio::test]
@@ -102,11 +98,11 @@ async fn a_connection_that_was_replaced_or_cut_off_stores_nothing() {
     let (_folder, store) = store().await;
     let old = connected(&store, "car-7").await;
     let new = store.connect("car-7", "car-7", &Hello::default()).await.unwrap();
-    assert!(store.append("car-7", old, &batch(1, 0..1), KEPT).await.is_err());
-    assert!(store.report("car-7", old, &report(json!({}), json!([]))).await.is_err());
-    assert!(store.append("car-7", new, &batch(1, 0..1), KEPT).await.is_ok());
+    assert!(store.append("car-7", old, batch(1, 0..1), KEPT).await.is_err());
+    assert!(store.report("car-7", old, report(json!({}), json!([]))).await.is_err());
+    assert!(store.append("car-7", new, batch(1, 0..1), KEPT).await.is_ok());
     store.revoke("ann", "car-7").await.unwrap();
-    assert!(store.append("car-7", new, &batch(1, 1..2), KEPT).await.is_err());
+    assert!(store.append("car-7", new, batch(1, 1..2), KEPT).await.is_err());
     assert!(store.connect("car-7", "car-7", &Hello::default()).await.is_err());
     assert!(store.wants("car-7").await.is_err());
     assert_eq!(lines(&store).await, ["line 0"]);
@@ -120,20 +116,93 @@ async fn a_connection_that_was_replaced_or_cut_off_stores_nothing() {
 async fn records_above_the_bounds_are_removed_and_counted() {
     let (_folder, store) = store().await;
     let epoch = connected(&store, "car-7").await;
-    let few = Retention { records: 3, bytes: 1 << 20 };
-    store.append("car-7", epoch, &batch(1, 0..4), few).await.unwrap();
-    store.append("car-7", epoch, &batch(1, 4..5), few).await.unwrap();
+    let few = Retention { records: 3, ..KEPT };
+    store.append("car-7", epoch, batch(1, 0..4), few).await.unwrap();
+    store.append("car-7", epoch, batch(1, 4..5), few).await.unwrap();
     let kept = lines(&store).await;
     let gap: Value = serde_json::from_str(&kept[0]).unwrap();
     assert_eq!((&gap["kind"], &gap["record"]["to"]), (&json!("gap"), &json!(1)));
     assert_eq!(gap["record"]["records"], 2);
     assert_eq!(kept[1..], ["line 2", "line 3", "line 4"]);
     // Sent again, a record that was removed does not come back.
-    store.append("car-7", epoch, &batch(1, 0..2), few).await.unwrap();
+    store.append("car-7", epoch, batch(1, 0..2), few).await.unwrap();
     assert_eq!(lines(&store).await, kept);
-    let short = Retention { records: 3, bytes: 12 };
-    store.append("car-7", epoch, &batch(1, 5..6), short).await.unwrap();
+    let short = Retention { records: 3, bytes: 12, ..KEPT };
+    store.append("car-7", epoch, batch(1, 5..6), short).await.unwrap();
     assert_eq!(lines(&store).await[1..], ["line 4", "line 5"]);
+}
+
+#[tokio::test]
+async fn all_streams_of_a_vehicle_have_a_bound_together() {
+    let (_folder, store) = store().await;
+    let epoch = connected(&store, "car-7").await;
+    let few = Retention { vehicle_bytes: 24, ..KEPT };
+    store.append("car-7", epoch, batch(1, 0..3), few).await.unwrap();
+    let mut other = batch(1, 3..5);
+    other.cursor.stream = "orchestrator".to_owned();
+    store.append("car-7", epoch, other, few).await.unwrap();
+    let gap = lines(&store).await.remove(0);
+    assert!(gap.contains("\"records\":1"), "{gap}");
+    assert_eq!(lines(&store).await[1..], ["line 1", "line 2"]);
+}
+
+#[tokio::test]
+async fn vehicles_are_stored_together_and_an_error_is_of_one_only() {
+    let (_folder, store) = store().await;
+    let names: Vec<_> = (0..50).map(|number| format!("car-{number}")).collect();
+    let mut epochs = Vec::new();
+    for name in &names {
+        epochs.push(connected(&store, name).await);
+    }
+    epochs[7] = 99;
+    store.append("car-8", epochs[8], batch(2, 0..1), KEPT).await.unwrap();
+    let appends = names.iter().zip(&epochs).map(|(name, epoch)| {
+        // More than one statement takes.
+        store.append(name, *epoch, batch(1, 0..100), KEPT)
+    });
+    let results = futures_util::future::join_all(appends).await;
+    for (number, result) in results.into_iter().enumerate() {
+        match number {
+            7 => assert!(result.unwrap_err().reason().contains("does not count")),
+            8 => assert!(result.unwrap_err().reason().contains("has life 2; this is 1")),
+            _ => assert_eq!(result.unwrap().next, 100),
+        }
+    }
+    for (name, count) in [("car-7", 0), ("car-8", 1), ("car-9", 100)] {
+        let page = store.page(name, ["events"; 2], 0, 0, 1000).await.unwrap();
+        assert_eq!(page.lines.len(), count, "{name}");
+    }
+}
+
+#[tokio::test]
+async fn what_the_database_refuses_does_not_take_others_with_it() {
+    let (_folder, store) = store().await;
+    let (one, other) = (connected(&store, "car-7").await, connected(&store, "car-8").await);
+    store
+        .execute(
+            "CREATE TRIGGER refuse BEFORE INSERT ON records WHEN NEW.vehicle = 'car-7'
+             BEGIN SELECT RAISE(ROLLBACK, 'refused'); END",
+        )
+        .await;
+    let (refused, stored) = tokio::join!(
+        store.append("car-7", one, batch(1, 0..2), KEPT),
+        store.append("car-8", other, batch(1, 0..2), KEPT),
+    );
+    assert!(refused.unwrap_err().is_internal());
+    assert_eq!(stored.unwrap().next, 2);
+    assert_eq!(store.page("car-8", ["events"; 2], 0, 0, 9).await.unwrap().lines.len(), 2);
+}
+
+#[tokio::test]
+async fn a_certificate_stays_valid_until_the_next_one_is_used() {
+    let (_folder, store) = store().await;
+    enrolled(&store, "car-7", "first").await;
+    enrolled(&store, "car-7", "second").await;
+    let connect = async |certificate| store.connect("car-7", certificate, &Hello::default()).await;
+    assert!(connect("first").await.is_ok(), "the answer to the enrolment may be lost");
+    assert!(connect("second").await.is_ok());
+    assert!(connect("first").await.is_err() && store.vehicle_of("first").await.unwrap().is_none());
+    assert!(store.vehicle_of("second").await.unwrap().is_some());
 }
 
 #[tokio::test]
@@ -145,7 +214,7 @@ async fn a_wanted_state_gets_another_number_only_when_it_changes() {
     let (_, changed) = store.deploy("ann", &offered("a", 1, "test")).await.unwrap();
     assert_eq!((changed.len(), generation().await), (0, 1), "its labels do not fit");
     assert!(
-        store.report("car-7", epoch, &report(json!({"fleet": "test"}), json!([]))).await.unwrap()
+        store.report("car-7", epoch, report(json!({"fleet": "test"}), json!([]))).await.unwrap()
     );
     let wants = store.wants("car-7").await.unwrap();
     assert_eq!((wants.generation, &*wants.deployments[0].id), (2, "a"));
@@ -209,12 +278,12 @@ async fn vehicles_of_a_deployment_are_counted_by_what_they_report() {
     for (refused, phase, expected) in
         [(Value::Null, "running", (2, 1, 0)), (json!("no room"), "waiting", (2, 0, 1))]
     {
-        store.report("car-7", epoch, &report(json!({}), status(refused, phase))).await.unwrap();
+        store.report("car-7", epoch, report(json!({}), status(refused, phase))).await.unwrap();
         assert_eq!(counts().await, expected);
     }
     // It has handled the wanted state that has the deployment, and does not have it.
     let handled = VehicleReport { handled: 2, ..report(json!({}), json!([])) };
-    store.report("car-7", epoch, &handled).await.unwrap();
+    store.report("car-7", epoch, handled).await.unwrap();
     assert_eq!(counts().await, (2, 0, 1));
     let all = store.vehicles(|name| name == "car-7").await.unwrap();
     assert_eq!((all[0].wanted, all[0].handled, &*all[0].problems[0]), (2, 2, "no room"));
@@ -260,7 +329,7 @@ async fn the_database_of_a_later_version_is_refused() {
     let (folder, store) = store().await;
     store.execute("INSERT INTO migrations (version) VALUES (99)").await;
     store.close().await;
-    let refused = CloudStore::open(&folder.path().join("cloud.db")).await.unwrap_err();
+    let refused = CloudStore::open(&folder.path().join("cloud.db")).await.err().unwrap();
     let expected = format!("the database has version 99; this program has {}", MIGRATIONS.len());
     assert_eq!(refused.message, expected);
     assert!(refused.help.is_some());

@@ -8,9 +8,11 @@ use gleaner_fleet::people::{VehicleState, VehicleSummary};
 use gleaner_protocol::supervision::LambdaPhase;
 use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
 use gleaner_trust::VehicleName;
+use sqlx::AssertSqlSafe;
 
 use super::secrets::SecretKind;
-use super::{CloudStore, StoreChange, int, now, unsigned};
+use super::writer::VehicleWrite;
+use super::{CloudStore, StoreChange, int, now, parts, placeholders, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of deployments in a report that count.
@@ -25,13 +27,118 @@ pub(crate) struct Issued {
     pub(crate) expires: u64,
 }
 
-/// A report of a vehicle.
-#[derive(Debug)]
+/// A report of a vehicle, as it is stored.
+#[derive(Debug, Default, Clone, PartialEq)]
 pub(crate) struct VehicleReport {
+    /// Number of the newest wanted state that it has handled.
     pub(crate) handled: u64,
     pub(crate) problems: Vec<String>,
-    pub(crate) status: VehicleStatus,
-    pub(crate) json: String,
+    pub(crate) version: String,
+    pub(crate) labels: BTreeMap<String, String>,
+    /// Number and state of each deployment, by its id.
+    pub(crate) states: BTreeMap<String, (u64, &'static str)>,
+    /// The status, as JSON.
+    pub(crate) status: String,
+    /// False if an earlier report of the connection had the same states, or labels.
+    pub(crate) has_new_states: bool,
+    pub(crate) has_new_labels: bool,
+}
+
+impl VehicleReport {
+    /// Returns the report of a vehicle with this status, which `json` states.
+    pub(crate) fn new(
+        handled: u64,
+        problems: Vec<String>,
+        status: VehicleStatus,
+        json: String,
+    ) -> Self {
+        let deployments = status.deployments.into_iter().take(DEPLOYMENTS_MAX);
+        let states = deployments.map(|it| {
+            let state = state(&it);
+            (it.id, (it.release, state))
+        });
+        Self {
+            handled,
+            problems,
+            version: excerpt(&status.orchestrator.version),
+            states: states.collect(),
+            labels: status.labels,
+            status: json,
+            has_new_states: true,
+            has_new_labels: true,
+        }
+    }
+}
+
+/// A connection that begins.
+struct Connect {
+    name: String,
+    certificate: String,
+    version: String,
+    key: String,
+}
+
+impl VehicleWrite for Connect {
+    type Done = u64;
+
+    async fn apply(&self, change: &mut StoreChange<'_>) -> CloudResult<u64> {
+        let Self { name, certificate, version, key } = self;
+        let epoch: Option<(i64,)> = row!(&mut *change.tx;
+            "UPDATE vehicles SET epoch = epoch + 1, version = $2, clip_key = $3, seen = $4
+             WHERE name = $1 AND is_revoked = 0 AND EXISTS
+             (SELECT 1 FROM certificates WHERE sha256 = $5 AND vehicle = $1 AND expires > $4)
+             RETURNING epoch";
+            name, version, key, now(), certificate);
+        let (epoch,) = epoch.ok_or_else(ended)?;
+        // Used, a certificate is durable on the vehicle, and replaces the former ones.
+        run!(&mut *change.tx;
+            "DELETE FROM certificates WHERE vehicle = $1 AND expires <
+             (SELECT expires FROM certificates WHERE sha256 = $2)";
+            name, certificate);
+        Ok(unsigned(epoch))
+    }
+}
+
+/// A report to store, if the connection still counts.
+struct Report {
+    name: String,
+    epoch: u64,
+    report: VehicleReport,
+}
+
+impl VehicleWrite for Report {
+    type Done = bool;
+
+    async fn apply(&self, change: &mut StoreChange<'_>) -> CloudResult<bool> {
+        let Self { name, epoch, report } = self;
+        let states = &report.states;
+        let running = states.values().filter(|(_, state)| *state == RUNNING).count();
+        let stored = run!(&mut *change.tx;
+            "UPDATE vehicles SET handled = $3, problems = $4, status = $5, labels = $6,
+             deployments = $7, running = $8, version = $9
+             WHERE name = $1 AND epoch = $2 AND is_revoked = 0";
+            name, int(*epoch), int(report.handled), json(&report.problems), &report.status,
+            json(&report.labels), int(states.len() as u64), int(running as u64), &report.version);
+        if stored.rows_affected() == 0 {
+            return Err(ended());
+        }
+        if report.has_new_states {
+            run!(&mut *change.tx; "DELETE FROM reported WHERE vehicle = $1"; name);
+            let states: Vec<_> = states.iter().collect();
+            for part in parts(&states) {
+                let sql = format!(
+                    "INSERT INTO reported (vehicle, deployment, number, state) VALUES {}",
+                    placeholders(part.len(), 1, 3)
+                );
+                let mut query = sqlx::query(AssertSqlSafe(sql)).bind(name);
+                for (id, (number, state)) in part {
+                    query = query.bind(id).bind(int(*number)).bind(*state);
+                }
+                query.execute(&mut *change.tx).await?;
+            }
+        }
+        Ok(report.has_new_labels && !change.refresh(name).await?.is_empty())
+    }
 }
 
 impl CloudStore {
@@ -56,9 +163,9 @@ impl CloudStore {
         Ok(token)
     }
 
-    /// Gives a vehicle its certificate for the token, and drops former ones: the vehicle may have
-    /// another disk, and the former one another owner. `None` if the token is wrong, used or too
-    /// old.
+    /// Gives a vehicle its certificate for the token; `None` if the token is wrong, used or too
+    /// old. Former certificates stay valid until this one is used: if it is lost on its way, or
+    /// cannot be stored, the vehicle is not locked out.
     pub(crate) async fn enrol(
         &self,
         name: &str,
@@ -72,15 +179,14 @@ impl CloudStore {
             return Ok(None);
         }
         let issued = issue()?;
-        change.drop_certificates(name, "").await?;
         change.add_certificate(name, &issued).await?;
         change.note(name, "enrol", name).await?;
         change.commit().await?;
         Ok(Some(issued))
     }
 
-    /// Stores the next certificate of a vehicle. The current one stays valid until its end, and
-    /// others do not.
+    /// Stores the next certificate of a vehicle. The current one stays valid until that is used,
+    /// and others do not.
     pub(crate) async fn renew(
         &self,
         name: &str,
@@ -130,16 +236,9 @@ impl CloudStore {
         certificate: &str,
         hello: &Hello,
     ) -> CloudResult<u64> {
-        let mut change = self.change().await?;
-        let epoch: Option<(i64,)> = row!(&mut *change.tx;
-            "UPDATE vehicles SET epoch = epoch + 1, version = $2, clip_key = $3, seen = $4
-             WHERE name = $1 AND is_revoked = 0 AND EXISTS
-             (SELECT 1 FROM certificates WHERE sha256 = $5 AND vehicle = $1 AND expires > $4)
-             RETURNING epoch";
-            name, excerpt(&hello.version), excerpt(&hello.key), now(), certificate);
-        let (epoch,) = epoch.ok_or_else(ended)?;
-        change.commit().await?;
-        Ok(unsigned(epoch))
+        let (name, certificate) = (name.to_owned(), certificate.to_owned());
+        let (version, key) = (excerpt(&hello.version), excerpt(&hello.key));
+        self.write(Connect { name, certificate, version, key }).await
     }
 
     /// Stores a report, if the connection still counts; returns whether the vehicle's wanted state
@@ -148,34 +247,9 @@ impl CloudStore {
         &self,
         name: &str,
         epoch: u64,
-        report: &VehicleReport,
+        report: VehicleReport,
     ) -> CloudResult<bool> {
-        let deployments = &report.status.deployments;
-        let deployments = &deployments[..deployments.len().min(DEPLOYMENTS_MAX)];
-        let states: BTreeMap<_, _> =
-            deployments.iter().map(|it| (&it.id, (it.release, state(it)))).collect();
-        let running = states.values().filter(|(_, state)| *state == RUNNING).count();
-        let mut change = self.change().await?;
-        let stored = run!(&mut *change.tx;
-            "UPDATE vehicles SET handled = $3, problems = $4, status = $5, labels = $6,
-             deployments = $7, running = $8, version = $9
-             WHERE name = $1 AND epoch = $2 AND is_revoked = 0";
-            name, int(epoch), int(report.handled), json(&report.problems), &report.json,
-            json(&report.status.labels), int(states.len() as u64), int(running as u64),
-            excerpt(&report.status.orchestrator.version));
-        if stored.rows_affected() == 0 {
-            return Err(ended());
-        }
-        run!(&mut *change.tx; "DELETE FROM reported WHERE vehicle = $1"; name);
-        for (id, (number, state)) in states {
-            run!(&mut *change.tx;
-                "INSERT INTO reported (vehicle, deployment, number, state)
-                 VALUES ($1, $2, $3, $4)";
-                name, id, int(number), state);
-        }
-        let changed = change.refresh(name).await?;
-        change.commit().await?;
-        Ok(!changed.is_empty())
+        self.write(Report { name: name.to_owned(), epoch, report }).await
     }
 
     /// Returns all vehicles, those that are in `online` as connected.
@@ -229,22 +303,35 @@ impl CloudStore {
 
     /// Stores the times of the last signs of life.
     pub(crate) async fn seen(&self, times: &BTreeMap<String, i64>) -> CloudResult<()> {
-        if times.is_empty() {
-            return Ok(());
-        }
-        let mut change = self.change().await?;
+        let mut names_of = BTreeMap::<i64, Vec<&String>>::new();
         for (name, time) in times {
-            run!(&mut *change.tx; "UPDATE vehicles SET seen = $2 WHERE name = $1"; name, time);
+            names_of.entry(*time).or_default().push(name);
         }
-        change.commit().await
+        for (time, names) in names_of {
+            // A transaction for each second, so that what vehicles send does not wait for all.
+            let mut change = self.change().await?;
+            for part in parts(&names) {
+                let (names, last) = (placeholders(1, 0, part.len()), part.len() + 1);
+                let sql = format!("UPDATE vehicles SET seen = ${last} WHERE name IN {names}");
+                let query = sqlx::query(AssertSqlSafe(sql));
+                let query = part.iter().fold(query, |query, name| query.bind(*name));
+                query.bind(time).execute(&mut *change.tx).await?;
+            }
+            change.commit().await?;
+        }
+        Ok(())
     }
 }
 
 impl StoreChange<'_> {
+    /// Adds a certificate. Its end in the database is after those of former ones: it tells which is
+    /// the newest.
     async fn add_certificate(&mut self, name: &str, issued: &Issued) -> CloudResult<()> {
+        let (last,): (i64,) = one!(&mut *self.tx;
+            "SELECT COALESCE(MAX(expires), 0) FROM certificates WHERE vehicle = $1"; name);
         run!(&mut *self.tx;
             "INSERT INTO certificates (sha256, vehicle, expires) VALUES ($1, $2, $3)";
-            &issued.sha256, name, int(issued.expires));
+            &issued.sha256, name, int(issued.expires).max(last + 1));
         Ok(())
     }
 

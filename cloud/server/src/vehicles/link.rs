@@ -1,15 +1,17 @@
 //! The control channel of a vehicle, from its first frame to its end.
 
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
 use gleaner_base::{RateLimit, visible};
 use gleaner_fleet::{
-    Body, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Reported, Welcome, decompress,
+    Ack, Body, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records, Reported, Welcome,
+    decompress,
 };
 use gleaner_protocol::vehicle_api::VehicleStatus;
-use tokio::sync::watch;
+use tokio::sync::{SemaphorePermit, watch};
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use super::batch;
@@ -45,12 +47,29 @@ struct VehicleLink<'c> {
     /// Number of the wanted state that was sent last.
     sent: u64,
     writes: RateLimit,
+    stored: StoredReport,
+}
+
+/// Hashes of what is stored of the last report of a connection: the next one is compared with it.
+#[derive(Debug, Default, Clone, Copy)]
+struct StoredReport {
+    whole: u64,
+    states: u64,
+    labels: u64,
 }
 
 /// Serves a connection until its end.
 pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), socket: WebSocket) {
-    let mut link =
-        VehicleLink { cloud, name, certificate, socket, epoch: 0, sent: 0, writes: WRITES };
+    let mut link = VehicleLink {
+        cloud,
+        name,
+        certificate,
+        socket,
+        epoch: 0,
+        sent: 0,
+        writes: WRITES,
+        stored: StoredReport::default(),
+    };
     let end = match link.run().await {
         Ok(end) => end,
         Err(error) => {
@@ -66,7 +85,7 @@ pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), sock
     }
 }
 
-impl VehicleLink<'_> {
+impl<'c> VehicleLink<'c> {
     /// Serves the connection; returns the reason of its end, unless it was the vehicle.
     async fn run(&mut self) -> CloudResult<Option<GoAway>> {
         let Ok(hello) = timeout(HELLO, self.receive()).await else { return Ok(None) };
@@ -99,7 +118,9 @@ impl VehicleLink<'_> {
         orders: &mut watch::Receiver<LinkOrders>,
     ) -> CloudResult<Option<GoAway>> {
         let period = Duration::from_secs(PING_S.into());
-        let (mut pings, mut received, mut number) = (interval(period), Instant::now(), 0);
+        let (mut pings, mut number) = (interval(period), 0);
+        let silence = sleep(3 * period);
+        tokio::pin!(silence);
         pings.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             // An order may be older than this loop.
@@ -110,7 +131,7 @@ impl VehicleLink<'_> {
             tokio::select! {
                 body = self.receive() => {
                     let Some(body) = body? else { return Ok(None) };
-                    received = Instant::now();
+                    silence.as_mut().reset(tokio::time::Instant::now() + 3 * period);
                     self.cloud.hub.saw(self.name);
                     self.handle(body).await?;
                 }
@@ -120,10 +141,10 @@ impl VehicleLink<'_> {
                     // It was removed from the hub, which has set the end before.
                     Err(_) => return Ok(orders.borrow().end.clone()),
                 },
+                () = silence.as_mut() => {
+                    return Ok(Some(GoAway { after_ms: 0, reason: "no sign of life".into() }));
+                }
                 _ = pings.tick() => {
-                    if received.elapsed() > 3 * period {
-                        return Ok(Some(GoAway { after_ms: 0, reason: "no sign of life".into() }));
-                    }
                     number += 1;
                     self.send(Body::Ping(Ping { number })).await?;
                 }
@@ -132,26 +153,17 @@ impl VehicleLink<'_> {
     }
 
     async fn handle(&mut self, body: Body) -> CloudResult<()> {
-        if matches!(body, Body::Reported(_) | Body::Records(_)) {
-            while !self.writes.take(1.0, Instant::now()) {
-                sleep(Duration::from_millis(100)).await;
-            }
-        }
         match body {
             Body::Ping(Ping { number }) => self.send(Body::Pong(Pong { number })).await,
             Body::Pong(_) => Ok(()),
             Body::Reported(reported) => {
-                let report = report(reported)?;
-                if self.cloud.store.report(self.name, self.epoch, &report).await? {
+                if self.store_report(reported).await? {
                     self.send_wanted().await?;
                 }
                 Ok(())
             }
             Body::Records(records) => {
-                let (store, retention) = (&self.cloud.store, self.cloud.retention);
-                let batch = batch::parse(&records)?;
-                let ack = store.append(self.name, self.epoch, &batch, retention).await?;
-                self.cloud.hub.arrived(self.name);
+                let ack = self.store_records(records).await?;
                 self.send(Body::Ack(ack)).await
             }
             Body::Hello(_)
@@ -160,6 +172,40 @@ impl VehicleLink<'_> {
             | Body::Ack(_)
             | Body::GoAway(_) => Err(wrong("a frame came that a vehicle does not send")),
         }
+    }
+
+    /// Waits until a frame may be stored: one of this vehicle, and one of all.
+    async fn may_store(&mut self) -> Option<SemaphorePermit<'c>> {
+        while !self.writes.take(1.0, Instant::now()) {
+            sleep(Duration::from_millis(100)).await;
+        }
+        // It is never closed.
+        self.cloud.stored_frames.acquire().await.ok()
+    }
+
+    /// Stores a report, as far as it has something new; returns whether the wanted state changed.
+    async fn store_report(&mut self, reported: Reported) -> CloudResult<bool> {
+        let _frame = self.may_store().await;
+        let mut report = report(reported)?;
+        let (before, stored) = (self.stored, StoredReport::of(&report));
+        if stored.whole == before.whole {
+            return Ok(false);
+        }
+        report.has_new_states = stored.states != before.states;
+        report.has_new_labels = stored.labels != before.labels;
+        let has_changed = self.cloud.store.report(self.name, self.epoch, report).await?;
+        self.stored = stored;
+        Ok(has_changed)
+    }
+
+    async fn store_records(&mut self, records: Records) -> CloudResult<Ack> {
+        let _frame = self.may_store().await;
+        let batch = batch::parse(&records)?;
+        drop(records);
+        let (store, retention) = (&self.cloud.store, self.cloud.retention);
+        let ack = store.append(self.name, self.epoch, batch, retention).await?;
+        self.cloud.hub.arrived(self.name);
+        Ok(ack)
     }
 
     /// Sends the wanted state, unless it was sent.
@@ -216,7 +262,24 @@ fn report(reported: Reported) -> CloudResult<VehicleReport> {
     let problems = reported.problems.iter().take(PROBLEMS_MAX);
     let short = |problem: &String| problem.chars().take(PROBLEM_MAX).collect::<String>();
     let problems = problems.map(|problem| visible(&short(problem))).collect();
-    Ok(VehicleReport { handled: reported.generation, problems, status, json })
+    Ok(VehicleReport::new(reported.generation, problems, status, json))
+}
+
+impl StoredReport {
+    fn of(report: &VehicleReport) -> Self {
+        Self {
+            whole: hash(&(report.handled, &report.problems, &report.status)),
+            states: hash(&report.states),
+            labels: hash(&report.labels),
+        }
+    }
+}
+
+fn hash(value: &impl Hash) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    value.hash(&mut hasher);
+    // 0 stands for nothing.
+    hasher.finish().max(1)
 }
 
 fn wrong(message: impl Into<String>) -> CloudError {

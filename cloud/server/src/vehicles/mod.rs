@@ -74,6 +74,9 @@ async fn guard(
     };
     match cloud.store.vehicle_of(&certificate).await {
         Ok(Some(name)) => {
+            if let Err(busy) = cloud.limits.request(&name) {
+                return busy.into_response();
+            }
             request.extensions_mut().insert(KnownVehicle { name, certificate });
             next.run(request).await
         }
@@ -99,7 +102,6 @@ async fn enrol(
                     one with `gleaner vehicles enrol NAME --to FILE`";
         return Err(CloudError::unknown("the enrolment is not valid", help));
     };
-    cloud.hub.end(&vehicle, "the vehicle was enrolled again");
     Ok(Json(reply(issued)))
 }
 
@@ -109,6 +111,7 @@ async fn renew(
     body: Bytes,
 ) -> CloudResult<Json<EnrolReply>> {
     let RenewRequest { csr } = parsed(&body, "request for a certificate")?;
+    cloud.limits.renewal(&vehicle.name)?;
     let issued = cloud.authorities.issue(&vehicle.name, &csr)?;
     cloud.store.renew(&vehicle.name, &vehicle.certificate, &issued).await?;
     Ok(Json(reply(issued)))
@@ -123,8 +126,9 @@ async fn link(
     Extension(vehicle): Extension<KnownVehicle>,
     Extension(peer): Extension<Arc<PeerConnection>>,
     upgrade: WebSocketUpgrade,
-) -> Response {
-    upgrade
+) -> CloudResult<Response> {
+    cloud.limits.link(&vehicle.name)?;
+    Ok(upgrade
         .read_buffer_size(READ_BUFFER)
         .write_buffer_size(0)
         .max_message_size(FRAME_MAX)
@@ -132,14 +136,22 @@ async fn link(
         .on_upgrade(async move |socket| {
             link::serve(&cloud, (&vehicle.name, &vehicle.certificate), socket).await;
             drop(peer);
-        })
+        }))
 }
 
+/// Sends a deployment that the vehicle should have. Only from one it learns the digests of
+/// revisions and their files, so that these need no check of their own.
 async fn deployment(
     State(cloud): State<Arc<Cloud>>,
+    Extension(vehicle): Extension<KnownVehicle>,
     Path(sha256): Path<String>,
 ) -> CloudResult<Response> {
-    let envelope = cloud.store.envelope(digest(&sha256)?.as_str()).await?;
+    let digest = digest(&sha256)?;
+    let wants = cloud.store.wants(&vehicle.name).await?;
+    let envelope = match wants.deployments.iter().any(|it| it.envelope == digest.as_str()) {
+        true => cloud.store.envelope(digest.as_str()).await?,
+        false => None,
+    };
     found(envelope, "deployment", &sha256)
 }
 

@@ -2,6 +2,7 @@
 
 mod fake;
 mod hostile;
+mod links;
 mod restarts;
 
 use std::path::Path;
@@ -156,21 +157,4 @@ async fn a_vehicle_enrols_gets_what_is_deployed_and_is_cut_off() {
         (&json!("revoke vehicle"), &json!("admin"))
     );
     server.stop().await;
-}
-
-#[tokio::test]
-async fn a_newer_connection_takes_the_place_of_an_older_one() {
-    let folder = TempDir::new().unwrap();
-    let (server, admin) = start(&folder).await;
-    let (vehicle, _) = admin.enrol("car-7").await;
-    let (mut older, ..) = vehicle.connect().await;
-    let (mut newer, welcome, _) = vehicle.connect().await;
-    assert_eq!(welcome.epoch, 2);
-    assert_eq!(older.end().await.as_deref(), Some("the vehicle has a newer connection"));
-    drop(older);
-    newer.settle().await;
-    assert_eq!(admin.vehicle("car-7").await["state"], "online");
-    // Vehicles are asked to come back at different times.
-    let (stopped, reason) = tokio::join!(server.stop(), newer.end());
-    assert_eq!((stopped, reason.as_deref()), ((), Some("the cloud stops")));
 }

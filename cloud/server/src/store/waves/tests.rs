@@ -68,7 +68,7 @@ impl TestFleet {
             }]);
             let handled = self.store.wants(name).await.unwrap().generation;
             let report = VehicleReport { handled, ..report(json!({}), deployment) };
-            self.store.report(name, self.epochs[name], &report).await.unwrap();
+            self.store.report(name, self.epochs[name], report).await.unwrap();
         }
     }
 
@@ -232,7 +232,7 @@ async fn a_vehicle_whose_labels_change_leaves_the_waves() {
     assert!(fleet.having(2).await.is_empty());
     for (site, expected) in [("berlin", 1), ("paris", 0)] {
         let labels = report(json!({ "site": site }), json!([]));
-        fleet.store.report("car-0", fleet.epochs["car-0"], &labels).await.unwrap();
+        fleet.store.report("car-0", fleet.epochs["car-0"], labels).await.unwrap();
         fleet.store.advance_waves().await.unwrap();
         assert_eq!(fleet.having(2).await.len(), expected, "{site}");
     }

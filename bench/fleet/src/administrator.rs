@@ -1,0 +1,101 @@
+//! The person of the bench: enrols vehicles, deploys, and reads what is stored.
+
+use std::net::SocketAddr;
+
+use gleaner_fleet::Enrolment;
+use gleaner_fleet::people::{Login, NewVehicle, UserToken};
+use http_body_util::{BodyExt, Full};
+use hyper::body::Bytes;
+use hyper::client::conn::http1::{self, SendRequest};
+use hyper::{Method, Request, StatusCode};
+use hyper_util::rt::TokioIo;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::TcpStream;
+
+/// Sends one request over a connection; returns the status and the body of the answer.
+pub async fn send(
+    stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    request: Request<Full<Bytes>>,
+) -> Result<(StatusCode, Bytes), String> {
+    let (mut sender, connection) =
+        http1::handshake(TokioIo::new(stream)).await.map_err(|error| error.to_string())?;
+    tokio::spawn(connection);
+    answer(&mut sender, request).await
+}
+
+async fn answer(
+    sender: &mut SendRequest<Full<Bytes>>,
+    request: Request<Full<Bytes>>,
+) -> Result<(StatusCode, Bytes), String> {
+    let reply = sender.send_request(request).await.map_err(|error| error.to_string())?;
+    let status = reply.status();
+    let body = reply.into_body().collect().await.map_err(|error| error.to_string())?;
+    Ok((status, body.to_bytes()))
+}
+
+/// An administrator with a token, and one connection.
+pub struct Administrator {
+    token: String,
+    sender: SendRequest<Full<Bytes>>,
+}
+
+impl Administrator {
+    /// Logs in with a one-time code; returns the token.
+    pub async fn login(address: SocketAddr, code: &str) -> Result<String, String> {
+        let mut stranger = Self::connect(address, "").await?;
+        let login = Login { code: code.to_owned() };
+        let session: UserToken = stranger.call(Method::POST, "/v1/login", &login).await?;
+        Ok(session.token)
+    }
+
+    /// Connects with a token.
+    pub async fn connect(address: SocketAddr, token: &str) -> Result<Self, String> {
+        let stream = TcpStream::connect(address).await.map_err(|error| error.to_string())?;
+        let stream = TokioIo::new(stream);
+        let handshake = http1::handshake(stream).await.map_err(|error| error.to_string())?;
+        let (sender, connection) = handshake;
+        tokio::spawn(connection);
+        Ok(Self { token: token.to_owned(), sender })
+    }
+
+    /// Sends a request that must succeed; returns the body of the answer.
+    pub async fn bytes(
+        &mut self,
+        method: Method,
+        path: &str,
+        body: Vec<u8>,
+    ) -> Result<Bytes, String> {
+        let request = Request::builder()
+            .method(method)
+            .uri(path)
+            .header("host", "cloud")
+            .header("authorization", format!("Bearer {}", self.token))
+            .body(Full::new(Bytes::from(body)))
+            .map_err(|error| error.to_string())?;
+        self.sender.ready().await.map_err(|error| format!("{path}: {error}"))?;
+        let (status, body) = answer(&mut self.sender, request).await?;
+        match status.is_success() {
+            true => Ok(body),
+            false => Err(format!("{path}: {status} {}", String::from_utf8_lossy(&body))),
+        }
+    }
+
+    /// Sends a request of JSON that must succeed; returns the answer.
+    pub async fn call<T: DeserializeOwned>(
+        &mut self,
+        method: Method,
+        path: &str,
+        body: &impl Serialize,
+    ) -> Result<T, String> {
+        let body = serde_json::to_vec(body).map_err(|error| error.to_string())?;
+        let answer = self.bytes(method, path, body).await?;
+        serde_json::from_slice(&answer).map_err(|error| format!("{path}: {error}"))
+    }
+
+    /// Adds a vehicle; returns its enrolment.
+    pub async fn invite(&mut self, name: &str) -> Result<Enrolment, String> {
+        self.call(Method::POST, "/v1/vehicles", &NewVehicle { name: name.to_owned() }).await
+    }
+}

@@ -1,0 +1,104 @@
+//! The cloud is killed again and again under a fleet that sends records.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::Duration;
+
+use hyper::Method;
+use serde::Deserialize;
+use tokio::time::sleep;
+
+use crate::figure::{FleetFigure, quantile};
+use crate::fleet::EnrolledFleet;
+use crate::simulation::{FleetLoad, Simulation};
+
+/// Longest pause between attempts to connect. Real vehicles wait up to five minutes, and would be
+/// away most of the time.
+const PAUSE_MAX: Duration = Duration::from_secs(4);
+/// Interval of reports and batches, and the number of records in a batch.
+const INTERVAL: Duration = Duration::from_secs(1);
+const RECORDS: u64 = 2;
+/// Longest time to wait for the fleet to do something.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// A line of records.
+#[derive(Deserialize)]
+struct StoredLine {
+    seq: u64,
+    kind: String,
+}
+
+/// Measures `count` vehicles under `kills` kills, one in each `interval`.
+pub async fn figures(
+    count: usize,
+    kills: usize,
+    interval: Duration,
+) -> Result<Vec<FleetFigure>, String> {
+    let mut fleet = EnrolledFleet::enrol(count).await?;
+    let (simulation, mut vehicles) = fleet.start(count, PAUSE_MAX);
+    let all = |it: &Simulation| it.connected.load(Relaxed) == count;
+    if simulation.until(PATIENCE, all).await.is_none() {
+        return Err("not all vehicles connect".to_owned());
+    }
+    simulation.load.send_replace(FleetLoad { interval: Some(INTERVAL), records: RECORDS });
+    simulation.is_restarting.store(true, Relaxed);
+    for _ in 0..kills {
+        sleep(interval).await;
+        fleet.cloud.kill();
+        fleet.cloud.start_again()?;
+    }
+    let after = simulation.until(PATIENCE, all).await;
+    let after = after.map_or(f64::INFINITY, |it| it.as_secs_f64());
+    simulation.is_restarting.store(false, Relaxed);
+    sleep(Duration::from_secs(3)).await;
+    simulation.load.send_replace(FleetLoad::default());
+    sleep(Duration::from_secs(3)).await;
+    vehicles.abort_all();
+    while vehicles.join_next().await.is_some() {}
+    let sent = simulation.take_acknowledged_ms().len() as f64 * RECORDS as f64;
+    let stored = stored(&fleet, &simulation).await?;
+
+    let reconnected = simulation.take_reconnected_s();
+    let mut figures = vec![
+        FleetFigure::free("kills: vehicles", "", count as f64),
+        FleetFigure::free("kills: number of kills", "", kills as f64),
+        FleetFigure::free("kills: records that were acknowledged", "", sent),
+        FleetFigure::free("kills: records that are stored", "", stored),
+        FleetFigure::at_most("kills: records lost, or stored twice", "", 0.0, simulation.losses()),
+        FleetFigure::at_most("kills: all connected after the last one", "s", 30.0, after),
+    ];
+    for (name, share) in [("p50", 0.5), ("p99", 0.99), ("max", 1.0)] {
+        let name = format!("kills: time without a connection, {name}");
+        figures.push(FleetFigure::free(&name, "s", quantile(&reconnected, share)));
+    }
+    figures.push(FleetFigure::at_most("kills: other errors", "", 0.0, simulation.errors()));
+    Ok(figures)
+}
+
+/// Reads the records of all vehicles; returns their number. Each vehicle must have each number
+/// once, to the last one that was acknowledged.
+async fn stored(fleet: &EnrolledFleet, simulation: &Arc<Simulation>) -> Result<f64, String> {
+    let mut administrator = fleet.administrator().await?;
+    let mut all = 0;
+    for vehicle in &fleet.vehicles {
+        let path = format!("/v1/vehicles/{}/events", vehicle.name);
+        let lines = administrator.bytes(Method::GET, &path, Vec::new()).await?;
+        let mut times = BTreeMap::<u64, u64>::new();
+        for line in lines.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()) {
+            let line: StoredLine =
+                serde_json::from_slice(line).map_err(|error| error.to_string())?;
+            if line.kind != "event" {
+                simulation.loss(format!("{}: a line of kind `{}`", vehicle.name, line.kind));
+            }
+            *times.entry(line.seq).or_default() += 1;
+        }
+        let acknowledged = simulation.end_of(&vehicle.name);
+        let is_whole = (0..acknowledged).all(|seq| times.contains_key(&seq));
+        if !is_whole || times.values().any(|count| *count != 1) {
+            simulation.loss(format!("{}: {acknowledged} acknowledged", vehicle.name));
+        }
+        all += times.len();
+    }
+    Ok(all as f64)
+}

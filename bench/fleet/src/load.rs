@@ -1,0 +1,192 @@
+//! A fleet connects, is idle, reports and sends records, and gets a deployment.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::Duration;
+
+use gleaner_fleet::people::FleetDeployment;
+use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
+use hyper::Method;
+use serde_json::{Value, json};
+use tokio::time::{Instant, sleep, timeout};
+
+use crate::administrator::Administrator;
+use crate::figure::{FleetFigure, quantile};
+use crate::fleet::EnrolledFleet;
+use crate::simulation::FleetLoad;
+use crate::vehicle::{be_silent, open};
+
+/// Longest pause between attempts to connect, as of a real vehicle.
+const PAUSE_MAX: Duration = Duration::from_secs(300);
+/// Interval of reports and batches of an active vehicle, and the number of records in a batch.
+const INTERVAL: Duration = Duration::from_secs(5);
+const RECORDS: u64 = 4;
+/// Number of vehicles that send no sign of life.
+const SILENT: usize = 5;
+/// Longest time to wait for the fleet to do something.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// The duration of the parts.
+pub struct LoadTimes {
+    /// Time without load, of which the second half is measured.
+    pub idle: Duration,
+    /// Time under load, apart from the deployment.
+    pub active: Duration,
+    /// Whether vehicles without a sign of life are waited for, which takes a minute.
+    pub has_silent: bool,
+}
+
+/// Measures `count` vehicles.
+pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>, String> {
+    let fleet = EnrolledFleet::enrol(count + SILENT + 1).await?;
+    let cloud = &fleet.cloud;
+    let mut figures = Vec::new();
+    let mut add = |figure| figures.push(figure);
+    add(FleetFigure::free("vehicles", "", count as f64));
+    add(FleetFigure::free("enrolment of all", "s", fleet.enrolled_s));
+    let of_each = |kb: f64| kb / count as f64;
+
+    let (fresh_kb, cpu_s) = (cloud.memory_kb(), cloud.cpu_s());
+    let (simulation, _vehicles) = fleet.start(count, PAUSE_MAX);
+    let connected = simulation.until(PATIENCE, |it| it.connected.load(Relaxed) == count).await;
+    let connected = connected.map_or(f64::INFINITY, |it| it.as_secs_f64());
+    add(FleetFigure::at_most("all connected after", "s", 15.0, connected));
+    add(FleetFigure::free("CPU of the cloud to connect all", "s", cloud.cpu_s() - cpu_s));
+
+    sleep(times.idle / 2).await;
+    let cpu_s = cloud.cpu_s();
+    sleep(times.idle / 2).await;
+    let idle_cores = (cloud.cpu_s() - cpu_s) / times.idle.as_secs_f64() * 2.0;
+    add(FleetFigure::free("idle: cores of the cloud", "cores", idle_cores));
+    let idle_kb = of_each(cloud.memory_kb() - fresh_kb);
+    add(FleetFigure::at_most("memory per idle vehicle", "kB", 20.0, idle_kb));
+
+    let silent: Vec<_> = fleet.vehicles[count..count + SILENT].to_vec();
+    let silent = silent.into_iter().filter(|_| times.has_silent).map(|identity| {
+        let simulation = Arc::clone(&simulation);
+        tokio::spawn(async move {
+            let begun = Instant::now();
+            let end = timeout(PATIENCE, be_silent(&identity, &simulation)).await;
+            match end {
+                Ok(Ok(reason)) if reason == "no sign of life" => begun.elapsed().as_secs_f64(),
+                other => {
+                    simulation.error(format!("a silent connection: {other:?}"));
+                    f64::INFINITY
+                }
+            }
+        })
+    });
+    let silent: Vec<_> = silent.collect();
+
+    let (cpu_s, reports) = (cloud.cpu_s(), simulation.reports.load(Relaxed));
+    let begun = Instant::now();
+    simulation.load.send_replace(FleetLoad { interval: Some(INTERVAL), records: RECORDS });
+    sleep(times.active).await;
+    let active_s = begun.elapsed().as_secs_f64();
+    let reports = (simulation.reports.load(Relaxed) - reports) as f64;
+    let acknowledged = simulation.take_acknowledged_ms();
+    add(FleetFigure::free(
+        "active: cores of the cloud",
+        "cores",
+        (cloud.cpu_s() - cpu_s) / active_s,
+    ));
+    add(FleetFigure::free("active: reports", "1/s", reports / active_s));
+    let batches = acknowledged.len() as f64 / active_s;
+    add(FleetFigure::free("active: batches of records", "1/s", batches));
+    for (name, share) in [("p50", 0.5), ("p99", 0.99), ("max", 1.0)] {
+        let name = format!("active: batch to acknowledgement, {name}");
+        add(FleetFigure::free(&name, "ms", quantile(&acknowledged, share)));
+    }
+    let active_kb = of_each(cloud.memory_kb() - fresh_kb);
+    add(FleetFigure::at_most("memory per active vehicle", "kB", 50.0, active_kb));
+
+    let mut administrator = fleet.administrator().await?;
+    let cpu_s = cloud.cpu_s();
+    let release = simulation.begun.elapsed().as_secs() + 1;
+    simulation.await_release(release);
+    deploy(&mut administrator, release).await?;
+    let most = count * 99 / 100;
+    simulation.until(PATIENCE, |it| it.applied_s().len() >= most).await;
+    let applied = simulation.applied_s();
+    let p99 = match applied.len() >= most {
+        true => quantile(&applied, most as f64 / applied.len() as f64),
+        false => f64::INFINITY,
+    };
+    add(FleetFigure::at_most("a deployment is applied by 99 % after", "s", 30.0, p99));
+    add(FleetFigure::free("CPU of the cloud for it", "s", cloud.cpu_s() - cpu_s));
+    simulation.until(PATIENCE, |it| it.applied_s().len() >= count).await;
+    // The cloud closes connections without a request.
+    let mut administrator = fleet.administrator().await?;
+    let begun = Instant::now();
+    let all = administrator.bytes(Method::GET, "/v1/deployments", Vec::new()).await?;
+    add(FleetFigure::free("list of deployments", "s", begun.elapsed().as_secs_f64()));
+    let all: Vec<FleetDeployment> =
+        serde_json::from_slice(&all).map_err(|error| error.to_string())?;
+    if all.first().map(|it| it.running) != Some(count as u64) {
+        simulation.error(format!("of {count} vehicles, these run it: {all:?}"));
+    }
+
+    let revoked = &fleet.vehicles[count + SILENT];
+    let (mut socket, _) = open(revoked, &simulation).await?;
+    let begun = Instant::now();
+    let path = format!("/v1/vehicles/{}", revoked.name);
+    administrator.bytes(Method::DELETE, &path, Vec::new()).await?;
+    let ended =
+        async { while let Some(Ok(_)) = futures_util::StreamExt::next(&mut socket).await {} };
+    let cut_s =
+        timeout(PATIENCE, ended).await.map_or(f64::INFINITY, |()| begun.elapsed().as_secs_f64());
+    add(FleetFigure::at_most("a vehicle that is removed is cut off after", "s", 5.0, cut_s));
+    let mut silent_s = Vec::new();
+    for link in silent {
+        silent_s.push(link.await.map_err(|error| error.to_string())?);
+    }
+    if times.has_silent {
+        let longest = quantile(&silent_s, 1.0);
+        add(FleetFigure::at_most("a silent connection is ended after", "s", 60.5, longest));
+    }
+    add(FleetFigure::at_most("errors", "", 0.0, simulation.errors() + simulation.losses()));
+    Ok(figures)
+}
+
+/// Deploys a lambda of one file to the whole fleet.
+async fn deploy(administrator: &mut Administrator, release: u64) -> Result<(), String> {
+    let failed = |error: &dyn std::fmt::Display| error.to_string();
+    let file = b"content of a lambda";
+    let key = SecretKey::generate().map_err(|error| failed(&error))?;
+    let revision = Revision {
+        name: "brake-dark".parse().map_err(|error| failed(&error))?,
+        version: "1.0.0".parse().map_err(|error| failed(&error))?,
+        kind: serde_json::from_value(json!("wasm")).map_err(|error| failed(&error))?,
+        release,
+        created: 1,
+        files: vec![RevisionFile {
+            path: "lambda.toml".parse().map_err(|error| failed(&error))?,
+            bytes: file.len() as u64,
+            sha256: sha256(file),
+        }],
+    };
+    let digest = serde_json::to_vec(&revision).map_err(|error| failed(&error))?;
+    let selector = "fleet".parse().map_err(|error| failed(&error))?;
+    let deployment = Deployment {
+        id: "brake-dark".parse().map_err(|error| failed(&error))?,
+        release,
+        selector: [(selector, "simulated".to_owned())].into(),
+        revision: sha256(&digest),
+        fallback: None,
+        config: [].into(),
+        grants: Grants::default(),
+        created: 1,
+        expires: 2,
+    };
+    let sealed = seal(&deployment, &[&key]).map_err(|error| failed(&error))?;
+    let revision = seal(&revision, &[&key]).map_err(|error| failed(&error))?;
+    let text = |envelope: &[u8]| String::from_utf8_lossy(envelope).into_owned();
+    let request = json!({ "deployment": text(&sealed), "revisions": [text(&revision)] });
+    let reply: Value = administrator.call(Method::POST, "/v1/deployments", &request).await?;
+    if reply["result"] == "missing" {
+        let path = format!("/v1/objects/{}", sha256(file));
+        administrator.bytes(Method::PUT, &path, file.to_vec()).await?;
+        let _: Value = administrator.call(Method::POST, "/v1/deployments", &request).await?;
+    }
+    Ok(())
+}

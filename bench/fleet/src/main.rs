@@ -1,0 +1,87 @@
+//! Measures the cloud under a simulated fleet, against its promises. `cargo xtask bench --fleet`
+//! builds both programs first.
+//!
+//! - `identity` enrols vehicles, and `vehicle` is one: it speaks the protocol of real vehicles over
+//!   TLS, and runs nothing. `simulation` is the state that all of them share.
+//! - `cloud_process` starts and measures the real `gleaner-cloud`, `administrator` is its user, and
+//!   `fleet` has both with the vehicles.
+//! - `load` measures a fleet that connects, is idle and is active; `chaos` kills the cloud.
+
+mod administrator;
+mod chaos;
+mod cloud_process;
+mod figure;
+mod fleet;
+mod identity;
+mod load;
+mod simulation;
+mod vehicle;
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Parser;
+use figure::FleetFigure;
+use load::LoadTimes;
+
+/// Measures the cloud under a simulated fleet and prints a table in Markdown.
+#[derive(Parser)]
+struct Args {
+    /// 1,000 vehicles for a short time: tests the bench itself; figures of time do not count.
+    #[arg(long)]
+    quick: bool,
+    /// Number of vehicles under load
+    #[arg(long, value_name = "N")]
+    vehicles: Option<usize>,
+    /// Time under load, in s
+    #[arg(long, value_name = "S")]
+    seconds: Option<u64>,
+    /// Number of times that the cloud is killed, under 1,000 vehicles
+    #[arg(long, value_name = "N")]
+    kills: Option<usize>,
+}
+
+fn main() -> ExitCode {
+    let args = Args::parse();
+    // Each vehicle takes one.
+    gleaner_base::raise_open_files();
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build();
+    let measured = match runtime {
+        Ok(runtime) => runtime.block_on(measure(&args)),
+        Err(error) => Err(format!("cannot start threads: {error}")),
+    };
+    match measured {
+        Ok(figures) => {
+            println!("| measurement | promise | measured | |\n|---|---|---|---|");
+            figures.iter().for_each(|figure| println!("{figure}"));
+            match figures.iter().all(|figure| figure.is_met()) {
+                true => ExitCode::SUCCESS,
+                false => ExitCode::FAILURE,
+            }
+        }
+        Err(reason) => {
+            eprintln!("error: the fleet cannot be measured\n  cause: {reason}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+async fn measure(args: &Args) -> Result<Vec<FleetFigure>, String> {
+    let by_hand = |quick: u64, full: u64| if args.quick { quick } else { full };
+    let vehicles = args.vehicles.unwrap_or(if args.quick { 1000 } else { 10_000 });
+    let times = LoadTimes {
+        idle: Duration::from_secs(by_hand(4, 30)),
+        active: Duration::from_secs(args.seconds.unwrap_or(by_hand(10, 600))),
+        has_silent: !args.quick,
+    };
+    let kills = args.kills.unwrap_or(if args.quick { 2 } else { 60 });
+    let mut figures = Vec::new();
+    if vehicles > 0 {
+        figures.extend(load::figures(vehicles, &times).await?);
+    }
+    if kills > 0 {
+        let count = if args.quick { 200 } else { 1000 };
+        figures.extend(chaos::figures(count, kills, Duration::from_secs(by_hand(5, 10))).await?);
+    }
+    Ok(figures)
+}

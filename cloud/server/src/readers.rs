@@ -1,0 +1,109 @@
+//! Streams of records that people read: bounded for each user and for all.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::watch;
+
+use crate::error::{CloudError, CloudResult};
+
+/// Maximum number of streams that are read at a time, by all users and by one.
+const READERS_MAX: usize = 64;
+const OF_USER_MAX: usize = 16;
+
+/// The streams that are being read.
+#[derive(Default)]
+pub(crate) struct Readers(Mutex<HashMap<String, OpenReaders>>);
+
+struct OpenReaders {
+    count: usize,
+    end: watch::Sender<()>,
+}
+
+/// The right to read a stream, until it is dropped.
+pub(crate) struct ReaderSlot {
+    readers: Arc<Readers>,
+    user: String,
+    ended: watch::Receiver<()>,
+}
+
+impl Readers {
+    /// Begins to read a stream for a user.
+    ///
+    /// # Errors
+    ///
+    /// An error if too many are read already.
+    pub(crate) fn open(self: &Arc<Self>, user: &str) -> CloudResult<ReaderSlot> {
+        let mut all = self.lock();
+        let busy = |message| CloudError::busy(message, "end another `gleaner logs -f`");
+        if all.values().map(|it| it.count).sum::<usize>() >= READERS_MAX {
+            return Err(busy("too many streams are read already"));
+        }
+        let of_user = all
+            .entry(user.to_owned())
+            .or_insert_with(|| OpenReaders { count: 0, end: watch::Sender::new(()) });
+        if of_user.count >= OF_USER_MAX {
+            return Err(busy("you read too many streams already"));
+        }
+        of_user.count += 1;
+        let ended = of_user.end.subscribe();
+        Ok(ReaderSlot { readers: Arc::clone(self), user: user.to_owned(), ended })
+    }
+
+    /// Ends all streams of a user.
+    pub(crate) fn end(&self, user: &str) {
+        if let Some(of_user) = self.lock().get(user) {
+            of_user.end.send_replace(());
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<String, OpenReaders>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl ReaderSlot {
+    /// Returns whether the stream has to end.
+    pub(crate) fn has_ended(&self) -> bool {
+        self.ended.has_changed().unwrap_or(true)
+    }
+
+    /// Waits until the stream has to end.
+    pub(crate) async fn ended(&mut self) {
+        // It stays changed, so that no later look misses it.
+        while !self.has_ended() {
+            let _ = self.ended.clone().changed().await;
+        }
+    }
+}
+
+impl Drop for ReaderSlot {
+    fn drop(&mut self) {
+        let mut all = self.readers.lock();
+        if let Some(of_user) = all.get_mut(&self.user) {
+            of_user.count -= 1;
+            if of_user.count == 0 {
+                all.remove(&self.user);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn streams_are_bounded_for_each_user_and_end_with_the_user() {
+        let readers = Arc::new(Readers::default());
+        let mut of_ann: Vec<_> = (0..OF_USER_MAX).map(|_| readers.open("ann").unwrap()).collect();
+        assert!(readers.open("ann").is_err());
+        let _of_bob = readers.open("bob").unwrap();
+        readers.end("ann");
+        of_ann[0].ended().await;
+        of_ann.pop();
+        assert!(readers.open("ann").is_ok());
+        let more: Vec<_> = (0..READERS_MAX).map(|user| readers.open(&user.to_string())).collect();
+        assert_eq!(more.iter().filter(|it| it.is_ok()).count(), READERS_MAX - OF_USER_MAX);
+    }
+}
