@@ -77,8 +77,13 @@ impl From<Failure> for CloudError {
 
 impl From<sqlx::Error> for CloudError {
     fn from(error: sqlx::Error) -> Self {
+        // PostgreSQL stores no NUL in a text, and SQLite does.
+        if error.as_database_error().and_then(|it| it.code()).as_deref() == Some("22021") {
+            let help = "send texts without the character NUL";
+            return Self::usage("a text cannot be stored", help);
+        }
         let action = "the database cannot be used";
-        let help = "check that the disk of the data folder has room, and the log of the cloud";
+        let help = "check that the disk of the database has room, and the log of the cloud";
         Failure::caused_by(Exit::Internal, action, &error).with_help(help).into()
     }
 }

@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 use gleaner_base::{Exit, Failure, sync_folder};
 use rustix::fs::{FlockOperation, flock};
 
+use crate::store::StoreAddress;
+
 /// The data folder.
 #[derive(Debug, Clone)]
 pub(crate) struct DataFolder(PathBuf);
@@ -20,8 +22,7 @@ impl DataFolder {
     /// A failure that names the folder.
     pub(crate) fn create(path: &Path) -> Result<Self, Failure> {
         let folder = Self(path.to_owned());
-        let is_of_others = !folder.database().exists()
-            && !folder.0.join("lock").exists()
+        let is_of_others = !folder.is_known()
             && fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_some());
         if is_of_others {
             let message = format!("`{}` is not empty, and no data folder", path.display());
@@ -47,10 +48,10 @@ impl DataFolder {
     ///
     /// # Errors
     ///
-    /// A failure if it has no database.
+    /// A failure if it is of another program.
     pub(crate) fn existing(path: &Path) -> Result<Self, Failure> {
         let folder = Self(path.to_owned());
-        if folder.database().is_file() {
+        if folder.is_known() {
             return Ok(folder);
         }
         let message = format!("`{}` is no data folder of a cloud", path.display());
@@ -79,8 +80,39 @@ impl DataFolder {
         Ok(file)
     }
 
-    pub(crate) fn database(&self) -> PathBuf {
-        self.0.join("cloud.db")
+    fn is_known(&self) -> bool {
+        ["cloud.db", "lock", "postgres"].iter().any(|name| self.0.join(name).exists())
+    }
+
+    /// Returns the address of the database: `url`, or a file in the folder.
+    ///
+    /// # Errors
+    ///
+    /// A failure if `url` is none, or the folder belongs to the other kind: its objects and
+    /// certificates are of no use with another database.
+    pub(crate) fn store(&self, url: Option<&str>) -> Result<StoreAddress, Failure> {
+        let (file, mark) = (self.0.join("cloud.db"), self.0.join("postgres"));
+        let refused = |reason: &str, help: &str| {
+            let message = format!("the database of `{}` {reason}", self.0.display());
+            Failure::new(Exit::Usage, message).with_help(help)
+        };
+        match url {
+            None if mark.exists() => {
+                Err(refused("is on a PostgreSQL server", "add --store, as the folder was served"))
+            }
+            None => Ok(StoreAddress::file(&file)),
+            Some(_) if file.exists() => {
+                Err(refused("is a file in it", "leave --store out, or choose a new folder"))
+            }
+            Some(url) => {
+                let address = StoreAddress::server(url)?;
+                write_private(&mark, b"").map_err(|error| {
+                    let action = format!("cannot write `{}`", mark.display());
+                    Failure::caused_by(Exit::Internal, action, &error)
+                })?;
+                Ok(address)
+            }
+        }
     }
 
     pub(crate) fn objects(&self) -> PathBuf {

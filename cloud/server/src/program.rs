@@ -32,6 +32,8 @@ enum CloudCommand {
         /// Folder of everything that survives a restart
         #[arg(long, value_name = "DIR")]
         data: PathBuf,
+        #[command(flatten)]
+        store: StoreArgs,
         /// Address of the API for people, without TLS
         #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
         people: SocketAddr,
@@ -55,6 +57,8 @@ enum CloudCommand {
         /// Folder of the server
         #[arg(long, value_name = "DIR")]
         data: PathBuf,
+        #[command(flatten)]
+        store: StoreArgs,
     },
     /// Write a copy of the database; a server may run meanwhile
     Backup {
@@ -64,6 +68,15 @@ enum CloudCommand {
         #[arg(long, value_name = "DIR")]
         data: PathBuf,
     },
+}
+
+/// The database.
+#[derive(clap::Args, Debug)]
+struct StoreArgs {
+    /// Database of a PostgreSQL server, as postgres://USER@HOST/DATABASE, with the password in
+    /// PGPASSWORD [default: a file in the folder]
+    #[arg(long, value_name = "URL")]
+    store: Option<String>,
 }
 
 /// Runs the program.
@@ -90,12 +103,12 @@ fn run(command: CloudCommand) -> Result<(), Failure> {
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot start threads", &error))?;
     let done = runtime.block_on(async {
         match command {
-            CloudCommand::Serve { data, people, vehicles, name, insecure_people } => {
-                let is_insecure = insecure_people;
-                serve(ServeOptions { data, people, vehicles, name, is_insecure }).await
+            CloudCommand::Serve { data, store, people, vehicles, name, insecure_people } => {
+                let (store, is_insecure) = (store.store, insecure_people);
+                serve(ServeOptions { data, store, people, vehicles, name, is_insecure }).await
             }
-            CloudCommand::Invite { name, role, data } => {
-                invite(NewUser { name, role }, &data).await
+            CloudCommand::Invite { name, role, data, store } => {
+                invite(NewUser { name, role }, &data, store.store.as_deref()).await
             }
             CloudCommand::Backup { file, data } => backup(&file, &data).await,
         }
@@ -124,8 +137,8 @@ async fn serve(options: ServeOptions) -> Result<(), Failure> {
     Ok(())
 }
 
-async fn invite(new: NewUser, data: &Path) -> Result<(), Failure> {
-    let store = CloudStore::open(&DataFolder::existing(data)?.database()).await?;
+async fn invite(new: NewUser, data: &Path, store: Option<&str>) -> Result<(), Failure> {
+    let store = CloudStore::open(&DataFolder::existing(data)?.store(store)?).await?;
     let invitation = store.invite(CONSOLE, new).await?;
     store.close().await;
     print(&format!("{}\n", invitation.code));
@@ -141,7 +154,7 @@ async fn backup(file: &Path, data: &Path) -> Result<(), Failure> {
         return Err(refused("exists already", "choose another file, or remove it first"));
     }
     let name = file.to_str().ok_or_else(|| refused("is not UTF-8", "choose another name"))?;
-    let store = CloudStore::open(&DataFolder::existing(data)?.database()).await?;
+    let store = CloudStore::open(&DataFolder::existing(data)?.store(None)?).await?;
     store.copy_to(name).await?;
     store.close().await;
     Ok(())

@@ -37,6 +37,8 @@ const CERTIFICATE_INTERVAL: Duration = Duration::from_secs(30 * 86_400);
 pub struct ServeOptions {
     /// Folder of everything that survives a restart.
     pub data: PathBuf,
+    /// URL of a PostgreSQL server with the database; without one, it is a file in the folder.
+    pub store: Option<String>,
     /// Address of the API for people.
     pub people: SocketAddr,
     /// Address for vehicles.
@@ -79,7 +81,7 @@ impl CloudServer {
         let folder = DataFolder::create(&options.data)?;
         let lock = folder.lock()?;
         let authorities = Authorities::open(&folder)?;
-        let store = CloudStore::open(&folder.database()).await?;
+        let store = CloudStore::open(&folder.store(options.store.as_deref())?).await?;
         if let Some(seq) = store.first_changed_entry().await? {
             tracing::error!(seq, "the audit trail was changed: an entry is not as it was written");
         }

@@ -18,7 +18,7 @@ const ROLES: [Role; 4] = [Role::Viewer, Role::Operator, Role::Deployer, Role::Ad
 async fn cloud(folder: &TempDir) -> Arc<Cloud> {
     let data = DataFolder::create(&folder.path().join("data")).unwrap();
     Arc::new(Cloud {
-        store: CloudStore::open(&data.database()).await.unwrap(),
+        store: CloudStore::of_test(folder).await,
         objects: Objects::open(data.objects()).unwrap(),
         hub: Hub::default(),
         authorities: Authorities::open(&data).unwrap(),

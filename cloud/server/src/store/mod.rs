@@ -32,6 +32,7 @@ macro_rules! rows {
     };
 }
 
+mod address;
 mod audit;
 mod deployments;
 mod records;
@@ -44,19 +45,17 @@ mod wants;
 mod waves;
 mod writer;
 
-use std::path::Path;
-use std::str::FromStr;
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use gleaner_base::{Exit, Failure};
-use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
-use sqlx::{Any, AnyPool, Connection, Transaction};
+use gleaner_base::Failure;
+use sqlx::{Any, AnyPool, Transaction};
 use tokio::sync::{Mutex, MutexGuard};
 
 use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
 
+pub(crate) use address::StoreAddress;
 pub(crate) use deployments::OfferedDeployment;
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
 pub(crate) use users::CONSOLE;
@@ -68,60 +67,33 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0002_releases.sql"),
 ];
 
-/// Settings of each connection to SQLite. In the mode WAL, readers and the writer do not wait for
-/// each other; FULL makes each commit durable before it returns.
-const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
-                       PRAGMA foreign_keys = ON; PRAGMA busy_timeout = 10000;";
-
 /// The database.
 pub(crate) struct CloudStore {
     pool: AnyPool,
-    turn: Arc<Mutex<()>>,
+    /// The statement that begins a change, for one at a time.
+    turn: Arc<Mutex<&'static str>>,
     writes: WriteQueue,
+    is_file: bool,
 }
 
 /// A change that is not committed yet; dropped, it is undone.
 pub(crate) struct StoreChange<'s> {
     tx: Transaction<'static, Any>,
-    _turn: MutexGuard<'s, ()>,
+    _turn: MutexGuard<'s, &'static str>,
 }
 
 impl CloudStore {
-    /// Opens the database in this file, and brings it to the newest version.
+    /// Opens the database, and brings it to the newest version.
     ///
     /// # Errors
     ///
     /// A failure if it cannot be opened, or a later version of the program has made it.
-    pub(crate) async fn open(path: &Path) -> Result<Self, Failure> {
-        let failed = |error: sqlx::Error| {
-            let action = format!("cannot open the database `{}`", path.display());
-            Failure::caused_by(Exit::Internal, action, &error)
-        };
-        sqlx::any::install_default_drivers();
-        // A path may have the characters that end it in a URL.
-        let escaped = path.display().to_string().replace('%', "%25");
-        let escaped = escaped.replace('?', "%3f").replace('#', "%23");
-        let options = AnyConnectOptions::from_str(&format!("sqlite://{escaped}?mode=rwc"));
-        let pool = AnyPoolOptions::new()
-            .max_connections(8)
-            // Each was in order when it was returned.
-            .test_before_acquire(false)
-            // SQLite itself undoes a transaction, for example on a full disk. Its connection still
-            // counts it, and could begin no other one.
-            .before_acquire(|connection, _| {
-                let is_usable = !connection.is_in_transaction();
-                Box::pin(async move { Ok(is_usable) })
-            })
-            .after_connect(|connection, _| {
-                Box::pin(async move {
-                    sqlx::raw_sql(PRAGMAS).execute(connection).await?;
-                    Ok(())
-                })
-            });
-        let pool = pool.connect_with(options.map_err(failed)?).await.map_err(failed)?;
-        let turn = Arc::default();
+    pub(crate) async fn open(address: &StoreAddress) -> Result<Self, Failure> {
+        let pool = address.connect().await?;
+        let turn = Arc::new(Mutex::new(address.begin()));
         let writes = WriteQueue::start(pool.clone(), Arc::clone(&turn));
-        let store = Self { pool, turn, writes };
+        let store =
+            Self { pool, turn, writes, is_file: matches!(address, StoreAddress::Sqlite(_)) };
         store.migrate().await?;
         Ok(store)
     }
@@ -155,6 +127,10 @@ impl CloudStore {
 
     /// Writes a copy of the database to a new file.
     pub(crate) async fn copy_to(&self, file: &str) -> CloudResult<()> {
+        if !self.is_file {
+            let message = "the database is on a PostgreSQL server, which copies it itself";
+            return Err(CloudError::usage(message, "use `pg_dump`, and copy the data folder, too"));
+        }
         run!(&self.pool; "VACUUM INTO $1"; file);
         Ok(())
     }
@@ -172,11 +148,9 @@ impl StoreChange<'_> {
     }
 }
 
-async fn begin<'s>(pool: &AnyPool, turn: &'s Mutex<()>) -> CloudResult<StoreChange<'s>> {
+async fn begin<'s>(pool: &AnyPool, turn: &'s Mutex<&'static str>) -> CloudResult<StoreChange<'s>> {
     let turn = turn.lock().await;
-    // A program beside this one, such as `invite`, writes too: a transaction that became a writer
-    // only later would fail instead of waiting for it.
-    let tx = pool.begin_with("BEGIN IMMEDIATE").await?;
+    let tx = pool.begin_with(*turn).await?;
     Ok(StoreChange { tx, _turn: turn })
 }
 

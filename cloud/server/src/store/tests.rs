@@ -6,11 +6,29 @@ use tempfile::TempDir;
 
 use super::*;
 
+#[path = "../../tests/postgres/mod.rs"]
+mod postgres;
+
 const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20, vehicle_bytes: 1 << 20 };
+
+/// Returns the address of a database of its own.
+async fn address(folder: &TempDir) -> StoreAddress {
+    match postgres::store_of(folder.path()).await {
+        Some(url) => StoreAddress::server(&url).unwrap(),
+        None => StoreAddress::file(&folder.path().join("cloud.db")),
+    }
+}
+
+impl CloudStore {
+    /// Opens an empty database.
+    pub(crate) async fn of_test(folder: &TempDir) -> Self {
+        Self::open(&address(folder).await).await.unwrap()
+    }
+}
 
 pub(super) async fn store() -> (TempDir, CloudStore) {
     let folder = TempDir::new().unwrap();
-    let store = CloudStore::open(&folder.path().join("cloud.db")).await.unwrap();
+    let store = CloudStore::of_test(&folder).await;
     (folder, store)
 }
 
@@ -178,12 +196,14 @@ async fn vehicles_are_stored_together_and_an_error_is_of_one_only() {
 async fn what_the_database_refuses_does_not_take_others_with_it() {
     let (_folder, store) = store().await;
     let (one, other) = (connected(&store, "car-7").await, connected(&store, "car-8").await);
-    store
-        .execute(
+    let refuse = match store.is_file {
+        true => {
             "CREATE TRIGGER refuse BEFORE INSERT ON records WHEN NEW.vehicle = 'car-7'
-             BEGIN SELECT RAISE(ROLLBACK, 'refused'); END",
-        )
-        .await;
+             BEGIN SELECT RAISE(ROLLBACK, 'refused'); END"
+        }
+        false => "ALTER TABLE records ADD CHECK (vehicle <> 'car-7')",
+    };
+    store.execute(refuse).await;
     let (refused, stored) = tokio::join!(
         store.append("car-7", one, batch(1, 0..2), KEPT),
         store.append("car-8", other, batch(1, 0..2), KEPT),
@@ -329,8 +349,13 @@ async fn the_database_of_a_later_version_is_refused() {
     let (folder, store) = store().await;
     store.execute("INSERT INTO migrations (version) VALUES (99)").await;
     store.close().await;
-    let refused = CloudStore::open(&folder.path().join("cloud.db")).await.err().unwrap();
+    let refused = CloudStore::open(&address(&folder).await).await.err().unwrap();
     let expected = format!("the database has version 99; this program has {}", MIGRATIONS.len());
     assert_eq!(refused.message, expected);
     assert!(refused.help.is_some());
+}
+
+#[test]
+fn the_same_tests_pass_on_postgresql() {
+    postgres::run_again(&["store::", "people::"], "the_same_tests_pass_on_postgresql");
 }

@@ -72,7 +72,7 @@ pub(super) struct WriteQueue(mpsc::Sender<Box<dyn WaitingWrite>>);
 
 impl WriteQueue {
     /// Starts the task, which ends with the queue.
-    pub(super) fn start(pool: AnyPool, turn: Arc<Mutex<()>>) -> Self {
+    pub(super) fn start(pool: AnyPool, turn: Arc<Mutex<&'static str>>) -> Self {
         let (queue, waiting) = mpsc::channel(GROUP_MAX);
         tokio::spawn(GroupWriter { pool, turn, waiting }.run());
         Self(queue)
@@ -91,7 +91,7 @@ impl CloudStore {
 
 struct GroupWriter {
     pool: AnyPool,
-    turn: Arc<Mutex<()>>,
+    turn: Arc<Mutex<&'static str>>,
     waiting: mpsc::Receiver<Box<dyn WaitingWrite>>,
 }
 

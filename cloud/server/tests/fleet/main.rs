@@ -3,6 +3,8 @@
 mod fake;
 mod hostile;
 mod links;
+#[path = "../postgres/mod.rs"]
+mod postgres;
 mod restarts;
 
 use std::path::Path;
@@ -16,15 +18,15 @@ use hyper::{Method, StatusCode};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-fn options(folder: &Path) -> ServeOptions {
+async fn options(folder: &Path) -> ServeOptions {
     let any = ([127, 0, 0, 1], 0).into();
-    let data = folder.join("data");
-    ServeOptions { data, people: any, vehicles: any, name: None, is_insecure: false }
+    let (data, store) = (folder.join("data"), postgres::store_of(folder).await);
+    ServeOptions { data, store, people: any, vehicles: any, name: None, is_insecure: false }
 }
 
 /// Starts a cloud; returns it with its administrator.
 async fn start(folder: &TempDir) -> (CloudServer, Person) {
-    let server = CloudServer::start(&options(folder.path())).await.unwrap();
+    let server = CloudServer::start(&options(folder.path()).await).await.unwrap();
     let admin = Person::login(server.people, server.code.as_ref().unwrap()).await;
     (server, admin)
 }
@@ -157,4 +159,9 @@ async fn a_vehicle_enrols_gets_what_is_deployed_and_is_cut_off() {
         (&json!("revoke vehicle"), &json!("admin"))
     );
     server.stop().await;
+}
+
+#[test]
+fn the_same_tests_pass_on_postgresql() {
+    postgres::run_again(&[], "the_same_tests_pass_on_postgresql");
 }

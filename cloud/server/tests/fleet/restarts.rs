@@ -13,13 +13,13 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::fake::{Person, cursor_after};
-use crate::{deploy, options, reported, signed, start};
+use crate::{deploy, options, postgres, reported, signed, start};
 
 #[tokio::test]
 async fn a_restart_keeps_everything() {
     let folder = TempDir::new().unwrap();
     let (server, admin) = start(&folder).await;
-    let second = CloudServer::start(&options(folder.path())).await.err().unwrap();
+    let second = CloudServer::start(&options(folder.path()).await).await.err().unwrap();
     assert!(second.message.starts_with("another gleaner-cloud uses"), "{second}");
     let (mut vehicle, _) = admin.enrol("car-7").await;
     let (mut link, _, before) = vehicle.connect().await;
@@ -31,7 +31,7 @@ async fn a_restart_keeps_everything() {
     let listed = admin.call(Method::GET, "/v1/deployments", Value::Null).await;
     server.stop().await;
 
-    let server = CloudServer::start(&options(folder.path())).await.unwrap();
+    let server = CloudServer::start(&options(folder.path()).await).await.unwrap();
     assert_eq!(server.code, None, "an administrator has a token");
     let admin = admin.at(server.people);
     vehicle.address = server.vehicles.to_string();
@@ -47,7 +47,7 @@ async fn a_restart_keeps_everything() {
 #[tokio::test]
 async fn a_kill_loses_nothing_that_was_acknowledged() {
     let folder = TempDir::new().unwrap();
-    let mut program = CloudProgram::start(folder.path());
+    let mut program = CloudProgram::start(folder.path()).await;
     let admin = Person::login(program.people, program.code.as_ref().unwrap()).await;
     let (mut vehicle, _) = admin.enrol("car-7").await;
     for round in 0..5 {
@@ -58,7 +58,7 @@ async fn a_kill_loses_nothing_that_was_acknowledged() {
             link.record(seq..seq + 1).await;
         }
         drop(program);
-        program = CloudProgram::start(folder.path());
+        program = CloudProgram::start(folder.path()).await;
         vehicle.address = program.vehicles.to_string();
     }
     let admin = admin.at(program.people);
@@ -66,6 +66,7 @@ async fn a_kill_loses_nothing_that_was_acknowledged() {
     let invited = Command::new(env!("CARGO_BIN_EXE_gleaner-cloud"))
         .args(["invite", "ann", "--role", "viewer", "--data"])
         .arg(folder.path().join("data"))
+        .args(store_option(folder.path()).await)
         .output()
         .unwrap();
     let code = String::from_utf8(invited.stdout).unwrap();
@@ -77,12 +78,25 @@ async fn a_kill_loses_nothing_that_was_acknowledged() {
         .arg(&copy)
         .arg("--data")
         .arg(folder.path().join("data"))
-        .status();
-    assert!(backup.unwrap().success());
-    assert_eq!(std::fs::metadata(copy).unwrap().permissions().mode() & 0o777, 0o600);
+        .output()
+        .unwrap();
+    let message = String::from_utf8(backup.stderr).unwrap();
+    match store_option(folder.path()).await.is_empty() {
+        true => {
+            assert!(backup.status.success(), "{message}");
+            assert_eq!(std::fs::metadata(copy).unwrap().permissions().mode() & 0o777, 0o600);
+        }
+        false => assert!(message.contains("add --store"), "{message}"),
+    }
     let pid = Pid::from_child(&program.child);
     rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
     assert!(program.child.wait().unwrap().success());
+}
+
+/// Returns the arguments that name the database of the tests in a folder.
+async fn store_option(folder: &Path) -> Vec<String> {
+    let url = postgres::store_of(folder).await;
+    url.map_or_else(Vec::new, |url| vec!["--store".to_owned(), url])
 }
 
 /// The program, killed when it is dropped.
@@ -94,10 +108,11 @@ struct CloudProgram {
 }
 
 impl CloudProgram {
-    fn start(folder: &Path) -> Self {
+    async fn start(folder: &Path) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_gleaner-cloud"))
             .args(["serve", "--people", "127.0.0.1:0", "--vehicles", "127.0.0.1:0", "--data"])
             .arg(folder.join("data"))
+            .args(store_option(folder).await)
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();

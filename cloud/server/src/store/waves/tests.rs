@@ -5,7 +5,7 @@ use serde_json::json;
 use tempfile::TempDir;
 
 use super::super::tests::{connected, offered, report, store};
-use super::super::{OfferedDeployment, VehicleReport};
+use super::super::{OfferedDeployment, StoreAddress, VehicleReport};
 use super::*;
 
 const PLAN: WavePlan = WavePlan {
@@ -258,7 +258,7 @@ async fn a_database_of_the_first_version_keeps_its_deployments() {
         sqlx::raw_sql(sql).execute(&pool).await.unwrap();
     }
     pool.close().await;
-    let store = CloudStore::open(&path).await.unwrap();
+    let store = CloudStore::open(&StoreAddress::file(&path)).await.unwrap();
     let stored = store.deployment("a").await.unwrap();
     assert_eq!((stored.release, stored.is_wanted, stored.waves), (7, false, None));
     assert_eq!((stored.fallback.as_deref(), &*stored.selector["x"]), (Some("f"), "y"));

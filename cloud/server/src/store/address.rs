@@ -1,0 +1,100 @@
+//! The place of the database: a file of SQLite, or a PostgreSQL server.
+
+use std::path::Path;
+use std::str::FromStr;
+
+use gleaner_base::{Exit, Failure};
+use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
+use sqlx::{AnyPool, Connection};
+
+/// Settings of each connection to SQLite. In the mode WAL, readers and the writer do not wait for
+/// each other; FULL makes each commit durable before it returns.
+const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
+                       PRAGMA foreign_keys = ON; PRAGMA busy_timeout = 10000;";
+
+/// Beginning of a change in SQLite. A program beside this one, such as `invite`, writes too: a
+/// transaction that became a writer only later would fail instead of waiting for it.
+const BEGIN_SQLITE: &str = "BEGIN IMMEDIATE";
+
+/// Beginning of a change in PostgreSQL, which waits for others as SQLite does: each change has its
+/// place in the audit trail. The number is that of this program.
+const BEGIN_POSTGRES: &str = "BEGIN; SELECT pg_advisory_xact_lock(7021465)";
+
+/// The place of the database.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum StoreAddress {
+    /// A file of SQLite, as a URL.
+    Sqlite(String),
+    /// A database of a PostgreSQL server, as a URL.
+    Postgres(String),
+}
+
+impl StoreAddress {
+    /// Returns the address of a file.
+    pub(crate) fn file(path: &Path) -> Self {
+        // A path may have the characters that end it in a URL.
+        let escaped = path.display().to_string().replace('%', "%25");
+        let escaped = escaped.replace('?', "%3f").replace('#', "%23");
+        Self::Sqlite(format!("sqlite://{escaped}?mode=rwc"))
+    }
+
+    /// Parses the URL of a server.
+    ///
+    /// # Errors
+    ///
+    /// A failure if it is none of PostgreSQL. It does not repeat the URL, which may have a
+    /// password.
+    pub(crate) fn server(url: &str) -> Result<Self, Failure> {
+        if url.starts_with("postgres://") || url.starts_with("postgresql://") {
+            return Ok(Self::Postgres(url.to_owned()));
+        }
+        Err(Failure::new(Exit::Usage, "--store is no address of a PostgreSQL server")
+            .with_help("write postgres://USER@HOST/DATABASE, with the password in PGPASSWORD"))
+    }
+
+    /// Returns the statement that begins a change.
+    pub(super) fn begin(&self) -> &'static str {
+        match self {
+            Self::Sqlite(_) => BEGIN_SQLITE,
+            Self::Postgres(_) => BEGIN_POSTGRES,
+        }
+    }
+
+    /// Connects.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the cause.
+    pub(super) async fn connect(&self) -> Result<AnyPool, Failure> {
+        sqlx::any::install_default_drivers();
+        let is_sqlite = matches!(self, Self::Sqlite(_));
+        let (Self::Sqlite(url) | Self::Postgres(url)) = self;
+        let failed = |error: sqlx::Error| {
+            let help = match is_sqlite {
+                true => "check that --data is a folder of this user on a disk with room",
+                false => "check --store, PGPASSWORD, and that the server runs",
+            };
+            Failure::caused_by(Exit::Internal, "cannot open the database", &error).with_help(help)
+        };
+        let options = AnyConnectOptions::from_str(url).map_err(failed)?;
+        let pool = AnyPoolOptions::new()
+            .max_connections(8)
+            // A connection to a file is in order as long as it is open.
+            .test_before_acquire(!is_sqlite)
+            // SQLite itself undoes a transaction, for example on a full disk. Its connection still
+            // counts it, and could begin no other one.
+            .before_acquire(|connection, _| {
+                let is_usable = !connection.is_in_transaction();
+                Box::pin(async move { Ok(is_usable) })
+            })
+            .after_connect(move |connection, _| {
+                Box::pin(async move {
+                    if is_sqlite {
+                        sqlx::raw_sql(PRAGMAS).execute(connection).await?;
+                    }
+                    Ok(())
+                })
+            });
+        pool.connect_with(options).await.map_err(failed)
+    }
+}
