@@ -34,6 +34,7 @@ macro_rules! rows {
 
 mod audit;
 mod deployments;
+mod page;
 mod records;
 mod secrets;
 #[cfg(test)]
@@ -52,13 +53,18 @@ use tokio::sync::{Mutex, MutexGuard};
 
 use crate::error::{CloudError, CloudResult};
 
-pub(crate) use deployments::OfferedDeployment;
+pub(crate) use audit::ENTRIES_MAX;
+pub(crate) use deployments::{ChangedVehicles, OfferedDeployment};
+pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::{Issued, VehicleReport};
 
 /// The migrations, oldest first: the version of a database is the number of those that it has.
-const MIGRATIONS: &[&str] = &[include_str!("../../migrations/0001_start.sql")];
+const MIGRATIONS: &[&str] = &[
+    include_str!("../../migrations/0001_start.sql"),
+    include_str!("../../migrations/0004_page.sql"),
+];
 
 /// Settings of each connection to SQLite. In the mode WAL, readers and the writer do not wait for
 /// each other; FULL makes each commit durable before it returns.

@@ -1,0 +1,196 @@
+//! Queries of the page: parts of lists, as a person looks at them.
+
+use std::collections::BTreeMap;
+
+use gleaner_fleet::people::{VehicleState, VehicleSummary};
+
+use super::vehicles::FAILED;
+use super::{CloudStore, int, unsigned};
+use crate::error::CloudResult;
+
+/// Maximum number of streams of a vehicle in one time line.
+const STREAMS_MAX: usize = 64;
+
+/// Choice of vehicles.
+#[derive(Debug, Default)]
+pub(crate) struct VehicleFilter {
+    /// The whole name; any if it is empty.
+    pub(crate) only: String,
+    /// A part of the name.
+    pub(crate) name: String,
+    /// A label with its value; any value if that is empty.
+    pub(crate) label: Option<(String, String)>,
+    pub(crate) state: Option<VehicleState>,
+    /// True for those with a problem or a failed deployment only.
+    pub(crate) has_problem: bool,
+}
+
+/// A part of the vehicles, with numbers of all.
+#[derive(Debug, Default)]
+pub(crate) struct VehiclePage {
+    /// Those of this part, with the number of failed deployments of each.
+    pub(crate) vehicles: Vec<(VehicleSummary, u64)>,
+    /// Number of those that the filter chooses.
+    pub(crate) found: usize,
+    /// Number of all by state: online, offline, invited and cut off.
+    pub(crate) states: [usize; 4],
+    /// Number of all with a problem or a failed deployment.
+    pub(crate) with_problems: usize,
+}
+
+/// The newest records of some streams.
+#[derive(Debug, Default)]
+pub(crate) struct NewestRecords {
+    /// Number of the arrival and the line of each, the newest first.
+    pub(crate) lines: Vec<(i64, String)>,
+    /// Number of the last arrival that was looked at.
+    pub(crate) position: i64,
+    /// Number of the oldest arrival that was read.
+    pub(crate) oldest_read: i64,
+    /// True if older ones in the same range were left out.
+    pub(crate) has_more: bool,
+}
+
+type VehicleRow = (String, i64, i64, i64, String, String, i64, i64, String, i64, i64);
+
+impl CloudStore {
+    /// Returns the `index`-th part, of `size` each, of the vehicles that `filter` chooses, by name.
+    pub(crate) async fn vehicle_page(
+        &self,
+        filter: &VehicleFilter,
+        is_online: impl Fn(&str) -> bool,
+        index: usize,
+        size: usize,
+    ) -> CloudResult<VehiclePage> {
+        let rows: Vec<VehicleRow> = rows!(&self.pool;
+            "SELECT name, is_revoked, epoch, seen, version, labels, generation, handled, problems,
+             running, deployments
+             FROM vehicles WHERE $1 = '' OR name = $1 ORDER BY name"; &filter.only);
+        let failed: Vec<(String, i64)> = rows!(&self.pool;
+            "SELECT vehicle, COUNT(*) FROM reported WHERE state = $1 AND ($2 = '' OR vehicle = $2)
+             GROUP BY vehicle";
+            FAILED, &filter.only);
+        let failed: BTreeMap<String, i64> = failed.into_iter().collect();
+        // Labels are stored as JSON without spaces. This text can also be a part of another label,
+        // so that the ones with it are parsed.
+        let label = filter.label.as_ref().map(|(name, value)| match value.is_empty() {
+            true => format!("{}:", json(name)),
+            false => format!("{}:{}", json(name), json(value)),
+        });
+        let mut page = VehiclePage::default();
+        for row in rows {
+            let state = match () {
+                () if row.1 != 0 => VehicleState::Revoked,
+                () if is_online(&row.0) => VehicleState::Online,
+                () if row.2 == 0 => VehicleState::Invited,
+                () => VehicleState::Offline,
+            };
+            let failures = failed.get(&row.0).map_or(0, |count| unsigned(*count));
+            let has_problem = state != VehicleState::Revoked && (row.8 != "[]" || failures > 0);
+            page.states[state_index(state)] += 1;
+            page.with_problems += usize::from(has_problem);
+            let is_chosen = filter.state.is_none_or(|wanted| wanted == state)
+                && (has_problem || !filter.has_problem)
+                && row.0.contains(&filter.name)
+                && label.as_ref().is_none_or(|label| row.5.contains(label) && filter.has(&row.5));
+            if !is_chosen {
+                continue;
+            }
+            if (index * size..(index + 1) * size).contains(&page.found) {
+                page.vehicles.push((summary(row, state), failures));
+            }
+            page.found += 1;
+        }
+        Ok(page)
+    }
+
+    /// Returns the vehicles that have reported this release of a deployment, with their states:
+    /// first those with a failure, at most `most`.
+    pub(crate) async fn reports(
+        &self,
+        deployment: &str,
+        release: u64,
+        most: i64,
+    ) -> CloudResult<Vec<(String, String)>> {
+        Ok(rows!(&self.pool;
+            "SELECT vehicle, state FROM reported WHERE deployment = $1 AND number = $2
+             ORDER BY CASE WHEN state = $3 THEN 0 ELSE 1 END, vehicle LIMIT $4";
+            deployment, int(release), FAILED, most))
+    }
+
+    /// Returns the names of the streams of a vehicle: at most as many as one time line shows.
+    pub(crate) async fn streams(&self, vehicle: &str) -> CloudResult<Vec<String>> {
+        let rows: Vec<(String,)> = rows!(&self.pool;
+            "SELECT stream FROM streams WHERE vehicle = $1 ORDER BY stream LIMIT $2";
+            vehicle, int(STREAMS_MAX as u64));
+        Ok(rows.into_iter().map(|(stream,)| stream).collect())
+    }
+
+    /// Returns the newest records of these streams whose arrivals are after `after` and before
+    /// `before`: at most `most`.
+    pub(crate) async fn newest(
+        &self,
+        vehicle: &str,
+        streams: &[String],
+        (after, before): (i64, i64),
+        most: usize,
+    ) -> CloudResult<NewestRecords> {
+        // First the end: what arrives between the queries of two streams comes next time.
+        let arrived: Option<(i64,)> =
+            row!(&self.pool; "SELECT arrived FROM vehicles WHERE name = $1"; vehicle);
+        let position = arrived.map_or(0, |(arrived,)| arrived).min(before.saturating_sub(1));
+        let mut lines: Vec<(i64, String)> = Vec::new();
+        for stream in streams {
+            let rows: Vec<(i64, String)> = rows!(&self.pool;
+                "SELECT arrival, line FROM records
+                 WHERE vehicle = $1 AND stream = $2 AND arrival > $3 AND arrival <= $4
+                 ORDER BY arrival DESC LIMIT $5";
+                vehicle, stream, after, position, int(most as u64 + 1));
+            lines.extend(rows);
+        }
+        lines.sort_unstable_by_key(|(arrival, _)| std::cmp::Reverse(*arrival));
+        let has_more = lines.len() > most;
+        lines.truncate(most);
+        let oldest_read = lines.last().map_or(position, |(arrival, _)| *arrival);
+        Ok(NewestRecords { lines, position: position.max(after), oldest_read, has_more })
+    }
+}
+
+impl VehicleFilter {
+    /// Returns whether these labels have the one that is asked for.
+    fn has(&self, labels: &str) -> bool {
+        let labels: BTreeMap<String, String> = serde_json::from_str(labels).unwrap_or_default();
+        self.label.as_ref().is_none_or(|(name, value)| {
+            labels.get(name).is_some_and(|found| value.is_empty() || found == value)
+        })
+    }
+}
+
+fn state_index(state: VehicleState) -> usize {
+    match state {
+        VehicleState::Online => 0,
+        VehicleState::Offline => 1,
+        VehicleState::Invited => 2,
+        VehicleState::Revoked => 3,
+    }
+}
+
+fn summary(row: VehicleRow, state: VehicleState) -> VehicleSummary {
+    let (name, _, _, seen, version, labels, wanted, handled, problems, running, deployments) = row;
+    VehicleSummary {
+        name,
+        labels: serde_json::from_str(&labels).unwrap_or_default(),
+        state,
+        seen: (seen > 0).then_some(unsigned(seen)),
+        version: (!version.is_empty()).then_some(version),
+        wanted: unsigned(wanted),
+        handled: unsigned(handled),
+        problems: serde_json::from_str(&problems).unwrap_or_default(),
+        running: unsigned(running),
+        deployments: unsigned(deployments),
+    }
+}
+
+fn json(text: &str) -> String {
+    super::vehicles::json(&text)
+}
