@@ -74,7 +74,7 @@ fn new_user(user: &PageUser) -> Markup {
                 label for="user-name" { "Name" }
                 input id="user-name" name="name" required maxlength="64" autocomplete="off"
                     spellcheck="false" aria-describedby="user-help";
-                p.help id="user-help" { "Letters, digits and `._-@+`. A user of this name gets \
+                p.help id="user-help" { "Letters, digits and ._-@+ are allowed. A user of this name gets \
                                          another code, and this role." }
                 label for="role" { "Role" }
                 select id="role" name="role" {

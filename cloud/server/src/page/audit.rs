@@ -34,12 +34,12 @@ pub(super) async fn page(
             div.scroll role="region" aria-label="List of entries" tabindex="0" {
                 table {
                     caption { "Entries " (entries[0].seq) " to " (entries[entries.len() - 1].seq) }
-                    thead { tr { th.number scope="col" { "Entry" } th scope="col" { "Time" }
+                    thead { tr { th.number.optional scope="col" { "Entry" } th scope="col" { "Time" }
                         th scope="col" { "User" } th scope="col" { "Change" }
                         th scope="col" { "Of" } th.optional scope="col" { "Hash" } } }
                     tbody { @for entry in &entries {
                         tr {
-                            td.number { (entry.seq) }
+                            td.number.optional { (entry.seq) }
                             td { (time(entry.time_ms / 1000)) }
                             td { (shown(&entry.actor)) }
                             td { (shown(&entry.action)) }

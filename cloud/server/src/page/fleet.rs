@@ -212,7 +212,7 @@ fn health_of(vehicle: &VehicleSummary, failures: u64) -> Markup {
             _ if !vehicle.problems.is_empty() => span.bad {
                 (count(vehicle.problems.len() as u64, "problem")) },
             _ if failures > 0 => span.bad { (count(failures, "failed deployment")) },
-            _ if vehicle.handled < vehicle.wanted => span.warn { "has changes to apply" },
+            _ if vehicle.handled < vehicle.wanted => span.warn { "has yet to apply changes" },
             _ => span.good { "well" },
         }
     }

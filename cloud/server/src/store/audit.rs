@@ -75,6 +75,13 @@ impl CloudStore {
     pub(crate) async fn execute(&self, sql: &'static str) {
         sqlx::raw_sql(sql).execute(&self.pool).await.unwrap();
     }
+
+    #[cfg(test)]
+    pub(crate) async fn execute_with(&self, sql: &'static str, values: &[&str]) {
+        let bind =
+            |query: sqlx::query::Query<'static, _, _>, value: &&str| query.bind(value.to_string());
+        values.iter().fold(sqlx::query(sql), bind).execute(&self.pool).await.unwrap();
+    }
 }
 
 fn hash(before: &str, seq: i64, time_ms: i64, texts: [&str; 3]) -> String {
