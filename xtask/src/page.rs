@@ -51,7 +51,8 @@ fn packages(checkout: &Checkout, is_installing: bool) -> Result<(), Failure> {
         let mut install = checkout.command("apt-get");
         install.args(["install", "-y", "--no-install-recommends"]).args(&missing);
         install.env("DEBIAN_FRONTEND", "noninteractive");
-        run(&mut install, "install packages as root after `apt-get update`").map_err(unreachable)?;
+        run(&mut install, "install packages as root after `apt-get update`")
+            .map_err(unreachable)?;
     }
     let missing = self::missing(checkout);
     if missing.is_empty() {

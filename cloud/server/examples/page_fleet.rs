@@ -127,7 +127,8 @@ async fn drive(
             },
             _ = ticks.tick() => {
                 link.send(Body::Ping(Ping { number: seq })).await;
-                let runs = wanted.deployments.iter().any(|it| it.id == "brake-dark" && it.is_wanted);
+                let is_run = |it: &Wanted| it.id == "brake-dark" && it.is_wanted;
+                let runs = wanted.deployments.iter().any(is_run);
                 if name != "car-2" && runs {
                     records(&mut link, seq, is_hostile).await;
                     seq += 1;
@@ -176,7 +177,8 @@ async fn report(
     let program = json!({ "version": "0.1.0", "pid": 1, "up_s": 7300.0, "rss_bytes": 21_000_000,
                           "cpu_s": 31.0 });
     let capacity = json!([
-        { "resource": "memory", "unit": "B", "asked": 3.1e8, "used": 1.9e8, "most": 1e9, "source": "" },
+        { "resource": "memory", "unit": "B", "asked": 3.1e8, "used": 1.9e8, "most": 1e9,
+          "source": "" },
         { "resource": "cpu", "unit": "cores", "asked": 2.5, "most": 2.0, "source": "" },
     ]);
     let status = json!({

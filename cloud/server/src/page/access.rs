@@ -12,7 +12,7 @@ use serde::Deserialize;
 use super::guard::FormFields;
 use super::layout::{self, PageResult, confirmed, done, failure, form, with_status};
 use super::session::PageUser;
-use super::text::{query, segment, shown, time};
+use super::text::{query, segment, shown, time, vehicle_path};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::people::enrolment;
@@ -74,8 +74,10 @@ fn new_user(user: &PageUser) -> Markup {
                 label for="user-name" { "Name" }
                 input id="user-name" name="name" required maxlength="64" autocomplete="off"
                     spellcheck="false" aria-describedby="user-help";
-                p.help id="user-help" { "Letters, digits and ._-@+ are allowed. A user of this name gets \
-                                         another code, and this role." }
+                p.help id="user-help" {
+                    "Letters, digits and ._-@+ are allowed. A user of this name gets another code, \
+                     and this role."
+                }
                 label for="role" { "Role" }
                 select id="role" name="role" {
                     @for (role, may) in ROLES {
@@ -136,7 +138,7 @@ async fn vehicles(cloud: &Cloud, user: &PageUser, asked: &AccessQuery) -> CloudR
             @if found.found == 0 { (layout::empty("There are none yet.")) }
             ul.rows { @for (it, _) in &found.vehicles {
                 li.card {
-                    span { a href=(format!("/vehicles/{}", segment(&it.name))) { (shown(&it.name)) }
+                    span { a href=(vehicle_path(&it.name)) { (shown(&it.name)) }
                         " " (super::fleet::state(it)) }
                     @if it.state != VehicleState::Revoked {
                         (confirmed(user, &format!("/access/vehicles/{}/cut-off", segment(&it.name)),

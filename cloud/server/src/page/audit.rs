@@ -34,8 +34,9 @@ pub(super) async fn page(
             div.scroll role="region" aria-label="List of entries" tabindex="0" {
                 table {
                     caption { "Entries " (entries[0].seq) " to " (entries[entries.len() - 1].seq) }
-                    thead { tr { th.number.optional scope="col" { "Entry" } th scope="col" { "Time" }
-                        th scope="col" { "User" } th scope="col" { "Change" }
+                    thead { tr {
+                        th.number.optional scope="col" { "Entry" }
+                        th scope="col" { "Time" } th scope="col" { "User" } th scope="col" { "Change" }
                         th scope="col" { "Of" } th.optional scope="col" { "Hash" } } }
                     tbody { @for entry in &entries {
                         tr {
@@ -53,7 +54,8 @@ pub(super) async fn page(
         nav.pages aria-label="Parts of the list" {
             @if part.before.is_some() { a href="/audit" { "Newest" } }
             @if let Some(last) = entries.last() && last.seq > 1 {
-                a href=(format!("/audit{}", query(&[("before", &last.seq.to_string())]))) { "Older" }
+                @let before = last.seq.to_string();
+                a href=(format!("/audit{}", query(&[("before", &before)]))) { "Older" }
             }
         }
     };

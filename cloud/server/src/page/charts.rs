@@ -1,5 +1,6 @@
 //! Small charts as SVG, which state in words what they show.
 
+use gleaner_protocol::DurationStats;
 use maud::{Markup, html};
 
 /// Renders parts of a whole as one bar with a legend. Each part has a class of the style, a name
@@ -27,7 +28,10 @@ pub(super) fn parts(label: &str, parts: &[(&str, &str, u64)]) -> Markup {
             }
             figcaption aria-hidden="true" {
                 @for (class, name, number) in parts {
-                    span.legend { svg.swatch width="9" height="9" { rect class=(class) width="9" height="9" rx="2" {} }
+                    span.legend {
+                        svg.swatch width="9" height="9" {
+                            rect class=(class) width="9" height="9" rx="2" {}
+                        }
                         b { (gleaner_base::grouped(number)) } " " (name) }
                 }
             }
@@ -49,12 +53,12 @@ pub(super) fn share(value: f64, most: f64) -> Markup {
 
 /// Renders durations on a logarithmic scale from 1 µs to 10 s: a line from the median to p99, and a
 /// dot at the maximum.
-pub(super) fn spread(p50_ns: u64, p99_ns: u64, max_ns: u64) -> Markup {
+pub(super) fn spread(stats: &DurationStats) -> Markup {
     let place = |ns: u64| {
         let decades = (ns.max(1000) as f64 / 1000.0).log10();
         2.0 + (decades / 7.0).clamp(0.0, 1.0) * 96.0
     };
-    let (p50, p99, max) = (place(p50_ns), place(p99_ns), place(max_ns));
+    let (p50, p99, max) = (place(stats.p50_ns), place(stats.p99_ns), place(stats.max_ns));
     html! {
         svg.bar aria-hidden="true" width="100%" height="12" {
             line.axis x1="2%" x2="98%" y1="6" y2="6" {}

@@ -12,7 +12,7 @@ use super::charts;
 use super::layout::{self, PageResult, confirmed, done, empty, form};
 use super::login::Done;
 use super::session::PageUser;
-use super::text::{count, query, segment, short, shown};
+use super::text::{count, deployment_path, label, segment, short, shown, vehicle_path};
 use crate::cloud::Cloud;
 use crate::error::CloudResult;
 use crate::store::ChangedVehicles;
@@ -37,7 +37,7 @@ pub(super) async fn list(
             }
             @for deployment in &all {
                 article.card {
-                    h2 { a id=(format!("d-{}", deployment.id)) href=(path(&deployment.id)) {
+                    h2 { a id=(format!("d-{}", deployment.id)) href=(deployment_path(&deployment.id)) {
                         (shown(&deployment.id)) } " " (wish(deployment)) }
                     p.dim { "release " (deployment.release) ", to " (selector(deployment)) }
                     (progress(deployment))
@@ -56,7 +56,7 @@ pub(super) async fn page(
 ) -> PageResult {
     let deployment = cloud.store.deployment(&id).await?;
     let reports = cloud.store.reports(&id, deployment.release, VEHICLES_MAX).await?;
-    let here = path(&id);
+    let here = deployment_path(&id);
     let body = html! {
         nav.crumbs aria-label="Path" { a href="/deployments" { "Deployments" } }
         h1 { (shown(&deployment.id)) }
@@ -73,10 +73,6 @@ pub(super) async fn page(
         (changes(&user, &here, &deployment))
     };
     Ok(layout::page(&deployment.id, "/deployments", Some(&user), body))
-}
-
-fn path(id: &str) -> String {
-    format!("/deployments/{}", segment(id))
 }
 
 fn wish(deployment: &FleetDeployment) -> Markup {
@@ -106,10 +102,7 @@ fn progress(deployment: &FleetDeployment) -> Markup {
 fn selector(deployment: &FleetDeployment) -> Markup {
     html! {
         @if deployment.selector.is_empty() { "all vehicles" }
-        @for (name, value) in &deployment.selector {
-            @let label = format!("{name}={value}");
-            a.label href=(format!("/vehicles{}", query(&[("label", &label)]))) { (shown(&label)) } " "
-        }
+        @for pair in &deployment.selector { (label(pair)) }
     }
 }
 
@@ -120,13 +113,18 @@ fn vehicles(reports: &[(String, String)]) -> Markup {
                 h2 id="vehicles" { "Vehicles that have it" }
                 ul.columns { @for (vehicle, state) in reports {
                     li {
-                        a id=(format!("v-{vehicle}")) href=(format!("/vehicles/{}", segment(vehicle))) { (shown(vehicle)) } " "
-                        @let class = match &**state { "running" => "running", "failed" => "failed", _ => "other" };
-                        span.state.(class) { (shown(if state == "other" { "not running" } else { state })) }
+                        @let (class, text) = match &**state {
+                            "running" => ("running", "running"),
+                            "failed" => ("failed", "failed or refused"),
+                            _ => ("other", "not running"),
+                        };
+                        a id=(format!("v-{vehicle}")) href=(vehicle_path(vehicle)) {
+                            (shown(vehicle)) } " "
+                        span.state.(class) { (text) }
                     }
                 } }
                 @if reports.len() as i64 >= VEHICLES_MAX {
-                    p.dim { "These are the first " (VEHICLES_MAX) ", those with a failure before others." }
+                    p.dim { "The first " (VEHICLES_MAX) ", those with a failure before others." }
                 }
             }
         }
@@ -203,7 +201,7 @@ pub(super) async fn start(
     Path(id): Path<String>,
 ) -> PageResult {
     let changed = cloud.store.set_wanted(&user.user.name, &id, true).await;
-    changed_to(&cloud, changed, &format!("{}?done=start", path(&id)))
+    changed_to(&cloud, changed, &format!("{}?done=start", deployment_path(&id)))
 }
 
 pub(super) async fn stop(
@@ -212,7 +210,7 @@ pub(super) async fn stop(
     Path(id): Path<String>,
 ) -> PageResult {
     let changed = cloud.store.set_wanted(&user.user.name, &id, false).await;
-    changed_to(&cloud, changed, &format!("{}?done=stop", path(&id)))
+    changed_to(&cloud, changed, &format!("{}?done=stop", deployment_path(&id)))
 }
 
 pub(super) async fn roll_back(
@@ -221,7 +219,7 @@ pub(super) async fn roll_back(
     Path(id): Path<String>,
 ) -> PageResult {
     let changed = cloud.store.roll_back(&user.user.name, &id).await;
-    changed_to(&cloud, changed, &format!("{}?done=rollback", path(&id)))
+    changed_to(&cloud, changed, &format!("{}?done=rollback", deployment_path(&id)))
 }
 
 pub(super) async fn remove(

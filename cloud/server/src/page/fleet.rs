@@ -11,7 +11,7 @@ use serde::Deserialize;
 use super::charts;
 use super::layout::{self, PageResult, empty};
 use super::session::PageUser;
-use super::text::{ago, count, query, segment, shown};
+use super::text::{ago, count, label, query, shown, vehicle_path};
 use crate::cloud::Cloud;
 use crate::store::{VehicleFilter, VehiclePage};
 
@@ -175,17 +175,14 @@ fn row(vehicle: &VehicleSummary, failures: u64) -> Markup {
     html! {
         tr {
             th scope="row" {
-                a id=(format!("v-{}", vehicle.name)) href=(format!("/vehicles/{}", segment(&vehicle.name))) {
+                a id=(format!("v-{}", vehicle.name)) href=(vehicle_path(&vehicle.name)) {
                     (shown(&vehicle.name)) }
             }
             td { (state(vehicle)) }
             td { (health_of(vehicle, failures)) }
             td.number { (vehicle.running) " of " (vehicle.deployments) }
             td.optional {
-                @for (name, value) in vehicle.labels.iter().take(LABELS_MAX) {
-                    @let label = format!("{name}={value}");
-                    a.label href=(format!("/vehicles{}", query(&[("label", &label)]))) { (shown(&label)) } " "
-                }
+                @for pair in vehicle.labels.iter().take(LABELS_MAX) { (label(pair)) }
                 @if vehicle.labels.len() > LABELS_MAX { "…" }
             }
             td.optional { (vehicle.version.as_deref().map(shown).unwrap_or_default()) }

@@ -11,7 +11,7 @@ use serde::Deserialize;
 
 use super::layout::{self, PageResult, empty};
 use super::session::PageUser;
-use super::text::{bytes, count, query, segment, short, shown, time};
+use super::text::{bytes, count, deployment_path, query, segment, short, shown, time};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 
@@ -89,7 +89,9 @@ fn row(digest: &str, used: &(Vec<String>, Vec<String>), revision: Option<&Revisi
         tr {
             th scope="row" {
                 @match revision {
-                    Some(it) => { (shown(it.name.as_ref())) " " span.dim { (shown(&it.version.to_string())) } },
+                    Some(it) => {
+                        (shown(it.name.as_ref())) " " span.dim { (shown(&it.version.to_string())) }
+                    },
                     None => span.bad { "cannot be read" },
                 }
             }
@@ -102,14 +104,14 @@ fn row(digest: &str, used: &(Vec<String>, Vec<String>), revision: Option<&Revisi
 }
 
 fn signed(revision: &Revision) -> Markup {
-    time(i64::try_from(revision.created).unwrap_or(i64::MAX).min(253_402_300_799))
+    time(i64::try_from(revision.created).unwrap_or(i64::MAX))
 }
 
 fn links((current, fallbacks): &(Vec<String>, Vec<String>)) -> Markup {
     html! {
-        @for id in current.iter().take(20) { a href=(format!("/deployments/{}", segment(id))) { (shown(id)) } " " }
+        @for id in current.iter().take(20) { a href=(deployment_path(id)) { (shown(id)) } " " }
         @for id in fallbacks.iter().take(20) {
-            a href=(format!("/deployments/{}", segment(id))) { (shown(id)) } " " span.dim { "(fallback) " }
+            a href=(deployment_path(id)) { (shown(id)) } " " span.dim { "(fallback) " }
         }
         @let more = current.len().saturating_sub(20) + fallbacks.len().saturating_sub(20);
         @if more > 0 { span.dim { "and " (more) " more" } }

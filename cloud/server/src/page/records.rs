@@ -10,7 +10,7 @@ use serde::Deserialize;
 use super::layout::{self, PageResult, empty};
 use super::line::line;
 use super::session::PageUser;
-use super::text::{query, segment, shown};
+use super::text::{query, segment, shown, vehicle_path};
 use super::vehicle::find;
 use crate::cloud::Cloud;
 use crate::error::CloudResult;
@@ -63,7 +63,7 @@ impl RecordSource {
 
     /// Returns the path of its page.
     fn path(&self) -> String {
-        let vehicle = format!("/vehicles/{}", segment(&self.vehicle));
+        let vehicle = vehicle_path(&self.vehicle);
         match &self.lambda {
             None => format!("{vehicle}/events"),
             Some(id) => format!("{vehicle}/lambdas/{}", segment(id)),
@@ -98,7 +98,7 @@ async fn page(
     let vehicle = find(cloud, &source.vehicle).await?;
     let newest = source.newest(cloud, (0, before.unwrap_or(i64::MAX)), SIZE).await?;
     let here = source.path();
-    let up = format!("/vehicles/{}", segment(&vehicle.name));
+    let up = vehicle_path(&vehicle.name);
     let title = source.lambda.as_deref().map_or("Time line".to_owned(), shown);
     let body = html! {
         nav.crumbs aria-label="Path" {

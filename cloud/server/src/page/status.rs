@@ -25,7 +25,8 @@ pub(super) fn all(here: &str, status: &VehicleStatus) -> Markup {
                 (lambda(here, deployment))
             }
             @if status.deployments.len() > LAMBDAS_MAX {
-                p { (status.deployments.len() - LAMBDAS_MAX) " more: `gleaner status --on` shows all" }
+                p { (status.deployments.len() - LAMBDAS_MAX)
+                    " more: `gleaner status --on` shows all" }
             }
         }
         div.pair {
@@ -56,9 +57,10 @@ fn lambda(here: &str, deployment: &DeploymentStatus) -> Markup {
                 ", revision " code { (short(&revision.digest)) }
                 @if deployment.runs_fallback { ", " span.warn { "runs its fallback" } }
             }
-            @for (class, reason) in [("bad", &deployment.failed), ("bad", &deployment.refused), ("warn", &deployment.stale)] {
-                @if let Some(reason) = reason { p.(class) { (shown(reason)) } }
+            @for reason in [&deployment.failed, &deployment.refused].into_iter().flatten() {
+                p.bad { (shown(reason)) }
             }
+            @if let Some(reason) = &deployment.stale { p.warn { (shown(reason)) } }
             @if let Some(status) = status { (process(status)) }
         }
     }
@@ -71,8 +73,8 @@ fn process(status: &LambdaStatus) -> Markup {
             div { dt { "In this phase" } dd { (span(status.phase_s)) } }
             div { dt { "Restarts" } dd { (status.restarts) } }
             @if let Some(live) = &status.live {
-                div { dt { "Wakes" } dd { (live.wakes) } }
-                div { dt { "Triggers" } dd { (live.triggers) } }
+                div { dt { "Wakes" } dd { (gleaner_base::grouped(live.wakes)) } }
+                div { dt { "Triggers" } dd { (gleaner_base::grouped(live.triggers)) } }
                 div { dt { "Faults" } dd { (number_of(live.faults)) } }
                 div { dt { "Memory" } dd { (bytes(live.rss_bytes as f64)) } }
             }
@@ -108,7 +110,7 @@ fn latency(live: &LiveStatus) -> Markup {
                             @for ns in [stats.p50_ns, stats.p99_ns, stats.max_ns] {
                                 td.number { (duration(ns)) }
                             }
-                            td.optional.chart { (charts::spread(stats.p50_ns, stats.p99_ns, stats.max_ns)) }
+                            td.optional.chart { (charts::spread(&stats)) }
                         }
                     } } }
                 }
@@ -156,8 +158,9 @@ fn topics(live: &LiveStatus) -> Markup {
                         th.number scope="col" { "Received" } th.number scope="col" { "Lost" }
                         th.number.optional scope="col" { "Age" } } }
                     tbody { @for topic in live.topics.iter().take(TOPICS_MAX) {
-                        @let dropped = [topic.malformed, topic.no_slot, topic.too_big, topic.skipped]
-                            .into_iter().fold(0, u64::saturating_add);
+                        @let dropped = [
+                            topic.malformed, topic.no_slot, topic.too_big, topic.skipped,
+                        ].into_iter().fold(0, u64::saturating_add);
                         tr {
                             th scope="row" { (shown(&topic.topic))
                                 @for warning in topic.qos_warnings.iter().take(3) {
@@ -239,7 +242,7 @@ fn vehicle(status: &VehicleStatus) -> Markup {
                         None => span.bad { "none is installed" },
                         Some(trust) => {
                             "version " (trust.version) ", until "
-                            (time(i64::try_from(trust.expires).unwrap_or(i64::MAX).min(253_402_300_799)))
+                            (time(i64::try_from(trust.expires).unwrap_or(i64::MAX)))
                             @if trust.is_expired { " " span.bad { "expired" } }
                         },
                     }
@@ -249,7 +252,8 @@ fn vehicle(status: &VehicleStatus) -> Markup {
                 dd {
                     @let lost = status.events_lost
                         .saturating_add(status.supervisor.as_ref().map_or(0, |it| it.events_lost));
-                    @if lost == 0 { "no event was lost" } @else { span.warn { (count(lost, "event")) " lost" } }
+                    @if lost == 0 { "no event was lost" }
+                    @else { span.warn { (count(lost, "event")) " lost" } }
                 }
                 @match &status.supervisor {
                     None => { dt { "Supervisor" } dd { span.bad { "cannot be reached" } } },

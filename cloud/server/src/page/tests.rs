@@ -270,8 +270,8 @@ async fn hostile_vehicle(cloud: &Cloud) {
         "grants": { "topics": [bad], "models": [bad], "record": true } });
     let capacity =
         json!({ "resource": bad, "unit": bad, "asked": -1.0, "most": 0.0, "source": bad });
-    let status = json!({ "vehicle": bad, "key": bad, "labels": { bad: bad }, "orchestrator": program,
-        "trust": { "version": 1, "expires": u64::MAX, "is_expired": true }, "generation": 1,
+    let status = json!({ "vehicle": bad, "key": bad, "labels": { bad: bad },
+        "orchestrator": program, "trust": { "version": 1, "expires": u64::MAX, "is_expired": true }, "generation": 1,
         "deployments": [deployment], "capacity": [capacity], "supervisor": null });
     let text = |value: serde_json::Value| value.to_string();
     cloud.store.invite_vehicle("console", "car-1").await.unwrap();
@@ -332,13 +332,17 @@ async fn what_a_vehicle_sends_is_never_markup() {
 async fn ten_thousand_vehicles_are_filtered_and_listed_in_parts() {
     let folder = TempDir::new().unwrap();
     let cloud = cloud(&folder).await;
-    cloud.store.execute(
-        "WITH RECURSIVE n (i) AS (SELECT 0 UNION ALL SELECT i + 1 FROM n WHERE i < 9999)
+    cloud
+        .store
+        .execute(
+            "WITH RECURSIVE n (i) AS (SELECT 0 UNION ALL SELECT i + 1 FROM n WHERE i < 9999)
          INSERT INTO vehicles (name, epoch, seen, labels, problems, version, status)
          SELECT 'car-' || i, i % 10, 1,
-         '{\"site\":\"' || CASE i % 3 WHEN 0 THEN 'berlin' ELSE 'ulm' END || '\",\"x\\\"site\":\"berlin\"}',
+         '{\"site\":\"' || CASE i % 3 WHEN 0 THEN 'berlin' ELSE 'ulm' END ||
+         '\",\"x\\\"site\":\"berlin\"}',
          CASE i % 100 WHEN 0 THEN '[\"no room\"]' ELSE '[]' END, '0.1.0', '' FROM n",
-    ).await;
+        )
+        .await;
     let mut user = Browser::of(&cloud, "ann", Role::Viewer).await;
     let begin = Instant::now();
     let first = user.get("/vehicles").await;

@@ -57,11 +57,31 @@ pub(super) fn query(values: &[(&str, &str)]) -> String {
     }
 }
 
+/// Returns the path of a vehicle's page.
+pub(super) fn vehicle_path(name: &str) -> String {
+    format!("/vehicles/{}", segment(name))
+}
+
+/// Returns the path of a deployment's page.
+pub(super) fn deployment_path(id: &str) -> String {
+    format!("/deployments/{}", segment(id))
+}
+
+/// Renders a label as a link to all vehicles that have it.
+pub(super) fn label((name, value): (&String, &String)) -> Markup {
+    let text = format!("{name}={value}");
+    let address = format!("/vehicles{}", query(&[("label", &text)]));
+    html! { a.label href=(address) { (shown(&text)) } " " }
+}
+
 /// Returns an element with a time in UTC, in s since 1970.
 pub(super) fn time(seconds: i64) -> Markup {
-    let text = UtcTime::of(seconds).to_string();
-    let readable = text.replace('T', " ").replace('Z', " UTC");
-    html! { time datetime=(text) { (readable) } }
+    // The end of year 9999: later ones have no such form.
+    let text = UtcTime::of(seconds.min(253_402_300_799)).to_string();
+    let (day, rest) = text.split_once('T').unwrap_or_default();
+    // On a narrow screen, a line may end between these only.
+    let of_day = rest.replace('Z', " UTC");
+    html! { time datetime=(text) { span { (day) } " " span { (of_day) } } }
 }
 
 /// Returns an element with a time of day with ms, in ns since 1970, and the date as its title; a

@@ -11,7 +11,7 @@ use super::fleet::state;
 use super::layout::{self, PageResult, empty};
 use super::session::PageUser;
 use super::status;
-use super::text::{ago, query, segment, shown};
+use super::text::{ago, label, shown, vehicle_path};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::store::VehicleFilter;
@@ -28,7 +28,7 @@ pub(super) async fn page(
     // Absent before the first report, and of a version whose status has another form.
     let status = cloud.store.status(&name).await.ok();
     let status: Option<VehicleStatus> = status.and_then(|text| serde_json::from_str(&text).ok());
-    let here = format!("/vehicles/{}", segment(&name));
+    let here = vehicle_path(&name);
     let body = html! {
         nav.crumbs aria-label="Path" { a href="/vehicles" { "Fleet" } }
         h1 { (shown(&vehicle.name)) }
@@ -36,7 +36,8 @@ pub(super) async fn page(
             a href=(here) aria-current="page" { "Status" }
             a href=(format!("{here}/events")) { "Time line" }
         }
-        div id="vehicle" hx-get=(here) hx-trigger="every 5s" hx-select="#vehicle" hx-swap="outerHTML" {
+        div id="vehicle" hx-get=(here) hx-trigger="every 5s" hx-select="#vehicle"
+            hx-swap="outerHTML" {
             (summary(&vehicle))
             @match &status {
                 Some(status) => (status::all(&here, status)),
@@ -91,11 +92,7 @@ fn summary(vehicle: &VehicleSummary) -> Markup {
                 }
                 @if !vehicle.labels.is_empty() {
                     div.all { dt { "Labels" } dd {
-                        @for (name, value) in &vehicle.labels {
-                            @let label = format!("{name}={value}");
-                            a.label href=(format!("/vehicles{}", query(&[("label", &label)]))) {
-                                (shown(&label)) } " "
-                        }
+                        @for pair in &vehicle.labels { (label(pair)) }
                     } }
                 }
             }
