@@ -36,7 +36,8 @@ pub(super) async fn page(
                     caption { "Entries " (entries[0].seq) " to " (entries[entries.len() - 1].seq) }
                     thead { tr {
                         th.number.optional scope="col" { "Entry" }
-                        th scope="col" { "Time" } th scope="col" { "User" } th scope="col" { "Change" }
+                        th scope="col" { "Time" } th scope="col" { "User" }
+                        th scope="col" { "Change" }
                         th scope="col" { "Of" } th.optional scope="col" { "Hash" } } }
                     tbody { @for entry in &entries {
                         tr {

@@ -37,8 +37,9 @@ pub(super) async fn list(
             }
             @for deployment in &all {
                 article.card {
-                    h2 { a id=(format!("d-{}", deployment.id)) href=(deployment_path(&deployment.id)) {
-                        (shown(&deployment.id)) } " " (wish(deployment)) }
+                    @let id = &deployment.id;
+                    h2 { a id=(format!("d-{id}")) href=(deployment_path(id)) { (shown(id)) } " "
+                        (wish(deployment)) }
                     p.dim { "release " (deployment.release) ", to " (selector(deployment)) }
                     (progress(deployment))
                 }

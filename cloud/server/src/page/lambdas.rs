@@ -90,7 +90,7 @@ fn row(digest: &str, used: &(Vec<String>, Vec<String>), revision: Option<&Revisi
             th scope="row" {
                 @match revision {
                     Some(it) => {
-                        (shown(it.name.as_ref())) " " span.dim { (shown(&it.version.to_string())) }
+                        (shown(it.name.as_ref())) " " span.dim { (shown(it.version.as_ref())) }
                     },
                     None => span.bad { "cannot be read" },
                 }
@@ -130,7 +130,7 @@ pub(super) async fn revision(
     let total: u64 = revision.files.iter().map(|it| it.bytes).fold(0, u64::saturating_add);
     let body = html! {
         nav.crumbs aria-label="Path" { a href="/lambdas" { "Lambdas" } }
-        h1 { (name) " " span.dim { (shown(&revision.version.to_string())) } }
+        h1 { (name) " " span.dim { (shown(revision.version.as_ref())) } }
         section.card aria-label="Summary" {
             dl {
                 dt { "Revision" } dd { code { (shown(&digest)) } }
@@ -146,7 +146,7 @@ pub(super) async fn revision(
                     th.optional scope="col" { "SHA-256" } } }
                 tbody { @for file in revision.files.iter().take(FILES_MAX) {
                     tr {
-                        th scope="row" { code { (shown(&file.path.to_string())) } }
+                        th scope="row" { code { (shown(file.path.as_ref())) } }
                         td.number { (bytes(file.bytes as f64)) }
                         td.optional { code { (short(file.sha256.as_str())) } }
                     }

@@ -271,7 +271,8 @@ async fn hostile_vehicle(cloud: &Cloud) {
     let capacity =
         json!({ "resource": bad, "unit": bad, "asked": -1.0, "most": 0.0, "source": bad });
     let status = json!({ "vehicle": bad, "key": bad, "labels": { bad: bad },
-        "orchestrator": program, "trust": { "version": 1, "expires": u64::MAX, "is_expired": true }, "generation": 1,
+        "orchestrator": program, "generation": 1,
+        "trust": { "version": 1, "expires": u64::MAX, "is_expired": true },
         "deployments": [deployment], "capacity": [capacity], "supervisor": null });
     let text = |value: serde_json::Value| value.to_string();
     cloud.store.invite_vehicle("console", "car-1").await.unwrap();
