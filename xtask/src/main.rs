@@ -12,6 +12,7 @@ mod demo;
 mod docs;
 mod examples;
 mod fuzz;
+mod page;
 mod peers;
 mod player;
 mod setup;
@@ -36,6 +37,7 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   bench    run the benchmarks; further arguments are passed to gleaner-bench, with --fleet to
            gleaner-fleet-bench
   peers    build test programs on other DDS implementations; --install fetches their packages first
+  page     use the cloud's page in Chromium; --install fetches the browser's package first
   player   fetch the tools for gleaner-player, which plays drives with Cyclone DDS, and build it
   fuzz     fuzz parsers of untrusted input; [TARGET...] [--seconds N] [--seed N]
   aarch64  build for ARM vehicles, and compare the decisions of lambdas there, emulated
@@ -57,7 +59,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         Some((command, rest)) => (command.to_str().unwrap_or_default(), rest),
         None => ("", &[][..]),
     };
-    if !rest.is_empty() && !["bench", "deb", "fuzz", "peers"].contains(&command) {
+    if !rest.is_empty() && !["bench", "deb", "fuzz", "page", "peers"].contains(&command) {
         return Err(Failure::new(
             Exit::Usage,
             format!("`cargo xtask {command}` takes no arguments"),
@@ -76,6 +78,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         }
         "bench" => bench(&checkout, rest),
         "fuzz" => fuzz::run(&checkout, rest),
+        "page" => page::run_flows(&checkout, rest),
         "peers" => peers::build(&checkout, rest),
         "player" => player::run(&checkout),
         "deb" => deb::run(&checkout, rest),

@@ -42,13 +42,21 @@ impl<K: Hash + Eq> LimitOfEach<K> {
     }
 }
 
-/// Wrong secrets of each address: ten at once, then one in six seconds.
+/// Wrong secrets of each address, and passwords that were tried for each name: ten at once, then
+/// one in six seconds.
 #[derive(Debug)]
-pub(crate) struct WrongSecrets(LimitOfEach<IpAddr>);
+pub(crate) struct WrongSecrets {
+    addresses: LimitOfEach<IpAddr>,
+    passwords: LimitOfEach<(IpAddr, String)>,
+}
 
 impl Default for WrongSecrets {
     fn default() -> Self {
-        Self(LimitOfEach::new(1.0 / 6.0, 10.0))
+        let (per_s, burst) = (1.0 / 6.0, 10.0);
+        Self {
+            addresses: LimitOfEach::new(per_s, burst),
+            passwords: LimitOfEach::new(per_s, burst),
+        }
     }
 }
 
@@ -58,11 +66,24 @@ impl WrongSecrets {
     /// them.
     pub(crate) fn count(&self, address: IpAddr) -> CloudResult<()> {
         let help = "wait a minute, and use the newest code or token";
-        match self.0.take(address) {
+        match self.addresses.take(address) {
             true => Ok(()),
             false => Err(CloudError::busy(
                 "too many wrong codes and tokens came from your address",
                 help,
+            )),
+        }
+    }
+
+    /// Counts a password before it is checked: unlike codes and tokens, passwords can be guessed,
+    /// so that right ones are refused, too.
+    pub(crate) fn count_password(&self, address: IpAddr, name: &str) -> CloudResult<()> {
+        let name = gleaner_base::excerpt(name);
+        match self.passwords.take((address, name)) {
+            true => Ok(()),
+            false => Err(CloudError::busy(
+                "too many passwords were tried for this name from your address",
+                "wait a minute, or log in by a code that an administrator gives you",
             )),
         }
     }
@@ -125,9 +146,13 @@ mod tests {
         let (wrong, one, other) = (WrongSecrets::default(), [10, 0, 0, 1], [10, 0, 0, 2]);
         for _ in 0..10 {
             assert!(wrong.count(one.into()).is_ok());
+            assert!(wrong.count_password(one.into(), "ann").is_ok());
         }
         assert!(wrong.count(one.into()).is_err());
+        assert!(wrong.count_password(one.into(), "ann").is_err());
         assert!(wrong.count(other.into()).is_ok());
+        assert!(wrong.count_password(one.into(), "bea").is_ok());
+        assert!(wrong.count_password(other.into(), "ann").is_ok());
     }
 
     #[test]

@@ -45,6 +45,11 @@ impl CloudError {
         Self { status, failure: Failure::new(exit, message).with_help(help) }
     }
 
+    /// Returns its HTTP status.
+    pub(crate) fn status(&self) -> StatusCode {
+        self.status
+    }
+
     /// Adds the cause.
     pub(crate) fn because(mut self, cause: impl ToString) -> Self {
         self.failure.causes.push(cause.to_string());

@@ -2,8 +2,9 @@
 //!
 //! `store` is the database and `objects` the folder of files; together with the certificates of
 //! `authority` they are all that survives a restart. `accept` accepts connections for both
-//! listeners: `people` answers requests of people, and `vehicles` those of vehicles, each of which
-//! keeps one connection open. `hub` knows these connections, and wakes them after a change.
+//! listeners: `people` and `page` answer requests of people, and `vehicles` those of vehicles, each
+//! of which keeps one connection open. `hub` knows these connections, and wakes them after a
+//! change.
 //!
 //! Nothing here runs a lambda, or decides what a vehicle runs: each vehicle verifies signatures by
 //! its own trust root.
@@ -16,6 +17,7 @@ mod error;
 mod folder;
 mod hub;
 mod objects;
+mod page;
 mod people;
 mod program;
 mod readers;

@@ -34,7 +34,7 @@ enum CloudCommand {
         data: PathBuf,
         #[command(flatten)]
         store: StoreArgs,
-        /// Address of the API for people, without TLS
+        /// Address of the API and the page for people, without TLS
         #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
         people: SocketAddr,
         /// Address for vehicles, with TLS
@@ -125,6 +125,7 @@ async fn serve(options: ServeOptions) -> Result<(), Failure> {
     let server = CloudServer::start(&options).await?;
     let address = format!("http://{}", server.people);
     let mut text = format!("people:   {address}\nvehicles: {}\n", server.vehicles);
+    text += &format!("page:     {address}/login\n");
     if let Some(code) = &server.code {
         text += &format!("first:    gleaner login {address} --code {code}\n");
     }

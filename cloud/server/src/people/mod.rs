@@ -8,7 +8,7 @@
 mod deploy;
 mod records;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::sync::Arc;
 
@@ -16,7 +16,7 @@ use axum::Json;
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{DefaultBodyLimit, Extension, Path, Request, State};
-use axum::http::{HeaderMap, Method, StatusCode, header};
+use axum::http::{HeaderMap, Method, StatusCode, Uri, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, delete, get, post, put};
@@ -29,7 +29,9 @@ use gleaner_fleet::waves::WaveState;
 use crate::accept::PeerConnection;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
+use crate::page;
 use crate::request::{in_time, parsed};
+use crate::store::ENTRIES_MAX;
 
 /// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
 /// text in JSON.
@@ -97,7 +99,12 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
         router = router.route(path, timed);
     }
     router
-        .fallback(async || CloudError::missing("there is nothing under this path", "see the docs"))
+        .merge(page::router(cloud))
+        .fallback(async |uri: Uri| match uri.path().starts_with("/v1/") {
+            true => CloudError::missing("there is nothing under this path", "see the docs")
+                .into_response(),
+            false => page::nothing_here(),
+        })
         .layer(DefaultBodyLimit::max(BODY_MAX))
         .with_state(Arc::clone(cloud))
 }
@@ -194,14 +201,19 @@ async fn invite_vehicle(
     body: Bytes,
 ) -> CloudResult<Json<Enrolment>> {
     let NewVehicle { name } = parsed(&body, "enrolment of a vehicle")?;
-    let token = cloud.store.invite_vehicle(&actor.name, &name).await?;
-    Ok(Json(Enrolment {
+    enrolment(&cloud, &actor.name, &name).await.map(Json)
+}
+
+/// Invites a vehicle; returns the content of its file.
+pub(crate) async fn enrolment(cloud: &Cloud, actor: &str, name: &str) -> CloudResult<Enrolment> {
+    let token = cloud.store.invite_vehicle(actor, name).await?;
+    Ok(Enrolment {
         gleaner_enrolment: 1,
         address: cloud.address.clone(),
-        vehicle: name,
+        vehicle: name.to_owned(),
         authority: cloud.authorities.server_pem().to_owned(),
         token,
-    }))
+    })
 }
 
 async fn revoke(
@@ -259,5 +271,5 @@ async fn remove_deployment(
 }
 
 async fn audit(State(cloud): State<Arc<Cloud>>) -> CloudResult<Response> {
-    Ok(Json(cloud.store.audit().await?).into_response())
+    Ok(Json(cloud.store.audit(u64::MAX, ENTRIES_MAX).await?).into_response())
 }

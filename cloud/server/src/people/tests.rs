@@ -13,9 +13,9 @@ use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::store::{CloudStore, Retention};
 
-const ROLES: [Role; 4] = [Role::Viewer, Role::Operator, Role::Deployer, Role::Admin];
+pub(crate) const ROLES: [Role; 4] = [Role::Viewer, Role::Operator, Role::Deployer, Role::Admin];
 
-async fn cloud(folder: &TempDir) -> Arc<Cloud> {
+pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
     let data = DataFolder::create(&folder.path().join("data")).unwrap();
     Arc::new(Cloud {
         store: CloudStore::of_test(folder).await,

@@ -7,7 +7,7 @@ use super::{CloudStore, StoreChange, int, now_ms, unsigned};
 use crate::error::CloudResult;
 
 /// Maximum number of entries in an answer.
-const ENTRIES_MAX: i64 = 1000;
+pub(crate) const ENTRIES_MAX: i64 = 1000;
 
 type Row = (i64, i64, String, String, String, String);
 
@@ -33,12 +33,12 @@ impl StoreChange<'_> {
 }
 
 impl CloudStore {
-    /// Returns the newest entries, the newest first.
-    pub(crate) async fn audit(&self) -> CloudResult<Vec<AuditEntry>> {
+    /// Returns the newest entries before the one of this number, the newest first: at most `most`.
+    pub(crate) async fn audit(&self, before: u64, most: i64) -> CloudResult<Vec<AuditEntry>> {
         let rows: Vec<Row> = rows!(&self.pool;
             "SELECT seq, time_ms, actor, action, subject, hash FROM audit
-             ORDER BY seq DESC LIMIT $1";
-            ENTRIES_MAX);
+             WHERE seq < $1 ORDER BY seq DESC LIMIT $2";
+            int(before), most.min(ENTRIES_MAX));
         let entry = |(seq, time_ms, actor, action, subject, hash)| AuditEntry {
             seq: unsigned(seq),
             time_ms,
@@ -74,6 +74,13 @@ impl CloudStore {
     #[cfg(test)]
     pub(crate) async fn execute(&self, sql: &'static str) {
         sqlx::raw_sql(sql).execute(&self.pool).await.unwrap();
+    }
+
+    #[cfg(test)]
+    pub(crate) async fn execute_with(&self, sql: &'static str, values: &[&str]) {
+        let bind =
+            |query: sqlx::query::Query<'static, _, _>, value: &&str| query.bind(value.to_string());
+        values.iter().fold(sqlx::query(sql), bind).execute(&self.pool).await.unwrap();
     }
 }
 

@@ -35,6 +35,7 @@ macro_rules! rows {
 mod address;
 mod audit;
 mod deployments;
+mod page;
 mod records;
 mod secrets;
 #[cfg(test)]
@@ -56,15 +57,19 @@ use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
 
 pub(crate) use address::StoreAddress;
+pub(crate) use audit::ENTRIES_MAX;
 pub(crate) use deployments::OfferedDeployment;
+pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::{Issued, VehicleReport};
+pub(crate) use wants::ChangedVehicles;
 
 /// The migrations, oldest first: the version of a database is the number of those that it has.
 const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0001_start.sql"),
     include_str!("../../migrations/0002_releases.sql"),
+    include_str!("../../migrations/0004_page.sql"),
 ];
 
 /// The database.

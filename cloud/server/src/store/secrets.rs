@@ -13,6 +13,8 @@ pub(super) enum SecretKind {
     Code,
     /// Token of a user.
     Token,
+    /// Session of a user of the page.
+    Session,
     /// One-time token of a vehicle.
     Enrolment,
 }
@@ -22,6 +24,7 @@ impl SecretKind {
         match self {
             SecretKind::Code => "code",
             SecretKind::Token => "token",
+            SecretKind::Session => "session",
             SecretKind::Enrolment => "enrolment",
         }
     }
@@ -31,6 +34,7 @@ impl SecretKind {
         match self {
             SecretKind::Code => "glc_",
             SecretKind::Token => "gln_",
+            SecretKind::Session => "gls_",
             SecretKind::Enrolment => "gle_",
         }
     }
@@ -38,6 +42,7 @@ impl SecretKind {
     fn lifetime_s(self) -> i64 {
         match self {
             SecretKind::Code | SecretKind::Enrolment => DAY_S,
+            SecretKind::Session => DAY_S / 2,
             SecretKind::Token => 90 * DAY_S,
         }
     }
@@ -76,6 +81,19 @@ impl StoreChange<'_> {
         Ok(subject.map(|(subject,)| subject))
     }
 
+    /// Removes the secrets of `subject` but `kept`.
+    pub(super) async fn drop_other_secrets(
+        &mut self,
+        kind: SecretKind,
+        subject: &str,
+        kept: &str,
+    ) -> CloudResult<()> {
+        run!(&mut *self.tx;
+            "DELETE FROM secrets WHERE kind = $1 AND subject = $2 AND hash <> $3";
+            kind.as_str(), subject, hash(kept));
+        Ok(())
+    }
+
     /// Removes the secrets of `subject`.
     pub(super) async fn drop_secrets(
         &mut self,
@@ -90,12 +108,16 @@ impl StoreChange<'_> {
 }
 
 impl CloudStore {
-    /// Returns the name and the role of the user with this token.
-    pub(super) async fn user_row(&self, token: &str) -> CloudResult<Option<(String, String)>> {
+    /// Returns the name and the role of the user with this secret.
+    pub(super) async fn user_row(
+        &self,
+        kind: SecretKind,
+        secret: &str,
+    ) -> CloudResult<Option<(String, String)>> {
         Ok(row!(&self.pool;
             "SELECT users.name, users.role FROM secrets JOIN users ON users.name = secrets.subject
-             WHERE secrets.hash = $1 AND secrets.kind = 'token' AND secrets.expires > $2";
-            hash(token), now()))
+             WHERE secrets.hash = $1 AND secrets.kind = $2 AND secrets.expires > $3";
+            hash(secret), kind.as_str(), now()))
     }
 }
 

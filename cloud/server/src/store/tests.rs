@@ -335,7 +335,7 @@ async fn a_changed_entry_of_the_audit_trail_is_detected() {
         store.invite_vehicle("ann", name).await.unwrap();
     }
     assert_eq!(store.first_changed_entry().await.unwrap(), None);
-    assert_eq!(store.audit().await.unwrap()[0].subject, "car-3");
+    assert_eq!(store.audit(u64::MAX, ENTRIES_MAX).await.unwrap()[0].subject, "car-3");
     store.execute("UPDATE audit SET actor = 'bob' WHERE seq = 2").await;
     assert_eq!(store.first_changed_entry().await.unwrap(), Some(2));
     store.execute("UPDATE audit SET actor = 'ann' WHERE seq = 2").await;

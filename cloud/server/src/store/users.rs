@@ -35,13 +35,14 @@ impl CloudStore {
         Ok(Invitation { user: User { name, role }, code, expires: unsigned(expires) })
     }
 
-    /// Invites an administrator, unless one has a valid token.
+    /// Invites an administrator, unless one has a valid token or a password.
     pub(crate) async fn invite_first(&self) -> CloudResult<Option<Invitation>> {
-        let (tokens,): (i64,) = one!(&self.pool;
-            "SELECT COUNT(*) FROM secrets JOIN users ON users.name = secrets.subject
-             WHERE secrets.kind = 'token' AND users.role = 'admin' AND secrets.expires > $1";
+        let (able,): (i64,) = one!(&self.pool;
+            "SELECT COUNT(*) FROM users WHERE role = 'admin' AND (password <> '' OR EXISTS
+             (SELECT 1 FROM secrets WHERE secrets.subject = users.name
+              AND secrets.kind = 'token' AND secrets.expires > $1))";
             now());
-        match tokens {
+        match able {
             0 => {
                 let admin = NewUser { name: ADMIN.to_owned(), role: Role::Admin };
                 self.invite(CONSOLE, admin).await.map(Some)
@@ -64,7 +65,69 @@ impl CloudStore {
 
     /// Returns the user with this token.
     pub(crate) async fn user(&self, token: &str) -> CloudResult<Option<User>> {
-        self.user_row(token).await?.map(user).transpose()
+        self.user_row(SecretKind::Token, token).await?.map(user).transpose()
+    }
+
+    /// Exchanges a code for a session of the page; returns the session and the user's name. `None`
+    /// if the code is wrong, used or too old.
+    pub(crate) async fn open_session(&self, code: &str) -> CloudResult<Option<(String, String)>> {
+        let mut change = self.change().await?;
+        let Some(name) = change.take_secret(SecretKind::Code, code).await? else { return Ok(None) };
+        let (session, _) = change.add_secret(SecretKind::Session, &name).await?;
+        change.note(&name, "login", &name).await?;
+        change.commit().await?;
+        Ok(Some((session, name)))
+    }
+
+    /// Opens a session for a user whose password was right, unless it has changed meanwhile.
+    pub(crate) async fn open_session_of(
+        &self,
+        name: &str,
+        password: &str,
+    ) -> CloudResult<Option<String>> {
+        let mut change = self.change().await?;
+        let stored: Option<(String,)> =
+            row!(&mut *change.tx; "SELECT password FROM users WHERE name = $1"; name);
+        if stored.is_none_or(|(stored,)| stored != password) {
+            return Ok(None);
+        }
+        let (session, _) = change.add_secret(SecretKind::Session, name).await?;
+        change.note(name, "login by password", name).await?;
+        change.commit().await?;
+        Ok(Some(session))
+    }
+
+    /// Returns the user with this session.
+    pub(crate) async fn session(&self, session: &str) -> CloudResult<Option<User>> {
+        self.user_row(SecretKind::Session, session).await?.map(user).transpose()
+    }
+
+    /// Ends a session, if it exists.
+    pub(crate) async fn close_session(&self, session: &str) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        change.take_secret(SecretKind::Session, session).await?;
+        change.commit().await
+    }
+
+    /// Returns the hash of a user's password; `None` without one.
+    pub(crate) async fn password(&self, name: &str) -> CloudResult<Option<String>> {
+        let row: Option<(String,)> =
+            row!(&self.pool; "SELECT password FROM users WHERE name = $1"; name);
+        Ok(row.map(|(password,)| password).filter(|it| !it.is_empty()))
+    }
+
+    /// Sets the hash of a user's password, and ends the user's other sessions than `session`.
+    pub(crate) async fn set_password(
+        &self,
+        name: &str,
+        password: &str,
+        session: &str,
+    ) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        run!(&mut *change.tx; "UPDATE users SET password = $2 WHERE name = $1"; name, password);
+        change.drop_other_secrets(SecretKind::Session, name, session).await?;
+        change.note(name, "set password", name).await?;
+        change.commit().await
     }
 
     /// Returns all users.
@@ -73,7 +136,7 @@ impl CloudStore {
         rows.into_iter().map(user).collect()
     }
 
-    /// Removes a user, and the tokens of the user.
+    /// Removes a user, and the tokens and sessions of the user.
     pub(crate) async fn remove_user(&self, actor: &str, name: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
         let removed = run!(&mut *change.tx; "DELETE FROM users WHERE name = $1"; name);
@@ -81,7 +144,7 @@ impl CloudStore {
             let message = format!("there is no user `{}`", excerpt(name));
             return Err(CloudError::missing(message, "list the users, and use one of their names"));
         }
-        for kind in [SecretKind::Code, SecretKind::Token] {
+        for kind in [SecretKind::Code, SecretKind::Token, SecretKind::Session] {
             change.drop_secrets(kind, name).await?;
         }
         change.note(actor, "remove user", name).await?;

@@ -123,8 +123,9 @@ impl<'c> VehicleLink<'c> {
         tokio::pin!(silence);
         pings.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
-            // An order may be older than this loop.
-            let end = orders.borrow_and_update().end.clone();
+            // An order may be older than this loop. It is not marked as seen: a change that came
+            // during the last frame is still to be sent.
+            let end = orders.borrow().end.clone();
             if end.is_some() {
                 return Ok(end);
             }

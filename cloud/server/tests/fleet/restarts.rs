@@ -123,7 +123,8 @@ impl CloudProgram {
         };
         let people = value("people:").strip_prefix("http://").unwrap().parse().unwrap();
         let vehicles = value("vehicles:").parse().unwrap();
-        // The third line is there only without an administrator.
+        value("page:");
+        // The fourth line is there only without an administrator.
         let is_first = !folder.join("started").exists();
         std::fs::write(folder.join("started"), "").unwrap();
         let code = is_first.then(|| value("first:").rsplit(' ').next().unwrap().to_owned());

@@ -112,7 +112,7 @@ async fn a_wave_opens_once_the_one_before_has_succeeded() {
     let (releases,): (i64,) =
         sqlx::query_as("SELECT COUNT(*) FROM releases").fetch_one(&fleet.store.pool).await.unwrap();
     assert_eq!(releases, 1);
-    let steps: Vec<_> = fleet.store.audit().await.unwrap();
+    let steps: Vec<_> = fleet.store.audit(u64::MAX, 100).await.unwrap();
     let steps: Vec<_> = steps.iter().filter(|it| it.actor == WAVES).map(|it| &*it.action).collect();
     assert_eq!(steps, ["open release 2 to all", "open wave 2 of release 2"]);
 }

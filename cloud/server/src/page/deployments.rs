@@ -1,0 +1,239 @@
+//! Deployments of the fleet, their progress, and their changes. None of them needs a key: what runs
+//! was signed elsewhere.
+
+use std::sync::Arc;
+
+use axum::extract::{Extension, Path, Query, State};
+use axum::response::{IntoResponse, Redirect};
+use gleaner_fleet::people::{FleetDeployment, Role};
+use maud::{Markup, html};
+
+use super::charts;
+use super::layout::{self, PageResult, confirmed, done, empty, form};
+use super::login::Done;
+use super::session::PageUser;
+use super::text::{count, deployment_path, label, segment, short, shown, vehicle_path};
+use crate::cloud::Cloud;
+use crate::error::CloudResult;
+use crate::store::ChangedVehicles;
+
+/// Maximum number of vehicles that are listed with a deployment.
+const VEHICLES_MAX: i64 = 100;
+
+pub(super) async fn list(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Query(query): Query<Done>,
+) -> PageResult {
+    let all = cloud.store.deployments().await?;
+    let body = html! {
+        h1 { "Deployments" }
+        (done(query.done.as_deref()))
+        div id="deployments" hx-get="/deployments" hx-trigger="every 10s" hx-select="#deployments"
+            hx-swap="outerHTML" {
+            @if all.is_empty() {
+                (empty("There are none yet. A deployer signs one and sends it with \
+                        `gleaner deploy --fleet`: keys never come to this page."))
+            }
+            @for deployment in &all {
+                article.card {
+                    @let id = &deployment.id;
+                    h2 { a id=(format!("d-{id}")) href=(deployment_path(id)) { (shown(id)) } " "
+                        (wish(deployment)) }
+                    p.dim { "release " (deployment.release) ", to " (selector(deployment)) }
+                    (progress(deployment))
+                }
+            }
+        }
+    };
+    Ok(layout::page("Deployments", "/deployments", Some(&user), body))
+}
+
+pub(super) async fn page(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(id): Path<String>,
+    Query(query): Query<Done>,
+) -> PageResult {
+    let deployment = cloud.store.deployment(&id).await?;
+    let reports = cloud.store.reports(&id, deployment.release, VEHICLES_MAX).await?;
+    let here = deployment_path(&id);
+    let body = html! {
+        nav.crumbs aria-label="Path" { a href="/deployments" { "Deployments" } }
+        h1 { (shown(&deployment.id)) }
+        (done(query.done.as_deref()))
+        div id="progress" hx-get=(here) hx-trigger="every 5s" hx-select="#progress"
+            hx-swap="outerHTML" {
+            section.card aria-label="Progress" {
+                p { (wish(&deployment)) }
+                (progress(&deployment))
+            }
+            (vehicles(&reports))
+        }
+        (content(&deployment))
+        (changes(&user, &here, &deployment))
+    };
+    Ok(layout::page(&deployment.id, "/deployments", Some(&user), body))
+}
+
+fn wish(deployment: &FleetDeployment) -> Markup {
+    match deployment.is_wanted {
+        true => html! { span.state.running { "wanted" } },
+        false => html! { span.state.other { "stopped" } },
+    }
+}
+
+/// Renders how many of its vehicles run it.
+fn progress(deployment: &FleetDeployment) -> Markup {
+    let FleetDeployment { vehicles, running, failed, .. } = *deployment;
+    let others = vehicles.saturating_sub(running).saturating_sub(failed);
+    let rest = if deployment.is_wanted { "to come" } else { "not running" };
+    html! {
+        @if vehicles == 0 { (empty("No vehicle has all labels of its selector.")) }
+        @else {
+            (charts::parts("Vehicles", &[
+                ("running", "running", running),
+                ("failed", "failed or refused", failed),
+                ("other", rest, others),
+            ]))
+        }
+    }
+}
+
+fn selector(deployment: &FleetDeployment) -> Markup {
+    html! {
+        @if deployment.selector.is_empty() { "all vehicles" }
+        @for pair in &deployment.selector { (label(pair)) }
+    }
+}
+
+fn vehicles(reports: &[(String, String)]) -> Markup {
+    html! {
+        @if !reports.is_empty() {
+            section aria-labelledby="vehicles" {
+                h2 id="vehicles" { "Vehicles that have it" }
+                ul.columns { @for (vehicle, state) in reports {
+                    li {
+                        @let (class, text) = match &**state {
+                            "running" => ("running", "running"),
+                            "failed" => ("failed", "failed or refused"),
+                            _ => ("other", "not running"),
+                        };
+                        a id=(format!("v-{vehicle}")) href=(vehicle_path(vehicle)) {
+                            (shown(vehicle)) } " "
+                        span.state.(class) { (text) }
+                    }
+                } }
+                @if reports.len() as i64 >= VEHICLES_MAX {
+                    p.dim { "The first " (VEHICLES_MAX) ", those with a failure before others." }
+                }
+            }
+        }
+    }
+}
+
+fn content(deployment: &FleetDeployment) -> Markup {
+    let revision = |digest: &str| {
+        html! {
+            a href=(format!("/lambdas/{}", segment(digest))) { code { (short(digest)) } }
+        }
+    };
+    let grants = &deployment.grants;
+    html! {
+        section.card aria-labelledby="content-title" {
+            h2 id="content-title" { "As it was signed" }
+            dl {
+                dt { "Release" } dd { (deployment.release) }
+                dt { "Revision" } dd { (revision(&deployment.revision)) }
+                dt { "Fallback" } dd {
+                    @match &deployment.fallback {
+                        Some(digest) => (revision(digest)),
+                        None => span.dim { "none" },
+                    }
+                }
+                dt { "Vehicles with" } dd { (selector(deployment)) }
+                dt { "Topics" } dd { (names(&grants.topics)) }
+                dt { "Models" } dd { (names(&grants.models)) }
+                dt { "Clips" } dd { @if grants.record { "may be recorded" } @else { "none" } }
+            }
+        }
+    }
+}
+
+fn names(all: &[String]) -> Markup {
+    html! {
+        @if all.is_empty() { span.dim { "none" } }
+        @for (index, name) in all.iter().take(100).enumerate() {
+            @if index > 0 { ", " }
+            code { (shown(name)) }
+        }
+        @if all.len() > 100 { " and " (count(all.len() as u64 - 100, "other")) }
+    }
+}
+
+fn changes(user: &PageUser, here: &str, deployment: &FleetDeployment) -> Markup {
+    let role = user.user.role;
+    html! {
+        @if role >= Role::Operator {
+            section.card.changes aria-labelledby="changes" {
+                h2 id="changes" { "Change" }
+                @if deployment.is_wanted {
+                    (form(user, &format!("{here}/stop"), html! { button { "Stop" } }))
+                } @else {
+                    (form(user, &format!("{here}/start"), html! { button { "Start" } }))
+                }
+                @if deployment.fallback.is_some() {
+                    (confirmed(user, &format!("{here}/rollback"), "Roll back",
+                        "Each vehicle will run the fallback until the next release.", html! {}))
+                }
+                @if role >= Role::Deployer {
+                    (confirmed(user, &format!("{here}/remove"), "Remove",
+                        "Each vehicle will end it. To run it again, it has to be deployed again.",
+                        html! {}))
+                }
+            }
+        }
+    }
+}
+
+pub(super) async fn start(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(id): Path<String>,
+) -> PageResult {
+    let changed = cloud.store.set_wanted(&user.user.name, &id, true).await;
+    changed_to(&cloud, changed, &format!("{}?done=start", deployment_path(&id)))
+}
+
+pub(super) async fn stop(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(id): Path<String>,
+) -> PageResult {
+    let changed = cloud.store.set_wanted(&user.user.name, &id, false).await;
+    changed_to(&cloud, changed, &format!("{}?done=stop", deployment_path(&id)))
+}
+
+pub(super) async fn roll_back(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(id): Path<String>,
+) -> PageResult {
+    let changed = cloud.store.roll_back(&user.user.name, &id).await;
+    changed_to(&cloud, changed, &format!("{}?done=rollback", deployment_path(&id)))
+}
+
+pub(super) async fn remove(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(id): Path<String>,
+) -> PageResult {
+    let changed = cloud.store.remove_deployment(&user.user.name, &id).await;
+    changed_to(&cloud, changed, "/deployments?done=deployment")
+}
+
+/// Wakes the vehicles whose wanted state has changed, and shows a page.
+fn changed_to(cloud: &Cloud, changed: CloudResult<ChangedVehicles>, to: &str) -> PageResult {
+    cloud.hub.wake(&changed?);
+    Ok(Redirect::to(to).into_response())
+}

@@ -1,0 +1,178 @@
+//! The frame of every page: head, navigation, forms and errors.
+
+use axum::http::{StatusCode, header};
+use axum::response::{Html, IntoResponse, Response};
+use gleaner_base::Failure;
+use gleaner_fleet::people::Role;
+use maud::{DOCTYPE, Markup, html};
+
+use super::assets;
+use super::guard::secured;
+use super::session::PageUser;
+use super::text::shown;
+use crate::error::CloudError;
+
+/// Settings of htmx: it evaluates no text as a script, and adds no style.
+const HTMX: &str = r#"{"includeIndicatorStyles":false,"allowEval":false,"allowScriptTags":false,
+"historyCacheSize":0,"selfRequestsOnly":true}"#;
+
+/// The places of the navigation: name, path, and the least role.
+const PLACES: [(&str, &str, Role); 5] = [
+    ("Fleet", "/vehicles", Role::Viewer),
+    ("Deployments", "/deployments", Role::Viewer),
+    ("Lambdas", "/lambdas", Role::Viewer),
+    ("Access", "/access", Role::Admin),
+    ("Audit", "/audit", Role::Admin),
+];
+
+/// The result of a page.
+pub(super) type PageResult = Result<Response, PageError>;
+
+/// An error that is answered as a page.
+#[derive(Debug)]
+pub(super) struct PageError(pub(super) CloudError);
+
+impl<E: Into<CloudError>> From<E> for PageError {
+    fn from(error: E) -> Self {
+        Self(error.into())
+    }
+}
+
+impl IntoResponse for PageError {
+    fn into_response(self) -> Response {
+        let status = self.0.status();
+        if status.is_server_error() {
+            tracing::error!("{}", self.0.reason());
+        }
+        let body = html! {
+            h1 { "This did not work" }
+            (failure(self.0))
+            p { a href="/vehicles" { "Go to the fleet" } }
+        };
+        (status, page("Error", "", None, body)).into_response()
+    }
+}
+
+/// Answers a path that does not exist.
+pub(crate) fn nothing_here() -> Response {
+    let error = CloudError::missing("there is no page at this address", "use the links of a page");
+    secured(PageError(error).into_response())
+}
+
+/// Renders an error: the failed action, its causes, and a way out.
+pub(super) fn failure(error: CloudError) -> Markup {
+    let Failure { message, causes, help, .. } = error.into();
+    html! {
+        div.banner.bad role="alert" {
+            p { b { "Error: " } (shown(&message)) }
+            @for cause in causes { p { "Cause: " (shown(&cause)) } }
+            @if let Some(help) = help { p { "Help: " (shown(&help)) } }
+        }
+    }
+}
+
+/// Renders a page. `place` is the path of its place in the navigation.
+pub(super) fn page(title: &str, place: &str, user: Option<&PageUser>, body: Markup) -> Response {
+    let markup = html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
+                meta name="color-scheme" content="light dark";
+                meta name="htmx-config" content=(HTMX);
+                title { (shown(title)) " – Gleaner" }
+                link rel="icon" type="image/svg+xml" href=(assets::address("icon.svg"));
+                link rel="stylesheet" href=(assets::address("page.css"));
+                @for script in ["htmx.min.js", "htmx-sse.js", "page.js"] {
+                    script src=(assets::address(script)) defer {}
+                }
+            }
+            body {
+                a.skip href="#content" { "Skip to the content" }
+                header.top {
+                    a.logo href="/vehicles" { "Gleaner" }
+                    @if let Some(user) = user { (navigation(place, user)) }
+                }
+                main id="content" tabindex="-1" { (body) }
+            }
+        }
+    };
+    ([(header::CACHE_CONTROL, "no-store")], Html(markup.into_string())).into_response()
+}
+
+fn navigation(place: &str, user: &PageUser) -> Markup {
+    let current = |path: &str| (path == place).then_some("page");
+    html! {
+        nav aria-label="Pages" {
+            @for (name, path, role) in PLACES {
+                @if user.user.role >= role {
+                    a href=(path) aria-current=[current(path)] { (name) }
+                }
+            }
+        }
+        div.account {
+            a href="/account" aria-current=[current("/account")] {
+                (user.user.name) " " span.dim { "(" (user.user.role) ")" }
+            }
+            (form(user, "/logout", html! { button.plain { "Log out" } }))
+        }
+    }
+}
+
+/// Renders a form that a page of this session sends.
+pub(super) fn form(user: &PageUser, action: &str, content: Markup) -> Markup {
+    html! {
+        form method="post" action=(action) {
+            input type="hidden" name="token" value=(user.form_token());
+            (content)
+        }
+    }
+}
+
+/// Renders a form for a change that cannot be undone: its button appears after a first click.
+pub(super) fn confirmed(
+    user: &PageUser,
+    action: &str,
+    label: &str,
+    warning: &str,
+    content: Markup,
+) -> Markup {
+    html! {
+        details.confirm {
+            summary { (label) "…" }
+            div.card {
+                p { (warning) }
+                (form(user, action, html! { (content) button.bad { (label) } }))
+            }
+        }
+    }
+}
+
+/// Renders the confirmation of a change, which the address names after it was made.
+pub(super) fn done(change: Option<&str>) -> Markup {
+    let text = match change {
+        Some("start") => "It is wanted again: each vehicle starts it as soon as it is connected.",
+        Some("stop") => {
+            "It is not wanted any more: each vehicle stops it as soon as it is connected."
+        }
+        Some("rollback") => "Each vehicle runs the fallback as soon as it is connected.",
+        Some("deployment") => "The deployment is removed.",
+        Some("user") => "The user is removed, and the user's sessions and tokens have ended.",
+        Some("vehicle") => "The vehicle is cut off.",
+        Some("password") => "The password is set. Other sessions of yours have ended.",
+        Some("first") => "You are logged in. Set a password to log in without a code next time.",
+        _ => return html! {},
+    };
+    html! { p.banner.good role="status" { (text) } }
+}
+
+/// Renders a notice in the place of an empty list.
+pub(super) fn empty(text: &str) -> Markup {
+    html! { p.empty { (text) } }
+}
+
+/// Returns a page with a status other than 200.
+pub(super) fn with_status(status: StatusCode, page: Response) -> Response {
+    (status, page).into_response()
+}

@@ -1,0 +1,198 @@
+//! Login by code or by password, logout, and the account of a user.
+
+use std::sync::Arc;
+
+use axum::extract::{Extension, Query, State};
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Redirect, Response};
+use maud::{Markup, html};
+use serde::Deserialize;
+
+use super::guard::FormFields;
+use super::layout::{self, PageResult, done, failure, form, with_status};
+use super::password;
+use super::session::{PageUser, session_of, set_cookie};
+use crate::accept::PeerConnection;
+use crate::cloud::Cloud;
+use crate::error::{CloudError, CloudResult};
+
+/// The change that was made before a page is shown.
+#[derive(Debug, Deserialize)]
+pub(super) struct Done {
+    pub(super) done: Option<String>,
+}
+
+pub(super) async fn page(State(cloud): State<Arc<Cloud>>, headers: HeaderMap) -> PageResult {
+    match PageUser::of(&cloud, &headers).await? {
+        Some(_) => Ok(Redirect::to("/vehicles").into_response()),
+        None => Ok(login_page(html! {})),
+    }
+}
+
+fn login_page(message: Markup) -> Response {
+    let body = html! {
+        h1 { "Log in" }
+        (message)
+        div.pair {
+            section.card aria-labelledby="by-password" {
+                h2 id="by-password" { "By password" }
+                form method="post" action="/login/password" {
+                    label for="name" { "Name" }
+                    input id="name" name="name" autocomplete="username" required maxlength="64";
+                    label for="password" { "Password" }
+                    input id="password" name="password" type="password" required maxlength="256"
+                        autocomplete="current-password";
+                    button { "Log in" }
+                }
+            }
+            section.card aria-labelledby="by-code" {
+                h2 id="by-code" { "By code" }
+                form method="post" action="/login/code" {
+                    label for="code" { "One-time code" }
+                    input id="code" name="code" autocomplete="one-time-code" required
+                        maxlength="100" spellcheck="false" autocapitalize="off"
+                        aria-describedby="code-help";
+                    p.help id="code-help" {
+                        "The cloud prints one when it starts for the first time. Later an \
+                         administrator gives you one. It works once."
+                    }
+                    button { "Log in" }
+                }
+            }
+        }
+    };
+    layout::page("Log in", "", None, body)
+}
+
+pub(super) async fn by_code(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(peer): Extension<Arc<PeerConnection>>,
+    Extension(fields): Extension<FormFields>,
+    headers: HeaderMap,
+) -> PageResult {
+    match cloud.store.open_session(fields.get("code").trim()).await? {
+        Some((session, name)) => {
+            let has_password = cloud.store.password(&name).await?.is_some();
+            let to = if has_password { "/vehicles" } else { "/account?done=first" };
+            enter(&cloud, &headers, &session, to).await
+        }
+        None => {
+            let help = "a code works once, for 24 hours: let an administrator invite you again";
+            Ok(refused(&cloud, &peer, CloudError::unknown("the code is not valid", help)))
+        }
+    }
+}
+
+pub(super) async fn by_password(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(peer): Extension<Arc<PeerConnection>>,
+    Extension(fields): Extension<FormFields>,
+    headers: HeaderMap,
+) -> PageResult {
+    match session_by_password(&cloud, &peer, &fields).await {
+        Ok(Some(session)) => enter(&cloud, &headers, &session, "/vehicles").await,
+        Ok(None) => {
+            let message = "the name or the password is wrong";
+            let help = "without a password, log in by a code that an administrator gives you";
+            Ok(refused(&cloud, &peer, CloudError::unknown(message, help)))
+        }
+        Err(error) => Ok(answer(error)),
+    }
+}
+
+async fn session_by_password(
+    cloud: &Cloud,
+    peer: &PeerConnection,
+    fields: &FormFields,
+) -> CloudResult<Option<String>> {
+    let (name, password) = (fields.get("name").trim(), fields.get("password"));
+    cloud.wrong_secrets.count_password(peer.address, name)?;
+    let hash = cloud.store.password(name).await?;
+    let is_right = password::is_right(password.to_owned(), hash.as_deref()).await?;
+    match hash.filter(|_| is_right) {
+        Some(hash) => cloud.store.open_session_of(name, &hash).await,
+        None => Ok(None),
+    }
+}
+
+fn refused(cloud: &Cloud, peer: &PeerConnection, error: CloudError) -> Response {
+    answer(cloud.wrong_secrets.count(peer.address).err().unwrap_or(error))
+}
+
+fn answer(error: CloudError) -> Response {
+    with_status(error.status(), login_page(failure(error)))
+}
+
+/// Answers with a new session. The browser's former one ends: it never becomes that of a user.
+async fn enter(cloud: &Cloud, headers: &HeaderMap, session: &str, to: &str) -> PageResult {
+    if let Some(former) = session_of(headers) {
+        cloud.store.close_session(&former).await?;
+    }
+    let cookie = set_cookie(headers, Some(session));
+    Ok(([(header::SET_COOKIE, cookie)], Redirect::to(to)).into_response())
+}
+
+pub(super) async fn logout(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    headers: HeaderMap,
+) -> PageResult {
+    cloud.store.close_session(user.session()).await?;
+    let cookie = set_cookie(&headers, None);
+    Ok(([(header::SET_COOKIE, cookie)], Redirect::to("/login")).into_response())
+}
+
+pub(super) async fn account(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Query(query): Query<Done>,
+) -> PageResult {
+    account_page(&cloud, &user, done(query.done.as_deref())).await
+}
+
+async fn account_page(cloud: &Cloud, user: &PageUser, message: Markup) -> PageResult {
+    let has_password = cloud.store.password(&user.user.name).await?.is_some();
+    let title = if has_password { "Change your password" } else { "Set a password" };
+    let body = html! {
+        h1 { "Account of " (user.user.name) }
+        (message)
+        section.card.narrow aria-labelledby="password-title" {
+            h2 id="password-title" { (title) }
+            (form(user, "/account/password", html! {
+                // Password managers store it under this name.
+                input type="hidden" name="name" value=(user.user.name) autocomplete="username";
+                label for="password" { "New password" }
+                input id="password" name="password" type="password" required minlength="12"
+                    maxlength="256" autocomplete="new-password" aria-describedby="password-help";
+                p.help id="password-help" { "12 characters or more, such as four random words." }
+                label for="again" { "New password again" }
+                input id="again" name="again" type="password" required minlength="12"
+                    maxlength="256" autocomplete="new-password";
+                button { (title) }
+            }))
+        }
+    };
+    Ok(layout::page("Account", "/account", Some(user), body))
+}
+
+pub(super) async fn set_password(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Extension(fields): Extension<FormFields>,
+) -> PageResult {
+    let new = fields.get("password");
+    let hash = match new == fields.get("again") {
+        true => password::hashed(new.to_owned()).await,
+        false => Err(CloudError::usage("the two passwords differ", "type the same one twice")),
+    };
+    match hash {
+        Ok(hash) => {
+            cloud.store.set_password(&user.user.name, &hash, user.session()).await?;
+            Ok(Redirect::to("/account?done=password").into_response())
+        }
+        Err(error) => {
+            let page = account_page(&cloud, &user, failure(error)).await?;
+            Ok(with_status(StatusCode::BAD_REQUEST, page))
+        }
+    }
+}

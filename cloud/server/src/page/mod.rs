@@ -1,0 +1,107 @@
+//! The page for people: HTML that needs no script, at the address of the API.
+//!
+//! `routes` lists every page and every form with its role; `guard` lets requests pass by it. A form
+//! has to come from a page of the same session. `htmx` refreshes parts and follows streams where a
+//! browser runs scripts; all else works without.
+//!
+//! Names, labels, problems and log lines come from vehicles and lambdas: they are escaped as HTML
+//! by the templates, and lose their control characters and their excess of length in `text`. The
+//! page signs nothing: it has no key, and offers only what needs none.
+
+mod access;
+mod assets;
+mod audit;
+mod charts;
+mod deployments;
+mod fleet;
+mod guard;
+mod lambdas;
+mod layout;
+mod line;
+mod login;
+mod password;
+mod records;
+mod session;
+mod status;
+mod stream;
+#[cfg(test)]
+mod tests;
+mod text;
+mod vehicle;
+
+use std::sync::Arc;
+
+use axum::Router;
+use axum::extract::DefaultBodyLimit;
+use axum::http::Method;
+use axum::middleware::{from_fn, from_fn_with_state};
+use axum::routing::{MethodRouter, get, post};
+use gleaner_fleet::people::Role;
+
+use crate::cloud::Cloud;
+use crate::request::in_time;
+
+pub(crate) use layout::nothing_here;
+
+/// A page, or a form that it sends.
+pub(crate) struct PageRoute {
+    /// Its method, which the handler has, too.
+    #[cfg_attr(not(test), expect(dead_code, reason = "read by the test of all roles"))]
+    pub(crate) method: Method,
+    /// Its path.
+    pub(crate) path: &'static str,
+    /// The least role; `None` if no session is needed.
+    pub(crate) role: Option<Role>,
+    handler: MethodRouter<Arc<Cloud>>,
+}
+
+/// Returns every page and every form: no role is stated elsewhere.
+pub(crate) fn routes() -> Vec<PageRoute> {
+    use Role::{Admin, Deployer, Operator, Viewer};
+    let route = |method, path, role, handler| PageRoute { method, path, role, handler };
+    let open = |path, handler| route(Method::GET, path, None, handler);
+    let enter = |path, handler| route(Method::POST, path, None, handler);
+    let read = |path, role, handler| route(Method::GET, path, Some(role), handler);
+    let send = |path, role, handler| route(Method::POST, path, Some(role), handler);
+    vec![
+        open("/assets/{file}", get(assets::file)),
+        open("/login", get(login::page)),
+        enter("/login/code", post(login::by_code)),
+        enter("/login/password", post(login::by_password)),
+        send("/logout", Viewer, post(login::logout)),
+        read("/account", Viewer, get(login::account)),
+        send("/account/password", Viewer, post(login::set_password)),
+        read("/", Viewer, get(fleet::start)),
+        read("/vehicles", Viewer, get(fleet::page)),
+        read("/vehicles/{name}", Viewer, get(vehicle::page)),
+        read("/vehicles/{name}/events", Viewer, get(records::time_line)),
+        read("/vehicles/{name}/events/stream", Viewer, get(stream::time_line)),
+        read("/vehicles/{name}/lambdas/{id}", Viewer, get(records::lambda)),
+        read("/vehicles/{name}/lambdas/{id}/stream", Viewer, get(stream::lambda)),
+        read("/lambdas", Viewer, get(lambdas::page)),
+        read("/lambdas/{digest}", Viewer, get(lambdas::revision)),
+        read("/deployments", Viewer, get(deployments::list)),
+        read("/deployments/{id}", Viewer, get(deployments::page)),
+        send("/deployments/{id}/start", Operator, post(deployments::start)),
+        send("/deployments/{id}/stop", Operator, post(deployments::stop)),
+        send("/deployments/{id}/rollback", Operator, post(deployments::roll_back)),
+        send("/deployments/{id}/remove", Deployer, post(deployments::remove)),
+        read("/access", Admin, get(access::page)),
+        send("/access/users", Admin, post(access::invite)),
+        send("/access/users/{name}/remove", Admin, post(access::remove_user)),
+        send("/access/vehicles", Admin, post(access::enrol)),
+        send("/access/vehicles/{name}/cut-off", Admin, post(access::cut_off)),
+        read("/audit", Admin, get(audit::page)),
+    ]
+}
+
+/// Returns the routes.
+pub(crate) fn router(cloud: &Arc<Cloud>) -> Router<Arc<Cloud>> {
+    let mut router = Router::new();
+    for PageRoute { path, role, handler, .. } in routes() {
+        let state = (Arc::clone(cloud), role);
+        let guarded = handler.route_layer(from_fn_with_state(state, guard::guard));
+        router = router.route(path, guarded.layer(from_fn(in_time)));
+    }
+    router.layer(DefaultBodyLimit::max(guard::FORM_MAX))
+}

@@ -1,0 +1,167 @@
+//! The time line of a vehicle, and the records of one lambda: the newest first, followed by a
+//! stream.
+
+use std::sync::Arc;
+
+use axum::extract::{Extension, Path, Query, State};
+use maud::{Markup, html};
+use serde::Deserialize;
+
+use super::layout::{self, PageResult, empty};
+use super::line::line;
+use super::session::PageUser;
+use super::text::{query, segment, shown, vehicle_path};
+use super::vehicle::find;
+use crate::cloud::Cloud;
+use crate::error::CloudResult;
+use crate::store::NewestRecords;
+
+/// Maximum number of records on a page.
+const SIZE: usize = 100;
+/// Number of records that are read for a page of the time line, which leaves log lines out.
+const READ: usize = 1000;
+
+/// The records of a page.
+#[derive(Debug, Clone)]
+pub(super) struct RecordSource {
+    pub(super) vehicle: String,
+    /// Id of the deployment whose lambda has them; without one, the time line of the vehicle.
+    pub(super) lambda: Option<String>,
+}
+
+/// The part of the records, as the address has it.
+#[derive(Debug, Deserialize)]
+pub(super) struct RecordPart {
+    before: Option<i64>,
+}
+
+impl RecordSource {
+    /// Returns the newest records between two arrivals, without both.
+    pub(super) async fn newest(
+        &self,
+        cloud: &Cloud,
+        range: (i64, i64),
+        most: usize,
+    ) -> CloudResult<NewestRecords> {
+        let store = &cloud.store;
+        let Some(lambda) = &self.lambda else {
+            let streams = store.streams(&self.vehicle).await?;
+            let mut newest = store.newest(&self.vehicle, &streams, range, READ).await?;
+            newest.lines.retain(|(_, line)| super::line::is_of_time_line(line));
+            newest.has_more |= newest.lines.len() > most;
+            newest.lines.truncate(most);
+            return Ok(newest);
+        };
+        let stream = [format!("lambdas/{lambda}")];
+        store.newest(&self.vehicle, &stream, range, most).await
+    }
+
+    /// Renders a record.
+    pub(super) fn line(&self, text: &str) -> Markup {
+        line(text, self.lambda.is_none())
+    }
+
+    /// Returns the path of its page.
+    fn path(&self) -> String {
+        let vehicle = vehicle_path(&self.vehicle);
+        match &self.lambda {
+            None => format!("{vehicle}/events"),
+            Some(id) => format!("{vehicle}/lambdas/{}", segment(id)),
+        }
+    }
+}
+
+pub(super) async fn time_line(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(vehicle): Path<String>,
+    Query(part): Query<RecordPart>,
+) -> PageResult {
+    page(&cloud, &user, RecordSource { vehicle, lambda: None }, part.before).await
+}
+
+pub(super) async fn lambda(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path((vehicle, id)): Path<(String, String)>,
+    Query(part): Query<RecordPart>,
+) -> PageResult {
+    page(&cloud, &user, RecordSource { vehicle, lambda: Some(id) }, part.before).await
+}
+
+async fn page(
+    cloud: &Cloud,
+    user: &PageUser,
+    source: RecordSource,
+    before: Option<i64>,
+) -> PageResult {
+    let vehicle = find(cloud, &source.vehicle).await?;
+    let newest = source.newest(cloud, (0, before.unwrap_or(i64::MAX)), SIZE).await?;
+    let here = source.path();
+    let up = vehicle_path(&vehicle.name);
+    let title = source.lambda.as_deref().map_or("Time line".to_owned(), shown);
+    let body = html! {
+        nav.crumbs aria-label="Path" {
+            a href="/vehicles" { "Fleet" } " / " a href=(up) { (shown(&vehicle.name)) }
+        }
+        h1 { (title) " " span.dim { "of " (shown(&vehicle.name)) } }
+        @if source.lambda.is_none() {
+            nav.tabs aria-label="Vehicle" {
+                a href=(up) { "Status" }
+                a href=(here) aria-current="page" { "Time line" }
+            }
+            p.help { "Events and triggers, the newest first; times are in UTC. Log lines are with \
+                      their lambda." }
+        } @else {
+            p.help { "Log lines, triggers, starts and ends, the newest first; times are in UTC." }
+        }
+        @if before.is_none() {
+            (followed(&source, &here, &newest))
+        } @else {
+            p { a href=(here) { "Go to the newest" } }
+            (lines(&source, &newest))
+        }
+        @if newest.lines.is_empty() && before.is_some() { (empty("There are no older ones.")) }
+        @if let Some(before) = older(&newest) {
+            nav.pages aria-label="Parts of the list" {
+                a href=(format!("{here}{}", query(&[("before", &before.to_string())]))) { "Older" }
+            }
+        }
+    };
+    let title = format!("{title} of {}", vehicle.name);
+    Ok(layout::page(&title, "/vehicles", Some(user), body))
+}
+
+/// Returns the arrival before which older records are, if there may be any.
+fn older(newest: &NewestRecords) -> Option<i64> {
+    match newest.has_more {
+        true => newest.lines.last().map(|(arrival, _)| *arrival).or(Some(newest.oldest_read)),
+        false => None,
+    }
+}
+
+/// Renders records with the stream of those that come after them.
+fn followed(source: &RecordSource, here: &str, newest: &NewestRecords) -> Markup {
+    let stream = format!("{here}/stream?after={}", newest.position);
+    html! {
+        div hx-ext="sse" sse-connect=(stream) {
+            p.live role="status" data-live="Following: new records appear at the top."
+                data-lost="The connection is lost; it is opened again." {
+                noscript { "Without scripts, load the page again for new records." }
+            }
+            div.lines role="log" aria-label="Records" aria-live="polite" tabindex="0"
+                sse-swap="records" hx-swap="afterbegin" {
+                @for (_, text) in &newest.lines { (source.line(text)) }
+                @if newest.lines.is_empty() { (empty("There are no records yet.")) }
+            }
+        }
+    }
+}
+
+fn lines(source: &RecordSource, newest: &NewestRecords) -> Markup {
+    html! {
+        div.lines role="region" aria-label="Records" tabindex="0" {
+            @for (_, text) in &newest.lines { (source.line(text)) }
+        }
+    }
+}

@@ -1,0 +1,126 @@
+//! Streams of records: server-sent events, each with the number of its last arrival, after which a
+//! browser goes on when it connects again.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::{Extension, Path, Query, State};
+use axum::http::HeaderMap;
+use axum::response::sse::{Event, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream::unfold;
+use maud::html;
+use serde::Deserialize;
+use tokio::sync::watch;
+use tokio::time::{sleep, timeout};
+
+use super::layout::PageResult;
+use super::records::RecordSource;
+use super::session::PageUser;
+use crate::cloud::Cloud;
+use crate::readers::ReaderSlot;
+
+/// Maximum number of records in a message.
+const MESSAGE_MAX: usize = 100;
+/// Least time between two messages.
+const PAUSE: Duration = Duration::from_millis(500);
+/// Time without a record after which a sign of life is sent, and the session is looked at.
+const QUIET: Duration = Duration::from_secs(10);
+
+/// The start of a stream, as the address has it.
+#[derive(Debug, Deserialize)]
+pub(super) struct StreamStart {
+    after: Option<i64>,
+}
+
+/// Follows the records of a page for one browser.
+struct RecordFollower {
+    cloud: Arc<Cloud>,
+    user: PageUser,
+    source: RecordSource,
+    position: i64,
+    arrivals: watch::Receiver<()>,
+    _slot: ReaderSlot,
+}
+
+pub(super) async fn time_line(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(vehicle): Path<String>,
+    Query(start): Query<StreamStart>,
+    headers: HeaderMap,
+) -> PageResult {
+    follow(cloud, user, RecordSource { vehicle, lambda: None }, start, &headers)
+}
+
+pub(super) async fn lambda(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path((vehicle, id)): Path<(String, String)>,
+    Query(start): Query<StreamStart>,
+    headers: HeaderMap,
+) -> PageResult {
+    follow(cloud, user, RecordSource { vehicle, lambda: Some(id) }, start, &headers)
+}
+
+fn follow(
+    cloud: Arc<Cloud>,
+    user: PageUser,
+    source: RecordSource,
+    start: StreamStart,
+    headers: &HeaderMap,
+) -> PageResult {
+    let slot = cloud.readers.open(&user.user.name)?;
+    let last = headers.get("last-event-id").and_then(|it| it.to_str().ok()?.parse().ok());
+    let position = last.or(start.after).unwrap_or(0);
+    // Before the first look, so that nothing arrives in between.
+    let mut arrivals = cloud.hub.arrivals(&source.vehicle);
+    arrivals.mark_changed();
+    let follower = RecordFollower { cloud, user, source, position, arrivals, _slot: slot };
+    let events = unfold(follower, RecordFollower::next);
+    Ok(without_buffers(Sse::new(events).into_response()))
+}
+
+/// Asks proxies not to keep events back.
+fn without_buffers(reply: Response) -> Response {
+    ([("x-accel-buffering", "no")], reply).into_response()
+}
+
+impl RecordFollower {
+    /// Returns the next event; `None` at the end: of the server, or of the session.
+    async fn next(mut self) -> Option<(Result<Event, Infallible>, Self)> {
+        let event = match timeout(QUIET, self.arrivals.changed()).await {
+            Ok(Err(_)) => return None,
+            // Also without an arrival that was noticed: a record may have come from another way.
+            Ok(Ok(())) | Err(_) => {
+                if !self.user.is_current(&self.cloud).await {
+                    return None;
+                }
+                self.message().await?
+            }
+        };
+        Some((Ok(event), self))
+    }
+
+    async fn message(&mut self) -> Option<Event> {
+        let range = (self.position, i64::MAX);
+        let newest = self.source.newest(&self.cloud, range, MESSAGE_MAX).await.ok()?;
+        self.position = newest.position;
+        if newest.lines.is_empty() {
+            return Some(Event::default().comment("nothing new"));
+        }
+        let markup = html! {
+            @for (_, text) in &newest.lines { (self.source.line(text)) }
+            @if newest.has_more {
+                div.line { span.kind.warn { "left out" } span.words {
+                    "More records came at once than are shown here: load the page again, and go to \
+                     older ones." } }
+            }
+        };
+        // A vehicle that sends more does not make a browser busy.
+        sleep(PAUSE).await;
+        let id = self.position.to_string();
+        Some(Event::default().event("records").id(id).data(markup.into_string()))
+    }
+}

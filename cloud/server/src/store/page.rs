@@ -1,0 +1,203 @@
+//! Queries of the page: parts of lists, as a person looks at them.
+
+use std::collections::BTreeMap;
+
+use gleaner_fleet::people::{VehicleState, VehicleSummary};
+
+use super::vehicles::FAILED;
+use super::{CloudStore, int, unsigned};
+use crate::error::CloudResult;
+
+/// Maximum number of streams of a vehicle in one time line.
+const STREAMS_MAX: usize = 64;
+
+/// Choice of vehicles.
+#[derive(Debug, Default)]
+pub(crate) struct VehicleFilter {
+    /// The whole name; any if it is empty.
+    pub(crate) only: String,
+    /// A part of the name.
+    pub(crate) name: String,
+    /// A label with its value; any value if that is empty.
+    pub(crate) label: Option<(String, String)>,
+    pub(crate) state: Option<VehicleState>,
+    /// True for those with a problem or a failed deployment only.
+    pub(crate) has_problem: bool,
+}
+
+/// A part of the vehicles, with numbers of all.
+#[derive(Debug, Default)]
+pub(crate) struct VehiclePage {
+    /// Those of this part, with the number of failed deployments of each.
+    pub(crate) vehicles: Vec<(VehicleSummary, u64)>,
+    /// Number of those that the filter chooses.
+    pub(crate) found: usize,
+    /// Number of all by state: online, offline, invited and cut off.
+    pub(crate) states: [usize; 4],
+    /// Number of all with a problem or a failed deployment.
+    pub(crate) with_problems: usize,
+}
+
+/// The newest records of some streams.
+#[derive(Debug, Default)]
+pub(crate) struct NewestRecords {
+    /// Number of the arrival and the line of each, the newest first.
+    pub(crate) lines: Vec<(i64, String)>,
+    /// Number of the last arrival that was looked at.
+    pub(crate) position: i64,
+    /// Number of the oldest arrival that was read.
+    pub(crate) oldest_read: i64,
+    /// True if older ones in the same range were left out.
+    pub(crate) has_more: bool,
+}
+
+type VehicleRow = (String, i64, String, String, i64, i64, String, i64, i64);
+
+impl CloudStore {
+    /// Returns the `index`-th part, of `size` each, of the vehicles that `filter` chooses, by name.
+    pub(crate) async fn vehicle_page(
+        &self,
+        filter: &VehicleFilter,
+        is_online: impl Fn(&str) -> bool,
+        index: usize,
+        size: usize,
+    ) -> CloudResult<VehiclePage> {
+        // Of all vehicles, only what the filters look at: texts of thousands take their time.
+        let rows: Vec<(String, i64, i64, i64, String)> = rows!(&self.pool;
+            "SELECT name, is_revoked, epoch, CASE WHEN problems = '[]' THEN 0 ELSE 1 END,
+             CASE WHEN $2 = 0 THEN '' ELSE labels END
+             FROM vehicles WHERE $1 = '' OR name = $1 ORDER BY name";
+            &filter.only, i64::from(filter.label.is_some()));
+        let failed: Vec<(String, i64)> = rows!(&self.pool;
+            "SELECT vehicle, COUNT(*) FROM reported WHERE state = $1 AND ($2 = '' OR vehicle = $2)
+             GROUP BY vehicle";
+            FAILED, &filter.only);
+        let failed: BTreeMap<String, i64> = failed.into_iter().collect();
+        let mut page = VehiclePage::default();
+        let mut names = Vec::new();
+        for (name, is_revoked, epoch, problems, labels) in rows {
+            let state = match () {
+                () if is_revoked != 0 => VehicleState::Revoked,
+                () if is_online(&name) => VehicleState::Online,
+                () if epoch == 0 => VehicleState::Invited,
+                () => VehicleState::Offline,
+            };
+            let failures = failed.get(&name).map_or(0, |count| unsigned(*count));
+            let has_problem = state != VehicleState::Revoked && (problems != 0 || failures > 0);
+            page.states[state_index(state)] += 1;
+            page.with_problems += usize::from(has_problem);
+            let is_chosen = filter.state.is_none_or(|wanted| wanted == state)
+                && (has_problem || !filter.has_problem)
+                && name.contains(&filter.name)
+                && filter.has(&labels);
+            if !is_chosen {
+                continue;
+            }
+            if (index * size..(index + 1) * size).contains(&page.found) {
+                names.push((name, state, failures));
+            }
+            page.found += 1;
+        }
+        for (name, state, failures) in names {
+            let row: Option<VehicleRow> = row!(&self.pool;
+                "SELECT name, seen, version, labels, generation, handled, problems, running,
+                 deployments FROM vehicles WHERE name = $1";
+                &name);
+            page.vehicles.extend(row.map(|row| (summary(row, state), failures)));
+        }
+        Ok(page)
+    }
+
+    /// Returns the vehicles that have reported this release of a deployment, with their states:
+    /// first those with a failure, at most `most`.
+    pub(crate) async fn reports(
+        &self,
+        deployment: &str,
+        release: u64,
+        most: i64,
+    ) -> CloudResult<Vec<(String, String)>> {
+        Ok(rows!(&self.pool;
+            "SELECT vehicle, state FROM reported WHERE deployment = $1 AND number = $2
+             ORDER BY CASE WHEN state = $3 THEN 0 ELSE 1 END, vehicle LIMIT $4";
+            deployment, int(release), FAILED, most))
+    }
+
+    /// Returns the names of the streams of a vehicle: at most as many as one time line shows.
+    pub(crate) async fn streams(&self, vehicle: &str) -> CloudResult<Vec<String>> {
+        let rows: Vec<(String,)> = rows!(&self.pool;
+            "SELECT stream FROM streams WHERE vehicle = $1 ORDER BY stream LIMIT $2";
+            vehicle, int(STREAMS_MAX as u64));
+        Ok(rows.into_iter().map(|(stream,)| stream).collect())
+    }
+
+    /// Returns the newest records of these streams whose arrivals are after `after` and before
+    /// `before`: at most `most`.
+    pub(crate) async fn newest(
+        &self,
+        vehicle: &str,
+        streams: &[String],
+        (after, before): (i64, i64),
+        most: usize,
+    ) -> CloudResult<NewestRecords> {
+        // First the end: what arrives between the queries of two streams comes next time.
+        let arrived: Option<(i64,)> =
+            row!(&self.pool; "SELECT arrived FROM vehicles WHERE name = $1"; vehicle);
+        let position = arrived.map_or(0, |(arrived,)| arrived).min(before.saturating_sub(1));
+        let mut lines: Vec<(i64, String)> = Vec::new();
+        for stream in streams {
+            let rows: Vec<(i64, String)> = rows!(&self.pool;
+                "SELECT arrival, line FROM records
+                 WHERE vehicle = $1 AND stream = $2 AND arrival > $3 AND arrival <= $4
+                 ORDER BY arrival DESC LIMIT $5";
+                vehicle, stream, after, position, int(most as u64 + 1));
+            lines.extend(rows);
+        }
+        lines.sort_unstable_by_key(|(arrival, _)| std::cmp::Reverse(*arrival));
+        let has_more = lines.len() > most;
+        lines.truncate(most);
+        let oldest_read = lines.last().map_or(position, |(arrival, _)| *arrival);
+        Ok(NewestRecords { lines, position: position.max(after), oldest_read, has_more })
+    }
+}
+
+impl VehicleFilter {
+    /// Returns whether these labels, as JSON without spaces, have the one that is asked for.
+    fn has(&self, labels: &str) -> bool {
+        let Some((name, value)) = &self.label else { return true };
+        let label = match value.is_empty() {
+            true => format!("{}:", json(name)),
+            false => format!("{}:{}", json(name), json(value)),
+        };
+        // A quote after one of these begins a name: in a text, it would be escaped.
+        ["{", ","].iter().any(|before| labels.contains(&format!("{before}{label}")))
+    }
+}
+
+fn state_index(state: VehicleState) -> usize {
+    match state {
+        VehicleState::Online => 0,
+        VehicleState::Offline => 1,
+        VehicleState::Invited => 2,
+        VehicleState::Revoked => 3,
+    }
+}
+
+fn summary(row: VehicleRow, state: VehicleState) -> VehicleSummary {
+    let (name, seen, version, labels, wanted, handled, problems, running, deployments) = row;
+    VehicleSummary {
+        name,
+        labels: serde_json::from_str(&labels).unwrap_or_default(),
+        state,
+        seen: (seen > 0).then_some(unsigned(seen)),
+        version: (!version.is_empty()).then_some(version),
+        wanted: unsigned(wanted),
+        handled: unsigned(handled),
+        problems: serde_json::from_str(&problems).unwrap_or_default(),
+        running: unsigned(running),
+        deployments: unsigned(deployments),
+    }
+}
+
+fn json(text: &str) -> String {
+    super::vehicles::json(&text)
+}
