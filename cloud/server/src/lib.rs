@@ -3,7 +3,7 @@
 //! `store` is the database and `objects` the folder of files; together with the certificates of
 //! `authority` they are all that survives a restart. `accept` accepts connections for both
 //! listeners: `people` answers requests of people, and `vehicles` those of vehicles, each of which
-//! keeps one connection open. `hub` knows these connections, and wakes them after a change.
+//! keeps one connection open. `clips` has recorded clips of vehicles, with a folder of its own. `hub` knows these connections, and wakes them after a change.
 //!
 //! Nothing here runs a lambda, or decides what a vehicle runs: each vehicle verifies signatures by
 //! its own trust root.
@@ -11,6 +11,7 @@
 mod accept;
 mod attempts;
 mod authority;
+mod clips;
 mod cloud;
 mod error;
 mod folder;

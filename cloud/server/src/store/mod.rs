@@ -33,6 +33,8 @@ macro_rules! rows {
 }
 
 mod audit;
+mod clip_list;
+mod clips;
 mod deployments;
 mod records;
 mod secrets;
@@ -52,13 +54,18 @@ use tokio::sync::{Mutex, MutexGuard};
 
 use crate::error::{CloudError, CloudResult};
 
+pub(crate) use clip_list::ClipQuery;
+pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::{Issued, VehicleReport};
 
 /// The migrations, oldest first: the version of a database is the number of those that it has.
-const MIGRATIONS: &[&str] = &[include_str!("../../migrations/0001_start.sql")];
+const MIGRATIONS: &[&str] = &[
+    include_str!("../../migrations/0001_start.sql"),
+    include_str!("../../migrations/0003_clips.sql"),
+];
 
 /// Settings of each connection to SQLite. In the mode WAL, readers and the writer do not wait for
 /// each other; FULL makes each commit durable before it returns.
