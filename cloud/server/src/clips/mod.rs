@@ -6,6 +6,8 @@
 
 mod files;
 pub(crate) mod people;
+#[cfg(test)]
+mod tests;
 mod vehicles;
 
 use std::time::Duration;
