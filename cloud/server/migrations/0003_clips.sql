@@ -22,7 +22,7 @@ CREATE TABLE clips (
     UNIQUE (vehicle, name)
 );
 CREATE INDEX clips_by_state ON clips (vehicle, state);
-CREATE INDEX clips_in_progress ON clips (parts, state);
+CREATE INDEX clips_with_bytes ON clips (vehicle, bytes) WHERE parts > 0;
 
 -- Lambdas and labels of each clip: `kind` is `lambda` or `label`.
 CREATE TABLE clip_words (

@@ -10,11 +10,12 @@ use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Extension, Path, State};
 use axum::middleware::from_fn;
 use axum::routing::{post, put};
+use futures_util::StreamExt;
 use gleaner_base::{Exit, Failure};
 use gleaner_fleet::UnfinishedFile;
 use gleaner_fleet::clips::{
-    CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName, ClipOrders, ClipReport,
-    THUMBNAIL_MAX,
+    CLIP_PART, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName, ClipOrders,
+    ClipReport, THUMBNAIL_MAX,
 };
 use tokio::time::timeout;
 
@@ -27,6 +28,8 @@ use crate::vehicles::KnownVehicle;
 
 /// Time for a part: 14 kB/s.
 const PART_TIME: Duration = Duration::from_secs(600);
+/// Time for a part that is not wanted.
+const UNWANTED_TIME: Duration = Duration::from_secs(30);
 /// Longest position in the list of a vehicle.
 const CURSOR_MAX: usize = 256;
 /// First bytes of a JPEG.
@@ -111,31 +114,52 @@ async fn part(
     body: Body,
 ) -> CloudResult<Json<ClipOrders>> {
     let (name, sha256) = (clip_name(&name)?, digest(&sha256)?);
-    let bounds = cloud.clips.bounds;
-    let progress = cloud.store.clip_progress(&vehicle.name, &name, bounds).await?;
-    let is_next = progress.part == number;
-    match ClipFacts::part_length(progress.bytes, number) {
-        Some(length) if is_next => {
-            let _slot = cloud.clips.slot()?;
-            let receive = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body);
-            let received = timeout(PART_TIME, receive).await.map_err(|_| {
-                let message = format!("a part of clip `{}` took too long", progress.id);
-                CloudError::busy(message, "send it again")
-            })??;
-            let working = Arc::clone(&cloud);
-            // A vehicle that goes away in the middle must not leave it half done.
-            let stored = tokio::spawn(store_part(working, progress, length, received)).await;
-            stored.map_err(|error| {
-                Failure::caused_by(Exit::Internal, "a part of a clip is not stored", &error)
-            })??;
-        }
-        Some(_) => {}
-        None => {
-            let message = format!("clip `{}` has no part {number}", progress.id);
-            return Err(CloudError::usage(message, "send the next part of the orders"));
+    let expected = expected(&cloud, &vehicle.name, &name, number).await;
+    let Ok(Some((progress, length))) = expected else {
+        // Unread, it could hide the answer from the vehicle.
+        let _ = timeout(UNWANTED_TIME, skip(body)).await;
+        expected?;
+        return orders(&cloud, &vehicle.name).await;
+    };
+    let _slot = cloud.clips.slot()?;
+    let receive = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body);
+    let received = timeout(PART_TIME, receive).await.map_err(|_| {
+        let message = format!("a part of clip `{}` took too long", progress.id);
+        CloudError::busy(message, "send it again")
+    })??;
+    let working = Arc::clone(&cloud);
+    // A vehicle that goes away in the middle must not leave it half done.
+    let stored = tokio::spawn(store_part(working, progress, length, received)).await;
+    stored.map_err(|error| {
+        Failure::caused_by(Exit::Internal, "a part of a clip is not stored", &error)
+    })??;
+    orders(&cloud, &vehicle.name).await
+}
+
+/// Returns the clip and the length of a part that is the next one; `None` of any other one.
+async fn expected(
+    cloud: &Cloud,
+    vehicle: &str,
+    name: &ClipName,
+    number: u64,
+) -> CloudResult<Option<(ClipProgress, u64)>> {
+    let progress = cloud.store.clip_progress(vehicle, name, cloud.clips.bounds).await?;
+    let length = ClipFacts::part_length(progress.bytes, number).ok_or_else(|| {
+        let message = format!("clip `{}` has no part {number}", progress.id);
+        CloudError::usage(message, "send the next part of the orders")
+    })?;
+    Ok((progress.part == number).then_some((progress, length)))
+}
+
+/// Reads a body that is not wanted, up to the length of a part.
+async fn skip(body: Body) {
+    let (mut pieces, mut bytes) = (body.into_data_stream(), 0);
+    while let Some(Ok(piece)) = pieces.next().await {
+        bytes += piece.len() as u64;
+        if bytes > CLIP_PART {
+            return;
         }
     }
-    orders(&cloud, &vehicle.name).await
 }
 
 /// Appends a part, and compares the file after the last one.

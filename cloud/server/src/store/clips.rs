@@ -51,6 +51,26 @@ pub(crate) struct ClipProgress {
     pub(crate) part: u64,
 }
 
+/// Bytes of files.
+struct ClipUsage {
+    /// Those of a vehicle.
+    own: u64,
+    /// Those of all vehicles.
+    all: u64,
+}
+
+impl ClipUsage {
+    /// Returns the reason why a further file of this length does not fit.
+    fn excess(&self, bytes: u64, bounds: ClipBounds) -> Option<String> {
+        let limits = [
+            (self.own, bounds.vehicle_bytes, "of its vehicle"),
+            (self.all, bounds.bytes, "of all vehicles"),
+        ];
+        let full = limits.into_iter().find(|(used, most, _)| used.saturating_add(bytes) > *most);
+        full.map(|(used, most, of)| format!("clips {of} have {used} of {most} bytes already"))
+    }
+}
+
 /// The outcome of a report.
 #[derive(Debug, Default)]
 pub(crate) struct Announced {
@@ -133,40 +153,27 @@ impl CloudStore {
              AND $2 <> 'none' AND (is_requested = 1 OR $2 = 'all') AND (parts > 0 OR $3 = 1)
              ORDER BY is_requested DESC, score DESC, from_ns, seq LIMIT $4";
             vehicle, policy.upload.as_str(), may_begin, ORDERS_MAX);
-        let mut wanted = Vec::new();
-        for (name, bytes, sha256, parts) in rows {
-            let (bytes, part) = (unsigned(bytes), unsigned(parts));
-            // Files that do not fit must not keep smaller ones from being sent.
-            if part == 0 && self.has_room(vehicle, bytes, bounds).await?.is_some() {
-                continue;
-            }
-            if let Ok(name) = name.parse::<ClipName>() {
-                wanted.push(WantedClip { name, bytes, sha256, part });
-            }
+        if rows.is_empty() {
+            return Ok(Vec::new());
         }
-        Ok(wanted)
+        let usage = self.clip_usage(vehicle).await?;
+        let wanted = rows.into_iter().filter_map(|(name, bytes, sha256, parts)| {
+            let (name, bytes, part) = (name.parse().ok()?, unsigned(bytes), unsigned(parts));
+            Some(WantedClip { name, bytes, sha256, part })
+        });
+        // Files that do not fit must not keep smaller ones from being sent.
+        Ok(wanted.filter(|it| it.part > 0 || usage.excess(it.bytes, bounds).is_none()).collect())
     }
 
-    /// Returns the reason why a further file of this length does not fit.
-    async fn has_room(
-        &self,
-        vehicle: &str,
-        bytes: u64,
-        bounds: ClipBounds,
-    ) -> CloudResult<Option<String>> {
-        let (mine, all): (i64, i64) = one!(&self.pool;
-            "SELECT
-             (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips
-              WHERE vehicle = $1 AND (parts > 0 OR state = 'stored')),
-             (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips
-              WHERE parts > 0 OR state = 'stored')";
+    /// Returns the bytes of the files of a vehicle, and of all, those that are announced of
+    /// unfinished ones.
+    async fn clip_usage(&self, vehicle: &str) -> CloudResult<ClipUsage> {
+        let (own, all): (i64, i64) = one!(&self.pool;
+            "SELECT (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips
+                     WHERE vehicle = $1 AND parts > 0),
+                    (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips WHERE parts > 0)";
             vehicle);
-        let limits = [
-            (unsigned(mine), bounds.vehicle_bytes, "of its vehicle"),
-            (unsigned(all), bounds.bytes, "of all vehicles"),
-        ];
-        let full = limits.into_iter().find(|(used, most, _)| used.saturating_add(bytes) > *most);
-        Ok(full.map(|(used, most, of)| format!("clips {of} have {used} of {most} bytes already")))
+        Ok(ClipUsage { own: unsigned(own), all: unsigned(all) })
     }
 
     /// Returns the progress of a file that a vehicle may send now.
@@ -208,7 +215,8 @@ impl CloudStore {
                 "SELECT COUNT(*) FROM clips
                  WHERE vehicle = $1 AND state = 'vehicle' AND parts > 0";
                 vehicle);
-            let mut full = self.has_room(vehicle, progress.bytes, bounds).await?;
+            let usage = self.clip_usage(vehicle).await?;
+            let mut full = usage.excess(progress.bytes, bounds);
             if unsigned(unfinished) >= bounds.unfinished {
                 full = Some(format!("{unfinished} uploads of the vehicle are unfinished"));
             }

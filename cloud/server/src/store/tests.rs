@@ -260,6 +260,6 @@ async fn the_database_of_a_later_version_is_refused() {
     store.execute("INSERT INTO migrations (version) VALUES (99)").await;
     store.close().await;
     let refused = CloudStore::open(&folder.path().join("cloud.db")).await.unwrap_err();
-    assert_eq!(refused.message, "the database has version 99; this program has 1");
+    assert_eq!(refused.message, "the database has version 99; this program has 2");
     assert!(refused.help.is_some());
 }
