@@ -88,7 +88,7 @@ def write_parquet(folder: Union[str, Path]) -> Path:
 
 def _clip(folder: Union[str, Path], event: Dict[str, Any]) -> Path:
     root = Path(folder).resolve()
-    path = (root / event["clip"]).resolve()
+    path: Path = (root / event["clip"]).resolve()
     if root not in path.parents:
         raise ValueError(f"the clip {event['clip']!r} is not in the folder {str(folder)!r}")
     return path

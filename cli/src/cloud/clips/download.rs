@@ -59,28 +59,37 @@ impl<'c> ClipTarget<'c> {
             file.set_len(0).map_err(failed)?;
             from = 0;
         }
-        if from < self.clip.facts.bytes {
-            let mut left = self.clip.facts.bytes - from;
-            client.download(&format!("/v1/clips/{}/file", self.clip.id), from, |piece| {
+        let (mut left, mut is_longer) = (self.clip.facts.bytes - from, false);
+        if left > 0 {
+            let path = format!("/v1/clips/{}/file", self.clip.id);
+            let done = client.download(&path, from, |piece| {
                 left = left.checked_sub(piece.len() as u64).ok_or_else(|| {
-                    let message = format!("the cloud sends more than clip `{}`", self.clip.id);
-                    Failure::new(Exit::Denied, message)
+                    is_longer = true;
+                    self.refused("it is longer")
                 })?;
                 file.write_all(piece).map_err(failed)
-            })?;
+            });
+            if is_longer {
+                fs::remove_file(&part).map_err(failed)?;
+            }
+            done?;
         }
         file.sync_all().map_err(failed)?;
         if let Err(reason) = self.compare(&part).map_err(failed)? {
             fs::remove_file(&part).map_err(failed)?;
-            let message = format!("the cloud sent another file than clip `{}`", self.clip.id);
-            let mut failure = Failure::new(Exit::Denied, message);
-            failure.causes = vec![reason];
-            return Err(failure.with_help("run this again"));
+            return Err(self.refused(&reason));
         }
         // An existing file is never replaced.
         renameat_with(CWD, &part, CWD, &self.file, RenameFlags::NOREPLACE)
             .map_err(|error| failed(error.into()))?;
         Ok(self.file.clone())
+    }
+
+    fn refused(&self, reason: &str) -> Failure {
+        let message = format!("the cloud sent another file than clip `{}`", self.clip.id);
+        let mut failure = Failure::new(Exit::Denied, message);
+        failure.causes = vec![reason.to_owned()];
+        failure.with_help("run this again")
     }
 
     fn compare(&self, path: &Path) -> io::Result<Result<(), String>> {
@@ -98,3 +107,6 @@ impl<'c> ClipTarget<'c> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

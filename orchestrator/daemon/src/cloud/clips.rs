@@ -146,6 +146,9 @@ impl ClipSender {
     ) -> Result<Result<Vec<u8>, String>, Failure> {
         match in_background(move |_| read()).await {
             Ok(content) => Ok(Ok(content)),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                Ok(Err("the vehicle has deleted the file".to_owned()))
+            }
             Err(error) if is_gone(&error) => Ok(Err(error.to_string())),
             Err(error) => Err(unreadable(&error)),
         }
