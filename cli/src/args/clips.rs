@@ -11,7 +11,7 @@ use gleaner_fleet::clips::{ClipId, UploadedClips};
 #[derive(Args, Debug)]
 #[command(args_conflicts_with_subcommands = true)]
 pub struct ClipsArgs {
-    /// What to do; without it, the clips are listed
+    /// The action; without one, the clips are listed
     #[command(subcommand)]
     pub command: Option<ClipsCommand>,
     #[command(flatten)]

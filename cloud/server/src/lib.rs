@@ -3,7 +3,8 @@
 //! `store` is the database and `objects` the folder of files; together with the certificates of
 //! `authority` they are all that survives a restart. `accept` accepts connections for both
 //! listeners: `people` answers requests of people, and `vehicles` those of vehicles, each of which
-//! keeps one connection open. `clips` has recorded clips of vehicles, with a folder of its own. `hub` knows these connections, and wakes them after a change.
+//! keeps one connection open. `hub` knows these connections, and wakes them after a change.
+//! `clips` has recorded clips of vehicles, with a folder of its own.
 //!
 //! Nothing here runs a lambda, or decides what a vehicle runs: each vehicle verifies signatures by
 //! its own trust root.

@@ -38,9 +38,10 @@ const JPEG: [u8; 3] = [0xff, 0xd8, 0xff];
 /// Returns the routes, which need a certificate.
 pub(crate) fn router() -> Router<Arc<Cloud>> {
     let report = post(report).layer(DefaultBodyLimit::max(CLIP_REPORT_MAX));
+    let thumbnail = put(thumbnail).layer(DefaultBodyLimit::max(THUMBNAIL_MAX as usize));
     Router::new()
         .route("/v1/clips", report.layer(from_fn(in_time)))
-        .route("/v1/clips/{name}/thumbnail", put(thumbnail).layer(from_fn(in_time)))
+        .route("/v1/clips/{name}/thumbnail", thumbnail.layer(from_fn(in_time)))
         .route("/v1/clips/{name}/parts/{part}/{sha256}", put(part))
 }
 

@@ -73,7 +73,7 @@ impl ClipUsage {
 
 /// The outcome of a report.
 #[derive(Debug, Default)]
-pub(crate) struct Announced {
+pub(crate) struct AnnouncedClips {
     /// Clips whose files the cloud must remove.
     pub(crate) dropped: Vec<ClipId>,
 }
@@ -85,8 +85,8 @@ impl CloudStore {
         vehicle: &str,
         report: &ClipReport,
         bounds: ClipBounds,
-    ) -> CloudResult<Announced> {
-        let mut announced = Announced::default();
+    ) -> CloudResult<AnnouncedClips> {
+        let mut announced = AnnouncedClips::default();
         let mut change = self.change().await?;
         change.must_count(vehicle).await?;
         for facts in &report.clips {

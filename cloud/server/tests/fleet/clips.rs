@@ -13,7 +13,11 @@ use tokio::io::AsyncWriteExt;
 use crate::fake::{FakeVehicle, Person, soon};
 use crate::{options, start};
 
-const IMAGE: &[u8] = &[0xff, 0xd8, 0xff, 7];
+const IMAGE: &[u8] = &{
+    let mut image = [7; 100_000];
+    (image[0], image[1], image[2]) = (0xff, 0xd8, 0xff);
+    image
+};
 
 /// Returns the facts of a clip with this content.
 fn facts(name: &str, label: &str, at_ns: i64, content: &[u8]) -> Value {
@@ -127,7 +131,7 @@ async fn a_wanted_clip_comes_in_parts_across_an_interruption_and_a_restart() {
     assert_eq!(vehicle.request(Method::PUT, path, IMAGE).await.0, StatusCode::OK);
     let image = bytes(&admin, "/v1/clips/a@car-7/thumbnail").await;
     assert_eq!(image, (StatusCode::OK, IMAGE.to_vec()));
-    assert_eq!(put(&vehicle, "a", 0, first).await.0, StatusCode::NOT_FOUND, "nobody wants it");
+    assert_eq!(put(&vehicle, "a", 0, first).await.0, StatusCode::NOT_FOUND, "it is not wanted");
 
     // The vehicle learns of the wish by the number of its wanted state.
     assert_eq!(pull(&admin, "a@car-7").await, StatusCode::OK);
