@@ -19,7 +19,7 @@ pub const THUMBNAIL_MAX: u64 = 256 << 10;
 /// Maximum length of a [`ClipReport`] as JSON.
 pub const CLIP_REPORT_MAX: usize = 1 << 20;
 /// Maximum length of [`ClipFacts`] as JSON.
-pub const CLIP_FACTS_MAX: usize = 512 << 10;
+pub const CLIP_FACTS_MAX: usize = 64 << 10;
 /// Maximum number of clips in a report.
 pub const CLIPS_IN_REPORT: usize = 64;
 /// Maximum number of moments, lambdas and texts of a clip.
@@ -241,6 +241,7 @@ impl ClipFacts {
             () if moments.iter().any(|it| it.score.is_some_and(|score| !score.is_finite())) => {
                 "a score is no number"
             }
+            () if self.length() > CLIP_FACTS_MAX => "its facts are too long",
             () => return Ok(()),
         };
         Err(format!("clip `{name}`: {reason}"))
@@ -269,8 +270,12 @@ impl ClipFacts {
             [&mut moment.lambda, &mut moment.kind, &mut moment.label].into_iter().for_each(cut);
             moment.source.iter_mut().for_each(cut);
         }
-        let is_long = |it: &Self| serde_json::to_vec(it).map_or(0, |it| it.len()) > CLIP_FACTS_MAX;
-        while is_long(self) && self.moments.pop().is_some() {}
+        while self.length() > CLIP_FACTS_MAX && self.moments.pop().is_some() {}
+    }
+
+    /// Returns the length as JSON.
+    pub fn length(&self) -> usize {
+        serde_json::to_vec(self).map_or(usize::MAX, |text| text.len())
     }
 }
 

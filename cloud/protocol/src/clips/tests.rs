@@ -50,4 +50,7 @@ fn facts_are_bounded_and_long_ones_are_shortened_until_they_fit() {
     assert_eq!(long.check(), Ok(()));
     assert!(serde_json::to_vec(&long).unwrap().len() <= CLIP_FACTS_MAX);
     assert!(!long.moments.is_empty());
+    long.moments[0].attributes =
+        Some(Map::from_iter([("text".to_owned(), "y".repeat(70_000).into())]));
+    assert!(long.check().is_err());
 }

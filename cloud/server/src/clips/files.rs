@@ -3,11 +3,13 @@
 //! The parts of a file are appended to it one after the other, each once it is complete and its
 //! digest is right. How many there are is in the database only: bytes after them do not count.
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{self, Arc, PoisonError};
+use std::time::Duration;
 
 use axum::body::Body;
 use futures_util::StreamExt;
@@ -17,14 +19,18 @@ use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use gleaner_trust::sha256;
 use tokio::io::AsyncWriteExt;
 use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
+use tokio::time::timeout;
 
 use crate::error::{CloudError, CloudResult};
 use crate::store::ClipBounds;
 
 /// Extension of a part that is being received.
 const PART: &str = "part";
-/// Number of parts that are received at a time.
-const PARTS_MAX: usize = 256;
+/// Number of parts of a vehicle that are received at a time: some may be of connections that it
+/// has lost.
+const PARTS_MAX: usize = 4;
+/// Time for the next piece of a part.
+const PIECE_TIME: Duration = Duration::from_secs(60);
 /// Number of locks for all files.
 const TURNS: usize = 64;
 
@@ -34,7 +40,8 @@ pub(crate) struct ClipFiles {
     folder: PathBuf,
     pub(crate) bounds: ClipBounds,
     parts: AtomicU64,
-    slots: Arc<Semaphore>,
+    /// Slots of the vehicles that send parts.
+    slots: sync::Mutex<BTreeMap<String, Arc<Semaphore>>>,
     turns: Vec<Arc<Mutex<()>>>,
 }
 
@@ -59,8 +66,7 @@ impl ClipFiles {
             Failure::caused_by(Exit::Internal, action, &error)
         })?;
         let turns = (0..TURNS).map(|_| Arc::default()).collect();
-        let slots = Arc::new(Semaphore::new(PARTS_MAX));
-        Ok(Self { folder, bounds, parts: AtomicU64::new(0), slots, turns })
+        Ok(Self { folder, bounds, parts: AtomicU64::new(0), slots: sync::Mutex::default(), turns })
     }
 
     fn path(&self, id: &ClipId, extension: &str) -> PathBuf {
@@ -88,10 +94,15 @@ impl ClipFiles {
         }
     }
 
-    /// Returns a slot to receive a part in.
-    pub(crate) fn slot(&self) -> CloudResult<OwnedSemaphorePermit> {
-        Arc::clone(&self.slots).try_acquire_owned().map_err(|_| {
-            CloudError::busy("too many parts of clips are received already", "send it again later")
+    /// Returns a slot to receive a part of a vehicle in.
+    pub(crate) fn slot(&self, vehicle: &str) -> CloudResult<OwnedSemaphorePermit> {
+        let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
+        slots.retain(|_, slots| slots.available_permits() < PARTS_MAX);
+        let slots = slots.entry(vehicle.to_owned());
+        let slots = slots.or_insert_with(|| Arc::new(Semaphore::new(PARTS_MAX)));
+        Arc::clone(slots).try_acquire_owned().map_err(|_| {
+            let message = format!("{PARTS_MAX} parts of the vehicle are received already");
+            CloudError::busy(message, "send one part at a time")
         })
     }
 
@@ -121,11 +132,14 @@ impl ClipFiles {
         let mut file = tokio::fs::File::create_new(&part.0).await.map_err(failed)?;
         let mut announced = AnnouncedFile::new(length, sha256);
         let mut body = body.into_data_stream();
-        while let Some(piece) = body.next().await {
-            let piece = piece.map_err(|error| {
-                let message = format!("a part of clip `{id}` did not come in full");
-                CloudError::usage(message, "send it again").because(error)
-            })?;
+        let broken = |error: &dyn std::error::Error| {
+            let message = format!("a part of clip `{id}` did not come in full");
+            CloudError::usage(message, "send it again").because(error)
+        };
+        loop {
+            let piece = timeout(PIECE_TIME, body.next()).await.map_err(|late| broken(&late))?;
+            let Some(piece) = piece else { break };
+            let piece = piece.map_err(|error| broken(&error))?;
             announced.add(&piece).map_err(refused)?;
             file.write_all(&piece).await.map_err(failed)?;
         }

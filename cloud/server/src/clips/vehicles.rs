@@ -122,7 +122,7 @@ async fn part(
         expected?;
         return orders(&cloud, &vehicle.name).await;
     };
-    let _slot = cloud.clips.slot()?;
+    let _slot = cloud.clips.slot(&vehicle.name)?;
     let receive = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body);
     let received = timeout(PART_TIME, receive).await.map_err(|_| {
         let message = format!("a part of clip `{}` took too long", progress.id);

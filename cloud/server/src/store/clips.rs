@@ -1,5 +1,7 @@
 //! Clips that vehicles have announced, and the progress of their files.
 
+use std::collections::BTreeSet;
+
 use gleaner_base::{excerpt, visible};
 use gleaner_fleet::clips::{
     ClipFacts, ClipId, ClipName, ClipOrders, ClipPolicy, ClipReport, GoneClip, WantedClip,
@@ -363,10 +365,10 @@ impl StoreChange<'_> {
         }
         let lambdas = facts.lambdas.iter().map(|it| ("lambda", &it.name));
         let labels = facts.moments.iter().map(|it| ("label", &it.label));
-        for (kind, word) in lambdas.chain(labels) {
+        let words: BTreeSet<_> = lambdas.chain(labels).collect();
+        for (kind, word) in words {
             run!(&mut *self.tx;
-                "INSERT INTO clip_words (kind, word, clip) VALUES ($1, $2, $3)
-                 ON CONFLICT (kind, word, clip) DO NOTHING";
+                "INSERT INTO clip_words (kind, word, clip) VALUES ($1, $2, $3)";
                 kind, word, last + 1);
         }
         Ok(())

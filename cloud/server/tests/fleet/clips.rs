@@ -205,6 +205,23 @@ async fn hostile_uploads_are_refused_and_change_nothing() {
         assert!(text.contains(expected), "{text}");
     }
     assert_eq!(orders(&good).await.wanted[0].part, 0);
+    // Parts that never end take the place of no other vehicle's.
+    let mut endless = Vec::new();
+    for _ in 0..4 {
+        let mut stream = bad.stream().await;
+        let head = format!(
+            "PUT /v1/clips/liar/parts/0/{} HTTP/1.1\r\nhost: cloud\r\ncontent-length: 7\r\n\r\n7",
+            sha256(b"7654321")
+        );
+        stream.write_all(head.as_bytes()).await.unwrap();
+        stream.flush().await.unwrap();
+        endless.push(stream);
+    }
+    let wrong = format!("/v1/clips/liar/parts/0/{}", sha256(b"other"));
+    while bad.request(Method::PUT, &wrong, b"7654321").await.0 != StatusCode::TOO_MANY_REQUESTS {}
+    assert_eq!(put(&good, "a", 0, b"conten").await.0, StatusCode::FORBIDDEN);
+    drop(endless);
+    while bad.request(Method::PUT, &wrong, b"7654321").await.0 == StatusCode::TOO_MANY_REQUESTS {}
     // Another file than announced is not wanted any more after some times.
     for _ in 0..3 {
         let (status, text) = put(&bad, "liar", 0, b"7654321").await;

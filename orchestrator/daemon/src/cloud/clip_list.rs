@@ -111,7 +111,7 @@ impl ClipFolder {
             match clip {
                 Some((name, clip)) => {
                     let facts = self.facts(name, clip, builds, is_over)?;
-                    let bytes = serde_json::to_vec(&facts).map_or(0, |text| text.len());
+                    let bytes = facts.length();
                     if !report.clips.is_empty() && length + bytes > CLIP_REPORT_MAX - CLIP_FACTS_MAX
                     {
                         break;
