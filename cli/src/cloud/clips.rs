@@ -107,7 +107,7 @@ fn text(clips: &[FleetClip]) -> String {
             clip.id.to_string(),
             super::date(u64::try_from(facts.from_ns / 1_000_000_000).unwrap_or(0)),
             format!("{:.1}s", facts.to_ns.saturating_sub(facts.from_ns) as f64 / 1e9),
-            ByteSize::new(facts.bytes).to_string(),
+            format!("{:.1} MiB", facts.bytes as f64 / (1 << 20) as f64),
             if labels.is_empty() { "-".to_owned() } else { labels.join(", ") },
             score.unwrap_or_else(|| "-".to_owned()),
             state,
