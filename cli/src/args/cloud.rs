@@ -9,7 +9,7 @@ use gleaner_base::parse_duration;
 use gleaner_fleet::people::Role;
 use gleaner_trust::VehicleName;
 
-use super::{FleetArgs, VehicleArgs};
+use super::{ClipsArgs, FleetArgs, VehicleArgs};
 
 /// Commands of `gleaner` for the cloud.
 #[derive(Subcommand, Debug)]
@@ -33,6 +33,8 @@ pub enum CloudCommand {
     Vehicles(VehiclesArgs),
     /// List the deployments of the cloud, or change their waves
     Fleet(FleetArgs),
+    /// List the clips of the vehicles of the cloud, fetch or export them
+    Clips(ClipsArgs),
     /// List who changed what in the cloud, the newest first
     Audit(AuditArgs),
     /// Connect this vehicle to a cloud

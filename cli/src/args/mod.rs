@@ -1,6 +1,7 @@
 //! Defines the command line, and checks arguments as far as possible without opening files.
 
 mod authoring;
+mod clips;
 mod cloud;
 mod signing;
 mod vehicle;
@@ -16,6 +17,7 @@ use clap_complete::Shell;
 use gleaner_protocol::DriveTime;
 
 pub use authoring::{BuildArgs, Language, NewArgs};
+pub use clips::{ClipFilterArgs, ClipsArgs, ClipsCommand, ExportArgs, PolicyArgs, PullArgs};
 pub use cloud::{
     AuditArgs, CloudCommand, EnrolArgs, ListArgs, LoginArgs, NewVehicleArgs, RemoveArgs, UserArgs,
     UsersArgs, UsersCommand, VehiclesArgs, VehiclesCommand,

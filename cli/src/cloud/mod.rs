@@ -2,9 +2,11 @@
 //!
 //! - `login`: the address and the token. `people`: users, and the audit trail.
 //! - `vehicles`: lists, enrols and revokes vehicles. `enrol`: connects this one.
+//! - `clips`: lists and fetches recorded clips.
 //! - `fleet`: deployments of the cloud, signed here. `rollout`: waits for all their vehicles, and
 //!   `waves` for the waves before.
 
+mod clips;
 mod enrol;
 mod fleet;
 mod login;
@@ -35,6 +37,7 @@ pub(crate) fn run(command: &CloudCommand) -> Result<Exit, Failure> {
         CloudCommand::Users(args) => people::users(args),
         CloudCommand::Vehicles(args) => vehicles::vehicles(args),
         CloudCommand::Fleet(args) => fleet::fleet(args),
+        CloudCommand::Clips(args) => clips::clips(args),
         CloudCommand::Audit(args) => people::audit(args),
         CloudCommand::Enrol(args) => enrol::enrol(args),
         CloudCommand::Unenrol(args) => enrol::unenrol(args),

@@ -174,6 +174,32 @@ impl VehicleClient {
         })
     }
 
+    /// Calls `take` with each piece of a file, which begins after `from` bytes.
+    pub(crate) fn download(
+        &self,
+        path: &str,
+        from: u64,
+        mut take: impl FnMut(&[u8]) -> Result<(), Failure>,
+    ) -> Result<(), Failure> {
+        self.runtime.block_on(async {
+            let body = Either::Left(Full::default());
+            let answer = self.request_from(Method::GET, path, body, from).await?;
+            if from > 0 && answer.status() != StatusCode::PARTIAL_CONTENT {
+                let message = format!("{} does not continue a file", self.program());
+                return Err(Failure::new(Exit::Internal, message)
+                    .with_help("remove the file that ends with `.part`, and run this again"));
+            }
+            let mut body = answer.into_body();
+            while let Some(frame) =
+                timeout(ANSWER_TIMEOUT, body.frame()).await.map_err(|late| self.lost(&late))?
+            {
+                let frame = frame.map_err(|error| self.lost(&error))?;
+                take(frame.data_ref().map_or(&[][..], |data| data))?;
+            }
+            Ok(())
+        })
+    }
+
     async fn json<T: DeserializeOwned>(
         &self,
         method: Method,
@@ -194,6 +220,17 @@ impl VehicleClient {
         method: Method,
         path: &str,
         body: Content,
+    ) -> Result<Response<Incoming>, Failure> {
+        self.request_from(method, path, body, 0).await
+    }
+
+    /// As [`request`](Self::request), for the content after `from` bytes.
+    async fn request_from(
+        &self,
+        method: Method,
+        path: &str,
+        body: Content,
+        from: u64,
     ) -> Result<Response<Incoming>, Failure> {
         let (mut sender, host, token) = match &self.endpoint {
             Endpoint::Orchestrator(socket) => {
@@ -222,6 +259,9 @@ impl VehicleClient {
         }
         if !token.is_empty() {
             request = request.header("authorization", format!("Bearer {token}"));
+        }
+        if from > 0 {
+            request = request.header("range", format!("bytes={from}-"));
         }
         let request = request.body(body).map_err(|error| {
             Failure::caused_by(Exit::Usage, format!("`{path}` is no request"), &error)

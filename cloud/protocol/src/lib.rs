@@ -3,13 +3,15 @@
 //! `frame` has the frames of the control channel: one WebSocket per vehicle, opened by it.
 //! `enrolment` has the messages by which a vehicle gets its certificate, and `people` those of the
 //! API for people; `waves` is the part of it by which a release reaches vehicles step by step.
-//! `object` checks files that are sent. Nothing here opens a connection.
+//! `clips` has those about recorded clips. `object` checks files that are sent. Nothing here opens
+//! a connection.
 //!
 //! A vehicle is given the complete wanted state, never a change of it: a list of deployments, each
 //! by the digest of its signed envelope. It fetches envelopes and files that it lacks by HTTPS from
 //! the same address, and verifies all of them by its own trust root. What it has recorded goes up
 //! in batches, and counts as delivered once the cloud has acknowledged it.
 
+pub mod clips;
 mod enrolment;
 mod frame;
 mod object;

@@ -6,6 +6,7 @@ use tokio::sync::Semaphore;
 
 use crate::attempts::{VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
+use crate::clips::ClipFiles;
 use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::readers::Readers;
@@ -18,6 +19,7 @@ pub(crate) const STORED_FRAMES_MAX: usize = 64;
 pub(crate) struct Cloud {
     pub(crate) store: CloudStore,
     pub(crate) objects: Objects,
+    pub(crate) clips: ClipFiles,
     pub(crate) hub: Hub,
     pub(crate) authorities: Authorities,
     pub(crate) wrong_secrets: WrongSecrets,

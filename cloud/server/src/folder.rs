@@ -29,7 +29,7 @@ impl DataFolder {
             return Err(Failure::new(Exit::Usage, message)
                 .with_help("choose an empty folder, or one that does not exist, with --data"));
         }
-        for path in [path, &folder.objects(), &folder.authorities()] {
+        for path in [path, &folder.objects(), &folder.clips(), &folder.authorities()] {
             DirBuilder::new()
                 .recursive(true)
                 .mode(0o700)
@@ -117,6 +117,11 @@ impl DataFolder {
 
     pub(crate) fn objects(&self) -> PathBuf {
         self.0.join("objects")
+    }
+
+    /// Folder of the files of clips.
+    pub(crate) fn clips(&self) -> PathBuf {
+        self.0.join("clips")
     }
 
     /// Folder of the keys and certificates of the authorities.

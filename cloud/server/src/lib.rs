@@ -5,6 +5,7 @@
 //! listeners: `people` and `page` answer requests of people, and `vehicles` those of vehicles, each
 //! of which keeps one connection open. `hub` knows these connections, and wakes them after a
 //! change.
+//! `clips` has recorded clips of vehicles, with a folder of its own.
 //!
 //! Nothing here runs a lambda, or decides what a vehicle runs: each vehicle verifies signatures by
 //! its own trust root.
@@ -12,6 +13,7 @@
 mod accept;
 mod attempts;
 mod authority;
+mod clips;
 mod cloud;
 mod error;
 mod folder;

@@ -15,12 +15,13 @@ use tokio::time::{MissedTickBehavior, interval};
 use crate::accept::Entrance;
 use crate::attempts::{VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
+use crate::clips::ClipFiles;
 use crate::cloud::{Cloud, STORED_FRAMES_MAX};
 use crate::folder::DataFolder;
 use crate::hub::Hub;
 use crate::objects::Objects;
-use crate::store::{CloudStore, Retention};
-use crate::{people, vehicles};
+use crate::store::{ClipBounds, CloudStore, Retention};
+use crate::{clips, people, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles.
 const PEOPLE_MAX: u32 = 1000;
@@ -96,6 +97,7 @@ impl CloudServer {
         let cloud = Arc::new(Cloud {
             store,
             objects: Objects::open(folder.objects())?,
+            clips: ClipFiles::open(folder.clips(), ClipBounds::DEFAULT)?,
             hub: Hub::default(),
             authorities,
             wrong_secrets: WrongSecrets::default(),
@@ -130,8 +132,11 @@ impl CloudServer {
             let mut certificate = interval(CERTIFICATE_INTERVAL);
             let mut waves = interval(WAVES_INTERVAL);
             waves.set_missed_tick_behavior(MissedTickBehavior::Delay);
+            let clips = clips::clean(&working);
+            tokio::pin!(clips);
             loop {
                 tokio::select! {
+                    () = &mut clips => {}
                     _ = seen.tick() => store_seen(&working).await,
                     _ = waves.tick() => advance_waves(&working).await,
                     _ = certificate.tick() => match working.authorities.server_config(&host) {

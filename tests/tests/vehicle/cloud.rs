@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use gleaner_fleet::clips::{ClipState, FleetClip};
 use gleaner_fleet::people::VehicleState;
 use gleaner_protocol::supervision::LambdaPhase;
 use gleaner_protocol::vehicle_api::StreamLine;
@@ -9,7 +10,7 @@ use gleaner_tests::LambdaCopy;
 use gleaner_tests::cloud::TestCloud;
 use gleaner_tests::vehicle::{TestVehicle, text};
 
-use super::ticker;
+use super::{recording, ticker};
 
 const NAME: &str = "car-7";
 
@@ -101,6 +102,55 @@ pub fn follows() {
     });
     until_all_events(&cloud, &vehicle);
     vehicle.stop();
+}
+
+pub fn clips() {
+    let (mut cloud, mut vehicle) = enrolled();
+    let lambda = recording("rust", "ticks");
+    let deployed = vehicle.deploy(lambda.path(), &[]);
+    assert!(deployed.status.success(), "{}", text(&deployed));
+    vehicle.until("two clips", |vehicle| (super::clips(vehicle).len() > 1).then_some(()));
+    // Both sides are killed while clips are announced.
+    cloud.kill();
+    vehicle.kill_orchestrator();
+    assert!(cloud.start().is_none(), "its user is still logged in");
+    vehicle.start();
+    vehicle.succeeds(&["stop", "ticks"]);
+    let listed = |cloud: &TestCloud| -> Vec<FleetClip> {
+        let text = cloud.succeeds(&["clips", "--lambda", "ticks", "-n", "10000", "--json"]);
+        serde_json::from_str(&text).expect("a list")
+    };
+    vehicle.until("every clip at the cloud, once", |vehicle| {
+        let here = super::clips(vehicle).into_iter().map(|clip| clip.file);
+        let here: Vec<_> = here.map(|file| file.display().to_string()).collect();
+        let mut there: Vec<_> =
+            listed(&cloud).iter().map(|clip| format!("clips/{}.mcap", clip.facts.name)).collect();
+        there.reverse();
+        (here == there).then_some(())
+    });
+    let clip = listed(&cloud).pop().expect("there is one");
+    let lambda = &clip.facts.lambdas[0];
+    assert_eq!((clip.state, lambda.deployment.as_deref()), (ClipState::OnVehicle, Some("ticks")));
+    assert!(lambda.revision.is_some() && !clip.facts.moments.is_empty(), "{clip:?}");
+    let folder = cloud.path("fetched");
+    let to = folder.to_str().expect("a plain path");
+    cloud.succeeds(&["clips", "pull", &clip.id.to_string(), "--to", to]);
+    let file = folder.join(NAME).join(format!("{}.mcap", clip.facts.name));
+    let original = vehicle.path(&format!("state/clips/clips/{}.mcap", clip.facts.name));
+    assert!(std::fs::read(&file).expect("it came") == std::fs::read(original).expect("it stays"));
+    let trust = cloud.path("vehicles");
+    std::fs::write(&trust, format!("{NAME} {}\n", vehicle.status().key)).expect("a file");
+    let [file, trust] = [&file, &trust].map(|path| path.to_str().expect("a plain path"));
+    let verified = cloud.succeeds(&["verify", file, "--trust", trust]);
+    assert!(verified.contains("signed by car-7"), "{verified}");
+    // The table of an export names the file that is there already.
+    cloud.succeeds(&["clips", "export", "--label", &clip.facts.moments[0].label, "--to", to]);
+    let table = std::fs::read_to_string(folder.join("events.jsonl")).expect("a table");
+    let row: serde_json::Value =
+        serde_json::from_str(table.lines().next().expect("a row")).expect("JSON");
+    assert_eq!(row["clip"], format!("{NAME}/{}.mcap", clip.facts.name));
+    let again = cloud.gleaner(&["clips", "export", "--to", to]);
+    assert!(!again.status.success(), "a table is not replaced");
 }
 
 pub fn killed() {

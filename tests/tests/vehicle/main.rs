@@ -21,7 +21,7 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 28] = [
+const CASES: [Case; 29] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_supervisor_that_ends_after_sighup_is_no_zombie", deployments::reaped),
     ("after_an_upgrade_old_and_new_programs_do_not_mix", deployments::upgraded),
@@ -47,6 +47,7 @@ const CASES: [Case; 28] = [
     ("top_ends_with_a_terminal_that_sends_no_signal", top::lost_terminal),
     ("what_follows_ends_with_its_reader_although_nothing_happens", top::readers),
     ("a_vehicle_runs_what_the_cloud_wants_and_sends_its_records", cloud::follows),
+    ("clips_reach_the_cloud_once_and_are_verified_after_a_pull", cloud::clips),
     ("a_cloud_that_is_killed_loses_nothing", cloud::killed),
     ("a_vehicle_refuses_what_no_trusted_key_signed_and_runs_without_a_cloud", cloud::refused),
     ("processes_are_killed_at_random", chaos::killed_at_random),

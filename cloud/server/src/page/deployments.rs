@@ -6,6 +6,7 @@ use std::sync::Arc;
 use axum::extract::{Extension, Path, Query, State};
 use axum::response::{IntoResponse, Redirect};
 use gleaner_fleet::people::{FleetDeployment, Role};
+use gleaner_fleet::waves::{WaveProgress, WaveState};
 use maud::{Markup, html};
 
 use super::charts;
@@ -97,6 +98,27 @@ fn progress(deployment: &FleetDeployment) -> Markup {
                 ("other", rest, others),
             ]))
         }
+        @if let Some(waves) = &deployment.waves { (waves_of(waves)) }
+    }
+}
+
+/// Renders how far the waves have come.
+fn waves_of(waves: &WaveProgress) -> Markup {
+    let WaveProgress { wave, waves: all, vehicles, running, failed, reason, .. } = waves;
+    let (class, state) = match waves.state {
+        WaveState::Running => ("waiting", "goes on once it has succeeded"),
+        WaveState::Paused => ("failed", "paused"),
+        WaveState::Aborted => ("other", "aborted"),
+    };
+    html! {
+        p {
+            span.state.(class) { "Wave " (wave) " of " (all) ": " (state) }
+            @if !reason.is_empty() { " (" (shown(reason)) ")" }
+            span.dim {
+                ". It has reached " (count(*vehicles, "vehicle")) ": " (running) " running, "
+                (failed) " failed. The others keep their release."
+            }
+        }
     }
 }
 
@@ -182,6 +204,19 @@ fn changes(user: &PageUser, here: &str, deployment: &FleetDeployment) -> Markup 
                 } @else {
                     (form(user, &format!("{here}/start"), html! { button { "Start" } }))
                 }
+                @match deployment.waves.as_ref().map(|waves| waves.state) {
+                    Some(WaveState::Running) => {
+                        (form(user, &format!("{here}/pause"), html! { button { "Pause waves" } }))
+                    }
+                    Some(WaveState::Paused) => {
+                        (form(user, &format!("{here}/resume"), html! { button { "Resume waves" } }))
+                    }
+                    _ => {}
+                }
+                @if deployment.waves.as_ref().is_some_and(|it| it.state != WaveState::Aborted) {
+                    (confirmed(user, &format!("{here}/abort"), "Abort waves",
+                        "Vehicles that have the release keep it, and no others get it.", html! {}))
+                }
                 @if deployment.fallback.is_some() {
                     (confirmed(user, &format!("{here}/rollback"), "Roll back",
                         "Each vehicle will run the fallback until the next release.", html! {}))
@@ -212,6 +247,35 @@ pub(super) async fn stop(
 ) -> PageResult {
     let changed = cloud.store.set_wanted(&user.user.name, &id, false).await;
     changed_to(&cloud, changed, &format!("{}?done=stop", deployment_path(&id)))
+}
+
+pub(super) async fn pause(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(id): Path<String>,
+) -> PageResult {
+    steer(&cloud, &user, &id, WaveState::Paused).await
+}
+
+pub(super) async fn resume(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(id): Path<String>,
+) -> PageResult {
+    steer(&cloud, &user, &id, WaveState::Running).await
+}
+
+pub(super) async fn abort(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(id): Path<String>,
+) -> PageResult {
+    steer(&cloud, &user, &id, WaveState::Aborted).await
+}
+
+async fn steer(cloud: &Cloud, user: &PageUser, id: &str, state: WaveState) -> PageResult {
+    let changed = cloud.store.steer_waves(&user.user.name, id, state).await;
+    changed_to(cloud, changed, &format!("{}?done=waves", deployment_path(id)))
 }
 
 pub(super) async fn roll_back(

@@ -27,6 +27,7 @@ use gleaner_fleet::people::{
 use gleaner_fleet::waves::WaveState;
 
 use crate::accept::PeerConnection;
+use crate::clips::people as clips;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::page;
@@ -82,6 +83,13 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
         send("/v1/deployments/{id}/{change}", Operator, post(change)),
         remove("/v1/deployments/{id}", Deployer, delete(remove_deployment)),
         read("/v1/audit", Admin, get(audit)),
+        read("/v1/clips", Viewer, get(clips::list)),
+        read("/v1/clips/policy", Viewer, get(clips::policy)),
+        endpoint(Method::PUT, "/v1/clips/policy", Some(Admin), put(clips::set_policy)),
+        read("/v1/clips/{id}", Viewer, get(clips::show)),
+        read("/v1/clips/{id}/thumbnail", Viewer, get(clips::thumbnail)),
+        read("/v1/clips/{id}/file", Viewer, get(clips::file)),
+        send("/v1/clips/{id}/pull", Operator, post(clips::pull)),
     ]
 }
 

@@ -8,10 +8,11 @@ use tokio::sync::Semaphore;
 use super::*;
 use crate::attempts::{VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
+use crate::clips::ClipFiles;
 use crate::folder::DataFolder;
 use crate::hub::Hub;
 use crate::objects::Objects;
-use crate::store::{CloudStore, Retention};
+use crate::store::{ClipBounds, CloudStore, Retention};
 
 pub(crate) const ROLES: [Role; 4] = [Role::Viewer, Role::Operator, Role::Deployer, Role::Admin];
 
@@ -20,6 +21,7 @@ pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
     Arc::new(Cloud {
         store: CloudStore::of_test(folder).await,
         objects: Objects::open(data.objects()).unwrap(),
+        clips: ClipFiles::open(data.clips(), ClipBounds::DEFAULT).unwrap(),
         hub: Hub::default(),
         authorities: Authorities::open(&data).unwrap(),
         wrong_secrets: WrongSecrets::default(),

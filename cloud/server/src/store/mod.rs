@@ -34,6 +34,8 @@ macro_rules! rows {
 
 mod address;
 mod audit;
+mod clip_list;
+mod clips;
 mod deployments;
 mod page;
 mod records;
@@ -58,6 +60,8 @@ use crate::error::{CloudError, CloudResult};
 
 pub(crate) use address::StoreAddress;
 pub(crate) use audit::ENTRIES_MAX;
+pub(crate) use clip_list::ClipQuery;
+pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
 pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
@@ -69,6 +73,7 @@ pub(crate) use wants::ChangedVehicles;
 const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0001_start.sql"),
     include_str!("../../migrations/0002_releases.sql"),
+    include_str!("../../migrations/0003_clips.sql"),
     include_str!("../../migrations/0004_page.sql"),
 ];
 

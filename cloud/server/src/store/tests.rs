@@ -357,5 +357,8 @@ async fn the_database_of_a_later_version_is_refused() {
 
 #[test]
 fn the_same_tests_pass_on_postgresql() {
-    postgres::run_again(&["store::", "people::"], "the_same_tests_pass_on_postgresql");
+    postgres::run_again(
+        &["store::", "people::", "page::", "clips::"],
+        "the_same_tests_pass_on_postgresql",
+    );
 }

@@ -8,6 +8,7 @@
 //! | `GET /v1/deployments/SHA256` | the envelope of a deployment |
 //! | `GET /v1/revisions/DIGEST` | the envelope of a revision |
 //! | `GET /v1/objects/SHA256` | a file of a revision |
+//! | `POST /v1/clips`, `PUT /v1/clips/NAME/...` | what is wanted; see [`gleaner_fleet::clips`] |
 
 mod batch;
 mod link;
@@ -38,8 +39,8 @@ const READ_BUFFER: usize = 4096;
 
 /// The vehicle that sends a request, by its certificate.
 #[derive(Debug, Clone)]
-struct KnownVehicle {
-    name: String,
+pub(crate) struct KnownVehicle {
+    pub(crate) name: String,
     certificate: String,
 }
 
@@ -51,6 +52,7 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
         .route("/v1/deployments/{sha256}", get(deployment))
         .route("/v1/revisions/{digest}", get(revision))
         .route("/v1/objects/{sha256}", get(object))
+        .merge(crate::clips::router())
         .route_layer(from_fn_with_state(Arc::clone(cloud), guard))
         .route("/v1/enrol", post(enrol).layer(from_fn(in_time)))
         .fallback(async || CloudError::missing("there is nothing under this path", "see the docs"))

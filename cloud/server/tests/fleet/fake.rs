@@ -183,6 +183,28 @@ impl FakeVehicle {
         whole(soon(send(tls(&self.address, &self.config).await, request)).await.unwrap()).await
     }
 
+    /// Sends a request with a body; returns the answer.
+    pub(crate) async fn request(
+        &self,
+        method: Method,
+        path: &str,
+        body: &[u8],
+    ) -> (StatusCode, Vec<u8>) {
+        let body = Full::new(Bytes::copy_from_slice(body));
+        let request = Request::builder().method(method).uri(path).header("host", "cloud");
+        whole(soon(send(self.stream().await, request.body(body).unwrap())).await.unwrap()).await
+    }
+
+    /// Opens a connection.
+    pub(crate) async fn stream(&self) -> TlsStream<TcpStream> {
+        tls(&self.address, &self.config).await
+    }
+
+    /// Returns the same vehicle, for a cloud at this address.
+    pub(crate) fn at(&self, address: SocketAddr) -> Self {
+        Self { address: address.to_string(), config: Arc::clone(&self.config) }
+    }
+
     /// Opens the control channel up to the welcome and the first wanted state.
     pub(crate) async fn connect(&self) -> (FakeLink, Welcome, Desired) {
         let mut link = self.link().await.expect("the control channel opens");

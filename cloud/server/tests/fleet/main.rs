@@ -1,5 +1,6 @@
 //! People and vehicles use a cloud together, over its two addresses.
 
+mod clips;
 mod fake;
 mod hostile;
 mod links;

@@ -25,6 +25,9 @@ use tokio_rustls::client::TlsStream;
 /// Time to connect, and to wait for the head of an answer or for the next piece of its body.
 pub(super) const PATIENCE: Duration = Duration::from_secs(30);
 
+/// Time to send a part of a file and to get the answer: 14 kB/s.
+const SENDING: Duration = Duration::from_secs(600);
+
 /// Longest answer without a file.
 const ANSWER_MAX: u64 = 64 << 10;
 
@@ -69,8 +72,29 @@ impl CloudHttp {
             let answer = self.request(Method::POST, path, body).await?;
             self.whole(answer, ANSWER_MAX).await
         });
-        let whole = whole.await??;
-        serde_json::from_slice(&whole)
+        self.parsed(&whole.await??)
+    }
+
+    /// Sends bytes, and returns the answer.
+    ///
+    /// # Errors
+    ///
+    /// A failure if there is none, or it is an error.
+    pub(super) async fn put<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: Vec<u8>,
+    ) -> Result<T, Failure> {
+        let sent = timeout(SENDING, async {
+            let answer = self.request_within(SENDING, Method::PUT, path, body).await?;
+            self.whole(answer, ANSWER_MAX).await
+        });
+        let whole = sent.await.map_err(|late| self.unreachable("it did not answer", &late))??;
+        self.parsed(&whole)
+    }
+
+    fn parsed<T: DeserializeOwned>(&self, text: &[u8]) -> Result<T, Failure> {
+        serde_json::from_slice(text)
             .map_err(|error| self.unreachable("its answer cannot be parsed", &error))
     }
 
@@ -103,6 +127,16 @@ impl CloudHttp {
         path: &str,
         body: Vec<u8>,
     ) -> Result<Response<Incoming>, Failure> {
+        self.request_within(PATIENCE, method, path, body).await
+    }
+
+    async fn request_within(
+        &self,
+        patience: Duration,
+        method: Method,
+        path: &str,
+        body: Vec<u8>,
+    ) -> Result<Response<Incoming>, Failure> {
         let failed = |error: hyper::Error| self.unreachable("the connection was lost", &error);
         let stream = TokioIo::new(self.connect().await?);
         let (mut sender, connection) =
@@ -115,7 +149,8 @@ impl CloudHttp {
             .header(header::CONTENT_TYPE, "application/json")
             .body(Full::new(Bytes::from(body)))
             .map_err(|error| self.unreachable("a request to it is invalid", &error))?;
-        let answer = self.in_time("it did not answer", sender.send_request(request)).await?;
+        let answer = timeout(patience, sender.send_request(request)).await;
+        let answer = answer.map_err(|late| self.unreachable("it did not answer", &late))?;
         let answer = answer.map_err(failed)?;
         if answer.status().is_success() {
             return Ok(answer);

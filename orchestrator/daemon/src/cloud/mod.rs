@@ -5,10 +5,13 @@
 //! - `link`: keeps a connection, and `session` exchanges frames over one.
 //! - `plan`: the steps from what runs to what the cloud wants; `reconcile` takes them.
 //! - `uplink`: sends records that the cloud does not have, `resume` finds where to go on.
+//! - `clips`: announces clips, and sends those that the cloud wants; `clip_list` reads them.
 //!
 //! Without a connection everything runs on, and records wait in their spools. What the cloud wants
 //! is verified as a deployment by a user is: it can run nothing that no trusted key has signed.
 
+mod clip_list;
+mod clips;
 mod enrolling;
 mod http;
 mod link;

@@ -1,6 +1,7 @@
 //! One connection to the cloud: frames in both directions, until it ends.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::mpsc as sync_mpsc;
 use std::time::Duration;
 
@@ -11,6 +12,7 @@ use gleaner_fleet::{
 };
 use tokio::net::TcpStream;
 use tokio::sync::{mpsc, watch};
+use tokio::task::JoinSet;
 use tokio::time::{Instant, interval, sleep_until, timeout};
 use tokio_rustls::client::TlsStream;
 use tokio_tungstenite::WebSocketStream;
@@ -19,6 +21,8 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 
 use super::LinkState;
+use super::clip_list::ClipFolder;
+use super::clips::ClipSender;
 use super::http::{CloudHttp, PATIENCE};
 use super::reconcile::{Handled, Order};
 use super::settings::CloudSettings;
@@ -76,6 +80,11 @@ impl CloudSession<'_> {
             acks: received_acks,
         };
         tokio::task::spawn_blocking(move || uplink.run());
+        let (generation, wanted) = watch::channel(0);
+        let (core, clips) = (Arc::clone(&self.api.core), ClipFolder(self.api.layout.clips()));
+        // It ends with the connection, which drops the set.
+        let mut tasks = JoinSet::new();
+        tasks.spawn(ClipSender::new(core, clips, self.http.clone(), wanted).run());
         let ping = Duration::from_secs((*PING_S.start()).max(ping_s.min(*PING_S.end())).into());
         let (mut pings, mut looks) = (interval(ping), interval(STATUS_INTERVAL));
         let mut last_heard = Instant::now();
@@ -91,6 +100,7 @@ impl CloudSession<'_> {
                                 let why = format!("it wants more than {WANTED_MAX} deployments");
                                 return Err(self.lost(&why));
                             }
+                            generation.send_replace(desired.generation);
                             let order = Order { desired, http: self.http.clone() };
                             self.orders.send_replace(Some(order));
                         }

@@ -1,0 +1,211 @@
+//! `gleaner clips`: clips of the vehicles of a cloud.
+//!
+//! `download` fetches a file into a folder, and `export` does so for many, with a table.
+
+mod download;
+mod export;
+
+use std::collections::BTreeMap;
+use std::thread::sleep;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use gleaner_base::{ByteSize, Exit, Failure, nanoseconds, visible};
+use gleaner_fleet::clips::{ClipId, ClipPage, ClipPolicy, ClipState, FleetClip};
+use serde_json::{Value, json};
+
+use self::download::ClipTarget;
+use super::{client, show};
+use crate::args::{ClipFilterArgs, ClipsArgs, ClipsCommand, PolicyArgs, PullArgs};
+use crate::render::table;
+use crate::vehicle::VehicleClient;
+
+/// Interval of looks whether a vehicle has sent a clip.
+const INTERVAL: Duration = Duration::from_secs(2);
+/// Number of clips in a page.
+const PAGE: usize = 500;
+
+/// Runs `gleaner clips`.
+pub(super) fn clips(args: &ClipsArgs) -> Result<Exit, Failure> {
+    match &args.command {
+        None => {
+            let clips = matching(&client()?, &args.filter, args.last)?;
+            show(args.json, &clips, |clips| text(clips))
+        }
+        Some(ClipsCommand::Pull(pull)) => self::pull(pull),
+        Some(ClipsCommand::Export(export)) => export::export(export),
+        Some(ClipsCommand::Policy(policy)) => self::policy(policy),
+    }
+}
+
+/// Returns the last announced clips that match, at most `most`.
+fn matching(
+    client: &VehicleClient,
+    filter: &ClipFilterArgs,
+    most: usize,
+) -> Result<Vec<FleetClip>, Failure> {
+    let mut query = String::new();
+    let since = filter.since.map(|since| {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        nanoseconds(now.saturating_sub(since)).to_string()
+    });
+    let values = [
+        ("vehicle", filter.vehicle.as_ref()),
+        ("lambda", filter.lambda.as_ref()),
+        ("label", filter.label.as_ref()),
+        ("from_ns", since.as_ref()),
+    ];
+    for (key, value) in values.into_iter().filter_map(|(key, value)| Some((key, value?))) {
+        query += &format!("&{key}={}", escaped(value));
+    }
+    let (mut clips, mut after) = (Vec::new(), String::new());
+    while clips.len() < most {
+        let count = PAGE.min(most - clips.len());
+        let page: ClipPage = client.get(&format!("/v1/clips?last={count}{query}{after}"))?;
+        clips.extend(page.clips);
+        match page.next {
+            Some(next) => after = format!("&after={next}"),
+            None => break,
+        }
+    }
+    clips.truncate(most);
+    Ok(clips)
+}
+
+/// Escapes a value of a query.
+fn escaped(text: &str) -> String {
+    let escape = |byte: u8| match byte {
+        b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' => char::from(byte).into(),
+        _ => format!("%{byte:02X}"),
+    };
+    text.bytes().map(escape).collect()
+}
+
+fn path(id: &ClipId) -> String {
+    format!("/v1/clips/{id}")
+}
+
+fn text(clips: &[FleetClip]) -> String {
+    if clips.is_empty() {
+        return "there are no such clips\n".to_owned();
+    }
+    let head = ["id", "time", "length", "size", "labels", "score", "state"];
+    let rows = clips.iter().map(|clip| {
+        let facts = &clip.facts;
+        let mut labels: Vec<_> = facts.moments.iter().map(|it| visible(&it.label)).collect();
+        labels.sort();
+        labels.dedup();
+        let scores = facts.moments.iter().filter_map(|it| it.score);
+        let score = scores.reduce(f64::max).map(|score| format!("{score:.2}"));
+        let state = match clip.state {
+            ClipState::Uploading => {
+                let percent = clip.received * 100 / facts.bytes.max(1);
+                format!("uploading, {percent} %")
+            }
+            state => state.as_str().to_owned(),
+        };
+        [
+            clip.id.to_string(),
+            super::date(u64::try_from(facts.from_ns / 1_000_000_000).unwrap_or(0)),
+            format!("{:.1}s", facts.to_ns.saturating_sub(facts.from_ns) as f64 / 1e9),
+            format!("{:.1} MiB", facts.bytes as f64 / (1 << 20) as f64),
+            if labels.is_empty() { "-".to_owned() } else { labels.join(", ") },
+            score.unwrap_or_else(|| "-".to_owned()),
+            state,
+        ]
+    });
+    let rows = std::iter::once(head.map(str::to_owned)).chain(rows);
+    table(rows.collect(), &[2, 3, 5])
+}
+
+fn policy(args: &PolicyArgs) -> Result<Exit, Failure> {
+    let client = client()?;
+    let mut policy: ClipPolicy = client.get("/v1/clips/policy")?;
+    if let Some(upload) = args.upload {
+        let day_bytes = args.budget.map_or(policy.day_bytes, ByteSize::bytes);
+        policy = ClipPolicy { upload, day_bytes };
+        let body = serde_json::to_vec(&policy).expect("a policy is plain data");
+        client.put("/v1/clips/policy", body)?;
+    }
+    show(args.json, &policy, |policy| {
+        let budget = ByteSize::new(policy.day_bytes);
+        format!("vehicles send clips: {}; each at most {budget} a day\n", policy.upload.as_str())
+    })
+}
+
+fn pull(args: &PullArgs) -> Result<Exit, Failure> {
+    let client = client()?;
+    let mut waiting = BTreeMap::new();
+    for id in &args.ids {
+        let clip: FleetClip = client.post(&format!("{}/pull", path(id)), &json!({}))?;
+        waiting.insert(id.clone(), clip);
+    }
+    if args.no_wait {
+        let clips: Vec<_> = waiting.into_values().collect();
+        return show(args.json, &clips, |clips| text(clips));
+    }
+    let until = Instant::now() + args.timeout;
+    let mut files: Vec<Value> = Vec::new();
+    let mut shown = BTreeMap::new();
+    loop {
+        let mut left = BTreeMap::new();
+        for (id, clip) in waiting {
+            match clip.state {
+                ClipState::Stored => {
+                    let file = ClipTarget::of(&args.to, &clip)?.fetch(&client)?;
+                    let file = file.display().to_string();
+                    files.push(json!({ "id": id, "file": file, "sha256": clip.facts.sha256 }));
+                }
+                ClipState::Gone | ClipState::Failed => {
+                    let reason = clip.reason.as_deref().map(visible).unwrap_or_default();
+                    let state = clip.state.as_str();
+                    let mut failure =
+                        Failure::new(Exit::Differs, format!("clip `{id}` cannot be fetched"));
+                    failure.causes = vec![format!("it is {state}: {reason}")];
+                    return Err(failure.with_help("choose another clip: `gleaner clips`"));
+                }
+                state => {
+                    let progress = (state, clip.received);
+                    if shown.insert(id.clone(), progress) != Some(progress) && !args.json {
+                        let (received, bytes) = (clip.received, clip.facts.bytes);
+                        eprintln!("{id}: {}, {received} of {bytes} bytes", state.as_str());
+                    }
+                    left.insert(id, clip);
+                }
+            }
+        }
+        if left.is_empty() {
+            break;
+        }
+        if Instant::now() >= until {
+            let message = format!("{} clips have not come yet", left.len());
+            return Err(Failure::new(Exit::Differs, message).with_help(
+                "they stay wanted: check `gleaner vehicles` and the budget, `gleaner clips \
+                 policy`, and run this again",
+            ));
+        }
+        sleep(INTERVAL);
+        waiting = BTreeMap::new();
+        for id in left.into_keys() {
+            let clip = client.get(&path(&id))?;
+            waiting.insert(id, clip);
+        }
+    }
+    show(args.json, &files, |files| {
+        let files = files.iter().filter_map(|file| file["file"].as_str());
+        let lines = files.map(|file| {
+            format!("{file}\n  gleaner verify {file} --trust VEHICLES    # its signature\n")
+        });
+        lines.collect()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_of_a_query_cannot_end_it() {
+        assert_eq!(escaped("a-1.b_C"), "a-1.b_C");
+        assert_eq!(escaped("x&y=ä z"), "x%26y%3D%C3%A4%20z");
+    }
+}

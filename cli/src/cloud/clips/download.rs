@@ -1,0 +1,112 @@
+//! Downloads the file of a clip.
+//!
+//! Names come from the cloud and are checked: `DIR/VEHICLE/NAME.mcap` cannot lead out of `DIR`.
+//! Until a file is whole and has the right SHA-256 it is `NAME.mcap.part`, and goes on there.
+
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+
+use gleaner_base::{Exit, Failure, safe_file};
+use gleaner_fleet::AnnouncedFile;
+use gleaner_fleet::clips::FleetClip;
+use rustix::fs::{CWD, RenameFlags, renameat_with};
+
+use crate::vehicle::VehicleClient;
+
+/// A clip and the place for its file.
+pub(super) struct ClipTarget<'c> {
+    clip: &'c FleetClip,
+    sha256: &'c str,
+    file: PathBuf,
+}
+
+impl<'c> ClipTarget<'c> {
+    /// Returns the place of a clip in a folder.
+    pub(super) fn of(folder: &Path, clip: &'c FleetClip) -> Result<Self, Failure> {
+        let sha256 = clip.facts.sha256.as_deref().ok_or_else(|| {
+            Failure::new(Exit::Internal, format!("the cloud has no SHA-256 of clip `{}`", clip.id))
+        })?;
+        // The parts of an id have no separators, and do not begin with a dot.
+        let file = folder.join(clip.id.vehicle()).join(format!("{}.mcap", clip.id.name()));
+        Ok(Self { clip, sha256, file })
+    }
+
+    /// Returns the path of the file, once it is there: downloaded, or from an earlier time.
+    pub(super) fn fetch(&self, client: &VehicleClient) -> Result<PathBuf, Failure> {
+        let shown = self.file.display();
+        let failed = |error: io::Error| {
+            Failure::caused_by(Exit::Usage, format!("cannot write `{shown}`"), &error)
+                .with_help("choose another folder with --to DIR, or make room")
+        };
+        let folder = self.file.parent().unwrap_or(Path::new("."));
+        safe_file::folder(folder).map_err(failed)?;
+        if self.file.symlink_metadata().is_ok() {
+            return match self.compare(&self.file).map_err(failed)? {
+                Ok(()) => Ok(self.file.clone()),
+                Err(reason) => {
+                    let message = format!("`{shown}` exists, and is another file");
+                    let mut failure = Failure::new(Exit::Usage, message);
+                    failure.causes = vec![reason];
+                    Err(failure.with_help("choose another folder with --to DIR"))
+                }
+            };
+        }
+        let part = self.file.with_extension("mcap.part");
+        let mut file = safe_file::append(&part).map_err(failed)?;
+        let mut from = file.metadata().map_err(failed)?.len();
+        if from > self.clip.facts.bytes {
+            file.set_len(0).map_err(failed)?;
+            from = 0;
+        }
+        let (mut left, mut is_longer) = (self.clip.facts.bytes - from, false);
+        if left > 0 {
+            let path = format!("/v1/clips/{}/file", self.clip.id);
+            let done = client.download(&path, from, |piece| {
+                left = left.checked_sub(piece.len() as u64).ok_or_else(|| {
+                    is_longer = true;
+                    self.refused("it is longer")
+                })?;
+                file.write_all(piece).map_err(failed)
+            });
+            if is_longer {
+                fs::remove_file(&part).map_err(failed)?;
+            }
+            done?;
+        }
+        file.sync_all().map_err(failed)?;
+        if let Err(reason) = self.compare(&part).map_err(failed)? {
+            fs::remove_file(&part).map_err(failed)?;
+            return Err(self.refused(&reason));
+        }
+        // An existing file is never replaced.
+        renameat_with(CWD, &part, CWD, &self.file, RenameFlags::NOREPLACE)
+            .map_err(|error| failed(error.into()))?;
+        Ok(self.file.clone())
+    }
+
+    fn refused(&self, reason: &str) -> Failure {
+        let message = format!("the cloud sent another file than clip `{}`", self.clip.id);
+        let mut failure = Failure::new(Exit::Denied, message);
+        failure.causes = vec![reason.to_owned()];
+        failure.with_help("run this again")
+    }
+
+    fn compare(&self, path: &Path) -> io::Result<Result<(), String>> {
+        let mut announced = AnnouncedFile::new(self.clip.facts.bytes, self.sha256);
+        let (mut file, mut piece): (File, _) = (safe_file::read(path)?, vec![0; 1 << 20]);
+        loop {
+            match file.read(&mut piece)? {
+                0 => return Ok(announced.finish()),
+                read => {
+                    if let Err(reason) = announced.add(&piece[..read]) {
+                        return Ok(Err(reason));
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

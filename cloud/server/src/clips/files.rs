@@ -1,0 +1,198 @@
+//! The folder of clips: files under names that are digests of their ids.
+//!
+//! The parts of a file are appended to it one after the other, each once it is complete and its
+//! digest is right. How many there are is in the database only: bytes after them do not count.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{self, Arc, PoisonError};
+use std::time::Duration;
+
+use axum::body::Body;
+use futures_util::StreamExt;
+use gleaner_base::{Exit, Failure, sync_folder};
+use gleaner_fleet::clips::{CLIP_PART, ClipId};
+use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
+use gleaner_trust::sha256;
+use tokio::io::AsyncWriteExt;
+use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
+use tokio::time::timeout;
+
+use crate::error::{CloudError, CloudResult};
+use crate::store::ClipBounds;
+
+/// Extension of a part that is being received.
+const PART: &str = "part";
+/// Number of parts of a vehicle that are received at a time: some may be of connections that it
+/// has lost.
+const PARTS_MAX: usize = 4;
+/// Time for the next piece of a part.
+const PIECE_TIME: Duration = Duration::from_secs(60);
+/// Number of locks for all files.
+const TURNS: usize = 64;
+
+/// The folder.
+#[derive(Debug)]
+pub(crate) struct ClipFiles {
+    folder: PathBuf,
+    pub(crate) bounds: ClipBounds,
+    parts: AtomicU64,
+    /// Slots of the vehicles that send parts.
+    slots: sync::Mutex<BTreeMap<String, Arc<Semaphore>>>,
+    turns: Vec<Arc<Mutex<()>>>,
+}
+
+impl ClipFiles {
+    /// Opens the folder, and removes parts that an earlier process left.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the folder.
+    pub(crate) fn open(folder: PathBuf, bounds: ClipBounds) -> Result<Self, Failure> {
+        let cleaned = fs::read_dir(&folder).and_then(|entries| {
+            for entry in entries {
+                let path = entry?.path();
+                if path.extension().is_some_and(|it| it == PART) {
+                    fs::remove_file(path)?;
+                }
+            }
+            Ok(())
+        });
+        cleaned.map_err(|error| {
+            let action = format!("cannot open the folder `{}`", folder.display());
+            Failure::caused_by(Exit::Internal, action, &error)
+        })?;
+        let turns = (0..TURNS).map(|_| Arc::default()).collect();
+        Ok(Self { folder, bounds, parts: AtomicU64::new(0), slots: sync::Mutex::default(), turns })
+    }
+
+    fn path(&self, id: &ClipId, extension: &str) -> PathBuf {
+        self.folder.join(format!("{}.{extension}", sha256(id.to_string().as_bytes())))
+    }
+
+    /// Returns the path of the file of a clip.
+    pub(crate) fn clip(&self, id: &ClipId) -> PathBuf {
+        self.path(id, "mcap")
+    }
+
+    /// Returns the path of the thumbnail of a clip.
+    pub(crate) fn thumbnail(&self, id: &ClipId) -> PathBuf {
+        self.path(id, "jpg")
+    }
+
+    /// Removes the file of a clip.
+    pub(crate) fn remove_file(&self, id: &ClipId) {
+        let path = self.clip(id);
+        match fs::remove_file(&path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                tracing::warn!(path = %path.display(), %error, "a file cannot be removed");
+            }
+            _ => {}
+        }
+    }
+
+    /// Returns a slot to receive a part of a vehicle in.
+    pub(crate) fn slot(&self, vehicle: &str) -> CloudResult<OwnedSemaphorePermit> {
+        let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
+        slots.retain(|_, slots| slots.available_permits() < PARTS_MAX);
+        let slots = slots.entry(vehicle.to_owned());
+        let slots = slots.or_insert_with(|| Arc::new(Semaphore::new(PARTS_MAX)));
+        Arc::clone(slots).try_acquire_owned().map_err(|_| {
+            let message = format!("{PARTS_MAX} parts of the vehicle are received already");
+            CloudError::busy(message, "send one part at a time")
+        })
+    }
+
+    /// Waits until no other part of a clip is stored.
+    pub(crate) async fn turn(&self, id: &ClipId) -> OwnedMutexGuard<()> {
+        let digest = sha256(id.to_string().as_bytes());
+        let index = usize::from_str_radix(&digest.as_str()[..4], 16).unwrap_or(0) % TURNS;
+        Arc::clone(&self.turns[index]).lock_owned().await
+    }
+
+    /// Receives bytes with this length and SHA-256 into a file of their own.
+    pub(crate) async fn receive(
+        &self,
+        id: &ClipId,
+        (length, sha256): (u64, &str),
+        body: Body,
+    ) -> CloudResult<UnfinishedFile> {
+        let number = self.parts.fetch_add(1, Ordering::Relaxed);
+        let part = UnfinishedFile(self.path(id, &format!("{number}.{PART}")));
+        let failed = |error: io::Error| {
+            Failure::caused_by(Exit::Internal, format!("cannot receive clip `{id}`"), &error)
+        };
+        let refused = |reason: String| {
+            let help = "send it again, as it was announced";
+            CloudError::denied(format!("a part of clip `{id}` is refused"), help).because(reason)
+        };
+        let mut file = tokio::fs::File::create_new(&part.0).await.map_err(failed)?;
+        let mut announced = AnnouncedFile::new(length, sha256);
+        let mut body = body.into_data_stream();
+        let broken = |error: &dyn std::error::Error| {
+            let message = format!("a part of clip `{id}` did not come in full");
+            CloudError::usage(message, "send it again").because(error)
+        };
+        loop {
+            let piece = timeout(PIECE_TIME, body.next()).await.map_err(|late| broken(&late))?;
+            let Some(piece) = piece else { break };
+            let piece = piece.map_err(|error| broken(&error))?;
+            announced.add(&piece).map_err(refused)?;
+            file.write_all(&piece).await.map_err(failed)?;
+        }
+        announced.finish().map_err(refused)?;
+        file.flush().await.map_err(failed)?;
+        Ok(part)
+    }
+
+    /// Makes a received file durable as the thumbnail of a clip.
+    pub(crate) fn keep_thumbnail(&self, id: &ClipId, part: &UnfinishedFile) -> io::Result<()> {
+        File::open(&part.0)?.sync_all()?;
+        fs::rename(&part.0, self.thumbnail(id))?;
+        sync_folder(&self.folder)
+    }
+
+    /// Makes a received part durable at its place in the file of a clip. Returns false if the
+    /// parts before it are not there.
+    pub(crate) fn append(
+        &self,
+        id: &ClipId,
+        number: u64,
+        part: &UnfinishedFile,
+    ) -> io::Result<bool> {
+        let mut options = File::options();
+        let mut file = options.write(true).create(true).truncate(false).open(self.clip(id))?;
+        let begin = number * CLIP_PART;
+        if file.metadata()?.len() < begin {
+            return Ok(false);
+        }
+        file.set_len(begin)?;
+        file.seek(SeekFrom::Start(begin))?;
+        io::copy(&mut File::open(&part.0)?, &mut file)?;
+        file.flush()?;
+        file.sync_all()?;
+        if number == 0 {
+            sync_folder(&self.folder)?;
+        }
+        Ok(true)
+    }
+}
+
+/// Compares a file with its length and SHA-256.
+pub(super) fn compare(path: &Path, bytes: u64, sha256: &str) -> io::Result<Result<(), String>> {
+    let mut announced = AnnouncedFile::new(bytes, sha256);
+    let (mut file, mut piece) = (File::open(path)?, vec![0; 1 << 20]);
+    loop {
+        match file.read(&mut piece)? {
+            0 => return Ok(announced.finish()),
+            read => {
+                if let Err(reason) = announced.add(&piece[..read]) {
+                    return Ok(Err(reason));
+                }
+            }
+        }
+    }
+}

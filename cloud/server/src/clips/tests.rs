@@ -1,0 +1,87 @@
+use gleaner_fleet::clips::{ClipName, ClipPolicy, ClipReport, UploadedClips};
+use serde_json::json;
+use tempfile::TempDir;
+
+use crate::store::{ClipBounds, ClipQuery, CloudStore};
+
+const BOUNDS: ClipBounds =
+    ClipBounds { clips: 3, vehicle_bytes: 100, bytes: 150, unfinished: 1, unfinished_s: 0 };
+
+async fn store(folder: &TempDir) -> CloudStore {
+    let store = CloudStore::of_test(folder).await;
+    let policy = ClipPolicy { upload: UploadedClips::All, day_bytes: 1 << 40 };
+    for vehicle in ["a", "b"] {
+        store.invite_vehicle("ann", vehicle).await.unwrap();
+    }
+    store.set_clip_policy("ann", &policy).await.unwrap();
+    store
+}
+
+async fn announce(store: &CloudStore, vehicle: &str, name: &str, bytes: u64) {
+    let clip = json!({ "name": name, "from_ns": 1, "to_ns": 2, "bytes": bytes,
+                       "sha256": "0".repeat(64), "thumbnail": null, "lambdas": [], "triggers": 0,
+                       "moments": [] });
+    let report = json!({ "cursor": "1", "clips": [clip], "gone": [] });
+    let report: ClipReport = serde_json::from_value(report).unwrap();
+    store.announce_clips(vehicle, &report, BOUNDS).await.unwrap();
+}
+
+async fn wanted(store: &CloudStore, vehicle: &str) -> Vec<String> {
+    let orders = store.clip_orders(vehicle, BOUNDS).await.unwrap();
+    orders.wanted.iter().map(|it| it.name.to_string()).collect()
+}
+
+fn name(text: &str) -> ClipName {
+    text.parse().unwrap()
+}
+
+#[tokio::test]
+async fn files_are_bounded_for_each_vehicle_and_in_all() {
+    let folder = TempDir::new().unwrap();
+    let store = store(&folder).await;
+    for (vehicle, name, bytes) in [("a", "1", 60), ("a", "2", 60), ("b", "1", 95)] {
+        announce(&store, vehicle, name, bytes).await;
+    }
+    assert_eq!(wanted(&store, "a").await, ["1", "2"]);
+    let first = store.clip_progress("a", &name("1"), BOUNDS).await.unwrap();
+    store.clip_part_received(&first, 60, true).await.unwrap();
+    assert!(wanted(&store, "a").await.is_empty(), "the second one does not fit any more");
+    let full = store.clip_progress("a", &name("2"), BOUNDS).await.unwrap_err().reason();
+    assert!(full.contains("of its vehicle have 60 of 100 bytes"), "{full}");
+    let full = store.clip_progress("b", &name("1"), BOUNDS).await.unwrap_err().reason();
+    assert!(full.contains("of all vehicles have 60 of 150 bytes"), "{full}");
+}
+
+#[tokio::test]
+async fn unfinished_files_are_bounded_and_forgotten_after_a_time() {
+    let folder = TempDir::new().unwrap();
+    let store = store(&folder).await;
+    for name in ["1", "2"] {
+        announce(&store, "a", name, 10).await;
+    }
+    let first = store.clip_progress("a", &name("1"), BOUNDS).await.unwrap();
+    store.clip_part_received(&first, 8, false).await.unwrap();
+    assert_eq!(wanted(&store, "a").await, ["1"], "no other one is begun");
+    let busy = store.clip_progress("a", &name("2"), BOUNDS).await.unwrap_err().reason();
+    assert!(busy.contains("1 uploads of the vehicle are unfinished"), "{busy}");
+    let forgotten = store.forget_unfinished_clips(3600).await.unwrap();
+    assert!(forgotten.is_empty(), "it is still young");
+    let forgotten = store.forget_unfinished_clips(0).await.unwrap();
+    assert_eq!(forgotten.iter().map(ToString::to_string).collect::<Vec<_>>(), ["1@a"]);
+    assert_eq!(wanted(&store, "a").await, ["1", "2"]);
+}
+
+#[tokio::test]
+async fn the_oldest_clips_without_files_are_forgotten_above_the_bound() {
+    let folder = TempDir::new().unwrap();
+    let store = store(&folder).await;
+    announce(&store, "a", "0", 10).await;
+    let stored = store.clip_progress("a", &name("0"), BOUNDS).await.unwrap();
+    store.clip_part_received(&stored, 10, true).await.unwrap();
+    for name in ["1", "2", "3", "4"] {
+        announce(&store, "a", name, 10).await;
+    }
+    let page = store.clips(&ClipQuery::default()).await.unwrap();
+    let names: Vec<_> = page.clips.iter().map(|clip| clip.facts.name.to_string()).collect();
+    assert_eq!(names, ["4", "3", "2", "0"]);
+}

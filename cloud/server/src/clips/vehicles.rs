@@ -1,0 +1,221 @@
+//! Requests of vehicles about their clips.
+
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Json;
+use axum::Router;
+use axum::body::{Body, Bytes};
+use axum::extract::{DefaultBodyLimit, Extension, Path, State};
+use axum::middleware::from_fn;
+use axum::routing::{post, put};
+use futures_util::StreamExt;
+use gleaner_base::{Exit, Failure};
+use gleaner_fleet::UnfinishedFile;
+use gleaner_fleet::clips::{
+    CLIP_PART, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName, ClipOrders,
+    ClipReport, THUMBNAIL_MAX,
+};
+use tokio::time::timeout;
+
+use super::files::compare;
+use crate::cloud::Cloud;
+use crate::error::{CloudError, CloudResult};
+use crate::request::{digest, in_time, parsed};
+use crate::store::ClipProgress;
+use crate::vehicles::KnownVehicle;
+
+/// Time for a part: 14 kB/s.
+const PART_TIME: Duration = Duration::from_secs(600);
+/// Time for a part that is not wanted.
+const UNWANTED_TIME: Duration = Duration::from_secs(30);
+/// Longest position in the list of a vehicle.
+const CURSOR_MAX: usize = 256;
+/// First bytes of a JPEG.
+const JPEG: [u8; 3] = [0xff, 0xd8, 0xff];
+
+/// Returns the routes, which need a certificate.
+pub(crate) fn router() -> Router<Arc<Cloud>> {
+    let report = post(report).layer(DefaultBodyLimit::max(CLIP_REPORT_MAX));
+    let thumbnail = put(thumbnail).layer(DefaultBodyLimit::max(THUMBNAIL_MAX as usize));
+    Router::new()
+        .route("/v1/clips", report.layer(from_fn(in_time)))
+        .route("/v1/clips/{name}/thumbnail", thumbnail.layer(from_fn(in_time)))
+        .route("/v1/clips/{name}/parts/{part}/{sha256}", put(part))
+}
+
+/// Stores a report; answers with everything that is wanted.
+async fn report(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(vehicle): Extension<KnownVehicle>,
+    body: Bytes,
+) -> CloudResult<Json<ClipOrders>> {
+    let report: ClipReport = parsed(&body, "report of clips")?;
+    let refused = |reason: String| {
+        let help = "use a version of gleaner that fits the one of the cloud";
+        CloudError::usage("the report of clips is refused", help).because(reason)
+    };
+    if report.clips.len() > CLIPS_IN_REPORT
+        || report.gone.len() > CLIPS_IN_REPORT
+        || report.cursor.as_ref().is_some_and(|it| it.len() > CURSOR_MAX)
+    {
+        return Err(refused("it is too long".to_owned()));
+    }
+    report.clips.iter().try_for_each(ClipFacts::check).map_err(refused)?;
+    // A vehicle whose name is no safe part of a path has no clips here.
+    if let Some(first) = report.clips.first() {
+        ClipId::new(first.name.clone(), &vehicle.name).map_err(refused)?;
+    }
+    let bounds = cloud.clips.bounds;
+    if report != ClipReport::default() {
+        let announced = cloud.store.announce_clips(&vehicle.name, &report, bounds).await?;
+        for id in announced.dropped {
+            let _turn = cloud.clips.turn(&id).await;
+            cloud.clips.remove_file(&id);
+        }
+    }
+    orders(&cloud, &vehicle.name).await
+}
+
+async fn orders(cloud: &Cloud, vehicle: &str) -> CloudResult<Json<ClipOrders>> {
+    Ok(Json(cloud.store.clip_orders(vehicle, cloud.clips.bounds).await?))
+}
+
+/// Receives a thumbnail.
+async fn thumbnail(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(vehicle): Extension<KnownVehicle>,
+    Path(name): Path<String>,
+    body: Bytes,
+) -> CloudResult<Json<ClipOrders>> {
+    let name = clip_name(&name)?;
+    let Some(wanted) = cloud.store.wanted_thumbnail(&vehicle.name, &name).await? else {
+        return orders(&cloud, &vehicle.name).await;
+    };
+    let id = id(&name, &vehicle.name)?;
+    let is_jpeg = body.starts_with(&JPEG) && body.len() as u64 <= THUMBNAIL_MAX;
+    if !is_jpeg || gleaner_trust::sha256(&body).as_str() != wanted {
+        let message = format!("the thumbnail of clip `{id}` is refused");
+        return Err(CloudError::denied(message, "send the JPEG that was announced"));
+    }
+    let length = body.len() as u64;
+    let part = cloud.clips.receive(&id, (length, &wanted), Body::from(body)).await?;
+    let (working, of) = (Arc::clone(&cloud), id.clone());
+    blocking(&id, move || working.clips.keep_thumbnail(&of, &part)).await?;
+    cloud.store.thumbnail_received(&id).await?;
+    orders(&cloud, &vehicle.name).await
+}
+
+/// Receives a part. One that was received before changes nothing.
+async fn part(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(vehicle): Extension<KnownVehicle>,
+    Path((name, number, sha256)): Path<(String, u64, String)>,
+    body: Body,
+) -> CloudResult<Json<ClipOrders>> {
+    let (name, sha256) = (clip_name(&name)?, digest(&sha256)?);
+    let expected = expected(&cloud, &vehicle.name, &name, number).await;
+    let Ok(Some((progress, length))) = expected else {
+        // Unread, it could hide the answer from the vehicle.
+        let _ = timeout(UNWANTED_TIME, skip(body)).await;
+        expected?;
+        return orders(&cloud, &vehicle.name).await;
+    };
+    let _slot = cloud.clips.slot(&vehicle.name)?;
+    let receive = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body);
+    let received = timeout(PART_TIME, receive).await.map_err(|_| {
+        let message = format!("a part of clip `{}` took too long", progress.id);
+        CloudError::busy(message, "send it again")
+    })??;
+    let working = Arc::clone(&cloud);
+    // A vehicle that goes away in the middle must not leave it half done.
+    let stored = tokio::spawn(store_part(working, progress, length, received)).await;
+    stored.map_err(|error| {
+        Failure::caused_by(Exit::Internal, "a part of a clip is not stored", &error)
+    })??;
+    orders(&cloud, &vehicle.name).await
+}
+
+/// Returns the clip and the length of a part that is the next one; `None` of any other one.
+async fn expected(
+    cloud: &Cloud,
+    vehicle: &str,
+    name: &ClipName,
+    number: u64,
+) -> CloudResult<Option<(ClipProgress, u64)>> {
+    let progress = cloud.store.clip_progress(vehicle, name, cloud.clips.bounds).await?;
+    let length = ClipFacts::part_length(progress.bytes, number).ok_or_else(|| {
+        let message = format!("clip `{}` has no part {number}", progress.id);
+        CloudError::usage(message, "send the next part of the orders")
+    })?;
+    Ok((progress.part == number).then_some((progress, length)))
+}
+
+/// Reads a body that is not wanted, up to the length of a part.
+async fn skip(body: Body) {
+    let (mut pieces, mut bytes) = (body.into_data_stream(), 0);
+    while let Some(Ok(piece)) = pieces.next().await {
+        bytes += piece.len() as u64;
+        if bytes > CLIP_PART {
+            return;
+        }
+    }
+}
+
+/// Appends a part, and compares the file after the last one.
+async fn store_part(
+    cloud: Arc<Cloud>,
+    progress: ClipProgress,
+    length: u64,
+    received: UnfinishedFile,
+) -> CloudResult<()> {
+    let id = progress.id.clone();
+    let _turn = cloud.clips.turn(&id).await;
+    let name = clip_name(id.name())?;
+    let now = cloud.store.clip_progress(id.vehicle(), &name, cloud.clips.bounds).await?;
+    if now != progress {
+        // Another request has stored the part meanwhile.
+        return Ok(());
+    }
+    let is_last = ClipFacts::part_length(progress.bytes, progress.part + 1).is_none();
+    let (working, of) = (Arc::clone(&cloud), progress.clone());
+    let outcome = blocking(&id, move || {
+        if !working.clips.append(&of.id, of.part, &received)? {
+            return Ok(Err("its first parts are not there any more".to_owned()));
+        }
+        match is_last {
+            true => compare(&working.clips.clip(&of.id), of.bytes, &of.sha256),
+            false => Ok(Ok(())),
+        }
+    });
+    match outcome.await? {
+        Ok(()) => cloud.store.clip_part_received(&progress, length, is_last).await,
+        Err(reason) => {
+            cloud.store.clip_upload_failed(&id, &reason).await?;
+            cloud.clips.remove_file(&id);
+            let message = format!("the file of clip `{id}` is refused");
+            Err(CloudError::denied(message, "send it again from its first part").because(reason))
+        }
+    }
+}
+
+async fn blocking<T: Send + 'static>(
+    id: &ClipId,
+    work: impl FnOnce() -> io::Result<T> + Send + 'static,
+) -> CloudResult<T> {
+    let done = tokio::task::spawn_blocking(work).await.map_err(io::Error::other);
+    let failed =
+        |error| Failure::caused_by(Exit::Internal, format!("cannot store clip `{id}`"), &error);
+    Ok(done.and_then(|it| it).map_err(failed)?)
+}
+
+fn clip_name(text: &str) -> CloudResult<ClipName> {
+    text.parse()
+        .map_err(|reason: String| CloudError::usage(reason, "use the name that was announced"))
+}
+
+fn id(name: &ClipName, vehicle: &str) -> CloudResult<ClipId> {
+    ClipId::new(name.clone(), vehicle)
+        .map_err(|reason| CloudError::usage(reason, "enrol the vehicle under another name"))
+}

@@ -1,0 +1,147 @@
+//! Clips, as people see and want them.
+
+use gleaner_fleet::clips::{ClipFacts, ClipId, ClipPage, ClipState, FleetClip, UploadedClips};
+use serde::Deserialize;
+
+use super::{CloudStore, int, unsigned};
+use crate::error::{CloudError, CloudResult};
+
+/// Number of clips in a page, and its maximum.
+const PAGE: u64 = 100;
+const PAGE_MAX: u64 = 500;
+
+/// A choice of clips.
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ClipQuery {
+    /// Name of the vehicle.
+    vehicle: Option<String>,
+    /// Name of a lambda.
+    lambda: Option<String>,
+    /// Label of a moment.
+    label: Option<String>,
+    /// Begin of the time, in ns since 1970: clips that end before are left out.
+    from_ns: Option<i64>,
+    /// End of the time, in ns since 1970: clips that begin after are left out.
+    to_ns: Option<i64>,
+    /// `next` of the page before.
+    after: Option<u64>,
+    /// Number of clips in a page.
+    last: Option<u64>,
+}
+
+type Row = (i64, String, String, String, i64, i64, i64, String, String, i64);
+
+/// The columns of a clip.
+macro_rules! select {
+    ($rest:literal) => {
+        concat!(
+            "SELECT seq, vehicle, name, facts, bytes, has_thumbnail, is_requested, state, reason, \
+             parts FROM clips ",
+            $rest
+        )
+    };
+}
+
+impl CloudStore {
+    /// Returns a page of clips, the last announced first.
+    pub(crate) async fn clips(&self, query: &ClipQuery) -> CloudResult<ClipPage> {
+        let text = |value: &Option<String>| value.clone().unwrap_or_default();
+        let count = query.last.unwrap_or(PAGE).clamp(1, PAGE_MAX);
+        let rows: Vec<Row> = rows!(&self.pool;
+            select!("WHERE seq < $1 AND ($2 = '' OR vehicle = $2)
+             AND ($3 = '' OR EXISTS (SELECT 1 FROM clip_words
+                  WHERE kind = 'lambda' AND word = $3 AND clip = seq))
+             AND ($4 = '' OR EXISTS (SELECT 1 FROM clip_words
+                  WHERE kind = 'label' AND word = $4 AND clip = seq))
+             AND to_ns >= $5 AND from_ns <= $6
+             ORDER BY seq DESC LIMIT $7");
+            int(query.after.unwrap_or(u64::MAX)), text(&query.vehicle), text(&query.lambda),
+            text(&query.label), query.from_ns.unwrap_or(i64::MIN),
+            query.to_ns.unwrap_or(i64::MAX), int(count));
+        let is_full = rows.len() as u64 == count;
+        let next = rows.last().filter(|_| is_full).map(|row| unsigned(row.0));
+        let upload = self.clip_policy().await?.upload;
+        let clips = rows.into_iter().map(|row| clip(row, upload)).collect::<CloudResult<_>>()?;
+        Ok(ClipPage { clips, next })
+    }
+
+    /// Returns a clip.
+    pub(crate) async fn clip(&self, id: &ClipId) -> CloudResult<FleetClip> {
+        let row: Option<Row> = row!(&self.pool;
+            select!("WHERE vehicle = $1 AND name = $2"); id.vehicle(), id.name());
+        let missing =
+            || CloudError::missing(format!("there is no clip `{id}`"), "`gleaner clips` lists all");
+        clip(row.ok_or_else(missing)?, self.clip_policy().await?.upload)
+    }
+
+    /// Marks the file of a clip as wanted by a person; returns the clip. `is_lost` states that a
+    /// file which was stored is not there any more.
+    pub(crate) async fn pull_clip(
+        &self,
+        actor: &str,
+        id: &ClipId,
+        is_lost: bool,
+    ) -> CloudResult<FleetClip> {
+        let before = self.clip(id).await?;
+        let refused = |reason: &str, help: &str| {
+            Err(CloudError::usage(format!("clip `{id}` cannot be fetched"), help).because(reason))
+        };
+        match before.state {
+            ClipState::Stored if !is_lost => return Ok(before),
+            ClipState::Gone => return refused("its vehicle has deleted it", "choose another clip"),
+            _ if self.clip_policy().await?.upload == UploadedClips::None => {
+                return refused(
+                    "the cloud fetches no clips",
+                    "change that: `gleaner clips policy on-demand`",
+                );
+            }
+            _ => {}
+        }
+        let mut change = self.change().await?;
+        let changed = run!(&mut *change.tx;
+            "UPDATE clips SET is_requested = 1, failures = 0, state = 'vehicle',
+             parts = CASE WHEN state = 'vehicle' THEN parts ELSE 0 END
+             WHERE vehicle = $1 AND name = $2 AND (is_requested = 0 OR state <> 'vehicle')";
+            id.vehicle(), id.name());
+        if changed.rows_affected() > 0 {
+            change.note(actor, "pull clip", &id.to_string()).await?;
+            // The vehicle reads its orders again with each new number.
+            run!(&mut *change.tx;
+                "UPDATE vehicles SET generation = generation + 1 WHERE name = $1"; id.vehicle());
+        }
+        change.commit().await?;
+        self.clip(id).await
+    }
+}
+
+fn clip(row: Row, upload: UploadedClips) -> CloudResult<FleetClip> {
+    let (_, vehicle, name, facts, bytes, has_thumbnail, is_requested, state, reason, parts) = row;
+    let damaged = |error: String| {
+        CloudError::usage(format!("the clip `{name}` of `{vehicle}` is damaged"), "report this")
+            .because(error)
+    };
+    let facts: ClipFacts =
+        serde_json::from_str(&facts).map_err(|error| damaged(error.to_string()))?;
+    let id = ClipId::new(facts.name.clone(), &vehicle).map_err(damaged)?;
+    let (bytes, received) = (unsigned(bytes), unsigned(parts) * gleaner_fleet::clips::CLIP_PART);
+    let is_wanted =
+        upload == UploadedClips::All || (is_requested != 0 && upload == UploadedClips::OnDemand);
+    let state = match &*state {
+        "stored" => ClipState::Stored,
+        "gone" => ClipState::Gone,
+        "failed" => ClipState::Failed,
+        _ if !is_wanted => ClipState::OnVehicle,
+        _ if parts > 0 => ClipState::Uploading,
+        _ => ClipState::Wanted,
+    };
+    Ok(FleetClip {
+        id,
+        vehicle,
+        state,
+        received: received.min(bytes),
+        reason: (!reason.is_empty()).then_some(reason),
+        has_thumbnail: has_thumbnail != 0,
+        facts,
+    })
+}

@@ -1,0 +1,288 @@
+//! Reads the list of clips that the recorder writes, and the files in it.
+//!
+//! Lists and files come from another program: lines are bounded, names have no path in them, and
+//! links are refused.
+
+use std::fs::{self, File};
+use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use gleaner_base::{ByteSize, NotPlain, PlainFile, hex, safe_file};
+use gleaner_fleet::clips::{
+    CLIP_FACTS_MAX, CLIP_MAX, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipMoment, ClipName,
+    ClipReport, RecordedLambda, THUMBNAIL_MAX,
+};
+use gleaner_lambda::Clip;
+use gleaner_lambda::manifest::Sha256 as Digest;
+use gleaner_trust::{sha256, unverified_deployment, unverified_revision};
+use sha2::{Digest as _, Sha256};
+
+use crate::core::Core;
+
+/// Longest line of the list, as the recorder writes it.
+const LINE_MAX: u64 = 16 << 20;
+/// Bytes of clips that are read for one report, so that it does not wait for many long ones.
+const READ_MAX: u64 = 256 << 20;
+/// Bytes that are read per second: the recorder needs the disk.
+const READ_RATE: f64 = 64e6;
+/// Length of the pieces in which a clip is read.
+const PIECE: usize = 1 << 20;
+
+/// The folder of the recorder.
+#[derive(Debug, Clone)]
+pub(super) struct ClipFolder(pub(super) PathBuf);
+
+/// A build that the vehicle has, with the deployment that it belongs to.
+#[derive(Debug)]
+pub(super) struct KnownBuild {
+    /// SHA-256 over its files, as clips have it.
+    digest: String,
+    revision: String,
+    deployment: String,
+}
+
+/// A position in the list: the number of bytes before it, and the last line of these.
+struct ListPosition {
+    offset: u64,
+    line: u64,
+    sha256: String,
+}
+
+impl ListPosition {
+    fn parse(text: &str) -> Option<Self> {
+        let mut parts = text.split('-');
+        let offset = parts.next()?.parse().ok()?;
+        let line = parts.next()?.parse().ok().filter(|line| (1..=LINE_MAX).contains(line))?;
+        let sha256 = parts.next()?.to_owned();
+        (line <= offset && parts.next().is_none()).then_some(Self { offset, line, sha256 })
+    }
+
+    /// Returns whether the list still has the line.
+    fn is_in(&self, list: &mut File) -> io::Result<bool> {
+        list.seek(SeekFrom::Start(self.offset - self.line))?;
+        let mut line = Vec::new();
+        list.take(self.line).read_to_end(&mut line)?;
+        Ok(line.len() as u64 == self.line && sha256(&line).as_str() == self.sha256)
+    }
+}
+
+impl ClipFolder {
+    fn list(&self) -> PathBuf {
+        self.0.join("clips.jsonl")
+    }
+
+    /// Returns the length of the list, by which its growth is noticed.
+    pub(super) fn length(&self) -> u64 {
+        fs::symlink_metadata(self.list()).map_or(0, |found| found.len())
+    }
+
+    /// Reads the clips after the position that the cloud has; `None` if there are none. A list
+    /// that was begun again is read from its begin. `is_over` ends it early.
+    pub(super) fn new_clips(
+        &self,
+        cursor: Option<&str>,
+        builds: &[KnownBuild],
+        is_over: &dyn Fn() -> bool,
+    ) -> io::Result<Option<ClipReport>> {
+        let mut list = match safe_file::read(&self.list()) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            list => list?,
+        };
+        let position = cursor.and_then(ListPosition::parse);
+        let mut offset = match position {
+            Some(position) if position.is_in(&mut list)? => position.offset,
+            _ => 0,
+        };
+        list.seek(SeekFrom::Start(offset))?;
+        let mut lines = BufReader::new(list);
+        let mut report = ClipReport::default();
+        let (mut read, mut length) = (0, 0);
+        while report.clips.len() < CLIPS_IN_REPORT && read < READ_MAX && !is_over() {
+            let mut line = Vec::new();
+            lines.by_ref().take(LINE_MAX).read_until(b'\n', &mut line)?;
+            // The recorder still writes it, or a power cut tore it.
+            if !line.ends_with(b"\n") && (line.len() as u64) < LINE_MAX {
+                break;
+            }
+            let clip = serde_json::from_slice::<Clip>(&line).ok();
+            let clip = clip.and_then(|clip| Some((name(&clip.file, ".mcap")?, clip)));
+            match clip {
+                Some((name, clip)) => {
+                    let facts = self.facts(name, clip, builds, is_over)?;
+                    let bytes = facts.length();
+                    if !report.clips.is_empty() && length + bytes > CLIP_REPORT_MAX - CLIP_FACTS_MAX
+                    {
+                        break;
+                    }
+                    length += bytes;
+                    read += facts.bytes;
+                    report.clips.push(facts);
+                }
+                None => tracing::warn!(offset, "a line of the list of clips names none"),
+            }
+            offset += line.len() as u64;
+            report.cursor = Some(format!("{offset}-{}-{}", line.len(), sha256(&line)));
+        }
+        // What was not read to its end is read again.
+        Ok(report.cursor.is_some().then_some(report).filter(|_| !is_over()))
+    }
+
+    fn facts(
+        &self,
+        name: ClipName,
+        clip: Clip,
+        builds: &[KnownBuild],
+        is_over: &dyn Fn() -> bool,
+    ) -> io::Result<ClipFacts> {
+        let file = match self.open(&name) {
+            Ok(file) => Some(file),
+            Err(error) if is_gone(&error) => None,
+            Err(error) => return Err(error),
+        };
+        let bytes = file.as_ref().map_or(clip.bytes.min(CLIP_MAX), PlainFile::length);
+        let digest = file.map(|file| digest(file, is_over)).transpose()?;
+        let has_image =
+            clip.thumbnail.and_then(|path| self::name(&path, ".jpg")) == Some(name.clone());
+        let image = if has_image { self.thumbnail(&name).ok() } else { None };
+        let lambda = |it: gleaner_lambda::ClipLambda| {
+            let build = builds.iter().find(|build| build.digest == it.digest);
+            RecordedLambda {
+                name: it.name,
+                version: it.version,
+                digest: it.digest,
+                deployment: build.map(|build| build.deployment.clone()),
+                revision: build.map(|build| build.revision.clone()),
+            }
+        };
+        let moment = |it: gleaner_lambda::Moment| ClipMoment {
+            lambda: it.lambda,
+            kind: serde_json::to_value(it.kind)
+                .ok()
+                .and_then(|kind| kind.as_str().map(str::to_owned))
+                .unwrap_or_default(),
+            label: it.label,
+            score: it.score,
+            attributes: it.attributes,
+            at_ns: it.at_ns,
+            source: it.source,
+        };
+        let mut facts = ClipFacts {
+            name,
+            from_ns: clip.from_ns.min(clip.to_ns),
+            to_ns: clip.to_ns,
+            bytes,
+            sha256: digest,
+            thumbnail: image.map(|image| sha256(&image).to_string()),
+            lambdas: clip.lambdas.into_iter().map(lambda).collect(),
+            triggers: clip.triggers,
+            moments: clip.moments.into_iter().map(moment).collect(),
+            incomplete: clip.incomplete,
+            is_recovered: clip.recovered.is_some(),
+        };
+        facts.shorten();
+        Ok(facts)
+    }
+
+    fn path(&self, name: &ClipName, suffix: &str) -> io::Result<PathBuf> {
+        let folder = self.0.join("clips");
+        match fs::symlink_metadata(&folder)?.is_dir() {
+            true => Ok(folder.join(format!("{name}{suffix}"))),
+            false => Err(io::Error::other(NotPlain::NoFile)),
+        }
+    }
+
+    fn open(&self, name: &ClipName) -> io::Result<PlainFile> {
+        PlainFile::result(&self.path(name, ".mcap")?, ByteSize::new(CLIP_MAX))
+    }
+
+    /// Reads the part of a clip that begins at `begin`.
+    ///
+    /// # Errors
+    ///
+    /// Those of the file system, and one that [`is_gone`] accepts if the file does not have the
+    /// expected length any more.
+    pub(super) fn part(&self, name: &ClipName, bytes: u64, part: u64) -> io::Result<Vec<u8>> {
+        let file = self.open(name)?;
+        let length = ClipFacts::part_length(bytes, part).filter(|_| file.length() == bytes);
+        let length = length.ok_or(io::ErrorKind::UnexpectedEof)?;
+        let mut file = file.into_file();
+        file.seek(SeekFrom::Start(part * gleaner_fleet::clips::CLIP_PART))?;
+        let mut content = vec![0; length as usize];
+        file.read_exact(&mut content)?;
+        Ok(content)
+    }
+
+    /// Reads the thumbnail of a clip.
+    ///
+    /// # Errors
+    ///
+    /// As for [`part`](Self::part).
+    pub(super) fn thumbnail(&self, name: &ClipName) -> io::Result<Vec<u8>> {
+        PlainFile::result(&self.path(name, ".jpg")?, ByteSize::new(THUMBNAIL_MAX))?.read_whole()
+    }
+}
+
+/// Returns whether an error means that the file is not there any more, or is another one.
+pub(super) fn is_gone(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::UnexpectedEof)
+        || NotPlain::of(error).is_some()
+}
+
+/// Returns the name in `clips/NAME` with this suffix, and nothing else.
+fn name(path: &Path, suffix: &str) -> Option<ClipName> {
+    path.to_str()?.strip_prefix("clips/")?.strip_suffix(suffix)?.parse().ok()
+}
+
+/// Reads a file slowly; returns its SHA-256.
+fn digest(mut file: PlainFile, is_over: &dyn Fn() -> bool) -> io::Result<String> {
+    let (mut sha256, mut piece) = (Sha256::new(), vec![0; PIECE]);
+    let (begin, mut bytes) = (Instant::now(), 0.0);
+    loop {
+        let read = file.read(&mut piece)?;
+        if read == 0 {
+            return Ok(hex(&sha256.finalize()));
+        }
+        if is_over() {
+            return Err(io::ErrorKind::Interrupted.into());
+        }
+        sha256.update(&piece[..read]);
+        bytes += read as f64;
+        let due = Duration::from_secs_f64(bytes / READ_RATE);
+        sleep(due.saturating_sub(begin.elapsed()));
+    }
+}
+
+/// Returns the builds of all deployments of the vehicle.
+pub(super) fn known_builds(core: &Core) -> Vec<KnownBuild> {
+    let deployments = core.lock().state.deployments.clone();
+    let mut known = Vec::new();
+    for (id, deployed) in deployments {
+        let named = unverified_deployment(deployed.envelope.as_bytes()).ok();
+        let named =
+            named.into_iter().flat_map(|it| std::iter::once(it.revision).chain(it.fallback));
+        for revision in named.chain(deployed.history) {
+            let digest = core.store.envelope(&revision).ok().and_then(|text| build_digest(&text));
+            known.extend(digest.map(|digest| KnownBuild {
+                digest,
+                revision: revision.to_string(),
+                deployment: id.to_string(),
+            }));
+        }
+    }
+    known
+}
+
+/// Returns the SHA-256 over the files of a revision, as the recorder computes it over a build.
+fn build_digest(envelope: &[u8]) -> Option<String> {
+    let (revision, _) = unverified_revision(envelope).ok()?;
+    let mut files: Vec<(&Path, &Digest)> =
+        revision.files.iter().map(|it| (it.path.as_path(), &it.sha256)).collect();
+    files.sort();
+    let lines = files.iter().map(|(path, sha256)| format!("{sha256}  {}\n", path.display()));
+    Some(sha256(lines.collect::<String>().as_bytes()).to_string())
+}
+
+#[cfg(test)]
+mod tests;
