@@ -49,7 +49,7 @@ impl TestCloud {
             .expect("gleaner-cloud starts");
         let out = BufReader::new(server.stdout.take().expect("it is piped"));
         self.server = Some(server);
-        // Of four lines, the last one is there only before anybody has logged in.
+        // These two lines come first, and always.
         let lines: Vec<_> = out.lines().map_while(Result::ok).take(2).collect();
         assert!(lines.last().is_some_and(|line| line.starts_with("vehicles:")), "{lines:?}");
         let is_new = !self.path("config").exists();

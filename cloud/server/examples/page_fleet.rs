@@ -19,7 +19,6 @@ use gleaner_protocol::{DurationStats, Layer, LiveStatus, LiveTopic};
 use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
 use hyper::Method;
 use serde_json::{Value, json};
-use tokio::io::AsyncReadExt;
 use tokio::time::interval;
 
 /// A text that must not become markup, and must not break the layout.
@@ -61,8 +60,8 @@ async fn main() {
     let invitation = admin.call(Method::POST, "/v1/users", invited).await;
     let address = format!("http://{}", server.people);
     println!("{}", json!({ "address": address, "code": invitation["code"] }));
-    let mut rest = Vec::new();
-    tokio::io::stdin().read_to_end(&mut rest).await.unwrap();
+    let end = || std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+    tokio::task::spawn_blocking(end).await.unwrap().unwrap();
     server.stop().await;
 }
 

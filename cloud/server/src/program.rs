@@ -125,10 +125,10 @@ async fn serve(options: ServeOptions) -> Result<(), Failure> {
     let server = CloudServer::start(&options).await?;
     let address = format!("http://{}", server.people);
     let mut text = format!("people:   {address}\nvehicles: {}\n", server.vehicles);
-    text += &format!("page:     {address}/login\n");
     if let Some(code) = &server.code {
         text += &format!("first:    gleaner login {address} --code {code}\n");
     }
+    text += &format!("page:     {address}/login\n");
     print(&text);
     tokio::select! {
         _ = terminate.recv() => {}

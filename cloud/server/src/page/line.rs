@@ -42,10 +42,10 @@ pub(super) fn line(text: &str, has_stream: bool) -> Markup {
 /// Returns whether a record belongs to the time line of its vehicle: all but log lines do.
 pub(super) fn is_of_time_line(text: &str) -> bool {
     #[derive(serde::Deserialize)]
-    struct Kind {
+    struct KindOfLine {
         kind: String,
     }
-    serde_json::from_str::<Kind>(text).is_ok_and(|it| it.kind != "log")
+    serde_json::from_str::<KindOfLine>(text).is_ok_and(|it| it.kind != "log")
 }
 
 fn words_of(line: &StreamLine) -> RecordWords {

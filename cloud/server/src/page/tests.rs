@@ -25,13 +25,13 @@ struct Browser {
     cookie: Option<String>,
 }
 
-struct Reply {
+struct PageReply {
     status: StatusCode,
     headers: HeaderMap,
     text: String,
 }
 
-impl Reply {
+impl PageReply {
     fn location(&self) -> &str {
         self.headers.get(header::LOCATION).map_or("", |it| it.to_str().unwrap())
     }
@@ -65,7 +65,7 @@ impl Browser {
         path: &str,
         fields: &[(&str, &str)],
         site: &str,
-    ) -> Reply {
+    ) -> PageReply {
         let slots = Arc::new(Semaphore::new(1));
         let peer =
             PeerConnection::of_test([127, 0, 0, 1].into(), slots.try_acquire_owned().unwrap());
@@ -91,20 +91,20 @@ impl Browser {
         let bytes =
             if is_stream { Default::default() } else { to_bytes(body, 1 << 24).await.unwrap() };
         let text = String::from_utf8(bytes.to_vec()).unwrap();
-        Reply { status: parts.status, headers: parts.headers, text }
+        PageReply { status: parts.status, headers: parts.headers, text }
     }
 
-    async fn get(&mut self, path: &str) -> Reply {
+    async fn get(&mut self, path: &str) -> PageReply {
         self.request(Method::GET, path, &[], "none").await
     }
 
     /// Sends a form as it is.
-    async fn send(&mut self, path: &str, fields: &[(&str, &str)]) -> Reply {
+    async fn send(&mut self, path: &str, fields: &[(&str, &str)]) -> PageReply {
         self.request(Method::POST, path, fields, "same-origin").await
     }
 
     /// Sends a form with the token of the session's pages.
-    async fn post(&mut self, path: &str, fields: &[(&str, &str)]) -> Reply {
+    async fn post(&mut self, path: &str, fields: &[(&str, &str)]) -> PageReply {
         let page = self.get("/account").await.text;
         let token =
             page.split("name=\"token\" value=\"").nth(1).unwrap().split('"').next().unwrap();
