@@ -92,3 +92,25 @@ fn a_part_is_of_the_file_that_was_announced() {
     fs::remove_file(path).unwrap();
     assert!(is_gone(&clips.part(&name, part + 3, 1).unwrap_err()));
 }
+
+/// The digest was computed with `sha256sum`, over its own lines of the two files.
+#[test]
+fn a_build_is_found_by_the_digest_that_clips_have() {
+    let key = gleaner_trust::SecretKey::generate().unwrap();
+    let file = |path: &str, content: &[u8]| gleaner_trust::RevisionFile {
+        path: path.parse().unwrap(),
+        bytes: 1,
+        sha256: sha256(content),
+    };
+    let revision = gleaner_trust::Revision {
+        name: "brake".parse().unwrap(),
+        version: "1.0.0".parse().unwrap(),
+        kind: serde_json::from_value(serde_json::json!("wasm")).unwrap(),
+        release: 1,
+        created: 1,
+        files: vec![file("lambda.toml", b"a"), file("models/a.onnx", b"b")],
+    };
+    let envelope = gleaner_trust::seal(&revision, &[&key]).unwrap();
+    let expected = "ae5853b272b64d515ad0a5783db1e65d34cc9d278373224157614818426e89de";
+    assert_eq!(build_digest(&envelope).as_deref(), Some(expected));
+}
