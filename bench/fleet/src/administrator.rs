@@ -2,8 +2,8 @@
 
 use std::net::SocketAddr;
 
-use gleaner_fleet::people::{Login, NewVehicle, UserToken};
 use gleaner_fleet::Enrolment;
+use gleaner_fleet::people::{Login, NewVehicle, UserToken};
 use http_body_util::{BodyExt, Full};
 use hyper::body::Bytes;
 use hyper::client::conn::http1::{self, SendRequest};

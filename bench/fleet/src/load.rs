@@ -32,7 +32,7 @@ pub struct LoadTimes {
     pub idle: Duration,
     /// Time under load, apart from the deployment.
     pub active: Duration,
-    /// Whether vehicles without a sign of life are waited for, which takes a minute.
+    /// True to wait for the end of silent connections, which takes a minute.
     pub has_silent: bool,
 }
 
@@ -41,7 +41,10 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
     let fleet = EnrolledFleet::enrol(count + SILENT + 1).await?;
     let cloud = &fleet.cloud;
     let mut figures = Vec::new();
-    let mut add = |figure| figures.push(figure);
+    let mut add = |figure: FleetFigure| {
+        println!("{figure}");
+        figures.push(figure);
+    };
     add(FleetFigure::free("vehicles", "", count as f64));
     add(FleetFigure::free("enrolment of all", "s", fleet.enrolled_s));
     let of_each = |kb: f64| kb / count as f64;
@@ -85,7 +88,11 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
     let active_s = begun.elapsed().as_secs_f64();
     let reports = (simulation.reports.load(Relaxed) - reports) as f64;
     let acknowledged = simulation.take_acknowledged_ms();
-    add(FleetFigure::free("active: cores of the cloud", "cores", (cloud.cpu_s() - cpu_s) / active_s));
+    add(FleetFigure::free(
+        "active: cores of the cloud",
+        "cores",
+        (cloud.cpu_s() - cpu_s) / active_s,
+    ));
     add(FleetFigure::free("active: reports", "1/s", reports / active_s));
     let batches = acknowledged.len() as f64 / active_s;
     add(FleetFigure::free("active: batches of records", "1/s", batches));
@@ -127,8 +134,10 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
     let begun = Instant::now();
     let path = format!("/v1/vehicles/{}", revoked.name);
     administrator.bytes(Method::DELETE, &path, Vec::new()).await?;
-    let ended = async { while let Some(Ok(_)) = futures_util::StreamExt::next(&mut socket).await {} };
-    let cut_s = timeout(PATIENCE, ended).await.map_or(f64::INFINITY, |()| begun.elapsed().as_secs_f64());
+    let ended =
+        async { while let Some(Ok(_)) = futures_util::StreamExt::next(&mut socket).await {} };
+    let cut_s =
+        timeout(PATIENCE, ended).await.map_or(f64::INFINITY, |()| begun.elapsed().as_secs_f64());
     add(FleetFigure::at_most("a vehicle that is removed is cut off after", "s", 5.0, cut_s));
     let mut silent_s = Vec::new();
     for link in silent {

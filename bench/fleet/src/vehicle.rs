@@ -185,8 +185,8 @@ impl SimulatedVehicle {
         Ok(None)
     }
 
-    /// Fetches what a wanted state has anew, over a connection for each file as real vehicles do,
-    /// and reports that it runs. Nothing is verified and nothing starts.
+    /// Fetches the deployments of a wanted state that are new, over a connection for each file as
+    /// real vehicles do, and reports that they run. Nothing is verified and nothing starts.
     async fn apply(&mut self, socket: &mut Socket, desired: Desired) -> Result<(), String> {
         let mut runs = Vec::new();
         for Wanted { id, envelope, .. } in desired.deployments.into_iter().filter(|it| it.is_wanted)
@@ -242,7 +242,8 @@ impl SimulatedVehicle {
         self.next += count;
         self.waiting = Some((self.next, Instant::now()));
         let (stream, next) = (STREAM.to_owned(), self.next);
-        send(socket, Body::Records(Records { stream, life: 1, next, lines: compress(&lines) })).await
+        send(socket, Body::Records(Records { stream, life: 1, next, lines: compress(&lines) }))
+            .await
     }
 
     async fn report(&mut self, socket: &mut Socket) -> Result<(), String> {

@@ -87,8 +87,7 @@ async fn lines(
     if arrival > 0 {
         first.clear();
     }
-    let reader =
-        RecordReader { cloud, vehicle, streams, from, arrival, first, arrivals, slot };
+    let reader = RecordReader { cloud, vehicle, streams, from, arrival, first, arrivals, slot };
     let pieces = try_unfold(reader, RecordReader::next);
     Ok(([(header::CONTENT_TYPE, "application/x-ndjson")], Body::from_stream(pieces))
         .into_response())

@@ -179,7 +179,8 @@ async fn begin<'s>(pool: &AnyPool, turn: &'s Mutex<()>) -> CloudResult<StoreChan
 fn placeholders(rows: usize, shared: usize, own: usize) -> String {
     let row = |row| {
         let first = shared + row * own + 1;
-        let all: Vec<_> = (1..=shared).chain(first..first + own).map(|it| format!("${it}")).collect();
+        let all: Vec<_> =
+            (1..=shared).chain(first..first + own).map(|it| format!("${it}")).collect();
         format!("({})", all.join(", "))
     };
     (0..rows).map(row).collect::<Vec<_>>().join(", ")

@@ -57,7 +57,7 @@ struct Append {
     retention: Retention,
 }
 
-/// What is known of a stream.
+/// Position and size of a stream.
 struct StoredStream {
     cursor: Cursor,
     kept: i64,

@@ -324,8 +324,7 @@ impl CloudStore {
 }
 
 impl StoreChange<'_> {
-    /// Adds a certificate. Its end in the database is after those of former ones: it tells which is
-    /// the newest.
+    /// Adds a certificate. In the database, each ends after the former ones: so the newest is known.
     async fn add_certificate(&mut self, name: &str, issued: &Issued) -> CloudResult<()> {
         let (last,): (i64,) = one!(&mut *self.tx;
             "SELECT COALESCE(MAX(expires), 0) FROM certificates WHERE vehicle = $1"; name);

@@ -122,11 +122,16 @@ impl<'c> VehicleLink<'c> {
         let silence = sleep(3 * period);
         tokio::pin!(silence);
         pings.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut sent_changes = 0;
         loop {
-            // An order may be older than this loop.
-            let end = orders.borrow_and_update().end.clone();
+            // An order may be older than this loop, or have come while a frame was handled.
+            let LinkOrders { changes, end } = orders.borrow_and_update().clone();
             if end.is_some() {
                 return Ok(end);
+            }
+            if changes != sent_changes {
+                sent_changes = changes;
+                self.send_wanted().await?;
             }
             tokio::select! {
                 body = self.receive() => {
@@ -135,11 +140,9 @@ impl<'c> VehicleLink<'c> {
                     self.cloud.hub.saw(self.name);
                     self.handle(body).await?;
                 }
-                changed = orders.changed() => match changed {
-                    Ok(()) if orders.borrow().end.is_some() => {}
-                    Ok(()) => self.send_wanted().await?,
+                changed = orders.changed() => if changed.is_err() {
                     // It was removed from the hub, which has set the end before.
-                    Err(_) => return Ok(orders.borrow().end.clone()),
+                    return Ok(orders.borrow().end.clone());
                 },
                 () = silence.as_mut() => {
                     return Ok(Some(GoAway { after_ms: 0, reason: "no sign of life".into() }));
