@@ -45,7 +45,7 @@ mod writer;
 use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure};
 use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
@@ -68,9 +68,17 @@ const MIGRATIONS: &[&str] = &[include_str!("../../migrations/0001_start.sql")];
 const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
                        PRAGMA foreign_keys = ON; PRAGMA busy_timeout = 10000;";
 
+/// Maximum number of queries at a time: with more threads than cores, each only takes longer.
+const QUERIES_MAX: u32 = 4;
+/// Time that a query waits before the log has it.
+const ACQUIRE_SLOW: Duration = Duration::from_secs(20);
+
 /// The database.
 pub(crate) struct CloudStore {
+    /// Connections of queries.
     pool: AnyPool,
+    /// The connection of changes: they do not wait behind the queries of a whole fleet.
+    changes: AnyPool,
     turn: Arc<Mutex<()>>,
     writes: WriteQueue,
 }
@@ -97,26 +105,32 @@ impl CloudStore {
         let escaped = path.display().to_string().replace('%', "%25");
         let escaped = escaped.replace('?', "%3f").replace('#', "%23");
         let options = AnyConnectOptions::from_str(&format!("sqlite://{escaped}?mode=rwc"));
-        let pool = AnyPoolOptions::new()
-            .max_connections(8)
-            // Each was in order when it was returned.
-            .test_before_acquire(false)
-            // SQLite itself undoes a transaction, for example on a full disk. Its connection still
-            // counts it, and could begin no other one.
-            .before_acquire(|connection, _| {
-                let is_usable = !connection.is_in_transaction();
-                Box::pin(async move { Ok(is_usable) })
-            })
-            .after_connect(|connection, _| {
-                Box::pin(async move {
-                    sqlx::raw_sql(PRAGMAS).execute(connection).await?;
-                    Ok(())
+        let pool = |connections| {
+            AnyPoolOptions::new()
+                .max_connections(connections)
+                // Each was in order when it was returned.
+                .test_before_acquire(false)
+                // After a restart, the queries of a whole fleet wait.
+                .acquire_slow_threshold(ACQUIRE_SLOW)
+                // SQLite itself undoes a transaction, for example on a full disk. Its connection
+                // still counts it, and could begin no other one.
+                .before_acquire(|connection, _| {
+                    let is_usable = !connection.is_in_transaction();
+                    Box::pin(async move { Ok(is_usable) })
                 })
-            });
-        let pool = pool.connect_with(options.map_err(failed)?).await.map_err(failed)?;
+                .after_connect(|connection, _| {
+                    Box::pin(async move {
+                        sqlx::raw_sql(PRAGMAS).execute(connection).await?;
+                        Ok(())
+                    })
+                })
+        };
+        let options = options.map_err(failed)?;
+        let changes = pool(1).connect_with(options.clone()).await.map_err(failed)?;
+        let pool = pool(QUERIES_MAX).connect_with(options).await.map_err(failed)?;
         let turn = Arc::default();
-        let writes = WriteQueue::start(pool.clone(), Arc::clone(&turn));
-        let store = Self { pool, turn, writes };
+        let writes = WriteQueue::start(changes.clone(), Arc::clone(&turn));
+        let store = Self { pool, changes, turn, writes };
         store.migrate().await?;
         Ok(store)
     }
@@ -145,7 +159,7 @@ impl CloudStore {
 
     /// Begins a change, once no other one is in progress.
     pub(crate) async fn change(&self) -> CloudResult<StoreChange<'_>> {
-        begin(&self.pool, &self.turn).await
+        begin(&self.changes, &self.turn).await
     }
 
     /// Writes a copy of the database to a new file.
@@ -156,6 +170,7 @@ impl CloudStore {
 
     /// Closes the database, once open changes have ended.
     pub(crate) async fn close(&self) {
+        self.changes.close().await;
         self.pool.close().await;
     }
 }

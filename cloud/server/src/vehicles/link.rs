@@ -86,11 +86,20 @@ pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), sock
 }
 
 impl<'c> VehicleLink<'c> {
-    /// Serves the connection; returns the reason of its end, unless it was the vehicle.
+    /// Serves the connection; returns the reason of its end, unless it was the vehicle. Everything
+    /// but the wait for the next frame is in a box: an idle connection does not have its room.
     async fn run(&mut self) -> CloudResult<Option<GoAway>> {
-        let Ok(hello) = timeout(HELLO, self.receive()).await else { return Ok(None) };
+        match Box::pin(self.open()).await? {
+            Ok(mut orders) => self.serve_frames(&mut orders).await,
+            Err(end) => Ok(end),
+        }
+    }
+
+    /// Exchanges the first frames; returns the orders, or the reason of the end.
+    async fn open(&mut self) -> CloudResult<Result<watch::Receiver<LinkOrders>, Option<GoAway>>> {
+        let Ok(hello) = timeout(HELLO, self.receive()).await else { return Ok(Err(None)) };
         let hello = match hello? {
-            None => return Ok(None),
+            None => return Ok(Err(None)),
             Some(Body::Hello(hello)) if hello.protocol == PROTOCOL => hello,
             Some(Body::Hello(Hello { protocol, .. })) => {
                 let message = format!("the channel has version {PROTOCOL}, not {protocol}");
@@ -99,8 +108,9 @@ impl<'c> VehicleLink<'c> {
             Some(_) => return Err(wrong("the first frame is no hello")),
         };
         self.epoch = self.cloud.store.connect(self.name, self.certificate, &hello).await?;
-        let Some(mut orders) = self.cloud.hub.add(self.name, self.epoch) else {
-            return Ok(Some(GoAway { after_ms: 0, reason: "there is a newer one".to_owned() }));
+        let Some(orders) = self.cloud.hub.add(self.name, self.epoch) else {
+            let reason = "there is a newer one".to_owned();
+            return Ok(Err(Some(GoAway { after_ms: 0, reason })));
         };
         let welcome = Welcome {
             epoch: self.epoch,
@@ -110,7 +120,7 @@ impl<'c> VehicleLink<'c> {
         };
         self.send(Body::Welcome(welcome)).await?;
         self.send_wanted().await?;
-        self.serve_frames(&mut orders).await
+        Ok(Ok(orders))
     }
 
     async fn serve_frames(
@@ -131,14 +141,14 @@ impl<'c> VehicleLink<'c> {
             }
             if changes != sent_changes {
                 sent_changes = changes;
-                self.send_wanted().await?;
+                Box::pin(self.send_wanted()).await?;
             }
             tokio::select! {
                 body = self.receive() => {
                     let Some(body) = body? else { return Ok(None) };
                     silence.as_mut().reset(tokio::time::Instant::now() + 3 * period);
                     self.cloud.hub.saw(self.name);
-                    self.handle(body).await?;
+                    Box::pin(self.handle(body)).await?;
                 }
                 changed = orders.changed() => if changed.is_err() {
                     // It was removed from the hub, which has set the end before.
@@ -149,7 +159,7 @@ impl<'c> VehicleLink<'c> {
                 }
                 _ = pings.tick() => {
                     number += 1;
-                    self.send(Body::Ping(Ping { number })).await?;
+                    Box::pin(self.send(Body::Ping(Ping { number }))).await?;
                 }
             }
         }
