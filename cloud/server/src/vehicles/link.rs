@@ -30,6 +30,9 @@ const SEND: Duration = Duration::from_secs(60);
 const WRONG_MS: u64 = 60_000;
 /// Frames of a vehicle that are written to the disk: more wait.
 const WRITES: RateLimit = RateLimit::of(20.0, 100.0);
+/// Length of a report or of records, decompressed, that does not count among the frames that are
+/// stored at a time: many small ones are committed together.
+const SMALL: usize = 16 << 10;
 /// Number of the problems of a report that count, and of the characters of each.
 const PROBLEMS_MAX: usize = 100;
 const PROBLEM_MAX: usize = 1000;
@@ -198,8 +201,9 @@ impl<'c> VehicleLink<'c> {
 
     /// Stores a report, as far as it has something new; returns whether the wanted state changed.
     async fn store_report(&mut self, reported: Reported) -> CloudResult<bool> {
-        let _frame = self.may_store().await;
+        let frame = self.may_store().await;
         let mut report = report(reported)?;
+        let _frame = frame.filter(|_| report.status.len() > SMALL);
         let (before, stored) = (self.stored, StoredReport::of(&report));
         if stored.whole == before.whole {
             return Ok(false);
@@ -212,9 +216,11 @@ impl<'c> VehicleLink<'c> {
     }
 
     async fn store_records(&mut self, records: Records) -> CloudResult<Ack> {
-        let _frame = self.may_store().await;
+        let frame = self.may_store().await;
         let batch = batch::parse(&records)?;
         drop(records);
+        let bytes = batch.lines.iter().map(|(_, _, line)| line.len()).sum::<usize>();
+        let _frame = frame.filter(|_| bytes > SMALL);
         let (store, retention) = (&self.cloud.store, self.cloud.retention);
         let ack = store.append(self.name, self.epoch, batch, retention).await?;
         self.cloud.hub.arrived(self.name);
