@@ -73,6 +73,7 @@ pub async fn figures(
         figures.push(FleetFigure::free(&name, "s", quantile(&reconnected, share)));
     }
     figures.push(FleetFigure::at_most("kills: other errors", "", 0.0, simulation.errors()));
+    figures.iter().for_each(|figure| println!("{figure}"));
     Ok(figures)
 }
 

@@ -11,7 +11,7 @@ use tokio::time::Instant;
 
 use crate::administrator::Administrator;
 use crate::cloud_process::CloudProcess;
-use crate::identity::{FleetKey, VehicleIdentity};
+use crate::identity::{FleetKey, SimulatedIdentity};
 use crate::simulation::Simulation;
 use crate::vehicle::SimulatedVehicle;
 
@@ -22,7 +22,7 @@ const AT_A_TIME: usize = 32;
 pub struct EnrolledFleet {
     pub cloud: CloudProcess,
     pub token: String,
-    pub vehicles: Vec<VehicleIdentity>,
+    pub vehicles: Vec<SimulatedIdentity>,
     /// Time of the enrolments, in s.
     pub enrolled_s: f64,
     _folder: TempDir,

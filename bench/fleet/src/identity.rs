@@ -29,7 +29,7 @@ pub struct FleetKey {
 
 /// The means of a vehicle to connect.
 #[derive(Clone)]
-pub struct VehicleIdentity {
+pub struct SimulatedIdentity {
     pub name: String,
     tls: Arc<ClientConfig>,
     /// The own address: a range of ports for each four thousandth of the fleet.
@@ -51,12 +51,12 @@ impl FleetKey {
         &self,
         index: usize,
         enrolment: Enrolment,
-    ) -> Result<VehicleIdentity, String> {
+    ) -> Result<SimulatedIdentity, String> {
         let Enrolment { address, vehicle, authority, token, .. } = enrolment;
         let last = u8::try_from(index / 4000 % 250).unwrap_or(0) + 1;
         let source = Ipv4Addr::new(127, 0, 0, last);
         let stranger =
-            VehicleIdentity { name: vehicle.clone(), tls: self.tls(&authority, None)?, source };
+            SimulatedIdentity { name: vehicle.clone(), tls: self.tls(&authority, None)?, source };
         let request = EnrolRequest { vehicle, token, csr: self.csr.clone() };
         let body = serde_json::to_vec(&request).map_err(|error| error.to_string())?;
         let request = Request::post("/v1/enrol").header("host", "cloud");
@@ -70,7 +70,7 @@ impl FleetKey {
         let reply: EnrolReply =
             serde_json::from_slice(&answer).map_err(|error| error.to_string())?;
         let tls = self.tls(&authority, Some(&reply.certificate))?;
-        Ok(VehicleIdentity { tls, ..stranger })
+        Ok(SimulatedIdentity { tls, ..stranger })
     }
 
     fn tls(&self, authority: &str, own: Option<&str>) -> Result<Arc<ClientConfig>, String> {
@@ -97,7 +97,7 @@ impl FleetKey {
     }
 }
 
-impl VehicleIdentity {
+impl SimulatedIdentity {
     /// Connects to the cloud.
     pub async fn connect(&self, address: SocketAddr) -> Result<TlsStream<TcpStream>, String> {
         let failed = |error: std::io::Error| error.to_string();

@@ -32,7 +32,7 @@ pub struct LoadTimes {
     pub idle: Duration,
     /// Time under load, apart from the deployment.
     pub active: Duration,
-    /// Whether vehicles without a sign of life are waited for, which takes a minute.
+    /// True to wait for the end of silent connections, which takes a minute.
     pub has_silent: bool,
 }
 
@@ -41,7 +41,10 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
     let fleet = EnrolledFleet::enrol(count + SILENT + 1).await?;
     let cloud = &fleet.cloud;
     let mut figures = Vec::new();
-    let mut add = |figure| figures.push(figure);
+    let mut add = |figure: FleetFigure| {
+        println!("{figure}");
+        figures.push(figure);
+    };
     add(FleetFigure::free("vehicles", "", count as f64));
     add(FleetFigure::free("enrolment of all", "s", fleet.enrolled_s));
     let of_each = |kb: f64| kb / count as f64;

@@ -51,14 +51,10 @@ fn main() -> ExitCode {
         Err(error) => Err(format!("cannot start threads: {error}")),
     };
     match measured {
-        Ok(figures) => {
-            println!("| measurement | promise | measured | |\n|---|---|---|---|");
-            figures.iter().for_each(|figure| println!("{figure}"));
-            match figures.iter().all(|figure| figure.is_met()) {
-                true => ExitCode::SUCCESS,
-                false => ExitCode::FAILURE,
-            }
-        }
+        Ok(figures) => match figures.iter().all(|figure| figure.is_met()) {
+            true => ExitCode::SUCCESS,
+            false => ExitCode::FAILURE,
+        },
         Err(reason) => {
             eprintln!("error: the fleet cannot be measured\n  cause: {reason}");
             ExitCode::FAILURE
@@ -76,6 +72,7 @@ async fn measure(args: &Args) -> Result<Vec<FleetFigure>, String> {
     };
     let kills = args.kills.unwrap_or(if args.quick { 2 } else { 60 });
     let mut figures = Vec::new();
+    println!("| measurement | promise | measured | |\n|---|---|---|---|");
     if vehicles > 0 {
         figures.extend(load::figures(vehicles, &times).await?);
     }

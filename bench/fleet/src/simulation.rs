@@ -13,7 +13,7 @@ use tokio::time::{Instant, sleep};
 /// Number of errors that are printed.
 const SHOWN: usize = 10;
 
-/// What each vehicle sends.
+/// Frames that each vehicle sends.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct FleetLoad {
     /// Interval of reports, and of batches of records; without one, the vehicle is idle.

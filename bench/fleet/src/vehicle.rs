@@ -19,7 +19,7 @@ use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 
-use crate::identity::VehicleIdentity;
+use crate::identity::SimulatedIdentity;
 use crate::simulation::{FleetLoad, Simulation, random_part};
 
 /// The stream of all records.
@@ -37,7 +37,7 @@ type Socket = WebSocketStream<TlsStream<TcpStream>>;
 
 /// A vehicle between connections.
 pub struct SimulatedVehicle {
-    identity: VehicleIdentity,
+    identity: SimulatedIdentity,
     simulation: Arc<Simulation>,
     load: watch::Receiver<FleetLoad>,
     /// The number of the next record, and of the first one that is not acknowledged.
@@ -46,11 +46,11 @@ pub struct SimulatedVehicle {
     /// The batch that was sent and not acknowledged: its end, and the time.
     waiting: Option<(u64, Instant)>,
     /// Each deployment that runs: id, envelope, release and digest of its revision.
-    runs: Vec<Running>,
+    runs: Vec<RunningRelease>,
     handled: u64,
 }
 
-struct Running {
+struct RunningRelease {
     id: String,
     envelope: String,
     release: u64,
@@ -58,7 +58,7 @@ struct Running {
 }
 
 impl SimulatedVehicle {
-    pub fn new(identity: VehicleIdentity, simulation: Arc<Simulation>) -> Self {
+    pub fn new(identity: SimulatedIdentity, simulation: Arc<Simulation>) -> Self {
         let load = simulation.load.subscribe();
         let (next, acknowledged, waiting) = (0, 0, None);
         Self { identity, simulation, load, next, acknowledged, waiting, runs: vec![], handled: 0 }
@@ -185,8 +185,8 @@ impl SimulatedVehicle {
         Ok(None)
     }
 
-    /// Fetches what a wanted state has anew, over a connection for each file as real vehicles do,
-    /// and reports that it runs. Nothing is verified and nothing starts.
+    /// Fetches the deployments of a wanted state that are new, over a connection for each file as
+    /// real vehicles do, and reports that they run. Nothing is verified and nothing starts.
     async fn apply(&mut self, socket: &mut Socket, desired: Desired) -> Result<(), String> {
         let mut runs = Vec::new();
         for Wanted { id, envelope, .. } in desired.deployments.into_iter().filter(|it| it.is_wanted)
@@ -206,7 +206,7 @@ impl SimulatedVehicle {
                 get(format!("/v1/objects/{}", file.sha256)).await?;
             }
             let (release, revision) = (deployment.release, digest.to_string());
-            runs.push(Running { id, envelope, release, revision });
+            runs.push(RunningRelease { id, envelope, release, revision });
         }
         (self.runs, self.handled) = (runs, desired.generation);
         self.report(socket).await?;
@@ -258,7 +258,7 @@ impl SimulatedVehicle {
 
 /// Opens the control channel up to the welcome.
 pub async fn open(
-    identity: &VehicleIdentity,
+    identity: &SimulatedIdentity,
     simulation: &Simulation,
 ) -> Result<(Socket, Welcome), String> {
     let stream = identity.connect(simulation.address).await?;
@@ -281,7 +281,7 @@ pub async fn open(
 
 /// Keeps a connection without a sign of life until the cloud ends it; returns the reason.
 pub async fn be_silent(
-    identity: &VehicleIdentity,
+    identity: &SimulatedIdentity,
     simulation: &Simulation,
 ) -> Result<String, String> {
     let (mut socket, _) = open(identity, simulation).await?;
@@ -313,8 +313,8 @@ fn body(
 }
 
 /// Returns a status as a vehicle reports it, of some 1.5 kB.
-fn status(name: &str, up_s: f64, generation: u64, runs: &[Running]) -> Value {
-    let deployments = runs.iter().map(|Running { id, release, revision, .. }| {
+fn status(name: &str, up_s: f64, generation: u64, runs: &[RunningRelease]) -> Value {
+    let deployments = runs.iter().map(|RunningRelease { id, release, revision, .. }| {
         json!({
             "id": id, "release": release, "attempt": 1, "lambda": id,
             "revision": { "digest": revision, "version": "1.0.0", "release": 1 },

@@ -17,7 +17,7 @@ const KEYS_MAX: usize = 20_000;
 #[derive(Debug)]
 struct LimitOfEach<K> {
     limit: RateLimit,
-    /// What fills a limit completely: a key with that much left needs not be remembered.
+    /// Content of a full limit: its key needs not be remembered.
     burst: f64,
     limits: Mutex<HashMap<Option<K>, RateLimit>>,
 }
@@ -89,7 +89,7 @@ impl WrongSecrets {
     }
 }
 
-/// What each vehicle may do: a vehicle in a loop must cost little.
+/// Limits of each vehicle: one in a loop must cost little.
 #[derive(Debug)]
 pub(crate) struct VehicleLimits {
     /// Requests, which fetch a file each.

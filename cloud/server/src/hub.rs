@@ -19,7 +19,7 @@ const TAKEN_MS: u64 = 10_000;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct LinkOrders {
     /// Number of changes of the wanted state since the connection began.
-    changes: u64,
+    pub(crate) changes: u64,
     /// The end of the connection.
     pub(crate) end: Option<GoAway>,
 }

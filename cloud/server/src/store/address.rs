@@ -2,6 +2,7 @@
 
 use std::path::Path;
 use std::str::FromStr;
+use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
 use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
@@ -11,6 +12,9 @@ use sqlx::{AnyPool, Connection};
 /// each other; FULL makes each commit durable before it returns.
 const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
                        PRAGMA foreign_keys = ON; PRAGMA busy_timeout = 10000;";
+
+/// Time that a query waits before the log has it.
+const ACQUIRE_SLOW: Duration = Duration::from_secs(20);
 
 /// Beginning of a change in SQLite. A program beside this one, such as `invite`, writes too: a
 /// transaction that became a writer only later would fail instead of waiting for it.
@@ -60,12 +64,12 @@ impl StoreAddress {
         }
     }
 
-    /// Connects.
+    /// Makes at most this many connections.
     ///
     /// # Errors
     ///
     /// A failure that names the cause.
-    pub(super) async fn connect(&self) -> Result<AnyPool, Failure> {
+    pub(super) async fn connect(&self, connections: u32) -> Result<AnyPool, Failure> {
         sqlx::any::install_default_drivers();
         let is_sqlite = matches!(self, Self::Sqlite(_));
         let (Self::Sqlite(url) | Self::Postgres(url)) = self;
@@ -78,7 +82,9 @@ impl StoreAddress {
         };
         let options = AnyConnectOptions::from_str(url).map_err(failed)?;
         let pool = AnyPoolOptions::new()
-            .max_connections(8)
+            .max_connections(connections)
+            // After a restart, the queries of a whole fleet wait.
+            .acquire_slow_threshold(ACQUIRE_SLOW)
             // A connection to a file is in order as long as it is open.
             .test_before_acquire(!is_sqlite)
             // SQLite itself undoes a transaction, for example on a full disk. Its connection still

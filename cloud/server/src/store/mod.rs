@@ -77,9 +77,15 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0004_page.sql"),
 ];
 
+/// Maximum number of queries at a time: with more threads than cores, each only takes longer.
+const QUERIES_MAX: u32 = 4;
+
 /// The database.
 pub(crate) struct CloudStore {
+    /// Connections of queries.
     pool: AnyPool,
+    /// The connection of changes: they do not wait behind the queries of a whole fleet.
+    changes: AnyPool,
     /// The statement that begins a change, for one at a time.
     turn: Arc<Mutex<&'static str>>,
     writes: WriteQueue,
@@ -99,11 +105,11 @@ impl CloudStore {
     ///
     /// A failure if it cannot be opened, or a later version of the program has made it.
     pub(crate) async fn open(address: &StoreAddress) -> Result<Self, Failure> {
-        let pool = address.connect().await?;
+        let (changes, pool) = (address.connect(1).await?, address.connect(QUERIES_MAX).await?);
         let turn = Arc::new(Mutex::new(address.begin()));
-        let writes = WriteQueue::start(pool.clone(), Arc::clone(&turn));
-        let store =
-            Self { pool, turn, writes, is_file: matches!(address, StoreAddress::Sqlite(_)) };
+        let writes = WriteQueue::start(changes.clone(), Arc::clone(&turn));
+        let is_file = matches!(address, StoreAddress::Sqlite(_));
+        let store = Self { pool, changes, turn, writes, is_file };
         store.migrate().await?;
         Ok(store)
     }
@@ -132,7 +138,7 @@ impl CloudStore {
 
     /// Begins a change, once no other one is in progress.
     pub(crate) async fn change(&self) -> CloudResult<StoreChange<'_>> {
-        begin(&self.pool, &self.turn).await
+        begin(&self.changes, &self.turn).await
     }
 
     /// Writes a copy of the database to a new file.
@@ -147,6 +153,7 @@ impl CloudStore {
 
     /// Closes the database, once open changes have ended.
     pub(crate) async fn close(&self) {
+        self.changes.close().await;
         self.pool.close().await;
     }
 }

@@ -12,7 +12,8 @@ use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of streams of a vehicle: two, and one for each lambda that it ever had.
 const STREAMS_MAX: i64 = 1000;
-/// A stream that grows across a multiple of this, in bytes, is a reason to add up all of its vehicle.
+/// A stream that grows across a multiple of this, in bytes, is a reason to add up all streams of
+/// its vehicle.
 const SUM_STEP: i64 = 64 << 10;
 /// Number of the oldest records that are looked at in one step of making room.
 const STEP: i64 = 1000;
@@ -50,21 +51,21 @@ pub(crate) struct RecordPage {
 }
 
 /// A batch to store, if the connection still counts.
-struct Append {
+struct AppendWrite {
     name: String,
     epoch: u64,
     batch: StreamBatch,
     retention: Retention,
 }
 
-/// What is known of a stream.
+/// Position and size of a stream.
 struct StoredStream {
     cursor: Cursor,
     kept: i64,
     kept_bytes: i64,
 }
 
-impl VehicleWrite for Append {
+impl VehicleWrite for AppendWrite {
     type Done = Ack;
 
     async fn apply(&self, change: &mut StoreChange<'_>) -> CloudResult<Ack> {
@@ -105,7 +106,7 @@ impl CloudStore {
         batch: StreamBatch,
         retention: Retention,
     ) -> CloudResult<Ack> {
-        self.write(Append { name: name.to_owned(), epoch, batch, retention }).await
+        self.write(AppendWrite { name: name.to_owned(), epoch, batch, retention }).await
     }
 
     /// Returns the positions of all streams of a vehicle.

@@ -71,14 +71,14 @@ impl VehicleReport {
 }
 
 /// A connection that begins.
-struct Connect {
+struct ConnectWrite {
     name: String,
     certificate: String,
     version: String,
     key: String,
 }
 
-impl VehicleWrite for Connect {
+impl VehicleWrite for ConnectWrite {
     type Done = u64;
 
     async fn apply(&self, change: &mut StoreChange<'_>) -> CloudResult<u64> {
@@ -100,13 +100,13 @@ impl VehicleWrite for Connect {
 }
 
 /// A report to store, if the connection still counts.
-struct Report {
+struct ReportWrite {
     name: String,
     epoch: u64,
     report: VehicleReport,
 }
 
-impl VehicleWrite for Report {
+impl VehicleWrite for ReportWrite {
     type Done = bool;
 
     async fn apply(&self, change: &mut StoreChange<'_>) -> CloudResult<bool> {
@@ -238,7 +238,7 @@ impl CloudStore {
     ) -> CloudResult<u64> {
         let (name, certificate) = (name.to_owned(), certificate.to_owned());
         let (version, key) = (excerpt(&hello.version), excerpt(&hello.key));
-        self.write(Connect { name, certificate, version, key }).await
+        self.write(ConnectWrite { name, certificate, version, key }).await
     }
 
     /// Stores a report, if the connection still counts; returns whether the vehicle's wanted state
@@ -249,7 +249,7 @@ impl CloudStore {
         epoch: u64,
         report: VehicleReport,
     ) -> CloudResult<bool> {
-        self.write(Report { name: name.to_owned(), epoch, report }).await
+        self.write(ReportWrite { name: name.to_owned(), epoch, report }).await
     }
 
     /// Returns all vehicles, those that are in `online` as connected.
@@ -324,8 +324,8 @@ impl CloudStore {
 }
 
 impl StoreChange<'_> {
-    /// Adds a certificate. Its end in the database is after those of former ones: it tells which is
-    /// the newest.
+    /// Adds a certificate. In the database, each ends after the former ones, by which the newest
+    /// is known.
     async fn add_certificate(&mut self, name: &str, issued: &Issued) -> CloudResult<()> {
         let (last,): (i64,) = one!(&mut *self.tx;
             "SELECT COALESCE(MAX(expires), 0) FROM certificates WHERE vehicle = $1"; name);

@@ -30,6 +30,9 @@ const SEND: Duration = Duration::from_secs(60);
 const WRONG_MS: u64 = 60_000;
 /// Frames of a vehicle that are written to the disk: more wait.
 const WRITES: RateLimit = RateLimit::of(20.0, 100.0);
+/// Length of a report or of records, decompressed, that does not count among the frames that are
+/// stored at a time: many small ones are committed together.
+const SMALL: usize = 16 << 10;
 /// Number of the problems of a report that count, and of the characters of each.
 const PROBLEMS_MAX: usize = 100;
 const PROBLEM_MAX: usize = 1000;
@@ -86,11 +89,20 @@ pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), sock
 }
 
 impl<'c> VehicleLink<'c> {
-    /// Serves the connection; returns the reason of its end, unless it was the vehicle.
+    /// Serves the connection; returns the reason of its end, unless it was the vehicle. Everything
+    /// but the wait for the next frame is in a box: an idle connection does not have its room.
     async fn run(&mut self) -> CloudResult<Option<GoAway>> {
-        let Ok(hello) = timeout(HELLO, self.receive()).await else { return Ok(None) };
+        match Box::pin(self.open()).await? {
+            Ok(mut orders) => self.serve_frames(&mut orders).await,
+            Err(end) => Ok(end),
+        }
+    }
+
+    /// Exchanges the first frames; returns the orders, or the reason of the end.
+    async fn open(&mut self) -> CloudResult<Result<watch::Receiver<LinkOrders>, Option<GoAway>>> {
+        let Ok(hello) = timeout(HELLO, self.receive()).await else { return Ok(Err(None)) };
         let hello = match hello? {
-            None => return Ok(None),
+            None => return Ok(Err(None)),
             Some(Body::Hello(hello)) if hello.protocol == PROTOCOL => hello,
             Some(Body::Hello(Hello { protocol, .. })) => {
                 let message = format!("the channel has version {PROTOCOL}, not {protocol}");
@@ -99,8 +111,9 @@ impl<'c> VehicleLink<'c> {
             Some(_) => return Err(wrong("the first frame is no hello")),
         };
         self.epoch = self.cloud.store.connect(self.name, self.certificate, &hello).await?;
-        let Some(mut orders) = self.cloud.hub.add(self.name, self.epoch) else {
-            return Ok(Some(GoAway { after_ms: 0, reason: "there is a newer one".to_owned() }));
+        let Some(orders) = self.cloud.hub.add(self.name, self.epoch) else {
+            let reason = "there is a newer one".to_owned();
+            return Ok(Err(Some(GoAway { after_ms: 0, reason })));
         };
         let welcome = Welcome {
             epoch: self.epoch,
@@ -110,7 +123,7 @@ impl<'c> VehicleLink<'c> {
         };
         self.send(Body::Welcome(welcome)).await?;
         self.send_wanted().await?;
-        self.serve_frames(&mut orders).await
+        Ok(Ok(orders))
     }
 
     async fn serve_frames(
@@ -122,32 +135,34 @@ impl<'c> VehicleLink<'c> {
         let silence = sleep(3 * period);
         tokio::pin!(silence);
         pings.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut sent_changes = 0;
         loop {
-            // An order may be older than this loop. It is not marked as seen: a change that came
-            // during the last frame is still to be sent.
-            let end = orders.borrow().end.clone();
+            // An order may be older than this loop, or have come while a frame was handled.
+            let LinkOrders { changes, end } = orders.borrow_and_update().clone();
             if end.is_some() {
                 return Ok(end);
+            }
+            if changes != sent_changes {
+                sent_changes = changes;
+                Box::pin(self.send_wanted()).await?;
             }
             tokio::select! {
                 body = self.receive() => {
                     let Some(body) = body? else { return Ok(None) };
                     silence.as_mut().reset(tokio::time::Instant::now() + 3 * period);
                     self.cloud.hub.saw(self.name);
-                    self.handle(body).await?;
+                    Box::pin(self.handle(body)).await?;
                 }
-                changed = orders.changed() => match changed {
-                    Ok(()) if orders.borrow().end.is_some() => {}
-                    Ok(()) => self.send_wanted().await?,
+                changed = orders.changed() => if changed.is_err() {
                     // It was removed from the hub, which has set the end before.
-                    Err(_) => return Ok(orders.borrow().end.clone()),
+                    return Ok(orders.borrow().end.clone());
                 },
                 () = silence.as_mut() => {
                     return Ok(Some(GoAway { after_ms: 0, reason: "no sign of life".into() }));
                 }
                 _ = pings.tick() => {
                     number += 1;
-                    self.send(Body::Ping(Ping { number })).await?;
+                    Box::pin(self.send(Body::Ping(Ping { number }))).await?;
                 }
             }
         }
@@ -186,8 +201,9 @@ impl<'c> VehicleLink<'c> {
 
     /// Stores a report, as far as it has something new; returns whether the wanted state changed.
     async fn store_report(&mut self, reported: Reported) -> CloudResult<bool> {
-        let _frame = self.may_store().await;
+        let frame = self.may_store().await;
         let mut report = report(reported)?;
+        let _frame = frame.filter(|_| report.status.len() > SMALL);
         let (before, stored) = (self.stored, StoredReport::of(&report));
         if stored.whole == before.whole {
             return Ok(false);
@@ -200,9 +216,11 @@ impl<'c> VehicleLink<'c> {
     }
 
     async fn store_records(&mut self, records: Records) -> CloudResult<Ack> {
-        let _frame = self.may_store().await;
+        let frame = self.may_store().await;
         let batch = batch::parse(&records)?;
         drop(records);
+        let bytes = batch.lines.iter().map(|(_, _, line)| line.len()).sum::<usize>();
+        let _frame = frame.filter(|_| bytes > SMALL);
         let (store, retention) = (&self.cloud.store, self.cloud.retention);
         let ack = store.append(self.name, self.epoch, batch, retention).await?;
         self.cloud.hub.arrived(self.name);

@@ -1,5 +1,7 @@
 //! Clips of a vehicle, from their announcement to the file that a person gets.
 
+use std::time::Duration;
+
 use gleaner_cloud::CloudServer;
 use gleaner_fleet::Body;
 use gleaner_fleet::clips::{CLIP_PART, ClipOrders};
@@ -9,9 +11,13 @@ use hyper::{Method, StatusCode};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 use tokio::io::AsyncWriteExt;
+use tokio::time::sleep;
 
 use crate::fake::{FakeVehicle, Person, soon};
 use crate::{options, start};
+
+/// Time between two looks at what changes soon.
+const PAUSE: Duration = Duration::from_millis(50);
 
 const IMAGE: &[u8] = &{
     let mut image = [7; 100_000];
@@ -218,10 +224,14 @@ async fn hostile_uploads_are_refused_and_change_nothing() {
         endless.push(stream);
     }
     let wrong = format!("/v1/clips/liar/parts/0/{}", sha256(b"other"));
-    while bad.request(Method::PUT, &wrong, b"7654321").await.0 != StatusCode::TOO_MANY_REQUESTS {}
+    while bad.request(Method::PUT, &wrong, b"7654321").await.0 != StatusCode::TOO_MANY_REQUESTS {
+        sleep(PAUSE).await;
+    }
     assert_eq!(put(&good, "a", 0, b"conten").await.0, StatusCode::FORBIDDEN);
     drop(endless);
-    while bad.request(Method::PUT, &wrong, b"7654321").await.0 == StatusCode::TOO_MANY_REQUESTS {}
+    while bad.request(Method::PUT, &wrong, b"7654321").await.0 == StatusCode::TOO_MANY_REQUESTS {
+        sleep(PAUSE).await;
+    }
     // Another file than announced is not wanted any more after some times.
     for _ in 0..3 {
         let (status, text) = put(&bad, "liar", 0, b"7654321").await;

@@ -70,6 +70,29 @@ async fn a_vehicle_that_is_enrolled_again_stays_connected_until_it_uses_that() {
 }
 
 #[tokio::test]
+async fn no_change_is_missed_while_frames_are_handled() {
+    let folder = TempDir::new().unwrap();
+    let (server, admin) = start(&folder).await;
+    let (vehicle, _) = admin.enrol("car-7").await;
+    deploy(&admin, &signed(1)).await;
+    let (mut link, ..) = vehicle.connect().await;
+    link.send(reported(1)).await;
+    assert!(matches!(link.next().await, Some(Body::Desired(_))));
+    for number in 0..20 {
+        // Each report differs, and is being stored while the change comes.
+        for report in 0..5 {
+            link.send(reported(10 * number + report)).await;
+        }
+        let change = if number % 2 == 0 { "stop" } else { "start" };
+        let path = format!("/v1/deployments/brake-dark/{change}");
+        admin.call(Method::POST, &path, Value::Null).await;
+        let Some(Body::Desired(desired)) = link.next().await else { panic!("no wanted state") };
+        assert_eq!(desired.deployments[0].is_wanted, number % 2 == 1);
+    }
+    server.stop().await;
+}
+
+#[tokio::test]
 async fn a_vehicle_fetches_only_deployments_that_are_for_it() {
     let folder = TempDir::new().unwrap();
     let (server, admin) = start(&folder).await;
