@@ -21,6 +21,11 @@ impl FleetFigure {
         Self { name: name.to_owned(), unit, most: None, value }
     }
 
+    /// Returns whether it counts errors: only these are significant in a short run.
+    pub fn is_of_errors(&self) -> bool {
+        self.most == Some(0.0)
+    }
+
     /// Returns whether the promise is kept. What was not measured is not.
     pub fn is_met(&self) -> bool {
         self.most.is_none_or(|most| self.value <= most)

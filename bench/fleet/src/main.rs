@@ -51,7 +51,11 @@ fn main() -> ExitCode {
         Err(error) => Err(format!("cannot start threads: {error}")),
     };
     match measured {
-        Ok(figures) => match figures.iter().all(|figure| figure.is_met()) {
+        Ok(figures) => match figures
+            .iter()
+            .filter(|it| !args.quick || it.is_of_errors())
+            .all(FleetFigure::is_met)
+        {
             true => ExitCode::SUCCESS,
             false => ExitCode::FAILURE,
         },
