@@ -123,8 +123,7 @@ impl CloudProgram {
         };
         let people = value("people:").strip_prefix("http://").unwrap().parse().unwrap();
         let vehicles = value("vehicles:").parse().unwrap();
-        value("page:");
-        // The fourth line is there only without an administrator.
+        // The next line is there only without an administrator.
         let is_first = !folder.join("started").exists();
         std::fs::write(folder.join("started"), "").unwrap();
         let code = is_first.then(|| value("first:").rsplit(' ').next().unwrap().to_owned());
