@@ -20,7 +20,7 @@ pub struct WaveArgs {
     /// Share of a wave's vehicles that may fail
     #[arg(long, value_name = "PERCENT", value_parser = percent, default_value = "5%", requires = "wave")]
     pub max_failed: u8,
-    /// What happens when more fail
+    /// Action when more fail
     #[arg(long, value_name = "ACTION", default_value = "pause", requires = "wave")]
     pub on_failure: FailureAction,
     /// Shortest time that a wave is open before the next one
@@ -34,7 +34,7 @@ pub struct WaveArgs {
     pub watch: bool,
 }
 
-/// What happens when too many vehicles fail.
+/// The action when too many vehicles fail.
 #[derive(ValueEnum, Debug, Clone, Copy)]
 pub enum FailureAction {
     /// No wave opens until `gleaner fleet resume`, or another deployment

@@ -23,11 +23,11 @@ pub struct WavePlan {
     pub soak_s: u64,
     /// The time after which a wave that has not succeeded stops, in s.
     pub deadline_s: u64,
-    /// What happens when too many vehicles fail.
+    /// The action when too many vehicles fail.
     pub on_failure: OnFailure,
 }
 
-/// What happens when too many vehicles fail.
+/// The action when too many vehicles fail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum OnFailure {

@@ -30,7 +30,7 @@ pub(crate) struct ClipQuery {
     last: Option<u64>,
 }
 
-type Row = (i64, String, String, String, i64, i64, i64, String, String, i64);
+type ClipRow = (i64, String, String, String, i64, i64, i64, String, String, i64);
 
 /// The columns of a clip.
 macro_rules! select {
@@ -48,7 +48,7 @@ impl CloudStore {
     pub(crate) async fn clips(&self, query: &ClipQuery) -> CloudResult<ClipPage> {
         let text = |value: &Option<String>| value.clone().unwrap_or_default();
         let count = query.last.unwrap_or(PAGE).clamp(1, PAGE_MAX);
-        let rows: Vec<Row> = rows!(&self.pool;
+        let rows: Vec<ClipRow> = rows!(&self.pool;
             select!("WHERE seq < $1 AND ($2 = '' OR vehicle = $2)
              AND ($3 = '' OR EXISTS (SELECT 1 FROM clip_words
                   WHERE kind = 'lambda' AND word = $3 AND clip = seq))
@@ -68,7 +68,7 @@ impl CloudStore {
 
     /// Returns a clip.
     pub(crate) async fn clip(&self, id: &ClipId) -> CloudResult<FleetClip> {
-        let row: Option<Row> = row!(&self.pool;
+        let row: Option<ClipRow> = row!(&self.pool;
             select!("WHERE vehicle = $1 AND name = $2"); id.vehicle(), id.name());
         let missing =
             || CloudError::missing(format!("there is no clip `{id}`"), "`gleaner clips` lists all");
@@ -115,7 +115,7 @@ impl CloudStore {
     }
 }
 
-fn clip(row: Row, upload: UploadedClips) -> CloudResult<FleetClip> {
+fn clip(row: ClipRow, upload: UploadedClips) -> CloudResult<FleetClip> {
     let (_, vehicle, name, facts, bytes, has_thumbnail, is_requested, state, reason, parts) = row;
     let damaged = |error: String| {
         CloudError::usage(format!("the clip `{name}` of `{vehicle}` is damaged"), "report this")

@@ -204,7 +204,7 @@ impl StoreChange<'_> {
         Ok(true)
     }
 
-    /// Opens a wave of the newest release: adds as many vehicles as its plan says, and returns their
+    /// Opens a wave of the newest release: adds as many vehicles as its plan has, and returns their
     /// number.
     pub(super) async fn open_wave(
         &mut self,

@@ -37,7 +37,7 @@ pub async fn store_of(folder: &Path) -> Option<String> {
 }
 
 /// Runs the tests of this program that have one of these names again, on PostgreSQL, but not
-/// `except`. Without PostgreSQL, it says so and returns.
+/// `except`. Without PostgreSQL, it prints that and returns.
 pub fn run_again(names: &[&str], except: &str) {
     let Some(programs) = programs() else {
         eprintln!("skipped: PostgreSQL is not installed (Debian: postgresql)");
