@@ -72,9 +72,20 @@ impl Checkout {
         command
     }
 
-    /// Cargo as a [`command`](Self::command).
+    /// Cargo as a [`command`](Self::command), without what `cargo run` has told this program about
+    /// its package: some build scripts look at it, and would run again after each build without
+    /// xtask, with all that depends on them.
     pub(crate) fn cargo(&self) -> Command {
-        self.command(&self.cargo)
+        let mut cargo = self.command(&self.cargo);
+        let is_of_package = |name: &str| {
+            ["CARGO_MANIFEST_", "CARGO_PKG_"].iter().any(|start| name.starts_with(start))
+        };
+        for (name, _) in env::vars_os() {
+            if name.to_str().is_some_and(is_of_package) {
+                cargo.env_remove(name);
+            }
+        }
+        cargo
     }
 
     /// The folders of the lambdas in `families`, relative to the checkout: all twins of each.

@@ -17,7 +17,7 @@ use gleaner_protocol::supervision::{LambdaPhase, LambdaStatus, ProcessStatus, Su
 use gleaner_protocol::vehicle_api::{DeploymentStatus, RevisionStatus, VehicleStatus};
 use gleaner_protocol::{DurationStats, Layer, LiveStatus, LiveTopic};
 use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
-use hyper::Method;
+use hyper::{Method, StatusCode};
 use serde_json::{Value, json};
 use tokio::time::interval;
 
@@ -197,7 +197,7 @@ async fn report(
     status.supervisor =
         Some(SupervisorStatus { ingress, up_s: 7300.0, clips: 12, ..SupervisorStatus::default() });
     for wanted in &desired.deployments {
-        status.deployments.push(deployment(vehicle, wanted, is_hostile).await);
+        status.deployments.extend(deployment(vehicle, wanted, is_hostile).await);
     }
     let generation = desired.generation;
     let status = compress(&serde_json::to_vec(&status).unwrap());
@@ -205,13 +205,21 @@ async fn report(
     link.send(Body::Reported(Reported { generation, status, problems })).await;
 }
 
-/// Returns the status of a deployment. A hostile vehicle refuses all but one.
-async fn deployment(vehicle: &FakeVehicle, wanted: &Wanted, is_hostile: bool) -> DeploymentStatus {
-    let (_, envelope) = vehicle.get(&format!("/v1/deployments/{}", wanted.envelope)).await;
+/// Returns the status of a deployment; `None` if another one has replaced it meanwhile. A hostile
+/// vehicle refuses all but one.
+async fn deployment(
+    vehicle: &FakeVehicle,
+    wanted: &Wanted,
+    is_hostile: bool,
+) -> Option<DeploymentStatus> {
+    let (status, envelope) = vehicle.get(&format!("/v1/deployments/{}", wanted.envelope)).await;
+    if status == StatusCode::NOT_FOUND {
+        return None;
+    }
     let signed = gleaner_trust::unverified_deployment(&envelope).unwrap();
     let digest = signed.revision.to_string();
     let is_refused = is_hostile && wanted.id != "brake-dark";
-    DeploymentStatus {
+    Some(DeploymentStatus {
         id: wanted.id.clone(),
         release: signed.release,
         attempt: 1,
@@ -227,7 +235,7 @@ async fn deployment(vehicle: &FakeVehicle, wanted: &Wanted, is_hostile: bool) ->
         stale: None,
         demand: Vec::new(),
         status: (wanted.is_wanted && !is_refused).then(|| lambda(&wanted.id, digest)),
-    }
+    })
 }
 
 fn lambda(id: &str, revision: String) -> LambdaStatus {
