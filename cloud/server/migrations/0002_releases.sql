@@ -16,7 +16,6 @@ CREATE TABLE releases (
     wave BIGINT NOT NULL DEFAULT 0,
     since BIGINT NOT NULL DEFAULT 0,
     reason TEXT NOT NULL DEFAULT '',
-    forgiven BIGINT NOT NULL DEFAULT 0,
     PRIMARY KEY (deployment, number)
 );
 CREATE INDEX releases_by_sha256 ON releases (sha256);
@@ -33,11 +32,13 @@ INSERT INTO wanted_deployments (id, is_wanted) SELECT id, is_wanted FROM deploym
 DROP TABLE deployments;
 ALTER TABLE wanted_deployments RENAME TO deployments;
 
--- The vehicles that the waves of a release have reached.
+-- The vehicles that the waves of a release have reached. `is_forgiven` is 1 of those that had
+-- failed when a person let the waves go on.
 CREATE TABLE wave_members (
     vehicle TEXT NOT NULL REFERENCES vehicles (name),
     deployment TEXT NOT NULL,
     number BIGINT NOT NULL,
+    is_forgiven BIGINT NOT NULL DEFAULT 0,
     PRIMARY KEY (deployment, number, vehicle)
 );
 CREATE INDEX wave_members_by_vehicle ON wave_members (vehicle);

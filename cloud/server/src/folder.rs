@@ -1,5 +1,6 @@
 //! The data folder: private, and of one process at a time.
 
+use std::ffi::OsStr;
 use std::fs::{self, DirBuilder, File, OpenOptions, Permissions};
 use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
@@ -22,8 +23,11 @@ impl DataFolder {
     /// A failure that names the folder.
     pub(crate) fn create(path: &Path) -> Result<Self, Failure> {
         let folder = Self(path.to_owned());
+        // A restored folder has no lock, and with PostgreSQL no database.
+        let is_ours = |name: &OsStr| ["objects", "clips", "ca"].iter().any(|ours| name == *ours);
         let is_of_others = !folder.is_known()
-            && fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_some());
+            && fs::read_dir(path)
+                .is_ok_and(|entries| entries.flatten().any(|it| !is_ours(&it.file_name())));
         if is_of_others {
             let message = format!("`{}` is not empty, and no data folder", path.display());
             return Err(Failure::new(Exit::Usage, message)

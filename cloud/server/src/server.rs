@@ -9,8 +9,8 @@ use std::time::Duration;
 use gleaner_base::{Exit, Failure};
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
-use tokio::task::{JoinHandle, JoinSet};
-use tokio::time::{MissedTickBehavior, interval};
+use tokio::task::JoinSet;
+use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use crate::accept::Entrance;
 use crate::attempts::{VehicleLimits, WrongSecrets};
@@ -61,7 +61,7 @@ pub struct CloudServer {
     cloud: Arc<Cloud>,
     stop: watch::Sender<bool>,
     entrances: JoinSet<()>,
-    chores: JoinHandle<()>,
+    chores: JoinSet<()>,
     _lock: File,
 }
 
@@ -125,24 +125,34 @@ impl CloudServer {
             stop: stopped,
         };
         entrances.spawn(entrance.serve());
+        // Each has a task of its own: one that waits for the database must not hold it up.
+        let mut chores = JoinSet::new();
         let working = Arc::clone(&cloud);
-        let chores = tokio::spawn(async move {
-            let mut seen = interval(SEEN_INTERVAL);
-            seen.set_missed_tick_behavior(MissedTickBehavior::Delay);
-            let mut certificate = interval(CERTIFICATE_INTERVAL);
-            let mut waves = interval(WAVES_INTERVAL);
-            waves.set_missed_tick_behavior(MissedTickBehavior::Delay);
-            let clips = clips::clean(&working);
-            tokio::pin!(clips);
+        chores.spawn(async move { clips::clean(&working).await });
+        let working = Arc::clone(&cloud);
+        chores.spawn(async move {
+            let mut ticks = ticks(SEEN_INTERVAL);
             loop {
-                tokio::select! {
-                    () = &mut clips => {}
-                    _ = seen.tick() => store_seen(&working).await,
-                    _ = waves.tick() => advance_waves(&working).await,
-                    _ = certificate.tick() => match working.authorities.server_config(&host) {
-                        Ok(config) => drop(tls.send_replace(config)),
-                        Err(failure) => tracing::error!("{failure}"),
-                    },
+                ticks.tick().await;
+                store_seen(&working).await;
+            }
+        });
+        let working = Arc::clone(&cloud);
+        chores.spawn(async move {
+            let mut ticks = ticks(WAVES_INTERVAL);
+            loop {
+                ticks.tick().await;
+                advance_waves(&working).await;
+            }
+        });
+        let working = Arc::clone(&cloud);
+        chores.spawn(async move {
+            let mut ticks = ticks(CERTIFICATE_INTERVAL);
+            loop {
+                ticks.tick().await;
+                match working.authorities.server_config(&host) {
+                    Ok(config) => drop(tls.send_replace(config)),
+                    Err(failure) => tracing::error!("{failure}"),
                 }
             }
         });
@@ -151,14 +161,21 @@ impl CloudServer {
 
     /// Stops the server: vehicles are asked to come back later, and open requests are answered.
     pub async fn stop(self) {
-        let Self { cloud, stop, entrances, chores, .. } = self;
-        chores.abort();
+        let Self { cloud, stop, entrances, mut chores, .. } = self;
+        chores.shutdown().await;
         stop.send_replace(true);
         cloud.hub.stop();
         entrances.join_all().await;
         store_seen(&cloud).await;
         cloud.store.close().await;
     }
+}
+
+/// Returns ticks, now and then after each interval. One that comes late moves those after it.
+fn ticks(period: Duration) -> Interval {
+    let mut ticks = interval(period);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    ticks
 }
 
 async fn store_seen(cloud: &Cloud) {

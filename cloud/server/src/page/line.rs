@@ -55,6 +55,7 @@ fn words_of(line: &StreamLine) -> RecordWords {
         "log" => parsed(record).map(log),
         "decision" => parsed(record).map(decision),
         "gap" | "torn" | "damaged" => Some(gap(kind, *seq, record)),
+        "large" => Some(large(record)),
         "started" => Some(started(record)),
         _ => None,
     }
@@ -145,6 +146,11 @@ fn gap(kind: &str, first: u64, record: &Value) -> RecordWords {
         " are missing: " (shown(reason))
     };
     RecordWords { kind: shown(kind), class: "bad", words }
+}
+
+fn large(record: &Value) -> RecordWords {
+    let text = record.get("text").and_then(Value::as_str).unwrap_or_default();
+    RecordWords { kind: "large".to_owned(), class: "warn", words: html! { (shown(text)) } }
 }
 
 fn started(record: &Value) -> RecordWords {

@@ -96,6 +96,8 @@ async fn page(
     before: Option<i64>,
 ) -> PageResult {
     let vehicle = find(cloud, &source.vehicle).await?;
+    // Reading takes memory: as many at a time as streams.
+    let _slot = cloud.readers.open(&user.user.name)?;
     let newest = source.newest(cloud, (0, before.unwrap_or(i64::MAX)), SIZE).await?;
     let here = source.path();
     let up = vehicle_path(&vehicle.name);

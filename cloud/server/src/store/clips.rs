@@ -365,7 +365,9 @@ impl StoreChange<'_> {
         }
         let lambdas = facts.lambdas.iter().map(|it| ("lambda", &it.name));
         let labels = facts.moments.iter().map(|it| ("label", &it.label));
-        let words: BTreeSet<_> = lambdas.chain(labels).collect();
+        // PostgreSQL stores no NUL, and nobody looks for one: the facts have it, escaped.
+        let words = lambdas.chain(labels).filter(|(_, word)| !word.contains('\0'));
+        let words: BTreeSet<_> = words.collect();
         for (kind, word) in words {
             run!(&mut *self.tx;
                 "INSERT INTO clip_words (kind, word, clip) VALUES ($1, $2, $3)";

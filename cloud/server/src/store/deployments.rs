@@ -78,6 +78,9 @@ impl CloudStore {
              ON CONFLICT (id) DO UPDATE SET is_wanted = 1";
             id);
         let number = change.note(actor, &format!("deploy release {release}"), id).await?;
+        if before.as_ref().is_some_and(|before| before.is_wanted == 0) {
+            change.restart_wave(id).await?;
+        }
         if !is_same {
             change.add_release(offered, &sha256).await?;
         }
@@ -94,6 +97,9 @@ impl CloudStore {
         is_wanted: bool,
     ) -> CloudResult<ChangedVehicles> {
         let mut change = self.change().await?;
+        if is_wanted && change.newest(id).await?.is_some_and(|it| it.is_wanted == 0) {
+            change.restart_wave(id).await?;
+        }
         let sql = "UPDATE deployments SET is_wanted = $2 WHERE id = $1";
         let found = run!(&mut *change.tx; sql; id, i64::from(is_wanted)).rows_affected();
         change.finish(found, actor, if is_wanted { "start" } else { "stop" }, id).await

@@ -3,11 +3,14 @@
 use std::collections::BTreeMap;
 
 use gleaner_fleet::people::{VehicleState, VehicleSummary};
+use gleaner_protocol::vehicle_api::StreamLine;
 
 use super::vehicles::FAILED;
-use super::{CloudStore, int, unsigned};
+use super::{CloudStore, int, name_in_lines, unsigned};
 use crate::error::CloudResult;
 
+/// Longest line that is shown, in bytes: a page has a thousand at most.
+const LINE_MAX: i64 = 4096;
 /// Maximum number of streams of a vehicle in one time line.
 const STREAMS_MAX: usize = 64;
 
@@ -145,19 +148,40 @@ impl CloudStore {
         let position = arrived.map_or(0, |(arrived,)| arrived).min(before.saturating_sub(1));
         let mut lines: Vec<(i64, String)> = Vec::new();
         for stream in streams {
-            let rows: Vec<(i64, String)> = rows!(&self.pool;
-                "SELECT arrival, line FROM records
+            let rows: Vec<(i64, String, i64)> = rows!(&self.pool;
+                "SELECT arrival, CASE WHEN bytes > $6 THEN '' ELSE line END, bytes FROM records
                  WHERE vehicle = $1 AND stream = $2 AND arrival > $3 AND arrival <= $4
                  ORDER BY arrival DESC LIMIT $5";
-                vehicle, stream, after, position, int(most as u64 + 1));
-            lines.extend(rows);
+                vehicle, stream, after, position, int(most as u64 + 1), LINE_MAX);
+            let line = |(arrival, line, bytes): (i64, String, i64)| match line.is_empty() {
+                true => (arrival, large(stream, bytes)),
+                false => (arrival, line),
+            };
+            lines.extend(rows.into_iter().map(line));
+            // Of many streams, no more are kept than of one.
+            lines.sort_unstable_by_key(|(arrival, _)| std::cmp::Reverse(*arrival));
+            lines.truncate(most + 1);
         }
-        lines.sort_unstable_by_key(|(arrival, _)| std::cmp::Reverse(*arrival));
         let has_more = lines.len() > most;
         lines.truncate(most);
         let oldest_read = lines.last().map_or(position, |(arrival, _)| *arrival);
         Ok(NewestRecords { lines, position: position.max(after), oldest_read, has_more })
     }
+}
+
+/// Returns the line of a record that is too long to show.
+fn large(stream: &str, bytes: i64) -> String {
+    let text = format!("a record of {bytes} bytes is not shown here: `gleaner logs` has it");
+    let line = StreamLine {
+        stream: name_in_lines(stream).to_owned(),
+        seq: 0,
+        time_ns: 0,
+        boot_ns: 0,
+        boot: String::new(),
+        kind: "large".to_owned(),
+        record: serde_json::json!({ "text": text }),
+    };
+    super::vehicles::json(&line)
 }
 
 impl VehicleFilter {

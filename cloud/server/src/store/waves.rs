@@ -37,7 +37,6 @@ pub(super) struct Release {
     wave: i64,
     since: i64,
     reason: String,
-    forgiven: i64,
     pub(super) is_wanted: i64,
 }
 
@@ -47,6 +46,8 @@ pub(super) struct VehicleCount {
     pub(super) vehicles: u64,
     pub(super) running: u64,
     pub(super) failed: u64,
+    /// Those of the failed ones that a person knew of when the waves went on.
+    forgiven: u64,
     /// Those without the release that have not shown up since the wave opened.
     away: u64,
 }
@@ -78,7 +79,6 @@ impl FromRow<'_, AnyRow> for Release {
             wave: row.try_get("wave")?,
             since: row.try_get("since")?,
             reason: row.try_get("reason")?,
-            forgiven: row.try_get("forgiven")?,
             is_wanted: row.try_get("is_wanted")?,
         })
     }
@@ -88,7 +88,7 @@ impl FromRow<'_, AnyRow> for Release {
 pub(super) async fn newest_releases(tx: &mut Tx, only: &str) -> CloudResult<Vec<Release>> {
     Ok(rows!(&mut **tx;
         "SELECT deployment, number, sha256, revision, fallback, grants, selector, state, plan, wave,
-         since, reason, forgiven, is_wanted
+         since, reason, is_wanted
          FROM releases JOIN deployments ON deployments.id = releases.deployment
          WHERE number = (SELECT MAX(number) FROM releases AS other
                          WHERE other.deployment = releases.deployment)
@@ -147,15 +147,14 @@ impl CloudStore {
             WaveState::Aborted => ("aborted", format!("aborted by {actor}"), "abort waves"),
         };
         if name != newest.state {
-            // Who resumes waves has seen the failures so far; more count.
-            let failed = match state {
-                WaveState::Running => newest.count(&mut change.tx, true).await?.failed,
-                _ => unsigned(newest.forgiven),
-            };
             run!(&mut *change.tx;
-                "UPDATE releases SET state = $3, since = $4, reason = $5, forgiven = $6
+                "UPDATE releases SET state = $3, since = $4, reason = $5
                  WHERE deployment = $1 AND number = $2";
-                id, newest.number, name, now(), reason, super::int(failed));
+                id, newest.number, name, now(), reason);
+        }
+        // Who resumes waves has seen the failures so far; those of other vehicles count.
+        if state == WaveState::Running {
+            change.forgive(id, newest.number).await?;
         }
         change.finish(1, actor, action, id).await
     }
@@ -169,6 +168,30 @@ impl StoreChange<'_> {
             return Ok(None);
         }
         Ok(newest_releases(&mut self.tx, id).await?.pop())
+    }
+
+    /// Marks the vehicles of a release's waves that have failed so far.
+    async fn forgive(&mut self, id: &str, number: i64) -> CloudResult<()> {
+        run!(&mut *self.tx;
+            "UPDATE wave_members SET is_forgiven = 1 WHERE deployment = $1 AND number = $2
+             AND CASE WHEN EXISTS (SELECT 1 FROM reported
+                  WHERE reported.vehicle = wave_members.vehicle
+                  AND reported.deployment = $1 AND reported.number = $2)
+             THEN EXISTS (SELECT 1 FROM reported
+                  WHERE reported.vehicle = wave_members.vehicle
+                  AND reported.deployment = $1 AND reported.number = $2 AND state = $3)
+             ELSE EXISTS (SELECT 1 FROM vehicles
+                  WHERE name = wave_members.vehicle AND handled >= generation) END";
+            id, number, FAILED);
+        Ok(())
+    }
+
+    /// Begins the time of the open wave again.
+    pub(super) async fn restart_wave(&mut self, id: &str) -> CloudResult<()> {
+        run!(&mut *self.tx;
+            "UPDATE releases SET since = $2 WHERE deployment = $1 AND state = 'running'";
+            id, now());
+        Ok(())
     }
 
     /// Takes a step; returns whether anything has changed.
@@ -273,35 +296,43 @@ impl Release {
     /// Counts its vehicles, or those of them that its waves have reached.
     pub(super) async fn count(&self, tx: &mut Tx, only_members: bool) -> CloudResult<VehicleCount> {
         // Grouped by labels, of which there are few: SQL cannot compare them with the selector.
-        let groups: Vec<(String, String, i64)> = rows!(&mut **tx;
+        let groups: Vec<(String, String, i64, i64)> = rows!(&mut **tx;
             "SELECT labels,
              CASE WHEN reported.number = $2 THEN reported.state
                   WHEN handled >= generation THEN 'refused'
                   WHEN seen < $3 THEN 'away'
                   ELSE 'late' END AS standing,
-             COUNT(*)
+             COALESCE(is_forgiven, 0), COUNT(*)
              FROM vehicles LEFT JOIN reported
              ON reported.vehicle = vehicles.name AND reported.deployment = $1
-             WHERE is_revoked = 0 AND epoch > 0 AND ($4 = 0 OR EXISTS
-             (SELECT 1 FROM wave_members WHERE wave_members.deployment = $1
-              AND wave_members.number = $2 AND wave_members.vehicle = vehicles.name))
-             GROUP BY 1, 2";
+             LEFT JOIN wave_members ON wave_members.vehicle = vehicles.name
+             AND wave_members.deployment = $1 AND wave_members.number = $2
+             WHERE is_revoked = 0 AND epoch > 0 AND ($4 = 0 OR wave_members.vehicle IS NOT NULL)
+             GROUP BY 1, 2, 3";
             &self.deployment, self.number, self.since, i64::from(only_members));
         let (selector, mut count) = (map(&self.selector), VehicleCount::default());
-        for (labels, standing, vehicles) in groups {
+        for (labels, standing, is_forgiven, vehicles) in groups {
             let labels: TextMap = map(&labels);
             if !selects(&selector, &labels) {
                 continue;
             }
             let vehicles = unsigned(vehicles);
             count.vehicles += vehicles;
-            match &*standing {
-                RUNNING => count.running += vehicles,
-                FAILED => count.failed += vehicles,
+            let has_failed = match &*standing {
+                FAILED => true,
                 // It has handled its wanted state, and has not accepted this.
-                "refused" if self.is_wanted != 0 => count.failed += vehicles,
-                "away" => count.away += vehicles,
-                _ => {}
+                "refused" => self.is_wanted != 0,
+                _ => false,
+            };
+            let counter = match &*standing {
+                _ if has_failed => &mut count.failed,
+                RUNNING => &mut count.running,
+                "away" => &mut count.away,
+                _ => continue,
+            };
+            *counter += vehicles;
+            if has_failed && is_forgiven != 0 {
+                count.forgiven += vehicles;
             }
         }
         Ok(count)
@@ -333,9 +364,9 @@ impl Release {
     fn next(&self, count: &VehicleCount, now: i64) -> CloudResult<WaveStep> {
         let plan = self.plan()?;
         let open_s = unsigned(now.saturating_sub(self.since));
-        let VehicleCount { vehicles, running, failed, away } = *count;
+        let VehicleCount { vehicles, running, failed, forgiven, away } = *count;
         let share = |part: u64, percent: u8| part * 100 > vehicles * u64::from(percent);
-        let new = failed.saturating_sub(unsigned(self.forgiven));
+        let new = failed - forgiven;
         if new > 0 && share(new, plan.failures) {
             let reason =
                 format!("wave {}: it failed on {failed} of {vehicles} vehicles", self.wave);

@@ -138,6 +138,36 @@ async fn waves_stop_at_failures_until_a_person_resumes_them() {
 }
 
 #[tokio::test]
+async fn failures_of_other_vehicles_count_after_waves_were_resumed() {
+    let fleet = TestFleet::of(10).await;
+    let plan = WavePlan { shares: vec![50], success: 50, failures: 20, soak_s: 60, ..PLAN };
+    fleet.deploy(2, plan).await;
+    let first = fleet.having(2).await;
+    fleet.report(&first[..3], 2, None).await;
+    fleet.report(&first[3..], 2, Some("it faults")).await;
+    fleet.store.advance_waves().await.unwrap();
+    assert_eq!(fleet.progress().await.state, WaveState::Paused);
+    fleet.store.steer_waves("ann", "a", WaveState::Running).await.unwrap();
+    fleet.report(&first[3..], 2, None).await;
+    fleet.report(&first[..2], 2, Some("it faults")).await;
+    fleet.store.advance_waves().await.unwrap();
+    assert_eq!(fleet.progress().await.state, WaveState::Paused);
+}
+
+#[tokio::test]
+async fn the_time_of_a_wave_does_not_run_while_its_deployment_is_stopped() {
+    let fleet = TestFleet::of(2).await;
+    fleet.deploy(2, WavePlan { shares: vec![50], soak_s: 60, ..PLAN }).await;
+    fleet.report(&fleet.having(2).await, 2, None).await;
+    fleet.store.set_wanted("ann", "a", false).await.unwrap();
+    fleet.pass(7200).await;
+    fleet.store.set_wanted("ann", "a", true).await.unwrap();
+    fleet.report(&fleet.having(2).await, 2, None).await;
+    assert!(fleet.store.advance_waves().await.unwrap().is_empty());
+    assert_eq!(fleet.progress().await.state, WaveState::Running);
+}
+
+#[tokio::test]
 async fn a_failed_wave_runs_the_fallback_if_the_plan_says_so() {
     let fleet = TestFleet::of(3).await;
     let on_failure = OnFailure::Rollback;
