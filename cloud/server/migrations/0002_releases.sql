@@ -32,6 +32,11 @@ INSERT INTO wanted_deployments (id, is_wanted) SELECT id, is_wanted FROM deploym
 DROP TABLE deployments;
 ALTER TABLE wanted_deployments RENAME TO deployments;
 
+-- SHA-256 of the certificate that signs the cloud's, of the folder that the database belongs to.
+CREATE TABLE folder (
+    authority TEXT NOT NULL
+);
+
 -- The vehicles that the waves of a release have reached. `is_forgiven` is 1 of those that had
 -- failed when a person let the waves go on.
 CREATE TABLE wave_members (

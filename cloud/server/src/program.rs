@@ -1,12 +1,13 @@
 //! The command line of the program.
 
-use std::io::Write;
+use std::fs::{self, File};
+use std::io::{self, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, sync_folder};
 use gleaner_fleet::people::{NewUser, Role};
 use gleaner_vitals::log;
 use rustix::fs::Mode;
@@ -151,14 +152,27 @@ async fn backup(file: &Path, data: &Path) -> Result<(), Failure> {
         let message = format!("`{}` {reason}", file.display());
         Failure::new(Exit::Usage, message).with_help(help)
     };
-    if file.exists() {
+    let failed = |error: io::Error| {
+        Failure::caused_by(Exit::Usage, format!("cannot write `{}`", file.display()), &error)
+    };
+    if file.symlink_metadata().is_ok() {
         return Err(refused("exists already", "choose another file, or remove it first"));
     }
-    let name = file.to_str().ok_or_else(|| refused("is not UTF-8", "choose another name"))?;
+    // A name that began with `file:` would be a URL to SQLite.
+    let whole = std::path::absolute(file).map_err(failed)?;
+    let part = whole.with_added_extension("part");
+    let name = part.to_str().ok_or_else(|| refused("is not UTF-8", "choose another name"))?;
     let store = CloudStore::open(&DataFolder::existing(data)?.store(None)?).await?;
+    // One that was killed has left it.
+    match fs::remove_file(&part) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(failed(error)),
+        _ => {}
+    }
     store.copy_to(name).await?;
     store.close().await;
-    Ok(())
+    let made = File::open(&part).and_then(|copy| copy.sync_all());
+    made.and_then(|()| fs::rename(&part, &whole)).map_err(failed)?;
+    whole.parent().map_or(Ok(()), sync_folder).map_err(failed)
 }
 
 fn print(text: &str) {

@@ -83,6 +83,7 @@ impl CloudServer {
         let lock = folder.lock()?;
         let authorities = Authorities::open(&folder)?;
         let store = CloudStore::open(&folder.store(options.store.as_deref())?).await?;
+        store.tie(gleaner_trust::sha256(authorities.server_pem().as_bytes()).as_str()).await?;
         if let Some(seq) = store.first_changed_entry().await? {
             tracing::error!(seq, "the audit trail was changed: an entry is not as it was written");
         }

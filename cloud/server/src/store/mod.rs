@@ -141,6 +141,31 @@ impl CloudStore {
         begin(&self.changes, &self.turn).await
     }
 
+    /// Ties a database on a server to the folder with this authority, the first time.
+    ///
+    /// # Errors
+    ///
+    /// An error if it belongs to another folder: its vehicles would not know this cloud.
+    pub(crate) async fn tie(&self, authority: &str) -> CloudResult<()> {
+        if self.is_file {
+            return Ok(());
+        }
+        let mut change = self.change().await?;
+        let row: Option<(String,)> = row!(&mut *change.tx; "SELECT authority FROM folder");
+        match row {
+            Some((stored,)) if stored != authority => {
+                let message = "the database of --store belongs to another data folder";
+                let help = "serve the folder that it was made with, or name an empty database";
+                Err(CloudError::usage(message, help))
+            }
+            Some(_) => Ok(()),
+            None => {
+                run!(&mut *change.tx; "INSERT INTO folder (authority) VALUES ($1)"; authority);
+                change.commit().await
+            }
+        }
+    }
+
     /// Writes a copy of the database to a new file.
     pub(crate) async fn copy_to(&self, file: &str) -> CloudResult<()> {
         if !self.is_file {

@@ -16,8 +16,8 @@ use tokio::time::sleep;
 use crate::fake::{FakeVehicle, Person, soon};
 use crate::{options, start};
 
-/// Time between two looks at what changes soon.
-const PAUSE: Duration = Duration::from_millis(50);
+/// Time between two looks at what changes soon: with more looks, the vehicle would be in a loop.
+const PAUSE: Duration = Duration::from_millis(250);
 
 const IMAGE: &[u8] = &{
     let mut image = [7; 100_000];

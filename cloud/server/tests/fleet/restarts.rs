@@ -6,7 +6,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use gleaner_cloud::CloudServer;
+use gleaner_cloud::{CloudServer, ServeOptions};
 use hyper::Method;
 use rustix::process::Pid;
 use serde_json::Value;
@@ -21,6 +21,12 @@ async fn a_restart_keeps_everything() {
     let (server, admin) = start(&folder).await;
     let second = CloudServer::start(&options(folder.path()).await).await.err().unwrap();
     assert!(second.message.starts_with("another gleaner-cloud uses"), "{second}");
+    let other = TempDir::new().unwrap();
+    let stolen = ServeOptions { data: other.path().join("data"), ..options(folder.path()).await };
+    if stolen.store.is_some() {
+        let third = CloudServer::start(&stolen).await.err().unwrap();
+        assert!(third.message.contains("belongs to another data folder"), "{third}");
+    }
     let (mut vehicle, _) = admin.enrol("car-7").await;
     let (mut link, _, before) = vehicle.connect().await;
     link.record(0..2).await;
