@@ -72,8 +72,8 @@ impl Checkout {
         command
     }
 
-    /// Cargo as a [`command`](Self::command), without what `cargo run` has told this program about
-    /// its package: some build scripts look at it, and would run again after each build without
+    /// Cargo as a [`command`](Self::command), without the variables in which `cargo run` describes
+    /// this package: some build scripts look at them, and would run again after each build without
     /// xtask, with all that depends on them.
     pub(crate) fn cargo(&self) -> Command {
         let mut cargo = self.command(&self.cargo);

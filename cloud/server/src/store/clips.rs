@@ -365,7 +365,7 @@ impl StoreChange<'_> {
         }
         let lambdas = facts.lambdas.iter().map(|it| ("lambda", &it.name));
         let labels = facts.moments.iter().map(|it| ("label", &it.label));
-        // PostgreSQL stores no NUL, and nobody looks for one: the facts have it, escaped.
+        // PostgreSQL stores no NUL. The facts have it, escaped.
         let words = lambdas.chain(labels).filter(|(_, word)| !word.contains('\0'));
         let words: BTreeSet<_> = words.collect();
         for (kind, word) in words {
