@@ -78,7 +78,11 @@ fn command(program: &Path) -> Command {
 
 impl PostgresServer {
     fn start(programs: &Path) -> Self {
-        let folder = tempfile::tempdir().unwrap();
+        // The folder of temporary files of this user may be closed to others.
+        let folder = match is_root() {
+            true => tempfile::tempdir_in("/tmp").unwrap(),
+            false => tempfile::tempdir().unwrap(),
+        };
         let [data, run] = ["data", "run"].map(|name| folder.path().join(name));
         fs::create_dir(&run).unwrap();
         fs::create_dir(&data).unwrap();
