@@ -19,7 +19,7 @@ use gleaner_protocol::{DurationStats, Layer, LiveStatus, LiveTopic};
 use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
 use hyper::{Method, StatusCode};
 use serde_json::{Value, json};
-use tokio::time::interval;
+use tokio::time::{MissedTickBehavior, interval};
 
 /// A text that must not become markup, and must not break the layout.
 const HOSTILE: &str = "</div><script>document.title='x'</script><img src=x onerror=alert(1)> \
@@ -120,6 +120,8 @@ async fn drive(
     let (mut link, _, mut wanted) = vehicle.connect().await;
     report(&mut link, name, &labels, &wanted, &vehicle, is_hostile).await;
     let mut ticks = interval(Duration::from_millis(500));
+    // Two records at one time would look like one that came twice.
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut seq = 0;
     loop {
         tokio::select! {
