@@ -417,6 +417,15 @@ impl UploadedClips {
             UploadedClips::None => "none",
         }
     }
+
+    /// Returns whether a clip is one of them; `is_requested` if a person wants it.
+    pub fn wants(self, is_requested: bool) -> bool {
+        match self {
+            UploadedClips::All => true,
+            UploadedClips::OnDemand => is_requested,
+            UploadedClips::None => false,
+        }
+    }
 }
 
 impl FromStr for UploadedClips {

@@ -1,6 +1,7 @@
 //! Files that are sent to a vehicle or to the cloud, as both check them.
 
 use std::fs;
+use std::io::{self, Read};
 use std::path::PathBuf;
 
 use sha2::{Digest, Sha256};
@@ -32,6 +33,25 @@ impl<'f> AnnouncedFile<'f> {
         }
         self.digest.update(piece);
         Ok(())
+    }
+
+    /// Compares all of a file.
+    ///
+    /// # Errors
+    ///
+    /// The outer one if it cannot be read, and the inner one with the reason if it is another file.
+    pub fn compare(mut self, mut file: impl Read) -> io::Result<Result<(), String>> {
+        let mut piece = vec![0; 1 << 20];
+        loop {
+            match file.read(&mut piece)? {
+                0 => return Ok(self.finish()),
+                read => {
+                    if let Err(reason) = self.add(&piece[..read]) {
+                        return Ok(Err(reason));
+                    }
+                }
+            }
+        }
     }
 
     /// Ends the file.
@@ -81,6 +101,9 @@ mod tests {
         assert!(compared(2, &["a"]).unwrap_err().starts_with("it has 1 of 2 bytes"));
         assert!(compared(3, &["ab"]).unwrap_err().starts_with("it has 2 of 3 bytes"));
         assert!(compared(2, &["ba"]).unwrap_err().contains("the SHA-256"));
+        let whole = |content: &str| AnnouncedFile::new(2, AB).compare(content.as_bytes()).unwrap();
+        assert_eq!(whole("ab"), Ok(()));
+        assert_eq!(whole("abc"), Err("it is longer than 2 bytes".to_owned()));
     }
 
     #[test]

@@ -11,6 +11,9 @@ use rustix::fs::{FlockOperation, flock};
 
 use crate::store::StoreAddress;
 
+/// Extension of a file that is being received.
+pub(crate) const PART: &str = "part";
+
 /// The data folder.
 #[derive(Debug, Clone)]
 pub(crate) struct DataFolder(PathBuf);
@@ -132,6 +135,27 @@ impl DataFolder {
     pub(crate) fn authorities(&self) -> PathBuf {
         self.0.join("ca")
     }
+}
+
+/// Removes files in a folder that an earlier process had not received in full.
+///
+/// # Errors
+///
+/// A failure that names the folder.
+pub(crate) fn remove_parts(folder: &Path) -> Result<(), Failure> {
+    let removed = fs::read_dir(folder).and_then(|entries| {
+        for entry in entries {
+            let path = entry?.path();
+            if path.extension().is_some_and(|it| it == PART) {
+                fs::remove_file(path)?;
+            }
+        }
+        Ok(())
+    });
+    removed.map_err(|error| {
+        let action = format!("cannot open the folder `{}`", folder.display());
+        Failure::caused_by(Exit::Internal, action, &error)
+    })
 }
 
 /// Writes a file that only this user can read; durable, and whole or not at all.

@@ -21,6 +21,7 @@ use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use crate::error::{CloudError, CloudResult};
+use crate::folder::{PART, remove_parts};
 
 /// Maximum number of deployments that wait for files.
 const OFFERS_MAX: usize = 64;
@@ -43,19 +44,7 @@ impl Objects {
     ///
     /// A failure that names the folder.
     pub(crate) fn open(folder: PathBuf) -> Result<Self, Failure> {
-        let cleaned = fs::read_dir(&folder).and_then(|entries| {
-            for entry in entries {
-                let path = entry?.path();
-                if path.extension().is_some_and(|it| it == "part") {
-                    fs::remove_file(path)?;
-                }
-            }
-            Ok(())
-        });
-        cleaned.map_err(|error| {
-            let action = format!("cannot open the folder `{}`", folder.display());
-            Failure::caused_by(Exit::Internal, action, &error)
-        })?;
+        remove_parts(&folder)?;
         Ok(Self { folder, offers: Mutex::default(), parts: AtomicU64::new(0) })
     }
 
@@ -102,7 +91,7 @@ impl Objects {
     pub(crate) async fn receive(&self, sha256: &Sha256, body: Body) -> CloudResult<()> {
         let length = self.expected(sha256)?;
         let number = self.parts.fetch_add(1, Ordering::Relaxed);
-        let part = self.folder.join(format!("{sha256}.{number}.part"));
+        let part = self.folder.join(format!("{sha256}.{number}.{PART}"));
         let part = UnfinishedFile(part);
         let failed = |error: io::Error| {
             Failure::caused_by(Exit::Internal, format!("cannot receive the file {sha256}"), &error)
@@ -142,14 +131,18 @@ impl Objects {
             Failure::caused_by(Exit::Internal, format!("cannot send the file {sha256}"), &error)
         };
         let length = file.metadata().await.map_err(failed)?.len();
-        let pieces = futures_util::stream::try_unfold(file, async |mut file| {
-            let mut piece = Vec::with_capacity(PIECE);
-            (&mut file).take(PIECE as u64).read_to_end(&mut piece).await?;
-            io::Result::Ok((!piece.is_empty()).then_some((piece, file)))
-        });
         let headers = [(header::CONTENT_LENGTH, length.to_string()), octets()];
-        Ok((headers, Body::from_stream(pieces)).into_response())
+        Ok((headers, body_of(file)).into_response())
     }
+}
+
+/// Returns the rest of a file as the body of an answer, which is read piece by piece.
+pub(crate) fn body_of(file: File) -> Body {
+    Body::from_stream(futures_util::stream::try_unfold(file, async |mut file| {
+        let mut piece = Vec::with_capacity(PIECE);
+        (&mut file).take(PIECE as u64).read_to_end(&mut piece).await?;
+        io::Result::Ok((!piece.is_empty()).then_some((piece, file)))
+    }))
 }
 
 /// Returns the type of a file whose content does not matter.

@@ -3,8 +3,8 @@
 //! Names come from the cloud and are checked: `DIR/VEHICLE/NAME.mcap` cannot lead out of `DIR`.
 //! Until a file is whole and has the right SHA-256 it is `NAME.mcap.part`, and goes on there.
 
-use std::fs::{self, File};
-use std::io::{self, Read, Write};
+use std::fs;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure, safe_file};
@@ -93,18 +93,8 @@ impl<'c> ClipTarget<'c> {
     }
 
     fn compare(&self, path: &Path) -> io::Result<Result<(), String>> {
-        let mut announced = AnnouncedFile::new(self.clip.facts.bytes, self.sha256);
-        let (mut file, mut piece): (File, _) = (safe_file::read(path)?, vec![0; 1 << 20]);
-        loop {
-            match file.read(&mut piece)? {
-                0 => return Ok(announced.finish()),
-                read => {
-                    if let Err(reason) = announced.add(&piece[..read]) {
-                        return Ok(Err(reason));
-                    }
-                }
-            }
-        }
+        let announced = AnnouncedFile::new(self.clip.facts.bytes, self.sha256);
+        announced.compare(safe_file::read(path)?)
     }
 }
 

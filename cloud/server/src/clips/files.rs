@@ -5,8 +5,8 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{self, Read, Seek, SeekFrom, Write};
-use std::path::{Path, PathBuf};
+use std::io::{self, Seek, SeekFrom, Write};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{self, Arc, PoisonError};
 use std::time::Duration;
@@ -22,10 +22,9 @@ use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout;
 
 use crate::error::{CloudError, CloudResult};
+use crate::folder::{PART, remove_parts};
 use crate::store::ClipBounds;
 
-/// Extension of a part that is being received.
-const PART: &str = "part";
 /// Number of parts of a vehicle that are received at a time: some may be of connections that it
 /// has lost.
 const PARTS_MAX: usize = 4;
@@ -52,19 +51,7 @@ impl ClipFiles {
     ///
     /// A failure that names the folder.
     pub(crate) fn open(folder: PathBuf, bounds: ClipBounds) -> Result<Self, Failure> {
-        let cleaned = fs::read_dir(&folder).and_then(|entries| {
-            for entry in entries {
-                let path = entry?.path();
-                if path.extension().is_some_and(|it| it == PART) {
-                    fs::remove_file(path)?;
-                }
-            }
-            Ok(())
-        });
-        cleaned.map_err(|error| {
-            let action = format!("cannot open the folder `{}`", folder.display());
-            Failure::caused_by(Exit::Internal, action, &error)
-        })?;
+        remove_parts(&folder)?;
         let turns = (0..TURNS).map(|_| Arc::default()).collect();
         Ok(Self { folder, bounds, parts: AtomicU64::new(0), slots: sync::Mutex::default(), turns })
     }
@@ -178,21 +165,5 @@ impl ClipFiles {
             sync_folder(&self.folder)?;
         }
         Ok(true)
-    }
-}
-
-/// Compares a file with its length and SHA-256.
-pub(super) fn compare(path: &Path, bytes: u64, sha256: &str) -> io::Result<Result<(), String>> {
-    let mut announced = AnnouncedFile::new(bytes, sha256);
-    let (mut file, mut piece) = (File::open(path)?, vec![0; 1 << 20]);
-    loop {
-        match file.read(&mut piece)? {
-            0 => return Ok(announced.finish()),
-            read => {
-                if let Err(reason) = announced.add(&piece[..read]) {
-                    return Ok(Err(reason));
-                }
-            }
-        }
     }
 }

@@ -5,7 +5,7 @@ use std::path::Path as FilePath;
 use std::sync::Arc;
 
 use axum::Json;
-use axum::body::{Body, Bytes};
+use axum::body::Bytes;
 use axum::extract::{Extension, Path, Query, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
@@ -13,15 +13,13 @@ use gleaner_base::{Exit, Failure};
 use gleaner_fleet::clips::{ClipId, ClipPage, ClipPolicy, ClipState, FleetClip};
 use gleaner_fleet::people::User;
 use tokio::fs::File;
-use tokio::io::{AsyncReadExt, AsyncSeekExt};
+use tokio::io::AsyncSeekExt;
 
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
+use crate::objects::body_of;
 use crate::request::parsed;
 use crate::store::ClipQuery;
-
-/// Length of the pieces in which a file is sent.
-const PIECE: u64 = 64 << 10;
 
 pub(crate) async fn list(
     State(cloud): State<Arc<Cloud>>,
@@ -122,12 +120,7 @@ async fn send(
         _ => (0, StatusCode::OK),
     };
     file.seek(io::SeekFrom::Start(begin)).await.map_err(failed)?;
-    let pieces = futures_util::stream::try_unfold(file, async |mut file| {
-        let mut piece = Vec::with_capacity(PIECE as usize);
-        (&mut file).take(PIECE).read_to_end(&mut piece).await?;
-        io::Result::Ok((!piece.is_empty()).then_some((piece, file)))
-    });
-    let mut answer = Body::from_stream(pieces).into_response();
+    let mut answer = body_of(file).into_response();
     *answer.status_mut() = status;
     let mut set = |name, value: String| {
         if let Ok(value) = value.parse() {

@@ -1,5 +1,6 @@
 //! Requests of vehicles about their clips.
 
+use std::fs::File;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,14 +13,13 @@ use axum::middleware::from_fn;
 use axum::routing::{post, put};
 use futures_util::StreamExt;
 use gleaner_base::{Exit, Failure};
-use gleaner_fleet::UnfinishedFile;
 use gleaner_fleet::clips::{
     CLIP_PART, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName, ClipOrders,
     ClipReport, THUMBNAIL_MAX,
 };
+use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use tokio::time::timeout;
 
-use super::files::compare;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, in_time, parsed};
@@ -69,8 +69,8 @@ async fn report(
     }
     let bounds = cloud.clips.bounds;
     if report != ClipReport::default() {
-        let announced = cloud.store.announce_clips(&vehicle.name, &report, bounds).await?;
-        for id in announced.dropped {
+        let dropped = cloud.store.announce_clips(&vehicle.name, &report, bounds).await?;
+        for id in dropped {
             let _turn = cloud.clips.turn(&id).await;
             cloud.clips.remove_file(&id);
         }
@@ -185,7 +185,10 @@ async fn store_part(
             return Ok(Err("its first parts are not there any more".to_owned()));
         }
         match is_last {
-            true => compare(&working.clips.clip(&of.id), of.bytes, &of.sha256),
+            true => {
+                let file = File::open(working.clips.clip(&of.id))?;
+                AnnouncedFile::new(of.bytes, &of.sha256).compare(file)
+            }
             false => Ok(Ok(())),
         }
     });

@@ -24,7 +24,7 @@ const SIZE: usize = 50;
 /// Roles with what they may do.
 const ROLES: [(Role, &str); 4] = [
     (Role::Viewer, "read"),
-    (Role::Operator, "also start, stop and roll back"),
+    (Role::Operator, "also start, stop and roll back, steer waves and fetch clips"),
     (Role::Deployer, "also deploy and remove deployments"),
     (Role::Admin, "also manage vehicles and users"),
 ];

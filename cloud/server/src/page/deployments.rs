@@ -15,8 +15,7 @@ use super::login::Done;
 use super::session::PageUser;
 use super::text::{count, deployment_path, label, segment, short, shown, vehicle_path};
 use crate::cloud::Cloud;
-use crate::error::CloudResult;
-use crate::store::ChangedVehicles;
+use crate::people::change_deployment;
 
 /// Maximum number of vehicles that are listed with a deployment.
 const VEHICLES_MAX: i64 = 100;
@@ -231,60 +230,15 @@ fn changes(user: &PageUser, here: &str, deployment: &FleetDeployment) -> Markup 
     }
 }
 
-pub(super) async fn start(
+pub(super) async fn change(
     State(cloud): State<Arc<Cloud>>,
     Extension(user): Extension<PageUser>,
-    Path(id): Path<String>,
+    Path((id, change)): Path<(String, String)>,
 ) -> PageResult {
-    let changed = cloud.store.set_wanted(&user.user.name, &id, true).await;
-    changed_to(&cloud, changed, &format!("{}?done=start", deployment_path(&id)))
-}
-
-pub(super) async fn stop(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(id): Path<String>,
-) -> PageResult {
-    let changed = cloud.store.set_wanted(&user.user.name, &id, false).await;
-    changed_to(&cloud, changed, &format!("{}?done=stop", deployment_path(&id)))
-}
-
-pub(super) async fn pause(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(id): Path<String>,
-) -> PageResult {
-    steer(&cloud, &user, &id, WaveState::Paused).await
-}
-
-pub(super) async fn resume(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(id): Path<String>,
-) -> PageResult {
-    steer(&cloud, &user, &id, WaveState::Running).await
-}
-
-pub(super) async fn abort(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(id): Path<String>,
-) -> PageResult {
-    steer(&cloud, &user, &id, WaveState::Aborted).await
-}
-
-async fn steer(cloud: &Cloud, user: &PageUser, id: &str, state: WaveState) -> PageResult {
-    let changed = cloud.store.steer_waves(&user.user.name, id, state).await;
-    changed_to(cloud, changed, &format!("{}?done=waves", deployment_path(id)))
-}
-
-pub(super) async fn roll_back(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Path(id): Path<String>,
-) -> PageResult {
-    let changed = cloud.store.roll_back(&user.user.name, &id).await;
-    changed_to(&cloud, changed, &format!("{}?done=rollback", deployment_path(&id)))
+    change_deployment(&cloud, &user.user, &id, &change).await?;
+    // One of the changes that there are.
+    let to = format!("{}?done={change}", deployment_path(&id));
+    Ok(Redirect::to(&to).into_response())
 }
 
 pub(super) async fn remove(
@@ -292,12 +246,7 @@ pub(super) async fn remove(
     Extension(user): Extension<PageUser>,
     Path(id): Path<String>,
 ) -> PageResult {
-    let changed = cloud.store.remove_deployment(&user.user.name, &id).await;
-    changed_to(&cloud, changed, "/deployments?done=deployment")
-}
-
-/// Wakes the vehicles whose wanted state has changed, and shows a page.
-fn changed_to(cloud: &Cloud, changed: CloudResult<ChangedVehicles>, to: &str) -> PageResult {
-    cloud.hub.wake(&changed?);
-    Ok(Redirect::to(to).into_response())
+    let changed = cloud.store.remove_deployment(&user.user.name, &id).await?;
+    cloud.hub.wake(&changed);
+    Ok(Redirect::to("/deployments?done=deployment").into_response())
 }

@@ -157,7 +157,7 @@ pub(super) fn done(change: Option<&str>) -> Markup {
             "It is not wanted any more: each vehicle stops it as soon as it is connected."
         }
         Some("rollback") => "Each vehicle runs the fallback as soon as it is connected.",
-        Some("waves") => "The waves are as you have set them.",
+        Some("pause" | "resume" | "abort") => "The waves are as you have set them.",
         Some("deployment") => "The deployment is removed.",
         Some("user") => "The user is removed, and the user's sessions and tokens have ended.",
         Some("vehicle") => "The vehicle is cut off.",

@@ -128,7 +128,10 @@ async fn each_page_is_open_to_its_role_and_the_higher_ones_only() {
         }
         // Things that do not exist: a form that is let through changes nothing.
         let path = path.replace("{name}", "no-such").replace("{id}", "no-such");
-        let path = path.replace("{digest}", "no-such").replace("{file}", "page.css");
+        let path = path
+            .replace("{change}", "start")
+            .replace("{digest}", "no-such")
+            .replace("{file}", "page.css");
         let mut stranger = Browser::new(&cloud);
         let reply = stranger.request(method.clone(), &path, &[], "same-origin").await;
         assert!(reply.headers.contains_key(header::CONTENT_SECURITY_POLICY), "{path}");

@@ -246,18 +246,20 @@ async fn deployments(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<Vec<Fl
     Ok(Json(cloud.store.deployments().await?))
 }
 
-async fn change(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(actor): Extension<User>,
-    Path((id, change)): Path<(String, String)>,
-) -> CloudResult<Json<FleetDeployment>> {
-    let changed = match &*change {
-        "start" => cloud.store.set_wanted(&actor.name, &id, true).await?,
-        "stop" => cloud.store.set_wanted(&actor.name, &id, false).await?,
-        "rollback" => cloud.store.roll_back(&actor.name, &id).await?,
-        "pause" => cloud.store.steer_waves(&actor.name, &id, WaveState::Paused).await?,
-        "resume" => cloud.store.steer_waves(&actor.name, &id, WaveState::Running).await?,
-        "abort" => cloud.store.steer_waves(&actor.name, &id, WaveState::Aborted).await?,
+/// Makes a change of a deployment that its name states, and wakes the vehicles that it is for.
+pub(crate) async fn change_deployment(
+    cloud: &Cloud,
+    actor: &User,
+    id: &str,
+    change: &str,
+) -> CloudResult<()> {
+    let changed = match change {
+        "start" => cloud.store.set_wanted(&actor.name, id, true).await?,
+        "stop" => cloud.store.set_wanted(&actor.name, id, false).await?,
+        "rollback" => cloud.store.roll_back(&actor.name, id).await?,
+        "pause" => cloud.store.steer_waves(&actor.name, id, WaveState::Paused).await?,
+        "resume" => cloud.store.steer_waves(&actor.name, id, WaveState::Running).await?,
+        "abort" => cloud.store.steer_waves(&actor.name, id, WaveState::Aborted).await?,
         other => {
             let message = format!("`{}` is no change", gleaner_base::excerpt(other));
             let help = "use `start`, `stop`, `rollback`, `pause`, `resume` or `abort`";
@@ -265,6 +267,15 @@ async fn change(
         }
     };
     cloud.hub.wake(&changed);
+    Ok(())
+}
+
+async fn change(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(actor): Extension<User>,
+    Path((id, change)): Path<(String, String)>,
+) -> CloudResult<Json<FleetDeployment>> {
+    change_deployment(&cloud, &actor, &id, &change).await?;
     Ok(Json(cloud.store.deployment(&id).await?))
 }
 

@@ -125,13 +125,11 @@ fn clip(row: ClipRow, upload: UploadedClips) -> CloudResult<FleetClip> {
         serde_json::from_str(&facts).map_err(|error| damaged(error.to_string()))?;
     let id = ClipId::new(facts.name.clone(), &vehicle).map_err(damaged)?;
     let (bytes, received) = (unsigned(bytes), unsigned(parts) * gleaner_fleet::clips::CLIP_PART);
-    let is_wanted =
-        upload == UploadedClips::All || (is_requested != 0 && upload == UploadedClips::OnDemand);
     let state = match &*state {
         "stored" => ClipState::Stored,
         "gone" => ClipState::Gone,
         "failed" => ClipState::Failed,
-        _ if !is_wanted => ClipState::OnVehicle,
+        _ if !upload.wants(is_requested != 0) => ClipState::OnVehicle,
         _ if parts > 0 => ClipState::Uploading,
         _ => ClipState::Wanted,
     };

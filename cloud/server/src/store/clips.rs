@@ -73,22 +73,16 @@ impl ClipUsage {
     }
 }
 
-/// The outcome of a report.
-#[derive(Debug, Default)]
-pub(crate) struct AnnouncedClips {
-    /// Clips whose files the cloud must remove.
-    pub(crate) dropped: Vec<ClipId>,
-}
-
 impl CloudStore {
-    /// Stores what a vehicle reports. A clip that was announced before stays as it is.
+    /// Stores what a vehicle reports; returns the clips whose files the cloud must remove. A clip
+    /// that was announced before stays as it is.
     pub(crate) async fn announce_clips(
         &self,
         vehicle: &str,
         report: &ClipReport,
         bounds: ClipBounds,
-    ) -> CloudResult<AnnouncedClips> {
-        let mut announced = AnnouncedClips::default();
+    ) -> CloudResult<Vec<ClipId>> {
+        let mut dropped = Vec::new();
         let mut change = self.change().await?;
         change.must_count(vehicle).await?;
         for facts in &report.clips {
@@ -96,7 +90,7 @@ impl CloudStore {
         }
         for gone in &report.gone {
             if change.lose_clip(vehicle, gone).await? {
-                announced.dropped.extend(ClipId::new(gone.name.clone(), vehicle));
+                dropped.extend(ClipId::new(gone.name.clone(), vehicle));
             }
         }
         if let Some(position) = &report.cursor {
@@ -105,9 +99,9 @@ impl CloudStore {
                  ON CONFLICT (vehicle) DO UPDATE SET position = excluded.position";
                 vehicle, position);
         }
-        announced.dropped.extend(change.forget_clips(vehicle, bounds).await?);
+        dropped.extend(change.forget_clips(vehicle, bounds).await?);
         change.commit().await?;
-        Ok(announced)
+        Ok(dropped)
     }
 
     /// Returns everything that is wanted of the clips of a vehicle.
@@ -144,11 +138,8 @@ impl CloudStore {
         policy: &ClipPolicy,
         bounds: ClipBounds,
     ) -> CloudResult<Vec<WantedClip>> {
-        let (unfinished,): (i64,) = one!(&self.pool;
-            "SELECT COUNT(*) FROM clips
-             WHERE vehicle = $1 AND state = 'vehicle' AND parts > 0";
-            vehicle);
-        let may_begin = i64::from(unsigned(unfinished) < bounds.unfinished);
+        let unfinished = self.unfinished_clips(vehicle).await?;
+        let may_begin = i64::from(unfinished < bounds.unfinished);
         let rows: Vec<(String, i64, String, i64)> = rows!(&self.pool;
             "SELECT name, bytes, sha256, parts FROM clips
              WHERE vehicle = $1 AND state = 'vehicle' AND sha256 <> '' AND bytes > 0
@@ -178,6 +169,15 @@ impl CloudStore {
         Ok(ClipUsage { own: unsigned(own), all: unsigned(all) })
     }
 
+    /// Returns the number of files of a vehicle that have not come in full yet.
+    async fn unfinished_clips(&self, vehicle: &str) -> CloudResult<u64> {
+        let (unfinished,): (i64,) = one!(&self.pool;
+            "SELECT COUNT(*) FROM clips
+             WHERE vehicle = $1 AND state = 'vehicle' AND parts > 0";
+            vehicle);
+        Ok(unsigned(unfinished))
+    }
+
     /// Returns the progress of a file that a vehicle may send now.
     ///
     /// # Errors
@@ -204,22 +204,14 @@ impl CloudStore {
             return Ok(progress);
         }
         let policy = self.clip_policy().await?;
-        let is_wanted = match policy.upload.as_str() {
-            "none" => false,
-            "all" => true,
-            _ => is_requested != 0,
-        };
-        if !is_wanted || state != "vehicle" {
+        if !policy.upload.wants(is_requested != 0) || state != "vehicle" {
             return Err(not_wanted());
         }
         if progress.part == 0 {
-            let (unfinished,): (i64,) = one!(&self.pool;
-                "SELECT COUNT(*) FROM clips
-                 WHERE vehicle = $1 AND state = 'vehicle' AND parts > 0";
-                vehicle);
+            let unfinished = self.unfinished_clips(vehicle).await?;
             let usage = self.clip_usage(vehicle).await?;
             let mut full = usage.excess(progress.bytes, bounds);
-            if unsigned(unfinished) >= bounds.unfinished {
+            if unfinished >= bounds.unfinished {
                 full = Some(format!("{unfinished} uploads of the vehicle are unfinished"));
             }
             if let Some(reason) = full {

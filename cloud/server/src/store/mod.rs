@@ -67,7 +67,6 @@ pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::{Issued, VehicleReport};
-pub(crate) use wants::ChangedVehicles;
 
 /// The migrations, oldest first: the version of a database is the number of those that it has.
 const MIGRATIONS: &[&str] = &[

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use gleaner_fleet::people::{VehicleState, VehicleSummary};
 use gleaner_protocol::vehicle_api::StreamLine;
 
-use super::vehicles::FAILED;
+use super::vehicles::{FAILED, VehicleRow, summary, vehicle_columns, vehicle_state};
 use super::{CloudStore, int, name_in_lines, unsigned};
 use crate::error::CloudResult;
 
@@ -54,8 +54,6 @@ pub(crate) struct NewestRecords {
     pub(crate) has_more: bool,
 }
 
-type VehicleRow = (String, i64, String, String, i64, i64, String, i64, i64);
-
 impl CloudStore {
     /// Returns the `index`-th part, of `size` each, of the vehicles that `filter` chooses, by name.
     pub(crate) async fn vehicle_page(
@@ -79,12 +77,7 @@ impl CloudStore {
         let mut page = VehiclePage::default();
         let mut names = Vec::new();
         for (name, is_revoked, epoch, problems, labels) in rows {
-            let state = match () {
-                () if is_revoked != 0 => VehicleState::Revoked,
-                () if is_online(&name) => VehicleState::Online,
-                () if epoch == 0 => VehicleState::Invited,
-                () => VehicleState::Offline,
-            };
+            let state = vehicle_state(&name, (is_revoked, epoch), &is_online);
             let failures = failed.get(&name).map_or(0, |count| unsigned(*count));
             let has_problem = state != VehicleState::Revoked && (problems != 0 || failures > 0);
             page.states[state_index(state)] += 1;
@@ -97,16 +90,14 @@ impl CloudStore {
                 continue;
             }
             if (index * size..(index + 1) * size).contains(&page.found) {
-                names.push((name, state, failures));
+                names.push((name, failures));
             }
             page.found += 1;
         }
-        for (name, state, failures) in names {
-            let row: Option<VehicleRow> = row!(&self.pool;
-                "SELECT name, seen, version, labels, generation, handled, problems, running,
-                 deployments FROM vehicles WHERE name = $1";
-                &name);
-            page.vehicles.extend(row.map(|row| (summary(row, state), failures)));
+        for (name, failures) in names {
+            let row: Option<VehicleRow> =
+                row!(&self.pool; concat!(vehicle_columns!(), " WHERE name = $1"); &name);
+            page.vehicles.extend(row.map(|row| (summary(row, &is_online), failures)));
         }
         Ok(page)
     }
@@ -203,22 +194,6 @@ fn state_index(state: VehicleState) -> usize {
         VehicleState::Offline => 1,
         VehicleState::Invited => 2,
         VehicleState::Revoked => 3,
-    }
-}
-
-fn summary(row: VehicleRow, state: VehicleState) -> VehicleSummary {
-    let (name, seen, version, labels, wanted, handled, problems, running, deployments) = row;
-    VehicleSummary {
-        name,
-        labels: serde_json::from_str(&labels).unwrap_or_default(),
-        state,
-        seen: (seen > 0).then_some(unsigned(seen)),
-        version: (!version.is_empty()).then_some(version),
-        wanted: unsigned(wanted),
-        handled: unsigned(handled),
-        problems: serde_json::from_str(&problems).unwrap_or_default(),
-        running: unsigned(running),
-        deployments: unsigned(deployments),
     }
 }
 

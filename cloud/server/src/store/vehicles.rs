@@ -257,34 +257,9 @@ impl CloudStore {
         &self,
         is_online: impl Fn(&str) -> bool,
     ) -> CloudResult<Vec<VehicleSummary>> {
-        type Row = (String, i64, i64, i64, String, String, i64, i64, String, i64, i64);
-        let rows: Vec<Row> = rows!(&self.pool;
-            "SELECT name, is_revoked, epoch, seen, version, labels, generation, handled, problems,
-             running, deployments
-             FROM vehicles ORDER BY name");
-        let summary = |row: Row| {
-            let (name, is_revoked, epoch, seen, version, labels, wanted, handled, problems, ..) =
-                row;
-            let state = match () {
-                () if is_revoked != 0 => VehicleState::Revoked,
-                () if is_online(&name) => VehicleState::Online,
-                () if epoch == 0 => VehicleState::Invited,
-                () => VehicleState::Offline,
-            };
-            VehicleSummary {
-                labels: serde_json::from_str(&labels).unwrap_or_default(),
-                state,
-                seen: (seen > 0).then_some(unsigned(seen)),
-                version: (!version.is_empty()).then_some(version),
-                wanted: unsigned(wanted),
-                handled: unsigned(handled),
-                problems: serde_json::from_str(&problems).unwrap_or_default(),
-                running: unsigned(row.9),
-                deployments: unsigned(row.10),
-                name,
-            }
-        };
-        Ok(rows.into_iter().map(summary).collect())
+        let rows: Vec<VehicleRow> =
+            rows!(&self.pool; concat!(vehicle_columns!(), " ORDER BY name"));
+        Ok(rows.into_iter().map(|row| summary(row, &is_online)).collect())
     }
 
     /// Returns the newest status of a vehicle, as JSON.
@@ -341,6 +316,49 @@ impl StoreChange<'_> {
             "DELETE FROM certificates WHERE vehicle = $1 AND sha256 <> $2";
             name, kept);
         Ok(())
+    }
+}
+
+/// The columns of a [`VehicleRow`].
+macro_rules! vehicle_columns {
+    () => {
+        "SELECT name, is_revoked, epoch, seen, version, labels, generation, handled, problems,
+         running, deployments FROM vehicles"
+    };
+}
+pub(super) use vehicle_columns;
+
+/// The values from which the summary of a vehicle is made.
+pub(super) type VehicleRow = (String, i64, i64, i64, String, String, i64, i64, String, i64, i64);
+
+/// Returns the summary of a vehicle.
+pub(super) fn summary(row: VehicleRow, is_online: impl Fn(&str) -> bool) -> VehicleSummary {
+    let (name, is_revoked, epoch, seen, version, labels, wanted, handled, problems, ..) = row;
+    VehicleSummary {
+        labels: serde_json::from_str(&labels).unwrap_or_default(),
+        state: vehicle_state(&name, (is_revoked, epoch), is_online),
+        seen: (seen > 0).then_some(unsigned(seen)),
+        version: (!version.is_empty()).then_some(version),
+        wanted: unsigned(wanted),
+        handled: unsigned(handled),
+        problems: serde_json::from_str(&problems).unwrap_or_default(),
+        running: unsigned(row.9),
+        deployments: unsigned(row.10),
+        name,
+    }
+}
+
+/// Returns the state of a vehicle with these values of `is_revoked` and `epoch`.
+pub(super) fn vehicle_state(
+    name: &str,
+    (is_revoked, epoch): (i64, i64),
+    is_online: impl Fn(&str) -> bool,
+) -> VehicleState {
+    match () {
+        () if is_revoked != 0 => VehicleState::Revoked,
+        () if is_online(name) => VehicleState::Online,
+        () if epoch == 0 => VehicleState::Invited,
+        () => VehicleState::Offline,
     }
 }
 

@@ -24,7 +24,7 @@ pub(crate) type ChangedVehicles = Vec<String>;
 
 /// All releases, and the vehicles that waves have reached.
 struct FleetWishes {
-    /// By deployment, the newest first.
+    /// The releases by deployment, of each the newest first.
     releases: Vec<WishedRelease>,
     members: HashMap<String, HashSet<(String, i64)>>,
 }

@@ -138,6 +138,18 @@ async fn waves_stop_at_failures_until_a_person_resumes_them() {
 }
 
 #[tokio::test]
+async fn a_plan_that_cannot_be_followed_changes_nothing() {
+    let fleet = TestFleet::of(2).await;
+    for shares in [vec![], vec![0], vec![50, 50], vec![100], (1..30).collect()] {
+        let bad = release(2, Some(WavePlan { shares, ..PLAN }));
+        let refused = fleet.store.deploy("ann", &bad).await.unwrap_err().reason();
+        assert!(refused.starts_with("the plan of the waves is refused: "), "{refused}");
+    }
+    assert_eq!(fleet.having(1).await.len(), 2);
+    assert_eq!(fleet.store.deployment("a").await.unwrap().release, 1);
+}
+
+#[tokio::test]
 async fn failures_of_other_vehicles_count_after_waves_were_resumed() {
     let fleet = TestFleet::of(10).await;
     let plan = WavePlan { shares: vec![50], success: 50, failures: 20, soak_s: 60, ..PLAN };
