@@ -23,12 +23,14 @@ pub enum CloudCommand {
     },
     /// Log in to a cloud with the code of an invitation
     Login(LoginArgs),
-    /// Forget the cloud and its token
+    /// End the token, and forget the cloud
     Logout(ListArgs),
     /// Show the user of the token, and the cloud
     Whoami(ListArgs),
     /// List, invite or remove the users of the cloud
     Users(UsersArgs),
+    /// List, make or remove tokens for programs that use the cloud
+    Tokens(TokensArgs),
     /// List, enrol or revoke the vehicles of the cloud
     Vehicles(VehiclesArgs),
     /// List the deployments of the cloud, or change their waves
@@ -103,6 +105,51 @@ pub struct RemoveArgs {
     /// Name of the user
     #[arg(value_name = "NAME", value_parser = name)]
     pub name: String,
+}
+
+/// Arguments of `gleaner tokens`.
+#[derive(Args, Debug)]
+pub struct TokensArgs {
+    /// The change; without one, your tokens are listed, and for an admin all
+    #[command(subcommand)]
+    pub command: Option<TokensCommand>,
+    /// Print the result as JSON
+    #[arg(long, global = true)]
+    pub json: bool,
+}
+
+/// Commands of `gleaner tokens`.
+#[derive(Subcommand, Debug)]
+pub enum TokensCommand {
+    /// Make a token, and show it once; programs have it as GLEANER_CLOUD_TOKEN
+    New(NewTokenArgs),
+    /// Remove a token, which ends at once
+    Remove(RemoveTokenArgs),
+}
+
+/// Arguments of `gleaner tokens new`.
+#[derive(Args, Debug)]
+pub struct NewTokenArgs {
+    /// Name of the token, one of yours
+    #[arg(value_name = "NAME", value_parser = name)]
+    pub name: String,
+    /// The rights: your role, or a lesser one
+    #[arg(long, value_name = "ROLE")]
+    pub role: Role,
+    /// Days until the token ends, at most 366
+    #[arg(long, value_name = "DAYS", default_value_t = 90)]
+    pub days: u32,
+}
+
+/// Arguments of `gleaner tokens remove`.
+#[derive(Args, Debug)]
+pub struct RemoveTokenArgs {
+    /// Name of the token
+    #[arg(value_name = "NAME", value_parser = name)]
+    pub name: String,
+    /// User of the token, if it is not yours
+    #[arg(long, value_name = "USER", value_parser = name)]
+    pub user: Option<String>,
 }
 
 /// Arguments of `gleaner vehicles`.

@@ -19,8 +19,9 @@ use gleaner_protocol::DriveTime;
 pub use authoring::{BuildArgs, Language, NewArgs};
 pub use clips::{ClipFilterArgs, ClipsArgs, ClipsCommand, ExportArgs, PolicyArgs, PullArgs};
 pub use cloud::{
-    AuditArgs, CloudCommand, EnrolArgs, ListArgs, LoginArgs, NewVehicleArgs, RemoveArgs, UserArgs,
-    UsersArgs, UsersCommand, VehiclesArgs, VehiclesCommand,
+    AuditArgs, CloudCommand, EnrolArgs, ListArgs, LoginArgs, NewTokenArgs, NewVehicleArgs,
+    RemoveArgs, RemoveTokenArgs, TokensArgs, TokensCommand, UserArgs, UsersArgs, UsersCommand,
+    VehiclesArgs, VehiclesCommand,
 };
 pub use signing::{KeysArgs, KeysCommand, PublishArgs, SignArgs};
 pub use vehicle::{

@@ -51,10 +51,27 @@ fn read_code() -> Result<String, Failure> {
 
 /// Runs `gleaner logout`.
 pub(super) fn logout(args: &ListArgs) -> Result<Exit, Failure> {
+    // A file that cannot be read is removed, too.
+    let account = CloudAccount::stored().unwrap_or(None);
+    let ended = match account {
+        Some(account) => VehicleClient::of_cloud(account)?.delete("/v1/login"),
+        None => Ok(()),
+    };
     let removed = CloudAccount::remove()?;
+    match ended {
+        // The cloud did not know the token any more.
+        Err(failure) if failure.exit == Exit::Denied => {}
+        Err(mut failure) => {
+            let message = "removed the token here, but the cloud accepts it until it expires";
+            failure.causes.insert(0, failure.message);
+            failure.message = message.to_owned();
+            return Err(failure);
+        }
+        Ok(()) => {}
+    }
     show(args.json, &json!({ "removed": removed }), |_| {
         let text = match removed {
-            true => "removed the token; the cloud accepts it until it expires\n",
+            true => "ended and removed the token\n",
             false => "there was no token\n",
         };
         text.to_owned()

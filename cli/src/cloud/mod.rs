@@ -1,6 +1,7 @@
 //! The commands for a cloud: they send requests to its `gleaner-cloud`.
 //!
-//! - `login`: the address and the token. `people`: users, and the audit trail.
+//! - `login`: the address and the token. `people`: users, and the audit trail. `tokens`: tokens for
+//!   programs.
 //! - `vehicles`: lists, enrols and revokes vehicles. `enrol`: connects this one.
 //! - `clips`: lists and fetches recorded clips.
 //! - `fleet`: deployments of the cloud, signed here. `rollout`: waits for all their vehicles, and
@@ -12,6 +13,7 @@ mod fleet;
 mod login;
 mod people;
 mod rollout;
+mod tokens;
 mod vehicles;
 mod waves;
 
@@ -35,6 +37,7 @@ pub(crate) fn run(command: &CloudCommand) -> Result<Exit, Failure> {
         CloudCommand::Logout(args) => login::logout(args),
         CloudCommand::Whoami(args) => login::whoami(args),
         CloudCommand::Users(args) => people::users(args),
+        CloudCommand::Tokens(args) => tokens::tokens(args),
         CloudCommand::Vehicles(args) => vehicles::vehicles(args),
         CloudCommand::Fleet(args) => fleet::fleet(args),
         CloudCommand::Clips(args) => clips::clips(args),

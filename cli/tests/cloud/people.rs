@@ -23,11 +23,47 @@ fn a_login_stores_the_token_for_its_user_alone_until_the_logout() {
     fs::set_permissions(&file, fs::Permissions::from_mode(0o644)).unwrap();
     let text = user.fails(3, &["whoami"]);
     assert!(text.contains("other users can read the token") && text.contains("chmod 600"));
-    assert!(user.done(&["logout"]).starts_with("removed the token"));
-    assert!(!file.exists() && user.cloud.seen().is_empty());
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o600)).unwrap();
+    user.cloud.answers("DELETE /v1/login", &[(204, json!(null))]);
+    assert!(user.done(&["logout"]).starts_with("ended and removed the token"));
+    assert!(!file.exists());
+    assert_eq!(user.cloud.seen()[0].authorization.as_deref(), Some("Bearer gln_1"));
     assert_eq!(user.json(&["logout"]), json!({ "removed": false }));
     let text = user.fails(3, &["whoami"]);
     assert!(text.contains("there is no token for a cloud") && text.contains("`gleaner login URL"));
+}
+
+#[test]
+fn a_logout_without_the_cloud_forgets_the_token_and_reports_that_it_has_not_ended() {
+    let user = CloudUser::logged_in();
+    user.cloud.answers("DELETE /v1/login", &[(500, problem(1, "the disk is full"))]);
+    let text = user.fails(1, &["logout"]);
+    assert!(text.contains("the cloud accepts it until it expires"), "{text}");
+    assert!(text.contains("the disk is full"), "{text}");
+    assert!(!user.path("config/gleaner/cloud.json").exists());
+}
+
+#[test]
+fn tokens_are_made_listed_and_removed() {
+    let user = CloudUser::logged_in();
+    let me = json!({ "name": "ada", "role": "viewer" });
+    let made = json!({ "user": me, "token": "gln_2", "expires": 4102444800_u64 });
+    user.cloud.answers("POST /v1/tokens", &[(200, made)]);
+    user.cloud.seen();
+    let text = user.done(&["tokens", "new", "nightly", "--role", "viewer", "--days", "7"]);
+    assert!(text.contains("nightly (viewer) until 2100-01-01T00:00:00Z"), "{text}");
+    assert!(text.ends_with("\n  gln_2\n"), "{text}");
+    let sent = r#"{"name":"nightly","role":"viewer","days":7}"#;
+    assert_eq!(user.cloud.seen()[0].body, sent.as_bytes());
+    let listed = json!([{ "user": "ada", "name": "nightly", "role": "viewer", "expires": 0 }]);
+    user.cloud.answers("GET /v1/tokens", &[(200, listed.clone())]);
+    assert_eq!(user.json(&["tokens"]), listed);
+    assert!(user.done(&["tokens"]).contains("nightly"));
+    user.cloud.answers("GET /v1/me", &[(200, me)]);
+    user.cloud.answers("DELETE /v1/tokens/ada/nightly", &[(204, json!(null))]);
+    assert_eq!(user.done(&["tokens", "remove", "nightly"]), "removed nightly\n");
+    user.cloud.answers("DELETE /v1/tokens/bea/old", &[(204, json!(null))]);
+    user.done(&["tokens", "remove", "old", "--user", "bea"]);
 }
 
 #[test]

@@ -4,6 +4,10 @@
 //! |---|---|---|
 //! | `POST /v1/login` | none | [`UserToken`], of a [`Login`] |
 //! | `GET /v1/me` | viewer | [`User`] |
+//! | `DELETE /v1/login` | viewer | nothing, once the token has ended |
+//! | `GET /v1/tokens` | viewer | [`TokenSummary`] of own ones, of all for an admin |
+//! | `POST /v1/tokens` | viewer | [`UserToken`], of a [`NewToken`] |
+//! | `DELETE /v1/tokens/USER/NAME` | viewer | nothing |
 //! | `GET /v1/users` | admin | [`User`] of each |
 //! | `POST /v1/users` | admin | [`Invitation`], of a [`NewUser`] |
 //! | `DELETE /v1/users/NAME` | admin | nothing |
@@ -95,6 +99,34 @@ pub struct UserToken {
     /// The token, for the header `Authorization: Bearer TOKEN`.
     pub token: String,
     /// End of the token, in s since 1970.
+    pub expires: u64,
+}
+
+/// Longest lifetime of a token for programs, in days.
+pub const TOKEN_DAYS_MAX: u32 = 366;
+
+/// A request for a token for programs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NewToken {
+    /// The name, one of the user's.
+    pub name: String,
+    /// The rights: at most those of the user.
+    pub role: Role,
+    /// Days until its end, at most [`TOKEN_DAYS_MAX`].
+    pub days: u32,
+}
+
+/// A token for programs, without the token itself.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TokenSummary {
+    /// The user who has made it.
+    pub user: String,
+    /// The name.
+    pub name: String,
+    /// The rights, if the user still has them.
+    pub role: Role,
+    /// Its end, in s since 1970.
     pub expires: u64,
 }
 

@@ -22,7 +22,7 @@ use crate::store::VehicleFilter;
 const SIZE: usize = 50;
 
 /// Roles with what they may do.
-const ROLES: [(Role, &str); 4] = [
+pub(super) const ROLES: [(Role, &str); 4] = [
     (Role::Viewer, "read"),
     (Role::Operator, "also start, stop and roll back, steer waves and fetch clips"),
     (Role::Deployer, "also deploy and remove deployments"),

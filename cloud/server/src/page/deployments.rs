@@ -9,9 +9,9 @@ use gleaner_fleet::people::{FleetDeployment, Role};
 use gleaner_fleet::waves::{WaveProgress, WaveState};
 use maud::{Markup, html};
 
+use super::account::Done;
 use super::charts;
 use super::layout::{self, PageResult, confirmed, done, empty, form};
-use super::login::Done;
 use super::session::PageUser;
 use super::text::{count, deployment_path, label, segment, short, shown, vehicle_path};
 use crate::cloud::Cloud;

@@ -162,6 +162,7 @@ pub(super) fn done(change: Option<&str>) -> Markup {
         Some("user") => "The user is removed, and the user's sessions and tokens have ended.",
         Some("vehicle") => "The vehicle is cut off.",
         Some("password") => "The password is set. Other sessions of yours have ended.",
+        Some("token") => "The token is removed.",
         Some("first") => "You are logged in. Set a password to log in without a code next time.",
         _ => return html! {},
     };

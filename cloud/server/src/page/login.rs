@@ -1,26 +1,19 @@
-//! Login by code or by password, logout, and the account of a user.
+//! Login by code or by password, and logout.
 
 use std::sync::Arc;
 
-use axum::extract::{Extension, Query, State};
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::extract::{Extension, State};
+use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Redirect, Response};
 use maud::{Markup, html};
-use serde::Deserialize;
 
 use super::guard::FormFields;
-use super::layout::{self, PageResult, done, failure, form, with_status};
+use super::layout::{self, PageResult, failure, with_status};
 use super::password;
 use super::session::{PageUser, session_of, set_cookie};
 use crate::accept::PeerConnection;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
-
-/// The change that was made before a page is shown.
-#[derive(Debug, Deserialize)]
-pub(super) struct Done {
-    pub(super) done: Option<String>,
-}
 
 pub(super) async fn page(State(cloud): State<Arc<Cloud>>, headers: HeaderMap) -> PageResult {
     match PageUser::of(&cloud, &headers).await? {
@@ -140,59 +133,4 @@ pub(super) async fn logout(
     cloud.store.close_session(user.session()).await?;
     let cookie = set_cookie(&headers, None);
     Ok(([(header::SET_COOKIE, cookie)], Redirect::to("/login")).into_response())
-}
-
-pub(super) async fn account(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Query(query): Query<Done>,
-) -> PageResult {
-    account_page(&cloud, &user, done(query.done.as_deref())).await
-}
-
-async fn account_page(cloud: &Cloud, user: &PageUser, message: Markup) -> PageResult {
-    let has_password = cloud.store.password(&user.user.name).await?.is_some();
-    let title = if has_password { "Change your password" } else { "Set a password" };
-    let body = html! {
-        h1 { "Account of " (user.user.name) }
-        (message)
-        section.card.narrow aria-labelledby="password-title" {
-            h2 id="password-title" { (title) }
-            (form(user, "/account/password", html! {
-                // Password managers store it under this name.
-                input type="hidden" name="name" value=(user.user.name) autocomplete="username";
-                label for="password" { "New password" }
-                input id="password" name="password" type="password" required minlength="12"
-                    maxlength="256" autocomplete="new-password" aria-describedby="password-help";
-                p.help id="password-help" { "12 characters or more, such as four random words." }
-                label for="again" { "New password again" }
-                input id="again" name="again" type="password" required minlength="12"
-                    maxlength="256" autocomplete="new-password";
-                button { (title) }
-            }))
-        }
-    };
-    Ok(layout::page("Account", "/account", Some(user), body))
-}
-
-pub(super) async fn set_password(
-    State(cloud): State<Arc<Cloud>>,
-    Extension(user): Extension<PageUser>,
-    Extension(fields): Extension<FormFields>,
-) -> PageResult {
-    let new = fields.get("password");
-    let hash = match new == fields.get("again") {
-        true => password::hashed(new.to_owned()).await,
-        false => Err(CloudError::usage("the two passwords differ", "type the same one twice")),
-    };
-    match hash {
-        Ok(hash) => {
-            cloud.store.set_password(&user.user.name, &hash, user.session()).await?;
-            Ok(Redirect::to("/account?done=password").into_response())
-        }
-        Err(error) => {
-            let page = account_page(&cloud, &user, failure(error)).await?;
-            Ok(with_status(StatusCode::BAD_REQUEST, page))
-        }
-    }
 }

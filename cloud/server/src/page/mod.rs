@@ -9,6 +9,7 @@
 //! page signs nothing: it has no key, and offers only what needs none.
 
 mod access;
+mod account;
 mod assets;
 mod audit;
 mod charts;
@@ -69,8 +70,10 @@ pub(crate) fn routes() -> Vec<PageRoute> {
         enter("/login/code", post(login::by_code)),
         enter("/login/password", post(login::by_password)),
         send("/logout", Viewer, post(login::logout)),
-        read("/account", Viewer, get(login::account)),
-        send("/account/password", Viewer, post(login::set_password)),
+        read("/account", Viewer, get(account::page)),
+        send("/account/password", Viewer, post(account::set_password)),
+        send("/account/tokens", Viewer, post(account::make_token)),
+        send("/account/tokens/{name}/remove", Viewer, post(account::remove_token)),
         read("/", Viewer, get(fleet::start)),
         read("/vehicles", Viewer, get(fleet::page)),
         read("/vehicles/{name}", Viewer, get(vehicle::page)),

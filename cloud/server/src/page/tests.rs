@@ -224,6 +224,28 @@ async fn each_login_makes_a_session_and_ends_the_former_one() {
 }
 
 #[tokio::test]
+async fn tokens_are_shown_once_and_can_be_removed() {
+    let folder = TempDir::new().unwrap();
+    let cloud = cloud(&folder).await;
+    let mut browser = Browser::of(&cloud, "ann", Role::Operator).await;
+    let page = browser.get("/account").await;
+    assert!(page.has("value=\"operator\"") && !page.has("value=\"deployer\""));
+    let fields = |days| [("name", "nightly"), ("role", "viewer"), ("days", days)];
+    for days in ["", "0", "1e9", "-1"] {
+        let reply = browser.post("/account/tokens", &fields(days)).await;
+        assert_eq!(reply.status, StatusCode::BAD_REQUEST, "{days}");
+    }
+    let reply = browser.post("/account/tokens", &fields("30")).await;
+    let token = reply.text.split("<code>").nth(1).unwrap().split('<').next().unwrap();
+    let found = cloud.store.user(token).await.unwrap().unwrap();
+    assert_eq!((found.user.role, &*found.name), (Role::Viewer, "nightly"));
+    assert!(browser.get("/account").await.has("<b>nightly</b>"));
+    let reply = browser.post("/account/tokens/nightly/remove", &[]).await;
+    assert_eq!(reply.location(), "/account?done=token");
+    assert!(cloud.store.user(token).await.unwrap().is_none());
+}
+
+#[tokio::test]
 async fn passwords_cannot_be_guessed_and_a_new_one_ends_other_sessions() {
     let folder = TempDir::new().unwrap();
     let cloud = cloud(&folder).await;

@@ -9,6 +9,7 @@ mod deploy;
 mod records;
 #[cfg(test)]
 pub(crate) mod tests;
+mod tokens;
 
 use std::sync::Arc;
 
@@ -32,7 +33,7 @@ use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::page;
 use crate::request::{in_time, parsed};
-use crate::store::ENTRIES_MAX;
+use crate::store::{ENTRIES_MAX, TokenUser};
 
 /// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
 /// text in JSON.
@@ -53,6 +54,10 @@ pub(crate) struct Endpoint {
     handler: MethodRouter<Arc<Cloud>>,
 }
 
+/// Name of the token of a request; empty for that of a login.
+#[derive(Debug, Clone)]
+struct TokenName(String);
+
 /// Returns every request that the API answers: no role is stated elsewhere.
 pub(crate) fn endpoints() -> Vec<Endpoint> {
     use Role::{Admin, Deployer, Operator, Viewer};
@@ -68,6 +73,10 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
             post(login).layer(DefaultBodyLimit::max(LOGIN_MAX)),
         ),
         read("/v1/me", Viewer, get(me)),
+        remove("/v1/login", Viewer, delete(tokens::logout)),
+        read("/v1/tokens", Viewer, get(tokens::list)),
+        send("/v1/tokens", Viewer, post(tokens::make)),
+        remove("/v1/tokens/{user}/{name}", Viewer, delete(tokens::remove)),
         read("/v1/users", Admin, get(users)),
         send("/v1/users", Admin, post(invite)),
         remove("/v1/users/{name}", Admin, delete(remove_user)),
@@ -125,8 +134,9 @@ async fn guard(
     next: Next,
 ) -> Response {
     match user(&cloud, role, &peer, request.headers()).await {
-        Ok(user) => {
+        Ok(TokenUser { user, name }) => {
             request.extensions_mut().insert(user);
+            request.extensions_mut().insert(TokenName(name));
             next.run(request).await
         }
         Err(error) => error.into_response(),
@@ -138,22 +148,35 @@ async fn user(
     role: Role,
     peer: &PeerConnection,
     headers: &HeaderMap,
-) -> CloudResult<User> {
+) -> CloudResult<TokenUser> {
     let help = "log in again: `gleaner login URL --code CODE`; an administrator gives you a code";
-    let header = headers.get(header::AUTHORIZATION).and_then(|it| it.to_str().ok());
-    let token = header
-        .and_then(|it| it.strip_prefix("Bearer "))
-        .ok_or_else(|| CloudError::unknown("the request has no token", help))?;
-    let Some(user) = cloud.store.user(token).await? else {
+    let token = bearer(headers);
+    let token = token.ok_or_else(|| CloudError::unknown("the request has no token", help))?;
+    let Some(token_user) = cloud.store.user(token).await? else {
         cloud.wrong_secrets.count(peer.address)?;
         return Err(CloudError::unknown("the token is not valid, or has expired", help));
     };
-    if user.role < role {
-        let message =
-            format!("user `{}` has the role {}, and this needs {role}", user.name, user.role);
-        return Err(CloudError::denied(message, "let an administrator invite you with that role"));
+    let User { name, role: has } = &token_user.user;
+    if *has < role {
+        let (message, help) = match &*token_user.name {
+            "" => (
+                format!("user `{name}` has the role {has}, and this needs {role}"),
+                "let an administrator invite you with that role",
+            ),
+            token => (
+                format!("token `{token}` has the role {has}, and this needs {role}"),
+                "make another token with that role, if you have it",
+            ),
+        };
+        return Err(CloudError::denied(message, help));
     }
-    Ok(user)
+    Ok(token_user)
+}
+
+/// Returns the token of a request.
+fn bearer(headers: &HeaderMap) -> Option<&str> {
+    let header = headers.get(header::AUTHORIZATION)?.to_str().ok()?;
+    header.strip_prefix("Bearer ")
 }
 
 async fn login(

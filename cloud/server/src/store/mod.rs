@@ -42,6 +42,7 @@ mod records;
 mod secrets;
 #[cfg(test)]
 mod tests;
+mod tokens;
 mod users;
 mod vehicles;
 mod wants;
@@ -65,6 +66,7 @@ pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
 pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
+pub(crate) use tokens::TokenUser;
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::{Issued, VehicleReport};
 
@@ -74,6 +76,7 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0002_releases.sql"),
     include_str!("../../migrations/0003_clips.sql"),
     include_str!("../../migrations/0004_page.sql"),
+    include_str!("../../migrations/0009_tokens.sql"),
 ];
 
 /// Maximum number of queries at a time: with more threads than cores, each only takes longer.

@@ -55,16 +55,28 @@ impl StoreChange<'_> {
         kind: SecretKind,
         subject: &str,
     ) -> CloudResult<(String, i64)> {
+        self.add_named_secret(kind, subject, "", ("", kind.lifetime_s())).await
+    }
+
+    /// Makes a secret of `subject` with a name, a role and a lifetime in s.
+    pub(super) async fn add_named_secret(
+        &mut self,
+        kind: SecretKind,
+        subject: &str,
+        name: &str,
+        (role, lifetime_s): (&str, i64),
+    ) -> CloudResult<(String, i64)> {
         let mut bytes = [0; 32];
         getrandom::fill(&mut bytes).map_err(|error| {
             CloudError::busy("no secret can be made", "try again").because(error)
         })?;
         let secret = format!("{}{}", kind.prefix(), gleaner_base::hex(&bytes));
-        let expires = now() + kind.lifetime_s();
+        let expires = now() + lifetime_s;
         run!(&mut *self.tx; "DELETE FROM secrets WHERE expires <= $1"; now());
         run!(&mut *self.tx;
-            "INSERT INTO secrets (hash, kind, subject, expires) VALUES ($1, $2, $3, $4)";
-            hash(&secret), kind.as_str(), subject, expires);
+            "INSERT INTO secrets (hash, kind, subject, expires, name, role)
+             VALUES ($1, $2, $3, $4, $5, $6)";
+            hash(&secret), kind.as_str(), subject, expires, name, role);
         Ok((secret, expires))
     }
 
@@ -108,14 +120,15 @@ impl StoreChange<'_> {
 }
 
 impl CloudStore {
-    /// Returns the name and the role of the user with this secret.
+    /// Returns the name and the role of the user with this secret, and the name and the role that
+    /// the secret itself has, which are empty for most.
     pub(super) async fn user_row(
         &self,
         kind: SecretKind,
         secret: &str,
-    ) -> CloudResult<Option<(String, String)>> {
+    ) -> CloudResult<Option<(String, String, String, String)>> {
         Ok(row!(&self.pool;
-            "SELECT users.name, users.role FROM secrets JOIN users ON users.name = secrets.subject
+            "SELECT users.name, users.role, secrets.name, secrets.role FROM secrets JOIN users ON users.name = secrets.subject
              WHERE secrets.hash = $1 AND secrets.kind = $2 AND secrets.expires > $3";
             hash(secret), kind.as_str(), now()))
     }

@@ -63,11 +63,6 @@ impl CloudStore {
         Ok(Some(UserToken { user: user((name, role))?, token, expires: unsigned(expires) }))
     }
 
-    /// Returns the user with this token.
-    pub(crate) async fn user(&self, token: &str) -> CloudResult<Option<User>> {
-        self.user_row(SecretKind::Token, token).await?.map(user).transpose()
-    }
-
     /// Exchanges a code for a session of the page; returns the session and the user's name. `None`
     /// if the code is wrong, used or too old.
     pub(crate) async fn open_session(&self, code: &str) -> CloudResult<Option<(String, String)>> {
@@ -99,7 +94,8 @@ impl CloudStore {
 
     /// Returns the user with this session.
     pub(crate) async fn session(&self, session: &str) -> CloudResult<Option<User>> {
-        self.user_row(SecretKind::Session, session).await?.map(user).transpose()
+        let row = self.user_row(SecretKind::Session, session).await?;
+        row.map(|(name, role, ..)| user((name, role))).transpose()
     }
 
     /// Ends a session, if it exists.
@@ -152,7 +148,7 @@ impl CloudStore {
     }
 }
 
-fn user((name, role): (String, String)) -> CloudResult<User> {
+pub(super) fn user((name, role): (String, String)) -> CloudResult<User> {
     let role = role.parse().map_err(|error: String| {
         CloudError::denied(format!("the role of user `{name}` is damaged"), "invite the user again")
             .because(error)

@@ -1,0 +1,43 @@
+//! `gleaner tokens`: tokens for programs, with at most the rights of their user.
+
+use gleaner_base::{Exit, Failure, visible};
+use gleaner_fleet::people::{NewToken, TokenSummary, User, UserToken};
+use serde_json::json;
+
+use super::{client, date, show};
+use crate::args::{TokensArgs, TokensCommand};
+use crate::render::table;
+
+/// Runs `gleaner tokens`.
+pub(super) fn tokens(args: &TokensArgs) -> Result<Exit, Failure> {
+    let client = client()?;
+    match &args.command {
+        None => show(args.json, &client.get::<Vec<TokenSummary>>("/v1/tokens")?, |tokens| {
+            let rows = tokens.iter().map(|it| {
+                [visible(&it.user), visible(&it.name), it.role.to_string(), date(it.expires)]
+            });
+            let head = ["user", "token", "role", "until"].map(str::to_owned);
+            table(std::iter::once(head).chain(rows).collect(), &[])
+        }),
+        Some(TokensCommand::New(new)) => {
+            let request = NewToken { name: new.name.clone(), role: new.role, days: new.days };
+            let made: UserToken = client.post("/v1/tokens", &request)?;
+            show(args.json, &made, |UserToken { user, token, expires }| {
+                let (until, token) = (date(*expires), visible(token));
+                format!(
+                    "made the token {} ({}) until {until}; it is not shown again:\n  {token}\n",
+                    new.name, user.role
+                )
+            })
+        }
+        Some(TokensCommand::Remove(token)) => {
+            let of = match &token.user {
+                Some(user) => user.clone(),
+                None => client.get::<User>("/v1/me")?.name,
+            };
+            client.delete(&format!("/v1/tokens/{of}/{}", token.name))?;
+            let removed = json!({ "user": of, "name": token.name, "removed": true });
+            show(args.json, &removed, |_| format!("removed {}\n", token.name))
+        }
+    }
+}

@@ -1,0 +1,171 @@
+//! The account of a user: the password, and the tokens for programs.
+
+use std::sync::Arc;
+
+use axum::extract::{Extension, Path, Query, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Redirect};
+use gleaner_fleet::people::{NewToken, TOKEN_DAYS_MAX, TokenSummary};
+use maud::{Markup, html};
+use serde::Deserialize;
+
+use super::access::ROLES;
+use super::guard::FormFields;
+use super::layout::{self, PageResult, confirmed, done, failure, form, with_status};
+use super::password;
+use super::session::PageUser;
+use super::text::{segment, shown, time};
+use crate::cloud::Cloud;
+use crate::error::CloudError;
+
+/// The change that was made before a page is shown.
+#[derive(Debug, Deserialize)]
+pub(super) struct Done {
+    pub(super) done: Option<String>,
+}
+
+pub(super) async fn page(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Query(query): Query<Done>,
+) -> PageResult {
+    account_page(&cloud, &user, done(query.done.as_deref())).await
+}
+
+async fn account_page(cloud: &Cloud, user: &PageUser, message: Markup) -> PageResult {
+    let has_password = cloud.store.password(&user.user.name).await?.is_some();
+    let title = if has_password { "Change your password" } else { "Set a password" };
+    let body = html! {
+        h1 { "Account of " (user.user.name) }
+        (message)
+        section.card.narrow aria-labelledby="password-title" {
+            h2 id="password-title" { (title) }
+            (form(user, "/account/password", html! {
+                // Password managers store it under this name.
+                input type="hidden" name="name" value=(user.user.name) autocomplete="username";
+                label for="password" { "New password" }
+                input id="password" name="password" type="password" required minlength="12"
+                    maxlength="256" autocomplete="new-password" aria-describedby="password-help";
+                p.help id="password-help" { "12 characters or more, such as four random words." }
+                label for="again" { "New password again" }
+                input id="again" name="again" type="password" required minlength="12"
+                    maxlength="256" autocomplete="new-password";
+                button { (title) }
+            }))
+        }
+        (tokens(user, &cloud.store.tokens(Some(&user.user.name)).await?))
+    };
+    Ok(layout::page("Account", "/account", Some(user), body))
+}
+
+pub(super) async fn set_password(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Extension(fields): Extension<FormFields>,
+) -> PageResult {
+    let new = fields.get("password");
+    let hash = match new == fields.get("again") {
+        true => password::hashed(new.to_owned()).await,
+        false => Err(CloudError::usage("the two passwords differ", "type the same one twice")),
+    };
+    match hash {
+        Ok(hash) => {
+            cloud.store.set_password(&user.user.name, &hash, user.session()).await?;
+            Ok(Redirect::to("/account?done=password").into_response())
+        }
+        Err(error) => {
+            let page = account_page(&cloud, &user, failure(error)).await?;
+            Ok(with_status(StatusCode::BAD_REQUEST, page))
+        }
+    }
+}
+
+fn tokens(user: &PageUser, all: &[TokenSummary]) -> Markup {
+    html! {
+        section aria-labelledby="tokens" {
+            h2 id="tokens" { "Tokens for programs" }
+            @if all.is_empty() { (layout::empty("There are none.")) }
+            ul.rows { @for it in all {
+                li.card {
+                    span { b { (shown(&it.name)) } " " span.dim { (it.role) ", until "
+                        (time(i64::try_from(it.expires).unwrap_or(i64::MAX))) } }
+                    (confirmed(user, &format!("/account/tokens/{}/remove", segment(&it.name)),
+                        "Remove", &format!("Programs that use {} are refused at once.", it.name),
+                        html! {}))
+                }
+            } }
+        }
+        section.card.narrow aria-labelledby="new-token" {
+            h2 id="new-token" { "Make a token" }
+            (form(user, "/account/tokens", html! {
+                label for="token-name" { "Name" }
+                input id="token-name" name="name" required maxlength="64" autocomplete="off"
+                    spellcheck="false" aria-describedby="token-help";
+                p.help id="token-help" {
+                    "Letters, digits and ._- are allowed, as in nightly-export. A token makes no \
+                     other tokens."
+                }
+                label for="token-role" { "Role" }
+                select id="token-role" name="role" {
+                    @for (role, may) in ROLES.into_iter().filter(|(it, _)| *it <= user.user.role) {
+                        option value=(role) { (role) ": " (may) }
+                    }
+                }
+                label for="token-days" { "Days until it ends" }
+                input id="token-days" name="days" type="number" required min="1"
+                    max=(TOKEN_DAYS_MAX) value="90";
+                button { "Make" }
+            }))
+        }
+    }
+}
+
+pub(super) async fn make_token(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Extension(fields): Extension<FormFields>,
+) -> PageResult {
+    let role = fields.get("role").parse().map_err(|error: String| {
+        CloudError::usage("the role is not known", "choose one of the list").because(error)
+    });
+    let made = match role {
+        Ok(role) => {
+            let name = fields.get("name").trim().to_owned();
+            // No number is none that is allowed.
+            let days = fields.get("days").trim().parse().unwrap_or(0);
+            cloud.store.make_token(&user.user, NewToken { name, role, days }).await
+        }
+        Err(error) => Err(error),
+    };
+    let made = match made {
+        Ok(made) => made,
+        Err(error) => {
+            let status = error.status();
+            let page = account_page(&cloud, &user, failure(error)).await?;
+            return Ok(with_status(status, page));
+        }
+    };
+    let body = html! {
+        nav.crumbs aria-label="Path" { a href="/account" { "Account" } }
+        h1 { "Token " (shown(fields.get("name").trim())) }
+        section.card.narrow aria-label="Token" {
+            p { "Copy this token now. It is not shown again." }
+            p.code { code { (made.token) } }
+            p { "It has the role " (made.user.role) ", until "
+                (time(i64::try_from(made.expires).unwrap_or(i64::MAX)))
+                ". Programs have it as " code { "GLEANER_CLOUD_TOKEN" } ", with the address of \
+                the cloud as " code { "GLEANER_CLOUD" } "." }
+        }
+    };
+    Ok(layout::page("Token", "/account", Some(&user), body))
+}
+
+pub(super) async fn remove_token(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(name): Path<String>,
+) -> PageResult {
+    cloud.store.remove_token(&user.user.name, &user.user.name, &name).await?;
+    cloud.readers.end(&user.user.name);
+    Ok(Redirect::to("/account?done=token").into_response())
+}

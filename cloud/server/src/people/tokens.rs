@@ -1,0 +1,64 @@
+//! Tokens for programs, and the end of the token of a login.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::body::Bytes;
+use axum::extract::{Extension, Path, State};
+use axum::http::{HeaderMap, StatusCode};
+use gleaner_base::excerpt;
+use gleaner_fleet::people::{NewToken, Role, TokenSummary, User, UserToken};
+
+use super::{TokenName, bearer};
+use crate::cloud::Cloud;
+use crate::error::{CloudError, CloudResult};
+use crate::request::parsed;
+
+pub(super) async fn make(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(actor): Extension<User>,
+    Extension(TokenName(of)): Extension<TokenName>,
+    body: Bytes,
+) -> CloudResult<Json<UserToken>> {
+    let new: NewToken = parsed(&body, "token")?;
+    // A stolen one must not outlive its end.
+    if !of.is_empty() {
+        let message = format!("token `{of}` makes no other tokens");
+        return Err(CloudError::denied(message, "use that of a login: `gleaner login`"));
+    }
+    Ok(Json(cloud.store.make_token(&actor, new).await?))
+}
+
+pub(super) async fn list(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(actor): Extension<User>,
+) -> CloudResult<Json<Vec<TokenSummary>>> {
+    let of = (actor.role < Role::Admin).then_some(&*actor.name);
+    Ok(Json(cloud.store.tokens(of).await?))
+}
+
+pub(super) async fn remove(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(actor): Extension<User>,
+    Path((of, name)): Path<(String, String)>,
+) -> CloudResult<StatusCode> {
+    if of != actor.name && actor.role < Role::Admin {
+        let message = format!("you have no token `{}/{}`", excerpt(&of), excerpt(&name));
+        let help = "remove one of your own, or let an administrator remove it";
+        return Err(CloudError::missing(message, help));
+    }
+    cloud.store.remove_token(&actor.name, &of, &name).await?;
+    cloud.readers.end(&of);
+    Ok(StatusCode::NO_CONTENT)
+}
+
+pub(super) async fn logout(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(actor): Extension<User>,
+    headers: HeaderMap,
+) -> CloudResult<StatusCode> {
+    if let Some(token) = bearer(&headers) {
+        cloud.store.end_token(&actor.name, token).await?;
+    }
+    Ok(StatusCode::NO_CONTENT)
+}

@@ -1,0 +1,125 @@
+//! Tokens of users: those of logins, and named ones for programs, with at most the rights of their
+//! user.
+
+use gleaner_base::excerpt;
+use gleaner_fleet::people::{NewToken, Role, TOKEN_DAYS_MAX, TokenSummary, User, UserToken};
+
+use super::secrets::SecretKind;
+use super::users::user;
+use super::{CloudStore, now, unsigned};
+use crate::error::{CloudError, CloudResult};
+
+/// Maximum number of named tokens of a user.
+const TOKENS_MAX: i64 = 50;
+
+/// A user with a token, and the rights of that token.
+#[derive(Debug)]
+pub(crate) struct TokenUser {
+    /// The user, with the role of the token if that is less.
+    pub(crate) user: User,
+    /// Name of the token; empty for that of a login.
+    pub(crate) name: String,
+}
+
+impl CloudStore {
+    /// Returns the user with this token.
+    pub(crate) async fn user(&self, token: &str) -> CloudResult<Option<TokenUser>> {
+        let Some((name, role, token, most)) = self.user_row(SecretKind::Token, token).await? else {
+            return Ok(None);
+        };
+        let mut user = user((name, role))?;
+        if !token.is_empty() {
+            user.role = user.role.min(role_of(&most)?);
+        }
+        Ok(Some(TokenUser { user, name: token }))
+    }
+
+    /// Makes a named token of a user.
+    pub(crate) async fn make_token(&self, user: &User, new: NewToken) -> CloudResult<UserToken> {
+        let NewToken { name, role, days } = new;
+        let allowed = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
+        if !(1..=64).contains(&name.len()) || !name.chars().all(allowed) {
+            let message = format!("`{}` cannot be the name of a token", excerpt(&name));
+            let help = "use 1 to 64 letters, digits and `._-`, as in nightly-export";
+            return Err(CloudError::usage(message, help));
+        }
+        if !(1..=TOKEN_DAYS_MAX).contains(&days) {
+            let message = format!("a token cannot be valid for {days} days");
+            let help = format!("choose 1 to {TOKEN_DAYS_MAX} days");
+            return Err(CloudError::usage(message, &help));
+        }
+        if role > user.role {
+            let message = format!("user `{}` has the role {}, not {role}", user.name, user.role);
+            return Err(CloudError::denied(message, "choose your own role, or a lesser one"));
+        }
+        let mut change = self.change().await?;
+        run!(&mut *change.tx; "DELETE FROM secrets WHERE expires <= $1"; now());
+        let (count, same): (i64, i64) = one!(&mut *change.tx;
+            "SELECT COUNT(*), COUNT(CASE WHEN name = $2 THEN 1 END) FROM secrets
+             WHERE kind = 'token' AND subject = $1 AND name <> ''";
+            &user.name, &name);
+        if same > 0 {
+            let message = format!("you have a token `{name}` already");
+            return Err(CloudError::usage(message, "choose another name, or remove that token"));
+        }
+        if count >= TOKENS_MAX {
+            let message = format!("you have {count} tokens already");
+            return Err(CloudError::usage(message, "remove one that you do not need any more"));
+        }
+        let rights = (role.as_str(), i64::from(days) * 86_400);
+        let (token, expires) =
+            change.add_named_secret(SecretKind::Token, &user.name, &name, rights).await?;
+        let subject = format!("{}/{name}", user.name);
+        change.note(&user.name, &format!("make token as {role}"), &subject).await?;
+        change.commit().await?;
+        let user = User { name: user.name.clone(), role };
+        Ok(UserToken { user, token, expires: unsigned(expires) })
+    }
+
+    /// Returns the named tokens of a user, or of all.
+    pub(crate) async fn tokens(&self, of: Option<&str>) -> CloudResult<Vec<TokenSummary>> {
+        let rows: Vec<(String, String, String, i64)> = rows!(&self.pool;
+            "SELECT subject, name, role, expires FROM secrets
+             WHERE kind = 'token' AND name <> '' AND expires > $1 AND ($2 = '' OR subject = $2)
+             ORDER BY subject, name";
+            now(), of.unwrap_or_default());
+        let summary = |(user, name, role, expires): (String, String, String, i64)| {
+            Ok(TokenSummary { user, name, role: role_of(&role)?, expires: unsigned(expires) })
+        };
+        rows.into_iter().map(summary).collect()
+    }
+
+    /// Removes a named token of the user `of`.
+    pub(crate) async fn remove_token(&self, actor: &str, of: &str, name: &str) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        let removed = run!(&mut *change.tx;
+            "DELETE FROM secrets WHERE kind = 'token' AND subject = $1 AND name = $2
+             AND name <> ''";
+            of, name);
+        let subject = format!("{of}/{name}");
+        if removed.rows_affected() == 0 {
+            let message = format!("there is no token `{}`", excerpt(&subject));
+            return Err(CloudError::missing(
+                message,
+                "list the tokens, and use one of their names",
+            ));
+        }
+        change.note(actor, "remove token", &subject).await?;
+        change.commit().await
+    }
+
+    /// Ends the token of a request.
+    pub(crate) async fn end_token(&self, actor: &str, token: &str) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        if change.take_secret(SecretKind::Token, token).await?.is_some() {
+            change.note(actor, "logout", actor).await?;
+        }
+        change.commit().await
+    }
+}
+
+fn role_of(text: &str) -> CloudResult<Role> {
+    text.parse().map_err(|error: String| {
+        CloudError::denied("the role of a token is damaged", "make another token").because(error)
+    })
+}
