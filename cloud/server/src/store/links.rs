@@ -163,7 +163,8 @@ impl StoreChange<'_> {
                 continue;
             };
             // Used, a certificate is durable on the vehicle, and replaces the former ones.
-            replaced.extend(all.extract_if(.., |(_, end)| *end < expires).map(|(sha256, _)| sha256));
+            replaced
+                .extend(all.extract_if(.., |(_, end)| *end < expires).map(|(sha256, _)| sha256));
             vehicle.epoch += 1;
             waiting.result = Some(Ok((unsigned(vehicle.epoch), Vec::new())));
             begun.insert(name.clone(), vehicle.epoch);
@@ -263,10 +264,7 @@ impl StoreChange<'_> {
         Ok(())
     }
 
-    async fn store_reports(
-        &mut self,
-        rows: &[(&str, (&VehicleReport, bool))],
-    ) -> CloudResult<()> {
+    async fn store_reports(&mut self, rows: &[(&str, (&VehicleReport, bool))]) -> CloudResult<()> {
         for part in parts(rows) {
             let sql = format!(
                 "INSERT INTO vehicles

@@ -159,9 +159,8 @@ impl StoreChange<'_> {
                 "SELECT name, epoch, is_revoked, arrived, labels, digest FROM vehicles
                  WHERE name IN ({names})"
             );
-            let query = sqlx::query_as::<_, (String, i64, i64, i64, String, String)>(
-                AssertSqlSafe(sql),
-            );
+            let query =
+                sqlx::query_as::<_, (String, i64, i64, i64, String, String)>(AssertSqlSafe(sql));
             let query = part.iter().fold(query, |query, write| query.bind(write.vehicle()));
             for (name, epoch, is_revoked, arrived, labels, digest) in
                 query.fetch_all(&mut *self.tx).await?
