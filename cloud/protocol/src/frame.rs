@@ -1,9 +1,18 @@
 //! Frames of the control channel: protobuf, one in each binary message of the WebSocket.
 
-use std::io::Read;
+use std::cell::RefCell;
+use std::io::{self, Read};
 
 use prost::Message;
 use sha2::{Digest, Sha256};
+use zstd::bulk::Decompressor;
+
+thread_local! {
+    /// Decompresses parts one after the other in the same memory. Between what lives as long as a
+    /// connection, that of each part would keep the heap of a cloud at twice of what is in use.
+    static DECOMPRESSOR: RefCell<Option<Decompressor<'static>>> =
+        RefCell::new(Decompressor::new().ok());
+}
 
 /// Version of the channel. A cloud refuses vehicles of another one.
 pub const PROTOCOL: u32 = 1;
@@ -266,8 +275,9 @@ const WINDOW_LOG: u32 = 23;
 
 /// Compresses a part of a frame.
 pub fn compress(bytes: &[u8]) -> Vec<u8> {
-    // It writes to memory, which does not fail.
-    zstd::stream::encode_all(bytes, 3).unwrap_or_default()
+    // It writes to memory, which does not fail. As a whole, it states its length, and takes no more
+    // memory than it needs: in a stream, each part would take some 2 MB on both sides.
+    zstd::bulk::compress(bytes, 3).unwrap_or_default()
 }
 
 /// Decompresses a part of a frame, at most [`LINES_MAX`] bytes.
@@ -277,16 +287,24 @@ pub fn compress(bytes: &[u8]) -> Vec<u8> {
 /// [`FrameError::Compressed`] if it is damaged or longer.
 pub fn decompress(bytes: &[u8]) -> Result<Vec<u8>, FrameError> {
     let failed = |reason: String| FrameError::Compressed { reason };
-    let mut decoder =
-        zstd::stream::Decoder::new(bytes).map_err(|error| failed(error.to_string()))?;
-    decoder.window_log_max(WINDOW_LOG).map_err(|error| failed(error.to_string()))?;
-    let mut whole = Vec::new();
-    let read = decoder.take(LINES_MAX + 1).read_to_end(&mut whole);
-    read.map_err(|error| failed(error.to_string()))?;
-    match whole.len() as u64 > LINES_MAX {
-        true => Err(failed(format!("it has more than {LINES_MAX} bytes"))),
-        false => Ok(whole),
+    let long = || failed(format!("it has more than {LINES_MAX} bytes"));
+    let length = Decompressor::upper_bound(bytes);
+    if length.is_some_and(|length| length as u64 > LINES_MAX) {
+        return Err(long());
     }
+    let whole = DECOMPRESSOR.with_borrow_mut(|it| Some(it.as_mut()?.decompress(bytes, length?)));
+    let whole = whole.unwrap_or_else(|| decompress_stream(bytes));
+    let whole = whole.map_err(|error| failed(error.to_string()))?;
+    if whole.len() as u64 > LINES_MAX { Err(long()) } else { Ok(whole) }
+}
+
+/// Decompresses a part that does not state its length, to one byte more than is allowed.
+fn decompress_stream(bytes: &[u8]) -> io::Result<Vec<u8>> {
+    let mut decoder = zstd::stream::Decoder::new(bytes)?;
+    decoder.window_log_max(WINDOW_LOG)?;
+    let mut whole = Vec::new();
+    decoder.take(LINES_MAX + 1).read_to_end(&mut whole)?;
+    Ok(whole)
 }
 
 /// Returns the digest of a wanted state, without its number: equal states have the same one.
@@ -328,6 +346,10 @@ mod tests {
     fn a_compressed_part_is_bounded() {
         let text = b"a line\n".repeat(1000);
         assert_eq!(decompress(&compress(&text)).unwrap(), text);
+        // As earlier versions send it: without its length.
+        let stream = |bytes: &[u8]| zstd::stream::encode_all(bytes, 3).unwrap();
+        assert_eq!(decompress(&stream(&text)).unwrap(), text);
+        assert!(decompress(&stream(&vec![0; LINES_MAX as usize + 1])).is_err());
         let bomb = compress(&vec![0; LINES_MAX as usize + 1]);
         assert!(bomb.len() < 10_000);
         let refused = decompress(&bomb).unwrap_err().to_string();

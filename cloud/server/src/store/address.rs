@@ -9,8 +9,10 @@ use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
 use sqlx::{AnyPool, Connection};
 
 /// Settings of each connection to SQLite. In the mode WAL, readers and the writer do not wait for
-/// each other; FULL makes each commit durable before it returns.
+/// each other; FULL makes each commit durable before it returns. Pages that change often are copied
+/// to the database once in 16 MB of changes.
 const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
+                       PRAGMA wal_autocheckpoint = 4000; \
                        PRAGMA foreign_keys = ON; PRAGMA busy_timeout = 10000;";
 
 /// Time that a query waits before the log has it.

@@ -84,7 +84,7 @@ impl CloudStore {
         if !is_same {
             change.add_release(offered, &sha256).await?;
         }
-        let changed = change.refresh("").await?;
+        let changed = change.refresh_all().await?;
         change.commit().await?;
         Ok((number, changed))
     }
@@ -248,7 +248,7 @@ impl StoreChange<'_> {
             return Err(unknown(id));
         }
         self.note(actor, action, id).await?;
-        let changed = self.refresh("").await?;
+        let changed = self.refresh_all().await?;
         self.commit().await?;
         Ok(changed)
     }

@@ -37,6 +37,7 @@ mod audit;
 mod clip_list;
 mod clips;
 mod deployments;
+mod links;
 mod page;
 mod records;
 mod secrets;
@@ -56,6 +57,7 @@ use gleaner_base::Failure;
 use sqlx::{Any, AnyPool, Transaction};
 use tokio::sync::{Mutex, MutexGuard};
 
+use self::wants::WantedStates;
 use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
 
@@ -64,11 +66,12 @@ pub(crate) use audit::ENTRIES_MAX;
 pub(crate) use clip_list::ClipQuery;
 pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
+pub(crate) use links::VehicleReport;
 pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
 pub(crate) use tokens::TokenUser;
 pub(crate) use users::CONSOLE;
-pub(crate) use vehicles::{Issued, VehicleReport};
+pub(crate) use vehicles::Issued;
 
 /// The migrations, oldest first: the version of a database is the number of those that it has.
 const MIGRATIONS: &[&str] = &[
@@ -91,6 +94,7 @@ pub(crate) struct CloudStore {
     /// The statement that begins a change, for one at a time.
     turn: Arc<Mutex<&'static str>>,
     writes: WriteQueue,
+    wanted: WantedStates,
     is_file: bool,
 }
 
@@ -111,7 +115,8 @@ impl CloudStore {
         let turn = Arc::new(Mutex::new(address.begin()));
         let writes = WriteQueue::start(changes.clone(), Arc::clone(&turn));
         let is_file = matches!(address, StoreAddress::Sqlite(_));
-        let store = Self { pool, changes, turn, writes, is_file };
+        let wanted = WantedStates::default();
+        let store = Self { pool, changes, turn, writes, wanted, is_file };
         store.migrate().await?;
         Ok(store)
     }
@@ -198,21 +203,25 @@ async fn begin<'s>(pool: &AnyPool, turn: &'s Mutex<&'static str>) -> CloudResult
     Ok(StoreChange { tx, _turn: turn })
 }
 
-/// Returns the placeholders of `rows` rows: each has `own` values of its own after `shared` ones.
-fn placeholders(rows: usize, shared: usize, own: usize) -> String {
+/// Returns the placeholders of `rows` rows of so many values.
+fn placeholders(rows: usize, columns: usize) -> String {
     let row = |row| {
-        let first = shared + row * own + 1;
-        let all: Vec<_> =
-            (1..=shared).chain(first..first + own).map(|it| format!("${it}")).collect();
+        let first = row * columns + 1;
+        let all: Vec<_> = (first..first + columns).map(|it| format!("${it}")).collect();
         format!("({})", all.join(", "))
     };
     (0..rows).map(row).collect::<Vec<_>>().join(", ")
 }
 
+/// Returns the placeholders of the first `count` values, for a list.
+fn in_list(count: usize) -> String {
+    (1..=count).map(|number| format!("${number}")).collect::<Vec<_>>().join(", ")
+}
+
 /// Splits rows into parts of few different lengths: for each, a statement is prepared once.
 fn parts<T>(mut rows: &[T]) -> impl Iterator<Item = &[T]> {
     std::iter::from_fn(move || {
-        let length = [64, 16, 4, 1].into_iter().find(|length| *length <= rows.len())?;
+        let length = [256, 64, 16, 4, 1].into_iter().find(|length| *length <= rows.len())?;
         let (part, rest) = rows.split_at(length);
         rows = rest;
         Some(part)

@@ -1,13 +1,15 @@
 //! Records of vehicles: each stored once, the newest kept.
 
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
 use gleaner_fleet::{Ack, Cursor};
 use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::json;
 use sqlx::AssertSqlSafe;
 
-use super::vehicles::{ended, unknown};
-use super::writer::VehicleWrite;
-use super::{CloudStore, StoreChange, int, parts, placeholders, unsigned};
+use super::vehicles::unknown;
+use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
+use super::{CloudStore, StoreChange, in_list, int, parts, placeholders, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of streams of a vehicle: two, and one for each lambda that it ever had.
@@ -51,11 +53,22 @@ pub(crate) struct RecordPage {
 }
 
 /// A batch to store, if the connection still counts.
-struct AppendWrite {
+pub(super) struct AppendWrite {
     name: String,
     epoch: u64,
     batch: StreamBatch,
     retention: Retention,
+}
+
+/// What is stored of the streams of a group, by vehicle.
+#[derive(Default)]
+struct StoredStreams(HashMap<String, VehicleStreams>);
+
+#[derive(Default)]
+struct VehicleStreams {
+    known: HashMap<String, StoredStream>,
+    /// Number of all streams, if one of the group is new.
+    count: i64,
 }
 
 /// Position and size of a stream.
@@ -68,33 +81,26 @@ struct StoredStream {
 impl VehicleWrite for AppendWrite {
     type Done = Ack;
 
-    async fn apply(&self, change: &mut StoreChange<'_>) -> CloudResult<Ack> {
-        let Self { name, epoch, batch, retention } = self;
-        let Cursor { stream, life, next, .. } = &batch.cursor;
-        let count = int(batch.lines.len() as u64);
-        let arrived: Option<(i64,)> = row!(&mut *change.tx;
-            "UPDATE vehicles SET arrived = arrived + $3
-             WHERE name = $1 AND epoch = $2 AND is_revoked = 0 RETURNING arrived";
-            name, int(*epoch), count);
-        let (arrived,) = arrived.ok_or_else(ended)?;
-        let stored = change.stored_stream(name, stream, *life).await?;
-        let known = stored.cursor.next;
-        // Those before the position were stored, and may have made room since.
-        let arrivals = (arrived - count + 1..).zip(&batch.lines);
-        let lines: Vec<_> =
-            arrivals.filter(|(_, (seq, mark, _))| !mark.is_empty() || *seq >= known).collect();
-        let (added, bytes) = change.insert_lines(name, &batch.cursor, &lines).await?;
-        let (kept, kept_bytes) = (stored.kept + added, stored.kept_bytes + bytes);
-        let cursor = moved(stored.cursor, &batch.cursor);
-        change.set_stream(name, &cursor, (kept, kept_bytes)).await?;
-        let excess = (kept - int(retention.records), kept_bytes - int(retention.bytes));
-        change.make_room(name, stream, excess).await?;
-        if stored.kept == 0 || kept_bytes / SUM_STEP > stored.kept_bytes / SUM_STEP {
-            change.make_room_of_all(name, int(retention.vehicle_bytes)).await?;
-        }
-        Ok(Ack { stream: stream.clone(), life: *life, next: known.max(*next) })
+    fn vehicle(&self) -> &str {
+        &self.name
+    }
+
+    fn waiting(write: Waiting<Self>) -> WaitingWrite {
+        WaitingWrite::Append(write)
     }
 }
+
+/// A line to insert.
+struct NewLine<'a> {
+    vehicle: &'a str,
+    stream: &'a str,
+    life: u64,
+    arrival: i64,
+    line: &'a (u64, String, String),
+}
+
+/// Vehicle and name of a stream.
+type StreamKey<'a> = (&'a str, &'a str);
 
 impl CloudStore {
     /// Stores records and the position after them, if the connection still counts. Records that
@@ -107,23 +113,6 @@ impl CloudStore {
         retention: Retention,
     ) -> CloudResult<Ack> {
         self.write(AppendWrite { name: name.to_owned(), epoch, batch, retention }).await
-    }
-
-    /// Returns the positions of all streams of a vehicle.
-    pub(crate) async fn cursors(&self, name: &str) -> CloudResult<Vec<Cursor>> {
-        let rows: Vec<(String, i64, i64, i64, String, i64)> = rows!(&self.pool;
-            "SELECT stream, life, next, seq, boot, boot_ns FROM streams WHERE vehicle = $1
-             ORDER BY stream";
-            name);
-        let cursor = |(stream, life, next, seq, boot, boot_ns)| Cursor {
-            stream,
-            life: unsigned(life),
-            next: unsigned(next),
-            seq: unsigned(seq),
-            boot,
-            boot_ns: unsigned(boot_ns),
-        };
-        Ok(rows.into_iter().map(cursor).collect())
     }
 
     /// Returns the arrival before the `last` newest records of two streams, which may be the same;
@@ -196,6 +185,49 @@ impl CloudStore {
     }
 }
 
+impl StoredStreams {
+    fn get(&self, (vehicle, stream): StreamKey<'_>) -> Option<&StoredStream> {
+        self.0.get(vehicle)?.known.get(stream)
+    }
+
+    fn get_mut(&mut self, (vehicle, stream): StreamKey<'_>) -> Option<&mut StoredStream> {
+        self.0.get_mut(vehicle)?.known.get_mut(stream)
+    }
+
+    /// Returns the bytes that are kept of each of these streams.
+    fn kept_bytes(&self, keys: &BTreeMap<StreamKey<'_>, Retention>) -> Vec<i64> {
+        keys.keys().map(|key| self.get(*key).map_or(0, |stored| stored.kept_bytes)).collect()
+    }
+
+    /// Returns a stream that gets records of a life; the position of an earlier one does not count.
+    ///
+    /// # Errors
+    ///
+    /// An error if the life has ended, or the vehicle has too many streams.
+    fn begin(&mut self, vehicle: &str, stream: &str, life: u64) -> CloudResult<&mut StoredStream> {
+        let VehicleStreams { known, count } = self.0.entry(vehicle.to_owned()).or_default();
+        let is_new = !known.contains_key(stream);
+        if is_new && *count >= STREAMS_MAX {
+            let message = format!("the vehicle has {count} streams; no more are stored");
+            return Err(CloudError::usage(message, "deploy under ids that were used before"));
+        }
+        *count += i64::from(is_new);
+        let stored = known.entry(stream.to_owned()).or_insert_with(|| {
+            let cursor = Cursor { stream: stream.to_owned(), life, ..Cursor::default() };
+            StoredStream { cursor, kept: 0, kept_bytes: 0 }
+        });
+        if stored.cursor.life > life {
+            let message =
+                format!("stream `{stream}` has life {}; this is {life}", stored.cursor.life);
+            return Err(CloudError::usage(message, "begin the next life of the stream"));
+        }
+        if stored.cursor.life < life {
+            (stored.cursor.life, stored.cursor.next) = (life, 0);
+        }
+        Ok(stored)
+    }
+}
+
 /// Returns the name of a stream in its lines: of a lambda's records, the id of its deployment.
 pub(crate) fn name_in_lines(stream: &str) -> &str {
     stream.strip_prefix("lambdas/").unwrap_or(stream)
@@ -214,85 +246,248 @@ fn moved(stored: Cursor, next: &Cursor) -> Cursor {
 }
 
 impl StoreChange<'_> {
-    /// Returns what is stored of a stream; nothing of an earlier life counts as its position.
-    async fn stored_stream(
+    /// Returns the positions of all streams of these vehicles.
+    pub(super) async fn cursors_of(
         &mut self,
-        name: &str,
-        stream: &str,
-        life: u64,
-    ) -> CloudResult<StoredStream> {
-        let row: Option<(i64, i64, i64, String, i64, i64, i64)> = row!(&mut *self.tx;
-            "SELECT life, next, seq, boot, boot_ns, kept, kept_bytes FROM streams
-             WHERE vehicle = $1 AND stream = $2";
-            name, stream);
-        let mut cursor = Cursor { stream: stream.to_owned(), life, ..Cursor::default() };
-        let Some((stored, next, seq, boot, boot_ns, kept, kept_bytes)) = row else {
-            let (streams,): (i64,) =
-                one!(&mut *self.tx; "SELECT COUNT(*) FROM streams WHERE vehicle = $1"; name);
-            if streams >= STREAMS_MAX {
-                let message = format!("the vehicle has {streams} streams; no more are stored");
-                return Err(CloudError::usage(message, "deploy under ids that were used before"));
+        vehicles: &[&String],
+    ) -> CloudResult<HashMap<String, Vec<Cursor>>> {
+        let mut cursors = HashMap::<_, Vec<_>>::new();
+        for part in parts(vehicles) {
+            let sql = format!(
+                "SELECT vehicle, stream, life, next, seq, boot, boot_ns FROM streams
+                 WHERE vehicle IN ({}) ORDER BY stream",
+                in_list(part.len())
+            );
+            let query = sqlx::query_as(AssertSqlSafe(sql));
+            let query = part.iter().fold(query, |query, name| query.bind(*name));
+            let rows: Vec<(String, String, i64, i64, i64, String, i64)> =
+                query.fetch_all(&mut *self.tx).await?;
+            for (vehicle, stream, life, next, seq, boot, boot_ns) in rows {
+                cursors.entry(vehicle).or_default().push(Cursor {
+                    stream,
+                    life: unsigned(life),
+                    next: unsigned(next),
+                    seq: unsigned(seq),
+                    boot,
+                    boot_ns: unsigned(boot_ns),
+                });
             }
-            return Ok(StoredStream { cursor, kept: 0, kept_bytes: 0 });
-        };
-        let stored = unsigned(stored);
-        if stored > life {
-            let message = format!("stream `{stream}` has life {stored}; this is {life}");
-            return Err(CloudError::usage(message, "begin the next life of the stream"));
         }
-        (cursor.seq, cursor.boot, cursor.boot_ns) = (unsigned(seq), boot, unsigned(boot_ns));
-        if stored == life {
-            cursor.next = unsigned(next);
-        }
-        Ok(StoredStream { cursor, kept, kept_bytes })
+        Ok(cursors)
     }
 
-    /// Inserts lines with their arrivals; returns the number and the bytes of those that were not
-    /// there already.
+    /// Stores batches of connections that still count.
+    pub(super) async fn append_all(
+        &mut self,
+        vehicles: &mut GroupVehicles,
+        appends: &mut [&mut Waiting<AppendWrite>],
+    ) -> CloudResult<()> {
+        let keys = appends.iter().map(|it| (&*it.write.name, &*it.write.batch.cursor.stream));
+        let mut streams = self.streams_of(&keys.collect::<Vec<_>>()).await?;
+        let (mut lines, mut grown) = (Vec::new(), BTreeMap::new());
+        for waiting in appends.iter_mut() {
+            let AppendWrite { name, epoch, batch, retention } = &waiting.write;
+            let Cursor { stream, life, next, .. } = &batch.cursor;
+            let checked = counting(vehicles, name, int(*epoch))
+                .and_then(|vehicle| Ok((vehicle, streams.begin(name, stream, *life)?)));
+            let (vehicle, stored) = match checked {
+                Ok(checked) => checked,
+                Err(error) => {
+                    waiting.result = Some(Err(error));
+                    continue;
+                }
+            };
+            let known = stored.cursor.next;
+            // Those before the position were stored, and may have made room since.
+            let is_new = |seq: u64, mark: &str| !mark.is_empty() || seq >= known;
+            for line in &batch.lines {
+                vehicle.arrived += 1;
+                if is_new(line.0, &line.1) {
+                    let (life, arrival) = (*life, vehicle.arrived);
+                    lines.push(NewLine { vehicle: name, stream, life, arrival, line });
+                }
+            }
+            stored.cursor = moved(std::mem::take(&mut stored.cursor), &batch.cursor);
+            grown.insert((&**name, &**stream), *retention);
+            let ack = Ack { stream: stream.clone(), life: *life, next: known.max(*next) };
+            waiting.result = Some(Ok(ack));
+        }
+        let before = streams.kept_bytes(&grown);
+        self.insert_lines(&lines, &mut streams).await?;
+        let arrived: BTreeSet<_> = grown.keys().map(|(vehicle, _)| *vehicle).collect();
+        let arrived = arrived.into_iter().filter_map(|name| Some((name, vehicles.get(name)?)));
+        for part in parts(&arrived.collect::<Vec<_>>()) {
+            let sql = format!(
+                "INSERT INTO vehicles (name, arrived) VALUES {}
+                 ON CONFLICT (name) DO UPDATE SET arrived = excluded.arrived",
+                placeholders(part.len(), 2)
+            );
+            let query = sqlx::query(AssertSqlSafe(sql));
+            let query = part
+                .iter()
+                .fold(query, |query, (name, vehicle)| query.bind(*name).bind(vehicle.arrived));
+            query.execute(&mut *self.tx).await?;
+        }
+        self.set_streams(&grown.keys().copied().collect::<Vec<_>>(), &streams).await?;
+        self.make_room_where_due(&grown, &streams, &before).await
+    }
+
+    /// Returns what is stored of these streams.
+    async fn streams_of(&mut self, keys: &[StreamKey<'_>]) -> CloudResult<StoredStreams> {
+        let mut streams = StoredStreams::default();
+        for part in parts(keys) {
+            let sql = format!(
+                "SELECT vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes
+                 FROM streams WHERE (vehicle, stream) IN (VALUES {})",
+                placeholders(part.len(), 2)
+            );
+            type Row = (String, String, i64, i64, i64, String, i64, i64, i64);
+            let query = sqlx::query_as::<_, Row>(AssertSqlSafe(sql));
+            let query =
+                part.iter().fold(query, |query, (name, stream)| query.bind(*name).bind(*stream));
+            let rows = query.fetch_all(&mut *self.tx).await?;
+            for (vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes) in rows {
+                let cursor = Cursor {
+                    stream: stream.clone(),
+                    life: unsigned(life),
+                    next: unsigned(next),
+                    seq: unsigned(seq),
+                    boot,
+                    boot_ns: unsigned(boot_ns),
+                };
+                let stored = StoredStream { cursor, kept, kept_bytes };
+                streams.0.entry(vehicle).or_default().known.insert(stream, stored);
+            }
+        }
+        // Vehicles with a stream that is new.
+        let mut names: Vec<_> = keys
+            .iter()
+            .filter(|(vehicle, stream)| streams.get((vehicle, stream)).is_none())
+            .map(|(vehicle, _)| *vehicle)
+            .collect();
+        names.sort_unstable();
+        names.dedup();
+        for part in parts(&names) {
+            let sql = format!(
+                "SELECT vehicle, COUNT(*) FROM streams WHERE vehicle IN ({}) GROUP BY vehicle",
+                in_list(part.len())
+            );
+            let query = sqlx::query_as::<_, (String, i64)>(AssertSqlSafe(sql));
+            let query = part.iter().fold(query, |query, name| query.bind(*name));
+            for (vehicle, count) in query.fetch_all(&mut *self.tx).await? {
+                streams.0.entry(vehicle).or_default().count = count;
+            }
+        }
+        Ok(streams)
+    }
+
+    /// Inserts lines with their arrivals, and adds those that were not there already to their
+    /// streams.
     async fn insert_lines(
         &mut self,
-        name: &str,
-        cursor: &Cursor,
-        lines: &[(i64, &(u64, String, String))],
-    ) -> CloudResult<(i64, i64)> {
-        let (mut added, mut bytes) = (0, 0);
+        lines: &[NewLine<'_>],
+        streams: &mut StoredStreams,
+    ) -> CloudResult<()> {
         for part in parts(lines) {
             let sql = format!(
                 "INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
                  VALUES {} ON CONFLICT (vehicle, stream, life, seq, mark) DO NOTHING
-                 RETURNING bytes",
-                placeholders(part.len(), 3, 5)
+                 RETURNING vehicle, stream, bytes",
+                placeholders(part.len(), 8)
             );
-            let mut query = sqlx::query_as::<_, (i64,)>(AssertSqlSafe(sql))
-                .bind(name)
-                .bind(&cursor.stream)
-                .bind(int(cursor.life));
-            for (arrival, (seq, mark, line)) in part {
-                let length = int(line.len() as u64);
-                query = query.bind(int(*seq)).bind(mark).bind(arrival).bind(line).bind(length);
+            let mut query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql));
+            for NewLine { vehicle, stream, life, arrival, line: (seq, mark, line) } in part {
+                query = query
+                    .bind(*vehicle)
+                    .bind(*stream)
+                    .bind(int(*life))
+                    .bind(int(*seq))
+                    .bind(mark)
+                    .bind(*arrival)
+                    .bind(line)
+                    .bind(int(line.len() as u64));
             }
-            let inserted: Vec<(i64,)> = query.fetch_all(&mut *self.tx).await?;
-            added += int(inserted.len() as u64);
-            bytes += inserted.iter().map(|(length,)| length).sum::<i64>();
+            for (vehicle, stream, bytes) in query.fetch_all(&mut *self.tx).await? {
+                if let Some(stored) = streams.get_mut((&vehicle, &stream)) {
+                    stored.kept += 1;
+                    stored.kept_bytes += bytes;
+                }
+            }
         }
-        Ok((added, bytes))
+        Ok(())
     }
 
-    /// Stores the position of a stream, and what is kept of it.
-    async fn set_stream(
+    /// Stores the positions of streams, and what is kept of them.
+    async fn set_streams(
         &mut self,
-        name: &str,
-        cursor: &Cursor,
-        (kept, kept_bytes): (i64, i64),
+        keys: &[StreamKey<'_>],
+        streams: &StoredStreams,
     ) -> CloudResult<()> {
-        run!(&mut *self.tx;
-            "INSERT INTO streams (vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes)
-             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9)
-             ON CONFLICT (vehicle, stream) DO UPDATE SET life = excluded.life,
-             next = excluded.next, seq = excluded.seq, boot = excluded.boot,
-             boot_ns = excluded.boot_ns, kept = excluded.kept, kept_bytes = excluded.kept_bytes";
-            name, &cursor.stream, int(cursor.life), int(cursor.next), int(cursor.seq),
-            &cursor.boot, int(cursor.boot_ns), kept, kept_bytes);
+        for part in parts(keys) {
+            let sql = format!(
+                "INSERT INTO streams
+                 (vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes)
+                 VALUES {} ON CONFLICT (vehicle, stream) DO UPDATE SET life = excluded.life,
+                 next = excluded.next, seq = excluded.seq, boot = excluded.boot,
+                 boot_ns = excluded.boot_ns, kept = excluded.kept,
+                 kept_bytes = excluded.kept_bytes",
+                placeholders(part.len(), 9)
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql));
+            for key in part {
+                let Some(StoredStream { cursor, kept, kept_bytes }) = streams.get(*key) else {
+                    continue;
+                };
+                query = query
+                    .bind(key.0)
+                    .bind(key.1)
+                    .bind(int(cursor.life))
+                    .bind(int(cursor.next))
+                    .bind(int(cursor.seq))
+                    .bind(&cursor.boot)
+                    .bind(int(cursor.boot_ns))
+                    .bind(*kept)
+                    .bind(*kept_bytes);
+            }
+            query.execute(&mut *self.tx).await?;
+        }
+        Ok(())
+    }
+
+    /// Removes the oldest records of streams, and of vehicles, that have too many. `before` are the
+    /// bytes of each stream so far.
+    async fn make_room_where_due(
+        &mut self,
+        grown: &BTreeMap<StreamKey<'_>, Retention>,
+        streams: &StoredStreams,
+        before: &[i64],
+    ) -> CloudResult<()> {
+        let mut to_sum = BTreeMap::new();
+        for ((key, retention), before) in grown.iter().zip(before) {
+            let Some(stored) = streams.get(*key) else { continue };
+            let records = stored.kept - int(retention.records);
+            let bytes = stored.kept_bytes - int(retention.bytes);
+            self.make_room(key.0, key.1, (records, bytes)).await?;
+            if *before == 0 || stored.kept_bytes / SUM_STEP > before / SUM_STEP {
+                to_sum.insert(key.0, int(retention.vehicle_bytes));
+            }
+        }
+        let names: Vec<_> = to_sum.keys().copied().collect();
+        for part in parts(&names) {
+            let sql = format!(
+                "SELECT vehicle, CAST(SUM(kept_bytes) AS BIGINT) FROM streams
+                 WHERE vehicle IN ({}) GROUP BY vehicle",
+                in_list(part.len())
+            );
+            let query = sqlx::query_as::<_, (String, i64)>(AssertSqlSafe(sql));
+            let query = part.iter().fold(query, |query, name| query.bind(*name));
+            for (vehicle, bytes) in query.fetch_all(&mut *self.tx).await? {
+                let most = to_sum.get(&*vehicle).copied().unwrap_or(i64::MAX);
+                if bytes > most {
+                    self.make_room_of_all(&vehicle, most).await?;
+                }
+            }
+        }
         Ok(())
     }
 

@@ -45,7 +45,7 @@ async fn enrolled(store: &CloudStore, name: &str, certificate: &str) {
 pub(super) async fn connected(store: &CloudStore, name: &str) -> u64 {
     // Its certificate has its name.
     enrolled(store, name, name).await;
-    store.connect(name, name, &Hello::default()).await.unwrap()
+    store.connect(name, name, &Hello::default()).await.unwrap().0
 }
 
 pub(super) fn offered(id: &str, release: u64, fleet: &str) -> OfferedDeployment {
@@ -104,7 +104,8 @@ async fn records_that_come_again_are_stored_once() {
     store.append("car-7", epoch, batch(1, 2..4), KEPT).await.unwrap();
     assert_eq!(lines(&store).await, ["line 0", "line 1", "line 2", "line 3"]);
     let cursor = batch(1, 2..4).cursor;
-    assert_eq!(store.cursors("car-7").await.unwrap(), [cursor]);
+    let (epoch, cursors) = store.connect("car-7", "car-7", &Hello::default()).await.unwrap();
+    assert_eq!(cursors, [cursor]);
     // The vehicle has lost its records, and begins again.
     store.append("car-7", epoch, batch(2, 0..1), KEPT).await.unwrap();
     assert_eq!(lines(&store).await.len(), 5);
@@ -115,7 +116,7 @@ async fn records_that_come_again_are_stored_once() {
 async fn a_connection_that_was_replaced_or_cut_off_stores_nothing() {
     let (_folder, store) = store().await;
     let old = connected(&store, "car-7").await;
-    let new = store.connect("car-7", "car-7", &Hello::default()).await.unwrap();
+    let (new, _) = store.connect("car-7", "car-7", &Hello::default()).await.unwrap();
     assert!(store.append("car-7", old, batch(1, 0..1), KEPT).await.is_err());
     assert!(store.report("car-7", old, report(json!({}), json!([]))).await.is_err());
     assert!(store.append("car-7", new, batch(1, 0..1), KEPT).await.is_ok());

@@ -3,20 +3,13 @@
 use std::collections::BTreeMap;
 
 use gleaner_base::excerpt;
-use gleaner_fleet::Hello;
 use gleaner_fleet::people::{VehicleState, VehicleSummary};
-use gleaner_protocol::supervision::LambdaPhase;
-use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
 use gleaner_trust::VehicleName;
 use sqlx::AssertSqlSafe;
 
 use super::secrets::SecretKind;
-use super::writer::VehicleWrite;
-use super::{CloudStore, StoreChange, int, now, parts, placeholders, unsigned};
+use super::{CloudStore, StoreChange, in_list, int, now, parts, unsigned};
 use crate::error::{CloudError, CloudResult};
-
-/// Maximum number of deployments in a report that count.
-const DEPLOYMENTS_MAX: usize = 1000;
 
 /// A certificate that was made for a vehicle.
 #[derive(Debug)]
@@ -25,120 +18,6 @@ pub(crate) struct Issued {
     pub(crate) sha256: String,
     pub(crate) renew: u64,
     pub(crate) expires: u64,
-}
-
-/// A report of a vehicle, as it is stored.
-#[derive(Debug, Default, Clone, PartialEq)]
-pub(crate) struct VehicleReport {
-    /// Number of the newest wanted state that it has handled.
-    pub(crate) handled: u64,
-    pub(crate) problems: Vec<String>,
-    pub(crate) version: String,
-    pub(crate) labels: BTreeMap<String, String>,
-    /// Number and state of each deployment, by its id.
-    pub(crate) states: BTreeMap<String, (u64, &'static str)>,
-    /// The status, as JSON.
-    pub(crate) status: String,
-    /// False if an earlier report of the connection had the same states, or labels.
-    pub(crate) has_new_states: bool,
-    pub(crate) has_new_labels: bool,
-}
-
-impl VehicleReport {
-    /// Returns the report of a vehicle with this status, which `json` states.
-    pub(crate) fn new(
-        handled: u64,
-        problems: Vec<String>,
-        status: VehicleStatus,
-        json: String,
-    ) -> Self {
-        let deployments = status.deployments.into_iter().take(DEPLOYMENTS_MAX);
-        let states = deployments.map(|it| {
-            let state = state(&it);
-            (it.id, (it.release, state))
-        });
-        Self {
-            handled,
-            problems,
-            version: excerpt(&status.orchestrator.version),
-            states: states.collect(),
-            labels: status.labels,
-            status: json,
-            has_new_states: true,
-            has_new_labels: true,
-        }
-    }
-}
-
-/// A connection that begins.
-struct ConnectWrite {
-    name: String,
-    certificate: String,
-    version: String,
-    key: String,
-}
-
-impl VehicleWrite for ConnectWrite {
-    type Done = u64;
-
-    async fn apply(&self, change: &mut StoreChange<'_>) -> CloudResult<u64> {
-        let Self { name, certificate, version, key } = self;
-        let epoch: Option<(i64,)> = row!(&mut *change.tx;
-            "UPDATE vehicles SET epoch = epoch + 1, version = $2, clip_key = $3, seen = $4
-             WHERE name = $1 AND is_revoked = 0 AND EXISTS
-             (SELECT 1 FROM certificates WHERE sha256 = $5 AND vehicle = $1 AND expires > $4)
-             RETURNING epoch";
-            name, version, key, now(), certificate);
-        let (epoch,) = epoch.ok_or_else(ended)?;
-        // Used, a certificate is durable on the vehicle, and replaces the former ones.
-        run!(&mut *change.tx;
-            "DELETE FROM certificates WHERE vehicle = $1 AND expires <
-             (SELECT expires FROM certificates WHERE sha256 = $2)";
-            name, certificate);
-        Ok(unsigned(epoch))
-    }
-}
-
-/// A report to store, if the connection still counts.
-struct ReportWrite {
-    name: String,
-    epoch: u64,
-    report: VehicleReport,
-}
-
-impl VehicleWrite for ReportWrite {
-    type Done = bool;
-
-    async fn apply(&self, change: &mut StoreChange<'_>) -> CloudResult<bool> {
-        let Self { name, epoch, report } = self;
-        let states = &report.states;
-        let running = states.values().filter(|(_, state)| *state == RUNNING).count();
-        let stored = run!(&mut *change.tx;
-            "UPDATE vehicles SET handled = $3, problems = $4, status = $5, labels = $6,
-             deployments = $7, running = $8, version = $9
-             WHERE name = $1 AND epoch = $2 AND is_revoked = 0";
-            name, int(*epoch), int(report.handled), json(&report.problems), &report.status,
-            json(&report.labels), int(states.len() as u64), int(running as u64), &report.version);
-        if stored.rows_affected() == 0 {
-            return Err(ended());
-        }
-        if report.has_new_states {
-            run!(&mut *change.tx; "DELETE FROM reported WHERE vehicle = $1"; name);
-            let states: Vec<_> = states.iter().collect();
-            for part in parts(&states) {
-                let sql = format!(
-                    "INSERT INTO reported (vehicle, deployment, number, state) VALUES {}",
-                    placeholders(part.len(), 1, 3)
-                );
-                let mut query = sqlx::query(AssertSqlSafe(sql)).bind(name);
-                for (id, (number, state)) in part {
-                    query = query.bind(id).bind(int(*number)).bind(*state);
-                }
-                query.execute(&mut *change.tx).await?;
-            }
-        }
-        Ok(report.has_new_labels && !change.refresh(name).await?.is_empty())
-    }
 }
 
 impl CloudStore {
@@ -158,7 +37,7 @@ impl CloudStore {
         change.drop_secrets(SecretKind::Enrolment, name).await?;
         let (token, _) = change.add_secret(SecretKind::Enrolment, name).await?;
         change.note(actor, "invite vehicle", name).await?;
-        change.refresh(name).await?;
+        change.refresh_one(name).await?;
         change.commit().await?;
         Ok(token)
     }
@@ -228,30 +107,6 @@ impl CloudStore {
         Ok(name.map(|(name,)| name))
     }
 
-    /// Begins a connection of a vehicle; returns its number. `certificate` is the SHA-256 of its
-    /// certificate, which may have been replaced since the request was let in.
-    pub(crate) async fn connect(
-        &self,
-        name: &str,
-        certificate: &str,
-        hello: &Hello,
-    ) -> CloudResult<u64> {
-        let (name, certificate) = (name.to_owned(), certificate.to_owned());
-        let (version, key) = (excerpt(&hello.version), excerpt(&hello.key));
-        self.write(ConnectWrite { name, certificate, version, key }).await
-    }
-
-    /// Stores a report, if the connection still counts; returns whether the vehicle's wanted state
-    /// has changed with its labels.
-    pub(crate) async fn report(
-        &self,
-        name: &str,
-        epoch: u64,
-        report: VehicleReport,
-    ) -> CloudResult<bool> {
-        self.write(ReportWrite { name: name.to_owned(), epoch, report }).await
-    }
-
     /// Returns all vehicles, those that are in `online` as connected.
     pub(crate) async fn vehicles(
         &self,
@@ -286,8 +141,8 @@ impl CloudStore {
             // A transaction for each second, so that what vehicles send does not wait for all.
             let mut change = self.change().await?;
             for part in parts(&names) {
-                let (names, last) = (placeholders(1, 0, part.len()), part.len() + 1);
-                let sql = format!("UPDATE vehicles SET seen = ${last} WHERE name IN {names}");
+                let (names, last) = (in_list(part.len()), part.len() + 1);
+                let sql = format!("UPDATE vehicles SET seen = ${last} WHERE name IN ({names})");
                 let query = sqlx::query(AssertSqlSafe(sql));
                 let query = part.iter().fold(query, |query, name| query.bind(*name));
                 query.bind(time).execute(&mut *change.tx).await?;
@@ -366,17 +221,6 @@ pub(super) fn vehicle_state(
 pub(super) const RUNNING: &str = "running";
 /// State of a deployment that was refused, or whose lambda or revision has failed.
 pub(super) const FAILED: &str = "failed";
-
-fn state(deployment: &DeploymentStatus) -> &'static str {
-    let phase = deployment.status.as_ref().map(|status| status.phase);
-    let has_failed = deployment.failed.is_some() || deployment.refused.is_some();
-    match phase {
-        _ if has_failed => FAILED,
-        Some(LambdaPhase::Quarantined) => FAILED,
-        Some(LambdaPhase::Running) => RUNNING,
-        _ => "other",
-    }
-}
 
 /// Returns the error of a connection that does not count any more.
 pub(super) fn ended() -> CloudError {

@@ -2,25 +2,59 @@
 //! the vehicle and that it has the labels for.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use gleaner_fleet::{Wanted, desired_digest};
 
+use sqlx::AssertSqlSafe;
+
 use super::deployments::COMPLETE;
 use super::vehicles::ended;
-use super::{CloudStore, StoreChange, unsigned};
+use super::{CloudStore, StoreChange, in_list, parts, unsigned};
 use crate::error::CloudResult;
+
+/// Maximum number of deployments of all states that are kept, some 200 bytes each.
+const CACHED_MAX: usize = 32_000;
 
 pub(super) type TextMap = BTreeMap<String, String>;
 
 /// The state that a vehicle should have.
-#[derive(Debug, Default, PartialEq)]
+#[derive(Debug, PartialEq)]
 pub(crate) struct VehicleWants {
     pub(crate) generation: u64,
-    pub(crate) deployments: Vec<Wanted>,
+    pub(crate) deployments: Arc<[Wanted]>,
 }
 
 /// The vehicles whose wanted state has changed.
 pub(crate) type ChangedVehicles = Vec<String>;
+
+/// A vehicle whose wanted state may have changed.
+pub(super) struct WishedVehicle {
+    pub(super) name: String,
+    pub(super) labels: String,
+    /// The digest of its wanted state so far.
+    pub(super) digest: String,
+}
+
+/// Wanted states by their digests. It cannot be out of date, whoever changes the database: a
+/// vehicle's digest is read each time, and equal digests are equal states. Few differ.
+#[derive(Default)]
+pub(super) struct WantedStates(Mutex<HashMap<String, Arc<[Wanted]>>>);
+
+impl WantedStates {
+    fn get(&self, digest: &str) -> Option<Arc<[Wanted]>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).get(digest).cloned()
+    }
+
+    fn add(&self, digest: String, state: Arc<[Wanted]>) {
+        let mut states = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let kept: usize = states.values().map(|it| it.len() + 1).sum();
+        if kept + state.len() > CACHED_MAX {
+            states.clear();
+        }
+        states.insert(digest, state);
+    }
+}
 
 /// All releases, and the vehicles that waves have reached.
 struct FleetWishes {
@@ -39,52 +73,90 @@ struct WishedRelease {
 impl CloudStore {
     /// Returns the state that a vehicle should have.
     pub(crate) async fn wants(&self, name: &str) -> CloudResult<VehicleWants> {
+        let row: Option<(i64, String)> = row!(&self.pool;
+            "SELECT generation, digest FROM vehicles WHERE name = $1 AND is_revoked = 0"; name);
+        let (generation, digest) = row.ok_or_else(ended)?;
+        if let Some(deployments) = self.wanted.get(&digest) {
+            return Ok(VehicleWants { generation: unsigned(generation), deployments });
+        }
         // One transaction: the number and the deployments are of the same moment.
         let mut tx = self.pool.begin().await?;
         let row: Option<(i64, String)> = row!(&mut *tx;
             "SELECT generation, labels FROM vehicles WHERE name = $1 AND is_revoked = 0";
             name);
         let (generation, labels) = row.ok_or_else(ended)?;
-        let deployments = FleetWishes::load(&mut tx, name).await?.of(name, &map(&labels));
+        let mut wishes = FleetWishes::load(&mut tx).await?;
+        wishes.add_members(&mut tx, &[name]).await?;
+        let deployments: Arc<[Wanted]> = wishes.of(name, &map(&labels)).into();
+        self.wanted.add(desired_digest(&deployments), Arc::clone(&deployments));
         Ok(VehicleWants { generation: unsigned(generation), deployments })
     }
 }
 
 impl StoreChange<'_> {
-    /// Counts a new wanted state of the vehicle `only`, or of all if it is empty, where it has
-    /// changed; returns these vehicles.
-    pub(super) async fn refresh(&mut self, only: &str) -> CloudResult<ChangedVehicles> {
-        let wishes = FleetWishes::load(&mut self.tx, only).await?;
+    /// Counts a new wanted state of each vehicle where it has changed; returns these vehicles.
+    pub(super) async fn refresh_all(&mut self) -> CloudResult<ChangedVehicles> {
         let vehicles: Vec<(String, String, String)> = rows!(&mut *self.tx;
-            "SELECT name, labels, digest FROM vehicles
-             WHERE is_revoked = 0 AND ($1 = '' OR name = $1)";
-            only);
+            "SELECT name, labels, digest FROM vehicles WHERE is_revoked = 0");
+        let vehicles = vehicles.into_iter();
+        let vehicles =
+            vehicles.map(|(name, labels, digest)| WishedVehicle { name, labels, digest });
+        self.refresh(vehicles.collect()).await
+    }
+
+    /// Counts a new wanted state of the vehicle, if it has changed.
+    pub(super) async fn refresh_one(&mut self, name: &str) -> CloudResult<()> {
+        let (labels, digest): (String, String) = one!(&mut *self.tx;
+            "SELECT labels, digest FROM vehicles WHERE name = $1"; name);
+        self.refresh(vec![WishedVehicle { name: name.to_owned(), labels, digest }]).await.map(drop)
+    }
+
+    /// Counts a new wanted state of each of these vehicles where it has changed; returns those.
+    pub(super) async fn refresh(
+        &mut self,
+        vehicles: Vec<WishedVehicle>,
+    ) -> CloudResult<ChangedVehicles> {
+        if vehicles.is_empty() {
+            return Ok(Vec::new());
+        }
+        let mut wishes = FleetWishes::load(&mut self.tx).await?;
+        let names: Vec<_> = vehicles.iter().map(|it| &*it.name).collect();
+        wishes.add_members(&mut self.tx, &names).await?;
         // Many vehicles have the same labels, and few are members of waves.
         let mut digests: HashMap<String, String> = HashMap::new();
-        let mut changed = Vec::new();
-        for (name, labels, before) in vehicles {
+        let mut changed: HashMap<String, Vec<String>> = HashMap::new();
+        for WishedVehicle { name, labels, digest: before } in vehicles {
             let is_member = wishes.members.contains_key(&name);
             let digest = match digests.get(&labels).filter(|_| !is_member) {
                 Some(digest) => digest.clone(),
                 None => desired_digest(&wishes.of(&name, &map(&labels))),
             };
             if digest != before {
-                run!(&mut *self.tx;
-                    "UPDATE vehicles SET generation = generation + 1, digest = $2 WHERE name = $1";
-                    &name, &digest);
-                changed.push(name);
+                changed.entry(digest.clone()).or_default().push(name);
             }
             if !is_member {
                 digests.insert(labels, digest);
             }
         }
-        Ok(changed)
+        for (digest, names) in &changed {
+            for part in parts(names) {
+                let (list, last) = (in_list(part.len()), part.len() + 1);
+                let sql = format!(
+                    "UPDATE vehicles SET generation = generation + 1, digest = ${last}
+                     WHERE name IN ({list})"
+                );
+                let query = sqlx::query(AssertSqlSafe(sql));
+                let query = part.iter().fold(query, |query, name| query.bind(name));
+                query.bind(digest).execute(&mut *self.tx).await?;
+            }
+        }
+        Ok(changed.into_values().flatten().collect())
     }
 }
 
 impl FleetWishes {
-    /// Loads the releases, and the members among the vehicle `only`, or among all if it is empty.
-    async fn load(tx: &mut sqlx::Transaction<'static, sqlx::Any>, only: &str) -> CloudResult<Self> {
+    /// Loads the releases.
+    async fn load(tx: &mut sqlx::Transaction<'static, sqlx::Any>) -> CloudResult<Self> {
         type Row = (String, i64, String, String, i64, i64, String);
         let rows: Vec<Row> = rows!(&mut **tx;
             "SELECT id, number, sha256, selector, is_wanted, rollback_request, state
@@ -100,15 +172,30 @@ impl FleetWishes {
                 wanted,
             }
         };
-        let pairs: Vec<(String, String, i64)> = rows!(&mut **tx;
-            "SELECT vehicle, deployment, number FROM wave_members
-             WHERE $1 = '' OR vehicle = $1";
-            only);
-        let mut members: HashMap<String, HashSet<(String, i64)>> = HashMap::new();
-        for (vehicle, deployment, number) in pairs {
-            members.entry(vehicle).or_default().insert((deployment, number));
+        Ok(Self { releases: rows.into_iter().map(release).collect(), members: HashMap::new() })
+    }
+
+    /// Adds those of these vehicles that waves have reached.
+    async fn add_members(
+        &mut self,
+        tx: &mut sqlx::Transaction<'static, sqlx::Any>,
+        names: &[&str],
+    ) -> CloudResult<()> {
+        if self.releases.iter().all(|release| release.is_complete) {
+            return Ok(());
         }
-        Ok(Self { releases: rows.into_iter().map(release).collect(), members })
+        for part in parts(names) {
+            let sql = format!(
+                "SELECT vehicle, deployment, number FROM wave_members WHERE vehicle IN ({})",
+                in_list(part.len())
+            );
+            let query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql));
+            let query = part.iter().fold(query, |query, name| query.bind(*name));
+            for (vehicle, deployment, number) in query.fetch_all(&mut **tx).await? {
+                self.members.entry(vehicle).or_default().insert((deployment, number));
+            }
+        }
+        Ok(())
     }
 
     /// Returns the deployments that a vehicle should have.

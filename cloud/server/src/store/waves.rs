@@ -118,7 +118,7 @@ impl CloudStore {
         if !has_changed {
             return Ok(Vec::new());
         }
-        let changed = change.refresh("").await?;
+        let changed = change.refresh_all().await?;
         change.commit().await?;
         Ok(changed)
     }

@@ -1,66 +1,81 @@
-//! Group commit: one task writes what vehicles send, that of many in one transaction. On the disk
-//! it takes as long as that of one vehicle.
+//! Group commit: one task writes what vehicles send, that of many in one transaction and by few
+//! statements. On the disk it takes as long as that of one vehicle.
 
-use std::future::Future;
-use std::pin::Pin;
+use std::collections::HashMap;
 use std::sync::Arc;
 
-use sqlx::AnyPool;
+use sqlx::{AnyPool, AssertSqlSafe};
 use tokio::sync::{Mutex, mpsc, oneshot};
 
-use super::{CloudStore, StoreChange, begin};
+use super::links::{ConnectWrite, ReportWrite};
+use super::records::AppendWrite;
+use super::{CloudStore, StoreChange, begin, in_list, parts};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of writes in a transaction, so that other changes have their turn.
 const GROUP_MAX: usize = 256;
 
 /// A write of a vehicle.
-pub(super) trait VehicleWrite: Send + Sync + 'static {
-    type Done: Send;
+pub(super) trait VehicleWrite: Sized {
+    type Done;
 
-    /// Applies the write. After an error of the vehicle, what it has changed so far is committed
-    /// with the others: it checks before it changes what matters.
-    fn apply(
-        &self,
-        change: &mut StoreChange<'_>,
-    ) -> impl Future<Output = CloudResult<Self::Done>> + Send;
+    /// Returns the name of the vehicle.
+    fn vehicle(&self) -> &str;
+
+    /// Returns the write as one of a group.
+    fn waiting(write: Waiting<Self>) -> WaitingWrite;
 }
 
 /// A write that waits for its transaction.
-trait WaitingWrite: Send {
-    /// Applies the write, and keeps its result until the commit.
-    ///
-    /// # Errors
-    ///
-    /// An error of the database, which affects all of the transaction.
-    fn apply<'w>(&'w mut self, change: &'w mut StoreChange<'_>) -> Applied<'w>;
-
-    /// Sends the result, once it is durable, or the failure of the transaction.
-    fn finish(self: Box<Self>, failed: Option<CloudError>);
-}
-
-type Applied<'w> = Pin<Box<dyn Future<Output = CloudResult<()>> + Send + 'w>>;
-
-struct Waiting<W: VehicleWrite> {
-    write: W,
-    result: Option<CloudResult<W::Done>>,
+pub(super) struct Waiting<W: VehicleWrite> {
+    pub(super) write: W,
+    /// The result, which is sent once it is durable. Without one, the write has failed with all of
+    /// its transaction.
+    pub(super) result: Option<CloudResult<W::Done>>,
     reply: oneshot::Sender<CloudResult<W::Done>>,
 }
 
-impl<W: VehicleWrite> WaitingWrite for Waiting<W> {
-    fn apply<'w>(&'w mut self, change: &'w mut StoreChange<'_>) -> Applied<'w> {
-        Box::pin(async {
-            match self.write.apply(change).await {
-                Err(error) if error.is_internal() => Err(error),
-                result => {
-                    self.result = Some(result);
-                    Ok(())
-                }
-            }
-        })
+/// A write of any kind.
+pub(super) enum WaitingWrite {
+    Connect(Waiting<ConnectWrite>),
+    Report(Waiting<ReportWrite>),
+    Append(Waiting<AppendWrite>),
+}
+
+/// The vehicles of a group as they are stored, apart from what the group has changed already.
+pub(super) type GroupVehicles = HashMap<String, GroupVehicle>;
+
+/// Values of a vehicle that its writes are checked against.
+#[derive(Debug)]
+pub(super) struct GroupVehicle {
+    pub(super) epoch: i64,
+    pub(super) is_revoked: bool,
+    pub(super) arrived: i64,
+    pub(super) labels: String,
+    pub(super) digest: String,
+}
+
+impl WaitingWrite {
+    fn vehicle(&self) -> &str {
+        match self {
+            Self::Connect(waiting) => waiting.write.vehicle(),
+            Self::Report(waiting) => waiting.write.vehicle(),
+            Self::Append(waiting) => waiting.write.vehicle(),
+        }
     }
 
-    fn finish(self: Box<Self>, failed: Option<CloudError>) {
+    /// Sends the result, or the failure of the transaction.
+    fn finish(self, failed: Option<CloudError>) {
+        match self {
+            Self::Connect(waiting) => waiting.finish(failed),
+            Self::Report(waiting) => waiting.finish(failed),
+            Self::Append(waiting) => waiting.finish(failed),
+        }
+    }
+}
+
+impl<W: VehicleWrite> Waiting<W> {
+    fn finish(self, failed: Option<CloudError>) {
         let result = failed.map(Err).or(self.result);
         // The connection may have ended meanwhile.
         let _ = self.reply.send(result.unwrap_or_else(|| Err(stopped())));
@@ -68,7 +83,7 @@ impl<W: VehicleWrite> WaitingWrite for Waiting<W> {
 }
 
 /// The queue of the task that writes.
-pub(super) struct WriteQueue(mpsc::Sender<Box<dyn WaitingWrite>>);
+pub(super) struct WriteQueue(mpsc::Sender<WaitingWrite>);
 
 impl WriteQueue {
     /// Starts the task, which ends with the queue.
@@ -83,8 +98,8 @@ impl CloudStore {
     /// Writes with others; returns once the write is durable.
     pub(super) async fn write<W: VehicleWrite>(&self, write: W) -> CloudResult<W::Done> {
         let (reply, result) = oneshot::channel();
-        let waiting = Waiting { write, result: None, reply };
-        self.writes.0.send(Box::new(waiting)).await.map_err(|_| stopped())?;
+        let waiting = W::waiting(Waiting { write, result: None, reply });
+        self.writes.0.send(waiting).await.map_err(|_| stopped())?;
         result.await.map_err(|_| stopped())?
     }
 }
@@ -92,7 +107,7 @@ impl CloudStore {
 struct GroupWriter {
     pool: AnyPool,
     turn: Arc<Mutex<&'static str>>,
-    waiting: mpsc::Receiver<Box<dyn WaitingWrite>>,
+    waiting: mpsc::Receiver<WaitingWrite>,
 }
 
 impl GroupWriter {
@@ -111,13 +126,62 @@ impl GroupWriter {
         }
     }
 
-    async fn commit(&self, group: &mut [Box<dyn WaitingWrite>]) -> CloudResult<()> {
+    /// Applies the writes of a group: the beginnings of connections first, as older connections of
+    /// their vehicles do not count any more. An error of a vehicle is the result of its write.
+    ///
+    /// # Errors
+    ///
+    /// An error of the database, which affects all of the group.
+    async fn commit(&self, group: &mut [WaitingWrite]) -> CloudResult<()> {
         let mut change = begin(&self.pool, &self.turn).await?;
+        let mut vehicles = change.group_vehicles(group).await?;
+        let (mut connects, mut reports, mut appends) = (Vec::new(), Vec::new(), Vec::new());
         for write in group {
-            write.apply(&mut change).await?;
+            match write {
+                WaitingWrite::Connect(waiting) => connects.push(waiting),
+                WaitingWrite::Report(waiting) => reports.push(waiting),
+                WaitingWrite::Append(waiting) => appends.push(waiting),
+            }
         }
+        change.connect_all(&mut vehicles, &mut connects).await?;
+        change.report_all(&mut vehicles, &mut reports).await?;
+        change.append_all(&mut vehicles, &mut appends).await?;
         change.commit().await
     }
+}
+
+impl StoreChange<'_> {
+    async fn group_vehicles(&mut self, group: &[WaitingWrite]) -> CloudResult<GroupVehicles> {
+        let mut vehicles = GroupVehicles::with_capacity(group.len());
+        for part in parts(group) {
+            let names = in_list(part.len());
+            let sql = format!(
+                "SELECT name, epoch, is_revoked, arrived, labels, digest FROM vehicles
+                 WHERE name IN ({names})"
+            );
+            let query =
+                sqlx::query_as::<_, (String, i64, i64, i64, String, String)>(AssertSqlSafe(sql));
+            let query = part.iter().fold(query, |query, write| query.bind(write.vehicle()));
+            for (name, epoch, is_revoked, arrived, labels, digest) in
+                query.fetch_all(&mut *self.tx).await?
+            {
+                let is_revoked = is_revoked != 0;
+                let vehicle = GroupVehicle { epoch, is_revoked, arrived, labels, digest };
+                vehicles.insert(name, vehicle);
+            }
+        }
+        Ok(vehicles)
+    }
+}
+
+/// Returns a vehicle if its connection `epoch` still counts.
+pub(super) fn counting<'v>(
+    vehicles: &'v mut GroupVehicles,
+    name: &str,
+    epoch: i64,
+) -> CloudResult<&'v mut GroupVehicle> {
+    let vehicle = vehicles.get_mut(name).filter(|it| it.epoch == epoch && !it.is_revoked);
+    vehicle.ok_or_else(super::vehicles::ended)
 }
 
 fn stopped() -> CloudError {

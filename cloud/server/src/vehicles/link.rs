@@ -58,7 +58,6 @@ struct VehicleLink<'c> {
 struct StoredReport {
     whole: u64,
     states: u64,
-    labels: u64,
 }
 
 /// Serves a connection until its end.
@@ -110,17 +109,14 @@ impl<'c> VehicleLink<'c> {
             }
             Some(_) => return Err(wrong("the first frame is no hello")),
         };
-        self.epoch = self.cloud.store.connect(self.name, self.certificate, &hello).await?;
+        let begun = self.cloud.store.connect(self.name, self.certificate, &hello).await?;
+        let (epoch, cursors) = begun;
+        self.epoch = epoch;
         let Some(orders) = self.cloud.hub.add(self.name, self.epoch) else {
             let reason = "there is a newer one".to_owned();
             return Ok(Err(Some(GoAway { after_ms: 0, reason })));
         };
-        let welcome = Welcome {
-            epoch: self.epoch,
-            time_ms: now_ms(),
-            ping_s: PING_S,
-            cursors: self.cloud.store.cursors(self.name).await?,
-        };
+        let welcome = Welcome { epoch, time_ms: now_ms(), ping_s: PING_S, cursors };
         self.send(Body::Welcome(welcome)).await?;
         self.send_wanted().await?;
         Ok(Ok(orders))
@@ -209,7 +205,6 @@ impl<'c> VehicleLink<'c> {
             return Ok(false);
         }
         report.has_new_states = stored.states != before.states;
-        report.has_new_labels = stored.labels != before.labels;
         let has_changed = self.cloud.store.report(self.name, self.epoch, report).await?;
         self.stored = stored;
         Ok(has_changed)
@@ -234,7 +229,8 @@ impl<'c> VehicleLink<'c> {
             return Ok(());
         }
         self.sent = wants.generation;
-        let desired = Desired { generation: wants.generation, deployments: wants.deployments };
+        let (generation, deployments) = (wants.generation, wants.deployments.to_vec());
+        let desired = Desired { generation, deployments };
         self.send(Body::Desired(desired)).await
     }
 
@@ -289,7 +285,6 @@ impl StoredReport {
         Self {
             whole: hash(&(report.handled, &report.problems, &report.status)),
             states: hash(&report.states),
-            labels: hash(&report.labels),
         }
     }
 }

@@ -34,8 +34,8 @@ use crate::store::Issued;
 /// Maximum length of the body of a request.
 const BODY_MAX: usize = 64 << 10;
 /// Buffer for reading frames: with the default of 128 KiB, idle vehicles would take ten times the
-/// memory.
-const READ_BUFFER: usize = 4096;
+/// memory. Most frames are shorter than this.
+const READ_BUFFER: usize = 1024;
 
 /// The vehicle that sends a request, by its certificate.
 #[derive(Debug, Clone)]
