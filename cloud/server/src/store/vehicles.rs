@@ -76,19 +76,22 @@ struct ConnectWrite {
     certificate: String,
     version: String,
     key: String,
+    /// The process that has the connection.
+    replica: String,
 }
 
 impl VehicleWrite for ConnectWrite {
     type Done = u64;
 
     async fn apply(&self, change: &mut StoreChange<'_>) -> CloudResult<u64> {
-        let Self { name, certificate, version, key } = self;
+        let Self { name, certificate, version, key, replica } = self;
         let epoch: Option<(i64,)> = row!(&mut *change.tx;
-            "UPDATE vehicles SET epoch = epoch + 1, version = $2, clip_key = $3, seen = $4
+            "UPDATE vehicles SET epoch = epoch + 1, version = $2, clip_key = $3, seen = $4,
+             replica = $6
              WHERE name = $1 AND is_revoked = 0 AND EXISTS
              (SELECT 1 FROM certificates WHERE sha256 = $5 AND vehicle = $1 AND expires > $4)
              RETURNING epoch";
-            name, version, key, now(), certificate);
+            name, version, key, now(), certificate, replica);
         let (epoch,) = epoch.ok_or_else(ended)?;
         // Used, a certificate is durable on the vehicle, and replaces the former ones.
         run!(&mut *change.tx;
@@ -207,8 +210,11 @@ impl CloudStore {
     /// Cuts a vehicle off: none of its certificates and tokens is accepted from now on.
     pub(crate) async fn revoke(&self, actor: &str, name: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        let revoked =
-            run!(&mut *change.tx; "UPDATE vehicles SET is_revoked = 1 WHERE name = $1"; name);
+        // With a higher epoch, no connection to any replica counts, also once it is enrolled again.
+        let revoked = run!(&mut *change.tx;
+            "UPDATE vehicles SET is_revoked = 1, replica = '',
+             epoch = CASE WHEN epoch > 0 THEN epoch + 1 ELSE 0 END WHERE name = $1";
+            name);
         if revoked.rows_affected() == 0 {
             return Err(unknown(name));
         }
@@ -238,7 +244,8 @@ impl CloudStore {
     ) -> CloudResult<u64> {
         let (name, certificate) = (name.to_owned(), certificate.to_owned());
         let (version, key) = (excerpt(&hello.version), excerpt(&hello.key));
-        self.write(ConnectWrite { name, certificate, version, key }).await
+        let replica = self.replica().to_owned();
+        self.write(ConnectWrite { name, certificate, version, key, replica }).await
     }
 
     /// Stores a report, if the connection still counts; returns whether the vehicle's wanted state
@@ -252,14 +259,11 @@ impl CloudStore {
         self.write(ReportWrite { name: name.to_owned(), epoch, report }).await
     }
 
-    /// Returns all vehicles, those that are in `online` as connected.
-    pub(crate) async fn vehicles(
-        &self,
-        is_online: impl Fn(&str) -> bool,
-    ) -> CloudResult<Vec<VehicleSummary>> {
+    /// Returns all vehicles.
+    pub(crate) async fn vehicles(&self) -> CloudResult<Vec<VehicleSummary>> {
         let rows: Vec<VehicleRow> =
             rows!(&self.pool; concat!(vehicle_columns!(), " ORDER BY name"));
-        Ok(rows.into_iter().map(|row| summary(row, &is_online)).collect())
+        Ok(rows.into_iter().map(summary).collect())
     }
 
     /// Returns the newest status of a vehicle, as JSON.
@@ -287,7 +291,9 @@ impl CloudStore {
             let mut change = self.change().await?;
             for part in parts(&names) {
                 let (names, last) = (placeholders(1, 0, part.len()), part.len() + 1);
-                let sql = format!("UPDATE vehicles SET seen = ${last} WHERE name IN {names}");
+                let sql = format!(
+                    "UPDATE vehicles SET seen = ${last} WHERE seen < ${last} AND name IN {names}"
+                );
                 let query = sqlx::query(AssertSqlSafe(sql));
                 let query = part.iter().fold(query, |query, name| query.bind(*name));
                 query.bind(time).execute(&mut *change.tx).await?;
@@ -323,20 +329,22 @@ impl StoreChange<'_> {
 macro_rules! vehicle_columns {
     () => {
         "SELECT name, is_revoked, epoch, seen, version, labels, generation, handled, problems,
-         running, deployments FROM vehicles"
+         running, deployments,
+         CASE WHEN replica IN (SELECT id FROM replicas) THEN 1 ELSE 0 END FROM vehicles"
     };
 }
 pub(super) use vehicle_columns;
 
 /// The values from which the summary of a vehicle is made.
-pub(super) type VehicleRow = (String, i64, i64, i64, String, String, i64, i64, String, i64, i64);
+pub(super) type VehicleRow =
+    (String, i64, i64, i64, String, String, i64, i64, String, i64, i64, i64);
 
 /// Returns the summary of a vehicle.
-pub(super) fn summary(row: VehicleRow, is_online: impl Fn(&str) -> bool) -> VehicleSummary {
+pub(super) fn summary(row: VehicleRow) -> VehicleSummary {
     let (name, is_revoked, epoch, seen, version, labels, wanted, handled, problems, ..) = row;
     VehicleSummary {
         labels: serde_json::from_str(&labels).unwrap_or_default(),
-        state: vehicle_state(&name, (is_revoked, epoch), is_online),
+        state: vehicle_state(is_revoked, epoch, row.11),
         seen: (seen > 0).then_some(unsigned(seen)),
         version: (!version.is_empty()).then_some(version),
         wanted: unsigned(wanted),
@@ -348,15 +356,12 @@ pub(super) fn summary(row: VehicleRow, is_online: impl Fn(&str) -> bool) -> Vehi
     }
 }
 
-/// Returns the state of a vehicle with these values of `is_revoked` and `epoch`.
-pub(super) fn vehicle_state(
-    name: &str,
-    (is_revoked, epoch): (i64, i64),
-    is_online: impl Fn(&str) -> bool,
-) -> VehicleState {
+/// Returns the state of a vehicle with these values. It is online if a process whose lease has not
+/// ended has its newest connection.
+pub(super) fn vehicle_state(is_revoked: i64, epoch: i64, is_online: i64) -> VehicleState {
     match () {
         () if is_revoked != 0 => VehicleState::Revoked,
-        () if is_online(name) => VehicleState::Online,
+        () if is_online != 0 => VehicleState::Online,
         () if epoch == 0 => VehicleState::Invited,
         () => VehicleState::Offline,
     }
