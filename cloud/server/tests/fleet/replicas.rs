@@ -145,7 +145,7 @@ async fn are_one_cloud(bus: &str) {
     let (other, _) = at_one.enrol("car-8").await;
     let mut link = other.at(two.vehicles).connect().await.0;
     assert_eq!(at_one.vehicle("car-8").await["state"], "online");
-    drop(link.settle().await);
+    link.settle().await;
     drop(link);
     becomes(at_one, "car-8", "offline").await;
     let _link = other.at(two.vehicles).connect().await.0;
@@ -258,6 +258,8 @@ async fn processes_that_do_not_fit_together_are_refused() {
     let reason = refused(second.clone()).await;
     assert!(reason.contains("another gleaner-cloud serves the database"), "{reason}");
     server.stop().await;
-    CloudServer::start(&second).await.unwrap().stop().await;
+    let moved = ServeOptions { data: alone.path().join("moved"), ..second };
+    copy_authorities(&alone.path().join("data"), &alone.path().join("moved"));
+    CloudServer::start(&moved).await.unwrap().stop().await;
     replicas.stop().await;
 }
