@@ -11,8 +11,8 @@ use serde::Deserialize;
 use tokio::task::JoinSet;
 use tokio::time::sleep;
 
-use crate::figure::{FleetFigure, quantile};
 use crate::administrator::Administrator;
+use crate::figure::{FleetFigure, quantile};
 use crate::fleet::{EnrolledFleet, enrol_all, start_all};
 use crate::identity::SimulatedIdentity;
 use crate::simulation::{FleetLoad, Simulation};

@@ -79,9 +79,9 @@ impl BusAddress {
                  password in NATS_PASSWORD",
             )
         };
-        let is_known = url.split_once("://").is_some_and(|(scheme, host)| {
-            ["nats", "tls"].contains(&scheme) && !host.is_empty()
-        });
+        let is_known = url
+            .split_once("://")
+            .is_some_and(|(scheme, host)| ["nats", "tls"].contains(&scheme) && !host.is_empty());
         let address = url.parse::<ServerAddr>().ok().filter(|_| is_known);
         let address = address.ok_or_else(|| refused("--bus is no address of a NATS server"))?;
         match address.username().is_some() || address.password().is_some() {

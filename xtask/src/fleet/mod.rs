@@ -53,8 +53,7 @@ impl FleetOptions {
 
 /// Runs the command.
 pub(crate) fn run_scaled(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
-    let options =
-        FleetOptions::parse(arguments).ok_or_else(|| Failure::new(Exit::Usage, USAGE))?;
+    let options = FleetOptions::parse(arguments).ok_or_else(|| Failure::new(Exit::Usage, USAGE))?;
     let mut steps = Steps::of(3);
     steps.begin("PostgreSQL, NATS, haproxy and an object store");
     if options.is_installing {
@@ -120,8 +119,8 @@ fn kill(
     bench.args(["--seconds", &seconds.to_string()]);
     let mut bench = bench.stdout(Stdio::piped()).spawn().map_err(failed)?;
     let output = bench.stdout.take();
-    let output = output
-        .ok_or_else(|| Failure::new(Exit::Internal, "gleaner-fleet-bench has no output"))?;
+    let output =
+        output.ok_or_else(|| Failure::new(Exit::Internal, "gleaner-fleet-bench has no output"))?;
     let lines = BufReader::new(output);
     for line in lines.lines() {
         let line = line.map_err(failed)?;

@@ -196,7 +196,7 @@ fn code(log: &Path) -> Result<String, Failure> {
 
 /// Returns the configuration of the balancer, which passes TLS on as it is.
 fn balancer(people: SocketAddr, vehicles: SocketAddr, listeners: &[SocketAddr]) -> String {
-    let mut text = "global\n  maxconn 20000\ndefaults\n  mode tcp\n  balance leastconn\n  \
+    let mut text = "global\n  maxconn 8000\ndefaults\n  mode tcp\n  balance leastconn\n  \
                     option redispatch\n  retries 3\n  timeout connect 2s\n  timeout client 1h\n  \
                     timeout server 1h\n  timeout check 2s\n  \
                     default-server check inter 500ms fall 2 rise 1 on-marked-down shutdown-sessions\n"

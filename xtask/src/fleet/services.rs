@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::os::unix::fs::OpenOptionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -25,6 +26,8 @@ pub(super) struct Service {
     child: Child,
     /// Where it listens.
     address: SocketAddr,
+    /// File with its output.
+    log: PathBuf,
 }
 
 impl Service {
@@ -33,18 +36,20 @@ impl Service {
         name: &'static str,
         mut command: Command,
         address: SocketAddr,
-        log: &Path,
+        path: &Path,
     ) -> Result<Self, Failure> {
-        let failed = |error| {
-            Failure::caused_by(Exit::Internal, format!("cannot start {name}"), &error)
-        };
-        let log = fs::File::create(log).map_err(failed)?;
+        let failed =
+            |error| Failure::caused_by(Exit::Internal, format!("cannot start {name}"), &error);
+        // Private: the log of a replica has the code of the administrator.
+        let mut private = fs::OpenOptions::new();
+        private.write(true).create_new(true).mode(0o600);
+        let log = private.open(path).map_err(failed)?;
         let errors = log.try_clone().map_err(failed)?;
         command.stdin(Stdio::null()).stdout(log).stderr(errors);
         // A group of its own, so that the end reaches its children, and ctrl-C only this program.
         command.process_group(0);
         let child = command.spawn().map_err(failed)?;
-        let mut service = Self { name, command, child, address };
+        let mut service = Self { name, command, child, address, log: path.to_owned() };
         service.listens()?;
         Ok(service)
     }
@@ -61,8 +66,10 @@ impl Service {
             }
             if begun.elapsed() > START {
                 let message = format!("{} does not listen at {}", self.name, self.address);
-                return Err(Failure::new(Exit::Internal, message)
-                    .with_help("see its log in the folder that was printed"));
+                let log = fs::read_to_string(&self.log).unwrap_or_default();
+                let mut failure = Failure::new(Exit::Internal, message);
+                failure.causes.extend(log.lines().next_back().map(str::to_owned));
+                return Err(failure.with_help("run `cargo xtask fleet` again"));
             }
             sleep(LOOK);
         }

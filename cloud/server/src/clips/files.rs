@@ -38,7 +38,7 @@ const TURNS: usize = 64;
 
 /// A file of a clip.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum ClipFile {
+pub(crate) enum FileOfClip {
     /// The recording, of this length.
     Recording(u64),
     Thumbnail,
@@ -77,13 +77,13 @@ impl ClipFiles {
     }
 
     /// Returns the length of a file that is complete, if it is there.
-    pub(crate) async fn length(&self, id: &ClipId, file: ClipFile) -> io::Result<Option<u64>> {
+    pub(crate) async fn length(&self, id: &ClipId, file: FileOfClip) -> io::Result<Option<u64>> {
         match file {
-            ClipFile::Thumbnail => self.place.length(&thumbnail(id)).await,
-            ClipFile::Recording(length) if self.place.is_bucket() => {
+            FileOfClip::Thumbnail => self.place.length(&thumbnail(id)).await,
+            FileOfClip::Recording(length) if self.place.is_bucket() => {
                 Ok(self.has_recording(id).await?.then_some(length))
             }
-            ClipFile::Recording(_) => self.place.length(&recording(id)).await,
+            FileOfClip::Recording(_) => self.place.length(&recording(id)).await,
         }
     }
 
@@ -91,15 +91,15 @@ impl ClipFiles {
     pub(crate) async fn content(
         self: &Arc<Self>,
         id: &ClipId,
-        file: ClipFile,
+        file: FileOfClip,
         begin: u64,
     ) -> io::Result<Option<Body>> {
         match file {
-            ClipFile::Thumbnail => self.place.content(&thumbnail(id), begin).await,
-            ClipFile::Recording(length) if self.place.is_bucket() => {
+            FileOfClip::Thumbnail => self.place.content(&thumbnail(id), begin).await,
+            FileOfClip::Recording(length) if self.place.is_bucket() => {
                 Ok(Some(self.parts_from(id, length, begin)))
             }
-            ClipFile::Recording(_) => self.place.content(&recording(id), begin).await,
+            FileOfClip::Recording(_) => self.place.content(&recording(id), begin).await,
         }
     }
 

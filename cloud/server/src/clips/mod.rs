@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use tokio::time::interval;
 
-pub(crate) use files::{ClipFile, ClipFiles};
+pub(crate) use files::{ClipFiles, FileOfClip};
 pub(crate) use vehicles::router;
 
 use crate::cloud::Cloud;

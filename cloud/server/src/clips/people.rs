@@ -12,7 +12,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_fleet::clips::{ClipId, ClipPage, ClipPolicy, ClipState, FleetClip};
 use gleaner_fleet::people::User;
 
-use super::ClipFile;
+use super::FileOfClip;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::request::parsed;
@@ -54,7 +54,7 @@ pub(crate) async fn thumbnail(
         let message = format!("clip `{id}` has no thumbnail here");
         return Err(CloudError::missing(message, "its vehicle sends it when it is connected"));
     }
-    send(&cloud, (&id, ClipFile::Thumbnail), "image/jpeg", &HeaderMap::new()).await
+    send(&cloud, (&id, FileOfClip::Thumbnail), "image/jpeg", &HeaderMap::new()).await
 }
 
 pub(crate) async fn file(
@@ -69,7 +69,7 @@ pub(crate) async fn file(
             format!("the file of clip `{id}` is not in the cloud: {}", clip.state.as_str());
         return Err(CloudError::missing(message, "fetch it: `gleaner clips pull ID`"));
     }
-    let file = ClipFile::Recording(clip.facts.bytes);
+    let file = FileOfClip::Recording(clip.facts.bytes);
     send(&cloud, (&id, file), "application/octet-stream", &headers).await
 }
 
@@ -99,7 +99,7 @@ fn not_sent(id: &ClipId, error: io::Error) -> CloudError {
 /// Returns the answer with a file, or with the end of it that `Range` asks for.
 async fn send(
     cloud: &Cloud,
-    (id, file): (&ClipId, ClipFile),
+    (id, file): (&ClipId, FileOfClip),
     kind: &'static str,
     headers: &HeaderMap,
 ) -> CloudResult<Response> {

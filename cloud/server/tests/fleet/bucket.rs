@@ -14,7 +14,7 @@ use tokio::net::TcpListener;
 /// User of the store, in each signature.
 pub(crate) const KEY: &str = "test-key";
 
-type Content = Arc<Mutex<BTreeMap<String, Bytes>>>;
+type BucketContent = Arc<Mutex<BTreeMap<String, Bytes>>>;
 
 /// Starts a store in a thread, which lives as long as the process; returns its address.
 pub(crate) fn serve() -> SocketAddr {
@@ -24,14 +24,14 @@ pub(crate) fn serve() -> SocketAddr {
         runtime.block_on(async {
             let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
             sender.send(listener.local_addr().unwrap()).unwrap();
-            let router = Router::new().fallback(answer).with_state(Content::default());
+            let router = Router::new().fallback(answer).with_state(BucketContent::default());
             axum::serve(listener, router).await.unwrap();
         });
     });
     address.recv().unwrap()
 }
 
-async fn answer(State(content): State<Content>, request: Request) -> Response {
+async fn answer(State(content): State<BucketContent>, request: Request) -> Response {
     let (method, uri, headers) =
         (request.method().clone(), request.uri().clone(), request.headers().clone());
     let body = axum::body::to_bytes(request.into_body(), 64 << 20).await;
@@ -48,7 +48,7 @@ fn is_signed(uri: &Uri) -> bool {
 }
 
 fn answer_signed(
-    content: &Content,
+    content: &BucketContent,
     method: &Method,
     uri: &Uri,
     headers: &HeaderMap,
