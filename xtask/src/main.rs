@@ -11,6 +11,7 @@ mod deb;
 mod demo;
 mod docs;
 mod examples;
+mod fleet;
 mod fuzz;
 mod page;
 mod peers;
@@ -36,6 +37,8 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   docs     fetch mdBook and build the pages as a book in target/book
   bench    run the benchmarks; further arguments are passed to gleaner-bench, with --fleet to
            gleaner-fleet-bench
+  fleet    serve the cloud as three replicas on this machine, until ctrl-C; --install fetches its
+           packages first, --kills N kills its programs in turn under simulated vehicles
   peers    build test programs on other DDS implementations; --install fetches their packages first
   page     use the cloud's page in Chromium; --install fetches the browser's package first
   player   fetch the tools for gleaner-player, which plays drives with Cyclone DDS, and build it
@@ -59,7 +62,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         Some((command, rest)) => (command.to_str().unwrap_or_default(), rest),
         None => ("", &[][..]),
     };
-    if !rest.is_empty() && !["bench", "deb", "fuzz", "page", "peers"].contains(&command) {
+    if !rest.is_empty() && !["bench", "deb", "fleet", "fuzz", "page", "peers"].contains(&command) {
         return Err(Failure::new(
             Exit::Usage,
             format!("`cargo xtask {command}` takes no arguments"),
@@ -77,6 +80,7 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
             fleet_bench(&checkout, rest)
         }
         "bench" => bench(&checkout, rest),
+        "fleet" => fleet::run_scaled(&checkout, rest),
         "fuzz" => fuzz::run(&checkout, rest),
         "page" => page::run_flows(&checkout, rest),
         "peers" => peers::build(&checkout, rest),

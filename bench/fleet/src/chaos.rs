@@ -1,16 +1,20 @@
 //! The cloud is killed again and again under a fleet that sends records.
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 use hyper::Method;
 use serde::Deserialize;
+use tokio::task::JoinSet;
 use tokio::time::sleep;
 
+use crate::administrator::Administrator;
 use crate::figure::{FleetFigure, quantile};
-use crate::fleet::EnrolledFleet;
+use crate::fleet::{EnrolledFleet, enrol_all, start_all};
+use crate::identity::SimulatedIdentity;
 use crate::simulation::{FleetLoad, Simulation};
 
 /// Longest pause between attempts to connect. Real vehicles wait up to five minutes, and would be
@@ -21,6 +25,22 @@ const INTERVAL: Duration = Duration::from_secs(1);
 const RECORDS: u64 = 2;
 /// Longest time to wait for the fleet to do something.
 const PATIENCE: Duration = Duration::from_secs(120);
+
+/// A cloud that others have started.
+pub struct RunningCloud {
+    pub people: SocketAddr,
+    /// Its address for vehicles.
+    pub cloud: SocketAddr,
+    /// A one-time code of an administrator.
+    pub code: String,
+}
+
+/// The vehicles of a cloud, and access to it.
+struct FleetMembers<'f> {
+    people: SocketAddr,
+    token: &'f str,
+    identities: &'f [SimulatedIdentity],
+}
 
 /// A line of records.
 #[derive(Deserialize)]
@@ -36,7 +56,7 @@ pub async fn figures(
     interval: Duration,
 ) -> Result<Vec<FleetFigure>, String> {
     let mut fleet = EnrolledFleet::enrol(count).await?;
-    let (simulation, mut vehicles) = fleet.start(count, PAUSE_MAX);
+    let (simulation, vehicles) = fleet.start(count, PAUSE_MAX);
     let all = |it: &Simulation| it.connected.load(Relaxed) == count;
     if simulation.until(PATIENCE, all).await.is_none() {
         return Err("not all vehicles connect".to_owned());
@@ -48,6 +68,45 @@ pub async fn figures(
         fleet.cloud.kill();
         fleet.cloud.start_again()?;
     }
+    let EnrolledFleet { cloud, token, vehicles: identities, .. } = &fleet;
+    let members = FleetMembers { people: cloud.people, token, identities };
+    let mut figures = vec![FleetFigure::free("kills: number of kills", "", kills as f64)];
+    figures.extend(finish(&simulation, vehicles, &members).await?);
+    figures.iter().for_each(|figure| println!("{figure}"));
+    Ok(figures)
+}
+
+/// Measures `count` vehicles of a running cloud, of which others kill parts for `time`.
+pub async fn figures_of(
+    running: &RunningCloud,
+    count: usize,
+    time: Duration,
+) -> Result<Vec<FleetFigure>, String> {
+    let token = Administrator::login(running.people, &running.code).await?;
+    let identities = enrol_all(running.people, &token, count).await?;
+    let (simulation, vehicles) = start_all(&identities, running.cloud, PAUSE_MAX);
+    let all = |it: &Simulation| it.connected.load(Relaxed) == count;
+    if simulation.until(PATIENCE, all).await.is_none() {
+        return Err("not all vehicles connect".to_owned());
+    }
+    simulation.load.send_replace(FleetLoad { interval: Some(INTERVAL), records: RECORDS });
+    simulation.is_restarting.store(true, Relaxed);
+    println!("all vehicles are connected");
+    sleep(time).await;
+    let members = FleetMembers { people: running.people, token: &token, identities: &identities };
+    let figures = finish(&simulation, vehicles, &members).await?;
+    figures.iter().for_each(|figure| println!("{figure}"));
+    Ok(figures)
+}
+
+/// Waits until all are connected after the last kill; returns what was measured.
+async fn finish(
+    simulation: &Arc<Simulation>,
+    mut vehicles: JoinSet<()>,
+    members: &FleetMembers<'_>,
+) -> Result<Vec<FleetFigure>, String> {
+    let count = members.identities.len();
+    let all = |it: &Simulation| it.connected.load(Relaxed) == count;
     let after = simulation.until(PATIENCE, all).await;
     let after = after.map_or(f64::INFINITY, |it| it.as_secs_f64());
     simulation.is_restarting.store(false, Relaxed);
@@ -57,12 +116,11 @@ pub async fn figures(
     vehicles.abort_all();
     while vehicles.join_next().await.is_some() {}
     let sent = simulation.take_acknowledged_ms().len() as f64 * RECORDS as f64;
-    let stored = stored(&fleet, &simulation).await?;
+    let stored = stored(members, simulation).await?;
 
     let reconnected = simulation.take_reconnected_s();
     let mut figures = vec![
         FleetFigure::free("kills: vehicles", "", count as f64),
-        FleetFigure::free("kills: number of kills", "", kills as f64),
         FleetFigure::free("kills: records that were acknowledged", "", sent),
         FleetFigure::free("kills: records that are stored", "", stored),
         FleetFigure::at_most("kills: records lost, or stored twice", "", 0.0, simulation.losses()),
@@ -73,16 +131,15 @@ pub async fn figures(
         figures.push(FleetFigure::free(&name, "s", quantile(&reconnected, share)));
     }
     figures.push(FleetFigure::at_most("kills: other errors", "", 0.0, simulation.errors()));
-    figures.iter().for_each(|figure| println!("{figure}"));
     Ok(figures)
 }
 
 /// Reads the records of all vehicles; returns their number. Each vehicle must have each number
 /// once, to the last one that was acknowledged.
-async fn stored(fleet: &EnrolledFleet, simulation: &Arc<Simulation>) -> Result<f64, String> {
-    let mut administrator = fleet.administrator().await?;
+async fn stored(members: &FleetMembers<'_>, simulation: &Simulation) -> Result<f64, String> {
+    let mut administrator = Administrator::connect(members.people, members.token).await?;
     let mut all = 0;
-    for vehicle in &fleet.vehicles {
+    for vehicle in members.identities {
         let path = format!("/v1/vehicles/{}/events", vehicle.name);
         let lines = administrator.bytes(Method::GET, &path, Vec::new()).await?;
         let mut times = BTreeMap::<u64, u64>::new();

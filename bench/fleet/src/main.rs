@@ -17,9 +17,11 @@ mod load;
 mod simulation;
 mod vehicle;
 
+use std::net::SocketAddr;
 use std::process::ExitCode;
 use std::time::Duration;
 
+use chaos::RunningCloud;
 use clap::Parser;
 use figure::FleetFigure;
 use load::LoadTimes;
@@ -39,6 +41,15 @@ struct Args {
     /// Number of times that the cloud is killed, under 1,000 vehicles
     #[arg(long, value_name = "N")]
     kills: Option<usize>,
+    /// Address for people of a running cloud, of which others kill parts for --seconds
+    #[arg(long, value_name = "ADDRESS", requires_all = ["cloud", "code"])]
+    people: Option<SocketAddr>,
+    /// Its address for vehicles
+    #[arg(long, value_name = "ADDRESS", requires = "people")]
+    cloud: Option<SocketAddr>,
+    /// A one-time code of its administrator
+    #[arg(long, value_name = "CODE", requires = "people")]
+    code: Option<String>,
 }
 
 fn main() -> ExitCode {
@@ -67,6 +78,11 @@ fn main() -> ExitCode {
 }
 
 async fn measure(args: &Args) -> Result<Vec<FleetFigure>, String> {
+    if let (Some(people), Some(cloud), Some(code)) = (args.people, args.cloud, &args.code) {
+        let running = RunningCloud { people, cloud, code: code.clone() };
+        let time = Duration::from_secs(args.seconds.unwrap_or(60));
+        return chaos::figures_of(&running, args.vehicles.unwrap_or(1000), time).await;
+    }
     let by_hand = |quick: u64, full: u64| if args.quick { quick } else { full };
     let vehicles = args.vehicles.unwrap_or(if args.quick { 1000 } else { 10_000 });
     let times = LoadTimes {

@@ -34,6 +34,8 @@ async fn main() {
     let options = ServeOptions {
         data,
         store: None,
+        bus: None,
+        objects: None,
         people: any,
         vehicles: any,
         name: None,

@@ -19,7 +19,7 @@ pub(crate) const STORED_FRAMES_MAX: usize = 64;
 pub(crate) struct Cloud {
     pub(crate) store: CloudStore,
     pub(crate) objects: Objects,
-    pub(crate) clips: ClipFiles,
+    pub(crate) clips: Arc<ClipFiles>,
     pub(crate) hub: Hub,
     pub(crate) authorities: Authorities,
     pub(crate) wrong_secrets: WrongSecrets,

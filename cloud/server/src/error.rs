@@ -57,7 +57,6 @@ impl CloudError {
     }
 
     /// Returns whether it is an error of the cloud, not of the request.
-    #[cfg(test)]
     pub(crate) fn is_internal(&self) -> bool {
         self.status.is_server_error()
     }

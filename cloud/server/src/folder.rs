@@ -2,8 +2,8 @@
 
 use std::ffi::OsStr;
 use std::fs::{self, DirBuilder, File, OpenOptions, Permissions};
-use std::io::{self, Write};
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
+use std::io::{self, Read, Write};
+use std::os::unix::fs::{DirBuilderExt, FileExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure, sync_folder};
@@ -13,6 +13,27 @@ use crate::store::StoreAddress;
 
 /// Extension of a file that is being received.
 pub(crate) const PART: &str = "part";
+
+/// Longest name of a process in the file of the lock.
+const FORMER_MAX: u64 = 64;
+
+/// The lock of the folder, until it is dropped.
+#[derive(Debug)]
+pub(crate) struct FolderLock {
+    file: File,
+    /// Name of the process that had the lock before, among those that serve its database; it has
+    /// ended.
+    pub(crate) former: String,
+}
+
+impl FolderLock {
+    /// Notes the name of this process for the next one.
+    pub(crate) fn note(&self, name: &str) -> io::Result<()> {
+        self.file.set_len(0)?;
+        self.file.write_all_at(name.as_bytes(), 0)?;
+        self.file.sync_all()
+    }
+}
 
 /// The data folder.
 #[derive(Debug, Clone)]
@@ -71,20 +92,30 @@ impl DataFolder {
     /// # Errors
     ///
     /// A failure if another server has it.
-    pub(crate) fn lock(&self) -> Result<File, Failure> {
+    pub(crate) fn lock(&self) -> Result<FolderLock, Failure> {
         let path = self.0.join("lock");
         let mut options = OpenOptions::new();
-        let file = options.write(true).create(true).truncate(false).mode(0o600).open(&path);
-        let file = file.map_err(|error| {
+        let file =
+            options.read(true).write(true).create(true).truncate(false).mode(0o600).open(&path);
+        let failed = |error: io::Error| {
             let action = format!("cannot open `{}`", path.display());
             Failure::caused_by(Exit::Internal, action, &error)
-        })?;
+        };
+        let file = file.map_err(failed)?;
         if flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
             let message = format!("another gleaner-cloud uses `{}`", self.0.display());
             return Err(Failure::new(Exit::Usage, message)
                 .with_help("stop that one first, or choose another folder with --data"));
         }
-        Ok(file)
+        let mut text = Vec::new();
+        (&file).take(FORMER_MAX).read_to_end(&mut text).map_err(failed)?;
+        let former = String::from_utf8_lossy(&text).trim().to_owned();
+        Ok(FolderLock { file, former })
+    }
+
+    /// Returns whether the folder has authorities.
+    pub(crate) fn has_authorities(&self) -> bool {
+        self.authorities().join("server.pem").exists()
     }
 
     fn is_known(&self) -> bool {

@@ -1,12 +1,13 @@
 //! Connections of vehicles, by vehicle: presence, and the wishes that reach them at once.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use gleaner_fleet::GoAway;
 use tokio::sync::watch;
 
-use crate::store::now;
+use crate::bus::Bus;
+use crate::store::{OwnLink, now};
 
 /// Latest time after which vehicles connect again when the server stops, in ms.
 const RECONNECT_MS: u64 = 30_000;
@@ -20,6 +21,8 @@ const TAKEN_MS: u64 = 10_000;
 pub(crate) struct LinkOrders {
     /// Number of changes of the wanted state since the connection began.
     pub(crate) changes: u64,
+    /// Number of the wanted state that another replica has made, or an older one.
+    pub(crate) generation: u64,
     /// The end of the connection.
     pub(crate) end: Option<GoAway>,
 }
@@ -30,11 +33,13 @@ struct OpenLink {
     orders: watch::Sender<LinkOrders>,
 }
 
-/// All connections. A vehicle is online as long as its newest one is open: an older one that ends
-/// later changes nothing.
+/// All connections to this process: of each vehicle the newest one. An older one that ends later
+/// changes nothing.
 #[derive(Debug, Default)]
 pub(crate) struct Hub {
     state: Mutex<HubState>,
+    /// Other replicas, which learn of changes here.
+    bus: Bus,
 }
 
 #[derive(Debug, Default)]
@@ -48,6 +53,11 @@ struct HubState {
 }
 
 impl Hub {
+    /// Creates a hub that sends hints to other replicas.
+    pub(crate) fn new(bus: Bus) -> Self {
+        Self { state: Mutex::default(), bus }
+    }
+
     fn lock(&self) -> MutexGuard<'_, HubState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -59,20 +69,25 @@ impl Hub {
             return None;
         }
         let end = state.is_stopping.then(stopping);
-        let (orders, receiver) = watch::channel(LinkOrders { changes: 0, end });
+        let (orders, receiver) = watch::channel(LinkOrders { changes: 0, generation: 0, end });
         let before = state.links.insert(name.to_owned(), OpenLink { epoch, orders });
         if let Some(before) = before {
             before.end(TAKEN_MS, "the vehicle has a newer connection");
         }
+        drop(state);
+        self.bus.changed(&[name.to_owned()]);
         Some(receiver)
     }
 
-    /// Removes a connection that has ended.
-    pub(crate) fn remove(&self, name: &str, epoch: u64) {
+    /// Removes a connection that has ended; returns whether the database should have its end.
+    pub(crate) fn remove(&self, name: &str, epoch: u64) -> bool {
         let mut state = self.lock();
-        if state.links.get(name).is_some_and(|link| link.epoch == epoch) {
+        let is_newest = state.links.get(name).is_some_and(|link| link.epoch == epoch);
+        if is_newest {
             state.links.remove(name);
         }
+        // With the process, all its vehicles are offline.
+        is_newest && !state.is_stopping
     }
 
     /// Ends the connection of a vehicle.
@@ -80,6 +95,7 @@ impl Hub {
         if let Some(link) = self.lock().links.remove(name) {
             link.end(60_000, reason);
         }
+        self.bus.changed(&[name.to_owned()]);
     }
 
     /// Lets connections send the wanted state again.
@@ -88,6 +104,53 @@ impl Hub {
         for link in names.iter().filter_map(|name| state.links.get(name)) {
             link.orders.send_modify(|orders| orders.changes += 1);
         }
+        drop(state);
+        self.bus.changed(names);
+    }
+
+    /// Returns the epochs of the connections by vehicle: of all, or of those in `only`.
+    pub(crate) fn open_links(&self, only: Option<&[String]>) -> HashMap<String, u64> {
+        let state = self.lock();
+        match only {
+            None => state.links.iter().map(|(name, link)| (name.clone(), link.epoch)).collect(),
+            Some(names) => {
+                let link = |name: &String| Some((name.clone(), state.links.get(name)?.epoch));
+                names.iter().filter_map(link).collect()
+            }
+        }
+    }
+
+    /// Compares connections that were `open` with those that count by the database: ends others,
+    /// and wakes those with a higher wanted state. Returns those of the database that are not here.
+    pub(crate) fn compare(
+        &self,
+        open: &HashMap<String, u64>,
+        own: &[OwnLink],
+    ) -> BTreeSet<(String, u64)> {
+        let counting: HashMap<_, _> = own.iter().map(|it| (&*it.vehicle, it)).collect();
+        let mut state = self.lock();
+        for (name, epoch) in open {
+            let Some(link) = state.links.get(name).filter(|link| link.epoch == *epoch) else {
+                continue;
+            };
+            match counting.get(&**name).filter(|it| it.epoch == *epoch) {
+                Some(own) => {
+                    link.orders.send_if_modified(|orders| {
+                        let is_higher = own.generation > orders.generation;
+                        orders.generation = orders.generation.max(own.generation);
+                        is_higher
+                    });
+                }
+                None => {
+                    link.end(TAKEN_MS, "the vehicle has a newer connection, or was cut off");
+                    state.links.remove(name);
+                }
+            }
+        }
+        let is_missing = |own: &&OwnLink| {
+            state.links.get(&own.vehicle).is_none_or(|link| link.epoch < own.epoch)
+        };
+        own.iter().filter(is_missing).map(OwnLink::key).collect()
     }
 
     /// Ends all connections and all readers, those of the future, too.
@@ -98,11 +161,6 @@ impl Hub {
         for link in state.links.values() {
             link.orders.send_modify(|orders| orders.end = Some(stopping()));
         }
-    }
-
-    /// Returns whether a vehicle is connected.
-    pub(crate) fn is_online(&self, name: &str) -> bool {
-        self.lock().links.contains_key(name)
     }
 
     /// Notes a sign of life.
@@ -136,6 +194,22 @@ impl Hub {
         if let Some(sender) = self.lock().arrivals.get(name) {
             sender.send_replace(());
         }
+        self.bus.arrived(name);
+    }
+
+    /// Wakes readers here of records that other replicas have received.
+    pub(crate) fn arrived_elsewhere(&self, names: &BTreeSet<String>) {
+        let state = self.lock();
+        for sender in names.iter().filter_map(|name| state.arrivals.get(name)) {
+            sender.send_replace(());
+        }
+    }
+
+    /// Returns the vehicles whose records are read.
+    pub(crate) fn read_vehicles(&self) -> BTreeSet<String> {
+        let mut state = self.lock();
+        state.arrivals.retain(|_, sender| sender.receiver_count() > 0);
+        state.arrivals.keys().cloned().collect()
     }
 }
 
@@ -163,9 +237,34 @@ mod tests {
         let second = hub.add("car-7", 2).unwrap();
         assert!(first.borrow().end.is_some() && second.borrow().end.is_none());
         assert!(hub.add("car-7", 1).is_none());
-        hub.remove("car-7", 1);
-        assert!(hub.is_online("car-7"), "the end of the older one changes nothing");
-        hub.remove("car-7", 2);
-        assert!(!hub.is_online("car-7"));
+        assert!(!hub.remove("car-7", 1), "the end of the older one changes nothing");
+        assert!(hub.remove("car-7", 2));
+        assert!(hub.open_links(None).is_empty());
+    }
+
+    #[test]
+    fn what_other_replicas_have_changed_reaches_the_connections_here() {
+        let hub = Hub::default();
+        let mut links = ["a", "b", "c"].map(|name| hub.add(name, 3).unwrap());
+        let open = hub.open_links(None);
+        let own = |vehicle: &str, epoch, generation| OwnLink {
+            vehicle: vehicle.to_owned(),
+            epoch,
+            generation,
+        };
+        // Of `b`, another replica has the connection; that of `d` begins during the look, and the
+        // end of `e` was not stored.
+        let _later = hub.add("d", 1).unwrap();
+        let counting = [own("a", 3, 7), own("c", 4, 7), own("e", 1, 1)];
+        let missing = hub.compare(&open, &counting);
+        let [a, b, c] = &mut links;
+        let (orders, is_changed) = (a.borrow().clone(), a.has_changed().unwrap());
+        assert!(is_changed && orders.generation == 7 && orders.end.is_none());
+        assert!(b.borrow().end.is_some() && c.borrow().end.is_some());
+        assert_eq!(missing, [("c".to_owned(), 4), ("e".to_owned(), 1)].into());
+        assert_eq!(hub.open_links(None).len(), 2);
+        a.mark_unchanged();
+        hub.compare(&hub.open_links(None), &[own("a", 3, 7), own("d", 1, 1)]);
+        assert!(!a.has_changed().unwrap(), "nothing is new");
     }
 }

@@ -1,11 +1,15 @@
-//! The cloud of a fleet, as one process: vehicles connect to it, and people deploy by it.
+//! The cloud of a fleet: vehicles connect to it, and people deploy by it.
 //!
-//! `store` is the database and `objects` the folder of files; together with the certificates of
-//! `authority` they are all that survives a restart. `accept` accepts connections for both
+//! `store` is the database and `objects` has the files, in a `place`: a folder, or a bucket of `s3`.
+//! Together with the certificates of `authority` they are all that survives a restart. `accept` accepts connections for both
 //! listeners: `people` and `page` answer requests of people, and `vehicles` those of vehicles, each
 //! of which keeps one connection open. `hub` knows these connections, and wakes them after a
 //! change.
-//! `clips` has recorded clips of vehicles, with a folder of its own.
+//! `clips` has recorded clips of vehicles, with a place of its own.
+//!
+//! One process with a database in its folder is a cloud, and so are several over one PostgreSQL
+//! database and one bucket: `replicas` follows what the others have changed, and `bus` tells them to
+//! look.
 //!
 //! Nothing here runs a lambda, or decides what a vehicle runs: each vehicle verifies signatures by
 //! its own trust root.
@@ -13,6 +17,7 @@
 mod accept;
 mod attempts;
 mod authority;
+mod bus;
 mod clips;
 mod cloud;
 mod error;
@@ -21,9 +26,12 @@ mod hub;
 mod objects;
 mod page;
 mod people;
+mod place;
 mod program;
 mod readers;
+mod replicas;
 mod request;
+mod s3;
 mod server;
 mod store;
 mod vehicles;

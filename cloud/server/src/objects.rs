@@ -2,17 +2,14 @@
 //! and durable, and is never changed afterwards.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::io;
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
 
 use axum::body::Body;
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt;
-use gleaner_base::{Exit, Failure, sync_folder};
+use gleaner_base::{Exit, Failure};
 use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use gleaner_lambda::manifest::Sha256;
 use gleaner_protocol::vehicle_api::MissingObject;
@@ -21,77 +18,57 @@ use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use crate::error::{CloudError, CloudResult};
-use crate::folder::{PART, remove_parts};
+use crate::folder::PART;
+use crate::place::FilePlace;
+use crate::store::CloudStore;
 
-/// Maximum number of deployments that wait for files.
-const OFFERS_MAX: usize = 64;
 /// Length of the pieces in which a file is sent.
 const PIECE: usize = 64 << 10;
 
-/// The folder of files.
+/// All files.
 #[derive(Debug)]
 pub(crate) struct Objects {
-    folder: PathBuf,
-    /// Files that offered deployments need, by the id of the deployment.
-    offers: Mutex<BTreeMap<String, Vec<MissingObject>>>,
+    place: FilePlace,
     parts: AtomicU64,
 }
 
 impl Objects {
-    /// Opens the folder, and removes what an earlier process left unfinished.
-    ///
-    /// # Errors
-    ///
-    /// A failure that names the folder.
-    pub(crate) fn open(folder: PathBuf) -> Result<Self, Failure> {
-        remove_parts(&folder)?;
-        Ok(Self { folder, offers: Mutex::default(), parts: AtomicU64::new(0) })
+    /// Creates the access to a place of files.
+    pub(crate) fn new(place: FilePlace) -> Self {
+        Self { place, parts: AtomicU64::new(0) }
     }
 
     /// Returns the files of `revisions` that are not stored.
-    pub(crate) fn missing<'r>(
+    pub(crate) async fn missing<'r>(
         &self,
         revisions: impl IntoIterator<Item = &'r Revision>,
-    ) -> Vec<MissingObject> {
+    ) -> CloudResult<Vec<MissingObject>> {
         let files = revisions.into_iter().flat_map(|revision| &revision.files);
-        let missing = files.filter(|file| {
-            let stored = fs::metadata(self.folder.join(file.sha256.as_str()));
-            !stored.is_ok_and(|stored| stored.len() == file.bytes)
-        });
-        let missing: BTreeMap<_, _> =
-            missing.map(|file| (file.sha256.to_string(), file.bytes)).collect();
-        missing.into_iter().map(|(sha256, bytes)| MissingObject { sha256, bytes }).collect()
-    }
-
-    /// Accepts these files from now on, for the deployment `id`; without any, none for it.
-    pub(crate) fn offer(&self, id: &str, objects: &[MissingObject]) -> CloudResult<()> {
-        let mut offers = self.offers.lock().unwrap_or_else(PoisonError::into_inner);
-        offers.remove(id);
-        if objects.is_empty() {
-            return Ok(());
+        let files: BTreeMap<_, _> =
+            files.map(|file| (file.sha256.to_string(), file.bytes)).collect();
+        let mut missing = Vec::new();
+        for (sha256, bytes) in files {
+            let stored = self.place.length(&sha256).await.map_err(|error| {
+                let action = format!("cannot look for the file {sha256}");
+                Failure::caused_by(Exit::Internal, action, &error)
+            })?;
+            if stored != Some(bytes) {
+                missing.push(MissingObject { sha256, bytes });
+            }
         }
-        if offers.len() >= OFFERS_MAX {
-            let help = "send the files of those that were offered, or start the cloud again";
-            return Err(CloudError::busy("too many deployments wait for files", help));
-        }
-        offers.insert(id.to_owned(), objects.to_vec());
-        Ok(())
-    }
-
-    fn expected(&self, sha256: &Sha256) -> CloudResult<u64> {
-        let offers = self.offers.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut files = offers.values().flatten();
-        files.find(|file| file.sha256 == sha256.as_str()).map(|file| file.bytes).ok_or_else(|| {
-            let help = "send the deployment first, and then the files that are missing";
-            CloudError::usage(format!("no deployment needs the file {sha256}"), help)
-        })
+        Ok(missing)
     }
 
     /// Receives a file. It counts only if its length and digest are right.
-    pub(crate) async fn receive(&self, sha256: &Sha256, body: Body) -> CloudResult<()> {
-        let length = self.expected(sha256)?;
+    pub(crate) async fn receive(
+        &self,
+        store: &CloudStore,
+        sha256: &Sha256,
+        body: Body,
+    ) -> CloudResult<()> {
+        let length = store.awaited_length(sha256.as_str()).await?;
         let number = self.parts.fetch_add(1, Ordering::Relaxed);
-        let part = self.folder.join(format!("{sha256}.{number}.{PART}"));
+        let part = self.place.folder().join(format!("{sha256}.{number}.{PART}"));
         let part = UnfinishedFile(part);
         let failed = |error: io::Error| {
             Failure::caused_by(Exit::Internal, format!("cannot receive the file {sha256}"), &error)
@@ -110,29 +87,24 @@ impl Objects {
         }
         announced.finish().map_err(refused)?;
         file.flush().await.map_err(failed)?;
-        file.sync_all().await.map_err(failed)?;
-        tokio::fs::rename(&part.0, self.folder.join(sha256.as_str())).await.map_err(failed)?;
-        let folder = self.folder.clone();
-        let synced = tokio::task::spawn_blocking(move || sync_folder(&folder)).await;
-        Ok(synced.map_err(io::Error::other).and_then(|it| it).map_err(failed)?)
+        Ok(self.place.keep(&part, sha256.as_str()).await.map_err(failed)?)
     }
 
     /// Returns the answer with a file.
     pub(crate) async fn send(&self, sha256: &Sha256) -> CloudResult<Response> {
-        let file = File::open(self.folder.join(sha256.as_str())).await;
-        let file = match file {
-            Ok(file) => file,
-            Err(_) => {
-                let help = "deploy the revision again, which sends missing files";
-                return Err(CloudError::missing(format!("the file {sha256} is missing"), help));
-            }
+        let missing = || {
+            let help = "deploy the revision again, which sends missing files";
+            CloudError::missing(format!("the file {sha256} is missing"), help)
         };
         let failed = |error| {
             Failure::caused_by(Exit::Internal, format!("cannot send the file {sha256}"), &error)
         };
-        let length = file.metadata().await.map_err(failed)?.len();
+        let length = self.place.length(sha256.as_str()).await.map_err(failed)?;
+        let length = length.ok_or_else(missing)?;
+        let content = self.place.content(sha256.as_str(), 0).await.map_err(failed)?;
+        let content = content.ok_or_else(missing)?;
         let headers = [(header::CONTENT_LENGTH, length.to_string()), octets()];
-        Ok((headers, body_of(file)).into_response())
+        Ok((headers, content).into_response())
     }
 }
 

@@ -35,6 +35,15 @@ enum CloudCommand {
         data: PathBuf,
         #[command(flatten)]
         store: StoreArgs,
+        /// NATS server by which several processes over one database wake each other, as
+        /// nats://HOST:PORT, with NATS_USER and NATS_PASSWORD
+        #[arg(long, value_name = "URL")]
+        bus: Option<String>,
+        /// Bucket of an object store for files, as s3://BUCKET/PREFIX, with AWS_ACCESS_KEY_ID,
+        /// AWS_SECRET_ACCESS_KEY and AWS_ENDPOINT_URL; with it, several processes can serve one
+        /// database [default: the folder]
+        #[arg(long, value_name = "URL")]
+        objects: Option<String>,
         /// Address of the API and the page for people, without TLS
         #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
         people: SocketAddr,
@@ -104,9 +113,27 @@ fn run(command: CloudCommand) -> Result<(), Failure> {
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot start threads", &error))?;
     let done = runtime.block_on(async {
         match command {
-            CloudCommand::Serve { data, store, people, vehicles, name, insecure_people } => {
-                let (store, is_insecure) = (store.store, insecure_people);
-                serve(ServeOptions { data, store, people, vehicles, name, is_insecure }).await
+            CloudCommand::Serve {
+                data,
+                store: StoreArgs { store },
+                bus,
+                objects,
+                people,
+                vehicles,
+                name,
+                insecure_people: is_insecure,
+            } => {
+                serve(ServeOptions {
+                    data,
+                    store,
+                    bus,
+                    objects,
+                    people,
+                    vehicles,
+                    name,
+                    is_insecure,
+                })
+                .await
             }
             CloudCommand::Invite { name, role, data, store } => {
                 invite(NewUser { name, role }, &data, store.store.as_deref()).await

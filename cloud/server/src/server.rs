@@ -1,6 +1,5 @@
 //! The start and the end of the server.
 
-use std::fs::File;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -15,13 +14,16 @@ use tokio::time::{Interval, MissedTickBehavior, interval};
 use crate::accept::Entrance;
 use crate::attempts::{VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
+use crate::bus::{Bus, BusAddress};
 use crate::clips::ClipFiles;
 use crate::cloud::{Cloud, STORED_FRAMES_MAX};
-use crate::folder::DataFolder;
+use crate::folder::{DataFolder, FolderLock};
 use crate::hub::Hub;
 use crate::objects::Objects;
+use crate::place::FilePlace;
+use crate::s3::S3Bucket;
 use crate::store::{ClipBounds, CloudStore, Retention};
-use crate::{clips, people, vehicles};
+use crate::{clips, people, replicas, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles.
 const PEOPLE_MAX: u32 = 1000;
@@ -40,6 +42,11 @@ pub struct ServeOptions {
     pub data: PathBuf,
     /// URL of a PostgreSQL server with the database; without one, it is a file in the folder.
     pub store: Option<String>,
+    /// URL of a NATS server by which replicas wake each other.
+    pub bus: Option<String>,
+    /// Place of files that replicas share, `s3://BUCKET/PREFIX`; without one, they are in the folder
+    /// and this process is the only one.
+    pub objects: Option<String>,
     /// Address of the API for people.
     pub people: SocketAddr,
     /// Address for vehicles.
@@ -62,7 +69,7 @@ pub struct CloudServer {
     stop: watch::Sender<bool>,
     entrances: JoinSet<()>,
     chores: JoinSet<()>,
-    _lock: File,
+    _lock: FolderLock,
 }
 
 impl CloudServer {
@@ -81,9 +88,22 @@ impl CloudServer {
         }
         let folder = DataFolder::create(&options.data)?;
         let lock = folder.lock()?;
-        let authorities = Authorities::open(&folder)?;
+        if options.store.is_none() && (options.bus.is_some() || options.objects.is_some()) {
+            let message = "--bus and --objects are for several processes over one database";
+            return Err(Failure::new(Exit::Usage, message)
+                .with_help("add --store postgres://USER@HOST/DATABASE, or leave them out"));
+        }
+        let bus = options.bus.as_deref().map(BusAddress::parse).transpose()?;
+        let bucket = options.objects.as_deref().map(S3Bucket::parse).transpose()?;
+        let objects = bucket.as_ref().map(S3Bucket::url).unwrap_or_default();
         let store = CloudStore::open(&folder.store(options.store.as_deref())?).await?;
-        store.tie(gleaner_trust::sha256(authorities.server_pem().as_bytes()).as_str()).await?;
+        if !folder.has_authorities() {
+            // Those of a new folder would be others than the database has.
+            store.tie(None, &objects).await?;
+        }
+        let authorities = Authorities::open(&folder)?;
+        let authority = gleaner_trust::sha256(authorities.server_pem().as_bytes());
+        store.tie(Some(authority.as_str()), &objects).await?;
         if let Some(seq) = store.first_changed_entry().await? {
             tracing::error!(seq, "the audit trail was changed: an entry is not as it was written");
         }
@@ -93,13 +113,27 @@ impl CloudServer {
             (local(&people_listener, "--people")?, local(&vehicles_listener, "--vehicles")?);
         let address = options.name.clone().unwrap_or_else(|| vehicles.to_string());
         let host = host(&address)?.to_owned();
+        store.begin_lease(&lock.former, bucket.is_none()).await?;
+        lock.note(store.replica()).map_err(|error| {
+            let action = format!("cannot write in `{}`", options.data.display());
+            Failure::caused_by(Exit::Internal, action, &error)
+        })?;
+        let mut chores = JoinSet::new();
+        let (bus, hints) = match bus {
+            None => (Bus::default(), None),
+            Some(address) => {
+                let (bus, hints) = address.connect(&authority.as_str()[..16], &mut chores).await?;
+                (bus, Some(hints))
+            }
+        };
+        let place = |folder, start| FilePlace::open(folder, bucket.as_ref(), start);
         let (tls, tls_config) = watch::channel(authorities.server_config(&host)?);
         let code = store.invite_first().await?.map(|invitation| invitation.code);
         let cloud = Arc::new(Cloud {
             store,
-            objects: Objects::open(folder.objects())?,
-            clips: ClipFiles::open(folder.clips(), ClipBounds::DEFAULT)?,
-            hub: Hub::default(),
+            objects: Objects::new(place(folder.objects(), "objects/")?),
+            clips: Arc::new(ClipFiles::new(place(folder.clips(), "clips/")?, ClipBounds::DEFAULT)),
+            hub: Hub::new(bus),
             authorities,
             wrong_secrets: WrongSecrets::default(),
             limits: VehicleLimits::default(),
@@ -127,7 +161,12 @@ impl CloudServer {
         };
         entrances.spawn(entrance.serve());
         // Each has a task of its own: one that waits for the database must not hold it up.
-        let mut chores = JoinSet::new();
+        if cloud.store.is_shared() {
+            let working = Arc::clone(&cloud);
+            chores.spawn(async move { replicas::keep_lease(&working).await });
+            let working = Arc::clone(&cloud);
+            chores.spawn(async move { replicas::follow(&working, hints).await });
+        }
         let working = Arc::clone(&cloud);
         chores.spawn(async move { clips::clean(&working).await });
         let working = Arc::clone(&cloud);
@@ -168,6 +207,9 @@ impl CloudServer {
         cloud.hub.stop();
         entrances.join_all().await;
         store_seen(&cloud).await;
+        if let Err(error) = cloud.store.end_lease().await {
+            tracing::warn!(reason = error.reason(), "vehicles count as connected for a while");
+        }
         cloud.store.close().await;
     }
 }

@@ -1,18 +1,20 @@
-//! The folder of clips: files under names that are digests of their ids.
+//! Files of clips, under names that are digests of their ids.
 //!
-//! The parts of a file are appended to it one after the other, each once it is complete and its
-//! digest is right. How many there are is in the database only: bytes after them do not count.
+//! In a folder, the parts of a file are appended to it one after the other, each once it is complete
+//! and its digest is right; in a bucket, each part is an object. How many there are is in the
+//! database only: bytes after them do not count.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, Seek, SeekFrom, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{self, Arc, PoisonError};
 use std::time::Duration;
 
 use axum::body::Body;
-use futures_util::StreamExt;
+use futures_util::stream::try_unfold;
+use futures_util::{StreamExt, TryStreamExt};
 use gleaner_base::{Exit, Failure, sync_folder};
 use gleaner_fleet::clips::{CLIP_PART, ClipId};
 use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
@@ -22,7 +24,8 @@ use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout;
 
 use crate::error::{CloudError, CloudResult};
-use crate::folder::{PART, remove_parts};
+use crate::folder::PART;
+use crate::place::{FilePlace, blocking};
 use crate::store::ClipBounds;
 
 /// Number of parts of a vehicle that are received at a time: some may be of connections that it
@@ -33,10 +36,18 @@ const PIECE_TIME: Duration = Duration::from_secs(60);
 /// Number of locks for all files.
 const TURNS: usize = 64;
 
-/// The folder.
+/// A file of a clip.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum FileOfClip {
+    /// The recording, of this length.
+    Recording(u64),
+    Thumbnail,
+}
+
+/// All files of clips.
 #[derive(Debug)]
 pub(crate) struct ClipFiles {
-    folder: PathBuf,
+    place: FilePlace,
     pub(crate) bounds: ClipBounds,
     parts: AtomicU64,
     /// Slots of the vehicles that send parts.
@@ -45,39 +56,73 @@ pub(crate) struct ClipFiles {
 }
 
 impl ClipFiles {
-    /// Opens the folder, and removes parts that an earlier process left.
-    ///
-    /// # Errors
-    ///
-    /// A failure that names the folder.
-    pub(crate) fn open(folder: PathBuf, bounds: ClipBounds) -> Result<Self, Failure> {
-        remove_parts(&folder)?;
+    /// Creates the access to a place of files.
+    pub(crate) fn new(place: FilePlace, bounds: ClipBounds) -> Self {
         let turns = (0..TURNS).map(|_| Arc::default()).collect();
-        Ok(Self { folder, bounds, parts: AtomicU64::new(0), slots: sync::Mutex::default(), turns })
+        Self { place, bounds, parts: AtomicU64::new(0), slots: sync::Mutex::default(), turns }
     }
 
-    fn path(&self, id: &ClipId, extension: &str) -> PathBuf {
-        self.folder.join(format!("{}.{extension}", sha256(id.to_string().as_bytes())))
+    /// Returns the path of the recording of a clip in the folder.
+    fn path(&self, id: &ClipId) -> PathBuf {
+        self.place.folder().join(recording(id))
     }
 
-    /// Returns the path of the file of a clip.
-    pub(crate) fn clip(&self, id: &ClipId) -> PathBuf {
-        self.path(id, "mcap")
+    /// Returns whether any of the recording of a clip is there.
+    pub(crate) async fn has_recording(&self, id: &ClipId) -> io::Result<bool> {
+        let name = match self.place.is_bucket() {
+            true => part_name(id, 0),
+            false => recording(id),
+        };
+        Ok(self.place.length(&name).await?.is_some())
     }
 
-    /// Returns the path of the thumbnail of a clip.
-    pub(crate) fn thumbnail(&self, id: &ClipId) -> PathBuf {
-        self.path(id, "jpg")
-    }
-
-    /// Removes the file of a clip.
-    pub(crate) fn remove_file(&self, id: &ClipId) {
-        let path = self.clip(id);
-        match fs::remove_file(&path) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                tracing::warn!(path = %path.display(), %error, "a file cannot be removed");
+    /// Returns the length of a file that is complete, if it is there.
+    pub(crate) async fn length(&self, id: &ClipId, file: FileOfClip) -> io::Result<Option<u64>> {
+        match file {
+            FileOfClip::Thumbnail => self.place.length(&thumbnail(id)).await,
+            FileOfClip::Recording(length) if self.place.is_bucket() => {
+                Ok(self.has_recording(id).await?.then_some(length))
             }
-            _ => {}
+            FileOfClip::Recording(_) => self.place.length(&recording(id)).await,
+        }
+    }
+
+    /// Returns the content of a file that is complete from the byte `begin` on, if it is there.
+    pub(crate) async fn content(
+        self: &Arc<Self>,
+        id: &ClipId,
+        file: FileOfClip,
+        begin: u64,
+    ) -> io::Result<Option<Body>> {
+        match file {
+            FileOfClip::Thumbnail => self.place.content(&thumbnail(id), begin).await,
+            FileOfClip::Recording(length) if self.place.is_bucket() => {
+                Ok(Some(self.parts_from(id, length, begin)))
+            }
+            FileOfClip::Recording(_) => self.place.content(&recording(id), begin).await,
+        }
+    }
+
+    /// Returns the parts of a recording in a bucket, one after the other.
+    fn parts_from(self: &Arc<Self>, id: &ClipId, length: u64, begin: u64) -> Body {
+        let start = (Arc::clone(self), id.clone(), begin);
+        let parts = try_unfold(start, move |(files, id, begin)| async move {
+            if begin >= length {
+                return io::Result::Ok(None);
+            }
+            let (number, skipped) = (begin / CLIP_PART, begin % CLIP_PART);
+            let part = files.place.content(&part_name(&id, number), skipped).await?;
+            let part = part.ok_or_else(|| io::Error::from(io::ErrorKind::NotFound))?;
+            let pieces = part.into_data_stream().map(|it| it.map_err(io::Error::other));
+            Ok(Some((pieces, (files, id, (number + 1) * CLIP_PART))))
+        });
+        Body::from_stream(parts.try_flatten())
+    }
+
+    /// Removes the recording of a clip.
+    pub(crate) async fn remove_recording(&self, id: &ClipId) {
+        if let Err(error) = self.place.remove(&recording(id)).await {
+            tracing::warn!(clip = %id, %error, "a file cannot be removed");
         }
     }
 
@@ -108,7 +153,8 @@ impl ClipFiles {
         body: Body,
     ) -> CloudResult<UnfinishedFile> {
         let number = self.parts.fetch_add(1, Ordering::Relaxed);
-        let part = UnfinishedFile(self.path(id, &format!("{number}.{PART}")));
+        let path = self.path(id).with_extension(format!("{number}.{PART}"));
+        let part = UnfinishedFile(path);
         let failed = |error: io::Error| {
             Failure::caused_by(Exit::Internal, format!("cannot receive clip `{id}`"), &error)
         };
@@ -136,34 +182,80 @@ impl ClipFiles {
     }
 
     /// Makes a received file durable as the thumbnail of a clip.
-    pub(crate) fn keep_thumbnail(&self, id: &ClipId, part: &UnfinishedFile) -> io::Result<()> {
-        File::open(&part.0)?.sync_all()?;
-        fs::rename(&part.0, self.thumbnail(id))?;
-        sync_folder(&self.folder)
+    pub(crate) async fn keep_thumbnail(
+        &self,
+        id: &ClipId,
+        part: &UnfinishedFile,
+    ) -> io::Result<()> {
+        self.place.keep(part, &thumbnail(id)).await
     }
 
-    /// Makes a received part durable at its place in the file of a clip. Returns false if the
+    /// Makes a received part durable at its place in the recording of a clip. Returns false if the
     /// parts before it are not there.
-    pub(crate) fn append(
+    pub(crate) async fn append(
         &self,
         id: &ClipId,
         number: u64,
-        part: &UnfinishedFile,
+        part: UnfinishedFile,
     ) -> io::Result<bool> {
-        let mut options = File::options();
-        let mut file = options.write(true).create(true).truncate(false).open(self.clip(id))?;
-        let begin = number * CLIP_PART;
-        if file.metadata()?.len() < begin {
-            return Ok(false);
+        if self.place.is_bucket() {
+            return self.place.keep(&part, &part_name(id, number)).await.map(|()| true);
         }
-        file.set_len(begin)?;
-        file.seek(SeekFrom::Start(begin))?;
-        io::copy(&mut File::open(&part.0)?, &mut file)?;
-        file.flush()?;
-        file.sync_all()?;
-        if number == 0 {
-            sync_folder(&self.folder)?;
-        }
-        Ok(true)
+        let path = self.path(id);
+        blocking(move || append(&path, number, &part)).await
     }
+
+    /// Compares a recording with its announced length and SHA-256; returns the reason if it is
+    /// another one.
+    pub(crate) async fn compare(
+        self: &Arc<Self>,
+        id: &ClipId,
+        (length, sha256): (u64, String),
+    ) -> io::Result<Result<(), String>> {
+        if !self.place.is_bucket() {
+            let path = self.path(id);
+            return blocking(move || {
+                AnnouncedFile::new(length, &sha256).compare(File::open(path)?)
+            })
+            .await;
+        }
+        let mut announced = AnnouncedFile::new(length, &sha256);
+        let mut pieces = self.parts_from(id, length, 0).into_data_stream();
+        while let Some(piece) = timeout(PIECE_TIME, pieces.next()).await? {
+            if let Err(reason) = announced.add(&piece.map_err(io::Error::other)?) {
+                return Ok(Err(reason));
+            }
+        }
+        Ok(announced.finish())
+    }
+}
+
+fn append(path: &Path, number: u64, part: &UnfinishedFile) -> io::Result<bool> {
+    let mut file = File::options().write(true).create(true).truncate(false).open(path)?;
+    let begin = number * CLIP_PART;
+    if file.metadata()?.len() < begin {
+        return Ok(false);
+    }
+    file.set_len(begin)?;
+    file.seek(SeekFrom::Start(begin))?;
+    io::copy(&mut File::open(&part.0)?, &mut file)?;
+    file.flush()?;
+    file.sync_all()?;
+    if number == 0 {
+        path.parent().map_or(Ok(()), sync_folder)?;
+    }
+    Ok(true)
+}
+
+fn recording(id: &ClipId) -> String {
+    format!("{}.mcap", sha256(id.to_string().as_bytes()))
+}
+
+/// Returns the name of the object with a part of a recording.
+fn part_name(id: &ClipId, number: u64) -> String {
+    format!("{}/{number}", recording(id))
+}
+
+fn thumbnail(id: &ClipId) -> String {
+    format!("{}.jpg", sha256(id.to_string().as_bytes()))
 }

@@ -1,7 +1,7 @@
 //! Clips: announced by vehicles, wanted by people, and sent in parts.
 //!
 //! `vehicles` receives announcements and parts, `people` lists clips and sends their files, and
-//! `files` is the folder. A vehicle reads the complete list of what is wanted: there is no command
+//! `files` has their files. A vehicle reads the complete list of what is wanted: there is no command
 //! that could be lost or come twice. Nothing here deletes anything on a vehicle.
 
 mod files;
@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use tokio::time::interval;
 
-pub(crate) use files::ClipFiles;
+pub(crate) use files::{ClipFiles, FileOfClip};
 pub(crate) use vehicles::router;
 
 use crate::cloud::Cloud;
@@ -32,7 +32,7 @@ pub(crate) async fn clean(cloud: &Cloud) {
             Ok(forgotten) => {
                 for id in forgotten {
                     let _turn = cloud.clips.turn(&id).await;
-                    cloud.clips.remove_file(&id);
+                    cloud.clips.remove_recording(&id).await;
                 }
             }
             Err(error) => {

@@ -1,7 +1,6 @@
 //! Requests of people about clips.
 
 use std::io;
-use std::path::Path as FilePath;
 use std::sync::Arc;
 
 use axum::Json;
@@ -12,12 +11,10 @@ use axum::response::{IntoResponse, Response};
 use gleaner_base::{Exit, Failure};
 use gleaner_fleet::clips::{ClipId, ClipPage, ClipPolicy, ClipState, FleetClip};
 use gleaner_fleet::people::User;
-use tokio::fs::File;
-use tokio::io::AsyncSeekExt;
 
+use super::FileOfClip;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
-use crate::objects::body_of;
 use crate::request::parsed;
 use crate::store::ClipQuery;
 
@@ -42,7 +39,7 @@ pub(crate) async fn pull(
     Path(id): Path<String>,
 ) -> CloudResult<Json<FleetClip>> {
     let id = parse(&id)?;
-    let is_lost = !cloud.clips.clip(&id).exists();
+    let is_lost = !cloud.clips.has_recording(&id).await.map_err(|error| not_sent(&id, error))?;
     let clip = cloud.store.pull_clip(&actor.name, &id, is_lost).await?;
     cloud.hub.wake(&[id.vehicle().to_owned()]);
     Ok(Json(clip))
@@ -57,7 +54,7 @@ pub(crate) async fn thumbnail(
         let message = format!("clip `{id}` has no thumbnail here");
         return Err(CloudError::missing(message, "its vehicle sends it when it is connected"));
     }
-    send(&cloud.clips.thumbnail(&id), &id, "image/jpeg", &HeaderMap::new()).await
+    send(&cloud, (&id, FileOfClip::Thumbnail), "image/jpeg", &HeaderMap::new()).await
 }
 
 pub(crate) async fn file(
@@ -72,7 +69,8 @@ pub(crate) async fn file(
             format!("the file of clip `{id}` is not in the cloud: {}", clip.state.as_str());
         return Err(CloudError::missing(message, "fetch it: `gleaner clips pull ID`"));
     }
-    send(&cloud.clips.clip(&id), &id, "application/octet-stream", &headers).await
+    let file = FileOfClip::Recording(clip.facts.bytes);
+    send(&cloud, (&id, file), "application/octet-stream", &headers).await
 }
 
 pub(crate) async fn policy(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<ClipPolicy>> {
@@ -94,20 +92,23 @@ fn parse(id: &str) -> CloudResult<ClipId> {
     id.parse().map_err(|reason: String| CloudError::missing(reason, "`gleaner clips` lists all"))
 }
 
+fn not_sent(id: &ClipId, error: io::Error) -> CloudError {
+    Failure::caused_by(Exit::Internal, format!("cannot send clip `{id}`"), &error).into()
+}
+
 /// Returns the answer with a file, or with the end of it that `Range` asks for.
 async fn send(
-    path: &FilePath,
-    id: &ClipId,
+    cloud: &Cloud,
+    (id, file): (&ClipId, FileOfClip),
     kind: &'static str,
     headers: &HeaderMap,
 ) -> CloudResult<Response> {
-    let failed =
-        |error| Failure::caused_by(Exit::Internal, format!("cannot send clip `{id}`"), &error);
-    let mut file = File::open(path).await.map_err(|_| {
-        let message = format!("a file of clip `{id}` is not in the folder of the cloud");
+    let failed = |error| not_sent(id, error);
+    let missing = || {
+        let message = format!("a file of clip `{id}` is not among the files of the cloud");
         CloudError::missing(message, "fetch it again: `gleaner clips pull ID`")
-    })?;
-    let length = file.metadata().await.map_err(failed)?.len();
+    };
+    let length = cloud.clips.length(id, file).await.map_err(failed)?.ok_or_else(missing)?;
     let range = headers.get(header::RANGE).and_then(|it| it.to_str().ok());
     // Any other range is answered with the whole file, as the standard allows.
     let begin = range.and_then(|it| it.strip_prefix("bytes=")?.strip_suffix('-')?.parse().ok());
@@ -119,8 +120,8 @@ async fn send(
         }
         _ => (0, StatusCode::OK),
     };
-    file.seek(io::SeekFrom::Start(begin)).await.map_err(failed)?;
-    let mut answer = body_of(file).into_response();
+    let content = cloud.clips.content(id, file, begin).await.map_err(failed)?;
+    let mut answer = content.ok_or_else(missing)?.into_response();
     *answer.status_mut() = status;
     let mut set = |name, value: String| {
         if let Ok(value) = value.parse() {

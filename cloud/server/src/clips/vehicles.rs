@@ -1,6 +1,5 @@
 //! Requests of vehicles about their clips.
 
-use std::fs::File;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,11 +12,11 @@ use axum::middleware::from_fn;
 use axum::routing::{post, put};
 use futures_util::StreamExt;
 use gleaner_base::{Exit, Failure};
+use gleaner_fleet::UnfinishedFile;
 use gleaner_fleet::clips::{
     CLIP_PART, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName, ClipOrders,
     ClipReport, THUMBNAIL_MAX,
 };
-use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use tokio::time::timeout;
 
 use crate::cloud::Cloud;
@@ -72,7 +71,7 @@ async fn report(
         let dropped = cloud.store.announce_clips(&vehicle.name, &report, bounds).await?;
         for id in dropped {
             let _turn = cloud.clips.turn(&id).await;
-            cloud.clips.remove_file(&id);
+            cloud.clips.remove_recording(&id).await;
         }
     }
     orders(&cloud, &vehicle.name).await
@@ -101,8 +100,7 @@ async fn thumbnail(
     }
     let length = body.len() as u64;
     let part = cloud.clips.receive(&id, (length, &wanted), Body::from(body)).await?;
-    let (working, of) = (Arc::clone(&cloud), id.clone());
-    blocking(&id, move || working.clips.keep_thumbnail(&of, &part)).await?;
+    cloud.clips.keep_thumbnail(&id, &part).await.map_err(|error| not_stored(&id, error))?;
     cloud.store.thumbnail_received(&id).await?;
     orders(&cloud, &vehicle.name).await
 }
@@ -179,38 +177,29 @@ async fn store_part(
         return Ok(());
     }
     let is_last = ClipFacts::part_length(progress.bytes, progress.part + 1).is_none();
-    let (working, of) = (Arc::clone(&cloud), progress.clone());
-    let outcome = blocking(&id, move || {
-        if !working.clips.append(&of.id, of.part, &received)? {
-            return Ok(Err("its first parts are not there any more".to_owned()));
+    let failed = |error| not_stored(&id, error);
+    let is_appended = cloud.clips.append(&id, progress.part, received).await.map_err(failed)?;
+    let outcome = match (is_appended, is_last) {
+        (false, _) => Err("its first parts are not there any more".to_owned()),
+        (true, false) => Ok(()),
+        (true, true) => {
+            let announced = (progress.bytes, progress.sha256.clone());
+            cloud.clips.compare(&id, announced).await.map_err(failed)?
         }
-        match is_last {
-            true => {
-                let file = File::open(working.clips.clip(&of.id))?;
-                AnnouncedFile::new(of.bytes, &of.sha256).compare(file)
-            }
-            false => Ok(Ok(())),
-        }
-    });
-    match outcome.await? {
+    };
+    match outcome {
         Ok(()) => cloud.store.clip_part_received(&progress, length, is_last).await,
         Err(reason) => {
             cloud.store.clip_upload_failed(&id, &reason).await?;
-            cloud.clips.remove_file(&id);
+            cloud.clips.remove_recording(&id).await;
             let message = format!("the file of clip `{id}` is refused");
             Err(CloudError::denied(message, "send it again from its first part").because(reason))
         }
     }
 }
 
-async fn blocking<T: Send + 'static>(
-    id: &ClipId,
-    work: impl FnOnce() -> io::Result<T> + Send + 'static,
-) -> CloudResult<T> {
-    let done = tokio::task::spawn_blocking(work).await.map_err(io::Error::other);
-    let failed =
-        |error| Failure::caused_by(Exit::Internal, format!("cannot store clip `{id}`"), &error);
-    Ok(done.and_then(|it| it).map_err(failed)?)
+fn not_stored(id: &ClipId, error: io::Error) -> CloudError {
+    Failure::caused_by(Exit::Internal, format!("cannot store clip `{id}`"), &error).into()
 }
 
 fn clip_name(text: &str) -> CloudResult<ClipName> {

@@ -129,9 +129,8 @@ fn users(user: &PageUser, all: &[User], asked: &AccessQuery) -> Markup {
 
 async fn vehicles(cloud: &Cloud, user: &PageUser, asked: &AccessQuery) -> CloudResult<Markup> {
     let index = asked.vehicles.min(1_000_000);
-    let is_online = |name: &str| cloud.hub.is_online(name);
     let filter = VehicleFilter::default();
-    let found = cloud.store.vehicle_page(&filter, is_online, index, SIZE).await?;
+    let found = cloud.store.vehicle_page(&filter, index, SIZE).await?;
     Ok(html! {
         section aria-labelledby="vehicles" {
             h2 id="vehicles" { "Vehicles" }
@@ -208,6 +207,7 @@ pub(super) async fn remove_user(
     Path(name): Path<String>,
 ) -> PageResult {
     cloud.store.remove_user(&user.user.name, &name).await?;
+    cloud.readers.end(&name);
     Ok(Redirect::to("/access?done=user").into_response())
 }
 

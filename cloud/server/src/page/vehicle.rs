@@ -54,8 +54,7 @@ pub(super) async fn find(cloud: &Cloud, name: &str) -> CloudResult<VehicleSummar
         return Err(CloudError::missing("a vehicle has a name", "choose one from the fleet"));
     }
     let filter = VehicleFilter { only: name.to_owned(), ..VehicleFilter::default() };
-    let is_online = |name: &str| cloud.hub.is_online(name);
-    let page = cloud.store.vehicle_page(&filter, is_online, 0, 1).await?;
+    let page = cloud.store.vehicle_page(&filter, 0, 1).await?;
     page.vehicles.into_iter().map(|(it, _)| it).next().ok_or_else(|| {
         let message = format!("there is no vehicle `{}`", gleaner_base::excerpt(name));
         CloudError::missing(message, "choose one from the fleet")

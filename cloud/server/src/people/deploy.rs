@@ -50,8 +50,8 @@ pub(super) async fn deploy(
         envelopes.insert(digest.to_string(), envelope);
     }
     let id = deployment.id.to_string();
-    let objects = cloud.objects.missing(&revisions);
-    cloud.objects.offer(&id, &objects)?;
+    let objects = cloud.objects.missing(&revisions).await?;
+    cloud.store.await_files(&id, &objects).await?;
     if !objects.is_empty() {
         return Ok(Json(DeployReply::Missing { objects }));
     }
@@ -96,6 +96,6 @@ pub(super) async fn object(
     Path(sha256): Path<String>,
     body: Body,
 ) -> CloudResult<StatusCode> {
-    cloud.objects.receive(&digest(&sha256)?, body).await?;
+    cloud.objects.receive(&cloud.store, &digest(&sha256)?, body).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -222,7 +222,7 @@ async fn remove_user(
 }
 
 async fn vehicles(State(cloud): State<Arc<Cloud>>) -> CloudResult<Response> {
-    let vehicles = cloud.store.vehicles(|name| cloud.hub.is_online(name)).await?;
+    let vehicles = cloud.store.vehicles().await?;
     Ok(Json(vehicles).into_response())
 }
 

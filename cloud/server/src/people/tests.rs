@@ -12,16 +12,18 @@ use crate::clips::ClipFiles;
 use crate::folder::DataFolder;
 use crate::hub::Hub;
 use crate::objects::Objects;
+use crate::place::FilePlace;
 use crate::store::{ClipBounds, CloudStore, Retention};
 
 pub(crate) const ROLES: [Role; 4] = [Role::Viewer, Role::Operator, Role::Deployer, Role::Admin];
 
 pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
     let data = DataFolder::create(&folder.path().join("data")).unwrap();
+    let clips = FilePlace::open(data.clips(), None, "").unwrap();
     Arc::new(Cloud {
         store: CloudStore::of_test(folder).await,
-        objects: Objects::open(data.objects()).unwrap(),
-        clips: ClipFiles::open(data.clips(), ClipBounds::DEFAULT).unwrap(),
+        objects: Objects::new(FilePlace::open(data.objects(), None, "").unwrap()),
+        clips: Arc::new(ClipFiles::new(clips, ClipBounds::DEFAULT)),
         hub: Hub::default(),
         authorities: Authorities::open(&data).unwrap(),
         wrong_secrets: WrongSecrets::default(),

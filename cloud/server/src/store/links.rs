@@ -75,6 +75,8 @@ pub(super) struct ConnectWrite {
     certificate: String,
     version: String,
     key: String,
+    /// The process that has the connection.
+    replica: String,
 }
 
 impl VehicleWrite for ConnectWrite {
@@ -122,7 +124,8 @@ impl CloudStore {
     ) -> CloudResult<(u64, Vec<Cursor>)> {
         let (name, certificate) = (name.to_owned(), certificate.to_owned());
         let (version, key) = (excerpt(&hello.version), excerpt(&hello.key));
-        self.write(ConnectWrite { name, certificate, version, key }).await
+        let replica = self.replica().to_owned();
+        self.write(ConnectWrite { name, certificate, version, key, replica }).await
     }
 
     /// Stores a report, if the connection still counts; returns whether the vehicle's wanted state
@@ -172,23 +175,25 @@ impl StoreChange<'_> {
         let mut cursors = self.cursors_of(&begun.keys().collect::<Vec<_>>()).await?;
         let mut rows = Vec::new();
         for waiting in connects.iter_mut() {
-            let ConnectWrite { name, version, key, .. } = &waiting.write;
+            let ConnectWrite { name, version, key, replica, .. } = &waiting.write;
             let Some(Ok((epoch, positions))) = &mut waiting.result else { continue };
             if begun.get(name) == Some(&int(*epoch)) {
                 *positions = cursors.remove(name).unwrap_or_default();
-                rows.push((name, *epoch, version, key));
+                rows.push((name, *epoch, [version, key, replica]));
             }
         }
         for part in parts(&rows) {
             let sql = format!(
-                "INSERT INTO vehicles (name, epoch, version, clip_key, seen) VALUES {}
+                "INSERT INTO vehicles (name, epoch, version, clip_key, replica, seen) VALUES {}
                  ON CONFLICT (name) DO UPDATE SET epoch = excluded.epoch,
-                 version = excluded.version, clip_key = excluded.clip_key, seen = excluded.seen",
-                placeholders(part.len(), 5)
+                 version = excluded.version, clip_key = excluded.clip_key,
+                 replica = excluded.replica, seen = excluded.seen",
+                placeholders(part.len(), 6)
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
-            for (name, epoch, version, key) in part {
-                query = query.bind(*name).bind(int(*epoch)).bind(*version).bind(*key).bind(now());
+            for (name, epoch, texts) in part {
+                query = query.bind(*name).bind(int(*epoch));
+                query = texts.iter().fold(query, |query, text| query.bind(*text)).bind(now());
             }
             query.execute(&mut *self.tx).await?;
         }

@@ -34,12 +34,14 @@ macro_rules! rows {
 
 mod address;
 mod audit;
+mod awaited;
 mod clip_list;
 mod clips;
 mod deployments;
 mod links;
 mod page;
 mod records;
+mod replicas;
 mod secrets;
 #[cfg(test)]
 mod tests;
@@ -53,7 +55,7 @@ mod writer;
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use gleaner_base::Failure;
+use gleaner_base::{Exit, Failure};
 use sqlx::{Any, AnyPool, Transaction};
 use tokio::sync::{Mutex, MutexGuard};
 
@@ -69,6 +71,7 @@ pub(crate) use deployments::OfferedDeployment;
 pub(crate) use links::VehicleReport;
 pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
+pub(crate) use replicas::OwnLink;
 pub(crate) use tokens::TokenUser;
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::Issued;
@@ -79,6 +82,7 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0002_releases.sql"),
     include_str!("../../migrations/0003_clips.sql"),
     include_str!("../../migrations/0004_page.sql"),
+    include_str!("../../migrations/0006_replicas.sql"),
     include_str!("../../migrations/0009_tokens.sql"),
 ];
 
@@ -96,6 +100,8 @@ pub(crate) struct CloudStore {
     writes: WriteQueue,
     wanted: WantedStates,
     is_file: bool,
+    /// Name of this process among those that serve the database.
+    replica: String,
 }
 
 /// A change that is not committed yet; dropped, it is undone.
@@ -116,7 +122,12 @@ impl CloudStore {
         let writes = WriteQueue::start(changes.clone(), Arc::clone(&turn));
         let is_file = matches!(address, StoreAddress::Sqlite(_));
         let wanted = WantedStates::default();
-        let store = Self { pool, changes, turn, writes, wanted, is_file };
+        let mut bytes = [0; 16];
+        getrandom::fill(&mut bytes).map_err(|error| {
+            Failure::caused_by(Exit::Internal, "no random numbers can be made", &error)
+        })?;
+        let replica = gleaner_base::hex(&bytes);
+        let store = Self { pool, changes, turn, writes, wanted, is_file, replica };
         store.migrate().await?;
         Ok(store)
     }
@@ -148,26 +159,38 @@ impl CloudStore {
         begin(&self.changes, &self.turn).await
     }
 
-    /// Ties a database on a server to the folder with this authority, the first time.
+    /// Ties a database on a server to this authority and this place of files, the first time.
+    /// `authority` is `None` if the folder has none yet: then an empty database is left as it is.
     ///
     /// # Errors
     ///
-    /// An error if it belongs to another folder: its vehicles would not know this cloud.
-    pub(crate) async fn tie(&self, authority: &str) -> CloudResult<()> {
+    /// An error if it belongs to another authority, as its vehicles would not accept this cloud, or
+    /// has its files elsewhere.
+    pub(crate) async fn tie(&self, authority: Option<&str>, objects: &str) -> CloudResult<()> {
         if self.is_file {
             return Ok(());
         }
         let mut change = self.change().await?;
-        let row: Option<(String,)> = row!(&mut *change.tx; "SELECT authority FROM folder");
-        match row {
-            Some((stored,)) if stored != authority => {
+        let row: Option<(String, String)> =
+            row!(&mut *change.tx; "SELECT authority, objects FROM folder");
+        match (row, authority) {
+            (Some((stored, _)), _) if Some(&*stored) != authority => {
                 let message = "the database of --store belongs to another data folder";
-                let help = "serve the folder that it was made with, or name an empty database";
+                let help = "serve the folder that it was made with, put a copy of its folder `ca` \
+                            in the place of this one's, or name an empty database";
                 Err(CloudError::usage(message, help))
             }
-            Some(_) => Ok(()),
-            None => {
-                run!(&mut *change.tx; "INSERT INTO folder (authority) VALUES ($1)"; authority);
+            (Some((_, stored)), _) if stored != objects => {
+                let place = if stored.is_empty() { "the data folder" } else { &stored };
+                let message = format!("the files of the database of --store are in {place}");
+                let help = "start with the --objects that it was made with, or without";
+                Err(CloudError::usage(message, help))
+            }
+            (Some(_), _) | (None, None) => Ok(()),
+            (None, Some(authority)) => {
+                run!(&mut *change.tx;
+                    "INSERT INTO folder (authority, objects) VALUES ($1, $2)";
+                    authority, objects);
                 change.commit().await
             }
         }

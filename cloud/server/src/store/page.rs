@@ -59,13 +59,14 @@ impl CloudStore {
     pub(crate) async fn vehicle_page(
         &self,
         filter: &VehicleFilter,
-        is_online: impl Fn(&str) -> bool,
         index: usize,
         size: usize,
     ) -> CloudResult<VehiclePage> {
         // Of all vehicles, only what the filters look at: texts of thousands take their time.
-        let rows: Vec<(String, i64, i64, i64, String)> = rows!(&self.pool;
-            "SELECT name, is_revoked, epoch, CASE WHEN problems = '[]' THEN 0 ELSE 1 END,
+        let rows: Vec<(String, i64, i64, i64, i64, String)> = rows!(&self.pool;
+            "SELECT name, is_revoked, epoch,
+             CASE WHEN replica IN (SELECT id FROM replicas) THEN 1 ELSE 0 END,
+             CASE WHEN problems = '[]' THEN 0 ELSE 1 END,
              CASE WHEN $2 = 0 THEN '' ELSE labels END
              FROM vehicles WHERE $1 = '' OR name = $1 ORDER BY name";
             &filter.only, i64::from(filter.label.is_some()));
@@ -76,8 +77,8 @@ impl CloudStore {
         let failed: BTreeMap<String, i64> = failed.into_iter().collect();
         let mut page = VehiclePage::default();
         let mut names = Vec::new();
-        for (name, is_revoked, epoch, problems, labels) in rows {
-            let state = vehicle_state(&name, (is_revoked, epoch), &is_online);
+        for (name, is_revoked, epoch, is_online, problems, labels) in rows {
+            let state = vehicle_state(is_revoked, epoch, is_online);
             let failures = failed.get(&name).map_or(0, |count| unsigned(*count));
             let has_problem = state != VehicleState::Revoked && (problems != 0 || failures > 0);
             page.states[state_index(state)] += 1;
@@ -97,7 +98,7 @@ impl CloudStore {
         for (name, failures) in names {
             let row: Option<VehicleRow> =
                 row!(&self.pool; concat!(vehicle_columns!(), " WHERE name = $1"); &name);
-            page.vehicles.extend(row.map(|row| (summary(row, &is_online), failures)));
+            page.vehicles.extend(row.map(|row| (summary(row), failures)));
         }
         Ok(page)
     }

@@ -1,4 +1,4 @@
-use gleaner_fleet::people::{NewUser, Role};
+use gleaner_fleet::people::{NewUser, Role, VehicleState};
 use gleaner_fleet::{Cursor, Hello};
 use gleaner_protocol::vehicle_api::GrantStatus;
 use serde_json::{Value, json};
@@ -12,7 +12,7 @@ mod postgres;
 const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20, vehicle_bytes: 1 << 20 };
 
 /// Returns the address of a database of its own.
-async fn address(folder: &TempDir) -> StoreAddress {
+pub(super) async fn address(folder: &TempDir) -> StoreAddress {
     match postgres::store_of(folder.path()).await {
         Some(url) => StoreAddress::server(&url).unwrap(),
         None => StoreAddress::file(&folder.path().join("cloud.db")),
@@ -306,7 +306,7 @@ async fn vehicles_of_a_deployment_are_counted_by_what_they_report() {
     let handled = VehicleReport { handled: 2, ..report(json!({}), json!([])) };
     store.report("car-7", epoch, handled).await.unwrap();
     assert_eq!(counts().await, (2, 0, 1));
-    let all = store.vehicles(|name| name == "car-7").await.unwrap();
+    let all = store.vehicles().await.unwrap();
     assert_eq!((all[0].wanted, all[0].handled, &*all[0].problems[0]), (2, 2, "no room"));
 }
 
@@ -357,10 +357,50 @@ async fn the_database_of_a_later_version_is_refused() {
     assert!(refused.help.is_some());
 }
 
+#[tokio::test]
+async fn vehicles_of_a_process_are_online_as_long_as_its_lease_is() {
+    let (folder, store) = store().await;
+    store.begin_lease("", false).await.unwrap();
+    let epoch = connected(&store, "car-7").await;
+    let state = async || store.vehicles().await.unwrap()[0].state;
+    assert_eq!(state().await, VehicleState::Online);
+    store.disconnect("car-7", epoch - 1).await.unwrap();
+    assert_eq!(state().await, VehicleState::Online, "an older connection changes nothing");
+    store.disconnect("car-7", epoch).await.unwrap();
+    assert_eq!(state().await, VehicleState::Offline);
+
+    let (epoch, _) = store.connect("car-7", "car-7", &Hello::default()).await.unwrap();
+    let link = OwnLink { vehicle: "car-7".to_owned(), epoch, generation: 1 };
+    let none = ["car-8".to_owned()];
+    assert_eq!(store.own_links(None).await.unwrap(), [link]);
+    assert_eq!(store.own_links(Some(&none)).await.unwrap(), []);
+    // Another process removes a lease that has ended, and the next renewal is in time again.
+    let other = CloudStore::open(&address(&folder).await).await.unwrap();
+    assert_eq!(other.own_links(None).await.unwrap(), []);
+    store.execute("UPDATE replicas SET until = 1").await;
+    other.renew_lease().await.unwrap();
+    assert_eq!(state().await, VehicleState::Offline);
+    store.renew_lease().await.unwrap();
+    assert_eq!(state().await, VehicleState::Online);
+    other.begin_lease(store.replica(), false).await.unwrap();
+    assert_eq!(state().await, VehicleState::Offline, "it has ended, and this is its successor");
+}
+
+#[tokio::test]
+async fn a_connection_does_not_count_any_more_once_its_vehicle_was_cut_off() {
+    let (_folder, store) = store().await;
+    let epoch = connected(&store, "car-7").await;
+    store.revoke("ann", "car-7").await.unwrap();
+    store.invite_vehicle("ann", "car-7").await.unwrap();
+    let report = report(json!({}), json!([]));
+    assert!(store.report("car-7", epoch, report).await.is_err(), "also if it is invited again");
+}
+
 #[test]
 fn the_same_tests_pass_on_postgresql() {
     postgres::run_again(
         &["store::", "people::", "page::", "clips::"],
         "the_same_tests_pass_on_postgresql",
+        &[],
     );
 }

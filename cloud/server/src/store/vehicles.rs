@@ -86,8 +86,11 @@ impl CloudStore {
     /// Cuts a vehicle off: none of its certificates and tokens is accepted from now on.
     pub(crate) async fn revoke(&self, actor: &str, name: &str) -> CloudResult<()> {
         let mut change = self.change().await?;
-        let revoked =
-            run!(&mut *change.tx; "UPDATE vehicles SET is_revoked = 1 WHERE name = $1"; name);
+        // With a higher epoch, no connection to any replica counts, also once it is enrolled again.
+        let revoked = run!(&mut *change.tx;
+            "UPDATE vehicles SET is_revoked = 1, replica = '',
+             epoch = CASE WHEN epoch > 0 THEN epoch + 1 ELSE 0 END WHERE name = $1";
+            name);
         if revoked.rows_affected() == 0 {
             return Err(unknown(name));
         }
@@ -107,14 +110,11 @@ impl CloudStore {
         Ok(name.map(|(name,)| name))
     }
 
-    /// Returns all vehicles, those that are in `online` as connected.
-    pub(crate) async fn vehicles(
-        &self,
-        is_online: impl Fn(&str) -> bool,
-    ) -> CloudResult<Vec<VehicleSummary>> {
+    /// Returns all vehicles.
+    pub(crate) async fn vehicles(&self) -> CloudResult<Vec<VehicleSummary>> {
         let rows: Vec<VehicleRow> =
             rows!(&self.pool; concat!(vehicle_columns!(), " ORDER BY name"));
-        Ok(rows.into_iter().map(|row| summary(row, &is_online)).collect())
+        Ok(rows.into_iter().map(summary).collect())
     }
 
     /// Returns the newest status of a vehicle, as JSON.
@@ -142,7 +142,9 @@ impl CloudStore {
             let mut change = self.change().await?;
             for part in parts(&names) {
                 let (names, last) = (in_list(part.len()), part.len() + 1);
-                let sql = format!("UPDATE vehicles SET seen = ${last} WHERE name IN ({names})");
+                let sql = format!(
+                    "UPDATE vehicles SET seen = ${last} WHERE seen < ${last} AND name IN ({names})"
+                );
                 let query = sqlx::query(AssertSqlSafe(sql));
                 let query = part.iter().fold(query, |query, name| query.bind(*name));
                 query.bind(time).execute(&mut *change.tx).await?;
@@ -178,20 +180,22 @@ impl StoreChange<'_> {
 macro_rules! vehicle_columns {
     () => {
         "SELECT name, is_revoked, epoch, seen, version, labels, generation, handled, problems,
-         running, deployments FROM vehicles"
+         running, deployments,
+         CASE WHEN replica IN (SELECT id FROM replicas) THEN 1 ELSE 0 END FROM vehicles"
     };
 }
 pub(super) use vehicle_columns;
 
 /// The values from which the summary of a vehicle is made.
-pub(super) type VehicleRow = (String, i64, i64, i64, String, String, i64, i64, String, i64, i64);
+pub(super) type VehicleRow =
+    (String, i64, i64, i64, String, String, i64, i64, String, i64, i64, i64);
 
 /// Returns the summary of a vehicle.
-pub(super) fn summary(row: VehicleRow, is_online: impl Fn(&str) -> bool) -> VehicleSummary {
+pub(super) fn summary(row: VehicleRow) -> VehicleSummary {
     let (name, is_revoked, epoch, seen, version, labels, wanted, handled, problems, ..) = row;
     VehicleSummary {
         labels: serde_json::from_str(&labels).unwrap_or_default(),
-        state: vehicle_state(&name, (is_revoked, epoch), is_online),
+        state: vehicle_state(is_revoked, epoch, row.11),
         seen: (seen > 0).then_some(unsigned(seen)),
         version: (!version.is_empty()).then_some(version),
         wanted: unsigned(wanted),
@@ -203,15 +207,12 @@ pub(super) fn summary(row: VehicleRow, is_online: impl Fn(&str) -> bool) -> Vehi
     }
 }
 
-/// Returns the state of a vehicle with these values of `is_revoked` and `epoch`.
-pub(super) fn vehicle_state(
-    name: &str,
-    (is_revoked, epoch): (i64, i64),
-    is_online: impl Fn(&str) -> bool,
-) -> VehicleState {
+/// Returns the state of a vehicle with these values. It is online if a process whose lease has not
+/// ended has its newest connection.
+pub(super) fn vehicle_state(is_revoked: i64, epoch: i64, is_online: i64) -> VehicleState {
     match () {
         () if is_revoked != 0 => VehicleState::Revoked,
-        () if is_online(name) => VehicleState::Online,
+        () if is_online != 0 => VehicleState::Online,
         () if epoch == 0 => VehicleState::Invited,
         () => VehicleState::Offline,
     }

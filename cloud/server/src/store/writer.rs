@@ -9,6 +9,7 @@ use tokio::sync::{Mutex, mpsc, oneshot};
 
 use super::links::{ConnectWrite, ReportWrite};
 use super::records::AppendWrite;
+use super::replicas::DisconnectWrite;
 use super::{CloudStore, StoreChange, begin, in_list, parts};
 use crate::error::{CloudError, CloudResult};
 
@@ -40,6 +41,7 @@ pub(super) enum WaitingWrite {
     Connect(Waiting<ConnectWrite>),
     Report(Waiting<ReportWrite>),
     Append(Waiting<AppendWrite>),
+    Disconnect(Waiting<DisconnectWrite>),
 }
 
 /// The vehicles of a group as they are stored, apart from what the group has changed already.
@@ -61,6 +63,7 @@ impl WaitingWrite {
             Self::Connect(waiting) => waiting.write.vehicle(),
             Self::Report(waiting) => waiting.write.vehicle(),
             Self::Append(waiting) => waiting.write.vehicle(),
+            Self::Disconnect(waiting) => waiting.write.vehicle(),
         }
     }
 
@@ -70,6 +73,7 @@ impl WaitingWrite {
             Self::Connect(waiting) => waiting.finish(failed),
             Self::Report(waiting) => waiting.finish(failed),
             Self::Append(waiting) => waiting.finish(failed),
+            Self::Disconnect(waiting) => waiting.finish(failed),
         }
     }
 }
@@ -135,17 +139,20 @@ impl GroupWriter {
     async fn commit(&self, group: &mut [WaitingWrite]) -> CloudResult<()> {
         let mut change = begin(&self.pool, &self.turn).await?;
         let mut vehicles = change.group_vehicles(group).await?;
-        let (mut connects, mut reports, mut appends) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut connects, mut ends) = (Vec::new(), Vec::new());
+        let (mut reports, mut appends) = (Vec::new(), Vec::new());
         for write in group {
             match write {
                 WaitingWrite::Connect(waiting) => connects.push(waiting),
                 WaitingWrite::Report(waiting) => reports.push(waiting),
                 WaitingWrite::Append(waiting) => appends.push(waiting),
+                WaitingWrite::Disconnect(waiting) => ends.push(waiting),
             }
         }
         change.connect_all(&mut vehicles, &mut connects).await?;
         change.report_all(&mut vehicles, &mut reports).await?;
         change.append_all(&mut vehicles, &mut appends).await?;
+        change.disconnect_all(&mut vehicles, &mut ends).await?;
         change.commit().await
     }
 }

@@ -28,6 +28,8 @@ const HELLO: Duration = Duration::from_secs(10);
 const SEND: Duration = Duration::from_secs(60);
 /// Time after which a vehicle connects again that has sent something wrong, in ms.
 const WRONG_MS: u64 = 60_000;
+/// Latest time after which one connects again whose connection the cloud itself has failed, in ms.
+const INTERNAL_MS: u64 = 10_000;
 /// Frames of a vehicle that are written to the disk: more wait.
 const WRITES: RateLimit = RateLimit::of(20.0, 100.0);
 /// Length of a report or of records, decompressed, that does not count among the frames that are
@@ -76,10 +78,19 @@ pub(super) async fn serve(cloud: &Cloud, (name, certificate): (&str, &str), sock
         Ok(end) => end,
         Err(error) => {
             tracing::warn!(vehicle = name, reason = error.reason(), "a connection was ended");
-            Some(GoAway { after_ms: WRONG_MS, reason: error.reason() })
+            // With a database that is back soon, the vehicle should be, too, but not all at once.
+            let after_ms = match error.is_internal() {
+                true => getrandom::u64().map_or(WRONG_MS, |random| random % INTERNAL_MS),
+                false => WRONG_MS,
+            };
+            Some(GoAway { after_ms, reason: error.reason() })
         }
     };
-    cloud.hub.remove(name, link.epoch);
+    if cloud.hub.remove(name, link.epoch)
+        && let Err(error) = cloud.store.disconnect(name, link.epoch).await
+    {
+        tracing::debug!(vehicle = name, reason = error.reason(), "its end is stored later");
+    }
     if let Some(end) = end {
         // The vehicle may be gone.
         let _ = link.send(Body::GoAway(end)).await;
@@ -134,11 +145,11 @@ impl<'c> VehicleLink<'c> {
         let mut sent_changes = 0;
         loop {
             // An order may be older than this loop, or have come while a frame was handled.
-            let LinkOrders { changes, end } = orders.borrow_and_update().clone();
+            let LinkOrders { changes, generation, end } = orders.borrow_and_update().clone();
             if end.is_some() {
                 return Ok(end);
             }
-            if changes != sent_changes {
+            if changes != sent_changes || generation > self.sent {
                 sent_changes = changes;
                 Box::pin(self.send_wanted()).await?;
             }

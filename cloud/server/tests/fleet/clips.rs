@@ -26,7 +26,7 @@ const IMAGE: &[u8] = &{
 };
 
 /// Returns the facts of a clip with this content.
-fn facts(name: &str, label: &str, at_ns: i64, content: &[u8]) -> Value {
+pub(crate) fn facts(name: &str, label: &str, at_ns: i64, content: &[u8]) -> Value {
     let moment = json!({ "lambda": "brake", "kind": "event", "label": label, "score": 0.5,
                          "attributes": { "lat": 59.9 }, "at_ns": at_ns });
     let lambda = json!({ "name": "brake", "version": "1.0.0", "digest": "d", "deployment": "b",
@@ -37,31 +37,40 @@ fn facts(name: &str, label: &str, at_ns: i64, content: &[u8]) -> Value {
 }
 
 /// A content of two parts.
-fn two_parts() -> Vec<u8> {
+pub(crate) fn two_parts() -> Vec<u8> {
     (0..CLIP_PART + 5).map(|byte| byte as u8).collect()
 }
 
-async fn report(vehicle: &FakeVehicle, clips: &[Value], gone: Value) -> (StatusCode, ClipOrders) {
+pub(crate) async fn report(
+    vehicle: &FakeVehicle,
+    clips: &[Value],
+    gone: Value,
+) -> (StatusCode, ClipOrders) {
     let cursor = (!clips.is_empty()).then(|| format!("after {}", clips.len()));
     let body = json!({ "cursor": cursor, "clips": clips, "gone": gone }).to_string();
     let (status, text) = vehicle.request(Method::POST, "/v1/clips", body.as_bytes()).await;
     (status, serde_json::from_slice(&text).unwrap_or_default())
 }
 
-async fn orders(vehicle: &FakeVehicle) -> ClipOrders {
+pub(crate) async fn orders(vehicle: &FakeVehicle) -> ClipOrders {
     let (status, orders) = report(vehicle, &[], json!([])).await;
     assert_eq!(status, StatusCode::OK);
     orders
 }
 
 /// Sends a part of a content; returns the status, or the reason of the refusal.
-async fn put(vehicle: &FakeVehicle, name: &str, number: u64, part: &[u8]) -> (StatusCode, String) {
+pub(crate) async fn put(
+    vehicle: &FakeVehicle,
+    name: &str,
+    number: u64,
+    part: &[u8],
+) -> (StatusCode, String) {
     let path = format!("/v1/clips/{name}/parts/{number}/{}", sha256(part));
     let (status, text) = vehicle.request(Method::PUT, &path, part).await;
     (status, String::from_utf8_lossy(&text).into_owned())
 }
 
-async fn pull(person: &Person, id: &str) -> StatusCode {
+pub(crate) async fn pull(person: &Person, id: &str) -> StatusCode {
     person.open(Method::POST, &format!("/v1/clips/{id}/pull"), b"").await.status()
 }
 
@@ -75,7 +84,7 @@ async fn names(person: &Person, query: &str) -> Vec<String> {
     clips.map(|clip| clip["name"].as_str().unwrap().to_owned()).collect()
 }
 
-async fn bytes(person: &Person, path: &str) -> (StatusCode, Vec<u8>) {
+pub(crate) async fn bytes(person: &Person, path: &str) -> (StatusCode, Vec<u8>) {
     let answer = person.open(Method::GET, path, b"").await;
     let status = answer.status();
     (status, soon(answer.into_body().collect()).await.unwrap().to_bytes().to_vec())

@@ -12,6 +12,7 @@ use gleaner_fleet::{
 use http_body_util::{BodyExt, Full};
 use hyper::body::Incoming;
 use hyper::client::conn::http1;
+use hyper::http::request;
 use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::TokioIo;
 use rcgen::{CertificateParams, KeyPair};
@@ -70,9 +71,16 @@ impl Person {
 
     /// Sends a request; returns the answer as it begins.
     pub(crate) async fn open(&self, method: Method, path: &str, body: &[u8]) -> Response<Incoming> {
-        let request = Request::builder()
-            .method(method)
-            .uri(path)
+        self.send(Request::builder().method(method).uri(path), body).await
+    }
+
+    /// Requests a part of a file.
+    pub(crate) async fn open_range(&self, path: &str, range: &str) -> Response<Incoming> {
+        self.send(Request::get(path).header("range", range), b"").await
+    }
+
+    async fn send(&self, request: request::Builder, body: &[u8]) -> Response<Incoming> {
+        let request = request
             .header("host", "cloud")
             .header("authorization", format!("Bearer {}", self.token))
             .body(Full::new(Bytes::copy_from_slice(body)))

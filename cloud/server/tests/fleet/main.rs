@@ -1,11 +1,14 @@
 //! People and vehicles use a cloud together, over its two addresses.
 
+mod bucket;
 mod clips;
 mod fake;
 mod hostile;
 mod links;
+mod nats;
 #[path = "../postgres/mod.rs"]
 mod postgres;
+mod replicas;
 mod restarts;
 
 use std::path::Path;
@@ -22,7 +25,16 @@ use tempfile::TempDir;
 async fn options(folder: &Path) -> ServeOptions {
     let any = ([127, 0, 0, 1], 0).into();
     let (data, store) = (folder.join("data"), postgres::store_of(folder).await);
-    ServeOptions { data, store, people: any, vehicles: any, name: None, is_insecure: false }
+    ServeOptions {
+        data,
+        store,
+        bus: None,
+        objects: None,
+        people: any,
+        vehicles: any,
+        name: None,
+        is_insecure: false,
+    }
 }
 
 /// Starts a cloud; returns it with its administrator.
@@ -164,5 +176,11 @@ async fn a_vehicle_enrols_gets_what_is_deployed_and_is_cut_off() {
 
 #[test]
 fn the_same_tests_pass_on_postgresql() {
-    postgres::run_again(&[], "the_same_tests_pass_on_postgresql");
+    let url = format!("http://{}", bucket::serve());
+    let variables = [
+        ("AWS_ACCESS_KEY_ID", bucket::KEY),
+        ("AWS_SECRET_ACCESS_KEY", "secret"),
+        ("AWS_ENDPOINT_URL", &url),
+    ];
+    postgres::run_again(&[], "the_same_tests_pass_on_postgresql", &variables);
 }

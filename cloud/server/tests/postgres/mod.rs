@@ -37,8 +37,8 @@ pub async fn store_of(folder: &Path) -> Option<String> {
 }
 
 /// Runs the tests of this program that have one of these names again, on PostgreSQL, but not
-/// `except`. Without PostgreSQL, it prints that and returns.
-pub fn run_again(names: &[&str], except: &str) {
+/// `except`, with these environment variables. Without PostgreSQL, it prints that and returns.
+pub fn run_again(names: &[&str], except: &str, variables: &[(&str, &str)]) {
     let Some(programs) = programs() else {
         eprintln!("skipped: PostgreSQL is not installed (Debian: postgresql)");
         return;
@@ -49,7 +49,7 @@ pub fn run_again(names: &[&str], except: &str) {
     let mut tests = Command::new(std::env::current_exe().unwrap());
     // Many tests at a time would need more connections than the server has.
     tests.args(names).args(["--skip", except, "--test-threads", "4"]);
-    let output = tests.env(STORE, url).output().unwrap();
+    let output = tests.env(STORE, url).envs(variables.iter().copied()).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout);
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success() && text.contains(" passed"), "{text}{errors}");

@@ -4,7 +4,7 @@ use gleaner_fleet::Hello;
 use serde_json::json;
 use tempfile::TempDir;
 
-use super::super::tests::{connected, offered, report, store};
+use super::super::tests::{address, connected, offered, report, store};
 use super::super::{OfferedDeployment, StoreAddress, VehicleReport};
 use super::*;
 
@@ -19,7 +19,7 @@ const PLAN: WavePlan = WavePlan {
 
 /// A store with vehicles that run release 1 of the deployment `a`.
 struct TestFleet {
-    _folder: TempDir,
+    folder: TempDir,
     store: CloudStore,
     epochs: BTreeMap<String, u64>,
 }
@@ -33,7 +33,7 @@ impl TestFleet {
             epochs.insert(name.clone(), connected(&store, &name).await);
         }
         store.deploy("ann", &release(1, None)).await.unwrap();
-        Self { _folder: folder, store, epochs }
+        Self { folder, store, epochs }
     }
 
     async fn deploy(&self, number: u64, plan: WavePlan) {
@@ -115,6 +115,25 @@ async fn a_wave_opens_once_the_one_before_has_succeeded() {
     let steps: Vec<_> = fleet.store.audit(u64::MAX, 100).await.unwrap();
     let steps: Vec<_> = steps.iter().filter(|it| it.actor == WAVES).map(|it| &*it.action).collect();
     assert_eq!(steps, ["open release 2 to all", "open wave 2 of release 2"]);
+}
+
+#[tokio::test]
+async fn two_processes_take_a_step_once() {
+    let fleet = TestFleet::of(10).await;
+    let other = CloudStore::open(&address(&fleet.folder).await).await.unwrap();
+    fleet.deploy(2, WavePlan { shares: vec![10, 50], ..PLAN }).await;
+    fleet.report(&fleet.having(2).await, 2, None).await;
+    let looks = async |store: &CloudStore| {
+        let mut changed = 0;
+        for _ in 0..5 {
+            changed += store.advance_waves().await.unwrap().len();
+        }
+        changed
+    };
+    let (here, there) = tokio::join!(looks(&fleet.store), looks(&other));
+    assert_eq!(here + there, 4, "vehicles of the second wave");
+    let audit = fleet.store.audit(u64::MAX, 100).await.unwrap();
+    assert_eq!(audit.iter().filter(|it| it.actor == WAVES).count(), 1);
 }
 
 #[tokio::test]

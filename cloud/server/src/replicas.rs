@@ -1,0 +1,144 @@
+//! This process as one of several that serve the same PostgreSQL database: it keeps its lease, and
+//! learns there what the others have changed.
+//!
+//! It looks every two seconds, and at once at what a hint names: without hints, changes arrive that
+//! much later, and nothing else is different.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::{MissedTickBehavior, interval, sleep};
+
+use crate::bus::ReceivedHints;
+use crate::cloud::Cloud;
+use crate::error::CloudResult;
+use crate::store::OwnLink;
+
+/// Interval of looks. With a look that takes its time, a revoked vehicle is cut off within 5 s.
+const LOOK: Duration = Duration::from_secs(2);
+/// Interval at which the lease is renewed.
+const RENEW: Duration = Duration::from_secs(4);
+/// Least time between two looks that hints cause.
+const PAUSE: Duration = Duration::from_millis(20);
+
+/// Keeps the lease of this process, for as long as it runs.
+pub(crate) async fn keep_lease(cloud: &Cloud) {
+    let mut ticks = interval(RENEW);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        ticks.tick().await;
+        if let Err(error) = cloud.store.renew_lease().await {
+            tracing::warn!(reason = error.reason(), "the lease of this process is not renewed");
+        }
+    }
+}
+
+/// Follows the changes of other replicas, for as long as this process runs.
+pub(crate) async fn follow(cloud: &Cloud, hints: Option<Arc<ReceivedHints>>) {
+    let mut ticks = interval(LOOK);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut follower = ReplicaFollower::default();
+    let mut has_failed = false;
+    loop {
+        let look = match &hints {
+            None => {
+                ticks.tick().await;
+                follower.look(cloud).await
+            }
+            Some(hints) => tokio::select! {
+                _ = ticks.tick() => follower.look(cloud).await,
+                hinted = hints.next() => {
+                    sleep(PAUSE).await;
+                    let changed: Vec<_> = hinted.changed.into_iter().collect();
+                    let looked = follower.look_at_links(cloud, Some(&changed)).await;
+                    cloud.hub.arrived_elsewhere(&hinted.with_records);
+                    looked
+                }
+            },
+        };
+        match look {
+            Err(error) if !has_failed => {
+                let reason = error.reason();
+                tracing::warn!(reason, "changes of other replicas cannot be read");
+                has_failed = true;
+            }
+            Ok(()) => has_failed = false,
+            Err(_) => {}
+        }
+    }
+}
+
+/// What the last look has found.
+#[derive(Debug, Default)]
+struct ReplicaFollower {
+    /// Number of the last entry of the audit trail; `None` before the first look.
+    entry: Option<i64>,
+    /// Last arrivals of the vehicles whose records are read.
+    arrivals: BTreeMap<String, i64>,
+    /// Connections of this process in the database that it does not have.
+    missing: BTreeSet<(String, u64)>,
+}
+
+impl ReplicaFollower {
+    async fn look(&mut self, cloud: &Cloud) -> CloudResult<()> {
+        self.look_at_links(cloud, None).await?;
+        self.look_at_records(cloud).await?;
+        self.look_at_users(cloud).await
+    }
+
+    /// Ends connections that do not count any more, and wakes those with another wanted state.
+    async fn look_at_links(&mut self, cloud: &Cloud, only: Option<&[String]>) -> CloudResult<()> {
+        // First the connections: one that begins after this is not in question.
+        let open = cloud.hub.open_links(only);
+        if only.is_some() && open.is_empty() {
+            return Ok(());
+        }
+        let names: Option<Vec<String>> = only.map(|_| open.keys().cloned().collect());
+        let own = cloud.store.own_links(names.as_deref()).await?;
+        let missing = cloud.hub.compare(&open, &own);
+        if only.is_some() {
+            return Ok(());
+        }
+        // One that was missing before has ended while its end could not be stored.
+        for (vehicle, epoch) in missing.intersection(&self.missing) {
+            cloud.store.disconnect(vehicle, *epoch).await?;
+        }
+        self.missing = missing;
+        Ok(())
+    }
+
+    async fn look_at_records(&mut self, cloud: &Cloud) -> CloudResult<()> {
+        let vehicles = cloud.hub.read_vehicles();
+        self.arrivals.retain(|name, _| vehicles.contains(name));
+        let mut arrived = BTreeSet::new();
+        for name in vehicles {
+            let last = cloud.store.last_arrival(&name).await?;
+            // The first time, a reader may have looked before it.
+            if self.arrivals.insert(name.clone(), last) != Some(last) {
+                arrived.insert(name);
+            }
+        }
+        cloud.hub.arrived_elsewhere(&arrived);
+        Ok(())
+    }
+
+    async fn look_at_users(&mut self, cloud: &Cloud) -> CloudResult<()> {
+        let last = cloud.store.last_entry().await?;
+        // Readers cannot be older than the first look, which is at the start.
+        if let Some(before) = self.entry.filter(|before| *before < last) {
+            for user in cloud.store.users_removed(before, last).await? {
+                cloud.readers.end(&user);
+            }
+        }
+        self.entry = Some(last);
+        Ok(())
+    }
+}
+
+impl OwnLink {
+    /// Returns the vehicle and the epoch.
+    pub(crate) fn key(&self) -> (String, u64) {
+        (self.vehicle.clone(), self.epoch)
+    }
+}
