@@ -377,15 +377,6 @@ impl ClipState {
     }
 }
 
-/// A part of a list of clips, the last announced first.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct ClipPage {
-    /// The clips.
-    pub clips: Vec<FleetClip>,
-    /// The value of `after` for the next part; `None` at the end.
-    pub next: Option<u64>,
-}
-
 /// Rules for the upload of clips of the fleet.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -4,10 +4,10 @@
 //! |---|---|---|
 //! | `POST /v1/login` | none | [`UserToken`], of a [`Login`] |
 //! | `GET /v1/me` | viewer | [`User`] |
-//! | `GET /v1/users` | admin | [`User`] of each |
+//! | `GET /v1/users` | admin | [`ListPage`] of [`User`] |
 //! | `POST /v1/users` | admin | [`Invitation`], of a [`NewUser`] |
 //! | `DELETE /v1/users/NAME` | admin | nothing |
-//! | `GET /v1/vehicles` | viewer | [`VehicleSummary`] of each |
+//! | `GET /v1/vehicles` | viewer | [`ListPage`] of [`VehicleSummary`] |
 //! | `POST /v1/vehicles` | admin | [`Enrolment`](crate::Enrolment), of a [`NewVehicle`] |
 //! | `DELETE /v1/vehicles/NAME` | admin | nothing, once it is cut off |
 //! | `GET /v1/vehicles/NAME/status` | viewer | [`VehicleStatus`] |
@@ -15,14 +15,14 @@
 //! | `GET /v1/vehicles/NAME/lambdas/ID/records` | viewer | a line of JSON per record |
 //! | `PUT /v1/objects/SHA256` | deployer | nothing |
 //! | `POST /v1/deployments` | deployer | `DeployReply`, of a [`FleetDeployRequest`] |
-//! | `GET /v1/deployments` | viewer | [`FleetDeployment`] of each |
+//! | `GET /v1/deployments` | viewer | [`ListPage`] of [`FleetDeployment`] |
 //! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | operator | [`FleetDeployment`] |
 //! | `POST /v1/deployments/ID/pause`, `resume`, `abort` | operator | [`FleetDeployment`] |
 //! | `DELETE /v1/deployments/ID` | deployer | nothing |
-//! | `GET /v1/audit` | admin | [`AuditEntry`] of each, the newest first |
+//! | `GET /v1/audit` | admin | [`ListPage`] of [`AuditEntry`], the newest first |
 //!
 //! In the answer to a deployment, `attempt` is 0, as each vehicle counts its own, and `generation`
-//! is the number of its entry in the audit trail. The audit trail is answered up to 1,000 entries.
+//! is the number of its entry in the audit trail.
 //!
 //! [`VehicleStatus`]: gleaner_protocol::vehicle_api::VehicleStatus
 
@@ -34,6 +34,26 @@ use gleaner_protocol::vehicle_api::GrantStatus;
 use serde::{Deserialize, Serialize};
 
 use crate::waves::{WavePlan, WaveProgress};
+
+/// A part of a list that can grow: `?after=CURSOR&limit=N`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ListPage<T> {
+    /// The entries.
+    pub items: Vec<T>,
+    /// The value of `after` for the next part. Only a part with as many entries as `limit` has it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next: Option<String>,
+}
+
+impl<T> ListPage<T> {
+    /// Returns a part with its entries, which are at most `limit`. `cursor` returns the position
+    /// of an entry.
+    pub fn of(items: Vec<T>, limit: u64, cursor: impl Fn(&T) -> String) -> Self {
+        let is_full = items.len() as u64 == limit;
+        let next = items.last().filter(|_| is_full).map(cursor);
+        Self { items, next }
+    }
+}
 
 /// The rights of a user. Each has those of the ones before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]

@@ -248,11 +248,18 @@ pub struct StreamLine {
     pub record: serde_json::Value,
 }
 
-/// An error, as `application/problem+json`: a [`Failure`].
+/// An error, as `application/problem+json` of RFC 9457: a [`Failure`]. It has no `type`: all are of
+/// the type `about:blank`, and the status tells them apart.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Problem {
     /// The failed action.
     pub title: String,
+    /// HTTP status of the answer.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub status: Option<u16>,
+    /// The causes as one text.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub detail: Option<String>,
     /// The causes, the nearest first.
     #[serde(default)]
     pub causes: Vec<String>,
@@ -263,14 +270,17 @@ pub struct Problem {
     pub exit: u8,
 }
 
-impl From<Failure> for Problem {
-    fn from(Failure { exit, message, causes, help }: Failure) -> Self {
-        Self { title: message, causes, help, exit: exit.code() }
+impl Problem {
+    /// Returns a failure as the answer with an HTTP status.
+    pub fn new(failure: Failure, status: u16) -> Self {
+        let Failure { exit, message, causes, help } = failure;
+        let detail = (!causes.is_empty()).then(|| causes.join(": "));
+        Self { title: message, status: Some(status), detail, causes, help, exit: exit.code() }
     }
 }
 
 impl From<Problem> for Failure {
-    fn from(Problem { title, causes, help, exit }: Problem) -> Self {
+    fn from(Problem { title, causes, help, exit, .. }: Problem) -> Self {
         let exit = Exit::from_code(exit.into()).filter(|exit| *exit != Exit::Ok);
         Failure { exit: exit.unwrap_or(Exit::Internal), message: title, causes, help }
     }

@@ -6,6 +6,7 @@
 //! its format.
 
 mod deploy;
+mod lists;
 mod records;
 #[cfg(test)]
 pub(crate) mod tests;
@@ -29,10 +30,9 @@ use gleaner_fleet::waves::WaveState;
 use crate::accept::PeerConnection;
 use crate::clips::people as clips;
 use crate::cloud::Cloud;
-use crate::error::{CloudError, CloudResult};
+use crate::error::{CloudError, CloudResult, as_problem, is_api};
 use crate::page;
 use crate::request::{in_time, parsed};
-use crate::store::ENTRIES_MAX;
 
 /// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
 /// text in JSON.
@@ -68,10 +68,10 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
             post(login).layer(DefaultBodyLimit::max(LOGIN_MAX)),
         ),
         read("/v1/me", Viewer, get(me)),
-        read("/v1/users", Admin, get(users)),
+        read("/v1/users", Admin, get(lists::users)),
         send("/v1/users", Admin, post(invite)),
         remove("/v1/users/{name}", Admin, delete(remove_user)),
-        read("/v1/vehicles", Viewer, get(vehicles)),
+        read("/v1/vehicles", Viewer, get(lists::vehicles)),
         send("/v1/vehicles", Admin, post(invite_vehicle)),
         remove("/v1/vehicles/{name}", Admin, delete(revoke)),
         read("/v1/vehicles/{name}/status", Viewer, get(status)),
@@ -79,10 +79,10 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
         read("/v1/vehicles/{name}/lambdas/{id}/records", Viewer, get(records::lambda)),
         endpoint(Method::PUT, "/v1/objects/{sha256}", Some(Deployer), put(deploy::object)),
         send("/v1/deployments", Deployer, post(deploy::deploy)),
-        read("/v1/deployments", Viewer, get(deployments)),
+        read("/v1/deployments", Viewer, get(lists::deployments)),
         send("/v1/deployments/{id}/{change}", Operator, post(change)),
         remove("/v1/deployments/{id}", Deployer, delete(remove_deployment)),
-        read("/v1/audit", Admin, get(audit)),
+        read("/v1/audit", Admin, get(lists::audit)),
         read("/v1/clips", Viewer, get(clips::list)),
         read("/v1/clips/policy", Viewer, get(clips::policy)),
         endpoint(Method::PUT, "/v1/clips/policy", Some(Admin), put(clips::set_policy)),
@@ -108,12 +108,13 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
     }
     router
         .merge(page::router(cloud))
-        .fallback(async |uri: Uri| match uri.path().starts_with("/v1/") {
-            true => CloudError::missing("there is nothing under this path", "see the docs")
+        .fallback(async |uri: Uri| match is_api(uri.path()) {
+            true => CloudError::missing("there is nothing under this path", "`GET /v1/openapi.json` describes all requests")
                 .into_response(),
             false => page::nothing_here(),
         })
         .layer(DefaultBodyLimit::max(BODY_MAX))
+        .layer(from_fn(as_problem))
         .with_state(Arc::clone(cloud))
 }
 
@@ -175,10 +176,6 @@ async fn me(Extension(user): Extension<User>) -> Json<User> {
     Json(user)
 }
 
-async fn users(State(cloud): State<Arc<Cloud>>) -> CloudResult<Response> {
-    Ok(Json(cloud.store.users().await?).into_response())
-}
-
 async fn invite(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
@@ -196,11 +193,6 @@ async fn remove_user(
     cloud.store.remove_user(&actor.name, &name).await?;
     cloud.readers.end(&name);
     Ok(StatusCode::NO_CONTENT)
-}
-
-async fn vehicles(State(cloud): State<Arc<Cloud>>) -> CloudResult<Response> {
-    let vehicles = cloud.store.vehicles(|name| cloud.hub.is_online(name)).await?;
-    Ok(Json(vehicles).into_response())
 }
 
 async fn invite_vehicle(
@@ -240,10 +232,6 @@ async fn status(
 ) -> CloudResult<Response> {
     let status = cloud.store.status(&name).await?;
     Ok(([(header::CONTENT_TYPE, "application/json")], status).into_response())
-}
-
-async fn deployments(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<Vec<FleetDeployment>>> {
-    Ok(Json(cloud.store.deployments().await?))
 }
 
 /// Makes a change of a deployment that its name states, and wakes the vehicles that it is for.
@@ -287,8 +275,4 @@ async fn remove_deployment(
     let changed = cloud.store.remove_deployment(&actor.name, &id).await?;
     cloud.hub.wake(&changed);
     Ok(StatusCode::NO_CONTENT)
-}
-
-async fn audit(State(cloud): State<Arc<Cloud>>) -> CloudResult<Response> {
-    Ok(Json(cloud.store.audit(u64::MAX, ENTRIES_MAX).await?).into_response())
 }

@@ -9,6 +9,7 @@ use gleaner_protocol::vehicle_api::GrantStatus;
 
 use super::vehicles::json;
 use super::wants::{ChangedVehicles, TextMap, map};
+use super::waves::ReleaseChoice;
 use super::{CloudStore, StoreChange, int, now, now_ms, unsigned};
 use crate::error::{CloudError, CloudResult};
 
@@ -132,22 +133,28 @@ impl CloudStore {
         change.finish(found, actor, "remove deployment", id).await
     }
 
-    /// Returns all deployments, each with the number of vehicles that should run its newest release
-    /// and do.
-    pub(crate) async fn deployments(&self) -> CloudResult<Vec<FleetDeployment>> {
-        self.some_deployments("").await
+    /// Returns the deployments after this id, at most `most`, each with the number of vehicles that
+    /// should run its newest release and do.
+    pub(crate) async fn deployments(
+        &self,
+        after: &str,
+        most: u64,
+    ) -> CloudResult<Vec<FleetDeployment>> {
+        self.some_deployments(ReleaseChoice::Part(after, most)).await
     }
 
     /// Returns one of the [`deployments`](Self::deployments).
     pub(crate) async fn deployment(&self, id: &str) -> CloudResult<FleetDeployment> {
-        self.some_deployments(id).await?.pop().ok_or_else(|| unknown(id))
+        self.some_deployments(ReleaseChoice::Of(id)).await?.pop().ok_or_else(|| unknown(id))
     }
 
-    /// Returns the deployment `only`, or all if it is empty.
-    async fn some_deployments(&self, only: &str) -> CloudResult<Vec<FleetDeployment>> {
+    async fn some_deployments(
+        &self,
+        choice: ReleaseChoice<'_>,
+    ) -> CloudResult<Vec<FleetDeployment>> {
         // One transaction: all numbers are of the same moment.
         let mut tx = self.pool.begin().await?;
-        let releases = super::waves::newest_releases(&mut tx, only).await?;
+        let releases = super::waves::newest_releases(&mut tx, choice).await?;
         let mut deployments = Vec::new();
         for release in releases {
             let all = release.count(&mut tx, false).await?;

@@ -4,7 +4,7 @@ use gleaner_base::excerpt;
 use gleaner_fleet::people::{Invitation, NewUser, Role, User, UserToken};
 
 use super::secrets::SecretKind;
-use super::{CloudStore, now, unsigned};
+use super::{CloudStore, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Actor of changes that the program itself makes, for a person at its machine.
@@ -130,9 +130,11 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Returns all users.
-    pub(crate) async fn users(&self) -> CloudResult<Vec<User>> {
-        let rows: Vec<_> = rows!(&self.pool; "SELECT name, role FROM users ORDER BY name");
+    /// Returns the users after this name, at most `most`.
+    pub(crate) async fn users(&self, after: &str, most: u64) -> CloudResult<Vec<User>> {
+        let rows: Vec<_> = rows!(&self.pool;
+            "SELECT name, role FROM users WHERE name > $1 ORDER BY name LIMIT $2";
+            after, int(most));
         rows.into_iter().map(user).collect()
     }
 

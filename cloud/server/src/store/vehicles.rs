@@ -252,13 +252,16 @@ impl CloudStore {
         self.write(ReportWrite { name: name.to_owned(), epoch, report }).await
     }
 
-    /// Returns all vehicles, those that are in `online` as connected.
+    /// Returns the vehicles after this name, at most `most`.
     pub(crate) async fn vehicles(
         &self,
+        after: &str,
+        most: u64,
         is_online: impl Fn(&str) -> bool,
     ) -> CloudResult<Vec<VehicleSummary>> {
-        let rows: Vec<VehicleRow> =
-            rows!(&self.pool; concat!(vehicle_columns!(), " ORDER BY name"));
+        let rows: Vec<VehicleRow> = rows!(&self.pool;
+            concat!(vehicle_columns!(), " WHERE name > $1 ORDER BY name LIMIT $2");
+            after, int(most));
         Ok(rows.into_iter().map(|row| summary(row, &is_online)).collect())
     }
 

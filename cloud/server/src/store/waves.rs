@@ -10,7 +10,7 @@ use sqlx::{FromRow, Row};
 use super::deployments::{COMPLETE, unknown};
 use super::vehicles::{FAILED, RUNNING};
 use super::wants::{ChangedVehicles, TextMap, map, selects};
-use super::{CloudStore, StoreChange, now, unsigned};
+use super::{CloudStore, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Actor of steps that the cloud takes by a plan.
@@ -84,17 +84,37 @@ impl FromRow<'_, AnyRow> for Release {
     }
 }
 
-/// Returns the newest release of the deployment `only`, or of each if it is empty.
-pub(super) async fn newest_releases(tx: &mut Tx, only: &str) -> CloudResult<Vec<Release>> {
+/// Choice of deployments.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum ReleaseChoice<'c> {
+    /// The one with this id.
+    Of(&'c str),
+    /// Those after this id, at most so many.
+    Part(&'c str, u64),
+}
+
+impl ReleaseChoice<'_> {
+    const ALL: Self = Self::Part("", u64::MAX);
+}
+
+/// Returns the newest release of each chosen deployment.
+pub(super) async fn newest_releases(
+    tx: &mut Tx,
+    choice: ReleaseChoice<'_>,
+) -> CloudResult<Vec<Release>> {
+    let (is_one, id, most) = match choice {
+        ReleaseChoice::Of(id) => (1, id, 1),
+        ReleaseChoice::Part(after, most) => (0, after, int(most)),
+    };
     Ok(rows!(&mut **tx;
         "SELECT deployment, number, sha256, revision, fallback, grants, selector, state, plan, wave,
          since, reason, is_wanted
          FROM releases JOIN deployments ON deployments.id = releases.deployment
          WHERE number = (SELECT MAX(number) FROM releases AS other
                          WHERE other.deployment = releases.deployment)
-         AND ($1 = '' OR deployment = $1)
-         ORDER BY deployment";
-        only))
+         AND CASE WHEN $1 = 1 THEN deployment = $2 ELSE deployment > $2 END
+         ORDER BY deployment LIMIT $3";
+        is_one, id, most))
 }
 
 impl CloudStore {
@@ -107,7 +127,7 @@ impl CloudStore {
         }
         let mut change = self.change().await?;
         let mut has_changed = false;
-        for release in newest_releases(&mut change.tx, "").await? {
+        for release in newest_releases(&mut change.tx, ReleaseChoice::ALL).await? {
             if release.state != "running" || release.is_wanted == 0 {
                 continue;
             }
@@ -163,11 +183,7 @@ impl CloudStore {
 impl StoreChange<'_> {
     /// Returns the newest release of a deployment.
     pub(super) async fn newest(&mut self, id: &str) -> CloudResult<Option<Release>> {
-        // The empty text would mean all.
-        if id.is_empty() {
-            return Ok(None);
-        }
-        Ok(newest_releases(&mut self.tx, id).await?.pop())
+        Ok(newest_releases(&mut self.tx, ReleaseChoice::Of(id)).await?.pop())
     }
 
     /// Marks the vehicles of a release's waves that have failed so far.

@@ -108,7 +108,7 @@ impl Person {
     /// Returns a vehicle of the list.
     pub(crate) async fn vehicle(&self, name: &str) -> Value {
         let all = self.call(Method::GET, "/v1/vehicles", Value::Null).await;
-        all.as_array().unwrap().iter().find(|it| it["name"] == name).unwrap().clone()
+        all["items"].as_array().unwrap().iter().find(|it| it["name"] == name).unwrap().clone()
     }
 }
 

@@ -156,7 +156,7 @@ async fn a_vehicle_enrols_gets_what_is_deployed_and_is_cut_off() {
     assert_eq!(admin.vehicle("car-7").await["state"], "revoked");
     let audit = admin.call(Method::GET, "/v1/audit", Value::Null).await;
     assert_eq!(
-        (&audit[0]["action"], &audit[0]["actor"]),
+        (&audit["items"][0]["action"], &audit["items"][0]["actor"]),
         (&json!("revoke vehicle"), &json!("admin"))
     );
     server.stop().await;
