@@ -23,7 +23,7 @@ pub(super) fn users(args: &UsersArgs) -> Result<Exit, Failure> {
         }),
         Some(UsersCommand::Invite(user)) => {
             let request = NewUser { name: user.name.clone(), role: user.role };
-            let invitation: Invitation = client.post("/v1/users", &request)?;
+            let invitation: Invitation = client.create("/v1/users", &request)?;
             show(args.json, &invitation, |Invitation { user, code, expires }| {
                 let (name, code) = (visible(&user.name), visible(code));
                 format!(

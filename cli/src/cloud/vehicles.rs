@@ -45,7 +45,7 @@ fn enrol(args: &NewVehicleArgs, json: bool) -> Result<Exit, Failure> {
             .with_help("create it, or name another file with --to FILE"));
     }
     let enrolment: Enrolment =
-        client()?.post("/v1/vehicles", &NewVehicle { name: name.clone() })?;
+        client()?.create("/v1/vehicles", &NewVehicle { name: name.clone() })?;
     let text = serde_json::to_vec_pretty(&enrolment).expect("an enrolment is text");
     write_private(&args.to, &text, false).map_err(|error| {
         Failure::caused_by(Exit::Usage, format!("cannot write `{file}`"), &error)

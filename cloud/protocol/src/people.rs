@@ -37,6 +37,8 @@ use crate::waves::{WavePlan, WaveProgress};
 
 /// A part of a list that can grow: `?after=CURSOR&limit=N`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[cfg_attr(feature = "schema", schemars(rename = "ListPageOf{T}"))]
 pub struct ListPage<T> {
     /// The entries.
     pub items: Vec<T>,
@@ -58,6 +60,7 @@ impl<T> ListPage<T> {
 /// The rights of a user. Each has those of the ones before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum Role {
     /// May read everything but the audit trail and users.
     Viewer,
@@ -102,6 +105,7 @@ impl FromStr for Role {
 /// A request for a token, by the one-time code of an invitation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Login {
     /// The code.
     pub code: String,
@@ -109,6 +113,7 @@ pub struct Login {
 
 /// A token of a user. It is not shown again.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct UserToken {
     /// The user.
     pub user: User,
@@ -120,6 +125,7 @@ pub struct UserToken {
 
 /// A user.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct User {
     /// The name.
     pub name: String,
@@ -130,6 +136,7 @@ pub struct User {
 /// A request to add a user, or to invite one again.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct NewUser {
     /// The name.
     pub name: String,
@@ -139,6 +146,7 @@ pub struct NewUser {
 
 /// An invitation of a user.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Invitation {
     /// The user.
     pub user: User,
@@ -151,6 +159,7 @@ pub struct Invitation {
 /// A request to enrol a vehicle.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct NewVehicle {
     /// The name.
     pub name: String,
@@ -158,6 +167,7 @@ pub struct NewVehicle {
 
 /// A vehicle in a list.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct VehicleSummary {
     /// The name.
     pub name: String,
@@ -184,6 +194,7 @@ pub struct VehicleSummary {
 /// The state of a vehicle, as the cloud sees it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum VehicleState {
     /// It was invited, and has not connected yet.
     Invited,
@@ -198,6 +209,7 @@ pub enum VehicleState {
 /// A deployment for the fleet: as for one vehicle, and with a plan of its waves.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct FleetDeployRequest {
     /// The envelope of the deployment.
     pub deployment: String,
@@ -210,11 +222,15 @@ pub struct FleetDeployRequest {
 
 /// A deployment of the fleet.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct FleetDeployment {
     /// Its id.
     pub id: String,
     /// Number of its release.
     pub release: u64,
+    /// Digest of what people and waves want of it: the part of its `ETag` before the dot.
+    #[serde(default)]
+    pub version: String,
     /// Digest of its revision.
     pub revision: String,
     /// Digest of its fallback.
@@ -239,6 +255,7 @@ pub struct FleetDeployment {
 
 /// An entry of the audit trail.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct AuditEntry {
     /// Number of the entry.
     pub seq: u64,

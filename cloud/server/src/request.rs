@@ -7,6 +7,7 @@ use axum::extract::Request;
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use gleaner_lambda::manifest::Sha256;
+use schemars::JsonSchema;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use tokio::time::timeout;
@@ -20,13 +21,14 @@ const IN_TIME: Duration = Duration::from_secs(30);
 const ENTRIES_MAX: u16 = 500;
 
 /// Choice of a part of a list.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ListQuery<Cursor> {
     /// `next` of the part before.
     pub(crate) after: Option<Cursor>,
     /// Maximum number of entries.
     #[serde(default)]
+    #[schemars(with = "Option<u16>", range(min = 1, max = 500))]
     pub(crate) limit: PageLimit,
 }
 

@@ -4,8 +4,11 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::extract::{Query, State};
+use axum::http::HeaderMap;
+use axum::response::Response;
 use gleaner_fleet::people::{AuditEntry, FleetDeployment, ListPage, User, VehicleSummary};
 
+use super::conditions::tagged;
 use crate::cloud::Cloud;
 use crate::error::CloudResult;
 use crate::request::ListQuery;
@@ -32,10 +35,12 @@ pub(super) async fn vehicles(
 pub(super) async fn deployments(
     State(cloud): State<Arc<Cloud>>,
     Query(part): Query<ListQuery<String>>,
-) -> CloudResult<Json<ListPage<FleetDeployment>>> {
+    headers: HeaderMap,
+) -> CloudResult<Response> {
     let after = part.after.unwrap_or_default();
     let deployments = cloud.store.deployments(&after, part.limit.into()).await?;
-    Ok(Json(ListPage::of(deployments, part.limit.into(), |it| it.id.clone())))
+    let page = ListPage::of(deployments, part.limit.into(), |it: &FleetDeployment| it.id.clone());
+    tagged(&headers, "", &page)
 }
 
 /// Returns entries of the audit trail, the newest first.

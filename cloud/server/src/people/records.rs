@@ -8,6 +8,7 @@ use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use futures_util::stream::try_unfold;
 use gleaner_fleet::people::User;
+use schemars::JsonSchema;
 use serde::Deserialize;
 use tokio::sync::watch;
 
@@ -19,7 +20,7 @@ use crate::readers::ReaderSlot;
 const PIECE: i64 = 256;
 
 /// Choice of the records of a stream, as on a vehicle.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(super) struct RecordQuery {
     /// Number of the first record; without one, the oldest that is kept.

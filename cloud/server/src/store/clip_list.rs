@@ -2,6 +2,7 @@
 
 use gleaner_fleet::clips::{ClipFacts, ClipId, ClipState, FleetClip, UploadedClips};
 use gleaner_fleet::people::ListPage;
+use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::{CloudStore, int, unsigned};
@@ -9,7 +10,7 @@ use crate::error::{CloudError, CloudResult};
 use crate::request::PageLimit;
 
 /// A choice of clips.
-#[derive(Debug, Default, Deserialize)]
+#[derive(Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ClipQuery {
     /// Name of the vehicle.
@@ -26,6 +27,7 @@ pub(crate) struct ClipQuery {
     after: Option<u64>,
     /// Maximum number of clips in a page.
     #[serde(default)]
+    #[schemars(with = "Option<u16>", range(min = 1, max = 500))]
     limit: PageLimit,
 }
 

@@ -39,6 +39,7 @@ mod clips;
 mod deployments;
 mod page;
 mod records;
+mod requests;
 mod secrets;
 #[cfg(test)]
 mod tests;
@@ -64,6 +65,7 @@ pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
 pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
+pub(crate) use requests::{ChangeAuthor, RequestKey};
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::{Issued, VehicleReport};
 
@@ -73,6 +75,7 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0002_releases.sql"),
     include_str!("../../migrations/0003_clips.sql"),
     include_str!("../../migrations/0004_page.sql"),
+    include_str!("../../migrations/0007_requests.sql"),
 ];
 
 /// Maximum number of queries at a time: with more threads than cores, each only takes longer.

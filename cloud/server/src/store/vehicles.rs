@@ -12,7 +12,7 @@ use sqlx::AssertSqlSafe;
 
 use super::secrets::SecretKind;
 use super::writer::VehicleWrite;
-use super::{CloudStore, StoreChange, int, now, parts, placeholders, unsigned};
+use super::{ChangeAuthor, CloudStore, StoreChange, int, now, parts, placeholders, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of deployments in a report that count.
@@ -144,20 +144,26 @@ impl VehicleWrite for ReportWrite {
 impl CloudStore {
     /// Adds a vehicle, or lets one enrol again; returns the one-time token. One that is connected
     /// stays so until the token is used.
-    pub(crate) async fn invite_vehicle(&self, actor: &str, name: &str) -> CloudResult<String> {
+    pub(crate) async fn invite_vehicle(
+        &self,
+        author: impl Into<ChangeAuthor<'_>>,
+        name: &str,
+    ) -> CloudResult<String> {
+        let author = author.into();
         if let Err(reason) = name.parse::<VehicleName>() {
             return Err(
                 CloudError::usage("no vehicle can be enrolled", "use another name").because(reason)
             );
         }
         let mut change = self.change().await?;
+        change.begin_request(author).await?;
         run!(&mut *change.tx;
             "INSERT INTO vehicles (name) VALUES ($1)
              ON CONFLICT (name) DO UPDATE SET is_revoked = 0";
             name);
         change.drop_secrets(SecretKind::Enrolment, name).await?;
         let (token, _) = change.add_secret(SecretKind::Enrolment, name).await?;
-        change.note(actor, "invite vehicle", name).await?;
+        change.note(author.name, "invite vehicle", name).await?;
         change.refresh(name).await?;
         change.commit().await?;
         Ok(token)

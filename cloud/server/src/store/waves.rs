@@ -10,7 +10,7 @@ use sqlx::{FromRow, Row};
 use super::deployments::{COMPLETE, unknown};
 use super::vehicles::{FAILED, RUNNING};
 use super::wants::{ChangedVehicles, TextMap, map, selects};
-use super::{CloudStore, StoreChange, int, now, unsigned};
+use super::{ChangeAuthor, CloudStore, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Actor of steps that the cloud takes by a plan.
@@ -32,6 +32,7 @@ pub(super) struct Release {
     pub(super) fallback: String,
     pub(super) grants: String,
     pub(super) selector: String,
+    rollback_request: i64,
     pub(super) state: String,
     plan: String,
     wave: i64,
@@ -74,6 +75,7 @@ impl FromRow<'_, AnyRow> for Release {
             fallback: row.try_get("fallback")?,
             grants: row.try_get("grants")?,
             selector: row.try_get("selector")?,
+            rollback_request: row.try_get("rollback_request")?,
             state: row.try_get("state")?,
             plan: row.try_get("plan")?,
             wave: row.try_get("wave")?,
@@ -107,8 +109,8 @@ pub(super) async fn newest_releases(
         ReleaseChoice::Part(after, most) => (0, after, int(most)),
     };
     Ok(rows!(&mut **tx;
-        "SELECT deployment, number, sha256, revision, fallback, grants, selector, state, plan, wave,
-         since, reason, is_wanted
+        "SELECT deployment, number, sha256, revision, fallback, grants, selector,
+         rollback_request, state, plan, wave, since, reason, is_wanted
          FROM releases JOIN deployments ON deployments.id = releases.deployment
          WHERE number = (SELECT MAX(number) FROM releases AS other
                          WHERE other.deployment = releases.deployment)
@@ -146,11 +148,13 @@ impl CloudStore {
     /// Pauses, resumes or aborts the waves of the newest release.
     pub(crate) async fn steer_waves(
         &self,
-        actor: &str,
+        author: impl Into<ChangeAuthor<'_>>,
         id: &str,
         state: WaveState,
     ) -> CloudResult<ChangedVehicles> {
-        let mut change = self.change().await?;
+        let author = author.into();
+        let (mut change, actor) = (self.change().await?, author.name);
+        change.expect(author, id).await?;
         let newest = change.newest(id).await?.ok_or_else(|| unknown(id))?;
         let refused = match (&*newest.state, state) {
             (COMPLETE, _) => Some("is open to all its vehicles"),
@@ -294,6 +298,14 @@ impl StoreChange<'_> {
 }
 
 impl Release {
+    /// Returns a digest of what people and waves want of the deployment: it changes with that, and
+    /// not with what vehicles report.
+    pub(super) fn version(&self) -> String {
+        let Self { number, sha256, is_wanted, rollback_request, state, wave, .. } = self;
+        let wanted = serde_json::json!([number, sha256, is_wanted, rollback_request, state, wave]);
+        gleaner_trust::sha256(wanted.to_string().as_bytes()).to_string().split_off(48)
+    }
+
     fn plan(&self) -> CloudResult<WavePlan> {
         serde_json::from_str(&self.plan).map_err(|error| {
             let message =
