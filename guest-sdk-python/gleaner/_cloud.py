@@ -1,4 +1,4 @@
-"""Requests to the cloud of a fleet, with nothing but Python. ``gleaner.cloud`` has the public names.
+"""Requests to the cloud of a fleet, for ``gleaner.cloud``, which has the public names.
 
 What comes from the cloud is bounded and checked: names lead out of no folder, lists and answers
 end, and a file counts only with the digest that its vehicle has announced.
@@ -45,8 +45,8 @@ class Cloud:
     """A cloud, as a user with a token.
 
     Without ``url`` and ``token``, they are those of ``gleaner login``: of the variables
-    ``GLEANER_CLOUD`` and ``GLEANER_CLOUD_TOKEN``, or of the file of the command. ``timeout`` is the
-    longest wait for a connection, and for each piece of an answer, in s.
+    ``GLEANER_CLOUD`` and ``GLEANER_CLOUD_TOKEN``, or of the file of the command. ``timeout`` is
+    the longest wait for a connection, and for each piece of an answer, in s.
     """
 
     def __init__(
@@ -82,7 +82,8 @@ class Cloud:
     ) -> Iterator[Dict[str, Any]]:
         """Events of a vehicle, the oldest first: all that are kept, or the ``last`` ones.
 
-        With ``follow``, it goes on with new ones until the cloud ends, or is silent for ``timeout``.
+        With ``follow``, it goes on with new ones until the cloud ends, or until none came for
+        ``timeout``: that raises an OSError.
         """
         return self._lines(f"/v1/vehicles/{_part(vehicle)}/events", last, follow)
 
@@ -182,7 +183,7 @@ class Cloud:
 
 
 class Clip:
-    """A clip of a vehicle; ``facts`` has all that the cloud states of it, as of the last request."""
+    """A clip of a vehicle; ``facts`` has all that the cloud stated of it in the last answer."""
 
     def __init__(self, cloud: Cloud, facts: Dict[str, Any]) -> None:
         self._cloud, self.facts = cloud, facts
@@ -201,8 +202,8 @@ class Clip:
 
     @property
     def state(self) -> str:
-        """The place of its file: ``on-vehicle``, ``wanted``, ``uploading``, ``stored``, ``gone`` or
-        ``failed``."""
+        """The place of its file: ``on-vehicle``, ``wanted``, ``uploading``, ``stored``, ``gone``
+        or ``failed``."""
         return str(self.facts["state"])
 
     def refresh(self) -> None:
@@ -323,7 +324,8 @@ def _account(url: Optional[str], token: Optional[str]) -> Tuple[str, str]:
         mode = path.stat().st_mode
         account = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ValueError("there is no token for a cloud: `gleaner login URL --code CODE`") from None
+        reason = "there is no token for a cloud: `gleaner login URL --code CODE`"
+        raise ValueError(reason) from None
     if stat.S_IMODE(mode) & 0o077:
         raise ValueError(f"other users can read the token in {path}: `chmod 600 {path}`")
     # The token must not reach another cloud.

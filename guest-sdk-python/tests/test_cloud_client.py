@@ -47,7 +47,8 @@ class FakeCloud(unittest.TestCase):
             def answer(self) -> None:
                 line = f"{self.command} {self.path}"
                 test.seen.append((line, {key.lower(): it for key, it in self.headers.items()}))
-                problem = {"title": f"no answer to {line}", "causes": ["a cause"], "help": "a help"}
+                title = f"no answer to {line}"
+                problem = {"title": title, "causes": ["a cause"], "help": "a help"}
                 missing = (404, json.dumps(problem).encode())
                 status, content = test.answers.get(line, missing)
                 begin = self.headers.get("Range", "bytes=0-")[len("bytes=") : -1]
@@ -92,7 +93,8 @@ class FakeCloud(unittest.TestCase):
             self.cloud.deployments()
 
     def test_an_error_has_its_cause_and_help_and_no_redirection_is_followed(self) -> None:
-        with self.assertRaisesRegex(CloudError, "no answer to GET(.|\n)*a cause(.|\n)*a help") as it:
+        text = "no answer to GET(.|\n)*a cause(.|\n)*a help"
+        with self.assertRaisesRegex(CloudError, text) as it:
             self.cloud.status("car 7")
         self.assertEqual(it.exception.status, 404)
         self.assertEqual(self.seen[-1][0], "GET /v1/vehicles/car%207/status")

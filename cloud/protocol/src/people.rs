@@ -1,30 +1,9 @@
 //! Messages of the API for people: JSON over HTTP, each request with a token.
 //!
-//! | request | role | answer |
-//! |---|---|---|
-//! | `POST /v1/login` | none | [`UserToken`], of a [`Login`] |
-//! | `GET /v1/me` | viewer | [`User`] |
-//! | `GET /v1/users` | admin | [`ListPage`] of [`User`] |
-//! | `POST /v1/users` | admin | [`Invitation`], of a [`NewUser`] |
-//! | `DELETE /v1/users/NAME` | admin | nothing |
-//! | `GET /v1/vehicles` | viewer | [`ListPage`] of [`VehicleSummary`] |
-//! | `POST /v1/vehicles` | admin | [`Enrolment`](crate::Enrolment), of a [`NewVehicle`] |
-//! | `DELETE /v1/vehicles/NAME` | admin | nothing, once it is cut off |
-//! | `GET /v1/vehicles/NAME/status` | viewer | [`VehicleStatus`] |
-//! | `GET /v1/vehicles/NAME/events` | viewer | a line of JSON per record |
-//! | `GET /v1/vehicles/NAME/lambdas/ID/records` | viewer | a line of JSON per record |
-//! | `PUT /v1/objects/SHA256` | deployer | nothing |
-//! | `POST /v1/deployments` | deployer | `DeployReply`, of a [`FleetDeployRequest`] |
-//! | `GET /v1/deployments` | viewer | [`ListPage`] of [`FleetDeployment`] |
-//! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | operator | [`FleetDeployment`] |
-//! | `POST /v1/deployments/ID/pause`, `resume`, `abort` | operator | [`FleetDeployment`] |
-//! | `DELETE /v1/deployments/ID` | deployer | nothing |
-//! | `GET /v1/audit` | admin | [`ListPage`] of [`AuditEntry`], the newest first |
+//! `GET /v1/openapi.json` of a cloud describes all requests, their roles, and these messages.
 //!
 //! In the answer to a deployment, `attempt` is 0, as each vehicle counts its own, and `generation`
 //! is the number of its entry in the audit trail.
-//!
-//! [`VehicleStatus`]: gleaner_protocol::vehicle_api::VehicleStatus
 
 use std::collections::BTreeMap;
 use std::fmt;

@@ -143,7 +143,9 @@ pub(crate) async fn as_problem(request: Request, next: Next) -> Response {
         StatusCode::METHOD_NOT_ALLOWED => {
             ("the path has no such method", "use one that the header `Allow` names")
         }
-        StatusCode::PAYLOAD_TOO_LARGE => ("the body of the request is too long", "send a shorter one"),
+        StatusCode::PAYLOAD_TOO_LARGE => {
+            ("the body of the request is too long", "send a shorter one")
+        }
         StatusCode::RANGE_NOT_SATISFIABLE => {
             ("the file ends before the range", "begin within the length of `Content-Range`")
         }

@@ -168,8 +168,8 @@ fn a_request_that_creates_is_sent_again_with_its_key_after_a_lost_connection() {
     for (answer, is_done) in [(done, true), (&*refused, false)] {
         let (keys, result) = thread::scope(|scope| {
             let body = serde_json::json!({});
-            let asked = scope
-                .spawn(|| cloud.client("t").create::<serde_json::Value>("/v1/users", &body));
+            let asked =
+                scope.spawn(|| cloud.client("t").create::<serde_json::Value>("/v1/users", &body));
             let keys = ["", answer].map(|answer| {
                 let mut stream = cloud.0.accept().unwrap().0;
                 let head = head(&mut stream);

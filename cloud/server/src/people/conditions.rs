@@ -75,9 +75,8 @@ pub(super) fn tagged(
     let digest = sha256(text.as_bytes()).to_string().split_off(48);
     let dot = if version.is_empty() { "" } else { "." };
     let tag = format!("\"{version}{dot}{digest}\"");
-    let has = tags(headers, header::IF_NONE_MATCH)?.is_some_and(|tags| {
-        tags.iter().any(|it| it == "*" || it.trim_start_matches("W/") == tag)
-    });
+    let has = tags(headers, header::IF_NONE_MATCH)?
+        .is_some_and(|tags| tags.iter().any(|it| it == "*" || it.trim_start_matches("W/") == tag));
     let etag = [(header::ETAG, tag)];
     Ok(match has {
         true => (StatusCode::NOT_MODIFIED, etag).into_response(),

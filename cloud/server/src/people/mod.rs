@@ -1,5 +1,5 @@
-//! The API for people: JSON over HTTP, each request with a token. `gleaner_fleet::people` lists the
-//! requests.
+//! The API for people: JSON over HTTP, each request with a token. [`endpoints`] lists the requests,
+//! and `openapi` describes them for other programs; `gleaner_fleet::people` has the messages.
 //!
 //! This room checks no signature and has no key: the cloud stores and forwards what was signed, and
 //! each vehicle decides by its own trust root. A deployment is only parsed, within the bounds of
@@ -32,7 +32,7 @@ use gleaner_fleet::people::{
 };
 use gleaner_fleet::waves::WaveState;
 use gleaner_protocol::vehicle_api::{DeployReply, StreamLine, VehicleStatus};
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use crate::accept::PeerConnection;
 use crate::clips::people as clips;
@@ -53,10 +53,11 @@ const BODY_MAX: usize = 12 << 20;
 /// Maximum length of a request without a token.
 const LOGIN_MAX: usize = 4 << 10;
 
-/// Headers of a request that creates something, of a change, and of a read.
+/// Headers of a request that creates something, of a change, of a read, and of a stream.
 const CREATES: &[&str] = &["Idempotency-Key"];
 const CHANGES: &[&str] = &["If-Match"];
 const READS: &[&str] = &["If-None-Match"];
+const RESUMES: &[&str] = &["Last-Event-ID"];
 
 /// Returns every request that the API answers: no role is stated elsewhere.
 pub(crate) fn endpoints() -> Vec<Endpoint> {
@@ -76,7 +77,7 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
     let open = |method, path, summary, handler| Endpoint::new(method, path, None, summary, handler);
     vec![
         open(Method::GET, "/v1/openapi.json", "This description", get(openapi::document))
-            .gives::<Value>(),
+            .gives::<Map<String, Value>>(),
         open(
             Method::POST,
             "/v1/login",
@@ -106,6 +107,7 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
             .gives::<VehicleStatus>(),
         read("/v1/vehicles/{name}/events", Viewer, "Events of a vehicle", get(records::events))
             .query::<RecordQuery>()
+            .headers(RESUMES)
             .gives_lines::<StreamLine>(),
         read(
             "/v1/vehicles/{name}/lambdas/{id}/records",
@@ -114,6 +116,7 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
             get(records::lambda),
         )
         .query::<RecordQuery>()
+        .headers(RESUMES)
         .gives_lines::<StreamLine>(),
         put(
             "/v1/objects/{sha256}",
@@ -181,8 +184,11 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
     router
         .merge(page::router(cloud))
         .fallback(async |uri: Uri| match is_api(uri.path()) {
-            true => CloudError::missing("there is nothing under this path", "`GET /v1/openapi.json` describes all requests")
-                .into_response(),
+            true => CloudError::missing(
+                "there is nothing under this path",
+                "`GET /v1/openapi.json` describes all requests",
+            )
+            .into_response(),
             false => page::nothing_here(),
         })
         .layer(DefaultBodyLimit::max(BODY_MAX))

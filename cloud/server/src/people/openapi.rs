@@ -6,8 +6,8 @@ use std::sync::LazyLock;
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use gleaner_protocol::vehicle_api::Problem;
-use schemars::generate::SchemaSettings;
 use schemars::SchemaGenerator;
+use schemars::generate::SchemaSettings;
 use serde_json::{Map, Value, json};
 
 use super::endpoint::{Endpoint, MessageShape};
@@ -63,12 +63,17 @@ fn operation(endpoint: &Endpoint, generator: &mut SchemaGenerator) -> Value {
         .collect();
     let schema = query.map(|query| query(generator).to_value());
     let values = schema.as_ref().and_then(|it| it["properties"].as_object());
-    parameters.extend(values.into_iter().flatten().map(
-        |(name, schema)| json!({ "name": name, "in": "query", "schema": schema }),
-    ));
-    parameters.extend(headers.iter().map(
-        |name| json!({ "name": name, "in": "header", "schema": { "type": "string" } }),
-    ));
+    parameters.extend(
+        values
+            .into_iter()
+            .flatten()
+            .map(|(name, schema)| json!({ "name": name, "in": "query", "schema": schema })),
+    );
+    parameters.extend(
+        headers
+            .iter()
+            .map(|name| json!({ "name": name, "in": "header", "schema": { "type": "string" } })),
+    );
     let mut responses = json!({ "default": { "$ref": "#/components/responses/Problem" } });
     match gives {
         Some(shape) => {

@@ -6,7 +6,6 @@ use tempfile::TempDir;
 use tokio::sync::Semaphore;
 
 use super::*;
-use serde_json::{Value, json};
 use crate::attempts::{VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
 use crate::clips::ClipFiles;
@@ -14,6 +13,7 @@ use crate::folder::DataFolder;
 use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::store::{ClipBounds, CloudStore, Retention};
+use serde_json::{Value, json};
 
 pub(crate) const ROLES: [Role; 4] = [Role::Viewer, Role::Operator, Role::Deployer, Role::Admin];
 
@@ -89,6 +89,7 @@ async fn token_of(cloud: &Cloud, name: &str, role: Role) -> String {
 
 mod conditions;
 mod openapi;
+mod ranges;
 
 #[tokio::test]
 async fn each_request_is_open_to_its_role_and_the_higher_ones_only() {
@@ -216,8 +217,10 @@ async fn a_list_has_each_entry_once_in_parts_of_any_length() {
         token_of(&cloud, &format!("u{number}"), Role::Viewer).await;
         cloud.store.invite_vehicle("u0", &format!("car-{number}")).await.unwrap();
     }
-    for (list, key, count) in [("users", "name", 7), ("vehicles", "name", 6), ("audit", "seq", 20)] {
-        let whole = send(&cloud, (Method::GET, &format!("/v1/{list}")), Some(&token), &[], "").await;
+    for (list, key, count) in [("users", "name", 7), ("vehicles", "name", 6), ("audit", "seq", 20)]
+    {
+        let whole =
+            send(&cloud, (Method::GET, &format!("/v1/{list}")), Some(&token), &[], "").await;
         let whole = whole.json();
         assert_eq!(whole["items"].as_array().unwrap().len(), count, "{list}");
         assert_eq!(whole["next"], Value::Null);

@@ -98,7 +98,8 @@ impl StoreChange<'_> {
     /// Checks that a deployment has one of the versions that the change may replace.
     pub(super) async fn expect(&mut self, author: ChangeAuthor<'_>, id: &str) -> CloudResult<()> {
         let Some(versions) = author.versions else { return Ok(()) };
-        let newest = super::waves::newest_releases(&mut self.tx, ReleaseChoice::Of(id)).await?.pop();
+        let newest =
+            super::waves::newest_releases(&mut self.tx, ReleaseChoice::Of(id)).await?.pop();
         match newest.map(|release| release.version()) {
             Some(version) if !versions.contains(&version) => {
                 let message = format!("deployment `{id}` has changed since: it is not as expected");

@@ -70,13 +70,23 @@ impl Person {
 
     /// Sends a request; returns the answer as it begins.
     pub(crate) async fn open(&self, method: Method, path: &str, body: &[u8]) -> Response<Incoming> {
+        self.open_with(method, path, &[], body).await
+    }
+
+    async fn open_with(
+        &self,
+        method: Method,
+        path: &str,
+        headers: &[(&str, &str)],
+        body: &[u8],
+    ) -> Response<Incoming> {
         let request = Request::builder()
             .method(method)
             .uri(path)
             .header("host", "cloud")
-            .header("authorization", format!("Bearer {}", self.token))
-            .body(Full::new(Bytes::copy_from_slice(body)))
-            .unwrap();
+            .header("authorization", format!("Bearer {}", self.token));
+        let request = headers.iter().fold(request, |request, (key, it)| request.header(*key, *it));
+        let request = request.body(Full::new(Bytes::copy_from_slice(body))).unwrap();
         let stream = TcpStream::connect(self.address).await.unwrap();
         soon(send(stream, request)).await.unwrap()
     }
@@ -87,6 +97,15 @@ impl Person {
             whole(self.open(method, path, body.to_string().as_bytes()).await).await;
         assert!(status.is_success(), "{path}: {status} {}", String::from_utf8_lossy(&text));
         serde_json::from_slice(&text).unwrap_or(Value::Null)
+    }
+
+    /// Returns a stream as server-sent events, from the one after `last` on.
+    pub(crate) async fn events(&self, path: &str, last: Option<&str>) -> String {
+        let last = last.map(|last| ("last-event-id", last));
+        let headers: Vec<_> = [("accept", "text/event-stream")].into_iter().chain(last).collect();
+        let (status, text) = whole(self.open_with(Method::GET, path, &headers, b"").await).await;
+        assert_eq!(status, StatusCode::OK);
+        String::from_utf8(text).unwrap()
     }
 
     /// Returns the lines of an answer.

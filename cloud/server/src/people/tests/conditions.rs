@@ -5,7 +5,7 @@ use gleaner_protocol::vehicle_api::GrantStatus;
 use super::*;
 use crate::store::OfferedDeployment;
 
-fn offered(release: u64) -> OfferedDeployment {
+pub(super) fn offered(release: u64) -> OfferedDeployment {
     OfferedDeployment {
         id: "brake".to_owned(),
         release,
@@ -46,6 +46,7 @@ async fn a_change_is_made_only_of_the_state_that_it_expects() {
     }
     // What a vehicle does is no change of what is wanted of it.
     cloud.store.invite_vehicle("console", "car-7").await.unwrap();
+    cloud.store.execute("UPDATE vehicles SET epoch = 1").await;
     let moved = read(path, &[]).await;
     assert_ne!(tag(&moved), tag(&one));
     for bad in ["x", "\"", "", "\"a\" \"b"] {
