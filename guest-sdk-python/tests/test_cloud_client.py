@@ -10,6 +10,7 @@ import subprocess
 import tempfile
 import threading
 import unittest
+import urllib.request
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Dict, List, Optional, Tuple
@@ -202,8 +203,6 @@ class RealCloud(unittest.TestCase):
                 break
         url = next(word for word in words if word.startswith("http://")).rstrip("/")
         code = words[words.index("--code") + 1]
-        import urllib.request
-
         body = json.dumps({"code": code}).encode()
         with urllib.request.urlopen(f"{url}/v1/login", body) as answer:
             token = json.load(answer)["token"]
