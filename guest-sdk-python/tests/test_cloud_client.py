@@ -4,13 +4,13 @@ built."""
 from __future__ import annotations
 
 import hashlib
+import http.client
 import json
 import os
 import subprocess
 import tempfile
 import threading
 import unittest
-import urllib.request
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Dict, List, Optional, Tuple
@@ -203,13 +203,21 @@ class RealCloud(unittest.TestCase):
                 break
         url = next(word for word in words if word.startswith("http://")).rstrip("/")
         code = words[words.index("--code") + 1]
-        body = json.dumps({"code": code}).encode()
-        with urllib.request.urlopen(f"{url}/v1/login", body) as answer:
-            token = json.load(answer)["token"]
+        connection = http.client.HTTPConnection(url[len("http://") :])
+        self.addCleanup(connection.close)
+
+        def post(path: str, body: Dict[str, str], token: str) -> Any:
+            headers = {"Authorization": f"Bearer {token}"}
+            connection.request("POST", path, json.dumps(body), headers)
+            return json.load(connection.getresponse())
+
+        token = post("/v1/login", {"code": code}, "")["token"]
         cloud = Cloud(url, token)
         self.assertEqual((cloud.vehicles(), cloud.deployments(), cloud.clips()), ([], [], []))
         with self.assertRaisesRegex(CloudError, "there is no vehicle `car-7`"):
             cloud.status("car-7")
+        post("/v1/vehicles", {"name": "car-7"}, token)
+        self.assertEqual([it["state"] for it in cloud.vehicles()], ["invited"])
         with self.assertRaisesRegex(CloudError, "there is no clip"):
             cloud.clip("a@car-7")
         self.assertEqual(list(cloud.events("car-7", last=1)), [])
