@@ -97,7 +97,8 @@ fn on_vehicle(release: u64, phase: &str) -> Value {
 
 fn in_cloud(release: u64) -> Value {
     json!({
-        "id": "brake", "release": release, "revision": "b".repeat(64), "fallback": "a".repeat(64),
+        "id": "brake", "release": release, "version": "v", "revision": "b".repeat(64),
+        "fallback": "a".repeat(64),
         "grants": { "topics": ["/imu"], "models": [], "record": true },
         "selector": { "site": "berlin" }, "is_wanted": true, "vehicles": 2, "running": 1,
         "failed": 0,

@@ -3,7 +3,7 @@
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::fake::problem;
 use crate::{CloudUser, fails};
@@ -139,6 +139,7 @@ fn a_list_is_followed_to_its_end_and_one_without_an_end_is_refused() {
     user.cloud.answers("GET /v1/users?after=a%26b", &[last]);
     assert_eq!(user.json(&["users"]), some(0..501));
     user.cloud.answers("GET /v1/users?after=a%26b", &[page(0..500, "a&b")]);
+    user.cloud.answers("GET /v1/users?limit=1&after=a%26b", &[page(0..1, "a&b")]);
     let text = user.fails(1, &["users"]);
     assert!(text.contains("more than 100000 entries"), "{text}");
     // Parts without entries would be requested for ever.

@@ -19,7 +19,7 @@ pub(super) const KEY: &str = "idempotency-key";
 /// Longest key.
 const KEY_MAX: usize = 128;
 
-/// Longest list of tags, and maximum number of tags in it.
+/// Longest list of tags, in bytes.
 const TAGS_MAX: usize = 4 << 10;
 
 /// The conditions of a change.
