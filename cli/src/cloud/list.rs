@@ -1,6 +1,6 @@
 //! Lists of a cloud, which come in parts.
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{ByteSize, Exit, Failure};
 use gleaner_fleet::people::ListPage;
 use serde::de::DeserializeOwned;
 
@@ -10,6 +10,8 @@ use crate::vehicle::VehicleClient;
 const PART: usize = 500;
 /// Maximum number of entries of a whole list: a cloud has room for fewer vehicles and deployments.
 const ENTRIES_MAX: usize = 100_000;
+/// Maximum length of all parts of a list: one is kept in memory.
+const BYTES_MAX: ByteSize = ByteSize::mib(512);
 
 /// Returns all entries of a list.
 ///
@@ -39,7 +41,7 @@ pub(super) fn first<T: DeserializeOwned>(
     query: &[(&str, String)],
     most: usize,
 ) -> Result<Vec<T>, Failure> {
-    let (mut entries, mut after) = (Vec::new(), None);
+    let (mut entries, mut after, mut bytes) = (Vec::new(), None, 0);
     while entries.len() < most {
         let limit = PART.min(most - entries.len());
         let limits = (limit < PART).then(|| ("limit", limit.to_string()));
@@ -47,7 +49,12 @@ pub(super) fn first<T: DeserializeOwned>(
         let own = query.iter().cloned().chain(limits).chain(position);
         let query: Vec<_> = own.map(|(key, it)| format!("{key}={}", escaped(&it))).collect();
         let mark = if query.is_empty() { "" } else { "?" };
-        let part: ListPage<T> = client.get(&format!("{path}{mark}{}", query.join("&")))?;
+        let (part, length): (ListPage<T>, _) =
+            client.get_sized(&format!("{path}{mark}{}", query.join("&")))?;
+        bytes += length as u64;
+        if bytes > BYTES_MAX.bytes() {
+            return Err(endless(path, &format!("it has more than {BYTES_MAX}")));
+        }
         let is_full = part.items.len() >= limit;
         entries.extend(part.items);
         match part.next {

@@ -103,6 +103,11 @@ impl VehicleClient {
 
     /// Returns the answer to a request without effect.
     pub(crate) fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, Failure> {
+        self.get_sized(path).map(|(answer, _)| answer)
+    }
+
+    /// Returns the answer to a request without effect, and its length in bytes.
+    pub(crate) fn get_sized<T: DeserializeOwned>(&self, path: &str) -> Result<(T, usize), Failure> {
         self.runtime.block_on(async {
             let answer = self.json(Method::GET, path, Bytes::new());
             timeout(ANSWER_TIMEOUT, answer).await.unwrap_or_else(|_| {
@@ -120,7 +125,8 @@ impl VehicleClient {
         body: &impl Serialize,
     ) -> Result<T, Failure> {
         let body = serde_json::to_vec(body).expect("a request is plain data");
-        self.runtime.block_on(self.json(Method::POST, path, body.into()))
+        let answer = self.json(Method::POST, path, body.into());
+        self.runtime.block_on(answer).map(|(answer, _)| answer)
     }
 
     /// Sends a request of JSON that creates something, with a key: after a lost connection it is
@@ -143,7 +149,7 @@ impl VehicleClient {
             self.runtime.block_on(async {
                 let body = Either::Left(Full::new(body.clone().into()));
                 let answer = self.request_with(Method::POST, path, body, &key).await?;
-                self.parsed(answer).await
+                self.parsed(answer).await.map(|(answer, _)| answer)
             })
         };
         match send() {
@@ -235,17 +241,22 @@ impl VehicleClient {
         method: Method,
         path: &str,
         body: Bytes,
-    ) -> Result<T, Failure> {
+    ) -> Result<(T, usize), Failure> {
         let answer = self.request(method, path, Either::Left(Full::new(body))).await?;
         self.parsed(answer).await
     }
 
-    async fn parsed<T: DeserializeOwned>(&self, answer: Response<Incoming>) -> Result<T, Failure> {
+    /// Returns the content of an answer, and its length in bytes.
+    async fn parsed<T: DeserializeOwned>(
+        &self,
+        answer: Response<Incoming>,
+    ) -> Result<(T, usize), Failure> {
         let body = self.whole(answer.into_body()).await?;
-        serde_json::from_slice(&body).map_err(|error| {
+        let parsed = serde_json::from_slice(&body).map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot parse the answer", &error)
                 .with_help(format!("use the `gleaner` of the version of {}", self.program()))
-        })
+        });
+        Ok((parsed?, body.len()))
     }
 
     /// Sends a request; returns its answer if that is no error.

@@ -165,9 +165,9 @@ fn a_request_that_creates_is_sent_again_with_its_key_after_a_lost_connection() {
     let done = "HTTP/1.1 200 OK\r\ncontent-length: 2\r\n\r\n{}";
     let problem = r#"{"title":"its secret is not kept","exit":2}"#;
     let refused = format!("HTTP/1.1 409 Conflict\r\ncontent-length: 43\r\n\r\n{problem}");
+    let body = serde_json::json!({});
     for (answer, is_done) in [(done, true), (&*refused, false)] {
         let (keys, result) = thread::scope(|scope| {
-            let body = serde_json::json!({});
             let asked =
                 scope.spawn(|| cloud.client("t").create::<serde_json::Value>("/v1/users", &body));
             let keys = ["", answer].map(|answer| {
