@@ -16,8 +16,8 @@ use crate::steps::{run, succeeds};
 const PACKAGES: [(&str, &str); 1] = [("numpy", "numpy")];
 
 /// Packages for tests and benches: types, readers, pictures in `gleaner.testing`, tests of lambdas,
-/// and notebooks.
-const FOR_TESTS: [(&str, &str); 9] = [
+/// notebooks, and the check of the description of the cloud's API.
+const FOR_TESTS: [(&str, &str); 10] = [
     ("mypy<2.5", "mypy"),
     ("mcap", "mcap"),
     ("mcap-ros2-support", "mcap_ros2"),
@@ -27,6 +27,7 @@ const FOR_TESTS: [(&str, &str); 9] = [
     ("nbclient", "nbclient"),
     ("ipykernel", "ipykernel"),
     ("matplotlib", "matplotlib"),
+    ("openapi-spec-validator", "openapi_spec_validator"),
 ];
 
 /// Creates or completes the environment. It is created again if its Python does not run, because

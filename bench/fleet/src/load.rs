@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
-use gleaner_fleet::people::FleetDeployment;
+use gleaner_fleet::people::{FleetDeployment, ListPage};
 use gleaner_trust::{Deployment, Grants, Revision, RevisionFile, SecretKey, seal, sha256};
 use hyper::Method;
 use serde_json::{Value, json};
@@ -123,9 +123,9 @@ pub async fn figures(count: usize, times: &LoadTimes) -> Result<Vec<FleetFigure>
     let begun = Instant::now();
     let all = administrator.bytes(Method::GET, "/v1/deployments", Vec::new()).await?;
     add(FleetFigure::free("list of deployments", "s", begun.elapsed().as_secs_f64()));
-    let all: Vec<FleetDeployment> =
+    let all: ListPage<FleetDeployment> =
         serde_json::from_slice(&all).map_err(|error| error.to_string())?;
-    if all.first().map(|it| it.running) != Some(count as u64) {
+    if all.items.first().map(|it| it.running) != Some(count as u64) {
         simulation.error(format!("of {count} vehicles, these run it: {all:?}"));
     }
 

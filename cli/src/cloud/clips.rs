@@ -10,25 +10,25 @@ use std::thread::sleep;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{ByteSize, Exit, Failure, nanoseconds, visible};
-use gleaner_fleet::clips::{ClipId, ClipPage, ClipPolicy, ClipState, FleetClip};
+use gleaner_fleet::clips::{ClipId, ClipPolicy, ClipState, FleetClip};
 use serde_json::{Value, json};
 
 use self::download::ClipTarget;
-use super::{client, show};
+use super::{client, list, show};
 use crate::args::{ClipFilterArgs, ClipsArgs, ClipsCommand, PolicyArgs, PullArgs};
 use crate::render::table;
-use crate::vehicle::VehicleClient;
 
 /// Interval of looks whether a vehicle has sent a clip.
 const INTERVAL: Duration = Duration::from_secs(2);
-/// Number of clips in a page.
-const PAGE: usize = 500;
+/// Path of the list of clips.
+const CLIPS: &str = "/v1/clips";
 
 /// Runs `gleaner clips`.
 pub(super) fn clips(args: &ClipsArgs) -> Result<Exit, Failure> {
     match &args.command {
         None => {
-            let clips = matching(&client()?, &args.filter, args.last)?;
+            let clips: Vec<FleetClip> =
+                list::first(&client()?, CLIPS, &query(&args.filter), args.last)?;
             show(args.json, &clips, |clips| text(clips))
         }
         Some(ClipsCommand::Pull(pull)) => self::pull(pull),
@@ -37,51 +37,23 @@ pub(super) fn clips(args: &ClipsArgs) -> Result<Exit, Failure> {
     }
 }
 
-/// Returns the last announced clips that match, at most `most`.
-fn matching(
-    client: &VehicleClient,
-    filter: &ClipFilterArgs,
-    most: usize,
-) -> Result<Vec<FleetClip>, Failure> {
-    let mut query = String::new();
+/// Returns the parts of a query that choose clips.
+fn query(filter: &ClipFilterArgs) -> Vec<(&'static str, String)> {
     let since = filter.since.map(|since| {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         nanoseconds(now.saturating_sub(since)).to_string()
     });
     let values = [
-        ("vehicle", filter.vehicle.as_ref()),
-        ("lambda", filter.lambda.as_ref()),
-        ("label", filter.label.as_ref()),
-        ("from_ns", since.as_ref()),
+        ("vehicle", filter.vehicle.clone()),
+        ("lambda", filter.lambda.clone()),
+        ("label", filter.label.clone()),
+        ("from_ns", since),
     ];
-    for (key, value) in values.into_iter().filter_map(|(key, value)| Some((key, value?))) {
-        query += &format!("&{key}={}", escaped(value));
-    }
-    let (mut clips, mut after) = (Vec::new(), String::new());
-    while clips.len() < most {
-        let count = PAGE.min(most - clips.len());
-        let page: ClipPage = client.get(&format!("/v1/clips?last={count}{query}{after}"))?;
-        clips.extend(page.clips);
-        match page.next {
-            Some(next) => after = format!("&after={next}"),
-            None => break,
-        }
-    }
-    clips.truncate(most);
-    Ok(clips)
-}
-
-/// Escapes a value of a query.
-fn escaped(text: &str) -> String {
-    let escape = |byte: u8| match byte {
-        b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' => char::from(byte).into(),
-        _ => format!("%{byte:02X}"),
-    };
-    text.bytes().map(escape).collect()
+    values.into_iter().filter_map(|(key, value)| Some((key, value?))).collect()
 }
 
 fn path(id: &ClipId) -> String {
-    format!("/v1/clips/{id}")
+    format!("{CLIPS}/{id}")
 }
 
 fn text(clips: &[FleetClip]) -> String {
@@ -197,15 +169,4 @@ fn pull(args: &PullArgs) -> Result<Exit, Failure> {
         });
         lines.collect()
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_value_of_a_query_cannot_end_it() {
-        assert_eq!(escaped("a-1.b_C"), "a-1.b_C");
-        assert_eq!(escaped("x&y=ä z"), "x%26y%3D%C3%A4%20z");
-    }
 }

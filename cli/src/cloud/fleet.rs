@@ -7,7 +7,7 @@ use gleaner_trust::SecretKey;
 use serde_json::{Value, json};
 
 use super::rollout::{Goal, Rollout};
-use super::{client, show, waves};
+use super::{client, list, show, waves};
 use crate::args::{ChangeArgs, DeployArgs, FleetArgs, FleetCommand};
 use crate::render::table;
 use crate::vehicle::{Former, LocalRevision, VehicleClient, deployment, path};
@@ -118,13 +118,13 @@ pub(crate) fn change(args: &ChangeArgs, change: Change) -> Result<Exit, Failure>
 }
 
 pub(super) fn deployments(client: &VehicleClient) -> Result<Vec<FleetDeployment>, Failure> {
-    client.get("/v1/deployments")
+    list::all(client, "/v1/deployments", &[])
 }
 
 /// Returns the newest release of a deployment that a vehicle has or had. It accepts only later
 /// ones.
 fn newest_on_vehicles(client: &VehicleClient, id: &str) -> Result<u64, Failure> {
-    let vehicles: Vec<VehicleSummary> = client.get("/v1/vehicles")?;
+    let vehicles: Vec<VehicleSummary> = list::all(client, "/v1/vehicles", &[])?;
     let release = |status: VehicleStatus| {
         let deployments = status.deployments.into_iter().filter(|it| it.id == id);
         deployments.map(|it| it.release).chain(status.removed.get(id).copied()).max()

@@ -6,10 +6,12 @@
 //! - `clips`: lists and fetches recorded clips.
 //! - `fleet`: deployments of the cloud, signed here. `rollout`: waits for all their vehicles, and
 //!   `waves` for the waves before.
+//! - `list`: lists, part by part.
 
 mod clips;
 mod enrol;
 mod fleet;
+mod list;
 mod login;
 mod people;
 mod rollout;

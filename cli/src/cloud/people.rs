@@ -4,7 +4,7 @@ use gleaner_base::{Exit, Failure, visible};
 use gleaner_fleet::people::{AuditEntry, Invitation, NewUser, User};
 use serde_json::json;
 
-use super::{client, date, show};
+use super::{client, date, list, show};
 use crate::account::CloudAccount;
 use crate::args::{AuditArgs, UsersArgs, UsersCommand};
 use crate::render::table;
@@ -16,14 +16,14 @@ pub(super) fn users(args: &UsersArgs) -> Result<Exit, Failure> {
     let url = account.url.clone();
     let client = VehicleClient::of_cloud(account)?;
     match &args.command {
-        None => show(args.json, &client.get::<Vec<User>>("/v1/users")?, |users| {
+        None => show(args.json, &list::all::<User>(&client, "/v1/users", &[])?, |users| {
             let rows = users.iter().map(|user| [visible(&user.name), user.role.to_string()]);
             let head = ["name", "role"].map(str::to_owned);
             table(std::iter::once(head).chain(rows).collect(), &[])
         }),
         Some(UsersCommand::Invite(user)) => {
             let request = NewUser { name: user.name.clone(), role: user.role };
-            let invitation: Invitation = client.post("/v1/users", &request)?;
+            let invitation: Invitation = client.create("/v1/users", &request)?;
             show(args.json, &invitation, |Invitation { user, code, expires }| {
                 let (name, code) = (visible(&user.name), visible(code));
                 format!(
@@ -44,8 +44,7 @@ pub(super) fn users(args: &UsersArgs) -> Result<Exit, Failure> {
 
 /// Runs `gleaner audit`.
 pub(super) fn audit(args: &AuditArgs) -> Result<Exit, Failure> {
-    let mut entries: Vec<AuditEntry> = client()?.get(&format!("/v1/audit?last={}", args.last))?;
-    entries.truncate(args.last);
+    let entries: Vec<AuditEntry> = list::first(&client()?, "/v1/audit", &[], args.last)?;
     show(args.json, &entries, |entries| {
         let rows = entries.iter().map(|entry| {
             let time = date(entry.time_ms.div_euclid(1000).try_into().unwrap_or(0));

@@ -11,7 +11,7 @@ use gleaner_protocol::vehicle_api::VehicleStatus;
 use gleaner_report::format::counted;
 use serde_json::json;
 
-use super::vehicles;
+use super::{list, vehicles};
 use crate::render::json_line;
 use crate::stdout::print;
 use crate::vehicle::VehicleClient;
@@ -95,7 +95,7 @@ impl Rollout {
         let started = Instant::now();
         let mut standings: BTreeMap<String, Standing> = BTreeMap::new();
         loop {
-            let vehicles: Vec<VehicleSummary> = client.get("/v1/vehicles")?;
+            let vehicles: Vec<VehicleSummary> = list::all(client, "/v1/vehicles", &[])?;
             let mut former = std::mem::take(&mut standings);
             for vehicle in vehicles.iter().filter(|vehicle| self.selects(vehicle)) {
                 let standing = match former.remove(&vehicle.name).filter(Standing::is_done) {

@@ -4,7 +4,7 @@ use gleaner_base::{Exit, Failure, visible};
 use gleaner_fleet::people::{NewToken, TokenSummary, User, UserToken};
 use serde_json::json;
 
-use super::{client, date, show};
+use super::{client, date, list, show};
 use crate::args::{TokensArgs, TokensCommand};
 use crate::render::table;
 
@@ -12,7 +12,7 @@ use crate::render::table;
 pub(super) fn tokens(args: &TokensArgs) -> Result<Exit, Failure> {
     let client = client()?;
     match &args.command {
-        None => show(args.json, &client.get::<Vec<TokenSummary>>("/v1/tokens")?, |tokens| {
+        None => show(args.json, &list::all::<TokenSummary>(&client, "/v1/tokens", &[])?, |tokens| {
             let rows = tokens.iter().map(|it| {
                 [visible(&it.user), visible(&it.name), it.role.to_string(), date(it.expires)]
             });
@@ -21,7 +21,7 @@ pub(super) fn tokens(args: &TokensArgs) -> Result<Exit, Failure> {
         }),
         Some(TokensCommand::New(new)) => {
             let request = NewToken { name: new.name.clone(), role: new.role, days: new.days };
-            let made: UserToken = client.post("/v1/tokens", &request)?;
+            let made: UserToken = client.create("/v1/tokens", &request)?;
             show(args.json, &made, |UserToken { user, token, expires }| {
                 let (until, token) = (date(*expires), visible(token));
                 format!(

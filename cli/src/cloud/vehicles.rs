@@ -8,7 +8,7 @@ use gleaner_fleet::Enrolment;
 use gleaner_fleet::people::{NewVehicle, VehicleState, VehicleSummary};
 use serde_json::json;
 
-use super::{client, show};
+use super::{client, list, show};
 use crate::account::write_private;
 use crate::args::{NewVehicleArgs, VehiclesArgs, VehiclesCommand};
 use crate::render::{Paint, table};
@@ -17,7 +17,7 @@ use crate::render::{Paint, table};
 pub(super) fn vehicles(args: &VehiclesArgs) -> Result<Exit, Failure> {
     match &args.command {
         None => {
-            let vehicles: Vec<VehicleSummary> = client()?.get("/v1/vehicles")?;
+            let vehicles: Vec<VehicleSummary> = list::all(&client()?, "/v1/vehicles", &[])?;
             let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
             show(args.json, &vehicles, |vehicles| text(vehicles, now, Paint::of_stdout()))
         }
@@ -45,7 +45,7 @@ fn enrol(args: &NewVehicleArgs, json: bool) -> Result<Exit, Failure> {
             .with_help("create it, or name another file with --to FILE"));
     }
     let enrolment: Enrolment =
-        client()?.post("/v1/vehicles", &NewVehicle { name: name.clone() })?;
+        client()?.create("/v1/vehicles", &NewVehicle { name: name.clone() })?;
     let text = serde_json::to_vec_pretty(&enrolment).expect("an enrolment is text");
     write_private(&args.to, &text, false).map_err(|error| {
         Failure::caused_by(Exit::Usage, format!("cannot write `{file}`"), &error)

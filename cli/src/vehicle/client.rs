@@ -103,6 +103,11 @@ impl VehicleClient {
 
     /// Returns the answer to a request without effect.
     pub(crate) fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, Failure> {
+        self.get_sized(path).map(|(answer, _)| answer)
+    }
+
+    /// Returns the answer to a request without effect, and its length in bytes.
+    pub(crate) fn get_sized<T: DeserializeOwned>(&self, path: &str) -> Result<(T, usize), Failure> {
         self.runtime.block_on(async {
             let answer = self.json(Method::GET, path, Bytes::new());
             timeout(ANSWER_TIMEOUT, answer).await.unwrap_or_else(|_| {
@@ -120,7 +125,37 @@ impl VehicleClient {
         body: &impl Serialize,
     ) -> Result<T, Failure> {
         let body = serde_json::to_vec(body).expect("a request is plain data");
-        self.runtime.block_on(self.json(Method::POST, path, body.into()))
+        let answer = self.json(Method::POST, path, body.into());
+        self.runtime.block_on(answer).map(|(answer, _)| answer)
+    }
+
+    /// Sends a request of JSON that creates something, with a key: after a lost connection it is
+    /// sent once more, and a cloud that has carried it out does not do so again.
+    pub(crate) fn create<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &impl Serialize,
+    ) -> Result<T, Failure> {
+        if matches!(self.endpoint, Endpoint::Orchestrator(_)) {
+            return self.post(path, body);
+        }
+        let body = serde_json::to_vec(body).expect("a request is plain data");
+        let mut bytes = [0; 16];
+        getrandom::fill(&mut bytes).map_err(|error| {
+            Failure::caused_by(Exit::Internal, "cannot make a key for the request", &error)
+        })?;
+        let key = [("idempotency-key", gleaner_base::hex(&bytes))];
+        let send = || {
+            self.runtime.block_on(async {
+                let body = Either::Left(Full::new(body.clone().into()));
+                let answer = self.request_with(Method::POST, path, body, &key).await?;
+                self.parsed(answer).await.map(|(answer, _)| answer)
+            })
+        };
+        match send() {
+            Err(failure) if failure.exit == Exit::Unreachable => send(),
+            result => result,
+        }
     }
 
     /// Sends a request to remove something.
@@ -183,7 +218,8 @@ impl VehicleClient {
     ) -> Result<(), Failure> {
         self.runtime.block_on(async {
             let body = Either::Left(Full::default());
-            let answer = self.request_from(Method::GET, path, body, from).await?;
+            let range = (from > 0).then(|| ("range", format!("bytes={from}-")));
+            let answer = self.request_with(Method::GET, path, body, range.as_slice()).await?;
             if from > 0 && answer.status() != StatusCode::PARTIAL_CONTENT {
                 let message = format!("{} does not continue a file", self.program());
                 return Err(Failure::new(Exit::Internal, message)
@@ -205,13 +241,22 @@ impl VehicleClient {
         method: Method,
         path: &str,
         body: Bytes,
-    ) -> Result<T, Failure> {
+    ) -> Result<(T, usize), Failure> {
         let answer = self.request(method, path, Either::Left(Full::new(body))).await?;
+        self.parsed(answer).await
+    }
+
+    /// Returns the content of an answer, and its length in bytes.
+    async fn parsed<T: DeserializeOwned>(
+        &self,
+        answer: Response<Incoming>,
+    ) -> Result<(T, usize), Failure> {
         let body = self.whole(answer.into_body()).await?;
-        serde_json::from_slice(&body).map_err(|error| {
+        let parsed = serde_json::from_slice(&body).map_err(|error| {
             Failure::caused_by(Exit::Internal, "cannot parse the answer", &error)
                 .with_help(format!("use the `gleaner` of the version of {}", self.program()))
-        })
+        });
+        Ok((parsed?, body.len()))
     }
 
     /// Sends a request; returns its answer if that is no error.
@@ -221,16 +266,16 @@ impl VehicleClient {
         path: &str,
         body: Content,
     ) -> Result<Response<Incoming>, Failure> {
-        self.request_from(method, path, body, 0).await
+        self.request_with(method, path, body, &[]).await
     }
 
-    /// As [`request`](Self::request), for the content after `from` bytes.
-    async fn request_from(
+    /// As [`request`](Self::request), with further headers.
+    async fn request_with(
         &self,
         method: Method,
         path: &str,
         body: Content,
-        from: u64,
+        headers: &[(&str, String)],
     ) -> Result<Response<Incoming>, Failure> {
         let (mut sender, host, token) = match &self.endpoint {
             Endpoint::Orchestrator(socket) => {
@@ -260,8 +305,8 @@ impl VehicleClient {
         if !token.is_empty() {
             request = request.header("authorization", format!("Bearer {token}"));
         }
-        if from > 0 {
-            request = request.header("range", format!("bytes={from}-"));
+        for (name, value) in headers {
+            request = request.header(*name, value);
         }
         let request = request.body(body).map_err(|error| {
             Failure::caused_by(Exit::Usage, format!("`{path}` is no request"), &error)

@@ -137,7 +137,7 @@ impl LocalRevision {
         };
         let (mut sent, mut rounds) = (0, 0);
         let attempt = loop {
-            match client.post("/v1/deployments", &request)? {
+            match client.create("/v1/deployments", &request)? {
                 DeployReply::Accepted { attempt, .. } => break attempt,
                 DeployReply::Missing { objects } if rounds < ROUNDS => {
                     objects.iter().try_for_each(|object| self.send(client, object))?;

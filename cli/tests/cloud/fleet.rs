@@ -23,7 +23,7 @@ impl CloudUser {
         user.done(&["keys", "new", "key.pem"]);
         user.done(&["build", "brake"]);
         user.done(&["publish", "brake", "--key", "key.pem"]);
-        user.cloud.answers("GET /v1/deployments", &[(200, json!([]))]);
+        user.cloud.answers("GET /v1/deployments", &[(200, list(json!([])))]);
         user.cloud.answers("POST /v1/deployments", &[(200, accepted())]);
         user.cloud.seen();
         user
@@ -37,7 +37,7 @@ impl CloudUser {
                 "wanted": 3, "handled": 3, "problems": [], "running": 0, "deployments": 1,
             })
         });
-        self.cloud.answers("GET /v1/vehicles", &[(200, vehicles.collect())]);
+        self.cloud.answers("GET /v1/vehicles", &[(200, list(vehicles.collect()))]);
     }
 
     /// Sets the statuses of a vehicle, in turn: one for each value.
@@ -73,6 +73,11 @@ impl CloudUser {
     }
 }
 
+/// Returns a list with these entries.
+fn list(items: Value) -> Value {
+    json!({ "items": items })
+}
+
 fn accepted() -> Value {
     json!({ "result": "accepted", "id": "brake", "attempt": 0, "generation": 3 })
 }
@@ -92,7 +97,8 @@ fn on_vehicle(release: u64, phase: &str) -> Value {
 
 fn in_cloud(release: u64) -> Value {
     json!({
-        "id": "brake", "release": release, "revision": "b".repeat(64), "fallback": "a".repeat(64),
+        "id": "brake", "release": release, "version": "v", "revision": "b".repeat(64),
+        "fallback": "a".repeat(64),
         "grants": { "topics": ["/imu"], "models": [], "record": true },
         "selector": { "site": "berlin" }, "is_wanted": true, "vehicles": 2, "running": 1,
         "failed": 0,
@@ -102,7 +108,7 @@ fn in_cloud(release: u64) -> Value {
 #[test]
 fn a_deployment_to_a_fleet_sends_missing_files_and_waits_for_each_vehicle() {
     let user = CloudUser::with_lambda();
-    user.cloud.answers("GET /v1/deployments", &[(200, json!([in_cloud(6)]))]);
+    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([in_cloud(6)])))]);
     let main = "x = 0\n";
     let digest = gleaner_base::hex(&<sha2::Sha256 as sha2::Digest>::digest(main));
     let missing = json!({
@@ -192,7 +198,7 @@ fn the_release_follows_those_that_vehicles_remember() {
 #[test]
 fn a_deployment_of_a_fleet_is_listed_changed_and_removed() {
     let user = CloudUser::logged_in();
-    user.cloud.answers("GET /v1/deployments", &[(200, json!([in_cloud(6)]))]);
+    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([in_cloud(6)])))]);
     let text = user.done(&["fleet"]);
     let words: Vec<_> = text.lines().nth(1).unwrap().split_whitespace().collect();
     let row = ["brake", "6", "bbbbbbbbbbbb", "site=berlin", "wanted", "2", "1", "0"];
@@ -245,7 +251,7 @@ fn in_waves(release: u64, wave: u64, state: &str, reason: &str) -> Value {
 fn a_deployment_in_waves_sends_its_plan_and_can_be_watched() {
     let user = CloudUser::with_lambda();
     let deployments = |all: &[Value]| {
-        let answers = all.iter().map(|it| (200, json!([it]))).collect::<Vec<_>>();
+        let answers = all.iter().map(|it| (200, list(json!([it])))).collect::<Vec<_>>();
         user.cloud.answers("GET /v1/deployments", &answers);
     };
     let waves = ["--wave", "5%", "--canary", "50", "--success", "90%"];
@@ -292,7 +298,7 @@ fn waves_are_listed_paused_resumed_and_aborted() {
     let paused = in_waves(6, 2, "paused", "paused by ada");
     let line =
         "brake: wave 2 of 3, paused: paused by ada; it runs on 3 of 4 vehicles, and 1 failed\n";
-    user.cloud.answers("GET /v1/deployments", &[(200, json!([paused]))]);
+    user.cloud.answers("GET /v1/deployments", &[(200, list(json!([paused])))]);
     assert!(user.done(&["fleet"]).ends_with(line));
     for change in ["pause", "resume", "abort"] {
         let request = format!("POST /v1/deployments/brake/{change}");

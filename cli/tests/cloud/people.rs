@@ -3,7 +3,7 @@
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::fake::problem;
 use crate::{CloudUser, fails};
@@ -56,7 +56,8 @@ fn tokens_are_made_listed_and_removed() {
     let sent = r#"{"name":"nightly","role":"viewer","days":7}"#;
     assert_eq!(user.cloud.seen()[0].body, sent.as_bytes());
     let listed = json!([{ "user": "ada", "name": "nightly", "role": "viewer", "expires": 0 }]);
-    user.cloud.answers("GET /v1/tokens", &[(200, listed.clone())]);
+    let page = json!({ "items": listed });
+    user.cloud.answers("GET /v1/tokens", &[(200, page)]);
     assert_eq!(user.json(&["tokens"]), listed);
     assert!(user.done(&["tokens"]).contains("nightly"));
     user.cloud.answers("GET /v1/me", &[(200, me)]);
@@ -129,7 +130,7 @@ fn a_refused_token_is_an_error_that_names_the_login() {
 fn users_are_listed_invited_and_removed() {
     let user = CloudUser::logged_in();
     let users = json!([{ "name": "ada", "role": "admin" }, { "name": "bob", "role": "viewer" }]);
-    user.cloud.answers("GET /v1/users", &[(200, users.clone())]);
+    user.cloud.answers("GET /v1/users", &[(200, json!({ "items": users }))]);
     assert_eq!(user.done(&["users"]), "name  role\nada   admin\nbob   viewer\n");
     assert_eq!(user.json(&["users"]), users);
     let invitation = json!({
@@ -157,8 +158,32 @@ fn the_audit_trail_shows_the_newest_entries() {
             "subject": format!("brake-{seq}"), "hash": "h",
         })
     };
-    user.cloud.answers("GET /v1/audit?last=1", &[(200, json!([entry(2), entry(1)]))]);
+    user.cloud.answers("GET /v1/audit?limit=1", &[(200, json!({ "items": [entry(2), entry(1)] }))]);
     let text = user.done(&["audit", "-n", "1"]);
     assert!(text.ends_with("2018-08-02T08:34:51Z  ada  deploy  brake-2\n"), "{text}");
     assert_eq!(user.json(&["audit", "--last", "1"]), json!([entry(2)]));
+}
+
+#[test]
+fn a_list_is_followed_to_its_end_and_one_without_an_end_is_refused() {
+    let user = CloudUser::logged_in();
+    let some = |names: std::ops::Range<usize>| -> Value {
+        names.map(|it| json!({ "name": format!("u{it}"), "role": "viewer" })).collect()
+    };
+    let page = |names, next: &str| (200, json!({ "items": some(names), "next": next }));
+    let last = (200, json!({ "items": some(500..501) }));
+    user.cloud.answers("GET /v1/users", &[page(0..500, "a&b")]);
+    user.cloud.answers("GET /v1/users?after=a%26b", &[last]);
+    assert_eq!(user.json(&["users"]), some(0..501));
+    user.cloud.answers("GET /v1/users?after=a%26b", &[page(0..500, "a&b")]);
+    user.cloud.answers("GET /v1/users?limit=1&after=a%26b", &[page(0..1, "a&b")]);
+    let text = user.fails(1, &["users"]);
+    assert!(text.contains("more than 100000 entries"), "{text}");
+    // Parts without entries would be requested for ever.
+    user.cloud.answers("GET /v1/users?after=a%26b", &[page(0..0, "a&b")]);
+    let text = user.fails(1, &["users"]);
+    assert!(text.contains("the list `/v1/users` has no end"), "{text}");
+    user.cloud.answers("GET /v1/clips?label=x", &[page(0..0, "1")]);
+    let text = user.fails(1, &["clips", "export", "--label", "x", "--to", "out"]);
+    assert!(text.contains("the list `/v1/clips` has no end"), "{text}");
 }

@@ -32,6 +32,7 @@ const NAME_MAX: usize = 200;
 /// The name of a clip at its vehicle, without `.mcap`. It is always safe as a part of a path.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ClipName(String);
 
 impl ClipName {
@@ -79,6 +80,7 @@ impl From<ClipName> for String {
 /// The id of a clip in the fleet: `NAME@VEHICLE`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ClipId {
     name: ClipName,
     vehicle: ClipName,
@@ -143,6 +145,7 @@ impl From<ClipId> for String {
 
 /// The facts of a clip, as its vehicle states them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ClipFacts {
     /// Its name.
     pub name: ClipName,
@@ -172,6 +175,7 @@ pub struct ClipFacts {
 
 /// A lambda of a clip.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct RecordedLambda {
     /// Its name.
     pub name: String,
@@ -187,6 +191,7 @@ pub struct RecordedLambda {
 
 /// A trigger or a command of a clip.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ClipMoment {
     /// Name of the lambda.
     pub lambda: String,
@@ -327,6 +332,7 @@ pub struct WantedClip {
 
 /// A clip of the fleet.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct FleetClip {
     /// Its id.
     pub id: ClipId,
@@ -348,6 +354,7 @@ pub struct FleetClip {
 /// The place of the file of a clip.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum ClipState {
     /// On its vehicle only.
     OnVehicle,
@@ -377,18 +384,10 @@ impl ClipState {
     }
 }
 
-/// A part of a list of clips, the last announced first.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct ClipPage {
-    /// The clips.
-    pub clips: Vec<FleetClip>,
-    /// The value of `after` for the next part; `None` at the end.
-    pub next: Option<u64>,
-}
-
 /// Rules for the upload of clips of the fleet.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ClipPolicy {
     /// The clips that are uploaded.
     pub upload: UploadedClips,
@@ -399,6 +398,7 @@ pub struct ClipPolicy {
 /// The clips that vehicles upload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum UploadedClips {
     /// All of them.
     All,

@@ -12,6 +12,7 @@ const ENROLMENT_MAX: usize = 64 << 10;
 /// `gleaner vehicles enrol` writes. It is a secret until it was used.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Enrolment {
     /// Version of this format: 1.
     pub gleaner_enrolment: u32,

@@ -1,34 +1,9 @@
 //! Messages of the API for people: JSON over HTTP, each request with a token.
 //!
-//! | request | role | answer |
-//! |---|---|---|
-//! | `POST /v1/login` | none | [`UserToken`], of a [`Login`] |
-//! | `GET /v1/me` | viewer | [`User`] |
-//! | `DELETE /v1/login` | viewer | nothing, once the token has ended |
-//! | `GET /v1/tokens` | viewer | [`TokenSummary`] of own ones, of all for an admin |
-//! | `POST /v1/tokens` | viewer | [`UserToken`], of a [`NewToken`] |
-//! | `DELETE /v1/tokens/USER/NAME` | viewer | nothing |
-//! | `GET /v1/users` | admin | [`User`] of each |
-//! | `POST /v1/users` | admin | [`Invitation`], of a [`NewUser`] |
-//! | `DELETE /v1/users/NAME` | admin | nothing |
-//! | `GET /v1/vehicles` | viewer | [`VehicleSummary`] of each |
-//! | `POST /v1/vehicles` | admin | [`Enrolment`](crate::Enrolment), of a [`NewVehicle`] |
-//! | `DELETE /v1/vehicles/NAME` | admin | nothing, once it is cut off |
-//! | `GET /v1/vehicles/NAME/status` | viewer | [`VehicleStatus`] |
-//! | `GET /v1/vehicles/NAME/events` | viewer | a line of JSON per record |
-//! | `GET /v1/vehicles/NAME/lambdas/ID/records` | viewer | a line of JSON per record |
-//! | `PUT /v1/objects/SHA256` | deployer | nothing |
-//! | `POST /v1/deployments` | deployer | `DeployReply`, of a [`FleetDeployRequest`] |
-//! | `GET /v1/deployments` | viewer | [`FleetDeployment`] of each |
-//! | `POST /v1/deployments/ID/start`, `stop`, `rollback` | operator | [`FleetDeployment`] |
-//! | `POST /v1/deployments/ID/pause`, `resume`, `abort` | operator | [`FleetDeployment`] |
-//! | `DELETE /v1/deployments/ID` | deployer | nothing |
-//! | `GET /v1/audit` | admin | [`AuditEntry`] of each, the newest first |
+//! `GET /v1/openapi.json` of a cloud describes all requests, their roles, and these messages.
 //!
 //! In the answer to a deployment, `attempt` is 0, as each vehicle counts its own, and `generation`
-//! is the number of its entry in the audit trail. The audit trail is answered up to 1,000 entries.
-//!
-//! [`VehicleStatus`]: gleaner_protocol::vehicle_api::VehicleStatus
+//! is the number of its entry in the audit trail.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -39,9 +14,32 @@ use serde::{Deserialize, Serialize};
 
 use crate::waves::{WavePlan, WaveProgress};
 
+/// A part of a list that can grow: `?after=CURSOR&limit=N`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[cfg_attr(feature = "schema", schemars(rename = "ListPageOf{T}"))]
+pub struct ListPage<T> {
+    /// The entries.
+    pub items: Vec<T>,
+    /// The value of `after` for the next part. Only a part with as many entries as `limit` has it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next: Option<String>,
+}
+
+impl<T> ListPage<T> {
+    /// Returns a part with its entries, which are at most `limit`. `cursor` returns the position
+    /// of an entry.
+    pub fn of(items: Vec<T>, limit: u64, cursor: impl Fn(&T) -> String) -> Self {
+        let is_full = items.len() as u64 == limit;
+        let next = items.last().filter(|_| is_full).map(cursor);
+        Self { items, next }
+    }
+}
+
 /// The rights of a user. Each has those of the ones before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum Role {
     /// May read everything but the audit trail and users.
     Viewer,
@@ -86,6 +84,7 @@ impl FromStr for Role {
 /// A request for a token, by the one-time code of an invitation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Login {
     /// The code.
     pub code: String,
@@ -93,6 +92,7 @@ pub struct Login {
 
 /// A token of a user. It is not shown again.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct UserToken {
     /// The user.
     pub user: User,
@@ -107,6 +107,7 @@ pub const TOKEN_DAYS_MAX: u32 = 366;
 
 /// A request for a token for programs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct NewToken {
     /// The name, one of the user's.
@@ -119,6 +120,7 @@ pub struct NewToken {
 
 /// A token for programs, without the token itself.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct TokenSummary {
     /// The user who has made it.
     pub user: String,
@@ -132,6 +134,7 @@ pub struct TokenSummary {
 
 /// A user.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct User {
     /// The name.
     pub name: String,
@@ -142,6 +145,7 @@ pub struct User {
 /// A request to add a user, or to invite one again.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct NewUser {
     /// The name.
     pub name: String,
@@ -151,6 +155,7 @@ pub struct NewUser {
 
 /// An invitation of a user.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Invitation {
     /// The user.
     pub user: User,
@@ -163,6 +168,7 @@ pub struct Invitation {
 /// A request to enrol a vehicle.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct NewVehicle {
     /// The name.
     pub name: String,
@@ -170,6 +176,7 @@ pub struct NewVehicle {
 
 /// A vehicle in a list.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct VehicleSummary {
     /// The name.
     pub name: String,
@@ -196,6 +203,7 @@ pub struct VehicleSummary {
 /// The state of a vehicle, as the cloud sees it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum VehicleState {
     /// It was invited, and has not connected yet.
     Invited,
@@ -210,6 +218,7 @@ pub enum VehicleState {
 /// A deployment for the fleet: as for one vehicle, and with a plan of its waves.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct FleetDeployRequest {
     /// The envelope of the deployment.
     pub deployment: String,
@@ -222,11 +231,15 @@ pub struct FleetDeployRequest {
 
 /// A deployment of the fleet.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct FleetDeployment {
     /// Its id.
     pub id: String,
     /// Number of its release.
     pub release: u64,
+    /// Digest of what people and waves want of it: the part of its `ETag` before the dot.
+    #[serde(default)]
+    pub version: String,
     /// Digest of its revision.
     pub revision: String,
     /// Digest of its fallback.
@@ -251,6 +264,7 @@ pub struct FleetDeployment {
 
 /// An entry of the audit trail.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct AuditEntry {
     /// Number of the entry.
     pub seq: u64,

@@ -11,6 +11,7 @@ const SECONDS_MAX: u64 = 366 * 86_400;
 /// The plan by which a release reaches its vehicles.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct WavePlan {
     /// The share of its vehicles that each wave reaches, with those before, in percent. One more
     /// wave reaches all.
@@ -30,6 +31,7 @@ pub struct WavePlan {
 /// The action when too many vehicles fail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum OnFailure {
     /// The release reaches no more vehicles until a person decides.
     Pause,
@@ -40,6 +42,7 @@ pub enum OnFailure {
 /// The state of the waves of a release.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum WaveState {
     /// The next wave opens once this one has succeeded.
     Running,
@@ -51,6 +54,7 @@ pub enum WaveState {
 
 /// The progress of a release that has not reached all its vehicles.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct WaveProgress {
     /// The plan.
     pub plan: WavePlan,

@@ -1,9 +1,18 @@
 //! Errors, as people and vehicles get them.
 
+use axum::body::to_bytes;
+use axum::extract::Request;
 use axum::http::{StatusCode, header};
+use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use gleaner_base::{Exit, Failure};
 use gleaner_protocol::vehicle_api::Problem;
+
+/// The type of the content of an error.
+const PROBLEM: &str = "application/problem+json";
+
+/// Longest text of an error of the framework that is used as a cause.
+const TEXT_MAX: usize = 4 << 10;
 
 /// A failure with its HTTP status.
 #[derive(Debug)]
@@ -39,6 +48,11 @@ impl CloudError {
     /// Creates an error: a limit is reached for now.
     pub(crate) fn busy(message: impl Into<String>, help: &str) -> Self {
         Self::with(StatusCode::TOO_MANY_REQUESTS, Exit::Unreachable, message, help)
+    }
+
+    /// Creates an error: a request that contradicts the state, with this status.
+    pub(crate) fn conflict(status: StatusCode, message: impl Into<String>, help: &str) -> Self {
+        Self::with(status, Exit::Usage, message, help)
     }
 
     fn with(status: StatusCode, exit: Exit, message: impl Into<String>, help: &str) -> Self {
@@ -104,7 +118,50 @@ impl IntoResponse for CloudError {
         if self.status.is_server_error() {
             tracing::error!("{}", self.reason());
         }
-        let text = serde_json::to_string(&Problem::from(self.failure)).unwrap_or_default();
-        (self.status, [(header::CONTENT_TYPE, "application/problem+json")], text).into_response()
+        let problem = Problem::new(self.failure, self.status.as_u16());
+        let text = serde_json::to_string(&problem).unwrap_or_default();
+        (self.status, [(header::CONTENT_TYPE, PROBLEM)], text).into_response()
     }
+}
+
+/// Returns whether a path is one of the API.
+pub(crate) fn is_api(path: &str) -> bool {
+    path == "/v1" || path.starts_with("/v1/")
+}
+
+/// Gives the errors that the framework itself answers below `/v1` the form of all others.
+pub(crate) async fn as_problem(request: Request, next: Next) -> Response {
+    let is_api = is_api(request.uri().path());
+    let answer = next.run(request).await;
+    let status = answer.status();
+    let is_error = status.is_client_error() || status.is_server_error();
+    let has_problem = answer.headers().get(header::CONTENT_TYPE).is_some_and(|it| it == PROBLEM);
+    if !is_api || !is_error || has_problem {
+        return answer;
+    }
+    let (message, help) = match status {
+        StatusCode::METHOD_NOT_ALLOWED => {
+            ("the path has no such method", "use one that the header `Allow` names")
+        }
+        StatusCode::PAYLOAD_TOO_LARGE => {
+            ("the body of the request is too long", "send a shorter one")
+        }
+        StatusCode::RANGE_NOT_SATISFIABLE => {
+            ("the file ends before the range", "begin within the length of `Content-Range`")
+        }
+        _ => ("the request cannot be used", "`GET /v1/openapi.json` describes all requests"),
+    };
+    let exit = if status.is_server_error() { Exit::Internal } else { Exit::Usage };
+    let mut error = CloudError::with(status, exit, message, help);
+    let (mut parts, body) = answer.into_parts();
+    let text = to_bytes(body, TEXT_MAX).await.unwrap_or_default();
+    if !text.is_empty() {
+        error = error.because(String::from_utf8_lossy(&text));
+    }
+    for name in [header::CONTENT_TYPE, header::CONTENT_LENGTH] {
+        parts.headers.remove(name);
+    }
+    let mut problem = error.into_response();
+    problem.headers_mut().extend(parts.headers);
+    problem
 }

@@ -242,7 +242,8 @@ impl IntoResponse for ApiError {
             Exit::Unreachable => StatusCode::SERVICE_UNAVAILABLE,
             _ => StatusCode::INTERNAL_SERVER_ERROR,
         };
-        let text = serde_json::to_string(&Problem::from(self.0)).expect("plain data");
+        let text = serde_json::to_string(&Problem::new(self.0, status.as_u16()));
+        let text = text.expect("plain data");
         (status, [(header::CONTENT_TYPE, "application/problem+json")], text).into_response()
     }
 }

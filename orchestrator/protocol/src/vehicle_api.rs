@@ -12,6 +12,7 @@ pub const API_SOCKET: &str = "control.sock";
 
 /// The status of a vehicle: `GET /v1/status`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct VehicleStatus {
     /// Name of the vehicle.
     pub vehicle: String,
@@ -37,6 +38,7 @@ pub struct VehicleStatus {
     #[serde(default)]
     pub events_lost: u64,
     /// The processes; absent while the supervisor cannot be reached.
+    #[cfg_attr(feature = "schema", schemars(with = "Option<serde_json::Value>"))]
     pub supervisor: Option<SupervisorStatus>,
     /// The connection to the cloud; absent unless the vehicle is enrolled.
     #[serde(default)]
@@ -45,6 +47,7 @@ pub struct VehicleStatus {
 
 /// The connection of a vehicle to the cloud.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct CloudStatus {
     /// Address of the cloud: `HOST:PORT`.
     pub address: String,
@@ -64,6 +67,7 @@ pub struct CloudStatus {
 
 /// The status of a program.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ProgramStatus {
     /// Its version.
     pub version: String,
@@ -79,6 +83,7 @@ pub struct ProgramStatus {
 
 /// The status of the trust root.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct TrustStatus {
     /// Its version.
     pub version: u64,
@@ -90,6 +95,7 @@ pub struct TrustStatus {
 
 /// The status of a deployment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct DeploymentStatus {
     /// Its id.
     pub id: String,
@@ -122,11 +128,13 @@ pub struct DeploymentStatus {
     #[serde(default)]
     pub demand: Vec<ResourceDemand>,
     /// The status of its lambda, if the supervisor knows it.
+    #[cfg_attr(feature = "schema", schemars(with = "Option<serde_json::Value>"))]
     pub status: Option<LambdaStatus>,
 }
 
 /// Rights of a lambda in a deployment.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct GrantStatus {
     /// Topics that it may read.
     pub topics: Vec<String>,
@@ -145,6 +153,7 @@ pub struct Changed {
 
 /// A revision of a deployment.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct RevisionStatus {
     /// Digest of the revision.
     pub digest: String,
@@ -156,6 +165,7 @@ pub struct RevisionStatus {
 
 /// A resource that lambdas share.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Capacity {
     /// Its name: `memory`, `topics`, `cpu`, `model_time`.
     pub resource: String,
@@ -174,6 +184,7 @@ pub struct Capacity {
 
 /// The demand of a deployment for a resource.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct ResourceDemand {
     /// Name of the resource, as in [`Capacity`].
     pub resource: String,
@@ -202,6 +213,7 @@ pub struct DeployRequest {
 /// The answer to a deployment.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "result", rename_all = "snake_case")]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub enum DeployReply {
     /// Files are missing: `PUT /v1/objects/SHA256` each, then repeat the request.
     Missing {
@@ -221,6 +233,7 @@ pub enum DeployReply {
 
 /// A file that a vehicle needs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct MissingObject {
     /// Its digest.
     pub sha256: String,
@@ -230,6 +243,7 @@ pub struct MissingObject {
 
 /// A line of `GET /v1/events` and `GET /v1/lambdas/ID/records`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct StreamLine {
     /// Name of the stream.
     pub stream: String,
@@ -248,11 +262,19 @@ pub struct StreamLine {
     pub record: serde_json::Value,
 }
 
-/// An error, as `application/problem+json`: a [`Failure`].
+/// An error, as `application/problem+json` of RFC 9457: a [`Failure`]. It has no `type`: all are of
+/// the type `about:blank`, and the status tells them apart.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Problem {
     /// The failed action.
     pub title: String,
+    /// HTTP status of the answer.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub status: Option<u16>,
+    /// The causes as one text.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub detail: Option<String>,
     /// The causes, the nearest first.
     #[serde(default)]
     pub causes: Vec<String>,
@@ -263,14 +285,17 @@ pub struct Problem {
     pub exit: u8,
 }
 
-impl From<Failure> for Problem {
-    fn from(Failure { exit, message, causes, help }: Failure) -> Self {
-        Self { title: message, causes, help, exit: exit.code() }
+impl Problem {
+    /// Returns a failure as the answer with an HTTP status.
+    pub fn new(failure: Failure, status: u16) -> Self {
+        let Failure { exit, message, causes, help } = failure;
+        let detail = (!causes.is_empty()).then(|| causes.join(": "));
+        Self { title: message, status: Some(status), detail, causes, help, exit: exit.code() }
     }
 }
 
 impl From<Problem> for Failure {
-    fn from(Problem { title, causes, help, exit }: Problem) -> Self {
+    fn from(Problem { title, causes, help, exit, .. }: Problem) -> Self {
         let exit = Exit::from_code(exit.into()).filter(|exit| *exit != Exit::Ok);
         Failure { exit: exit.unwrap_or(Exit::Internal), message: title, causes, help }
     }

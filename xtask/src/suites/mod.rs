@@ -111,7 +111,8 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
     let mut unittest = checkout.command(checkout.python());
     unittest
         .args(["-m", "unittest", "discover", "-v", "guest-sdk-python/tests"])
-        .env("GLEANER_EXTENSION", checkout.program("lib_gleaner.so"));
+        .env("GLEANER_EXTENSION", checkout.program("lib_gleaner.so"))
+        .env("GLEANER_CLOUD_PROGRAM", checkout.program("gleaner-cloud"));
 
     // As users test lambdas, with the SDK of this checkout.
     let mut pytest = checkout.command(checkout.python());

@@ -8,21 +8,20 @@ use gleaner_fleet::clips::{ClipMoment, ClipState, FleetClip};
 use serde_json::{Value, json};
 
 use super::download::ClipTarget;
-use super::matching;
+use super::{CLIPS, query};
 use crate::args::ExportArgs;
-use crate::cloud::{client, show};
+use crate::cloud::{client, list, show};
 
 /// The table, in the folder of an export. `gleaner.cloud` of the Python SDK reads it.
 const TABLE: &str = "events.jsonl";
-/// Maximum number of clips in an export.
-const CLIPS_MAX: usize = 100_000;
 
 /// Runs `gleaner clips export`.
 pub(super) fn export(args: &ExportArgs) -> Result<Exit, Failure> {
     let client = client()?;
-    let (stored, others): (Vec<_>, Vec<_>) = matching(&client, &args.filter, CLIPS_MAX)?
-        .into_iter()
-        .partition(|clip| clip.state == ClipState::Stored);
+    let (stored, others): (Vec<FleetClip>, Vec<_>) =
+        list::all::<FleetClip>(&client, CLIPS, &query(&args.filter))?
+            .into_iter()
+            .partition(|clip| clip.state == ClipState::Stored);
     let table = args.to.join(TABLE);
     let failed = |error: std::io::Error| {
         let action = format!("cannot write `{}`", table.display());

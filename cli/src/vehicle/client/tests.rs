@@ -158,3 +158,28 @@ fn a_cloud_that_is_gone_or_never_stops_is_an_error() {
     assert_eq!(failure.exit, Exit::Unreachable);
     assert!(failure.to_string().contains("cannot reach the cloud at http://127.0.0.1:"));
 }
+
+#[test]
+fn a_request_that_creates_is_sent_again_with_its_key_after_a_lost_connection() {
+    let cloud = OneAnswer::new();
+    let done = "HTTP/1.1 200 OK\r\ncontent-length: 2\r\n\r\n{}";
+    let problem = r#"{"title":"its secret is not kept","exit":2}"#;
+    let refused = format!("HTTP/1.1 409 Conflict\r\ncontent-length: 43\r\n\r\n{problem}");
+    let body = serde_json::json!({});
+    for (answer, is_done) in [(done, true), (&*refused, false)] {
+        let (keys, result) = thread::scope(|scope| {
+            let asked =
+                scope.spawn(|| cloud.client("t").create::<serde_json::Value>("/v1/users", &body));
+            let keys = ["", answer].map(|answer| {
+                let mut stream = cloud.0.accept().unwrap().0;
+                let head = head(&mut stream);
+                stream.write_all(answer.as_bytes()).unwrap();
+                let key = head.lines().find(|line| line.starts_with("idempotency-key: "));
+                key.unwrap().to_owned()
+            });
+            (keys, asked.join().unwrap())
+        });
+        assert_eq!(keys[0], keys[1]);
+        assert_eq!(result.is_ok(), is_done, "{result:?}");
+    }
+}

@@ -9,8 +9,8 @@ use axum::extract::{Extension, Path, Query, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use gleaner_base::{Exit, Failure};
-use gleaner_fleet::clips::{ClipId, ClipPage, ClipPolicy, ClipState, FleetClip};
-use gleaner_fleet::people::User;
+use gleaner_fleet::clips::{ClipId, ClipPolicy, ClipState, FleetClip};
+use gleaner_fleet::people::{ListPage, User};
 
 use super::FileOfClip;
 use crate::cloud::Cloud;
@@ -21,7 +21,7 @@ use crate::store::ClipQuery;
 pub(crate) async fn list(
     State(cloud): State<Arc<Cloud>>,
     Query(query): Query<ClipQuery>,
-) -> CloudResult<Json<ClipPage>> {
+) -> CloudResult<Json<ListPage<FleetClip>>> {
     Ok(Json(cloud.store.clips(&query).await?))
 }
 

@@ -82,6 +82,6 @@ async fn the_oldest_clips_without_files_are_forgotten_above_the_bound() {
         announce(&store, "a", name, 10).await;
     }
     let page = store.clips(&ClipQuery::default()).await.unwrap();
-    let names: Vec<_> = page.clips.iter().map(|clip| clip.facts.name.to_string()).collect();
+    let names: Vec<_> = page.items.iter().map(|clip| clip.facts.name.to_string()).collect();
     assert_eq!(names, ["4", "3", "2", "0"]);
 }

@@ -60,7 +60,7 @@ async fn access_page(
             (new_user(user))
             (new_vehicle(user))
         }
-        (users(user, &cloud.store.users().await?, asked))
+        (users(user, &cloud.store.users("", u64::MAX).await?, asked))
         (vehicles(cloud, user, asked).await?)
     };
     Ok(layout::page("Access", "/access", Some(user), body))

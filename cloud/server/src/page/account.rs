@@ -17,6 +17,7 @@ use super::session::PageUser;
 use super::text::{segment, shown, time};
 use crate::cloud::Cloud;
 use crate::error::CloudError;
+use crate::store::TOKENS_MAX;
 
 /// The change that was made before a page is shown.
 #[derive(Debug, Deserialize)]
@@ -33,6 +34,7 @@ pub(super) async fn page(
 }
 
 async fn account_page(cloud: &Cloud, user: &PageUser, message: Markup) -> PageResult {
+    let most = TOKENS_MAX.unsigned_abs();
     let has_password = cloud.store.password(&user.user.name).await?.is_some();
     let title = if has_password { "Change your password" } else { "Set a password" };
     let body = html! {
@@ -53,7 +55,7 @@ async fn account_page(cloud: &Cloud, user: &PageUser, message: Markup) -> PageRe
                 button { (title) }
             }))
         }
-        (tokens(user, &cloud.store.tokens(Some(&user.user.name)).await?))
+        (tokens(user, &cloud.store.tokens(Some(&user.user.name), "", most).await?))
     };
     Ok(layout::page("Account", "/account", Some(user), body))
 }
@@ -133,7 +135,7 @@ pub(super) async fn make_token(
             let name = fields.get("name").trim().to_owned();
             // No number is none that is allowed.
             let days = fields.get("days").trim().parse().unwrap_or(0);
-            cloud.store.make_token(&user.user, NewToken { name, role, days }).await
+            cloud.store.make_token((&user.user, (&user.user).into()), NewToken { name, role, days }).await
         }
         Err(error) => Err(error),
     };

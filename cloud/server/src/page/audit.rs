@@ -12,7 +12,7 @@ use super::text::{query, short, shown, time};
 use crate::cloud::Cloud;
 
 /// Number of entries on a page.
-const SIZE: i64 = 50;
+const SIZE: u64 = 50;
 
 /// The part of the list, as the address has it.
 #[derive(Debug, Deserialize)]

@@ -25,7 +25,7 @@ pub(super) async fn list(
     Extension(user): Extension<PageUser>,
     Query(query): Query<Done>,
 ) -> PageResult {
-    let all = cloud.store.deployments().await?;
+    let all = cloud.store.deployments("", u64::MAX).await?;
     let body = html! {
         h1 { "Deployments" }
         (done(query.done.as_deref()))

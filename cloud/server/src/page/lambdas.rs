@@ -31,7 +31,9 @@ type RevisionUses = BTreeMap<String, (Vec<String>, Vec<String>)>;
 
 async fn uses(cloud: &Cloud) -> CloudResult<RevisionUses> {
     let mut uses = RevisionUses::new();
-    for FleetDeployment { id, revision, fallback, .. } in cloud.store.deployments().await? {
+    for FleetDeployment { id, revision, fallback, .. } in
+        cloud.store.deployments("", u64::MAX).await?
+    {
         if let Some(fallback) = fallback {
             uses.entry(fallback).or_default().1.push(id.clone());
         }

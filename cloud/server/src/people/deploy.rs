@@ -6,13 +6,14 @@ use std::sync::Arc;
 use axum::Json;
 use axum::body::{Body, Bytes};
 use axum::extract::{Extension, Path, State};
-use axum::http::StatusCode;
+use axum::http::{HeaderMap, StatusCode};
 use gleaner_base::Failure;
 use gleaner_fleet::people::{FleetDeployRequest, User};
 use gleaner_lambda::manifest::Sha256;
 use gleaner_protocol::vehicle_api::{DeployReply, GrantStatus};
 use gleaner_trust::{Refusal, Revision, unverified_deployment, unverified_revision};
 
+use super::conditions::ChangeConditions;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, parsed};
@@ -22,8 +23,10 @@ use crate::store::OfferedDeployment;
 pub(super) async fn deploy(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
+    headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<DeployReply>> {
+    let conditions = ChangeConditions::of_new(&headers, "/v1/deployments", &body)?;
     let request: FleetDeployRequest = parsed(&body, "deployment")?;
     let refused = |what: &str| {
         let action = format!("the {what} is refused");
@@ -73,7 +76,7 @@ pub(super) async fn deploy(
         revisions: envelopes,
         waves: request.waves,
     };
-    let (generation, changed) = cloud.store.deploy(&actor.name, &offered).await?;
+    let (generation, changed) = cloud.store.deploy(conditions.by(&actor), &offered).await?;
     cloud.hub.wake(&changed);
     Ok(Json(DeployReply::Accepted { id, attempt: 0, generation }))
 }

@@ -1,11 +1,15 @@
-//! The API for people: JSON over HTTP, each request with a token. `gleaner_fleet::people` lists the
-//! requests.
+//! The API for people: JSON over HTTP, each request with a token. [`endpoints`] lists the requests,
+//! and `openapi` describes them for other programs; `gleaner_fleet::people` has the messages.
 //!
 //! This room checks no signature and has no key: the cloud stores and forwards what was signed, and
 //! each vehicle decides by its own trust root. A deployment is only parsed, within the bounds of
 //! its format.
 
+mod conditions;
 mod deploy;
+mod endpoint;
+mod lists;
+mod openapi;
 mod records;
 #[cfg(test)]
 pub(crate) mod tests;
@@ -20,20 +24,28 @@ use axum::extract::{DefaultBodyLimit, Extension, Path, Request, State};
 use axum::http::{HeaderMap, Method, StatusCode, Uri, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
-use axum::routing::{MethodRouter, delete, get, post, put};
+use axum::routing::{self, delete, get, post};
 use gleaner_fleet::Enrolment;
+use gleaner_fleet::clips::{ClipPolicy, FleetClip};
 use gleaner_fleet::people::{
-    FleetDeployment, Invitation, Login, NewUser, NewVehicle, Role, User, UserToken,
+    AuditEntry, FleetDeployRequest, FleetDeployment, Invitation, ListPage, Login, NewToken,
+    NewUser, NewVehicle, Role, TokenSummary, User, UserToken, VehicleSummary,
 };
 use gleaner_fleet::waves::WaveState;
+use gleaner_protocol::vehicle_api::{DeployReply, StreamLine, VehicleStatus};
+use serde_json::{Map, Value};
 
 use crate::accept::PeerConnection;
 use crate::clips::people as clips;
 use crate::cloud::Cloud;
-use crate::error::{CloudError, CloudResult};
+use crate::error::{CloudError, CloudResult, as_problem, is_api};
 use crate::page;
-use crate::request::{in_time, parsed};
-use crate::store::{ENTRIES_MAX, TokenUser};
+use crate::request::{ListQuery, in_time, parsed};
+use crate::store::{ChangeAuthor, ClipQuery, TokenUser};
+
+use self::conditions::{ChangeConditions, tagged};
+use self::endpoint::{Endpoint, FILE};
+use self::records::RecordQuery;
 
 /// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
 /// text in JSON.
@@ -42,17 +54,11 @@ const BODY_MAX: usize = 12 << 20;
 /// Maximum length of a request without a token.
 const LOGIN_MAX: usize = 4 << 10;
 
-/// A request that the API answers.
-pub(crate) struct Endpoint {
-    /// Its method, which the handler has, too.
-    #[cfg_attr(not(test), expect(dead_code, reason = "read by the test of all roles"))]
-    pub(crate) method: Method,
-    /// Its path.
-    pub(crate) path: &'static str,
-    /// The least role; `None` if no token is needed.
-    pub(crate) role: Option<Role>,
-    handler: MethodRouter<Arc<Cloud>>,
-}
+/// Headers of a request that creates something, of a change, of a read, and of a stream.
+const CREATES: &[&str] = &["Idempotency-Key"];
+const CHANGES: &[&str] = &["If-Match"];
+const READS: &[&str] = &["If-None-Match"];
+const RESUMES: &[&str] = &["Last-Event-ID"];
 
 /// Name of the token of a request; empty for that of a login.
 #[derive(Debug, Clone)]
@@ -61,44 +67,118 @@ struct TokenName(String);
 /// Returns every request that the API answers: no role is stated elsewhere.
 pub(crate) fn endpoints() -> Vec<Endpoint> {
     use Role::{Admin, Deployer, Operator, Viewer};
-    let endpoint = |method, path, role, handler| Endpoint { method, path, role, handler };
-    let read = |path, role, handler| endpoint(Method::GET, path, Some(role), handler);
-    let send = |path, role, handler| endpoint(Method::POST, path, Some(role), handler);
-    let remove = |path, role, handler| endpoint(Method::DELETE, path, Some(role), handler);
+    let read = |path, role, summary, handler| {
+        Endpoint::new(Method::GET, path, Some(role), summary, handler)
+    };
+    let send = |path, role, summary, handler| {
+        Endpoint::new(Method::POST, path, Some(role), summary, handler)
+    };
+    let put = |path, role, summary, handler| {
+        Endpoint::new(Method::PUT, path, Some(role), summary, handler)
+    };
+    let remove = |path, role, summary, handler| {
+        Endpoint::new(Method::DELETE, path, Some(role), summary, handler)
+    };
+    let open = |method, path, summary, handler| Endpoint::new(method, path, None, summary, handler);
     vec![
-        endpoint(
+        open(Method::GET, "/v1/openapi.json", "This description", get(openapi::document))
+            .gives::<Map<String, Value>>(),
+        open(
             Method::POST,
             "/v1/login",
-            None,
+            "Exchanges a one-time code for a token",
             post(login).layer(DefaultBodyLimit::max(LOGIN_MAX)),
-        ),
-        read("/v1/me", Viewer, get(me)),
-        remove("/v1/login", Viewer, delete(tokens::logout)),
-        read("/v1/tokens", Viewer, get(tokens::list)),
-        send("/v1/tokens", Viewer, post(tokens::make)),
-        remove("/v1/tokens/{user}/{name}", Viewer, delete(tokens::remove)),
-        read("/v1/users", Admin, get(users)),
-        send("/v1/users", Admin, post(invite)),
-        remove("/v1/users/{name}", Admin, delete(remove_user)),
-        read("/v1/vehicles", Viewer, get(vehicles)),
-        send("/v1/vehicles", Admin, post(invite_vehicle)),
-        remove("/v1/vehicles/{name}", Admin, delete(revoke)),
-        read("/v1/vehicles/{name}/status", Viewer, get(status)),
-        read("/v1/vehicles/{name}/events", Viewer, get(records::events)),
-        read("/v1/vehicles/{name}/lambdas/{id}/records", Viewer, get(records::lambda)),
-        endpoint(Method::PUT, "/v1/objects/{sha256}", Some(Deployer), put(deploy::object)),
-        send("/v1/deployments", Deployer, post(deploy::deploy)),
-        read("/v1/deployments", Viewer, get(deployments)),
-        send("/v1/deployments/{id}/{change}", Operator, post(change)),
-        remove("/v1/deployments/{id}", Deployer, delete(remove_deployment)),
-        read("/v1/audit", Admin, get(audit)),
-        read("/v1/clips", Viewer, get(clips::list)),
-        read("/v1/clips/policy", Viewer, get(clips::policy)),
-        endpoint(Method::PUT, "/v1/clips/policy", Some(Admin), put(clips::set_policy)),
-        read("/v1/clips/{id}", Viewer, get(clips::show)),
-        read("/v1/clips/{id}/thumbnail", Viewer, get(clips::thumbnail)),
-        read("/v1/clips/{id}/file", Viewer, get(clips::file)),
-        send("/v1/clips/{id}/pull", Operator, post(clips::pull)),
+        )
+        .takes::<Login>()
+        .gives::<UserToken>(),
+        read("/v1/me", Viewer, "The user of the token", get(me)).gives::<User>(),
+        remove("/v1/login", Viewer, "Ends the token of the request", delete(tokens::logout)),
+        read("/v1/tokens", Viewer, "Own tokens for programs, or all for an admin", get(tokens::list))
+            .query::<ListQuery<String>>()
+            .gives::<ListPage<TokenSummary>>(),
+        send("/v1/tokens", Viewer, "Makes a token for programs", post(tokens::make))
+            .headers(CREATES)
+            .takes::<NewToken>()
+            .gives::<UserToken>(),
+        remove("/v1/tokens/{user}/{name}", Viewer, "Removes a token", delete(tokens::remove)),
+        read("/v1/users", Admin, "All users", get(lists::users))
+            .query::<ListQuery<String>>()
+            .gives::<ListPage<User>>(),
+        send("/v1/users", Admin, "Invites a user, or one again", post(invite))
+            .headers(CREATES)
+            .takes::<NewUser>()
+            .gives::<Invitation>(),
+        remove("/v1/users/{name}", Admin, "Removes a user", delete(remove_user)),
+        read("/v1/vehicles", Viewer, "All vehicles", get(lists::vehicles))
+            .query::<ListQuery<String>>()
+            .gives::<ListPage<VehicleSummary>>(),
+        send("/v1/vehicles", Admin, "Invites a vehicle, or one again", post(invite_vehicle))
+            .headers(CREATES)
+            .takes::<NewVehicle>()
+            .gives::<Enrolment>(),
+        remove("/v1/vehicles/{name}", Admin, "Cuts a vehicle off", delete(revoke)),
+        read("/v1/vehicles/{name}/status", Viewer, "The last report of a vehicle", get(status))
+            .gives::<VehicleStatus>(),
+        read("/v1/vehicles/{name}/events", Viewer, "Events of a vehicle", get(records::events))
+            .query::<RecordQuery>()
+            .headers(RESUMES)
+            .gives_lines::<StreamLine>(),
+        read(
+            "/v1/vehicles/{name}/lambdas/{id}/records",
+            Viewer,
+            "Records of a deployment on a vehicle",
+            get(records::lambda),
+        )
+        .query::<RecordQuery>()
+        .headers(RESUMES)
+        .gives_lines::<StreamLine>(),
+        put(
+            "/v1/objects/{sha256}",
+            Deployer,
+            "Stores a file that a deployment needs",
+            routing::put(deploy::object),
+        )
+        .takes_file(),
+        send("/v1/deployments", Deployer, "Stores a deployment", post(deploy::deploy))
+            .headers(CREATES)
+            .takes::<FleetDeployRequest>()
+            .gives::<DeployReply>(),
+        read("/v1/deployments", Viewer, "All deployments", get(lists::deployments))
+            .query::<ListQuery<String>>()
+            .headers(READS)
+            .gives::<ListPage<FleetDeployment>>(),
+        read("/v1/deployments/{id}", Viewer, "A deployment", get(deployment))
+            .headers(READS)
+            .gives::<FleetDeployment>(),
+        send(
+            "/v1/deployments/{id}/{change}",
+            Operator,
+            "Changes a deployment: `start`, `stop`, `rollback`, `pause`, `resume` or `abort`",
+            post(change),
+        )
+        .headers(CHANGES)
+        .gives::<FleetDeployment>(),
+        remove("/v1/deployments/{id}", Deployer, "Removes a deployment", delete(remove_deployment))
+            .headers(CHANGES),
+        read("/v1/audit", Admin, "The audit trail, the newest entry first", get(lists::audit))
+            .query::<ListQuery<u64>>()
+            .gives::<ListPage<AuditEntry>>(),
+        read("/v1/clips", Viewer, "Clips, the last announced first", get(clips::list))
+            .query::<ClipQuery>()
+            .gives::<ListPage<FleetClip>>(),
+        read("/v1/clips/policy", Viewer, "The rules for the upload of clips", get(clips::policy))
+            .gives::<ClipPolicy>(),
+        put("/v1/clips/policy", Admin, "Sets these rules", routing::put(clips::set_policy))
+            .takes::<ClipPolicy>()
+            .gives::<ClipPolicy>(),
+        read("/v1/clips/{id}", Viewer, "A clip", get(clips::show)).gives::<FleetClip>(),
+        read("/v1/clips/{id}/thumbnail", Viewer, "An image of a clip", get(clips::thumbnail))
+            .gives_file("image/jpeg"),
+        read("/v1/clips/{id}/file", Viewer, "The file of a clip", get(clips::file))
+            .headers(&["Range"])
+            .gives_file(FILE),
+        send("/v1/clips/{id}/pull", Operator, "Marks a clip as wanted", post(clips::pull))
+            .gives::<FleetClip>(),
     ]
 }
 
@@ -117,12 +197,16 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
     }
     router
         .merge(page::router(cloud))
-        .fallback(async |uri: Uri| match uri.path().starts_with("/v1/") {
-            true => CloudError::missing("there is nothing under this path", "see the docs")
-                .into_response(),
+        .fallback(async |uri: Uri| match is_api(uri.path()) {
+            true => CloudError::missing(
+                "there is nothing under this path",
+                "`GET /v1/openapi.json` describes all requests",
+            )
+            .into_response(),
             false => page::nothing_here(),
         })
         .layer(DefaultBodyLimit::max(BODY_MAX))
+        .layer(from_fn(as_problem))
         .with_state(Arc::clone(cloud))
 }
 
@@ -198,17 +282,15 @@ async fn me(Extension(user): Extension<User>) -> Json<User> {
     Json(user)
 }
 
-async fn users(State(cloud): State<Arc<Cloud>>) -> CloudResult<Response> {
-    Ok(Json(cloud.store.users().await?).into_response())
-}
-
 async fn invite(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
+    headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<Invitation>> {
+    let conditions = ChangeConditions::of_new(&headers, "/v1/users", &body)?;
     let new: NewUser = parsed(&body, "invitation")?;
-    Ok(Json(cloud.store.invite(&actor.name, new).await?))
+    Ok(Json(cloud.store.invite(conditions.by(&actor), new).await?))
 }
 
 async fn remove_user(
@@ -221,23 +303,24 @@ async fn remove_user(
     Ok(StatusCode::NO_CONTENT)
 }
 
-async fn vehicles(State(cloud): State<Arc<Cloud>>) -> CloudResult<Response> {
-    let vehicles = cloud.store.vehicles().await?;
-    Ok(Json(vehicles).into_response())
-}
-
 async fn invite_vehicle(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
+    headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<Enrolment>> {
+    let conditions = ChangeConditions::of_new(&headers, "/v1/vehicles", &body)?;
     let NewVehicle { name } = parsed(&body, "enrolment of a vehicle")?;
-    enrolment(&cloud, &actor.name, &name).await.map(Json)
+    enrolment(&cloud, conditions.by(&actor), &name).await.map(Json)
 }
 
 /// Invites a vehicle; returns the content of its file.
-pub(crate) async fn enrolment(cloud: &Cloud, actor: &str, name: &str) -> CloudResult<Enrolment> {
-    let token = cloud.store.invite_vehicle(actor, name).await?;
+pub(crate) async fn enrolment(
+    cloud: &Cloud,
+    author: impl Into<ChangeAuthor<'_>>,
+    name: &str,
+) -> CloudResult<Enrolment> {
+    let token = cloud.store.invite_vehicle(author, name).await?;
     Ok(Enrolment {
         gleaner_enrolment: 1,
         address: cloud.address.clone(),
@@ -265,24 +348,30 @@ async fn status(
     Ok(([(header::CONTENT_TYPE, "application/json")], status).into_response())
 }
 
-async fn deployments(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<Vec<FleetDeployment>>> {
-    Ok(Json(cloud.store.deployments().await?))
+async fn deployment(
+    State(cloud): State<Arc<Cloud>>,
+    Path(id): Path<String>,
+    headers: HeaderMap,
+) -> CloudResult<Response> {
+    let deployment = cloud.store.deployment(&id).await?;
+    tagged(&headers, &deployment.version, &deployment)
 }
 
 /// Makes a change of a deployment that its name states, and wakes the vehicles that it is for.
 pub(crate) async fn change_deployment(
     cloud: &Cloud,
-    actor: &User,
+    author: impl Into<ChangeAuthor<'_>>,
     id: &str,
     change: &str,
 ) -> CloudResult<()> {
+    let author = author.into();
     let changed = match change {
-        "start" => cloud.store.set_wanted(&actor.name, id, true).await?,
-        "stop" => cloud.store.set_wanted(&actor.name, id, false).await?,
-        "rollback" => cloud.store.roll_back(&actor.name, id).await?,
-        "pause" => cloud.store.steer_waves(&actor.name, id, WaveState::Paused).await?,
-        "resume" => cloud.store.steer_waves(&actor.name, id, WaveState::Running).await?,
-        "abort" => cloud.store.steer_waves(&actor.name, id, WaveState::Aborted).await?,
+        "start" => cloud.store.set_wanted(author, id, true).await?,
+        "stop" => cloud.store.set_wanted(author, id, false).await?,
+        "rollback" => cloud.store.roll_back(author, id).await?,
+        "pause" => cloud.store.steer_waves(author, id, WaveState::Paused).await?,
+        "resume" => cloud.store.steer_waves(author, id, WaveState::Running).await?,
+        "abort" => cloud.store.steer_waves(author, id, WaveState::Aborted).await?,
         other => {
             let message = format!("`{}` is no change", gleaner_base::excerpt(other));
             let help = "use `start`, `stop`, `rollback`, `pause`, `resume` or `abort`";
@@ -297,21 +386,22 @@ async fn change(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
     Path((id, change)): Path<(String, String)>,
-) -> CloudResult<Json<FleetDeployment>> {
-    change_deployment(&cloud, &actor, &id, &change).await?;
-    Ok(Json(cloud.store.deployment(&id).await?))
+    headers: HeaderMap,
+) -> CloudResult<Response> {
+    let conditions = ChangeConditions::of_change(&headers)?;
+    change_deployment(&cloud, conditions.by(&actor), &id, &change).await?;
+    let deployment = cloud.store.deployment(&id).await?;
+    tagged(&HeaderMap::new(), &deployment.version, &deployment)
 }
 
 async fn remove_deployment(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
     Path(id): Path<String>,
+    headers: HeaderMap,
 ) -> CloudResult<StatusCode> {
-    let changed = cloud.store.remove_deployment(&actor.name, &id).await?;
+    let conditions = ChangeConditions::of_change(&headers)?;
+    let changed = cloud.store.remove_deployment(conditions.by(&actor), &id).await?;
     cloud.hub.wake(&changed);
     Ok(StatusCode::NO_CONTENT)
-}
-
-async fn audit(State(cloud): State<Arc<Cloud>>) -> CloudResult<Response> {
-    Ok(Json(cloud.store.audit(u64::MAX, ENTRIES_MAX).await?).into_response())
 }

@@ -1,15 +1,19 @@
-//! Records of a vehicle, as lines of JSON in the order of their arrival.
+//! Records of a vehicle in the order of their arrival: as lines of JSON, or as server-sent events
+//! for a client that accepts these. It goes on after a lost connection by `Last-Event-ID`.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::{Extension, Path, Query, State};
-use axum::http::header;
+use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream::try_unfold;
 use gleaner_fleet::people::User;
+use schemars::JsonSchema;
 use serde::Deserialize;
 use tokio::sync::watch;
+use tokio::time::sleep;
 
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
@@ -18,8 +22,14 @@ use crate::readers::ReaderSlot;
 /// Number of lines in a piece.
 const PIECE: i64 = 256;
 
+/// Time without a record after which a sign of life is sent among events.
+const QUIET: Duration = Duration::from_secs(10);
+
+/// The kind of a stream of events.
+const EVENTS: &str = "text/event-stream";
+
 /// Choice of the records of a stream, as on a vehicle.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(super) struct RecordQuery {
     /// Number of the first record; without one, the oldest that is kept.
@@ -39,6 +49,7 @@ struct RecordReader {
     from: u64,
     /// Number of the last arrival that was sent.
     arrival: i64,
+    is_events: bool,
     /// Lines to send first.
     first: Vec<String>,
     arrivals: Option<watch::Receiver<()>>,
@@ -50,12 +61,14 @@ pub(super) async fn events(
     Extension(user): Extension<User>,
     Path(name): Path<String>,
     Query(query): Query<RecordQuery>,
+    headers: HeaderMap,
 ) -> CloudResult<Response> {
     if query.from.is_some() {
         let message = "`from` counts records of one stream, and these are several";
         return Err(CloudError::usage(message, "use `last`"));
     }
-    lines((cloud, user), name, ["events".to_owned(), "orchestrator".to_owned()], query).await
+    let streams = ["events".to_owned(), "orchestrator".to_owned()];
+    lines((cloud, user), name, streams, query, &headers).await
 }
 
 pub(super) async fn lambda(
@@ -63,9 +76,10 @@ pub(super) async fn lambda(
     Extension(user): Extension<User>,
     Path((name, id)): Path<(String, String)>,
     Query(query): Query<RecordQuery>,
+    headers: HeaderMap,
 ) -> CloudResult<Response> {
     let stream = format!("lambdas/{id}");
-    lines((cloud, user), name, [stream.clone(), stream], query).await
+    lines((cloud, user), name, [stream.clone(), stream], query, &headers).await
 }
 
 async fn lines(
@@ -73,24 +87,49 @@ async fn lines(
     vehicle: String,
     streams: [String; 2],
     query: RecordQuery,
+    headers: &HeaderMap,
 ) -> CloudResult<Response> {
+    let accepts = |value: &header::HeaderValue| value.to_str().is_ok_and(|it| it.contains(EVENTS));
+    let is_events = headers.get(header::ACCEPT).is_some_and(accepts);
+    let position = headers.get("last-event-id").filter(|_| is_events).map(|id| {
+        let id = id.to_str().ok().and_then(|id| id.parse().ok()).filter(|id: &i64| *id >= 0);
+        let help = "use the id of an event of this stream as it is";
+        id.ok_or_else(|| CloudError::usage("the header `Last-Event-ID` has no id", help))
+    });
     let slot = cloud.readers.open(&user.name)?;
     // Before the first look, so that nothing arrives in between.
     let arrivals = query.follow.then(|| cloud.hub.arrivals(&vehicle));
     let names = [&*streams[0], &*streams[1]];
     let from = query.from.unwrap_or(0);
     let mut first = cloud.store.removed(&vehicle, names, from).await?;
-    let arrival = match query.last {
-        Some(last) => cloud.store.arrival_before(&vehicle, names, last).await?,
-        None => 0,
+    let arrival = match (position, query.last) {
+        (Some(position), _) => {
+            let position = position?;
+            // What was removed is news unless a record before the position is still kept.
+            let oldest = cloud.store.page(&vehicle, names, from, 0, 1).await?.arrival;
+            if oldest <= position {
+                first.clear();
+            }
+            position
+        }
+        (None, Some(last)) => {
+            let arrival = cloud.store.arrival_before(&vehicle, names, last).await?;
+            if arrival > 0 {
+                first.clear();
+            }
+            arrival
+        }
+        (None, None) => 0,
     };
-    if arrival > 0 {
-        first.clear();
-    }
-    let reader = RecordReader { cloud, vehicle, streams, from, arrival, first, arrivals, slot };
+    let reader =
+        RecordReader { cloud, vehicle, streams, from, arrival, is_events, first, arrivals, slot };
     let pieces = try_unfold(reader, RecordReader::next);
-    Ok(([(header::CONTENT_TYPE, "application/x-ndjson")], Body::from_stream(pieces))
-        .into_response())
+    let kind = if is_events { EVENTS } else { "application/x-ndjson" };
+    let headers = [
+        (header::CONTENT_TYPE, kind),
+        (header::HeaderName::from_static("x-accel-buffering"), "no"),
+    ];
+    Ok((headers, Body::from_stream(pieces)).into_response())
 }
 
 impl RecordReader {
@@ -108,8 +147,7 @@ impl RecordReader {
             self.arrival = page.arrival;
             lines.extend(page.lines);
             if !lines.is_empty() {
-                let text: String = lines.iter().flat_map(|line| [&**line, "\n"]).collect();
-                return Ok(Some((text, self)));
+                return Ok(Some((self.text(&lines), self)));
             }
             // It closes when the server stops.
             let Some(arrivals) = &mut self.arrivals else { return Ok(None) };
@@ -118,7 +156,24 @@ impl RecordReader {
                     return Ok(None);
                 },
                 () = self.slot.ended() => return Ok(None),
+                () = sleep(QUIET), if self.is_events => return Ok(Some((":\n\n".to_owned(), self))),
             }
         }
+    }
+
+    /// Returns lines as they are sent. The last event of a piece has the position after it: a
+    /// client that lost a part of the piece gets all of it again.
+    fn text(&self, lines: &[String]) -> String {
+        if !self.is_events {
+            return lines.iter().flat_map(|line| [&**line, "\n"]).collect();
+        }
+        let mut text = String::new();
+        for (index, line) in lines.iter().enumerate() {
+            if index + 1 == lines.len() {
+                text += &format!("id: {}\n", self.arrival);
+            }
+            text += &format!("data: {line}\n\n");
+        }
+        text
     }
 }

@@ -1,4 +1,4 @@
-use axum::body::Body;
+use axum::body::{Body, to_bytes};
 use gleaner_fleet::people::{NewToken, NewUser};
 use hyper::service::Service;
 use hyper_util::service::TowerToHyperService;
@@ -14,6 +14,7 @@ use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::place::FilePlace;
 use crate::store::{ClipBounds, CloudStore, Retention};
+use serde_json::{Value, json};
 
 pub(crate) const ROLES: [Role; 4] = [Role::Viewer, Role::Operator, Role::Deployer, Role::Admin];
 
@@ -35,34 +36,62 @@ pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
     })
 }
 
-/// Sends a request with a token; returns the status of the answer.
-async fn status_of(
-    cloud: &Arc<Cloud>,
-    method: Method,
-    path: &str,
-    token: Option<&str>,
-) -> StatusCode {
-    request(cloud, method, path, token, "{}".to_owned()).await
+/// An answer of the API.
+struct Answer {
+    status: StatusCode,
+    headers: HeaderMap,
+    body: Vec<u8>,
 }
 
-/// Sends a request with a token and a body; returns the status of the answer.
-async fn request(
+impl Answer {
+    fn json(&self) -> Value {
+        serde_json::from_slice(&self.body).unwrap()
+    }
+}
+
+/// Sends a request with a token and further headers; returns the answer.
+async fn send(
     cloud: &Arc<Cloud>,
-    method: Method,
-    path: &str,
+    (method, path): (Method, &str),
     token: Option<&str>,
-    body: String,
-) -> StatusCode {
+    headers: &[(&str, &str)],
+    body: impl Into<Body>,
+) -> Answer {
     let slots = Arc::new(Semaphore::new(1));
     let peer = PeerConnection::of_test([127, 0, 0, 1].into(), slots.try_acquire_owned().unwrap());
     let mut request = Request::builder().method(method).uri(path).extension(Arc::new(peer));
     if let Some(token) = token {
         request = request.header(header::AUTHORIZATION, format!("Bearer {token}"));
     }
+    for (name, value) in headers {
+        request = request.header(*name, *value);
+    }
     let router = TowerToHyperService::new(router(cloud));
-    let reply = router.call(request.body(Body::from(body)).unwrap()).await;
-    reply.unwrap().status()
+    let reply = router.call(request.body(body.into()).unwrap()).await.unwrap();
+    let (parts, body) = reply.into_parts();
+    let body = to_bytes(body, BODY_MAX).await.unwrap().to_vec();
+    Answer { status: parts.status, headers: parts.headers, body }
 }
+
+async fn status_of(
+    cloud: &Arc<Cloud>,
+    method: Method,
+    path: &str,
+    token: Option<&str>,
+) -> StatusCode {
+    send(cloud, (method, path), token, &[], "{}").await.status
+}
+
+/// Adds a user; returns the token.
+async fn token_of(cloud: &Cloud, name: &str, role: Role) -> String {
+    let new = NewUser { name: name.to_owned(), role };
+    let code = cloud.store.invite("console", new).await.unwrap().code;
+    cloud.store.login(&code).await.unwrap().unwrap().token
+}
+
+mod conditions;
+mod openapi;
+mod ranges;
 
 #[tokio::test]
 async fn each_request_is_open_to_its_role_and_the_higher_ones_only() {
@@ -70,10 +99,7 @@ async fn each_request_is_open_to_its_role_and_the_higher_ones_only() {
     let cloud = cloud(&folder).await;
     let mut tokens = Vec::new();
     for role in ROLES {
-        let new = NewUser { name: role.to_string(), role };
-        let code = cloud.store.invite("console", new).await.unwrap().code;
-        let session = cloud.store.login(&code).await.unwrap().unwrap();
-        tokens.push((role, session.token));
+        tokens.push((role, token_of(&cloud, role.as_str(), role).await));
     }
     assert!(endpoints().len() > 15);
     for Endpoint { method, path, role, .. } in endpoints() {
@@ -86,8 +112,11 @@ async fn each_request_is_open_to_its_role_and_the_higher_ones_only() {
         }
         let path = path.replace("{change}", "start").replace("{sha256}", &"0".repeat(64));
         let status = status_of(&cloud, method.clone(), &path, None).await;
-        let expected =
-            if role.is_none() { StatusCode::BAD_REQUEST } else { StatusCode::UNAUTHORIZED };
+        let expected = match role {
+            None if path.ends_with("openapi.json") => StatusCode::OK,
+            None => StatusCode::BAD_REQUEST,
+            Some(_) => StatusCode::UNAUTHORIZED,
+        };
         assert_eq!(status, expected, "{method} {path} without a token");
         for (has, token) in &tokens {
             let status = status_of(&cloud, method.clone(), &path, Some(token)).await;
@@ -114,7 +143,7 @@ async fn a_token_for_programs_has_at_most_the_rights_of_its_user_and_makes_no_ot
     let login = cloud.store.login(&invite(Role::Deployer).await).await.unwrap().unwrap();
     let make = async |name: &str, role, days| {
         let new = NewToken { name: name.to_owned(), role, days };
-        cloud.store.make_token(&login.user, new).await
+        cloud.store.make_token((&login.user, (&login.user).into()), new).await
     };
     let made = make("nightly", Role::Operator, 30).await.unwrap();
     let reason = |made: CloudResult<UserToken>| made.unwrap_err().reason();
@@ -131,10 +160,11 @@ async fn a_token_for_programs_has_at_most_the_rights_of_its_user_and_makes_no_ot
     assert_eq!(status(Method::POST, "/v1/deployments", token).await, StatusCode::FORBIDDEN);
     let new = NewToken { name: "child".to_owned(), role: Role::Viewer, days: 1 };
     let body = serde_json::to_string(&new).unwrap();
-    let sent = request(&cloud, Method::POST, "/v1/tokens", Some(token), body.clone()).await;
-    assert_eq!(sent, StatusCode::FORBIDDEN);
-    let sent = request(&cloud, Method::POST, "/v1/tokens", Some(&login.token), body).await;
-    assert_eq!(sent, StatusCode::OK);
+    let path = (Method::POST, "/v1/tokens");
+    let sent = send(&cloud, path.clone(), Some(token), &[], body.clone()).await;
+    assert_eq!(sent.status, StatusCode::FORBIDDEN);
+    let sent = send(&cloud, path, Some(&login.token), &[], body).await;
+    assert_eq!(sent.status, StatusCode::OK);
     // A user who has fewer rights from now on has them with each token.
     invite(Role::Viewer).await;
     assert_eq!(status(Method::POST, "/v1/deployments/x/start", token).await, StatusCode::FORBIDDEN);
@@ -144,9 +174,13 @@ async fn a_token_for_programs_has_at_most_the_rights_of_its_user_and_makes_no_ot
     let bea = cloud.store.login(&code.await.unwrap().code).await.unwrap().unwrap().token;
     let path = "/v1/tokens/ann/nightly";
     assert_eq!(status(Method::DELETE, path, &bea).await, StatusCode::NOT_FOUND);
-    assert_eq!(cloud.store.tokens(Some("bea")).await.unwrap(), []);
-    let all: Vec<_> = cloud.store.tokens(None).await.unwrap();
-    assert_eq!(all.iter().map(|it| &*it.name).collect::<Vec<_>>(), ["child", "nightly"]);
+    assert_eq!(cloud.store.tokens(Some("bea"), "", 9).await.unwrap(), []);
+    let after = async |after| {
+        let all = cloud.store.tokens(None, after, 9).await.unwrap();
+        all.into_iter().map(|it| it.name).collect::<Vec<_>>()
+    };
+    assert_eq!(after("").await, ["child", "nightly"]);
+    assert_eq!(after("ann/child").await, ["nightly"]);
     assert_eq!(status(Method::DELETE, path, &login.token).await, StatusCode::NO_CONTENT);
     assert_eq!(status(Method::GET, "/v1/me", token).await, StatusCode::UNAUTHORIZED);
     // A logout ends the token in the cloud, too.
@@ -158,9 +192,7 @@ async fn a_token_for_programs_has_at_most_the_rights_of_its_user_and_makes_no_ot
 async fn wrong_tokens_are_limited_and_the_user_is_removed_with_the_token() {
     let folder = TempDir::new().unwrap();
     let cloud = cloud(&folder).await;
-    let new = NewUser { name: "ann".to_owned(), role: Role::Viewer };
-    let code = cloud.store.invite("console", new).await.unwrap().code;
-    let token = cloud.store.login(&code).await.unwrap().unwrap().token;
+    let token = token_of(&cloud, "ann", Role::Viewer).await;
     let me = async |token| status_of(&cloud, Method::GET, "/v1/me", Some(token)).await;
     assert_eq!(me(&token).await, StatusCode::OK);
     cloud.store.remove_user("console", "ann").await.unwrap();
@@ -169,8 +201,105 @@ async fn wrong_tokens_are_limited_and_the_user_is_removed_with_the_token() {
     }
     assert_eq!(me(&token).await, StatusCode::TOO_MANY_REQUESTS);
     // Others at the address are not refused.
-    let new = NewUser { name: "bea".to_owned(), role: Role::Viewer };
-    let code = cloud.store.invite("console", new).await.unwrap().code;
-    let other = cloud.store.login(&code).await.unwrap().unwrap().token;
+    let other = token_of(&cloud, "bea", Role::Viewer).await;
     assert_eq!(me(&other).await, StatusCode::OK);
+}
+
+#[tokio::test]
+async fn each_error_is_a_problem_with_its_status() {
+    let folder = TempDir::new().unwrap();
+    let cloud = cloud(&folder).await;
+    let token = token_of(&cloud, "ann", Role::Admin).await;
+    let long = "x".repeat(BODY_MAX + 1);
+    let number = u64::from(u16::MAX) + 1;
+    let (get, post) = (Method::GET, Method::POST);
+    for (method, path, body, status) in [
+        (&get, "/v1", "", 404),
+        (&get, "/v1/no-such", "", 404),
+        (&get, "/v1/users/%ff/x", "", 404),
+        (&Method::PATCH, "/v1/users", "", 405),
+        (&Method::DELETE, "/v1/users/%ff", "", 400),
+        (&get, "/v1/vehicles/%ff/status", "", 400),
+        (&get, "/v1/vehicles/car-7/events?last=some", "", 400),
+        (&get, "/v1/vehicles/car-7/events?last=-1", "", 400),
+        (&get, "/v1/vehicles/car-7/events?follow=yes", "", 400),
+        (&get, "/v1/vehicles/car-7/events?more=1", "", 400),
+        (&get, "/v1/vehicles/car-7/events?from=1", "", 400),
+        (&get, "/v1/vehicles?limit=0", "", 400),
+        (&get, "/v1/vehicles?limit=501", "", 400),
+        (&get, &format!("/v1/vehicles?limit={number}"), "", 400),
+        (&get, "/v1/vehicles?after=%00", "", 200),
+        (&get, "/v1/vehicles?after=a&after=b", "", 400),
+        (&get, "/v1/users?limit=", "", 400),
+        (&get, "/v1/deployments?limit=1.5", "", 400),
+        (&get, "/v1/deployments?last=1", "", 400),
+        (&get, "/v1/audit?after=x", "", 400),
+        (&get, "/v1/audit?after=-1", "", 400),
+        (&get, "/v1/clips?after=18446744073709551616", "", 400),
+        (&get, "/v1/clips?limit=0", "", 400),
+        (&get, "/v1/clips?from_ns=1e3", "", 400),
+        (&get, "/v1/clips/no-id", "", 404),
+        (&post, "/v1/users", "no JSON", 400),
+        (&post, "/v1/users", r#"{"name":"a","role":"root"}"#, 400),
+        (&post, "/v1/users", r#"{"name":"a","role":"viewer","more":1}"#, 400),
+        (&post, "/v1/login", &long[..LOGIN_MAX + 1], 413),
+        (&post, "/v1/users", &long, 413),
+        (&post, "/v1/deployments/a/explode", "", 400),
+        (&Method::PUT, "/v1/objects/..", "", 400),
+    ] {
+        let answer = send(&cloud, (method.clone(), path), Some(&token), &[], body.to_owned()).await;
+        // PostgreSQL has no texts with NUL.
+        let is_refused = answer.status == 400 && path.contains("%00");
+        assert!(answer.status == status || is_refused, "{method} {path}: {}", answer.status);
+        if answer.status == 200 {
+            continue;
+        }
+        assert_eq!(answer.headers[header::CONTENT_TYPE], "application/problem+json", "{path}");
+        let problem = answer.json();
+        assert_eq!(problem["status"], answer.status.as_u16(), "{path}");
+        let texts = ["title", "help"].map(|name| problem[name].as_str().map(str::len));
+        assert!(texts.iter().all(|length| length.is_some_and(|it| it > 5)), "{path}: {problem}");
+        assert!(problem["causes"].is_array() && problem["exit"] == 2, "{path}: {problem}");
+        assert_eq!(problem["detail"].is_string(), problem["causes"] != json!([]), "{problem}");
+    }
+    let answer = send(&cloud, (Method::PATCH, "/v1/users"), None, &[], "").await;
+    let allowed = answer.headers[header::ALLOW].to_str().unwrap();
+    assert!(["GET", "POST"].iter().all(|it| allowed.contains(it)), "{allowed}");
+    // The page answers with pages.
+    let answer = send(&cloud, (Method::GET, "/no-such"), None, &[], "").await;
+    assert_eq!(answer.status, StatusCode::NOT_FOUND);
+    assert!(answer.headers[header::CONTENT_TYPE].to_str().unwrap().starts_with("text/html"));
+}
+
+#[tokio::test]
+async fn a_list_has_each_entry_once_in_parts_of_any_length() {
+    let folder = TempDir::new().unwrap();
+    let cloud = cloud(&folder).await;
+    let token = token_of(&cloud, "u0", Role::Admin).await;
+    for number in 1..7 {
+        token_of(&cloud, &format!("u{number}"), Role::Viewer).await;
+        cloud.store.invite_vehicle("u0", &format!("car-{number}")).await.unwrap();
+    }
+    for (list, key, count) in [("users", "name", 7), ("vehicles", "name", 6), ("audit", "seq", 20)]
+    {
+        let whole =
+            send(&cloud, (Method::GET, &format!("/v1/{list}")), Some(&token), &[], "").await;
+        let whole = whole.json();
+        assert_eq!(whole["items"].as_array().unwrap().len(), count, "{list}");
+        assert_eq!(whole["next"], Value::Null);
+        for limit in [1, 3, count, count + 1] {
+            let (mut entries, mut after) = (Vec::new(), String::new());
+            loop {
+                let path = format!("/v1/{list}?limit={limit}{after}");
+                let part = send(&cloud, (Method::GET, &path), Some(&token), &[], "").await.json();
+                let items = part["items"].as_array().unwrap();
+                assert!(items.len() <= limit);
+                entries.extend(items.iter().cloned());
+                let Some(next) = part["next"].as_str() else { break };
+                assert_eq!(items.len(), limit, "only full parts have a next one");
+                after = format!("&after={next}");
+            }
+            assert_eq!(Value::from(entries), whole["items"], "{list} by {limit} {key}");
+        }
+    }
 }

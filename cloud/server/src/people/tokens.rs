@@ -4,37 +4,44 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::body::Bytes;
-use axum::extract::{Extension, Path, State};
+use axum::extract::{Extension, Path, Query, State};
 use axum::http::{HeaderMap, StatusCode};
 use gleaner_base::excerpt;
-use gleaner_fleet::people::{NewToken, Role, TokenSummary, User, UserToken};
+use gleaner_fleet::people::{ListPage, NewToken, Role, TokenSummary, User, UserToken};
 
+use super::conditions::ChangeConditions;
 use super::{TokenName, bearer};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
-use crate::request::parsed;
+use crate::request::{ListQuery, parsed};
 
 pub(super) async fn make(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
     Extension(TokenName(of)): Extension<TokenName>,
+    headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<UserToken>> {
+    let conditions = ChangeConditions::of_new(&headers, "/v1/tokens", &body)?;
     let new: NewToken = parsed(&body, "token")?;
     // A stolen one must not outlive its end.
     if !of.is_empty() {
         let message = format!("token `{of}` makes no other tokens");
         return Err(CloudError::denied(message, "use that of a login: `gleaner login`"));
     }
-    Ok(Json(cloud.store.make_token(&actor, new).await?))
+    Ok(Json(cloud.store.make_token((&actor, conditions.by(&actor)), new).await?))
 }
 
 pub(super) async fn list(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
-) -> CloudResult<Json<Vec<TokenSummary>>> {
+    Query(part): Query<ListQuery<String>>,
+) -> CloudResult<Json<ListPage<TokenSummary>>> {
     let of = (actor.role < Role::Admin).then_some(&*actor.name);
-    Ok(Json(cloud.store.tokens(of).await?))
+    let after = part.after.unwrap_or_default();
+    let tokens = cloud.store.tokens(of, &after, part.limit.into()).await?;
+    let position = |it: &TokenSummary| format!("{}/{}", it.user, it.name);
+    Ok(Json(ListPage::of(tokens, part.limit.into(), position)))
 }
 
 pub(super) async fn remove(

@@ -6,8 +6,8 @@ use gleaner_fleet::people::AuditEntry;
 use super::{CloudStore, StoreChange, int, now_ms, unsigned};
 use crate::error::CloudResult;
 
-/// Maximum number of entries in an answer.
-pub(crate) const ENTRIES_MAX: i64 = 1000;
+/// Number of entries that are checked at a time.
+const CHECKED: i64 = 1000;
 
 type Row = (i64, i64, String, String, String, String);
 
@@ -34,11 +34,11 @@ impl StoreChange<'_> {
 
 impl CloudStore {
     /// Returns the newest entries before the one of this number, the newest first: at most `most`.
-    pub(crate) async fn audit(&self, before: u64, most: i64) -> CloudResult<Vec<AuditEntry>> {
+    pub(crate) async fn audit(&self, before: u64, most: u64) -> CloudResult<Vec<AuditEntry>> {
         let rows: Vec<Row> = rows!(&self.pool;
             "SELECT seq, time_ms, actor, action, subject, hash FROM audit
              WHERE seq < $1 ORDER BY seq DESC LIMIT $2";
-            int(before), most.min(ENTRIES_MAX));
+            int(before), int(most));
         let entry = |(seq, time_ms, actor, action, subject, hash)| AuditEntry {
             seq: unsigned(seq),
             time_ms,
@@ -57,7 +57,7 @@ impl CloudStore {
             let rows: Vec<Row> = rows!(&self.pool;
                 "SELECT seq, time_ms, actor, action, subject, hash FROM audit
                  WHERE seq >= $1 ORDER BY seq LIMIT $2";
-                next, ENTRIES_MAX);
+                next, CHECKED);
             if rows.is_empty() {
                 return Ok(None);
             }

@@ -1,17 +1,16 @@
 //! Clips, as people see and want them.
 
-use gleaner_fleet::clips::{ClipFacts, ClipId, ClipPage, ClipState, FleetClip, UploadedClips};
+use gleaner_fleet::clips::{ClipFacts, ClipId, ClipState, FleetClip, UploadedClips};
+use gleaner_fleet::people::ListPage;
+use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::{CloudStore, int, unsigned};
 use crate::error::{CloudError, CloudResult};
-
-/// Number of clips in a page, and its maximum.
-const PAGE: u64 = 100;
-const PAGE_MAX: u64 = 500;
+use crate::request::PageLimit;
 
 /// A choice of clips.
-#[derive(Debug, Default, Deserialize)]
+#[derive(Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ClipQuery {
     /// Name of the vehicle.
@@ -26,8 +25,10 @@ pub(crate) struct ClipQuery {
     to_ns: Option<i64>,
     /// `next` of the page before.
     after: Option<u64>,
-    /// Number of clips in a page.
-    last: Option<u64>,
+    /// Maximum number of clips in a page.
+    #[serde(default)]
+    #[schemars(with = "Option<u16>", range(min = 1, max = 500))]
+    limit: PageLimit,
 }
 
 type ClipRow = (i64, String, String, String, i64, i64, i64, String, String, i64);
@@ -45,9 +46,9 @@ macro_rules! select {
 
 impl CloudStore {
     /// Returns a page of clips, the last announced first.
-    pub(crate) async fn clips(&self, query: &ClipQuery) -> CloudResult<ClipPage> {
+    pub(crate) async fn clips(&self, query: &ClipQuery) -> CloudResult<ListPage<FleetClip>> {
         let text = |value: &Option<String>| value.clone().unwrap_or_default();
-        let count = query.last.unwrap_or(PAGE).clamp(1, PAGE_MAX);
+        let count = u64::from(query.limit);
         let rows: Vec<ClipRow> = rows!(&self.pool;
             select!("WHERE seq < $1 AND ($2 = '' OR vehicle = $2)
              AND ($3 = '' OR EXISTS (SELECT 1 FROM clip_words
@@ -60,10 +61,10 @@ impl CloudStore {
             text(&query.label), query.from_ns.unwrap_or(i64::MIN),
             query.to_ns.unwrap_or(i64::MAX), int(count));
         let is_full = rows.len() as u64 == count;
-        let next = rows.last().filter(|_| is_full).map(|row| unsigned(row.0));
+        let next = rows.last().filter(|_| is_full).map(|row| row.0.to_string());
         let upload = self.clip_policy().await?.upload;
-        let clips = rows.into_iter().map(|row| clip(row, upload)).collect::<CloudResult<_>>()?;
-        Ok(ClipPage { clips, next })
+        let items = rows.into_iter().map(|row| clip(row, upload)).collect::<CloudResult<_>>()?;
+        Ok(ListPage { items, next })
     }
 
     /// Returns a clip.

@@ -9,7 +9,8 @@ use gleaner_protocol::vehicle_api::GrantStatus;
 
 use super::vehicles::json;
 use super::wants::{ChangedVehicles, TextMap, map};
-use super::{CloudStore, StoreChange, int, now, now_ms, unsigned};
+use super::waves::ReleaseChoice;
+use super::{ChangeAuthor, CloudStore, StoreChange, int, now, now_ms, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of deployments: all of them fit into one frame for a vehicle.
@@ -42,9 +43,10 @@ impl CloudStore {
     /// again starts it, if it was stopped, and leaves its waves as they are.
     pub(crate) async fn deploy(
         &self,
-        actor: &str,
+        author: impl Into<ChangeAuthor<'_>>,
         offered: &OfferedDeployment,
     ) -> CloudResult<(u64, ChangedVehicles)> {
+        let author = author.into();
         let OfferedDeployment { id, release, envelope, waves, .. } = offered;
         if let Some(Err(reason)) = waves.as_ref().map(WavePlan::check) {
             let help = "correct the options of the waves";
@@ -52,6 +54,9 @@ impl CloudStore {
         }
         let sha256 = gleaner_trust::sha256(envelope.as_bytes()).to_string();
         let mut change = self.change().await?;
+        if let Some(number) = change.begin_request(author).await? {
+            return Ok((number.parse().unwrap_or_default(), Vec::new()));
+        }
         let before = change.newest(id).await?;
         let is_same = before.as_ref().is_some_and(|before| before.sha256 == sha256);
         if let Some(before) = &before
@@ -77,7 +82,8 @@ impl CloudStore {
             "INSERT INTO deployments (id, is_wanted) VALUES ($1, 1)
              ON CONFLICT (id) DO UPDATE SET is_wanted = 1";
             id);
-        let number = change.note(actor, &format!("deploy release {release}"), id).await?;
+        let number = change.note(author.name, &format!("deploy release {release}"), id).await?;
+        change.keep_answer(author, &number.to_string()).await?;
         if before.as_ref().is_some_and(|before| before.is_wanted == 0) {
             change.restart_wave(id).await?;
         }
@@ -92,23 +98,31 @@ impl CloudStore {
     /// Starts or stops a deployment.
     pub(crate) async fn set_wanted(
         &self,
-        actor: &str,
+        author: impl Into<ChangeAuthor<'_>>,
         id: &str,
         is_wanted: bool,
     ) -> CloudResult<ChangedVehicles> {
+        let author = author.into();
         let mut change = self.change().await?;
+        change.expect(author, id).await?;
         if is_wanted && change.newest(id).await?.is_some_and(|it| it.is_wanted == 0) {
             change.restart_wave(id).await?;
         }
         let sql = "UPDATE deployments SET is_wanted = $2 WHERE id = $1";
         let found = run!(&mut *change.tx; sql; id, i64::from(is_wanted)).rows_affected();
-        change.finish(found, actor, if is_wanted { "start" } else { "stop" }, id).await
+        change.finish(found, author.name, if is_wanted { "start" } else { "stop" }, id).await
     }
 
     /// Requests each vehicle with the newest release to run its fallback. Its waves reach no more
     /// vehicles.
-    pub(crate) async fn roll_back(&self, actor: &str, id: &str) -> CloudResult<ChangedVehicles> {
-        let mut change = self.change().await?;
+    pub(crate) async fn roll_back(
+        &self,
+        author: impl Into<ChangeAuthor<'_>>,
+        id: &str,
+    ) -> CloudResult<ChangedVehicles> {
+        let author = author.into();
+        let (mut change, actor) = (self.change().await?, author.name);
+        change.expect(author, id).await?;
         let newest = change.newest(id).await?.ok_or_else(|| unknown(id))?;
         if newest.fallback.is_empty() {
             let message = format!("deployment `{id}` has no fallback");
@@ -121,38 +135,47 @@ impl CloudStore {
     /// Removes a deployment.
     pub(crate) async fn remove_deployment(
         &self,
-        actor: &str,
+        author: impl Into<ChangeAuthor<'_>>,
         id: &str,
     ) -> CloudResult<ChangedVehicles> {
+        let author = author.into();
         let mut change = self.change().await?;
+        change.expect(author, id).await?;
         run!(&mut *change.tx; "DELETE FROM wave_members WHERE deployment = $1"; id);
         run!(&mut *change.tx; "DELETE FROM releases WHERE deployment = $1"; id);
         let found = run!(&mut *change.tx; "DELETE FROM deployments WHERE id = $1"; id);
         let found = found.rows_affected();
-        change.finish(found, actor, "remove deployment", id).await
+        change.finish(found, author.name, "remove deployment", id).await
     }
 
-    /// Returns all deployments, each with the number of vehicles that should run its newest release
-    /// and do.
-    pub(crate) async fn deployments(&self) -> CloudResult<Vec<FleetDeployment>> {
-        self.some_deployments("").await
+    /// Returns the deployments after this id, at most `most`, each with the number of vehicles that
+    /// should run its newest release and do.
+    pub(crate) async fn deployments(
+        &self,
+        after: &str,
+        most: u64,
+    ) -> CloudResult<Vec<FleetDeployment>> {
+        self.some_deployments(ReleaseChoice::Part(after, most)).await
     }
 
     /// Returns one of the [`deployments`](Self::deployments).
     pub(crate) async fn deployment(&self, id: &str) -> CloudResult<FleetDeployment> {
-        self.some_deployments(id).await?.pop().ok_or_else(|| unknown(id))
+        self.some_deployments(ReleaseChoice::Of(id)).await?.pop().ok_or_else(|| unknown(id))
     }
 
-    /// Returns the deployment `only`, or all if it is empty.
-    async fn some_deployments(&self, only: &str) -> CloudResult<Vec<FleetDeployment>> {
+    async fn some_deployments(
+        &self,
+        choice: ReleaseChoice<'_>,
+    ) -> CloudResult<Vec<FleetDeployment>> {
         // One transaction: all numbers are of the same moment.
         let mut tx = self.pool.begin().await?;
-        let releases = super::waves::newest_releases(&mut tx, only).await?;
+        let releases = super::waves::newest_releases(&mut tx, choice).await?;
         let mut deployments = Vec::new();
         for release in releases {
             let all = release.count(&mut tx, false).await?;
             let waves = release.progress(&mut tx).await?;
             deployments.push(FleetDeployment {
+                version: release.version(),
                 id: release.deployment,
                 release: unsigned(release.number),
                 revision: release.revision,

@@ -42,6 +42,7 @@ mod links;
 mod page;
 mod records;
 mod replicas;
+mod requests;
 mod secrets;
 #[cfg(test)]
 mod tests;
@@ -64,7 +65,6 @@ use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
 
 pub(crate) use address::StoreAddress;
-pub(crate) use audit::ENTRIES_MAX;
 pub(crate) use clip_list::ClipQuery;
 pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
@@ -72,7 +72,8 @@ pub(crate) use links::VehicleReport;
 pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
 pub(crate) use replicas::OwnLink;
-pub(crate) use tokens::TokenUser;
+pub(crate) use requests::{ChangeAuthor, RequestKey};
+pub(crate) use tokens::{TOKENS_MAX, TokenUser};
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::Issued;
 
@@ -83,6 +84,7 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0003_clips.sql"),
     include_str!("../../migrations/0004_page.sql"),
     include_str!("../../migrations/0006_replicas.sql"),
+    include_str!("../../migrations/0007_requests.sql"),
     include_str!("../../migrations/0009_tokens.sql"),
 ];
 

@@ -306,7 +306,7 @@ async fn vehicles_of_a_deployment_are_counted_by_what_they_report() {
     let handled = VehicleReport { handled: 2, ..report(json!({}), json!([])) };
     store.report("car-7", epoch, handled).await.unwrap();
     assert_eq!(counts().await, (2, 0, 1));
-    let all = store.vehicles().await.unwrap();
+    let all = store.vehicles("", 10).await.unwrap();
     assert_eq!((all[0].wanted, all[0].handled, &*all[0].problems[0]), (2, 2, "no room"));
 }
 
@@ -337,7 +337,7 @@ async fn a_changed_entry_of_the_audit_trail_is_detected() {
         store.invite_vehicle("ann", name).await.unwrap();
     }
     assert_eq!(store.first_changed_entry().await.unwrap(), None);
-    assert_eq!(store.audit(u64::MAX, ENTRIES_MAX).await.unwrap()[0].subject, "car-3");
+    assert_eq!(store.audit(u64::MAX, 1).await.unwrap()[0].subject, "car-3");
     store.execute("UPDATE audit SET actor = 'bob' WHERE seq = 2").await;
     assert_eq!(store.first_changed_entry().await.unwrap(), Some(2));
     store.execute("UPDATE audit SET actor = 'ann' WHERE seq = 2").await;
@@ -362,7 +362,7 @@ async fn vehicles_of_a_process_are_online_as_long_as_its_lease_is() {
     let (folder, store) = store().await;
     store.begin_lease("", false).await.unwrap();
     let epoch = connected(&store, "car-7").await;
-    let state = async || store.vehicles().await.unwrap()[0].state;
+    let state = async || store.vehicles("", 9).await.unwrap()[0].state;
     assert_eq!(state().await, VehicleState::Online);
     store.disconnect("car-7", epoch - 1).await.unwrap();
     assert_eq!(state().await, VehicleState::Online, "an older connection changes nothing");

@@ -6,11 +6,11 @@ use gleaner_fleet::people::{NewToken, Role, TOKEN_DAYS_MAX, TokenSummary, User, 
 
 use super::secrets::SecretKind;
 use super::users::user;
-use super::{CloudStore, now, unsigned};
+use super::{ChangeAuthor, CloudStore, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of named tokens of a user.
-const TOKENS_MAX: i64 = 50;
+pub(crate) const TOKENS_MAX: i64 = 50;
 
 /// A user with a token, and the rights of that token.
 #[derive(Debug)]
@@ -35,7 +35,11 @@ impl CloudStore {
     }
 
     /// Makes a named token of a user.
-    pub(crate) async fn make_token(&self, user: &User, new: NewToken) -> CloudResult<UserToken> {
+    pub(crate) async fn make_token(
+        &self,
+        (user, author): (&User, ChangeAuthor<'_>),
+        new: NewToken,
+    ) -> CloudResult<UserToken> {
         let NewToken { name, role, days } = new;
         let allowed = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
         if !(1..=64).contains(&name.len()) || !name.chars().all(allowed) {
@@ -53,6 +57,7 @@ impl CloudStore {
             return Err(CloudError::denied(message, "choose your own role, or a lesser one"));
         }
         let mut change = self.change().await?;
+        change.begin_request(author).await?;
         run!(&mut *change.tx; "DELETE FROM secrets WHERE expires <= $1"; now());
         let (count, same): (i64, i64) = one!(&mut *change.tx;
             "SELECT COUNT(*), COUNT(CASE WHEN name = $2 THEN 1 END) FROM secrets
@@ -76,13 +81,18 @@ impl CloudStore {
         Ok(UserToken { user, token, expires: unsigned(expires) })
     }
 
-    /// Returns the named tokens of a user, or of all.
-    pub(crate) async fn tokens(&self, of: Option<&str>) -> CloudResult<Vec<TokenSummary>> {
+    /// Returns the named tokens of a user, or of all, after this `USER/NAME`, at most `most`.
+    pub(crate) async fn tokens(
+        &self,
+        of: Option<&str>,
+        after: &str,
+        most: u64,
+    ) -> CloudResult<Vec<TokenSummary>> {
         let rows: Vec<(String, String, String, i64)> = rows!(&self.pool;
             "SELECT subject, name, role, expires FROM secrets
              WHERE kind = 'token' AND name <> '' AND expires > $1 AND ($2 = '' OR subject = $2)
-             ORDER BY subject, name";
-            now(), of.unwrap_or_default());
+             AND subject || '/' || name > $3 ORDER BY subject || '/' || name LIMIT $4";
+            now(), of.unwrap_or_default(), after, int(most));
         let summary = |(user, name, role, expires): (String, String, String, i64)| {
             Ok(TokenSummary { user, name, role: role_of(&role)?, expires: unsigned(expires) })
         };

@@ -4,7 +4,7 @@ use gleaner_base::excerpt;
 use gleaner_fleet::people::{Invitation, NewUser, Role, User, UserToken};
 
 use super::secrets::SecretKind;
-use super::{CloudStore, now, unsigned};
+use super::{ChangeAuthor, CloudStore, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Actor of changes that the program itself makes, for a person at its machine.
@@ -15,7 +15,12 @@ const ADMIN: &str = "admin";
 
 impl CloudStore {
     /// Adds a user, or invites one again with this role: codes before it do not work any more.
-    pub(crate) async fn invite(&self, actor: &str, new: NewUser) -> CloudResult<Invitation> {
+    pub(crate) async fn invite(
+        &self,
+        author: impl Into<ChangeAuthor<'_>>,
+        new: NewUser,
+    ) -> CloudResult<Invitation> {
+        let author = author.into();
         let NewUser { name, role } = new;
         let allowed = |c: char| c.is_ascii_alphanumeric() || "._-@+".contains(c);
         if !(1..=64).contains(&name.len()) || !name.chars().all(allowed) || name == CONSOLE {
@@ -24,13 +29,14 @@ impl CloudStore {
             return Err(CloudError::usage(message, help));
         }
         let mut change = self.change().await?;
+        change.begin_request(author).await?;
         run!(&mut *change.tx;
             "INSERT INTO users (name, role) VALUES ($1, $2)
              ON CONFLICT (name) DO UPDATE SET role = excluded.role";
             &name, role.as_str());
         change.drop_secrets(SecretKind::Code, &name).await?;
         let (code, expires) = change.add_secret(SecretKind::Code, &name).await?;
-        change.note(actor, &format!("invite as {role}"), &name).await?;
+        change.note(author.name, &format!("invite as {role}"), &name).await?;
         change.commit().await?;
         Ok(Invitation { user: User { name, role }, code, expires: unsigned(expires) })
     }
@@ -40,7 +46,7 @@ impl CloudStore {
         let (able,): (i64,) = one!(&self.pool;
             "SELECT COUNT(*) FROM users WHERE role = 'admin' AND (password <> '' OR EXISTS
              (SELECT 1 FROM secrets WHERE secrets.subject = users.name
-              AND secrets.kind = 'token' AND secrets.expires > $1))";
+              AND secrets.kind = 'token' AND secrets.name = '' AND secrets.expires > $1))";
             now());
         match able {
             0 => {
@@ -126,9 +132,11 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Returns all users.
-    pub(crate) async fn users(&self) -> CloudResult<Vec<User>> {
-        let rows: Vec<_> = rows!(&self.pool; "SELECT name, role FROM users ORDER BY name");
+    /// Returns the users after this name, at most `most`.
+    pub(crate) async fn users(&self, after: &str, most: u64) -> CloudResult<Vec<User>> {
+        let rows: Vec<_> = rows!(&self.pool;
+            "SELECT name, role FROM users WHERE name > $1 ORDER BY name LIMIT $2";
+            after, int(most));
         rows.into_iter().map(user).collect()
     }
 
@@ -143,6 +151,7 @@ impl CloudStore {
         for kind in [SecretKind::Code, SecretKind::Token, SecretKind::Session] {
             change.drop_secrets(kind, name).await?;
         }
+        run!(&mut *change.tx; "DELETE FROM request_keys WHERE actor = $1"; name);
         change.note(actor, "remove user", name).await?;
         change.commit().await
     }

@@ -8,7 +8,7 @@ use gleaner_trust::VehicleName;
 use sqlx::AssertSqlSafe;
 
 use super::secrets::SecretKind;
-use super::{CloudStore, StoreChange, in_list, int, now, parts, unsigned};
+use super::{ChangeAuthor, CloudStore, StoreChange, in_list, int, now, parts, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// A certificate that was made for a vehicle.
@@ -23,20 +23,26 @@ pub(crate) struct Issued {
 impl CloudStore {
     /// Adds a vehicle, or lets one enrol again; returns the one-time token. One that is connected
     /// stays so until the token is used.
-    pub(crate) async fn invite_vehicle(&self, actor: &str, name: &str) -> CloudResult<String> {
+    pub(crate) async fn invite_vehicle(
+        &self,
+        author: impl Into<ChangeAuthor<'_>>,
+        name: &str,
+    ) -> CloudResult<String> {
+        let author = author.into();
         if let Err(reason) = name.parse::<VehicleName>() {
             return Err(
                 CloudError::usage("no vehicle can be enrolled", "use another name").because(reason)
             );
         }
         let mut change = self.change().await?;
+        change.begin_request(author).await?;
         run!(&mut *change.tx;
             "INSERT INTO vehicles (name) VALUES ($1)
              ON CONFLICT (name) DO UPDATE SET is_revoked = 0";
             name);
         change.drop_secrets(SecretKind::Enrolment, name).await?;
         let (token, _) = change.add_secret(SecretKind::Enrolment, name).await?;
-        change.note(actor, "invite vehicle", name).await?;
+        change.note(author.name, "invite vehicle", name).await?;
         change.refresh_one(name).await?;
         change.commit().await?;
         Ok(token)
@@ -110,10 +116,15 @@ impl CloudStore {
         Ok(name.map(|(name,)| name))
     }
 
-    /// Returns all vehicles.
-    pub(crate) async fn vehicles(&self) -> CloudResult<Vec<VehicleSummary>> {
-        let rows: Vec<VehicleRow> =
-            rows!(&self.pool; concat!(vehicle_columns!(), " ORDER BY name"));
+    /// Returns the vehicles after this name, at most `most`.
+    pub(crate) async fn vehicles(
+        &self,
+        after: &str,
+        most: u64,
+    ) -> CloudResult<Vec<VehicleSummary>> {
+        let rows: Vec<VehicleRow> = rows!(&self.pool;
+            concat!(vehicle_columns!(), " WHERE name > $1 ORDER BY name LIMIT $2");
+            after, int(most));
         Ok(rows.into_iter().map(summary).collect())
     }
 

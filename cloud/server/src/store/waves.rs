@@ -10,7 +10,7 @@ use sqlx::{FromRow, Row};
 use super::deployments::{COMPLETE, unknown};
 use super::vehicles::{FAILED, RUNNING};
 use super::wants::{ChangedVehicles, TextMap, map, selects};
-use super::{CloudStore, StoreChange, now, unsigned};
+use super::{ChangeAuthor, CloudStore, StoreChange, int, now, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Actor of steps that the cloud takes by a plan.
@@ -32,6 +32,7 @@ pub(super) struct Release {
     pub(super) fallback: String,
     pub(super) grants: String,
     pub(super) selector: String,
+    rollback_request: i64,
     pub(super) state: String,
     plan: String,
     wave: i64,
@@ -74,6 +75,7 @@ impl FromRow<'_, AnyRow> for Release {
             fallback: row.try_get("fallback")?,
             grants: row.try_get("grants")?,
             selector: row.try_get("selector")?,
+            rollback_request: row.try_get("rollback_request")?,
             state: row.try_get("state")?,
             plan: row.try_get("plan")?,
             wave: row.try_get("wave")?,
@@ -84,17 +86,37 @@ impl FromRow<'_, AnyRow> for Release {
     }
 }
 
-/// Returns the newest release of the deployment `only`, or of each if it is empty.
-pub(super) async fn newest_releases(tx: &mut Tx, only: &str) -> CloudResult<Vec<Release>> {
+/// Choice of deployments.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum ReleaseChoice<'c> {
+    /// The one with this id.
+    Of(&'c str),
+    /// Those after this id, at most so many.
+    Part(&'c str, u64),
+}
+
+impl ReleaseChoice<'_> {
+    const ALL: Self = Self::Part("", u64::MAX);
+}
+
+/// Returns the newest release of each chosen deployment.
+pub(super) async fn newest_releases(
+    tx: &mut Tx,
+    choice: ReleaseChoice<'_>,
+) -> CloudResult<Vec<Release>> {
+    let (is_one, id, most) = match choice {
+        ReleaseChoice::Of(id) => (1, id, 1),
+        ReleaseChoice::Part(after, most) => (0, after, int(most)),
+    };
     Ok(rows!(&mut **tx;
-        "SELECT deployment, number, sha256, revision, fallback, grants, selector, state, plan, wave,
-         since, reason, is_wanted
+        "SELECT deployment, number, sha256, revision, fallback, grants, selector,
+         rollback_request, state, plan, wave, since, reason, is_wanted
          FROM releases JOIN deployments ON deployments.id = releases.deployment
          WHERE number = (SELECT MAX(number) FROM releases AS other
                          WHERE other.deployment = releases.deployment)
-         AND ($1 = '' OR deployment = $1)
-         ORDER BY deployment";
-        only))
+         AND CASE WHEN $1 = 1 THEN deployment = $2 ELSE deployment > $2 END
+         ORDER BY deployment LIMIT $3";
+        is_one, id, most))
 }
 
 impl CloudStore {
@@ -107,7 +129,7 @@ impl CloudStore {
         }
         let mut change = self.change().await?;
         let mut has_changed = false;
-        for release in newest_releases(&mut change.tx, "").await? {
+        for release in newest_releases(&mut change.tx, ReleaseChoice::ALL).await? {
             if release.state != "running" || release.is_wanted == 0 {
                 continue;
             }
@@ -126,11 +148,13 @@ impl CloudStore {
     /// Pauses, resumes or aborts the waves of the newest release.
     pub(crate) async fn steer_waves(
         &self,
-        actor: &str,
+        author: impl Into<ChangeAuthor<'_>>,
         id: &str,
         state: WaveState,
     ) -> CloudResult<ChangedVehicles> {
-        let mut change = self.change().await?;
+        let author = author.into();
+        let (mut change, actor) = (self.change().await?, author.name);
+        change.expect(author, id).await?;
         let newest = change.newest(id).await?.ok_or_else(|| unknown(id))?;
         let refused = match (&*newest.state, state) {
             (COMPLETE, _) => Some("is open to all its vehicles"),
@@ -163,11 +187,7 @@ impl CloudStore {
 impl StoreChange<'_> {
     /// Returns the newest release of a deployment.
     pub(super) async fn newest(&mut self, id: &str) -> CloudResult<Option<Release>> {
-        // The empty text would mean all.
-        if id.is_empty() {
-            return Ok(None);
-        }
-        Ok(newest_releases(&mut self.tx, id).await?.pop())
+        Ok(newest_releases(&mut self.tx, ReleaseChoice::Of(id)).await?.pop())
     }
 
     /// Marks the vehicles of a release's waves that have failed so far.
@@ -278,6 +298,14 @@ impl StoreChange<'_> {
 }
 
 impl Release {
+    /// Returns a digest of what people and waves want of the deployment: it changes with that, and
+    /// not with what vehicles report.
+    pub(super) fn version(&self) -> String {
+        let Self { number, sha256, is_wanted, rollback_request, state, wave, .. } = self;
+        let wanted = serde_json::json!([number, sha256, is_wanted, rollback_request, state, wave]);
+        gleaner_trust::sha256(wanted.to_string().as_bytes()).to_string().split_off(48)
+    }
+
     fn plan(&self) -> CloudResult<WavePlan> {
         serde_json::from_str(&self.plan).map_err(|error| {
             let message =

@@ -80,7 +80,7 @@ async fn clip(person: &Person, id: &str) -> Value {
 
 async fn names(person: &Person, query: &str) -> Vec<String> {
     let page = person.call(Method::GET, &format!("/v1/clips{query}"), Value::Null).await;
-    let clips = page["clips"].as_array().unwrap().iter();
+    let clips = page["items"].as_array().unwrap().iter();
     clips.map(|clip| clip["name"].as_str().unwrap().to_owned()).collect()
 }
 
@@ -114,12 +114,12 @@ async fn announced_clips_are_listed_once_by_vehicle_lambda_label_and_time() {
         ("?lambda=brake&label=wet", &["b"]),
         ("?lambda=other", &[]),
         ("?from_ns=1500&to_ns=2500", &["b"]),
-        ("?last=1", &["a"]),
+        ("?limit=1", &["a"]),
     ] {
         assert_eq!(names(&admin, query).await, expected, "{query}");
     }
-    let first = admin.call(Method::GET, "/v1/clips?last=2", Value::Null).await;
-    let rest = format!("?last=2&after={}", first["next"]);
+    let first = admin.call(Method::GET, "/v1/clips?limit=2", Value::Null).await;
+    let rest = format!("?limit=2&after={}", first["next"].as_str().unwrap());
     assert_eq!(names(&admin, &rest).await, ["a"]);
     // After a restart it goes on where the cloud has acknowledged it.
     server.stop().await;

@@ -12,7 +12,6 @@ use gleaner_fleet::{
 use http_body_util::{BodyExt, Full};
 use hyper::body::Incoming;
 use hyper::client::conn::http1;
-use hyper::http::request;
 use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::TokioIo;
 use rcgen::{CertificateParams, KeyPair};
@@ -71,20 +70,28 @@ impl Person {
 
     /// Sends a request; returns the answer as it begins.
     pub(crate) async fn open(&self, method: Method, path: &str, body: &[u8]) -> Response<Incoming> {
-        self.send(Request::builder().method(method).uri(path), body).await
+        self.open_with(method, path, &[], body).await
     }
 
     /// Requests a part of a file.
     pub(crate) async fn open_range(&self, path: &str, range: &str) -> Response<Incoming> {
-        self.send(Request::get(path).header("range", range), b"").await
+        self.open_with(Method::GET, path, &[("range", range)], b"").await
     }
 
-    async fn send(&self, request: request::Builder, body: &[u8]) -> Response<Incoming> {
-        let request = request
+    async fn open_with(
+        &self,
+        method: Method,
+        path: &str,
+        headers: &[(&str, &str)],
+        body: &[u8],
+    ) -> Response<Incoming> {
+        let request = Request::builder()
+            .method(method)
+            .uri(path)
             .header("host", "cloud")
-            .header("authorization", format!("Bearer {}", self.token))
-            .body(Full::new(Bytes::copy_from_slice(body)))
-            .unwrap();
+            .header("authorization", format!("Bearer {}", self.token));
+        let request = headers.iter().fold(request, |request, (key, it)| request.header(*key, *it));
+        let request = request.body(Full::new(Bytes::copy_from_slice(body))).unwrap();
         let stream = TcpStream::connect(self.address).await.unwrap();
         soon(send(stream, request)).await.unwrap()
     }
@@ -95,6 +102,15 @@ impl Person {
             whole(self.open(method, path, body.to_string().as_bytes()).await).await;
         assert!(status.is_success(), "{path}: {status} {}", String::from_utf8_lossy(&text));
         serde_json::from_slice(&text).unwrap_or(Value::Null)
+    }
+
+    /// Returns a stream as server-sent events, from the one after `last` on.
+    pub(crate) async fn events(&self, path: &str, last: Option<&str>) -> String {
+        let last = last.map(|last| ("last-event-id", last));
+        let headers: Vec<_> = [("accept", "text/event-stream")].into_iter().chain(last).collect();
+        let (status, text) = whole(self.open_with(Method::GET, path, &headers, b"").await).await;
+        assert_eq!(status, StatusCode::OK);
+        String::from_utf8(text).unwrap()
     }
 
     /// Returns the lines of an answer.
@@ -116,7 +132,7 @@ impl Person {
     /// Returns a vehicle of the list.
     pub(crate) async fn vehicle(&self, name: &str) -> Value {
         let all = self.call(Method::GET, "/v1/vehicles", Value::Null).await;
-        all.as_array().unwrap().iter().find(|it| it["name"] == name).unwrap().clone()
+        all["items"].as_array().unwrap().iter().find(|it| it["name"] == name).unwrap().clone()
     }
 }
 

@@ -157,6 +157,13 @@ async fn a_vehicle_enrols_gets_what_is_deployed_and_is_cut_off() {
     link.record(2..3).await;
     assert!(String::from_utf8_lossy(&piece().await).contains("\"seq\":2"));
     assert_eq!(admin.lines("/v1/vehicles/car-7/events").await.len(), 3);
+    let events = admin.events("/v1/vehicles/car-7/events", None).await;
+    assert!(events.starts_with("data: {") && events.ends_with("}\n\n"), "{events}");
+    let last = events.lines().find_map(|line| line.strip_prefix("id: ")).unwrap().to_owned();
+    link.record(3..5).await;
+    let events = admin.events("/v1/vehicles/car-7/events", Some(&last)).await;
+    assert_eq!(events.matches("data: ").count(), 2, "{events}");
+    assert!(events.contains("\"seq\":3") && events.contains("\"seq\":4"), "{events}");
 
     // The next certificate, and the end of both.
     let renew = RenewRequest { csr: csr(&rcgen::KeyPair::generate().unwrap()) };
@@ -168,7 +175,7 @@ async fn a_vehicle_enrols_gets_what_is_deployed_and_is_cut_off() {
     assert_eq!(admin.vehicle("car-7").await["state"], "revoked");
     let audit = admin.call(Method::GET, "/v1/audit", Value::Null).await;
     assert_eq!(
-        (&audit[0]["action"], &audit[0]["actor"]),
+        (&audit["items"][0]["action"], &audit["items"][0]["actor"]),
         (&json!("revoke vehicle"), &json!("admin"))
     );
     server.stop().await;

@@ -280,7 +280,7 @@ async fn a_newer_release_ends_the_waves_of_the_one_before_and_takes_nothing_back
     fleet.store.deploy("ann", &release(9, None)).await.unwrap();
     assert_eq!(fleet.having(9).await.len(), 4);
     fleet.store.remove_deployment("ann", "a").await.unwrap();
-    assert!(fleet.store.deployments().await.unwrap().is_empty());
+    assert!(fleet.store.deployments("", 1).await.unwrap().is_empty());
 }
 
 #[tokio::test]

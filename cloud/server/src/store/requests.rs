@@ -1,0 +1,122 @@
+//! Conditions of a change: the key by which it is made once, and the versions that it may replace.
+
+use axum::http::StatusCode;
+use gleaner_fleet::people::User;
+
+use super::waves::ReleaseChoice;
+use super::{StoreChange, now};
+use crate::error::{CloudError, CloudResult};
+
+/// Time for which the key of a request is kept, in s.
+const KEPT_S: i64 = 86_400;
+
+/// A key that names a request, so that it has its effect once.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct RequestKey {
+    pub(crate) name: String,
+    /// SHA-256 of the request.
+    pub(crate) request: String,
+}
+
+/// The user who makes a change, with the conditions of the request.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ChangeAuthor<'r> {
+    pub(crate) name: &'r str,
+    pub(crate) key: Option<&'r RequestKey>,
+    /// The versions of the deployment that the change may replace; any without a list.
+    pub(crate) versions: Option<&'r [String]>,
+}
+
+impl<'r> From<&'r str> for ChangeAuthor<'r> {
+    fn from(name: &'r str) -> Self {
+        Self { name, key: None, versions: None }
+    }
+}
+
+impl<'r> From<&'r String> for ChangeAuthor<'r> {
+    fn from(name: &'r String) -> Self {
+        name.as_str().into()
+    }
+}
+
+impl<'r> From<&'r User> for ChangeAuthor<'r> {
+    fn from(user: &'r User) -> Self {
+        user.name.as_str().into()
+    }
+}
+
+impl StoreChange<'_> {
+    /// Begins a request with a key; returns the answer if it was carried out before.
+    ///
+    /// # Errors
+    ///
+    /// An error if another request had the key, or if the answer had a secret, which is not kept.
+    pub(super) async fn begin_request(
+        &mut self,
+        author: ChangeAuthor<'_>,
+    ) -> CloudResult<Option<String>> {
+        let Some(RequestKey { name, request }) = author.key else { return Ok(None) };
+        run!(&mut *self.tx; "DELETE FROM request_keys WHERE time <= $1"; now() - KEPT_S);
+        // A request at the same time waits here, or for its turn, until this one has ended.
+        let added = run!(&mut *self.tx;
+            "INSERT INTO request_keys (actor, name, request, time) VALUES ($1, $2, $3, $4)
+             ON CONFLICT (actor, name) DO NOTHING";
+            author.name, name, request, now());
+        if added.rows_affected() > 0 {
+            return Ok(None);
+        }
+        let (stored, answer): (String, String) = one!(&mut *self.tx;
+            "SELECT request, answer FROM request_keys WHERE actor = $1 AND name = $2";
+            author.name, name);
+        if stored != *request {
+            let message = "another request had the same `Idempotency-Key`";
+            let help = "use a new key for each request, and the same one to repeat it";
+            return Err(CloudError::conflict(StatusCode::UNPROCESSABLE_ENTITY, message, help));
+        }
+        if answer.is_empty() {
+            let message = "the request was carried out, and its secret is not kept";
+            let help = "send it with another key: that makes a new secret, and ends the first one";
+            return Err(CloudError::conflict(StatusCode::CONFLICT, message, help));
+        }
+        Ok(Some(answer))
+    }
+
+    /// Keeps the answer to a request with a key.
+    pub(super) async fn keep_answer(
+        &mut self,
+        author: ChangeAuthor<'_>,
+        answer: &str,
+    ) -> CloudResult<()> {
+        if let Some(key) = author.key {
+            run!(&mut *self.tx;
+                "UPDATE request_keys SET answer = $3 WHERE actor = $1 AND name = $2";
+                author.name, &key.name, answer);
+        }
+        Ok(())
+    }
+
+    /// Checks that a deployment has one of the versions that the change may replace.
+    pub(super) async fn expect(&mut self, author: ChangeAuthor<'_>, id: &str) -> CloudResult<()> {
+        let Some(versions) = author.versions else { return Ok(()) };
+        let newest =
+            super::waves::newest_releases(&mut self.tx, ReleaseChoice::Of(id)).await?.pop();
+        match newest.map(|release| release.version()) {
+            Some(version) if !versions.contains(&version) => {
+                let message = format!("deployment `{id}` has changed since: it is not as expected");
+                let help = "get it again, and send the change with its new `ETag`";
+                Err(CloudError::conflict(StatusCode::PRECONDITION_FAILED, message, help))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+impl super::CloudStore {
+    /// Returns the answers that are kept.
+    pub(crate) async fn kept_answers(&self) -> Vec<String> {
+        let rows: Result<Vec<(String,)>, sqlx::Error> =
+            async { Ok(rows!(&self.pool; "SELECT answer FROM request_keys")) }.await;
+        rows.unwrap().into_iter().map(|(answer,)| answer).collect()
+    }
+}
