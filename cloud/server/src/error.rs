@@ -41,6 +41,11 @@ impl CloudError {
         Self::with(StatusCode::TOO_MANY_REQUESTS, Exit::Unreachable, message, help)
     }
 
+    /// Creates an error: a request that comes too slowly.
+    pub(crate) fn late(message: impl Into<String>, help: &str) -> Self {
+        Self::with(StatusCode::REQUEST_TIMEOUT, Exit::Unreachable, message, help)
+    }
+
     fn with(status: StatusCode, exit: Exit, message: impl Into<String>, help: &str) -> Self {
         Self { status, failure: Failure::new(exit, message).with_help(help) }
     }

@@ -5,7 +5,8 @@
 //! listeners: `people` and `page` answer requests of people, and `vehicles` those of vehicles, each
 //! of which keeps one connection open. `hub` knows these connections, and wakes them after a
 //! change.
-//! `clips` has recorded clips of vehicles, with a folder of its own.
+//! `clips` has recorded clips of vehicles, with a folder of its own. `transfer` receives files and
+//! sends them.
 //!
 //! Nothing here runs a lambda, or decides what a vehicle runs: each vehicle verifies signatures by
 //! its own trust root.
@@ -26,6 +27,7 @@ mod readers;
 mod request;
 mod server;
 mod store;
+mod transfer;
 mod vehicles;
 
 pub use program::main;

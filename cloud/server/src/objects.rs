@@ -2,31 +2,26 @@
 //! and durable, and is never changed afterwards.
 
 use std::collections::BTreeMap;
-use std::fs;
+use std::fs::{self, File};
 use std::io;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use axum::body::Body;
-use axum::http::header;
-use axum::response::{IntoResponse, Response};
-use futures_util::StreamExt;
+use axum::http::HeaderMap;
+use axum::response::Response;
 use gleaner_base::{Exit, Failure, sync_folder};
-use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use gleaner_lambda::manifest::Sha256;
 use gleaner_protocol::vehicle_api::MissingObject;
 use gleaner_trust::Revision;
-use tokio::fs::File;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use crate::error::{CloudError, CloudResult};
 use crate::folder::{PART, remove_parts};
+use crate::transfer::{IncomingFile, OCTETS, OutgoingFile};
 
 /// Maximum number of deployments that wait for files.
 const OFFERS_MAX: usize = 64;
-/// Length of the pieces in which a file is sent.
-const PIECE: usize = 64 << 10;
 
 /// The folder of files.
 #[derive(Debug)]
@@ -91,61 +86,31 @@ impl Objects {
     pub(crate) async fn receive(&self, sha256: &Sha256, body: Body) -> CloudResult<()> {
         let length = self.expected(sha256)?;
         let number = self.parts.fetch_add(1, Ordering::Relaxed);
-        let part = self.folder.join(format!("{sha256}.{number}.{PART}"));
-        let part = UnfinishedFile(part);
-        let failed = |error: io::Error| {
-            Failure::caused_by(Exit::Internal, format!("cannot receive the file {sha256}"), &error)
-        };
-        let refused = |reason: String| {
-            let help = "send the file again, as it was published";
-            CloudError::denied(format!("the file {sha256} is refused"), help).because(reason)
-        };
-        let mut file = File::create_new(&part.0).await.map_err(failed)?;
-        let mut announced = AnnouncedFile::new(length, sha256.as_str());
-        let mut body = body.into_data_stream();
-        while let Some(piece) = body.next().await {
-            let piece = piece.map_err(|error| failed(io::Error::other(error)))?;
-            announced.add(&piece).map_err(refused)?;
-            file.write_all(&piece).await.map_err(failed)?;
-        }
-        announced.finish().map_err(refused)?;
-        file.flush().await.map_err(failed)?;
-        file.sync_all().await.map_err(failed)?;
-        tokio::fs::rename(&part.0, self.folder.join(sha256.as_str())).await.map_err(failed)?;
-        let folder = self.folder.clone();
-        let synced = tokio::task::spawn_blocking(move || sync_folder(&folder)).await;
-        Ok(synced.map_err(io::Error::other).and_then(|it| it).map_err(failed)?)
+        let path = self.folder.join(format!("{sha256}.{number}.{PART}"));
+        let name = format!("the file {sha256}");
+        let file = IncomingFile { name: &name, length, sha256: sha256.as_str() };
+        let part = file.receive(path, body).await?;
+        let (folder, whole) = (self.folder.clone(), self.folder.join(sha256.as_str()));
+        let kept = tokio::task::spawn_blocking(move || {
+            File::open(&part.0)?.sync_all()?;
+            fs::rename(&part.0, whole)?;
+            sync_folder(&folder)
+        });
+        let kept = kept.await.map_err(io::Error::other).and_then(|it| it);
+        Ok(kept.map_err(|error| {
+            Failure::caused_by(Exit::Internal, format!("cannot store {name}"), &error)
+        })?)
     }
 
-    /// Returns the answer with a file.
-    pub(crate) async fn send(&self, sha256: &Sha256) -> CloudResult<Response> {
-        let file = File::open(self.folder.join(sha256.as_str())).await;
-        let file = match file {
-            Ok(file) => file,
-            Err(_) => {
-                let help = "deploy the revision again, which sends missing files";
-                return Err(CloudError::missing(format!("the file {sha256} is missing"), help));
-            }
-        };
-        let failed = |error| {
-            Failure::caused_by(Exit::Internal, format!("cannot send the file {sha256}"), &error)
-        };
-        let length = file.metadata().await.map_err(failed)?.len();
-        let headers = [(header::CONTENT_LENGTH, length.to_string()), octets()];
-        Ok((headers, body_of(file)).into_response())
+    /// Returns the answer with a file, or with the end of it.
+    pub(crate) async fn send(
+        &self,
+        sha256: &Sha256,
+        headers: &HeaderMap,
+    ) -> CloudResult<Response> {
+        let (path, name) =
+            (self.folder.join(sha256.as_str()), format!("the file {sha256}"));
+        let help = "deploy the revision again, which sends missing files";
+        OutgoingFile { path: &path, name: &name, kind: OCTETS, help }.send(headers).await
     }
-}
-
-/// Returns the rest of a file as the body of an answer, which is read piece by piece.
-pub(crate) fn body_of(file: File) -> Body {
-    Body::from_stream(futures_util::stream::try_unfold(file, async |mut file| {
-        let mut piece = Vec::with_capacity(PIECE);
-        (&mut file).take(PIECE as u64).read_to_end(&mut piece).await?;
-        io::Result::Ok((!piece.is_empty()).then_some((piece, file)))
-    }))
-}
-
-/// Returns the type of a file whose content does not matter.
-pub(crate) fn octets() -> (header::HeaderName, String) {
-    (header::CONTENT_TYPE, "application/octet-stream".to_owned())
 }

@@ -1,25 +1,21 @@
 //! Requests of people about clips.
 
-use std::io;
 use std::path::Path as FilePath;
 use std::sync::Arc;
 
 use axum::Json;
 use axum::body::Bytes;
 use axum::extract::{Extension, Path, Query, State};
-use axum::http::{HeaderMap, StatusCode, header};
-use axum::response::{IntoResponse, Response};
-use gleaner_base::{Exit, Failure};
+use axum::http::HeaderMap;
+use axum::response::Response;
 use gleaner_fleet::clips::{ClipId, ClipPage, ClipPolicy, ClipState, FleetClip};
 use gleaner_fleet::people::User;
-use tokio::fs::File;
-use tokio::io::AsyncSeekExt;
 
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
-use crate::objects::body_of;
 use crate::request::parsed;
 use crate::store::ClipQuery;
+use crate::transfer::{OCTETS, OutgoingFile};
 
 pub(crate) async fn list(
     State(cloud): State<Arc<Cloud>>,
@@ -72,7 +68,7 @@ pub(crate) async fn file(
             format!("the file of clip `{id}` is not in the cloud: {}", clip.state.as_str());
         return Err(CloudError::missing(message, "fetch it: `gleaner clips pull ID`"));
     }
-    send(&cloud.clips.clip(&id), &id, "application/octet-stream", &headers).await
+    send(&cloud.clips.clip(&id), &id, OCTETS, &headers).await
 }
 
 pub(crate) async fn policy(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<ClipPolicy>> {
@@ -94,45 +90,12 @@ fn parse(id: &str) -> CloudResult<ClipId> {
     id.parse().map_err(|reason: String| CloudError::missing(reason, "`gleaner clips` lists all"))
 }
 
-/// Returns the answer with a file, or with the end of it that `Range` asks for.
 async fn send(
     path: &FilePath,
     id: &ClipId,
     kind: &'static str,
     headers: &HeaderMap,
 ) -> CloudResult<Response> {
-    let failed =
-        |error| Failure::caused_by(Exit::Internal, format!("cannot send clip `{id}`"), &error);
-    let mut file = File::open(path).await.map_err(|_| {
-        let message = format!("a file of clip `{id}` is not in the folder of the cloud");
-        CloudError::missing(message, "fetch it again: `gleaner clips pull ID`")
-    })?;
-    let length = file.metadata().await.map_err(failed)?.len();
-    let range = headers.get(header::RANGE).and_then(|it| it.to_str().ok());
-    // Any other range is answered with the whole file, as the standard allows.
-    let begin = range.and_then(|it| it.strip_prefix("bytes=")?.strip_suffix('-')?.parse().ok());
-    let (begin, status) = match begin {
-        Some(begin) if begin > 0 && begin < length => (begin, StatusCode::PARTIAL_CONTENT),
-        Some(begin) if begin > 0 => {
-            let range = (header::CONTENT_RANGE, format!("bytes */{length}"));
-            return Ok((StatusCode::RANGE_NOT_SATISFIABLE, [range]).into_response());
-        }
-        _ => (0, StatusCode::OK),
-    };
-    file.seek(io::SeekFrom::Start(begin)).await.map_err(failed)?;
-    let mut answer = body_of(file).into_response();
-    *answer.status_mut() = status;
-    let mut set = |name, value: String| {
-        if let Ok(value) = value.parse() {
-            answer.headers_mut().insert(name, value);
-        }
-    };
-    set(header::CONTENT_TYPE, kind.to_owned());
-    set(header::X_CONTENT_TYPE_OPTIONS, "nosniff".to_owned());
-    set(header::ACCEPT_RANGES, "bytes".to_owned());
-    set(header::CONTENT_LENGTH, (length - begin).to_string());
-    if status == StatusCode::PARTIAL_CONTENT {
-        set(header::CONTENT_RANGE, format!("bytes {begin}-{}/{length}", length - 1));
-    }
-    Ok(answer)
+    let (name, help) = (format!("a file of clip `{id}`"), "fetch it again: `gleaner clips pull ID`");
+    OutgoingFile { path, name: &name, kind, help }.send(headers).await
 }

@@ -26,8 +26,6 @@ use crate::request::{digest, in_time, parsed};
 use crate::store::ClipProgress;
 use crate::vehicles::KnownVehicle;
 
-/// Time for a part: 14 kB/s.
-const PART_TIME: Duration = Duration::from_secs(600);
 /// Time for a part that is not wanted.
 const UNWANTED_TIME: Duration = Duration::from_secs(30);
 /// Longest position in the list of a vehicle.
@@ -123,11 +121,7 @@ async fn part(
         return orders(&cloud, &vehicle.name).await;
     };
     let _slot = cloud.clips.slot(&vehicle.name)?;
-    let receive = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body);
-    let received = timeout(PART_TIME, receive).await.map_err(|_| {
-        let message = format!("a part of clip `{}` took too long", progress.id);
-        CloudError::busy(message, "send it again")
-    })??;
+    let received = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body).await?;
     let working = Arc::clone(&cloud);
     // A vehicle that goes away in the middle must not leave it half done.
     let stored = tokio::spawn(store_part(working, progress, length, received)).await;
