@@ -103,13 +103,8 @@ impl Objects {
     }
 
     /// Returns the answer with a file, or with the end of it.
-    pub(crate) async fn send(
-        &self,
-        sha256: &Sha256,
-        headers: &HeaderMap,
-    ) -> CloudResult<Response> {
-        let (path, name) =
-            (self.folder.join(sha256.as_str()), format!("the file {sha256}"));
+    pub(crate) async fn send(&self, sha256: &Sha256, headers: &HeaderMap) -> CloudResult<Response> {
+        let (path, name) = (self.folder.join(sha256.as_str()), format!("the file {sha256}"));
         let help = "deploy the revision again, which sends missing files";
         OutgoingFile { path: &path, name: &name, kind: OCTETS, help }.send(headers).await
     }

@@ -12,8 +12,8 @@ use std::sync::{self, Arc, PoisonError};
 
 use axum::body::Body;
 use gleaner_base::{Failure, sync_folder};
-use gleaner_fleet::clips::{CLIP_PART, ClipId};
 use gleaner_fleet::UnfinishedFile;
+use gleaner_fleet::clips::{CLIP_PART, ClipId};
 use gleaner_trust::sha256;
 use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 

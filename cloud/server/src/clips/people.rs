@@ -96,6 +96,7 @@ async fn send(
     kind: &'static str,
     headers: &HeaderMap,
 ) -> CloudResult<Response> {
-    let (name, help) = (format!("a file of clip `{id}`"), "fetch it again: `gleaner clips pull ID`");
+    let (name, help) =
+        (format!("a file of clip `{id}`"), "fetch it again: `gleaner clips pull ID`");
     OutgoingFile { path, name: &name, kind, help }.send(headers).await
 }

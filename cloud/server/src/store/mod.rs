@@ -74,6 +74,7 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0002_releases.sql"),
     include_str!("../../migrations/0003_clips.sql"),
     include_str!("../../migrations/0004_page.sql"),
+    include_str!("../../migrations/0008_cleaning.sql"),
 ];
 
 /// Maximum number of queries at a time: with more threads than cores, each only takes longer.
