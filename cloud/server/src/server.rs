@@ -21,7 +21,7 @@ use crate::folder::DataFolder;
 use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::store::{ClipBounds, CloudStore, Retention};
-use crate::{clips, people, vehicles};
+use crate::{clips, objects, people, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles.
 const PEOPLE_MAX: u32 = 1000;
@@ -82,8 +82,10 @@ impl CloudServer {
         let folder = DataFolder::create(&options.data)?;
         let lock = folder.lock()?;
         let authorities = Authorities::open(&folder)?;
-        let store = CloudStore::open(&folder.store(options.store.as_deref())?).await?;
+        let address = folder.store(options.store.as_deref())?;
+        let store = CloudStore::open(&address).await?;
         store.tie(gleaner_trust::sha256(authorities.server_pem().as_bytes()).as_str()).await?;
+        folder.keep(&address)?;
         if let Some(seq) = store.first_changed_entry().await? {
             tracing::error!(seq, "the audit trail was changed: an entry is not as it was written");
         }
@@ -130,6 +132,8 @@ impl CloudServer {
         let mut chores = JoinSet::new();
         let working = Arc::clone(&cloud);
         chores.spawn(async move { clips::clean(&working).await });
+        let working = Arc::clone(&cloud);
+        chores.spawn(async move { objects::collect(&working).await });
         let working = Arc::clone(&cloud);
         chores.spawn(async move {
             let mut ticks = ticks(SEEN_INTERVAL);

@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Seek, SeekFrom, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{self, Arc, PoisonError};
 
@@ -67,13 +67,12 @@ impl ClipFiles {
 
     /// Removes the file of a clip.
     pub(crate) fn remove_file(&self, id: &ClipId) {
-        let path = self.clip(id);
-        match fs::remove_file(&path) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                tracing::warn!(path = %path.display(), %error, "a file cannot be removed");
-            }
-            _ => {}
-        }
+        remove(&self.clip(id));
+    }
+
+    /// Removes the thumbnail of a clip.
+    pub(crate) fn remove_thumbnail(&self, id: &ClipId) {
+        remove(&self.thumbnail(id));
     }
 
     /// Returns a slot to receive a part of a vehicle in.
@@ -138,5 +137,14 @@ impl ClipFiles {
             sync_folder(&self.folder)?;
         }
         Ok(true)
+    }
+}
+
+fn remove(path: &Path) {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            tracing::warn!(path = %path.display(), %error, "a file cannot be removed");
+        }
+        _ => {}
     }
 }

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use axum::Json;
 use axum::body::Bytes;
 use axum::extract::{Extension, Path, Query, State};
-use axum::http::HeaderMap;
+use axum::http::{HeaderMap, StatusCode};
 use axum::response::Response;
-use gleaner_fleet::clips::{ClipId, ClipPage, ClipPolicy, ClipState, FleetClip};
+use gleaner_fleet::clips::{ClipId, ClipPage, ClipPolicy, ClipState, ClipUsage, FleetClip};
 use gleaner_fleet::people::User;
 
 use crate::cloud::Cloud;
@@ -42,6 +42,21 @@ pub(crate) async fn pull(
     let clip = cloud.store.pull_clip(&actor.name, &id, is_lost).await?;
     cloud.hub.wake(&[id.vehicle().to_owned()]);
     Ok(Json(clip))
+}
+
+/// Removes a clip. A kill before its files are removed loses nothing: they go with the next look.
+pub(crate) async fn remove(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(actor): Extension<User>,
+    Path(id): Path<String>,
+) -> CloudResult<StatusCode> {
+    cloud.store.remove_clip(&actor.name, &parse(&id)?).await?;
+    super::remove_files(&cloud).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+pub(crate) async fn usage(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<ClipUsage>> {
+    Ok(Json(cloud.store.clip_counts().await?))
 }
 
 pub(crate) async fn thumbnail(

@@ -99,6 +99,11 @@ async fn thumbnail(
     }
     let length = body.len() as u64;
     let part = cloud.clips.receive(&id, (length, &wanted), Body::from(body)).await?;
+    let _turn = cloud.clips.turn(&id).await;
+    if cloud.store.wanted_thumbnail(&vehicle.name, &name).await?.is_none() {
+        // The clip was removed meanwhile, or another request has sent it.
+        return orders(&cloud, &vehicle.name).await;
+    }
     let (working, of) = (Arc::clone(&cloud), id.clone());
     blocking(&id, move || working.clips.keep_thumbnail(&of, &part)).await?;
     cloud.store.thumbnail_received(&id).await?;

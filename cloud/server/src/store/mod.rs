@@ -34,6 +34,7 @@ macro_rules! rows {
 
 mod address;
 mod audit;
+mod cleaning;
 mod clip_list;
 mod clips;
 mod deployments;
@@ -60,6 +61,7 @@ use crate::error::{CloudError, CloudResult};
 
 pub(crate) use address::StoreAddress;
 pub(crate) use audit::ENTRIES_MAX;
+pub(crate) use cleaning::RemovedClip;
 pub(crate) use clip_list::ClipQuery;
 pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
