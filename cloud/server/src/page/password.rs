@@ -118,22 +118,4 @@ mod tests {
         assert!(PasswordHash::new(NO_PASSWORD).is_ok());
         assert!(hashed("short".to_owned()).await.is_err());
     }
-
-    #[tokio::test]
-    async fn an_address_with_many_connections_does_not_delay_another() {
-        let (many, other) = ([10, 0, 0, 2].into(), [10, 0, 0, 3].into());
-        let checked = Arc::new(Mutex::new(0));
-        let mut tries = tokio::task::JoinSet::new();
-        for _ in 0..8 {
-            let checked = Arc::clone(&checked);
-            tries.spawn(async move {
-                is_right(many, "a guess of many".to_owned(), None).await.unwrap();
-                *checked.lock().unwrap() += 1;
-            });
-        }
-        // All of them wait.
-        tokio::task::yield_now().await;
-        is_right(other, "correct horse battery".to_owned(), None).await.unwrap();
-        assert!(*checked.lock().unwrap() < 5, "it waited for the others");
-    }
 }
