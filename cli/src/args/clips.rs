@@ -49,8 +49,21 @@ pub enum ClipsCommand {
     Pull(PullArgs),
     /// Download clips that are in the cloud, with a table of their events
     Export(ExportArgs),
-    /// Show or change which clips vehicles send
+    /// Remove clips from the cloud; those on vehicles stay there
+    Remove(RemoveClipsArgs),
+    /// Show or change which clips vehicles send, and which ones the cloud keeps
     Policy(PolicyArgs),
+}
+
+/// Arguments of `gleaner clips remove`.
+#[derive(Args, Debug)]
+pub struct RemoveClipsArgs {
+    /// Ids of the clips, as in brake-20260802T083451.136Z@car-7
+    #[arg(value_name = "ID", required = true)]
+    pub ids: Vec<ClipId>,
+    /// Print the result as JSON
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// Arguments of `gleaner clips pull`.
@@ -96,6 +109,12 @@ pub struct PolicyArgs {
     /// Bytes that each vehicle sends in a day of UTC, as in 2GiB
     #[arg(long, value_name = "SIZE", requires = "upload")]
     pub budget: Option<ByteSize>,
+    /// Time after which the cloud removes a clip, as in 720h; 0s without a bound
+    #[arg(long, value_name = "DURATION", requires = "upload", value_parser = parse_duration)]
+    pub keep: Option<Duration>,
+    /// Size of all clips above which the cloud removes the oldest, as in 500GiB; 0B without a bound
+    #[arg(long, value_name = "SIZE", requires = "upload")]
+    pub keep_size: Option<ByteSize>,
     /// Print the result as JSON
     #[arg(long)]
     pub json: bool,

@@ -17,7 +17,9 @@ use clap_complete::Shell;
 use gleaner_protocol::DriveTime;
 
 pub use authoring::{BuildArgs, Language, NewArgs};
-pub use clips::{ClipFilterArgs, ClipsArgs, ClipsCommand, ExportArgs, PolicyArgs, PullArgs};
+pub use clips::{
+    ClipFilterArgs, ClipsArgs, ClipsCommand, ExportArgs, PolicyArgs, PullArgs, RemoveClipsArgs,
+};
 pub use cloud::{
     AuditArgs, CloudCommand, EnrolArgs, ListArgs, LoginArgs, NewTokenArgs, NewVehicleArgs,
     RemoveArgs, RemoveTokenArgs, TokensArgs, TokensCommand, UserArgs, UsersArgs, UsersCommand,

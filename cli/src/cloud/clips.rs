@@ -10,7 +10,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{ByteSize, Exit, Failure, nanoseconds, visible};
-use gleaner_fleet::clips::{ClipId, ClipPolicy, ClipState, FleetClip};
+use gleaner_fleet::clips::{ClipId, ClipPolicy, ClipState, ClipUsage, FleetClip};
 use serde_json::{Value, json};
 
 use self::download::ClipTarget;
@@ -33,6 +33,14 @@ pub(super) fn clips(args: &ClipsArgs) -> Result<Exit, Failure> {
         }
         Some(ClipsCommand::Pull(pull)) => self::pull(pull),
         Some(ClipsCommand::Export(export)) => export::export(export),
+        Some(ClipsCommand::Remove(remove)) => {
+            let client = client()?;
+            remove.ids.iter().try_for_each(|id| client.delete(&path(id)))?;
+            let removed: Vec<_> = remove.ids.iter().map(ToString::to_string).collect();
+            show(remove.json, &json!({ "removed": removed }), |_| {
+                removed.iter().map(|id| format!("removed {id}\n")).collect()
+            })
+        }
         Some(ClipsCommand::Policy(policy)) => self::policy(policy),
     }
 }
@@ -94,13 +102,31 @@ fn policy(args: &PolicyArgs) -> Result<Exit, Failure> {
     let mut policy: ClipPolicy = client.get("/v1/clips/policy")?;
     if let Some(upload) = args.upload {
         let day_bytes = args.budget.map_or(policy.day_bytes, ByteSize::bytes);
-        policy = ClipPolicy { upload, day_bytes };
+        let keep_s = args.keep.map_or(policy.keep_s, |keep| keep.as_secs());
+        let keep_bytes = args.keep_size.map_or(policy.keep_bytes, ByteSize::bytes);
+        policy = ClipPolicy { upload, day_bytes, keep_s, keep_bytes };
         let body = serde_json::to_vec(&policy).expect("a policy is plain data");
         client.put("/v1/clips/policy", body)?;
     }
-    show(args.json, &policy, |policy| {
-        let budget = ByteSize::new(policy.day_bytes);
-        format!("vehicles send clips: {}; each at most {budget} a day\n", policy.upload.as_str())
+    let usage: ClipUsage = client.get("/v1/clips/usage")?;
+    show(args.json, &json!({ "policy": policy, "usage": usage }), |_| {
+        let ClipPolicy { upload, day_bytes, keep_s, keep_bytes } = &policy;
+        let budget = ByteSize::new(*day_bytes);
+        let mut text =
+            format!("vehicles send clips: {}; each at most {budget} a day\n", upload.as_str());
+        let bounds = [
+            (*keep_s > 0).then(|| format!("at most {} h", keep_s / 3600)),
+            (*keep_bytes > 0).then(|| format!("at most {}", ByteSize::new(*keep_bytes))),
+        ];
+        let bounds: Vec<_> = bounds.into_iter().flatten().collect();
+        let kept = if bounds.is_empty() { "without a bound".to_owned() } else { bounds.join(", ") };
+        let ClipUsage { stored, bytes, removed, removed_bytes } = &usage;
+        let [bytes, removed_bytes] = [*bytes, *removed_bytes].map(ByteSize::new);
+        text += &format!(
+            "the cloud keeps clips: {kept}\n\
+             in the cloud: {stored} clips, {bytes}; removed: {removed} clips, {removed_bytes}\n"
+        );
+        text
     })
 }
 

@@ -12,13 +12,15 @@ use crate::render::table;
 pub(super) fn tokens(args: &TokensArgs) -> Result<Exit, Failure> {
     let client = client()?;
     match &args.command {
-        None => show(args.json, &list::all::<TokenSummary>(&client, "/v1/tokens", &[])?, |tokens| {
-            let rows = tokens.iter().map(|it| {
-                [visible(&it.user), visible(&it.name), it.role.to_string(), date(it.expires)]
-            });
-            let head = ["user", "token", "role", "until"].map(str::to_owned);
-            table(std::iter::once(head).chain(rows).collect(), &[])
-        }),
+        None => {
+            show(args.json, &list::all::<TokenSummary>(&client, "/v1/tokens", &[])?, |tokens| {
+                let rows = tokens.iter().map(|it| {
+                    [visible(&it.user), visible(&it.name), it.role.to_string(), date(it.expires)]
+                });
+                let head = ["user", "token", "role", "until"].map(str::to_owned);
+                table(std::iter::once(head).chain(rows).collect(), &[])
+            })
+        }
         Some(TokensCommand::New(new)) => {
             let request = NewToken { name: new.name.clone(), role: new.role, days: new.days };
             let made: UserToken = client.create("/v1/tokens", &request)?;

@@ -393,6 +393,26 @@ pub struct ClipPolicy {
     pub upload: UploadedClips,
     /// Number of bytes that each vehicle uploads in a day of UTC.
     pub day_bytes: u64,
+    /// Time after which a stored clip is removed, in s; 0 without a bound.
+    #[serde(default)]
+    pub keep_s: u64,
+    /// Number of bytes of stored clips above which the oldest are removed; 0 without a bound.
+    #[serde(default)]
+    pub keep_bytes: u64,
+}
+
+/// The clips in the cloud, and those that were removed.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct ClipUsage {
+    /// Number of clips that are stored.
+    pub stored: u64,
+    /// Bytes of their files.
+    pub bytes: u64,
+    /// Number of clips that were removed, by people and by the rules.
+    pub removed: u64,
+    /// Bytes of their files.
+    pub removed_bytes: u64,
 }
 
 /// The clips that vehicles upload.

@@ -153,6 +153,10 @@ pub struct Wanted {
     /// once.
     #[prost(uint64, tag = "4")]
     pub rollback: u64,
+    /// Number of the request to start it again, also after a quarantine; 0 without one. A vehicle
+    /// follows each request once, and leaves a lambda alone that runs.
+    #[prost(uint64, tag = "5")]
+    pub start: u64,
 }
 
 /// The status of a vehicle.
@@ -321,7 +325,13 @@ mod tests {
     use super::*;
 
     fn wanted(id: &str) -> Wanted {
-        Wanted { id: id.to_owned(), envelope: "a".repeat(64), is_wanted: true, rollback: 0 }
+        Wanted {
+            id: id.to_owned(),
+            envelope: "a".repeat(64),
+            is_wanted: true,
+            rollback: 0,
+            start: 0,
+        }
     }
 
     #[test]
@@ -366,6 +376,7 @@ mod tests {
             vec![wanted("b"), wanted("a")],
             vec![Wanted { is_wanted: false, ..wanted("a") }],
             vec![Wanted { rollback: 1, ..wanted("a") }],
+            vec![Wanted { start: 1, ..wanted("a") }],
         ];
         let digests: std::collections::BTreeSet<_> =
             states.iter().map(|state| desired_digest(state)).collect();

@@ -55,6 +55,11 @@ impl CloudError {
         Self::with(status, Exit::Usage, message, help)
     }
 
+    /// Creates an error: a request that comes too slowly.
+    pub(crate) fn late(message: impl Into<String>, help: &str) -> Self {
+        Self::with(StatusCode::REQUEST_TIMEOUT, Exit::Unreachable, message, help)
+    }
+
     fn with(status: StatusCode, exit: Exit, message: impl Into<String>, help: &str) -> Self {
         Self { status, failure: Failure::new(exit, message).with_help(help) }
     }
@@ -101,10 +106,44 @@ impl From<sqlx::Error> for CloudError {
             let help = "send texts without the character NUL";
             return Self::usage("a text cannot be stored", help);
         }
-        let action = "the database cannot be used";
-        let help = "check that the disk of the database has room, and the log of the cloud";
-        Failure::caused_by(Exit::Internal, action, &error).with_help(help).into()
+        database_failure(&error).into()
     }
+}
+
+/// Returns the failure for an error of the database, with the way out.
+pub(crate) fn database_failure(error: &sqlx::Error) -> Failure {
+    let code = error.as_database_error().and_then(|it| it.code()).unwrap_or_default();
+    // Codes of PostgreSQL have five characters. The low byte of those of SQLite is the kind.
+    let (sqlite, postgres) = match code.len() {
+        5 => (None, &*code),
+        _ => (code.parse::<u32>().ok().map(|code| code & 0xff), ""),
+    };
+    let is_away = match error {
+        sqlx::Error::Io(_) | sqlx::Error::PoolTimedOut | sqlx::Error::PoolClosed => true,
+        // A connection that was lost, a server that stops or starts.
+        _ => postgres.starts_with("08") || postgres.starts_with("57P"),
+    };
+    let (exit, action, help) = match sqlite {
+        // It is damaged, or is no database.
+        Some(11 | 26) => (
+            Exit::Internal,
+            "the database, `cloud.db` in the data folder, is damaged",
+            "stop the cloud, move `cloud.db`, `cloud.db-wal` and `cloud.db-shm` away, and copy the \
+             file of the last `gleaner-cloud backup` to `cloud.db`; `sqlite3 cloud.db .recover` \
+             may save what came since",
+        ),
+        _ if is_away => (
+            Exit::Unreachable,
+            "the database cannot be reached",
+            "check that its server runs, and try again; vehicles and records wait meanwhile",
+        ),
+        _ => (
+            Exit::Internal,
+            "the database cannot be used",
+            "check that the disk of the database has room, and the log of the cloud",
+        ),
+    };
+    Failure::caused_by(exit, action, error).with_help(help)
 }
 
 impl From<CloudError> for Failure {

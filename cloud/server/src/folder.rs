@@ -129,7 +129,7 @@ impl DataFolder {
     /// A failure if `url` is none, or the folder belongs to the other kind: its objects and
     /// certificates are of no use with another database.
     pub(crate) fn store(&self, url: Option<&str>) -> Result<StoreAddress, Failure> {
-        let (file, mark) = (self.0.join("cloud.db"), self.0.join("postgres"));
+        let (file, mark) = (self.0.join("cloud.db"), self.mark());
         let refused = |reason: &str, help: &str| {
             let message = format!("the database of `{}` {reason}", self.0.display());
             Failure::new(Exit::Usage, message).with_help(help)
@@ -142,15 +142,29 @@ impl DataFolder {
             Some(_) if file.exists() => {
                 Err(refused("is a file in it", "leave --store out, or choose a new folder"))
             }
-            Some(url) => {
-                let address = StoreAddress::server(url)?;
-                write_private(&mark, b"").map_err(|error| {
-                    let action = format!("cannot write `{}`", mark.display());
-                    Failure::caused_by(Exit::Internal, action, &error)
-                })?;
-                Ok(address)
-            }
+            Some(url) => StoreAddress::server(url),
         }
+    }
+
+    /// Notes the kind of the database, once that was opened: the folder keeps it.
+    ///
+    /// # Errors
+    ///
+    /// A failure that names the file that cannot be written.
+    pub(crate) fn keep(&self, store: &StoreAddress) -> Result<(), Failure> {
+        let mark = self.mark();
+        if matches!(store, StoreAddress::Sqlite(_)) || mark.exists() {
+            return Ok(());
+        }
+        write_private(&mark, b"").map_err(|error| {
+            let action = format!("cannot write `{}`", mark.display());
+            Failure::caused_by(Exit::Internal, action, &error)
+        })
+    }
+
+    /// Returns the path of the file that exists if the database is on a server.
+    fn mark(&self) -> PathBuf {
+        self.0.join("postgres")
     }
 
     pub(crate) fn objects(&self) -> PathBuf {
@@ -198,4 +212,30 @@ pub(crate) fn write_private(path: &Path, content: &[u8]) -> io::Result<()> {
     file.sync_all()?;
     fs::rename(&part, path)?;
     path.parent().map_or(Ok(()), sync_folder)
+}
+
+#[cfg(test)]
+mod tests {
+    use tempfile::TempDir;
+
+    use super::*;
+
+    #[test]
+    fn a_folder_keeps_the_kind_of_the_first_database_that_was_opened() {
+        let data = TempDir::new().unwrap();
+        let folder = DataFolder::create(data.path()).unwrap();
+        for url in ["mysql://x", "", "postgres", "/tmp/x", "sqlite://x", " postgres://x"] {
+            let refused = folder.store(Some(url)).unwrap_err().to_string();
+            assert!(refused.contains("no address of a PostgreSQL server"), "{refused}");
+        }
+        // A typing error, with which no database was opened.
+        let server = folder.store(Some("postgres://typo/x")).unwrap();
+        let file = folder.store(None).unwrap();
+        assert!(matches!(file, StoreAddress::Sqlite(_)));
+        folder.keep(&file).unwrap();
+        assert!(folder.store(Some("postgres://x/y")).is_ok());
+        folder.keep(&server).unwrap();
+        let refused = folder.store(None).unwrap_err().to_string();
+        assert!(refused.contains("is on a PostgreSQL server"), "{refused}");
+    }
 }

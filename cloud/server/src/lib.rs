@@ -5,7 +5,8 @@
 //! listeners: `people` and `page` answer requests of people, and `vehicles` those of vehicles, each
 //! of which keeps one connection open. `hub` knows these connections, and wakes them after a
 //! change.
-//! `clips` has recorded clips of vehicles, with a place of its own.
+//! `clips` has recorded clips of vehicles, with a place of its own. `transfer` receives files and
+//! sends them.
 //!
 //! One process with a database in its folder is a cloud, and so are several over one PostgreSQL
 //! database and one bucket: `replicas` follows what the others have changed, and `bus` tells them to
@@ -34,6 +35,7 @@ mod request;
 mod s3;
 mod server;
 mod store;
+mod transfer;
 mod vehicles;
 
 pub use program::main;

@@ -1,41 +1,70 @@
 //! Files of revisions, by their SHA-256. A file appears under its digest only when it is complete
 //! and durable, and is never changed afterwards.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
 use std::io;
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use axum::body::Body;
-use axum::http::header;
-use axum::response::{IntoResponse, Response};
-use futures_util::StreamExt;
+use axum::http::HeaderMap;
+use axum::response::Response;
 use gleaner_base::{Exit, Failure};
-use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use gleaner_lambda::manifest::Sha256;
 use gleaner_protocol::vehicle_api::MissingObject;
 use gleaner_trust::Revision;
-use tokio::fs::File;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::sync::RwLock;
+use tokio::time::interval;
 
-use crate::error::{CloudError, CloudResult};
+use crate::cloud::Cloud;
+use crate::error::CloudResult;
 use crate::folder::PART;
-use crate::place::FilePlace;
+use crate::place::{FilePlace, blocking};
 use crate::store::CloudStore;
+use crate::transfer::{IncomingFile, OCTETS, OutgoingFile};
 
-/// Length of the pieces in which a file is sent.
-const PIECE: usize = 64 << 10;
+/// Interval of looks for revisions and files that no release needs.
+const COLLECTING: Duration = Duration::from_secs(3600);
+/// Time for which they are kept: files are sent before their deployment is.
+const GRACE: Duration = Duration::from_secs(86_400);
+
+/// Removes revisions and files that no release needs, for as long as the program runs.
+pub(crate) async fn collect(cloud: &Cloud) {
+    let mut looks = interval(COLLECTING);
+    loop {
+        looks.tick().await;
+        if let Err(error) = collect_once(cloud, GRACE).await {
+            tracing::warn!(reason = error.reason(), "unused files are not removed");
+        }
+    }
+}
+
+async fn collect_once(cloud: &Cloud, grace: Duration) -> CloudResult<()> {
+    let grace_s = i64::try_from(grace.as_secs()).unwrap_or(i64::MAX);
+    let revisions = cloud.store.collect_revisions(grace_s).await?;
+    let files = cloud.objects.collect(&cloud.store, grace).await?;
+    if revisions > 0 || files > 0 {
+        tracing::info!(revisions, files, "what no release needs was removed");
+    }
+    Ok(())
+}
 
 /// All files.
 #[derive(Debug)]
 pub(crate) struct Objects {
     place: FilePlace,
     parts: AtomicU64,
+    /// Held for reading from the look for missing files until the deployment is stored, and for
+    /// writing while unused files are removed.
+    pub(crate) uses: RwLock<()>,
 }
 
 impl Objects {
     /// Creates the access to a place of files.
     pub(crate) fn new(place: FilePlace) -> Self {
-        Self { place, parts: AtomicU64::new(0) }
+        Self { place, parts: AtomicU64::new(0), uses: RwLock::default() }
     }
 
     /// Returns the files of `revisions` that are not stored.
@@ -59,6 +88,20 @@ impl Objects {
         Ok(missing)
     }
 
+    /// Removes files of the folder that are older than `grace` and that no revision names; returns
+    /// their number. A bucket keeps its files: other replicas may use them at this moment.
+    async fn collect(&self, store: &CloudStore, grace: Duration) -> CloudResult<u64> {
+        if self.place.is_bucket() {
+            return Ok(0);
+        }
+        let _uses = self.uses.write().await;
+        let Some(used) = store.used_objects().await? else { return Ok(0) };
+        let folder = self.place.folder().to_owned();
+        Ok(blocking(move || remove_unused(&folder, &used, grace)).await.map_err(|error| {
+            Failure::caused_by(Exit::Internal, "cannot remove unused files", &error)
+        })?)
+    }
+
     /// Receives a file. It counts only if its length and digest are right.
     pub(crate) async fn receive(
         &self,
@@ -68,56 +111,66 @@ impl Objects {
     ) -> CloudResult<()> {
         let length = store.awaited_length(sha256.as_str()).await?;
         let number = self.parts.fetch_add(1, Ordering::Relaxed);
-        let part = self.place.folder().join(format!("{sha256}.{number}.{PART}"));
-        let part = UnfinishedFile(part);
-        let failed = |error: io::Error| {
-            Failure::caused_by(Exit::Internal, format!("cannot receive the file {sha256}"), &error)
-        };
-        let refused = |reason: String| {
-            let help = "send the file again, as it was published";
-            CloudError::denied(format!("the file {sha256} is refused"), help).because(reason)
-        };
-        let mut file = File::create_new(&part.0).await.map_err(failed)?;
-        let mut announced = AnnouncedFile::new(length, sha256.as_str());
-        let mut body = body.into_data_stream();
-        while let Some(piece) = body.next().await {
-            let piece = piece.map_err(|error| failed(io::Error::other(error)))?;
-            announced.add(&piece).map_err(refused)?;
-            file.write_all(&piece).await.map_err(failed)?;
+        let path = self.place.folder().join(format!("{sha256}.{number}.{PART}"));
+        let name = format!("the file {sha256}");
+        let file = IncomingFile { name: &name, length, sha256: sha256.as_str() };
+        let part = file.receive(path, body).await?;
+        Ok(self.place.keep(&part, sha256.as_str()).await.map_err(|error| {
+            Failure::caused_by(Exit::Internal, format!("cannot store {name}"), &error)
+        })?)
+    }
+
+    /// Returns the answer with a file, or with the end of it.
+    pub(crate) async fn send(&self, sha256: &Sha256, headers: &HeaderMap) -> CloudResult<Response> {
+        let name = format!("the file {sha256}");
+        let help = "deploy the revision again, which sends missing files";
+        let length = self.place.length(sha256.as_str()).await;
+        let content = async |begin| self.place.content(sha256.as_str(), begin).await;
+        OutgoingFile { name: &name, kind: OCTETS, help }.send(headers, length, content).await
+    }
+}
+
+fn remove_unused(folder: &Path, used: &BTreeSet<String>, grace: Duration) -> io::Result<u64> {
+    let mut removed = 0;
+    for entry in fs::read_dir(folder)? {
+        let path = entry?.path();
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        // One that is being received is not whole, and may have gone meanwhile.
+        if path.extension().is_some() || used.contains(name) {
+            continue;
         }
-        announced.finish().map_err(refused)?;
-        file.flush().await.map_err(failed)?;
-        Ok(self.place.keep(&part, sha256.as_str()).await.map_err(failed)?)
+        let changed = path.metadata().and_then(|found| found.modified())?;
+        // After a jump of the clock it stays.
+        if changed.elapsed().is_ok_and(|age| age >= grace) {
+            fs::remove_file(&path)?;
+            removed += 1;
+        }
     }
-
-    /// Returns the answer with a file.
-    pub(crate) async fn send(&self, sha256: &Sha256) -> CloudResult<Response> {
-        let missing = || {
-            let help = "deploy the revision again, which sends missing files";
-            CloudError::missing(format!("the file {sha256} is missing"), help)
-        };
-        let failed = |error| {
-            Failure::caused_by(Exit::Internal, format!("cannot send the file {sha256}"), &error)
-        };
-        let length = self.place.length(sha256.as_str()).await.map_err(failed)?;
-        let length = length.ok_or_else(missing)?;
-        let content = self.place.content(sha256.as_str(), 0).await.map_err(failed)?;
-        let content = content.ok_or_else(missing)?;
-        let headers = [(header::CONTENT_LENGTH, length.to_string()), octets()];
-        Ok((headers, content).into_response())
-    }
+    Ok(removed)
 }
 
-/// Returns the rest of a file as the body of an answer, which is read piece by piece.
-pub(crate) fn body_of(file: File) -> Body {
-    Body::from_stream(futures_util::stream::try_unfold(file, async |mut file| {
-        let mut piece = Vec::with_capacity(PIECE);
-        (&mut file).take(PIECE as u64).read_to_end(&mut piece).await?;
-        io::Result::Ok((!piece.is_empty()).then_some((piece, file)))
-    }))
-}
+#[cfg(test)]
+mod tests {
+    use std::fs::{File, FileTimes};
+    use std::time::SystemTime;
 
-/// Returns the type of a file whose content does not matter.
-pub(crate) fn octets() -> (header::HeaderName, String) {
-    (header::CONTENT_TYPE, "application/octet-stream".to_owned())
+    use tempfile::TempDir;
+
+    use super::*;
+
+    #[test]
+    fn only_old_files_that_nothing_needs_are_removed() {
+        let folder = TempDir::new().unwrap();
+        let old = SystemTime::now() - Duration::from_secs(90_000);
+        for (name, is_old) in [("used", true), ("new", false), ("x.1.part", true), ("old", true)] {
+            let file = File::create(folder.path().join(name)).unwrap();
+            if is_old {
+                file.set_times(FileTimes::new().set_modified(old)).unwrap();
+            }
+        }
+        let used = ["used".to_owned()].into();
+        assert_eq!(remove_unused(folder.path(), &used, GRACE).unwrap(), 1);
+        let left = ["used", "new", "x.1.part", "old"].map(|it| folder.path().join(it).exists());
+        assert_eq!(left, [true, true, true, false]);
+    }
 }

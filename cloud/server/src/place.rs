@@ -11,8 +11,8 @@ use tokio::fs::File;
 use tokio::io::AsyncSeekExt;
 
 use crate::folder::remove_parts;
-use crate::objects::body_of;
 use crate::s3::S3Bucket;
+use crate::transfer::body_of;
 
 /// Number of lists, of a thousand names each, that the removal of a file takes at most.
 const LISTS_MAX: usize = 100;

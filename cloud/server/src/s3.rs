@@ -25,7 +25,7 @@ use tokio::net::TcpStream;
 use tokio::time::{sleep, timeout};
 use tokio_rustls::TlsConnector;
 
-use crate::objects::body_of;
+use crate::transfer::body_of;
 
 /// Time for which a signed request is valid.
 const SIGNED: Duration = Duration::from_secs(60);

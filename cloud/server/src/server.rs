@@ -23,7 +23,7 @@ use crate::objects::Objects;
 use crate::place::FilePlace;
 use crate::s3::S3Bucket;
 use crate::store::{ClipBounds, CloudStore, Retention};
-use crate::{clips, people, replicas, vehicles};
+use crate::{clips, objects, people, replicas, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles.
 const PEOPLE_MAX: u32 = 1000;
@@ -96,7 +96,8 @@ impl CloudServer {
         let bus = options.bus.as_deref().map(BusAddress::parse).transpose()?;
         let bucket = options.objects.as_deref().map(S3Bucket::parse).transpose()?;
         let objects = bucket.as_ref().map(S3Bucket::url).unwrap_or_default();
-        let store = CloudStore::open(&folder.store(options.store.as_deref())?).await?;
+        let address = folder.store(options.store.as_deref())?;
+        let store = CloudStore::open(&address).await?;
         if !folder.has_authorities() {
             // Those of a new folder would be others than the database has.
             store.tie(None, &objects).await?;
@@ -104,6 +105,7 @@ impl CloudServer {
         let authorities = Authorities::open(&folder)?;
         let authority = gleaner_trust::sha256(authorities.server_pem().as_bytes());
         store.tie(Some(authority.as_str()), &objects).await?;
+        folder.keep(&address)?;
         if let Some(seq) = store.first_changed_entry().await? {
             tracing::error!(seq, "the audit trail was changed: an entry is not as it was written");
         }
@@ -169,6 +171,8 @@ impl CloudServer {
         }
         let working = Arc::clone(&cloud);
         chores.spawn(async move { clips::clean(&working).await });
+        let working = Arc::clone(&cloud);
+        chores.spawn(async move { objects::collect(&working).await });
         let working = Arc::clone(&cloud);
         chores.spawn(async move {
             let mut ticks = ticks(SEEN_INTERVAL);

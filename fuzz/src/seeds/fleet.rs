@@ -26,6 +26,7 @@ pub fn all() -> Vec<Vec<u8>> {
         envelope: "5".repeat(64),
         is_wanted: rollback == 0,
         rollback,
+        start: rollback + 1,
     };
     let records = Records {
         stream: "events".to_owned(),

@@ -204,6 +204,19 @@ impl Core {
         })
     }
 
+    /// Returns whether the lambda of a deployment is wanted and not quarantined, as far as the
+    /// supervisor has reported it.
+    pub(crate) fn runs(&self, id: &ItemName) -> bool {
+        let inner = self.lock();
+        let deployed = inner.state.deployments.get(id);
+        let reported = inner.status.iter().flat_map(|status| &status.lambdas);
+        let mut own = reported.filter(|lambda| {
+            deployed.is_some_and(|it| it.is_wanted && it.attempt == lambda.attempt)
+                && lambda.id == id.as_str()
+        });
+        own.next().is_some_and(|lambda| lambda.phase != LambdaPhase::Quarantined)
+    }
+
     /// Runs the fallback of a deployment.
     ///
     /// # Errors

@@ -1,4 +1,4 @@
-//! Receives files that deployments need, from users and from the cloud.
+//! Receives files that deployments need, from users.
 
 use std::error::Error;
 use std::io;

@@ -78,6 +78,9 @@ pub(crate) struct CloudWish {
     pub(crate) is_wanted: bool,
     /// Number of the request to run its fallback.
     pub(crate) rollback: u64,
+    /// Number of the request to start it again.
+    #[serde(default)]
+    pub(crate) start: u64,
 }
 
 impl Deployed {

@@ -5,11 +5,13 @@
 //! wheels, `gleaner-wheels` keeps the environment beside the build.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsStr;
 use std::fs::{self, File, Permissions};
 use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use gleaner_base::{Exit, Failure, PlainFile, hex, safe_file, sync_folder};
 use gleaner_lambda::BuildDir;
@@ -20,6 +22,9 @@ use gleaner_trust::{Payload, Revision, Trusted, check_files, revision_of_digest}
 use sha2::Digest;
 
 use crate::layout::VehicleFolders;
+
+/// Time for which a download that was interrupted can go on.
+const PARTIAL_AGE: Duration = Duration::from_secs(7 * 86_400);
 
 /// Name of the envelope in the folder of a revision.
 const ENVELOPE: &str = "revision.json";
@@ -203,9 +208,14 @@ impl RevisionStore {
             name.is_some_and(|name| set.iter().any(|digest| digest.as_str() == name))
         };
         for path in entries(&self.objects)? {
-            // Parts are being received.
-            let is_part = path.extension().is_some_and(|it| it == "part");
-            if !is_part && !is_of(expected, &path) {
+            let is_kept = match path.extension().and_then(OsStr::to_str) {
+                // It is being received.
+                Some("part") => true,
+                // A download goes on there, also after a restart, when nothing is expected yet.
+                Some("partial") => is_younger(&path, PARTIAL_AGE),
+                _ => is_of(expected, &path),
+            };
+            if !is_kept {
                 remove(&path);
             }
         }
@@ -262,6 +272,12 @@ pub(crate) fn remove(path: &Path) {
     if let Err(error) = removed {
         tracing::warn!(path = %path.display(), %error, "cannot remove");
     }
+}
+
+/// Returns whether a file was changed within this time. After a jump of the clock, it was not.
+fn is_younger(path: &Path, age: Duration) -> bool {
+    let changed = path.symlink_metadata().and_then(|found| found.modified());
+    changed.is_ok_and(|changed| changed.elapsed().is_ok_and(|elapsed| elapsed < age))
 }
 
 /// Begins a file that is being received.

@@ -1,17 +1,20 @@
 //! Downloads the file of a clip.
 //!
 //! Names come from the cloud and are checked: `DIR/VEHICLE/NAME.mcap` cannot lead out of `DIR`.
-//! Until a file is whole and has the right SHA-256 it is `NAME.mcap.part`, and goes on there.
+//! Until a file is whole and has the right SHA-256 it is `NAME.mcap.part`, and goes on there. It is
+//! locked meanwhile: another download of it waits, and then finds the whole file.
 
-use std::fs;
+use std::fs::{self, File};
 use std::io::{self, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure, safe_file};
 use gleaner_fleet::AnnouncedFile;
 use gleaner_fleet::clips::FleetClip;
-use rustix::fs::{CWD, RenameFlags, renameat_with};
+use rustix::fs::{CWD, FlockOperation, RenameFlags, flock, renameat_with};
 
+use super::export::TABLE;
 use crate::vehicle::VehicleClient;
 
 /// A clip and the place for its file.
@@ -28,7 +31,12 @@ impl<'c> ClipTarget<'c> {
             Failure::new(Exit::Internal, format!("the cloud has no SHA-256 of clip `{}`", clip.id))
         })?;
         // The parts of an id have no separators, and do not begin with a dot.
-        let file = folder.join(clip.id.vehicle()).join(format!("{}.mcap", clip.id.name()));
+        let vehicle = match clip.id.vehicle() {
+            // No name of a vehicle has the last character.
+            TABLE => format!("{TABLE}~"),
+            vehicle => vehicle.to_owned(),
+        };
+        let file = folder.join(vehicle).join(format!("{}.mcap", clip.id.name()));
         Ok(Self { clip, sha256, file })
     }
 
@@ -41,19 +49,15 @@ impl<'c> ClipTarget<'c> {
         };
         let folder = self.file.parent().unwrap_or(Path::new("."));
         safe_file::folder(folder).map_err(failed)?;
-        if self.file.symlink_metadata().is_ok() {
-            return match self.compare(&self.file).map_err(failed)? {
-                Ok(()) => Ok(self.file.clone()),
-                Err(reason) => {
-                    let message = format!("`{shown}` exists, and is another file");
-                    let mut failure = Failure::new(Exit::Usage, message);
-                    failure.causes = vec![reason];
-                    Err(failure.with_help("choose another folder with --to DIR"))
-                }
-            };
+        if self.is_there()? {
+            return Ok(self.file.clone());
         }
         let part = self.file.with_extension("mcap.part");
-        let mut file = safe_file::append(&part).map_err(failed)?;
+        let mut file = locked(&part).map_err(failed)?;
+        if self.is_there()? {
+            fs::remove_file(&part).map_err(failed)?;
+            return Ok(self.file.clone());
+        }
         let mut from = file.metadata().map_err(failed)?.len();
         if from > self.clip.facts.bytes {
             file.set_len(0).map_err(failed)?;
@@ -85,6 +89,23 @@ impl<'c> ClipTarget<'c> {
         Ok(self.file.clone())
     }
 
+    /// Returns whether the whole file is there, by another download or from an earlier time.
+    fn is_there(&self) -> Result<bool, Failure> {
+        if self.file.symlink_metadata().is_err() {
+            return Ok(false);
+        }
+        let shown = self.file.display();
+        let compared = self.compare(&self.file).map_err(|error| {
+            Failure::caused_by(Exit::Usage, format!("cannot read `{shown}`"), &error)
+        })?;
+        compared.map(|()| true).map_err(|reason| {
+            let mut failure =
+                Failure::new(Exit::Usage, format!("`{shown}` exists, and is another file"));
+            failure.causes = vec![reason];
+            failure.with_help("choose another folder with --to DIR")
+        })
+    }
+
     fn refused(&self, reason: &str) -> Failure {
         let message = format!("the cloud sent another file than clip `{}`", self.clip.id);
         let mut failure = Failure::new(Exit::Denied, message);
@@ -95,6 +116,21 @@ impl<'c> ClipTarget<'c> {
     fn compare(&self, path: &Path) -> io::Result<Result<(), String>> {
         let announced = AnnouncedFile::new(self.clip.facts.bytes, self.sha256);
         announced.compare(safe_file::read(path)?)
+    }
+}
+
+/// Opens a file for appending, and waits until no other download has it.
+fn locked(path: &Path) -> io::Result<File> {
+    loop {
+        let file = safe_file::append(path)?;
+        flock(&file, FlockOperation::LockExclusive)?;
+        // The other one has renamed or removed the file that was opened.
+        let opened = file.metadata()?;
+        let is_same =
+            |named: fs::Metadata| (named.dev(), named.ino()) == (opened.dev(), opened.ino());
+        if path.symlink_metadata().is_ok_and(is_same) {
+            return Ok(file);
+        }
     }
 }
 

@@ -4,7 +4,9 @@ use std::io::Write;
 use std::path::Path;
 
 use gleaner_base::{Exit, Failure, safe_file};
+use gleaner_fleet::UnfinishedFile;
 use gleaner_fleet::clips::{ClipMoment, ClipState, FleetClip};
+use rustix::fs::{CWD, RenameFlags, renameat_with};
 use serde_json::{Value, json};
 
 use super::download::ClipTarget;
@@ -13,7 +15,7 @@ use crate::args::ExportArgs;
 use crate::cloud::{client, list, show};
 
 /// The table, in the folder of an export. `gleaner.cloud` of the Python SDK reads it.
-const TABLE: &str = "events.jsonl";
+pub(super) const TABLE: &str = "events.jsonl";
 
 /// Runs `gleaner clips export`.
 pub(super) fn export(args: &ExportArgs) -> Result<Exit, Failure> {
@@ -39,9 +41,16 @@ pub(super) fn export(args: &ExportArgs) -> Result<Exit, Failure> {
         rows.extend(clip.facts.moments.iter().map(|moment| row(clip, moment, &file)));
     }
     // Last: an export that was interrupted goes on with the files that it has.
-    let mut file = safe_file::create(&table).map_err(failed)?;
+    // Another export may have written its own table meanwhile.
+    let part = args.to.join(format!("{TABLE}.{}.part", std::process::id()));
+    let mut file = safe_file::create(&part).map_err(failed)?;
     let lines: String = rows.iter().map(|row| format!("{row}\n")).collect();
-    file.write_all(lines.as_bytes()).and_then(|()| file.sync_all()).map_err(failed)?;
+    let written = file
+        .write_all(lines.as_bytes())
+        .and_then(|()| file.sync_all())
+        .and_then(|()| Ok(renameat_with(CWD, &part, CWD, &table, RenameFlags::NOREPLACE)?));
+    drop(UnfinishedFile(part));
+    written.map_err(failed)?;
     let wanted = others.iter().filter(|clip| clip.state != ClipState::Gone).count();
     let result = json!({ "table": table, "clips": stored.len(), "events": rows.len(),
                          "not_in_the_cloud": others.len(), "gone": others.len() - wanted });
@@ -69,7 +78,7 @@ fn row(clip: &FleetClip, moment: &ClipMoment, file: &Path) -> Value {
         "score": moment.score,
         "attributes": moment.attributes,
         "source": moment.source,
-        "vehicle": clip.vehicle,
+        "vehicle": clip.id.vehicle(),
         "lambda": moment.lambda,
         "version": lambda.map(|it| &it.version),
         "deployment": lambda.and_then(|it| it.deployment.as_ref()),

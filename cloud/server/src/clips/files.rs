@@ -10,16 +10,14 @@ use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{self, Arc, PoisonError};
-use std::time::Duration;
 
 use axum::body::Body;
 use futures_util::stream::try_unfold;
 use futures_util::{StreamExt, TryStreamExt};
-use gleaner_base::{Exit, Failure, sync_folder};
+use gleaner_base::sync_folder;
 use gleaner_fleet::clips::{CLIP_PART, ClipId};
 use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
 use gleaner_trust::sha256;
-use tokio::io::AsyncWriteExt;
 use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout;
 
@@ -27,12 +25,11 @@ use crate::error::{CloudError, CloudResult};
 use crate::folder::PART;
 use crate::place::{FilePlace, blocking};
 use crate::store::ClipBounds;
+use crate::transfer::{IncomingFile, PIECE_TIME};
 
 /// Number of parts of a vehicle that are received at a time: some may be of connections that it
 /// has lost.
 const PARTS_MAX: usize = 4;
-/// Time for the next piece of a part.
-const PIECE_TIME: Duration = Duration::from_secs(60);
 /// Number of locks for all files.
 const TURNS: usize = 64;
 
@@ -121,7 +118,16 @@ impl ClipFiles {
 
     /// Removes the recording of a clip.
     pub(crate) async fn remove_recording(&self, id: &ClipId) {
-        if let Err(error) = self.place.remove(&recording(id)).await {
+        self.remove(id, &recording(id)).await;
+    }
+
+    /// Removes the thumbnail of a clip.
+    pub(crate) async fn remove_thumbnail(&self, id: &ClipId) {
+        self.remove(id, &thumbnail(id)).await;
+    }
+
+    async fn remove(&self, id: &ClipId, name: &str) {
+        if let Err(error) = self.place.remove(name).await {
             tracing::warn!(clip = %id, %error, "a file cannot be removed");
         }
     }
@@ -154,31 +160,8 @@ impl ClipFiles {
     ) -> CloudResult<UnfinishedFile> {
         let number = self.parts.fetch_add(1, Ordering::Relaxed);
         let path = self.path(id).with_extension(format!("{number}.{PART}"));
-        let part = UnfinishedFile(path);
-        let failed = |error: io::Error| {
-            Failure::caused_by(Exit::Internal, format!("cannot receive clip `{id}`"), &error)
-        };
-        let refused = |reason: String| {
-            let help = "send it again, as it was announced";
-            CloudError::denied(format!("a part of clip `{id}` is refused"), help).because(reason)
-        };
-        let mut file = tokio::fs::File::create_new(&part.0).await.map_err(failed)?;
-        let mut announced = AnnouncedFile::new(length, sha256);
-        let mut body = body.into_data_stream();
-        let broken = |error: &dyn std::error::Error| {
-            let message = format!("a part of clip `{id}` did not come in full");
-            CloudError::usage(message, "send it again").because(error)
-        };
-        loop {
-            let piece = timeout(PIECE_TIME, body.next()).await.map_err(|late| broken(&late))?;
-            let Some(piece) = piece else { break };
-            let piece = piece.map_err(|error| broken(&error))?;
-            announced.add(&piece).map_err(refused)?;
-            file.write_all(&piece).await.map_err(failed)?;
-        }
-        announced.finish().map_err(refused)?;
-        file.flush().await.map_err(failed)?;
-        Ok(part)
+        let name = format!("a part of clip `{id}`");
+        IncomingFile { name: &name, length, sha256 }.receive(path, body).await
     }
 
     /// Makes a received file durable as the thumbnail of a clip.

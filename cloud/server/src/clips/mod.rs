@@ -18,15 +18,49 @@ pub(crate) use files::{ClipFiles, FileOfClip};
 pub(crate) use vehicles::router;
 
 use crate::cloud::Cloud;
+use crate::error::CloudResult;
+use crate::store::RemovedClip;
 
 /// Interval of looks for unfinished files that are not continued.
 const CLEANING: Duration = Duration::from_secs(600);
 
-/// Removes unfinished files that are not continued, for as long as the program runs.
+/// Removes clips that the rules do not keep, and the files of all that were removed.
+async fn remove_expired(cloud: &Cloud) -> CloudResult<()> {
+    while cloud.store.expire_clips().await? {}
+    remove_files(cloud).await
+}
+
+/// Removes the files of clips that were removed.
+pub(crate) async fn remove_files(cloud: &Cloud) -> CloudResult<()> {
+    loop {
+        let removed = cloud.store.removed_clips().await?;
+        if removed.is_empty() {
+            return Ok(());
+        }
+        for id in removed {
+            // A part that is being stored ends first, and no other one begins meanwhile.
+            let _turn = cloud.clips.turn(&id).await;
+            // Its vehicle may have announced and sent it again.
+            let RemovedClip { id, has_file, has_thumbnail } = cloud.store.removed_clip(id).await?;
+            if !has_file {
+                cloud.clips.remove_recording(&id).await;
+            }
+            if !has_thumbnail {
+                cloud.clips.remove_thumbnail(&id).await;
+            }
+            cloud.store.forget_removed_clip(&id).await?;
+        }
+    }
+}
+
+/// Removes old clips, and unfinished files that are not continued, for as long as the program runs.
 pub(crate) async fn clean(cloud: &Cloud) {
     let mut looks = interval(CLEANING);
     loop {
         looks.tick().await;
+        if let Err(error) = remove_expired(cloud).await {
+            tracing::warn!(reason = error.reason(), "old clips are not removed");
+        }
         let forgotten = cloud.store.forget_unfinished_clips(cloud.clips.bounds.unfinished_s).await;
         match forgotten {
             Ok(forgotten) => {

@@ -6,10 +6,10 @@ use std::sync::Arc;
 use axum::Json;
 use axum::body::Bytes;
 use axum::extract::{Extension, Path, Query, State};
-use axum::http::{HeaderMap, StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::Response;
 use gleaner_base::{Exit, Failure};
-use gleaner_fleet::clips::{ClipId, ClipPolicy, ClipState, FleetClip};
+use gleaner_fleet::clips::{ClipId, ClipPolicy, ClipState, ClipUsage, FleetClip};
 use gleaner_fleet::people::{ListPage, User};
 
 use super::FileOfClip;
@@ -17,6 +17,7 @@ use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::request::parsed;
 use crate::store::ClipQuery;
+use crate::transfer::{OCTETS, OutgoingFile};
 
 pub(crate) async fn list(
     State(cloud): State<Arc<Cloud>>,
@@ -45,6 +46,21 @@ pub(crate) async fn pull(
     Ok(Json(clip))
 }
 
+/// Removes a clip. A kill before its files are removed loses nothing: they go with the next look.
+pub(crate) async fn remove(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(actor): Extension<User>,
+    Path(id): Path<String>,
+) -> CloudResult<StatusCode> {
+    cloud.store.remove_clip(&actor.name, &parse(&id)?).await?;
+    super::remove_files(&cloud).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+pub(crate) async fn usage(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<ClipUsage>> {
+    Ok(Json(cloud.store.clip_counts().await?))
+}
+
 pub(crate) async fn thumbnail(
     State(cloud): State<Arc<Cloud>>,
     Path(id): Path<String>,
@@ -70,7 +86,7 @@ pub(crate) async fn file(
         return Err(CloudError::missing(message, "fetch it: `gleaner clips pull ID`"));
     }
     let file = FileOfClip::Recording(clip.facts.bytes);
-    send(&cloud, (&id, file), "application/octet-stream", &headers).await
+    send(&cloud, (&id, file), OCTETS, &headers).await
 }
 
 pub(crate) async fn policy(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<ClipPolicy>> {
@@ -103,37 +119,9 @@ async fn send(
     kind: &'static str,
     headers: &HeaderMap,
 ) -> CloudResult<Response> {
-    let failed = |error| not_sent(id, error);
-    let missing = || {
-        let message = format!("a file of clip `{id}` is not among the files of the cloud");
-        CloudError::missing(message, "fetch it again: `gleaner clips pull ID`")
-    };
-    let length = cloud.clips.length(id, file).await.map_err(failed)?.ok_or_else(missing)?;
-    let range = headers.get(header::RANGE).and_then(|it| it.to_str().ok());
-    // Any other range is answered with the whole file, as the standard allows.
-    let begin = range.and_then(|it| it.strip_prefix("bytes=")?.strip_suffix('-')?.parse().ok());
-    let (begin, status) = match begin {
-        Some(begin) if begin > 0 && begin < length => (begin, StatusCode::PARTIAL_CONTENT),
-        Some(begin) if begin > 0 => {
-            let range = (header::CONTENT_RANGE, format!("bytes */{length}"));
-            return Ok((StatusCode::RANGE_NOT_SATISFIABLE, [range]).into_response());
-        }
-        _ => (0, StatusCode::OK),
-    };
-    let content = cloud.clips.content(id, file, begin).await.map_err(failed)?;
-    let mut answer = content.ok_or_else(missing)?.into_response();
-    *answer.status_mut() = status;
-    let mut set = |name, value: String| {
-        if let Ok(value) = value.parse() {
-            answer.headers_mut().insert(name, value);
-        }
-    };
-    set(header::CONTENT_TYPE, kind.to_owned());
-    set(header::X_CONTENT_TYPE_OPTIONS, "nosniff".to_owned());
-    set(header::ACCEPT_RANGES, "bytes".to_owned());
-    set(header::CONTENT_LENGTH, (length - begin).to_string());
-    if status == StatusCode::PARTIAL_CONTENT {
-        set(header::CONTENT_RANGE, format!("bytes {begin}-{}/{length}", length - 1));
-    }
-    Ok(answer)
+    let name = format!("a file of clip `{id}`");
+    let help = "fetch it again: `gleaner clips pull ID`";
+    let length = cloud.clips.length(id, file).await;
+    let content = async |begin| cloud.clips.content(id, file, begin).await;
+    OutgoingFile { name: &name, kind, help }.send(headers, length, content).await
 }

@@ -9,7 +9,8 @@ const BOUNDS: ClipBounds =
 
 async fn store(folder: &TempDir) -> CloudStore {
     let store = CloudStore::of_test(folder).await;
-    let policy = ClipPolicy { upload: UploadedClips::All, day_bytes: 1 << 40 };
+    let policy =
+        ClipPolicy { upload: UploadedClips::All, day_bytes: 1 << 40, keep_s: 0, keep_bytes: 0 };
     for vehicle in ["a", "b"] {
         store.invite_vehicle("ann", vehicle).await.unwrap();
     }
@@ -84,4 +85,51 @@ async fn the_oldest_clips_without_files_are_forgotten_above_the_bound() {
     let page = store.clips(&ClipQuery::default()).await.unwrap();
     let names: Vec<_> = page.items.iter().map(|clip| clip.facts.name.to_string()).collect();
     assert_eq!(names, ["4", "3", "2", "0"]);
+}
+
+#[tokio::test]
+async fn stored_clips_are_removed_by_people_and_by_age_and_size() {
+    let folder = TempDir::new().unwrap();
+    let store = store(&folder).await;
+    for name in ["1", "2", "3", "4"] {
+        announce(&store, "a", name, 10).await;
+        if name != "4" {
+            let progress = store.clip_progress("a", &self::name(name), BOUNDS).await.unwrap();
+            store.clip_part_received(&progress, 10, true).await.unwrap();
+        }
+    }
+    let names = async || {
+        let page = store.clips(&ClipQuery::default()).await.unwrap();
+        page.items.iter().map(|clip| clip.facts.name.to_string()).collect::<Vec<_>>()
+    };
+    let id = |name: &str| format!("{name}@a").parse().unwrap();
+    store.remove_clip("ann", &id("1")).await.unwrap();
+    assert!(store.remove_clip("ann", &id("1")).await.is_err(), "it is removed already");
+    let refused = store.remove_clip("ann", &id("4")).await.unwrap_err().reason();
+    assert!(refused.contains("is not in the cloud"), "{refused}");
+    assert_eq!(names().await, ["4", "3", "2"]);
+    // Its files are removed later, also after a kill.
+    assert_eq!(store.removed_clips().await.unwrap(), [id("1")]);
+    let removed = store.removed_clip(id("1")).await.unwrap();
+    assert!(!removed.has_file && !removed.has_thumbnail);
+    store.forget_removed_clip(&id("1")).await.unwrap();
+
+    let keep = async |keep_s, keep_bytes| {
+        let upload = UploadedClips::All;
+        let policy = ClipPolicy { upload, day_bytes: 1 << 40, keep_s, keep_bytes };
+        store.set_clip_policy("ann", &policy).await.unwrap();
+        while store.expire_clips().await.unwrap() {}
+    };
+    keep(3600, 20).await;
+    assert_eq!(names().await, ["4", "3", "2"], "they are young and few");
+    keep(0, 10).await;
+    assert_eq!(names().await, ["4", "3"], "the oldest goes first");
+    store.execute("UPDATE clips SET part_time = part_time - 3600").await;
+    keep(3600, 0).await;
+    assert_eq!(names().await, ["4"], "only stored ones are removed");
+    let counts = store.clip_counts().await.unwrap();
+    assert_eq!((counts.stored, counts.removed, counts.removed_bytes), (0, 3, 30));
+    let audit = store.audit(u64::MAX, 100).await.unwrap();
+    let of = |action: &str| audit.iter().filter(|entry| entry.action == action).count();
+    assert_eq!((of("remove clip"), of("remove clips")), (1, 2));
 }

@@ -25,8 +25,6 @@ use crate::request::{digest, in_time, parsed};
 use crate::store::ClipProgress;
 use crate::vehicles::KnownVehicle;
 
-/// Time for a part: 14 kB/s.
-const PART_TIME: Duration = Duration::from_secs(600);
 /// Time for a part that is not wanted.
 const UNWANTED_TIME: Duration = Duration::from_secs(30);
 /// Longest position in the list of a vehicle.
@@ -100,6 +98,11 @@ async fn thumbnail(
     }
     let length = body.len() as u64;
     let part = cloud.clips.receive(&id, (length, &wanted), Body::from(body)).await?;
+    let _turn = cloud.clips.turn(&id).await;
+    if cloud.store.wanted_thumbnail(&vehicle.name, &name).await?.is_none() {
+        // The clip was removed meanwhile, or another request has sent it.
+        return orders(&cloud, &vehicle.name).await;
+    }
     cloud.clips.keep_thumbnail(&id, &part).await.map_err(|error| not_stored(&id, error))?;
     cloud.store.thumbnail_received(&id).await?;
     orders(&cloud, &vehicle.name).await
@@ -121,11 +124,7 @@ async fn part(
         return orders(&cloud, &vehicle.name).await;
     };
     let _slot = cloud.clips.slot(&vehicle.name)?;
-    let receive = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body);
-    let received = timeout(PART_TIME, receive).await.map_err(|_| {
-        let message = format!("a part of clip `{}` took too long", progress.id);
-        CloudError::busy(message, "send it again")
-    })??;
+    let received = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body).await?;
     let working = Arc::clone(&cloud);
     // A vehicle that goes away in the middle must not leave it half done.
     let stored = tokio::spawn(store_part(working, progress, length, received)).await;

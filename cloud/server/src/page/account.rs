@@ -135,7 +135,10 @@ pub(super) async fn make_token(
             let name = fields.get("name").trim().to_owned();
             // No number is none that is allowed.
             let days = fields.get("days").trim().parse().unwrap_or(0);
-            cloud.store.make_token((&user.user, (&user.user).into()), NewToken { name, role, days }).await
+            cloud
+                .store
+                .make_token((&user.user, (&user.user).into()), NewToken { name, role, days })
+                .await
         }
         Err(error) => Err(error),
     };

@@ -101,7 +101,7 @@ async fn session_by_password(
     let (name, password) = (fields.get("name").trim(), fields.get("password"));
     cloud.wrong_secrets.count_password(peer.address, name)?;
     let hash = cloud.store.password(name).await?;
-    let is_right = password::is_right(password.to_owned(), hash.as_deref()).await?;
+    let is_right = password::is_right(peer.address, password.to_owned(), hash.as_deref()).await?;
     match hash.filter(|_| is_right) {
         Some(hash) => cloud.store.open_session_of(name, &hash).await,
         None => Ok(None),

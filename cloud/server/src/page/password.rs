@@ -1,5 +1,8 @@
 //! Passwords: hashed with Argon2id, a few at a time.
 
+use std::collections::BTreeMap;
+use std::net::IpAddr;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use argon2::password_hash::phc::PasswordHash;
@@ -14,6 +17,12 @@ use crate::error::{CloudError, CloudResult};
 static SLOTS: Semaphore = Semaphore::const_new(2);
 /// Time to wait for one of them.
 const WAIT: Duration = Duration::from_secs(10);
+
+/// The turn of each address whose passwords are checked. It has one at a time, so that an address
+/// with many connections delays others by one hash, not by all of its own.
+static TURNS: Mutex<BTreeMap<IpAddr, Arc<Semaphore>>> = Mutex::new(BTreeMap::new());
+/// Maximum number of passwords of an address that wait or are checked.
+const WAITING_MAX: usize = 50;
 
 /// Lengths of passwords, in bytes.
 const LENGTHS: std::ops::RangeInclusive<usize> = 12..=256;
@@ -37,13 +46,23 @@ pub(super) async fn hashed(password: String) -> CloudResult<String> {
     })
 }
 
-/// Returns whether a password is the one with this hash; without a hash, none is.
-pub(super) async fn is_right(password: String, hash: Option<&str>) -> CloudResult<bool> {
+/// Returns whether a password, from this address, is the one with this hash; without a hash, none
+/// is.
+pub(super) async fn is_right(
+    address: IpAddr,
+    password: String,
+    hash: Option<&str>,
+) -> CloudResult<bool> {
     if password.len() > *LENGTHS.end() {
         return Ok(false);
     }
     let stored = hash.unwrap_or(NO_PASSWORD).to_owned();
+    let turn = turn_of(address)?;
+    let turn = timeout(WAIT, turn.acquire_owned()).await.map_err(|_| busy())?;
+    let turn = turn.map_err(|_| busy())?;
     let is_equal = work(move || {
+        // As for the slot: it ends with the work.
+        let _turn = turn;
         let hash = PasswordHash::new(&stored).ok()?;
         argon2().ok()?.verify_password(password.as_bytes(), &hash).ok()
     });
@@ -57,8 +76,21 @@ fn argon2() -> argon2::password_hash::Result<Argon2<'static>> {
     Ok(Argon2::new(Algorithm::Argon2id, Version::V0x13, params))
 }
 
+fn turn_of(address: IpAddr) -> CloudResult<Arc<Semaphore>> {
+    let mut turns = TURNS.lock().unwrap_or_else(PoisonError::into_inner);
+    turns.retain(|_, turn| Arc::strong_count(turn) > 1);
+    let turn = turns.entry(address).or_insert_with(|| Arc::new(Semaphore::new(1)));
+    match Arc::strong_count(turn) > WAITING_MAX {
+        true => Err(busy()),
+        false => Ok(Arc::clone(turn)),
+    }
+}
+
+fn busy() -> CloudError {
+    CloudError::busy("too many passwords are being checked", "try again in a minute")
+}
+
 async fn work<T: Send + 'static>(hash: impl FnOnce() -> T + Send + 'static) -> CloudResult<T> {
-    let busy = || CloudError::busy("too many passwords are being checked", "try again in a minute");
     let slot = timeout(WAIT, SLOTS.acquire()).await.map_err(|_| busy())?.map_err(|_| busy())?;
     // The slot is given back when the work ends, not when the browser leaves.
     let done = tokio::task::spawn_blocking(move || {
@@ -76,7 +108,9 @@ mod tests {
     async fn only_the_same_password_is_right() {
         let hash = hashed("correct horse battery".to_owned()).await.unwrap();
         assert!(hash.starts_with("$argon2id$v=19$m=19456,t=2,p=1$"), "{hash}");
-        let is_right = async |password: &str, hash| is_right(password.to_owned(), hash).await;
+        let address = [10, 0, 0, 1].into();
+        let is_right =
+            async |password: &str, hash| is_right(address, password.to_owned(), hash).await;
         assert!(is_right("correct horse battery", Some(&hash)).await.unwrap());
         assert!(!is_right("correct horse batterx", Some(&hash)).await.unwrap());
         assert!(!is_right("correct horse battery", None).await.unwrap());

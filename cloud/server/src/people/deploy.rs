@@ -53,6 +53,8 @@ pub(super) async fn deploy(
         envelopes.insert(digest.to_string(), envelope);
     }
     let id = deployment.id.to_string();
+    // What is not missing now is not removed until the deployment needs it.
+    let _uses = cloud.objects.uses.read().await;
     let objects = cloud.objects.missing(&revisions).await?;
     cloud.store.await_files(&id, &objects).await?;
     if !objects.is_empty() {

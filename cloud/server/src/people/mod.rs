@@ -26,7 +26,7 @@ use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{self, delete, get, post};
 use gleaner_fleet::Enrolment;
-use gleaner_fleet::clips::{ClipPolicy, FleetClip};
+use gleaner_fleet::clips::{ClipPolicy, ClipUsage, FleetClip};
 use gleaner_fleet::people::{
     AuditEntry, FleetDeployRequest, FleetDeployment, Invitation, ListPage, Login, NewToken,
     NewUser, NewVehicle, Role, TokenSummary, User, UserToken, VehicleSummary,
@@ -93,9 +93,14 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
         .gives::<UserToken>(),
         read("/v1/me", Viewer, "The user of the token", get(me)).gives::<User>(),
         remove("/v1/login", Viewer, "Ends the token of the request", delete(tokens::logout)),
-        read("/v1/tokens", Viewer, "Own tokens for programs, or all for an admin", get(tokens::list))
-            .query::<ListQuery<String>>()
-            .gives::<ListPage<TokenSummary>>(),
+        read(
+            "/v1/tokens",
+            Viewer,
+            "Own tokens for programs, or all for an admin",
+            get(tokens::list),
+        )
+        .query::<ListQuery<String>>()
+        .gives::<ListPage<TokenSummary>>(),
         send("/v1/tokens", Viewer, "Makes a token for programs", post(tokens::make))
             .headers(CREATES)
             .takes::<NewToken>()
@@ -171,7 +176,10 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
         put("/v1/clips/policy", Admin, "Sets these rules", routing::put(clips::set_policy))
             .takes::<ClipPolicy>()
             .gives::<ClipPolicy>(),
+        read("/v1/clips/usage", Viewer, "What is stored of clips", get(clips::usage))
+            .gives::<ClipUsage>(),
         read("/v1/clips/{id}", Viewer, "A clip", get(clips::show)).gives::<FleetClip>(),
+        remove("/v1/clips/{id}", Deployer, "Removes a stored clip", delete(clips::remove)),
         read("/v1/clips/{id}/thumbnail", Viewer, "An image of a clip", get(clips::thumbnail))
             .gives_file("image/jpeg"),
         read("/v1/clips/{id}/file", Viewer, "The file of a clip", get(clips::file))

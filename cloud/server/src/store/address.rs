@@ -8,6 +8,8 @@ use gleaner_base::{Exit, Failure};
 use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
 use sqlx::{AnyPool, Connection};
 
+use crate::error::database_failure;
+
 /// Settings of each connection to SQLite. In the mode WAL, readers and the writer do not wait for
 /// each other; FULL makes each commit durable before it returns. Pages that change often are copied
 /// to the database once in 16 MB of changes.
@@ -17,6 +19,10 @@ const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
 
 /// Time that a query waits before the log has it.
 const ACQUIRE_SLOW: Duration = Duration::from_secs(20);
+
+/// Longest wait for a connection. A server that is down is tried again until then.
+const WAIT_SQLITE: Duration = Duration::from_secs(30);
+const WAIT_POSTGRES: Duration = Duration::from_secs(4);
 
 /// Beginning of a change in SQLite. A program beside this one, such as `invite`, writes too: a
 /// transaction that became a writer only later would fail instead of waiting for it.
@@ -77,13 +83,17 @@ impl StoreAddress {
         let (Self::Sqlite(url) | Self::Postgres(url)) = self;
         let failed = |error: sqlx::Error| {
             let help = match is_sqlite {
+                true if error.as_database_error().is_some() => return database_failure(&error),
                 true => "check that --data is a folder of this user on a disk with room",
                 false => "check --store, PGPASSWORD, and that the server runs",
             };
             Failure::caused_by(Exit::Internal, "cannot open the database", &error).with_help(help)
         };
         let options = AnyConnectOptions::from_str(url).map_err(failed)?;
+        // SQLite is never away, and its queries may have to wait for those of a whole fleet.
+        let wait = if is_sqlite { WAIT_SQLITE } else { WAIT_POSTGRES };
         let pool = AnyPoolOptions::new()
+            .acquire_timeout(wait)
             .max_connections(connections)
             // After a restart, the queries of a whole fleet wait.
             .acquire_slow_threshold(ACQUIRE_SLOW)

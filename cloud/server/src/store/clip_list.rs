@@ -99,6 +99,14 @@ impl CloudStore {
             }
             _ => {}
         }
+        let (is_revoked,): (i64,) = one!(&self.pool;
+            "SELECT is_revoked FROM vehicles WHERE name = $1"; id.vehicle());
+        if is_revoked != 0 {
+            return refused(
+                "its vehicle was cut off, and can send nothing",
+                "enrol the vehicle again, or choose another clip",
+            );
+        }
         let mut change = self.change().await?;
         let changed = run!(&mut *change.tx;
             "UPDATE clips SET is_requested = 1, failures = 0, state = 'vehicle',

@@ -54,14 +54,14 @@ pub(crate) struct ClipProgress {
 }
 
 /// Bytes of files.
-struct ClipUsage {
+struct UsedBytes {
     /// Those of a vehicle.
     own: u64,
     /// Those of all vehicles.
     all: u64,
 }
 
-impl ClipUsage {
+impl UsedBytes {
     /// Returns the reason why a further file of this length does not fit.
     fn excess(&self, bytes: u64, bounds: ClipBounds) -> Option<String> {
         let limits = [
@@ -160,13 +160,13 @@ impl CloudStore {
 
     /// Returns the bytes of the files of a vehicle, and of all, those that are announced of
     /// unfinished ones.
-    async fn clip_usage(&self, vehicle: &str) -> CloudResult<ClipUsage> {
+    async fn clip_usage(&self, vehicle: &str) -> CloudResult<UsedBytes> {
         let (own, all): (i64, i64) = one!(&self.pool;
             "SELECT (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips
                      WHERE vehicle = $1 AND parts > 0),
                     (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips WHERE parts > 0)";
             vehicle);
-        Ok(ClipUsage { own: unsigned(own), all: unsigned(all) })
+        Ok(UsedBytes { own: unsigned(own), all: unsigned(all) })
     }
 
     /// Returns the number of files of a vehicle that have not come in full yet.
@@ -298,12 +298,13 @@ impl CloudStore {
 
     /// Returns the rules for uploads.
     pub(crate) async fn clip_policy(&self) -> CloudResult<ClipPolicy> {
-        let (upload, day_bytes): (String, i64) =
-            one!(&self.pool; "SELECT upload, day_bytes FROM clip_policy");
+        let (upload, day_bytes, keep_s, keep_bytes): (String, i64, i64, i64) =
+            one!(&self.pool; "SELECT upload, day_bytes, keep_s, keep_bytes FROM clip_policy");
         let upload = upload.parse().map_err(|error: String| {
             CloudError::usage("the rules for clips are damaged", "set them again").because(error)
         })?;
-        Ok(ClipPolicy { upload, day_bytes: unsigned(day_bytes) })
+        let [day_bytes, keep_s, keep_bytes] = [day_bytes, keep_s, keep_bytes].map(unsigned);
+        Ok(ClipPolicy { upload, day_bytes, keep_s, keep_bytes })
     }
 
     /// Changes the rules for uploads; returns the vehicles to wake.
@@ -313,9 +314,14 @@ impl CloudStore {
         policy: &ClipPolicy,
     ) -> CloudResult<Vec<String>> {
         let mut change = self.change().await?;
-        run!(&mut *change.tx; "UPDATE clip_policy SET upload = $1, day_bytes = $2";
-            policy.upload.as_str(), int(policy.day_bytes));
-        let text = format!("{}, {} bytes a day", policy.upload.as_str(), policy.day_bytes);
+        let ClipPolicy { upload, day_bytes, keep_s, keep_bytes } = policy;
+        run!(&mut *change.tx;
+            "UPDATE clip_policy SET upload = $1, day_bytes = $2, keep_s = $3, keep_bytes = $4";
+            upload.as_str(), int(*day_bytes), int(*keep_s), int(*keep_bytes));
+        let mut text = format!("{}, {day_bytes} bytes a day", upload.as_str());
+        if *keep_s > 0 || *keep_bytes > 0 {
+            text += &format!(", keep {keep_s} s and {keep_bytes} bytes");
+        }
         change.note(actor, "set policy of clips", &text).await?;
         let vehicles: Vec<(String,)> = rows!(&mut *change.tx;
             "UPDATE vehicles SET generation = generation + 1 WHERE is_revoked = 0 AND epoch > 0
@@ -411,7 +417,7 @@ impl StoreChange<'_> {
     }
 }
 
-fn clip_id((name, vehicle): (String, String)) -> Option<ClipId> {
+pub(super) fn clip_id((name, vehicle): (String, String)) -> Option<ClipId> {
     ClipId::new(name.parse().ok()?, &vehicle).ok()
 }
 

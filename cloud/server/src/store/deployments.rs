@@ -95,7 +95,7 @@ impl CloudStore {
         Ok((number, changed))
     }
 
-    /// Starts or stops a deployment.
+    /// Starts or stops a deployment. A start also reaches vehicles where it is quarantined.
     pub(crate) async fn set_wanted(
         &self,
         author: impl Into<ChangeAuthor<'_>>,
@@ -107,6 +107,14 @@ impl CloudStore {
         change.expect(author, id).await?;
         if is_wanted && change.newest(id).await?.is_some_and(|it| it.is_wanted == 0) {
             change.restart_wave(id).await?;
+        }
+        if is_wanted {
+            // As for a fallback: a number that is above all before.
+            run!(&mut *change.tx;
+                "UPDATE releases SET start_request =
+                 CASE WHEN start_request < $2 THEN $2 ELSE start_request + 1 END
+                 WHERE deployment = $1";
+                id, now_ms());
         }
         let sql = "UPDATE deployments SET is_wanted = $2 WHERE id = $1";
         let found = run!(&mut *change.tx; sql; id, i64::from(is_wanted)).rows_affected();

@@ -35,6 +35,7 @@ macro_rules! rows {
 mod address;
 mod audit;
 mod awaited;
+mod cleaning;
 mod clip_list;
 mod clips;
 mod deployments;
@@ -65,6 +66,7 @@ use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
 
 pub(crate) use address::StoreAddress;
+pub(crate) use cleaning::RemovedClip;
 pub(crate) use clip_list::ClipQuery;
 pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
@@ -85,6 +87,7 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0004_page.sql"),
     include_str!("../../migrations/0006_replicas.sql"),
     include_str!("../../migrations/0007_requests.sql"),
+    include_str!("../../migrations/0008_cleaning.sql"),
     include_str!("../../migrations/0009_tokens.sql"),
 ];
 

@@ -404,3 +404,54 @@ fn the_same_tests_pass_on_postgresql() {
         &[],
     );
 }
+
+#[tokio::test]
+async fn a_revision_without_a_release_is_removed_after_its_grace() {
+    let (_folder, store) = store().await;
+    let next = OfferedDeployment {
+        revision: "next".to_owned(),
+        fallback: Some("r".to_owned()),
+        revisions: [("next".to_owned(), "b".to_owned()), ("r".to_owned(), "a".to_owned())].into(),
+        ..offered("brake", 2, "test")
+    };
+    store.deploy("ann", &next).await.unwrap();
+    assert_eq!(store.collect_revisions(0).await.unwrap(), 0);
+    // The former revision was its fallback only.
+    store.deploy("ann", &OfferedDeployment { fallback: None, release: 3, ..next }).await.unwrap();
+    assert_eq!(store.collect_revisions(3600).await.unwrap(), 0, "it may be needed again");
+    assert_eq!(store.collect_revisions(0).await.unwrap(), 1);
+    assert!(store.revision("next").await.unwrap().is_some());
+    assert!(store.revision("r").await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn each_start_is_a_request_of_its_own() {
+    let (_folder, store) = store().await;
+    connected(&store, "car-7").await;
+    let offered = OfferedDeployment { selector: [].into(), ..offered("brake", 1, "test") };
+    store.deploy("ann", &offered).await.unwrap();
+    let request = async || store.wants("car-7").await.unwrap().deployments[0].start;
+    assert_eq!(request().await, 0);
+    assert_eq!(store.set_wanted("ann", "brake", true).await.unwrap(), ["car-7"]);
+    let first = request().await;
+    assert_eq!(store.set_wanted("ann", "brake", true).await.unwrap(), ["car-7"]);
+    assert!(first > 0 && request().await > first);
+}
+
+#[tokio::test]
+async fn a_damaged_database_is_named_with_the_way_out() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("cloud.db");
+    std::fs::write(&path, vec![b'x'; 8192]).unwrap();
+    let opened = CloudStore::open(&StoreAddress::file(&path)).await;
+    let failure = opened.err().unwrap().to_string();
+    assert!(failure.contains("`cloud.db` in the data folder, is damaged"), "{failure}");
+    assert!(failure.contains("gleaner-cloud backup"), "{failure}");
+}
+
+#[test]
+fn a_database_that_is_away_is_no_fault_of_the_cloud() {
+    let away = CloudError::from(sqlx::Error::PoolTimedOut);
+    assert_eq!(away.status().as_u16(), 503);
+    assert!(away.reason().starts_with("the database cannot be reached"), "{}", away.reason());
+}

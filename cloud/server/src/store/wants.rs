@@ -157,14 +157,15 @@ impl StoreChange<'_> {
 impl FleetWishes {
     /// Loads the releases.
     async fn load(tx: &mut sqlx::Transaction<'static, sqlx::Any>) -> CloudResult<Self> {
-        type Row = (String, i64, String, String, i64, i64, String);
+        type Row = (String, i64, String, String, i64, i64, i64, String);
         let rows: Vec<Row> = rows!(&mut **tx;
-            "SELECT id, number, sha256, selector, is_wanted, rollback_request, state
+            "SELECT id, number, sha256, selector, is_wanted, rollback_request, start_request, state
              FROM releases JOIN deployments ON deployments.id = releases.deployment
              ORDER BY id, number DESC");
-        let release = |(id, number, envelope, selector, is_wanted, rollback, state): Row| {
-            let (is_wanted, rollback) = (is_wanted != 0, unsigned(rollback));
-            let wanted = Wanted { id, envelope, is_wanted, rollback };
+        let release = |(id, number, envelope, selector, is_wanted, rollback, start, state): Row| {
+            let (is_wanted, rollback, start) =
+                (is_wanted != 0, unsigned(rollback), unsigned(start));
+            let wanted = Wanted { id, envelope, is_wanted, rollback, start };
             WishedRelease {
                 selector: map(&selector),
                 number,

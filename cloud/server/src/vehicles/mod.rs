@@ -7,7 +7,7 @@
 //! | `GET /v1/link` | the control channel, a WebSocket |
 //! | `GET /v1/deployments/SHA256` | the envelope of a deployment |
 //! | `GET /v1/revisions/DIGEST` | the envelope of a revision |
-//! | `GET /v1/objects/SHA256` | a file of a revision |
+//! | `GET /v1/objects/SHA256` | a file of a revision, or the end of it by `Range` |
 //! | `POST /v1/clips`, `PUT /v1/clips/NAME/...` | what is wanted; see [`gleaner_fleet::clips`] |
 
 mod batch;
@@ -18,6 +18,7 @@ use std::sync::Arc;
 use axum::body::Bytes;
 use axum::extract::ws::WebSocketUpgrade;
 use axum::extract::{DefaultBodyLimit, Extension, Path, Request, State};
+use axum::http::{HeaderMap, header};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
@@ -27,9 +28,9 @@ use gleaner_fleet::{EnrolReply, EnrolRequest, FRAME_MAX, RenewRequest};
 use crate::accept::PeerConnection;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
-use crate::objects::octets;
 use crate::request::{digest, in_time, parsed};
 use crate::store::Issued;
+use crate::transfer::OCTETS;
 
 /// Maximum length of the body of a request.
 const BODY_MAX: usize = 64 << 10;
@@ -170,12 +171,13 @@ fn found(envelope: Option<String>, what: &str, digest: &str) -> CloudResult<Resp
         let help = "wait for the next wanted state: it was replaced or removed meanwhile";
         CloudError::missing(format!("there is no {what} {digest}"), help)
     };
-    Ok(([octets()], envelope.ok_or_else(missing)?).into_response())
+    Ok(([(header::CONTENT_TYPE, OCTETS)], envelope.ok_or_else(missing)?).into_response())
 }
 
 async fn object(
     State(cloud): State<Arc<Cloud>>,
     Path(sha256): Path<String>,
+    headers: HeaderMap,
 ) -> CloudResult<Response> {
-    cloud.objects.send(&digest(&sha256)?).await
+    cloud.objects.send(&digest(&sha256)?, &headers).await
 }

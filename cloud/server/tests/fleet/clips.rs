@@ -262,6 +262,7 @@ async fn hostile_uploads_are_refused_and_change_nothing() {
     assert_eq!(names(&admin, "?vehicle=bad").await.len(), 2);
     // Nothing comes from a vehicle that was cut off, also if its request came before.
     admin.call(Method::DELETE, "/v1/vehicles/good", Value::Null).await;
+    assert_eq!(pull(&admin, "a@good").await, StatusCode::BAD_REQUEST);
     assert_eq!(put(&good, "a", 0, b"content").await.0, StatusCode::UNAUTHORIZED);
     assert_eq!(report(&good, &[], json!([])).await.0, StatusCode::UNAUTHORIZED);
     server.stop().await;

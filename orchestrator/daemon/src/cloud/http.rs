@@ -1,6 +1,7 @@
 //! HTTPS to the cloud: one connection for each request. Requests are rare.
 
 use std::future::Future;
+use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -11,6 +12,7 @@ use gleaner_protocol::vehicle_api::Problem;
 use http_body_util::{BodyDataStream, Full};
 use hyper::body::Incoming;
 use hyper::client::conn::http1;
+use hyper::http::request;
 use hyper::{Method, Request, Response, StatusCode, header};
 use hyper_util::rt::TokioIo;
 use rustls::ClientConfig;
@@ -108,17 +110,32 @@ impl CloudHttp {
         self.whole(answer, most).await
     }
 
-    /// Returns the pieces of the content under a path. Each comes in time, or is an error.
+    /// Returns the pieces of the file of this length under a path, from its byte `from`, each of
+    /// which comes in time, or is an error; and whether they are the whole file instead.
     ///
     /// # Errors
     ///
-    /// A failure if there is none.
+    /// A failure if there is none, or it is another part of a file.
     pub(super) async fn pieces(
         &self,
         path: &str,
-    ) -> Result<impl Stream<Item = Result<Bytes, std::io::Error>> + Unpin + use<>, Failure> {
-        let answer = self.request(Method::GET, path, Vec::new()).await?;
-        Ok(Box::pin(in_time(answer)))
+        from: u64,
+        length: u64,
+    ) -> Result<(impl Stream<Item = io::Result<Bytes>> + Unpin + use<>, bool), Failure> {
+        let request = Request::get(path).header(header::HOST, &self.address);
+        let request = match from {
+            0 => request,
+            from => request.header(header::RANGE, format!("bytes={from}-")),
+        };
+        let answer = self.answered(PATIENCE, request, Vec::new()).await?;
+        let is_whole = answer.status() != StatusCode::PARTIAL_CONTENT;
+        let range = answer.headers().get(header::CONTENT_RANGE).map(|it| it.as_bytes());
+        let expected = format!("bytes {from}-{}/{length}", length.saturating_sub(1));
+        if !is_whole && range != Some(expected.as_bytes()) {
+            let error = io::Error::other(format!("it is not `{expected}`"));
+            return Err(self.unreachable("it sends another part of a file", &error));
+        }
+        Ok((Box::pin(in_time(answer)), is_whole))
     }
 
     async fn request(
@@ -137,16 +154,26 @@ impl CloudHttp {
         path: &str,
         body: Vec<u8>,
     ) -> Result<Response<Incoming>, Failure> {
+        let request = Request::builder()
+            .method(method)
+            .uri(path)
+            .header(header::HOST, &self.address)
+            .header(header::CONTENT_TYPE, "application/json");
+        self.answered(patience, request, body).await
+    }
+
+    async fn answered(
+        &self,
+        patience: Duration,
+        request: request::Builder,
+        body: Vec<u8>,
+    ) -> Result<Response<Incoming>, Failure> {
         let failed = |error: hyper::Error| self.unreachable("the connection was lost", &error);
         let stream = TokioIo::new(self.connect().await?);
         let (mut sender, connection) =
             self.in_time("it did not answer", http1::handshake(stream)).await?.map_err(failed)?;
         tokio::spawn(connection);
-        let request = Request::builder()
-            .method(method)
-            .uri(path)
-            .header(header::HOST, &self.address)
-            .header(header::CONTENT_TYPE, "application/json")
+        let request = request
             .body(Full::new(Bytes::from(body)))
             .map_err(|error| self.unreachable("a request to it is invalid", &error))?;
         let answer = timeout(patience, sender.send_request(request)).await;
@@ -183,7 +210,7 @@ impl CloudHttp {
             let piece = piece.map_err(|it| self.unreachable("the connection was lost", &it))?;
             whole.extend_from_slice(&piece);
             if whole.len() as u64 > most {
-                let long = std::io::Error::other(format!("it has more than {most} bytes"));
+                let long = io::Error::other(format!("it has more than {most} bytes"));
                 return Err(self.unreachable("its answer is too long", &long));
             }
         }
@@ -208,11 +235,11 @@ impl CloudHttp {
 }
 
 /// Returns the pieces of a body; one that does not come in time is an error.
-fn in_time(answer: Response<Incoming>) -> impl Stream<Item = Result<Bytes, std::io::Error>> {
-    let pieces = BodyDataStream::new(answer.into_body()).map_err(std::io::Error::other);
+fn in_time(answer: Response<Incoming>) -> impl Stream<Item = Result<Bytes, io::Error>> {
+    let pieces = BodyDataStream::new(answer.into_body()).map_err(io::Error::other);
     futures_util::stream::unfold(Box::pin(pieces), async |mut pieces| {
         let next = timeout(PATIENCE, pieces.next()).await;
-        let piece = next.unwrap_or_else(|late| Some(Err(std::io::Error::other(late))))?;
+        let piece = next.unwrap_or_else(|late| Some(Err(io::Error::other(late))))?;
         Some((piece, pieces))
     })
 }

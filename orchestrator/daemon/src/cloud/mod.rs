@@ -4,6 +4,7 @@
 //! - `http`: HTTPS to the cloud. `enrolling`: gets the first certificate, and later ones.
 //! - `link`: keeps a connection, and `session` exchanges frames over one.
 //! - `plan`: the steps from what runs to what the cloud wants; `reconcile` takes them.
+//! - `download`: fetches a file of a revision, and goes on where that was interrupted.
 //! - `uplink`: sends records that the cloud does not have, `resume` finds where to go on.
 //! - `clips`: announces clips, and sends those that the cloud wants; `clip_list` reads them.
 //!
@@ -12,6 +13,7 @@
 
 mod clip_list;
 mod clips;
+mod download;
 mod enrolling;
 mod http;
 mod link;

@@ -18,13 +18,15 @@ pub(super) enum Step {
     Stop(ItemName, CloudWish),
     /// Run its fallback.
     RollBack(ItemName, CloudWish),
+    /// Start it again, unless it runs.
+    Start(ItemName, CloudWish),
 }
 
 impl Step {
     /// The deployment that it changes.
     pub(super) fn id(&self) -> &ItemName {
         match self {
-            Step::Remove(id) | Step::Stop(id, _) | Step::RollBack(id, _) => id,
+            Step::Remove(id) | Step::Stop(id, _) | Step::RollBack(id, _) | Step::Start(id, _) => id,
             Step::Deploy { id, .. } => id,
         }
     }
@@ -44,15 +46,18 @@ pub(super) fn plan(
             ignored.push(format!("`{}` is no id of a deployment", gleaner_base::excerpt(&item.id)));
             continue;
         };
-        let Wanted { envelope, is_wanted, rollback, .. } = item.clone();
-        let wish = CloudWish { envelope, is_wanted, rollback };
+        let Wanted { envelope, is_wanted, rollback, start, .. } = item.clone();
+        let wish = CloudWish { envelope, is_wanted, rollback, start };
         let followed = deployed.get(&id).and_then(|it| it.cloud.as_ref());
         let same = followed.filter(|before| before.envelope == wish.envelope);
         let step = match (followed, same) {
             _ if followed == Some(&wish) => None,
             (_, Some(same)) if same.is_wanted && wish.is_wanted => {
-                let is_new = wish.rollback > same.rollback;
-                is_new.then(|| Step::RollBack(id.clone(), wish))
+                if wish.rollback > same.rollback {
+                    Some(Step::RollBack(id.clone(), wish))
+                } else {
+                    (wish.start > same.start).then(|| Step::Start(id.clone(), wish))
+                }
             }
             _ if wish.is_wanted => {
                 let rolls_back = wish.rollback > same.map_or(0, |same| same.rollback);
@@ -78,11 +83,11 @@ mod tests {
     use super::*;
 
     fn wanted(id: &str, envelope: &str, is_wanted: bool, rollback: u64) -> Wanted {
-        Wanted { id: id.to_owned(), envelope: envelope.to_owned(), is_wanted, rollback }
+        Wanted { id: id.to_owned(), envelope: envelope.to_owned(), is_wanted, rollback, start: 0 }
     }
 
     fn wish(envelope: &str, is_wanted: bool, rollback: u64) -> CloudWish {
-        CloudWish { envelope: envelope.to_owned(), is_wanted, rollback }
+        CloudWish { envelope: envelope.to_owned(), is_wanted, rollback, start: 0 }
     }
 
     fn deployed(cloud: Option<CloudWish>) -> Deployed {
@@ -131,6 +136,20 @@ mod tests {
         assert_eq!(steps(&[wanted("a", "1", true, 2)], &rolled), [again]);
         let new = Step::Deploy { id: id("a"), wish: wish("1", true, 1), rolls_back: true };
         assert_eq!(steps(&[wanted("a", "1", true, 1)], &[]), [new]);
+    }
+
+    #[test]
+    fn a_lambda_is_started_again_once_for_each_request() {
+        let request = |start| Wanted { start, ..wanted("a", "1", true, 0) };
+        let followed = |start| CloudWish { start, ..wish("1", true, 0) };
+        let started = |start| [("a", Some(followed(start)))];
+        assert_eq!(steps(&[request(5)], &started(5)), []);
+        let again = Step::Start(id("a"), followed(6));
+        assert_eq!(steps(&[request(6)], &started(5)), [again]);
+        assert_eq!(steps(&[request(4)], &started(5)), [], "of an older backup");
+        let both = Wanted { start: 6, rollback: 1, ..request(6) };
+        let rolled = CloudWish { rollback: 1, ..followed(6) };
+        assert_eq!(steps(&[both], &started(5)), [Step::RollBack(id("a"), rolled)]);
     }
 
     #[test]

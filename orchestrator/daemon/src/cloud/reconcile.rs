@@ -12,10 +12,10 @@ use gleaner_trust::{Deployment, Payload, Revision, sha256};
 use tokio::sync::{Mutex, watch};
 use tokio::time::sleep;
 
+use super::download::Download;
 use super::http::CloudHttp;
 use super::plan::{Step, plan};
 use crate::core::Core;
-use crate::objects;
 use crate::state::CloudWish;
 
 /// Pause before the steps that failed are taken again; it doubles up to the longest. A deployment
@@ -128,6 +128,15 @@ impl Reconciler {
                 .await
             }
             Step::RollBack(id, wish) => self.roll_back(id, wish).await,
+            Step::Start(id, wish) => {
+                self.blocking(move |core| {
+                    if !core.runs(&id) {
+                        core.set_wanted(id.as_str(), true, CLOUD)?;
+                    }
+                    core.note_wish(&id, &wish)
+                })
+                .await
+            }
             Step::Deploy { id, wish, rolls_back } => {
                 self.deploy(&id, &wish, http).await?;
                 if rolls_back { self.roll_back(id, wish).await } else { Ok(()) }
@@ -183,8 +192,9 @@ impl Reconciler {
                         let digest: Sha256 = object.sha256.parse().map_err(|error| {
                             Failure::caused_by(Exit::Internal, "a digest is invalid", &error)
                         })?;
-                        let pieces = http.pieces(&format!("/v1/objects/{digest}")).await?;
-                        objects::receive(&self.core, &digest, pieces).await?;
+                        let (length, target) =
+                            (self.core.expected(&digest)?, self.core.store.object(&digest));
+                        Download { http, sha256: &digest, length, target }.run().await?;
                     }
                 }
             }

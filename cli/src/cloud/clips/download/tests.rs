@@ -89,3 +89,31 @@ fn files_are_not_replaced_and_links_are_not_followed() {
     symlink(folder.path(), other.join("car-7")).unwrap();
     assert!(ClipTarget::of(&other, &clip).unwrap().fetch(&client).is_err());
 }
+
+#[test]
+fn a_download_waits_for_another_one_of_the_same_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let (clip, to) = (clip(), folder.path().to_owned());
+    fs::create_dir_all(to.join("car-7")).unwrap();
+    let part = to.join("car-7/a.mcap.part");
+    let mut other = locked(&part).unwrap();
+    let (client, _) = cloud("500 No", b"");
+    let waiting = std::thread::spawn({
+        let to = to.clone();
+        move || ClipTarget::of(&to, &clip).unwrap().fetch(&client).map_err(|it| it.to_string())
+    });
+    other.write_all(b"content").unwrap();
+    fs::rename(&part, to.join("car-7/a.mcap")).unwrap();
+    drop(other);
+    assert_eq!(waiting.join().unwrap().unwrap(), to.join("car-7/a.mcap"));
+    assert_eq!(fs::read_dir(to.join("car-7")).unwrap().count(), 1, "and leaves nothing");
+}
+
+#[test]
+fn a_vehicle_with_the_name_of_the_table_has_a_folder_beside_it() {
+    let mut clip = serde_json::to_value(clip()).unwrap();
+    clip["id"] = json!("a@events.jsonl");
+    let clip: FleetClip = serde_json::from_value(clip).unwrap();
+    let target = ClipTarget::of(Path::new("to"), &clip).unwrap();
+    assert_eq!(target.file, Path::new("to/events.jsonl~/a.mcap"));
+}

@@ -1,0 +1,160 @@
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+
+use gleaner_trust::sha256;
+use rcgen::{CertificateParams, KeyPair};
+use rustls::pki_types::{PrivateKeyDer, PrivatePkcs8KeyDer};
+use rustls::{ClientConfig, RootCertStore, ServerConfig};
+use tempfile::TempDir;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
+use tokio_rustls::TlsAcceptor;
+
+use super::*;
+
+const CONTENT: &[u8] = b"content";
+
+/// The answer to one request: its head and its body, after which the connection ends.
+type Answer = (&'static str, &'static str);
+
+/// A cloud that gives these answers, one after the other; the handle returns the requests.
+async fn cloud(answers: Vec<Answer>) -> (CloudHttp, JoinHandle<Vec<String>>) {
+    let key = KeyPair::generate().unwrap();
+    let params = CertificateParams::new(vec!["127.0.0.1".to_owned()]).unwrap();
+    let certificate = params.self_signed(&key).unwrap().der().clone();
+    let key = PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(key.serialize_der()));
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let server = ServerConfig::builder_with_provider(Arc::clone(&provider))
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .unwrap()
+        .with_no_client_auth()
+        .with_single_cert(vec![certificate.clone()], key)
+        .unwrap();
+    let mut roots = RootCertStore::empty();
+    roots.add(certificate).unwrap();
+    let tls = ClientConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .unwrap()
+        .with_root_certificates(roots)
+        .with_no_client_auth();
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let http =
+        CloudHttp { address: listener.local_addr().unwrap().to_string(), tls: Arc::new(tls) };
+    let acceptor = TlsAcceptor::from(Arc::new(server));
+    let served = tokio::spawn(async move {
+        let mut requests = Vec::new();
+        for (head, body) in answers {
+            let (stream, _) = listener.accept().await.unwrap();
+            let mut stream = acceptor.accept(stream).await.unwrap();
+            let mut request = Vec::new();
+            while !request.ends_with(b"\r\n\r\n") {
+                request.push(stream.read_u8().await.unwrap());
+            }
+            requests.push(String::from_utf8(request).unwrap());
+            let answer = format!("HTTP/1.1 {head}\r\n\r\n{body}");
+            // A vehicle that refuses it closes the connection.
+            let _ = stream.write_all(answer.as_bytes()).await;
+            let _ = stream.shutdown().await;
+        }
+        requests
+    });
+    (http, served)
+}
+
+/// Downloads `CONTENT`; returns the outcome, and the requests.
+async fn download(folder: &Path, answers: Vec<Answer>) -> (Result<(), Failure>, Vec<String>) {
+    let (http, served) = cloud(answers).await;
+    let sha256 = sha256(CONTENT);
+    let target = folder.join("object");
+    let download = Download { http: &http, sha256: &sha256, length: 7, target };
+    let done = download.run_with(Duration::from_millis(1)).await;
+    (done, served.await.unwrap())
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let entries = fs::read_dir(folder).unwrap();
+    entries.map(|it| it.unwrap().file_name().into_string().unwrap()).collect()
+}
+
+const WHOLE: &str = "200 OK\r\ncontent-length: 7";
+const REST: &str = "206 Partial Content\r\ncontent-length: 4\r\ncontent-range: bytes 3-6/7";
+
+#[tokio::test]
+async fn a_download_goes_on_where_it_broke_off_also_of_an_earlier_process() {
+    let folder = TempDir::new().unwrap();
+    let (done, requests) = download(folder.path(), vec![(WHOLE, "con"), (REST, "tent")]).await;
+    done.unwrap();
+    assert!(!requests[0].contains("range:"), "{}", requests[0]);
+    assert!(requests[1].contains("range: bytes=3-\r\n"), "{}", requests[1]);
+    assert_eq!(names(folder.path()), ["object"]);
+    assert_eq!(fs::read(folder.path().join("object")).unwrap(), CONTENT);
+
+    fs::remove_file(folder.path().join("object")).unwrap();
+    fs::write(folder.path().join("object.partial"), "con").unwrap();
+    download(folder.path(), vec![(REST, "tent")]).await.0.unwrap();
+    assert_eq!(fs::read(folder.path().join("object")).unwrap(), CONTENT);
+}
+
+#[tokio::test]
+async fn a_cloud_that_does_not_continue_sends_the_whole_file() {
+    let folder = TempDir::new().unwrap();
+    fs::write(folder.path().join("object.partial"), "con").unwrap();
+    download(folder.path(), vec![(WHOLE, "content")]).await.0.unwrap();
+    assert_eq!(fs::read(folder.path().join("object")).unwrap(), CONTENT);
+}
+
+#[tokio::test]
+async fn a_damaged_part_is_fetched_again_from_its_begin() {
+    let folder = TempDir::new().unwrap();
+    fs::write(folder.path().join("object.partial"), "xxx").unwrap();
+    download(folder.path(), vec![(REST, "tent"), (WHOLE, "content")]).await.0.unwrap();
+    assert_eq!(fs::read(folder.path().join("object")).unwrap(), CONTENT);
+    // One that is too long, such as after a power cut.
+    fs::write(folder.path().join("object.partial"), "content and more").unwrap();
+    let (done, requests) = download(folder.path(), vec![(WHOLE, "content")]).await;
+    assert!(done.is_ok() && !requests[0].contains("range:"));
+}
+
+#[tokio::test]
+async fn another_file_than_signed_is_refused_and_leaves_nothing() {
+    let chunked = "200 OK\r\ntransfer-encoding: chunked";
+    for (answers, expected) in [
+        (vec![(WHOLE, "contend")], "the SHA-256"),
+        (vec![(chunked, "9\r\ncontent a\r\n")], "it is longer than 7 bytes"),
+        (vec![(WHOLE, "con"), (REST, "tend"), (WHOLE, "contend")], "the SHA-256"),
+    ] {
+        let folder = TempDir::new().unwrap();
+        let (done, _) = download(folder.path(), answers).await;
+        let refused = done.unwrap_err();
+        assert_eq!(refused.exit, Exit::Denied);
+        assert!(refused.to_string().contains(expected), "{refused}");
+        assert_eq!(names(folder.path()), Vec::<String>::new());
+    }
+}
+
+#[tokio::test]
+async fn another_range_than_requested_is_refused() {
+    for head in [
+        "206 Partial Content\r\ncontent-length: 4\r\ncontent-range: bytes 2-6/7",
+        "206 Partial Content\r\ncontent-length: 4\r\ncontent-range: bytes 3-6/8",
+        "206 Partial Content\r\ncontent-length: 4",
+    ] {
+        let folder = TempDir::new().unwrap();
+        fs::write(folder.path().join("object.partial"), "con").unwrap();
+        let refused = download(folder.path(), vec![(head, "tent")]).await.0.unwrap_err();
+        assert!(refused.to_string().contains("another part"), "{refused}");
+        assert_eq!(names(folder.path()), ["object.partial"]);
+        assert_eq!(fs::read(folder.path().join("object.partial")).unwrap(), b"con");
+    }
+}
+
+#[tokio::test]
+async fn a_cloud_that_always_breaks_off_is_not_tried_for_ever() {
+    let folder = TempDir::new().unwrap();
+    let (done, requests) = download(folder.path(), vec![(WHOLE, ""); 5]).await;
+    let failure = done.unwrap_err();
+    assert_eq!((failure.exit, requests.len()), (Exit::Unreachable, 5));
+    assert_eq!(names(folder.path()), ["object.partial"], "the next attempt goes on there");
+}
