@@ -7,8 +7,8 @@ use std::sync::Arc;
 use sqlx::{AnyPool, AssertSqlSafe};
 use tokio::sync::{Mutex, mpsc, oneshot};
 
+use super::append::AppendWrite;
 use super::links::{ConnectWrite, ReportWrite};
-use super::records::AppendWrite;
 use super::{CloudStore, StoreChange, begin, in_list, parts};
 use crate::error::{CloudError, CloudResult};
 
