@@ -26,7 +26,7 @@ use tokio_rustls::server::TlsStream;
 const HANDSHAKES: usize = 256;
 /// Time to wait for a handshake, which is as long as vehicles wait.
 const HANDSHAKE_TURN: Duration = Duration::from_secs(30);
-/// Time after which a handshake, and then the wait for the first answer, goes on and does not count:
+/// Time after which a handshake, and then the wait for the first answer, does not count any more:
 /// those that stall keep no others out.
 const HANDSHAKE_COUNTS: Duration = Duration::from_secs(1);
 /// Time for a TLS handshake, and for the headers of a request.
@@ -120,8 +120,8 @@ struct Handshake {
 }
 
 impl Handshake {
-    /// Returns the stream, with the turn that `peer` then has; `None` if the other side is too slow,
-    /// or wrong.
+    /// Returns the stream, and gives its turn to `peer`; `None` if the other side is too slow, or
+    /// wrong.
     async fn done(self, stream: TcpStream, peer: &PeerConnection) -> Option<TlsStream<TcpStream>> {
         let turn = timeout(HANDSHAKE_TURN, self.turns.acquire_owned()).await.ok()?.ok()?;
         *peer.turn.lock().unwrap_or_else(PoisonError::into_inner) = Some(turn);

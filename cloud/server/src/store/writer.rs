@@ -12,9 +12,9 @@ use super::links::{ConnectWrite, ReportWrite};
 use super::{CloudStore, StoreChange, begin, in_list, parts};
 use crate::error::{CloudError, CloudResult};
 
-/// Maximum number of writes in a transaction, so that other changes have their turn. A commit takes
-/// about as long for many as for few, and bounds what a large fleet can send.
-const GROUP_MAX: usize = 1024;
+/// Maximum number of writes in a transaction, so that other changes have their turn. With 1,024,
+/// 10,000 vehicles stored no more in a second.
+const GROUP_MAX: usize = 256;
 
 /// A write of a vehicle.
 pub(super) trait VehicleWrite: Sized {
