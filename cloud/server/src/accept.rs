@@ -1,7 +1,7 @@
 //! Accepts connections, with TLS or without, within bounds of their number and of time.
 
 use std::net::IpAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use axum::Router;
@@ -19,12 +19,15 @@ use tokio::time::{sleep, timeout};
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
 
-/// Maximum number of TLS handshakes at a time. After a restart all vehicles come at once: with all
-/// of them in progress, each would take longer than its time, and none would end.
+/// Maximum number of connections that begin at a time, up to the answer to the first request. After
+/// a restart all vehicles come at once: with all of them in progress, each would take longer than
+/// its time, and none would end. Their buffers, between what lives as long as a connection, would
+/// also keep the heap at several times of what is in use.
 const HANDSHAKES: usize = 256;
 /// Time to wait for a handshake, which is as long as vehicles wait.
 const HANDSHAKE_TURN: Duration = Duration::from_secs(30);
-/// Time after which one that goes on does not count: those that stall keep no others out.
+/// Time after which a handshake, and then the wait for the first answer, does not count any more:
+/// those that stall keep no others out.
 const HANDSHAKE_COUNTS: Duration = Duration::from_secs(1);
 /// Time for a TLS handshake, and for the headers of a request.
 const HANDSHAKE: Duration = Duration::from_secs(10);
@@ -38,13 +41,20 @@ pub(crate) struct PeerConnection {
     pub(crate) address: IpAddr,
     /// SHA-256 of its certificate, which the authority of vehicles has signed.
     pub(crate) certificate: Option<String>,
+    /// Its turn to begin, until its first answer.
+    turn: Mutex<Option<OwnedSemaphorePermit>>,
     _slot: OwnedSemaphorePermit,
 }
 
 impl PeerConnection {
+    /// Lets another connection begin.
+    fn end_turn(&self) {
+        drop(self.turn.lock().unwrap_or_else(PoisonError::into_inner).take());
+    }
+
     #[cfg(test)]
     pub(crate) fn of_test(address: IpAddr, slot: OwnedSemaphorePermit) -> Self {
-        Self { address, certificate: None, _slot: slot }
+        Self { address, certificate: None, turn: Mutex::default(), _slot: slot }
     }
 }
 
@@ -92,7 +102,8 @@ impl Entrance {
                 acceptor: TlsAcceptor::from(Arc::clone(&tls.borrow())),
                 turns: Arc::clone(&handshakes),
             });
-            let peer = PeerConnection { address: address.ip(), certificate: None, _slot: slot };
+            let (address, certificate, turn) = (address.ip(), None, Mutex::default());
+            let peer = PeerConnection { address, certificate, turn, _slot: slot };
             tokio::spawn(connection(stream, tls, peer, router.clone(), stopping.clone()));
         }
         drop(listener);
@@ -109,15 +120,17 @@ struct Handshake {
 }
 
 impl Handshake {
-    /// Returns the stream; `None` if the other side is too slow, or wrong.
-    async fn done(self, stream: TcpStream) -> Option<TlsStream<TcpStream>> {
-        let turn = timeout(HANDSHAKE_TURN, self.turns.acquire()).await.ok()?;
+    /// Returns the stream, and gives its turn to `peer`; `None` if the other side is too slow, or
+    /// wrong.
+    async fn done(self, stream: TcpStream, peer: &PeerConnection) -> Option<TlsStream<TcpStream>> {
+        let turn = timeout(HANDSHAKE_TURN, self.turns.acquire_owned()).await.ok()?.ok()?;
+        *peer.turn.lock().unwrap_or_else(PoisonError::into_inner) = Some(turn);
         let handshake = timeout(HANDSHAKE, self.acceptor.accept(stream));
         tokio::pin!(handshake);
         let accepted = match timeout(HANDSHAKE_COUNTS, handshake.as_mut()).await {
             Ok(accepted) => accepted,
             Err(_) => {
-                drop(turn);
+                peer.end_turn();
                 handshake.await
             }
         };
@@ -137,7 +150,7 @@ async fn connection(
         return requests(stream, peer, router, stop).await;
     };
     // In a box, as a connection that waits or is upgraded does not need the room.
-    let Some(stream) = Box::pin(tls.done(stream)).await else {
+    let Some(stream) = Box::pin(tls.done(stream, &peer)).await else {
         tracing::debug!(address = %peer.address, "a TLS handshake failed");
         return;
     };
@@ -154,9 +167,15 @@ async fn requests(
     mut stop: watch::Receiver<bool>,
 ) {
     let (peer, router) = (Arc::new(peer), TowerToHyperService::new(router));
+    let beginning = Arc::clone(&peer);
     let service = service_fn(move |mut request: Request<Incoming>| {
         request.extensions_mut().insert(Arc::clone(&peer));
-        router.call(request)
+        let (answer, peer) = (router.call(request), Arc::clone(&peer));
+        async move {
+            let answer = answer.await;
+            peer.end_turn();
+            answer
+        }
     });
     let connection = http1::Builder::new()
         .timer(TokioTimer::new())
@@ -165,6 +184,11 @@ async fn requests(
         .with_upgrades();
     tokio::pin!(connection);
     // Errors are the ends of connections by their other sides.
+    if timeout(HANDSHAKE_COUNTS, connection.as_mut()).await.is_ok() {
+        return;
+    }
+    beginning.end_turn();
+    drop(beginning);
     tokio::select! {
         _ = connection.as_mut() => return,
         _ = stop.wait_for(|is_stopping| *is_stopping) => connection.as_mut().graceful_shutdown(),

@@ -33,6 +33,7 @@ macro_rules! rows {
 }
 
 mod address;
+mod append;
 mod audit;
 mod awaited;
 mod cleaning;

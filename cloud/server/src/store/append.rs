@@ -1,0 +1,443 @@
+//! Records that vehicles send, those of many vehicles by few statements.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use gleaner_fleet::{Ack, Cursor};
+use sqlx::AssertSqlSafe;
+
+use super::records::{Retention, StreamBatch};
+use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
+use super::{CloudStore, StoreChange, in_list, int, parts, placeholders, unsigned};
+use crate::error::{CloudError, CloudResult};
+
+/// Maximum number of streams of a vehicle: two, and one for each lambda that it ever had.
+const STREAMS_MAX: i64 = 1000;
+/// A stream that grows across a multiple of this, in bytes, is a reason to add up all streams of
+/// its vehicle.
+const SUM_STEP: i64 = 64 << 10;
+/// Number of the oldest records that are looked at in one step of making room.
+const STEP: i64 = 1000;
+
+/// A batch to store, if the connection still counts.
+pub(super) struct AppendWrite {
+    name: String,
+    epoch: u64,
+    batch: StreamBatch,
+    retention: Retention,
+}
+
+/// What is stored of the streams of a group, by vehicle.
+#[derive(Default)]
+struct StoredStreams(HashMap<String, VehicleStreams>);
+
+#[derive(Default)]
+struct VehicleStreams {
+    known: HashMap<String, StoredStream>,
+    /// Number of all streams, if one of the group is new.
+    count: i64,
+}
+
+/// Position and size of a stream.
+struct StoredStream {
+    cursor: Cursor,
+    kept: i64,
+    kept_bytes: i64,
+}
+
+impl VehicleWrite for AppendWrite {
+    type Done = Ack;
+
+    fn vehicle(&self) -> &str {
+        &self.name
+    }
+
+    fn waiting(write: Waiting<Self>) -> WaitingWrite {
+        WaitingWrite::Append(write)
+    }
+}
+
+/// A line to insert.
+struct NewLine<'a> {
+    vehicle: &'a str,
+    stream: &'a str,
+    life: u64,
+    arrival: i64,
+    line: &'a (u64, String, String),
+}
+
+/// Vehicle and name of a stream.
+type StreamKey<'a> = (&'a str, &'a str);
+
+impl CloudStore {
+    /// Stores records and the position after them, if the connection still counts. Records that
+    /// are stored already are skipped.
+    pub(crate) async fn append(
+        &self,
+        name: &str,
+        epoch: u64,
+        batch: StreamBatch,
+        retention: Retention,
+    ) -> CloudResult<Ack> {
+        self.write(AppendWrite { name: name.to_owned(), epoch, batch, retention }).await
+    }
+}
+
+impl StoredStreams {
+    fn get(&self, (vehicle, stream): StreamKey<'_>) -> Option<&StoredStream> {
+        self.0.get(vehicle)?.known.get(stream)
+    }
+
+    fn get_mut(&mut self, (vehicle, stream): StreamKey<'_>) -> Option<&mut StoredStream> {
+        self.0.get_mut(vehicle)?.known.get_mut(stream)
+    }
+
+    /// Returns the bytes that are kept of each of these streams.
+    fn kept_bytes(&self, keys: &BTreeMap<StreamKey<'_>, Retention>) -> Vec<i64> {
+        keys.keys().map(|key| self.get(*key).map_or(0, |stored| stored.kept_bytes)).collect()
+    }
+
+    /// Returns a stream that gets records of a life; the position of an earlier one does not count.
+    ///
+    /// # Errors
+    ///
+    /// An error if the life has ended, or the vehicle has too many streams.
+    fn begin(&mut self, vehicle: &str, stream: &str, life: u64) -> CloudResult<&mut StoredStream> {
+        let VehicleStreams { known, count } = self.0.entry(vehicle.to_owned()).or_default();
+        let is_new = !known.contains_key(stream);
+        if is_new && *count >= STREAMS_MAX {
+            let message = format!("the vehicle has {count} streams; no more are stored");
+            return Err(CloudError::usage(message, "deploy under ids that were used before"));
+        }
+        *count += i64::from(is_new);
+        let stored = known.entry(stream.to_owned()).or_insert_with(|| {
+            let cursor = Cursor { stream: stream.to_owned(), life, ..Cursor::default() };
+            StoredStream { cursor, kept: 0, kept_bytes: 0 }
+        });
+        if stored.cursor.life > life {
+            let message =
+                format!("stream `{stream}` has life {}; this is {life}", stored.cursor.life);
+            return Err(CloudError::usage(message, "begin the next life of the stream"));
+        }
+        if stored.cursor.life < life {
+            (stored.cursor.life, stored.cursor.next) = (life, 0);
+        }
+        Ok(stored)
+    }
+}
+
+/// Returns the position of a stream after a batch that ends at `next`.
+fn moved(stored: Cursor, next: &Cursor) -> Cursor {
+    if next.next <= stored.next {
+        return stored;
+    }
+    // A batch of nothing but gaps leaves the last record as it was.
+    match next.boot.is_empty() {
+        true => Cursor { life: next.life, next: next.next, ..stored },
+        false => next.clone(),
+    }
+}
+
+impl StoreChange<'_> {
+    /// Returns the positions of all streams of these vehicles.
+    pub(super) async fn cursors_of(
+        &mut self,
+        vehicles: &[&String],
+    ) -> CloudResult<HashMap<String, Vec<Cursor>>> {
+        let mut cursors = HashMap::<_, Vec<_>>::new();
+        for part in parts(vehicles) {
+            let sql = format!(
+                "SELECT vehicle, stream, life, next, seq, boot, boot_ns FROM streams
+                 WHERE vehicle IN ({}) ORDER BY stream",
+                in_list(part.len())
+            );
+            let query = sqlx::query_as(AssertSqlSafe(sql));
+            let query = part.iter().fold(query, |query, name| query.bind(*name));
+            let rows: Vec<(String, String, i64, i64, i64, String, i64)> =
+                query.fetch_all(&mut *self.tx).await?;
+            for (vehicle, stream, life, next, seq, boot, boot_ns) in rows {
+                cursors.entry(vehicle).or_default().push(Cursor {
+                    stream,
+                    life: unsigned(life),
+                    next: unsigned(next),
+                    seq: unsigned(seq),
+                    boot,
+                    boot_ns: unsigned(boot_ns),
+                });
+            }
+        }
+        Ok(cursors)
+    }
+
+    /// Stores batches of connections that still count.
+    pub(super) async fn append_all(
+        &mut self,
+        vehicles: &mut GroupVehicles,
+        appends: &mut [&mut Waiting<AppendWrite>],
+    ) -> CloudResult<()> {
+        let keys = appends.iter().map(|it| (&*it.write.name, &*it.write.batch.cursor.stream));
+        let mut streams = self.streams_of(&keys.collect::<Vec<_>>()).await?;
+        let (mut lines, mut grown) = (Vec::new(), BTreeMap::new());
+        for waiting in appends.iter_mut() {
+            let AppendWrite { name, epoch, batch, retention } = &waiting.write;
+            let Cursor { stream, life, next, .. } = &batch.cursor;
+            let checked = counting(vehicles, name, int(*epoch))
+                .and_then(|vehicle| Ok((vehicle, streams.begin(name, stream, *life)?)));
+            let (vehicle, stored) = match checked {
+                Ok(checked) => checked,
+                Err(error) => {
+                    waiting.result = Some(Err(error));
+                    continue;
+                }
+            };
+            let known = stored.cursor.next;
+            // Those before the position were stored, and may have made room since.
+            let is_new = |seq: u64, mark: &str| !mark.is_empty() || seq >= known;
+            for line in &batch.lines {
+                vehicle.arrived += 1;
+                if is_new(line.0, &line.1) {
+                    let (life, arrival) = (*life, vehicle.arrived);
+                    lines.push(NewLine { vehicle: name, stream, life, arrival, line });
+                }
+            }
+            stored.cursor = moved(std::mem::take(&mut stored.cursor), &batch.cursor);
+            grown.insert((&**name, &**stream), *retention);
+            let ack = Ack { stream: stream.clone(), life: *life, next: known.max(*next) };
+            waiting.result = Some(Ok(ack));
+        }
+        let before = streams.kept_bytes(&grown);
+        self.insert_lines(&lines, &mut streams).await?;
+        let arrived: BTreeSet<_> = grown.keys().map(|(vehicle, _)| *vehicle).collect();
+        let arrived = arrived.into_iter().filter_map(|name| Some((name, vehicles.get(name)?)));
+        for part in parts(&arrived.collect::<Vec<_>>()) {
+            let sql = format!(
+                "INSERT INTO vehicles (name, arrived) VALUES {}
+                 ON CONFLICT (name) DO UPDATE SET arrived = excluded.arrived",
+                placeholders(part.len(), 2)
+            );
+            let query = sqlx::query(AssertSqlSafe(sql));
+            let query = part
+                .iter()
+                .fold(query, |query, (name, vehicle)| query.bind(*name).bind(vehicle.arrived));
+            query.execute(&mut *self.tx).await?;
+        }
+        self.set_streams(&grown.keys().copied().collect::<Vec<_>>(), &streams).await?;
+        self.make_room_where_due(&grown, &streams, &before).await
+    }
+
+    /// Returns what is stored of these streams.
+    async fn streams_of(&mut self, keys: &[StreamKey<'_>]) -> CloudResult<StoredStreams> {
+        let mut streams = StoredStreams::default();
+        for part in parts(keys) {
+            let sql = format!(
+                "SELECT vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes
+                 FROM streams WHERE (vehicle, stream) IN (VALUES {})",
+                placeholders(part.len(), 2)
+            );
+            type Row = (String, String, i64, i64, i64, String, i64, i64, i64);
+            let query = sqlx::query_as::<_, Row>(AssertSqlSafe(sql));
+            let query =
+                part.iter().fold(query, |query, (name, stream)| query.bind(*name).bind(*stream));
+            let rows = query.fetch_all(&mut *self.tx).await?;
+            for (vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes) in rows {
+                let cursor = Cursor {
+                    stream: stream.clone(),
+                    life: unsigned(life),
+                    next: unsigned(next),
+                    seq: unsigned(seq),
+                    boot,
+                    boot_ns: unsigned(boot_ns),
+                };
+                let stored = StoredStream { cursor, kept, kept_bytes };
+                streams.0.entry(vehicle).or_default().known.insert(stream, stored);
+            }
+        }
+        // Vehicles with a stream that is new.
+        let mut names: Vec<_> = keys
+            .iter()
+            .filter(|(vehicle, stream)| streams.get((vehicle, stream)).is_none())
+            .map(|(vehicle, _)| *vehicle)
+            .collect();
+        names.sort_unstable();
+        names.dedup();
+        for part in parts(&names) {
+            let sql = format!(
+                "SELECT vehicle, COUNT(*) FROM streams WHERE vehicle IN ({}) GROUP BY vehicle",
+                in_list(part.len())
+            );
+            let query = sqlx::query_as::<_, (String, i64)>(AssertSqlSafe(sql));
+            let query = part.iter().fold(query, |query, name| query.bind(*name));
+            for (vehicle, count) in query.fetch_all(&mut *self.tx).await? {
+                streams.0.entry(vehicle).or_default().count = count;
+            }
+        }
+        Ok(streams)
+    }
+
+    /// Inserts lines with their arrivals, and adds those that were not there already to their
+    /// streams.
+    async fn insert_lines(
+        &mut self,
+        lines: &[NewLine<'_>],
+        streams: &mut StoredStreams,
+    ) -> CloudResult<()> {
+        for part in parts(lines) {
+            let sql = format!(
+                "INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
+                 VALUES {} ON CONFLICT (vehicle, stream, life, seq, mark) DO NOTHING
+                 RETURNING vehicle, stream, bytes",
+                placeholders(part.len(), 8)
+            );
+            let mut query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql));
+            for NewLine { vehicle, stream, life, arrival, line: (seq, mark, line) } in part {
+                query = query
+                    .bind(*vehicle)
+                    .bind(*stream)
+                    .bind(int(*life))
+                    .bind(int(*seq))
+                    .bind(mark)
+                    .bind(*arrival)
+                    .bind(line)
+                    .bind(int(line.len() as u64));
+            }
+            for (vehicle, stream, bytes) in query.fetch_all(&mut *self.tx).await? {
+                if let Some(stored) = streams.get_mut((&vehicle, &stream)) {
+                    stored.kept += 1;
+                    stored.kept_bytes += bytes;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Stores the positions of streams, and what is kept of them.
+    async fn set_streams(
+        &mut self,
+        keys: &[StreamKey<'_>],
+        streams: &StoredStreams,
+    ) -> CloudResult<()> {
+        for part in parts(keys) {
+            let sql = format!(
+                "INSERT INTO streams
+                 (vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes)
+                 VALUES {} ON CONFLICT (vehicle, stream) DO UPDATE SET life = excluded.life,
+                 next = excluded.next, seq = excluded.seq, boot = excluded.boot,
+                 boot_ns = excluded.boot_ns, kept = excluded.kept,
+                 kept_bytes = excluded.kept_bytes",
+                placeholders(part.len(), 9)
+            );
+            let mut query = sqlx::query(AssertSqlSafe(sql));
+            for key in part {
+                let Some(StoredStream { cursor, kept, kept_bytes }) = streams.get(*key) else {
+                    continue;
+                };
+                query = query
+                    .bind(key.0)
+                    .bind(key.1)
+                    .bind(int(cursor.life))
+                    .bind(int(cursor.next))
+                    .bind(int(cursor.seq))
+                    .bind(&cursor.boot)
+                    .bind(int(cursor.boot_ns))
+                    .bind(*kept)
+                    .bind(*kept_bytes);
+            }
+            query.execute(&mut *self.tx).await?;
+        }
+        Ok(())
+    }
+
+    /// Removes the oldest records of streams, and of vehicles, that have too many. `before` are the
+    /// bytes of each stream so far.
+    async fn make_room_where_due(
+        &mut self,
+        grown: &BTreeMap<StreamKey<'_>, Retention>,
+        streams: &StoredStreams,
+        before: &[i64],
+    ) -> CloudResult<()> {
+        let mut to_sum = BTreeMap::new();
+        for ((key, retention), before) in grown.iter().zip(before) {
+            let Some(stored) = streams.get(*key) else { continue };
+            let records = stored.kept - int(retention.records);
+            let bytes = stored.kept_bytes - int(retention.bytes);
+            self.make_room(key.0, key.1, (records, bytes)).await?;
+            if *before == 0 || stored.kept_bytes / SUM_STEP > before / SUM_STEP {
+                to_sum.insert(key.0, int(retention.vehicle_bytes));
+            }
+        }
+        let names: Vec<_> = to_sum.keys().copied().collect();
+        for part in parts(&names) {
+            let sql = format!(
+                "SELECT vehicle, CAST(SUM(kept_bytes) AS BIGINT) FROM streams
+                 WHERE vehicle IN ({}) GROUP BY vehicle",
+                in_list(part.len())
+            );
+            let query = sqlx::query_as::<_, (String, i64)>(AssertSqlSafe(sql));
+            let query = part.iter().fold(query, |query, name| query.bind(*name));
+            for (vehicle, bytes) in query.fetch_all(&mut *self.tx).await? {
+                let most = to_sum.get(&*vehicle).copied().unwrap_or(i64::MAX);
+                if bytes > most {
+                    self.make_room_of_all(&vehicle, most).await?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Removes records of the largest streams of a vehicle while all have more than `most` bytes.
+    async fn make_room_of_all(&mut self, name: &str, most: i64) -> CloudResult<()> {
+        // Each step removes the excess, or all of a stream.
+        for _ in 0..STREAMS_MAX {
+            let streams: Vec<(String, i64)> = rows!(&mut *self.tx;
+                "SELECT stream, kept_bytes FROM streams WHERE vehicle = $1
+                 ORDER BY kept_bytes DESC";
+                name);
+            let excess = streams.iter().map(|(_, bytes)| bytes).sum::<i64>() - most;
+            let Some((stream, bytes)) = streams.first() else { break };
+            if excess <= 0 {
+                break;
+            }
+            self.make_room(name, stream, (0, excess.min(*bytes))).await?;
+        }
+        Ok(())
+    }
+
+    /// Removes the oldest of a stream, as many records and bytes as are too many, and counts them.
+    async fn make_room(
+        &mut self,
+        name: &str,
+        stream: &str,
+        (mut records, mut bytes): (i64, i64),
+    ) -> CloudResult<()> {
+        loop {
+            if records <= 0 && bytes <= 0 {
+                return Ok(());
+            }
+            let oldest: Vec<(i64, i64, i64)> = rows!(&mut *self.tx;
+                "SELECT arrival, seq, bytes FROM records WHERE vehicle = $1 AND stream = $2
+                 ORDER BY arrival LIMIT $3";
+                name, stream, STEP);
+            let (mut removed, mut removed_bytes, mut last) = (0, 0, (0, 0));
+            for (arrival, seq, length) in oldest {
+                if records <= 0 && bytes <= 0 {
+                    break;
+                }
+                records -= 1;
+                bytes -= length;
+                removed += 1;
+                removed_bytes += length;
+                last = (arrival, seq);
+            }
+            if removed == 0 {
+                return Ok(());
+            }
+            run!(&mut *self.tx;
+                "DELETE FROM records WHERE vehicle = $1 AND stream = $2 AND arrival <= $3";
+                name, stream, last.0);
+            run!(&mut *self.tx;
+                "UPDATE streams SET kept = kept - $3, kept_bytes = kept_bytes - $4,
+                 removed = removed + $3, removed_to = $5
+                 WHERE vehicle = $1 AND stream = $2";
+                name, stream, removed, removed_bytes, last.1);
+        }
+    }
+}
