@@ -199,7 +199,8 @@ fn balancer(people: SocketAddr, vehicles: SocketAddr, listeners: &[SocketAddr]) 
     let mut text = "global\n  maxconn 8000\ndefaults\n  mode tcp\n  balance leastconn\n  \
                     option redispatch\n  retries 3\n  timeout connect 2s\n  timeout client 1h\n  \
                     timeout server 1h\n  timeout check 2s\n  \
-                    default-server check inter 500ms fall 2 rise 1 on-marked-down shutdown-sessions\n"
+                    default-server check inter 500ms fall 2 rise 1 on-marked-down \
+                    shutdown-sessions\n"
         .to_owned();
     for (index, (name, address)) in [("people", people), ("vehicles", vehicles)].iter().enumerate()
     {
