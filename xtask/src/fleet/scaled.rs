@@ -44,7 +44,13 @@ struct FleetFolder(PathBuf);
 
 impl Drop for FleetFolder {
     fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
+        // The last processes of PostgreSQL end, and write, after it was killed.
+        for _ in 0..50 {
+            if fs::remove_dir_all(&self.0).is_ok() || !self.0.exists() {
+                return;
+            }
+            sleep(Duration::from_millis(100));
+        }
     }
 }
 
