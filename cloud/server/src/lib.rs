@@ -1,16 +1,16 @@
 //! The cloud of a fleet: vehicles connect to it, and people deploy by it.
 //!
-//! `store` is the database and `objects` has the files, in a `place`: a folder, or a bucket of `s3`.
-//! Together with the certificates of `authority` they are all that survives a restart. `accept` accepts connections for both
-//! listeners: `people` and `page` answer requests of people, and `vehicles` those of vehicles, each
-//! of which keeps one connection open. `hub` knows these connections, and wakes them after a
-//! change.
+//! `store` is the database and `objects` has the files, in a `place`: a folder, or a bucket (`s3`).
+//! Together with the certificates of `authority` they are all that survives a restart. `accept`
+//! accepts connections for both listeners: `people` and `page` answer requests of people, and
+//! `vehicles` those of vehicles, each of which keeps one connection open. `hub` has these
+//! connections, and wakes them after a change.
 //! `clips` has recorded clips of vehicles, with a place of its own. `transfer` receives files and
 //! sends them.
 //!
 //! One process with a database in its folder is a cloud, and so are several over one PostgreSQL
-//! database and one bucket: `replicas` follows what the others have changed, and `bus` tells them to
-//! look.
+//! database and one bucket: `replicas` follows what the others have changed, and `bus` carries
+//! hints that something has.
 //!
 //! Nothing here runs a lambda, or decides what a vehicle runs: each vehicle verifies signatures by
 //! its own trust root.

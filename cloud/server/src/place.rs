@@ -27,8 +27,8 @@ pub(crate) struct FilePlace {
 }
 
 impl FilePlace {
-    /// Opens a folder, and removes what an earlier process has left unfinished there. With a bucket,
-    /// files are kept in it, under names that begin with `start`.
+    /// Opens a folder, and removes what an earlier process has left unfinished there. With a
+    /// bucket, files are kept in it, under names that begin with `start`.
     ///
     /// # Errors
     ///

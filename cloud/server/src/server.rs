@@ -44,8 +44,8 @@ pub struct ServeOptions {
     pub store: Option<String>,
     /// URL of a NATS server by which replicas wake each other.
     pub bus: Option<String>,
-    /// Place of files that replicas share, `s3://BUCKET/PREFIX`; without one, they are in the folder
-    /// and this process is the only one.
+    /// Place of files that replicas share, `s3://BUCKET/PREFIX`; without one, they are in the
+    /// folder and this process is the only one.
     pub objects: Option<String>,
     /// Address of the API for people.
     pub people: SocketAddr,

@@ -1,5 +1,5 @@
-//! `cargo xtask fleet`: the cloud in its scaled form on this machine: three replicas over PostgreSQL,
-//! NATS and an object store, behind a TCP balancer.
+//! `cargo xtask fleet`: the cloud in its scaled form on this machine: three replicas over
+//! PostgreSQL, NATS and an object store, behind a TCP balancer.
 //!
 //! `services` starts and kills one program of it, and `scaled` has all of them.
 

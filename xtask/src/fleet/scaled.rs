@@ -44,7 +44,13 @@ struct FleetFolder(PathBuf);
 
 impl Drop for FleetFolder {
     fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
+        // The last processes of PostgreSQL end, and write, after it was killed.
+        for _ in 0..50 {
+            if fs::remove_dir_all(&self.0).is_ok() || !self.0.exists() {
+                return;
+            }
+            sleep(Duration::from_millis(100));
+        }
     }
 }
 
@@ -199,7 +205,8 @@ fn balancer(people: SocketAddr, vehicles: SocketAddr, listeners: &[SocketAddr]) 
     let mut text = "global\n  maxconn 8000\ndefaults\n  mode tcp\n  balance leastconn\n  \
                     option redispatch\n  retries 3\n  timeout connect 2s\n  timeout client 1h\n  \
                     timeout server 1h\n  timeout check 2s\n  \
-                    default-server check inter 500ms fall 2 rise 1 on-marked-down shutdown-sessions\n"
+                    default-server check inter 500ms fall 2 rise 1 on-marked-down \
+                    shutdown-sessions\n"
         .to_owned();
     for (index, (name, address)) in [("people", people), ("vehicles", vehicles)].iter().enumerate()
     {

@@ -1,8 +1,8 @@
 //! Files of clips, under names that are digests of their ids.
 //!
-//! In a folder, the parts of a file are appended to it one after the other, each once it is complete
-//! and its digest is right; in a bucket, each part is an object. How many there are is in the
-//! database only: bytes after them do not count.
+//! In a folder, the parts of a file are appended to it one after the other, each once it is
+//! complete and its digest is right; in a bucket, each part is an object. How many there are is in
+//! the database only: bytes after them do not count.
 
 use std::collections::BTreeMap;
 use std::fs::File;

@@ -1,8 +1,8 @@
 //! Clips: announced by vehicles, wanted by people, and sent in parts.
 //!
 //! `vehicles` receives announcements and parts, `people` lists clips and sends their files, and
-//! `files` has their files. A vehicle reads the complete list of what is wanted: there is no command
-//! that could be lost or come twice. Nothing here deletes anything on a vehicle.
+//! `files` has these. A vehicle reads the complete list of what is wanted: there is no command that
+//! could be lost or come twice. Nothing here deletes anything on a vehicle.
 
 mod files;
 pub(crate) mod people;

@@ -27,8 +27,10 @@ impl NatsServer {
             return None;
         }
         let folder = tempfile::tempdir().unwrap();
-        let (child, url) = started(program, &folder, "-1");
-        Some(Self { child, folder, program: program.to_owned(), url })
+        let child = command(program, &folder, "-1").spawn().unwrap();
+        let mut server = Self { child, folder, program: program.to_owned(), url: String::new() };
+        server.url = server.listening();
+        Some(server)
     }
 
     /// Publishes these messages to the clouds that use the server.
@@ -49,28 +51,30 @@ impl NatsServer {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
         let port = self.url.rsplit(':').next().unwrap().to_owned();
-        (self.child, _) = started(&self.program, &self.folder, &port);
+        self.child = command(&self.program, &self.folder, &port).spawn().unwrap();
+        self.listening();
+    }
+
+    /// Waits until the server listens; returns its address.
+    fn listening(&self) -> String {
+        let file = self.folder.path().join(format!("nats-server_{}.ports", self.child.id()));
+        let begin = Instant::now();
+        loop {
+            let ports = fs::read_to_string(&file).unwrap_or_default();
+            if let Ok(ports) = serde_json::from_str::<Value>(&ports) {
+                return ports["nats"][0].as_str().unwrap().to_owned();
+            }
+            assert!(begin.elapsed() < Duration::from_secs(30), "nats-server does not start");
+            std::thread::sleep(Duration::from_millis(20));
+        }
     }
 }
 
-fn started(program: &Path, folder: &TempDir, port: &str) -> (Child, String) {
-    let child = Command::new(program)
-        .args(["-a", "127.0.0.1", "-p", port, "--ports_file_dir"])
-        .arg(folder.path())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let file = folder.path().join(format!("nats-server_{}.ports", child.id()));
-    let begin = Instant::now();
-    loop {
-        let ports = fs::read_to_string(&file).unwrap_or_default();
-        if let Ok(ports) = serde_json::from_str::<Value>(&ports) {
-            return (child, ports["nats"][0].as_str().unwrap().to_owned());
-        }
-        assert!(begin.elapsed() < Duration::from_secs(30), "nats-server does not start");
-        std::thread::sleep(Duration::from_millis(20));
-    }
+fn command(program: &Path, folder: &TempDir, port: &str) -> Command {
+    let mut command = Command::new(program);
+    command.args(["-a", "127.0.0.1", "-p", port, "--ports_file_dir"]).arg(folder.path());
+    command.stdout(Stdio::null()).stderr(Stdio::null());
+    command
 }
 
 impl Drop for NatsServer {
