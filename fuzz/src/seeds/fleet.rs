@@ -1,4 +1,4 @@
-//! Seeds: a frame of each kind, and an enrolment.
+//! Seeds: a frame of each kind, an enrolment, a report of clips, and orders for them.
 
 use gleaner_fleet::{
     Ack, Body, Cursor, Desired, Enrolment, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records,
@@ -9,7 +9,16 @@ use crate::fleet::mode;
 
 /// Keys of an enrolment.
 pub const WORDS: &[&str] =
-    &["gleaner_enrolment", "address", "vehicle", "authority", "token", "events", "lambdas/"];
+    &["clips", "gone", "moments", "wanted", "thumbnails", "cursor", "gleaner_enrolment", "address", "vehicle", "authority", "token", "events", "lambdas/"];
+
+const REPORT: &str = r#"{"cursor":"1","clips":[{"name":"brake-1","from_ns":1,"to_ns":2,"bytes":9,
+    "sha256":"0000000000000000000000000000000000000000000000000000000000000000","thumbnail":null,
+    "lambdas":[{"name":"brake","version":"1","digest":"5","deployment":"brake","revision":null}],
+    "triggers":1,"moments":[{"lambda":"brake","kind":"event","label":"hard","score":0.5,
+    "attributes":{"mps2":-4.5},"at_ns":1}],"incomplete":["late"],"is_recovered":true}],
+    "gone":[{"name":"brake-0","is_thumbnail":true,"reason":"evicted"}]}"#;
+const ORDERS: &str = r#"{"cursor":"1","thumbnails":["brake-1"],
+    "wanted":[{"name":"brake-1","bytes":9,"sha256":"5","part":0}]}"#;
 
 /// All seeds.
 pub fn all() -> Vec<Vec<u8>> {
@@ -63,5 +72,11 @@ pub fn all() -> Vec<Vec<u8>> {
     let enrolment = serde_json::to_vec(&enrolment).expect("it is plain data");
     let seed = |mode: u8, bytes: Vec<u8>| [vec![mode], bytes].concat();
     let frames = frames.into_iter().map(|body| seed(mode::FRAME, Frame::encoded(body)));
-    frames.chain([seed(mode::ENROLMENT, enrolment)]).collect()
+    frames
+        .chain([
+            seed(mode::ENROLMENT, enrolment),
+            seed(mode::CLIPS, REPORT.into()),
+            seed(mode::ORDERS, ORDERS.into()),
+        ])
+        .collect()
 }
