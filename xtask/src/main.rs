@@ -30,7 +30,8 @@ use checkout::{Checkout, FAMILIES};
 use steps::Steps;
 
 const USAGE: &str = "usage: cargo xtask COMMAND
-  demo     replay the sample drive with both twins of every example, then run them on a vehicle
+  demo     replay the sample drive with both twins of every example, then run them on a vehicle by
+           a cloud, whose page stays open until Ctrl-C; --no-wait ends after the checks
   test     run all tests; the last line is `N passed, M failed, K skipped`
   bless    write the examples' decisions to expected.txt, and the generated files
   docs     fetch mdBook and build the pages as a book in target/book
@@ -59,7 +60,8 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         Some((command, rest)) => (command.to_str().unwrap_or_default(), rest),
         None => ("", &[][..]),
     };
-    if !rest.is_empty() && !["bench", "deb", "fuzz", "page", "peers"].contains(&command) {
+    let has_arguments = ["bench", "deb", "demo", demo::VEHICLE_COMMAND, "fuzz", "page", "peers"];
+    if !rest.is_empty() && !has_arguments.contains(&command) {
         return Err(Failure::new(
             Exit::Usage,
             format!("`cargo xtask {command}` takes no arguments"),
@@ -68,8 +70,8 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
     }
     let checkout = Checkout::find()?;
     match command {
-        "demo" => demo::run(&checkout),
-        demo::VEHICLE_COMMAND => demo::run_vehicle(&checkout),
+        "demo" => demo::run(&checkout, rest),
+        demo::VEHICLE_COMMAND => demo::run_vehicle(&checkout, rest),
         "test" => suites::run(&checkout),
         "bless" => bless::run(&checkout),
         "docs" => docs::run(&checkout),
