@@ -43,7 +43,7 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   fuzz     fuzz parsers of untrusted input; [TARGET...] [--seconds N] [--seed N]
   aarch64  build for ARM vehicles, and compare the decisions of lambdas there, emulated
   build    only set up: wasm target, Python environment, programs, lambdas
-  deb      build the Debian package; [--arch amd64|arm64] [--programs DIR] [--test]";
+  deb      build the Debian packages; [--arch amd64|arm64] [--programs DIR] [--test]";
 
 fn main() -> ExitCode {
     match run(env::args_os().skip(1).collect()) {

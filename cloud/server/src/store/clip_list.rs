@@ -15,19 +15,19 @@ const PAGE_MAX: u64 = 500;
 #[serde(deny_unknown_fields)]
 pub(crate) struct ClipQuery {
     /// Name of the vehicle.
-    vehicle: Option<String>,
+    pub(crate) vehicle: Option<String>,
     /// Name of a lambda.
-    lambda: Option<String>,
+    pub(crate) lambda: Option<String>,
     /// Label of a moment.
-    label: Option<String>,
+    pub(crate) label: Option<String>,
     /// Begin of the time, in ns since 1970: clips that end before are left out.
-    from_ns: Option<i64>,
+    pub(crate) from_ns: Option<i64>,
     /// End of the time, in ns since 1970: clips that begin after are left out.
-    to_ns: Option<i64>,
+    pub(crate) to_ns: Option<i64>,
     /// `next` of the page before.
-    after: Option<u64>,
+    pub(crate) after: Option<u64>,
     /// Number of clips in a page.
-    last: Option<u64>,
+    pub(crate) last: Option<u64>,
 }
 
 type ClipRow = (i64, String, String, String, i64, i64, i64, String, String, i64);
