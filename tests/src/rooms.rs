@@ -68,6 +68,7 @@ pub const CRATES: &[(&str, &[&str])] = &[
         &[
             "gleaner-base",
             "gleaner-fleet",
+            "gleaner-image",
             "gleaner-lambda",
             "gleaner-protocol",
             "gleaner-trust",

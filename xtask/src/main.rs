@@ -31,7 +31,8 @@ use checkout::{Checkout, FAMILIES};
 use steps::Steps;
 
 const USAGE: &str = "usage: cargo xtask COMMAND
-  demo     replay the sample drive with both twins of every example, then run them on a vehicle
+  demo     replay the sample drive with both twins of every example, then run them on a vehicle by
+           a cloud, whose page stays open until Ctrl-C; --no-wait ends after the checks
   test     run all tests; the last line is `N passed, M failed, K skipped`
   bless    write the examples' decisions to expected.txt, and the generated files
   docs     fetch mdBook and build the pages as a book in target/book
@@ -45,7 +46,7 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   fuzz     fuzz parsers of untrusted input; [TARGET...] [--seconds N] [--seed N]
   aarch64  build for ARM vehicles, and compare the decisions of lambdas there, emulated
   build    only set up: wasm target, Python environment, programs, lambdas
-  deb      build the Debian package; [--arch amd64|arm64] [--programs DIR] [--test]";
+  deb      build the Debian packages; [--arch amd64|arm64] [--programs DIR] [--test]";
 
 fn main() -> ExitCode {
     match run(env::args_os().skip(1).collect()) {
@@ -62,7 +63,9 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         Some((command, rest)) => (command.to_str().unwrap_or_default(), rest),
         None => ("", &[][..]),
     };
-    if !rest.is_empty() && !["bench", "deb", "fleet", "fuzz", "page", "peers"].contains(&command) {
+    let has_arguments =
+        ["bench", "deb", "demo", demo::VEHICLE_COMMAND, "fleet", "fuzz", "page", "peers"];
+    if !rest.is_empty() && !has_arguments.contains(&command) {
         return Err(Failure::new(
             Exit::Usage,
             format!("`cargo xtask {command}` takes no arguments"),
@@ -71,8 +74,8 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
     }
     let checkout = Checkout::find()?;
     match command {
-        "demo" => demo::run(&checkout),
-        demo::VEHICLE_COMMAND => demo::run_vehicle(&checkout),
+        "demo" => demo::run(&checkout, rest),
+        demo::VEHICLE_COMMAND => demo::run_vehicle(&checkout, rest),
         "test" => suites::run(&checkout),
         "bless" => bless::run(&checkout),
         "docs" => docs::run(&checkout),

@@ -5,6 +5,8 @@
 #[allow(dead_code, reason = "the tests of the fleet use all of it")]
 #[path = "../tests/fleet/fake.rs"]
 mod fake;
+#[path = "page_fleet/fake_clips.rs"]
+mod fake_clips;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -120,6 +122,9 @@ async fn drive(
     is_hostile: bool,
 ) {
     let (mut link, _, mut wanted) = vehicle.connect().await;
+    if name != "car-2" {
+        fake_clips::announce(&vehicle, is_hostile.then_some(HOSTILE)).await;
+    }
     report(&mut link, name, &labels, &wanted, &vehicle, is_hostile).await;
     let mut ticks = interval(Duration::from_millis(500));
     // Two records at one time would look like one that came twice.
@@ -130,6 +135,7 @@ async fn drive(
             body = link.next() => match body {
                 Some(Body::Desired(desired)) => {
                     wanted = desired;
+                    fake_clips::send_wanted(&vehicle).await;
                     report(&mut link, name, &labels, &wanted, &vehicle, is_hostile).await;
                 }
                 Some(_) => {}

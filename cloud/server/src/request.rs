@@ -37,6 +37,13 @@ pub(crate) struct ListQuery<Cursor> {
 #[serde(try_from = "u16")]
 pub(crate) struct PageLimit(u16);
 
+impl PageLimit {
+    /// Returns a limit of the program itself.
+    pub(crate) const fn of(limit: u16) -> Self {
+        Self(limit)
+    }
+}
+
 impl Default for PageLimit {
     fn default() -> Self {
         Self(ENTRIES_MAX)

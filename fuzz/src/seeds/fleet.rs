@@ -8,8 +8,21 @@ use gleaner_fleet::{
 use crate::fleet::mode;
 
 /// Keys of an enrolment.
-pub const WORDS: &[&str] =
-    &["clips", "gone", "moments", "wanted", "thumbnails", "cursor", "gleaner_enrolment", "address", "vehicle", "authority", "token", "events", "lambdas/"];
+pub const WORDS: &[&str] = &[
+    "clips",
+    "gone",
+    "moments",
+    "wanted",
+    "thumbnails",
+    "cursor",
+    "gleaner_enrolment",
+    "address",
+    "vehicle",
+    "authority",
+    "token",
+    "events",
+    "lambdas/",
+];
 
 const REPORT: &str = r#"{"cursor":"1","clips":[{"name":"brake-1","from_ns":1,"to_ns":2,"bytes":9,
     "sha256":"0000000000000000000000000000000000000000000000000000000000000000","thumbnail":null,

@@ -4,8 +4,9 @@ use std::path::Path;
 
 use gleaner_base::Failure;
 
-use super::tree::{self, DOC, LIB, PackageTree};
-use super::{Architecture, SOURCE, answer};
+use super::source::{LIB, PackageSource};
+use super::tree::{self, PackageTree};
+use super::{Architecture, answer};
 use crate::checkout::Checkout;
 use crate::steps;
 
@@ -13,6 +14,7 @@ use crate::steps;
 const SCRIPTS: [&str; 3] = ["postinst", "prerm", "postrm"];
 
 pub(super) struct PackageMetadata {
+    source: &'static PackageSource,
     version: String,
     architecture: Architecture,
     libraries: String,
@@ -28,6 +30,7 @@ impl PackageMetadata {
         checkout: &Checkout,
         tree: &PackageTree,
         architecture: Architecture,
+        source: &'static PackageSource,
     ) -> Result<Self, Failure> {
         let git = |arguments: &[&str]| answer(checkout.command("git").args(arguments));
         let release = env!("CARGO_PKG_VERSION");
@@ -49,11 +52,11 @@ impl PackageMetadata {
             Some(found) => found,
             None => libraries_by_version(tree)?,
         };
-        Ok(Self { version, architecture, libraries, time, date })
+        Ok(Self { source, version, architecture, libraries, time, date })
     }
 
     pub(super) fn file_name(&self) -> String {
-        format!("gleaner_{}_{}.deb", self.version, self.architecture.name())
+        format!("{}_{}_{}.deb", self.source.name, self.version, self.architecture.name())
     }
 
     /// Writes Debian's changelog: one entry for this package.
@@ -62,16 +65,17 @@ impl PackageMetadata {
         checkout: &Checkout,
         tree: &PackageTree,
     ) -> Result<(), Failure> {
-        let control = tree::read(&checkout.path(SOURCE).join("debian/control"))?;
+        let control = tree::read(&checkout.path(self.source.folder).join("debian/control"))?;
         let maintainer = control.lines().find_map(|line| line.strip_prefix("Maintainer: "));
         let entry = format!(
-            "gleaner ({}) unstable; urgency=medium\n\n  * CHANGELOG.md in this folder lists what \
+            "{} ({}) unstable; urgency=medium\n\n  * CHANGELOG.md in this folder lists what \
              changes for users.\n\n -- {}  {}\n",
+            self.source.name,
             self.version,
             maintainer.unwrap_or_default(),
             self.date
         );
-        tree.write(&format!("{DOC}/changelog"), &entry).map(drop)
+        tree.write(&format!("{}/changelog", self.source.doc()), &entry).map(drop)
     }
 
     /// Writes the folder `DEBIAN`.
@@ -79,7 +83,7 @@ impl PackageMetadata {
         let files = tree.files()?;
         let kib = |file: &Path| file.metadata().map_or(0, |data| data.len().div_ceil(1024));
         let size: u64 = files.iter().map(|file| kib(file)).sum();
-        let folder = checkout.path(SOURCE).join("debian");
+        let folder = checkout.path(self.source.folder).join("debian");
         let control = tree::read(&folder.join("control"))?
             .replace("@VERSION@", &self.version)
             .replace("@ARCHITECTURE@", self.architecture.name())

@@ -3,11 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::slice;
 
 use gleaner_base::{Exit, Failure};
 use serde::Deserialize;
 
-use super::tree::{DOC, PackageTree};
+use super::source::PackageSource;
+use super::tree::PackageTree;
 use crate::checkout::Checkout;
 use crate::{setup, steps};
 
@@ -27,7 +29,11 @@ struct CratePackage {
 }
 
 /// Writes one file with all crates, and the text of each licence once.
-pub(super) fn write(checkout: &Checkout, tree: &PackageTree) -> Result<(), Failure> {
+pub(super) fn write(
+    checkout: &Checkout,
+    tree: &PackageTree,
+    source: &PackageSource,
+) -> Result<(), Failure> {
     let help = "`cargo fetch` downloads all crates";
     let mut metadata = checkout.cargo();
     metadata.args(["metadata", "--format-version=1", "--locked", "--offline"]);
@@ -36,7 +42,8 @@ pub(super) fn write(checkout: &Checkout, tree: &PackageTree) -> Result<(), Failu
     let mut linked = checkout.cargo();
     linked.args(["tree", "--locked", "--offline", "--edges=normal", "--prefix=none"]);
     linked.args(["--format={p}", "--target=all"]);
-    linked.args(setup::PROGRAMS.iter().flat_map(|package| ["--package", package]));
+    let packages: &[&str] = source.cargo_package.as_ref().map_or(&setup::PROGRAMS, slice::from_ref);
+    linked.args(packages.iter().flat_map(|package| ["--package", package]));
     let linked = steps::output(&mut linked, help)?;
     // A line is `NAME vVERSION`, with a path or a mark.
     let linked: BTreeSet<(&str, &str)> = linked
@@ -63,7 +70,7 @@ pub(super) fn write(checkout: &Checkout, tree: &PackageTree) -> Result<(), Failu
         page += &format!("\n\n==== {}\n\n{}\n", names.join(", "), text.trim_end());
     }
     println!("{} crates, {} texts of licences", list.lines().count(), texts.len());
-    tree.write(&format!("{DOC}/licences"), &page).map(drop)
+    tree.write(&format!("{}/licences", source.doc()), &page).map(drop)
 }
 
 /// The files of a crate with a licence or a notice.

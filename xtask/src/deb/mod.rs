@@ -1,12 +1,15 @@
-//! `cargo xtask deb`: builds the Debian package `gleaner`, with the service of a vehicle.
+//! `cargo xtask deb`: builds the Debian packages `gleaner`, with the service of a vehicle, and
+//! `gleaner-cloud`, with that of the cloud.
 //!
-//! `tree` lays out its files, `control` writes its metadata, `licences` collects those of crates,
-//! `unit` checks the service with `systemd-analyze`, and `root` tests the package in a root of its
-//! own. The files that are not built are in `orchestrator/package`.
+//! `source` lists what they consist of, `tree` lays out their files, `control` writes their metadata, `licences` collects those
+//! of crates, `unit` checks the services with `systemd-analyze`, and `root` tests the packages in
+//! roots of their own. The files that are not built are in `orchestrator/package` and
+//! `cloud/package`.
 
 mod control;
 mod licences;
 mod root;
+mod source;
 mod tree;
 mod unit;
 
@@ -21,15 +24,13 @@ use crate::checkout::Checkout;
 use crate::steps::{self, Steps};
 use crate::{aarch64, setup};
 use control::PackageMetadata;
+use source::{PACKAGES, PackageSource};
 use tree::PackageTree;
 
-/// Folder of the files of the package that are not built.
-const SOURCE: &str = "orchestrator/package";
-
 const USAGE: &str = "usage: cargo xtask deb [--arch amd64|arm64] [--programs DIR] [--test]
-  --arch      architecture of the package; default: that of this machine
+  --arch      architecture of the packages; default: that of this machine
   --programs  folder with the built programs; default: build them
-  --test      as root: install, run, upgrade and purge it in a root that debootstrap makes";
+  --test      as root: install, run, upgrade and purge each in a root that debootstrap makes";
 
 /// Architectures of the package, by Debian's names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -99,7 +100,7 @@ fn usage() -> Failure {
     Failure::new(Exit::Usage, "`cargo xtask deb` does not take these arguments").with_help(USAGE)
 }
 
-/// Builds the package, and tests it if that is wanted.
+/// Builds the packages, and tests them if that is wanted.
 pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let options = DebOptions::parse(arguments)?;
     let architecture = options.architecture;
@@ -111,31 +112,46 @@ pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, F
                 .with_help(format!("on Debian and Ubuntu, as root: apt-get install {package}")));
         }
     }
-    let mut steps = Steps::of(if options.test { 5 } else { 4 });
+    let each = if options.test { 4 } else { 3 };
+    let mut steps = Steps::of(1 + PACKAGES.len() * each);
     steps.begin(&format!("programs for {}", architecture.name()));
     let programs = programs(checkout, &options)?;
     println!("{}", programs.display());
-    steps.begin("files");
+    for source in &PACKAGES {
+        package(checkout, &mut steps, &options, &programs, source)?;
+    }
+    Ok(Exit::Ok)
+}
+
+fn package(
+    checkout: &Checkout,
+    steps: &mut Steps,
+    options: &DebOptions,
+    programs: &Path,
+    source: &'static PackageSource,
+) -> Result<(), Failure> {
+    let (name, architecture) = (source.name, options.architecture);
+    steps.begin(&format!("{name}: files"));
     let work = checkout.target().join("deb");
-    let tree =
-        PackageTree::create(checkout, &work.join(architecture.name()), &programs, architecture)?;
-    licences::write(checkout, &tree)?;
-    let metadata = PackageMetadata::collect(checkout, &tree, architecture)?;
+    let root = work.join(architecture.name()).join(name);
+    let tree = PackageTree::create(checkout, &root, programs, architecture, source)?;
+    licences::write(checkout, &tree, source)?;
+    let metadata = PackageMetadata::collect(checkout, &tree, architecture, source)?;
     metadata.write_changelog(checkout, &tree)?;
     tree.finish()?;
-    steps.begin("service");
-    unit::check(checkout, &tree, &work)?;
-    steps.begin("package");
+    steps.begin(&format!("{name}: service"));
+    unit::check(checkout, &tree, &work, source)?;
+    steps.begin(&format!("{name}: package"));
     metadata.write(checkout, &tree)?;
     let package = work.join(metadata.file_name());
     build(checkout, &tree, &package, &metadata)?;
-    lint(checkout, &package)?;
+    lint(checkout, &package, source)?;
     println!("built {} ({} MiB)", package.display(), size_mib(&package));
     if options.test {
-        steps.begin("installation in a root of its own");
-        root::test(checkout, &package, &work)?;
+        steps.begin(&format!("{name}: installation in a root of its own"));
+        root::test(checkout, &package, &work, source)?;
     }
-    Ok(Exit::Ok)
+    Ok(())
 }
 
 fn programs(checkout: &Checkout, options: &DebOptions) -> Result<PathBuf, Failure> {
@@ -165,12 +181,12 @@ fn build(
 }
 
 /// Runs lintian, if it is installed. Its remarks are shown; errors fail.
-fn lint(checkout: &Checkout, package: &Path) -> Result<(), Failure> {
+fn lint(checkout: &Checkout, package: &Path, source: &PackageSource) -> Result<(), Failure> {
     if !steps::succeeds(checkout.command("lintian").arg("--version")) {
         println!("skipped: lintian is not installed");
         return Ok(());
     }
-    let overrides = checkout.path(SOURCE).join("debian/lintian");
+    let overrides = checkout.path(source.folder).join("debian/lintian");
     let suppressed = tree::read(&overrides)?;
     let tags: Vec<&str> =
         suppressed.lines().filter(|line| !line.is_empty() && !line.starts_with('#')).collect();

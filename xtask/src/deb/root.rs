@@ -1,4 +1,4 @@
-//! Tests the package in roots of their own: installs, runs, upgrades, removes and purges it there,
+//! Tests a package in roots of their own: installs, runs, upgrades, removes and purges it there,
 //! without a network. `test/in-root` runs without systemd, and `test/booted` in a container of
 //! `systemd-nspawn`. Nothing of this machine is changed.
 
@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
 
-use super::{SOURCE, answer, tree};
+use super::source::PackageSource;
+use super::{answer, tree};
 use crate::checkout::Checkout;
 use crate::steps;
 
@@ -32,7 +33,12 @@ TimeoutStartSec=10min
 ";
 
 /// Runs the test.
-pub(super) fn test(checkout: &Checkout, package: &Path, work: &Path) -> Result<(), Failure> {
+pub(super) fn test(
+    checkout: &Checkout,
+    package: &Path,
+    work: &Path,
+    source: &PackageSource,
+) -> Result<(), Failure> {
     if answer(checkout.command("id").arg("-u")).as_deref() != Some("0") {
         return Err(Failure::new(Exit::Usage, "only root can install a package into a root")
             .with_help("run `cargo xtask deb`, then `sudo cargo xtask deb --test`"));
@@ -44,7 +50,7 @@ pub(super) fn test(checkout: &Checkout, package: &Path, work: &Path) -> Result<(
         }
     }
     let base = base(checkout, work)?;
-    let (root, arguments) = prepare(checkout, &base, work, package)?;
+    let (root, arguments) = prepare(checkout, &base, work, package, source)?;
     println!("{}, without systemd", root.display());
     // `ip` of this machine, as the root need not have it.
     let script = "if command -v ip >/dev/null; then ip link set lo up multicast on; \
@@ -55,11 +61,14 @@ pub(super) fn test(checkout: &Checkout, package: &Path, work: &Path) -> Result<(
     run.args(["sh", "-c", script, "sh"]).arg(&root);
     run.args(["/usr/bin/env", "-i", "/test/in-root"]).args(&arguments);
     steps::run(&mut run, "its output is above; the log of the service is test/log in that root")?;
+    if !checkout.path(source.folder).join("test/booted").exists() {
+        return Ok(());
+    }
     if !steps::succeeds(checkout.command("systemd-nspawn").arg("--version")) {
         println!("skipped: no test with systemd, as systemd-nspawn (systemd-container) is missing");
         return Ok(());
     }
-    let (root, arguments) = prepare(checkout, &base, work, package)?;
+    let (root, arguments) = prepare(checkout, &base, work, package, source)?;
     println!("{}, with systemd", root.display());
     boot(checkout, &root, &arguments)
 }
@@ -88,6 +97,7 @@ fn prepare(
     base: &Path,
     work: &Path,
     package: &Path,
+    source: &PackageSource,
 ) -> Result<(PathBuf, Vec<String>), Failure> {
     let root = work.join("root");
     let _ = fs::remove_dir_all(&root);
@@ -96,10 +106,13 @@ fn prepare(
     fs::create_dir(&test).map_err(|error| tree::cannot("create", &test, &error))?;
     copy(checkout, package, &test.join("gleaner.deb"))?;
     for script in ["in-root", "booted"] {
-        copy(checkout, &checkout.path(SOURCE).join("test").join(script), &test)?;
+        let script = checkout.path(source.folder).join("test").join(script);
+        if script.exists() {
+            copy(checkout, &script, &test)?;
+        }
     }
     let mut arguments = vec!["/test/gleaner.deb".to_owned()];
-    for lambda in LAMBDAS {
+    for lambda in LAMBDAS.iter().filter(|_| source.has_command) {
         if checkout.path(lambda).join("build").exists() {
             let name = lambda.replace('/', "-");
             copy(checkout, &checkout.path(lambda), &test.join(&name))?;

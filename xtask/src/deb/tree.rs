@@ -1,4 +1,4 @@
-//! The files of the package, as they lie on a vehicle.
+//! The files of a package, as they lie on its machine.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -6,39 +6,11 @@ use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
 
-use super::{Architecture, SOURCE};
+use super::Architecture;
+use super::source::{LIB, PackageSource};
 use crate::checkout::Checkout;
 use crate::steps;
 
-/// Programs that users start.
-const COMMANDS: [&str; 2] = ["gleaner", "gleaner-orchestrator"];
-/// Programs that those start, and the extension module of Python.
-const PARTS: [&str; 8] = [
-    "gleaner-compile",
-    "gleaner-inference",
-    "gleaner-ingress",
-    "gleaner-recorder",
-    "gleaner-runtime",
-    "gleaner-shim",
-    "gleaner-supervisor",
-    "lib_gleaner.so",
-];
-/// Folder of the parts, where the programs search for them.
-pub(super) const LIB: &str = "usr/lib/gleaner";
-pub(super) const DOC: &str = "usr/share/doc/gleaner";
-/// The unit.
-pub(super) const UNIT: &str = "usr/lib/systemd/system/gleaner.service";
-/// Files of [`SOURCE`] with their places.
-const FILES: [(&str, &str); 8] = [
-    ("gleaner.service", UNIT),
-    ("control-groups.conf", "usr/lib/gleaner/control-groups.conf"),
-    ("gleaner-stop", "usr/lib/gleaner/gleaner-stop"),
-    ("gleaner.sysusers", "usr/lib/sysusers.d/gleaner.conf"),
-    ("vehicle.toml", "etc/gleaner/vehicle.toml"),
-    ("gleaner-orchestrator.8", "usr/share/man/man8/gleaner-orchestrator.8"),
-    ("debian/copyright", "usr/share/doc/gleaner/copyright"),
-    ("debian/README.Debian", "usr/share/doc/gleaner/README.Debian"),
-];
 /// Completion scripts of shells.
 const COMPLETIONS: [(&str, &str); 3] = [
     ("bash", "usr/share/bash-completion/completions/gleaner"),
@@ -58,13 +30,13 @@ impl PackageTree {
         root: &Path,
         programs: &Path,
         architecture: Architecture,
+        source: &PackageSource,
     ) -> Result<Self, Failure> {
         let tree = Self { root: root.to_owned() };
         if root.exists() {
             fs::remove_dir_all(root).map_err(|error| cannot("remove", root, &error))?;
         }
-        let placed = COMMANDS.map(|name| (name, "usr/bin")).into_iter();
-        for (name, folder) in placed.chain(PARTS.map(|name| (name, LIB))) {
+        for (name, folder) in source.programs {
             let file = tree.place(&programs.join(name), &Path::new(folder).join(name))?;
             // Symbols are most of the size. A panic names its place without them.
             let mut strip = checkout.command(architecture.strip());
@@ -72,13 +44,15 @@ impl PackageTree {
             // A library is not started.
             set_mode(&file, if name.ends_with(".so") { 0o644 } else { 0o755 })?;
         }
-        for (name, place) in FILES {
-            tree.place(&checkout.path(SOURCE).join(name), Path::new(place))?;
+        for (name, place) in source.files {
+            tree.place(&checkout.path(source.folder).join(name), Path::new(place))?;
         }
-        tree.sdk(checkout)?;
-        tree.documentation(checkout)?;
-        // The command of this machine: that of the package may be for another one.
-        tree.generated(checkout, &programs.join("gleaner"), architecture)?;
+        tree.documentation(checkout, &source.doc())?;
+        if source.has_command {
+            tree.sdk(checkout)?;
+            // The command of this machine: that of the package may be for another one.
+            tree.generated(checkout, &programs.join("gleaner"), architecture)?;
+        }
         Ok(tree)
     }
 
@@ -138,8 +112,8 @@ impl PackageTree {
         Ok(())
     }
 
-    fn documentation(&self, checkout: &Checkout) -> Result<(), Failure> {
-        let doc = Path::new(DOC);
+    fn documentation(&self, checkout: &Checkout, doc: &str) -> Result<(), Failure> {
+        let doc = Path::new(doc);
         for name in ["CHANGELOG.md", "THIRD_PARTY.md"] {
             self.place(&checkout.path(name), &doc.join(name))?;
         }
@@ -258,6 +232,6 @@ mod tests {
     fn the_programs_find_their_parts() {
         // As in `gleaner-parts`: `<exe>/../lib/gleaner`.
         let beside = Path::new("/usr/bin").parent().unwrap().join("lib/gleaner");
-        assert_eq!(beside, Path::new("/").join(super::LIB));
+        assert_eq!(beside, Path::new("/").join(super::super::source::LIB));
     }
 }

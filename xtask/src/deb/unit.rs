@@ -5,18 +5,21 @@ use std::path::Path;
 use gleaner_base::{Exit, Failure};
 
 use super::answer;
-use super::tree::{self, PackageTree, UNIT};
+use super::source::PackageSource;
+use super::tree::{self, PackageTree};
 use crate::checkout::Checkout;
 use crate::steps;
 
-/// The most exposure that `systemd-analyze security` may report, in tenths. It counts what the
-/// service must do: the network, devices, and memory with code.
-const EXPOSURE_MAX: u32 = 20;
 /// The first version that knows the keys of `control-groups.conf`.
 const WITH_SUBGROUPS: u32 = 254;
 
 /// Checks the unit in `tree`. Does nothing but print so if the tool is missing.
-pub(super) fn check(checkout: &Checkout, tree: &PackageTree, work: &Path) -> Result<(), Failure> {
+pub(super) fn check(
+    checkout: &Checkout,
+    tree: &PackageTree,
+    work: &Path,
+    source: &PackageSource,
+) -> Result<(), Failure> {
     let Some(version) = answer(checkout.command("systemd-analyze").arg("--version")) else {
         println!("skipped: systemd-analyze is not installed (package systemd)");
         return Ok(());
@@ -30,14 +33,19 @@ pub(super) fn check(checkout: &Checkout, tree: &PackageTree, work: &Path) -> Res
             .fold(text, |text, path| text.replace(&format!("={path}"), &format!("={root}{path}")))
     };
     let folder = work.join("unit");
-    let unit = folder.join("gleaner.service");
+    let unit = folder.join(source.unit());
     let dropin = folder.join("gleaner.service.d/control-groups.conf");
     let _ = std::fs::remove_dir_all(&folder);
-    write(&unit, &moved(tree::read(&tree.root().join(UNIT))?))?;
-    let exposure = exposure(checkout, &unit)?;
-    if version.is_some_and(|version| version >= WITH_SUBGROUPS) {
-        let text = tree::read(&tree.root().join("usr/lib/gleaner/control-groups.conf"))?;
-        write(&dropin, &moved(text))?;
+    write(
+        &unit,
+        &moved(tree::read(&tree.root().join("usr/lib/systemd/system").join(source.unit()))?),
+    )?;
+    let exposure = exposure(checkout, &unit, source.exposure_max)?;
+    let groups = tree.root().join("usr/lib/gleaner/control-groups.conf");
+    if !groups.exists() {
+        // It is of the package of vehicles only.
+    } else if version.is_some_and(|version| version >= WITH_SUBGROUPS) {
+        write(&dropin, &moved(tree::read(&groups)?))?;
     } else {
         println!("skipped: control-groups.conf needs systemd {WITH_SUBGROUPS}");
     }
@@ -49,14 +57,15 @@ pub(super) fn check(checkout: &Checkout, tree: &PackageTree, work: &Path) -> Res
     if !output.status.success() || remarks.contains("gleaner") {
         let mut failure = Failure::new(Exit::Differs, "systemd does not accept the service");
         failure.causes = remarks.lines().map(str::to_owned).collect();
-        return Err(failure.with_help("mend orchestrator/package/gleaner.service"));
+        let help = format!("mend {}/{}", source.folder, source.unit());
+        return Err(failure.with_help(help));
     }
     println!("systemd {}: accepted, exposure {exposure}", version.unwrap_or_default());
     Ok(())
 }
 
 /// Returns the exposure as a text; fails if it is too high.
-fn exposure(checkout: &Checkout, unit: &Path) -> Result<String, Failure> {
+fn exposure(checkout: &Checkout, unit: &Path, most: u32) -> Result<String, Failure> {
     let mut security = checkout.command("systemd-analyze");
     security.args(["security", "--offline=yes", "--no-pager"]).arg(unit);
     let text = steps::output(&mut security, "see the error above")?;
@@ -64,7 +73,7 @@ fn exposure(checkout: &Checkout, unit: &Path) -> Result<String, Failure> {
         Failure::new(Exit::Internal, "cannot parse the output of `systemd-analyze security`")
     })?;
     let exposure = format!("{}.{}", found / 10, found % 10);
-    if found > EXPOSURE_MAX {
+    if found > most {
         let message = format!("the service is exposed too much: {exposure}");
         return Err(Failure::new(Exit::Differs, message)
             .with_help("`systemd-analyze security --offline=yes FILE` lists the options"));

@@ -1,24 +1,32 @@
-//! The vehicle of the demo: its folders, keys and orchestrator, and commands to it.
+//! The vehicle of the demo: its folders, keys and orchestrator, and commands to it and its cloud.
 
 use std::fs::{self, File};
-use std::os::unix::fs::DirBuilderExt;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use gleaner_base::{Exit, Failure};
 use gleaner_protocol::vehicle_api::{DeploymentStatus, VehicleStatus};
 use rustix::process::{Pid, Signal, kill_process};
+use signal_hook::consts::SIGTERM;
 
+use super::demo_cloud::account;
 use crate::checkout::Checkout;
 use crate::steps;
 
 /// Folder of everything that the demo leaves, relative to the checkout.
 pub(super) const OUT: &str = "out/demo/vehicle";
 
+/// Name of the vehicle.
+pub(super) const NAME: &str = "demo-car";
+
 /// The configuration of the vehicle. Two cores are just enough for all examples in both languages.
-const SETTINGS: &str = "[vehicle]\nname = \"demo-car\"\n[deployments]\ncpu = 1\nmodel_time = 1\n";
+const SETTINGS: &str = "[vehicle]\nname = \"demo-car\"\nlabels = { fleet = \"demo\" }\n\
+                        [deployments]\ncpu = 1\nmodel_time = 1\n";
 
 /// Longest wait for anything: far longer than needed.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -29,25 +37,27 @@ const POLL_INTERVAL: Duration = Duration::from_millis(200);
 /// The vehicle. Dropping it ends all of its processes.
 pub(super) struct DemoVehicle<'c> {
     checkout: &'c Checkout,
-    /// Folder of the sockets: in a temporary place, as their paths must be short.
+    /// Folder of the sockets.
     run: PathBuf,
     orchestrator: Option<Child>,
+    /// Set by SIGTERM: the demo is to end.
+    ends: Arc<AtomicBool>,
 }
 
 impl<'c> DemoVehicle<'c> {
-    /// Makes keys and a trust root, starts the orchestrator, and installs the trust root.
-    pub(super) fn start(checkout: &'c Checkout) -> Result<Self, Failure> {
-        let out = checkout.path(OUT);
-        let run = std::env::temp_dir().join(format!("gleaner-demo-{}", std::process::id()));
+    /// Makes keys and a trust root, starts the orchestrator with its sockets in `run`, installs the
+    /// trust root, and enrols the vehicle at the cloud.
+    pub(super) fn start(checkout: &'c Checkout, run: &Path) -> Result<Self, Failure> {
+        let (out, ends) = (checkout.path(OUT), Arc::new(AtomicBool::new(false)));
         let prepared = remove(&out)
             .and_then(|()| fs::create_dir_all(&out))
             .and_then(|()| fs::write(out.join("vehicle.toml"), SETTINGS))
-            .and_then(|()| fs::DirBuilder::new().mode(0o700).create(&run))
-            .and_then(|()| File::create(out.join("orchestrator.log")));
+            .and_then(|()| signal_hook::flag::register(SIGTERM, Arc::clone(&ends)))
+            .and_then(|_| File::create(out.join("orchestrator.log")));
         let log = prepared.map_err(|error| {
             Failure::caused_by(Exit::Internal, format!("cannot prepare `{OUT}`"), &error)
         })?;
-        let mut vehicle = Self { checkout, run, orchestrator: None };
+        let mut vehicle = Self { checkout, run: run.to_owned(), orchestrator: None, ends };
         for key in ["root", "publisher", "deployer"] {
             vehicle.gleaner(&["keys", "new", &file(&format!("{key}.pem"))])?;
         }
@@ -66,13 +76,17 @@ impl<'c> DemoVehicle<'c> {
         vehicle.orchestrator = Some(started);
         vehicle.until("gleaner-orchestrator to answer", |_| Some(()))?;
         vehicle.gleaner(&["trust", "install", &trust])?;
+        let enrolment = file("enrolment.json");
+        vehicle.gleaner(&["vehicles", "enrol", NAME, "--to", &enrolment])?;
+        vehicle.gleaner(&["enrol", &enrolment])?;
         Ok(vehicle)
     }
 
-    /// Returns a command `gleaner` to the vehicle.
+    /// Returns a command `gleaner` to the vehicle or the cloud.
     fn command(&self, arguments: &[&str]) -> Command {
         let mut gleaner = self.checkout.command(self.checkout.program("gleaner"));
         gleaner.env("GLEANER_RUN", &self.run).args(arguments);
+        account(self.checkout, &mut gleaner);
         gleaner
     }
 
@@ -98,15 +112,34 @@ impl<'c> DemoVehicle<'c> {
         what: &str,
         mut wanted: impl FnMut(&VehicleStatus) -> Option<T>,
     ) -> Result<T, Failure> {
+        self.look_until(what, || Ok(self.status().and_then(|status| wanted(&status))))
+    }
+
+    /// Waits until `look` returns a value.
+    pub(super) fn look_until<T>(
+        &self,
+        what: &str,
+        mut look: impl FnMut() -> Result<Option<T>, Failure>,
+    ) -> Result<T, Failure> {
         let deadline = Instant::now() + PATIENCE;
         while Instant::now() < deadline {
-            if let Some(found) = self.status().and_then(|status| wanted(&status)) {
+            if self.ends.load(Ordering::Relaxed) {
+                return Err(Failure::new(Exit::Internal, "the demo was ended"));
+            }
+            if let Some(found) = look()? {
                 return Ok(found);
             }
             thread::sleep(POLL_INTERVAL);
         }
         let message = format!("waited {} s for {what}", PATIENCE.as_secs());
         Err(Failure::new(Exit::Internal, message).with_help(see_log()))
+    }
+
+    /// Waits until the demo is to end.
+    pub(super) fn until_end(&self) {
+        while !self.ends.load(Ordering::Relaxed) {
+            thread::sleep(POLL_INTERVAL);
+        }
     }
 
     /// Waits until `wanted` returns a value for the status of a deployment.
@@ -123,31 +156,15 @@ impl<'c> DemoVehicle<'c> {
 
     /// Ends the orchestrator in order, and with it all processes.
     pub(super) fn stop(mut self) -> Result<(), Failure> {
-        let Some(orchestrator) = self.orchestrator.as_mut() else { return Ok(()) };
-        terminate(orchestrator);
-        let deadline = Instant::now() + PATIENCE;
-        let ended = loop {
-            match orchestrator.try_wait() {
-                Ok(Some(status)) => break status.to_string(),
-                Ok(None) if Instant::now() < deadline => thread::sleep(POLL_INTERVAL),
-                Ok(None) => return Err(not_in_order("it does not end")),
-                Err(error) => return Err(not_in_order(&error.to_string())),
-            }
-        };
-        match self.orchestrator.take().map(|mut it| it.wait()) {
-            Some(Ok(status)) if status.success() => Ok(()),
-            _ => Err(not_in_order(&ended)),
-        }
+        self.orchestrator.take().map_or(Ok(()), |program| end(program, "gleaner-orchestrator"))
     }
 }
 
 impl Drop for DemoVehicle<'_> {
     fn drop(&mut self) {
-        if let Some(orchestrator) = &mut self.orchestrator {
-            terminate(orchestrator);
-            let _ = orchestrator.wait();
+        if let Some(program) = self.orchestrator.take() {
+            let _ = end(program, "gleaner-orchestrator");
         }
-        let _ = fs::remove_dir_all(&self.run);
     }
 }
 
@@ -164,24 +181,33 @@ pub(super) fn signal(pid: u32, signal: Signal) -> Result<(), Failure> {
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot signal a process", &error))
 }
 
-fn terminate(child: &Child) {
+/// Asks a program to end, and waits for that.
+pub(super) fn end(mut program: Child, name: &str) -> Result<(), Failure> {
     // Of one that has ended, its number is kept until it is waited for.
-    let _ = signal(child.id(), Signal::TERM);
-}
-
-fn not_in_order(why: &str) -> Failure {
-    let mut failure = Failure::new(Exit::Internal, "the orchestrator did not end in order");
-    failure.causes = vec![why.to_owned()];
-    failure.with_help(see_log())
+    let _ = signal(program.id(), Signal::TERM);
+    let deadline = Instant::now() + PATIENCE;
+    let ended = loop {
+        match program.try_wait() {
+            Ok(Some(status)) if status.success() => return Ok(()),
+            Ok(Some(status)) => break status.to_string(),
+            Ok(None) if Instant::now() < deadline => thread::sleep(POLL_INTERVAL),
+            Ok(None) => break "it does not end".to_owned(),
+            Err(error) => break error.to_string(),
+        }
+    };
+    let mut failure = Failure::new(Exit::Internal, format!("{name} did not end in order"));
+    failure.causes = vec![ended];
+    Err(failure.with_help(see_log()))
 }
 
 fn see_log() -> String {
-    format!("`{OUT}/orchestrator.log` is the log of the orchestrator")
+    format!("the logs are `{OUT}/orchestrator.log` and `out/demo/cloud.log`")
 }
 
-fn remove(folder: &Path) -> std::io::Result<()> {
+/// Removes a folder, if there is one.
+pub(super) fn remove(folder: &Path) -> io::Result<()> {
     match fs::remove_dir_all(folder) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error),
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
         _ => Ok(()),
     }
 }

@@ -1,11 +1,21 @@
-//! The second part of the demo: starts `vehicle_run` in a private network, so that no DDS
-//! participant of another program sees it.
+//! The second part of the demo: starts the cloud, and `vehicle_run` in a private network, so that no
+//! DDS participant of another program sees it. A relay connects both.
 
-use std::process::Command;
+use std::fs::{self, DirBuilder};
+use std::io::{self, Read};
+use std::os::unix::fs::DirBuilderExt;
+use std::os::unix::net::UnixStream;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitStatus, Stdio};
+use std::thread;
 
 use gleaner_base::{Exit, Failure};
+use rustix::process::{Pid, Signal, kill_process_group};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-use super::vehicle_run;
+use super::demo_cloud::DemoCloud;
+use super::{relay, vehicle_run};
 use crate::checkout::Checkout;
 use crate::player;
 use crate::steps::{self, Steps};
@@ -15,8 +25,13 @@ const SET_UP: &str = "ip link set lo up && ip link set lo multicast on && \
                       ip route add 224.0.0.0/4 dev lo && exec \"$0\" \"$@\"";
 
 /// Runs the part; skips it with a line if the player cannot be fetched, or no network be created.
-pub(super) fn run(checkout: &Checkout, steps: &mut Steps) -> Result<Exit, Failure> {
-    steps.begin("the same lambdas on a vehicle, in a network of its own");
+/// The page is left open until Ctrl-C if `stays_open`.
+pub(super) fn run(
+    checkout: &Checkout,
+    steps: &mut Steps,
+    stays_open: bool,
+) -> Result<Exit, Failure> {
+    steps.begin("the same lambdas on a vehicle, in a network of its own, by a cloud");
     if !checkout.program("gleaner-player").is_file() {
         match player::run(checkout) {
             Err(failure) if failure.exit == Exit::Unreachable => {
@@ -39,12 +54,58 @@ pub(super) fn run(checkout: &Checkout, steps: &mut Steps) -> Result<Exit, Failur
     let program = std::env::current_exe().map_err(|error| {
         Failure::caused_by(Exit::Internal, "cannot find the program of xtask", &error)
     })?;
-    let status = shell(checkout, options).arg(program).arg(vehicle_run::COMMAND).status();
-    let status = status.map_err(|error| {
-        Failure::caused_by(Exit::Internal, "cannot start a private network", &error)
-    })?;
+    let failed =
+        |error| Failure::caused_by(Exit::Internal, "cannot start a private network", &error);
+    let cloud = DemoCloud::start(checkout)?;
+    let run = RunFolder::create().map_err(failed)?;
+    relay::out_of(&run.0.join("relay"), &cloud.ports).map_err(failed)?;
+    let mut vehicle = shell(checkout, options);
+    vehicle.arg(program).arg(vehicle_run::COMMAND).arg(&run.0);
+    if stays_open {
+        vehicle.arg(&cloud.url);
+    }
+    let status = run_to_end(&mut vehicle).map_err(failed)?;
+    cloud.stop()?;
     // It has printed its error.
     Ok(status.code().and_then(Exit::from_code).unwrap_or(Exit::Internal))
+}
+
+/// The folder of the sockets: in a temporary place, as their paths must be short.
+struct RunFolder(PathBuf);
+
+impl RunFolder {
+    fn create() -> io::Result<Self> {
+        let folder = std::env::temp_dir().join(format!("gleaner-demo-{}", std::process::id()));
+        let private = |path: &Path| DirBuilder::new().mode(0o700).create(path);
+        private(&folder)?;
+        let folder = Self(folder);
+        private(&folder.0.join("relay"))?;
+        Ok(folder)
+    }
+}
+
+impl Drop for RunFolder {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Runs the part in the private network to its end. Ctrl-C, and other wishes that the demo ends,
+/// become a SIGTERM to all of its processes, which end in order.
+fn run_to_end(vehicle: &mut Command) -> io::Result<ExitStatus> {
+    let (mut signals, notifier) = UnixStream::pair()?;
+    for signal in [SIGHUP, SIGINT, SIGTERM] {
+        signal_hook::low_level::pipe::register(signal, notifier.try_clone()?)?;
+    }
+    // In a process group of its own, which a terminal does not signal.
+    let mut program = vehicle.process_group(0).stdin(Stdio::null()).spawn()?;
+    let group = i32::try_from(program.id()).ok().and_then(Pid::from_raw);
+    thread::spawn(move || {
+        while let (Ok(1..), Some(group)) = (signals.read(&mut [0]), group) {
+            let _ = kill_process_group(group, Signal::TERM);
+        }
+    });
+    program.wait()
 }
 
 fn shell(checkout: &Checkout, options: &[&str]) -> Command {

@@ -1,14 +1,16 @@
-//! A run of the examples on a vehicle: deployed, fed over DDS, one of them killed, and the clips
-//! verified. Each expectation that is not met is an error.
+//! A run of the examples on a vehicle: deployed by the cloud, fed over DDS, one of them killed, and
+//! the clips that reached the cloud verified. Each expectation that is not met is an error.
 
 use std::collections::BTreeSet;
+use std::ffi::OsString;
 use std::fs;
-use std::io;
+use std::io::{self, Write};
 use std::path::Path;
 use std::process::{Child, Stdio};
 use std::time::Instant;
 
 use gleaner_base::{Exit, Failure, visible};
+use gleaner_fleet::people::Invitation;
 use gleaner_lambda::Clip;
 use gleaner_protocol::Verified;
 use gleaner_protocol::supervision::LambdaPhase;
@@ -17,8 +19,9 @@ use gleaner_report::clips;
 use gleaner_report::format::{clip_contents, counted, grouped};
 use rustix::process::Signal;
 
-use super::demo_vehicle::{DemoVehicle, OUT, file, signal};
+use super::demo_vehicle::{DemoVehicle, NAME, OUT, file, signal};
 use super::drive::table;
+use super::{arrivals, relay};
 use crate::checkout::Checkout;
 use crate::examples::{DRIVE, EXAMPLES, Example};
 
@@ -43,10 +46,19 @@ const VICTIM: (&str, u64) = ("hello-python", 800);
 /// The lambda whose decisions are repeated from the clips: it keeps no state.
 const REPEATED: &str = "hello-rust";
 
-/// Runs everything, and prints a line for each result.
-pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
-    let vehicle = DemoVehicle::start(checkout)?;
-    println!("keys and a trust root are made, and gleaner-orchestrator runs\n");
+/// Runs everything, and prints a line for each result. The arguments are the folder of the sockets
+/// of the relay, and the address of the page if that is left open until SIGTERM.
+pub(crate) fn run(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
+    let (run, page) = match arguments {
+        [run] => (Path::new(run), None),
+        [run, page] => (Path::new(run), page.to_str()),
+        _ => return Err(Failure::new(Exit::Usage, "it is a part of `cargo xtask demo`")),
+    };
+    relay::into(&run.join("relay")).map_err(|error| {
+        Failure::caused_by(Exit::Internal, "cannot reach the cloud from the vehicle", &error)
+    })?;
+    let vehicle = DemoVehicle::start(checkout, run)?;
+    println!("{NAME} has keys and a trust root, runs gleaner-orchestrator, and is enrolled\n");
     let lambdas = EXAMPLES.iter().flat_map(|it| LANGUAGES.map(|language| (it, language)));
     let mut ids = Vec::new();
     for (example, language) in lambdas {
@@ -73,18 +85,40 @@ pub(crate) fn run(checkout: &Checkout) -> Result<Exit, Failure> {
     if let Some(id) = ids.iter().find(|id| !runs(&status, id)) {
         return Err(Failure::new(Exit::Differs, format!("`{id}` does not run at the end")));
     }
+    let recorded = clips(&checkout.path(file("state/clips")))?;
+    arrivals::run(&vehicle, &ids, &recorded)?;
     let vehicles = checkout.path(file("vehicles"));
     fs::write(&vehicles, format!("{} {}\n", status.vehicle, status.key))
         .map_err(|error| Failure::caused_by(Exit::Internal, "cannot write `vehicles`", &error))?;
-    let recorded = clips(&checkout.path(file("state/clips")))?;
     verify(&vehicle, &recorded)?;
     report(&vehicle, &recorded)?;
+    if let Some(page) = page {
+        leave_open(&vehicle, page)?;
+    }
     vehicle.stop()?;
     println!("\ngleaner-orchestrator has ended all lambdas; {OUT}/ has keys, state, clips and log");
     Ok(Exit::Ok)
 }
 
-/// Publishes and deploys a twin under a name of its own, as a vehicle runs each name once.
+/// Prints how to open the page, and waits until the demo is to end.
+fn leave_open(vehicle: &DemoVehicle, page: &str) -> Result<(), Failure> {
+    let invitation = vehicle.gleaner(&["users", "invite", "you", "--role", "admin", "--json"])?;
+    let invitation: Invitation = serde_json::from_str(&invitation).map_err(|error| {
+        Failure::caused_by(Exit::Internal, "`gleaner users invite` gave no code", &error)
+    })?;
+    println!(
+        "\nThe vehicle and the cloud run on. Look at all of this on the page:\n\n  \
+         {page}/vehicles/{NAME}/events\n  log in by the one-time code {}\n\n\
+         Press Ctrl-C to end the demo.",
+        invitation.code
+    );
+    // Flushed, since the output may be a pipe.
+    let _ = io::stdout().flush();
+    vehicle.until_end();
+    Ok(())
+}
+
+/// Publishes a twin, and deploys it by the cloud, under a name of its own, as a vehicle runs each name once.
 fn deploy(
     checkout: &Checkout,
     vehicle: &DemoVehicle,
@@ -111,7 +145,7 @@ fn deploy(
     })?;
     vehicle.gleaner(&["publish", &to, "--key", &file("publisher.pem")])?;
     let key = file("deployer.pem");
-    let mut arguments = vec!["deploy", "--local", &to, "--key", &key];
+    let mut arguments = vec!["deploy", "--fleet", &to, "--key", &key, "--label", "fleet=demo"];
     arguments.extend(example.set.iter().flat_map(|set| ["--set", *set]));
     let started = Instant::now();
     vehicle.gleaner(&arguments)?;
@@ -160,14 +194,14 @@ fn kill(vehicle: &DemoVehicle) -> Result<(), Failure> {
         "  kill -9 {pid}: `{id}` runs again after {:.1} s, restarts {before} -> {restarts}",
         killed.elapsed().as_secs_f64()
     );
-    let events = vehicle.gleaner(&["events", "--json"])?;
-    let mut events =
-        events.lines().filter_map(|line| serde_json::from_str::<StreamLine>(line).ok());
-    let event = events.find(|line| line.record["event"] == "failed" && line.record["lambda"] == id);
-    let event = event.ok_or_else(|| {
-        Failure::new(Exit::Differs, format!("`gleaner events` has no failure of `{id}`"))
+    let event = vehicle.look_until("its failure as an event in the cloud", || {
+        let events = vehicle.gleaner(&["events", "--on", NAME, "--json"])?;
+        let mut events =
+            events.lines().filter_map(|line| serde_json::from_str::<StreamLine>(line).ok());
+        Ok(events.find(|it| it.record["event"] == "failed" && it.record["lambda"] == id))
     })?;
-    println!("  gleaner events: {}", visible(event.record["text"].as_str().unwrap_or_default()));
+    let text = visible(event.record["text"].as_str().unwrap_or_default());
+    println!("  gleaner events --on {NAME}: {text}");
     Ok(())
 }
 
@@ -250,9 +284,10 @@ fn folder(name: &str) -> String {
     file(&format!("lambdas/{name}"))
 }
 
-/// Path of a clip, relative to the checkout.
+/// Path of a clip as it came from the cloud, relative to the checkout.
 fn clip_path(clip: &Clip) -> String {
-    file(&format!("state/clips/{}", clip.file.display()))
+    let name = clip.file.file_name().unwrap_or_default();
+    file(&format!("cloud-clips/{NAME}/{}", name.display()))
 }
 
 /// Copies all files and folders in `from` to `to`.

@@ -73,6 +73,19 @@ pub(super) fn spread(stats: &DurationStats) -> Markup {
     }
 }
 
+/// Renders moments of a time span, each as its share of the span.
+pub(super) fn ticks(shares: impl Iterator<Item = f64>) -> Markup {
+    html! {
+        svg.bar.ticks aria-hidden="true" width="100%" height="20" {
+            rect.ground width="100%" height="20" {}
+            @for share in shares {
+                @let x = format!("{:.2}%", share.clamp(0.0, 1.0) * 100.0);
+                line.range x1=(x) x2=(x) y1="3" y2="17" {}
+            }
+        }
+    }
+}
+
 fn percent(number: u64, total: u64) -> String {
     format!("{:.3}%", number as f64 * 100.0 / total.max(1) as f64)
 }

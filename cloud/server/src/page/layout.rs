@@ -17,8 +17,9 @@ const HTMX: &str = r#"{"includeIndicatorStyles":false,"allowEval":false,"allowSc
 "historyCacheSize":0,"selfRequestsOnly":true}"#;
 
 /// The places of the navigation: name, path, and the least role.
-const PLACES: [(&str, &str, Role); 5] = [
+const PLACES: [(&str, &str, Role); 6] = [
     ("Fleet", "/vehicles", Role::Viewer),
+    ("Clips", "/clips", Role::Viewer),
     ("Deployments", "/deployments", Role::Viewer),
     ("Lambdas", "/lambdas", Role::Viewer),
     ("Access", "/access", Role::Admin),
@@ -158,6 +159,7 @@ pub(super) fn done(change: Option<&str>) -> Markup {
         }
         Some("rollback") => "Each vehicle runs the fallback as soon as it is connected.",
         Some("pause" | "resume" | "abort") => "The waves are as you have set them.",
+        Some("clip") => "The file is wanted: its vehicle sends it as soon as it can.",
         Some("deployment") => "The deployment is removed.",
         Some("user") => "The user is removed, and the user's sessions and tokens have ended.",
         Some("vehicle") => "The vehicle is cut off.",

@@ -13,6 +13,8 @@ mod account;
 mod assets;
 mod audit;
 mod charts;
+mod clip;
+mod clips;
 mod deployments;
 mod fleet;
 mod guard;
@@ -21,6 +23,7 @@ mod layout;
 mod line;
 mod login;
 mod password;
+mod recording;
 mod records;
 mod session;
 mod status;
@@ -81,6 +84,11 @@ pub(crate) fn routes() -> Vec<PageRoute> {
         read("/vehicles/{name}/events/stream", Viewer, get(stream::time_line)),
         read("/vehicles/{name}/lambdas/{id}", Viewer, get(records::lambda)),
         read("/vehicles/{name}/lambdas/{id}/stream", Viewer, get(stream::lambda)),
+        read("/clips", Viewer, get(clips::page)),
+        read("/clips/{id}", Viewer, get(clip::page)),
+        read("/clips/{id}/thumbnail", Viewer, get(clip::thumbnail)),
+        read("/clips/{id}/file", Viewer, get(clip::file)),
+        send("/clips/{id}/pull", Operator, post(clip::pull)),
         read("/lambdas", Viewer, get(lambdas::page)),
         read("/lambdas/{digest}", Viewer, get(lambdas::revision)),
         read("/deployments", Viewer, get(deployments::list)),

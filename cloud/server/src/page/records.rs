@@ -7,19 +7,23 @@ use axum::extract::{Extension, Path, Query, State};
 use maud::{Markup, html};
 use serde::Deserialize;
 
+use super::clips;
 use super::layout::{self, PageResult, empty};
-use super::line::line;
+use super::line::{line, time_ns};
 use super::session::PageUser;
 use super::text::{query, segment, shown, vehicle_path};
 use super::vehicle::find;
 use crate::cloud::Cloud;
 use crate::error::CloudResult;
-use crate::store::NewestRecords;
+use crate::request::PageLimit;
+use crate::store::{ClipQuery, NewestRecords};
 
 /// Maximum number of records on a page.
 const SIZE: usize = 100;
 /// Number of records that are read for a page of the time line, which leaves log lines out.
 const READ: usize = 1000;
+/// Maximum number of clips above a time line.
+const CLIPS: PageLimit = PageLimit::of(12);
 
 /// The records of a page.
 #[derive(Debug, Clone)]
@@ -99,6 +103,10 @@ async fn page(
     // Reading takes memory: as many at a time as streams.
     let _slot = cloud.readers.open(&user.user.name)?;
     let newest = source.newest(cloud, (0, before.unwrap_or(i64::MAX)), SIZE).await?;
+    let clips = match source.lambda {
+        None => clips_of(cloud, &source.vehicle, before.is_some(), &newest).await?,
+        Some(_) => html! {},
+    };
     let here = source.path();
     let up = vehicle_path(&vehicle.name);
     let title = source.lambda.as_deref().map_or("Time line".to_owned(), shown);
@@ -112,8 +120,13 @@ async fn page(
                 a href=(up) { "Status" }
                 a href=(here) aria-current="page" { "Time line" }
             }
-            p.help { "Events and triggers, the newest first; times are in UTC. Log lines are with \
-                      their lambda." }
+            p.help { "Clips, events and triggers, the newest first; times are in UTC. Log lines \
+                      are with their lambda." }
+            div id="clips" hx-get=[before.is_none().then_some(&here)]
+                hx-trigger=[before.is_none().then_some("every 10s")]
+                hx-select="#clips" hx-swap="outerHTML" {
+                (clips)
+            }
         } @else {
             p.help { "Log lines, triggers, starts and ends, the newest first; times are in UTC." }
         }
@@ -132,6 +145,32 @@ async fn page(
     };
     let title = format!("{title} of {}", vehicle.name);
     Ok(layout::page(&title, "/vehicles", Some(user), body))
+}
+
+/// Renders the clips of the time that these records are of; without an end, if they are the newest.
+async fn clips_of(
+    cloud: &Cloud,
+    vehicle: &str,
+    has_end: bool,
+    newest: &NewestRecords,
+) -> CloudResult<Markup> {
+    let times = || newest.lines.iter().filter_map(|(_, line)| time_ns(line));
+    let query = ClipQuery {
+        vehicle: Some(vehicle.to_owned()),
+        // Without older records, all clips from before are of this part.
+        from_ns: times().min().filter(|_| newest.has_more),
+        to_ns: times().max().filter(|_| has_end),
+        limit: CLIPS,
+        ..ClipQuery::default()
+    };
+    let found = cloud.store.clips(&query).await?;
+    let all = format!("/clips{}", super::text::query(&[("vehicle", vehicle)]));
+    Ok(html! {
+        @if !found.items.is_empty() {
+            (clips::grid(&found.items, false))
+            p.help { a href=(all) { "All clips of this vehicle" } }
+        }
+    })
 }
 
 /// Returns the arrival before which older records are, if there may be any.

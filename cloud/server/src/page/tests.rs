@@ -16,6 +16,7 @@ use crate::accept::PeerConnection;
 use crate::cloud::Cloud;
 use crate::people;
 use crate::people::tests::{ROLES, cloud};
+use crate::store::ClipBounds;
 
 const PASSWORD: &str = "correct horse battery staple";
 
@@ -301,6 +302,16 @@ async fn hostile_vehicle(cloud: &Cloud) {
         "deployments": [deployment], "capacity": [capacity], "supervisor": null });
     let text = |value: serde_json::Value| value.to_string();
     cloud.store.invite_vehicle("console", "car-1").await.unwrap();
+    let moment = json!({ "lambda": bad, "kind": bad, "label": bad, "score": 1e300,
+                         "attributes": { bad: bad }, "at_ns": i64::MAX, "source": bad });
+    let lambda = json!({ "name": bad, "version": bad, "digest": bad, "deployment": bad,
+                         "revision": bad });
+    let clip = json!({ "name": "a", "from_ns": i64::MIN, "to_ns": i64::MAX, "bytes": 0,
+                       "sha256": null, "thumbnail": null, "lambdas": [lambda], "triggers": 9,
+                       "moments": [moment], "incomplete": [bad], "is_recovered": true });
+    let report = json!({ "cursor": "1", "clips": [clip], "gone": [] });
+    let report = serde_json::from_value(report).unwrap();
+    cloud.store.announce_clips("car-1", &report, ClipBounds::DEFAULT).await.unwrap();
     cloud
         .store
         .execute_with(
@@ -339,6 +350,9 @@ async fn what_a_vehicle_sends_is_never_markup() {
         ("/vehicles", true),
         ("/vehicles/car-1", true),
         ("/vehicles/car-1/events", true),
+        ("/clips?lambda=%3Cscript%3E&label=%22%3E%3Cb%3E", false),
+        ("/clips", true),
+        ("/clips/a%40car-1", true),
         ("/vehicles/car-1/lambdas/a", true),
         ("/vehicles/car-1/lambdas/%3Cscript%3Ealert(1)", true),
         (label, false),

@@ -84,6 +84,11 @@ pub(super) fn time(seconds: i64) -> Markup {
     html! { time datetime=(text) { span { (day) } " " span { (of_day) } } }
 }
 
+/// Returns an element with a time in UTC, in ns since 1970.
+pub(super) fn moment(ns: i64) -> Markup {
+    time(ns.div_euclid(1_000_000_000))
+}
+
 /// Returns an element with a time of day with ms, in ns since 1970, and the date as its title; a
 /// dash without a time.
 pub(super) fn time_of_day(ns: i64) -> Markup {

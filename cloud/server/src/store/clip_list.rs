@@ -14,21 +14,21 @@ use crate::request::PageLimit;
 #[serde(deny_unknown_fields)]
 pub(crate) struct ClipQuery {
     /// Name of the vehicle.
-    vehicle: Option<String>,
+    pub(crate) vehicle: Option<String>,
     /// Name of a lambda.
-    lambda: Option<String>,
+    pub(crate) lambda: Option<String>,
     /// Label of a moment.
-    label: Option<String>,
+    pub(crate) label: Option<String>,
     /// Begin of the time, in ns since 1970: clips that end before are left out.
-    from_ns: Option<i64>,
+    pub(crate) from_ns: Option<i64>,
     /// End of the time, in ns since 1970: clips that begin after are left out.
-    to_ns: Option<i64>,
+    pub(crate) to_ns: Option<i64>,
     /// `next` of the page before.
-    after: Option<u64>,
+    pub(crate) after: Option<u64>,
     /// Maximum number of clips in a page.
     #[serde(default)]
     #[schemars(with = "Option<u16>", range(min = 1, max = 500))]
-    limit: PageLimit,
+    pub(crate) limit: PageLimit,
 }
 
 type ClipRow = (i64, String, String, String, i64, i64, i64, String, String, i64);

@@ -21,6 +21,9 @@ const PAGES = {
   hostile: "/vehicles/truck-1",
   "time-line": "/vehicles/truck-1/events",
   records: "/vehicles/truck-1/lambdas/brake-dark",
+  clips: "/clips",
+  clip: "/clips/brake-dark-0%40car-1",
+  "hostile-clip": "/clips/brake-dark-0%40truck-1",
   deployments: "/deployments",
   deployment: "/deployments/hard-brake",
   lambdas: "/lambdas",
@@ -187,6 +190,39 @@ const flows = {
     await has(admin, "speed_ms=13.9");
     assert.equal(await admin.getByText("brightness").count(), 0, "no log lines");
   },
+  async "a clip is found in the time line, fetched, and looked into"() {
+    await admin.goto("/vehicles/car-1/events");
+    const card = admin.getByRole("link", { name: /hard-brake/ });
+    const width = (image) => image.naturalWidth;
+    await admin.waitForFunction(() => document.querySelector(".clip img")?.naturalWidth > 0);
+    await card.click();
+    await admin.waitForURL("**/clips/brake-dark-0%40car-1");
+    for (const text of ["0.912", "speed_ms=13.9", "12.0 s", "on the vehicle"])
+      await has(admin, text);
+    assert.ok(await admin.locator(".thumbnail img").evaluate(width) > 0);
+    await button(admin, "Fetch from the vehicle").click();
+    // Refreshed without a reload, once the vehicle has sent it.
+    const link = admin.getByRole("link", { name: "Download" });
+    const [download] = await Promise.all([admin.waitForEvent("download"), link.click()]);
+    assert.equal(download.suggestedFilename(), "brake-dark-0.mcap");
+    const magic = (await readFile(await download.path())).subarray(1, 5).toString();
+    assert.equal(magic, "MCAP");
+    await admin.reload();
+    await admin.getByRole("row", { name: /\/vehicle\/imu sensor_msgs\/msg\/Imu 1,200 100/ }).waitFor();
+  },
+  async "clips of the fleet are filtered; one that is hostile is no markup, and no image"() {
+    await admin.goto("/clips");
+    assert.equal(await admin.locator(".clip").count(), 4);
+    await admin.getByLabel("Label", { exact: true }).fill("dark");
+    await button(admin, "Show").click();
+    await admin.waitForURL(/label=dark/);
+    assert.equal(await admin.locator(".clip").count(), 1);
+    await admin.goto("/clips/brake-dark-0%40truck-1");
+    await has(admin, "<script>document.title='x'</script>");
+    assert.match(await admin.title(), /of truck-1 – Gleaner$/);
+    const images = await admin.locator("main img").evaluateAll((all) => all.map((it) => it.naturalWidth));
+    assert.deepEqual(images, [0]);
+  },
   async "a deployment is stopped, started, rolled back and removed"() {
     await admin.goto("/deployments");
     await admin.getByRole("link", { name: "hard-brake" }).click();
@@ -217,6 +253,9 @@ const flows = {
     await has(guest, "this needs admin");
     await guest.goto("/deployments/hard-brake");
     assert.equal(await button(guest, "Stop").count(), 0);
+    await guest.goto("/clips/brake-dark-60000000000%40car-1");
+    await has(guest, "Operators can fetch it");
+    assert.equal(await button(guest, "Fetch from the vehicle").count(), 0);
   },
   async "the audit trail has each change"() {
     await admin.goto("/audit");
@@ -261,6 +300,9 @@ const flows = {
     await page.goto("/vehicles/car-1/lambdas/brake-dark");
     await has(page, "brightness");
     assert.match(await page.content(), /Without scripts, load the page again/);
+    await page.goto("/clips/brake-dark-60000000000%40car-1");
+    await button(page, "Fetch from the vehicle").click();
+    await has(page, "The file is wanted");
     await page.goto("/deployments/brake-dark");
     await button(page, "Stop").click();
     await has(page, "It is not wanted any more");

@@ -97,6 +97,9 @@ async fn each_answer_has_the_form_that_the_description_states() {
             (_, "/v1/login") => code.clone(),
             (_, "/v1/vehicles") => json!({ "name": "car-8" }).to_string(),
             (_, "/v1/users") => json!({ "name": "eve", "role": "viewer" }).to_string(),
+            (_, "/v1/tokens") => {
+                json!({ "name": "nightly", "role": "viewer", "days": 1 }).to_string()
+            }
             (_, "/v1/clips/policy") => json!({ "upload": "all", "day_bytes": 1 }).to_string(),
             _ => String::new(),
         };

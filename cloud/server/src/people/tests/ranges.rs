@@ -9,7 +9,8 @@ async fn a_file_goes_on_at_a_position_and_other_ranges_get_all_of_it() {
     cloud.store.invite_vehicle("console", "car-7").await.unwrap();
     announce(&cloud.store).await;
     cloud.store.execute("UPDATE clips SET state = 'stored'").await;
-    let file = folder.path().join("data/clips/car-7/a.mcap");
+    let name = format!("{}.mcap", gleaner_trust::sha256(b"a@car-7"));
+    let file = folder.path().join("data/clips").join(name);
     std::fs::create_dir_all(file.parent().unwrap()).unwrap();
     std::fs::write(&file, "01234").unwrap();
     let path = (Method::GET, "/v1/clips/a@car-7/file");

@@ -1,0 +1,297 @@
+//! One clip: its facts, its thumbnail, its file, and the report of what is in it.
+
+use std::sync::Arc;
+
+use axum::extract::{Extension, Path, Query, State};
+use axum::http::{HeaderMap, header};
+use axum::response::{IntoResponse, Redirect};
+use gleaner_fleet::clips::{
+    ClipFacts, ClipId, ClipMoment, ClipState, FleetClip, RecordedLambda, THUMBNAIL_MAX,
+};
+use gleaner_fleet::people::Role;
+use gleaner_image::Format;
+use maud::{Markup, html};
+
+use super::account::Done;
+use super::charts;
+use super::clips::{clip_path, image, length, state, title};
+use super::layout::{self, PageResult, done, form};
+use super::recording::{self, Recording, TOPICS_MAX, whole};
+use super::session::PageUser;
+use super::text::{bytes, count, moment, segment, shown, vehicle_path};
+use crate::clips::people;
+use crate::cloud::Cloud;
+use crate::error::{CloudError, CloudResult};
+
+/// Largest side of a thumbnail that is sent to a browser, in pixels: a few KiB could claim more
+/// than the browser has memory for.
+const SIDE_MAX: u32 = 4096;
+/// Maximum number of attributes of a trigger that are shown.
+const ATTRIBUTES_MAX: usize = 16;
+
+pub(super) async fn page(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(id): Path<String>,
+    Query(query): Query<Done>,
+) -> PageResult {
+    let clip = cloud.store.clip(&parse(&id)?).await?;
+    let recording = match clip.state {
+        ClipState::Stored => {
+            // Reading takes memory: as many at a time as streams.
+            let _slot = cloud.readers.open(&user.user.name)?;
+            // A file that is lost is no reason to hide the facts.
+            recording::read(&cloud, &clip).await.ok().flatten()
+        }
+        _ => None,
+    };
+    let (vehicle, here) = (vehicle_path(&clip.vehicle), clip_path(&clip.id));
+    let title = title(&clip);
+    let is_on_its_way = matches!(clip.state, ClipState::Wanted | ClipState::Uploading);
+    let body = html! {
+        nav.crumbs aria-label="Path" {
+            a href="/vehicles" { "Fleet" } " / " a href=(vehicle) { (shown(&clip.vehicle)) }
+            " / " a href=(format!("{vehicle}/events")) { "Time line" }
+        }
+        h1 { (title) " " span.dim { "of " (shown(&clip.vehicle)) } }
+        (done(query.done.as_deref()))
+        (warnings(&clip.facts))
+        div.pair {
+            section.card aria-label="Image" {
+                figure.thumbnail { (image(&clip, &format!("The moment of {title}"))) }
+            }
+            section.card aria-labelledby="facts" {
+                h2 id="facts" { "Facts" }
+                (facts(&clip))
+            }
+        }
+        section.card aria-labelledby="file" id="clip-file"
+            hx-get=[is_on_its_way.then_some(&here)] hx-trigger=[is_on_its_way.then_some("every 3s")]
+            hx-select=[is_on_its_way.then_some("#clip-file")]
+            hx-swap=[is_on_its_way.then_some("outerHTML")] {
+            h2 id="file" { "File" }
+            (file_part(&clip, &user, &here))
+        }
+        (moments(&clip))
+        @if clip.state == ClipState::Stored { (recorded(recording.as_ref())) }
+    };
+    Ok(layout::page(&format!("{title} of {}", clip.vehicle), "/clips", Some(&user), body))
+}
+
+/// Answers with the thumbnail, once it is what it claims to be. Its type is never guessed.
+pub(super) async fn thumbnail(
+    State(cloud): State<Arc<Cloud>>,
+    Path(id): Path<String>,
+) -> PageResult {
+    let reply = people::thumbnail(State(cloud), Path(id)).await?;
+    let bytes = whole(reply, THUMBNAIL_MAX).await.unwrap_or_default();
+    let is_image = gleaner_image::probe(&bytes).is_ok_and(|image| {
+        image.format == Format::Jpeg && image.width.max(image.height) <= SIDE_MAX
+    });
+    if !is_image {
+        let help = "its vehicle has sent something else: look at the clip itself";
+        return Err(CloudError::missing("the thumbnail is no small JPEG", help).into());
+    }
+    let headers =
+        [(header::CONTENT_TYPE, "image/jpeg"), (header::CACHE_CONTROL, "private, max-age=600")];
+    Ok((headers, bytes).into_response())
+}
+
+/// Answers with the file, to be saved.
+pub(super) async fn file(
+    State(cloud): State<Arc<Cloud>>,
+    Path(id): Path<String>,
+    headers: HeaderMap,
+) -> PageResult {
+    let clip = parse(&id)?;
+    let reply = people::file(State(cloud), Path(id), headers).await?;
+    // Names of clips are letters, digits and `._-`.
+    let name = format!("attachment; filename=\"{}.mcap\"", clip.name());
+    Ok(([(header::CONTENT_DISPOSITION, name)], reply).into_response())
+}
+
+/// Marks the file as wanted.
+pub(super) async fn pull(
+    State(cloud): State<Arc<Cloud>>,
+    Extension(user): Extension<PageUser>,
+    Path(id): Path<String>,
+) -> PageResult {
+    let here = clip_path(&parse(&id)?);
+    let _ = people::pull(State(cloud), Extension(user.user), Path(id)).await?;
+    Ok(Redirect::to(&format!("{here}?done=clip")).into_response())
+}
+
+fn parse(id: &str) -> CloudResult<ClipId> {
+    id.parse().map_err(|reason: String| CloudError::missing(reason, "choose one from the list"))
+}
+
+fn warnings(facts: &ClipFacts) -> Markup {
+    html! {
+        @if facts.is_recovered {
+            p.banner { "The recorder died while it wrote the clip, which was recovered later." }
+        }
+        @for reason in &facts.incomplete { p.banner { "Incomplete: " (shown(reason)) } }
+    }
+}
+
+fn facts(clip: &FleetClip) -> Markup {
+    let ClipFacts { from_ns, lambdas, triggers, sha256, .. } = &clip.facts;
+    html! {
+        dl {
+            dt { "Name" } dd { code { (clip.id.name()) } }
+            dt { "Begin" } dd { (moment(*from_ns)) }
+            dt { "Length" } dd { (length(clip)) }
+            dt { "Size" } dd { (bytes(clip.facts.bytes as f64)) }
+            dt { "Triggers" } dd { (gleaner_base::grouped(*triggers)) }
+            dt { "Lambdas" } dd {
+                @for (index, it) in lambdas.iter().enumerate() {
+                    @if index > 0 { ", " }
+                    (lambda(clip, it))
+                }
+            }
+            @if let Some(sha256) = sha256 { dt { "SHA-256" } dd { code { (shown(sha256)) } } }
+        }
+    }
+}
+
+/// Renders a lambda, with a link to its records if its deployment is known.
+fn lambda(
+    clip: &FleetClip,
+    RecordedLambda { name, version, deployment, .. }: &RecordedLambda,
+) -> Markup {
+    let page = |id: &String| format!("{}/lambdas/{}", vehicle_path(&clip.vehicle), segment(id));
+    html! {
+        @match deployment {
+            Some(id) => a href=(page(id)) { (shown(name)) },
+            None => (shown(name)),
+        }
+        " " span.dim { (shown(version)) }
+    }
+}
+
+fn file_part(clip: &FleetClip, user: &PageUser, here: &str) -> Markup {
+    let may_pull = user.user.role >= Role::Operator;
+    let words = match clip.state {
+        ClipState::OnVehicle if may_pull => "Only its vehicle has the file.",
+        ClipState::OnVehicle => "Only its vehicle has the file. Operators can fetch it.",
+        ClipState::Wanted | ClipState::Uploading => {
+            "The vehicle sends it when it is connected and has bytes left for today."
+        }
+        ClipState::Stored => "The cloud has the file, as its vehicle has signed it.",
+        ClipState::Gone => "The vehicle has deleted it before it was fetched.",
+        ClipState::Failed => "The vehicle has sent another file than announced.",
+    };
+    let can_be_pulled = may_pull && matches!(clip.state, ClipState::OnVehicle | ClipState::Failed);
+    html! {
+        p { (state(clip)) " " span.dim {
+            (words)
+            @if let Some(reason) = &clip.reason { " " (shown(reason)) }
+        } }
+        @if can_be_pulled {
+            (form(user, &format!("{here}/pull"), html! { button { "Fetch from the vehicle" } }))
+        }
+        @if clip.state == ClipState::Stored {
+            p { a.button href=(format!("{here}/file")) download { "Download" } }
+            p.help {
+                "To look at it, download it, and choose “Open local file” in Foxglove. Foxglove \
+                 cannot open it from here, as the file needs your session."
+            }
+            p.help { "To check its signature: "
+                code { "gleaner verify " (clip.id.name()) ".mcap --trust VEHICLES" } }
+        }
+    }
+}
+
+fn moments(clip: &FleetClip) -> Markup {
+    let ClipFacts { moments, from_ns, to_ns, triggers, .. } = &clip.facts;
+    let span = to_ns.saturating_sub(*from_ns).max(1) as f64;
+    let offset = |moment: &ClipMoment| moment.at_ns.saturating_sub(*from_ns) as f64;
+    html! {
+        section.card aria-labelledby="moments" {
+            h2 id="moments" { "Triggers" }
+            @if moments.is_empty() { p.dim { "There are none." } } @else {
+                (charts::ticks(moments.iter().map(|it| offset(it) / span)))
+                div.scroll tabindex="0" role="region" aria-labelledby="moments" {
+                    table {
+                        thead { tr {
+                            th.number scope="col" { "Time" }
+                            th scope="col" { "Label" } th.number scope="col" { "Score" }
+                            th scope="col" { "Lambda" } th scope="col" { "Attributes" }
+                        } }
+                        tbody { @for it in moments { (row(it, offset(it))) } }
+                    }
+                }
+                @if *triggers > moments.len() as u64 {
+                    p.help { "The first of " (count(*triggers, "trigger"))
+                        "; the file has all of them." }
+                }
+            }
+        }
+    }
+}
+
+fn row(moment: &ClipMoment, offset: f64) -> Markup {
+    let ClipMoment { lambda, kind, label, score, attributes, source, .. } = moment;
+    html! {
+        tr {
+            td.number { (format!("{:.2} s", offset / 1e9)) }
+            th scope="row" {
+                @if kind != "event" { (shown(kind)) " " }
+                (shown(label))
+            }
+            td.number { @if let Some(score) = score { (format!("{score:.3}")) } }
+            td { (shown(lambda)) @if let Some(source) = source { " " span.dim { "by " (shown(source)) } } }
+            td.attributes {
+                @match attributes {
+                    None => span.dim { "too long for the list; the file has them" },
+                    Some(all) => {
+                        @for (name, value) in all.iter().take(ATTRIBUTES_MAX) {
+                            span { (shown(name)) "=" (shown(&value.to_string())) } " "
+                        }
+                        @if all.len() > ATTRIBUTES_MAX {
+                            span.dim { "and " (all.len() - ATTRIBUTES_MAX) " more" }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn recorded(recording: Option<&Recording>) -> Markup {
+    html! {
+        section.card aria-labelledby="topics" {
+            h2 id="topics" { "Recording" }
+            @match recording {
+                None => p.dim {
+                    "The file has no list of its topics that can be read here; download it to look \
+                     at it."
+                },
+                Some(recording) => (topics(recording)),
+            }
+        }
+    }
+}
+
+fn topics(Recording { messages, span, topics, omitted }: &Recording) -> Markup {
+    let [first, last] = span.map(|ns| i64::try_from(ns).unwrap_or(i64::MAX));
+    let seconds = last.saturating_sub(first) as f64 / 1e9;
+    html! {
+        p { (count(*messages, "message")) " from " (moment(first)) " to " (moment(last)) }
+        div.scroll tabindex="0" role="region" aria-labelledby="topics" {
+            table {
+                thead { tr {
+                    th scope="col" { "Topic" } th.optional scope="col" { "Type" }
+                    th.number scope="col" { "Messages" } th.number scope="col" { "Per second" }
+                } }
+                tbody { @for it in topics { tr {
+                    th scope="row" { code { (shown(&it.name)) } }
+                    td.optional { (shown(&it.type_name)) }
+                    td.number { (gleaner_base::grouped(it.messages)) }
+                    td.number { @if seconds > 0.0 { (format!("{:.1}", it.messages as f64 / seconds)) } }
+                } } }
+            }
+        }
+        @if *omitted > 0 { p.help { "The first " (TOPICS_MAX) "; " (omitted) " more are not shown." } }
+    }
+}

@@ -1,0 +1,86 @@
+//! The packages: what each consists of.
+
+/// A Debian package.
+pub(super) struct PackageSource {
+    pub(super) name: &'static str,
+    /// Folder of its files that are not built.
+    pub(super) folder: &'static str,
+    /// Built programs with their folders.
+    pub(super) programs: &'static [(&'static str, &'static str)],
+    /// Files of `folder` with their places.
+    pub(super) files: &'static [(&'static str, &'static str)],
+    /// Package of cargo whose crates the programs contain; without one, those of all programs.
+    pub(super) cargo_package: Option<&'static str>,
+    /// True if it has the command `gleaner` with its manual, and what Python lambdas need.
+    pub(super) has_command: bool,
+    /// The most exposure that `systemd-analyze security` may report, in tenths. It counts what the
+    /// service must do: the network, and for lambdas devices and memory with code.
+    pub(super) exposure_max: u32,
+}
+
+/// Folder of the parts, where the programs search for them.
+pub(super) const LIB: &str = "usr/lib/gleaner";
+
+/// Lambdas on a vehicle: the commands, the parts that those start, and the extension module of
+/// Python.
+const VEHICLE: PackageSource = PackageSource {
+    name: "gleaner",
+    folder: "orchestrator/package",
+    programs: &[
+        ("gleaner", "usr/bin"),
+        ("gleaner-orchestrator", "usr/bin"),
+        ("gleaner-compile", LIB),
+        ("gleaner-inference", LIB),
+        ("gleaner-ingress", LIB),
+        ("gleaner-recorder", LIB),
+        ("gleaner-runtime", LIB),
+        ("gleaner-shim", LIB),
+        ("gleaner-supervisor", LIB),
+        ("lib_gleaner.so", LIB),
+    ],
+    files: &[
+        ("gleaner.service", "usr/lib/systemd/system/gleaner.service"),
+        ("control-groups.conf", "usr/lib/gleaner/control-groups.conf"),
+        ("gleaner-stop", "usr/lib/gleaner/gleaner-stop"),
+        ("gleaner.sysusers", "usr/lib/sysusers.d/gleaner.conf"),
+        ("vehicle.toml", "etc/gleaner/vehicle.toml"),
+        ("gleaner-orchestrator.8", "usr/share/man/man8/gleaner-orchestrator.8"),
+        ("debian/copyright", "usr/share/doc/gleaner/copyright"),
+        ("debian/README.Debian", "usr/share/doc/gleaner/README.Debian"),
+    ],
+    cargo_package: None,
+    has_command: true,
+    exposure_max: 20,
+};
+
+/// The cloud of a fleet, on another machine than a vehicle.
+const CLOUD: PackageSource = PackageSource {
+    name: "gleaner-cloud",
+    folder: "cloud/package",
+    programs: &[("gleaner-cloud", "usr/bin")],
+    files: &[
+        ("gleaner-cloud.service", "usr/lib/systemd/system/gleaner-cloud.service"),
+        ("gleaner-cloud.sysusers", "usr/lib/sysusers.d/gleaner-cloud.conf"),
+        ("gleaner-cloud.default", "etc/default/gleaner-cloud"),
+        ("debian/copyright", "usr/share/doc/gleaner-cloud/copyright"),
+        ("debian/README.Debian", "usr/share/doc/gleaner-cloud/README.Debian"),
+    ],
+    cargo_package: Some("gleaner-cloud"),
+    has_command: false,
+    exposure_max: 13,
+};
+
+/// All packages.
+pub(super) const PACKAGES: [PackageSource; 2] = [VEHICLE, CLOUD];
+
+impl PackageSource {
+    /// Returns the folder of its documentation.
+    pub(super) fn doc(&self) -> String {
+        format!("usr/share/doc/{}", self.name)
+    }
+
+    /// Returns the name of its unit.
+    pub(super) fn unit(&self) -> String {
+        format!("{}.service", self.name)
+    }
+}
