@@ -183,10 +183,8 @@ fn file_part(clip: &FleetClip, user: &PageUser, here: &str) -> Markup {
     };
     let can_be_pulled = may_pull && matches!(clip.state, ClipState::OnVehicle | ClipState::Failed);
     html! {
-        p { (state(clip)) " " span.dim {
-            (words)
-            @if let Some(reason) = &clip.reason { " " (shown(reason)) }
-        } }
+        p { (state(clip)) }
+        p.help { (words) @if let Some(reason) = &clip.reason { " " (shown(reason)) } }
         @if can_be_pulled {
             (form(user, &format!("{here}/pull"), html! { button { "Fetch from the vehicle" } }))
         }
@@ -211,8 +209,8 @@ fn moments(clip: &FleetClip) -> Markup {
             h2 id="moments" { "Triggers" }
             @if moments.is_empty() { p.dim { "There are none." } } @else {
                 (charts::ticks(moments.iter().map(|it| offset(it) / span)))
-                div.scroll tabindex="0" role="region" aria-labelledby="moments" {
-                    table {
+                div.scroll tabindex="0" role="region" aria-label="List of triggers" {
+                    table.tight {
                         thead { tr {
                             th.number scope="col" { "Time" }
                             th scope="col" { "Label" } th.number scope="col" { "Score" }
@@ -278,8 +276,8 @@ fn topics(Recording { messages, span, topics, omitted }: &Recording) -> Markup {
     let seconds = last.saturating_sub(first) as f64 / 1e9;
     html! {
         p { (count(*messages, "message")) " from " (moment(first)) " to " (moment(last)) }
-        div.scroll tabindex="0" role="region" aria-labelledby="topics" {
-            table {
+        div.scroll tabindex="0" role="region" aria-label="List of topics" {
+            table.tight {
                 thead { tr {
                     th scope="col" { "Topic" } th.optional scope="col" { "Type" }
                     th.number scope="col" { "Messages" } th.number scope="col" { "Per second" }
