@@ -1,8 +1,8 @@
 //! `cargo xtask deb`: builds the Debian packages `gleaner`, with the service of a vehicle, and
 //! `gleaner-cloud`, with that of the cloud.
 //!
-//! `source` lists what they consist of, `tree` lays out their files, `control` writes their metadata, `licences` collects those
-//! of crates, `unit` checks the services with `systemd-analyze`, and `root` tests the packages in
+//! `source` lists what they consist of, `tree` lays out their files, `control` writes their
+//! metadata, `licences` collects those of crates, `unit` checks the services with `systemd-analyze`, and `root` tests the packages in
 //! roots of their own. The files that are not built are in `orchestrator/package` and
 //! `cloud/package`.
 

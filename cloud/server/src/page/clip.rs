@@ -191,7 +191,7 @@ fn file_part(clip: &FleetClip, user: &PageUser, here: &str) -> Markup {
         @if clip.state == ClipState::Stored {
             p { a.button href=(format!("{here}/file")) download { "Download" } }
             p.help {
-                "To look at it, download it, and choose “Open local file” in Foxglove. Foxglove \
+                "To look at it, download it, and choose \"Open local file\" in Foxglove. Foxglove \
                  cannot open it from here, as the file needs your session."
             }
             p.help { "To check its signature: "
@@ -238,7 +238,10 @@ fn row(moment: &ClipMoment, offset: f64) -> Markup {
                 (shown(label))
             }
             td.number { @if let Some(score) = score { (format!("{score:.3}")) } }
-            td { (shown(lambda)) @if let Some(source) = source { " " span.dim { "by " (shown(source)) } } }
+            td {
+                (shown(lambda))
+                @if let Some(source) = source { " " span.dim { "by " (shown(source)) } }
+            }
             td.attributes {
                 @match attributes {
                     None => span.dim { "too long for the list; the file has them" },
@@ -286,10 +289,14 @@ fn topics(Recording { messages, span, topics, omitted }: &Recording) -> Markup {
                     th scope="row" { code { (shown(&it.name)) } }
                     td.optional { (shown(&it.type_name)) }
                     td.number { (gleaner_base::grouped(it.messages)) }
-                    td.number { @if seconds > 0.0 { (format!("{:.1}", it.messages as f64 / seconds)) } }
+                    td.number {
+                        @if seconds > 0.0 { (format!("{:.1}", it.messages as f64 / seconds)) }
+                    }
                 } } }
             }
         }
-        @if *omitted > 0 { p.help { "The first " (TOPICS_MAX) "; " (omitted) " more are not shown." } }
+        @if *omitted > 0 {
+            p.help { "The first " (TOPICS_MAX) "; " (omitted) " more are not shown." }
+        }
     }
 }

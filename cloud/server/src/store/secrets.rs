@@ -128,7 +128,8 @@ impl CloudStore {
         secret: &str,
     ) -> CloudResult<Option<(String, String, String, String)>> {
         Ok(row!(&self.pool;
-            "SELECT users.name, users.role, secrets.name, secrets.role FROM secrets JOIN users ON users.name = secrets.subject
+            "SELECT users.name, users.role, secrets.name, secrets.role FROM secrets
+             JOIN users ON users.name = secrets.subject
              WHERE secrets.hash = $1 AND secrets.kind = $2 AND secrets.expires > $3";
             hash(secret), kind.as_str(), now()))
     }
