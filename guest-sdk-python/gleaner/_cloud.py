@@ -21,6 +21,9 @@ from urllib.parse import quote, urlencode, urlsplit
 ANSWER_MAX = 64 << 20
 """Longest answer, and longest line of one, in bytes."""
 
+LIST_MAX = 512 << 20
+"""Maximum length of all parts of a list together, in bytes."""
+
 ENTRIES_MAX = 100_000
 """Maximum number of entries of a list."""
 
@@ -37,7 +40,7 @@ class CloudError(Exception):
 
     def __init__(self, status: int, title: str, causes: List[str], help: Optional[str]) -> None:
         lines = [title, *(f"cause: {cause}" for cause in causes)]
-        super().__init__("\n".join(lines + ([f"help: {help}"] if help else [])))
+        super().__init__(_shown("\n".join(lines + ([f"help: {help}"] if help else []))))
         self.status, self.title, self.causes, self.help = status, title, causes, help
 
 
@@ -74,8 +77,7 @@ class Cloud:
 
     def status(self, vehicle: str) -> Dict[str, Any]:
         """The last report of a vehicle."""
-        found: Dict[str, Any] = self._json("GET", f"/v1/vehicles/{_part(vehicle)}/status")
-        return found
+        return self._json("GET", f"/v1/vehicles/{_part(vehicle)}/status")
 
     def events(
         self, vehicle: str, last: Optional[int] = None, follow: bool = False
@@ -115,24 +117,32 @@ class Cloud:
 
     def clip(self, id: str) -> Clip:
         """The clip with this id: ``NAME@VEHICLE``."""
-        return Clip(self, self._json("GET", f"/v1/clips/{_part(id)}"))
+        return Clip(self, self._json("GET", f"/v1/clips/{_part(id)}")).must_be(id)
 
     def _list(
         self, path: str, query: Mapping[str, str], most: Optional[int]
     ) -> List[Dict[str, Any]]:
         entries: List[Dict[str, Any]] = []
+        size = 0
         wanted = ENTRIES_MAX + 1 if most is None else most
         after: Dict[str, str] = {}
         while len(entries) < wanted:
             limit = min(PART, wanted - len(entries))
             values = {**query, **after, "limit": str(limit)}
-            part = self._json("GET", f"{path}?{urlencode(values)}")
-            entries.extend(part["items"])
-            if part.get("next") is None:
+            content = self._bytes("GET", f"{path}?{urlencode(values)}")
+            size += len(content)
+            if size > LIST_MAX:
+                raise _bad(f"the list {path} has more than {LIST_MAX} bytes")
+            part = _parsed(content, path)
+            items, more = part.get("items"), part.get("next")
+            if not isinstance(items, list) or not all(isinstance(it, dict) for it in items):
+                raise _bad(f"the list {path} has no entries of the right form")
+            entries.extend(items)
+            if more is None:
                 break
-            if len(part["items"]) < limit:
+            if len(items) < limit or not isinstance(more, str):
                 raise _bad(f"the list {path} goes on after a part that is not full")
-            after = {"after": part["next"]}
+            after = {"after": more}
         if most is None and len(entries) > ENTRIES_MAX:
             raise _bad(f"the list {path} has more than {ENTRIES_MAX} entries")
         return entries[:wanted]
@@ -149,12 +159,12 @@ class Cloud:
                     return
                 if not line.endswith(b"\n"):
                     raise _bad(f"a line of {path} is cut off, or too long")
-                yield json.loads(line)
+                yield _parsed(line, path)
         finally:
             close.close()
 
-    def _json(self, method: str, path: str) -> Any:
-        return json.loads(self._bytes(method, path))
+    def _json(self, method: str, path: str) -> Dict[str, Any]:
+        return _parsed(self._bytes(method, path), path)
 
     def _bytes(self, method: str, path: str) -> bytes:
         answer, connection = self._open(method, path, {})
@@ -190,7 +200,16 @@ class Clip:
         name, _, vehicle = str(facts.get("id")).rpartition("@")
         if not NAME.fullmatch(name) or not NAME.fullmatch(vehicle):
             raise _bad(f"{facts.get('id')!r} is no id of a clip")
+        types = {"state": str, "bytes": int}
+        if not all(isinstance(facts.get(key), kind) for key, kind in types.items()):
+            raise _bad(f"clip {name}@{vehicle} has no state or no length")
         self._name, self._vehicle = name, vehicle
+
+    def must_be(self, id: str) -> Clip:
+        """Itself, if it has this id; raises CloudError for another clip."""
+        if self.id != id:
+            raise _bad(f"the cloud answers with clip {self.id} in the place of {id!r}")
+        return self
 
     def __repr__(self) -> str:
         return f"<Clip {self.id}: {self.state}>"
@@ -212,7 +231,8 @@ class Clip:
 
     def pull(self, wait_s: float = 0.0) -> None:
         """Marks its file as wanted, and waits for at most ``wait_s`` until the cloud has it."""
-        self.facts = self._cloud._json("POST", f"{self._path}/pull")
+        pulled = self._cloud._json("POST", f"{self._path}/pull")
+        self.facts = Clip(self._cloud, pulled).must_be(self.id).facts
         until = time.monotonic() + wait_s
         while self.state in ("on-vehicle", "wanted", "uploading") and time.monotonic() < until:
             time.sleep(min(2.0, max(0.0, until - time.monotonic())))
@@ -299,6 +319,21 @@ def _whole(answer: http.client.HTTPResponse, path: str) -> bytes:
     return content
 
 
+def _parsed(content: bytes, path: str) -> Dict[str, Any]:
+    try:
+        found = json.loads(content)
+    except (ValueError, RecursionError):
+        raise _bad(f"the answer to {path} cannot be read") from None
+    if not isinstance(found, dict):
+        raise _bad(f"the answer to {path} has another form")
+    return found
+
+
+def _shown(text: str) -> str:
+    """A text without characters that would control a terminal."""
+    return "".join(it if it.isprintable() or it == "\n" else "?" for it in text)
+
+
 def _bad(reason: str) -> CloudError:
     return CloudError(0, reason, [], None)
 
@@ -308,7 +343,7 @@ def _problem(status: int, content: bytes) -> CloudError:
         problem = json.loads(content)
         causes = [str(cause) for cause in problem.get("causes", [])]
         return CloudError(status, str(problem["title"]), causes, problem.get("help"))
-    except (ValueError, KeyError, AttributeError, TypeError):
+    except (ValueError, RecursionError, KeyError, AttributeError, TypeError):
         return CloudError(status, f"the cloud answers {status}", [], None)
 
 

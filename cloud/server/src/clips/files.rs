@@ -117,19 +117,13 @@ impl ClipFiles {
     }
 
     /// Removes the recording of a clip.
-    pub(crate) async fn remove_recording(&self, id: &ClipId) {
-        self.remove(id, &recording(id)).await;
+    pub(crate) async fn remove_recording(&self, id: &ClipId) -> io::Result<()> {
+        self.place.remove(&recording(id)).await
     }
 
     /// Removes the thumbnail of a clip.
-    pub(crate) async fn remove_thumbnail(&self, id: &ClipId) {
-        self.remove(id, &thumbnail(id)).await;
-    }
-
-    async fn remove(&self, id: &ClipId, name: &str) {
-        if let Err(error) = self.place.remove(name).await {
-            tracing::warn!(clip = %id, %error, "a file cannot be removed");
-        }
+    pub(crate) async fn remove_thumbnail(&self, id: &ClipId) -> io::Result<()> {
+        self.place.remove(&thumbnail(id)).await
     }
 
     /// Returns a slot to receive a part of a vehicle in.

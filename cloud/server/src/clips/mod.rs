@@ -12,6 +12,7 @@ mod vehicles;
 
 use std::time::Duration;
 
+use gleaner_fleet::clips::ClipId;
 use tokio::time::interval;
 
 pub(crate) use files::{ClipFiles, FileOfClip};
@@ -30,27 +31,40 @@ async fn remove_expired(cloud: &Cloud) -> CloudResult<()> {
     remove_files(cloud).await
 }
 
-/// Removes the files of clips that were removed.
-pub(crate) async fn remove_files(cloud: &Cloud) -> CloudResult<()> {
+/// Removes the files of clips that were removed. Those that cannot be removed stay noted for the
+/// next time.
+async fn remove_files(cloud: &Cloud) -> CloudResult<()> {
     loop {
         let removed = cloud.store.removed_clips().await?;
-        if removed.is_empty() {
+        let mut has_progress = false;
+        for id in removed {
+            has_progress |= remove_files_of(cloud, id).await?;
+        }
+        if !has_progress {
             return Ok(());
         }
-        for id in removed {
-            // A part that is being stored ends first, and no other one begins meanwhile.
-            let _turn = cloud.clips.turn(&id).await;
-            // Its vehicle may have announced and sent it again.
-            let RemovedClip { id, has_file, has_thumbnail } = cloud.store.removed_clip(id).await?;
-            if !has_file {
-                cloud.clips.remove_recording(&id).await;
-            }
-            if !has_thumbnail {
-                cloud.clips.remove_thumbnail(&id).await;
-            }
-            cloud.store.forget_removed_clip(&id).await?;
-        }
     }
+}
+
+/// Removes the files of a clip that was removed; returns whether none is left.
+pub(crate) async fn remove_files_of(cloud: &Cloud, id: ClipId) -> CloudResult<bool> {
+    // A part that is being stored ends first, and no other one begins meanwhile.
+    let _turn = cloud.clips.turn(&id).await;
+    // Its vehicle may have announced and sent it again.
+    let RemovedClip { id, has_file, has_thumbnail } = cloud.store.removed_clip(id).await?;
+    let mut removed = Ok(());
+    if !has_file {
+        removed = cloud.clips.remove_recording(&id).await;
+    }
+    if !has_thumbnail {
+        removed = removed.and(cloud.clips.remove_thumbnail(&id).await);
+    }
+    if let Err(error) = removed {
+        tracing::warn!(clip = %id, %error, "a file cannot be removed, and is tried again later");
+        return Ok(false);
+    }
+    cloud.store.forget_removed_clip(&id).await?;
+    Ok(true)
 }
 
 /// Removes old clips, and unfinished files that are not continued, for as long as the program runs.
@@ -66,7 +80,9 @@ pub(crate) async fn clean(cloud: &Cloud) {
             Ok(forgotten) => {
                 for id in forgotten {
                     let _turn = cloud.clips.turn(&id).await;
-                    cloud.clips.remove_recording(&id).await;
+                    if let Err(error) = cloud.clips.remove_recording(&id).await {
+                        tracing::warn!(clip = %id, %error, "a file cannot be removed");
+                    }
                 }
             }
             Err(error) => {

@@ -40,7 +40,10 @@ pub(crate) async fn pull(
     Path(id): Path<String>,
 ) -> CloudResult<Json<FleetClip>> {
     let id = parse(&id)?;
-    let is_lost = !cloud.clips.has_recording(&id).await.map_err(|error| not_sent(&id, error))?;
+    let before = cloud.store.clip(&id).await?;
+    // Only a file that was stored before this look can be lost: another one may arrive meanwhile.
+    let is_lost = before.state == ClipState::Stored
+        && !cloud.clips.has_recording(&id).await.map_err(|error| not_sent(&id, error))?;
     let clip = cloud.store.pull_clip(&actor.name, &id, is_lost).await?;
     cloud.hub.wake(&[id.vehicle().to_owned()]);
     Ok(Json(clip))
@@ -52,8 +55,9 @@ pub(crate) async fn remove(
     Extension(actor): Extension<User>,
     Path(id): Path<String>,
 ) -> CloudResult<StatusCode> {
-    cloud.store.remove_clip(&actor.name, &parse(&id)?).await?;
-    super::remove_files(&cloud).await?;
+    let id = parse(&id)?;
+    cloud.store.remove_clip(&actor.name, &id).await?;
+    super::remove_files_of(&cloud, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 

@@ -29,6 +29,8 @@ use crate::vehicles::KnownVehicle;
 const UNWANTED_TIME: Duration = Duration::from_secs(30);
 /// Longest position in the list of a vehicle.
 const CURSOR_MAX: usize = 256;
+/// The reason of a failed upload whose earlier parts were lost.
+const NO_PARTS: &str = "its first parts are not there any more";
 /// First bytes of a JPEG.
 const JPEG: [u8; 3] = [0xff, 0xd8, 0xff];
 
@@ -69,7 +71,9 @@ async fn report(
         let dropped = cloud.store.announce_clips(&vehicle.name, &report, bounds).await?;
         for id in dropped {
             let _turn = cloud.clips.turn(&id).await;
-            cloud.clips.remove_recording(&id).await;
+            if let Err(error) = cloud.clips.remove_recording(&id).await {
+                tracing::warn!(clip = %id, %error, "a file cannot be removed");
+            }
         }
     }
     orders(&cloud, &vehicle.name).await
@@ -179,18 +183,23 @@ async fn store_part(
     let failed = |error| not_stored(&id, error);
     let is_appended = cloud.clips.append(&id, progress.part, received).await.map_err(failed)?;
     let outcome = match (is_appended, is_last) {
-        (false, _) => Err("its first parts are not there any more".to_owned()),
+        (false, _) => Err(NO_PARTS.to_owned()),
         (true, false) => Ok(()),
         (true, true) => {
             let announced = (progress.bytes, progress.sha256.clone());
-            cloud.clips.compare(&id, announced).await.map_err(failed)?
+            match cloud.clips.compare(&id, announced).await {
+                Err(error) if error.kind() == io::ErrorKind::NotFound => Err(NO_PARTS.to_owned()),
+                compared => compared.map_err(failed)?,
+            }
         }
     };
     match outcome {
         Ok(()) => cloud.store.clip_part_received(&progress, length, is_last).await,
         Err(reason) => {
-            cloud.store.clip_upload_failed(&id, &reason).await?;
-            cloud.clips.remove_recording(&id).await;
+            // Otherwise another replica has stored it meanwhile.
+            if cloud.store.clip_upload_failed(&id, &reason).await? {
+                cloud.clips.remove_recording(&id).await.map_err(failed)?;
+            }
             let message = format!("the file of clip `{id}` is refused");
             Err(CloudError::denied(message, "send it again from its first part").because(reason))
         }

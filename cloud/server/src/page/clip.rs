@@ -177,7 +177,7 @@ fn file_part(clip: &FleetClip, user: &PageUser, here: &str) -> Markup {
         ClipState::Wanted | ClipState::Uploading => {
             "The vehicle sends it when it is connected and has bytes left for today."
         }
-        ClipState::Stored => "The cloud has the file, as its vehicle has signed it.",
+        ClipState::Stored => "The cloud has the file, as its vehicle has announced it.",
         ClipState::Gone => "The vehicle has deleted it before it was fetched.",
         ClipState::Failed => "The vehicle has sent another file than announced.",
     };

@@ -47,9 +47,12 @@ use self::conditions::{ChangeConditions, tagged};
 use self::endpoint::{Endpoint, FILE};
 use self::records::RecordQuery;
 
-/// Maximum length of a request without files: a deployment with two revisions of 4 MiB each, as
+/// Maximum length of a deployment without its files: one with two revisions of 4 MiB each, as
 /// text in JSON.
 const BODY_MAX: usize = 12 << 20;
+
+/// Maximum length of any other request without files.
+const SMALL_MAX: usize = 64 << 10;
 
 /// Maximum length of a request without a token.
 const LOGIN_MAX: usize = 4 << 10;
@@ -63,6 +66,19 @@ const RESUMES: &[&str] = &["Last-Event-ID"];
 /// Name of the token of a request; empty for that of a login.
 #[derive(Debug, Clone)]
 struct TokenName(String);
+
+impl TokenName {
+    /// Refuses a token for programs: if it is stolen, nothing that it makes must outlive its end.
+    fn must_be_login(&self, what: &str) -> CloudResult<()> {
+        match &*self.0 {
+            "" => Ok(()),
+            name => Err(CloudError::denied(
+                format!("token `{name}` {what}"),
+                "use the token of a login: `gleaner login`",
+            )),
+        }
+    }
+}
 
 /// Returns every request that the API answers: no role is stated elsewhere.
 pub(crate) fn endpoints() -> Vec<Endpoint> {
@@ -79,6 +95,7 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
     let remove = |path, role, summary, handler| {
         Endpoint::new(Method::DELETE, path, Some(role), summary, handler)
     };
+    let deploy = post(deploy::deploy).layer(DefaultBodyLimit::max(BODY_MAX));
     let open = |method, path, summary, handler| Endpoint::new(method, path, None, summary, handler);
     vec![
         open(Method::GET, "/v1/openapi.json", "This description", get(openapi::document))
@@ -144,7 +161,7 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
             routing::put(deploy::object),
         )
         .takes_file(),
-        send("/v1/deployments", Deployer, "Stores a deployment", post(deploy::deploy))
+        send("/v1/deployments", Deployer, "Stores a deployment", deploy)
             .headers(CREATES)
             .takes::<FleetDeployRequest>()
             .gives::<DeployReply>(),
@@ -213,7 +230,7 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
             .into_response(),
             false => page::nothing_here(),
         })
-        .layer(DefaultBodyLimit::max(BODY_MAX))
+        .layer(DefaultBodyLimit::max(SMALL_MAX))
         .layer(from_fn(as_problem))
         .with_state(Arc::clone(cloud))
 }
@@ -293,11 +310,13 @@ async fn me(Extension(user): Extension<User>) -> Json<User> {
 async fn invite(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
+    Extension(token): Extension<TokenName>,
     headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<Invitation>> {
     let conditions = ChangeConditions::of_new(&headers, "/v1/users", &body)?;
     let new: NewUser = parsed(&body, "invitation")?;
+    token.must_be_login("invites no users")?;
     Ok(Json(cloud.store.invite(conditions.by(&actor), new).await?))
 }
 

@@ -165,6 +165,21 @@ async fn a_token_for_programs_has_at_most_the_rights_of_its_user_and_makes_no_ot
     assert_eq!(sent.status, StatusCode::FORBIDDEN);
     let sent = send(&cloud, path, Some(&login.token), &[], body).await;
     assert_eq!(sent.status, StatusCode::OK);
+    // Nor does it make a login, or end other tokens.
+    let code = cloud.store.invite("console", NewUser { name: "eve".to_owned(), role: Role::Admin });
+    let eve = cloud.store.login(&code.await.unwrap().code).await.unwrap().unwrap();
+    let new = NewToken { name: "ops".to_owned(), role: Role::Admin, days: 1 };
+    let made = cloud.store.make_token((&eve.user, (&eve.user).into()), new).await.unwrap();
+    let new = serde_json::to_string(&NewUser { name: "mallory".to_owned(), role: Role::Admin });
+    let path = (Method::POST, "/v1/users");
+    let sent = send(&cloud, path, Some(&made.token), &[], new.unwrap()).await;
+    assert_eq!(sent.status, StatusCode::FORBIDDEN);
+    for other in ["/v1/tokens/ann/nightly", "/v1/tokens/eve/other"] {
+        let sent = status(Method::DELETE, other, &made.token).await;
+        assert_eq!(sent, StatusCode::FORBIDDEN, "{other}");
+    }
+    let sent = status(Method::DELETE, "/v1/tokens/eve/ops", &made.token).await;
+    assert_eq!(sent, StatusCode::NO_CONTENT);
     // A user who has fewer rights from now on has them with each token.
     invite(Role::Viewer).await;
     assert_eq!(status(Method::POST, "/v1/deployments/x/start", token).await, StatusCode::FORBIDDEN);

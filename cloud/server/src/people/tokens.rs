@@ -18,17 +18,13 @@ use crate::request::{ListQuery, parsed};
 pub(super) async fn make(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
-    Extension(TokenName(of)): Extension<TokenName>,
+    Extension(token): Extension<TokenName>,
     headers: HeaderMap,
     body: Bytes,
 ) -> CloudResult<Json<UserToken>> {
     let conditions = ChangeConditions::of_new(&headers, "/v1/tokens", &body)?;
     let new: NewToken = parsed(&body, "token")?;
-    // A stolen one must not outlive its end.
-    if !of.is_empty() {
-        let message = format!("token `{of}` makes no other tokens");
-        return Err(CloudError::denied(message, "use that of a login: `gleaner login`"));
-    }
+    token.must_be_login("makes no other tokens")?;
     Ok(Json(cloud.store.make_token((&actor, conditions.by(&actor)), new).await?))
 }
 
@@ -47,8 +43,12 @@ pub(super) async fn list(
 pub(super) async fn remove(
     State(cloud): State<Arc<Cloud>>,
     Extension(actor): Extension<User>,
+    Extension(token): Extension<TokenName>,
     Path((of, name)): Path<(String, String)>,
 ) -> CloudResult<StatusCode> {
+    if (&of, &name) != (&actor.name, &token.0) {
+        token.must_be_login("removes no tokens but itself")?;
+    }
     if of != actor.name && actor.role < Role::Admin {
         let message = format!("you have no token `{}/{}`", excerpt(&of), excerpt(&name));
         let help = "remove one of your own, or let an administrator remove it";
@@ -66,6 +66,7 @@ pub(super) async fn logout(
 ) -> CloudResult<StatusCode> {
     if let Some(token) = bearer(&headers) {
         cloud.store.end_token(&actor.name, token).await?;
+        cloud.readers.end(&actor.name);
     }
     Ok(StatusCode::NO_CONTENT)
 }

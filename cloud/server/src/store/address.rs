@@ -17,6 +17,12 @@ const PRAGMAS: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; \
                        PRAGMA wal_autocheckpoint = 4000; \
                        PRAGMA foreign_keys = ON; PRAGMA busy_timeout = 10000;";
 
+/// Settings of each connection to PostgreSQL: a process that was stopped in the middle of a change,
+/// or whose machine is gone, keeps the others waiting for so long at most.
+const SETTINGS: &str = "SET idle_in_transaction_session_timeout = '15s'; \
+                        SET lock_timeout = '25s'; SET tcp_keepalives_idle = 10; \
+                        SET tcp_keepalives_interval = 5; SET tcp_keepalives_count = 3";
+
 /// Time that a query waits before the log has it.
 const ACQUIRE_SLOW: Duration = Duration::from_secs(20);
 
@@ -107,9 +113,8 @@ impl StoreAddress {
             })
             .after_connect(move |connection, _| {
                 Box::pin(async move {
-                    if is_sqlite {
-                        sqlx::raw_sql(PRAGMAS).execute(connection).await?;
-                    }
+                    let settings = if is_sqlite { PRAGMAS } else { SETTINGS };
+                    sqlx::raw_sql(settings).execute(connection).await?;
                     Ok(())
                 })
             });

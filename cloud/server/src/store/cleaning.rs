@@ -44,8 +44,10 @@ impl CloudStore {
             "SELECT seq, name, vehicle, bytes FROM clips
              WHERE vehicle = $1 AND name = $2 AND state = 'stored'";
             id.vehicle(), id.name());
-        let rows: Vec<_> = row.into_iter().collect();
-        change.remove_clips(&rows).await?;
+        let row = row.ok_or_else(|| {
+            CloudError::missing(format!("clip `{id}` was removed"), "`gleaner clips` lists all")
+        })?;
+        change.remove_clips(&[row]).await?;
         change.note(actor, "remove clip", &id.to_string()).await?;
         change.commit().await
     }
@@ -57,9 +59,12 @@ impl CloudStore {
         if policy.keep_s == 0 && policy.keep_bytes == 0 {
             return Ok(false);
         }
-        let ClipUsage { bytes: mut kept, .. } = self.clip_counts().await?;
         let before = now().saturating_sub(int(policy.keep_s));
         let mut change = self.change().await?;
+        // Counted in the change: others may have removed some until it began.
+        let (kept,): (i64,) = one!(&mut *change.tx;
+            "SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM clips WHERE state = 'stored'");
+        let mut kept = unsigned(kept);
         let oldest: Vec<(i64, String, String, i64, i64)> = rows!(&mut *change.tx;
             "SELECT seq, name, vehicle, bytes, part_time FROM clips WHERE state = 'stored'
              ORDER BY part_time, seq LIMIT $1";

@@ -108,11 +108,14 @@ impl CloudStore {
             );
         }
         let mut change = self.change().await?;
+        // It may have been stored since: that is not undone.
+        let is_lost = i64::from(is_lost);
         let changed = run!(&mut *change.tx;
             "UPDATE clips SET is_requested = 1, failures = 0, state = 'vehicle',
              parts = CASE WHEN state = 'vehicle' THEN parts ELSE 0 END
-             WHERE vehicle = $1 AND name = $2 AND (is_requested = 0 OR state <> 'vehicle')";
-            id.vehicle(), id.name());
+             WHERE vehicle = $1 AND name = $2 AND (is_requested = 0 OR state <> 'vehicle')
+             AND state <> 'gone' AND (state <> 'stored' OR $3 = 1)";
+            id.vehicle(), id.name(), is_lost);
         if changed.rows_affected() > 0 {
             change.note(actor, "pull clip", &id.to_string()).await?;
             // The vehicle reads its orders again with each new number.

@@ -250,15 +250,17 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Forgets the parts of a file, which was not the announced one or is not there.
-    pub(crate) async fn clip_upload_failed(&self, id: &ClipId, reason: &str) -> CloudResult<()> {
+    /// Forgets the parts of a file, which was not the announced one or is not there; returns whether
+    /// it was not complete.
+    pub(crate) async fn clip_upload_failed(&self, id: &ClipId, reason: &str) -> CloudResult<bool> {
         let mut change = self.change().await?;
-        run!(&mut *change.tx;
+        let failed = run!(&mut *change.tx;
             "UPDATE clips SET parts = 0, failures = failures + 1, reason = $3,
              state = CASE WHEN failures + 1 >= $4 THEN 'failed' ELSE 'vehicle' END
              WHERE vehicle = $1 AND name = $2 AND state = 'vehicle'";
             id.vehicle(), id.name(), excerpt(reason), FAILURES_MAX);
-        change.commit().await
+        change.commit().await?;
+        Ok(failed.rows_affected() > 0)
     }
 
     /// Returns the SHA-256 of the thumbnail that is wanted of a clip.

@@ -42,9 +42,10 @@ impl CloudStore {
     ) -> CloudResult<UserToken> {
         let NewToken { name, role, days } = new;
         let allowed = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
-        if !(1..=64).contains(&name.len()) || !name.chars().all(allowed) {
+        if !(1..=64).contains(&name.len()) || !name.chars().all(allowed) || name.starts_with('.') {
             let message = format!("`{}` cannot be the name of a token", excerpt(&name));
-            let help = "use 1 to 64 letters, digits and `._-`, as in nightly-export";
+            let help =
+                "use 1 to 64 letters, digits and `._-`, with no dot first, as in nightly-export";
             return Err(CloudError::usage(message, help));
         }
         if !(1..=TOKEN_DAYS_MAX).contains(&days) {

@@ -23,7 +23,11 @@ impl CloudStore {
         let author = author.into();
         let NewUser { name, role } = new;
         let allowed = |c: char| c.is_ascii_alphanumeric() || "._-@+".contains(c);
-        if !(1..=64).contains(&name.len()) || !name.chars().all(allowed) || name == CONSOLE {
+        if !(1..=64).contains(&name.len())
+            || !name.chars().all(allowed)
+            || name.starts_with('.')
+            || name == CONSOLE
+        {
             let message = format!("`{}` cannot be the name of a user", excerpt(&name));
             let help = "use 1 to 64 letters, digits and `._-@+`, as in ann-lee; not `console`";
             return Err(CloudError::usage(message, help));

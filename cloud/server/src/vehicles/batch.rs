@@ -44,6 +44,8 @@ pub(super) fn parse(records: &Records) -> CloudResult<StreamBatch> {
         // A torn end may have the number of the next record.
         let is_before = |line: &StreamLine| is_mark(line) || line.seq < *next;
         let line = line.and_then(|line| match line.stream == name && is_before(&line) {
+            // PostgreSQL stores no text with it.
+            true if line.boot.contains('\0') => Err("its `boot` has a zero byte".to_owned()),
             true => Ok(line),
             false => Err(format!("it is record {} of `{}`", line.seq, excerpt(&line.stream))),
         });
