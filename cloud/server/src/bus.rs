@@ -28,7 +28,7 @@ const NAME_MAX: usize = 200;
 /// Longest pause between two attempts to connect.
 const RECONNECT_MAX: Duration = Duration::from_secs(2);
 
-/// What may have changed.
+/// A thing that may have changed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub(crate) enum Hint {

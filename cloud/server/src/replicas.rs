@@ -69,7 +69,7 @@ pub(crate) async fn follow(cloud: &Cloud, hints: Option<Arc<ReceivedHints>>) {
     }
 }
 
-/// What the last look has found.
+/// The findings of the last look.
 #[derive(Debug, Default)]
 struct ReplicaFollower {
     /// Number of the last entry of the audit trail; `None` before the first look.

@@ -263,7 +263,7 @@ pub struct StreamLine {
 }
 
 /// An error, as `application/problem+json` of RFC 9457: a [`Failure`]. It has no `type`: all are of
-/// the type `about:blank`, and the status tells them apart.
+/// the type `about:blank`, and they differ by their status.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Problem {

@@ -219,7 +219,7 @@ fn every_command_on_pages_exists_with_its_flags() {
                 seen += 1;
                 let mut name = words.next().unwrap_or_default().to_owned();
                 // These have commands of their own.
-                if ["clips", "keys", "trust", "users", "vehicles"].contains(&&*name)
+                if ["clips", "keys", "tokens", "trust", "users", "vehicles"].contains(&&*name)
                     && let Some(second) = words.next_if(|word| !word.starts_with("--"))
                 {
                     name = format!("{name} {second}");

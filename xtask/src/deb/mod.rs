@@ -2,9 +2,9 @@
 //! `gleaner-cloud`, with that of the cloud.
 //!
 //! `source` lists what they consist of, `tree` lays out their files, `control` writes their
-//! metadata, `licences` collects those of crates, `unit` checks the services with `systemd-analyze`, and `root` tests the packages in
-//! roots of their own. The files that are not built are in `orchestrator/package` and
-//! `cloud/package`.
+//! metadata, `licences` collects those of crates, `unit` checks the services with
+//! `systemd-analyze`, and `root` tests the packages in roots of their own. The files that are not
+//! built are in `orchestrator/package` and `cloud/package`.
 
 mod control;
 mod licences;

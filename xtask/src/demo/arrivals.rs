@@ -1,4 +1,5 @@
-//! What the cloud has of the run: each event, trigger and clip that the vehicle recorded.
+//! The part of the run that has reached the cloud: each event, trigger and clip that the vehicle
+//! recorded.
 
 use std::collections::BTreeMap;
 

@@ -2,8 +2,8 @@
 //!
 //! - `drive`: replays the sample drive with every example, and repeats the decisions.
 //! - `vehicle`: runs the examples on a vehicle, in a network of its own, by a cloud; `vehicle_run`
-//!   is the part inside of that network, `demo_vehicle` its programs, `demo_cloud` the cloud outside,
-//!   `relay` the connection between them, and `arrivals` compares what reached the cloud.
+//!   is the part inside of that network, `demo_vehicle` its programs, `demo_cloud` the cloud
+//!   outside, `relay` the connection between them, and `arrivals` compares what reached the cloud.
 
 mod arrivals;
 mod demo_cloud;

@@ -1,5 +1,5 @@
-//! The second part of the demo: starts the cloud, and `vehicle_run` in a private network, so that no
-//! DDS participant of another program sees it. A relay connects both.
+//! The second part of the demo: starts the cloud, and `vehicle_run` in a private network, so that
+//! no DDS participant of another program sees it. A relay connects both.
 
 use std::fs::{self, DirBuilder};
 use std::io::{self, Read};

@@ -118,7 +118,8 @@ fn leave_open(vehicle: &DemoVehicle, page: &str) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Publishes a twin, and deploys it by the cloud, under a name of its own, as a vehicle runs each name once.
+/// Publishes a twin, and deploys it by the cloud, under a name of its own, as a vehicle runs each
+/// name once.
 fn deploy(
     checkout: &Checkout,
     vehicle: &DemoVehicle,

@@ -24,7 +24,7 @@ pub(super) struct Service {
     pub(super) name: &'static str,
     command: Command,
     child: Child,
-    /// Where it listens.
+    /// Address at which it listens.
     address: SocketAddr,
     /// File with its output.
     log: PathBuf,

@@ -37,13 +37,13 @@ pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
 }
 
 /// An answer of the API.
-struct Answer {
+struct ApiAnswer {
     status: StatusCode,
     headers: HeaderMap,
     body: Vec<u8>,
 }
 
-impl Answer {
+impl ApiAnswer {
     fn json(&self) -> Value {
         serde_json::from_slice(&self.body).unwrap()
     }
@@ -56,7 +56,7 @@ async fn send(
     token: Option<&str>,
     headers: &[(&str, &str)],
     body: impl Into<Body>,
-) -> Answer {
+) -> ApiAnswer {
     let slots = Arc::new(Semaphore::new(1));
     let peer = PeerConnection::of_test([127, 0, 0, 1].into(), slots.try_acquire_owned().unwrap());
     let mut request = Request::builder().method(method).uri(path).extension(Arc::new(peer));
@@ -70,7 +70,7 @@ async fn send(
     let reply = router.call(request.body(body.into()).unwrap()).await.unwrap();
     let (parts, body) = reply.into_parts();
     let body = to_bytes(body, BODY_MAX).await.unwrap().to_vec();
-    Answer { status: parts.status, headers: parts.headers, body }
+    ApiAnswer { status: parts.status, headers: parts.headers, body }
 }
 
 async fn status_of(
@@ -183,7 +183,7 @@ async fn a_token_for_programs_has_at_most_the_rights_of_its_user_and_makes_no_ot
     // A user who has fewer rights from now on has them with each token.
     invite(Role::Viewer).await;
     assert_eq!(status(Method::POST, "/v1/deployments/x/start", token).await, StatusCode::FORBIDDEN);
-    // Nobody else than an administrator can remove it, or learn that it exists.
+    // Of other users, only an administrator can remove it, or learn that it exists.
     let code =
         cloud.store.invite("console", NewUser { name: "bea".to_owned(), role: Role::Viewer });
     let bea = cloud.store.login(&code.await.unwrap().code).await.unwrap().unwrap().token;

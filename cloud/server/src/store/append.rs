@@ -26,7 +26,7 @@ pub(super) struct AppendWrite {
     retention: Retention,
 }
 
-/// What is stored of the streams of a group, by vehicle.
+/// The stored state of the streams of a group, by vehicle.
 #[derive(Default)]
 struct StoredStreams(HashMap<String, VehicleStreams>);
 

@@ -250,8 +250,8 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Forgets the parts of a file, which was not the announced one or is not there; returns whether
-    /// it was not complete.
+    /// Forgets the parts of a file, which was not the announced one or is not there; returns
+    /// whether it was not complete.
     pub(crate) async fn clip_upload_failed(&self, id: &ClipId, reason: &str) -> CloudResult<bool> {
         let mut change = self.change().await?;
         let failed = run!(&mut *change.tx;

@@ -100,7 +100,7 @@ pub(super) struct ReportWrite {
 }
 
 impl VehicleWrite for ReportWrite {
-    /// Whether the wanted state has changed with the labels.
+    /// True if the wanted state has changed with the labels.
     type Done = bool;
 
     fn vehicle(&self) -> &str {

@@ -36,8 +36,8 @@ pub(super) struct WishedVehicle {
     pub(super) digest: String,
 }
 
-/// Wanted states by their digests. It cannot be out of date, whoever changes the database: a
-/// vehicle's digest is read each time, and equal digests are equal states. Few differ.
+/// Wanted states by their digests. It cannot be out of date, also if others change the database:
+/// a vehicle's digest is read each time, and equal digests are equal states. Few differ.
 #[derive(Default)]
 pub(super) struct WantedStates(Mutex<HashMap<String, Arc<[Wanted]>>>);
 

@@ -33,7 +33,7 @@ async fn a_change_is_made_only_of_the_state_that_it_expects() {
         let path = format!("{path}/stop");
         send(&cloud, (Method::POST, &path), Some(&token), &[("if-match", tag)], "").await
     };
-    let tag = |answer: &Answer| answer.headers[header::ETAG].to_str().unwrap().to_owned();
+    let tag = |answer: &ApiAnswer| answer.headers[header::ETAG].to_str().unwrap().to_owned();
     let (one, all) = (read(path, &[]).await, read("/v1/deployments", &[]).await);
     assert_eq!(one.json(), all.json()["items"][0]);
     for (path, tag) in [(path, tag(&one)), ("/v1/deployments", tag(&all))] {

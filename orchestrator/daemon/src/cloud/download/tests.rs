@@ -17,10 +17,10 @@ use super::*;
 const CONTENT: &[u8] = b"content";
 
 /// The answer to one request: its head and its body, after which the connection ends.
-type Answer = (&'static str, &'static str);
+type FakeAnswer = (&'static str, &'static str);
 
 /// A cloud that gives these answers, one after the other; the handle returns the requests.
-async fn cloud(answers: Vec<Answer>) -> (CloudHttp, JoinHandle<Vec<String>>) {
+async fn cloud(answers: Vec<FakeAnswer>) -> (CloudHttp, JoinHandle<Vec<String>>) {
     let key = KeyPair::generate().unwrap();
     let params = CertificateParams::new(vec!["127.0.0.1".to_owned()]).unwrap();
     let certificate = params.self_signed(&key).unwrap().der().clone();
@@ -64,7 +64,7 @@ async fn cloud(answers: Vec<Answer>) -> (CloudHttp, JoinHandle<Vec<String>>) {
 }
 
 /// Downloads `CONTENT`; returns the outcome, and the requests.
-async fn download(folder: &Path, answers: Vec<Answer>) -> (Result<(), Failure>, Vec<String>) {
+async fn download(folder: &Path, answers: Vec<FakeAnswer>) -> (Result<(), Failure>, Vec<String>) {
     let (http, served) = cloud(answers).await;
     let sha256 = sha256(CONTENT);
     let target = folder.join("object");
