@@ -32,18 +32,7 @@ async fn main() {
     let temporary = tempfile::tempdir().unwrap();
     let data = std::env::args_os().nth(1).map(PathBuf::from);
     let data = data.unwrap_or_else(|| temporary.path().join("data"));
-    let any = ([127, 0, 0, 1], 0).into();
-    let options = ServeOptions {
-        data,
-        store: None,
-        bus: None,
-        objects: None,
-        people: any,
-        vehicles: any,
-        name: None,
-        is_insecure: false,
-    };
-    let server = CloudServer::start(&options).await.unwrap();
+    let server = CloudServer::start(&ServeOptions::local(data)).await.unwrap();
     let admin = Person::login(server.people, server.code.as_ref().unwrap()).await;
     for (name, site, is_hostile) in
         [("car-1", "berlin", false), ("car-2", "berlin", false), ("truck-1", "ulm", true)]

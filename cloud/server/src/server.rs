@@ -57,6 +57,23 @@ pub struct ServeOptions {
     pub is_insecure: bool,
 }
 
+impl ServeOptions {
+    /// Returns settings of a server with a folder, at any two free ports of this machine.
+    pub fn local(data: PathBuf) -> Self {
+        let any = ([127, 0, 0, 1], 0).into();
+        Self {
+            data,
+            store: None,
+            bus: None,
+            objects: None,
+            people: any,
+            vehicles: any,
+            name: None,
+            is_insecure: false,
+        }
+    }
+}
+
 /// A server that runs.
 pub struct CloudServer {
     /// Address of the API for people.

@@ -44,7 +44,7 @@ pub(crate) async fn pull(
     // Only a file that was stored before this look can be lost: another one may arrive meanwhile.
     let is_lost = before.state == ClipState::Stored
         && !cloud.clips.has_recording(&id).await.map_err(|error| not_sent(&id, error))?;
-    let clip = cloud.store.pull_clip(&actor.name, &id, is_lost).await?;
+    let clip = cloud.store.pull_clip(&actor.name, before, is_lost).await?;
     cloud.hub.wake(&[id.vehicle().to_owned()]);
     Ok(Json(clip))
 }

@@ -168,10 +168,8 @@ pub(super) async fn invite(
     Extension(user): Extension<PageUser>,
     Extension(fields): Extension<FormFields>,
 ) -> PageResult {
-    let role = fields.get("role").parse().map_err(|error: String| {
-        CloudError::usage("the role is not known", "choose one of the list").because(error)
-    });
-    let new = role.map(|role| NewUser { name: fields.get("name").trim().to_owned(), role });
+    let new =
+        fields.role().map(|role| NewUser { name: fields.get("name").trim().to_owned(), role });
     let invited = match new {
         Ok(new) => cloud.store.invite(&user.user.name, new).await,
         Err(error) => Err(error),

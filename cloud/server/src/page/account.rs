@@ -127,10 +127,7 @@ pub(super) async fn make_token(
     Extension(user): Extension<PageUser>,
     Extension(fields): Extension<FormFields>,
 ) -> PageResult {
-    let role = fields.get("role").parse().map_err(|error: String| {
-        CloudError::usage("the role is not known", "choose one of the list").because(error)
-    });
-    let made = match role {
+    let made = match fields.role() {
         Ok(role) => {
             let name = fields.get("name").trim().to_owned();
             // No number is none that is allowed.

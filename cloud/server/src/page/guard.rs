@@ -39,6 +39,13 @@ const HEADERS: [(HeaderName, &str); 6] = [
 pub(super) struct FormFields(HashMap<String, String>);
 
 impl FormFields {
+    /// Returns the role in the field `role`.
+    pub(super) fn role(&self) -> CloudResult<Role> {
+        self.get("role").parse().map_err(|error: String| {
+            CloudError::usage("the role is not known", "choose one of the list").because(error)
+        })
+    }
+
     /// Returns a field; empty without one.
     pub(super) fn get(&self, name: &str) -> &str {
         self.0.get(name).map_or("", String::as_str)

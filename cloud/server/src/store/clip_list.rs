@@ -76,15 +76,15 @@ impl CloudStore {
         clip(row.ok_or_else(missing)?, self.clip_policy().await?.upload)
     }
 
-    /// Marks the file of a clip as wanted by a person; returns the clip. `is_lost` states that a
-    /// file which was stored is not there any more.
+    /// Marks the file of a clip, which was as in `before`, as wanted by a person; returns the clip.
+    /// `is_lost` states that a file which was stored is not there any more.
     pub(crate) async fn pull_clip(
         &self,
         actor: &str,
-        id: &ClipId,
+        before: FleetClip,
         is_lost: bool,
     ) -> CloudResult<FleetClip> {
-        let before = self.clip(id).await?;
+        let id = &before.id;
         let refused = |reason: &str, help: &str| {
             Err(CloudError::usage(format!("clip `{id}` cannot be fetched"), help).because(reason))
         };

@@ -197,13 +197,7 @@ impl StoreChange<'_> {
             }
             query.execute(&mut *self.tx).await?;
         }
-        for part in parts(&replaced) {
-            let sql = format!("DELETE FROM certificates WHERE sha256 IN ({})", in_list(part.len()));
-            let query = sqlx::query(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, sha256| query.bind(sha256));
-            query.execute(&mut *self.tx).await?;
-        }
-        Ok(())
+        self.run_in("DELETE FROM certificates WHERE sha256 IN", &replaced).await
     }
 
     async fn certificates_of(&mut self, names: &[String]) -> CloudResult<Certificates> {
@@ -300,12 +294,8 @@ impl StoreChange<'_> {
     }
 
     async fn store_states(&mut self, reports: &[(&str, &VehicleReport)]) -> CloudResult<()> {
-        for part in parts(reports) {
-            let sql = format!("DELETE FROM reported WHERE vehicle IN ({})", in_list(part.len()));
-            let query = sqlx::query(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, (name, _)| query.bind(*name));
-            query.execute(&mut *self.tx).await?;
-        }
+        let names: Vec<_> = reports.iter().map(|(name, _)| *name).collect();
+        self.run_in("DELETE FROM reported WHERE vehicle IN", &names).await?;
         let states = reports.iter().flat_map(|(name, report)| {
             report.states.iter().map(move |(id, (number, state))| (*name, id, *number, *state))
         });

@@ -59,7 +59,7 @@ use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use gleaner_base::{Exit, Failure};
-use sqlx::{Any, AnyPool, Transaction};
+use sqlx::{Any, AnyPool, AssertSqlSafe, Transaction};
 use tokio::sync::{Mutex, MutexGuard};
 
 use self::wants::WantedStates;
@@ -220,6 +220,17 @@ impl CloudStore {
 }
 
 impl StoreChange<'_> {
+    /// Runs a statement that ends with `IN` for these values.
+    async fn run_in<V: AsRef<str>>(&mut self, sql: &str, values: &[V]) -> CloudResult<()> {
+        for part in parts(values) {
+            let sql = format!("{sql} ({})", in_list(part.len()));
+            let query = sqlx::query(AssertSqlSafe(sql));
+            let query = part.iter().fold(query, |query, value| query.bind(value.as_ref()));
+            query.execute(&mut *self.tx).await?;
+        }
+        Ok(())
+    }
+
     /// Makes the change durable.
     pub(crate) async fn commit(self) -> CloudResult<()> {
         Ok(self.tx.commit().await?)

@@ -157,14 +157,7 @@ impl StoreChange<'_> {
                 names.push(vehicle.clone());
             }
         }
-        for part in parts(&names) {
-            let names = in_list(part.len());
-            let sql = format!("UPDATE vehicles SET replica = '' WHERE name IN ({names})");
-            let query = sqlx::query(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, name| query.bind(name));
-            query.execute(&mut *self.tx).await?;
-        }
-        Ok(())
+        self.run_in("UPDATE vehicles SET replica = '' WHERE name IN", &names).await
     }
 
     async fn extend_lease(&mut self, replica: &str, is_endless: bool) -> CloudResult<()> {

@@ -23,18 +23,8 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 async fn options(folder: &Path) -> ServeOptions {
-    let any = ([127, 0, 0, 1], 0).into();
-    let (data, store) = (folder.join("data"), postgres::store_of(folder).await);
-    ServeOptions {
-        data,
-        store,
-        bus: None,
-        objects: None,
-        people: any,
-        vehicles: any,
-        name: None,
-        is_insecure: false,
-    }
+    let store = postgres::store_of(folder).await;
+    ServeOptions { store, ..ServeOptions::local(folder.join("data")) }
 }
 
 /// Starts a cloud; returns it with its administrator.
