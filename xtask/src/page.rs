@@ -8,7 +8,7 @@ use std::path::Path;
 use gleaner_base::{Exit, Failure};
 
 use crate::checkout::Checkout;
-use crate::steps::{Steps, run, succeeds};
+use crate::steps::{self, Steps, run, succeeds};
 
 /// The browser, as Debian's package has it.
 const BROWSER: &str = "/usr/bin/chromium";
@@ -48,11 +48,7 @@ pub(crate) fn run_flows(checkout: &Checkout, arguments: &[OsString]) -> Result<E
 fn packages(checkout: &Checkout, is_installing: bool) -> Result<(), Failure> {
     let missing = missing(checkout);
     if is_installing && !missing.is_empty() {
-        let mut install = checkout.command("apt-get");
-        install.args(["install", "-y", "--no-install-recommends"]).args(&missing);
-        install.env("DEBIAN_FRONTEND", "noninteractive");
-        run(&mut install, "install packages as root after `apt-get update`")
-            .map_err(unreachable)?;
+        steps::install(checkout, &missing)?;
     }
     let missing = self::missing(checkout);
     if missing.is_empty() {
@@ -88,10 +84,5 @@ fn modules(checkout: &Checkout, folder: &Path) -> Result<(), Failure> {
     // Scripts of packages are not run: these need none.
     install.args(["install", "--ignore-scripts", "--no-audit", "--no-fund", "--prefer-offline"]);
     install.arg("--prefix").arg(folder).args(MODULES);
-    run(&mut install, "check the network, or configure a mirror for npm").map_err(unreachable)
-}
-
-/// Marks a failed download.
-fn unreachable(failure: Failure) -> Failure {
-    Failure { exit: Exit::Unreachable, ..failure }
+    steps::download(&mut install, "check the network, or configure a mirror for npm")
 }

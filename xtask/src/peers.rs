@@ -10,7 +10,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_parts::Parts;
 
 use crate::checkout::Checkout;
-use crate::steps::{Steps, run, succeeds};
+use crate::steps::{self, Steps, run, succeeds};
 use crate::venv;
 
 /// Debian and Ubuntu packages of Cyclone DDS.
@@ -42,7 +42,7 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     steps.begin("packages");
     let missing = peers.missing();
     if install && !missing.is_empty() {
-        peers.install(&missing).map_err(unreachable)?;
+        steps::install(checkout, &missing)?;
     }
     steps.begin("Cyclone DDS in C");
     let cyclone = peers.has_cyclone();
@@ -68,11 +68,6 @@ pub(crate) fn build(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit,
     let help =
         format!("as root: cargo xtask peers --install, or: apt-get install {}", missing.join(" "));
     Err(Failure::new(Exit::Unreachable, "packages for the DDS peers are missing").with_help(help))
-}
-
-/// Marks a failed download.
-fn unreachable(failure: Failure) -> Failure {
-    Failure { exit: Exit::Unreachable, ..failure }
 }
 
 struct Peers<'c> {
@@ -114,14 +109,6 @@ impl Peers<'_> {
             .flat_map(|(_, packages)| packages)
             .copied()
             .collect()
-    }
-
-    fn install(&self, packages: &[&str]) -> Result<(), Failure> {
-        let help = "install packages as root after `apt-get update`; on other systems than Debian \
-                    and Ubuntu, install their equivalents";
-        let mut install = self.checkout.command("apt-get");
-        install.args(["install", "-y", "--no-install-recommends"]).args(packages);
-        run(install.env("DEBIAN_FRONTEND", "noninteractive"), help)
     }
 
     /// A folder below `peers/` for generated files.
@@ -198,6 +185,6 @@ impl Peers<'_> {
         make.args(["-m", "venv", "--clear"]).arg(&venv);
         run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip")?;
         let help = "check the network, or configure a mirror for pip";
-        venv::pip(self.checkout.command(&python), &["cyclonedds"], help).map_err(unreachable)
+        venv::pip(self.checkout.command(&python), &["cyclonedds"], help)
     }
 }

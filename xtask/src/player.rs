@@ -32,8 +32,7 @@ pub(crate) fn cargo(checkout: &Checkout) -> Result<Command, Failure> {
     let lacks_cmake = !steps::succeeds(checkout.command("cmake").arg("--version"));
     let lacks_libclang = env::var_os("LIBCLANG_PATH").is_none() && !has_libclang();
     if lacks_cmake || lacks_libclang {
-        // A failed download is reported as unreachable, unlike a compile error.
-        fetch(checkout).map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })?;
+        fetch(checkout)?;
     }
     let mut cargo = checkout.cargo();
     if lacks_cmake {

@@ -6,6 +6,8 @@ use std::process::{Command, Output, Stdio};
 
 use gleaner_base::{Exit, Failure};
 
+use crate::checkout::Checkout;
+
 /// Numbers the steps of a command.
 pub(crate) struct Steps {
     started: usize,
@@ -33,6 +35,21 @@ pub(crate) fn run(command: &mut Command, help: &str) -> Result<(), Failure> {
         .status()
         .map_err(|error| cannot_start(command, &error, help))?;
     if status.success() { Ok(()) } else { Err(ended(command, &status.to_string(), help)) }
+}
+
+/// Runs a command that downloads something: if it fails, [`Exit::Unreachable`] marks
+/// that what needs it can be skipped.
+pub(crate) fn download(command: &mut Command, help: &str) -> Result<(), Failure> {
+    run(command, help).map_err(|failure| Failure { exit: Exit::Unreachable, ..failure })
+}
+
+/// Installs packages of Debian or Ubuntu, as root.
+pub(crate) fn install(checkout: &Checkout, packages: &[&str]) -> Result<(), Failure> {
+    let mut install = checkout.command("apt-get");
+    install.args(["install", "-y", "--no-install-recommends"]).args(packages);
+    let help = "install packages as root after `apt-get update`; on other systems than Debian and \
+                Ubuntu, install their equivalents";
+    download(install.env("DEBIAN_FRONTEND", "noninteractive"), help)
 }
 
 /// Runs `command` and returns its standard output; standard error is shown.

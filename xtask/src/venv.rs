@@ -10,7 +10,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_parts::Parts;
 
 use crate::checkout::Checkout;
-use crate::steps::{run, succeeds};
+use crate::steps::{download, run, succeeds};
 
 /// Packages for lambdas: name in pip, and name of the module.
 const PACKAGES: [(&str, &str); 1] = [("numpy", "numpy")];
@@ -87,5 +87,5 @@ fn fetch(checkout: &Checkout, packages: &[(&str, &str)]) -> Result<(), Failure> 
 /// Installs packages with the pip of `python`. `help` is for the error message.
 pub(crate) fn pip(mut python: Command, packages: &[&str], help: &str) -> Result<(), Failure> {
     python.args(["-m", "pip", "install", "--disable-pip-version-check", "-q"]).args(packages);
-    run(&mut python, &format!("pip fetches {}: {help}", packages.join(", ")))
+    download(&mut python, &format!("pip fetches {}: {help}", packages.join(", ")))
 }

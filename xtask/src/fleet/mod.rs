@@ -15,7 +15,7 @@ use gleaner_base::{Exit, Failure};
 
 use crate::checkout::Checkout;
 use crate::setup;
-use crate::steps::{Steps, run};
+use crate::steps::{self, Steps, run};
 use crate::venv;
 use scaled::ScaledCloud;
 use services::{find, missing};
@@ -61,7 +61,8 @@ pub(crate) fn run_scaled(checkout: &Checkout, arguments: &[OsString]) -> Result<
     }
     let missing = missing(checkout);
     if !missing.is_empty() {
-        let message = format!("these programs are missing: {}", missing.join(", "));
+        let names: Vec<_> = missing.iter().map(|(name, _)| *name).collect();
+        let message = format!("these programs are missing: {}", names.join(", "));
         return Err(Failure::new(Exit::Unreachable, message)
             .with_help("as root, after `apt-get update`: cargo xtask fleet --install"));
     }
@@ -87,11 +88,11 @@ pub(crate) fn run_scaled(checkout: &Checkout, arguments: &[OsString]) -> Result<
 }
 
 fn install(checkout: &Checkout) -> Result<(), Failure> {
-    let mut packages = checkout.command("apt-get");
-    packages.args(["install", "-y", "--no-install-recommends"]);
-    packages.args(["postgresql", "nats-server", "haproxy"]);
-    packages.env("DEBIAN_FRONTEND", "noninteractive");
-    run(&mut packages, "install packages as root after `apt-get update`")?;
+    let missing = missing(checkout);
+    let packages: Vec<_> = missing.iter().filter_map(|(_, package)| *package).collect();
+    if !packages.is_empty() {
+        steps::install(checkout, &packages)?;
+    }
     if find(checkout, "moto_server").is_none() {
         // In an environment of its own: it has many packages, and lambdas need none of them.
         let folder = checkout.target().join("fleet/venv");

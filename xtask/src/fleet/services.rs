@@ -122,9 +122,15 @@ fn postgres() -> PathBuf {
     folders.max().unwrap_or_default()
 }
 
-/// Returns the programs that are missing.
-pub(super) fn missing(checkout: &Checkout) -> Vec<&'static str> {
-    let mut all = ["initdb", "nats-server", "haproxy", "moto_server"].to_vec();
-    all.retain(|name| find(checkout, name).is_none());
+/// Returns the programs that are missing, with their Debian packages; that of moto comes from pip.
+pub(super) fn missing(checkout: &Checkout) -> Vec<(&'static str, Option<&'static str>)> {
+    let mut all = [
+        ("initdb", Some("postgresql")),
+        ("nats-server", Some("nats-server")),
+        ("haproxy", Some("haproxy")),
+        ("moto_server", None),
+    ]
+    .to_vec();
+    all.retain(|(name, _)| find(checkout, name).is_none());
     all
 }
