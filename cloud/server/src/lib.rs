@@ -19,6 +19,7 @@ mod accept;
 mod attempts;
 mod authority;
 mod bus;
+mod clients;
 mod clips;
 mod cloud;
 mod error;

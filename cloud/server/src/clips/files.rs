@@ -25,7 +25,7 @@ use crate::error::{CloudError, CloudResult};
 use crate::folder::PART;
 use crate::place::{FilePlace, blocking};
 use crate::store::ClipBounds;
-use crate::transfer::{IncomingFile, PIECE_TIME};
+use crate::transfer::{IncomingFile, PIECE_TIME, StoredBytes};
 
 /// Number of parts of a vehicle that are received at a time: some may be of connections that it
 /// has lost.
@@ -110,6 +110,10 @@ impl ClipFiles {
             let (number, skipped) = (begin / CLIP_PART, begin % CLIP_PART);
             let part = files.place.content(&part_name(&id, number), skipped).await?;
             let part = part.ok_or_else(|| io::Error::from(io::ErrorKind::NotFound))?;
+            // A longer or shorter one would move all that follows.
+            let end = length.min((number + 1) * CLIP_PART);
+            let name = format!("part {number} of clip `{id}`");
+            let part = StoredBytes::new(&name, end - begin).checked(part);
             let pieces = part.into_data_stream().map(|it| it.map_err(io::Error::other));
             Ok(Some((pieces, (files, id, (number + 1) * CLIP_PART))))
         });

@@ -70,11 +70,13 @@ pub(crate) async fn thumbnail(
     Path(id): Path<String>,
 ) -> CloudResult<Response> {
     let id = parse(&id)?;
-    if !cloud.store.clip(&id).await?.has_thumbnail {
+    let clip = cloud.store.clip(&id).await?;
+    if !clip.has_thumbnail {
         let message = format!("clip `{id}` has no thumbnail here");
         return Err(CloudError::missing(message, "its vehicle sends it when it is connected"));
     }
-    send(&cloud, (&id, FileOfClip::Thumbnail), "image/jpeg", &HeaderMap::new()).await
+    let file = (&id, FileOfClip::Thumbnail, clip.facts.thumbnail.as_deref());
+    send(&cloud, file, "image/jpeg", &HeaderMap::new()).await
 }
 
 pub(crate) async fn file(
@@ -90,7 +92,7 @@ pub(crate) async fn file(
         return Err(CloudError::missing(message, "fetch it: `gleaner clips pull ID`"));
     }
     let file = FileOfClip::Recording(clip.facts.bytes);
-    send(&cloud, (&id, file), OCTETS, &headers).await
+    send(&cloud, (&id, file, clip.facts.sha256.as_deref()), OCTETS, &headers).await
 }
 
 pub(crate) async fn policy(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<ClipPolicy>> {
@@ -119,7 +121,7 @@ fn not_sent(id: &ClipId, error: io::Error) -> CloudError {
 /// Returns the answer with a file, or with the end of it that `Range` asks for.
 async fn send(
     cloud: &Cloud,
-    (id, file): (&ClipId, FileOfClip),
+    (id, file, sha256): (&ClipId, FileOfClip, Option<&str>),
     kind: &'static str,
     headers: &HeaderMap,
 ) -> CloudResult<Response> {
@@ -127,5 +129,5 @@ async fn send(
     let help = "fetch it again: `gleaner clips pull ID`";
     let length = cloud.clips.length(id, file).await;
     let content = async |begin| cloud.clips.content(id, file, begin).await;
-    OutgoingFile { name: &name, kind, help }.send(headers, length, content).await
+    OutgoingFile { name: &name, kind, help, sha256 }.send(headers, length, content).await
 }

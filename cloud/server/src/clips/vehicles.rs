@@ -17,6 +17,7 @@ use gleaner_fleet::clips::{
     CLIP_PART, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName, ClipOrders,
     ClipReport, THUMBNAIL_MAX,
 };
+use gleaner_image::Format;
 use tokio::time::timeout;
 
 use crate::cloud::Cloud;
@@ -31,8 +32,8 @@ const UNWANTED_TIME: Duration = Duration::from_secs(30);
 const CURSOR_MAX: usize = 256;
 /// The reason of a failed upload whose earlier parts were lost.
 const NO_PARTS: &str = "its first parts are not there any more";
-/// First bytes of a JPEG.
-const JPEG: [u8; 3] = [0xff, 0xd8, 0xff];
+/// Largest side of a thumbnail, in pixels: a few KiB could claim more than a browser has memory for.
+const SIDE_MAX: u32 = 4096;
 
 /// Returns the routes, which need a certificate.
 pub(crate) fn router() -> Router<Arc<Cloud>> {
@@ -95,10 +96,16 @@ async fn thumbnail(
         return orders(&cloud, &vehicle.name).await;
     };
     let id = id(&name, &vehicle.name)?;
-    let is_jpeg = body.starts_with(&JPEG) && body.len() as u64 <= THUMBNAIL_MAX;
-    if !is_jpeg || gleaner_trust::sha256(&body).as_str() != wanted {
-        let message = format!("the thumbnail of clip `{id}` is refused");
-        return Err(CloudError::denied(message, "send the JPEG that was announced"));
+    let refused = |help| {
+        CloudError::denied(format!("the thumbnail of clip `{id}` is refused"), help)
+    };
+    if gleaner_trust::sha256(&body).as_str() != wanted {
+        return Err(refused("send the JPEG that was announced"));
+    }
+    if !is_thumbnail(&body) {
+        // It will never be another one.
+        cloud.store.thumbnail_refused(&id, &wanted).await?;
+        return Err(refused("announce a JPEG of at most 4096 pixels a side"));
     }
     let length = body.len() as u64;
     let part = cloud.clips.receive(&id, (length, &wanted), Body::from(body)).await?;
@@ -110,6 +117,14 @@ async fn thumbnail(
     cloud.clips.keep_thumbnail(&id, &part).await.map_err(|error| not_stored(&id, error))?;
     cloud.store.thumbnail_received(&id).await?;
     orders(&cloud, &vehicle.name).await
+}
+
+/// Returns whether bytes begin as a JPEG of a size that a browser can show.
+pub(crate) fn is_thumbnail(bytes: &[u8]) -> bool {
+    bytes.len() as u64 <= THUMBNAIL_MAX
+        && gleaner_image::probe(bytes).is_ok_and(|image| {
+            image.format == Format::Jpeg && image.width.max(image.height) <= SIDE_MAX
+        })
 }
 
 /// Receives a part. One that was received before changes nothing.

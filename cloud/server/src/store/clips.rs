@@ -286,6 +286,16 @@ impl CloudStore {
         change.commit().await
     }
 
+    /// Forgets the announcement of a thumbnail that is no image.
+    pub(crate) async fn thumbnail_refused(&self, id: &ClipId, sha256: &str) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        run!(&mut *change.tx;
+            "UPDATE clips SET thumbnail = ''
+             WHERE vehicle = $1 AND name = $2 AND thumbnail = $3 AND has_thumbnail = 0";
+            id.vehicle(), id.name(), sha256);
+        change.commit().await
+    }
+
     /// Forgets the parts of files of which none came since `seconds`; returns these clips.
     pub(crate) async fn forget_unfinished_clips(&self, seconds: u64) -> CloudResult<Vec<ClipId>> {
         let before = now() - int(seconds);

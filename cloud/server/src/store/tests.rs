@@ -378,12 +378,26 @@ async fn vehicles_of_a_process_are_online_as_long_as_its_lease_is() {
     let other = CloudStore::open(&address(&folder).await).await.unwrap();
     assert_eq!(other.own_links(None).await.unwrap(), []);
     store.execute("UPDATE replicas SET until = 1").await;
-    other.renew_lease().await.unwrap();
+    other.renew_lease(false).await.unwrap();
     assert_eq!(state().await, VehicleState::Offline);
-    store.renew_lease().await.unwrap();
+    store.renew_lease(false).await.unwrap();
     assert_eq!(state().await, VehicleState::Online);
     other.begin_lease(store.replica(), false).await.unwrap();
     assert_eq!(state().await, VehicleState::Offline, "it has ended, and this is its successor");
+}
+
+#[tokio::test]
+async fn a_process_with_files_of_its_own_ends_when_another_one_has_taken_its_place() {
+    let (folder, store) = store().await;
+    store.begin_lease("", true).await.unwrap();
+    assert!(store.renew_lease(true).await.unwrap());
+    // It stood still, and another one has begun.
+    store.execute("UPDATE replicas SET until = 1").await;
+    let other = CloudStore::open(&address(&folder).await).await.unwrap();
+    other.begin_lease("", true).await.unwrap();
+    assert!(!store.renew_lease(true).await.unwrap());
+    assert!(other.renew_lease(true).await.unwrap(), "the newer one goes on");
+    assert!(store.renew_lease(false).await.unwrap(), "with shared files, both do");
 }
 
 #[tokio::test]
