@@ -15,9 +15,7 @@ use serde_json::{Value, json};
 
 use self::download::ClipTarget;
 use super::{client, list, show};
-use crate::args::{
-    ClipFilterArgs, ClipsArgs, ClipsCommand, PolicyArgs, PullArgs, RemoveClipsArgs,
-};
+use crate::args::{ClipFilterArgs, ClipsArgs, ClipsCommand, PolicyArgs, PullArgs, RemoveClipsArgs};
 use crate::render::table;
 
 /// Interval of looks whether a vehicle has sent a clip.

@@ -8,9 +8,9 @@ use std::time::Duration;
 use axum::Router;
 use axum::body::{Body, Bytes, HttpBody};
 use hyper::body::{Frame, Incoming, SizeHint};
-use hyper::{Request, StatusCode};
 use hyper::server::conn::http1;
 use hyper::service::{Service, service_fn};
+use hyper::{Request, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use rustls::ServerConfig;
@@ -127,10 +127,7 @@ impl Entrance {
 }
 
 /// Returns a free slot: if there is none, that of an idle connection, which ends for it.
-async fn free_slot(
-    slots: &Arc<Semaphore>,
-    clients: &OpenClients,
-) -> Option<OwnedSemaphorePermit> {
+async fn free_slot(slots: &Arc<Semaphore>, clients: &OpenClients) -> Option<OwnedSemaphorePermit> {
     if let Ok(slot) = Arc::clone(slots).try_acquire_owned() {
         return Some(slot);
     }

@@ -53,10 +53,7 @@ pub(crate) struct WrongSecrets {
 impl Default for WrongSecrets {
     fn default() -> Self {
         let (per_s, burst) = (1.0 / 6.0, 10.0);
-        Self {
-            networks: LimitOfEach::new(per_s, burst),
-            passwords: LimitOfEach::new(per_s, burst),
-        }
+        Self { networks: LimitOfEach::new(per_s, burst), passwords: LimitOfEach::new(per_s, burst) }
     }
 }
 

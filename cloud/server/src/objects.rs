@@ -127,7 +127,9 @@ impl Objects {
         let length = self.place.length(sha256.as_str()).await;
         let content = async |begin| self.place.content(sha256.as_str(), begin).await;
         let sha256 = Some(sha256.as_str());
-        OutgoingFile { name: &name, kind: OCTETS, help, sha256 }.send(headers, length, content).await
+        OutgoingFile { name: &name, kind: OCTETS, help, sha256 }
+            .send(headers, length, content)
+            .await
     }
 }
 

@@ -42,7 +42,8 @@ impl Readers {
     /// An error if too many are read already.
     pub(crate) fn open(self: &Arc<Self>, user: &str) -> CloudResult<ReaderSlot> {
         let mut all = self.lock();
-        let busy = |message| CloudError::busy(message, "end another `gleaner logs -f`, or close a page");
+        let busy =
+            |message| CloudError::busy(message, "end another `gleaner logs -f`, or close a page");
         if all.values().map(|it| it.count).sum::<usize>() >= READERS_MAX {
             return Err(busy("too many streams are read already"));
         }

@@ -137,9 +137,11 @@ impl OutgoingFile<'_> {
             return Err(failed(io::Error::other(reason)).into());
         }
         let stored = StoredBytes::new(name, length - begin);
-        // A part has no digest of its own: who goes on with a file has to compare all of it.
-        let sha256 = sha256.filter(|_| begin == 0).map(str::to_owned);
-        let stored = StoredBytes { sha256, ..stored };
+        // The rest of a file has no digest: a client that goes on with one has to compare all of it.
+        let stored = match sha256.filter(|_| begin == 0) {
+            Some(sha256) => stored.with_sha256(sha256),
+            None => stored,
+        };
         let mut answer = stored.checked(content).into_response();
         *answer.status_mut() = status;
         let mut set = |name, value: String| {
@@ -171,6 +173,11 @@ impl StoredBytes {
     /// Returns those of this length, of any content.
     pub(crate) fn new(name: &str, length: u64) -> Self {
         Self { name: name.to_owned(), length, sha256: None }
+    }
+
+    /// Returns the same bytes, with this SHA-256.
+    pub(crate) fn with_sha256(self, sha256: &str) -> Self {
+        Self { sha256: Some(sha256.to_owned()), ..self }
     }
 
     /// Returns a content that fails unless it is these bytes. The last piece comes only after the
@@ -311,8 +318,8 @@ mod tests {
     async fn sent(
         pieces: impl futures_util::Stream<Item = io::Result<Bytes>> + Send + 'static,
     ) -> Result<Vec<u8>, String> {
-        let sha256 = Some(gleaner_trust::sha256(b"content").to_string());
-        let stored = StoredBytes { sha256, ..StoredBytes::new("the file x", 7) };
+        let sha256 = gleaner_trust::sha256(b"content");
+        let stored = StoredBytes::new("the file x", 7).with_sha256(sha256.as_str());
         let body = stored.checked_within(Duration::from_millis(20), Body::from_stream(pieces));
         let mut pieces = body.into_data_stream();
         let mut content = Vec::new();
@@ -344,7 +351,10 @@ mod tests {
             assert!(stalled.starts_with("nothing came"), "{stalled}");
         }
         let lost = stream::iter([Err(io::Error::other("the connection was lost"))]);
-        assert_eq!(sent(pieces(&["con"]).chain(lost)).await.unwrap_err(), "the connection was lost");
+        assert_eq!(
+            sent(pieces(&["con"]).chain(lost)).await.unwrap_err(),
+            "the connection was lost"
+        );
     }
 
     #[tokio::test]

@@ -42,8 +42,10 @@ pub(crate) async fn pull(
     let id = parse(&id)?;
     let before = cloud.store.clip(&id).await?;
     // Only a file that was stored before this look can be lost: another one may arrive meanwhile.
-    let is_lost = before.state == ClipState::Stored
-        && !cloud.clips.has_recording(&id).await.map_err(|error| not_sent(&id, error))?;
+    let is_lost = before.state == ClipState::Stored && {
+        let parts = cloud.store.clip_parts(&id).await?;
+        !cloud.clips.has_recording(&id, &parts).await.map_err(|error| not_sent(&id, error))?
+    };
     let clip = cloud.store.pull_clip(&actor.name, before, is_lost).await?;
     cloud.hub.wake(&[id.vehicle().to_owned()]);
     Ok(Json(clip))
@@ -91,7 +93,7 @@ pub(crate) async fn file(
             format!("the file of clip `{id}` is not in the cloud: {}", clip.state.as_str());
         return Err(CloudError::missing(message, "fetch it: `gleaner clips pull ID`"));
     }
-    let file = FileOfClip::Recording(clip.facts.bytes);
+    let file = FileOfClip::Recording(clip.facts.bytes, cloud.store.clip_parts(&id).await?);
     send(&cloud, (&id, file, clip.facts.sha256.as_deref()), OCTETS, &headers).await
 }
 
@@ -127,7 +129,7 @@ async fn send(
 ) -> CloudResult<Response> {
     let name = format!("a file of clip `{id}`");
     let help = "fetch it again: `gleaner clips pull ID`";
-    let length = cloud.clips.length(id, file).await;
+    let length = cloud.clips.length(id, &file).await;
     let content = async |begin| cloud.clips.content(id, file, begin).await;
     OutgoingFile { name: &name, kind, help, sha256 }.send(headers, length, content).await
 }

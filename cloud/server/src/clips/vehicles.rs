@@ -18,6 +18,7 @@ use gleaner_fleet::clips::{
     ClipReport, THUMBNAIL_MAX,
 };
 use gleaner_image::Format;
+use gleaner_lambda::manifest::Sha256;
 use tokio::time::timeout;
 
 use crate::cloud::Cloud;
@@ -96,9 +97,8 @@ async fn thumbnail(
         return orders(&cloud, &vehicle.name).await;
     };
     let id = id(&name, &vehicle.name)?;
-    let refused = |help| {
-        CloudError::denied(format!("the thumbnail of clip `{id}` is refused"), help)
-    };
+    let refused =
+        |help| CloudError::denied(format!("the thumbnail of clip `{id}` is refused"), help);
     if gleaner_trust::sha256(&body).as_str() != wanted {
         return Err(refused("send the JPEG that was announced"));
     }
@@ -146,7 +146,7 @@ async fn part(
     let received = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body).await?;
     let working = Arc::clone(&cloud);
     // A vehicle that goes away in the middle must not leave it half done.
-    let stored = tokio::spawn(store_part(working, progress, length, received)).await;
+    let stored = tokio::spawn(store_part(working, progress, (length, sha256), received)).await;
     stored.map_err(|error| {
         Failure::caused_by(Exit::Internal, "a part of a clip is not stored", &error)
     })??;
@@ -183,7 +183,7 @@ async fn skip(body: Body) {
 async fn store_part(
     cloud: Arc<Cloud>,
     progress: ClipProgress,
-    length: u64,
+    (length, sha256): (u64, Sha256),
     received: UnfinishedFile,
 ) -> CloudResult<()> {
     let id = progress.id.clone();
@@ -196,20 +196,26 @@ async fn store_part(
     }
     let is_last = ClipFacts::part_length(progress.bytes, progress.part + 1).is_none();
     let failed = |error| not_stored(&id, error);
-    let is_appended = cloud.clips.append(&id, progress.part, received).await.map_err(failed)?;
+    let part = (progress.part, sha256.as_str());
+    let is_appended = cloud.clips.append(&id, part, received).await.map_err(failed)?;
     let outcome = match (is_appended, is_last) {
         (false, _) => Err(NO_PARTS.to_owned()),
         (true, false) => Ok(()),
         (true, true) => {
             let announced = (progress.bytes, progress.sha256.clone());
-            match cloud.clips.compare(&id, announced).await {
+            let mut parts = cloud.store.clip_parts(&id).await?;
+            parts.push(sha256.to_string());
+            match cloud.clips.compare(&id, announced, parts).await {
                 Err(error) if error.kind() == io::ErrorKind::NotFound => Err(NO_PARTS.to_owned()),
                 compared => compared.map_err(failed)?,
             }
         }
     };
     match outcome {
-        Ok(()) => cloud.store.clip_part_received(&progress, length, is_last).await,
+        Ok(()) => {
+            let part = (length, sha256.as_str());
+            cloud.store.clip_part_received(&progress, part, is_last).await
+        }
         Err(reason) => {
             // Otherwise another replica has stored it meanwhile.
             if cloud.store.clip_upload_failed(&id, &reason).await? {

@@ -348,3 +348,21 @@ async fn a_stream_ends_once_its_token_has_no_right_any_more() {
         assert_eq!(all.await.expect("the stream goes on").unwrap(), "");
     }
 }
+
+#[tokio::test]
+async fn only_a_deployment_has_a_long_body() {
+    let folder = TempDir::new().unwrap();
+    let cloud = cloud(&folder).await;
+    let token = token_of(&cloud, "ann", Role::Admin).await;
+    for (path, length, status) in [
+        ("/v1/users", SMALL_MAX, StatusCode::BAD_REQUEST),
+        ("/v1/users", SMALL_MAX + 1, StatusCode::PAYLOAD_TOO_LARGE),
+        ("/v1/deployments", BODY_MAX, StatusCode::BAD_REQUEST),
+        ("/v1/deployments", BODY_MAX + 1, StatusCode::PAYLOAD_TOO_LARGE),
+        ("/v1/login", LOGIN_MAX + 1, StatusCode::PAYLOAD_TOO_LARGE),
+    ] {
+        let body = vec![b' '; length];
+        let answer = send(&cloud, (Method::POST, path), Some(&token), &[], body).await;
+        assert_eq!(answer.status, status, "{path}: {length}");
+    }
+}

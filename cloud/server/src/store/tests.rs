@@ -12,7 +12,7 @@ mod postgres;
 const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20, vehicle_bytes: 1 << 20 };
 
 /// Returns the address of a database of its own.
-pub(super) async fn address(folder: &TempDir) -> StoreAddress {
+pub(crate) async fn address(folder: &TempDir) -> StoreAddress {
     match postgres::store_of(folder.path()).await {
         Some(url) => StoreAddress::server(&url).unwrap(),
         None => StoreAddress::file(&folder.path().join("cloud.db")),
@@ -110,6 +110,24 @@ async fn records_that_come_again_are_stored_once() {
     store.append("car-7", epoch, batch(2, 0..1), KEPT).await.unwrap();
     assert_eq!(lines(&store).await.len(), 5);
     assert!(store.append("car-7", epoch, batch(1, 4..5), KEPT).await.is_err());
+}
+
+#[tokio::test]
+async fn a_name_of_a_boot_that_cannot_be_stored_takes_no_others_with_it() {
+    let (_folder, store) = store().await;
+    let (bad, good) = (connected(&store, "bad").await, connected(&store, "car-7").await);
+    let mut damaged = batch(1, 0..1);
+    damaged.cursor.boot = "b\0".to_owned();
+    // PostgreSQL refuses it, and SQLite stores it. Both come in one group.
+    let (refused, stored) = tokio::join!(
+        store.append("bad", bad, damaged, KEPT),
+        store.append("car-7", good, batch(1, 0..1), KEPT),
+    );
+    if let Err(error) = refused {
+        assert!(error.reason().contains("a text cannot be stored"), "{}", error.reason());
+    }
+    assert_eq!(stored.unwrap().next, 1);
+    assert_eq!(lines(&store).await, ["line 0"]);
 }
 
 #[tokio::test]

@@ -192,6 +192,8 @@ async fn a_wanted_clip_comes_in_parts_across_an_interruption_and_a_restart() {
     assert_eq!(clip(&admin, "a@car-7").await["state"], "stored");
     let whole = bytes(&admin, "/v1/clips/a@car-7/file").await;
     assert!(whole == (StatusCode::OK, content.clone()));
+    assert_eq!(pull(&admin, "a@car-7").await, StatusCode::OK);
+    assert_eq!(clip(&admin, "a@car-7").await["state"], "stored", "it is not fetched again");
     // A file that is lost in the cloud can be fetched again.
     for entry in std::fs::read_dir(folder.path().join("data/clips")).unwrap() {
         let path = entry.unwrap().path();
@@ -201,6 +203,19 @@ async fn a_wanted_clip_comes_in_parts_across_an_interruption_and_a_restart() {
     assert_eq!(bytes(&admin, "/v1/clips/a@car-7/file").await.0, StatusCode::NOT_FOUND);
     assert_eq!(pull(&admin, "a@car-7").await, StatusCode::OK);
     assert_eq!(orders(&vehicle).await.wanted[0].part, 0);
+    // Nor does a part that is lost lock the upload.
+    assert_eq!(put(&vehicle, "a", 0, first).await.0, StatusCode::OK);
+    for entry in std::fs::read_dir(folder.path().join("data/clips")).unwrap() {
+        std::fs::remove_file(entry.unwrap().path()).unwrap();
+    }
+    let (status, reason) = put(&vehicle, "a", 1, second).await;
+    assert_eq!(status, StatusCode::FORBIDDEN);
+    assert!(reason.contains("its first parts are not there any more"), "{reason}");
+    for (number, part) in [(0, first), (1, second)] {
+        assert_eq!(orders(&vehicle).await.wanted[0].part, number);
+        assert_eq!(put(&vehicle, "a", number, part).await.0, StatusCode::OK);
+    }
+    assert_eq!(clip(&admin, "a@car-7").await["state"], "stored");
     server.stop().await;
 }
 
