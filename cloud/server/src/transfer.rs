@@ -137,7 +137,8 @@ impl OutgoingFile<'_> {
             return Err(failed(io::Error::other(reason)).into());
         }
         let stored = StoredBytes::new(name, length - begin);
-        // The rest of a file has no digest: a client that goes on with one has to compare all of it.
+        // The rest of a file has no digest: a client that goes on with a file has to compare all of
+        // it.
         let stored = match sha256.filter(|_| begin == 0) {
             Some(sha256) => stored.with_sha256(sha256),
             None => stored,

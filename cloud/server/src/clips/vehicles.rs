@@ -33,7 +33,8 @@ const UNWANTED_TIME: Duration = Duration::from_secs(30);
 const CURSOR_MAX: usize = 256;
 /// The reason of a failed upload whose earlier parts were lost.
 const NO_PARTS: &str = "its first parts are not there any more";
-/// Largest side of a thumbnail, in pixels: a few KiB could claim more than a browser has memory for.
+/// Largest side of a thumbnail, in pixels: a few KiB could claim more than a browser has memory
+/// for.
 const SIDE_MAX: u32 = 4096;
 
 /// Returns the routes, which need a certificate.
