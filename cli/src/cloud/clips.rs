@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 
 use self::download::ClipTarget;
 use super::{client, list, show};
-use crate::args::{ClipFilterArgs, ClipsArgs, ClipsCommand, PolicyArgs, PullArgs};
+use crate::args::{ClipFilterArgs, ClipsArgs, ClipsCommand, PolicyArgs, PullArgs, RemoveClipsArgs};
 use crate::render::table;
 
 /// Interval of looks whether a vehicle has sent a clip.
@@ -33,16 +33,44 @@ pub(super) fn clips(args: &ClipsArgs) -> Result<Exit, Failure> {
         }
         Some(ClipsCommand::Pull(pull)) => self::pull(pull),
         Some(ClipsCommand::Export(export)) => export::export(export),
-        Some(ClipsCommand::Remove(remove)) => {
-            let client = client()?;
-            remove.ids.iter().try_for_each(|id| client.delete(&path(id)))?;
-            let removed: Vec<_> = remove.ids.iter().map(ToString::to_string).collect();
-            show(remove.json, &json!({ "removed": removed }), |_| {
-                removed.iter().map(|id| format!("removed {id}\n")).collect()
-            })
-        }
+        Some(ClipsCommand::Remove(remove)) => self::remove(remove),
         Some(ClipsCommand::Policy(policy)) => self::policy(policy),
     }
+}
+
+/// Removes clips, each as far as it can be.
+///
+/// # Errors
+///
+/// The failure of a clip, or a failure that names all that stay, with the worst exit code.
+fn remove(args: &RemoveClipsArgs) -> Result<Exit, Failure> {
+    let client = client()?;
+    let (mut removed, mut failures) = (Vec::new(), Vec::new());
+    for id in &args.ids {
+        match client.delete(&path(id)) {
+            Ok(()) => removed.push(id.to_string()),
+            Err(failure) => failures.push((id, failure)),
+        }
+    }
+    let shown = show(args.json, &json!({ "removed": removed }), |_| {
+        removed.iter().map(|id| format!("removed {id}\n")).collect()
+    });
+    let Some(exit) = failures.iter().map(|(_, failure)| failure.exit).max_by_key(|it| it.code())
+    else {
+        return shown;
+    };
+    if let [_] = &*args.ids {
+        return Err(failures.remove(0).1);
+    }
+    shown?;
+    let message = format!("{} of {} clips stay in the cloud", failures.len(), args.ids.len());
+    let help = "`gleaner clips` lists all clips, with their states";
+    let mut all = Failure::new(exit, message).with_help(help);
+    for (id, Failure { message, causes, .. }) in failures {
+        let reason = std::iter::once(message).chain(causes).collect::<Vec<_>>().join(": ");
+        all.causes.push(format!("`{id}`: {reason}"));
+    }
+    Err(all)
 }
 
 /// Returns the parts of a query that choose clips.

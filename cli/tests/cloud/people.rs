@@ -187,3 +187,28 @@ fn a_list_is_followed_to_its_end_and_one_without_an_end_is_refused() {
     let text = user.fails(1, &["clips", "export", "--label", "x", "--to", "out"]);
     assert!(text.contains("the list `/v1/clips` has no end"), "{text}");
 }
+
+#[test]
+fn each_clip_is_removed_that_can_be_and_those_that_stay_are_named() {
+    let user = CloudUser::logged_in();
+    let remove = ["clips", "remove", "a@car-7", "b@car-7", "c@car-7", "d@car-7"];
+    let answers = [
+        ("a", 403, problem(3, "`ada` is no deployer")),
+        ("b", 204, json!(null)),
+        ("c", 404, problem(2, "there is no clip `c@car-7`")),
+        ("d", 204, json!(null)),
+    ];
+    for (name, status, answer) in answers {
+        user.cloud.answers(&format!("DELETE /v1/clips/{name}@car-7"), &[(status, answer)]);
+    }
+    let output = user.command(&remove).output().unwrap();
+    assert_eq!(output.status.code(), Some(3), "the worst one");
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(text, "removed b@car-7\nremoved d@car-7\n");
+    let errors = String::from_utf8(output.stderr).unwrap();
+    assert!(errors.contains("2 of 4 clips stay in the cloud"), "{errors}");
+    assert!(errors.contains("`a@car-7`: `ada` is no deployer"), "{errors}");
+    assert!(errors.contains("`c@car-7`: there is no clip `c@car-7`"), "{errors}");
+    let text = user.fails(2, &["clips", "remove", "c@car-7"]);
+    assert!(text.contains("there is no clip `c@car-7`") && !text.contains("of 1"), "{text}");
+}

@@ -2,12 +2,12 @@
 
 use std::collections::HashMap;
 use std::hash::Hash;
-use std::net::IpAddr;
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use gleaner_base::RateLimit;
 
+use crate::clients::ClientNetwork;
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of keys that are remembered. With this many at once, further ones share a limit.
@@ -42,31 +42,28 @@ impl<K: Hash + Eq> LimitOfEach<K> {
     }
 }
 
-/// Wrong secrets of each address, and passwords that were tried for each name: ten at once, then
-/// one in six seconds.
+/// Wrong secrets of each network of clients, and passwords that were tried for each name: ten at
+/// once, then one in six seconds.
 #[derive(Debug)]
 pub(crate) struct WrongSecrets {
-    addresses: LimitOfEach<IpAddr>,
-    passwords: LimitOfEach<(IpAddr, String)>,
+    networks: LimitOfEach<ClientNetwork>,
+    passwords: LimitOfEach<(ClientNetwork, String)>,
 }
 
 impl Default for WrongSecrets {
     fn default() -> Self {
         let (per_s, burst) = (1.0 / 6.0, 10.0);
-        Self {
-            addresses: LimitOfEach::new(per_s, burst),
-            passwords: LimitOfEach::new(per_s, burst),
-        }
+        Self { networks: LimitOfEach::new(per_s, burst), passwords: LimitOfEach::new(per_s, burst) }
     }
 }
 
 impl WrongSecrets {
-    /// Counts a wrong one; it is an error of its own if the address has sent too many. Those that
-    /// are right are never refused: others at the address, such as all behind a proxy, may use
+    /// Counts a wrong one; it is an error of its own if the network has sent too many. Those that
+    /// are right are never refused: others of it, such as all behind a proxy, may use
     /// them.
-    pub(crate) fn count(&self, address: IpAddr) -> CloudResult<()> {
+    pub(crate) fn count(&self, network: ClientNetwork) -> CloudResult<()> {
         let help = "wait a minute, and use the newest code or token";
-        match self.addresses.take(address) {
+        match self.networks.take(network) {
             true => Ok(()),
             false => Err(CloudError::busy(
                 "too many wrong codes and tokens came from your address",
@@ -77,9 +74,9 @@ impl WrongSecrets {
 
     /// Counts a password before it is checked: unlike codes and tokens, passwords can be guessed,
     /// so that right ones are refused, too.
-    pub(crate) fn count_password(&self, address: IpAddr, name: &str) -> CloudResult<()> {
+    pub(crate) fn count_password(&self, network: ClientNetwork, name: &str) -> CloudResult<()> {
         let name = gleaner_base::excerpt(name);
-        match self.passwords.take((address, name)) {
+        match self.passwords.take((network, name)) {
             true => Ok(()),
             false => Err(CloudError::busy(
                 "too many passwords were tried for this name from your address",
@@ -127,6 +124,30 @@ impl VehicleLimits {
     }
 }
 
+/// Changes of a user's own account, each with an entry in the audit trail, which keeps all of them:
+/// twenty at once, then one a minute. Users of every role may make them.
+#[derive(Debug)]
+pub(crate) struct AccountChanges(LimitOfEach<String>);
+
+impl Default for AccountChanges {
+    fn default() -> Self {
+        Self(LimitOfEach::new(1.0 / 60.0, 20.0))
+    }
+}
+
+impl AccountChanges {
+    /// Counts a change.
+    pub(crate) fn count(&self, user: &str) -> CloudResult<()> {
+        match self.0.take(user.to_owned()) {
+            true => Ok(()),
+            false => {
+                let message = format!("user `{user}` has changed too much of the account at once");
+                Err(CloudError::busy(message, "wait a minute, and try again"))
+            }
+        }
+    }
+}
+
 fn within(limits: &LimitOfEach<String>, vehicle: &str, what: &str) -> CloudResult<()> {
     match limits.take(vehicle.to_owned()) {
         true => Ok(()),
@@ -142,17 +163,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wrong_secrets_of_one_address_do_not_stop_another() {
-        let (wrong, one, other) = (WrongSecrets::default(), [10, 0, 0, 1], [10, 0, 0, 2]);
-        for _ in 0..10 {
-            assert!(wrong.count(one.into()).is_ok());
-            assert!(wrong.count_password(one.into(), "ann").is_ok());
+    fn wrong_secrets_of_one_network_do_not_stop_another() {
+        let wrong = WrongSecrets::default();
+        let network = |text: &str| ClientNetwork::of(text.parse().unwrap());
+        let (one, other) = (network("2001:db8::1"), network("2001:db8:1::1"));
+        for last in 0..10 {
+            let one = network(&format!("2001:db8::{last}"));
+            assert!(wrong.count(one).is_ok());
+            assert!(wrong.count_password(one, "ann").is_ok());
         }
-        assert!(wrong.count(one.into()).is_err());
-        assert!(wrong.count_password(one.into(), "ann").is_err());
-        assert!(wrong.count(other.into()).is_ok());
-        assert!(wrong.count_password(one.into(), "bea").is_ok());
-        assert!(wrong.count_password(other.into(), "ann").is_ok());
+        assert!(wrong.count(one).is_err());
+        assert!(wrong.count_password(one, "ann").is_err());
+        assert!(wrong.count(other).is_ok());
+        assert!(wrong.count_password(one, "bea").is_ok());
+        assert!(wrong.count_password(other, "ann").is_ok());
     }
 
     #[test]

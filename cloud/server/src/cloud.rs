@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use tokio::sync::Semaphore;
 
-use crate::attempts::{VehicleLimits, WrongSecrets};
+use crate::attempts::{AccountChanges, VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
 use crate::clips::ClipFiles;
 use crate::hub::Hub;
@@ -24,7 +24,10 @@ pub(crate) struct Cloud {
     pub(crate) authorities: Authorities,
     pub(crate) wrong_secrets: WrongSecrets,
     pub(crate) limits: VehicleLimits,
+    pub(crate) account_changes: AccountChanges,
     pub(crate) readers: Arc<Readers>,
+    /// Pages that are read whole: streams, which last, take no place of theirs.
+    pub(crate) page_readers: Arc<Readers>,
     /// Frames of vehicles that are parsed and stored at a time.
     pub(crate) stored_frames: Semaphore,
     pub(crate) retention: Retention,

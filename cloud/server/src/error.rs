@@ -12,7 +12,7 @@ use gleaner_protocol::vehicle_api::Problem;
 const PROBLEM: &str = "application/problem+json";
 
 /// Longest text of an error of the framework that is used as a cause.
-const TEXT_MAX: usize = 4 << 10;
+pub(crate) const TEXT_MAX: usize = 4 << 10;
 
 /// A failure with its HTTP status.
 #[derive(Debug)]

@@ -2,7 +2,7 @@
 //!
 //! `store` is the database and `objects` has the files, in a `place`: a folder, or a bucket (`s3`).
 //! Together with the certificates of `authority` they are all that survives a restart. `accept`
-//! accepts connections for both listeners: `people` and `page` answer requests of people, and
+//! accepts connections for both listeners, within the bounds of `clients`: `people` and `page` answer requests of people, and
 //! `vehicles` those of vehicles, each of which keeps one connection open. `hub` has these
 //! connections, and wakes them after a change.
 //! `clips` has recorded clips of vehicles, with a place of its own. `transfer` receives files and
@@ -19,6 +19,7 @@ mod accept;
 mod attempts;
 mod authority;
 mod bus;
+mod clients;
 mod clips;
 mod cloud;
 mod error;

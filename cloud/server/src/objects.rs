@@ -126,7 +126,10 @@ impl Objects {
         let help = "deploy the revision again, which sends missing files";
         let length = self.place.length(sha256.as_str()).await;
         let content = async |begin| self.place.content(sha256.as_str(), begin).await;
-        OutgoingFile { name: &name, kind: OCTETS, help }.send(headers, length, content).await
+        let sha256 = Some(sha256.as_str());
+        OutgoingFile { name: &name, kind: OCTETS, help, sha256 }
+            .send(headers, length, content)
+            .await
     }
 }
 

@@ -56,6 +56,10 @@ enum CloudCommand {
         /// Serve people without TLS also at an address that other machines can reach
         #[arg(long)]
         insecure_people: bool,
+        /// Count the limits of people by the last address in the header X-Forwarded-For, which a
+        /// proxy on this machine has to add to each request
+        #[arg(long)]
+        behind_proxy: bool,
     },
     /// Print a one-time code for a user; a server may run meanwhile
     Invite {
@@ -122,6 +126,7 @@ fn run(command: CloudCommand) -> Result<(), Failure> {
                 vehicles,
                 name,
                 insecure_people: is_insecure,
+                behind_proxy: is_behind_proxy,
             } => {
                 serve(ServeOptions {
                     data,
@@ -132,6 +137,7 @@ fn run(command: CloudCommand) -> Result<(), Failure> {
                     vehicles,
                     name,
                     is_insecure,
+                    is_behind_proxy,
                 })
                 .await
             }
@@ -150,7 +156,7 @@ async fn serve(options: ServeOptions) -> Result<(), Failure> {
         |error| Failure::caused_by(Exit::Internal, "cannot handle SIGTERM and SIGINT", &error);
     let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;
-    let server = CloudServer::start(&options).await?;
+    let mut server = CloudServer::start(&options).await?;
     let address = format!("http://{}", server.people);
     let mut text = format!("people:   {address}\nvehicles: {}\n", server.vehicles);
     if let Some(code) = &server.code {
@@ -158,12 +164,13 @@ async fn serve(options: ServeOptions) -> Result<(), Failure> {
     }
     text += &format!("page:     {address}/login\n");
     print(&text);
-    tokio::select! {
-        _ = terminate.recv() => {}
-        _ = interrupt.recv() => {}
-    }
+    let failed = tokio::select! {
+        _ = terminate.recv() => None,
+        _ = interrupt.recv() => None,
+        failure = server.failed() => Some(failure),
+    };
     server.stop().await;
-    Ok(())
+    failed.map_or(Ok(()), Err)
 }
 
 async fn invite(new: NewUser, data: &Path, store: Option<&str>) -> Result<(), Failure> {

@@ -2,14 +2,21 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
+use gleaner_fleet::people::{Role, User};
 use tokio::sync::watch;
+use tokio::time::{Instant, sleep_until};
 
+use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of streams that are read at a time, by all users and by one.
 const READERS_MAX: usize = 64;
 const OF_USER_MAX: usize = 16;
+
+/// Interval at which the right to read is looked up: a token expires, and other replicas remove it.
+const LOOK: Duration = Duration::from_millis(if cfg!(test) { 20 } else { 2000 });
 
 /// The streams that are being read.
 #[derive(Default)]
@@ -35,7 +42,8 @@ impl Readers {
     /// An error if too many are read already.
     pub(crate) fn open(self: &Arc<Self>, user: &str) -> CloudResult<ReaderSlot> {
         let mut all = self.lock();
-        let busy = |message| CloudError::busy(message, "end another `gleaner logs -f`");
+        let busy =
+            |message| CloudError::busy(message, "end another `gleaner logs -f`, or close a page");
         if all.values().map(|it| it.count).sum::<usize>() >= READERS_MAX {
             return Err(busy("too many streams are read already"));
         }
@@ -75,6 +83,43 @@ impl ReaderSlot {
             let _ = self.ended.clone().changed().await;
         }
     }
+}
+
+/// The token by which a stream is read.
+pub(crate) struct ReaderToken {
+    token: String,
+    user: String,
+    looked: Instant,
+}
+
+impl ReaderToken {
+    /// Returns a token that was valid right now.
+    pub(crate) fn new(token: &str, user: &User) -> Self {
+        Self { token: token.to_owned(), user: user.name.clone(), looked: Instant::now() }
+    }
+
+    /// Returns whether the token still has the right to read, as far as it is time to look.
+    pub(crate) async fn is_valid(&mut self, cloud: &Cloud) -> CloudResult<bool> {
+        if self.looked.elapsed() < LOOK {
+            return Ok(true);
+        }
+        self.looked = Instant::now();
+        let found = cloud.store.user(&self.token).await?;
+        Ok(found.is_some_and(|it| it.user.name == self.user && it.user.role >= Role::Viewer))
+    }
+
+    /// Waits until the token has no right to read any more.
+    pub(crate) async fn ended(&mut self, cloud: &Cloud) {
+        // Without the database, there is nothing to read meanwhile.
+        while !matches!(self.is_valid(cloud).await, Ok(false)) {
+            sleep_until(self.looked + LOOK).await;
+        }
+    }
+}
+
+/// Waits until it is time to look again whether a session may read.
+pub(crate) async fn next_look() {
+    tokio::time::sleep(LOOK).await;
 }
 
 impl Drop for ReaderSlot {

@@ -8,6 +8,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures_util::future::try_join_all;
+use gleaner_base::{Exit, Failure};
+use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval, sleep};
 
 use crate::bus::ReceivedHints;
@@ -22,14 +25,31 @@ const RENEW: Duration = Duration::from_secs(4);
 /// Least time between two looks that hints cause.
 const PAUSE: Duration = Duration::from_millis(20);
 
-/// Keeps the lease of this process, for as long as it runs.
-pub(crate) async fn keep_lease(cloud: &Cloud) {
+/// Keeps the lease of this process, for as long as it runs. One that has its files for itself ends
+/// if another one has taken its place, as when its machine stood still: then it stores nothing any
+/// more, and `failed` has the reason.
+pub(crate) async fn keep_lease(
+    cloud: &Cloud,
+    is_alone: bool,
+    failed: watch::Sender<Option<Failure>>,
+) {
     let mut ticks = interval(RENEW);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         ticks.tick().await;
-        if let Err(error) = cloud.store.renew_lease().await {
-            tracing::warn!(reason = error.reason(), "the lease of this process is not renewed");
+        match cloud.store.renew_lease(is_alone).await {
+            Ok(true) => {}
+            Ok(false) => {
+                let message = "another gleaner-cloud has begun to serve the database, as the lease \
+                               of this one had ended";
+                let help = "check which of both should run: each has files of its own; with \
+                            --objects s3://BUCKET, several can serve a new database";
+                failed.send_replace(Some(Failure::new(Exit::Differs, message).with_help(help)));
+                return cloud.store.close().await;
+            }
+            Err(error) => {
+                tracing::warn!(reason = error.reason(), "the lease of this process is not renewed");
+            }
         }
     }
 }
@@ -72,8 +92,6 @@ pub(crate) async fn follow(cloud: &Cloud, hints: Option<Arc<ReceivedHints>>) {
 /// The findings of the last look.
 #[derive(Debug, Default)]
 struct ReplicaFollower {
-    /// Number of the last entry of the audit trail; `None` before the first look.
-    entry: Option<i64>,
     /// Last arrivals of the vehicles whose records are read.
     arrivals: BTreeMap<String, i64>,
     /// Connections of this process in the database that it does not have.
@@ -83,8 +101,7 @@ struct ReplicaFollower {
 impl ReplicaFollower {
     async fn look(&mut self, cloud: &Cloud) -> CloudResult<()> {
         self.look_at_links(cloud, None).await?;
-        self.look_at_records(cloud).await?;
-        self.look_at_users(cloud).await
+        self.look_at_records(cloud).await
     }
 
     /// Ends connections that do not count any more, and wakes those with another wanted state.
@@ -101,9 +118,9 @@ impl ReplicaFollower {
             return Ok(());
         }
         // One that was missing before has ended while its end could not be stored.
-        for (vehicle, epoch) in missing.intersection(&self.missing) {
-            cloud.store.disconnect(vehicle, *epoch).await?;
-        }
+        // All at once: the writer stores them with a few statements.
+        let ended = missing.intersection(&self.missing);
+        try_join_all(ended.map(|(vehicle, epoch)| cloud.store.disconnect(vehicle, *epoch))).await?;
         self.missing = missing;
         Ok(())
     }
@@ -120,18 +137,6 @@ impl ReplicaFollower {
             }
         }
         cloud.hub.arrived_elsewhere(&arrived);
-        Ok(())
-    }
-
-    async fn look_at_users(&mut self, cloud: &Cloud) -> CloudResult<()> {
-        let last = cloud.store.last_entry().await?;
-        // Readers cannot be older than the first look, which is at the start.
-        if let Some(before) = self.entry.filter(|before| *before < last) {
-            for user in cloud.store.users_removed(before, last).await? {
-                cloud.readers.end(&user);
-            }
-        }
-        self.entry = Some(last);
         Ok(())
     }
 }

@@ -36,7 +36,7 @@ const ANSWER: Duration = Duration::from_secs(60);
 const RATE_MIN: u64 = 100_000;
 /// Number of attempts, and the pause after the first one; it doubles.
 const ATTEMPTS: u32 = 4;
-const PAUSE: Duration = Duration::from_millis(200);
+const PAUSE: Duration = Duration::from_millis(if cfg!(test) { 1 } else { 200 });
 /// Longest answer that is read as a whole.
 const TEXT_MAX: usize = 4 << 20;
 
@@ -105,6 +105,18 @@ impl S3Bucket {
         let prefix = if prefix.is_empty() { String::new() } else { format!("{prefix}/") };
         let tls = Arc::new(client_config()?);
         Ok(Self { bucket, credentials: Arc::new(credentials), prefix, tls })
+    }
+
+    /// Returns a bucket at another server.
+    #[cfg(test)]
+    pub(crate) fn of_test(endpoint: &str, key: &str) -> Self {
+        let endpoint = endpoint.parse().unwrap();
+        Self {
+            bucket: Bucket::new(endpoint, UrlStyle::Path, "b", "r").unwrap(),
+            credentials: Arc::new(Credentials::new(key, "secret")),
+            prefix: String::new(),
+            tls: Arc::new(client_config().unwrap()),
+        }
     }
 
     /// Returns its address, without credentials.
@@ -304,7 +316,72 @@ fn client_config() -> Result<ClientConfig, Failure> {
 
 #[cfg(test)]
 mod tests {
+    use axum::Router;
+    use axum::body::Bytes;
+    use axum::http::HeaderMap;
+    use axum::response::IntoResponse;
+    use futures_util::stream;
+    use tempfile::TempDir;
+    use tokio::net::TcpListener;
+
     use super::*;
+    use crate::place::FilePlace;
+    use crate::transfer::{OCTETS, OutgoingFile};
+
+    /// Answers as no store should, by the name of the object; all of them claim to have 7 bytes.
+    async fn hostile(request: Request<Body>) -> axum::response::Response {
+        let name = request.uri().path().rsplit('/').next().unwrap_or_default();
+        let endless = || {
+            let piece = Bytes::from_static(&[b'x'; 4096]);
+            Body::from_stream(stream::repeat_with(move || Ok::<_, io::Error>(piece.clone())))
+        };
+        match (request.method(), name) {
+            (&Method::HEAD, _) => "content".into_response(),
+            (_, "right") => "content".into_response(),
+            (_, "other") => "contend".into_response(),
+            (_, "short") => "cont".into_response(),
+            (_, "endless" | "") => endless().into_response(),
+            (_, "moved") => {
+                let place = [(header::LOCATION, "/b/right".to_owned())];
+                (StatusCode::TEMPORARY_REDIRECT, place).into_response()
+            }
+            _ => (StatusCode::INTERNAL_SERVER_ERROR, "<Code>Broken</Code>").into_response(),
+        }
+    }
+
+    #[tokio::test]
+    async fn a_store_that_answers_wrongly_is_an_error_and_never_another_file() {
+        let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
+        let endpoint = format!("http://{}", listener.local_addr().unwrap());
+        tokio::spawn(async { axum::serve(listener, Router::new().fallback(hostile)).await });
+        let bucket = S3Bucket::of_test(&endpoint, "key");
+        let folder = TempDir::new().unwrap();
+        let place = FilePlace::open(folder.path().to_owned(), Some(&bucket), "").unwrap();
+        let sha256 = gleaner_trust::sha256(b"content");
+        let sent = async |name: &str| {
+            let sha256 = Some(sha256.as_str());
+            let file = OutgoingFile { name: "a file", kind: OCTETS, help: "", sha256 };
+            let length = place.length(name).await;
+            let content = async |begin| place.content(name, begin).await;
+            let answer = file.send(&HeaderMap::new(), length, content).await;
+            let answer = answer.map_err(|error| error.reason())?;
+            let body = axum::body::to_bytes(answer.into_body(), 100).await;
+            body.map_err(|error| error.to_string())
+        };
+        assert_eq!(sent("right").await.unwrap(), "content");
+        for (name, reason) in [
+            ("other", "it has another SHA-256"),
+            ("short", "it has 4 of 7 bytes"),
+            ("endless", "it is too long"),
+            ("moved", "the object store answers 307"),
+            ("broken", "the object store answers 500 Internal Server Error: Broken"),
+        ] {
+            let failed = sent(name).await.unwrap_err();
+            assert!(failed.contains(reason), "{name}: {failed}");
+        }
+        let endless = bucket.list("x").await.unwrap_err().to_string();
+        assert!(endless.contains("length limit"), "{endless}");
+    }
 
     #[test]
     fn addresses_have_their_parts() {

@@ -12,7 +12,7 @@ use tokio::task::JoinSet;
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use crate::accept::Entrance;
-use crate::attempts::{VehicleLimits, WrongSecrets};
+use crate::attempts::{AccountChanges, VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
 use crate::bus::{Bus, BusAddress};
 use crate::clips::ClipFiles;
@@ -27,6 +27,8 @@ use crate::{clips, objects, people, replicas, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles.
 const PEOPLE_MAX: u32 = 1000;
+/// Maximum number of those of people in one network: a browser has six.
+const PEOPLE_OF_ONE_MAX: u32 = 200;
 const VEHICLES_MAX: u32 = 20_000;
 /// Interval at which times of signs of life are stored.
 const SEEN_INTERVAL: Duration = Duration::from_secs(30);
@@ -55,6 +57,8 @@ pub struct ServeOptions {
     pub name: Option<String>,
     /// Permission to serve people, without TLS, at an address that other machines can reach.
     pub is_insecure: bool,
+    /// True if a proxy on this machine sends the requests of people, with their addresses.
+    pub is_behind_proxy: bool,
 }
 
 impl ServeOptions {
@@ -70,6 +74,7 @@ impl ServeOptions {
             vehicles: any,
             name: None,
             is_insecure: false,
+            is_behind_proxy: false,
         }
     }
 }
@@ -83,6 +88,7 @@ pub struct CloudServer {
     /// The one-time code of an administrator, unless one has a valid token.
     pub code: Option<String>,
     cloud: Arc<Cloud>,
+    failed: watch::Receiver<Option<Failure>>,
     stop: watch::Sender<bool>,
     entrances: JoinSet<()>,
     chores: JoinSet<()>,
@@ -156,18 +162,24 @@ impl CloudServer {
             authorities,
             wrong_secrets: WrongSecrets::default(),
             limits: VehicleLimits::default(),
+            account_changes: AccountChanges::default(),
             readers: Arc::default(),
+            page_readers: Arc::default(),
             stored_frames: Semaphore::new(STORED_FRAMES_MAX),
             retention: Retention::DEFAULT,
             address,
         });
         let (stop, stopped) = watch::channel(false);
+        let (failure, failed) = watch::channel(None);
+        let is_alone = bucket.is_none();
         let mut entrances = JoinSet::new();
         let entrance = Entrance {
             listener: people_listener,
             router: people::router(&cloud),
             tls: None,
             most: PEOPLE_MAX,
+            most_of_one: PEOPLE_OF_ONE_MAX,
+            is_behind_proxy: options.is_behind_proxy,
             stop: stopped.clone(),
         };
         entrances.spawn(entrance.serve());
@@ -176,13 +188,16 @@ impl CloudServer {
             router: vehicles::router(&cloud),
             tls: Some(tls_config),
             most: VEHICLES_MAX,
+            // Many can be behind one address of a mobile network, or behind a balancer.
+            most_of_one: VEHICLES_MAX,
+            is_behind_proxy: false,
             stop: stopped,
         };
         entrances.spawn(entrance.serve());
         // Each has a task of its own: one that waits for the database must not hold it up.
         if cloud.store.is_shared() {
             let working = Arc::clone(&cloud);
-            chores.spawn(async move { replicas::keep_lease(&working).await });
+            chores.spawn(async move { replicas::keep_lease(&working, is_alone, failure).await });
             let working = Arc::clone(&cloud);
             chores.spawn(async move { replicas::follow(&working, hints).await });
         }
@@ -217,7 +232,20 @@ impl CloudServer {
                 }
             }
         });
-        Ok(Self { people, vehicles, code, cloud, stop, entrances, chores, _lock: lock })
+        Ok(Self { people, vehicles, code, cloud, failed, stop, entrances, chores, _lock: lock })
+    }
+
+    /// Waits for the reason for which the server cannot go on.
+    pub async fn failed(&mut self) -> Failure {
+        loop {
+            if let Some(failure) = self.failed.borrow_and_update().clone() {
+                return failure;
+            }
+            if self.failed.changed().await.is_err() {
+                // A server with a database of its own has none.
+                std::future::pending::<()>().await;
+            }
+        }
     }
 
     /// Stops the server: vehicles are asked to come back later, and open requests are answered.

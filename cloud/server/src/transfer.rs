@@ -4,12 +4,14 @@ use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use axum::body::Body;
+use axum::body::{Body, Bytes, HttpBody};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use futures_util::StreamExt;
+use futures_util::stream::try_unfold;
+use futures_util::{Stream, StreamExt, TryStreamExt};
 use gleaner_base::{Exit, Failure};
 use gleaner_fleet::{AnnouncedFile, UnfinishedFile};
+use sha2::{Digest, Sha256};
 use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::time::timeout;
@@ -98,6 +100,8 @@ pub(crate) struct OutgoingFile<'f> {
     pub(crate) kind: &'static str,
     /// The way to get it, if it is not there.
     pub(crate) help: &'f str,
+    /// Its SHA-256, if it is known.
+    pub(crate) sha256: Option<&'f str>,
 }
 
 impl OutgoingFile<'_> {
@@ -109,7 +113,7 @@ impl OutgoingFile<'_> {
         length: io::Result<Option<u64>>,
         content: impl AsyncFnOnce(u64) -> io::Result<Option<Body>>,
     ) -> CloudResult<Response> {
-        let Self { name, kind, help } = self;
+        let Self { name, kind, help, sha256 } = self;
         let failed =
             |error| Failure::caused_by(Exit::Internal, format!("cannot send {name}"), &error);
         let missing =
@@ -127,7 +131,19 @@ impl OutgoingFile<'_> {
             _ => (0, StatusCode::OK),
         };
         let content = content(begin).await.map_err(failed)?.ok_or_else(missing)?;
-        let mut answer = content.into_response();
+        let stated = content.size_hint().exact();
+        if let Some(stated) = stated.filter(|stated| *stated != length - begin) {
+            let reason = format!("it has {stated} of {} bytes", length - begin);
+            return Err(failed(io::Error::other(reason)).into());
+        }
+        let stored = StoredBytes::new(name, length - begin);
+        // The rest of a file has no digest: a client that goes on with a file has to compare all of
+        // it.
+        let stored = match sha256.filter(|_| begin == 0) {
+            Some(sha256) => stored.with_sha256(sha256),
+            None => stored,
+        };
+        let mut answer = stored.checked(content).into_response();
         *answer.status_mut() = status;
         let mut set = |name, value: String| {
             if let Ok(value) = value.parse() {
@@ -145,9 +161,106 @@ impl OutgoingFile<'_> {
     }
 }
 
+/// Bytes that a folder or a bucket should have. Neither is trusted: the one may be damaged, and the
+/// other one belongs to another program.
+#[derive(Debug, Clone)]
+pub(crate) struct StoredBytes {
+    name: String,
+    length: u64,
+    sha256: Option<String>,
+}
+
+impl StoredBytes {
+    /// Returns those of this length, of any content.
+    pub(crate) fn new(name: &str, length: u64) -> Self {
+        Self { name: name.to_owned(), length, sha256: None }
+    }
+
+    /// Returns the same bytes, with this SHA-256.
+    pub(crate) fn with_sha256(self, sha256: &str) -> Self {
+        Self { sha256: Some(sha256.to_owned()), ..self }
+    }
+
+    /// Returns a content that fails unless it is these bytes. The last piece comes only after the
+    /// comparison, so that no reader takes other ones for whole.
+    pub(crate) fn checked(self, content: Body) -> Body {
+        self.checked_within(PIECE_TIME, content)
+    }
+
+    fn checked_within(self, piece_time: Duration, content: Body) -> Body {
+        let Self { name, length, sha256 } = self;
+        let check = ByteCheck { left: length, digest: sha256.map(|it| (Sha256::new(), it)) };
+        let start = (content.into_data_stream(), Some(check));
+        let pieces = try_unfold(start, move |(mut pieces, check)| async move {
+            let Some(mut check) = check else { return Ok(None) };
+            let piece = check.next(&mut pieces, piece_time).await?;
+            check.count(&piece)?;
+            if check.left > 0 {
+                return Ok(Some((piece, (pieces, Some(check)))));
+            }
+            check.end(&mut pieces, piece_time).await?;
+            Ok((!piece.is_empty()).then_some((piece, (pieces, None))))
+        });
+        Body::from_stream(pieces.inspect_err(move |reason: &String| {
+            tracing::error!(file = name, reason, "a stored file cannot be sent");
+        }))
+    }
+}
+
+/// The comparison of bytes while they are sent.
+struct ByteCheck {
+    left: u64,
+    digest: Option<(Sha256, String)>,
+}
+
+impl ByteCheck {
+    /// Returns the next piece; an empty one at the end.
+    async fn next(
+        &self,
+        pieces: &mut (impl Stream<Item = Result<Bytes, axum::Error>> + Unpin),
+        time: Duration,
+    ) -> Result<Bytes, String> {
+        loop {
+            let piece = timeout(time, pieces.next()).await;
+            match piece.map_err(|_| format!("nothing came for {} s", time.as_secs()))? {
+                None => return Ok(Bytes::new()),
+                Some(Ok(piece)) if piece.is_empty() => {}
+                Some(piece) => return piece.map_err(|error| error.to_string()),
+            }
+        }
+    }
+
+    fn count(&mut self, piece: &[u8]) -> Result<(), String> {
+        if piece.is_empty() && self.left > 0 {
+            return Err(format!("it ends {} bytes too early", self.left));
+        }
+        let left = self.left.checked_sub(piece.len() as u64);
+        self.left = left.ok_or("it is too long")?;
+        if let Some((digest, _)) = &mut self.digest {
+            digest.update(piece);
+        }
+        Ok(())
+    }
+
+    async fn end(
+        &mut self,
+        pieces: &mut (impl Stream<Item = Result<Bytes, axum::Error>> + Unpin),
+        time: Duration,
+    ) -> Result<(), String> {
+        if !self.next(pieces, time).await?.is_empty() {
+            return Err("it is too long".to_owned());
+        }
+        let Some((digest, expected)) = self.digest.take() else { return Ok(()) };
+        match gleaner_base::hex(&digest.finalize()) == expected {
+            true => Ok(()),
+            false => Err("it has another SHA-256".to_owned()),
+        }
+    }
+}
+
 /// Returns the rest of a file as the body of an answer, which is read piece by piece.
 pub(crate) fn body_of(file: File) -> Body {
-    Body::from_stream(futures_util::stream::try_unfold(file, async |mut file| {
+    Body::from_stream(try_unfold(file, async |mut file| {
         let mut piece = Vec::with_capacity(PIECE);
         (&mut file).take(PIECE as u64).read_to_end(&mut piece).await?;
         io::Result::Ok((!piece.is_empty()).then_some((piece, file)))
@@ -199,5 +312,57 @@ mod tests {
             piece
         });
         assert_eq!(refusal(drops).await.0, StatusCode::REQUEST_TIMEOUT);
+    }
+
+    /// Returns the content of an answer with bytes of a store that should be `content`, or the
+    /// reason of its end.
+    async fn sent(
+        pieces: impl futures_util::Stream<Item = io::Result<Bytes>> + Send + 'static,
+    ) -> Result<Vec<u8>, String> {
+        let sha256 = gleaner_trust::sha256(b"content");
+        let stored = StoredBytes::new("the file x", 7).with_sha256(sha256.as_str());
+        let body = stored.checked_within(Duration::from_millis(20), Body::from_stream(pieces));
+        let mut pieces = body.into_data_stream();
+        let mut content = Vec::new();
+        while let Some(piece) = pieces.next().await {
+            content.extend(piece.map_err(|error| error.to_string())?);
+            assert!(content.len() < 7 || content == b"content", "other bytes were sent in full");
+        }
+        Ok(content)
+    }
+
+    #[tokio::test]
+    async fn bytes_of_a_store_that_are_other_ones_never_come_in_full() {
+        let pieces = |all: &[&'static str]| {
+            let all: Vec<_> = all.iter().map(|it| Ok(Bytes::from_static(it.as_bytes()))).collect();
+            stream::iter(all)
+        };
+        assert_eq!(sent(pieces(&["con", "", "tent", ""])).await.unwrap(), b"content");
+        for (wrong, reason) in [
+            (&["conten"][..], "it ends 1 bytes too early"),
+            (&[], "it ends 7 bytes too early"),
+            (&["content", "s"], "it is too long"),
+            (&["contents"], "it is too long"),
+            (&["con", "tend"], "it has another SHA-256"),
+        ] {
+            assert_eq!(sent(pieces(wrong)).await.unwrap_err(), reason);
+        }
+        for stalls in [&["con"][..], &["con", "tent"]] {
+            let stalled = sent(pieces(stalls).chain(stream::pending())).await.unwrap_err();
+            assert!(stalled.starts_with("nothing came"), "{stalled}");
+        }
+        let lost = stream::iter([Err(io::Error::other("the connection was lost"))]);
+        assert_eq!(
+            sent(pieces(&["con"]).chain(lost)).await.unwrap_err(),
+            "the connection was lost"
+        );
+    }
+
+    #[tokio::test]
+    async fn a_store_that_states_another_length_is_refused_before_an_answer_begins() {
+        let file = OutgoingFile { name: "the file x", kind: OCTETS, help: "", sha256: None };
+        let content = async |_| Ok(Some(Body::from("other")));
+        let refused = file.send(&HeaderMap::new(), Ok(Some(7)), content).await.unwrap_err();
+        assert_eq!(refused.reason(), "cannot send the file x: it has 5 of 7 bytes");
     }
 }

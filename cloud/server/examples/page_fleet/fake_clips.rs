@@ -37,9 +37,10 @@ pub(crate) async fn announce(vehicle: &FakeVehicle, bad: Option<&str>) {
                 "moments": moments, "incomplete": incomplete })
     });
     let orders = report(vehicle, &json!({ "cursor": "1", "clips": clips, "gone": [] })).await;
+    let expected = if bad.is_some() { StatusCode::FORBIDDEN } else { StatusCode::OK };
     for name in orders.thumbnails {
         let path = format!("/v1/clips/{name}/thumbnail");
-        assert_eq!(vehicle.request(Method::PUT, &path, &image).await.0, StatusCode::OK);
+        assert_eq!(vehicle.request(Method::PUT, &path, &image).await.0, expected);
     }
 }
 

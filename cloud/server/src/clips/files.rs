@@ -1,8 +1,9 @@
 //! Files of clips, under names that are digests of their ids.
 //!
 //! In a folder, the parts of a file are appended to it one after the other, each once it is
-//! complete and its digest is right; in a bucket, each part is an object. How many there are is in
-//! the database only: bytes after them do not count.
+//! complete and its digest is right; in a bucket, each part is an object with its digest in the
+//! name: a part that comes to another replica replaces none. Which parts count is in the database
+//! only.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -25,7 +26,7 @@ use crate::error::{CloudError, CloudResult};
 use crate::folder::PART;
 use crate::place::{FilePlace, blocking};
 use crate::store::ClipBounds;
-use crate::transfer::{IncomingFile, PIECE_TIME};
+use crate::transfer::{IncomingFile, PIECE_TIME, StoredBytes};
 
 /// Number of parts of a vehicle that are received at a time: some may be of connections that it
 /// has lost.
@@ -34,10 +35,10 @@ const PARTS_MAX: usize = 4;
 const TURNS: usize = 64;
 
 /// A file of a clip.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum FileOfClip {
-    /// The recording, of this length.
-    Recording(u64),
+    /// The recording, of this length, with the SHA-256 of each part.
+    Recording(u64, Vec<String>),
     Thumbnail,
 }
 
@@ -65,22 +66,23 @@ impl ClipFiles {
     }
 
     /// Returns whether any of the recording of a clip is there.
-    pub(crate) async fn has_recording(&self, id: &ClipId) -> io::Result<bool> {
-        let name = match self.place.is_bucket() {
-            true => part_name(id, 0),
-            false => recording(id),
+    pub(crate) async fn has_recording(&self, id: &ClipId, parts: &[String]) -> io::Result<bool> {
+        let name = match (self.place.is_bucket(), parts.first()) {
+            (false, _) => recording(id),
+            (true, Some(first)) => part_name(id, 0, first),
+            (true, None) => return Ok(false),
         };
         Ok(self.place.length(&name).await?.is_some())
     }
 
     /// Returns the length of a file that is complete, if it is there.
-    pub(crate) async fn length(&self, id: &ClipId, file: FileOfClip) -> io::Result<Option<u64>> {
+    pub(crate) async fn length(&self, id: &ClipId, file: &FileOfClip) -> io::Result<Option<u64>> {
         match file {
             FileOfClip::Thumbnail => self.place.length(&thumbnail(id)).await,
-            FileOfClip::Recording(length) if self.place.is_bucket() => {
-                Ok(self.has_recording(id).await?.then_some(length))
+            FileOfClip::Recording(length, parts) if self.place.is_bucket() => {
+                Ok(self.has_recording(id, parts).await?.then_some(*length))
             }
-            FileOfClip::Recording(_) => self.place.length(&recording(id)).await,
+            FileOfClip::Recording(..) => self.place.length(&recording(id)).await,
         }
     }
 
@@ -93,25 +95,38 @@ impl ClipFiles {
     ) -> io::Result<Option<Body>> {
         match file {
             FileOfClip::Thumbnail => self.place.content(&thumbnail(id), begin).await,
-            FileOfClip::Recording(length) if self.place.is_bucket() => {
-                Ok(Some(self.parts_from(id, length, begin)))
+            FileOfClip::Recording(length, parts) if self.place.is_bucket() => {
+                Ok(Some(self.parts_from(id, (length, parts), begin)))
             }
-            FileOfClip::Recording(_) => self.place.content(&recording(id), begin).await,
+            FileOfClip::Recording(..) => self.place.content(&recording(id), begin).await,
         }
     }
 
     /// Returns the parts of a recording in a bucket, one after the other.
-    fn parts_from(self: &Arc<Self>, id: &ClipId, length: u64, begin: u64) -> Body {
-        let start = (Arc::clone(self), id.clone(), begin);
-        let parts = try_unfold(start, move |(files, id, begin)| async move {
+    fn parts_from(
+        self: &Arc<Self>,
+        id: &ClipId,
+        (length, digests): (u64, Vec<String>),
+        begin: u64,
+    ) -> Body {
+        let start = (Arc::clone(self), id.clone(), digests, begin);
+        let parts = try_unfold(start, move |(files, id, digests, begin)| async move {
             if begin >= length {
                 return io::Result::Ok(None);
             }
             let (number, skipped) = (begin / CLIP_PART, begin % CLIP_PART);
-            let part = files.place.content(&part_name(&id, number), skipped).await?;
-            let part = part.ok_or_else(|| io::Error::from(io::ErrorKind::NotFound))?;
-            let pieces = part.into_data_stream().map(|it| it.map_err(io::Error::other));
-            Ok(Some((pieces, (files, id, (number + 1) * CLIP_PART))))
+            let lost = || io::Error::from(io::ErrorKind::NotFound);
+            let digest = usize::try_from(number).ok().and_then(|number| digests.get(number));
+            let digest = digest.ok_or_else(lost)?.clone();
+            let part = files.place.content(&part_name(&id, number, &digest), skipped).await?;
+            let part = part.ok_or_else(lost)?;
+            // A longer or shorter one would move all that follows.
+            let end = length.min((number + 1) * CLIP_PART);
+            let stored = StoredBytes::new(&format!("part {number} of clip `{id}`"), end - begin);
+            let stored = if skipped == 0 { stored.with_sha256(&digest) } else { stored };
+            let pieces = stored.checked(part).into_data_stream();
+            let pieces = pieces.map(|it| it.map_err(io::Error::other));
+            Ok(Some((pieces, (files, id, digests, (number + 1) * CLIP_PART))))
         });
         Body::from_stream(parts.try_flatten())
     }
@@ -172,11 +187,11 @@ impl ClipFiles {
     pub(crate) async fn append(
         &self,
         id: &ClipId,
-        number: u64,
+        (number, sha256): (u64, &str),
         part: UnfinishedFile,
     ) -> io::Result<bool> {
         if self.place.is_bucket() {
-            return self.place.keep(&part, &part_name(id, number)).await.map(|()| true);
+            return self.place.keep(&part, &part_name(id, number, sha256)).await.map(|()| true);
         }
         let path = self.path(id);
         blocking(move || append(&path, number, &part)).await
@@ -188,6 +203,7 @@ impl ClipFiles {
         self: &Arc<Self>,
         id: &ClipId,
         (length, sha256): (u64, String),
+        parts: Vec<String>,
     ) -> io::Result<Result<(), String>> {
         if !self.place.is_bucket() {
             let path = self.path(id);
@@ -197,7 +213,7 @@ impl ClipFiles {
             .await;
         }
         let mut announced = AnnouncedFile::new(length, &sha256);
-        let mut pieces = self.parts_from(id, length, 0).into_data_stream();
+        let mut pieces = self.parts_from(id, (length, parts), 0).into_data_stream();
         while let Some(piece) = timeout(PIECE_TIME, pieces.next()).await? {
             if let Err(reason) = announced.add(&piece.map_err(io::Error::other)?) {
                 return Ok(Err(reason));
@@ -229,8 +245,8 @@ fn recording(id: &ClipId) -> String {
 }
 
 /// Returns the name of the object with a part of a recording.
-fn part_name(id: &ClipId, number: u64) -> String {
-    format!("{}/{number}", recording(id))
+fn part_name(id: &ClipId, number: u64, sha256: &str) -> String {
+    format!("{}/{number}-{sha256}", recording(id))
 }
 
 fn thumbnail(id: &ClipId) -> String {

@@ -16,7 +16,7 @@ use gleaner_fleet::clips::ClipId;
 use tokio::time::interval;
 
 pub(crate) use files::{ClipFiles, FileOfClip};
-pub(crate) use vehicles::router;
+pub(crate) use vehicles::{is_thumbnail, router};
 
 use crate::cloud::Cloud;
 use crate::error::CloudResult;

@@ -42,8 +42,10 @@ pub(crate) async fn pull(
     let id = parse(&id)?;
     let before = cloud.store.clip(&id).await?;
     // Only a file that was stored before this look can be lost: another one may arrive meanwhile.
-    let is_lost = before.state == ClipState::Stored
-        && !cloud.clips.has_recording(&id).await.map_err(|error| not_sent(&id, error))?;
+    let is_lost = before.state == ClipState::Stored && {
+        let parts = cloud.store.clip_parts(&id).await?;
+        !cloud.clips.has_recording(&id, &parts).await.map_err(|error| not_sent(&id, error))?
+    };
     let clip = cloud.store.pull_clip(&actor.name, before, is_lost).await?;
     cloud.hub.wake(&[id.vehicle().to_owned()]);
     Ok(Json(clip))
@@ -70,11 +72,13 @@ pub(crate) async fn thumbnail(
     Path(id): Path<String>,
 ) -> CloudResult<Response> {
     let id = parse(&id)?;
-    if !cloud.store.clip(&id).await?.has_thumbnail {
+    let clip = cloud.store.clip(&id).await?;
+    if !clip.has_thumbnail {
         let message = format!("clip `{id}` has no thumbnail here");
         return Err(CloudError::missing(message, "its vehicle sends it when it is connected"));
     }
-    send(&cloud, (&id, FileOfClip::Thumbnail), "image/jpeg", &HeaderMap::new()).await
+    let file = (&id, FileOfClip::Thumbnail, clip.facts.thumbnail.as_deref());
+    send(&cloud, file, "image/jpeg", &HeaderMap::new()).await
 }
 
 pub(crate) async fn file(
@@ -89,8 +93,8 @@ pub(crate) async fn file(
             format!("the file of clip `{id}` is not in the cloud: {}", clip.state.as_str());
         return Err(CloudError::missing(message, "fetch it: `gleaner clips pull ID`"));
     }
-    let file = FileOfClip::Recording(clip.facts.bytes);
-    send(&cloud, (&id, file), OCTETS, &headers).await
+    let file = FileOfClip::Recording(clip.facts.bytes, cloud.store.clip_parts(&id).await?);
+    send(&cloud, (&id, file, clip.facts.sha256.as_deref()), OCTETS, &headers).await
 }
 
 pub(crate) async fn policy(State(cloud): State<Arc<Cloud>>) -> CloudResult<Json<ClipPolicy>> {
@@ -119,13 +123,13 @@ fn not_sent(id: &ClipId, error: io::Error) -> CloudError {
 /// Returns the answer with a file, or with the end of it that `Range` asks for.
 async fn send(
     cloud: &Cloud,
-    (id, file): (&ClipId, FileOfClip),
+    (id, file, sha256): (&ClipId, FileOfClip, Option<&str>),
     kind: &'static str,
     headers: &HeaderMap,
 ) -> CloudResult<Response> {
     let name = format!("a file of clip `{id}`");
     let help = "fetch it again: `gleaner clips pull ID`";
-    let length = cloud.clips.length(id, file).await;
+    let length = cloud.clips.length(id, &file).await;
     let content = async |begin| cloud.clips.content(id, file, begin).await;
-    OutgoingFile { name: &name, kind, help }.send(headers, length, content).await
+    OutgoingFile { name: &name, kind, help, sha256 }.send(headers, length, content).await
 }

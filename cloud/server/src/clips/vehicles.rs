@@ -17,6 +17,8 @@ use gleaner_fleet::clips::{
     CLIP_PART, CLIP_REPORT_MAX, CLIPS_IN_REPORT, ClipFacts, ClipId, ClipName, ClipOrders,
     ClipReport, THUMBNAIL_MAX,
 };
+use gleaner_image::Format;
+use gleaner_lambda::manifest::Sha256;
 use tokio::time::timeout;
 
 use crate::cloud::Cloud;
@@ -31,8 +33,9 @@ const UNWANTED_TIME: Duration = Duration::from_secs(30);
 const CURSOR_MAX: usize = 256;
 /// The reason of a failed upload whose earlier parts were lost.
 const NO_PARTS: &str = "its first parts are not there any more";
-/// First bytes of a JPEG.
-const JPEG: [u8; 3] = [0xff, 0xd8, 0xff];
+/// Largest side of a thumbnail, in pixels: a few KiB could claim more than a browser has memory
+/// for.
+const SIDE_MAX: u32 = 4096;
 
 /// Returns the routes, which need a certificate.
 pub(crate) fn router() -> Router<Arc<Cloud>> {
@@ -95,10 +98,15 @@ async fn thumbnail(
         return orders(&cloud, &vehicle.name).await;
     };
     let id = id(&name, &vehicle.name)?;
-    let is_jpeg = body.starts_with(&JPEG) && body.len() as u64 <= THUMBNAIL_MAX;
-    if !is_jpeg || gleaner_trust::sha256(&body).as_str() != wanted {
-        let message = format!("the thumbnail of clip `{id}` is refused");
-        return Err(CloudError::denied(message, "send the JPEG that was announced"));
+    let refused =
+        |help| CloudError::denied(format!("the thumbnail of clip `{id}` is refused"), help);
+    if gleaner_trust::sha256(&body).as_str() != wanted {
+        return Err(refused("send the JPEG that was announced"));
+    }
+    if !is_thumbnail(&body) {
+        // It will never be another one.
+        cloud.store.thumbnail_refused(&id, &wanted).await?;
+        return Err(refused("announce a JPEG of at most 4096 pixels a side"));
     }
     let length = body.len() as u64;
     let part = cloud.clips.receive(&id, (length, &wanted), Body::from(body)).await?;
@@ -110,6 +118,14 @@ async fn thumbnail(
     cloud.clips.keep_thumbnail(&id, &part).await.map_err(|error| not_stored(&id, error))?;
     cloud.store.thumbnail_received(&id).await?;
     orders(&cloud, &vehicle.name).await
+}
+
+/// Returns whether bytes begin as a JPEG of a size that a browser can show.
+pub(crate) fn is_thumbnail(bytes: &[u8]) -> bool {
+    bytes.len() as u64 <= THUMBNAIL_MAX
+        && gleaner_image::probe(bytes).is_ok_and(|image| {
+            image.format == Format::Jpeg && image.width.max(image.height) <= SIDE_MAX
+        })
 }
 
 /// Receives a part. One that was received before changes nothing.
@@ -131,7 +147,7 @@ async fn part(
     let received = cloud.clips.receive(&progress.id, (length, sha256.as_str()), body).await?;
     let working = Arc::clone(&cloud);
     // A vehicle that goes away in the middle must not leave it half done.
-    let stored = tokio::spawn(store_part(working, progress, length, received)).await;
+    let stored = tokio::spawn(store_part(working, progress, (length, sha256), received)).await;
     stored.map_err(|error| {
         Failure::caused_by(Exit::Internal, "a part of a clip is not stored", &error)
     })??;
@@ -168,7 +184,7 @@ async fn skip(body: Body) {
 async fn store_part(
     cloud: Arc<Cloud>,
     progress: ClipProgress,
-    length: u64,
+    (length, sha256): (u64, Sha256),
     received: UnfinishedFile,
 ) -> CloudResult<()> {
     let id = progress.id.clone();
@@ -181,20 +197,26 @@ async fn store_part(
     }
     let is_last = ClipFacts::part_length(progress.bytes, progress.part + 1).is_none();
     let failed = |error| not_stored(&id, error);
-    let is_appended = cloud.clips.append(&id, progress.part, received).await.map_err(failed)?;
+    let part = (progress.part, sha256.as_str());
+    let is_appended = cloud.clips.append(&id, part, received).await.map_err(failed)?;
     let outcome = match (is_appended, is_last) {
         (false, _) => Err(NO_PARTS.to_owned()),
         (true, false) => Ok(()),
         (true, true) => {
             let announced = (progress.bytes, progress.sha256.clone());
-            match cloud.clips.compare(&id, announced).await {
+            let mut parts = cloud.store.clip_parts(&id).await?;
+            parts.push(sha256.to_string());
+            match cloud.clips.compare(&id, announced, parts).await {
                 Err(error) if error.kind() == io::ErrorKind::NotFound => Err(NO_PARTS.to_owned()),
                 compared => compared.map_err(failed)?,
             }
         }
     };
     match outcome {
-        Ok(()) => cloud.store.clip_part_received(&progress, length, is_last).await,
+        Ok(()) => {
+            let part = (length, sha256.as_str());
+            cloud.store.clip_part_received(&progress, part, is_last).await
+        }
         Err(reason) => {
             // Otherwise another replica has stored it meanwhile.
             if cloud.store.clip_upload_failed(&id, &reason).await? {

@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use axum::extract::{Extension, Path, Query, State};
-use axum::http::StatusCode;
 use axum::response::{IntoResponse, Redirect};
 use gleaner_fleet::people::{NewToken, TOKEN_DAYS_MAX, TokenSummary};
 use maud::{Markup, html};
@@ -67,7 +66,10 @@ pub(super) async fn set_password(
 ) -> PageResult {
     let new = fields.get("password");
     let hash = match new == fields.get("again") {
-        true => password::hashed(new.to_owned()).await,
+        true => match cloud.account_changes.count(&user.user.name) {
+            Ok(()) => password::hashed(new.to_owned()).await,
+            Err(error) => Err(error),
+        },
         false => Err(CloudError::usage("the two passwords differ", "type the same one twice")),
     };
     match hash {
@@ -76,8 +78,9 @@ pub(super) async fn set_password(
             Ok(Redirect::to("/account?done=password").into_response())
         }
         Err(error) => {
+            let status = error.status();
             let page = account_page(&cloud, &user, failure(error)).await?;
-            Ok(with_status(StatusCode::BAD_REQUEST, page))
+            Ok(with_status(status, page))
         }
     }
 }
@@ -132,10 +135,11 @@ pub(super) async fn make_token(
             let name = fields.get("name").trim().to_owned();
             // No number is none that is allowed.
             let days = fields.get("days").trim().parse().unwrap_or(0);
-            cloud
-                .store
-                .make_token((&user.user, (&user.user).into()), NewToken { name, role, days })
-                .await
+            let new = NewToken { name, role, days };
+            match cloud.account_changes.count(&user.user.name) {
+                Ok(()) => cloud.store.make_token((&user.user, (&user.user).into()), new).await,
+                Err(error) => Err(error),
+            }
         }
         Err(error) => Err(error),
     };

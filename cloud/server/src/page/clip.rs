@@ -3,13 +3,12 @@
 use std::sync::Arc;
 
 use axum::extract::{Extension, Path, Query, State};
-use axum::http::{HeaderMap, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Redirect};
 use gleaner_fleet::clips::{
     ClipFacts, ClipId, ClipMoment, ClipState, FleetClip, RecordedLambda, THUMBNAIL_MAX,
 };
 use gleaner_fleet::people::Role;
-use gleaner_image::Format;
 use maud::{Markup, html};
 
 use super::account::Done;
@@ -18,14 +17,15 @@ use super::clips::{clip_path, image, length, state, title};
 use super::layout::{self, PageResult, done, form};
 use super::recording::{self, Recording, TOPICS_MAX, whole};
 use super::session::PageUser;
-use super::text::{bytes, count, moment, segment, shown, vehicle_path};
-use crate::clips::people;
+use super::text::{self, bytes, count, moment, segment, shown, vehicle_path};
+use crate::clips::{is_thumbnail, people};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 
-/// Largest side of a thumbnail that is sent to a browser, in pixels: a few KiB could claim more
-/// than the browser has memory for.
-const SIDE_MAX: u32 = 4096;
+/// The image in the place of a thumbnail that is lost or damaged: a page has no broken image.
+const NO_IMAGE: &str = r##"<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 160 90">
+<rect width="160" height="90" fill="#8883"/><text x="80" y="50" text-anchor="middle"
+font-family="sans-serif" font-size="12" fill="#888">no image</text></svg>"##;
 /// Maximum number of attributes of a trigger that are shown.
 const ATTRIBUTES_MAX: usize = 16;
 
@@ -38,8 +38,8 @@ pub(super) async fn page(
     let clip = cloud.store.clip(&parse(&id)?).await?;
     let recording = match clip.state {
         ClipState::Stored => {
-            // Reading takes memory: as many at a time as streams.
-            let _slot = cloud.readers.open(&user.user.name)?;
+            // Reading takes memory.
+            let _slot = cloud.page_readers.open(&user.user.name)?;
             // A file that is lost is no reason to hide the facts.
             recording::read(&cloud, &clip).await.ok().flatten()
         }
@@ -83,14 +83,14 @@ pub(super) async fn thumbnail(
     State(cloud): State<Arc<Cloud>>,
     Path(id): Path<String>,
 ) -> PageResult {
-    let reply = people::thumbnail(State(cloud), Path(id)).await?;
-    let bytes = whole(reply, THUMBNAIL_MAX).await.unwrap_or_default();
-    let is_image = gleaner_image::probe(&bytes).is_ok_and(|image| {
-        image.format == Format::Jpeg && image.width.max(image.height) <= SIDE_MAX
-    });
-    if !is_image {
-        let help = "its vehicle has sent something else: look at the clip itself";
-        return Err(CloudError::missing("the thumbnail is no small JPEG", help).into());
+    let bytes = match people::thumbnail(State(cloud), Path(id)).await {
+        Ok(reply) => whole(reply, THUMBNAIL_MAX).await.unwrap_or_default(),
+        Err(error) if error.is_internal() => return Err(error.into()),
+        Err(_) => Vec::new(),
+    };
+    if !is_thumbnail(&bytes) {
+        let headers = [(header::CONTENT_TYPE, "image/svg+xml")];
+        return Ok((StatusCode::NOT_FOUND, headers, NO_IMAGE).into_response());
     }
     let headers =
         [(header::CONTENT_TYPE, "image/jpeg"), (header::CACHE_CONTROL, "private, max-age=600")];
@@ -237,7 +237,7 @@ fn row(moment: &ClipMoment, offset: f64) -> Markup {
                 @if kind != "event" { (shown(kind)) " " }
                 (shown(label))
             }
-            td.number { @if let Some(score) = score { (format!("{score:.3}")) } }
+            td.number { @if let Some(score) = score { (text::score(*score)) } }
             td {
                 (shown(lambda))
                 @if let Some(source) = source { " " span.dim { "by " (shown(source)) } }

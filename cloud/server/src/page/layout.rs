@@ -1,6 +1,9 @@
 //! The frame of every page: head, navigation, forms and errors.
 
+use axum::body::to_bytes;
+use axum::extract::Request;
 use axum::http::{StatusCode, header};
+use axum::middleware::Next;
 use axum::response::{Html, IntoResponse, Response};
 use gleaner_base::Failure;
 use gleaner_fleet::people::Role;
@@ -10,7 +13,7 @@ use super::assets;
 use super::guard::secured;
 use super::session::PageUser;
 use super::text::shown;
-use crate::error::CloudError;
+use crate::error::{CloudError, TEXT_MAX};
 
 /// Settings of htmx: it evaluates no text as a script, and adds no style.
 const HTMX: &str = r#"{"includeIndicatorStyles":false,"allowEval":false,"allowScriptTags":false,
@@ -52,6 +55,29 @@ impl IntoResponse for PageError {
         };
         (status, page("Error", "", None, body)).into_response()
     }
+}
+
+/// Gives the errors that the framework itself answers the form of a page.
+pub(super) async fn as_page(request: Request, next: Next) -> Response {
+    let answer = next.run(request).await;
+    let status = answer.status();
+    let kind = answer.headers().get(header::CONTENT_TYPE).and_then(|it| it.to_str().ok());
+    let is_text = kind.is_none_or(|it| it.starts_with("text/plain"));
+    if !is_text || !(status.is_client_error() || status.is_server_error()) {
+        return answer;
+    }
+    let help = "use the links of a page";
+    let mut error = CloudError::conflict(status, "the address or the form cannot be used", help);
+    let (parts, body) = answer.into_parts();
+    let text = to_bytes(body, TEXT_MAX).await.unwrap_or_default();
+    if !text.is_empty() {
+        error = error.because(String::from_utf8_lossy(&text));
+    }
+    let mut page = secured(PageError(error).into_response());
+    if let Some(allow) = parts.headers.get(header::ALLOW) {
+        page.headers_mut().insert(header::ALLOW, allow.clone());
+    }
+    page
 }
 
 /// Answers a path that does not exist.

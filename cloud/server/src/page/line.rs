@@ -132,7 +132,7 @@ fn trigger(trigger: &Trigger) -> Markup {
     html! {
         @if trigger.kind.as_str() != "event" { (trigger.kind.as_str()) " " }
         b { (shown(&trigger.label)) }
-        @if let Some(score) = trigger.score { " " (format!("{score:.3}")) }
+        @if let Some(score) = trigger.score { " " (super::text::score(score)) }
         @if !trigger.attributes.is_empty() {
             span.dim {
                 @for (name, value) in trigger.attributes.iter().take(ATTRIBUTES_MAX) {

@@ -11,7 +11,7 @@ use super::guard::FormFields;
 use super::layout::{self, PageResult, failure, with_status};
 use super::password;
 use super::session::{PageUser, session_of, set_cookie};
-use crate::accept::PeerConnection;
+use crate::clients::ClientNetwork;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 
@@ -59,7 +59,7 @@ fn login_page(message: Markup) -> Response {
 
 pub(super) async fn by_code(
     State(cloud): State<Arc<Cloud>>,
-    Extension(peer): Extension<Arc<PeerConnection>>,
+    Extension(network): Extension<ClientNetwork>,
     Extension(fields): Extension<FormFields>,
     headers: HeaderMap,
 ) -> PageResult {
@@ -71,23 +71,23 @@ pub(super) async fn by_code(
         }
         None => {
             let help = "a code works once, for 24 hours: let an administrator invite you again";
-            Ok(refused(&cloud, &peer, CloudError::unknown("the code is not valid", help)))
+            Ok(refused(&cloud, network, CloudError::unknown("the code is not valid", help)))
         }
     }
 }
 
 pub(super) async fn by_password(
     State(cloud): State<Arc<Cloud>>,
-    Extension(peer): Extension<Arc<PeerConnection>>,
+    Extension(network): Extension<ClientNetwork>,
     Extension(fields): Extension<FormFields>,
     headers: HeaderMap,
 ) -> PageResult {
-    match session_by_password(&cloud, &peer, &fields).await {
+    match session_by_password(&cloud, network, &fields).await {
         Ok(Some(session)) => enter(&cloud, &headers, &session, "/vehicles").await,
         Ok(None) => {
             let message = "the name or the password is wrong";
             let help = "without a password, log in by a code that an administrator gives you";
-            Ok(refused(&cloud, &peer, CloudError::unknown(message, help)))
+            Ok(refused(&cloud, network, CloudError::unknown(message, help)))
         }
         Err(error) => Ok(answer(error)),
     }
@@ -95,21 +95,24 @@ pub(super) async fn by_password(
 
 async fn session_by_password(
     cloud: &Cloud,
-    peer: &PeerConnection,
+    network: ClientNetwork,
     fields: &FormFields,
 ) -> CloudResult<Option<String>> {
     let (name, password) = (fields.get("name").trim(), fields.get("password"));
-    cloud.wrong_secrets.count_password(peer.address, name)?;
+    cloud.wrong_secrets.count_password(network, name)?;
     let hash = cloud.store.password(name).await?;
-    let is_right = password::is_right(peer.address, password.to_owned(), hash.as_deref()).await?;
+    let is_right = password::is_right(network, password.to_owned(), hash.as_deref()).await?;
     match hash.filter(|_| is_right) {
-        Some(hash) => cloud.store.open_session_of(name, &hash).await,
+        Some(hash) => {
+            cloud.account_changes.count(name)?;
+            cloud.store.open_session_of(name, &hash).await
+        }
         None => Ok(None),
     }
 }
 
-fn refused(cloud: &Cloud, peer: &PeerConnection, error: CloudError) -> Response {
-    answer(cloud.wrong_secrets.count(peer.address).err().unwrap_or(error))
+fn refused(cloud: &Cloud, network: ClientNetwork, error: CloudError) -> Response {
+    answer(cloud.wrong_secrets.count(network).err().unwrap_or(error))
 }
 
 fn answer(error: CloudError) -> Response {

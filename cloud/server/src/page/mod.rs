@@ -110,7 +110,8 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router<Arc<Cloud>> {
     for PageRoute { path, role, handler, .. } in routes() {
         let state = (Arc::clone(cloud), role);
         let guarded = handler.route_layer(from_fn_with_state(state, guard::guard));
-        router = router.route(path, guarded.layer(from_fn(in_time)));
+        router =
+            router.route(path, guarded.layer(from_fn(in_time)).layer(from_fn(layout::as_page)));
     }
     router.layer(DefaultBodyLimit::max(guard::FORM_MAX))
 }

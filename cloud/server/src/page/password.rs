@@ -1,7 +1,6 @@
 //! Passwords: hashed with Argon2id, a few at a time.
 
 use std::collections::BTreeMap;
-use std::net::IpAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -11,6 +10,7 @@ use argon2::{Algorithm, Argon2, Params, Version};
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
+use crate::clients::ClientNetwork;
 use crate::error::{CloudError, CloudResult};
 
 /// Number of hashes at a time: each takes 19 MiB and a core.
@@ -18,10 +18,10 @@ static SLOTS: Semaphore = Semaphore::const_new(2);
 /// Time to wait for one of them.
 const WAIT: Duration = Duration::from_secs(10);
 
-/// The turn of each address whose passwords are checked. It has one at a time, so that an address
+/// The turn of each network whose passwords are checked. It has one at a time, so that a network
 /// with many connections delays others by one hash, not by all of its own.
-static TURNS: Mutex<BTreeMap<IpAddr, Arc<Semaphore>>> = Mutex::new(BTreeMap::new());
-/// Maximum number of passwords of an address that wait or are checked.
+static TURNS: Mutex<BTreeMap<ClientNetwork, Arc<Semaphore>>> = Mutex::new(BTreeMap::new());
+/// Maximum number of passwords of a network that wait or are checked.
 const WAITING_MAX: usize = 50;
 
 /// Lengths of passwords, in bytes.
@@ -46,10 +46,10 @@ pub(super) async fn hashed(password: String) -> CloudResult<String> {
     })
 }
 
-/// Returns whether a password, from this address, is the one with this hash; without a hash, none
+/// Returns whether a password, from this network, is the one with this hash; without a hash, none
 /// is.
 pub(super) async fn is_right(
-    address: IpAddr,
+    network: ClientNetwork,
     password: String,
     hash: Option<&str>,
 ) -> CloudResult<bool> {
@@ -57,7 +57,7 @@ pub(super) async fn is_right(
         return Ok(false);
     }
     let stored = hash.unwrap_or(NO_PASSWORD).to_owned();
-    let turn = turn_of(address)?;
+    let turn = turn_of(network)?;
     let turn = timeout(WAIT, turn.acquire_owned()).await.map_err(|_| busy())?;
     let turn = turn.map_err(|_| busy())?;
     let is_equal = work(move || {
@@ -76,10 +76,10 @@ fn argon2() -> argon2::password_hash::Result<Argon2<'static>> {
     Ok(Argon2::new(Algorithm::Argon2id, Version::V0x13, params))
 }
 
-fn turn_of(address: IpAddr) -> CloudResult<Arc<Semaphore>> {
+fn turn_of(network: ClientNetwork) -> CloudResult<Arc<Semaphore>> {
     let mut turns = TURNS.lock().unwrap_or_else(PoisonError::into_inner);
     turns.retain(|_, turn| Arc::strong_count(turn) > 1);
-    let turn = turns.entry(address).or_insert_with(|| Arc::new(Semaphore::new(1)));
+    let turn = turns.entry(network).or_insert_with(|| Arc::new(Semaphore::new(1)));
     match Arc::strong_count(turn) > WAITING_MAX {
         true => Err(busy()),
         false => Ok(Arc::clone(turn)),
@@ -108,9 +108,9 @@ mod tests {
     async fn only_the_same_password_is_right() {
         let hash = hashed("correct horse battery".to_owned()).await.unwrap();
         assert!(hash.starts_with("$argon2id$v=19$m=19456,t=2,p=1$"), "{hash}");
-        let address = [10, 0, 0, 1].into();
+        let network = ClientNetwork::of([10, 0, 0, 1].into());
         let is_right =
-            async |password: &str, hash| is_right(address, password.to_owned(), hash).await;
+            async |password: &str, hash| is_right(network, password.to_owned(), hash).await;
         assert!(is_right("correct horse battery", Some(&hash)).await.unwrap());
         assert!(!is_right("correct horse batterx", Some(&hash)).await.unwrap());
         assert!(!is_right("correct horse battery", None).await.unwrap());

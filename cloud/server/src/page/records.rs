@@ -100,8 +100,8 @@ async fn page(
     before: Option<i64>,
 ) -> PageResult {
     let vehicle = find(cloud, &source.vehicle).await?;
-    // Reading takes memory: as many at a time as streams.
-    let _slot = cloud.readers.open(&user.user.name)?;
+    // Reading takes memory.
+    let _slot = cloud.page_readers.open(&user.user.name)?;
     let newest = source.newest(cloud, (0, before.unwrap_or(i64::MAX)), SIZE).await?;
     let clips = match source.lambda {
         None => clips_of(cloud, &source.vehicle, before.is_some(), &newest).await?,

@@ -13,19 +13,19 @@ use futures_util::stream::unfold;
 use maud::html;
 use serde::Deserialize;
 use tokio::sync::watch;
-use tokio::time::{sleep, timeout};
+use tokio::time::sleep;
 
 use super::layout::PageResult;
 use super::records::RecordSource;
 use super::session::PageUser;
 use crate::cloud::Cloud;
-use crate::readers::ReaderSlot;
+use crate::readers::{ReaderSlot, next_look};
 
 /// Maximum number of records in a message.
 const MESSAGE_MAX: usize = 100;
 /// Least time between two messages.
 const PAUSE: Duration = Duration::from_millis(500);
-/// Time without a record after which a sign of life is sent, and the session is looked at.
+/// Time without a record after which a sign of life is sent.
 const QUIET: Duration = Duration::from_secs(10);
 
 /// The start of a stream, as the address has it.
@@ -41,7 +41,7 @@ struct RecordFollower {
     source: RecordSource,
     position: i64,
     arrivals: watch::Receiver<()>,
-    _slot: ReaderSlot,
+    slot: ReaderSlot,
 }
 
 pub(super) async fn time_line(
@@ -77,7 +77,7 @@ fn follow(
     // Before the first look, so that nothing arrives in between.
     let mut arrivals = cloud.hub.arrivals(&source.vehicle);
     arrivals.mark_changed();
-    let follower = RecordFollower { cloud, user, source, position, arrivals, _slot: slot };
+    let follower = RecordFollower { cloud, user, source, position, arrivals, slot };
     let events = unfold(follower, RecordFollower::next);
     Ok(without_buffers(Sse::new(events).into_response()))
 }
@@ -90,16 +90,26 @@ fn without_buffers(reply: Response) -> Response {
 impl RecordFollower {
     /// Returns the next event; `None` at the end: of the server, or of the session.
     async fn next(mut self) -> Option<(Result<Event, Infallible>, Self)> {
-        let event = match timeout(QUIET, self.arrivals.changed()).await {
-            Ok(Err(_)) => return None,
-            // Also without an arrival that was noticed: a record may have come from another way.
-            Ok(Ok(())) | Err(_) => {
-                if !self.user.is_current(&self.cloud).await {
+        let quiet = sleep(QUIET);
+        tokio::pin!(quiet);
+        loop {
+            tokio::select! {
+                changed = self.arrivals.changed() => match changed {
+                    Ok(()) => break,
+                    Err(_) => return None,
+                },
+                // Also without an arrival that was noticed: a record may have come another way.
+                () = &mut quiet => break,
+                () = self.slot.ended() => return None,
+                () = next_look() => if !self.user.is_current(&self.cloud).await {
                     return None;
-                }
-                self.message().await?
+                },
             }
-        };
+        }
+        if !self.user.is_current(&self.cloud).await {
+            return None;
+        }
+        let event = self.message().await?;
         Some((Ok(event), self))
     }
 

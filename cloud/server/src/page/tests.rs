@@ -9,14 +9,15 @@ use hyper::service::Service;
 use hyper_util::service::TowerToHyperService;
 use serde_json::json;
 use tempfile::TempDir;
-use tokio::sync::Semaphore;
 
 use super::{PageRoute, routes};
-use crate::accept::PeerConnection;
+use crate::clients::ClientNetwork;
 use crate::cloud::Cloud;
 use crate::people;
 use crate::people::tests::{ROLES, cloud};
 use crate::store::ClipBounds;
+
+mod limits;
 
 const PASSWORD: &str = "correct horse battery staple";
 
@@ -67,13 +68,10 @@ impl Browser {
         fields: &[(&str, &str)],
         site: &str,
     ) -> PageReply {
-        let slots = Arc::new(Semaphore::new(1));
-        let peer =
-            PeerConnection::of_test([127, 0, 0, 1].into(), slots.try_acquire_owned().unwrap());
         let mut request = Request::builder()
             .method(method)
             .uri(path)
-            .extension(Arc::new(peer))
+            .extension(ClientNetwork::of([127, 0, 0, 1].into()))
             .header("sec-fetch-site", site);
         if let Some(cookie) = &self.cookie {
             request = request.header(header::COOKIE, cookie);
@@ -255,8 +253,9 @@ async fn passwords_cannot_be_guessed_and_a_new_one_ends_other_sessions() {
     two.post("/account/password", &[("password", PASSWORD), ("again", PASSWORD)]).await;
     assert_eq!(one.get("/vehicles").await.location(), "/login");
     assert_eq!(two.get("/vehicles").await.status, StatusCode::OK);
+    let network = ClientNetwork::of([127, 0, 0, 1].into());
     for _ in 0..10 {
-        assert!(cloud.wrong_secrets.count_password([127, 0, 0, 1].into(), "ann").is_ok());
+        assert!(cloud.wrong_secrets.count_password(network, "ann").is_ok());
     }
     let right = [("name", "ann"), ("password", PASSWORD)];
     let reply = one.send("/login/password", &right).await;

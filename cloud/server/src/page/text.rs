@@ -57,6 +57,15 @@ pub(super) fn query(values: &[(&str, &str)]) -> String {
     }
 }
 
+/// Returns a score. Lambdas choose its scale: extreme ones are shown with an exponent.
+pub(super) fn score(score: f64) -> String {
+    match score.abs() {
+        0.0 => "0.000".to_owned(),
+        0.001..1e6 => format!("{score:.3}"),
+        _ => format!("{score:.3e}"),
+    }
+}
+
 /// Returns the path of a vehicle's page.
 pub(super) fn vehicle_path(name: &str) -> String {
     format!("/vehicles/{}", segment(name))
@@ -180,6 +189,20 @@ mod tests {
         assert_eq!(block("a\r\n\tb\0"), "a\n\\tb\\u{0}");
         assert_eq!(shown(&"x".repeat(1000)).chars().count(), SHOWN_MAX + 1);
         assert_eq!(block(&"x\n".repeat(1000)).lines().count(), LINES_MAX + 1);
+    }
+
+    #[test]
+    fn a_score_of_any_size_is_short() {
+        for (value, expected) in [
+            (0.9123, "0.912"),
+            (-12.5, "-12.500"),
+            (0.0, "0.000"),
+            (1e308, "1.000e308"),
+            (-1e7, "-1.000e7"),
+            (5e-324, "4.941e-324"),
+        ] {
+            assert_eq!(score(value), expected);
+        }
     }
 
     #[test]

@@ -35,7 +35,7 @@ use gleaner_fleet::waves::WaveState;
 use gleaner_protocol::vehicle_api::{DeployReply, StreamLine, VehicleStatus};
 use serde_json::{Map, Value};
 
-use crate::accept::PeerConnection;
+use crate::clients::ClientNetwork;
 use crate::clips::people as clips;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult, as_problem, is_api};
@@ -238,11 +238,11 @@ pub(crate) fn router(cloud: &Arc<Cloud>) -> Router {
 /// Lets requests pass whose token is of a user with the role.
 async fn guard(
     State((cloud, role)): State<(Arc<Cloud>, Role)>,
-    Extension(peer): Extension<Arc<PeerConnection>>,
+    Extension(network): Extension<ClientNetwork>,
     mut request: Request,
     next: Next,
 ) -> Response {
-    match user(&cloud, role, &peer, request.headers()).await {
+    match user(&cloud, role, network, request.headers()).await {
         Ok(TokenUser { user, name }) => {
             request.extensions_mut().insert(user);
             request.extensions_mut().insert(TokenName(name));
@@ -255,14 +255,14 @@ async fn guard(
 async fn user(
     cloud: &Cloud,
     role: Role,
-    peer: &PeerConnection,
+    network: ClientNetwork,
     headers: &HeaderMap,
 ) -> CloudResult<TokenUser> {
     let help = "log in again: `gleaner login URL --code CODE`; an administrator gives you a code";
     let token = bearer(headers);
     let token = token.ok_or_else(|| CloudError::unknown("the request has no token", help))?;
     let Some(token_user) = cloud.store.user(token).await? else {
-        cloud.wrong_secrets.count(peer.address)?;
+        cloud.wrong_secrets.count(network)?;
         return Err(CloudError::unknown("the token is not valid, or has expired", help));
     };
     let User { name, role: has } = &token_user.user;
@@ -290,12 +290,12 @@ fn bearer(headers: &HeaderMap) -> Option<&str> {
 
 async fn login(
     State(cloud): State<Arc<Cloud>>,
-    Extension(peer): Extension<Arc<PeerConnection>>,
+    Extension(network): Extension<ClientNetwork>,
     body: Bytes,
 ) -> CloudResult<Json<UserToken>> {
     let Login { code } = parsed(&body, "login")?;
     let Some(token) = cloud.store.login(&code).await? else {
-        cloud.wrong_secrets.count(peer.address)?;
+        cloud.wrong_secrets.count(network)?;
         let help = "a code works once, for 24 hours: let an administrator invite you again, or run \
                     `gleaner-cloud invite NAME --role ROLE --data DIR` beside the cloud";
         return Err(CloudError::unknown("the code is not valid", help));

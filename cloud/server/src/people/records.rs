@@ -17,7 +17,7 @@ use tokio::time::sleep;
 
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
-use crate::readers::ReaderSlot;
+use crate::readers::{ReaderSlot, ReaderToken};
 
 /// Number of lines in a piece.
 const PIECE: i64 = 256;
@@ -54,6 +54,7 @@ struct RecordReader {
     first: Vec<String>,
     arrivals: Option<watch::Receiver<()>>,
     slot: ReaderSlot,
+    token: ReaderToken,
 }
 
 pub(super) async fn events(
@@ -97,6 +98,7 @@ async fn lines(
         id.ok_or_else(|| CloudError::usage("the header `Last-Event-ID` has no id", help))
     });
     let slot = cloud.readers.open(&user.name)?;
+    let token = ReaderToken::new(super::bearer(headers).unwrap_or_default(), &user);
     // Before the first look, so that nothing arrives in between.
     let arrivals = query.follow.then(|| cloud.hub.arrivals(&vehicle));
     let names = [&*streams[0], &*streams[1]];
@@ -121,8 +123,18 @@ async fn lines(
         }
         (None, None) => 0,
     };
-    let reader =
-        RecordReader { cloud, vehicle, streams, from, arrival, is_events, first, arrivals, slot };
+    let reader = RecordReader {
+        cloud,
+        vehicle,
+        streams,
+        from,
+        arrival,
+        is_events,
+        first,
+        arrivals,
+        slot,
+        token,
+    };
     let pieces = try_unfold(reader, RecordReader::next);
     let kind = if is_events { EVENTS } else { "application/x-ndjson" };
     let headers = [
@@ -136,14 +148,15 @@ impl RecordReader {
     /// Returns the next piece; `None` at the end.
     async fn next(mut self) -> Result<Option<(String, Self)>, std::io::Error> {
         loop {
-            if self.slot.has_ended() {
+            let failed = |error: CloudError| std::io::Error::other(error.reason());
+            if self.slot.has_ended() || !self.token.is_valid(&self.cloud).await.map_err(failed)? {
                 return Ok(None);
             }
             let mut lines = std::mem::take(&mut self.first);
             let names = self.streams.each_ref().map(|name| &**name);
             let store = &self.cloud.store;
             let page = store.page(&self.vehicle, names, self.from, self.arrival, PIECE).await;
-            let page = page.map_err(|error| std::io::Error::other(error.reason()))?;
+            let page = page.map_err(failed)?;
             self.arrival = page.arrival;
             lines.extend(page.lines);
             if !lines.is_empty() {
@@ -156,6 +169,7 @@ impl RecordReader {
                     return Ok(None);
                 },
                 () = self.slot.ended() => return Ok(None),
+                () = self.token.ended(&self.cloud) => return Ok(None),
                 () = sleep(QUIET), if self.is_events => return Ok(Some((":\n\n".to_owned(), self))),
             }
         }

@@ -1,3 +1,5 @@
+use std::time::Duration;
+
 use axum::body::{Body, to_bytes};
 use gleaner_fleet::people::{NewToken, NewUser};
 use hyper::service::Service;
@@ -6,7 +8,7 @@ use tempfile::TempDir;
 use tokio::sync::Semaphore;
 
 use super::*;
-use crate::attempts::{VehicleLimits, WrongSecrets};
+use crate::attempts::{AccountChanges, VehicleLimits, WrongSecrets};
 use crate::authority::Authorities;
 use crate::clips::ClipFiles;
 use crate::folder::DataFolder;
@@ -29,7 +31,9 @@ pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
         authorities: Authorities::open(&data).unwrap(),
         wrong_secrets: WrongSecrets::default(),
         limits: VehicleLimits::default(),
+        account_changes: AccountChanges::default(),
         readers: Arc::default(),
+        page_readers: Arc::default(),
         stored_frames: Semaphore::new(4),
         retention: Retention::DEFAULT,
         address: "127.0.0.1:8443".to_owned(),
@@ -57,9 +61,8 @@ async fn send(
     headers: &[(&str, &str)],
     body: impl Into<Body>,
 ) -> ApiAnswer {
-    let slots = Arc::new(Semaphore::new(1));
-    let peer = PeerConnection::of_test([127, 0, 0, 1].into(), slots.try_acquire_owned().unwrap());
-    let mut request = Request::builder().method(method).uri(path).extension(Arc::new(peer));
+    let network = ClientNetwork::of([127, 0, 0, 1].into());
+    let mut request = Request::builder().method(method).uri(path).extension(network);
     if let Some(token) = token {
         request = request.header(header::AUTHORIZATION, format!("Bearer {token}"));
     }
@@ -316,5 +319,50 @@ async fn a_list_has_each_entry_once_in_parts_of_any_length() {
             }
             assert_eq!(Value::from(entries), whole["items"], "{list} by {limit} {key}");
         }
+    }
+}
+
+#[tokio::test]
+async fn a_stream_ends_once_its_token_has_no_right_any_more() {
+    let folder = TempDir::new().unwrap();
+    let cloud = cloud(&folder).await;
+    cloud.store.invite_vehicle("console", "car-7").await.unwrap();
+    let login = token_of(&cloud, "ann", Role::Operator).await;
+    let ann = cloud.store.user(&login).await.unwrap().unwrap().user;
+    let new = NewToken { name: "nightly".to_owned(), role: Role::Viewer, days: 1 };
+    let made = cloud.store.make_token((&ann, (&*ann.name).into()), new).await.unwrap();
+    // As another process does it: nothing here learns of it but from the database.
+    for (token, end) in [
+        (&made.token, "DELETE FROM secrets WHERE kind = 'token' AND name = 'nightly'"),
+        (&login, "UPDATE secrets SET expires = 1 WHERE kind = 'token'"),
+    ] {
+        let network = ClientNetwork::of([127, 0, 0, 1].into());
+        let request = Request::get("/v1/vehicles/car-7/events?follow=true")
+            .extension(network)
+            .header(header::AUTHORIZATION, format!("Bearer {token}"));
+        let request = request.body(Body::empty()).unwrap();
+        let reply = TowerToHyperService::new(router(&cloud)).call(request).await.unwrap();
+        assert_eq!(reply.status(), StatusCode::OK);
+        cloud.store.execute(end).await;
+        let all = tokio::time::timeout(Duration::from_secs(30), to_bytes(reply.into_body(), 99));
+        assert_eq!(all.await.expect("the stream goes on").unwrap(), "");
+    }
+}
+
+#[tokio::test]
+async fn only_a_deployment_has_a_long_body() {
+    let folder = TempDir::new().unwrap();
+    let cloud = cloud(&folder).await;
+    let token = token_of(&cloud, "ann", Role::Admin).await;
+    for (path, length, status) in [
+        ("/v1/users", SMALL_MAX, StatusCode::BAD_REQUEST),
+        ("/v1/users", SMALL_MAX + 1, StatusCode::PAYLOAD_TOO_LARGE),
+        ("/v1/deployments", BODY_MAX, StatusCode::BAD_REQUEST),
+        ("/v1/deployments", BODY_MAX + 1, StatusCode::PAYLOAD_TOO_LARGE),
+        ("/v1/login", LOGIN_MAX + 1, StatusCode::PAYLOAD_TOO_LARGE),
+    ] {
+        let body = vec![b' '; length];
+        let answer = send(&cloud, (Method::POST, path), Some(&token), &[], body).await;
+        assert_eq!(answer.status, status, "{path}: {length}");
     }
 }

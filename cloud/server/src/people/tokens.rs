@@ -25,6 +25,7 @@ pub(super) async fn make(
     let conditions = ChangeConditions::of_new(&headers, "/v1/tokens", &body)?;
     let new: NewToken = parsed(&body, "token")?;
     token.must_be_login("makes no other tokens")?;
+    cloud.account_changes.count(&actor.name)?;
     Ok(Json(cloud.store.make_token((&actor, conditions.by(&actor)), new).await?))
 }
 

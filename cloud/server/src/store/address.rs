@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use gleaner_base::{Exit, Failure};
 use sqlx::any::{AnyConnectOptions, AnyPoolOptions};
-use sqlx::{AnyPool, Connection};
+use sqlx::{AnyConnection, AnyPool, Connection};
 
 use crate::error::database_failure;
 
@@ -96,6 +96,14 @@ impl StoreAddress {
             Failure::caused_by(Exit::Internal, "cannot open the database", &error).with_help(help)
         };
         let options = AnyConnectOptions::from_str(url).map_err(failed)?;
+        if is_sqlite {
+            // A pool would try it again and again for its whole wait, and lose the reason.
+            let mut first = AnyConnection::connect_with(&options).await.map_err(failed)?;
+            sqlx::raw_sql(PRAGMAS).execute(&mut first).await.map_err(failed)?;
+            let look = "SELECT COUNT(*) FROM sqlite_master";
+            sqlx::raw_sql(look).execute(&mut first).await.map_err(failed)?;
+            first.close().await.map_err(failed)?;
+        }
         // SQLite is never away, and its queries may have to wait for those of a whole fleet.
         let wait = if is_sqlite { WAIT_SQLITE } else { WAIT_POSTGRES };
         let pool = AnyPoolOptions::new()
@@ -119,5 +127,29 @@ impl StoreAddress {
                 })
             });
         pool.connect_with(options).await.map_err(failed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tempfile::TempDir;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_damaged_file_is_named_at_once_with_the_way_out() {
+        let folder = TempDir::new().unwrap();
+        let path = folder.path().join("cloud.db");
+        // The head of a database, and then nothing that is one.
+        let mut damaged = b"SQLite format 3\0".to_vec();
+        damaged.resize(8192, 0xff);
+        for content in [&b"no database at all"[..], &[7; 5000], &damaged] {
+            std::fs::write(&path, content).unwrap();
+            let failure = StoreAddress::file(&path).connect(1).await.unwrap_err();
+            let text = failure.to_string();
+            assert!(text.contains("`cloud.db` in the data folder, is damaged"), "{text}");
+            assert!(text.contains("gleaner-cloud backup"), "{text}");
+            assert_eq!(failure.exit, Exit::Internal);
+        }
     }
 }

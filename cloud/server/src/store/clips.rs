@@ -228,7 +228,7 @@ impl CloudStore {
     pub(crate) async fn clip_part_received(
         &self,
         progress: &ClipProgress,
-        length: u64,
+        (length, sha256): (u64, &str),
         is_last: bool,
     ) -> CloudResult<()> {
         let ClipProgress { id, part, .. } = progress;
@@ -241,6 +241,11 @@ impl CloudStore {
             id.vehicle(), id.name(), int(*part), now(), i64::from(is_last));
         if stored.rows_affected() > 0 {
             run!(&mut *change.tx;
+                "INSERT INTO clip_parts (clip, part, sha256)
+                 SELECT seq, $3, $4 FROM clips WHERE vehicle = $1 AND name = $2
+                 ON CONFLICT (clip, part) DO UPDATE SET sha256 = excluded.sha256";
+                id.vehicle(), id.name(), int(*part), sha256);
+            run!(&mut *change.tx;
                 "INSERT INTO clip_vehicles (vehicle, day, day_bytes) VALUES ($1, $2, $3)
                  ON CONFLICT (vehicle) DO UPDATE SET day = excluded.day, day_bytes =
                  CASE WHEN clip_vehicles.day = excluded.day THEN clip_vehicles.day_bytes ELSE 0 END
@@ -248,6 +253,15 @@ impl CloudStore {
                 id.vehicle(), today(), int(length));
         }
         change.commit().await
+    }
+
+    /// Returns the SHA-256 of each part of a file that was acknowledged.
+    pub(crate) async fn clip_parts(&self, id: &ClipId) -> CloudResult<Vec<String>> {
+        let rows: Vec<(String,)> = rows!(&self.pool;
+            "SELECT clip_parts.sha256 FROM clip_parts JOIN clips ON clips.seq = clip_parts.clip
+             WHERE vehicle = $1 AND name = $2 AND part < parts ORDER BY part";
+            id.vehicle(), id.name());
+        Ok(rows.into_iter().map(|(sha256,)| sha256).collect())
     }
 
     /// Forgets the parts of a file, which was not the announced one or is not there; returns
@@ -283,6 +297,16 @@ impl CloudStore {
         run!(&mut *change.tx;
             "UPDATE clips SET has_thumbnail = 1 WHERE vehicle = $1 AND name = $2";
             id.vehicle(), id.name());
+        change.commit().await
+    }
+
+    /// Forgets the announcement of a thumbnail that is no image.
+    pub(crate) async fn thumbnail_refused(&self, id: &ClipId, sha256: &str) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        run!(&mut *change.tx;
+            "UPDATE clips SET thumbnail = ''
+             WHERE vehicle = $1 AND name = $2 AND thumbnail = $3 AND has_thumbnail = 0";
+            id.vehicle(), id.name(), sha256);
         change.commit().await
     }
 

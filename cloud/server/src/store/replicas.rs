@@ -74,12 +74,18 @@ impl CloudStore {
         change.commit().await
     }
 
-    /// Renews the lease of this process, and removes those that have ended.
-    pub(crate) async fn renew_lease(&self) -> CloudResult<()> {
+    /// Renews the lease of this process, and removes those that have ended. Returns false if the
+    /// process has to be alone, and another one has begun meanwhile.
+    pub(crate) async fn renew_lease(&self, is_alone: bool) -> CloudResult<bool> {
         let mut change = self.change().await?;
         run!(&mut *change.tx; "DELETE FROM replicas WHERE until <= $1"; now());
+        let (others,): (i64,) =
+            one!(&mut *change.tx; "SELECT COUNT(*) FROM replicas WHERE id <> $1"; &self.replica);
+        if is_alone && others > 0 {
+            return Ok(false);
+        }
         change.extend_lease(&self.replica, self.is_file).await?;
-        change.commit().await
+        change.commit().await.map(|()| true)
     }
 
     /// Ends the lease of this process: its vehicles are offline from now on.
@@ -125,20 +131,6 @@ impl CloudStore {
         let row: Option<(i64,)> =
             row!(&self.pool; "SELECT arrived FROM vehicles WHERE name = $1"; vehicle);
         Ok(row.map_or(0, |(arrived,)| arrived))
-    }
-
-    /// Returns the number of the newest entry of the audit trail.
-    pub(crate) async fn last_entry(&self) -> CloudResult<i64> {
-        let (last,): (i64,) = one!(&self.pool; "SELECT COALESCE(MAX(seq), 0) FROM audit");
-        Ok(last)
-    }
-
-    /// Returns the users who were removed by entries of the audit trail after `after` up to `last`.
-    pub(crate) async fn users_removed(&self, after: i64, last: i64) -> CloudResult<Vec<String>> {
-        let rows: Vec<(String,)> = rows!(&self.pool;
-            "SELECT subject FROM audit WHERE seq > $1 AND seq <= $2 AND action = 'remove user'";
-            after, last);
-        Ok(rows.into_iter().map(|(name,)| name).collect())
     }
 }
 

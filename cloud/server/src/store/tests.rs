@@ -12,7 +12,7 @@ mod postgres;
 const KEPT: Retention = Retention { records: 1000, bytes: 1 << 20, vehicle_bytes: 1 << 20 };
 
 /// Returns the address of a database of its own.
-pub(super) async fn address(folder: &TempDir) -> StoreAddress {
+pub(crate) async fn address(folder: &TempDir) -> StoreAddress {
     match postgres::store_of(folder.path()).await {
         Some(url) => StoreAddress::server(&url).unwrap(),
         None => StoreAddress::file(&folder.path().join("cloud.db")),
@@ -110,6 +110,24 @@ async fn records_that_come_again_are_stored_once() {
     store.append("car-7", epoch, batch(2, 0..1), KEPT).await.unwrap();
     assert_eq!(lines(&store).await.len(), 5);
     assert!(store.append("car-7", epoch, batch(1, 4..5), KEPT).await.is_err());
+}
+
+#[tokio::test]
+async fn a_name_of_a_boot_that_cannot_be_stored_takes_no_others_with_it() {
+    let (_folder, store) = store().await;
+    let (bad, good) = (connected(&store, "bad").await, connected(&store, "car-7").await);
+    let mut damaged = batch(1, 0..1);
+    damaged.cursor.boot = "b\0".to_owned();
+    // PostgreSQL refuses it, and SQLite stores it. Both come in one group.
+    let (refused, stored) = tokio::join!(
+        store.append("bad", bad, damaged, KEPT),
+        store.append("car-7", good, batch(1, 0..1), KEPT),
+    );
+    if let Err(error) = refused {
+        assert!(error.reason().contains("a text cannot be stored"), "{}", error.reason());
+    }
+    assert_eq!(stored.unwrap().next, 1);
+    assert_eq!(lines(&store).await, ["line 0"]);
 }
 
 #[tokio::test]
@@ -378,12 +396,26 @@ async fn vehicles_of_a_process_are_online_as_long_as_its_lease_is() {
     let other = CloudStore::open(&address(&folder).await).await.unwrap();
     assert_eq!(other.own_links(None).await.unwrap(), []);
     store.execute("UPDATE replicas SET until = 1").await;
-    other.renew_lease().await.unwrap();
+    other.renew_lease(false).await.unwrap();
     assert_eq!(state().await, VehicleState::Offline);
-    store.renew_lease().await.unwrap();
+    store.renew_lease(false).await.unwrap();
     assert_eq!(state().await, VehicleState::Online);
     other.begin_lease(store.replica(), false).await.unwrap();
     assert_eq!(state().await, VehicleState::Offline, "it has ended, and this is its successor");
+}
+
+#[tokio::test]
+async fn a_process_with_files_of_its_own_ends_when_another_one_has_taken_its_place() {
+    let (folder, store) = store().await;
+    store.begin_lease("", true).await.unwrap();
+    assert!(store.renew_lease(true).await.unwrap());
+    // It stood still, and another one has begun.
+    store.execute("UPDATE replicas SET until = 1").await;
+    let other = CloudStore::open(&address(&folder).await).await.unwrap();
+    other.begin_lease("", true).await.unwrap();
+    assert!(!store.renew_lease(true).await.unwrap());
+    assert!(other.renew_lease(true).await.unwrap(), "the newer one goes on");
+    assert!(store.renew_lease(false).await.unwrap(), "with shared files, both do");
 }
 
 #[tokio::test]

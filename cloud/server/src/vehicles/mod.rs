@@ -26,6 +26,7 @@ use axum::{Json, Router};
 use gleaner_fleet::{EnrolReply, EnrolRequest, FRAME_MAX, RenewRequest};
 
 use crate::accept::PeerConnection;
+use crate::clients::ClientNetwork;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::request::{digest, in_time, parsed};
@@ -94,13 +95,13 @@ async fn guard(
 
 async fn enrol(
     State(cloud): State<Arc<Cloud>>,
-    Extension(peer): Extension<Arc<PeerConnection>>,
+    Extension(network): Extension<ClientNetwork>,
     body: Bytes,
 ) -> CloudResult<Json<EnrolReply>> {
     let EnrolRequest { vehicle, token, csr } = parsed(&body, "enrolment")?;
     let issue = || cloud.authorities.issue(&vehicle, &csr);
     let Some(issued) = cloud.store.enrol(&vehicle, &token, issue).await? else {
-        cloud.wrong_secrets.count(peer.address)?;
+        cloud.wrong_secrets.count(network)?;
         let help = "an enrolment works once, for 24 hours, and for its own vehicle: make another \
                     one with `gleaner vehicles enrol NAME --to FILE`";
         return Err(CloudError::unknown("the enrolment is not valid", help));

@@ -19,11 +19,21 @@ use crate::{options, start};
 /// Time between two looks at what changes soon: with more looks, the vehicle would be in a loop.
 const PAUSE: Duration = Duration::from_millis(250);
 
-const IMAGE: &[u8] = &{
+const IMAGE: &[u8] = &jpeg(1920, 1080);
+
+/// Returns the head of a JPEG of this size, and then nothing that matters.
+const fn jpeg(width: u16, height: u16) -> [u8; 100_000] {
     let mut image = [7; 100_000];
-    (image[0], image[1], image[2]) = (0xff, 0xd8, 0xff);
+    let head = [0xff, 0xd8, 0xff, 0xc0, 0, 11, 8, 0, 0, 0, 0, 1, 1, 0x11, 0];
+    let mut index = 0;
+    while index < head.len() {
+        image[index] = head[index];
+        index += 1;
+    }
+    [image[7], image[8]] = height.to_be_bytes();
+    [image[9], image[10]] = width.to_be_bytes();
     image
-};
+}
 
 /// Returns the facts of a clip with this content.
 pub(crate) fn facts(name: &str, label: &str, at_ns: i64, content: &[u8]) -> Value {
@@ -182,6 +192,8 @@ async fn a_wanted_clip_comes_in_parts_across_an_interruption_and_a_restart() {
     assert_eq!(clip(&admin, "a@car-7").await["state"], "stored");
     let whole = bytes(&admin, "/v1/clips/a@car-7/file").await;
     assert!(whole == (StatusCode::OK, content.clone()));
+    assert_eq!(pull(&admin, "a@car-7").await, StatusCode::OK);
+    assert_eq!(clip(&admin, "a@car-7").await["state"], "stored", "it is not fetched again");
     // A file that is lost in the cloud can be fetched again.
     for entry in std::fs::read_dir(folder.path().join("data/clips")).unwrap() {
         let path = entry.unwrap().path();
@@ -191,6 +203,44 @@ async fn a_wanted_clip_comes_in_parts_across_an_interruption_and_a_restart() {
     assert_eq!(bytes(&admin, "/v1/clips/a@car-7/file").await.0, StatusCode::NOT_FOUND);
     assert_eq!(pull(&admin, "a@car-7").await, StatusCode::OK);
     assert_eq!(orders(&vehicle).await.wanted[0].part, 0);
+    // Nor does a part that is lost lock the upload.
+    assert_eq!(put(&vehicle, "a", 0, first).await.0, StatusCode::OK);
+    for entry in std::fs::read_dir(folder.path().join("data/clips")).unwrap() {
+        std::fs::remove_file(entry.unwrap().path()).unwrap();
+    }
+    let (status, reason) = put(&vehicle, "a", 1, second).await;
+    assert_eq!(status, StatusCode::FORBIDDEN);
+    assert!(reason.contains("its first parts are not there any more"), "{reason}");
+    for (number, part) in [(0, first), (1, second)] {
+        assert_eq!(orders(&vehicle).await.wanted[0].part, number);
+        assert_eq!(put(&vehicle, "a", number, part).await.0, StatusCode::OK);
+    }
+    assert_eq!(clip(&admin, "a@car-7").await["state"], "stored");
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn an_announced_thumbnail_that_is_no_image_is_refused_once() {
+    let folder = TempDir::new().unwrap();
+    let (server, admin) = start(&folder).await;
+    let (vehicle, _) = admin.enrol("car-7").await;
+    for (name, image) in [
+        ("empty", &jpeg(0, 0)[..]),
+        ("huge", &jpeg(65535, 65535)),
+        ("cut", &jpeg(8, 8)[..9]),
+        ("text", b"\xff\xd8\xff and a text"),
+    ] {
+        let mut clip = facts(name, "dark", 1000, b"a");
+        clip["thumbnail"] = json!(sha256(image));
+        report(&vehicle, &[clip], json!([])).await;
+        let path = format!("/v1/clips/{name}/thumbnail");
+        let (status, text) = vehicle.request(Method::PUT, &path, image).await;
+        assert_eq!(status, StatusCode::FORBIDDEN, "{name}");
+        assert!(String::from_utf8_lossy(&text).contains("4096 pixels"), "{name}");
+        assert_eq!(orders(&vehicle).await.thumbnails, [], "{name} is not wanted again");
+        let path = format!("/v1/clips/{name}@car-7/thumbnail");
+        assert_eq!(bytes(&admin, &path).await.0, StatusCode::NOT_FOUND);
+    }
     server.stop().await;
 }
 

@@ -43,7 +43,8 @@ for operation, status, answer in answers:
 
 /// Announces the clip `a` of the vehicle `car-7`.
 pub(super) async fn announce(store: &CloudStore) {
-    let clip = json!({ "name": "a", "from_ns": -1, "to_ns": 2, "bytes": 5, "sha256": "0".repeat(64),
+    let sha256 = gleaner_trust::sha256(b"01234");
+    let clip = json!({ "name": "a", "from_ns": -1, "to_ns": 2, "bytes": 5, "sha256": sha256,
                        "thumbnail": null, "triggers": 1,
                        "lambdas": [{ "name": "brake", "version": "1", "digest": "d",
                                      "deployment": null, "revision": null }],
