@@ -188,6 +188,8 @@ impl SimulatedVehicle {
     /// Fetches the deployments of a wanted state that are new, over one connection as real vehicles
     /// do, and reports that they run. Nothing is verified and nothing starts.
     async fn apply(&mut self, socket: &mut Socket, desired: Desired) -> Result<(), String> {
+        let simulation = Arc::clone(&self.simulation);
+        let turn = simulation.files.acquire().await.map_err(|error| error.to_string())?;
         let (mut runs, mut files) = (Vec::new(), None);
         for Wanted { id, envelope, .. } in desired.deployments.into_iter().filter(|it| it.is_wanted)
         {
@@ -209,6 +211,7 @@ impl SimulatedVehicle {
             let (release, revision) = (deployment.release, digest.to_string());
             runs.push(RunningRelease { id, envelope, release, revision });
         }
+        drop((files, turn));
         (self.runs, self.handled) = (runs, desired.generation);
         self.report(socket).await?;
         send(socket, Body::Ping(Ping { number: SETTLE })).await
