@@ -198,8 +198,7 @@ impl SimulatedVehicle {
                 continue;
             }
             let address = self.simulation.address;
-            let mut get =
-                async |path: String| self.identity.get(&mut files, address, &path).await;
+            let mut get = async |path: String| self.identity.get(&mut files, address, &path).await;
             let sealed = get(format!("/v1/deployments/{envelope}")).await?;
             let deployment = unverified_deployment(&sealed).map_err(|error| error.to_string())?;
             let sealed = get(format!("/v1/revisions/{}", deployment.revision)).await?;

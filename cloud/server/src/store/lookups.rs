@@ -71,11 +71,7 @@ async fn run(pool: AnyPool, sql: &'static str, mut waiting: mpsc::Receiver<Looku
     }
 }
 
-async fn found(
-    pool: &AnyPool,
-    sql: &str,
-    keys: &[&str],
-) -> CloudResult<HashMap<String, FoundRow>> {
+async fn found(pool: &AnyPool, sql: &str, keys: &[&str]) -> CloudResult<HashMap<String, FoundRow>> {
     let mut rows = HashMap::with_capacity(keys.len());
     for part in list_parts(keys) {
         let sql = format!("{sql} ({})", in_list(part.len()));
