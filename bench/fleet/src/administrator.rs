@@ -19,16 +19,25 @@ pub async fn send(
     stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
     request: Request<Full<Bytes>>,
 ) -> Result<(StatusCode, Bytes), String> {
-    let (mut sender, connection) =
-        http1::handshake(TokioIo::new(stream)).await.map_err(|error| error.to_string())?;
-    tokio::spawn(connection);
-    answer(&mut sender, request).await
+    answer(&mut requests(stream).await?, request).await
 }
 
-async fn answer(
+/// Begins to use a connection for requests.
+pub async fn requests(
+    stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
+) -> Result<SendRequest<Full<Bytes>>, String> {
+    let handshake = http1::handshake(TokioIo::new(stream)).await;
+    let (sender, connection) = handshake.map_err(|error| error.to_string())?;
+    tokio::spawn(connection);
+    Ok(sender)
+}
+
+/// Sends a request over a connection that may have served others.
+pub async fn answer(
     sender: &mut SendRequest<Full<Bytes>>,
     request: Request<Full<Bytes>>,
 ) -> Result<(StatusCode, Bytes), String> {
+    sender.ready().await.map_err(|error| error.to_string())?;
     let reply = sender.send_request(request).await.map_err(|error| error.to_string())?;
     let status = reply.status();
     let body = reply.into_body().collect().await.map_err(|error| error.to_string())?;
@@ -53,11 +62,7 @@ impl Administrator {
     /// Connects with a token.
     pub async fn connect(address: SocketAddr, token: &str) -> Result<Self, String> {
         let stream = TcpStream::connect(address).await.map_err(|error| error.to_string())?;
-        let stream = TokioIo::new(stream);
-        let handshake = http1::handshake(stream).await.map_err(|error| error.to_string())?;
-        let (sender, connection) = handshake;
-        tokio::spawn(connection);
-        Ok(Self { token: token.to_owned(), sender })
+        Ok(Self { token: token.to_owned(), sender: requests(stream).await? })
     }
 
     /// Sends a request that must succeed; returns the body of the answer.
@@ -74,7 +79,6 @@ impl Administrator {
             .header("authorization", format!("Bearer {}", self.token))
             .body(Full::new(Bytes::from(body)))
             .map_err(|error| error.to_string())?;
-        self.sender.ready().await.map_err(|error| format!("{path}: {error}"))?;
         let (status, body) = answer(&mut self.sender, request).await?;
         match status.is_success() {
             true => Ok(body),

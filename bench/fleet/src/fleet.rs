@@ -91,7 +91,7 @@ pub fn start_all(
     cloud: SocketAddr,
     pause_max: Duration,
 ) -> (Arc<Simulation>, JoinSet<()>) {
-    let simulation = Arc::new(Simulation::new(cloud, pause_max));
+    let simulation = Arc::new(Simulation::new(cloud, pause_max, identities.len()));
     let mut tasks = JoinSet::new();
     for identity in identities {
         let vehicle = SimulatedVehicle::new(identity.clone(), Arc::clone(&simulation));

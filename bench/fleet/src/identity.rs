@@ -7,6 +7,7 @@ use gleaner_fleet::{EnrolReply, EnrolRequest, Enrolment};
 use http_body_util::Full;
 use hyper::Request;
 use hyper::body::Bytes;
+use hyper::client::conn::http1::SendRequest;
 use rcgen::{CertificateParams, KeyPair};
 use rustls::client::Resumption;
 use rustls::crypto::{CryptoProvider, ring};
@@ -17,7 +18,7 @@ use tokio::net::{TcpSocket, TcpStream};
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
-use crate::administrator::send;
+use crate::administrator::{answer, requests, send};
 
 /// The key of all vehicles, with a request for a certificate: the cloud takes the names of vehicles
 /// from their enrolments.
@@ -91,7 +92,7 @@ impl FleetKey {
                 builder.with_client_auth_cert(vec![parsed(own)?], key).map_err(failed)?
             }
         };
-        // Real vehicles begin with a full handshake, too, and fetch files by shorter ones.
+        // Real vehicles begin with a full handshake, too, and fetch files after a shorter one.
         config.resumption = Resumption::in_memory_sessions(1);
         Ok(Arc::new(config))
     }
@@ -111,11 +112,20 @@ impl SimulatedIdentity {
         connector.connect(name, stream).await.map_err(failed)
     }
 
-    /// Fetches what is under a path, over a connection of its own.
-    pub async fn get(&self, address: SocketAddr, path: &str) -> Result<Bytes, String> {
+    /// Fetches what is under a path, over a connection that lasts for all files of a wanted state.
+    pub async fn get(
+        &self,
+        files: &mut Option<SendRequest<Full<Bytes>>>,
+        address: SocketAddr,
+        path: &str,
+    ) -> Result<Bytes, String> {
         let request = Request::get(path).header("host", "cloud").body(Full::default());
         let request = request.map_err(|error| error.to_string())?;
-        let (status, body) = send(self.connect(address).await?, request).await?;
+        if files.is_none() {
+            *files = Some(requests(self.connect(address).await?).await?);
+        }
+        let files = files.as_mut().ok_or("there is no connection")?;
+        let (status, body) = answer(files, request).await?;
         match status.is_success() {
             true => Ok(body),
             false => Err(format!("{path}: {status} {}", String::from_utf8_lossy(&body))),

@@ -54,7 +54,7 @@ struct Args {
 
 fn main() -> ExitCode {
     let args = Args::parse();
-    // Each vehicle takes one.
+    // Each vehicle takes one, and another one while it fetches files.
     gleaner_base::raise_open_files();
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build();
     let measured = match runtime {

@@ -7,9 +7,12 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use tokio::sync::watch;
+use rustix::process::{Resource, getrlimit};
+use tokio::sync::{Semaphore, watch};
 use tokio::time::{Instant, sleep};
 
+/// Number of open files for everything but the vehicles.
+const OTHER_FILES: usize = 500;
 /// Number of errors that are printed.
 const SHOWN: usize = 10;
 
@@ -34,6 +37,8 @@ pub struct Simulation {
     pub is_restarting: AtomicBool,
     pub connected: AtomicUsize,
     pub reports: AtomicU64,
+    /// Connections for files at a time: as many as the process may open beside those for frames.
+    pub files: Semaphore,
     /// Release that is awaited.
     pub release: AtomicU64,
     errors: Counted,
@@ -57,7 +62,10 @@ impl Counted {
 }
 
 impl Simulation {
-    pub fn new(address: SocketAddr, pause_max: Duration) -> Self {
+    pub fn new(address: SocketAddr, pause_max: Duration, vehicles: usize) -> Self {
+        let open_files = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+        let open_files = usize::try_from(open_files).unwrap_or(usize::MAX);
+        let files = open_files.saturating_sub(vehicles + OTHER_FILES);
         Self {
             address,
             begun: Instant::now(),
@@ -66,6 +74,7 @@ impl Simulation {
             is_restarting: AtomicBool::new(false),
             connected: AtomicUsize::new(0),
             reports: AtomicU64::new(0),
+            files: Semaphore::new(files.clamp(1, Semaphore::MAX_PERMITS)),
             release: AtomicU64::new(0),
             errors: Counted::default(),
             losses: Counted::default(),

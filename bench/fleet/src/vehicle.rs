@@ -185,10 +185,12 @@ impl SimulatedVehicle {
         Ok(None)
     }
 
-    /// Fetches the deployments of a wanted state that are new, over a connection for each file as
-    /// real vehicles do, and reports that they run. Nothing is verified and nothing starts.
+    /// Fetches the deployments of a wanted state that are new, over one connection as real vehicles
+    /// do, and reports that they run. Nothing is verified and nothing starts.
     async fn apply(&mut self, socket: &mut Socket, desired: Desired) -> Result<(), String> {
-        let mut runs = Vec::new();
+        let simulation = Arc::clone(&self.simulation);
+        let turn = simulation.files.acquire().await.map_err(|error| error.to_string())?;
+        let (mut runs, mut files) = (Vec::new(), None);
         for Wanted { id, envelope, .. } in desired.deployments.into_iter().filter(|it| it.is_wanted)
         {
             if let Some(same) = self.runs.iter().position(|it| it.envelope == envelope) {
@@ -196,7 +198,7 @@ impl SimulatedVehicle {
                 continue;
             }
             let address = self.simulation.address;
-            let get = async |path: String| self.identity.get(address, &path).await;
+            let mut get = async |path: String| self.identity.get(&mut files, address, &path).await;
             let sealed = get(format!("/v1/deployments/{envelope}")).await?;
             let deployment = unverified_deployment(&sealed).map_err(|error| error.to_string())?;
             let sealed = get(format!("/v1/revisions/{}", deployment.revision)).await?;
@@ -208,6 +210,7 @@ impl SimulatedVehicle {
             let (release, revision) = (deployment.release, digest.to_string());
             runs.push(RunningRelease { id, envelope, release, revision });
         }
+        drop((files, turn));
         (self.runs, self.handled) = (runs, desired.generation);
         self.report(socket).await?;
         send(socket, Body::Ping(Ping { number: SETTLE })).await

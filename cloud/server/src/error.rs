@@ -15,7 +15,7 @@ const PROBLEM: &str = "application/problem+json";
 pub(crate) const TEXT_MAX: usize = 4 << 10;
 
 /// A failure with its HTTP status.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct CloudError {
     status: StatusCode,
     failure: Failure,

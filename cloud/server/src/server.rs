@@ -25,11 +25,12 @@ use crate::s3::S3Bucket;
 use crate::store::{ClipBounds, CloudStore, Retention};
 use crate::{clips, objects, people, replicas, vehicles};
 
-/// Maximum number of open connections of people, and of vehicles.
+/// Maximum number of open connections of people, and of vehicles: a whole fleet has another one
+/// for the files of a deployment.
 const PEOPLE_MAX: u32 = 1000;
+const VEHICLES_MAX: u32 = 40_000;
 /// Maximum number of those of people in one network: a browser has six.
 const PEOPLE_OF_ONE_MAX: u32 = 200;
-const VEHICLES_MAX: u32 = 20_000;
 /// Interval at which times of signs of life are stored.
 const SEEN_INTERVAL: Duration = Duration::from_secs(30);
 /// Interval at which waves of releases are looked at.

@@ -7,7 +7,7 @@ use sqlx::AssertSqlSafe;
 
 use super::records::{Retention, StreamBatch};
 use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
-use super::{CloudStore, StoreChange, in_list, int, parts, placeholders, unsigned};
+use super::{CloudStore, StoreChange, in_list, int, list_parts, parts, unsigned};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of streams of a vehicle: two, and one for each lambda that it ever had.
@@ -144,7 +144,7 @@ impl StoreChange<'_> {
         vehicles: &[&String],
     ) -> CloudResult<HashMap<String, Vec<Cursor>>> {
         let mut cursors = HashMap::<_, Vec<_>>::new();
-        for part in parts(vehicles) {
+        for part in list_parts(vehicles) {
             let sql = format!(
                 "SELECT vehicle, stream, life, next, seq, boot, boot_ns FROM streams
                  WHERE vehicle IN ({}) ORDER BY stream",
@@ -212,7 +212,7 @@ impl StoreChange<'_> {
             let sql = format!(
                 "INSERT INTO vehicles (name, arrived) VALUES {}
                  ON CONFLICT (name) DO UPDATE SET arrived = excluded.arrived",
-                placeholders(part.len(), 2)
+                self.placeholders(part.len(), 2)
             );
             let query = sqlx::query(AssertSqlSafe(sql));
             let query = part
@@ -227,11 +227,11 @@ impl StoreChange<'_> {
     /// Returns what is stored of these streams.
     async fn streams_of(&mut self, keys: &[StreamKey<'_>]) -> CloudResult<StoredStreams> {
         let mut streams = StoredStreams::default();
-        for part in parts(keys) {
+        for part in list_parts(keys) {
             let sql = format!(
                 "SELECT vehicle, stream, life, next, seq, boot, boot_ns, kept, kept_bytes
                  FROM streams WHERE (vehicle, stream) IN (VALUES {})",
-                placeholders(part.len(), 2)
+                self.placeholders(part.len(), 2)
             );
             type Row = (String, String, i64, i64, i64, String, i64, i64, i64);
             let query = sqlx::query_as::<_, Row>(AssertSqlSafe(sql));
@@ -259,7 +259,7 @@ impl StoreChange<'_> {
             .collect();
         names.sort_unstable();
         names.dedup();
-        for part in parts(&names) {
+        for part in list_parts(&names) {
             let sql = format!(
                 "SELECT vehicle, COUNT(*) FROM streams WHERE vehicle IN ({}) GROUP BY vehicle",
                 in_list(part.len())
@@ -285,7 +285,7 @@ impl StoreChange<'_> {
                 "INSERT INTO records (vehicle, stream, life, seq, mark, arrival, line, bytes)
                  VALUES {} ON CONFLICT (vehicle, stream, life, seq, mark) DO NOTHING
                  RETURNING vehicle, stream, bytes",
-                placeholders(part.len(), 8)
+                self.placeholders(part.len(), 8)
             );
             let mut query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql));
             for NewLine { vehicle, stream, life, arrival, line: (seq, mark, line) } in part {
@@ -323,7 +323,7 @@ impl StoreChange<'_> {
                  next = excluded.next, seq = excluded.seq, boot = excluded.boot,
                  boot_ns = excluded.boot_ns, kept = excluded.kept,
                  kept_bytes = excluded.kept_bytes",
-                placeholders(part.len(), 9)
+                self.placeholders(part.len(), 9)
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
             for key in part {
@@ -365,7 +365,7 @@ impl StoreChange<'_> {
             }
         }
         let names: Vec<_> = to_sum.keys().copied().collect();
-        for part in parts(&names) {
+        for part in list_parts(&names) {
             let sql = format!(
                 "SELECT vehicle, CAST(SUM(kept_bytes) AS BIGINT) FROM streams
                  WHERE vehicle IN ({}) GROUP BY vehicle",

@@ -203,16 +203,12 @@ impl CloudStore {
 
     /// Returns the envelope of a deployment with this SHA-256.
     pub(crate) async fn envelope(&self, sha256: &str) -> CloudResult<Option<String>> {
-        let sql = "SELECT envelope FROM releases WHERE sha256 = $1";
-        let row: Option<(String,)> = row!(&self.pool; sql; sha256);
-        Ok(row.map(|(envelope,)| envelope))
+        Ok(self.envelopes.find(sha256).await?.map(|(_, envelope)| envelope))
     }
 
     /// Returns the envelope of a revision with this digest.
     pub(crate) async fn revision(&self, digest: &str) -> CloudResult<Option<String>> {
-        let sql = "SELECT envelope FROM revisions WHERE digest = $1";
-        let row: Option<(String,)> = row!(&self.pool; sql; digest);
-        Ok(row.map(|(envelope,)| envelope))
+        Ok(self.revisions.find(digest).await?.map(|(_, envelope)| envelope))
     }
 }
 

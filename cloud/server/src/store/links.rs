@@ -11,7 +11,7 @@ use sqlx::AssertSqlSafe;
 use super::vehicles::{FAILED, RUNNING, ended, json};
 use super::wants::WishedVehicle;
 use super::writer::{GroupVehicles, VehicleWrite, Waiting, WaitingWrite, counting};
-use super::{CloudStore, StoreChange, in_list, int, now, parts, placeholders, unsigned};
+use super::{CloudStore, StoreChange, in_list, int, list_parts, now, parts, unsigned};
 use crate::error::CloudResult;
 
 /// Maximum number of deployments in a report that count.
@@ -150,7 +150,7 @@ impl StoreChange<'_> {
         vehicles: &mut GroupVehicles,
         connects: &mut [&mut Waiting<ConnectWrite>],
     ) -> CloudResult<()> {
-        let names: Vec<_> = connects.iter().map(|it| it.write.name.clone()).collect();
+        let names: Vec<_> = connects.iter().map(|it| &*it.write.name).collect();
         let mut certificates = self.certificates_of(&names).await?;
         let mut replaced = Vec::new();
         // The newest connection of each vehicle.
@@ -188,7 +188,7 @@ impl StoreChange<'_> {
                  ON CONFLICT (name) DO UPDATE SET epoch = excluded.epoch,
                  version = excluded.version, clip_key = excluded.clip_key,
                  replica = excluded.replica, seen = excluded.seen",
-                placeholders(part.len(), 6)
+                self.placeholders(part.len(), 6)
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
             for (name, epoch, texts) in part {
@@ -200,15 +200,15 @@ impl StoreChange<'_> {
         self.run_in("DELETE FROM certificates WHERE sha256 IN", &replaced).await
     }
 
-    async fn certificates_of(&mut self, names: &[String]) -> CloudResult<Certificates> {
+    async fn certificates_of(&mut self, names: &[&str]) -> CloudResult<Certificates> {
         let mut certificates = Certificates::new();
-        for part in parts(names) {
+        for part in list_parts(names) {
             let sql = format!(
                 "SELECT vehicle, sha256, expires FROM certificates WHERE vehicle IN ({})",
                 in_list(part.len())
             );
             let query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, name| query.bind(name));
+            let query = part.iter().fold(query, |query, name| query.bind(*name));
             for (vehicle, sha256, expires) in query.fetch_all(&mut *self.tx).await? {
                 certificates.entry(vehicle).or_default().push((sha256, expires));
             }
@@ -272,7 +272,7 @@ impl StoreChange<'_> {
                  problems = excluded.problems, status = excluded.status, labels = excluded.labels,
                  deployments = excluded.deployments, running = excluded.running,
                  version = excluded.version",
-                placeholders(part.len(), 8)
+                self.placeholders(part.len(), 8)
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
             for (name, (report, _)) in part {
@@ -302,7 +302,7 @@ impl StoreChange<'_> {
         for part in parts(&states.collect::<Vec<_>>()) {
             let sql = format!(
                 "INSERT INTO reported (vehicle, deployment, number, state) VALUES {}",
-                placeholders(part.len(), 4)
+                self.placeholders(part.len(), 4)
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
             for (name, id, number, state) in part {

@@ -41,6 +41,7 @@ mod clip_list;
 mod clips;
 mod deployments;
 mod links;
+mod lookups;
 mod page;
 mod records;
 mod replicas;
@@ -62,6 +63,7 @@ use gleaner_base::{Exit, Failure};
 use sqlx::{Any, AnyPool, AssertSqlSafe, Transaction};
 use tokio::sync::{Mutex, MutexGuard};
 
+use self::lookups::LookupQueue;
 use self::wants::WantedStates;
 use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
@@ -107,6 +109,11 @@ pub(crate) struct CloudStore {
     /// The statement that begins a change, for one at a time.
     turn: Arc<Mutex<&'static str>>,
     writes: WriteQueue,
+    /// Lookups of certificates, wanted states, and envelopes of deployments and revisions.
+    certificates: LookupQueue,
+    wants: LookupQueue,
+    envelopes: LookupQueue,
+    revisions: LookupQueue,
     wanted: WantedStates,
     is_file: bool,
     /// Name of this process among those that serve the database.
@@ -136,7 +143,19 @@ impl CloudStore {
             Failure::caused_by(Exit::Internal, "no random numbers can be made", &error)
         })?;
         let replica = gleaner_base::hex(&bytes);
-        let store = Self { pool, changes, turn, writes, wanted, is_file, replica };
+        let store = Self {
+            certificates: LookupQueue::start(&pool, lookups::CERTIFICATES),
+            wants: LookupQueue::start(&pool, lookups::WANTS),
+            envelopes: LookupQueue::start(&pool, lookups::ENVELOPES),
+            revisions: LookupQueue::start(&pool, lookups::REVISIONS),
+            pool,
+            changes,
+            turn,
+            writes,
+            wanted,
+            is_file,
+            replica,
+        };
         store.migrate().await?;
         Ok(store)
     }
@@ -225,13 +244,29 @@ impl CloudStore {
 impl StoreChange<'_> {
     /// Runs a statement that ends with `IN` for these values.
     async fn run_in<V: AsRef<str>>(&mut self, sql: &str, values: &[V]) -> CloudResult<()> {
-        for part in parts(values) {
+        let values: Vec<_> = values.iter().map(AsRef::as_ref).collect();
+        for part in list_parts(&values) {
             let sql = format!("{sql} ({})", in_list(part.len()));
             let query = sqlx::query(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, value| query.bind(value.as_ref()));
+            let query = part.iter().fold(query, |query, value| query.bind(*value));
             query.execute(&mut *self.tx).await?;
         }
         Ok(())
+    }
+
+    /// Returns the placeholders of `rows` rows of so many values, the only ones of their statement.
+    /// SQLite gets them without numbers: it searches a list of all numbers for each value.
+    fn placeholders(&self, rows: usize, columns: usize) -> String {
+        if self.tx.backend_name() == "SQLite" {
+            let row = format!("(?{})", ", ?".repeat(columns - 1));
+            return vec![row; rows].join(", ");
+        }
+        let row = |row| {
+            let first = row * columns + 1;
+            let all: Vec<_> = (first..first + columns).map(|it| format!("${it}")).collect();
+            format!("({})", all.join(", "))
+        };
+        (0..rows).map(row).collect::<Vec<_>>().join(", ")
     }
 
     /// Makes the change durable.
@@ -246,16 +281,6 @@ async fn begin<'s>(pool: &AnyPool, turn: &'s Mutex<&'static str>) -> CloudResult
     Ok(StoreChange { tx, _turn: turn })
 }
 
-/// Returns the placeholders of `rows` rows of so many values.
-fn placeholders(rows: usize, columns: usize) -> String {
-    let row = |row| {
-        let first = row * columns + 1;
-        let all: Vec<_> = (first..first + columns).map(|it| format!("${it}")).collect();
-        format!("({})", all.join(", "))
-    };
-    (0..rows).map(row).collect::<Vec<_>>().join(", ")
-}
-
 /// Returns the placeholders of the first `count` values, for a list.
 fn in_list(count: usize) -> String {
     (1..=count).map(|number| format!("${number}")).collect::<Vec<_>>().join(", ")
@@ -268,6 +293,17 @@ fn parts<T>(mut rows: &[T]) -> impl Iterator<Item = &[T]> {
         let (part, rest) = rows.split_at(length);
         rows = rest;
         Some(part)
+    })
+}
+
+/// Splits the values of a list into parts of few different lengths, in which values may be repeated:
+/// so there are fewer of them than [`parts`].
+fn list_parts<T: Copy>(values: &[T]) -> impl Iterator<Item = Vec<T>> {
+    values.chunks(256).map(|chunk| {
+        let length = [1, 4, 16, 64].into_iter().find(|length| chunk.len() <= *length);
+        let mut part = chunk.to_vec();
+        part.resize(length.unwrap_or(256), chunk[0]);
+        part
     })
 }
 

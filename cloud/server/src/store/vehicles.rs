@@ -108,12 +108,8 @@ impl CloudStore {
 
     /// Returns the vehicle with the certificate of this SHA-256, if it is valid.
     pub(crate) async fn vehicle_of(&self, sha256: &str) -> CloudResult<Option<String>> {
-        let name: Option<(String,)> = row!(&self.pool;
-            "SELECT vehicles.name FROM certificates
-             JOIN vehicles ON vehicles.name = certificates.vehicle
-             WHERE sha256 = $1 AND expires > $2 AND is_revoked = 0";
-            sha256, now());
-        Ok(name.map(|(name,)| name))
+        let found = self.certificates.find(sha256).await?;
+        Ok(found.filter(|(expires, _)| *expires > now()).map(|(_, name)| name))
     }
 
     /// Returns the vehicles after this name, at most `most`.

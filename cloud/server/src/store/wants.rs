@@ -73,9 +73,7 @@ struct WishedRelease {
 impl CloudStore {
     /// Returns the state that a vehicle should have.
     pub(crate) async fn wants(&self, name: &str) -> CloudResult<VehicleWants> {
-        let row: Option<(i64, String)> = row!(&self.pool;
-            "SELECT generation, digest FROM vehicles WHERE name = $1 AND is_revoked = 0"; name);
-        let (generation, digest) = row.ok_or_else(ended)?;
+        let (generation, digest) = self.wants.find(name).await?.ok_or_else(ended)?;
         if let Some(deployments) = self.wanted.get(&digest) {
             return Ok(VehicleWants { generation: unsigned(generation), deployments });
         }

@@ -10,7 +10,7 @@ use tokio::sync::{Mutex, mpsc, oneshot};
 use super::append::AppendWrite;
 use super::links::{ConnectWrite, ReportWrite};
 use super::replicas::DisconnectWrite;
-use super::{CloudStore, StoreChange, begin, in_list, parts};
+use super::{CloudStore, StoreChange, begin, in_list, list_parts};
 use crate::error::{CloudError, CloudResult};
 
 /// Maximum number of writes in a transaction, so that other changes have their turn. With 1,024,
@@ -161,7 +161,8 @@ impl GroupWriter {
 impl StoreChange<'_> {
     async fn group_vehicles(&mut self, group: &[WaitingWrite]) -> CloudResult<GroupVehicles> {
         let mut vehicles = GroupVehicles::with_capacity(group.len());
-        for part in parts(group) {
+        let names: Vec<_> = group.iter().map(WaitingWrite::vehicle).collect();
+        for part in list_parts(&names) {
             let names = in_list(part.len());
             let sql = format!(
                 "SELECT name, epoch, is_revoked, arrived, labels, digest FROM vehicles
@@ -169,7 +170,7 @@ impl StoreChange<'_> {
             );
             let query =
                 sqlx::query_as::<_, (String, i64, i64, i64, String, String)>(AssertSqlSafe(sql));
-            let query = part.iter().fold(query, |query, write| query.bind(write.vehicle()));
+            let query = part.iter().fold(query, |query, name| query.bind(*name));
             for (name, epoch, is_revoked, arrived, labels, digest) in
                 query.fetch_all(&mut *self.tx).await?
             {
@@ -192,6 +193,6 @@ pub(super) fn counting<'v>(
     vehicle.ok_or_else(super::vehicles::ended)
 }
 
-fn stopped() -> CloudError {
+pub(super) fn stopped() -> CloudError {
     CloudError::busy("the cloud stops", "connect again")
 }

@@ -37,10 +37,8 @@ impl Cloud {
             let help = format!("make one for `{own}`, or change `name` in vehicle.toml");
             return Err(Failure::new(Exit::Usage, message).with_help(help));
         }
-        let http = CloudHttp {
-            address: enrolment.address.clone(),
-            tls: tls(core, &enrolment.authority, None)?,
-        };
+        let tls = tls(core, &enrolment.authority, None)?;
+        let http = CloudHttp::new(enrolment.address.clone(), tls);
         let (key, csr) = request(&own)?;
         let body = EnrolRequest { vehicle: own, token: enrolment.token, csr };
         let reply: EnrolReply = http.post("/v1/enrol", &body).await?;

@@ -1,8 +1,8 @@
-//! HTTPS to the cloud: one connection for each request. Requests are rare.
+//! HTTPS to the cloud: a connection for each request, or one for several that follow each other.
 
 use std::future::Future;
 use std::io;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use axum::body::Bytes;
@@ -11,7 +11,7 @@ use gleaner_base::{Exit, Failure};
 use gleaner_protocol::vehicle_api::Problem;
 use http_body_util::{BodyDataStream, Full};
 use hyper::body::Incoming;
-use hyper::client::conn::http1;
+use hyper::client::conn::http1::{self, SendRequest};
 use hyper::http::request;
 use hyper::{Method, Request, Response, StatusCode, header};
 use hyper_util::rt::TokioIo;
@@ -37,10 +37,27 @@ const ANSWER_MAX: u64 = 64 << 10;
 #[derive(Clone)]
 pub(super) struct CloudHttp {
     pub(super) address: String,
-    pub(super) tls: Arc<ClientConfig>,
+    tls: Arc<ClientConfig>,
+    /// The connection of the last request, if it is kept for the next one.
+    kept: Option<Arc<Mutex<Option<Requests>>>>,
 }
 
+/// A connection for requests.
+type Requests = SendRequest<Full<Bytes>>;
+
 impl CloudHttp {
+    /// Creates a cloud, with a connection for each request.
+    pub(super) fn new(address: String, tls: Arc<ClientConfig>) -> Self {
+        Self { address, tls, kept: None }
+    }
+
+    /// Returns the same cloud with one connection for requests that follow each other. It ends with
+    /// the returned value. One that is lost with a request is replaced, and the request is sent
+    /// again: it must be one that may come twice.
+    pub(super) fn keeping(&self) -> Self {
+        Self { kept: Some(Arc::default()), ..self.clone() }
+    }
+
     /// Connects.
     ///
     /// # Errors
@@ -169,20 +186,50 @@ impl CloudHttp {
         body: Vec<u8>,
     ) -> Result<Response<Incoming>, Failure> {
         let failed = |error: hyper::Error| self.unreachable("the connection was lost", &error);
-        let stream = TokioIo::new(self.connect().await?);
-        let (mut sender, connection) =
-            self.in_time("it did not answer", http1::handshake(stream)).await?.map_err(failed)?;
-        tokio::spawn(connection);
         let request = request
             .body(Full::new(Bytes::from(body)))
             .map_err(|error| self.unreachable("a request to it is invalid", &error))?;
+        if let Some(kept) = self.take_kept().await
+            && let Ok(answer) = self.sent(kept, patience, request.clone()).await?
+        {
+            return self.accepted(answer).await;
+        }
+        let stream = TokioIo::new(self.connect().await?);
+        let (sender, connection) =
+            self.in_time("it did not answer", http1::handshake(stream)).await?.map_err(failed)?;
+        tokio::spawn(connection);
+        let answer = self.sent(sender, patience, request).await?.map_err(failed)?;
+        self.accepted(answer).await
+    }
+
+    /// Sends a request over a connection, and keeps that if it is to be kept.
+    async fn sent(
+        &self,
+        mut sender: Requests,
+        patience: Duration,
+        request: Request<Full<Bytes>>,
+    ) -> Result<hyper::Result<Response<Incoming>>, Failure> {
         let answer = timeout(patience, sender.send_request(request)).await;
         let answer = answer.map_err(|late| self.unreachable("it did not answer", &late))?;
-        let answer = answer.map_err(failed)?;
-        if answer.status().is_success() {
-            return Ok(answer);
+        if let Some(kept) = &self.kept {
+            *kept.lock().unwrap_or_else(PoisonError::into_inner) = Some(sender);
         }
-        Err(self.refused(answer).await)
+        Ok(answer)
+    }
+
+    /// Takes the connection that was kept, unless it has ended.
+    async fn take_kept(&self) -> Option<Requests> {
+        let kept = self.kept.as_ref()?.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let mut sender = kept?;
+        timeout(PATIENCE, sender.ready()).await.ok()?.ok()?;
+        Some(sender)
+    }
+
+    async fn accepted(&self, answer: Response<Incoming>) -> Result<Response<Incoming>, Failure> {
+        match answer.status().is_success() {
+            true => Ok(answer),
+            false => Err(self.refused(answer).await),
+        }
     }
 
     async fn refused(&self, answer: Response<Incoming>) -> Failure {

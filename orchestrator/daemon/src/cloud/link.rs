@@ -90,7 +90,7 @@ impl CloudLink {
     fn http(&self, settings: &CloudSettings) -> Result<CloudHttp, Failure> {
         let identity = Some((&*settings.certificate, &*settings.key));
         let tls = tls(&self.api.core, &settings.authority, identity)?;
-        Ok(CloudHttp { address: settings.address.clone(), tls })
+        Ok(CloudHttp::new(settings.address.clone(), tls))
     }
 
     /// Returns the time of the next attempt to get another certificate.

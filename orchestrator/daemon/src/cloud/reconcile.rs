@@ -101,6 +101,8 @@ impl Reconciler {
         let deployed = self.core.lock().state.deployments.clone();
         drop(ended);
         let (steps, mut problems) = plan(&desired.deployments, &deployed);
+        // Files are many, and each handshake would take longer than most of them.
+        let http = &http.keeping();
         for step in steps {
             let id = step.id().clone();
             let mut orders = self.orders.clone();

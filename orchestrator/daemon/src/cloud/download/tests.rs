@@ -16,11 +16,12 @@ use super::*;
 
 const CONTENT: &[u8] = b"content";
 
-/// The answer to one request: its head and its body, after which the connection ends.
+/// The answer to one request: its head and its body.
 type FakeAnswer = (&'static str, &'static str);
 
-/// A cloud that gives these answers, one after the other; the handle returns the requests.
-async fn cloud(answers: Vec<FakeAnswer>) -> (CloudHttp, JoinHandle<Vec<String>>) {
+/// A cloud that gives these answers, one after the other on each of its connections; the handle
+/// returns the requests.
+async fn cloud(connections: Vec<Vec<FakeAnswer>>) -> (CloudHttp, JoinHandle<Vec<String>>) {
     let key = KeyPair::generate().unwrap();
     let params = CertificateParams::new(vec!["127.0.0.1".to_owned()]).unwrap();
     let certificate = params.self_signed(&key).unwrap().der().clone();
@@ -40,22 +41,23 @@ async fn cloud(answers: Vec<FakeAnswer>) -> (CloudHttp, JoinHandle<Vec<String>>)
         .with_root_certificates(roots)
         .with_no_client_auth();
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let http =
-        CloudHttp { address: listener.local_addr().unwrap().to_string(), tls: Arc::new(tls) };
+    let http = CloudHttp::new(listener.local_addr().unwrap().to_string(), Arc::new(tls));
     let acceptor = TlsAcceptor::from(Arc::new(server));
     let served = tokio::spawn(async move {
         let mut requests = Vec::new();
-        for (head, body) in answers {
+        for answers in connections {
             let (stream, _) = listener.accept().await.unwrap();
             let mut stream = acceptor.accept(stream).await.unwrap();
-            let mut request = Vec::new();
-            while !request.ends_with(b"\r\n\r\n") {
-                request.push(stream.read_u8().await.unwrap());
+            for (head, body) in answers {
+                let mut request = Vec::new();
+                while !request.ends_with(b"\r\n\r\n") {
+                    request.push(stream.read_u8().await.unwrap());
+                }
+                requests.push(String::from_utf8(request).unwrap());
+                let answer = format!("HTTP/1.1 {head}\r\n\r\n{body}");
+                // A vehicle that refuses it closes the connection.
+                let _ = stream.write_all(answer.as_bytes()).await;
             }
-            requests.push(String::from_utf8(request).unwrap());
-            let answer = format!("HTTP/1.1 {head}\r\n\r\n{body}");
-            // A vehicle that refuses it closes the connection.
-            let _ = stream.write_all(answer.as_bytes()).await;
             let _ = stream.shutdown().await;
         }
         requests
@@ -65,7 +67,7 @@ async fn cloud(answers: Vec<FakeAnswer>) -> (CloudHttp, JoinHandle<Vec<String>>)
 
 /// Downloads `CONTENT`; returns the outcome, and the requests.
 async fn download(folder: &Path, answers: Vec<FakeAnswer>) -> (Result<(), Failure>, Vec<String>) {
-    let (http, served) = cloud(answers).await;
+    let (http, served) = cloud(answers.into_iter().map(|it| vec![it]).collect()).await;
     let sha256 = sha256(CONTENT);
     let target = folder.join("object");
     let download = Download { http: &http, sha256: &sha256, length: 7, target };
@@ -157,4 +159,14 @@ async fn a_cloud_that_always_breaks_off_is_not_tried_for_ever() {
     let failure = done.unwrap_err();
     assert_eq!((failure.exit, requests.len()), (Exit::Unreachable, 5));
     assert_eq!(names(folder.path()), ["object.partial"], "the next attempt goes on there");
+}
+
+#[tokio::test]
+async fn requests_share_a_connection_that_is_kept_and_go_on_over_another_one() {
+    let (http, served) = cloud(vec![vec![(WHOLE, "content"); 2], vec![(WHOLE, "content")]]).await;
+    let http = http.keeping();
+    for path in ["/first", "/second", "/third"] {
+        assert_eq!(http.get(path, 7).await.unwrap(), CONTENT, "{path}");
+    }
+    assert_eq!(served.await.unwrap().len(), 3);
 }
