@@ -21,9 +21,10 @@ use crate::folder::{DataFolder, FolderLock};
 use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::place::FilePlace;
+use crate::records::ChunkFiles;
 use crate::s3::S3Bucket;
 use crate::store::{ClipBounds, CloudStore, Retention};
-use crate::{clips, objects, people, replicas, vehicles};
+use crate::{clips, objects, people, records, replicas, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles.
 const PEOPLE_MAX: u32 = 1000;
@@ -53,6 +54,8 @@ pub struct ServeOptions {
     pub vehicles: SocketAddr,
     /// Address for vehicles as enrolments state it, `HOST:PORT`; without one, `vehicles`.
     pub name: Option<String>,
+    /// Days for which records are kept at least; 0 is without an end.
+    pub keep_records_days: u32,
     /// Permission to serve people, without TLS, at an address that other machines can reach.
     pub is_insecure: bool,
 }
@@ -69,6 +72,7 @@ impl ServeOptions {
             people: any,
             vehicles: any,
             name: None,
+            keep_records_days: 30,
             is_insecure: false,
         }
     }
@@ -152,6 +156,7 @@ impl CloudServer {
             store,
             objects: Objects::new(place(folder.objects(), "objects/")?),
             clips: Arc::new(ClipFiles::new(place(folder.clips(), "clips/")?, ClipBounds::DEFAULT)),
+            chunks: ChunkFiles::new(place(folder.records(), "records/")?),
             hub: Hub::new(bus),
             authorities,
             wrong_secrets: WrongSecrets::default(),
@@ -159,6 +164,7 @@ impl CloudServer {
             readers: Arc::default(),
             stored_frames: Semaphore::new(STORED_FRAMES_MAX),
             retention: Retention::DEFAULT,
+            keep_records_days: options.keep_records_days,
             address,
         });
         let (stop, stopped) = watch::channel(false);
@@ -190,6 +196,8 @@ impl CloudServer {
         chores.spawn(async move { clips::clean(&working).await });
         let working = Arc::clone(&cloud);
         chores.spawn(async move { objects::collect(&working).await });
+        let working = Arc::clone(&cloud);
+        chores.spawn(async move { records::keep(&working).await });
         let working = Arc::clone(&cloud);
         chores.spawn(async move {
             let mut ticks = ticks(SEEN_INTERVAL);

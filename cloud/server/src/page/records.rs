@@ -47,17 +47,16 @@ impl RecordSource {
         range: (i64, i64),
         most: usize,
     ) -> CloudResult<NewestRecords> {
-        let store = &cloud.store;
         let Some(lambda) = &self.lambda else {
-            let streams = store.streams(&self.vehicle).await?;
-            let mut newest = store.newest(&self.vehicle, &streams, range, READ).await?;
+            let streams = cloud.store.streams(&self.vehicle).await?;
+            let mut newest = cloud.newest(&self.vehicle, &streams, range, READ).await?;
             newest.lines.retain(|(_, line)| super::line::is_of_time_line(line));
             newest.has_more |= newest.lines.len() > most;
             newest.lines.truncate(most);
             return Ok(newest);
         };
         let stream = [format!("lambdas/{lambda}")];
-        store.newest(&self.vehicle, &stream, range, most).await
+        cloud.newest(&self.vehicle, &stream, range, most).await
     }
 
     /// Renders a record.

@@ -36,18 +36,20 @@ mod address;
 mod append;
 mod audit;
 mod awaited;
+mod chunks;
 mod cleaning;
 mod clip_list;
 mod clips;
 mod deployments;
 mod links;
 mod page;
+mod record_age;
 mod records;
 mod replicas;
 mod requests;
 mod secrets;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod tokens;
 mod users;
 mod vehicles;
@@ -67,13 +69,14 @@ use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
 
 pub(crate) use address::StoreAddress;
+pub(crate) use chunks::{ChunkSizes, KeptLine, StoredChunk};
 pub(crate) use cleaning::RemovedClip;
 pub(crate) use clip_list::ClipQuery;
 pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
 pub(crate) use links::VehicleReport;
-pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
-pub(crate) use records::{Retention, StreamBatch, name_in_lines};
+pub(crate) use page::{LINE_MAX, NewestRecords, VehicleFilter, VehiclePage, large_line};
+pub(crate) use records::{RecordPage, Retention, StreamBatch, name_in_lines};
 pub(crate) use replicas::OwnLink;
 pub(crate) use requests::{ChangeAuthor, RequestKey};
 pub(crate) use tokens::{TOKENS_MAX, TokenUser};
@@ -90,6 +93,7 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0007_requests.sql"),
     include_str!("../../migrations/0008_cleaning.sql"),
     include_str!("../../migrations/0009_tokens.sql"),
+    include_str!("../../migrations/0010_chunks.sql"),
 ];
 
 /// Maximum number of queries at a time: with more threads than cores, each only takes longer.
