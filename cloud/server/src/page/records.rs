@@ -10,6 +10,7 @@ use serde::Deserialize;
 use super::clips;
 use super::layout::{self, PageResult, empty};
 use super::line::{line, time_ns};
+use super::search::SearchPart;
 use super::session::PageUser;
 use super::text::{query, segment, shown, vehicle_path};
 use super::vehicle::find;
@@ -37,6 +38,8 @@ pub(super) struct RecordSource {
 #[derive(Debug, Deserialize)]
 pub(super) struct RecordPart {
     before: Option<i64>,
+    #[serde(flatten)]
+    search: SearchPart,
 }
 
 impl RecordSource {
@@ -80,7 +83,7 @@ pub(super) async fn time_line(
     Path(vehicle): Path<String>,
     Query(part): Query<RecordPart>,
 ) -> PageResult {
-    page(&cloud, &user, RecordSource { vehicle, lambda: None }, part.before).await
+    page(&cloud, &user, RecordSource { vehicle, lambda: None }, &part).await
 }
 
 pub(super) async fn lambda(
@@ -89,18 +92,34 @@ pub(super) async fn lambda(
     Path((vehicle, id)): Path<(String, String)>,
     Query(part): Query<RecordPart>,
 ) -> PageResult {
-    page(&cloud, &user, RecordSource { vehicle, lambda: Some(id) }, part.before).await
+    page(&cloud, &user, RecordSource { vehicle, lambda: Some(id) }, &part).await
 }
 
 async fn page(
     cloud: &Cloud,
     user: &PageUser,
     source: RecordSource,
-    before: Option<i64>,
+    part: &RecordPart,
 ) -> PageResult {
     let vehicle = find(cloud, &source.vehicle).await?;
     // Reading takes memory: as many at a time as streams.
     let _slot = cloud.readers.open(&user.user.name)?;
+    let RecordPart { before, search } = part;
+    if search.is_search() {
+        let here = source.path();
+        let title = source.lambda.as_deref().map_or("Time line".to_owned(), shown);
+        let title = format!("Search in {title} of {}", shown(&vehicle.name));
+        let body = html! {
+            nav.crumbs aria-label="Path" {
+                a href="/vehicles" { "Fleet" } " / "
+                a href=(vehicle_path(&vehicle.name)) { (shown(&vehicle.name)) }
+            }
+            h1 { (title) }
+            (search.form(&here))
+            (search.found(cloud, &source, &here).await?)
+        };
+        return Ok(layout::page(&title, "/vehicles", Some(user), body));
+    }
     let newest = source.newest(cloud, (0, before.unwrap_or(i64::MAX)), SIZE).await?;
     let clips = match source.lambda {
         None => clips_of(cloud, &source.vehicle, before.is_some(), &newest).await?,
@@ -129,6 +148,7 @@ async fn page(
         } @else {
             p.help { "Log lines, triggers, starts and ends, the newest first; times are in UTC." }
         }
+        (search.form(&here))
         @if before.is_none() {
             (followed(&source, &here, &newest))
         } @else {

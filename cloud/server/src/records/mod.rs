@@ -17,4 +17,4 @@ mod tests;
 
 pub(crate) use files::ChunkFiles;
 pub(crate) use packing::keep;
-pub(crate) use search::RecordSearch;
+pub(crate) use search::{RecordLevel, RecordSearch};

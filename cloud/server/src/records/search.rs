@@ -41,6 +41,14 @@ pub(crate) enum RecordLevel {
     Error,
 }
 
+impl RecordLevel {
+    /// Parses the name of a level.
+    pub(crate) fn parse(name: &str) -> Option<Self> {
+        let name = serde::de::value::StrDeserializer::<serde::de::value::Error>::new(name);
+        Self::deserialize(name).ok()
+    }
+}
+
 /// A choice of records of all vehicles.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
