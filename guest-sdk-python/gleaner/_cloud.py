@@ -96,6 +96,41 @@ class Cloud:
         path = f"/v1/vehicles/{_part(vehicle)}/lambdas/{_part(deployment)}/records"
         return self._lines(path, last, follow)
 
+    def search(
+        self,
+        text: str = "",
+        vehicle: Optional[str] = None,
+        label: Optional[str] = None,
+        function: Optional[str] = None,
+        kind: Optional[str] = None,
+        level: Optional[str] = None,
+        from_ns: Optional[int] = None,
+        to_ns: Optional[int] = None,
+    ) -> Iterator[Dict[str, Any]]:
+        """Records with ``text`` in a value, each with its ``vehicle`` and its ``line``.
+
+        Those of a vehicle come newest first, one vehicle after the other. ``label`` is one of the
+        vehicle, as in ``site=berlin``, ``function`` the id of a deployment, and ``level`` the
+        least of a log line. Without a bound, read as many as you need, and stop.
+        """
+        values = {"text": text or None, "vehicle": vehicle, "label": label, "lambda": function}
+        values.update(kind=kind, level=level)
+        values.update(from_ns=None if from_ns is None else str(from_ns))
+        values.update(to_ns=None if to_ns is None else str(to_ns))
+        query = {key: value for key, value in values.items() if value is not None}
+        while True:
+            path = f"/v1/records?{urlencode(query)}"
+            part = self._json("GET", path)
+            items, more = part.get("items"), part.get("next")
+            if not isinstance(items, list) or not all(isinstance(it, dict) for it in items):
+                raise _bad(f"the answer to {path} has no records of the right form")
+            yield from items
+            if more is None:
+                return
+            if not isinstance(more, str) or more == query.get("after"):
+                raise _bad(f"the answer to {path} does not go on")
+            query["after"] = more
+
     def clips(
         self,
         vehicle: Optional[str] = None,

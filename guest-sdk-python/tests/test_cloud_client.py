@@ -114,6 +114,16 @@ class FakeCloud(unittest.TestCase):
         with self.assertRaisesRegex(CloudError, "cut off"):
             list(self.cloud.events("car-7"))
 
+    def test_a_search_goes_on_after_a_part_without_records(self) -> None:
+        path = "GET /v1/records?text=a+b&level=warn"
+        self.set(path, {"items": [], "next": "x"})
+        self.set(f"{path}&after=x", {"items": [{"vehicle": "car-7", "line": {}}], "next": None})
+        found = list(self.cloud.search("a b", level="warn"))
+        self.assertEqual([it["vehicle"] for it in found], ["car-7"])
+        self.set(f"{path}&after=x", {"items": [], "next": "x"})
+        with self.assertRaisesRegex(CloudError, "does not go on"):
+            list(self.cloud.search("a b", level="warn"))
+
     def test_a_clip_is_chosen_pulled_and_downloaded_in_two_parts(self) -> None:
         query = "GET /v1/clips?lambda=brake&label=dark&from_ns=5&limit=1"
         self.set(query, {"items": [facts(state="on-vehicle")], "next": "7"})

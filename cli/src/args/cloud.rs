@@ -37,6 +37,8 @@ pub enum CloudCommand {
     Fleet(FleetArgs),
     /// List the clips of the vehicles of the cloud, fetch or export them
     Clips(ClipsArgs),
+    /// Search the records of the vehicles of the cloud: log lines, triggers and events
+    Search(SearchArgs),
     /// List who changed what in the cloud, the newest first
     Audit(AuditArgs),
     /// Connect this vehicle to a cloud
@@ -185,6 +187,38 @@ pub struct NewVehicleArgs {
     /// The new file, which has a secret
     #[arg(long, value_name = "FILE")]
     pub to: PathBuf,
+}
+
+/// Arguments of `gleaner search`.
+#[derive(Args, Debug)]
+pub struct SearchArgs {
+    /// Text in the records, without regard to the case of A to Z [default: any]
+    #[arg(value_name = "TEXT", default_value = "", hide_default_value = true)]
+    pub text: String,
+    /// Only records of this vehicle
+    #[arg(long, value_name = "NAME")]
+    pub vehicle: Option<VehicleName>,
+    /// Only vehicles with this label, as in site=berlin
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub label: Option<String>,
+    /// Only records of the lambda of this deployment
+    #[arg(long, value_name = "ID")]
+    pub lambda: Option<String>,
+    /// Only records of this kind, as in log, decision or event
+    #[arg(long, value_name = "KIND")]
+    pub kind: Option<String>,
+    /// Only log lines of this level or a higher one, and faults: trace, debug, info, warn or error
+    #[arg(long, value_name = "LEVEL", value_parser = ["trace", "debug", "info", "warn", "error"])]
+    pub level: Option<String>,
+    /// Only records within this time before now, as in 2h
+    #[arg(long, value_name = "DURATION", value_parser = parse_duration)]
+    pub since: Option<Duration>,
+    /// Maximum number of records to show
+    #[arg(long, short = 'n', value_name = "N", default_value_t = 100)]
+    pub last: usize,
+    /// Print each record as a line of JSON
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// Arguments of `gleaner audit`.

@@ -76,7 +76,7 @@ fn endless(path: &str, cause: &str) -> Failure {
 }
 
 /// Escapes a value of a query.
-fn escaped(text: &str) -> String {
+pub(super) fn escaped(text: &str) -> String {
     let escape = |byte: u8| match byte {
         b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' => char::from(byte).into(),
         _ => format!("%{byte:02X}"),

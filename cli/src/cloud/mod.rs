@@ -6,7 +6,7 @@
 //! - `clips`: lists and fetches recorded clips.
 //! - `fleet`: deployments of the cloud, signed here. `rollout`: waits for all their vehicles, and
 //!   `waves` for the waves before.
-//! - `list`: lists, part by part.
+//! - `list`: lists, part by part. `search`: what is found in records.
 
 mod clips;
 mod enrol;
@@ -15,6 +15,7 @@ mod list;
 mod login;
 mod people;
 mod rollout;
+mod search;
 mod tokens;
 mod vehicles;
 mod waves;
@@ -43,6 +44,7 @@ pub(crate) fn run(command: &CloudCommand) -> Result<Exit, Failure> {
         CloudCommand::Vehicles(args) => vehicles::vehicles(args),
         CloudCommand::Fleet(args) => fleet::fleet(args),
         CloudCommand::Clips(args) => clips::clips(args),
+        CloudCommand::Search(args) => search::search(args),
         CloudCommand::Audit(args) => people::audit(args),
         CloudCommand::Enrol(args) => enrol::enrol(args),
         CloudCommand::Unenrol(args) => enrol::unenrol(args),

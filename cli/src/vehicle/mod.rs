@@ -16,6 +16,6 @@ mod trust;
 pub(crate) use client::VehicleClient;
 pub(crate) use deploy::{Former, LocalRevision, change, deploy, deployment, path, remove};
 pub(crate) use status::{cloud_line, status};
-pub(crate) use stream::{events, logs};
+pub(crate) use stream::{events, logs, record_text};
 pub(crate) use top::top;
 pub(crate) use trust::trust;

@@ -39,10 +39,15 @@ fn show(path: &str, args: &StreamArgs) -> Result<Exit, Failure> {
         }
         let line: StreamLine = serde_json::from_str(line)
             .map_err(|error| Failure::caused_by(Exit::Internal, "cannot parse a record", &error))?;
-        let since_1970 = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
-        print(&text(&line, &date(nanoseconds(since_1970)), paint))
+        print(&record_text(&line, paint))
     })?;
     Ok(Exit::Ok)
+}
+
+/// Formats a record as a line, with its date unless that is today.
+pub(crate) fn record_text(line: &StreamLine, paint: Paint) -> String {
+    let since_1970 = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
+    text(line, &date(nanoseconds(since_1970)), paint)
 }
 
 /// Formats a record as a line, with its date unless that is `today`.
@@ -66,6 +71,11 @@ fn text(line: &StreamLine, today: &str, paint: Paint) -> String {
         }
         "decision" => decision_words(record),
         "gap" => gap_words(line.seq, record),
+        "damaged" if record.get("records").is_some() => {
+            let to = record.get("to").and_then(Value::as_u64).unwrap_or(line.seq);
+            let reason = field("reason").unwrap_or_default();
+            format!("records {} to {to} are missing: {reason}", line.seq)
+        }
         "started" => format!("process of revision {}", field("revision").unwrap_or_default()),
         _ => record.to_string(),
     };
@@ -102,7 +112,7 @@ fn decision_words(record: &Value) -> String {
 fn gap_words(first: u64, record: &Value) -> String {
     let last = record.get("to").and_then(Value::as_u64).unwrap_or(first);
     let reason = match record.get("reason").and_then(Value::as_str).unwrap_or_default() {
-        "Budget" => "newer ones took their room",
+        "Budget" | "Retention" => "newer ones took their room",
         "DiskFull" => "the disk was full",
         "WriteFailed" => "writing to the disk failed",
         "QueueFull" => "there were too many at once",

@@ -3,7 +3,7 @@
 //! `frame` has the frames of the control channel: one WebSocket per vehicle, opened by it.
 //! `enrolment` has the messages by which a vehicle gets its certificate, and `people` those of the
 //! API for people; `waves` is the part of it by which a release reaches vehicles step by step.
-//! `clips` has those about recorded clips. `object` checks files that are sent. Nothing here opens
+//! `clips` has those about recorded clips, and `records` those of a search. `object` checks files that are sent. Nothing here opens
 //! a connection.
 //!
 //! A vehicle is given the complete wanted state, never a change of it: a list of deployments, each
@@ -16,6 +16,7 @@ mod enrolment;
 mod frame;
 mod object;
 pub mod people;
+pub mod records;
 pub mod waves;
 
 pub use enrolment::{

@@ -10,6 +10,7 @@ use crate::clips::ClipFiles;
 use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::readers::Readers;
+use crate::records::ChunkFiles;
 use crate::store::{CloudStore, Retention};
 
 /// Maximum number of frames of vehicles that are parsed and stored at a time: each may have 8 MiB.
@@ -20,6 +21,7 @@ pub(crate) struct Cloud {
     pub(crate) store: CloudStore,
     pub(crate) objects: Objects,
     pub(crate) clips: Arc<ClipFiles>,
+    pub(crate) chunks: ChunkFiles,
     pub(crate) hub: Hub,
     pub(crate) authorities: Authorities,
     pub(crate) wrong_secrets: WrongSecrets,
@@ -31,6 +33,8 @@ pub(crate) struct Cloud {
     /// Frames of vehicles that are parsed and stored at a time.
     pub(crate) stored_frames: Semaphore,
     pub(crate) retention: Retention,
+    /// Days for which records are kept at least; 0 is without an end.
+    pub(crate) keep_records_days: u32,
     /// Address for vehicles, as enrolments state it.
     pub(crate) address: String,
 }

@@ -48,7 +48,8 @@ impl DataFolder {
     pub(crate) fn create(path: &Path) -> Result<Self, Failure> {
         let folder = Self(path.to_owned());
         // A restored folder has no lock, and with PostgreSQL no database.
-        let is_ours = |name: &OsStr| ["objects", "clips", "ca"].iter().any(|ours| name == *ours);
+        let is_ours =
+            |name: &OsStr| ["objects", "clips", "records", "ca"].iter().any(|ours| name == *ours);
         let is_of_others = !folder.is_known()
             && fs::read_dir(path)
                 .is_ok_and(|entries| entries.flatten().any(|it| !is_ours(&it.file_name())));
@@ -57,7 +58,9 @@ impl DataFolder {
             return Err(Failure::new(Exit::Usage, message)
                 .with_help("choose an empty folder, or one that does not exist, with --data"));
         }
-        for path in [path, &folder.objects(), &folder.clips(), &folder.authorities()] {
+        for path in
+            [path, &folder.objects(), &folder.clips(), &folder.records(), &folder.authorities()]
+        {
             DirBuilder::new()
                 .recursive(true)
                 .mode(0o700)
@@ -174,6 +177,11 @@ impl DataFolder {
     /// Folder of the files of clips.
     pub(crate) fn clips(&self) -> PathBuf {
         self.0.join("clips")
+    }
+
+    /// Folder of the files of chunks of records.
+    pub(crate) fn records(&self) -> PathBuf {
+        self.0.join("records")
     }
 
     /// Folder of the keys and certificates of the authorities.

@@ -5,8 +5,8 @@
 //! accepts connections for both listeners, within the bounds of `clients`: `people` and `page` answer requests of people, and
 //! `vehicles` those of vehicles, each of which keeps one connection open. `hub` has these
 //! connections, and wakes them after a change.
-//! `clips` has recorded clips of vehicles, with a place of its own. `transfer` receives files and
-//! sends them.
+//! `clips` has recorded clips of vehicles, and `records` old records in files, each with a place of
+//! its own. `transfer` receives files and sends them.
 //!
 //! One process with a database in its folder is a cloud, and so are several over one PostgreSQL
 //! database and one bucket: `replicas` follows what the others have changed, and `bus` carries
@@ -31,6 +31,7 @@ mod people;
 mod place;
 mod program;
 mod readers;
+mod records;
 mod replicas;
 mod request;
 mod s3;

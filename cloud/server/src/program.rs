@@ -53,6 +53,9 @@ enum CloudCommand {
         /// Address for vehicles as enrolments state it, if it differs from --vehicles
         #[arg(long, value_name = "HOST:PORT")]
         name: Option<String>,
+        /// Days for which records of vehicles are kept, unless there are too many; 0 for any time
+        #[arg(long, value_name = "DAYS", default_value_t = 30)]
+        keep_records: u32,
         /// Serve people without TLS also at an address that other machines can reach
         #[arg(long)]
         insecure_people: bool,
@@ -125,6 +128,7 @@ fn run(command: CloudCommand) -> Result<(), Failure> {
                 people,
                 vehicles,
                 name,
+                keep_records: keep_records_days,
                 insecure_people: is_insecure,
                 behind_proxy: is_behind_proxy,
             } => {
@@ -136,6 +140,7 @@ fn run(command: CloudCommand) -> Result<(), Failure> {
                     people,
                     vehicles,
                     name,
+                    keep_records_days,
                     is_insecure,
                     is_behind_proxy,
                 })

@@ -21,9 +21,10 @@ use crate::folder::{DataFolder, FolderLock};
 use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::place::FilePlace;
+use crate::records::ChunkFiles;
 use crate::s3::S3Bucket;
 use crate::store::{ClipBounds, CloudStore, Retention};
-use crate::{clips, objects, people, replicas, vehicles};
+use crate::{clips, objects, people, records, replicas, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles: a whole fleet has another one
 /// for the files of a deployment.
@@ -56,6 +57,8 @@ pub struct ServeOptions {
     pub vehicles: SocketAddr,
     /// Address for vehicles as enrolments state it, `HOST:PORT`; without one, `vehicles`.
     pub name: Option<String>,
+    /// Days for which records are kept at least; 0 is without an end.
+    pub keep_records_days: u32,
     /// Permission to serve people, without TLS, at an address that other machines can reach.
     pub is_insecure: bool,
     /// True if a proxy on this machine sends the requests of people, with their addresses.
@@ -74,6 +77,7 @@ impl ServeOptions {
             people: any,
             vehicles: any,
             name: None,
+            keep_records_days: 30,
             is_insecure: false,
             is_behind_proxy: false,
         }
@@ -159,6 +163,7 @@ impl CloudServer {
             store,
             objects: Objects::new(place(folder.objects(), "objects/")?),
             clips: Arc::new(ClipFiles::new(place(folder.clips(), "clips/")?, ClipBounds::DEFAULT)),
+            chunks: ChunkFiles::new(place(folder.records(), "records/")?),
             hub: Hub::new(bus),
             authorities,
             wrong_secrets: WrongSecrets::default(),
@@ -168,6 +173,7 @@ impl CloudServer {
             page_readers: Arc::default(),
             stored_frames: Semaphore::new(STORED_FRAMES_MAX),
             retention: Retention::DEFAULT,
+            keep_records_days: options.keep_records_days,
             address,
         });
         let (stop, stopped) = watch::channel(false);
@@ -206,6 +212,8 @@ impl CloudServer {
         chores.spawn(async move { clips::clean(&working).await });
         let working = Arc::clone(&cloud);
         chores.spawn(async move { objects::collect(&working).await });
+        let working = Arc::clone(&cloud);
+        chores.spawn(async move { records::keep(&working).await });
         let working = Arc::clone(&cloud);
         chores.spawn(async move {
             let mut ticks = ticks(SEEN_INTERVAL);

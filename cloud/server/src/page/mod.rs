@@ -25,6 +25,7 @@ mod login;
 mod password;
 mod recording;
 mod records;
+mod search;
 mod session;
 mod status;
 mod stream;

@@ -10,6 +10,7 @@ use serde::Deserialize;
 use super::clips;
 use super::layout::{self, PageResult, empty};
 use super::line::{line, time_ns};
+use super::search::SearchPart;
 use super::session::PageUser;
 use super::text::{query, segment, shown, vehicle_path};
 use super::vehicle::find;
@@ -37,6 +38,8 @@ pub(super) struct RecordSource {
 #[derive(Debug, Deserialize)]
 pub(super) struct RecordPart {
     before: Option<i64>,
+    #[serde(flatten)]
+    search: SearchPart,
 }
 
 impl RecordSource {
@@ -47,17 +50,16 @@ impl RecordSource {
         range: (i64, i64),
         most: usize,
     ) -> CloudResult<NewestRecords> {
-        let store = &cloud.store;
         let Some(lambda) = &self.lambda else {
-            let streams = store.streams(&self.vehicle).await?;
-            let mut newest = store.newest(&self.vehicle, &streams, range, READ).await?;
+            let streams = cloud.store.streams(&self.vehicle).await?;
+            let mut newest = cloud.newest(&self.vehicle, &streams, range, READ).await?;
             newest.lines.retain(|(_, line)| super::line::is_of_time_line(line));
             newest.has_more |= newest.lines.len() > most;
             newest.lines.truncate(most);
             return Ok(newest);
         };
         let stream = [format!("lambdas/{lambda}")];
-        store.newest(&self.vehicle, &stream, range, most).await
+        cloud.newest(&self.vehicle, &stream, range, most).await
     }
 
     /// Renders a record.
@@ -81,7 +83,7 @@ pub(super) async fn time_line(
     Path(vehicle): Path<String>,
     Query(part): Query<RecordPart>,
 ) -> PageResult {
-    page(&cloud, &user, RecordSource { vehicle, lambda: None }, part.before).await
+    page(&cloud, &user, RecordSource { vehicle, lambda: None }, &part).await
 }
 
 pub(super) async fn lambda(
@@ -90,18 +92,34 @@ pub(super) async fn lambda(
     Path((vehicle, id)): Path<(String, String)>,
     Query(part): Query<RecordPart>,
 ) -> PageResult {
-    page(&cloud, &user, RecordSource { vehicle, lambda: Some(id) }, part.before).await
+    page(&cloud, &user, RecordSource { vehicle, lambda: Some(id) }, &part).await
 }
 
 async fn page(
     cloud: &Cloud,
     user: &PageUser,
     source: RecordSource,
-    before: Option<i64>,
+    part: &RecordPart,
 ) -> PageResult {
     let vehicle = find(cloud, &source.vehicle).await?;
     // Reading takes memory.
     let _slot = cloud.page_readers.open(&user.user.name)?;
+    let RecordPart { before, search } = part;
+    if search.is_search() {
+        let here = source.path();
+        let title = source.lambda.as_deref().map_or("Time line".to_owned(), shown);
+        let title = format!("Search in {title} of {}", shown(&vehicle.name));
+        let body = html! {
+            nav.crumbs aria-label="Path" {
+                a href="/vehicles" { "Fleet" } " / "
+                a href=(vehicle_path(&vehicle.name)) { (shown(&vehicle.name)) }
+            }
+            h1 { (title) }
+            (search.form(&here))
+            (search.found(cloud, &source, &here).await?)
+        };
+        return Ok(layout::page(&title, "/vehicles", Some(user), body));
+    }
     let newest = source.newest(cloud, (0, before.unwrap_or(i64::MAX)), SIZE).await?;
     let clips = match source.lambda {
         None => clips_of(cloud, &source.vehicle, before.is_some(), &newest).await?,
@@ -130,6 +148,7 @@ async fn page(
         } @else {
             p.help { "Log lines, triggers, starts and ends, the newest first; times are in UTC." }
         }
+        (search.form(&here))
         @if before.is_none() {
             (followed(&source, &here, &newest))
         } @else {

@@ -437,6 +437,22 @@ async fn the_audit_trail_and_records_are_listed_in_parts() {
     assert!(newest.has("stream?after=250") && newest.has("?before=151"));
     let oldest = admin.get(&format!("{page}?before=51")).await;
     assert!(oldest.has("line 50.") && oldest.has("line 1.") && !oldest.has(">Older"));
+
+    let stream = "INSERT INTO streams (vehicle, stream, life, next, seq, boot, boot_ns)
+                  VALUES ('car-1', 'lambdas/a', 1, 251, 250, 'b', 1)";
+    cloud.store.execute(stream).await;
+    let found = admin.get(&format!("{page}?text=LINE+7&level=info")).await;
+    assert!(found.has("line 79.") && found.has("line 7.") && !found.has("line 8."));
+    let found = admin.get(&format!("{page}?text=line")).await;
+    assert!(found.has("line 151.") && !found.has("line 150."));
+    let (_, older) =
+        found.text.split_once("href=\"/vehicles/car-1/lambdas/a?text=line&amp;").unwrap();
+    let older = older.split_once('"').unwrap().0;
+    let found = admin.get(&format!("{page}?text=line&{older}")).await;
+    assert!(found.has("line 150.") && !found.has("line 151."));
+    assert!(admin.get("/vehicles/car-1/events?level=warn").await.has("No record fits."));
+    let refused = admin.get(&format!("{page}?text=x&after=y")).await;
+    assert_eq!(refused.status, StatusCode::BAD_REQUEST);
 }
 
 #[tokio::test]

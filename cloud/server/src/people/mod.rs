@@ -11,6 +11,7 @@ mod endpoint;
 mod lists;
 mod openapi;
 mod records;
+mod search;
 #[cfg(test)]
 pub(crate) mod tests;
 mod tokens;
@@ -31,6 +32,7 @@ use gleaner_fleet::people::{
     AuditEntry, FleetDeployRequest, FleetDeployment, Invitation, ListPage, Login, NewToken,
     NewUser, NewVehicle, Role, TokenSummary, User, UserToken, VehicleSummary,
 };
+use gleaner_fleet::records::FoundRecords;
 use gleaner_fleet::waves::WaveState;
 use gleaner_protocol::vehicle_api::{DeployReply, StreamLine, VehicleStatus};
 use serde_json::{Map, Value};
@@ -40,6 +42,7 @@ use crate::clips::people as clips;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult, as_problem, is_api};
 use crate::page;
+use crate::records::RecordSearch;
 use crate::request::{ListQuery, in_time, parsed};
 use crate::store::{ChangeAuthor, ClipQuery, TokenUser};
 
@@ -154,6 +157,9 @@ pub(crate) fn endpoints() -> Vec<Endpoint> {
         .query::<RecordQuery>()
         .headers(RESUMES)
         .gives_lines::<StreamLine>(),
+        read("/v1/records", Viewer, "Searches records of all vehicles", get(search::records))
+            .query::<RecordSearch>()
+            .gives::<FoundRecords>(),
         put(
             "/v1/objects/{sha256}",
             Deployer,

@@ -19,7 +19,7 @@ use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::readers::{ReaderSlot, ReaderToken};
 
-/// Number of lines in a piece.
+/// Number of lines in a piece that has none of chunks.
 const PIECE: i64 = 256;
 
 /// Time without a record after which a sign of life is sent among events.
@@ -108,14 +108,14 @@ async fn lines(
         (Some(position), _) => {
             let position = position?;
             // What was removed is news unless a record before the position is still kept.
-            let oldest = cloud.store.page(&vehicle, names, from, 0, 1).await?.arrival;
-            if oldest <= position {
+            let oldest = cloud.store.oldest_arrival(&vehicle, names, from).await?;
+            if oldest.is_some_and(|oldest| oldest <= position) {
                 first.clear();
             }
             position
         }
         (None, Some(last)) => {
-            let arrival = cloud.store.arrival_before(&vehicle, names, last).await?;
+            let arrival = cloud.arrival_before(&vehicle, names, last).await?;
             if arrival > 0 {
                 first.clear();
             }
@@ -154,8 +154,8 @@ impl RecordReader {
             }
             let mut lines = std::mem::take(&mut self.first);
             let names = self.streams.each_ref().map(|name| &**name);
-            let store = &self.cloud.store;
-            let page = store.page(&self.vehicle, names, self.from, self.arrival, PIECE).await;
+            let (from, after) = (self.from, self.arrival);
+            let page = self.cloud.record_page(&self.vehicle, names, from, after, PIECE).await;
             let page = page.map_err(failed)?;
             self.arrival = page.arrival;
             lines.extend(page.lines);

@@ -15,6 +15,7 @@ use crate::folder::DataFolder;
 use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::place::FilePlace;
+use crate::records::ChunkFiles;
 use crate::store::{ClipBounds, CloudStore, Retention};
 use serde_json::{Value, json};
 
@@ -27,6 +28,7 @@ pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
         store: CloudStore::of_test(folder).await,
         objects: Objects::new(FilePlace::open(data.objects(), None, "").unwrap()),
         clips: Arc::new(ClipFiles::new(clips, ClipBounds::DEFAULT)),
+        chunks: ChunkFiles::new(FilePlace::open(data.records(), None, "").unwrap()),
         hub: Hub::default(),
         authorities: Authorities::open(&data).unwrap(),
         wrong_secrets: WrongSecrets::default(),
@@ -36,6 +38,7 @@ pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
         page_readers: Arc::default(),
         stored_frames: Semaphore::new(4),
         retention: Retention::DEFAULT,
+        keep_records_days: 30,
         address: "127.0.0.1:8443".to_owned(),
     })
 }

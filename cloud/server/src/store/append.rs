@@ -412,6 +412,11 @@ impl StoreChange<'_> {
             if records <= 0 && bytes <= 0 {
                 return Ok(());
             }
+            // The oldest are in chunks, of which each goes as a whole.
+            if let Some(chunk) = self.remove_oldest_chunk((name, stream), i64::MAX).await? {
+                (records, bytes) = (records - chunk.0, bytes - chunk.1);
+                continue;
+            }
             let oldest: Vec<(i64, i64, i64)> = rows!(&mut *self.tx;
                 "SELECT arrival, seq, bytes FROM records WHERE vehicle = $1 AND stream = $2
                  ORDER BY arrival LIMIT $3";
@@ -430,14 +435,26 @@ impl StoreChange<'_> {
             if removed == 0 {
                 return Ok(());
             }
-            run!(&mut *self.tx;
-                "DELETE FROM records WHERE vehicle = $1 AND stream = $2 AND arrival <= $3";
-                name, stream, last.0);
-            run!(&mut *self.tx;
-                "UPDATE streams SET kept = kept - $3, kept_bytes = kept_bytes - $4,
-                 removed = removed + $3, removed_to = $5
-                 WHERE vehicle = $1 AND stream = $2";
-                name, stream, removed, removed_bytes, last.1);
+            self.remove_rows((name, stream), last.0, (removed, removed_bytes, last.1)).await?;
         }
+    }
+
+    /// Removes the rows of a stream up to an arrival, and counts them: their number, their bytes,
+    /// and the number of the last record.
+    pub(super) async fn remove_rows(
+        &mut self,
+        (vehicle, stream): StreamKey<'_>,
+        to: i64,
+        (records, bytes, seq): (i64, i64, i64),
+    ) -> CloudResult<()> {
+        run!(&mut *self.tx;
+            "DELETE FROM records WHERE vehicle = $1 AND stream = $2 AND arrival <= $3";
+            vehicle, stream, to);
+        run!(&mut *self.tx;
+            "UPDATE streams SET kept = kept - $3, kept_bytes = kept_bytes - $4,
+             removed = removed + $3, removed_to = $5
+             WHERE vehicle = $1 AND stream = $2";
+            vehicle, stream, records, bytes, seq);
+        Ok(())
     }
 }

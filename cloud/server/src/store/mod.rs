@@ -36,6 +36,7 @@ mod address;
 mod append;
 mod audit;
 mod awaited;
+mod chunks;
 mod cleaning;
 mod clip_list;
 mod clips;
@@ -43,12 +44,13 @@ mod deployments;
 mod links;
 mod lookups;
 mod page;
+mod record_age;
 mod records;
 mod replicas;
 mod requests;
 mod secrets;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod tokens;
 mod users;
 mod vehicles;
@@ -69,13 +71,14 @@ use self::writer::WriteQueue;
 use crate::error::{CloudError, CloudResult};
 
 pub(crate) use address::StoreAddress;
+pub(crate) use chunks::{ChunkSizes, KeptLine, StoredChunk};
 pub(crate) use cleaning::RemovedClip;
 pub(crate) use clip_list::ClipQuery;
 pub(crate) use clips::{ClipBounds, ClipProgress};
 pub(crate) use deployments::OfferedDeployment;
 pub(crate) use links::VehicleReport;
-pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
-pub(crate) use records::{Retention, StreamBatch, name_in_lines};
+pub(crate) use page::{LINE_MAX, NewestRecords, VehicleFilter, VehiclePage, large_line};
+pub(crate) use records::{RecordPage, Retention, StreamBatch, name_in_lines};
 pub(crate) use replicas::OwnLink;
 pub(crate) use requests::{ChangeAuthor, RequestKey};
 #[cfg(test)]
@@ -94,7 +97,8 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0007_requests.sql"),
     include_str!("../../migrations/0008_cleaning.sql"),
     include_str!("../../migrations/0009_tokens.sql"),
-    include_str!("../../migrations/0015_clip_parts.sql"),
+    include_str!("../../migrations/0010_chunks.sql"),
+    include_str!("../../migrations/0012_clip_parts.sql"),
 ];
 
 /// Maximum number of queries at a time: with more threads than cores, each only takes longer.

@@ -10,9 +10,12 @@ use super::{CloudStore, int, name_in_lines, unsigned};
 use crate::error::CloudResult;
 
 /// Longest line that is shown, in bytes: a page has a thousand at most.
-const LINE_MAX: i64 = 4096;
+pub(crate) const LINE_MAX: i64 = 4096;
 /// Maximum number of streams of a vehicle in one time line.
 const STREAMS_MAX: usize = 64;
+
+/// Number of vehicles that a search looks at, at a time.
+const VEHICLES_AT_ONCE: i64 = 100;
 
 /// Choice of vehicles.
 #[derive(Debug, Default)]
@@ -117,52 +120,48 @@ impl CloudStore {
             deployment, int(release), FAILED, most))
     }
 
-    /// Returns the names of the streams of a vehicle: at most as many as one time line shows.
-    pub(crate) async fn streams(&self, vehicle: &str) -> CloudResult<Vec<String>> {
+    /// Returns vehicles by name after this one, or from it on, and whether the filter chooses each
+    /// by its name and its labels: some at a time.
+    pub(crate) async fn vehicles_from(
+        &self,
+        filter: &VehicleFilter,
+        name: &str,
+        is_included: bool,
+    ) -> CloudResult<Vec<(String, bool)>> {
+        let rows: Vec<(String, String)> = rows!(&self.pool;
+            "SELECT name, labels FROM vehicles
+             WHERE (name > $1 OR (name = $1 AND $2 = 1)) AND ($3 = '' OR name = $3)
+             ORDER BY name LIMIT $4";
+            name, i64::from(is_included), &filter.only, VEHICLES_AT_ONCE);
+        let chosen = |(name, labels): (String, String)| {
+            let is_chosen = filter.has(&labels);
+            (name, is_chosen)
+        };
+        Ok(rows.into_iter().map(chosen).collect())
+    }
+
+    /// Returns names of streams of a vehicle from `first` on: at most `most`.
+    pub(crate) async fn streams_from(
+        &self,
+        vehicle: &str,
+        first: &str,
+        most: usize,
+    ) -> CloudResult<Vec<String>> {
         let rows: Vec<(String,)> = rows!(&self.pool;
-            "SELECT stream FROM streams WHERE vehicle = $1 ORDER BY stream LIMIT $2";
-            vehicle, int(STREAMS_MAX as u64));
+            "SELECT stream FROM streams WHERE vehicle = $1 AND stream >= $2
+             ORDER BY stream LIMIT $3";
+            vehicle, first, int(most as u64));
         Ok(rows.into_iter().map(|(stream,)| stream).collect())
     }
 
-    /// Returns the newest records of these streams whose arrivals are after `after` and before
-    /// `before`: at most `most`.
-    pub(crate) async fn newest(
-        &self,
-        vehicle: &str,
-        streams: &[String],
-        (after, before): (i64, i64),
-        most: usize,
-    ) -> CloudResult<NewestRecords> {
-        // First the end: what arrives between the queries of two streams comes next time.
-        let arrived: Option<(i64,)> =
-            row!(&self.pool; "SELECT arrived FROM vehicles WHERE name = $1"; vehicle);
-        let position = arrived.map_or(0, |(arrived,)| arrived).min(before.saturating_sub(1));
-        let mut lines: Vec<(i64, String)> = Vec::new();
-        for stream in streams {
-            let rows: Vec<(i64, String, i64)> = rows!(&self.pool;
-                "SELECT arrival, CASE WHEN bytes > $6 THEN '' ELSE line END, bytes FROM records
-                 WHERE vehicle = $1 AND stream = $2 AND arrival > $3 AND arrival <= $4
-                 ORDER BY arrival DESC LIMIT $5";
-                vehicle, stream, after, position, int(most as u64 + 1), LINE_MAX);
-            let line = |(arrival, line, bytes): (i64, String, i64)| match line.is_empty() {
-                true => (arrival, large(stream, bytes)),
-                false => (arrival, line),
-            };
-            lines.extend(rows.into_iter().map(line));
-            // Of many streams, no more are kept than of one.
-            lines.sort_unstable_by_key(|(arrival, _)| std::cmp::Reverse(*arrival));
-            lines.truncate(most + 1);
-        }
-        let has_more = lines.len() > most;
-        lines.truncate(most);
-        let oldest_read = lines.last().map_or(position, |(arrival, _)| *arrival);
-        Ok(NewestRecords { lines, position: position.max(after), oldest_read, has_more })
+    /// Returns the names of the streams of a vehicle: at most as many as one time line shows.
+    pub(crate) async fn streams(&self, vehicle: &str) -> CloudResult<Vec<String>> {
+        self.streams_from(vehicle, "", STREAMS_MAX).await
     }
 }
 
 /// Returns the line of a record that is too long to show.
-fn large(stream: &str, bytes: i64) -> String {
+pub(crate) fn large_line(stream: &str, bytes: u64) -> String {
     let text = format!("a record of {bytes} bytes is not shown here: `gleaner logs` has it");
     let line = StreamLine {
         stream: name_in_lines(stream).to_owned(),
@@ -178,7 +177,7 @@ fn large(stream: &str, bytes: i64) -> String {
 
 impl VehicleFilter {
     /// Returns whether these labels, as JSON without spaces, have the one that is asked for.
-    fn has(&self, labels: &str) -> bool {
+    pub(super) fn has(&self, labels: &str) -> bool {
         let Some((name, value)) = &self.label else { return true };
         let label = match value.is_empty() {
             true => format!("{}:", json(name)),

@@ -5,10 +5,11 @@ use gleaner_protocol::vehicle_api::StreamLine;
 use serde_json::json;
 
 use super::vehicles::unknown;
-use super::{CloudStore, int};
+use super::{CloudStore, int, unsigned};
 use crate::error::CloudResult;
 
-/// Bounds of what is kept of each stream of each vehicle, and of all of them.
+/// Bounds of what is kept of each stream of each vehicle, and of all of them. Of records in chunks,
+/// the bytes are those of the files.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Retention {
     pub(crate) records: u64,
@@ -20,7 +21,7 @@ pub(crate) struct Retention {
 impl Retention {
     /// The bounds of the program.
     pub(crate) const DEFAULT: Retention =
-        Retention { records: 100_000, bytes: 64 << 20, vehicle_bytes: 512 << 20 };
+        Retention { records: 1_000_000, bytes: 64 << 20, vehicle_bytes: 512 << 20 };
 }
 
 /// Records of a stream that a vehicle has sent.
@@ -41,38 +42,61 @@ pub(crate) struct RecordPage {
 }
 
 impl CloudStore {
-    /// Returns the arrival before the `last` newest records of two streams, which may be the same;
-    /// 0 if there are not more.
-    pub(crate) async fn arrival_before(
-        &self,
-        vehicle: &str,
-        streams: [&str; 2],
-        last: usize,
-    ) -> CloudResult<i64> {
-        let row: Option<(i64,)> = row!(&self.pool;
-            "SELECT arrival FROM records WHERE vehicle = $1 AND stream IN ($2, $3)
-             ORDER BY arrival DESC LIMIT 1 OFFSET $4";
-            vehicle, streams[0], streams[1], int(last as u64));
-        Ok(row.map_or(0, |(arrival,)| arrival))
+    /// Checks that there is such a vehicle.
+    pub(crate) async fn vehicle_exists(&self, vehicle: &str) -> CloudResult<()> {
+        let exists: Option<(String,)> =
+            row!(&self.pool; "SELECT name FROM vehicles WHERE name = $1"; vehicle);
+        exists.map(drop).ok_or_else(|| unknown(vehicle))
     }
 
-    /// Returns at most `most` records of two streams, which may be the same, that have arrived
-    /// after `after` and have the number `from` or a later one.
-    pub(crate) async fn page(
+    /// Returns the number of the last arrival of a vehicle: all up to it are visible.
+    pub(crate) async fn arrived(&self, vehicle: &str) -> CloudResult<i64> {
+        let row: Option<(i64,)> =
+            row!(&self.pool; "SELECT arrived FROM vehicles WHERE name = $1"; vehicle);
+        Ok(row.map_or(0, |(arrived,)| arrived))
+    }
+
+    /// Returns the number of records of two streams, which may be the same, in rows and in chunks.
+    pub(crate) async fn kept(&self, vehicle: &str, streams: [&str; 2]) -> CloudResult<u64> {
+        let (kept,): (i64,) = one!(&self.pool;
+            "SELECT CAST(COALESCE(SUM(kept), 0) AS BIGINT) FROM streams
+             WHERE vehicle = $1 AND stream IN ($2, $3)";
+            vehicle, streams[0], streams[1]);
+        Ok(unsigned(kept))
+    }
+
+    /// Returns the arrival of the oldest record of two streams, which may be the same, that has the
+    /// number `from` or a later one; of a chunk, that of its first record.
+    pub(crate) async fn oldest_arrival(
         &self,
         vehicle: &str,
         streams: [&str; 2],
         from: u64,
-        after: i64,
+    ) -> CloudResult<Option<i64>> {
+        let (oldest,): (Option<i64>,) = one!(&self.pool;
+            "SELECT MIN(first) FROM (
+             SELECT MIN(first_arrival) AS first FROM chunks
+             WHERE vehicle = $1 AND stream IN ($2, $3) AND last_seq >= $4
+             UNION ALL SELECT MIN(arrival) AS first FROM records
+             WHERE vehicle = $1 AND stream IN ($2, $3) AND seq >= $4) AS ends";
+            vehicle, streams[0], streams[1], int(from));
+        Ok(oldest)
+    }
+
+    /// Returns at most `most` rows of two streams, which may be the same, that have arrived after
+    /// `after` and have the number `from` or a later one.
+    pub(crate) async fn rows_after(
+        &self,
+        vehicle: &str,
+        streams: [&str; 2],
+        (after, from): (i64, u64),
         most: i64,
-    ) -> CloudResult<RecordPage> {
-        let rows: Vec<(i64, String)> = rows!(&self.pool;
+    ) -> CloudResult<Vec<(i64, String)>> {
+        Ok(rows!(&self.pool;
             "SELECT arrival, line FROM records
              WHERE vehicle = $1 AND stream IN ($2, $3) AND arrival > $4 AND seq >= $5
              ORDER BY arrival LIMIT $6";
-            vehicle, streams[0], streams[1], after, int(from), most);
-        let arrival = rows.last().map_or(after, |(arrival, _)| *arrival);
-        Ok(RecordPage { lines: rows.into_iter().map(|(_, line)| line).collect(), arrival })
+            vehicle, streams[0], streams[1], after, int(from), most))
     }
 
     /// Returns a line for each of two streams, which may be the same, of which records with the
@@ -87,9 +111,7 @@ impl CloudStore {
         streams: [&str; 2],
         from: u64,
     ) -> CloudResult<Vec<String>> {
-        let exists: Option<(String,)> =
-            row!(&self.pool; "SELECT name FROM vehicles WHERE name = $1"; vehicle);
-        exists.ok_or_else(|| unknown(vehicle))?;
+        self.vehicle_exists(vehicle).await?;
         let rows: Vec<(String, i64, i64)> = rows!(&self.pool;
             "SELECT stream, removed, removed_to FROM streams
              WHERE vehicle = $1 AND stream IN ($2, $3) AND removed > 0 AND removed_to >= $4";

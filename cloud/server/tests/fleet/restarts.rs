@@ -11,8 +11,9 @@ use hyper::Method;
 use rustix::process::Pid;
 use serde_json::Value;
 use tempfile::TempDir;
+use tokio::time::{Duration, sleep};
 
-use crate::fake::{Person, cursor_after};
+use crate::fake::{Person, cursor_after, soon};
 use crate::{deploy, options, postgres, reported, signed, start};
 
 #[tokio::test]
@@ -47,6 +48,38 @@ async fn a_restart_keeps_everything() {
     assert_eq!((welcome.epoch, welcome.cursors), (2, vec![cursor_after(2)]));
     assert_eq!(desired.generation, before.generation + 1, "unchanged by the restart");
     assert_eq!(desired.deployments[0].envelope, envelope);
+    server.stop().await;
+}
+
+#[tokio::test]
+async fn many_records_move_into_files_and_are_read_and_found_as_before() {
+    let folder = TempDir::new().unwrap();
+    let (server, admin) = start(&folder).await;
+    let (vehicle, _) = admin.enrol("car-7").await;
+    let mut link = vehicle.connect().await.0;
+    for part in 0..5 {
+        link.record(part * 4000..(part + 1) * 4000).await;
+    }
+    let events = "/v1/vehicles/car-7/events";
+    let expected = admin.lines(events).await;
+    assert_eq!(expected.len(), 20_000);
+    server.stop().await;
+
+    // The next process looks for such records at once.
+    let server = CloudServer::start(&options(folder.path()).await).await.unwrap();
+    let admin = admin.at(server.people);
+    let files = || folder.path().join("data/records").read_dir().unwrap().count();
+    soon(async {
+        while files() == 0 {
+            sleep(Duration::from_millis(50)).await;
+        }
+    })
+    .await;
+    assert_eq!(admin.lines(events).await, expected);
+    let last = format!("{events}?last=19000");
+    assert_eq!(admin.lines(&last).await, expected[1000..]);
+    let found = admin.call(Method::GET, "/v1/records?vehicle=car-7&limit=2", Value::Null).await;
+    assert_eq!(found["items"][0]["line"]["seq"], 19_999);
     server.stop().await;
 }
 

@@ -1,0 +1,83 @@
+//! Moves old records into chunks, and removes those that are too old.
+
+use std::time::Duration;
+
+use gleaner_base::{Exit, Failure};
+use tokio::time::interval;
+
+use super::chunk;
+use crate::cloud::Cloud;
+use crate::error::CloudResult;
+use crate::place::blocking;
+use crate::store::ChunkSizes;
+
+/// Interval of looks for records to move or to remove.
+const LOOKS: Duration = Duration::from_secs(60);
+/// Time within which a chunk is made. Its file is removed afterwards, if it was not.
+const GRACE_S: i64 = 3600;
+
+/// Moves records into chunks and removes old ones, for as long as the program runs.
+pub(crate) async fn keep(cloud: &Cloud) {
+    let mut looks = interval(LOOKS);
+    loop {
+        looks.tick().await;
+        if let Err(error) = pack(cloud, ChunkSizes::DEFAULT).await {
+            tracing::warn!(reason = error.reason(), "old records stay in the database for now");
+        }
+        if let Err(error) = remove_old(cloud, GRACE_S).await {
+            tracing::warn!(reason = error.reason(), "old records are not removed");
+        }
+    }
+}
+
+/// Moves the oldest records of each stream that has many into chunks; returns their number.
+pub(super) async fn pack(cloud: &Cloud, sizes: ChunkSizes) -> CloudResult<u64> {
+    let mut made = 0;
+    for (vehicle, stream) in cloud.store.packable(sizes).await? {
+        while pack_stream(cloud, (&vehicle, &stream), sizes).await? {
+            made += 1;
+        }
+    }
+    if made > 0 {
+        tracing::debug!(chunks = made, "old records were moved into chunks");
+    }
+    Ok(made)
+}
+
+/// Moves the oldest records of a stream into a chunk. Returns false if there are not enough, or
+/// another process has moved them meanwhile.
+async fn pack_stream(cloud: &Cloud, of: (&str, &str), sizes: ChunkSizes) -> CloudResult<bool> {
+    let lines = cloud.store.oldest_lines(of, sizes).await?;
+    if lines.is_empty() {
+        return Ok(false);
+    }
+    let failed = |error| {
+        let action = format!("cannot store a chunk of `{}` of vehicle `{}`", of.1, of.0);
+        Failure::caused_by(Exit::Internal, action, &error)
+    };
+    let names = (of.0.to_owned(), of.1.to_owned());
+    let encode = move || chunk::encode((&names.0, &names.1), &lines);
+    let (chunk, file) = blocking(encode).await.map_err(failed)?;
+    cloud.store.note_chunk_file(&chunk.sha256).await?;
+    cloud.chunks.keep(&chunk.sha256, file).await.map_err(failed)?;
+    cloud.store.pack(of, &chunk).await
+}
+
+/// Removes records that are too old, and the files of all chunks that are not needed.
+pub(super) async fn remove_old(cloud: &Cloud, grace_s: i64) -> CloudResult<()> {
+    if cloud.keep_records_days > 0 {
+        cloud.store.note_arrivals().await?;
+        while cloud.store.expire_records(cloud.keep_records_days).await? {}
+    }
+    let mut removed = Vec::new();
+    for sha256 in cloud.store.unneeded_chunk_files(grace_s).await? {
+        match cloud.chunks.remove(&sha256).await {
+            Ok(()) => removed.push(sha256),
+            Err(error) => tracing::warn!(sha256, %error, "a file of a chunk is tried again later"),
+        }
+    }
+    if removed.is_empty() {
+        return Ok(());
+    }
+    cloud.store.forget_chunk_files(&removed).await
+}

@@ -1,0 +1,287 @@
+//! The index of chunks: files with many records of a stream, which follow one another. A stream has
+//! its oldest records in chunks, and the newest in rows.
+//!
+//! The file of a chunk is noted before it is stored, and the note is removed by the transaction
+//! that moves the records. Whatever is interrupted leaves a noted file, which is removed later.
+
+use super::{CloudStore, StoreChange, int, now, unsigned};
+use crate::error::CloudResult;
+
+/// Maximum number of records in a chunk.
+const CHUNK_RECORDS: i64 = 8192;
+/// Number of streams that are packed, and of files that are removed, at a time.
+const AT_ONCE: i64 = 500;
+
+/// A record as it is kept.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct KeptLine {
+    pub(crate) arrival: i64,
+    pub(crate) life: u64,
+    pub(crate) seq: u64,
+    pub(crate) line: String,
+}
+
+/// A chunk, as the index has it.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct StoredChunk {
+    pub(crate) first_arrival: i64,
+    pub(crate) last_arrival: i64,
+    pub(crate) first_seq: u64,
+    pub(crate) last_seq: u64,
+    /// Times of its records, in ns since 1970; 0 if none has one.
+    pub(crate) first_time: i64,
+    pub(crate) last_time: i64,
+    /// The highest level of its records.
+    pub(crate) level: i64,
+    pub(crate) records: u64,
+    /// Bytes of its lines, and of its file.
+    pub(crate) bytes: u64,
+    pub(crate) stored_bytes: u64,
+    pub(crate) sha256: String,
+}
+
+/// Sizes of the chunks that are made.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ChunkSizes {
+    /// Bytes of lines in a chunk.
+    pub(crate) chunk: i64,
+    /// Bytes of the newest lines that stay in rows.
+    pub(crate) rows: i64,
+}
+
+impl ChunkSizes {
+    /// The sizes of the program.
+    pub(crate) const DEFAULT: ChunkSizes = ChunkSizes { chunk: 1 << 20, rows: 256 << 10 };
+}
+
+type ChunkRow = (i64, i64, i64, i64, i64, i64, i64, i64, i64, i64, String);
+
+/// The columns of a chunk.
+macro_rules! select {
+    ($rest:literal) => {
+        concat!(
+            "SELECT first_arrival, last_arrival, first_seq, last_seq, first_time, last_time, \
+             level, records, bytes, stored_bytes, sha256 FROM chunks ",
+            $rest
+        )
+    };
+}
+
+impl CloudStore {
+    /// Returns streams, with their vehicles, that have enough records in rows for a chunk.
+    pub(crate) async fn packable(&self, sizes: ChunkSizes) -> CloudResult<Vec<(String, String)>> {
+        Ok(rows!(&self.pool;
+            "SELECT vehicle, stream FROM streams WHERE kept_bytes - packed_bytes >= $1
+             ORDER BY kept_bytes - packed_bytes DESC LIMIT $2";
+            sizes.chunk + sizes.rows, AT_ONCE))
+    }
+
+    /// Returns the oldest records of a stream in rows, enough for a chunk; none if there are not.
+    pub(crate) async fn oldest_lines(
+        &self,
+        (vehicle, stream): (&str, &str),
+        sizes: ChunkSizes,
+    ) -> CloudResult<Vec<KeptLine>> {
+        let row: Option<(i64,)> = row!(&self.pool;
+            "SELECT kept_bytes - packed_bytes FROM streams WHERE vehicle = $1 AND stream = $2";
+            vehicle, stream);
+        let bytes = row.map_or(0, |(bytes,)| bytes);
+        if bytes < sizes.chunk + sizes.rows {
+            return Ok(Vec::new());
+        }
+        let lengths: Vec<(i64, i64)> = rows!(&self.pool;
+            "SELECT arrival, bytes FROM records WHERE vehicle = $1 AND stream = $2
+             ORDER BY arrival LIMIT $3";
+            vehicle, stream, CHUNK_RECORDS);
+        let (mut taken, mut last) = (0, None);
+        for (arrival, length) in lengths {
+            // One that is longer than a chunk has one of its own.
+            let is_full = taken > 0 && taken + length > sizes.chunk;
+            if is_full || bytes - taken - length < sizes.rows {
+                break;
+            }
+            (taken, last) = (taken + length, Some(arrival));
+        }
+        let Some(last) = last else { return Ok(Vec::new()) };
+        let rows: Vec<(i64, i64, i64, String)> = rows!(&self.pool;
+            "SELECT arrival, life, seq, line FROM records
+             WHERE vehicle = $1 AND stream = $2 AND arrival <= $3 ORDER BY arrival";
+            vehicle, stream, last);
+        Ok(rows.into_iter().map(kept).collect())
+    }
+
+    /// Notes the file of a chunk that is about to be stored.
+    pub(crate) async fn note_chunk_file(&self, sha256: &str) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        run!(&mut *change.tx; "INSERT INTO chunk_files (sha256, since) VALUES ($1, $2)";
+            sha256, now());
+        change.commit().await
+    }
+
+    /// Replaces the records of a chunk, whose file is stored and noted, by its entry in the index.
+    /// Returns false, and changes nothing, if they are not all in rows any more, or the file may
+    /// have been removed.
+    pub(crate) async fn pack(
+        &self,
+        (vehicle, stream): (&str, &str),
+        chunk: &StoredChunk,
+    ) -> CloudResult<bool> {
+        let StoredChunk { first_arrival, last_arrival, records, bytes, stored_bytes, .. } = chunk;
+        let mut change = self.change().await?;
+        let noted = run!(&mut *change.tx;
+            "DELETE FROM chunk_files WHERE sha256 = $1 AND since > 0"; &chunk.sha256);
+        let moved = run!(&mut *change.tx;
+            "DELETE FROM records WHERE vehicle = $1 AND stream = $2 AND arrival >= $3
+             AND arrival <= $4";
+            vehicle, stream, first_arrival, last_arrival);
+        if noted.rows_affected() != 1 || moved.rows_affected() != *records {
+            return Ok(false);
+        }
+        run!(&mut *change.tx;
+            "INSERT INTO chunks (vehicle, stream, first_arrival, last_arrival, first_seq, last_seq,
+             first_time, last_time, level, records, bytes, stored_bytes, sha256)
+             VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13)";
+            vehicle, stream, first_arrival, last_arrival, int(chunk.first_seq),
+            int(chunk.last_seq), chunk.first_time, chunk.last_time, chunk.level, int(*records),
+            int(*bytes), int(*stored_bytes), &chunk.sha256);
+        run!(&mut *change.tx;
+            "UPDATE streams SET kept_bytes = kept_bytes - $3 + $4, packed = packed + $5,
+             packed_bytes = packed_bytes + $4 WHERE vehicle = $1 AND stream = $2";
+            vehicle, stream, int(*bytes), int(*stored_bytes), int(*records));
+        change.commit().await?;
+        Ok(true)
+    }
+
+    /// Returns the oldest chunk of a stream with a record after the arrival `after`, and one with
+    /// the number `from` or a later one.
+    pub(crate) async fn chunk_after(
+        &self,
+        (vehicle, stream): (&str, &str),
+        (after, from): (i64, u64),
+    ) -> CloudResult<Option<StoredChunk>> {
+        let row: Option<ChunkRow> = row!(&self.pool;
+            select!("WHERE vehicle = $1 AND stream = $2 AND last_arrival > $3 AND last_seq >= $4
+             ORDER BY last_arrival LIMIT 1");
+            vehicle, stream, after, int(from));
+        Ok(row.map(chunk))
+    }
+
+    /// Returns the newest chunk of a stream with a record between two arrivals, without both.
+    pub(crate) async fn chunk_before(
+        &self,
+        (vehicle, stream): (&str, &str),
+        (after, before): (i64, i64),
+    ) -> CloudResult<Option<StoredChunk>> {
+        let row: Option<ChunkRow> = row!(&self.pool;
+            select!("WHERE vehicle = $1 AND stream = $2 AND first_arrival < $3
+             AND last_arrival > $4 ORDER BY last_arrival DESC LIMIT 1");
+            vehicle, stream, before, after);
+        Ok(row.map(chunk))
+    }
+
+    /// Returns whether the index still has this chunk.
+    pub(crate) async fn has_chunk(
+        &self,
+        (vehicle, stream): (&str, &str),
+        chunk: &StoredChunk,
+    ) -> CloudResult<bool> {
+        let row: Option<(String,)> = row!(&self.pool;
+            "SELECT sha256 FROM chunks
+             WHERE vehicle = $1 AND stream = $2 AND last_arrival = $3 AND sha256 = $4";
+            vehicle, stream, chunk.last_arrival, &chunk.sha256);
+        Ok(row.is_some())
+    }
+
+    /// Returns at most `most` of the last rows of a stream between two arrivals, the newest first.
+    /// Of lines with more than `longest` bytes, the text is left out; the length of each comes
+    /// with it.
+    pub(crate) async fn rows_before(
+        &self,
+        (vehicle, stream): (&str, &str),
+        (after, before): (i64, i64),
+        (most, longest): (i64, i64),
+    ) -> CloudResult<Vec<(KeptLine, u64)>> {
+        let rows: Vec<(i64, i64, i64, String, i64)> = rows!(&self.pool;
+            "SELECT arrival, life, seq, CASE WHEN bytes > $5 THEN '' ELSE line END, bytes
+             FROM records WHERE vehicle = $1 AND stream = $2 AND arrival < $3
+             AND arrival > $6 ORDER BY arrival DESC LIMIT $4";
+            vehicle, stream, before, most, longest, after);
+        let row =
+            |(arrival, life, seq, line, bytes)| (kept((arrival, life, seq, line)), unsigned(bytes));
+        Ok(rows.into_iter().map(row).collect())
+    }
+
+    /// Returns files of chunks that no chunk needs: those to remove, and those whose chunk was not
+    /// made within `grace_s`, which then cannot be made any more.
+    pub(crate) async fn unneeded_chunk_files(&self, grace_s: i64) -> CloudResult<Vec<String>> {
+        let late = now() - grace_s;
+        let select = "SELECT sha256 FROM chunk_files WHERE since <= $1 ORDER BY since LIMIT $2";
+        let files: Vec<(String,)> = rows!(&self.pool; select; late, AT_ONCE);
+        if files.is_empty() {
+            return Ok(Vec::new());
+        }
+        let mut change = self.change().await?;
+        run!(&mut *change.tx; "UPDATE chunk_files SET since = 0 WHERE since <= $1"; late);
+        change.commit().await?;
+        let files: Vec<(String,)> = rows!(&self.pool; select; 0_i64, AT_ONCE);
+        Ok(files.into_iter().map(|(sha256,)| sha256).collect())
+    }
+
+    /// Forgets files of chunks that were removed.
+    pub(crate) async fn forget_chunk_files(&self, removed: &[String]) -> CloudResult<()> {
+        let mut change = self.change().await?;
+        change.run_in("DELETE FROM chunk_files WHERE sha256 IN", removed).await?;
+        change.commit().await
+    }
+}
+
+impl StoreChange<'_> {
+    /// Removes the oldest chunk of a stream that ends at the arrival `to` or before, and counts its
+    /// records as removed. Returns their number, and the bytes of its file.
+    pub(super) async fn remove_oldest_chunk(
+        &mut self,
+        (vehicle, stream): (&str, &str),
+        to: i64,
+    ) -> CloudResult<Option<(i64, i64)>> {
+        let row: Option<ChunkRow> = row!(&mut *self.tx;
+            select!("WHERE vehicle = $1 AND stream = $2 AND last_arrival <= $3
+             ORDER BY last_arrival LIMIT 1");
+            vehicle, stream, to);
+        let Some(chunk) = row.map(chunk) else { return Ok(None) };
+        run!(&mut *self.tx;
+            "DELETE FROM chunks WHERE vehicle = $1 AND stream = $2 AND last_arrival = $3";
+            vehicle, stream, chunk.last_arrival);
+        run!(&mut *self.tx; "INSERT INTO chunk_files (sha256, since) VALUES ($1, 0)";
+            &chunk.sha256);
+        let (records, bytes) = (int(chunk.records), int(chunk.stored_bytes));
+        run!(&mut *self.tx;
+            "UPDATE streams SET kept = kept - $3, kept_bytes = kept_bytes - $4,
+             packed = packed - $3, packed_bytes = packed_bytes - $4,
+             removed = removed + $3, removed_to = $5
+             WHERE vehicle = $1 AND stream = $2";
+            vehicle, stream, records, bytes, int(chunk.last_seq));
+        Ok(Some((records, bytes)))
+    }
+}
+
+fn kept((arrival, life, seq, line): (i64, i64, i64, String)) -> KeptLine {
+    KeptLine { arrival, life: unsigned(life), seq: unsigned(seq), line }
+}
+
+fn chunk(row: ChunkRow) -> StoredChunk {
+    let (first_arrival, last_arrival, first_seq, last_seq, first_time, last_time, ..) = row;
+    let (.., level, records, bytes, stored_bytes, sha256) = row;
+    StoredChunk {
+        first_arrival,
+        last_arrival,
+        first_seq: unsigned(first_seq),
+        last_seq: unsigned(last_seq),
+        first_time,
+        last_time,
+        level,
+        records: unsigned(records),
+        bytes: unsigned(bytes),
+        stored_bytes: unsigned(stored_bytes),
+        sha256,
+    }
+}
