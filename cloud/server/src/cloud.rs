@@ -11,6 +11,7 @@ use crate::hub::Hub;
 use crate::objects::Objects;
 use crate::readers::Readers;
 use crate::store::{CloudStore, Retention};
+use crate::tails::Tails;
 
 /// Maximum number of frames of vehicles that are parsed and stored at a time: each may have 8 MiB.
 pub(crate) const STORED_FRAMES_MAX: usize = 64;
@@ -25,6 +26,7 @@ pub(crate) struct Cloud {
     pub(crate) wrong_secrets: WrongSecrets,
     pub(crate) limits: VehicleLimits,
     pub(crate) readers: Arc<Readers>,
+    pub(crate) tails: Arc<Tails>,
     /// Frames of vehicles that are parsed and stored at a time.
     pub(crate) stored_frames: Semaphore,
     pub(crate) retention: Retention,

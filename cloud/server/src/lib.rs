@@ -35,6 +35,7 @@ mod request;
 mod s3;
 mod server;
 mod store;
+mod tails;
 mod transfer;
 mod vehicles;
 

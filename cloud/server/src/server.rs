@@ -23,7 +23,7 @@ use crate::objects::Objects;
 use crate::place::FilePlace;
 use crate::s3::S3Bucket;
 use crate::store::{ClipBounds, CloudStore, Retention};
-use crate::{clips, objects, people, replicas, vehicles};
+use crate::{clips, objects, people, replicas, tails, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles.
 const PEOPLE_MAX: u32 = 1000;
@@ -157,6 +157,7 @@ impl CloudServer {
             wrong_secrets: WrongSecrets::default(),
             limits: VehicleLimits::default(),
             readers: Arc::default(),
+            tails: Arc::default(),
             stored_frames: Semaphore::new(STORED_FRAMES_MAX),
             retention: Retention::DEFAULT,
             address,
@@ -190,6 +191,8 @@ impl CloudServer {
         chores.spawn(async move { clips::clean(&working).await });
         let working = Arc::clone(&cloud);
         chores.spawn(async move { objects::collect(&working).await });
+        let working = Arc::clone(&cloud);
+        chores.spawn(async move { tails::keep(&working).await });
         let working = Arc::clone(&cloud);
         chores.spawn(async move {
             let mut ticks = ticks(SEEN_INTERVAL);

@@ -18,6 +18,7 @@ use tokio::time::sleep;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::readers::ReaderSlot;
+use crate::tails::TailReader;
 
 /// Number of lines in a piece.
 const PIECE: i64 = 256;
@@ -54,6 +55,8 @@ struct RecordReader {
     first: Vec<String>,
     arrivals: Option<watch::Receiver<()>>,
     slot: ReaderSlot,
+    /// Lets the vehicle send at once what is followed.
+    _tail: Option<TailReader>,
 }
 
 pub(super) async fn events(
@@ -102,6 +105,7 @@ async fn lines(
     let names = [&*streams[0], &*streams[1]];
     let from = query.from.unwrap_or(0);
     let mut first = cloud.store.removed(&vehicle, names, from).await?;
+    let tail = query.follow.then(|| cloud.tails.read(&vehicle, &streams));
     let arrival = match (position, query.last) {
         (Some(position), _) => {
             let position = position?;
@@ -121,8 +125,18 @@ async fn lines(
         }
         (None, None) => 0,
     };
-    let reader =
-        RecordReader { cloud, vehicle, streams, from, arrival, is_events, first, arrivals, slot };
+    let reader = RecordReader {
+        cloud,
+        vehicle,
+        streams,
+        from,
+        arrival,
+        is_events,
+        first,
+        arrivals,
+        slot,
+        _tail: tail,
+    };
     let pieces = try_unfold(reader, RecordReader::next);
     let kind = if is_events { EVENTS } else { "application/x-ndjson" };
     let headers = [

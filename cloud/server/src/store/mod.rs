@@ -46,6 +46,7 @@ mod records;
 mod replicas;
 mod requests;
 mod secrets;
+mod tails;
 #[cfg(test)]
 mod tests;
 mod tokens;
@@ -76,6 +77,7 @@ pub(crate) use page::{NewestRecords, VehicleFilter, VehiclePage};
 pub(crate) use records::{Retention, StreamBatch, name_in_lines};
 pub(crate) use replicas::OwnLink;
 pub(crate) use requests::{ChangeAuthor, RequestKey};
+pub(crate) use tails::VehicleTail;
 pub(crate) use tokens::{TOKENS_MAX, TokenUser};
 pub(crate) use users::CONSOLE;
 pub(crate) use vehicles::Issued;
@@ -90,6 +92,7 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0007_requests.sql"),
     include_str!("../../migrations/0008_cleaning.sql"),
     include_str!("../../migrations/0009_tokens.sql"),
+    include_str!("../../migrations/0011_tails.sql"),
 ];
 
 /// Maximum number of queries at a time: with more threads than cores, each only takes longer.
