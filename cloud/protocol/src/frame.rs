@@ -26,6 +26,15 @@ pub const LINES_MAX: u64 = 8 << 20;
 /// Maximum number of records in a frame.
 pub const RECORDS_MAX: usize = 4000;
 
+/// Longest lease of streams that people read, in s; a cloud renews it in time.
+pub const TAIL_S: u32 = 60;
+
+/// Maximum number of streams in a lease.
+pub const TAIL_STREAMS_MAX: usize = 64;
+
+/// Maximum length of the name of a stream, in bytes.
+pub const STREAM_NAME_MAX: usize = 256;
+
 /// Maximum number of deployments in a wanted state.
 pub const WANTED_MAX: usize = 4000;
 
@@ -33,7 +42,7 @@ pub const WANTED_MAX: usize = 4000;
 #[derive(Clone, PartialEq, Message)]
 pub struct Frame {
     /// Its content; absent in a frame of a later version, which is skipped.
-    #[prost(oneof = "Body", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9")]
+    #[prost(oneof = "Body", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10")]
     pub body: Option<Body>,
 }
 
@@ -67,6 +76,9 @@ pub enum Body {
     /// Cloud to vehicle: the connection ends.
     #[prost(message, tag = "9")]
     GoAway(GoAway),
+    /// Cloud to vehicle: streams that people read as they come.
+    #[prost(message, tag = "10")]
+    Tail(Tail),
 }
 
 /// The first frame of a vehicle. Its name is that of its certificate.
@@ -229,6 +241,18 @@ pub struct GoAway {
     /// The reason.
     #[prost(string, tag = "2")]
     pub reason: String,
+}
+
+/// Streams of which people read each record as it comes: a lease, in the place of the one before.
+/// It changes the speed of records only; without one, a vehicle collects log lines for a while.
+#[derive(Clone, PartialEq, Message)]
+pub struct Tail {
+    /// Names of the streams, as in [`Cursor`]; at most [`TAIL_STREAMS_MAX`] count.
+    #[prost(string, repeated, tag = "1")]
+    pub streams: Vec<String>,
+    /// Time until the end of the lease, in s; at most [`TAIL_S`] count.
+    #[prost(uint32, tag = "2")]
+    pub seconds: u32,
 }
 
 /// A frame that cannot be used.

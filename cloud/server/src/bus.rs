@@ -36,19 +36,22 @@ pub(crate) enum Hint {
     Vehicles(Vec<String>),
     /// The records of a vehicle.
     Records(String),
+    /// The leases of streams that people read.
+    Tails,
 }
 
-/// Names of vehicles to look at.
+/// Things to look at.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(crate) struct HintedVehicles {
+pub(crate) struct HintedChanges {
     pub(crate) changed: BTreeSet<String>,
     pub(crate) with_records: BTreeSet<String>,
+    pub(crate) has_tails: bool,
 }
 
 /// The hints that were received, until they are looked at.
 #[derive(Debug, Default)]
 pub(crate) struct ReceivedHints {
-    waiting: Mutex<HintedVehicles>,
+    waiting: Mutex<HintedChanges>,
     notify: Notify,
     /// Number of messages that were no hint, or did not fit.
     ignored: AtomicU64,
@@ -148,6 +151,11 @@ impl Bus {
         self.send(|| Hint::Records(name.to_owned()));
     }
 
+    /// Sends a hint about leases of streams.
+    pub(crate) fn tails_changed(&self) {
+        self.send(|| Hint::Tails);
+    }
+
     fn send(&self, hint: impl FnOnce() -> Hint) {
         let Some(queue) = &self.queue else { return };
         if queue.try_send(hint()).is_err() {
@@ -184,10 +192,14 @@ impl ReceivedHints {
         };
         let is_added = hint.is_some_and(|hint| {
             let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
-            let HintedVehicles { changed, with_records } = &mut *waiting;
+            let HintedChanges { changed, with_records, has_tails } = &mut *waiting;
             let (set, names) = match hint {
                 Hint::Vehicles(names) => (changed, names),
                 Hint::Records(name) => (with_records, vec![name]),
+                Hint::Tails => {
+                    *has_tails = true;
+                    return true;
+                }
             };
             let is_fit = names.iter().all(|name| name.len() <= NAME_MAX)
                 && set.len() + names.len() <= WAITING_MAX;
@@ -207,12 +219,12 @@ impl ReceivedHints {
     }
 
     /// Waits for hints, and takes all that were received.
-    pub(crate) async fn next(&self) -> HintedVehicles {
+    pub(crate) async fn next(&self) -> HintedChanges {
         loop {
             self.notify.notified().await;
             let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
             let taken = std::mem::take(&mut *waiting);
-            if taken != HintedVehicles::default() {
+            if taken != HintedChanges::default() {
                 return taken;
             }
         }
@@ -252,10 +264,11 @@ mod tests {
         assert_eq!(received.ignored.load(Ordering::Relaxed), wrong.len() as u64 + 1);
         received.add(br#"{"vehicles":["car-7","car-8"]}"#);
         received.add(br#"{"records":"car-7"}"#);
-        received.add(br#"{"records":"car-7"}"#);
+        received.add(br#""tails""#);
         let taken = received.next().await;
         assert_eq!(taken.changed.into_iter().collect::<Vec<_>>(), ["car-7", "car-8"]);
         assert_eq!(taken.with_records.into_iter().collect::<Vec<_>>(), ["car-7"]);
+        assert!(taken.has_tails);
     }
 
     #[tokio::test]

@@ -12,6 +12,7 @@ use crate::objects::Objects;
 use crate::readers::Readers;
 use crate::records::ChunkFiles;
 use crate::store::{CloudStore, Retention};
+use crate::tails::Tails;
 
 /// Maximum number of frames of vehicles that are parsed and stored at a time: each may have 8 MiB.
 pub(crate) const STORED_FRAMES_MAX: usize = 64;
@@ -30,6 +31,7 @@ pub(crate) struct Cloud {
     pub(crate) readers: Arc<Readers>,
     /// Pages that are read whole: streams, which last, take no place of theirs.
     pub(crate) page_readers: Arc<Readers>,
+    pub(crate) tails: Arc<Tails>,
     /// Frames of vehicles that are parsed and stored at a time.
     pub(crate) stored_frames: Semaphore,
     pub(crate) retention: Retention,

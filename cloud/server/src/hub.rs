@@ -1,13 +1,13 @@
 //! Connections of vehicles, by vehicle: presence, and the wishes that reach them at once.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use gleaner_fleet::GoAway;
 use tokio::sync::watch;
 
 use crate::bus::Bus;
-use crate::store::{OwnLink, now};
+use crate::store::{OwnLink, VehicleTail, now};
 
 /// Latest time after which vehicles connect again when the server stops, in ms.
 const RECONNECT_MS: u64 = 30_000;
@@ -23,6 +23,8 @@ pub(crate) struct LinkOrders {
     pub(crate) changes: u64,
     /// Number of the wanted state that another replica has made, or an older one.
     pub(crate) generation: u64,
+    /// The streams that people read.
+    pub(crate) tail: Arc<VehicleTail>,
     /// The end of the connection.
     pub(crate) end: Option<GoAway>,
 }
@@ -69,7 +71,7 @@ impl Hub {
             return None;
         }
         let end = state.is_stopping.then(stopping);
-        let (orders, receiver) = watch::channel(LinkOrders { changes: 0, generation: 0, end });
+        let (orders, receiver) = watch::channel(LinkOrders { end, ..LinkOrders::default() });
         let before = state.links.insert(name.to_owned(), OpenLink { epoch, orders });
         if let Some(before) = before {
             before.end(TAKEN_MS, "the vehicle has a newer connection");
@@ -151,6 +153,26 @@ impl Hub {
             state.links.get(&own.vehicle).is_none_or(|link| link.epoch < own.epoch)
         };
         own.iter().filter(is_missing).map(OwnLink::key).collect()
+    }
+
+    /// Hands leases of streams to the connections of their vehicles.
+    pub(crate) fn tail(&self, tails: BTreeMap<String, VehicleTail>) {
+        let state = self.lock();
+        for (name, tail) in tails {
+            let Some(link) = state.links.get(&name) else { continue };
+            link.orders.send_if_modified(|orders| {
+                let is_other = *orders.tail != tail;
+                if is_other {
+                    orders.tail = Arc::new(tail);
+                }
+                is_other
+            });
+        }
+    }
+
+    /// Lets other replicas look at the leases of streams.
+    pub(crate) fn tails_changed(&self) {
+        self.bus.tails_changed();
     }
 
     /// Ends all connections and all readers, those of the future, too.

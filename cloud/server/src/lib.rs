@@ -37,6 +37,7 @@ mod request;
 mod s3;
 mod server;
 mod store;
+mod tails;
 mod transfer;
 mod vehicles;
 

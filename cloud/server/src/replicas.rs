@@ -17,6 +17,7 @@ use crate::bus::ReceivedHints;
 use crate::cloud::Cloud;
 use crate::error::CloudResult;
 use crate::store::OwnLink;
+use crate::tails;
 
 /// Interval of looks. With a look that takes its time, a revoked vehicle is cut off within 5 s.
 const LOOK: Duration = Duration::from_secs(2);
@@ -73,7 +74,10 @@ pub(crate) async fn follow(cloud: &Cloud, hints: Option<Arc<ReceivedHints>>) {
                     let changed: Vec<_> = hinted.changed.into_iter().collect();
                     let looked = follower.look_at_links(cloud, Some(&changed)).await;
                     cloud.hub.arrived_elsewhere(&hinted.with_records);
-                    looked
+                    match hinted.has_tails {
+                        true => looked.and(tails::deliver(cloud).await),
+                        false => looked,
+                    }
                 }
             },
         };
@@ -101,6 +105,7 @@ struct ReplicaFollower {
 impl ReplicaFollower {
     async fn look(&mut self, cloud: &Cloud) -> CloudResult<()> {
         self.look_at_links(cloud, None).await?;
+        tails::deliver(cloud).await?;
         self.look_at_records(cloud).await
     }
 

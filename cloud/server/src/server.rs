@@ -24,7 +24,7 @@ use crate::place::FilePlace;
 use crate::records::ChunkFiles;
 use crate::s3::S3Bucket;
 use crate::store::{ClipBounds, CloudStore, Retention};
-use crate::{clips, objects, people, records, replicas, vehicles};
+use crate::{clips, objects, people, records, replicas, tails, vehicles};
 
 /// Maximum number of open connections of people, and of vehicles: a whole fleet has another one
 /// for the files of a deployment.
@@ -171,6 +171,7 @@ impl CloudServer {
             account_changes: AccountChanges::default(),
             readers: Arc::default(),
             page_readers: Arc::default(),
+            tails: Arc::default(),
             stored_frames: Semaphore::new(STORED_FRAMES_MAX),
             retention: Retention::DEFAULT,
             keep_records_days: options.keep_records_days,
@@ -214,6 +215,8 @@ impl CloudServer {
         chores.spawn(async move { objects::collect(&working).await });
         let working = Arc::clone(&cloud);
         chores.spawn(async move { records::keep(&working).await });
+        let working = Arc::clone(&cloud);
+        chores.spawn(async move { tails::keep(&working).await });
         let working = Arc::clone(&cloud);
         chores.spawn(async move {
             let mut ticks = ticks(SEEN_INTERVAL);

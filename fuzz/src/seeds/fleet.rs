@@ -2,7 +2,7 @@
 
 use gleaner_fleet::{
     Ack, Body, Cursor, Desired, Enrolment, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records,
-    Reported, Wanted, Welcome, compress,
+    Reported, Tail, Wanted, Welcome, compress,
 };
 
 use crate::fleet::mode;
@@ -74,6 +74,7 @@ pub fn all() -> Vec<Vec<u8>> {
         Body::Ping(Ping { number: 1 }),
         Body::Pong(Pong { number: 1 }),
         Body::GoAway(GoAway { after_ms: 1000, reason: "revoked".to_owned() }),
+        Body::Tail(Tail { streams: vec!["events".to_owned()], seconds: 60 }),
     ];
     let enrolment = Enrolment {
         gleaner_enrolment: 1,

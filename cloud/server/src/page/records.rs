@@ -62,6 +62,15 @@ impl RecordSource {
         cloud.newest(&self.vehicle, &stream, range, most).await
     }
 
+    /// Returns the streams that its vehicle sends at once while it is followed: a time line has no
+    /// log lines, and everything else of lambdas does not wait.
+    pub(super) fn followed(&self) -> Vec<String> {
+        match &self.lambda {
+            None => ["events", "orchestrator"].map(str::to_owned).into(),
+            Some(lambda) => vec![format!("lambdas/{lambda}")],
+        }
+    }
+
     /// Renders a record.
     pub(super) fn line(&self, text: &str) -> Markup {
         line(text, self.lambda.is_none())

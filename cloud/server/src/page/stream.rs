@@ -20,6 +20,7 @@ use super::records::RecordSource;
 use super::session::PageUser;
 use crate::cloud::Cloud;
 use crate::readers::{ReaderSlot, next_look};
+use crate::tails::TailReader;
 
 /// Maximum number of records in a message.
 const MESSAGE_MAX: usize = 100;
@@ -42,6 +43,8 @@ struct RecordFollower {
     position: i64,
     arrivals: watch::Receiver<()>,
     slot: ReaderSlot,
+    /// Lets the vehicle send at once what is followed.
+    _tail: TailReader,
 }
 
 pub(super) async fn time_line(
@@ -77,7 +80,8 @@ fn follow(
     // Before the first look, so that nothing arrives in between.
     let mut arrivals = cloud.hub.arrivals(&source.vehicle);
     arrivals.mark_changed();
-    let follower = RecordFollower { cloud, user, source, position, arrivals, slot };
+    let tail = cloud.tails.read(&source.vehicle, &source.followed());
+    let follower = RecordFollower { cloud, user, source, position, arrivals, slot, _tail: tail };
     let events = unfold(follower, RecordFollower::next);
     Ok(without_buffers(Sse::new(events).into_response()))
 }

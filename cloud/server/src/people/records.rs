@@ -18,6 +18,7 @@ use tokio::time::sleep;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::readers::{ReaderSlot, ReaderToken};
+use crate::tails::TailReader;
 
 /// Number of lines in a piece that has none of chunks.
 const PIECE: i64 = 256;
@@ -55,6 +56,8 @@ struct RecordReader {
     arrivals: Option<watch::Receiver<()>>,
     slot: ReaderSlot,
     token: ReaderToken,
+    /// Lets the vehicle send at once what is followed.
+    _tail: Option<TailReader>,
 }
 
 pub(super) async fn events(
@@ -104,6 +107,7 @@ async fn lines(
     let names = [&*streams[0], &*streams[1]];
     let from = query.from.unwrap_or(0);
     let mut first = cloud.store.removed(&vehicle, names, from).await?;
+    let tail = query.follow.then(|| cloud.tails.read(&vehicle, &streams));
     let arrival = match (position, query.last) {
         (Some(position), _) => {
             let position = position?;
@@ -134,6 +138,7 @@ async fn lines(
         arrivals,
         slot,
         token,
+        _tail: tail,
     };
     let pieces = try_unfold(reader, RecordReader::next);
     let kind = if is_events { EVENTS } else { "application/x-ndjson" };

@@ -49,6 +49,7 @@ mod records;
 mod replicas;
 mod requests;
 mod secrets;
+mod tails;
 #[cfg(test)]
 pub(crate) mod tests;
 mod tokens;
@@ -81,6 +82,7 @@ pub(crate) use page::{LINE_MAX, NewestRecords, VehicleFilter, VehiclePage, large
 pub(crate) use records::{RecordPage, Retention, StreamBatch, name_in_lines};
 pub(crate) use replicas::OwnLink;
 pub(crate) use requests::{ChangeAuthor, RequestKey};
+pub(crate) use tails::VehicleTail;
 #[cfg(test)]
 pub(crate) use tests::address;
 pub(crate) use tokens::{TOKENS_MAX, TokenUser};
@@ -98,6 +100,7 @@ const MIGRATIONS: &[&str] = &[
     include_str!("../../migrations/0008_cleaning.sql"),
     include_str!("../../migrations/0009_tokens.sql"),
     include_str!("../../migrations/0010_chunks.sql"),
+    include_str!("../../migrations/0011_tails.sql"),
     include_str!("../../migrations/0012_clip_parts.sql"),
 ];
 

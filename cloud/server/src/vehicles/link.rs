@@ -1,14 +1,15 @@
 //! The control channel of a vehicle, from its first frame to its end.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket};
 use gleaner_base::{RateLimit, visible};
 use gleaner_fleet::{
-    Ack, Body, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records, Reported, Welcome,
-    decompress,
+    Ack, Body, Desired, Frame, GoAway, Hello, PROTOCOL, Ping, Pong, Records, Reported, TAIL_S,
+    TAIL_STREAMS_MAX, Tail, Welcome, decompress,
 };
 use gleaner_protocol::vehicle_api::VehicleStatus;
 use tokio::sync::{SemaphorePermit, watch};
@@ -18,7 +19,7 @@ use super::batch;
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::hub::LinkOrders;
-use crate::store::{VehicleReport, now_ms};
+use crate::store::{VehicleReport, VehicleTail, now, now_ms};
 
 /// Interval of signs of life, in s; without one for three of them, the connection is dead.
 const PING_S: u32 = 20;
@@ -128,6 +129,7 @@ impl<'c> VehicleLink<'c> {
             return Ok(Err(Some(GoAway { after_ms: 0, reason })));
         };
         let welcome = Welcome { epoch, time_ms: now_ms(), ping_s: PING_S, cursors };
+        self.cloud.tails.connected(self.name);
         self.send(Body::Welcome(welcome)).await?;
         self.send_wanted().await?;
         Ok(Ok(orders))
@@ -142,16 +144,20 @@ impl<'c> VehicleLink<'c> {
         let silence = sleep(3 * period);
         tokio::pin!(silence);
         pings.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut sent_changes = 0;
+        let (mut sent_changes, mut sent_tail) = (0, Arc::default());
         loop {
             // An order may be older than this loop, or have come while a frame was handled.
-            let LinkOrders { changes, generation, end } = orders.borrow_and_update().clone();
+            let LinkOrders { changes, generation, tail, end } = orders.borrow_and_update().clone();
             if end.is_some() {
                 return Ok(end);
             }
             if changes != sent_changes || generation > self.sent {
                 sent_changes = changes;
                 Box::pin(self.send_wanted()).await?;
+            }
+            if tail != sent_tail {
+                Box::pin(self.send(Body::Tail(lease(&tail)))).await?;
+                sent_tail = tail;
             }
             tokio::select! {
                 body = self.receive() => {
@@ -193,7 +199,8 @@ impl<'c> VehicleLink<'c> {
             | Body::Welcome(_)
             | Body::Desired(_)
             | Body::Ack(_)
-            | Body::GoAway(_) => Err(wrong("a frame came that a vehicle does not send")),
+            | Body::GoAway(_)
+            | Body::Tail(_) => Err(wrong("a frame came that a vehicle does not send")),
         }
     }
 
@@ -273,6 +280,13 @@ impl<'c> VehicleLink<'c> {
             _ => Err(wrong("a frame cannot be sent")),
         }
     }
+}
+
+/// Returns the frame of a lease.
+fn lease(tail: &VehicleTail) -> Tail {
+    let streams = tail.streams.iter().take(TAIL_STREAMS_MAX).cloned().collect();
+    let seconds = (tail.until - now()).clamp(1, TAIL_S.into());
+    Tail { streams, seconds: u32::try_from(seconds).unwrap_or(TAIL_S) }
 }
 
 fn report(reported: Reported) -> CloudResult<VehicleReport> {

@@ -265,8 +265,31 @@ impl FakeLink {
         let _ = soon(self.0.send(Message::Binary(bytes.into()))).await;
     }
 
-    /// Returns the next frame but signs of life; `None` at the end.
+    /// Returns the next frame but signs of life and leases; `None` at the end.
     pub(crate) async fn next(&mut self) -> Option<Body> {
+        loop {
+            match self.next_of_all().await {
+                Some(Body::Tail(_)) => {}
+                body => return body,
+            }
+        }
+    }
+
+    /// Returns the streams of the next lease.
+    pub(crate) async fn tail(&mut self) -> Vec<String> {
+        loop {
+            match self.next_of_all().await {
+                Some(Body::Tail(tail)) => {
+                    assert!((1..=gleaner_fleet::TAIL_S).contains(&tail.seconds), "{tail:?}");
+                    return tail.streams;
+                }
+                Some(_) => {}
+                None => panic!("the connection has ended"),
+            }
+        }
+    }
+
+    async fn next_of_all(&mut self) -> Option<Body> {
         loop {
             match soon(self.0.next()).await {
                 Some(Ok(Message::Binary(bytes))) => match Frame::decoded(&bytes).unwrap().body {

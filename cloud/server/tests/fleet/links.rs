@@ -148,3 +148,23 @@ async fn a_stream_ends_with_its_user() {
     assert!(soon(followed.frame()).await.is_none());
     server.stop().await;
 }
+
+#[tokio::test]
+async fn a_vehicle_learns_at_once_which_of_its_streams_are_followed() {
+    let folder = TempDir::new().unwrap();
+    let (server, admin) = start(&folder).await;
+    let (vehicle, _) = admin.enrol("car-7").await;
+    let (mut link, ..) = vehicle.connect().await;
+    let follow = async |path: &str| admin.open(Method::GET, path, b"").await.into_body();
+    // Whoever reads what is there, and no more, needs nothing of the vehicle.
+    admin.lines("/v1/vehicles/car-7/lambdas/dark/records").await;
+    let first = follow("/v1/vehicles/car-7/events?follow=true").await;
+    assert_eq!(link.tail().await, ["events", "orchestrator"]);
+    let second = follow("/v1/vehicles/car-7/lambdas/brake/records?follow=true").await;
+    assert_eq!(link.tail().await, ["events", "lambdas/brake", "orchestrator"]);
+    // Also after a lost connection.
+    let (mut next, ..) = vehicle.connect().await;
+    assert_eq!(next.tail().await, ["events", "lambdas/brake", "orchestrator"]);
+    drop((first, second));
+    server.stop().await;
+}

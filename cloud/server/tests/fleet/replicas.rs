@@ -121,6 +121,7 @@ async fn are_one_cloud(bus: &str) {
         Some(String::from_utf8(frame.into_data().unwrap().to_vec()).unwrap())
     };
     assert!(piece().await.unwrap().contains("\"seq\":0"));
+    assert_eq!(link.tail().await, ["events", "orchestrator"], "a reader at the other one");
     link.record(1..2).await;
     assert!(piece().await.unwrap().contains("\"seq\":1"));
     at_one.call(Method::DELETE, "/v1/users/ann", Value::Null).await;

@@ -8,7 +8,8 @@ use std::time::Duration;
 use futures_util::{SinkExt, StreamExt};
 use gleaner_base::{Exit, Failure, excerpt};
 use gleaner_fleet::{
-    Body, FRAME_MAX, Frame, Hello, PROTOCOL, Ping, Pong, Reported, WANTED_MAX, Welcome, compress,
+    Body, FRAME_MAX, Frame, Hello, PROTOCOL, Ping, Pong, Reported, STREAM_NAME_MAX,
+    TAIL_STREAMS_MAX, WANTED_MAX, Welcome, compress,
 };
 use tokio::net::TcpStream;
 use tokio::sync::{mpsc, watch};
@@ -26,7 +27,7 @@ use super::clips::ClipSender;
 use super::http::{CloudHttp, PATIENCE};
 use super::reconcile::{Handled, Order};
 use super::settings::CloudSettings;
-use super::uplink::Uplink;
+use super::uplink::{Uplink, UplinkOrder};
 use crate::api::Api;
 
 /// Interval of looks whether the status is to be reported.
@@ -36,6 +37,9 @@ const REPORT_MAX: Duration = Duration::from_secs(60);
 /// Maximum number of problems in a report, and of characters of each.
 const PROBLEMS_MAX: usize = 100;
 const PROBLEM_MAX: usize = 1000;
+/// Number of frames about records that wait for the thread that sends these. It has one batch of
+/// each stream on its way, so that a cloud that follows the rules does not send more.
+const UPLINK_ORDERS: usize = 4096;
 /// Bounds of the interval of signs of life, in s, whatever the cloud asks for.
 const PING_S: std::ops::RangeInclusive<u32> = 5..=300;
 
@@ -70,14 +74,14 @@ impl CloudSession<'_> {
         let Welcome { ping_s, cursors, .. } = self.welcome(&mut socket).await?;
         self.api.cloud.set_state(LinkState::Connected, None);
         let (out, mut outgoing) = mpsc::channel(4);
-        let (acks, received_acks) = sync_mpsc::channel();
+        let (uplink_orders, received_orders) = sync_mpsc::sync_channel(UPLINK_ORDERS);
         let cursors = cursors.into_iter().map(|cursor| (cursor.stream.clone(), cursor));
         let uplink = Uplink {
             spool: self.api.layout.spool(),
             cloud: self.api.cloud.clone(),
             cursors: cursors.collect::<BTreeMap<_, _>>(),
             out,
-            acks: received_acks,
+            orders: received_orders,
         };
         tokio::task::spawn_blocking(move || uplink.run());
         let (generation, wanted) = watch::channel(0);
@@ -105,7 +109,14 @@ impl CloudSession<'_> {
                             self.orders.send_replace(Some(order));
                         }
                         Some(Body::Ack(ack)) => {
-                            let _ = acks.send(ack);
+                            if ack.stream.len() <= STREAM_NAME_MAX {
+                                self.order(&uplink_orders, UplinkOrder::Ack(ack))?;
+                            }
+                        }
+                        Some(Body::Tail(mut tail)) => {
+                            tail.streams.truncate(TAIL_STREAMS_MAX);
+                            tail.streams.retain(|name| name.len() <= STREAM_NAME_MAX);
+                            self.order(&uplink_orders, UplinkOrder::Tail(tail))?;
                         }
                         Some(Body::Ping(Ping { number })) => {
                             self.send(&mut socket, Body::Pong(Pong { number })).await?;
@@ -140,6 +151,20 @@ impl CloudSession<'_> {
                 () = sleep_until(self.until.into()) => return Ok(SessionEnd::Changed),
                 _ = settings.changed() => return Ok(SessionEnd::Changed),
             }
+        }
+    }
+
+    /// Hands a frame to the thread that sends records, unless that has ended.
+    fn order(
+        &self,
+        orders: &sync_mpsc::SyncSender<UplinkOrder>,
+        order: UplinkOrder,
+    ) -> Result<(), Failure> {
+        match orders.try_send(order) {
+            Err(sync_mpsc::TrySendError::Full(_)) => {
+                Err(self.lost("it sends more acknowledgements than there are batches"))
+            }
+            Ok(()) | Err(sync_mpsc::TrySendError::Disconnected(_)) => Ok(()),
         }
     }
 

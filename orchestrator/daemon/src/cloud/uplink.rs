@@ -2,7 +2,7 @@
 //!
 //! Of each stream one batch is on its way at a time, and the next one follows when the cloud has
 //! made it durable. A connection that is lost loses nothing: the next one goes on after the last
-//! record that the cloud has.
+//! record that the cloud has. `collect` says which records wait for others.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -11,12 +11,13 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use gleaner_base::{RateLimit, chain};
-use gleaner_fleet::{Ack, Body, Cursor, FRAME_MAX, RECORDS_MAX, Records, compress};
+use gleaner_fleet::{Ack, Body, Cursor, FRAME_MAX, RECORDS_MAX, Records, Tail, compress};
 use gleaner_spool::{SpoolItem, SpoolReader};
 use serde_json::json;
 use tokio::sync::mpsc::Sender;
 
 use super::Cloud;
+use super::collect::{CollectedLines, LIVE_INTERVAL, TailLease};
 use super::resume::resume;
 use crate::streams::{STREAMS, line};
 
@@ -35,13 +36,22 @@ pub(super) struct Uplink {
     pub(super) cursors: BTreeMap<String, Cursor>,
     /// To the connection; it closes this with its end.
     pub(super) out: Sender<Body>,
-    pub(super) acks: Receiver<Ack>,
+    pub(super) orders: Receiver<UplinkOrder>,
+}
+
+/// A frame of the cloud about records.
+pub(super) enum UplinkOrder {
+    Ack(Ack),
+    Tail(Tail),
 }
 
 /// A stream that is sent.
 struct SentStream {
     life: u64,
     reader: SpoolReader,
+    collected: CollectedLines,
+    /// True until all records of the time before the connection are read: they have waited.
+    is_behind: bool,
     /// A batch that the rate does not allow yet.
     waits: Option<Batch>,
     /// The number after those that are on their way, and their count.
@@ -61,27 +71,39 @@ impl Uplink {
     /// Runs until the connection ends.
     pub(super) fn run(self) {
         let mut streams: BTreeMap<String, SentStream> = BTreeMap::new();
-        let mut rate = RATE;
-        let mut look_at = Instant::now();
+        let (mut rate, mut lease) = (RATE, TailLease::default());
+        // Times of the next looks: at all streams, and at those that people read.
+        let mut all_at = Instant::now();
+        let mut live_at = all_at;
         while !self.out.is_closed() {
-            match self.acks.recv_timeout(look_at.saturating_duration_since(Instant::now())) {
-                Ok(ack) => {
+            let look_at = if lease.is_over(live_at) { all_at } else { all_at.min(live_at) };
+            let wait = look_at.saturating_duration_since(Instant::now());
+            match self.orders.recv_timeout(wait) {
+                Ok(UplinkOrder::Ack(ack)) => {
                     let stream = streams.get_mut(&ack.stream).filter(|it| it.life == ack.life);
                     if let Some(stream) = stream
                         && stream.on_its_way.is_some_and(|(next, _)| ack.next >= next)
                     {
                         stream.on_its_way = None;
                         // There may be more.
-                        if !self.send(&ack.stream, stream, &mut rate) {
+                        if !self.send(&ack.stream, stream, &mut rate, &lease) {
                             return;
                         }
                     }
                 }
+                // However many come, looks keep their interval.
+                Ok(UplinkOrder::Tail(tail)) => lease = TailLease::of(tail, Instant::now()),
                 Err(RecvTimeoutError::Timeout) => {
-                    look_at = Instant::now() + INTERVAL;
-                    self.find_new(&mut streams);
-                    let mut all = streams.iter_mut();
-                    if !all.all(|(name, stream)| self.send(name, stream, &mut rate)) {
+                    let now = Instant::now();
+                    live_at = now + LIVE_INTERVAL;
+                    let is_of_all = now >= all_at;
+                    if is_of_all {
+                        all_at = now + INTERVAL;
+                        self.find_new(&mut streams);
+                    }
+                    let mut due =
+                        streams.iter_mut().filter(|(name, _)| is_of_all || lease.has(name, now));
+                    if !due.all(|(name, stream)| self.send(name, stream, &mut rate, &lease)) {
                         return;
                     }
                 }
@@ -101,20 +123,35 @@ impl Uplink {
             let folder = self.spool.join(&name);
             let opened = resume(&folder, last_part(&name), self.cursors.get(&name));
             let Ok((life, reader)) = opened else { continue };
-            let stream =
-                SentStream { life, reader, waits: None, on_its_way: None, is_unreadable: false };
+            let stream = SentStream {
+                life,
+                reader,
+                collected: CollectedLines::default(),
+                is_behind: true,
+                waits: None,
+                on_its_way: None,
+                is_unreadable: false,
+            };
             streams.insert(name, stream);
         }
     }
 
-    /// Sends a batch of a stream, if there is one and none is on its way. Returns false if the
+    /// Sends a batch of a stream, if one is due and none is on its way. Returns false if the
     /// connection has ended.
-    fn send(&self, name: &str, stream: &mut SentStream, rate: &mut RateLimit) -> bool {
+    fn send(
+        &self,
+        name: &str,
+        stream: &mut SentStream,
+        rate: &mut RateLimit,
+        lease: &TailLease,
+    ) -> bool {
         if stream.on_its_way.is_some() {
             return true;
         }
-        let Some(batch) = stream.waits.take().or_else(|| stream.batch(name)) else { return true };
-        if !rate.take(batch.lines.len() as f64, Instant::now()) {
+        let now = Instant::now();
+        let batch = stream.waits.take().or_else(|| stream.batch(name, lease.has(name, now), now));
+        let Some(batch) = batch else { return true };
+        if !rate.take(batch.lines.len() as f64, now) {
             stream.waits = Some(batch);
             return true;
         }
@@ -126,20 +163,34 @@ impl Uplink {
 }
 
 impl SentStream {
-    /// Reads the next records.
-    fn batch(&mut self, name: &str) -> Option<Batch> {
-        let name = last_part(name);
-        let (mut text, mut count) = (Vec::new(), 0);
-        while text.len() < BATCH && count < RECORDS_MAX as u64 && !self.is_unreadable {
+    /// Reads the next records; returns those that are due.
+    fn batch(&mut self, name: &str, is_read: bool, now: Instant) -> Option<Batch> {
+        let is_at_end = self.collect(last_part(name), now);
+        let is_due = self.is_behind || is_read || self.collected.is_due(now);
+        self.is_behind &= !is_at_end;
+        if !is_due {
+            return None;
+        }
+        let next = self.reader.position()?;
+        let (lines, count) = self.collected.take()?;
+        Some(Batch { lines: compress(&lines), count, next })
+    }
+
+    /// Reads records up to a whole batch; returns whether there are no more for now.
+    fn collect(&mut self, name: &str, now: Instant) -> bool {
+        while self.collected.bytes() < BATCH && self.collected.count() < RECORDS_MAX as u64 {
+            if self.is_unreadable {
+                return true;
+            }
             let item = match self.reader.next() {
                 // A commit in progress, or one that a power cut interrupted: a gap follows.
-                None | Some(Ok(SpoolItem::Torn(_))) => break,
+                None | Some(Ok(SpoolItem::Torn(_))) => return true,
                 Some(item) => item,
             };
             if let Err(error) = &item {
                 tracing::warn!(stream = name, error = chain(error), "a stream cannot be sent");
                 self.is_unreadable = true;
-                break;
+                return true;
             }
             let mut line = line(name, item);
             let mut encoded = serde_json::to_vec(&line).expect("a line is plain data");
@@ -148,12 +199,9 @@ impl SentStream {
                 (line.kind, line.record) = ("damaged".to_owned(), json!({ "text": text }));
                 encoded = serde_json::to_vec(&line).expect("a line is plain data");
             }
-            text.extend(encoded);
-            text.push(b'\n');
-            count += 1;
+            self.collected.add(&line, &encoded, now);
         }
-        let next = self.reader.position().filter(|_| count > 0)?;
-        Some(Batch { lines: compress(&text), count, next })
+        false
     }
 }
 

@@ -1,0 +1,147 @@
+//! Streams that people read as records come: a vehicle sends those at once, and collects the log
+//! lines of others.
+//!
+//! A reader holds a lease of its streams, which its process renews in the database. The process
+//! with the connection of the vehicle finds it there, and sends it to the vehicle. Without readers,
+//! nothing is done for any vehicle.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use gleaner_lambda::manifest::ItemName;
+use tokio::sync::Notify;
+use tokio::time::{MissedTickBehavior, interval, sleep};
+
+use crate::cloud::Cloud;
+use crate::error::CloudResult;
+
+/// Interval at which leases are renewed: a third of their time.
+const RENEW: Duration = Duration::from_secs(20);
+/// Pause after which leases that could not be stored are stored again.
+const RETRY: Duration = Duration::from_secs(2);
+
+/// The streams that this process reads, and the number of readers of each.
+#[derive(Debug, Default)]
+pub(crate) struct Tails {
+    read: Mutex<BTreeMap<(String, String), usize>>,
+    is_new: Notify,
+}
+
+/// A lease of streams of a vehicle, which is renewed until this is dropped.
+pub(crate) struct TailReader {
+    tails: Arc<Tails>,
+    keys: Vec<(String, String)>,
+}
+
+impl Tails {
+    /// Begins a lease of streams of a vehicle. What is no name of a stream has none.
+    pub(crate) fn read(self: &Arc<Self>, vehicle: &str, streams: &[String]) -> TailReader {
+        let is_stream = |name: &&String| match name.strip_prefix("lambdas/") {
+            Some(id) => id.parse::<ItemName>().is_ok(),
+            None => matches!(&***name, "events" | "orchestrator"),
+        };
+        let keys = streams.iter().filter(is_stream);
+        let keys: Vec<_> = keys.map(|stream| (vehicle.to_owned(), stream.clone())).collect();
+        let mut read = self.lock();
+        for key in &keys {
+            *read.entry(key.clone()).or_default() += 1;
+        }
+        drop(read);
+        self.is_new.notify_one();
+        TailReader { tails: Arc::clone(self), keys }
+    }
+
+    /// Lets a vehicle that has connected learn of its readers here.
+    pub(crate) fn connected(&self, vehicle: &str) {
+        let first = (vehicle.to_owned(), String::new());
+        let next = self.lock().range(first..).next().map(|((name, _), _)| name == vehicle);
+        if next == Some(true) {
+            self.is_new.notify_one();
+        }
+    }
+
+    fn all(&self) -> Vec<(String, String)> {
+        self.lock().keys().cloned().collect()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<(String, String), usize>> {
+        self.read.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Drop for TailReader {
+    fn drop(&mut self) {
+        let mut read = self.tails.lock();
+        for key in &self.keys {
+            if let Some(count) = read.get_mut(key) {
+                *count -= 1;
+                if *count == 0 {
+                    read.remove(key);
+                }
+            }
+        }
+    }
+}
+
+/// Keeps the leases of readers of this process, for as long as it runs.
+pub(crate) async fn keep(cloud: &Cloud) {
+    let mut ticks = interval(RENEW);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    // Those of an earlier process may be left.
+    let mut has_leases = true;
+    loop {
+        let is_new = tokio::select! {
+            _ = ticks.tick() => false,
+            () = cloud.tails.is_new.notified() => true,
+        };
+        let read = cloud.tails.all();
+        if read.is_empty() && !has_leases {
+            continue;
+        }
+        let renewed = async {
+            has_leases = cloud.store.extend_tails(&read).await? > 0;
+            if is_new {
+                cloud.hub.tails_changed();
+            }
+            deliver(cloud).await
+        };
+        if let Err(error) = renewed.await {
+            tracing::warn!(reason = error.reason(), "records that people follow come later");
+            sleep(RETRY).await;
+            cloud.tails.is_new.notify_one();
+        }
+    }
+}
+
+/// Hands the leases of all processes to the connections here.
+pub(crate) async fn deliver(cloud: &Cloud) -> CloudResult<()> {
+    cloud.hub.tail(cloud.store.own_tails().await?);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stream_is_read_until_its_last_reader_ends() {
+        let tails = Arc::new(Tails::default());
+        let names =
+            |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
+        let read = |streams: &[&str]| tails.read("car-7", &names(streams));
+        let [first, second] = [read(&["events", "orchestrator"]), read(&["events"])];
+        let odd = read(&["", "lambdas/", "lambdas/../x", "other", &"x".repeat(1 << 20)]);
+        let of = |streams: &[&str]| {
+            names(streams).into_iter().map(|it| ("car-7".to_owned(), it)).collect::<Vec<_>>()
+        };
+        assert_eq!(tails.all(), of(&["events", "orchestrator"]));
+        drop((first, odd));
+        assert_eq!(tails.all(), of(&["events"]));
+        drop(second);
+        assert_eq!(tails.all(), of(&[]));
+        // The same stream twice, as readers of one stream name it.
+        drop(read(&["lambdas/a", "lambdas/a"]));
+        assert_eq!(tails.all(), of(&[]));
+    }
+}
