@@ -2,9 +2,10 @@
 //!
 //! `store` is the database and `objects` has the files, in a `place`: a folder, or a bucket (`s3`).
 //! Together with the certificates of `authority` they are all that survives a restart. `accept`
-//! accepts connections for both listeners, within the bounds of `clients`: `people` and `page` answer requests of people, and
-//! `vehicles` those of vehicles, each of which keeps one connection open. `hub` has these
-//! connections, and wakes them after a change.
+//! accepts connections for both listeners, within the bounds of `clients`: `people` and `page`
+//! answer requests of people, and `vehicles` those of vehicles, each of which keeps one connection
+//! open. `hub` has these connections, and wakes them after a change; by `tails`, vehicles learn
+//! which of their records people follow.
 //! `clips` has recorded clips of vehicles, and `records` old records in files, each with a place of
 //! its own. `transfer` receives files and sends them.
 //!
