@@ -51,7 +51,10 @@ impl SearchPart {
                         }
                     }
                 }
-                div { button { "Search" } @if self.is_search() { " " a href=(here) { "Show all" } } }
+                div {
+                    button { "Search" }
+                    @if self.is_search() { " " a href=(here) { "Show all" } }
+                }
             }
         }
     }

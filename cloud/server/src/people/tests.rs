@@ -35,6 +35,7 @@ pub(crate) async fn cloud(folder: &TempDir) -> Arc<Cloud> {
         limits: VehicleLimits::default(),
         account_changes: AccountChanges::default(),
         readers: Arc::default(),
+        tails: Arc::default(),
         page_readers: Arc::default(),
         stored_frames: Semaphore::new(4),
         retention: Retention::DEFAULT,
