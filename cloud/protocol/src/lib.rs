@@ -3,8 +3,8 @@
 //! `frame` has the frames of the control channel: one WebSocket per vehicle, opened by it.
 //! `enrolment` has the messages by which a vehicle gets its certificate, and `people` those of the
 //! API for people; `waves` is the part of it by which a release reaches vehicles step by step.
-//! `clips` has those about recorded clips, and `records` those of a search. `object` checks files that are sent. Nothing here opens
-//! a connection.
+//! `clips` has those about recorded clips, and `records` those of a search. `object` checks files
+//! that are sent. Nothing here opens a connection.
 //!
 //! A vehicle is given the complete wanted state, never a change of it: a list of deployments, each
 //! by the digest of its signed envelope. It fetches envelopes and files that it lacks by HTTPS from

@@ -29,7 +29,7 @@ pub(crate) struct Cloud {
     pub(crate) limits: VehicleLimits,
     pub(crate) account_changes: AccountChanges,
     pub(crate) readers: Arc<Readers>,
-    /// Pages that are read whole: streams, which last, take no place of theirs.
+    /// Pages that are read whole, apart from streams, which last.
     pub(crate) page_readers: Arc<Readers>,
     pub(crate) tails: Arc<Tails>,
     /// Frames of vehicles that are parsed and stored at a time.

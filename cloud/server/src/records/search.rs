@@ -87,7 +87,7 @@ struct SearchPosition {
     before: Option<i64>,
 }
 
-/// What a search looks at in a record.
+/// Facts of a record that a search compares.
 #[derive(Debug, Default)]
 pub(super) struct LineFacts {
     pub(super) time_ns: i64,

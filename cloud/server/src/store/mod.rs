@@ -303,8 +303,8 @@ fn parts<T>(mut rows: &[T]) -> impl Iterator<Item = &[T]> {
     })
 }
 
-/// Splits the values of a list into parts of few different lengths, in which values may be repeated:
-/// so there are fewer of them than [`parts`].
+/// Splits the values of a list into parts of few different lengths, in which values may be
+/// repeated: so there are fewer of them than [`parts`].
 fn list_parts<T: Copy>(values: &[T]) -> impl Iterator<Item = Vec<T>> {
     values.chunks(256).map(|chunk| {
         let length = [1, 4, 16, 64].into_iter().find(|length| chunk.len() <= *length);

@@ -156,7 +156,7 @@ async fn a_vehicle_learns_at_once_which_of_its_streams_are_followed() {
     let (vehicle, _) = admin.enrol("car-7").await;
     let (mut link, ..) = vehicle.connect().await;
     let follow = async |path: &str| admin.open(Method::GET, path, b"").await.into_body();
-    // Whoever reads what is there, and no more, needs nothing of the vehicle.
+    // A person who reads what is there, and no more, needs nothing of the vehicle.
     admin.lines("/v1/vehicles/car-7/lambdas/dark/records").await;
     let first = follow("/v1/vehicles/car-7/events?follow=true").await;
     assert_eq!(link.tail().await, ["events", "orchestrator"]);

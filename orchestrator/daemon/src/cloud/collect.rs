@@ -1,4 +1,4 @@
-//! Which records are sent at once, and which ones wait for others: time comes from the caller.
+//! Records of a stream that wait to be sent together: time comes from the caller.
 //!
 //! Without a reader, log lines of a lambda are collected: sent each second by 10,000 vehicles with
 //! one chatty lambda each, they would be three times as many batches as a cloud stores. Everything
@@ -50,7 +50,7 @@ impl CollectedLines {
         self.has_news |= has_news(line);
     }
 
-    /// Returns whether they are to be sent although nobody reads them.
+    /// Returns whether they are to be sent without a reader.
     pub(super) fn is_due(&self, now: Instant) -> bool {
         self.has_news
             || self.lines.len() >= COLLECT_BYTES

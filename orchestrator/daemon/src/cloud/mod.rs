@@ -6,7 +6,7 @@
 //! - `plan`: the steps from what runs to what the cloud wants; `reconcile` takes them.
 //! - `download`: fetches a file of a revision, and goes on where that was interrupted.
 //! - `uplink`: sends records that the cloud does not have, `resume` finds where to go on, and
-//!   `collect` says which of them are sent at once.
+//!   `collect` decides which of them are sent at once.
 //! - `clips`: announces clips, and sends those that the cloud wants; `clip_list` reads them.
 //!
 //! Without a connection everything runs on, and records wait in their spools. What the cloud wants

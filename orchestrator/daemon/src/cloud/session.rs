@@ -108,10 +108,8 @@ impl CloudSession<'_> {
                             let order = Order { desired, http: self.http.clone() };
                             self.orders.send_replace(Some(order));
                         }
-                        Some(Body::Ack(ack)) => {
-                            if ack.stream.len() <= STREAM_NAME_MAX {
-                                self.order(&uplink_orders, UplinkOrder::Ack(ack))?;
-                            }
+                        Some(Body::Ack(ack)) if ack.stream.len() <= STREAM_NAME_MAX => {
+                            self.order(&uplink_orders, UplinkOrder::Ack(ack))?;
                         }
                         Some(Body::Tail(mut tail)) => {
                             tail.streams.truncate(TAIL_STREAMS_MAX);

@@ -2,7 +2,7 @@
 //!
 //! Of each stream one batch is on its way at a time, and the next one follows when the cloud has
 //! made it durable. A connection that is lost loses nothing: the next one goes on after the last
-//! record that the cloud has. `collect` says which records wait for others.
+//! record that the cloud has. `collect` decides which records wait for others.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -109,8 +109,7 @@ impl Uplink {
                 }
                 Err(RecvTimeoutError::Disconnected) => return,
             }
-            let on_their_way = streams.values().filter_map(|it| it.on_its_way);
-            self.cloud.lock().unsent = on_their_way.map(|(_, count)| count).sum();
+            self.cloud.lock().unsent = streams.values().map(SentStream::unsent).sum();
         }
     }
 
@@ -163,6 +162,12 @@ impl Uplink {
 }
 
 impl SentStream {
+    /// Returns the number of records that are read and that the cloud does not have.
+    fn unsent(&self) -> u64 {
+        let waiting = self.waits.as_ref().map_or(0, |batch| batch.count);
+        self.on_its_way.map_or(0, |(_, count)| count) + waiting + self.collected.count()
+    }
+
     /// Reads the next records; returns those that are due.
     fn batch(&mut self, name: &str, is_read: bool, now: Instant) -> Option<Batch> {
         let is_at_end = self.collect(last_part(name), now);
