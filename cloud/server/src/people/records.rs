@@ -53,6 +53,8 @@ struct RecordReader {
     is_events: bool,
     /// Lines to send first.
     first: Vec<String>,
+    /// Lines about what was removed so far.
+    removed: Vec<String>,
     arrivals: Option<watch::Receiver<()>>,
     slot: ReaderSlot,
     token: ReaderToken,
@@ -106,7 +108,8 @@ async fn lines(
     let arrivals = query.follow.then(|| cloud.hub.arrivals(&vehicle));
     let names = [&*streams[0], &*streams[1]];
     let from = query.from.unwrap_or(0);
-    let mut first = cloud.store.removed(&vehicle, names, from).await?;
+    let removed = cloud.store.removed(&vehicle, names, from).await?;
+    let mut first = removed.clone();
     let tail = query.follow.then(|| cloud.tails.read(&vehicle, &streams));
     let arrival = match (position, query.last) {
         (Some(position), _) => {
@@ -135,6 +138,7 @@ async fn lines(
         arrival,
         is_events,
         first,
+        removed,
         arrivals,
         slot,
         token,
@@ -162,6 +166,7 @@ impl RecordReader {
             let (from, after) = (self.from, self.arrival);
             let page = self.cloud.record_page(&self.vehicle, names, from, after, PIECE).await;
             let page = page.map_err(failed)?;
+            lines.extend(self.removed_since(after).await.map_err(failed)?);
             self.arrival = page.arrival;
             lines.extend(page.lines);
             if !lines.is_empty() {
@@ -178,6 +183,21 @@ impl RecordReader {
                 () = sleep(QUIET), if self.is_events => return Ok(Some((":\n\n".to_owned(), self))),
             }
         }
+    }
+
+    /// Returns lines about records that were removed since the last look, unless records before a
+    /// position are still kept: then none of those after it are missing.
+    async fn removed_since(&mut self, position: i64) -> CloudResult<Vec<String>> {
+        let names = self.streams.each_ref().map(|name| &**name);
+        let store = &self.cloud.store;
+        let removed = store.removed(&self.vehicle, names, self.from).await?;
+        if removed == self.removed {
+            return Ok(Vec::new());
+        }
+        let oldest = store.oldest_arrival(&self.vehicle, names, self.from).await?;
+        self.removed = removed;
+        let is_missing = oldest.is_none_or(|oldest| oldest > position);
+        Ok(if is_missing { self.removed.clone() } else { Vec::new() })
     }
 
     /// Returns lines as they are sent. The last event of a piece has the position after it: a

@@ -40,7 +40,7 @@ pub(crate) struct NewestFirst<'c> {
     /// Number of bytes that were read.
     pub(crate) read_bytes: u64,
     /// Longest line whose text is read from a row.
-    longest: i64,
+    pub(super) longest: i64,
 }
 
 impl<'c> NewestFirst<'c> {
@@ -103,8 +103,8 @@ impl<'c> NewestFirst<'c> {
                     let bytes = line.len() as u64;
                     let mut found = FoundLine { arrival, line, bytes };
                     if is_damage {
-                        // The end of the chunk may be before the range.
-                        found.arrival = arrival.min(*before - 1);
+                        // What goes on after this line goes on after the chunk.
+                        found.arrival = chunk.first_arrival;
                         self.found.push(found);
                     } else if arrival > self.after && arrival < *before && pick(stream, &mut found)
                     {

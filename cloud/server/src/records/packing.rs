@@ -30,11 +30,18 @@ pub(crate) async fn keep(cloud: &Cloud) {
     }
 }
 
+/// Maximum number of chunks of a stream that are made one after the other.
+const CHUNKS_AT_ONCE: usize = 64;
+
 /// Moves the oldest records of each stream that has many into chunks; returns their number.
 pub(super) async fn pack(cloud: &Cloud, sizes: ChunkSizes) -> CloudResult<u64> {
     let mut made = 0;
     for (vehicle, stream) in cloud.store.packable(sizes).await? {
-        while pack_stream(cloud, (&vehicle, &stream), sizes).await? {
+        // A stream that grows faster keeps no other one waiting.
+        for _ in 0..CHUNKS_AT_ONCE {
+            if !pack_stream(cloud, (&vehicle, &stream), sizes).await? {
+                break;
+            }
             made += 1;
         }
     }

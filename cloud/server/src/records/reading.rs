@@ -84,8 +84,9 @@ impl Cloud {
         }
         let names = distinct(streams).into_iter().map(str::to_owned);
         let mut newest = NewestFirst::new(self, vehicle, names, (0, i64::MAX), last + 1);
+        // Only the number counts.
+        newest.longest = 0;
         while !newest.is_done() {
-            // Only the number counts.
             let pick = |_: &str, found: &mut FoundLine| {
                 found.line = String::new();
                 true

@@ -9,12 +9,13 @@ use gleaner_protocol::vehicle_api::StreamLine;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use tokio::sync::Semaphore;
 
 use super::newest::{FoundLine, NewestFirst};
 use crate::cloud::Cloud;
 use crate::error::{CloudError, CloudResult};
 use crate::request::PageLimit;
-use crate::store::{StoredChunk, VehicleFilter};
+use crate::store::{StoredChunk, VehicleFilter, large_line};
 
 /// Bounds of a request: bytes of lines that are looked at, bytes of those that are returned, and
 /// the time after which nothing more is begun.
@@ -23,6 +24,11 @@ const FOUND_MAX: u64 = 4 << 20;
 const TIME: Duration = Duration::from_secs(3);
 /// Maximum number of streams that are read together. Others of the vehicle follow.
 const STREAMS: usize = 32;
+/// Longest record that is searched, in bytes: parsed, it takes many times as much memory. A longer
+/// one is among the results as a line of kind `large`.
+const SEARCHED_MAX: u64 = 256 << 10;
+/// Searches that read at a time: more wait for their turn, and do not keep all threads busy.
+static SEARCHES: Semaphore = Semaphore::const_new(2);
 /// Longest text to search for, in bytes.
 const TEXT_MAX: usize = 256;
 
@@ -208,6 +214,8 @@ impl Cloud {
                 CloudError::usage("`after` is no position of a search", help)
             })?,
         };
+        // It is never closed.
+        let _turn = SEARCHES.acquire().await.ok();
         let limit = usize::try_from(u64::from(search.limit)).unwrap_or(1);
         let (items, until) = (Vec::new(), Instant::now() + TIME);
         let mut work = SearchWork { limit, items, read_bytes: 0, found_bytes: 0, until };
@@ -267,12 +275,21 @@ impl Cloud {
         let start = before.unwrap_or(i64::MAX);
         let most = work.limit - work.items.len();
         let mut newest = NewestFirst::new(self, &vehicle, streams.into_iter(), (0, start), most);
-        let pick = |_: &str, found: &mut FoundLine| filter.has(&found.line);
+        newest.longest = i64::try_from(SEARCHED_MAX).unwrap_or(i64::MAX);
+        let pick = |stream: &str, found: &mut FoundLine| {
+            if found.bytes <= SEARCHED_MAX {
+                return filter.has(&found.line);
+            }
+            found.line = large_line(stream, found.bytes);
+            found.bytes = found.line.len() as u64;
+            true
+        };
         // Less than all streams at the position would not move it.
         while newest.unread_before() == Some(start)
             || (!newest.is_done() && !work.has_no_room(&newest))
         {
             newest.step(|chunk| filter.excludes(chunk), pick).await?;
+            tokio::task::yield_now().await;
         }
         work.read_bytes += newest.read_bytes;
         // Older ones may be missing between those that were found.

@@ -267,7 +267,7 @@ async fn chunks_that_are_too_many_or_too_old_are_removed_and_counted() {
     let day = now() / 86_400;
     store.note_arrivals_on(day - 40).await.unwrap();
     recorded.append("events", 101..103).await;
-    store.note_arrivals_on(day - 10).await.unwrap();
+    store.note_arrivals_on(day - 30).await.unwrap();
     recorded.append("events", 103..104).await;
     remove_old(&recorded.cloud, 3600).await.unwrap();
     assert_eq!(removed().await, 101);

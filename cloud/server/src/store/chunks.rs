@@ -95,9 +95,10 @@ impl CloudStore {
             vehicle, stream, CHUNK_RECORDS);
         let (mut taken, mut last) = (0, None);
         for (arrival, length) in lengths {
-            // One that is longer than a chunk has one of its own.
-            let is_full = taken > 0 && taken + length > sizes.chunk;
-            if is_full || bytes - taken - length < sizes.rows {
+            // One that is longer than a chunk has one of its own, also if too few stay in rows:
+            // a stream that was never packed would take the place of others.
+            let is_full = taken + length > sizes.chunk || bytes - taken - length < sizes.rows;
+            if taken > 0 && is_full {
                 break;
             }
             (taken, last) = (taken + length, Some(arrival));

@@ -32,9 +32,10 @@ impl CloudStore {
     }
 
     /// Removes records that arrived at least this many days ago, those of some vehicles; returns
-    /// whether there may be more.
+    /// whether there may be more. A note of a day may be of its last minute, so that a day counts
+    /// once it has been over for that long.
     pub(crate) async fn expire_records(&self, days: u32) -> CloudResult<bool> {
-        let last = now() / DAY_S - i64::from(days);
+        let last = now() / DAY_S - i64::from(days) - 1;
         let old: Vec<(String, i64)> = rows!(&self.pool;
             "SELECT vehicle, MAX(arrived) FROM arrival_days WHERE day <= $1
              GROUP BY vehicle ORDER BY vehicle LIMIT $2";
