@@ -135,7 +135,7 @@ impl ReplicaFollower {
         self.arrivals.retain(|name, _| vehicles.contains(name));
         let mut arrived = BTreeSet::new();
         for name in vehicles {
-            let last = cloud.store.last_arrival(&name).await?;
+            let last = cloud.store.arrived(&name).await?;
             // The first time, a reader may have looked before it.
             if self.arrivals.insert(name.clone(), last) != Some(last) {
                 arrived.insert(name);

@@ -108,6 +108,7 @@ async fn lines(
     let arrivals = query.follow.then(|| cloud.hub.arrivals(&vehicle));
     let names = [&*streams[0], &*streams[1]];
     let from = query.from.unwrap_or(0);
+    cloud.store.vehicle_exists(&vehicle).await?;
     let removed = cloud.store.removed(&vehicle, names, from).await?;
     let mut first = removed.clone();
     let tail = query.follow.then(|| cloud.tails.read(&vehicle, &streams));

@@ -43,6 +43,10 @@ pub(crate) struct RecordPage {
 
 impl CloudStore {
     /// Checks that there is such a vehicle.
+    ///
+    /// # Errors
+    ///
+    /// An error if there is none.
     pub(crate) async fn vehicle_exists(&self, vehicle: &str) -> CloudResult<()> {
         let exists: Option<(String,)> =
             row!(&self.pool; "SELECT name FROM vehicles WHERE name = $1"; vehicle);
@@ -101,17 +105,12 @@ impl CloudStore {
 
     /// Returns a line for each of two streams, which may be the same, of which records with the
     /// number `from` or a later one were removed to make room.
-    ///
-    /// # Errors
-    ///
-    /// An error if there is no such vehicle.
     pub(crate) async fn removed(
         &self,
         vehicle: &str,
         streams: [&str; 2],
         from: u64,
     ) -> CloudResult<Vec<String>> {
-        self.vehicle_exists(vehicle).await?;
         let rows: Vec<(String, i64, i64)> = rows!(&self.pool;
             "SELECT stream, removed, removed_to FROM streams
              WHERE vehicle = $1 AND stream IN ($2, $3) AND removed > 0 AND removed_to >= $4";

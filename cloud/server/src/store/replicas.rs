@@ -125,13 +125,6 @@ impl CloudStore {
         };
         Ok(rows.into_iter().map(link).collect())
     }
-
-    /// Returns the number of the last arrival of records of a vehicle.
-    pub(crate) async fn last_arrival(&self, vehicle: &str) -> CloudResult<i64> {
-        let row: Option<(i64,)> =
-            row!(&self.pool; "SELECT arrived FROM vehicles WHERE name = $1"; vehicle);
-        Ok(row.map_or(0, |(arrived,)| arrived))
-    }
 }
 
 impl StoreChange<'_> {

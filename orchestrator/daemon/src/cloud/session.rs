@@ -8,8 +8,8 @@ use std::time::Duration;
 use futures_util::{SinkExt, StreamExt};
 use gleaner_base::{Exit, Failure, excerpt};
 use gleaner_fleet::{
-    Body, FRAME_MAX, Frame, Hello, PROTOCOL, Ping, Pong, Reported, STREAM_NAME_MAX,
-    TAIL_STREAMS_MAX, WANTED_MAX, Welcome, compress,
+    Body, FRAME_MAX, Frame, Hello, PROTOCOL, Ping, Pong, Reported, STREAM_NAME_MAX, WANTED_MAX,
+    Welcome, compress,
 };
 use tokio::net::TcpStream;
 use tokio::sync::{mpsc, watch};
@@ -24,6 +24,7 @@ use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use super::LinkState;
 use super::clip_list::ClipFolder;
 use super::clips::ClipSender;
+use super::collect::TailLease;
 use super::http::{CloudHttp, PATIENCE};
 use super::reconcile::{Handled, Order};
 use super::settings::CloudSettings;
@@ -111,10 +112,9 @@ impl CloudSession<'_> {
                         Some(Body::Ack(ack)) if ack.stream.len() <= STREAM_NAME_MAX => {
                             self.order(&uplink_orders, UplinkOrder::Ack(ack))?;
                         }
-                        Some(Body::Tail(mut tail)) => {
-                            tail.streams.truncate(TAIL_STREAMS_MAX);
-                            tail.streams.retain(|name| name.len() <= STREAM_NAME_MAX);
-                            self.order(&uplink_orders, UplinkOrder::Tail(tail))?;
+                        Some(Body::Tail(tail)) => {
+                            let lease = TailLease::of(tail, Instant::now().into_std());
+                            self.order(&uplink_orders, UplinkOrder::Tail(lease))?;
                         }
                         Some(Body::Ping(Ping { number })) => {
                             self.send(&mut socket, Body::Pong(Pong { number })).await?;

@@ -11,7 +11,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use gleaner_base::{RateLimit, chain};
-use gleaner_fleet::{Ack, Body, Cursor, FRAME_MAX, RECORDS_MAX, Records, Tail, compress};
+use gleaner_fleet::{Ack, Body, Cursor, FRAME_MAX, RECORDS_MAX, Records, compress};
 use gleaner_spool::{SpoolItem, SpoolReader};
 use serde_json::json;
 use tokio::sync::mpsc::Sender;
@@ -42,7 +42,7 @@ pub(super) struct Uplink {
 /// A frame of the cloud about records.
 pub(super) enum UplinkOrder {
     Ack(Ack),
-    Tail(Tail),
+    Tail(TailLease),
 }
 
 /// A stream that is sent.
@@ -92,7 +92,7 @@ impl Uplink {
                     }
                 }
                 // However many come, looks keep their interval.
-                Ok(UplinkOrder::Tail(tail)) => lease = TailLease::of(tail, Instant::now()),
+                Ok(UplinkOrder::Tail(tail)) => lease = tail,
                 Err(RecvTimeoutError::Timeout) => {
                     let now = Instant::now();
                     live_at = now + LIVE_INTERVAL;
