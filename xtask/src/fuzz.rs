@@ -146,7 +146,7 @@ impl Fuzz<'_> {
         let machine = machine.trim();
         let mut build = self.checkout.cargo();
         // With an explicit target, the flags do not apply to build scripts.
-        build.args(["build", "--release", "-p", "gleaner-fuzz", "--target", machine]);
+        build.args(["build", "--profile", "fuzz", "-p", "gleaner-fuzz", "--target", machine]);
         for name in names {
             build.args(["--bin", &format!("fuzz-{name}")]);
         }
@@ -162,7 +162,7 @@ impl Fuzz<'_> {
             &mut build,
             "if a C++ compiler is missing, install one (`c++`); else see the first error above",
         )?;
-        Ok(self.build.join(machine).join("release"))
+        Ok(self.build.join(machine).join("fuzz"))
     }
 
     fn seeds(&self) -> Result<(), Failure> {

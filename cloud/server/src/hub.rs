@@ -12,8 +12,8 @@ use crate::store::{OwnLink, VehicleTail, now};
 /// Latest time after which vehicles connect again when the server stops, in ms.
 const RECONNECT_MS: u64 = 30_000;
 
-/// Time after which a replaced connection may be opened again, in ms: two machines with the same
-/// certificate would take turns without it.
+/// Time after which a connection that was replaced or cut off may be opened again, in ms: two
+/// machines with the same certificate would take turns without it.
 const TAKEN_MS: u64 = 10_000;
 
 /// Wishes for the connection of a vehicle.
@@ -95,7 +95,7 @@ impl Hub {
     /// Ends the connection of a vehicle.
     pub(crate) fn end(&self, name: &str, reason: &str) {
         if let Some(link) = self.lock().links.remove(name) {
-            link.end(60_000, reason);
+            link.end(TAKEN_MS, reason);
         }
         self.bus.changed(&[name.to_owned()]);
     }

@@ -11,6 +11,7 @@ mod wheels;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::RwLock;
 
 use gleaner_lambda::Clip;
 use gleaner_protocol::supervision::{EventKind, VehicleEvent};
@@ -21,7 +22,7 @@ use libtest_mimic::{Arguments, Trial};
 /// A case, and its name.
 type Case = (&'static str, fn());
 
-const CASES: [Case; 29] = [
+const CASES: [Case; 28] = [
     ("lambdas_outlive_the_orchestrator", deployments::outlive),
     ("a_supervisor_that_ends_after_sighup_is_no_zombie", deployments::reaped),
     ("after_an_upgrade_old_and_new_programs_do_not_mix", deployments::upgraded),
@@ -50,25 +51,37 @@ const CASES: [Case; 29] = [
     ("clips_reach_the_cloud_once_and_are_verified_after_a_pull", cloud::clips),
     ("a_cloud_that_is_killed_loses_nothing", cloud::killed),
     ("a_vehicle_refuses_what_no_trusted_key_signed_and_runs_without_a_cloud", cloud::refused),
-    ("processes_are_killed_at_random", chaos::killed_at_random),
 ];
+
+/// It measures the time to recover, so that it runs without another case beside it.
+const ALONE: Case = ("processes_are_killed_at_random", chaos::killed_at_random);
+
+/// Cases at a time: they mostly wait, each with a vehicle and a network of its own.
+const AT_ONCE: usize = 3;
 
 /// Selects the case that this process runs, in a network of its own.
 const CASE: &str = "GLEANER_CASE";
 
 fn main() -> ExitCode {
     if let Ok(case) = std::env::var(CASE) {
-        let case = CASES.iter().find(|(name, _)| *name == case).expect("a case");
+        let case = CASES.iter().chain([&ALONE]).find(|(name, _)| *name == case).expect("a case");
         (case.1)();
         return ExitCode::SUCCESS;
     }
     let mut arguments = Arguments::from_args();
-    // Cases measure the time to recover.
-    arguments.test_threads = Some(1);
+    arguments.test_threads = Some(AT_ONCE);
     let missing = namespace::unavailable();
-    let trials = CASES.iter().map(|(name, _)| match missing {
+    static OTHERS: RwLock<()> = RwLock::new(());
+    let trials = CASES.iter().chain([&ALONE]).map(|(name, _)| match missing {
         Some(why) => Trial::test(format!("{name} [{why}]"), || Ok(())).with_ignored_flag(true),
-        None => Trial::test(*name, || namespace::case(CASE, name)),
+        None => Trial::test(*name, || {
+            if *name == ALONE.0 {
+                let _alone = OTHERS.write();
+                return namespace::case(CASE, name);
+            }
+            let _beside = OTHERS.read();
+            namespace::case(CASE, name)
+        }),
     });
     libtest_mimic::run(&arguments, trials.collect()).exit_code()
 }
