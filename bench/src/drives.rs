@@ -7,7 +7,7 @@ use std::time::Instant;
 use gleaner_protocol::{DriveInfo, ReplaySummary};
 use gleaner_tests::{TempFolder, bag, program, replay, root, sample_drive};
 
-use crate::measure::Figure;
+use gleaner_bench_results::Figure;
 
 /// Copies of the sample drive that make 2 GB.
 const ROUNDS: u64 = 265;

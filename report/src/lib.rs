@@ -2,6 +2,7 @@
 //!
 //! - [`ReportPage`] is `report.html`: decisions, their causes, losses and cost, in one
 //!   self-contained file.
+//! - [`MeasurementPage`] is the page of a benchmark, with plots and tables.
 //! - [`Diff`] holds the differences between two runs, decision by decision.
 //! - [`Decisions`], [`JsonLines`] and [`clips`] read a file line by line; [`mod@format`] formats
 //!   times, sizes and scores.
@@ -15,6 +16,7 @@
 
 mod diff;
 pub mod format;
+mod measurements;
 mod page;
 mod results;
 mod run_summary;
@@ -23,6 +25,7 @@ pub use diff::{
     ChangeCounts, ChangeKind, ComparedRun, Cost, Diff, DiffError, Difference, DifferenceKind,
     ValueChange,
 };
+pub use measurements::{MeasurementPage, MeasurementSection, Plot, PlotCurve, PlotTable};
 pub use page::ReportPage;
 pub use results::{Decisions, JsonLines, ResultsError, clips};
 pub use run_summary::{FileError, OutputError};

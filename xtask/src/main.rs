@@ -36,8 +36,8 @@ const USAGE: &str = "usage: cargo xtask COMMAND
   test     run all tests; the last line is `N passed, M failed, K skipped`
   bless    write the examples' decisions to expected.txt, and the generated files
   docs     fetch mdBook and build the pages as a book in target/book
-  bench    run the benchmarks; further arguments are passed to gleaner-bench, with --fleet to
-           gleaner-fleet-bench
+  bench    run a benchmark: rtt, scale, isolation, cold-start, replay, record, drives, kernels,
+           inference or fleet; `compare A B` compares two results; see bench/README.md
   fleet    serve the cloud as three replicas on this machine, until ctrl-C; --install fetches its
            packages first, --kills N kills its programs in turn under simulated vehicles
   peers    build test programs on other DDS implementations; --install fetches their packages first
@@ -79,8 +79,8 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
         "test" => suites::run(&checkout),
         "bless" => bless::run(&checkout),
         "docs" => docs::run(&checkout),
-        "bench" if rest.iter().any(|argument| argument == "--fleet") => {
-            fleet_bench(&checkout, rest)
+        "bench" if rest.first().is_some_and(|name| name == "fleet") => {
+            fleet_bench(&checkout, &rest[1..])
         }
         "bench" => bench(&checkout, rest),
         "fleet" => fleet::run_scaled(&checkout, rest),
@@ -110,7 +110,7 @@ fn fleet_bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Fail
     )?;
     steps.begin("measurements");
     let mut bench = checkout.command(checkout.program("gleaner-fleet-bench"));
-    bench.args(arguments.iter().filter(|argument| *argument != "--fleet"));
+    bench.args(arguments);
     steps::run(&mut bench, "see the messages above").map(|()| Exit::Ok)
 }
 

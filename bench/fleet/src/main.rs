@@ -1,4 +1,4 @@
-//! Measures the cloud under a simulated fleet, against its promises. `cargo xtask bench --fleet`
+//! Measures the cloud under a simulated fleet, against its promises. `cargo xtask bench fleet`
 //! builds both programs first.
 //!
 //! - `identity` enrols vehicles, and `vehicle` is one: it speaks the protocol of real vehicles over

@@ -4,13 +4,17 @@
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
+use gleaner_bench_results::{BenchResults, Figure, Series, SeriesGroup, quantile};
+
 use super::frames::FrameFile;
 use super::lambda_path::LambdaPath;
 use super::model_process::{BenchModel, ModelProcess, peak_mib, pss_mib};
-use crate::measure::quantile;
 
 /// Time between two calls of the patient lambda.
 const PERIOD: Duration = Duration::from_millis(100);
+
+/// Name of the series without a lambda beside it.
+const ALONE: &str = "alone";
 
 /// Deadline of the calls of the patient lambda. The other one has an earlier deadline, and so comes
 /// first wherever that is allowed.
@@ -18,12 +22,7 @@ const PATIENT: Duration = Duration::from_secs(30);
 const SOON: Duration = Duration::from_secs(10);
 
 /// Measures the memory of the process with 1, 2 and 8 lambdas of one model.
-pub(super) fn memory(model: &BenchModel, frames: &mut FrameFile) {
-    println!(
-        "\n| lambdas of {}, by rten | memory of gleaner-inference (PSS), MiB | peak, MiB |\n\
-         |---|---|---|",
-        model.name
-    );
+pub(super) fn memory(model: &BenchModel, frames: &mut FrameFile, results: &mut BenchResults) {
     let process = ModelProcess::start(model);
     let mut paths = Vec::new();
     for count in [1, 2, 8] {
@@ -36,18 +35,24 @@ pub(super) fn memory(model: &BenchModel, frames: &mut FrameFile) {
             paths.push(path);
         }
         let (pss, peak) = (pss_mib(process.id()), peak_mib(process.id()));
-        println!("| {count} | {pss:.1} | {peak:.1} |");
+        for (what, mib) in [("PSS", pss), ("peak memory", peak)] {
+            let name = format!("{count} lambdas of {}, by rten: {what}", model.name);
+            results.figures.push(Figure::without_goal(&name, "MiB", &[mib]));
+        }
     }
 }
 
 /// Measures the calls of a patient lambda alone, and beside one that calls all the time.
-pub(super) fn flood(model: &BenchModel, frames: &mut FrameFile, calls: u32) {
-    println!(
-        "\n| calls of {} each {} ms, by rten | calls | p50, ms | p99, ms | max, ms | run p50, ms \
-         | calls of the other |\n|---|---|---|---|---|---|---|",
-        model.name,
-        PERIOD.as_millis()
-    );
+pub(super) fn flood(
+    model: &BenchModel,
+    frames: &mut FrameFile,
+    calls: u32,
+    results: &mut BenchResults,
+) {
+    let period = PERIOD.as_millis();
+    let name = format!("a call of {} each {period} ms, by rten", model.name);
+    let base = Some(ALONE.to_owned());
+    let mut group = SeriesGroup { name, unit: "ms".to_owned(), base, series: Vec::new() };
     let process = ModelProcess::start(model);
     let [mut patient, mut other] = [(); 2].map(|()| {
         let client = process.connect(model, "rten");
@@ -57,7 +62,7 @@ pub(super) fn flood(model: &BenchModel, frames: &mut FrameFile, calls: u32) {
         path
     });
     let (ends, count) = (AtomicBool::new(false), AtomicU32::new(0));
-    patient_calls(&mut patient, calls, "alone", &count);
+    group.series.push(patient_calls(&mut patient, calls, ALONE, &count));
     std::thread::scope(|scope| {
         let (ends, count) = (&ends, &count);
         scope.spawn(move || {
@@ -68,18 +73,20 @@ pub(super) fn flood(model: &BenchModel, frames: &mut FrameFile, calls: u32) {
                 other.run(Some(SOON));
             }
         });
-        patient_calls(&mut patient, calls, "beside a lambda that calls all the time", count);
+        let beside = "beside a lambda that calls all the time";
+        group.series.push(patient_calls(&mut patient, calls, beside, count));
         ends.store(true, Ordering::Relaxed);
     });
+    results.groups.push(group);
 }
 
-fn patient_calls(patient: &mut LambdaPath, calls: u32, name: &str, others: &AtomicU32) {
+fn patient_calls(patient: &mut LambdaPath, calls: u32, name: &str, others: &AtomicU32) -> Series {
     let (mut times, mut runs) = (Vec::new(), Vec::new());
     let others_before = others.load(Ordering::Relaxed);
     // The first call after a pause does not count.
     for number in 0..=calls {
         let began = Instant::now();
-        patient.mark(number << 1 | u32::from(name != "alone"));
+        patient.mark(number << 1 | u32::from(name != ALONE));
         let started = Instant::now();
         let (_, session) = patient.run(Some(PATIENT));
         if number > 0 {
@@ -89,11 +96,10 @@ fn patient_calls(patient: &mut LambdaPath, calls: u32, name: &str, others: &Atom
         std::thread::sleep(PERIOD.saturating_sub(began.elapsed()));
     }
     let count = others.load(Ordering::Relaxed) - others_before;
-    println!(
-        "| {name} | {calls} | {:.1} | {:.1} | {:.1} | {:.1} | {count} |",
-        quantile(&times, 0.5),
-        quantile(&times, 0.99),
-        times.iter().copied().fold(0.0, f64::max),
-        quantile(&runs, 0.5)
-    );
+    let runs = format!("{:.1}", quantile(&runs, 0.5));
+    let details = [
+        ("p50 of the run, ms".to_owned(), runs),
+        ("calls of the other".to_owned(), count.to_string()),
+    ];
+    Series { name: name.to_owned(), details: details.into(), reception: None, values: times }
 }

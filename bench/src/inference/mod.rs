@@ -19,8 +19,8 @@ mod yolo_graph;
 use gleaner_tests::{TempFolder, root};
 use gleaner_vision::DetectorLayout;
 
-use crate::measure::quantile;
 use frames::FrameFile;
+use gleaner_bench_results::{BenchResults, Series, SeriesGroup, quantile};
 use lambda_path::LambdaPath;
 use model_process::{BenchModel, ModelProcess, digest, peak_mib, pss_mib};
 use python_program::{PythonProgram, PythonResult};
@@ -40,25 +40,21 @@ const WARM_UP: usize = 3;
 /// The library of ONNX Runtime for `gleaner-inference`.
 const LIBRARY: &str = "ORT_DYLIB_PATH";
 
-/// Measures everything, and prints tables in Markdown.
-pub fn measure(quick: bool) {
+/// Measures everything.
+pub fn measure(quick: bool, results: &mut BenchResults) {
     let folder = TempFolder::new();
     let mut frames = FrameFile::create(folder.path());
     let models = models(&folder, quick);
     if std::env::var_os(LIBRARY).is_none() {
-        println!("skipped: onnxruntime and cuda in gleaner-inference, as {LIBRARY} is not set\n");
+        let skipped = format!("onnxruntime and cuda are skipped, as {LIBRARY} is not set");
+        results.notes.push(skipped);
     }
-    println!(
-        "| model | program | frames | frame p50, ms | p95, ms | session p50, ms | p95, ms \
-         | frame minus session p50, ms | p95, ms | of it conversion p50, ms | peak memory, MiB | of the caller, MiB \
-         | steady (PSS), MiB | boxes |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
-    );
-    let notes: Vec<String> = models.iter().flat_map(|model| detector(model, &mut frames)).collect();
-    println!();
-    notes.iter().for_each(|note| println!("- {note}"));
+    for model in &models {
+        detector(model, &mut frames, results);
+    }
     let [nano, _, large] = &models[..] else { return };
-    clients::memory(large, &mut frames);
-    clients::flood(nano, &mut frames, if quick { 20 } else { 200 });
+    clients::memory(large, &mut frames, results);
+    clients::flood(nano, &mut frames, if quick { 20 } else { 200 }, results);
 }
 
 fn models(folder: &TempFolder, quick: bool) -> Vec<BenchModel> {
@@ -67,10 +63,9 @@ fn models(folder: &TempFolder, quick: bool) -> Vec<BenchModel> {
         BenchModel { name, layout, path, sha256, frames: if quick { 3 } else { frames } }
     };
     let shaped = |scale, name: &'static str, frames| {
-        let (file, parameters) = yolo_shaped(scale);
+        let (file, _) = yolo_shaped(scale);
         let path = folder.path().join(format!("{name}.onnx"));
         std::fs::write(&path, &file).expect("the disk has room");
-        println!("{name}: {:.2} million parameters", parameters as f64 / 1e6);
         model(name, DetectorLayout::Ultralytics, path, frames)
     };
     let nano = root().join("examples/yolo-detector/rust/models/yolox_nano.onnx");
@@ -98,21 +93,23 @@ impl DetectorTimes {
         self.boxes += boxes;
     }
 
-    fn print(&self, model: &str, program: &str, [peak, caller, steady]: [f64; 3]) {
+    /// Returns the times of frames, with the median of their parts as details.
+    fn series(&self, program: &str, memory: [(&str, f64); 3]) -> Series {
         let overhead: Vec<f64> =
             self.total.iter().zip(&self.session).map(|(total, session)| total - session).collect();
-        let two = |values: &[f64]| {
-            format!("{:.2} | {:.2}", quantile(values, 0.5), quantile(values, 0.95))
-        };
-        let (frames, boxes) = (self.total.len(), self.boxes / self.total.len() as f64);
-        println!(
-            "| {model} | {program} | {frames} | {} | {} | {} | {:.2} | {peak:.0} | {caller:.0} \
-             | {steady:.0} | {boxes:.1} |",
-            two(&self.total),
-            two(&self.session),
-            two(&overhead),
-            quantile(&self.prepare, 0.5)
-        );
+        let ms = [
+            ("p50 of the session, ms", &self.session),
+            ("p50 without the session, ms", &overhead),
+            ("p50 of the conversion, ms", &self.prepare),
+        ];
+        let ms =
+            ms.map(|(name, values)| (name.to_owned(), format!("{:.2}", quantile(values, 0.5))));
+        let memory = memory.map(|(name, mib)| (name.to_owned(), format!("{mib:.0}")));
+        let boxes = format!("{:.1}", self.boxes / self.total.len() as f64);
+        let boxes = ("boxes in a frame".to_owned(), boxes);
+        let details = ms.into_iter().chain(memory).chain([boxes]).collect();
+        let (name, values) = (program.to_owned(), self.total.clone());
+        Series { name, details, reception: None, values }
     }
 }
 
@@ -125,8 +122,8 @@ struct MeasuredPath {
     first: Vec<f32>,
 }
 
-/// Measures a model by all programs, which take turns frame by frame. Returns notes.
-fn detector(model: &BenchModel, frames: &mut FrameFile) -> Vec<String> {
+/// Measures a model by all programs, which take turns frame by frame.
+fn detector(model: &BenchModel, frames: &mut FrameFile, results: &mut BenchResults) {
     let mut notes = Vec::new();
     let mut paths = Vec::new();
     let with_library: &[&str] =
@@ -171,21 +168,32 @@ fn detector(model: &BenchModel, frames: &mut FrameFile) -> Vec<String> {
             }
         }
     }
+    let memory = |id: u32, caller: f64| {
+        let (peak, steady) = (peak_mib(id), pss_mib(id));
+        [("peak memory, MiB", peak), ("PSS, MiB", steady), ("memory of the caller, MiB", caller)]
+    };
+    let mut group = SeriesGroup {
+        name: format!("{}: a frame of 1920x1080 to its boxes", model.name),
+        unit: "ms".to_owned(),
+        ..SeriesGroup::default()
+    };
     for MeasuredPath { process, path, times, .. } in &paths {
-        let memory = [peak_mib(process.id()), path.buffers_mib(), pss_mib(process.id())];
-        times.print(model.name, &format!("gleaner-inference, {}", path.runtime), memory);
+        let memory = memory(process.id(), path.buffers_mib());
+        let name = format!("gleaner-inference, {}", path.runtime);
+        group.series.push(times.series(&name, memory));
     }
     if let Some((python, times)) = &python {
-        let memory = [peak_mib(python.id()), 0.0, pss_mib(python.id())];
-        times.print(model.name, &python.runtime, memory);
+        group.base = Some(python.runtime.clone());
+        group.series.push(times.series(&python.runtime, memory(python.id(), 0.0)));
     }
+    results.groups.push(group);
     if let [one, others @ ..] = &paths[..] {
         notes.extend(others.iter().map(|other| {
             let by = format!("{} and {}", one.path.runtime, other.path.runtime);
             format!("{} by {by}: {}", model.name, difference(&one.first, &other.first))
         }));
     }
-    notes
+    results.notes.append(&mut notes);
 }
 
 /// Describes the largest difference between two outputs for one frame. Relative to a number below

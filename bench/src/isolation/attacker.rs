@@ -11,7 +11,8 @@ use gleaner_tests::{LambdaCopy, TempFolder};
 use gleaner_transport::Clock;
 
 use super::blocks::{BLOCK_MS, BlockSchedule};
-use crate::measure::{Figure, Twin, bind_to};
+use crate::measure::{Twin, bind_to};
+use gleaner_bench_results::Figure;
 
 /// An attack and its attacker.
 pub(super) struct Attack {

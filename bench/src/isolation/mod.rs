@@ -17,7 +17,8 @@ use gleaner_transport::{Clock, LiveSource};
 use self::attacker::{ATTACKS, Attacker};
 use self::blocks::BlockSchedule;
 use self::victim::Victim;
-use crate::measure::{Figure, Twin, bind_to, cores};
+use crate::measure::{Twin, bind_to, cores};
+use gleaner_bench_results::Figure;
 
 /// Pairs of blocks for each attack.
 const PAIRS: usize = 20;
@@ -27,14 +28,20 @@ const STARTS: usize = 21;
 const RATE_HZ: f64 = 500.0;
 const RATE: &str = "500";
 
+/// The start of a lambda of each kind.
+pub fn starts(quick: bool) -> Vec<Figure> {
+    let mut figures = Vec::new();
+    start::figures(if quick { 1 } else { STARTS }, &mut figures);
+    figures
+}
+
 /// All figures, or the reason why they cannot be measured.
 pub fn figures(quick: bool) -> Result<Vec<Figure>, String> {
     let cores = cores().map_err(|error| format!("cannot determine the allowed cores: {error}"))?;
     let [own, attacker, ..] = cores[..] else {
         return Err("victim and attacker need one core each".to_owned());
     };
-    let mut figures = Vec::new();
-    start::figures(if quick { 1 } else { STARTS }, &mut figures);
+    let mut figures = starts(quick);
     bind_to(own).map_err(|error| format!("cannot bind to one core: {error}"))?;
     attacks(quick, attacker, &mut figures);
     Ok(figures)

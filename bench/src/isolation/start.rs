@@ -8,7 +8,8 @@ use gleaner_tests::drive::{CdrBuilder, IMAGE, one_topic};
 use gleaner_tests::{TempFolder, program, root, runtime};
 
 use crate::live::lambda;
-use crate::measure::{Figure, Twin};
+use crate::measure::Twin;
+use gleaner_bench_results::Figure;
 
 /// Goals for the lifetime in ms: wasm, and Python without imports of the lambda.
 const GOALS_MS: [(Twin, f64); 2] = [(Twin::Rust, 10.0), (Twin::Python, 150.0)];

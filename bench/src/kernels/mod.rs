@@ -13,8 +13,8 @@ use std::hint::black_box;
 use bench_kernels::Work;
 use rustix::time::{ClockId, clock_gettime};
 
-use crate::measure::Figure;
 use bare::{BareInstance, EngineChecks};
+use gleaner_bench_results::Figure;
 use hosted::HostedKernel;
 
 /// Kernels, with the goal for the ratio of component to native time.

@@ -10,7 +10,8 @@ use gleaner_protocol::LiveStatus;
 use gleaner_tests::live::{RunningProgram, cpu_ns, descendants, play, run_all};
 use gleaner_tests::{LambdaCopy, TempFolder};
 
-use crate::measure::{Figure, Twin};
+use crate::measure::Twin;
+use gleaner_bench_results::Figure;
 
 /// Goals for the own memory (USS) of a lambda's process, in MB.
 const OWN_MB: [(Twin, f64); 2] = [(Twin::Rust, 8.0), (Twin::Python, 25.0)];
@@ -157,7 +158,7 @@ impl Load<'_> {
         self.add("wake latency, p99", "us", &us(|stats| stats.p99_ns), figures);
     }
 
-    fn add(&self, what: &str, unit: &'static str, values: &[f64], figures: &mut Vec<Figure>) {
+    fn add(&self, what: &str, unit: &str, values: &[f64], figures: &mut Vec<Figure>) {
         figures.push(Figure::without_goal(&format!("{}: {what}", self.name), unit, values));
     }
 }

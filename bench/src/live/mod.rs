@@ -11,7 +11,8 @@ use gleaner_protocol::LiveStatus;
 use gleaner_tests::live::{RunningProgram, no_player, play, run};
 use gleaner_tests::{TempFolder, namespace, root};
 
-use crate::measure::{Figure, Twin};
+use crate::measure::Twin;
+use gleaner_bench_results::Figure;
 use load::Load;
 
 /// Environment variable of the process in the private network.
@@ -48,13 +49,6 @@ fn start_in_private_network() -> Result<bool, String> {
         let _ = std::fs::write(BUFFER_LIMIT, before.trim());
     }
     status.map(|status| status.success()).map_err(|error| error.to_string())
-}
-
-/// All figures.
-pub fn figures(quick: bool) -> Vec<Figure> {
-    let mut figures = round_trips(quick);
-    figures.extend(loads(quick));
-    figures
 }
 
 /// Name, lambdas, players and seconds of a load.

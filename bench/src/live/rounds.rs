@@ -14,7 +14,8 @@ use gleaner_tests::live::play;
 use super::bare::BareReader;
 use super::{lambda, play_and_stop, start};
 use crate::answers::RttReceiver;
-use crate::measure::{Figure, Twin, cores, quantile};
+use crate::measure::{Twin, cores};
+use gleaner_bench_results::{Figure, quantile};
 
 /// Goals for the round trip of a lambda, relative to the bare reader: median and 99th percentile.
 const RATIO: f64 = 1.5;

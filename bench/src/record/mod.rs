@@ -8,13 +8,15 @@
 mod inline;
 mod process;
 
+use gleaner_bench_results::{Figure, quantile};
 use gleaner_journal::{InputView, JournalEntry, JournalHeader, LogDigest, WakeSource};
+use gleaner_lambda::manifest::Store;
 use gleaner_lambda::{Trigger, TriggerKind};
 use gleaner_messages::Endian;
 use gleaner_transport::{Guid, SampleMeta};
 
-pub use inline::record;
-pub use process::record_live;
+use inline::record;
+use process::record_live;
 
 const TYPE: &str = "std_msgs/msg/ByteMultiArray";
 /// Bytes of a camera frame, chosen so that all topics together make 20 MB/s.
@@ -24,6 +26,66 @@ const IMU_BYTES: usize = 324;
 const IMU_PER_FRAME: u64 = 10;
 const STATUS_BYTES: usize = 1000;
 const STATUS_TOPICS: usize = 8;
+
+/// All figures.
+pub fn figures(quick: bool) -> Vec<Figure> {
+    let mut figures = Vec::new();
+    for (name, store) in [("memory", Store::Ram), ("disk", Store::Disk)] {
+        let load = record(if quick { 2 } else { 60 }, store);
+        let mut add = |what: &str, unit, value| {
+            figures.push(Figure::without_goal(
+                &format!("recorder at 20 MB/s, preroll in {name}: {what}"),
+                unit,
+                &[value],
+            ));
+        };
+        add("arrived", "MB/s", load.megabytes_per_s);
+        add("share of time in clips", "%", load.recorded_percent);
+        add("share of a core", "%", load.cpu_percent);
+        // 64 MiB for a preroll in memory, and 16 MiB for a chunk of a clip and its compression.
+        let bound = if store == Store::Ram { 64.0 + 16.0 } else { 16.0 };
+        let memory = format!("recorder at 20 MB/s, preroll in {name}: memory");
+        figures.push(Figure::at_most(&memory, "MiB", bound, &[load.memory_mib]));
+        let name = format!("recorder at 20 MB/s, preroll in {name}: preroll against its limit");
+        figures.push(Figure::at_most(&name, "%", 100.0, &[load.preroll_percent]));
+    }
+
+    let live = record_live(if quick { 4 } else { 60 });
+    let opened_ms = |share| quantile(&live.opened_ms, share);
+    figures.push(Figure::without_goal(
+        "trigger to window open, at 20 MB/s: p50",
+        "ms",
+        &[opened_ms(0.5)],
+    ));
+    figures.push(Figure::at_most(
+        "trigger to window open, at 20 MB/s: p99",
+        "ms",
+        1.0,
+        &[opened_ms(0.99)],
+    ));
+    figures.push(Figure::without_goal(
+        "trigger to window open, at 20 MB/s: max",
+        "ms",
+        &live.opened_ms[live.opened_ms.len().max(1) - 1..],
+    ));
+    figures.push(Figure::without_goal(
+        "live recorder at 20 MB/s: max time to accept a sample",
+        "ms",
+        &[live.longest_ms],
+    ));
+    figures.push(Figure::without_goal(
+        "live recorder: time to send a wake, p50",
+        "us",
+        &[quantile(&live.sent_us, 0.5)],
+    ));
+    figures.push(Figure::at_most(
+        "live recorder at 20 MB/s: lost samples",
+        "samples",
+        0.0,
+        &[live.lost as f64],
+    ));
+    figures
+}
 
 /// The published data: a camera, an IMU, and eight topics with small messages.
 struct Traffic {

@@ -55,3 +55,13 @@ function followSystem() {
   window.addEventListener("beforeprint", print(true));
   window.addEventListener("afterprint", print(false));
 }
+
+/** Keeps `plot` as wide as `place`, and redraws it when the theme changes. */
+function keepWidth(plot, place) {
+  const fit = () => {
+    const width = Math.floor(place.clientWidth);
+    if (width > 0 && width !== plot.width) plot.setSize({ width, height: plot.height });
+  };
+  new ResizeObserver(fit).observe(place);
+  themeListeners.push(() => plot.redraw(false, true));
+}

@@ -8,16 +8,21 @@ use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
-use super::ReportPage;
-
 const PAGE: &str = include_str!("../../assets/page/page.html");
 const STYLE: [&str; 2] =
     [include_str!("../../assets/uPlot.min.css"), include_str!("../../assets/page/page.css")];
 /// uPlot, which draws the plots.
 const PLOTS: &str = include_str!("../../assets/uPlot.iife.min.js");
 const PLOTS_LICENSE: &str = include_str!("../../assets/uPlot.LICENSE");
-/// The scripts, each after those that it uses.
-const SCRIPTS: &[&str] = &[
+/// The scripts of a page of measurements.
+pub(crate) const MEASUREMENT_SCRIPTS: &[&str] = &[
+    include_str!("../../assets/page/elements.js"),
+    include_str!("../../assets/page/format.js"),
+    include_str!("../../assets/page/colours.js"),
+    include_str!("../../assets/page/measurements.js"),
+];
+/// The scripts of the report of a run, each after those that it uses.
+pub(super) const RUN_SCRIPTS: &[&str] = &[
     include_str!("../../assets/page/elements.js"),
     include_str!("../../assets/page/format.js"),
     include_str!("../../assets/page/colours.js"),
@@ -33,9 +38,9 @@ const SCRIPTS: &[&str] = &[
     include_str!("../../assets/page/main.js"),
 ];
 
-/// Renders `page`.
-pub(super) fn html(page: &ReportPage) -> String {
-    let script = script();
+/// Renders a page with the data `page`.
+pub(crate) fn html(page: &impl Serialize, scripts: &[&str]) -> String {
+    let script = script(scripts);
     let policy = format!(
         "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{}'; base-uri 'none'; form-action 'none'",
         STANDARD.encode(Sha256::digest(&script))
@@ -60,8 +65,8 @@ pub(super) fn html(page: &ReportPage) -> String {
 }
 
 /// Returns the script as one function, so that it adds no global names.
-fn script() -> String {
-    format!("\n{PLOTS}\n(() => {{\n\"use strict\";\n{}\n}})();\n", SCRIPTS.join("\n"))
+fn script(scripts: &[&str]) -> String {
+    format!("\n{PLOTS}\n(() => {{\n\"use strict\";\n{}\n}})();\n", scripts.join("\n"))
 }
 
 /// Returns `value` as JSON without characters that could end an HTML element or a line of a script.
@@ -99,10 +104,16 @@ mod tests {
 
     #[test]
     fn the_hash_is_that_of_the_script_in_its_element() {
-        let page = html(&ReportPage { made_by: String::new(), runs: Vec::new(), diff: None });
+        for scripts in [RUN_SCRIPTS, MEASUREMENT_SCRIPTS] {
+            check_hash(scripts);
+        }
+    }
+
+    fn check_hash(scripts: &[&str]) {
+        let page = html(&"", scripts);
         let (_, after) = page.split_once("<script>").unwrap();
         let (inside, rest) = after.split_once("</script>").unwrap();
-        assert_eq!(inside, script());
+        assert_eq!(inside, script(scripts));
         // An HTML comment in a script would change where it ends.
         assert!(!inside.contains("<!--") && !inside.contains('\r'));
         assert!(!rest.contains("<script"));
@@ -112,7 +123,12 @@ mod tests {
 
     #[test]
     fn the_page_fetches_nothing_and_sets_no_text_as_html() {
-        let sources = [PAGE, STYLE[1]].iter().chain(SCRIPTS).copied().collect::<String>();
+        let sources = [PAGE, STYLE[1]]
+            .iter()
+            .chain(RUN_SCRIPTS)
+            .chain(MEASUREMENT_SCRIPTS)
+            .copied()
+            .collect::<String>();
         for word in [
             "http://",
             "https://",

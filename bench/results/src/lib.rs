@@ -1,0 +1,24 @@
+//! Results of a benchmark: what was measured, on which machine, and what it means.
+//!
+//! - [`BenchResults`] is one run: tables of [`Figure`]s, and [`Series`] of single measurements with
+//!   all of their values. It is stored as JSON, as Markdown, and as a page with plots.
+//! - [`Summary`] has the statistics of a series, and [`Difference`] compares two.
+//! - [`Comparison`] compares two runs.
+//! - [`Machine`] is where a run took place.
+
+mod comparison;
+mod figure;
+mod machine;
+mod markdown;
+mod page;
+mod results;
+mod statistics;
+#[cfg(test)]
+#[path = "../../../base/src/test_folder.rs"]
+mod test_folder;
+
+pub use comparison::Comparison;
+pub use figure::{Figure, Goal};
+pub use machine::Machine;
+pub use results::{BenchResults, Reception, Series, SeriesGroup};
+pub use statistics::{Difference, Summary, quantile};

@@ -1,0 +1,199 @@
+//! The results of one run of a benchmark, and their files.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use gleaner_base::{Exit, Failure, write_atomically};
+use serde::{Deserialize, Serialize};
+
+use crate::figure::Figure;
+use crate::machine::Machine;
+
+/// Version of the format of the JSON file.
+const FORMAT: u32 = 1;
+
+/// What one run of a benchmark has measured.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BenchResults {
+    format: u32,
+    /// The benchmark, as in `cargo xtask bench NAME`.
+    pub bench: String,
+    /// True if it ran for a short time: the values show only that it works.
+    pub is_quick: bool,
+    /// Where it ran.
+    pub machine: Machine,
+    /// Rows with a value for each run.
+    pub figures: Vec<Figure>,
+    /// Series that are compared with each other.
+    pub groups: Vec<SeriesGroup>,
+    /// Sentences that a reader needs to understand the tables.
+    pub notes: Vec<String>,
+}
+
+/// Series under the same conditions.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct SeriesGroup {
+    /// The conditions.
+    pub name: String,
+    /// The unit of all values.
+    pub unit: String,
+    /// Name of the series that the others are compared with.
+    pub base: Option<String>,
+    /// The series.
+    pub series: Vec<Series>,
+}
+
+/// Measurements of one kind, in the order in which they were made.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Series {
+    /// What was measured, for example one side of a comparison.
+    pub name: String,
+    /// Facts about it, for example its socket buffer.
+    pub details: BTreeMap<String, String>,
+    /// Numbers of messages; `None` if there were none to count.
+    pub reception: Option<Reception>,
+    /// All values.
+    pub values: Vec<f64>,
+}
+
+/// What was sent, and what arrived.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Reception {
+    /// Number of messages that were sent.
+    pub sent: u64,
+    /// Number of those that were answered.
+    pub answered: u64,
+}
+
+impl BenchResults {
+    /// Returns empty results of `bench` on this machine.
+    pub fn new(bench: &str, is_quick: bool) -> Self {
+        let mut machine = Machine::of_this();
+        machine.add_load("load before");
+        Self {
+            format: FORMAT,
+            bench: bench.to_owned(),
+            is_quick,
+            machine,
+            figures: Vec::new(),
+            groups: Vec::new(),
+            notes: Vec::new(),
+        }
+    }
+
+    /// Returns whether all goals are met. They do not count in a quick run.
+    pub fn is_good(&self) -> bool {
+        self.is_quick || self.figures.iter().all(Figure::is_met)
+    }
+
+    /// Writes `results.json`, `results.md` and `report.html` into `folder`, which it creates.
+    ///
+    /// # Errors
+    ///
+    /// A file that cannot be written.
+    pub fn store(&self, folder: &Path) -> Result<(), Failure> {
+        let failed = |path: &Path, error| {
+            let message = format!("cannot write `{}`", path.display());
+            Failure::caused_by(Exit::Internal, message, &error)
+                .with_help("choose a folder that can be written: --out DIR")
+        };
+        fs::create_dir_all(folder).map_err(|error| failed(folder, error))?;
+        let json = serde_json::to_vec(self).expect("results are plain data");
+        let files =
+            [("results.json", json), ("results.md", self.to_markdown().into_bytes())].into_iter();
+        for (name, content) in files.chain([("report.html", self.to_html().into_bytes())]) {
+            let path = folder.join(name);
+            write_atomically(&path, &content).map_err(|error| failed(&path, error))?;
+        }
+        Ok(())
+    }
+
+    /// Reads the JSON file of a run, or the one in a folder.
+    ///
+    /// # Errors
+    ///
+    /// A file that cannot be read, or has no such results.
+    pub fn read(path: &Path) -> Result<Self, Failure> {
+        let path = if path.is_dir() { path.join("results.json") } else { path.to_owned() };
+        let failed = |error: &dyn std::error::Error| {
+            let message = format!("cannot read the results `{}`", path.display());
+            Failure::caused_by(Exit::Usage, message, error)
+                .with_help("name a folder with results, or the results.json in it")
+        };
+        let text = fs::read(&path).map_err(|error| failed(&error))?;
+        let results: Self = serde_json::from_slice(&text).map_err(|error| failed(&error))?;
+        if results.format != FORMAT {
+            let message = format!(
+                "`{}` has format {}; this program reads {FORMAT}",
+                path.display(),
+                results.format
+            );
+            return Err(Failure::new(Exit::Usage, message)
+                .with_help("measure again, or compare with the program that wrote it"));
+        }
+        Ok(results)
+    }
+}
+
+impl SeriesGroup {
+    /// Returns the series that the others are compared with.
+    pub fn base(&self) -> Option<&Series> {
+        let base = self.base.as_ref()?;
+        self.series.iter().find(|series| series.name == *base)
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::test_folder::TestFolder;
+
+    /// Results with a table and a comparison; `shift` is added to the times of wasm.
+    pub(crate) fn example(shift: f64) -> BenchResults {
+        let series = |name: &str, from: f64| Series {
+            name: name.to_owned(),
+            details: [("stack".to_owned(), "RustDDS <1>".to_owned())].into(),
+            reception: Some(Reception { sent: 201, answered: 200 }),
+            values: (0..200).map(|n| from + f64::from((n * 37) % 100) / 100.0).collect(),
+        };
+        let mut results = BenchResults::new("rtt", false);
+        results.figures.push(Figure::at_most("wake", "us", 20.0, &[18.0, 19.0, 21.0]));
+        results.groups.push(SeriesGroup {
+            name: "IMU | 100 Hz".to_owned(),
+            unit: "ms".to_owned(),
+            base: Some("bare".to_owned()),
+            series: vec![series("bare", 1.0), series("wasm", 1.5 + shift)],
+        });
+        results.notes.push("A note.".to_owned());
+        results
+    }
+
+    #[test]
+    fn results_are_stored_and_read_again() {
+        let folder = TestFolder::new();
+        let results = example(0.0);
+        let path = folder.path("deep/er");
+        results.store(&path).unwrap();
+        assert_eq!(BenchResults::read(&path).unwrap(), results);
+        assert_eq!(BenchResults::read(&path.join("results.json")).unwrap(), results);
+        let page = fs::read_to_string(path.join("report.html")).unwrap();
+        assert!(page.contains("RustDDS \\u003c1\\u003e") && !page.contains("RustDDS <1>"));
+        let text = fs::read_to_string(path.join("results.md")).unwrap();
+        assert!(text.contains("| bare | 200 of 201 | 1.00 |"), "{text}");
+        assert!(text.contains("| wasm | 1.33"), "{text}");
+    }
+
+    #[test]
+    fn other_files_are_refused_with_the_reason() {
+        let folder = TestFolder::new();
+        let path = folder.path("results.json");
+        assert!(BenchResults::read(&path).unwrap_err().to_string().contains("results.json"));
+        fs::write(&path, "{}").unwrap();
+        assert!(BenchResults::read(&path).unwrap_err().to_string().contains("missing field"));
+        let mut later = serde_json::to_value(example(0.0)).unwrap();
+        later["format"] = 2.into();
+        fs::write(&path, later.to_string()).unwrap();
+        assert!(BenchResults::read(&path).unwrap_err().to_string().contains("has format 2"));
+    }
+}
