@@ -12,6 +12,7 @@ mod live;
 mod measure;
 mod record;
 mod replay;
+mod rtt;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
@@ -37,8 +38,12 @@ struct Args {
 
 #[derive(Subcommand, Clone)]
 enum BenchCommand {
-    /// Round trips from a sample to its answer, against a bare reader; needs gleaner-player.
-    Rtt,
+    /// Round trips from a sample to its answer, against a bare reader and programs without
+    /// Gleaner; needs gleaner-player.
+    Rtt {
+        #[command(flatten)]
+        options: rtt::RttOptions,
+    },
     /// What one and several lambdas receive and cost; needs gleaner-player.
     Scale,
     /// Effect of a misbehaving lambda on others, and the start of a lambda; needs gleaner-player.
@@ -106,7 +111,7 @@ fn measure(command: &BenchCommand, args: &Args) -> Result<ExitCode, Failure> {
     let mut results = BenchResults::new(name, quick);
     add_versions(&mut results);
     match command {
-        BenchCommand::Rtt => results.figures = live::round_trips(quick),
+        BenchCommand::Rtt { options } => rtt::measure(quick, options, &mut results),
         BenchCommand::Scale => results.figures = live::loads(quick),
         BenchCommand::Isolation => match isolation::figures(quick) {
             Ok(figures) => results.figures = figures,
@@ -135,7 +140,7 @@ impl BenchCommand {
     /// The name of its results.
     fn name(&self) -> &'static str {
         match self {
-            Self::Rtt => "rtt",
+            Self::Rtt { .. } => "rtt",
             Self::Scale => "scale",
             Self::Isolation => "isolation",
             Self::ColdStart => "cold-start",
@@ -151,7 +156,7 @@ impl BenchCommand {
 
     /// Returns whether it needs a network of its own.
     fn is_live(&self) -> bool {
-        matches!(self, Self::Rtt | Self::Scale | Self::Isolation)
+        matches!(self, Self::Rtt { .. } | Self::Scale | Self::Isolation)
     }
 
     /// Returns whether it has only one process at a time, which is not to move between cores.

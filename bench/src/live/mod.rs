@@ -1,26 +1,25 @@
-//! Measures live topics: losses, latencies and costs, in a private network with `gleaner-player`
+//! Measures live topics: losses and costs, in a private network with `gleaner-player`
 //! (Cyclone DDS) as publisher.
 
-mod bare;
+mod busy_cores;
 mod load;
-mod rounds;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use gleaner_protocol::LiveStatus;
-use gleaner_tests::live::{RunningProgram, no_player, play, run};
-use gleaner_tests::{TempFolder, namespace, root};
+use gleaner_tests::live::no_player;
+use gleaner_tests::{namespace, root};
 
 use crate::measure::Twin;
+pub use busy_cores::BusyCores;
 use gleaner_bench_results::Figure;
 use load::Load;
 
-/// Environment variable of the process in the private network.
+/// Environment variable of the process in the private network: the process that started it.
 const ALONE: &str = "GLEANER_BENCH_ALONE";
 
 /// The system's limit of socket buffers. It applies to all network namespaces, and can be changed
 /// in the first one only.
-const BUFFER_LIMIT: &str = "/proc/sys/net/core/rmem_max";
+pub(crate) const BUFFER_LIMIT: &str = "/proc/sys/net/core/rmem_max";
 const BUFFER_BYTES: u64 = 64 << 20;
 
 /// Remap of the second camera of `bench/lambdas/rig`.
@@ -36,6 +35,11 @@ pub fn in_private_network() -> Option<Result<bool, String>> {
     Some(start_in_private_network())
 }
 
+/// Returns the id of the process that started this one in its private network.
+pub(crate) fn starter() -> Option<String> {
+    std::env::var(ALONE).ok()
+}
+
 fn start_in_private_network() -> Result<bool, String> {
     if let Some(why) = namespace::unavailable().or(no_player()) {
         return Err(why.to_owned());
@@ -43,9 +47,11 @@ fn start_in_private_network() -> Result<bool, String> {
     let before = std::fs::read_to_string(BUFFER_LIMIT).unwrap_or_default();
     let is_small = before.trim().parse::<u64>().is_ok_and(|bytes| bytes < BUFFER_BYTES);
     let raised = is_small && std::fs::write(BUFFER_LIMIT, BUFFER_BYTES.to_string()).is_ok();
-    let status = namespace::rerun(ALONE, "1").args(std::env::args_os().skip(1)).status();
-    if raised {
-        // Restored for the other users of this machine.
+    let status = namespace::rerun(ALONE, &std::process::id().to_string())
+        .args(std::env::args_os().skip(1))
+        .status();
+    // Restored for the other users of this machine, whatever the benchmark has set.
+    if raised || std::fs::read_to_string(BUFFER_LIMIT).is_ok_and(|after| after != before) {
         let _ = std::fs::write(BUFFER_LIMIT, before.trim());
     }
     status.map(|status| status.success()).map_err(|error| error.to_string())
@@ -105,35 +111,6 @@ pub fn loads(quick: bool) -> Vec<Figure> {
     figures
 }
 
-/// The times from a sample to its answer.
-pub fn round_trips(quick: bool) -> Vec<Figure> {
-    let mut figures = Vec::new();
-    rounds::figures(if quick { 3 } else { 60 }, &mut figures);
-    figures
-}
-
 pub(crate) fn lambda(name: &str, kind: Twin) -> PathBuf {
     root().join("bench/lambdas").join(name).join(kind.folder())
-}
-
-fn start(lambda: &Path, args: &[&str]) -> (RunningProgram, TempFolder) {
-    let out = TempFolder::new();
-    let started = run(lambda, out.path(), args);
-    started.until_ready();
-    (started, out)
-}
-
-/// Plays to the end, then stops the lambda and returns its final status.
-fn play_and_stop((started, _out): (RunningProgram, TempFolder), player: &[&str]) -> LiveStatus {
-    let playing = play(player);
-    let mut has_begun = false;
-    started.until_live("the end of the samples", |live| {
-        // Begun if something was received, as everything may be lost, or if all writers are there.
-        has_begun |= live.topics.iter().all(|topic| topic.writers > Some(0) || topic.received > 0);
-        has_begun && live.topics.iter().all(|topic| topic.writers == Some(0))
-    });
-    let played = playing.finish();
-    assert!(played.status.success(), "{}", played.stderr);
-    started.signal("INT");
-    started.finish().ended()
 }

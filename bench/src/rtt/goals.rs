@@ -1,0 +1,63 @@
+//! The promises of round trips, against a bare reader and against programs without Gleaner.
+
+use gleaner_bench_results::{Figure, Series, SeriesGroup, Summary};
+
+use super::node::NodeSide;
+use super::sides::Side;
+use super::workload::Workload;
+
+/// Most that an empty lambda takes, against the bare reader.
+const EMPTY: f64 = 1.5;
+/// Socket buffer from which on images are not lost, in bytes.
+const TUNED: u64 = 4 << 20;
+
+/// Statistics that are compared: name, value, and the goal of the ratio.
+type Ratio = (&'static str, fn(&Summary) -> f64, f64);
+
+const OF_FFT: [Ratio; 4] = [
+    ("median", |it| it.median, 0.5),
+    ("mean", |it| it.mean, 1.0),
+    ("p95", |it| it.p95, 1.0),
+    ("p99", |it| it.p99, 0.75),
+];
+
+/// Adds the rows of a group.
+pub(super) fn of_group(
+    workload: Workload,
+    granted: u64,
+    group: &SeriesGroup,
+    figures: &mut Vec<Figure>,
+) {
+    let of_images = if granted >= TUNED { 0.75 } else { 1.0 };
+    let of_images: [Ratio; 2] =
+        [("mean", |it| it.mean, of_images), ("p95", |it| it.p95, of_images)];
+    let (others, ratios): (&[&str], &[Ratio]) = match workload {
+        Workload::Empty | Workload::EmptyAwake => {
+            (&[Side::BARE], &[("median", |it| it.median, EMPTY)])
+        }
+        Workload::ImuFft => (&[NodeSide::STAND_IN, NodeSide::RCLPY], &OF_FFT),
+        Workload::Brake720 | Workload::Brake1080 => {
+            (&[NodeSide::STAND_IN, NodeSide::RCLPY], &of_images)
+        }
+    };
+    for series in group.series.iter().filter(|series| is_ours(series)) {
+        let Series { name, values, reception, .. } = series;
+        let Some(ours) = Summary::of(values) else { continue };
+        let missing = reception.map_or(f64::NAN, |it| it.sent as f64 - it.answered as f64);
+        let row = format!("{}, {name}: samples without an answer", group.name);
+        figures.push(Figure::at_most(&row, "samples", 0.0, &[missing]));
+        let compared = group.series.iter().filter(|other| others.contains(&other.name.as_str()));
+        for other in compared {
+            let Some(theirs) = Summary::of(&other.values) else { continue };
+            for (what, of, goal) in ratios {
+                let row = format!("{}, {name}, against the {}: {what}", group.name, other.name);
+                figures.push(Figure::at_most(&row, "times", *goal, &[of(&ours) / of(&theirs)]));
+            }
+        }
+    }
+}
+
+/// Returns whether a series is that of a lambda.
+fn is_ours(series: &Series) -> bool {
+    series.name.starts_with("lambda")
+}

@@ -1,0 +1,153 @@
+//! Round trips from a sample to its answer, by the protocol of the paper: a warm-up and a measured
+//! time, three times, for each side in turns. All sides have the same sender and the same recorder.
+//!
+//! - `workload`: what is answered, and by whom. `sides`: one side of a comparison, for one turn.
+//! - `bare`: a reader that only answers. `node`: a program that a user would write without Gleaner.
+//! - `buffers`: the system's limit of socket buffers. `goals`: the promises.
+
+mod bare;
+mod buffers;
+mod goals;
+mod node;
+mod sides;
+mod workload;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use clap::Args;
+use gleaner_bench_results::{BenchResults, Reception, Series, SeriesGroup, quantile};
+use gleaner_dds::{Dds, DdsOptions};
+
+use crate::answers::RttReceiver;
+use crate::live::BusyCores;
+use buffers::BufferLimit;
+use sides::{Side, Turn};
+use workload::Workload;
+
+/// Topic of all answers.
+const ANSWERS: &str = "/rtt/answers";
+
+/// The length of a run.
+#[derive(Args, Clone)]
+pub struct RttOptions {
+    /// Time before each measured one, in s.
+    #[arg(long, value_name = "S", default_value_t = 20)]
+    warm_up: u32,
+    /// Length of a measured time, in s.
+    #[arg(long, value_name = "S", default_value_t = 20)]
+    turn: u32,
+    /// Number of measured times of each side.
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    turns: u32,
+    /// Selects the order of the sides in each turn.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// Only this workload; may be repeated [default: all].
+    #[arg(long, value_name = "NAME")]
+    workload: Vec<Workload>,
+}
+
+/// Measures all workloads.
+pub fn measure(quick: bool, options: &RttOptions, results: &mut BenchResults) {
+    let mut options = options.clone();
+    if quick {
+        (options.warm_up, options.turn, options.turns) = (1, 2, 1);
+    }
+    let RttOptions { warm_up, turn, turns, seed, .. } = options;
+    results.notes.push(format!(
+        "{turns} turns of {turn} s after a warm-up of {warm_up} s for each side, in an order by the \
+         seed {seed}; each side starts anew for each turn. *Answered of sent* includes the warm-up."
+    ));
+    results.notes.push(
+        "A round trip is the time from the stamp that the sender writes, of CLOCK_MONOTONIC, to \
+         the stamp of the answer, just before it is sent."
+            .to_owned(),
+    );
+    let workloads =
+        if options.workload.is_empty() { Workload::ALL.to_vec() } else { options.workload.clone() };
+    let limit = BufferLimit::of_this_machine();
+    for workload in workloads {
+        let rows = if quick { vec![None] } else { workload.buffers() };
+        for bytes in rows {
+            if let Some(bytes) = bytes
+                && let Err(why) = limit.set(bytes)
+            {
+                results.notes.push(format!("{workload:?} with {bytes} B is skipped: {why}"));
+                continue;
+            }
+            let granted = limit.bytes();
+            let name = workload.title(granted);
+            eprintln!("{name}");
+            let busy = workload.is_awake().then(BusyCores::start);
+            if let Some(Err(error)) = &busy {
+                results.notes.push(format!("{name} is skipped: no busy cores: {error}"));
+                continue;
+            }
+            compare(workload, name, granted, &options, results);
+        }
+    }
+}
+
+/// Lets the sides of a workload take turns, and adds them to the results.
+fn compare(
+    workload: Workload,
+    name: String,
+    granted: u64,
+    options: &RttOptions,
+    results: &mut BenchResults,
+) {
+    let mut dds = Dds::open(DdsOptions::new("/gleaner_bench/answers")).expect("a private network");
+    let answers: Arc<RttReceiver> = RttReceiver::on(&mut dds, ANSWERS);
+    let mut sides = workload.sides(granted);
+    let mut turns: BTreeMap<usize, Vec<Turn>> = BTreeMap::new();
+    let mut random = options.seed.max(1);
+    for _ in 0..options.turns {
+        let mut order: Vec<usize> = (0..sides.len()).collect();
+        // Fisher and Yates.
+        for last in (1..order.len()).rev() {
+            random ^= random << 13;
+            random ^= random >> 7;
+            random ^= random << 17;
+            order.swap(last, (random % (last as u64 + 1)) as usize);
+        }
+        for index in order {
+            match sides[index].turn(workload, &answers, [options.warm_up, options.turn]) {
+                Ok(turn) => turns.entry(index).or_default().push(turn),
+                Err(why) => {
+                    let note = format!("{name}, {}: skipped: {why}", sides[index].name());
+                    if !results.notes.contains(&note) {
+                        results.notes.push(note);
+                    }
+                }
+            }
+        }
+    }
+    let series = sides.iter_mut().enumerate().filter_map(|(index, side)| {
+        let turns = turns.remove(&index)?;
+        let add = |count: fn(&Turn) -> u64| turns.iter().map(count).sum::<u64>();
+        let reception =
+            Reception { sent: add(|turn| turn.sent), answered: add(|turn| turn.answered) };
+        let median = |number: fn(&Turn) -> Option<f64>| {
+            let numbers: Vec<f64> = turns.iter().filter_map(number).collect();
+            (!numbers.is_empty()).then(|| format!("{:.1}", quantile(&numbers, 0.5)))
+        };
+        let mut details = turns.last()?.facts.clone();
+        for (name, value) in [
+            ("CPU, % of a core", median(|turn| turn.cpu_percent)),
+            ("memory (PSS), MB", median(|turn| turn.memory_mb)),
+        ] {
+            details.extend(value.map(|value| (name.to_owned(), value)));
+        }
+        let values = turns.iter().flat_map(|turn| turn.times_ms.iter().copied()).collect();
+        Some(Series { name: side.name(), details, reception: Some(reception), values })
+    });
+    let series: Vec<Series> = series.collect();
+    let base = Side::BARE.to_owned();
+    let group = SeriesGroup { name, unit: "ms".to_owned(), base: Some(base), series };
+    goals::of_group(workload, granted, &group, &mut results.figures);
+    for side in &sides {
+        side.stages(&group.name, &mut results.figures);
+    }
+    results.groups.push(group);
+}

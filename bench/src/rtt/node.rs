@@ -1,0 +1,118 @@
+//! A program that a user would write without Gleaner: a node of `bench/baselines`.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::process::Command;
+
+use gleaner_tests::live::RunningProgram;
+use gleaner_tests::root;
+use serde_json::Value;
+
+use super::ANSWERS;
+use super::workload::Workload;
+
+/// Kinds of nodes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum NodeKind {
+    /// Cyclone DDS for Python: a stand-in where there is no ROS 2.
+    StandIn,
+    /// An ordinary ROS 2 node.
+    Rclpy,
+    /// The same, with a C library that keeps the memory of messages.
+    RclpyKeepingMemory,
+}
+
+/// A node, and the limit of socket buffers.
+pub(super) struct NodeSide {
+    pub(super) kind: NodeKind,
+    pub(super) buffer: u64,
+}
+
+/// Settings of glibc with which it keeps the memory of messages.
+const KEEPING: [(&str, &str); 3] = [
+    ("MALLOC_MMAP_THRESHOLD_", "33554432"),
+    ("MALLOC_TRIM_THRESHOLD_", "4294967296"),
+    ("MALLOC_TOP_PAD_", "67108864"),
+];
+
+/// Facts that a node states, and their names in the table.
+const FACTS: [(&str, &str); 4] = [
+    ("stack", "stack"),
+    ("socket_buffer", "socket buffer, B"),
+    ("depth", "depth"),
+    ("luma", "luma"),
+];
+
+impl NodeSide {
+    /// Name of the stand-in.
+    pub(super) const STAND_IN: &'static str = "stand-in (Cyclone DDS for Python)";
+    /// Name of the ROS 2 node.
+    pub(super) const RCLPY: &'static str = "rclpy";
+
+    pub(super) fn name(&self) -> &'static str {
+        match self.kind {
+            NodeKind::StandIn => Self::STAND_IN,
+            NodeKind::Rclpy => Self::RCLPY,
+            NodeKind::RclpyKeepingMemory => "rclpy, memory kept",
+        }
+    }
+
+    /// Starts the node, and waits for its topics; returns what it states about itself.
+    ///
+    /// # Errors
+    ///
+    /// The reason why it cannot run here.
+    pub(super) fn start(
+        &self,
+        workload: Workload,
+    ) -> Result<(RunningProgram, BTreeMap<String, String>), String> {
+        let (folder, python) = match self.kind {
+            NodeKind::StandIn => ("cyclonedds_py", root().join("target/baselines/bin/python3")),
+            NodeKind::Rclpy | NodeKind::RclpyKeepingMemory => {
+                let python = std::env::var_os("GLEANER_ROS_PYTHON");
+                ("rclpy", python.map_or_else(|| "python3".into(), PathBuf::from))
+            }
+        };
+        if self.kind == NodeKind::StandIn && !python.is_file() {
+            return Err(format!("there is no {}", python.display()));
+        }
+        let (name, config) = workload.of_baseline();
+        let mut command = Command::new(python);
+        command.arg(root().join("bench/baselines").join(folder).join("node.py")).arg(name);
+        command.args(["--input", "/imu/synthetic", "--answers", ANSWERS]);
+        if workload.is_of_images() {
+            command.args(["--image", workload.event().0]);
+        }
+        command.args(config.iter().flat_map(|value| ["--config", value]));
+        command.env("CYCLONEDDS_URI", self.cyclone());
+        if self.kind == NodeKind::RclpyKeepingMemory {
+            command.envs(KEEPING);
+        }
+        let started = RunningProgram::start(command);
+        let first = started.until_line("the first line of a baseline", |line| {
+            serde_json::from_str::<Value>(line).ok()
+        });
+        if let Some(why) = first["skipped"].as_str() {
+            return Err(why.to_owned());
+        }
+        let facts = FACTS.iter().filter_map(|(key, name)| {
+            let value = match &first[*key] {
+                Value::Null => return None,
+                Value::String(text) => text.clone(),
+                other => other.to_string(),
+            };
+            Some(((*name).to_owned(), value))
+        });
+        Ok((started, facts.collect()))
+    }
+
+    /// Returns the configuration of Cyclone DDS: as much socket buffer as the system grants.
+    fn cyclone(&self) -> String {
+        format!(
+            "<CycloneDDS><Domain id=\"any\"><Internal>\
+               <SocketReceiveBufferSize min=\"{}B\"/>\
+             </Internal></Domain></CycloneDDS>",
+            self.buffer
+        )
+    }
+}

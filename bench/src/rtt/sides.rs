@@ -1,0 +1,231 @@
+//! One side of a comparison: it is started, fed for one turn, and ended.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use gleaner_bench_results::Figure;
+use gleaner_protocol::LiveStatus;
+use gleaner_tests::live::{PATIENCE, RunningProgram, cpu_ns, descendants, play, run};
+use gleaner_tests::{LambdaCopy, TempFolder};
+
+use super::ANSWERS;
+use super::bare::BareReader;
+use super::node::NodeSide;
+use super::workload::Workload;
+use crate::answers::{RttAnswer, RttReceiver};
+use crate::measure::Twin;
+
+/// A side.
+pub(super) enum Side {
+    /// A reader that only answers.
+    Bare,
+    /// A lambda in `gleaner run`.
+    Lambda(Box<LambdaSide>),
+    /// A program without Gleaner.
+    Node(NodeSide),
+}
+
+/// A lambda, and its status at the end of the last turn.
+pub(super) struct LambdaSide {
+    pub(super) kind: Twin,
+    pub(super) lambda: LambdaCopy,
+    pub(super) last: Option<LiveStatus>,
+}
+
+/// What one turn has measured.
+pub(super) struct Turn {
+    /// Round trips after the warm-up, in the order of their answers.
+    pub(super) times_ms: Vec<f64>,
+    /// Samples that were sent and answered, with those of the warm-up.
+    pub(super) sent: u64,
+    pub(super) answered: u64,
+    /// Costs of all processes of the side; `None` for a part of the bench itself.
+    pub(super) cpu_percent: Option<f64>,
+    pub(super) memory_mb: Option<f64>,
+    /// Facts about the side.
+    pub(super) facts: BTreeMap<String, String>,
+}
+
+/// A side that runs.
+enum RunningSide {
+    Bare(BareReader),
+    Lambda(RunningProgram, TempFolder),
+    Node(RunningProgram),
+}
+
+impl Side {
+    /// Name of the bare reader.
+    pub(super) const BARE: &'static str = "bare reader";
+
+    pub(super) fn name(&self) -> String {
+        match self {
+            Self::Bare => Self::BARE.to_owned(),
+            Self::Lambda(side) => format!("lambda, {}", side.kind),
+            Self::Node(side) => side.name().to_owned(),
+        }
+    }
+
+    /// Runs one turn; `seconds` are those of the warm-up and of the measured time.
+    ///
+    /// # Errors
+    ///
+    /// The reason why it cannot run here.
+    pub(super) fn turn(
+        &mut self,
+        workload: Workload,
+        answers: &RttReceiver,
+        [warm_up, measured]: [u32; 2],
+    ) -> Result<Turn, String> {
+        let (running, mut facts) = self.start(workload)?;
+        answers.take();
+        let duration = (warm_up + measured).to_string();
+        let is_alone = matches!(self, Self::Bare);
+        let player = ["--stamp", "monotonic", "--wait", "1", "--duration", &duration];
+        let player = play(&[&workload.player(is_alone)[..], &player].concat());
+        let mut received = first(answers, &self.name());
+        sleep(Duration::from_secs(warm_up.into()));
+        let (before, began) = (running.cpu_ns(), Instant::now());
+        sleep(Duration::from_secs_f64(0.9 * f64::from(measured)));
+        let cpu = running.cpu_ns().zip(before).map(|(after, before)| after.saturating_sub(before));
+        let span = began.elapsed();
+        let memory_mb = running.memory_mb();
+        let played = player.finish();
+        let sent = played.sent()[workload.event().0];
+        // The last answers may still be on their way.
+        sleep(Duration::from_millis(500));
+        received.extend(answers.take());
+        self.end(running, &mut facts);
+        let stamp = |answer: &RttAnswer| answer.at_ns - answer.ns as i64;
+        let from = stamp(&received[0]) + i64::from(warm_up) * 1_000_000_000;
+        let counted = received.iter().filter(|answer| stamp(answer) >= from);
+        Ok(Turn {
+            times_ms: counted.map(|answer| answer.ns / 1e6).collect(),
+            sent,
+            answered: received.len() as u64,
+            cpu_percent: cpu.map(|cpu| 100.0 * cpu as f64 / span.as_nanos() as f64),
+            memory_mb,
+            facts,
+        })
+    }
+
+    fn start(&self, workload: Workload) -> Result<(RunningSide, BTreeMap<String, String>), String> {
+        let (topic, type_name) = workload.event();
+        let fact = |name: &str, value: &str| (name.to_owned(), value.to_owned());
+        match self {
+            Self::Bare => {
+                let reader = BareReader::start(topic, type_name, ANSWERS);
+                Ok((RunningSide::Bare(reader), [fact("stack", "RustDDS, in one thread")].into()))
+            }
+            Self::Lambda(side) => {
+                let out = TempFolder::new();
+                let args = ["--no-record", "--rtt", ANSWERS];
+                let started = run(side.lambda.path(), out.path(), &args);
+                started.until_ready();
+                let stack = fact("stack", "RustDDS, in gleaner-ingress");
+                Ok((RunningSide::Lambda(started, out), [stack].into()))
+            }
+            Self::Node(side) => {
+                let (started, facts) = side.start(workload)?;
+                Ok((RunningSide::Node(started), facts))
+            }
+        }
+    }
+
+    /// Ends a side, and adds what it states at its end.
+    fn end(&mut self, running: RunningSide, facts: &mut BTreeMap<String, String>) {
+        match running {
+            RunningSide::Bare(reader) => reader.stop(),
+            RunningSide::Lambda(started, _out) => {
+                started.signal("INT");
+                let live = started.finish().ended();
+                let granted = live.network.buffer_granted;
+                facts.insert("socket buffer, B".to_owned(), granted.to_string());
+                if let Self::Lambda(side) = self {
+                    side.last = Some(live);
+                }
+            }
+            RunningSide::Node(started) => {
+                started.signal("INT");
+                let finished = started.finish();
+                assert!(finished.status.success(), "{}", finished.stderr);
+            }
+        }
+    }
+
+    /// Adds the times of the stages of a lambda, in its last turn.
+    pub(super) fn stages(&self, group: &str, figures: &mut Vec<Figure>) {
+        let Self::Lambda(side) = self else { return };
+        let Some(live) = &side.last else { return };
+        let goals = match side.kind {
+            Twin::Rust => [20.0, 100.0],
+            Twin::Python => [30.0, 150.0],
+        };
+        for (what, stats, has_goal) in [
+            ("sample received to lambda entered", live.wake_latency, true),
+            ("in the lambda", live.run_time, false),
+            ("lambda returned to decision sent", live.decision_latency, true),
+        ] {
+            let Some(stats) = stats else { continue };
+            for (share, ns, goal) in
+                [("p50", stats.p50_ns, goals[0]), ("p99", stats.p99_ns, goals[1])]
+            {
+                let name = format!("{group}, {}: {what}, {share}", side.kind);
+                let us = [ns as f64 / 1e3];
+                figures.push(if has_goal {
+                    Figure::at_most(&name, "us", goal, &us)
+                } else {
+                    Figure::without_goal(&name, "us", &us)
+                });
+            }
+        }
+    }
+}
+
+impl RunningSide {
+    /// Returns the processes of the side; none for a part of the bench itself.
+    fn processes(&self) -> Vec<u32> {
+        match self {
+            Self::Bare(_) => Vec::new(),
+            Self::Lambda(started, _) => {
+                // The command itself only waits, and prints the status once a second.
+                descendants(started.pid(), "")
+            }
+            Self::Node(started) => vec![started.pid()],
+        }
+    }
+
+    fn cpu_ns(&self) -> Option<u64> {
+        let processes = self.processes();
+        (!processes.is_empty()).then(|| processes.into_iter().map(cpu_ns).sum())
+    }
+
+    fn memory_mb(&self) -> Option<f64> {
+        let processes = self.processes();
+        (!processes.is_empty()).then(|| processes.into_iter().map(pss_mb).sum())
+    }
+}
+
+/// Waits for the first answers of a side.
+fn first(answers: &RttReceiver, side: &str) -> Vec<RttAnswer> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let received = answers.take();
+        if !received.is_empty() {
+            return received;
+        }
+        assert!(Instant::now() < deadline, "{side}: no answer arrives");
+        sleep(Duration::from_millis(20));
+    }
+}
+
+/// Returns the memory of a process in MB, with its share of what others use, too.
+fn pss_mb(pid: u32) -> f64 {
+    let path: PathBuf = ["/proc", &pid.to_string(), "smaps_rollup"].iter().collect();
+    let rollup = std::fs::read_to_string(path).unwrap_or_default();
+    let kib = rollup.lines().find_map(|line| {
+        line.strip_prefix("Pss:")?.trim().strip_suffix(" kB")?.trim().parse::<f64>().ok()
+    });
+    kib.unwrap_or(0.0) * 1024.0 / 1e6
+}

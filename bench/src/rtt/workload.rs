@@ -1,0 +1,114 @@
+//! What is answered: the inputs, and the sides that answer them.
+
+use clap::ValueEnum;
+use gleaner_tests::LambdaCopy;
+
+use super::node::{NodeKind, NodeSide};
+use super::sides::{LambdaSide, Side};
+use crate::measure::Twin;
+
+/// Limits of socket buffers: that of an ordinary Linux, a larger one, and that of the installation.
+const BUFFERS: [u64; 3] = [212_992, 4 << 20, 64 << 20];
+
+/// A workload.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(super) enum Workload {
+    /// An IMU at 100 Hz; nothing is computed.
+    Empty,
+    /// The same with cores that do not sleep.
+    EmptyAwake,
+    /// An IMU at 100 Hz: `examples/imu-fft`.
+    ImuFft,
+    /// Raw images of 1280x720 at 10 Hz: `examples/brake-dark`.
+    Brake720,
+    /// Raw images of 1920x1080 at 10 Hz.
+    Brake1080,
+}
+
+impl Workload {
+    pub(super) const ALL: [Self; 5] =
+        [Self::Empty, Self::EmptyAwake, Self::ImuFft, Self::Brake720, Self::Brake1080];
+
+    /// Returns its title, with the limit of socket buffers.
+    pub(super) fn title(self, buffer: u64) -> String {
+        let what = match self {
+            Self::Empty => "IMU at 100 Hz, empty",
+            Self::EmptyAwake => "IMU at 100 Hz, empty, cores awake",
+            Self::ImuFft => "IMU at 100 Hz, FFT",
+            Self::Brake720 => "720p at 10 Hz, Brake + Dark",
+            Self::Brake1080 => "1080p at 10 Hz, Brake + Dark",
+        };
+        format!("{what}, socket buffers up to {buffer} B")
+    }
+
+    /// Returns the limits of socket buffers to measure with; `None` leaves the one that there is.
+    /// An IMU fits in any.
+    pub(super) fn buffers(self) -> Vec<Option<u64>> {
+        if self.is_of_images() { BUFFERS.map(Some).to_vec() } else { vec![None] }
+    }
+
+    pub(super) fn is_of_images(self) -> bool {
+        matches!(self, Self::Brake720 | Self::Brake1080)
+    }
+
+    /// Returns whether no core is to sleep meanwhile.
+    pub(super) fn is_awake(self) -> bool {
+        self == Self::EmptyAwake
+    }
+
+    /// Returns the topic whose samples are answered, and its DDS type.
+    pub(super) fn event(self) -> (&'static str, &'static str) {
+        match self.is_of_images() {
+            true => ("/camera/synthetic/image_raw", "sensor_msgs::msg::dds_::Image_"),
+            false => ("/imu/synthetic", "sensor_msgs::msg::dds_::Imu_"),
+        }
+    }
+
+    /// Returns the arguments of the player: those for the event alone, or for all inputs.
+    pub(super) fn player(self, is_alone: bool) -> Vec<&'static str> {
+        let camera = match self {
+            Self::Brake720 => &["--synthetic", "1280x720@10"][..],
+            Self::Brake1080 => &["--synthetic", "1920x1080@10"],
+            _ => &[],
+        };
+        let imu = if self.is_of_images() && is_alone { &[][..] } else { &["--imu", "100"] };
+        [camera, imu].concat()
+    }
+
+    /// Returns the name of the workload in a baseline, and its configuration.
+    pub(super) fn of_baseline(self) -> (&'static str, &'static [&'static str]) {
+        match self {
+            Self::Empty | Self::EmptyAwake => ("empty", &[]),
+            Self::ImuFft => ("imu-fft", &[]),
+            Self::Brake720 | Self::Brake1080 => ("brake-dark", &["brake_mps2=100"]),
+        }
+    }
+
+    /// Returns all sides. `buffer` is the limit of socket buffers.
+    pub(super) fn sides(self, buffer: u64) -> Vec<Side> {
+        let lambdas = [Twin::Rust, Twin::Python].map(|kind| {
+            Side::Lambda(Box::new(LambdaSide { kind, lambda: self.lambda(kind), last: None }))
+        });
+        let nodes = [NodeKind::StandIn, NodeKind::Rclpy, NodeKind::RclpyKeepingMemory];
+        let nodes = nodes.map(|kind| Side::Node(NodeSide { kind, buffer }));
+        [Side::Bare].into_iter().chain(lambdas).chain(nodes).collect()
+    }
+
+    /// Returns a copy of the lambda, on the topics of the player. It looks at each image: at rest,
+    /// too, a car brakes by less than 100 m/s^2.
+    fn lambda(self, kind: Twin) -> LambdaCopy {
+        let folder = match self {
+            Self::Empty | Self::EmptyAwake => "bench/lambdas/imu",
+            Self::ImuFft => "examples/imu-fft",
+            Self::Brake720 | Self::Brake1080 => "examples/brake-dark",
+        };
+        LambdaCopy::of(&format!("{folder}/{}", kind.folder()), |manifest| {
+            manifest
+                .replace("/camera/front/compressed", "/camera/synthetic/image_raw")
+                .replace("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+                .replace("/imu/data", "/imu/synthetic")
+                .replace("max_size = \"2 MiB\"", "max_size = \"8 MiB\"")
+                .replace("default = -3.0", "default = 100.0")
+        })
+    }
+}
