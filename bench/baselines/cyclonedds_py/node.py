@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, List, Optional, Tuple
 
@@ -38,7 +39,9 @@ except ImportError as error:
 
 
 class Node:
-    """Reads the inputs of a workload, and writes its answers."""
+    """One thread that waits for the readers of the inputs."""
+
+    stack = f"cyclonedds {version('cyclonedds')} for Python (stand-in, not ROS 2)"
 
     def __init__(self, options: Any, workload: Any, tally: program.Tally) -> None:
         self.tally = tally
@@ -55,8 +58,8 @@ class Node:
         )
         self.readers: List[Tuple[DataReader, Any]] = []
         self.waitset = WaitSet(self.participant)
-        self.end = GuardCondition(self.participant)
-        self.waitset.attach(self.end)
+        self.stopped = GuardCondition(self.participant)
+        self.waitset.attach(self.stopped)
         self._read(options.input, Imu, workload.on_imu)
         if options.image is not None:
             self._read(options.image, Image, workload.on_image)
@@ -71,8 +74,8 @@ class Node:
         self.readers.append((reader, decide))
 
     def spin(self) -> None:
-        """Answers messages until `end` is set."""
-        while not self.end.read():
+        """Answers messages until `stop`."""
+        while not self.stopped.read():
             self.waitset.wait(duration(infinite=True))
             for reader, decide in self.readers:
                 for message in reader.take(N=self.depth):
@@ -92,41 +95,18 @@ class Node:
         self.writer.write(answer)
         self.tally.answered += 1
 
-    def lost(self) -> int:
-        """Number of messages that the readers know to be lost."""
+    def stop(self) -> None:
+        self.stopped.set(True)
+
+    def lost(self) -> Optional[int]:
         return sum(reader.get_sample_lost_status().total_count for reader, _ in self.readers)
 
-
-def main() -> None:
-    options = program.parse(workloads.CONFIG)
-    end = program.End()
-    try:
-        workload = workloads.workload(options.workload, options.config)
-    except ValueError as error:
-        program.fail("cannot configure the workload", error, "see [config] in its lambda.toml")
-    use_bytes(Image, "data")
-    tally = program.Tally(options.name)
-    try:
-        node = Node(options, workload, tally)
-    except DDSException as error:
-        program.fail(
-            "cannot join DDS",
-            error,
-            "check CYCLONEDDS_URI, ROS_DOMAIN_ID, and that a network interface is up",
-        )
-    versions = program.versions("cyclonedds", "numpy", "opencv-python-headless")
-    tally.ready(
-        stack=f"cyclonedds {versions.get('cyclonedds', '?')} for Python (stand-in, not ROS 2)",
-        workload=options.workload,
-        depth=options.depth,
-        luma=workloads.LUMA,
-        versions=versions,
-    )
-    try:
-        end.run(node.spin, lambda: node.end.set(True), lambda: tally.last(node.lost()))
-    except (DDSException, ValueError) as error:
-        program.fail(f"workload `{options.workload}` cannot go on", error, "see the cause")
+    def close(self) -> None:
+        # The participant leaves when it is deleted, with the process.
+        pass
 
 
 if __name__ == "__main__":
-    main()
+    use_bytes(Image, "data")
+    packages = ("cyclonedds", "numpy", "opencv-python-headless", "opencv-python")
+    program.run(workloads, Node, packages, (DDSException,))

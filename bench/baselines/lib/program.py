@@ -1,5 +1,5 @@
-"""A baseline as a program: its command line, its lines on standard output, and its end. No
-middleware here.
+"""A baseline as a program: its command line, its lines on standard output, and its end. The
+middleware is in a node, which the caller of `run` makes.
 
 A line is a JSON object. The first one has `ready`, the last one the counts. Where the middleware
 is missing, the only line has `skipped`, and the exit code is 3.
@@ -19,13 +19,73 @@ import sys
 import threading
 import time
 from importlib import metadata
-from typing import Any, Callable, Dict, List, NoReturn, Optional
+from typing import Any, Callable, Dict, List, NoReturn, Optional, Protocol, Tuple, Type
+
+WRONG_USE = 2
+"""Exit code of a wrong command line, as of `argparse`."""
 
 SKIPPED = 3
 """Exit code of a baseline that cannot run on this machine."""
 
 GRACE_S = 5.0
 """Time for the middleware to return at the end. It once stayed in a wait until the next message."""
+
+
+class Node(Protocol):
+    """What a stack does for a workload: it reads the inputs and writes the answers."""
+
+    stack: str
+    """Name and version of the stack."""
+
+    def spin(self) -> None:
+        """Answers messages until another thread has called `stop`."""
+
+    def stop(self) -> None:
+        """Lets `spin` return soon."""
+
+    def lost(self) -> Optional[int]:
+        """Returns the number of messages that the stack counted as lost; None if it counts none."""
+
+    def close(self) -> None:
+        """Leaves the network."""
+
+
+def run(
+    workloads: Any,
+    open_node: Callable[[argparse.Namespace, Any, Tally], Node],
+    packages: Tuple[str, ...],
+    errors: Tuple[Type[Exception], ...] = (),
+) -> None:
+    """Runs a baseline from its command line to its end. `packages` are those whose versions it
+    states, `errors` those of the middleware."""
+    options = parse(workloads.CONFIG)
+    end = End()
+    try:
+        workload = workloads.workload(options.workload, options.config)
+    except ValueError as error:
+        fail("cannot configure the workload", error, "see [config] of the lambda", WRONG_USE)
+    tally = Tally(options.name)
+    try:
+        node = open_node(options, workload, tally)
+    except errors as error:
+        fail(
+            "cannot join DDS",
+            error,
+            "check CYCLONEDDS_URI and ROS_DOMAIN_ID, and that a network interface is up",
+        )
+    tally.ready(
+        stack=node.stack,
+        workload=options.workload,
+        depth=options.depth,
+        luma=workloads.LUMA,
+        versions=versions(*packages),
+    )
+    try:
+        end.run(node.spin, node.stop, lambda: tally.last(node.lost()))
+    except errors + (ValueError,) as error:
+        inputs = " and ".join(filter(None, (options.input, options.image)))
+        fail(f"cannot answer {inputs}", error, "send the types that `--help` lists; see README.md")
+    node.close()
 
 
 def skip(error: ImportError) -> NoReturn:
@@ -39,11 +99,11 @@ def line(**values: Any) -> None:
     print(json.dumps(values), flush=True)
 
 
-def fail(what: str, error: BaseException, help_text: str) -> NoReturn:
+def fail(what: str, error: BaseException, help_text: str, code: int = 1) -> NoReturn:
     """Ends the program because of an error."""
     cause = " ".join(str(error).split()) or type(error).__name__
     print(f"error: {what}\n  cause: {cause}\n  help:  {help_text}", file=sys.stderr)
-    sys.exit(1)
+    sys.exit(code)
 
 
 def parse(workloads: Any, arguments: Optional[List[str]] = None) -> argparse.Namespace:
