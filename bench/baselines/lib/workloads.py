@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Dict, Optional, Sequence, Tuple
 
 import numpy as np
+import numpy.typing as npt
 
 try:
     import cv2
@@ -29,6 +30,8 @@ ROOT = Path(__file__).resolve().parents[3]
 sys.path.append(str(ROOT / "guest-sdk-python"))
 
 from gleaner import Column  # noqa: E402
+
+Pixels = npt.NDArray[np.uint8]
 
 Labels = Tuple[str, ...]
 """Labels of the triggers of one wake."""
@@ -61,7 +64,7 @@ def stamp_ns(message: Any) -> int:
     return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
 
 
-def frame(image: Any) -> np.ndarray:
+def frame(image: Any) -> Pixels:
     """Pixels of a `sensor_msgs/Image`: uint8, shape (height, width, 3), BGR. Not a copy.
 
     Raises ValueError for any other encoding, and for data that contradict the size."""
@@ -71,7 +74,7 @@ def frame(image: Any) -> np.ndarray:
     return rows[:, : 3 * image.width].reshape(image.height, image.width, 3)
 
 
-def mean_luma(bgr: np.ndarray) -> float:
+def mean_luma(bgr: Pixels) -> float:
     """Mean grey level, 0 to 255, of a frame as from `frame`.
 
     OpenCV rounds the grey level of each pixel, as most nodes do; without it, the result is exact.
@@ -82,7 +85,7 @@ def mean_luma(bgr: np.ndarray) -> float:
     # Sums of whole rows first: 30 times as fast as a sum over both axes.
     sums = bgr.reshape(height, -1).sum(axis=0, dtype=np.uint32).reshape(width, 3).sum(axis=0)
     blue, green, red = (int(total) for total in sums)
-    return float(114 * blue + 587 * green + 299 * red) / (1000 * height * width)
+    return (114 * blue + 587 * green + 299 * red) / (1000 * height * width)
 
 
 class Ring:
