@@ -23,8 +23,7 @@ class Lambda:
     def on_event(self, ctx: Context, event: Sample) -> None:
         now = ctx.now_ns()
         mean = braking(self.imu.column_since(self.forward, now - WINDOW_NS), now, self.brake_mps2)
-        rested = self.last_ns is None or now - self.last_ns >= REFRACTORY_NS
-        if mean is None or not rested:
+        if mean is None or not rested(self.last_ns, now):
             return
         # The image is decoded only here, so most frames are never decoded.
         luma = event.as_frame().mean_luma()
@@ -40,3 +39,8 @@ def braking(window: Column, now: int, brake_mps2: float) -> float | None:
         return None
     mean = float(window.values.mean())
     return mean if mean < brake_mps2 else None
+
+
+def rested(last_ns: int | None, now: int) -> bool:
+    """Returns whether the pause after the trigger at `last_ns` is over; None is no trigger."""
+    return last_ns is None or now - last_ns >= REFRACTORY_NS

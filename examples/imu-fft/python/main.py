@@ -44,7 +44,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from gleaner import Context, Sample
+from gleaner import Column, Context, Sample
 
 LEARN = 33
 SMALLEST, LARGEST = 16, 4096
@@ -60,31 +60,42 @@ class Lambda:
     def __init__(self, ctx: Context) -> None:
         self.imu = ctx.input("imu")
         self.vertical = self.imu.field("linear_acceleration.z")
-        self.window_s: float = ctx.config["window_s"]
         self.rough: float = ctx.config["rough"]
+        self.road = Road(ctx.config["window_s"])
+
+    def on_event(self, ctx: Context, event: Sample) -> None:
+        n = self.road.note(event.stamps.at_ns)
+        if n == 0:
+            return
+        window = self.imu.column(self.vertical, n)
+        if len(window.values) < n:
+            return
+        score, peak_hz = self.road.roughness(window)
+        if score > self.rough:
+            ctx.event("rough-road", score, peak_hz=peak_hz)
+
+
+class Road:
+    """State of the rules after the samples so far. Does not call the host."""
+
+    def __init__(self, window_s: float) -> None:
+        self.window_s = window_s
         self.learning: list[int] = []
         self.period_ns = 0
         self.last_ns = 0
         self.run = 0
         self.weights: Floats = np.empty(0)
 
-    def on_event(self, ctx: Context, event: Sample) -> None:
-        now = event.stamps.at_ns
+    def note(self, now: int) -> int:
+        """Adds a sample by its stamp. Returns the length of the window that it completes, in
+        samples; 0 if it completes none."""
         if self.period_ns == 0:
             self.learn(now)
         else:
             self.run = self.run + 1 if follows(now - self.last_ns, self.period_ns) else 1
         self.last_ns = now
         n = len(self.weights)
-        if n == 0 or self.run < n or (self.run - n) % (n // 4) != 0:
-            return
-        window = self.imu.column(self.vertical, n)
-        if len(window.values) < n:
-            return
-        rate = (n - 1) * 1e9 / float(window.at_ns[-1] - window.at_ns[0])
-        score, peak_hz = roughness(window.values, rate, self.weights)
-        if score > self.rough:
-            ctx.event("rough-road", score, peak_hz=peak_hz)
+        return n if n > 0 and self.run >= n and (self.run - n) % (n // 4) == 0 else 0
 
     def learn(self, now: int) -> None:
         """Applies rules 2 to 4 to the first samples."""
@@ -101,6 +112,12 @@ class Lambda:
         n = samples(self.window_s * 1e9 / self.period_ns)
         self.weights = (1 - np.cos(2 * np.pi * np.arange(n) / n)) / 2
         self.learning.clear()
+
+    def roughness(self, window: Column) -> tuple[float, float]:
+        """Returns the score in (m/s^2)^2 and the peak in Hz of the window that was just completed,
+        of vertical accelerations in m/s^2."""
+        rate = (len(window.values) - 1) * 1e9 / float(window.at_ns[-1] - window.at_ns[0])
+        return roughness(window.values, rate, self.weights)
 
 
 def follows(interval_ns: int, period_ns: int) -> bool:

@@ -1,0 +1,3 @@
+from types import SimpleNamespace
+
+SignalHandlerOptions = SimpleNamespace(NO=0)
