@@ -98,6 +98,10 @@ fn run(arguments: Vec<OsString>) -> Result<Exit, Failure> {
     }
 }
 
+/// Packages of the stand-in for ROS 2: name in pip, and name of the module.
+const STAND_IN: [(&str, &str); 3] =
+    [("cyclonedds", "cyclonedds.pub"), ("numpy", "numpy"), ("opencv-python-headless", "cv2")];
+
 /// Measures the cloud under a simulated fleet: without lambdas, and on all cores.
 fn fleet_bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let mut steps = Steps::of(2);
@@ -117,8 +121,13 @@ fn fleet_bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Fail
 fn bench(checkout: &Checkout, arguments: &[OsString]) -> Result<Exit, Failure> {
     let mut steps = Steps::of(setup::STEPS + 3);
     setup::run(checkout, &mut steps, &checkout.lambdas(&FAMILIES))?;
-    steps.begin("readers of drives for comparison");
+    steps.begin("programs for comparison");
     venv::set_up_for_tests(checkout)?;
+    if arguments.first().is_some_and(|name| name == "rtt")
+        && let Err(failure) = venv::apart(checkout, &checkout.target().join("baselines"), &STAND_IN)
+    {
+        println!("without the stand-in for ROS 2:\n{failure}");
+    }
     steps.begin("gleaner-bench");
     let mut build = checkout.cargo();
     // Only the binary is named: cargo selects features by the named packages, and other features

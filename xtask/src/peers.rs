@@ -7,7 +7,6 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use gleaner_base::{Exit, Failure};
-use gleaner_parts::Parts;
 
 use crate::checkout::Checkout;
 use crate::steps::{self, Steps, run, succeeds};
@@ -176,15 +175,7 @@ impl Peers<'_> {
     }
 
     fn python(&self) -> Result<(), Failure> {
-        let venv = self.folder.join("venv");
-        let python = venv.join("bin/python3");
-        if succeeds(self.checkout.command(&python).args(["-I", "-c", "import cyclonedds.pub"])) {
-            return Ok(());
-        }
-        let mut make = self.checkout.command(Parts::find()?.python(None)?);
-        make.args(["-m", "venv", "--clear"]).arg(&venv);
-        run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip")?;
-        let help = "check the network, or configure a mirror for pip";
-        venv::pip(self.checkout.command(&python), &["cyclonedds"], help)
+        let packages = [("cyclonedds", "cyclonedds.pub")];
+        venv::apart(self.checkout, &self.folder.join("venv"), &packages).map(drop)
     }
 }

@@ -4,6 +4,7 @@
 //! report new errors in old code.
 
 use std::fs;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use gleaner_base::{Exit, Failure};
@@ -29,6 +30,9 @@ const FOR_TESTS: [(&str, &str); 10] = [
     ("matplotlib", "matplotlib"),
     ("openapi-spec-validator", "openapi_spec_validator"),
 ];
+
+/// The way out of a download that failed.
+const NETWORK: &str = "check the network, or configure a mirror for pip";
 
 /// Creates or completes the environment. It is created again if its Python does not run, because
 /// the system's Python was removed.
@@ -63,6 +67,26 @@ pub(crate) fn set_up_for_tests(checkout: &Checkout) -> Result<(), Failure> {
     if has(checkout, &FOR_TESTS) { Ok(()) } else { fetch(checkout, &FOR_TESTS) }
 }
 
+/// Makes an environment of its own in `folder`, with packages that lambdas do not need: name in pip,
+/// and name of the module. Returns its Python.
+pub(crate) fn apart(
+    checkout: &Checkout,
+    folder: &Path,
+    packages: &[(&str, &str)],
+) -> Result<PathBuf, Failure> {
+    let python = folder.join("bin/python3");
+    let modules: Vec<_> = packages.iter().map(|(_, module)| *module).collect();
+    let import = format!("import {}", modules.join(", "));
+    if !succeeds(checkout.command(&python).args(["-I", "-c", &import])) {
+        let mut make = checkout.command(Parts::find()?.python(None)?);
+        make.args(["-m", "venv", "--clear"]).arg(folder);
+        run(&mut make, "set GLEANER_PYTHON to a Python 3.9 or newer with venv and ensurepip")?;
+        let packages: Vec<_> = packages.iter().map(|(package, _)| *package).collect();
+        pip(checkout.command(&python), &packages, NETWORK)?;
+    }
+    Ok(python)
+}
+
 /// A command that runs `code` with the environment's Python.
 fn python(checkout: &Checkout, code: &str) -> Command {
     let mut python = checkout.command(checkout.python());
@@ -77,11 +101,7 @@ fn has(checkout: &Checkout, packages: &[(&str, &str)]) -> bool {
 
 fn fetch(checkout: &Checkout, packages: &[(&str, &str)]) -> Result<(), Failure> {
     let packages: Vec<_> = packages.iter().map(|(package, _)| *package).collect();
-    pip(
-        checkout.command(checkout.python()),
-        &packages,
-        "check the network, or configure a mirror for pip",
-    )
+    pip(checkout.command(checkout.python()), &packages, NETWORK)
 }
 
 /// Installs packages with the pip of `python`. `help` is for the error message.

@@ -94,12 +94,8 @@ fn install(checkout: &Checkout) -> Result<(), Failure> {
         steps::install(checkout, &packages)?;
     }
     if find(checkout, "moto_server").is_none() {
-        // In an environment of its own: it has many packages, and lambdas need none of them.
-        let folder = checkout.target().join("fleet/venv");
-        let mut make = checkout.command("python3");
-        run(make.args(["-m", "venv"]).arg(&folder), "install python3-venv")?;
-        let python = checkout.command(folder.join("bin/python3"));
-        venv::pip(python, &["moto[server]"], "check the network, or configure a mirror for pip")?;
+        // It has many packages.
+        venv::apart(checkout, &checkout.target().join("fleet/venv"), &[("moto[server]", "moto")])?;
     }
     Ok(())
 }
