@@ -75,8 +75,9 @@ class Node:
 
     def spin(self) -> None:
         """Answers messages until `stop`."""
+        forever = duration(infinite=True)
         while not self.stopped.read():
-            self.waitset.wait(duration(infinite=True))
+            self.waitset.wait(forever)
             for reader, decide in self.readers:
                 for message in reader.take(N=self.depth):
                     # The end of a writer is a sample without a message.

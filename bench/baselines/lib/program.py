@@ -76,6 +76,7 @@ def run(
     tally.ready(
         stack=node.stack,
         workload=options.workload,
+        config=options.config,
         depth=options.depth,
         luma=workloads.LUMA,
         versions=versions(*packages),

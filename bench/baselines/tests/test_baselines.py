@@ -7,6 +7,7 @@ import io
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -121,6 +122,17 @@ def test_an_image_of_another_encoding_is_refused() -> None:
         workloads.frame(SimpleNamespace(encoding="rgb8"))
 
 
+def test_the_stand_in_decodes_pixels_into_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("cyclonedds")
+    monkeypatch.syspath_prepend(BASELINES / "cyclonedds_py")
+    import messages
+
+    head = messages.Header(messages.Time(1, 2), "front")
+    image = messages.Image(head, 2, 1, "bgr8", 0, 3, b"\0\1\2\3\4\5")
+    messages.use_bytes(messages.Image, "data")
+    assert messages.Image.deserialize(image.serialize()) == image
+
+
 def test_a_ring_returns_its_newest_samples_oldest_first() -> None:
     ring = workloads.Ring(4)
     for at in range(6):
@@ -204,9 +216,7 @@ def test_without_rclpy_a_node_is_skipped() -> None:
     assert "rclpy" in json.loads(output)["skipped"]
 
 
-def test_a_program_without_udp_sockets_has_no_socket_buffer() -> None:
-    import socket
-
+def test_the_socket_buffer_is_the_largest_of_the_bound_sockets() -> None:
     before = program.socket_buffer()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 100_000)
