@@ -9,6 +9,8 @@ use crate::page::{MEASUREMENT_SCRIPTS, html};
 pub struct MeasurementPage {
     /// Its title.
     pub title: String,
+    /// Where it comes from, in a line below the title.
+    pub origin: String,
     /// Facts about the machine: name and value.
     pub facts: Vec<(String, String)>,
     /// Sentences that a reader needs to understand the tables.

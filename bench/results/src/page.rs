@@ -8,6 +8,9 @@ use crate::results::{BenchResults, Series, SeriesGroup};
 /// Points of a curve below and above its 99th percentile: a tail has few values, which matter.
 const POINTS: [usize; 2] = [200, 100];
 
+/// Facts about the machine in the line below the title.
+const ORIGIN: [&str; 5] = ["measured", "board", "processor", "kernel", "revision"];
+
 impl BenchResults {
     /// Returns the page as one file.
     pub fn to_html(&self) -> String {
@@ -25,6 +28,11 @@ impl BenchResults {
         let facts = self.machine.facts.iter();
         MeasurementPage {
             title: self.title(),
+            origin: ORIGIN
+                .iter()
+                .filter_map(|name| self.machine.facts.get(*name).map(String::as_str))
+                .collect::<Vec<_>>()
+                .join(" · "),
             facts: facts.map(|(name, value)| (name.clone(), value.clone())).collect(),
             notes: self.notes.clone(),
             sections: self.groups.iter().map(SeriesGroup::section).chain(figures).collect(),

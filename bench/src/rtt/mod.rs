@@ -115,7 +115,7 @@ fn compare(
             match sides[index].turn(workload, &answers, [options.warm_up, options.turn]) {
                 Ok(turn) => turns.entry(index).or_default().push(turn),
                 Err(why) => {
-                    let note = format!("{name}, {}: skipped: {why}", sides[index].name());
+                    let note = format!("{}: skipped: {why}", sides[index].name());
                     if !results.notes.contains(&note) {
                         results.notes.push(note);
                     }
@@ -147,7 +147,7 @@ fn compare(
     let group = SeriesGroup { name, unit: "ms".to_owned(), base: Some(base), series };
     goals::of_group(workload, granted, &group, &mut results.figures);
     for side in &sides {
-        side.stages(&group.name, &mut results.figures);
+        side.stages(workload, &group.name, &mut results.figures);
     }
     results.groups.push(group);
 }

@@ -154,8 +154,9 @@ impl Side {
         }
     }
 
-    /// Adds the times of the stages of a lambda, in its last turn.
-    pub(super) fn stages(&self, group: &str, figures: &mut Vec<Figure>) {
+    /// Adds the times of the stages of a lambda, in its last turn. Goals are for small samples: an
+    /// image is copied into its slot on the way.
+    pub(super) fn stages(&self, workload: Workload, group: &str, figures: &mut Vec<Figure>) {
         let Self::Lambda(side) = self else { return };
         let Some(live) = &side.last else { return };
         let goals = match side.kind {
@@ -173,7 +174,7 @@ impl Side {
             {
                 let name = format!("{group}, {}: {what}, {share}", side.kind);
                 let us = [ns as f64 / 1e3];
-                figures.push(if has_goal {
+                figures.push(if has_goal && !workload.is_of_images() {
                     Figure::at_most(&name, "us", goal, &us)
                 } else {
                     Figure::without_goal(&name, "us", &us)

@@ -38,7 +38,14 @@ impl Workload {
             Self::Brake720 => "720p at 10 Hz, Brake + Dark",
             Self::Brake1080 => "1080p at 10 Hz, Brake + Dark",
         };
-        format!("{what}, socket buffers up to {buffer} B")
+        // Powers of two are written by people in MiB, the usual limit of Linux in bytes.
+        match buffer {
+            0 => what.to_owned(),
+            _ if buffer % (1 << 20) == 0 => {
+                format!("{what}, socket buffers of {} MiB", buffer >> 20)
+            }
+            _ => format!("{what}, socket buffers of {buffer} B"),
+        }
     }
 
     /// Returns the limits of socket buffers to measure with; `None` leaves the one that there is.

@@ -4,7 +4,8 @@ const PLOT_PX = 300;
 
 /** Ticks between `least` and `most` on a logarithmic axis. */
 function powersBetween(least, most) {
-  const digits = Math.log10(most / least) > 2 ? [1] : [1, 2, 3, 5];
+  const decades = Math.log10(most / least);
+  const digits = decades > 3 ? [1] : decades > 1.2 ? [1, 2, 5] : [1, 1.5, 2, 3, 5, 7];
   const ticks = [];
   for (let power = Math.floor(Math.log10(least)); power <= Math.log10(most); power += 1) {
     ticks.push(...digits.map((digit) => Number(`${digit}e${power}`)));
@@ -69,7 +70,7 @@ function main() {
   applyTheme();
   followSystem();
   document.title = page.title;
-  document.getElementById("head").append(make("div", { class: "name" }, make("h1", { text: page.title }), make("span", { class: "grow" }), themeButton()));
+  document.getElementById("head").append(make("div", { class: "name" }, make("h1", { text: page.title }), make("span", { class: "grow" }), themeButton()), make("p", { class: "origin", text: page.origin }));
   const notes = page.notes.length > 0 ? card("Notes", null, make("ul", {}, page.notes.map((text) => make("li", { text })))) : null;
   document.getElementById("page").append(...[...page.sections.map(sectionCard), notes, card("Machine", null, terms(page.facts))].filter(Boolean));
   document.getElementById("foot").textContent = "This page is self-contained and loads nothing.";

@@ -117,7 +117,16 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
     // As users test lambdas, with the SDK of this checkout.
     let mut pytest = checkout.command(checkout.python());
     pytest
-        .args(["-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "examples"])
+        .args([
+            "-m",
+            "pytest",
+            "-q",
+            "-rs",
+            "-p",
+            "no:cacheprovider",
+            "examples",
+            "bench/baselines",
+        ])
         .env("PYTHONPATH", checkout.path("guest-sdk-python"))
         .env("PYTHONDONTWRITEBYTECODE", "1");
 
@@ -127,7 +136,7 @@ fn suites(checkout: &Checkout) -> Vec<Suite> {
         suite("loom: orders of threads in gleaner-buffers", loom, OutputFormat::Libtest),
         Suite { name: "miri: memory in gleaner-buffers".to_owned(), action: miri(checkout) },
         suite("unittest: Python SDK", unittest, OutputFormat::Unittest),
-        suite("pytest: examples and notebooks", pytest, OutputFormat::Pytest),
+        suite("pytest: examples, notebooks and baselines", pytest, OutputFormat::Pytest),
     ];
     suites.extend(typed(checkout).into_iter().map(|file| {
         let mut mypy = checkout.command(checkout.python());
