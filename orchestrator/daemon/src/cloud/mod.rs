@@ -17,6 +17,8 @@ mod clips;
 mod collect;
 mod download;
 mod enrolling;
+#[cfg(test)]
+mod fake_cloud;
 mod http;
 mod link;
 mod plan;
@@ -24,6 +26,8 @@ mod reconcile;
 mod resume;
 mod session;
 mod settings;
+#[cfg(test)]
+mod tests;
 mod uplink;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

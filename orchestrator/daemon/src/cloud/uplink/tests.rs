@@ -39,11 +39,11 @@ struct StoredRecords {
     lines: BTreeMap<String, Vec<(u64, StreamLine)>>,
 }
 
-/// The end of a connection.
+/// The place where a connection is cut.
 #[derive(Clone, Copy)]
-enum LinkEnd {
-    /// Once everything is stored.
-    Idle,
+enum LinkCut {
+    /// Not before everything is stored.
+    Never,
     /// With the batch after so many, before it is stored.
     Before(usize),
     /// With the batch after so many, before it is acknowledged.
@@ -118,7 +118,7 @@ impl Spools {
     }
 
     /// Sends to a cloud over one connection.
-    async fn connect(&self, cloud: &mut StoredRecords, end: LinkEnd) {
+    async fn connect(&self, cloud: &mut StoredRecords, end: LinkCut) {
         let (out, mut frames) = channel(4);
         let (orders, received) = mpsc::sync_channel(STREAMS_HERE.len());
         let uplink = Uplink {
@@ -132,17 +132,17 @@ impl Spools {
         let mut batches = 0;
         while !self.are_in(cloud) {
             let batch = batch(&mut frames).await;
-            if matches!(end, LinkEnd::Before(most) if most == batches) {
+            if matches!(end, LinkCut::Before(most) if most == batches) {
                 break;
             }
             let ack = cloud.store(&batch);
-            if matches!(end, LinkEnd::Unacknowledged(most) if most == batches) {
+            if matches!(end, LinkCut::Unacknowledged(most) if most == batches) {
                 break;
             }
             orders.send(UplinkOrder::Ack(ack)).unwrap();
             batches += 1;
         }
-        assert_eq!(matches!(end, LinkEnd::Idle), self.are_in(cloud), "{batches} batches");
+        assert_eq!(matches!(end, LinkCut::Never), self.are_in(cloud), "{batches} batches");
         drop((frames, orders));
         sent.await.unwrap();
     }
@@ -223,7 +223,7 @@ async fn after_seven_days_offline_each_record_arrives_once_in_order_and_losses_a
     for stream in STREAMS_HERE {
         vehicle.add(stream, 0, 20, 20);
     }
-    vehicle.connect(&mut cloud, LinkEnd::Idle).await;
+    vehicle.connect(&mut cloud, LinkCut::Never).await;
     let before = cloud.cursors.clone();
     let lines_before: BTreeMap<_, _> =
         cloud.lines.iter().map(|(stream, lines)| (stream.clone(), lines.len())).collect();
@@ -243,14 +243,14 @@ async fn after_seven_days_offline_each_record_arrives_once_in_order_and_losses_a
         vehicle.add("orchestrator", day, 5, 5);
     }
 
-    vehicle.connect(&mut cloud, LinkEnd::Before(0)).await;
-    vehicle.connect(&mut cloud, LinkEnd::Unacknowledged(1)).await;
-    vehicle.connect(&mut cloud, LinkEnd::Before(3)).await;
+    vehicle.connect(&mut cloud, LinkCut::Before(0)).await;
+    vehicle.connect(&mut cloud, LinkCut::Unacknowledged(1)).await;
+    vehicle.connect(&mut cloud, LinkCut::Before(3)).await;
     // It is not idle meanwhile.
     vehicle.add("events", 8, 10, 10);
-    vehicle.connect(&mut cloud, LinkEnd::Unacknowledged(4)).await;
+    vehicle.connect(&mut cloud, LinkCut::Unacknowledged(4)).await;
     assert!(!vehicle.are_in(&cloud), "there is something left for the last connection");
-    vehicle.connect(&mut cloud, LinkEnd::Idle).await;
+    vehicle.connect(&mut cloud, LinkCut::Never).await;
 
     for stream in STREAMS_HERE {
         let life = cloud.cursors[stream].life;
