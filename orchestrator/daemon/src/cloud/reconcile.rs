@@ -19,12 +19,12 @@ use super::plan::{Step, plan};
 use crate::core::Core;
 use crate::state::CloudWish;
 
-/// Pause before the steps that failed are taken again; it doubles up to the longest. What is
-/// refused makes an event each time.
+/// Pause before the steps that failed are taken again; it doubles up to the longest. Each
+/// failure makes an event.
 const PAUSE: Duration = Duration::from_secs(10);
 const PAUSE_MAX: Duration = Duration::from_secs(1800);
-/// Events about refusals, at once and per second: a hostile cloud can cause any number of them.
-const REFUSALS: RateLimit = RateLimit::of(0.1, 100.0);
+/// Events per second and at once about steps that failed: a hostile cloud can cause any number.
+const EVENTS: RateLimit = RateLimit::of(0.1, 100.0);
 /// Number of times that missing files are fetched: another deployment may remove some in between.
 const ROUNDS: u32 = 5;
 
@@ -66,7 +66,7 @@ impl Order {
 impl Reconciler {
     /// Runs until the sender of wanted states is dropped.
     pub(super) async fn run(mut self) {
-        let (mut pause, mut before, mut refusals) = (PAUSE, None, REFUSALS);
+        let (mut pause, mut before, mut events) = (PAUSE, None, EVENTS);
         loop {
             let order = self.orders.borrow_and_update().clone();
             let Some(Order { desired, http }) = order else {
@@ -78,7 +78,7 @@ impl Reconciler {
             if before.as_ref() != Some(&desired) {
                 pause = PAUSE;
             }
-            let problems = self.follow(&desired, &http, &mut refusals).await;
+            let problems = self.follow(&desired, &http, &mut events).await;
             let (is_done, generation) = (problems.is_empty(), desired.generation);
             self.handled.send_replace(Handled { generation, problems });
             let desired = &*before.insert(desired);
@@ -102,11 +102,11 @@ impl Reconciler {
         &self,
         desired: &Desired,
         http: &CloudHttp,
-        refusals: &mut RateLimit,
+        events: &mut RateLimit,
     ) -> Vec<String> {
-        let mut note = |problem: &str| {
-            if refusals.take(1.0, Instant::now()) {
-                self.core.event(EventKind::Refused, None, problem);
+        let mut note = |kind, problem: &str| {
+            if events.take(1.0, Instant::now()) {
+                self.core.event(kind, None, problem);
             }
         };
         // A step of an earlier state, which was given up, may still end in its thread: what it
@@ -115,7 +115,7 @@ impl Reconciler {
         let deployed = self.core.lock().state.deployments.clone();
         drop(ended);
         let (steps, mut problems) = plan(&desired.deployments, &deployed);
-        problems.iter().for_each(|problem| note(problem));
+        problems.iter().for_each(|problem| note(EventKind::Refused, problem));
         // Files are many, and each handshake would take longer than most of them.
         let http = &http.keeping();
         for step in steps {
@@ -129,9 +129,8 @@ impl Reconciler {
             if let Err(failure) = taken {
                 // One that fails blocks no other one.
                 let problem = format!("`{id}`: {failure}");
-                if failure.exit != Exit::Unreachable {
-                    note(&problem);
-                }
+                let is_refused = failure.exit != Exit::Unreachable;
+                note(if is_refused { EventKind::Refused } else { EventKind::Warning }, &problem);
                 problems.push(problem);
             }
         }
