@@ -115,17 +115,18 @@ impl FakeCloud {
 }
 
 impl FakeConnection {
-    /// Receives a request, and returns its head; `None` at the end of the connection.
+    /// Receives a request, and returns its head and body; `None` at the end of the connection.
     pub(super) async fn request(&mut self) -> Option<String> {
         let mut head = Vec::new();
         while !head.ends_with(b"\r\n\r\n") {
             head.push(self.0.read_u8().await.ok()?);
         }
-        let head = String::from_utf8(head).unwrap();
-        let length = head.lines().find_map(|line| line.strip_prefix("content-length: "));
+        let mut request = String::from_utf8(head).unwrap();
+        let length = request.lines().find_map(|line| line.strip_prefix("content-length: "));
         let mut body = vec![0; length.map_or(0, |it| it.parse().unwrap())];
         self.0.read_exact(&mut body).await.ok()?;
-        Some(head)
+        request.push_str(&String::from_utf8_lossy(&body));
+        Some(request)
     }
 
     pub(super) async fn answer(&mut self, head: &str, body: &[u8]) {

@@ -47,7 +47,7 @@ struct LinkedVehicle {
     _folder: TempDir,
 }
 
-type Session = JoinHandle<Result<SessionEnd, Failure>>;
+type RunningSession = JoinHandle<Result<SessionEnd, Failure>>;
 
 impl LinkedVehicle {
     async fn new() -> Self {
@@ -76,7 +76,7 @@ impl LinkedVehicle {
     }
 
     /// Opens a connection.
-    async fn open(&mut self) -> (Session, ControlChannel) {
+    async fn open(&mut self) -> (RunningSession, ControlChannel) {
         let (api, http) = (self.api.clone(), self.http.clone());
         let (orders, handled) = (self.orders.clone(), self.handled.clone());
         let settings = self.settings.subscribe();
@@ -89,7 +89,7 @@ impl LinkedVehicle {
     }
 
     /// Opens a connection, with this answer to the first frame.
-    async fn connect(&mut self, welcome: Welcome) -> (Session, ControlChannel) {
+    async fn connect(&mut self, welcome: Welcome) -> (RunningSession, ControlChannel) {
         let (session, mut channel) = self.open().await;
         channel.send(Body::Welcome(welcome)).await;
         (session, channel)
