@@ -249,4 +249,4 @@ impl IntoResponse for ApiError {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -34,7 +34,10 @@ impl Core {
     ) -> Result<DeployReply, Failure> {
         let reply = self.try_deploy(request, wish);
         if let Err(failure) = &reply {
-            self.event(EventKind::Refused, None, &failure.to_string());
+            // Those of a cloud are noted by the caller, which bounds them.
+            if wish.is_none() {
+                self.event(EventKind::Refused, None, &failure.to_string());
+            }
             // What has expired once stays expired, also if the clock is reset soon.
             self.observe_time();
         }

@@ -19,17 +19,22 @@ fn answer(socket: &Path, method: &str, path: &str) -> String {
     answer
 }
 
+/// Returns a new vehicle with its state in the folder `state`, and its socket in `run`.
+pub(crate) fn vehicle(folder: &Path, settings: gleaner_lambda::Vehicle) -> Api {
+    let [state, run] = ["state", "run"].map(|name| folder.join(name));
+    let layout = VehicleFolders::create(&state, &run).unwrap();
+    let core = Arc::new(Core::open(&layout, settings).unwrap());
+    let key = SecretKey::generate().unwrap().public();
+    let name = "car".parse().unwrap();
+    let (cloud, _) = Cloud::load(DurableFile::new(layout.cloud()));
+    Api { core, layout, name, key, started: Instant::now(), cloud }
+}
+
 #[test]
 fn odd_ids_are_refused_and_leave_all_files() {
     let folder = tempfile::tempdir().unwrap();
-    let [state, run] = ["state", "run"].map(|name| folder.path().join(name));
-    let layout = VehicleFolders::create(&state, &run).unwrap();
-    let core = Arc::new(Core::open(&layout, gleaner_lambda::Vehicle::default()).unwrap());
-    let key = SecretKey::generate().unwrap().public();
-    let socket = layout.control_socket();
-    let name = "car".parse().unwrap();
-    let (cloud, _) = Cloud::load(DurableFile::new(layout.cloud()));
-    let api = Api { core, layout, name, key, started: Instant::now(), cloud };
+    let api = vehicle(folder.path(), gleaner_lambda::Vehicle::default());
+    let (socket, state) = (api.layout.control_socket(), folder.path().join("state"));
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
     let _entered = runtime.enter();
     let listener = tokio::net::UnixListener::bind(&socket).unwrap();

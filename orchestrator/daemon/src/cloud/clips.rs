@@ -71,7 +71,13 @@ impl ClipSender {
                 if length != Some(self.folder.length()) {
                     let seen = self.folder.length();
                     match self.new_clips(orders.cursor.clone()).await? {
-                        Some(report) => orders = self.report(&report).await?,
+                        Some(report) => {
+                            orders = self.report(&report).await?;
+                            // Else the same clips would be read again, without an end.
+                            if orders.cursor != report.cursor {
+                                return Err(not_stored());
+                            }
+                        }
                         None => length = Some(seen),
                     }
                 } else if let Some(name) = orders.thumbnails.first() {
@@ -95,7 +101,7 @@ impl ClipSender {
     }
 
     async fn report(&self, report: &ClipReport) -> Result<ClipOrders, Failure> {
-        self.http.post("/v1/clips", report).await
+        paced(0, self.http.post("/v1/clips", report)).await
     }
 
     async fn send_thumbnail(&self, name: &ClipName) -> Result<ClipOrders, Failure> {
@@ -119,14 +125,9 @@ impl ClipSender {
         }
     }
 
-    /// Sends bytes, not faster than allowed.
     async fn send(&self, path: &str, content: Vec<u8>) -> Result<ClipOrders, Failure> {
-        // Some for the request itself, so that small ones are paced, too.
-        let bytes = content.len() as f64 + 64e3;
-        let begin = Instant::now();
-        let orders = self.http.put(path, content).await?;
-        sleep(Duration::from_secs_f64(bytes / RATE).saturating_sub(begin.elapsed())).await;
-        Ok(orders)
+        let bytes = content.len();
+        paced(bytes, self.http.put(path, content)).await
     }
 
     async fn report_gone(
@@ -163,6 +164,23 @@ impl ClipSender {
     }
 }
 
+/// Awaits a request with so many bytes, and then the time that it takes at the allowed rate. Small
+/// ones count as well, so that no cloud makes the vehicle send them in a loop.
+async fn paced(
+    bytes: usize,
+    request: impl Future<Output = Result<ClipOrders, Failure>>,
+) -> Result<ClipOrders, Failure> {
+    let begin = Instant::now();
+    let orders = request.await?;
+    let due = Duration::from_secs_f64((bytes as f64 + 64e3) / RATE);
+    sleep(due.saturating_sub(begin.elapsed())).await;
+    Ok(orders)
+}
+
+fn not_stored() -> Failure {
+    Failure::new(Exit::Unreachable, "the cloud did not store the list of clips")
+}
+
 fn unreadable(error: &io::Error) -> Failure {
     Failure::caused_by(Exit::Internal, "cannot read the clips of this vehicle", error)
 }
@@ -181,3 +199,6 @@ async fn in_background<T: Send + 'static>(
     })?;
     received.await.map_err(io::Error::other)?
 }
+
+#[cfg(test)]
+mod tests;

@@ -8,6 +8,7 @@
 //! - `uplink`: sends records that the cloud does not have, `resume` finds where to go on, and
 //!   `collect` decides which of them are sent at once.
 //! - `clips`: announces clips, and sends those that the cloud wants; `clip_list` reads them.
+//! - `fake_cloud`: for tests, a cloud over TLS that answers as a test wants.
 //!
 //! Without a connection everything runs on, and records wait in their spools. What the cloud wants
 //! is verified as a deployment by a user is: it can run nothing that no trusted key has signed.
@@ -17,6 +18,8 @@ mod clips;
 mod collect;
 mod download;
 mod enrolling;
+#[cfg(test)]
+mod fake_cloud;
 mod http;
 mod link;
 mod plan;
@@ -24,6 +27,8 @@ mod reconcile;
 mod resume;
 mod session;
 mod settings;
+#[cfg(test)]
+mod tests;
 mod uplink;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

@@ -2,11 +2,12 @@
 //! steps an older one is given up.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use gleaner_base::{Exit, Failure};
+use gleaner_base::{Exit, Failure, RateLimit};
 use gleaner_fleet::Desired;
 use gleaner_lambda::manifest::{ItemName, Sha256};
+use gleaner_protocol::supervision::EventKind;
 use gleaner_protocol::vehicle_api::{DeployReply, DeployRequest};
 use gleaner_trust::{Deployment, Payload, Revision, sha256};
 use tokio::sync::{Mutex, watch};
@@ -18,10 +19,12 @@ use super::plan::{Step, plan};
 use crate::core::Core;
 use crate::state::CloudWish;
 
-/// Pause before the steps that failed are taken again; it doubles up to the longest. A deployment
-/// that is refused makes an event each time.
+/// Pause before the steps that failed are taken again; it doubles up to the longest. Each
+/// failure makes an event.
 const PAUSE: Duration = Duration::from_secs(10);
 const PAUSE_MAX: Duration = Duration::from_secs(1800);
+/// Events per second and at once about steps that failed: a hostile cloud can cause any number.
+const EVENTS: RateLimit = RateLimit::of(0.1, 100.0);
 /// Number of times that missing files are fetched: another deployment may remove some in between.
 const ROUNDS: u32 = 5;
 
@@ -63,7 +66,7 @@ impl Order {
 impl Reconciler {
     /// Runs until the sender of wanted states is dropped.
     pub(super) async fn run(mut self) {
-        let (mut pause, mut before) = (PAUSE, None);
+        let (mut pause, mut before, mut events) = (PAUSE, None, EVENTS);
         loop {
             let order = self.orders.borrow_and_update().clone();
             let Some(Order { desired, http }) = order else {
@@ -75,7 +78,7 @@ impl Reconciler {
             if before.as_ref() != Some(&desired) {
                 pause = PAUSE;
             }
-            let problems = self.follow(&desired, &http).await;
+            let problems = self.follow(&desired, &http, &mut events).await;
             let (is_done, generation) = (problems.is_empty(), desired.generation);
             self.handled.send_replace(Handled { generation, problems });
             let desired = &*before.insert(desired);
@@ -94,13 +97,25 @@ impl Reconciler {
         }
     }
 
-    async fn follow(&self, desired: &Desired, http: &CloudHttp) -> Vec<String> {
+    /// Takes the steps to a wanted state; returns the reasons why parts of it are not applied.
+    async fn follow(
+        &self,
+        desired: &Desired,
+        http: &CloudHttp,
+        events: &mut RateLimit,
+    ) -> Vec<String> {
+        let mut note = |kind, problem: &str| {
+            if events.take(1.0, Instant::now()) {
+                self.core.event(kind, None, problem);
+            }
+        };
         // A step of an earlier state, which was given up, may still end in its thread: what it
         // changes counts for the plan.
         let ended = self.step.lock().await;
         let deployed = self.core.lock().state.deployments.clone();
         drop(ended);
         let (steps, mut problems) = plan(&desired.deployments, &deployed);
+        problems.iter().for_each(|problem| note(EventKind::Refused, problem));
         // Files are many, and each handshake would take longer than most of them.
         let http = &http.keeping();
         for step in steps {
@@ -113,7 +128,10 @@ impl Reconciler {
             };
             if let Err(failure) = taken {
                 // One that fails blocks no other one.
-                problems.push(format!("`{id}`: {failure}"));
+                let problem = format!("`{id}`: {failure}");
+                let is_refused = failure.exit != Exit::Unreachable;
+                note(if is_refused { EventKind::Refused } else { EventKind::Warning }, &problem);
+                problems.push(problem);
             }
         }
         problems

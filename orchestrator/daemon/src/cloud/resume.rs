@@ -17,10 +17,12 @@ pub(super) fn resume(
 ) -> Result<(u64, SpoolReader), SpoolError> {
     let oldest = |life| Ok((life, SpoolReader::open(folder, stream, None)?));
     let Some(Cursor { life, next, seq, boot, boot_ns, .. }) = cursor else { return oldest(1) };
-    if !boot.is_empty() {
-        let mut reader = SpoolReader::open(folder, stream, Some(*seq))?;
+    // Of a stream of nothing but gaps, the cloud has no record to compare, but an end.
+    let last = if boot.is_empty() { next.checked_sub(1) } else { Some(*seq) };
+    if let Some(last) = last {
+        let mut reader = SpoolReader::open(folder, stream, Some(last))?;
         let is_same = match reader.next().transpose()? {
-            Some(SpoolItem::Record(record)) if record.seq == *seq => {
+            Some(SpoolItem::Record(record)) if record.seq == last => {
                 hex(&record.boot.0) == *boot && record.time.since_boot_ns == *boot_ns
             }
             // The budget has removed it.
@@ -86,6 +88,19 @@ mod tests {
         write(folder.path(), 200..205, b"x");
         assert_eq!(resumed(folder.path(), Some(&cursor(4, 103))), (4, Some(200)));
         assert_eq!(resumed(folder.path(), Some(&cursor(50, 149))), (4, Some(200)), "it is shorter");
+    }
+
+    #[test]
+    fn a_position_without_a_record_is_no_way_to_skip_records() {
+        let folder = tempfile::tempdir().unwrap();
+        write(folder.path(), 100..110, b"x");
+        let gaps = |next| Cursor { seq: 0, boot: String::new(), boot_ns: 0, ..cursor(next, 0) };
+        for next in [3, 11, 1 << 40, u64::MAX] {
+            assert_eq!(resumed(folder.path(), Some(&gaps(next))), (4, Some(100)), "{next}");
+        }
+        assert_eq!(resumed(folder.path(), Some(&cursor(u64::MAX, 0))), (4, Some(100)));
+        let last = Cursor { life: u64::MAX, ..cursor(50, 149) };
+        assert_eq!(resumed(folder.path(), Some(&last)), (u64::MAX, Some(100)));
     }
 
     #[test]

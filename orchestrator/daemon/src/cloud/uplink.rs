@@ -223,3 +223,6 @@ fn names(spool: &Path) -> Vec<String> {
     let lambdas = lambdas.filter_map(|entry| entry.file_name().into_string().ok());
     own.chain(lambdas.map(|id| format!("lambdas/{id}"))).collect()
 }
+
+#[cfg(test)]
+mod tests;

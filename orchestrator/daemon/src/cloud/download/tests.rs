@@ -1,17 +1,11 @@
 use std::fs;
 use std::path::Path;
-use std::sync::Arc;
 
 use gleaner_trust::sha256;
-use rcgen::{CertificateParams, KeyPair};
-use rustls::pki_types::{PrivateKeyDer, PrivatePkcs8KeyDer};
-use rustls::{ClientConfig, RootCertStore, ServerConfig};
 use tempfile::TempDir;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
-use tokio_rustls::TlsAcceptor;
 
+use super::super::fake_cloud::FakeCloud;
 use super::*;
 
 const CONTENT: &[u8] = b"content";
@@ -22,43 +16,17 @@ type FakeAnswer = (&'static str, &'static str);
 /// A cloud that gives these answers, one after the other on each of its connections; the handle
 /// returns the requests.
 async fn cloud(connections: Vec<Vec<FakeAnswer>>) -> (CloudHttp, JoinHandle<Vec<String>>) {
-    let key = KeyPair::generate().unwrap();
-    let params = CertificateParams::new(vec!["127.0.0.1".to_owned()]).unwrap();
-    let certificate = params.self_signed(&key).unwrap().der().clone();
-    let key = PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(key.serialize_der()));
-    let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let server = ServerConfig::builder_with_provider(Arc::clone(&provider))
-        .with_protocol_versions(&[&rustls::version::TLS13])
-        .unwrap()
-        .with_no_client_auth()
-        .with_single_cert(vec![certificate.clone()], key)
-        .unwrap();
-    let mut roots = RootCertStore::empty();
-    roots.add(certificate).unwrap();
-    let tls = ClientConfig::builder_with_provider(provider)
-        .with_protocol_versions(&[&rustls::version::TLS13])
-        .unwrap()
-        .with_root_certificates(roots)
-        .with_no_client_auth();
-    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let http = CloudHttp::new(listener.local_addr().unwrap().to_string(), Arc::new(tls));
-    let acceptor = TlsAcceptor::from(Arc::new(server));
+    let cloud = FakeCloud::start().await;
+    let http = cloud.http.clone();
     let served = tokio::spawn(async move {
         let mut requests = Vec::new();
         for answers in connections {
-            let (stream, _) = listener.accept().await.unwrap();
-            let mut stream = acceptor.accept(stream).await.unwrap();
+            let mut connection = cloud.accept().await;
             for (head, body) in answers {
-                let mut request = Vec::new();
-                while !request.ends_with(b"\r\n\r\n") {
-                    request.push(stream.read_u8().await.unwrap());
-                }
-                requests.push(String::from_utf8(request).unwrap());
-                let answer = format!("HTTP/1.1 {head}\r\n\r\n{body}");
-                // A vehicle that refuses it closes the connection.
-                let _ = stream.write_all(answer.as_bytes()).await;
+                requests.push(connection.request().await.unwrap());
+                connection.answer(head, body.as_bytes()).await;
             }
-            let _ = stream.shutdown().await;
+            connection.close().await;
         }
         requests
     });
@@ -169,4 +137,31 @@ async fn requests_share_a_connection_that_is_kept_and_go_on_over_another_one() {
         assert_eq!(http.get(path, 7).await.unwrap(), CONTENT, "{path}");
     }
     assert_eq!(served.await.unwrap().len(), 3);
+}
+
+#[tokio::test]
+async fn a_body_that_breaks_off_takes_no_other_request_with_it() {
+    let broken = [vec![(WHOLE, "content"), (WHOLE, "con")], vec![(WHOLE, "content"); 2]];
+    let (http, served) = cloud(broken.to_vec()).await;
+    let http = http.keeping();
+    assert_eq!(http.get("/first", 7).await.unwrap(), CONTENT);
+    let failure = http.get("/second", 7).await.unwrap_err();
+    assert_eq!(failure.exit, Exit::Unreachable);
+    assert!(failure.to_string().contains("the connection was lost"), "{failure}");
+    // What is left of an answer is not taken for another one.
+    for path in ["/third", "/fourth"] {
+        assert_eq!(http.get(path, 7).await.unwrap(), CONTENT, "{path}");
+    }
+    assert_eq!(served.await.unwrap().len(), 4);
+}
+
+#[tokio::test]
+async fn a_body_that_is_too_long_takes_no_other_request_with_it() {
+    let answers = [vec![(WHOLE, "content")], vec![(WHOLE, "content")]];
+    let (http, _served) = cloud(answers.to_vec()).await;
+    let http = http.keeping();
+    // It is refused before its end, which still arrives.
+    let failure = http.get("/first", 3).await.unwrap_err();
+    assert!(failure.to_string().contains("it has more than 3 bytes"), "{failure}");
+    assert_eq!(http.get("/second", 7).await.unwrap(), CONTENT);
 }

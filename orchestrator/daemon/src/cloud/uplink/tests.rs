@@ -1,0 +1,283 @@
+//! A vehicle comes back after seven days: what its spools have arrives once, in order, and what
+//! they lost is named.
+
+use std::num::NonZeroU8;
+use std::sync::mpsc;
+
+use gleaner_base::ByteSize;
+use gleaner_fleet::decompress;
+use gleaner_lambda::{LogLevel, LogLine};
+use gleaner_protocol::SpooledRecord;
+use gleaner_protocol::vehicle_api::StreamLine;
+use gleaner_spool::{BUDGET_MIN, BootId, SpoolConfig, SpoolError, SpoolTime, SpoolWriter};
+use serde_json::Value;
+use tempfile::TempDir;
+use tokio::sync::mpsc::{Receiver as FrameReceiver, channel};
+use tokio::time::timeout;
+
+use super::*;
+use crate::durable::DurableFile;
+
+const DAY_NS: u64 = 86_400_000_000_000;
+/// The first day, in ns since 1970.
+const BEGIN_NS: i64 = 1_800_000_000_000_000_000;
+const STREAMS_HERE: [&str; 4] = ["events", "lambdas/brake", "lambdas/moved", "orchestrator"];
+const DEADLINE: Duration = Duration::from_secs(60);
+
+/// The spools of a vehicle, one writer each, and all records that were durable in them.
+struct Spools {
+    folder: TempDir,
+    writers: BTreeMap<&'static str, SpoolWriter>,
+    durable: BTreeMap<&'static str, Vec<(u64, String)>>,
+}
+
+/// The records of a vehicle in the cloud, which stores them by the rules of the real one.
+#[derive(Default)]
+struct StoredRecords {
+    cursors: BTreeMap<String, Cursor>,
+    /// The lines of each stream as they came, with their lives.
+    lines: BTreeMap<String, Vec<(u64, StreamLine)>>,
+}
+
+/// The place where a connection is cut.
+#[derive(Clone, Copy)]
+enum LinkCut {
+    /// Not before everything is stored.
+    Never,
+    /// With the batch after so many, before it is stored.
+    Before(usize),
+    /// With the batch after so many, before it is acknowledged.
+    Unacknowledged(usize),
+}
+
+impl Spools {
+    fn new() -> Self {
+        let folder = TempDir::new().unwrap();
+        std::fs::create_dir(folder.path().join("lambdas")).unwrap();
+        Self { folder, writers: BTreeMap::new(), durable: BTreeMap::new() }
+    }
+
+    fn path(&self, stream: &str) -> PathBuf {
+        self.folder.path().join(stream)
+    }
+
+    /// Starts the machine: the boot of this number. A queue that was not committed is lost.
+    fn boot(&mut self, number: u8) {
+        self.writers.clear();
+        for stream in STREAMS_HERE {
+            let budget = if stream == "lambdas/brake" { BUDGET_MIN } else { ByteSize::mib(4) };
+            let (boot, of) = (BootId([number; 16]), last_part(stream).to_owned());
+            let config = SpoolConfig { stream: of, boot, budget };
+            self.writers.insert(stream, SpoolWriter::open(&self.path(stream), config).unwrap());
+        }
+    }
+
+    /// Appends records of a day, `group` of them before each commit.
+    fn add(&mut self, stream: &'static str, day: u64, count: u64, group: u64) {
+        let writer = self.writers.get_mut(stream).unwrap();
+        let mut waiting = Vec::new();
+        for number in 0..count {
+            let since_boot_ns = DAY_NS / count * number;
+            let wall_ns = BEGIN_NS + (day * DAY_NS + since_boot_ns).cast_signed();
+            let text = format!("record {number} of {stream} on day {day}");
+            let (kind, payload) = record(stream, &text);
+            match writer.append(kind, SpoolTime { since_boot_ns, wall_ns }, &payload) {
+                Ok(seq) => waiting.push((seq, text)),
+                Err(error) => assert!(matches!(error, SpoolError::Refused { .. }), "{error}"),
+            }
+            if number % group == group - 1 || number + 1 == count {
+                writer.commit().unwrap();
+                self.durable.entry(stream).or_default().append(&mut waiting);
+            }
+        }
+    }
+
+    /// Interrupts a commit by a kill.
+    fn tear(&mut self, stream: &str) {
+        self.writers.remove(stream);
+        let files = std::fs::read_dir(self.path(stream)).unwrap().map(|it| it.unwrap().path());
+        let newest = files.filter(|it| it.extension().is_some_and(|it| it == "seg")).max();
+        let mut segment = std::fs::File::options().append(true).open(newest.unwrap()).unwrap();
+        std::io::Write::write_all(&mut segment, &[1; 100]).unwrap();
+    }
+
+    /// Removes a stream with all of its records, as a disk that is replaced.
+    fn lose(&mut self, stream: &'static str) {
+        self.writers.remove(stream);
+        self.durable.remove(stream);
+        std::fs::remove_dir_all(self.path(stream)).unwrap();
+    }
+
+    /// Returns the lines of a stream, from a number on.
+    fn lines(&self, stream: &str, from: Option<u64>) -> Vec<StreamLine> {
+        let of = last_part(stream);
+        let reader = SpoolReader::open(&self.path(stream), of, from).unwrap();
+        // As they arrive: JSON has no order of keys.
+        let parse = |line| serde_json::from_slice(&serde_json::to_vec(&line).unwrap()).unwrap();
+        reader.map(|item| parse(line(of, item))).collect()
+    }
+
+    /// Sends to a cloud over one connection.
+    async fn connect(&self, cloud: &mut StoredRecords, end: LinkCut) {
+        let (out, mut frames) = channel(4);
+        let (orders, received) = mpsc::sync_channel(STREAMS_HERE.len());
+        let uplink = Uplink {
+            spool: self.folder.path().to_owned(),
+            cloud: Cloud::load(DurableFile::new(self.path("cloud.json"))).0,
+            cursors: cloud.cursors.clone(),
+            out,
+            orders: received,
+        };
+        let sent = tokio::task::spawn_blocking(move || uplink.run());
+        let mut batches = 0;
+        while !self.are_in(cloud) {
+            let batch = batch(&mut frames).await;
+            if matches!(end, LinkCut::Before(most) if most == batches) {
+                break;
+            }
+            let ack = cloud.store(&batch);
+            if matches!(end, LinkCut::Unacknowledged(most) if most == batches) {
+                break;
+            }
+            orders.send(UplinkOrder::Ack(ack)).unwrap();
+            batches += 1;
+        }
+        assert_eq!(matches!(end, LinkCut::Never), self.are_in(cloud), "{batches} batches");
+        drop((frames, orders));
+        sent.await.unwrap();
+    }
+
+    /// Returns whether a cloud has everything.
+    fn are_in(&self, cloud: &StoredRecords) -> bool {
+        let has = |(stream, writer): (&&str, &SpoolWriter)| {
+            cloud.cursors.get(*stream).is_some_and(|it| it.next == writer.status().next)
+        };
+        self.writers.iter().all(has)
+    }
+}
+
+impl StoredRecords {
+    fn store(&mut self, batch: &Records) -> Ack {
+        let Records { stream, life, next, lines } = batch;
+        let new = Cursor { stream: stream.clone(), life: *life, ..Cursor::default() };
+        let cursor = self.cursors.entry(stream.clone()).or_insert(new);
+        assert!(*life >= cursor.life, "life {life} of `{stream}` has ended");
+        if *life > cursor.life {
+            (cursor.life, cursor.next) = (*life, 0);
+        }
+        let before = cursor.next;
+        for text in decompress(lines).unwrap().split(|byte| *byte == b'\n') {
+            let Ok(line) = serde_json::from_slice::<StreamLine>(text) else {
+                assert!(text.is_empty(), "no line: {text:?}");
+                continue;
+            };
+            let is_gap = line.kind == "gap";
+            if !is_gap && *next > before {
+                (cursor.seq, cursor.boot_ns) = (line.seq, line.boot_ns);
+                cursor.boot.clone_from(&line.boot);
+            }
+            // It would skip a record that it has, but none has to come again.
+            assert!(is_gap || line.seq >= before, "record {} of `{stream}` came again", line.seq);
+            self.lines.entry(stream.clone()).or_default().push((*life, line));
+        }
+        cursor.next = before.max(*next);
+        Ack { stream: stream.clone(), life: *life, next: cursor.next }
+    }
+
+    /// Returns the lines of a life, without those before the first `from`.
+    fn of_life(&self, stream: &str, life: u64, from: usize) -> Vec<StreamLine> {
+        let lines = self.lines[stream].iter().skip(from).filter(|(it, _)| *it == life);
+        lines.map(|(_, line)| line.clone()).collect()
+    }
+}
+
+fn record(stream: &str, text: &str) -> (NonZeroU8, Vec<u8>) {
+    if STREAMS.contains(&stream) {
+        let event = json!({ "event": "warning", "message": text });
+        return (NonZeroU8::MIN, event.to_string().into_bytes());
+    }
+    let line = LogLine { at_ns: 1, level: LogLevel::Info, message: text.to_owned() };
+    let record = SpooledRecord::Log(line);
+    (record.kind(), record.to_payload())
+}
+
+/// Returns the next batch.
+async fn batch(frames: &mut FrameReceiver<Body>) -> Records {
+    match timeout(DEADLINE, frames.recv()).await.expect("a batch comes in time") {
+        Some(Body::Records(records)) => records,
+        other => panic!("{other:?}"),
+    }
+}
+
+/// Returns the first and the last number of each gap.
+fn gaps(lines: &[StreamLine]) -> Vec<(u64, u64, &str)> {
+    let gaps = lines.iter().filter(|line| line.kind == "gap");
+    let gaps = gaps.map(|it| (it.seq, &it.record["to"], it.record["reason"].as_str().unwrap()));
+    gaps.map(|(from, to, reason)| (from, to.as_u64().unwrap(), reason)).collect()
+}
+
+#[tokio::test]
+async fn after_seven_days_offline_each_record_arrives_once_in_order_and_losses_are_named() {
+    let (mut vehicle, mut cloud) = (Spools::new(), StoredRecords::default());
+    vehicle.boot(0);
+    for stream in STREAMS_HERE {
+        vehicle.add(stream, 0, 20, 20);
+    }
+    vehicle.connect(&mut cloud, LinkCut::Never).await;
+    let before = cloud.cursors.clone();
+    let lines_before: BTreeMap<_, _> =
+        cloud.lines.iter().map(|(stream, lines)| (stream.clone(), lines.len())).collect();
+
+    // From here on it is offline, and starts again each day.
+    for day in 1..=7 {
+        match day {
+            3 => vehicle.lose("lambdas/moved"),
+            4 => vehicle.tear("orchestrator"),
+            _ => {}
+        }
+        vehicle.boot(day as u8);
+        vehicle.add("events", day, 1440, 360);
+        // On one day, it logs more at once than fits into the queue.
+        vehicle.add("lambdas/brake", day, 200, if day == 6 { 100 } else { 25 });
+        vehicle.add("lambdas/moved", day, 50, 50);
+        vehicle.add("orchestrator", day, 5, 5);
+    }
+
+    vehicle.connect(&mut cloud, LinkCut::Before(0)).await;
+    vehicle.connect(&mut cloud, LinkCut::Unacknowledged(1)).await;
+    vehicle.connect(&mut cloud, LinkCut::Before(3)).await;
+    // It is not idle meanwhile.
+    vehicle.add("events", 8, 10, 10);
+    vehicle.connect(&mut cloud, LinkCut::Unacknowledged(4)).await;
+    assert!(!vehicle.are_in(&cloud), "there is something left for the last connection");
+    vehicle.connect(&mut cloud, LinkCut::Never).await;
+
+    for stream in STREAMS_HERE {
+        let life = cloud.cursors[stream].life;
+        assert_eq!(life, if stream == "lambdas/moved" { 2 } else { 1 }, "{stream}");
+        let from = (life == before[stream].life).then_some(before[stream].next);
+        let arrived = cloud.of_life(stream, life, lines_before[stream]);
+        assert_eq!(arrived, vehicle.lines(stream, from), "{stream}");
+        // Each record that was durable is there, or in a gap.
+        let all = cloud.of_life(stream, life, 0);
+        let gaps = gaps(&all);
+        let records: Vec<_> = all.iter().filter(|line| line.kind != "gap").collect();
+        assert!(records.is_sorted_by(|a, b| a.seq < b.seq), "{stream}");
+        let texts: BTreeMap<_, _> = records.iter().map(|it| (it.seq, &it.record)).collect();
+        let mut lost = 0;
+        for (seq, text) in &vehicle.durable[stream] {
+            let is_lost = gaps.iter().any(|(from, to, _)| (from..=to).contains(&seq));
+            match texts.get(seq) {
+                Some(record) => assert_eq!(record["message"], Value::from(text.as_str())),
+                None => assert!(is_lost, "record {seq} of {stream} is missing"),
+            }
+            lost += u64::from(!texts.contains_key(seq));
+        }
+        let has = |reason| gaps.iter().any(|(.., it)| *it == reason);
+        match stream {
+            "lambdas/brake" => assert!(has("Budget") && has("QueueFull") && lost > 500, "{gaps:?}"),
+            "orchestrator" => assert_eq!((has("Torn"), lost), (true, 0), "{gaps:?}"),
+            _ => assert_eq!((gaps.len(), lost), (0, 0), "{gaps:?}"),
+        }
+    }
+}
