@@ -168,6 +168,7 @@ impl BenchCommand {
 /// Adds the versions of what is measured.
 fn add_versions(results: &mut BenchResults) {
     let machine = &mut results.machine;
+    machine.add_version("measured", Command::new("date").args(["-u", "+%Y-%m-%d %H:%M UTC"]));
     let mut git = Command::new("git");
     git.args(["describe", "--always", "--dirty", "--abbrev=12"]).current_dir(root());
     machine.add_version("revision", &mut git);

@@ -4,10 +4,17 @@
 mod busy_cores;
 mod load;
 
+use std::io;
 use std::path::PathBuf;
+use std::process::{Command, ExitStatus};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::Duration;
 
-use gleaner_tests::live::no_player;
+use gleaner_tests::live::{no_player, signal};
 use gleaner_tests::{namespace, root};
+use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::measure::Twin;
 pub use busy_cores::BusyCores;
@@ -47,14 +54,33 @@ fn start_in_private_network() -> Result<bool, String> {
     let before = std::fs::read_to_string(BUFFER_LIMIT).unwrap_or_default();
     let is_small = before.trim().parse::<u64>().is_ok_and(|bytes| bytes < BUFFER_BYTES);
     let raised = is_small && std::fs::write(BUFFER_LIMIT, BUFFER_BYTES.to_string()).is_ok();
-    let status = namespace::rerun(ALONE, &std::process::id().to_string())
-        .args(std::env::args_os().skip(1))
-        .status();
+    let status = until_end(
+        namespace::rerun(ALONE, &std::process::id().to_string()).args(std::env::args_os().skip(1)),
+    );
     // Restored for the other users of this machine, whatever the benchmark has set.
     if raised || std::fs::read_to_string(BUFFER_LIMIT).is_ok_and(|after| after != before) {
         let _ = std::fs::write(BUFFER_LIMIT, before.trim());
     }
     status.map(|status| status.success()).map_err(|error| error.to_string())
+}
+
+/// Runs a command to its end. A signal that asks this program to end is passed on, so that the end
+/// is waited for, and the limit restored.
+fn until_end(command: &mut Command) -> io::Result<ExitStatus> {
+    let is_asked = Arc::<AtomicBool>::default();
+    for asks in [SIGINT, SIGTERM] {
+        signal_hook::flag::register(asks, Arc::clone(&is_asked))?;
+    }
+    let mut child = command.spawn()?;
+    loop {
+        if let Some(status) = child.try_wait()? {
+            return Ok(status);
+        }
+        if is_asked.swap(false, Ordering::Relaxed) {
+            signal(child.id(), "TERM");
+        }
+        thread::sleep(Duration::from_millis(100));
+    }
 }
 
 /// Name, lambdas, players and seconds of a load.

@@ -41,7 +41,7 @@ impl Workload {
         // Powers of two are written by people in MiB, the usual limit of Linux in bytes.
         match buffer {
             0 => what.to_owned(),
-            _ if buffer % (1 << 20) == 0 => {
+            _ if buffer.is_multiple_of(1 << 20) => {
                 format!("{what}, socket buffers of {} MiB", buffer >> 20)
             }
             _ => format!("{what}, socket buffers of {buffer} B"),
