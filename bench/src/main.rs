@@ -112,7 +112,7 @@ fn measure(command: &BenchCommand, args: &Args) -> Result<ExitCode, Failure> {
     add_versions(&mut results);
     match command {
         BenchCommand::Rtt { options } => rtt::measure(quick, options, &mut results),
-        BenchCommand::Scale => results.figures = live::loads(quick),
+        BenchCommand::Scale => live::loads(quick, &mut results),
         BenchCommand::Isolation => match isolation::figures(quick) {
             Ok(figures) => results.figures = figures,
             Err(why) => {

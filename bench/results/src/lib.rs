@@ -1,13 +1,14 @@
 //! Results of a benchmark: what was measured, on which machine, and what it means.
 //!
 //! - [`BenchResults`] is one run: tables of [`Figure`]s, and [`Series`] of single measurements with
-//!   all of their values. It is stored as JSON, as Markdown, and as a page with plots.
+//!   all of their values, and quantities with their [`Growth`]. It is stored as JSON, as Markdown, and as a page with plots.
 //! - [`Summary`] has the statistics of a series, and [`Difference`] compares two.
 //! - [`Comparison`] compares two runs.
 //! - [`Machine`] is where a run took place.
 
 mod comparison;
 mod figure;
+mod growth;
 mod machine;
 mod markdown;
 mod page;
@@ -19,6 +20,7 @@ mod test_folder;
 
 pub use comparison::Comparison;
 pub use figure::{Figure, Goal};
+pub use growth::{Growth, GrowthCurve};
 pub use machine::Machine;
 pub use results::{BenchResults, Reception, Series, SeriesGroup};
 pub use statistics::{Difference, Summary, quantile};

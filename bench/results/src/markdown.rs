@@ -36,6 +36,14 @@ impl BenchResults {
                 table(&mut text, &heads, compared.into_iter());
             }
         }
+        for growth in &self.growths {
+            let _ = write!(text, "\n## {}\n", growth.name);
+            table(&mut text, &growth.heads(), growth.rows().into_iter());
+            text.push('\n');
+            for slope in growth.slopes() {
+                let _ = writeln!(text, "- {slope}");
+            }
+        }
         if !self.notes.is_empty() {
             text.push('\n');
         }

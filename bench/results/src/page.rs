@@ -2,6 +2,7 @@
 
 use gleaner_report::{MeasurementPage, MeasurementSection, Plot, PlotCurve, PlotTable};
 
+use crate::growth::Growth;
 use crate::markdown::COMPARED;
 use crate::results::{BenchResults, Series, SeriesGroup};
 
@@ -26,6 +27,8 @@ impl BenchResults {
         };
         let figures = (!self.figures.is_empty()).then_some(figures);
         let facts = self.machine.facts.iter();
+        let groups = self.groups.iter().map(SeriesGroup::section);
+        let growths = self.growths.iter().map(Growth::section);
         MeasurementPage {
             title: self.title(),
             origin: ORIGIN
@@ -35,9 +38,29 @@ impl BenchResults {
                 .join(" · "),
             facts: facts.map(|(name, value)| (name.clone(), value.clone())).collect(),
             notes: self.notes.clone(),
-            sections: self.groups.iter().map(SeriesGroup::section).chain(figures).collect(),
+            sections: groups.chain(growths).chain(figures).collect(),
         }
         .to_html()
+    }
+}
+
+impl Growth {
+    fn section(&self) -> MeasurementSection {
+        let curves = self.curves.iter();
+        let curves = curves
+            .map(|curve| PlotCurve { name: curve.name.clone(), points: curve.points.clone() });
+        let plot = Plot {
+            x: self.of.clone(),
+            y: self.unit.clone(),
+            is_x_logarithmic: false,
+            curves: curves.collect(),
+        };
+        MeasurementSection {
+            title: self.name.clone(),
+            note: self.slopes().join("; "),
+            plots: vec![plot],
+            tables: vec![PlotTable { heads: self.heads(), rows: self.rows() }],
+        }
     }
 }
 

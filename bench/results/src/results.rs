@@ -8,6 +8,7 @@ use gleaner_base::{Exit, Failure, write_atomically};
 use serde::{Deserialize, Serialize};
 
 use crate::figure::Figure;
+use crate::growth::Growth;
 use crate::machine::Machine;
 
 /// Version of the format of the JSON file.
@@ -27,6 +28,8 @@ pub struct BenchResults {
     pub figures: Vec<Figure>,
     /// Series that are compared with each other.
     pub groups: Vec<SeriesGroup>,
+    /// Quantities that grow with others.
+    pub growths: Vec<Growth>,
     /// Sentences that a reader needs to understand the tables.
     pub notes: Vec<String>,
 }
@@ -78,6 +81,7 @@ impl BenchResults {
             machine,
             figures: Vec::new(),
             groups: Vec::new(),
+            growths: Vec::new(),
             notes: Vec::new(),
         }
     }

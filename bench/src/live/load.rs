@@ -11,7 +11,7 @@ use gleaner_tests::live::{RunningProgram, cpu_ns, descendants, play, run_all};
 use gleaner_tests::{LambdaCopy, TempFolder};
 
 use crate::measure::Twin;
-use gleaner_bench_results::Figure;
+use gleaner_bench_results::{Figure, quantile};
 
 /// Goals for the own memory (USS) of a lambda's process, in MB.
 const OWN_MB: [(Twin, f64); 2] = [(Twin::Rust, 8.0), (Twin::Python, 25.0)];
@@ -25,6 +25,15 @@ pub(super) struct Load<'a> {
     /// Arguments of each player.
     pub players: &'a [&'a [&'a str]],
     pub seconds: u32,
+}
+
+/// What a load costs.
+pub(super) struct LoadCosts {
+    /// Shares of a core, of the ingress and of all processes.
+    pub(super) ingress_percent: f64,
+    pub(super) all_percent: f64,
+    /// Median wake latency.
+    pub(super) wake_us: f64,
 }
 
 /// The processes of a run, with shares of a core in % and own memory in MB.
@@ -41,8 +50,8 @@ struct Process {
 }
 
 impl Load<'_> {
-    /// Measures the load; returns the share of a core that the ingress took, in %.
-    pub(super) fn measure(&self, figures: &mut Vec<Figure>) -> f64 {
+    /// Measures the load.
+    pub(super) fn measure(&self, figures: &mut Vec<Figure>) -> LoadCosts {
         let copies = self.lambdas.iter().flat_map(|(lambda, count)| {
             let folder = format!("bench/lambdas/{lambda}/{}", self.kind.folder());
             (0..*count).map(move |index| LambdaCopy::named(&folder, &format!("{lambda}-{index}")))
@@ -87,9 +96,9 @@ impl Load<'_> {
             names.iter().map(|name| finished.ended_of(name).expect("it has ended")).collect()
         };
         self.receptions(&ended, &sent, figures);
-        self.costs(&first, &last, span, ready_ms, figures);
-        self.latencies(&ended, figures);
-        first.ingress.share(&last.ingress, span)
+        let wake_us = self.latencies(&ended, figures);
+        let (ingress_percent, all_percent) = self.costs(&first, &last, span, ready_ms, figures);
+        LoadCosts { ingress_percent, all_percent, wake_us }
     }
 
     /// Adds what arrived of each topic, and what did not.
@@ -122,6 +131,7 @@ impl Load<'_> {
         self.add("counted as lost or refused", "samples", &refused, figures);
     }
 
+    /// Adds the costs; returns those of the ingress and of all processes, in % of a core.
     fn costs(
         &self,
         first: &Costs,
@@ -129,14 +139,15 @@ impl Load<'_> {
         span: Duration,
         ready_ms: f64,
         figures: &mut Vec<Figure>,
-    ) {
+    ) -> (f64, f64) {
         self.add("from the start of `gleaner run` to ready", "ms", &[ready_ms], figures);
         let lambdas = first.lambdas.iter().zip(&last.lambdas);
         let shares: Vec<f64> = lambdas.map(|(first, last)| first.share(last, span)).collect();
         let ingress = first.ingress.share(&last.ingress, span);
         self.add("ingress: share of a core", "%", &[ingress], figures);
         self.add("each lambda: share of a core", "%", &shares, figures);
-        self.add("all: share of a core", "%", &[ingress + shares.iter().sum::<f64>()], figures);
+        let all = ingress + shares.iter().sum::<f64>();
+        self.add("all: share of a core", "%", &[all], figures);
         self.add("ingress: own memory", "MB", &[last.ingress.own_mb], figures);
         let own: Vec<f64> = last.lambdas.iter().map(|process| process.own_mb).collect();
         let goal = OWN_MB.iter().find(|(kind, _)| kind.folder() == self.kind.folder());
@@ -147,15 +158,19 @@ impl Load<'_> {
         let growth: Vec<f64> =
             growth.map(|(first, last)| 100.0 * (last.own_mb / first.own_mb - 1.0)).collect();
         self.add("each process: growth of own memory", "%", &growth, figures);
+        (ingress, all)
     }
 
-    fn latencies(&self, ended: &[LiveStatus], figures: &mut Vec<Figure>) {
+    /// Adds the latencies; returns the median over the lambdas of their p50, in us.
+    fn latencies(&self, ended: &[LiveStatus], figures: &mut Vec<Figure>) -> f64 {
         let stats: Vec<_> = ended.iter().filter_map(|live| live.wake_latency).collect();
         let us = |ns: fn(&gleaner_protocol::DurationStats) -> u64| {
             stats.iter().map(|stats| ns(stats) as f64 / 1e3).collect::<Vec<_>>()
         };
-        self.add("wake latency, p50", "us", &us(|stats| stats.p50_ns), figures);
+        let p50 = us(|stats| stats.p50_ns);
+        self.add("wake latency, p50", "us", &p50, figures);
         self.add("wake latency, p99", "us", &us(|stats| stats.p99_ns), figures);
+        quantile(&p50, 0.5)
     }
 
     fn add(&self, what: &str, unit: &str, values: &[f64], figures: &mut Vec<Figure>) {

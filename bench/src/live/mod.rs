@@ -12,13 +12,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
+use gleaner_bench_results::{BenchResults, Figure, Growth, GrowthCurve};
 use gleaner_tests::live::{no_player, signal};
 use gleaner_tests::{namespace, root};
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::measure::Twin;
 pub use busy_cores::BusyCores;
-use gleaner_bench_results::Figure;
 use load::Load;
 
 /// Environment variable of the process in the private network: the process that started it.
@@ -87,9 +87,8 @@ fn until_end(command: &mut Command) -> io::Result<ExitStatus> {
 type LoadArgs<'a> = (&'a str, &'a [(&'a str, usize)], &'a [&'a [&'a str]], u32);
 
 /// Samples that one and several lambdas receive, and their costs.
-pub fn loads(quick: bool) -> Vec<Figure> {
+pub fn loads(quick: bool, results: &mut BenchResults) {
     let seconds = |long: u32| if quick { 2 } else { long };
-    let mut figures = Vec::new();
     const FULL_HD: &str = "1920x1080@30";
     let rig: [&[&str]; 2] =
         [&["--synthetic", FULL_HD, "--imu", "1000"], &["--synthetic", FULL_HD, "--remap", REAR]];
@@ -110,31 +109,102 @@ pub fn loads(quick: bool) -> Vec<Figure> {
     for (name, lambdas, players, long) in single {
         let seconds = seconds(long);
         let name = name.to_owned();
-        Load { name, lambdas, kind: Twin::Rust, players, seconds }.measure(&mut figures);
+        Load { name, lambdas, kind: Twin::Rust, players, seconds }.measure(&mut results.figures);
     }
-    let counts = if quick { &[1, 4][..] } else { &[1, 4, 8, 16] };
-    for kind in [Twin::Rust, Twin::Python] {
-        for rate in if quick { &[30][..] } else { &[10, 30] } {
-            let camera = format!("1920x1080@{rate}");
-            let mut one = None;
-            for count in counts {
-                let name = format!("1080p at {rate} Hz, {count} in {kind}");
-                let (lambdas, seconds) = (&[("camera", *count)][..], seconds(16));
-                let player = ["--synthetic", &camera];
-                let players = &[&player[..]];
-                let load = Load { name: name.clone(), lambdas, kind, players, seconds };
-                let ingress = load.measure(&mut figures);
-                let ratio = ingress / *one.get_or_insert(ingress);
-                let name = format!("{name}: ingress, against that of one");
-                figures.push(Figure::at_most(&name, "times", 1.1, &[ratio]));
+    let seconds = seconds(16);
+    let cameras = |rate: u32| Scale {
+        name: format!("1080p at {rate} Hz"),
+        of: "lambdas",
+        places: if quick { &[1, 4] } else { &[1, 4, 8, 16] },
+        load: Box::new(move |count| (("camera", count as usize), raw_camera("1920x1080", rate))),
+        seconds,
+    };
+    let rates = if quick { &[30][..] } else { &[10, 30] };
+    let mut scales: Vec<Scale> = rates.iter().map(|rate| cameras(*rate)).collect();
+    let imu = |rate: u32| vec!["--imu".to_owned(), rate.to_string()];
+    scales.push(Scale {
+        name: "IMU at 1 kHz".to_owned(),
+        of: "lambdas",
+        places: if quick { &[4] } else { &[1, 10, 25, 50] },
+        load: Box::new(move |count| (("imu", count as usize), imu(1000))),
+        seconds,
+    });
+    if !quick {
+        scales.push(Scale {
+            name: "one lambda on an IMU".to_owned(),
+            of: "samples per second",
+            places: &[100, 500, 1000, 2000, 5000],
+            load: Box::new(move |rate| (("imu", 1), imu(rate))),
+            seconds,
+        });
+        scales.push(Scale {
+            name: "one lambda on a camera at 10 Hz".to_owned(),
+            of: "rows of an image of 16:9",
+            places: &[720, 1080, 1440, 2160],
+            load: Box::new(|rows| {
+                (("camera", 1), raw_camera(&format!("{}x{rows}", rows * 16 / 9), 10))
+            }),
+            seconds,
+        });
+    }
+    scales.iter().for_each(|scale| scale.measure(results));
+}
+
+/// Arguments of a player of raw images.
+fn raw_camera(size: &str, rate: u32) -> Vec<String> {
+    vec!["--synthetic".to_owned(), format!("{size}@{rate}")]
+}
+
+/// Loads that differ in one number.
+struct Scale {
+    name: String,
+    /// The number, in plural.
+    of: &'static str,
+    places: &'static [u32],
+    /// Returns the lambda and its count, and the arguments of the player.
+    load: Box<dyn Fn(u32) -> ((&'static str, usize), Vec<String>)>,
+    seconds: u32,
+}
+
+impl Scale {
+    /// Measures each place with lambdas of both kinds.
+    fn measure(&self, results: &mut BenchResults) {
+        let (mut cpu, mut wakes) = (Vec::new(), Vec::new());
+        for kind in [Twin::Rust, Twin::Python] {
+            let (mut all, mut ingress, mut wake) = (Vec::new(), Vec::new(), Vec::new());
+            for place in self.places {
+                let (lambda, player) = (self.load)(*place);
+                let player: Vec<&str> = player.iter().map(String::as_str).collect();
+                let name = format!("{}, {place} {} in {kind}", self.name, self.of);
+                let (lambdas, players) = (&[lambda][..], &[&player[..]][..]);
+                let load =
+                    Load { name: name.clone(), lambdas, kind, players, seconds: self.seconds };
+                let costs = load.measure(&mut results.figures);
+                let at = f64::from(*place);
+                all.push([at, costs.all_percent]);
+                wake.push([at, costs.wake_us]);
+                ingress.push([at, costs.ingress_percent]);
+                // One reception serves all lambdas.
+                if lambda.1 > 1 && ingress[0][0] == 1.0 {
+                    let ratio = costs.ingress_percent / ingress[0][1];
+                    let name = format!("{name}: ingress, against that of one");
+                    results.figures.push(Figure::at_most(&name, "times", 1.1, &[ratio]));
+                }
             }
+            let curve = |name: String, points| GrowthCurve { name, points };
+            cpu.push(curve(format!("all, {kind}"), all));
+            cpu.push(curve(format!("ingress, {kind}"), ingress));
+            wakes.push(curve(kind.to_string(), wake));
         }
-        let (count, seconds) = (if quick { 4 } else { 50 }, seconds(16));
-        let name = format!("IMU at 1 kHz, {count} in {kind}");
-        let (lambdas, players) = (&[("imu", count)][..], &[&["--imu", "1000"][..]][..]);
-        Load { name, lambdas, kind, players, seconds }.measure(&mut figures);
+        let growth = |what: &str, unit: &str, curves| Growth {
+            name: format!("{}: {what}", self.name),
+            of: self.of.to_owned(),
+            unit: unit.to_owned(),
+            curves,
+        };
+        results.growths.push(growth("CPU time", "% of a core", cpu));
+        results.growths.push(growth("wake latency, p50", "us", wakes));
     }
-    figures
 }
 
 pub(crate) fn lambda(name: &str, kind: Twin) -> PathBuf {
