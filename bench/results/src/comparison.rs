@@ -2,7 +2,7 @@
 
 use crate::markdown::{COMPARED, number, table};
 use crate::results::BenchResults;
-use crate::statistics::{Difference, Summary};
+use crate::statistics::{MeasuredDifference, Summary};
 
 /// What two runs have in common, and what only one of them has.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -20,7 +20,7 @@ struct ComparedFigure {
     name: String,
     unit: String,
     medians: [f64; 2],
-    difference: Difference,
+    difference: MeasuredDifference,
 }
 
 impl Comparison {
@@ -38,7 +38,7 @@ impl Comparison {
             let (Some(first), Some(second)) = (Summary::of(values), Summary::of(others)) else {
                 continue;
             };
-            let Some(difference) = Difference::between(values, others) else { continue };
+            let Some(difference) = MeasuredDifference::between(values, others) else { continue };
             comparison.rows.push(ComparedFigure {
                 name: name.clone(),
                 unit: unit.clone(),
@@ -99,7 +99,7 @@ fn measured(results: &BenchResults) -> Vec<(String, String, Vec<f64>)> {
     figures.chain(series).collect()
 }
 
-fn verdict(difference: &Difference) -> String {
+fn verdict(difference: &MeasuredDifference) -> String {
     let Some([low, high]) = difference.interval else {
         return "too few runs for a verdict".to_owned();
     };

@@ -2,7 +2,7 @@
 //!
 //! - [`BenchResults`] is one run: tables of [`Figure`]s, and [`Series`] of single measurements with
 //!   all of their values, and quantities with their [`Growth`]. It is stored as JSON, as Markdown, and as a page with plots.
-//! - [`Summary`] has the statistics of a series, and [`Difference`] compares two.
+//! - [`Summary`] has the statistics of a series, and [`MeasuredDifference`] compares two.
 //! - [`Comparison`] compares two runs.
 //! - [`Machine`] is where a run took place.
 
@@ -23,4 +23,4 @@ pub use figure::{Figure, Goal};
 pub use growth::{Growth, GrowthCurve};
 pub use machine::Machine;
 pub use results::{BenchResults, Reception, Series, SeriesGroup};
-pub use statistics::{Difference, Summary, quantile};
+pub use statistics::{MeasuredDifference, Summary, quantile};

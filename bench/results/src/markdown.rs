@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use crate::results::{BenchResults, Series, SeriesGroup};
-use crate::statistics::{Difference, Summary};
+use crate::statistics::{MeasuredDifference, Summary};
 
 /// Heads of the statistics of a series, as in the table of the paper, and three more.
 pub(crate) const STATISTICS: [&str; 7] = ["min", "mean", "median", "MAD", "p95", "p99", "max"];
@@ -90,7 +90,7 @@ impl SeriesGroup {
         let Some(base) = self.base() else { return Vec::new() };
         let others = self.series.iter().filter(|series| series.name != base.name);
         let rows = others.filter_map(|series| {
-            let difference = Difference::between(&base.values, &series.values)?;
+            let difference = MeasuredDifference::between(&base.values, &series.values)?;
             Some([vec![series.name.clone()], difference.cells().to_vec()].concat())
         });
         rows.collect()
@@ -104,7 +104,7 @@ impl SeriesGroup {
     }
 }
 
-impl Difference {
+impl MeasuredDifference {
     /// Returns the cells of a comparison, in the order of its heads.
     pub(crate) fn cells(&self) -> [String; 4] {
         let interval = match self.interval {

@@ -54,7 +54,7 @@ impl Summary {
 
 /// The difference between two sets of values `a` and `b`, in the order of their measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Difference {
+pub struct MeasuredDifference {
     /// Median of `b` divided by that of `a`.
     pub ratio: f64,
     /// Interval of 95 % of the ratio, by drawing blocks of neighbours again; `None` with fewer than
@@ -68,7 +68,7 @@ pub struct Difference {
     pub p: f64,
 }
 
-impl Difference {
+impl MeasuredDifference {
     /// Compares `b` with `a`; `None` if one of them is empty or has something that is no number.
     pub fn between(a: &[f64], b: &[f64]) -> Option<Self> {
         let medians = [Summary::of(a)?.median, Summary::of(b)?.median];
@@ -184,15 +184,15 @@ mod tests {
     #[test]
     fn equal_sets_do_not_differ_and_shifted_ones_do() {
         let (a, b) = (numbers(200, 100.0), numbers(200, 150.0));
-        let same = Difference::between(&a, &a).unwrap();
+        let same = MeasuredDifference::between(&a, &a).unwrap();
         assert!(!same.is_seen() && same.effect.abs() < 1e-9 && same.p > 0.9, "{same:?}");
-        let later = Difference::between(&a, &b).unwrap();
+        let later = MeasuredDifference::between(&a, &b).unwrap();
         let [low, high] = later.interval.unwrap();
         assert!(later.is_seen() && low < later.ratio && later.ratio < high, "{later:?}");
         assert!((later.ratio - 1.25).abs() < 0.01 && later.p < 1e-6, "{later:?}");
         // Of the 40,000 pairs, 150 * 151 / 2 have a higher `a`, and 150 are equal.
         assert!((later.effect - (1.0 - 2.0 * 11_250.0 / 40_000.0)).abs() < 0.01, "{later:?}");
-        let earlier = Difference::between(&b, &a).unwrap();
+        let earlier = MeasuredDifference::between(&b, &a).unwrap();
         assert!((earlier.effect + later.effect).abs() < 1e-9);
     }
 
@@ -200,7 +200,7 @@ mod tests {
     fn the_test_agrees_with_a_worked_example() {
         // The times of tortoises and hares: U = 11 of 36 pairs.
         let (tortoises, hares) = ([1., 7., 8., 9., 10., 11.], [2., 3., 4., 5., 6., 12.]);
-        let found = Difference::between(&tortoises, &hares).unwrap();
+        let found = MeasuredDifference::between(&tortoises, &hares).unwrap();
         assert!((found.effect - (2.0 * 11.0 / 36.0 - 1.0)).abs() < 1e-9, "{found:?}");
         // The standard score, corrected for whole numbers, is 6.5 / sqrt(39).
         assert!((found.p - 0.298).abs() < 0.001, "{found:?}");
@@ -208,7 +208,7 @@ mod tests {
 
     #[test]
     fn few_values_have_no_interval() {
-        let few = Difference::between(&[1.0, 1.1, 1.2], &[2.0, 2.1, 2.2]).unwrap();
+        let few = MeasuredDifference::between(&[1.0, 1.1, 1.2], &[2.0, 2.1, 2.2]).unwrap();
         assert!(few.interval.is_none() && !few.is_seen() && few.effect == 1.0, "{few:?}");
     }
 }
